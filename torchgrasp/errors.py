@@ -1,0 +1,114 @@
+"""Every error that torchgrasp raises, and the status that a batch row carries instead.
+
+A bad *argument* raises a subclass of `GraspError` at the public function, before any work. A row of a batch
+that fails does not raise: it carries a `Status`, whose member holds the sentence for the user.
+"""
+
+import enum
+
+
+class GraspError(Exception):
+    """Base of all errors raised by torchgrasp."""
+
+
+class BadArgument(GraspError, ValueError):
+    """An argument is of the wrong shape, type or range; the message names it, what was found and what is allowed."""
+
+    def __init__(self, argument: str, found: object, allowed: str):
+        super().__init__(f"{argument}: found {found}, allowed is {allowed}")
+        self.argument, self.found, self.allowed = argument, found, allowed
+
+
+class TooFewPoints(BadArgument):
+    """A cloud has fewer points than a surface needs."""
+
+
+class SuspiciousScale(BadArgument):
+    """A cloud's extent is no object that a hand could grasp: most often millimetres given as metres."""
+
+
+class CloudFileError(BadArgument):
+    """A point-cloud file is missing, empty, or not what its suffix says."""
+
+
+class MeshError(BadArgument):
+    """A mesh is missing, open, or has no volume."""
+
+
+class HandFileError(BadArgument):
+    """A hand's URDF or hand.toml is missing, malformed, or reaches outside its folder."""
+
+
+class ModelFileError(BadArgument):
+    """A safetensors file is missing, truncated, or does not hold what its kind requires."""
+
+
+class OutputError(BadArgument):
+    """An output folder or file cannot be written."""
+
+
+class MissingExtra(GraspError, ImportError):
+    """A stage needs a package of an extra that is not installed; the message names the extra."""
+
+    def __init__(self, package: str, extra: str):
+        super().__init__(f"{package} is not installed: pip install 'torchgrasp[{extra}]'")
+        self.package, self.extra = package, extra
+
+
+class IndefiniteCovariance(GraspError, ValueError):
+    """A covariance matrix is not positive definite; nothing is added to its diagonal to hide it."""
+
+    def __init__(self, what: str, smallest_eigenvalue: float, remedy: str):
+        super().__init__(f"{what} is not positive definite (smallest eigenvalue {smallest_eigenvalue:.3g}): {remedy}")
+        self.smallest_eigenvalue = smallest_eigenvalue
+
+
+class DegenerateContacts(GraspError, ValueError):
+    """Three contacts lie on a line or in a point: no virtual frame exists."""
+
+
+class FailedRows(GraspError):
+    """Raised by `raise_for_status` when rows of a batch did not succeed."""
+
+
+class Status(enum.IntEnum):
+    """What became of one row of a batch. The member's `sentence` is written for the user.
+
+    >>> Status.NOT_CLOSED.sentence
+    'the contacts do not resist every wrench at the planned friction (no frictional form closure)'
+    """
+
+    sentence: str
+
+    def __new__(cls, code: int, sentence: str) -> "Status":
+        """Attach the sentence to the integer code."""
+        member = int.__new__(cls, code)
+        member._value_ = code
+        member.sentence = sentence
+        return member
+
+    OK = 0, "all checks passed"
+    # planning
+    OUT_OF_DOMAIN = 10, "a contact lies outside the ball in which the shape model holds"
+    OFF_SURFACE = 11, "a contact is not on the estimated surface"
+    TOO_UNCERTAIN = 12, "the shape at a contact is less certain than max_variance allows"
+    NOT_CLOSED = 13, "the contacts do not resist every wrench at the planned friction (no frictional form closure)"
+    TOO_CLOSE = 14, "two contacts are closer than a fingertip is wide"
+    NOT_FLAT = 15, "the surface around a contact bends too sharply for a fingertip"
+    BELOW_TABLE = 16, "a contact lies too near the table"
+    DEGENERATE = 17, "the contacts lie on a line or in a point: they span no virtual frame"
+    # hand configuration
+    OUT_OF_REACH = 20, "no posture of this hand spans the contacts"
+    TIP_ERROR = 21, "a fingertip does not reach its contact"
+    NORMAL_ANGLE = 22, "a fingertip would touch outside its pad"
+    JOINT_LIMITS = 23, "a joint would leave its limits"
+    SELF_COLLISION = 24, "links of the hand would collide with each other"
+    OBJECT_COLLISION = 25, "a link of the hand would penetrate the object"
+    TABLE_COLLISION = 26, "a link of the hand would penetrate the table"
+    # closing
+    START_OVERLAP = 30, "the hand overlaps the object or the table before closing starts"
+    NO_CONTACT = 31, "a fingertip never touched the object"
+    DROPPED = 32, "the object was lifted and lost"
+    NOT_LIFTED = 33, "the object stayed behind when the hand was lifted"
+    EJECTED = 34, "the object was pushed out while the hand closed"
+    UNSTABLE = 35, "the simulation did not stay finite"

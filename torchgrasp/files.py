@@ -1,0 +1,130 @@
+"""Files that torchgrasp writes and reads back: safetensors with JSON metadata, written atomically.
+
+There is no pickle anywhere: a file from a stranger can be malformed, but it cannot run code.
+"""
+
+import dataclasses
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from torchgrasp.errors import ModelFileError, OutputError
+from torchgrasp.values import Certificate, Contacts, Grasps
+
+VERSION = "1"
+"""Version of the layout of every file written here; readers refuse any other."""
+
+
+def write_atomically(path: Path | str, write: Callable[[Path], None]) -> Path:
+    """Call `write` on a temporary file beside `path`, then move it into place; nothing half-written stays.
+
+    Raises:
+        OutputError: the folder cannot be made or written, or the disk is full.
+    """
+    path = Path(path)
+    temporary: Path | None = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent)
+        os.close(handle)
+        temporary = Path(name)
+        write(temporary)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise OutputError("path", f"{path} ({error.strerror or error})", "a file in a writable folder") from error
+    finally:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+    return path
+
+
+def save_tensors(path: Path | str, kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) -> Path:
+    """Write named tensors and metadata as one safetensors file of a `kind` ("grasps", "mixture", ...).
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    contiguous = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
+    header = {**meta, "kind": kind, "version": VERSION}
+    return write_atomically(path, lambda temporary: save_file(contiguous, temporary, metadata=header))
+
+
+def load_tensors(path: Path | str, kind: str, names: set[str]) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Read a safetensors file, checking its kind, its version and that it holds exactly `names`, all finite.
+
+    Raises:
+        ModelFileError: the file is missing, malformed, of another kind or version, or holds other tensors.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ModelFileError("path", f"{path}, which is no file", f"a safetensors file of kind {kind!r}")
+    try:
+        with safe_open(path, framework="pt") as file:
+            meta: dict[str, str] = dict(file.metadata() or {})
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+    except (SafetensorError, OSError, ValueError, KeyError) as error:
+        raise ModelFileError("path", f"{path}: {error}", f"a safetensors file of kind {kind!r}") from error
+    if meta.get("kind") != kind or meta.get("version") != VERSION:
+        found = f"kind {meta.get('kind')!r}, version {meta.get('version')!r}"
+        raise ModelFileError("path", f"{path}: {found}", f"kind {kind!r}, version {VERSION!r}")
+    if set(tensors) != names:
+        raise ModelFileError("path", f"{path}: tensors {sorted(tensors)}", f"tensors {sorted(names)}")
+    for name, t in tensors.items():
+        if t.is_floating_point() and not bool(torch.isfinite(t).all()):
+            raise ModelFileError("path", f"{path}: a non-finite number in {name}", "finite numbers")
+    return tensors, meta
+
+
+def sha256(path: Path | str) -> str:
+    """Return the SHA-256 of a file's bytes as hexadecimal digits."""
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+
+
+def _flatten(value: Any, prefix: str = "") -> dict[str, Tensor]:
+    """Name every tensor inside a value by its path of field names."""
+    tensors: dict[str, Tensor] = {}
+    for field in dataclasses.fields(value):
+        inner = getattr(value, field.name)
+        if isinstance(inner, Tensor):
+            tensors[prefix + field.name] = inner
+        elif dataclasses.is_dataclass(inner):
+            tensors |= _flatten(inner, f"{prefix}{field.name}.")
+    return tensors
+
+
+def save_grasps(grasps: Grasps, path: Path | str) -> Path:
+    """Write grasps with their metadata (names, frames, units, hashes, seed); see `Grasps.save`."""
+    return save_tensors(path, "grasps", _flatten(grasps), {"meta": json.dumps(grasps.meta, sort_keys=True)})
+
+
+def load_grasps(path: Path | str) -> Grasps:
+    """Read grasps that `Grasps.save` wrote.
+
+    Raises:
+        ModelFileError: the file is missing or malformed.
+    """
+    nested = {"contacts": Contacts, "certificate": Certificate}
+    plain = [f.name for f in dataclasses.fields(Grasps) if f.name not in (*nested, "meta")]
+    names = set(plain) | {f"{k}.{f.name}" for k, t in nested.items() for f in dataclasses.fields(t)}
+    tensors, meta = load_tensors(path, "grasps", names)
+    rows = {name: len(t) for name, t in tensors.items()}
+    if len(set(rows.values())) != 1:
+        raise ModelFileError("path", f"{path}: rows {rows}", "as many rows in every tensor")
+    values: dict[str, Any] = {name: tensors[name] for name in plain}
+    for name, kind in nested.items():
+        values[name] = kind(**{f.name: tensors[f"{name}.{f.name}"] for f in dataclasses.fields(kind)})
+    try:
+        values["meta"] = json.loads(meta.get("meta", "{}"))
+    except json.JSONDecodeError as error:
+        raise ModelFileError("path", f"{path}: {error}", "JSON metadata") from error
+    return Grasps(**values)
