@@ -71,7 +71,7 @@ def load_tensors(path: Path | str, kind: str, names: set[str]) -> tuple[dict[str
     try:
         with safe_open(path, framework="pt") as file:
             meta: dict[str, str] = dict(file.metadata() or {})
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
     except (SafetensorError, OSError, ValueError, KeyError) as error:
         raise ModelFileError("path", f"{path}: {error}", f"a safetensors file of kind {kind!r}") from error
     if meta.get("kind") != kind or meta.get("version") != VERSION:

@@ -41,9 +41,7 @@ def cholesky(matrix: Float[Tensor, "*b n n"], what: str, remedy: str) -> Float[T
     return factor
 
 
-def squared_mahalanobis(
-    difference: Float[Tensor, "*b d"], factor: Float[Tensor, "*b d d"]
-) -> Float[Tensor, "*b"]:
+def squared_mahalanobis(difference: Float[Tensor, "*b d"], factor: Float[Tensor, "*b d d"]) -> Float[Tensor, "*b"]:
     """Return x^T Sigma^-1 x for the lower Cholesky factor of Sigma."""
     whitened = torch.linalg.solve_triangular(factor, difference[..., None], upper=False)[..., 0]
     return (whitened * whitened).sum(-1)

@@ -390,10 +390,11 @@ class TrialSpec(Value):
 class ClosureResult(Value):
     """What happened when the hand closed on the true object.
 
-    `time` [s] is the control ticks; `forces` [N] the normal force of each fingertip; `object_pose` the object in the
-    world at each tick and `joints` every joint of the URDF by the order of `joint_names`. `contact_order` lists the fingers in the order of
-    their first touch (-1: never touched). `object_motion` is how far the object moved [m] and turned [rad] against
-    the hand between the start and the end. `held` is true when the object is still up with the hand at the end.
+    `time` [s] is the control ticks; `forces` [N] the normal force of each fingertip; `object_pose` and `hand_pose`
+    the object's and the hand's frames in the world at each tick; `joints` every joint of the URDF in the order of
+    `joint_names`. `contact_order` lists the fingers in the order of their first touch, those that never touched left
+    out. `object_motion` is how far the object moved [m] and turned [rad] against the hand between the start and the
+    end. `held` is true when the object is still up with the hand at the end; `seconds` is the wall time.
     """
 
     held: bool
