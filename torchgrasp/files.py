@@ -55,7 +55,8 @@ def save_tensors(path: Path | str, kind: str, tensors: dict[str, Tensor], meta: 
         OutputError: the file cannot be written.
     """
     contiguous = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
-    header = {**meta, "kind": kind, "version": VERSION}
+    # One JSON string: safetensors writes several metadata keys in random order, and equal values must give equal bytes.
+    header = {"torchgrasp": json.dumps({**meta, "kind": kind, "version": VERSION}, sort_keys=True)}
     return write_atomically(path, lambda temporary: save_file(contiguous, temporary, metadata=header))
 
 
@@ -70,10 +71,12 @@ def load_tensors(path: Path | str, kind: str, names: set[str]) -> tuple[dict[str
         raise ModelFileError("path", f"{path}, which is no file", f"a safetensors file of kind {kind!r}")
     try:
         with safe_open(path, framework="pt") as file:
-            meta: dict[str, str] = dict(file.metadata() or {})
+            meta = json.loads((file.metadata() or {}).get("torchgrasp", "{}"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}
     except (SafetensorError, OSError, ValueError, KeyError) as error:
         raise ModelFileError("path", f"{path}: {error}", f"a safetensors file of kind {kind!r}") from error
+    if not isinstance(meta, dict):
+        meta = {}
     if meta.get("kind") != kind or meta.get("version") != VERSION:
         found = f"kind {meta.get('kind')!r}, version {meta.get('version')!r}"
         raise ModelFileError("path", f"{path}: {found}", f"kind {kind!r}, version {VERSION!r}")
@@ -104,7 +107,7 @@ def _flatten(value: Any, prefix: str = "") -> dict[str, Tensor]:
 
 def save_grasps(grasps: Grasps, path: Path | str) -> Path:
     """Write grasps with their metadata (names, frames, units, hashes, seed); see `Grasps.save`."""
-    return save_tensors(path, "grasps", _flatten(grasps), {"meta": json.dumps(grasps.meta, sort_keys=True)})
+    return save_tensors(path, "grasps", _flatten(grasps), grasps.meta)
 
 
 def load_grasps(path: Path | str) -> Grasps:
@@ -123,8 +126,4 @@ def load_grasps(path: Path | str) -> Grasps:
     values: dict[str, Any] = {name: tensors[name] for name in plain}
     for name, kind in nested.items():
         values[name] = kind(**{f.name: tensors[f"{name}.{f.name}"] for f in dataclasses.fields(kind)})
-    try:
-        values["meta"] = json.loads(meta.get("meta", "{}"))
-    except json.JSONDecodeError as error:
-        raise ModelFileError("path", f"{path}: {error}", "JSON metadata") from error
-    return Grasps(**values)
+    return Grasps(**values, meta={k: v for k, v in meta.items() if k not in ("kind", "version")})

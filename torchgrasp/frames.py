@@ -33,12 +33,12 @@ def inverse(a_from_b: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
     return rigid(rotation, -(rotation @ a_from_b[..., :3, 3:])[..., 0])
 
 
-def apply(a_from_b: Float[Tensor, "*b 4 4"], points: Float[Tensor, "*b n 3"]) -> Float[Tensor, "*b n 3"]:
+def apply(a_from_b: Float[Tensor, "*#b 4 4"], points: Float[Tensor, "*#b n 3"]) -> Float[Tensor, "*#b n 3"]:
     """Map points of frame b into frame a."""
     return points @ a_from_b[..., :3, :3].transpose(-1, -2) + a_from_b[..., None, :3, 3]
 
 
-def rotate(a_from_b: Float[Tensor, "*b 4 4"], directions: Float[Tensor, "*b n 3"]) -> Float[Tensor, "*b n 3"]:
+def rotate(a_from_b: Float[Tensor, "*#b 4 4"], directions: Float[Tensor, "*#b n 3"]) -> Float[Tensor, "*#b n 3"]:
     """Map directions of frame b into frame a."""
     return directions @ a_from_b[..., :3, :3].transpose(-1, -2)
 

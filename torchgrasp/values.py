@@ -9,20 +9,22 @@ Letters in shapes: n points, b batch rows, g grasps, e friction-cone edges, h ac
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from typing_extensions import Self
 
 from torchgrasp.errors import BadArgument, FailedRows, Status, TooFewPoints
+
+SomeValue = TypeVar("SomeValue", bound="Value")
+SomeBatch = TypeVar("SomeBatch", bound="Batch")
 
 
 class Value:
     """Base of all values: `.to()` maps every tensor inside, nested values included, into a new value."""
 
-    def to(self, *args: Any, **kwargs: Any) -> Self:
+    def to(self: SomeValue, *args: Any, **kwargs: Any) -> SomeValue:
         """Return the value on another device or in another floating dtype; integers keep theirs."""
 
         def move(x: Any) -> Any:
@@ -44,7 +46,7 @@ class Batch(Value):
         """Count the rows."""
         return len(getattr(self, dataclasses.fields(self)[0].name))  # pyright: ignore[reportArgumentType]
 
-    def __getitem__(self, rows: Any) -> Self:
+    def __getitem__(self: SomeBatch, rows: Any) -> SomeBatch:
         """Select rows by a slice, a mask or an index tensor; an integer keeps the batch axis."""
         if isinstance(rows, int):
             rows = range(len(self))[rows]  # raises IndexError as a list would
@@ -56,11 +58,11 @@ class Batch(Value):
         fields = dataclasses.fields(self)  # pyright: ignore[reportArgumentType]
         return type(self)(**{f.name: pick(getattr(self, f.name)) for f in fields})
 
-    def __iter__(self) -> Iterator[Self]:
+    def __iter__(self: SomeBatch) -> Iterator[SomeBatch]:
         """Iterate over the rows, each a batch of one."""
         return (self[i] for i in range(len(self)))
 
-    def raise_for_status(self) -> Self:
+    def raise_for_status(self: SomeBatch) -> SomeBatch:
         """Return the value itself when every row is `Status.OK`; raise `FailedRows` with counts otherwise."""
         counts = count_status(getattr(self, "status"))  # noqa: B009
         failed = {s: k for s, k in counts.items() if s is not Status.OK}
@@ -212,7 +214,7 @@ class ContactSpec(Value):
         return self.friction * self.friction_margin
 
     @classmethod
-    def paper(cls, friction: float = 0.8, edges: int = 8, max_variance: float = 0.03) -> Self:
+    def paper(cls, friction: float = 0.8, edges: int = 8, max_variance: float = 0.03) -> "ContactSpec":
         """Return the paper's own problem: full friction, no separation, flatness or table."""
         return cls(friction, edges, max_variance, friction_margin=1.0, separation=0.0, flatness=None)
 

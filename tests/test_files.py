@@ -1,0 +1,109 @@
+"""Safetensors files: round trip, refusals, atomic writes."""
+
+import os
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from torchgrasp.errors import ModelFileError, OutputError
+from torchgrasp.files import load_grasps, load_tensors, save_tensors, sha256, write_atomically
+from torchgrasp.values import Certificate, Contacts, Grasps
+
+
+def some_grasps(g: int = 2, h: int = 4) -> Grasps:
+    def rand(*shape: int) -> torch.Tensor:
+        return torch.rand(*shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+
+    return Grasps(
+        joints=rand(g, h),
+        pregrasp=rand(g, h),
+        obj_from_hand=rand(g, 4, 4),
+        contacts=Contacts(rand(g, 3, 3), rand(g, 3, 3), rand(g, 3), rand(g, 3)),
+        permutation=torch.tensor([[0, 1, 2]] * g),
+        tip_error=rand(g, 3),
+        clearance=rand(g),
+        normal_angle=rand(g, 3),
+        certificate=Certificate(rand(g), rand(g), rand(g), torch.ones(g, dtype=torch.bool)),
+        score=rand(g),
+        status=torch.zeros(g, dtype=torch.int64),
+        meta={"hand": "toy", "unit": "metre"},
+    )
+
+
+def test_grasps_survive_the_round_trip(tmp_path):
+    before = some_grasps()
+    before.save(tmp_path / "deep" / "grasps.safetensors")
+    after = load_grasps(tmp_path / "deep" / "grasps.safetensors")
+    assert after.meta == before.meta
+    torch.testing.assert_close(after.joints, before.joints, rtol=0, atol=0)
+    torch.testing.assert_close(after.contacts.std_m, before.contacts.std_m, rtol=0, atol=0)
+    assert torch.equal(after.certificate.closed, before.certificate.closed)
+
+
+def test_the_same_grasps_give_the_same_bytes(tmp_path):
+    for name in ("a", "b"):
+        some_grasps().save(tmp_path / name)
+    assert sha256(tmp_path / "a") == sha256(tmp_path / "b")
+
+
+def test_every_truncation_is_refused(tmp_path):
+    path = tmp_path / "grasps.safetensors"
+    some_grasps().save(path)
+    data = path.read_bytes()
+    for n in [*range(0, 200, 7), *range(200, len(data), 131)]:
+        path.write_bytes(data[:n])
+        with pytest.raises(ModelFileError):
+            load_grasps(path)
+
+
+def test_foreign_files_are_refused(tmp_path):
+    cases = {
+        "wrong kind": ({"a": torch.zeros(1)}, '{"kind": "mixture", "version": "1"}'),
+        "version": ({"a": torch.zeros(1)}, '{"kind": "toy", "version": "99"}'),
+        "other tensors": ({"b": torch.zeros(1)}, '{"kind": "toy", "version": "1"}'),
+        "nan": ({"a": torch.tensor([float("nan")])}, '{"kind": "toy", "version": "1"}'),
+        "no object": ({"a": torch.zeros(1)}, "[1]"),
+        "no json": ({"a": torch.zeros(1)}, "{"),
+        "no metadata": ({"a": torch.zeros(1)}, None),
+    }
+    for name, (tensors, meta) in cases.items():
+        save_file(tensors, tmp_path / name, metadata=None if meta is None else {"torchgrasp": meta})
+        with pytest.raises(ModelFileError):
+            load_tensors(tmp_path / name, "toy", {"a"})
+    for name in ("missing", "."):
+        with pytest.raises(ModelFileError):
+            load_tensors(tmp_path / name, "toy", {"a"})
+
+
+def test_unequal_rows_are_refused(tmp_path):
+    some_grasps(2).save(tmp_path / "f")
+    from safetensors import safe_open
+
+    with safe_open(tmp_path / "f", framework="pt") as file:
+        tensors = {k: file.get_tensor(k) for k in file.keys()}
+        meta = dict(file.metadata())
+    tensors["score"] = tensors["score"][:1].clone()
+    save_file(tensors, tmp_path / "f", metadata=meta)
+    with pytest.raises(ModelFileError, match="rows"):
+        load_grasps(tmp_path / "f")
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_debris(tmp_path):
+    path = save_tensors(tmp_path / "f", "toy", {"a": torch.zeros(1)}, {})
+    before = path.read_bytes()
+
+    def fail(temporary):
+        temporary.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OutputError, match="No space left"):
+        write_atomically(path, fail)
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["f"]
+
+
+def test_a_file_in_the_place_of_a_folder_is_named(tmp_path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(OutputError, match="writable folder"):
+        write_atomically(tmp_path / "file" / "x", lambda p: None)

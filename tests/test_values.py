@@ -1,0 +1,106 @@
+"""Value types: checks at construction, rows, devices and dtypes, statuses."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from torchgrasp.errors import BadArgument, FailedRows, GraspError, Status, TooFewPoints
+from torchgrasp.values import Certificate, ContactPlan, Contacts, ContactSpec, PointCloud, TrialSpec, count_status
+
+
+def plan(status: list[int]) -> ContactPlan:
+    b = len(status)
+    contacts = Contacts(torch.rand(b, 3, 3), torch.rand(b, 3, 3), torch.rand(b, 3), torch.rand(b, 3))
+    return ContactPlan(contacts, torch.rand(b, 3, 8), torch.arange(b) * 1.0, torch.tensor(status))
+
+
+def test_statuses_are_sentences_with_distinct_codes():
+    assert len({int(s) for s in Status}) == len(Status) == len({s.sentence for s in Status})
+    assert all(len(s.sentence.split()) > 2 for s in Status)
+
+
+def test_raise_for_status_counts_the_failures():
+    assert plan([0, 0]).raise_for_status() is not None
+    with pytest.raises(FailedRows, match=f"2 of 3 rows: {Status.TOO_CLOSE.sentence}".replace("(", r"\(")):
+        plan([0, 14, 14]).raise_for_status()
+
+
+def test_count_status_puts_the_most_frequent_first():
+    assert list(count_status(torch.tensor([0, 13, 13]))) == [Status.NOT_CLOSED, Status.OK]
+
+
+@pytest.mark.parametrize("rows", [1, slice(1, 2), torch.tensor([False, True, False]), torch.tensor([1])])
+def test_indexing_selects_rows_of_nested_values(rows):
+    picked = plan([0, 1 + 12, 0])[rows]
+    assert len(picked) == len(picked.contacts) == 1
+    assert picked.quality.tolist() == [1.0]
+    assert picked.status.tolist() == [Status.NOT_CLOSED]
+
+
+def test_iteration_ends_and_indices_are_checked():
+    assert [float(row.quality) for row in plan([0, 0, 0])] == [0.0, 1.0, 2.0]
+    with pytest.raises(IndexError):
+        plan([0])[1]
+
+
+def test_to_returns_a_new_value_and_keeps_integers():
+    before = plan([0])
+    after = before.to(torch.float64)
+    assert after.contacts.points.dtype == torch.float64 and before.contacts.points.dtype == torch.float32
+    assert after.status.dtype == torch.int64
+    certificate = Certificate(*(torch.rand(2) for _ in range(3)), torch.tensor([True, False])).to(torch.float64)
+    assert certificate.closed.dtype == torch.bool
+
+
+def test_values_are_frozen():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        ContactSpec().friction = 1.0  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("points", "error"),
+    [
+        (torch.rand(3, 3), TooFewPoints),
+        (torch.rand(0, 3), TooFewPoints),
+        (torch.rand(5, 2), BadArgument),
+        (torch.randint(9, (5, 3)), BadArgument),
+        (torch.full((5, 3), float("nan")), BadArgument),
+        (torch.rand(5, 3).half(), BadArgument),
+        ([[0.0, 0, 0]] * 5, BadArgument),
+    ],
+)
+@pytest.mark.filterwarnings("ignore")
+def test_bad_clouds_are_refused(points, error):
+    with pytest.raises((error, TypeError)) as caught:  # TypeError: the annotation check that runs in tests only
+        PointCloud(points)
+    if isinstance(caught.value, GraspError):
+        assert "points" in str(caught.value) and "allowed" in str(caught.value)
+
+
+def test_the_first_bad_index_is_named():
+    points = torch.rand(6, 3)
+    points[4, 1] = float("inf")
+    with pytest.raises(BadArgument, match=r"inf at index \[4, 1\]"):
+        PointCloud(points)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [dict(friction=-0.1), dict(friction=11.0), dict(edges=2), dict(max_variance=0.0), dict(max_variance=float("nan"))],
+)
+def test_bad_specs_are_refused(bad):
+    with pytest.raises(BadArgument, match=next(iter(bad))):
+        ContactSpec(**bad)
+
+
+@pytest.mark.parametrize("bad", [dict(controller="guess"), dict(mass=0.0), dict(timestep=1.0)])
+def test_bad_trials_are_refused(bad):
+    with pytest.raises((BadArgument, TypeError), match=next(iter(bad))):
+        TrialSpec(**bad)
+
+
+def test_paper_spec_has_no_margins():
+    spec = ContactSpec.paper()
+    assert spec.planned_friction == spec.friction == 0.8
+    assert spec.max_variance == 0.03 and spec.separation == 0 and spec.flatness is None and spec.table is None
