@@ -1,0 +1,77 @@
+"""A depth image becomes a point cloud with a viewpoint."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.cloud.check import check_cloud
+from torchgrasp.errors import BadArgument, TooFewPoints
+from torchgrasp.frames import apply
+from torchgrasp.values import PointCloud, check_tensor
+
+
+def cloud_from_depth(
+    depth: Float[Tensor, "h w"],
+    intrinsics: Float[Tensor, "3 3"],
+    mask: Bool[Tensor, "h w"] | None = None,
+    camera_pose: Float[Tensor, "4 4"] | None = None,
+) -> PointCloud:
+    """Return the points of a pinhole camera's depth image, with the camera as viewpoint.
+
+    Pixel (row v, column u) with depth z is the point z ((u - cx) / fx, (v - cy) / fy, 1) of the camera's frame
+    (x right, y down, z forward). Pixels with depth 0, NaN or infinity were not measured and are left out.
+
+    Args:
+        depth: distance along the optical axis [m]; integer images in mm need `depth.double() / 1000`.
+        intrinsics: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [pixels].
+        mask: pixels of the object; without it every measured pixel is taken for the object.
+        camera_pose: obj_from_camera, the camera's rigid pose in the frame of the result; None: the camera's frame.
+
+    Raises:
+        BadArgument: a wrong shape or type, negative depth, intrinsics of no pinhole camera, a pose that is not rigid.
+        TooFewPoints: fewer than 4 measured pixels.
+        SuspiciousScale: an extent outside [5 mm, 2 m]: depth in mm, or a whole scene without a mask.
+
+    >>> K = torch.tensor([[600.0, 0, 32], [0, 600.0, 24], [0, 0, 1]])
+    >>> cloud_from_depth(torch.full((48, 64), 0.5), K).viewpoint
+    tensor([0., 0., 0.])
+    """
+    if depth.ndim != 2 or depth.dtype not in (torch.float32, torch.float64):
+        raise BadArgument("depth", f"shape {tuple(depth.shape)} of {depth.dtype}", "shape (h, w), floating, in metres")
+    if bool((depth < 0).any()):
+        raise BadArgument("depth", f"{float(depth[depth < 0].min()):.4g} m", "depths >= 0")
+    check_intrinsics(intrinsics)
+    seen = torch.isfinite(depth) & (depth > 0)
+    if mask is not None:
+        if mask.shape != depth.shape or mask.dtype != torch.bool:
+            raise BadArgument("mask", f"shape {tuple(mask.shape)} of {mask.dtype}", f"bool of {tuple(depth.shape)}")
+        seen = seen & mask
+    if int(seen.sum()) < 4:
+        raise TooFewPoints("depth", f"{int(seen.sum())} measured pixels", "at least 4 measured pixels in the mask")
+    row, column = torch.nonzero(seen, as_tuple=True)
+    z = depth[seen]
+    k = intrinsics.to(depth)
+    points = torch.stack([z * (column - k[0, 2]) / k[0, 0], z * (row - k[1, 2]) / k[1, 1], z], -1)
+    viewpoint = torch.zeros(3, dtype=points.dtype, device=points.device)
+    if camera_pose is not None:
+        pose = check_rigid("camera_pose", camera_pose).to(points)
+        points, viewpoint = apply(pose, points), pose[:3, 3]
+    return check_cloud(PointCloud(points, None, viewpoint))
+
+
+def check_intrinsics(intrinsics: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+    """Return the intrinsics of a pinhole camera; raise `BadArgument` for anything else."""
+    k = check_tensor("intrinsics", intrinsics, (3, 3))
+    if not (k[0, 0] > 0 and k[1, 1] > 0) or k[0, 1] != 0 or k[1, 0] != 0 or k[2].tolist() != [0, 0, 1]:
+        raise BadArgument("intrinsics", k.tolist(), "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0")
+    return k
+
+
+def check_rigid(name: str, pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+    """Return a rigid transform (a rotation to 1e-4 and a translation); raise `BadArgument` for anything else."""
+    check_tensor(name, pose, (4, 4))
+    rotation, eye = pose[:3, :3].double(), torch.eye(3, dtype=torch.float64, device=pose.device)
+    error = float((rotation @ rotation.T - eye).abs().max())
+    if error > 1e-4 or float(torch.linalg.det(rotation)) < 0 or pose[3].tolist() != [0, 0, 0, 1]:
+        raise BadArgument(name, pose.tolist(), "a rigid transform: a right-handed rotation, and the row 0 0 0 1")
+    return pose
