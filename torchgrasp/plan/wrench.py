@@ -1,0 +1,154 @@
+"""Contact wrenches of three frictional contacts, their balance, and the exact closure test (Eq. 13).
+
+All normals given here are the outward ones of the surface; a fingertip pushes along their negative. Torques are
+taken about the contacts' centre and divided by the contacts' radius, so that nothing depends on units or origin.
+"""
+
+import itertools
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.frames import degenerate
+from torchgrasp.linalg import unit
+
+BALANCED = 1e-9
+"""Largest |W phi| of coefficients that are called balanced: rounding in float64, far below any wrench (about 1)."""
+
+PARALLEL = 1e-9
+"""Planar wrenches (of length about 1) whose cross product is shorter than this span no plane."""
+
+
+def centre_and_radius(points: Float[Tensor, "b 3 3"]) -> tuple[Float[Tensor, "b 1 3"], Float[Tensor, "b 1 1"]]:
+    """Return the contacts' centre and their root-mean-square distance from it, both in the unit of `points`.
+
+    Coincident contacts have the radius 1: their torques are zero in any unit.
+    """
+    centre = points.mean(-2, keepdim=True)
+    radius = torch.linalg.vector_norm(points - centre, dim=(-2, -1), keepdim=True) / math.sqrt(3.0)
+    return centre, torch.where(radius == 0, 1.0, radius)
+
+
+def tangents(points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
+    """Return for each contact the unit tangent that lies in the plane of the three contacts.
+
+    No field of tangents on the sphere is free of a seam. Fixed by the plane of the contacts it turns with the object,
+    and its only seam is a normal perpendicular to that plane, where no friction below infinity gives closure: the
+    three forces of a balance are coplanar. Edges along it also lose the least of the round cone. On the seam itself,
+    and for contacts on a line, an arbitrary tangent stands in, so that the result is finite.
+    """
+    plane = torch.linalg.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
+    inside = torch.linalg.cross(plane[:, None].expand_as(normals), normals)
+    length = torch.linalg.vector_norm(inside, dim=-1, keepdim=True)
+    size = torch.linalg.vector_norm(plane, dim=-1)[:, None, None]
+    smallest = normals.abs().argmin(-1)
+    axis = torch.eye(3, dtype=normals.dtype, device=normals.device)[smallest]
+    stand_in = torch.linalg.cross(axis, normals)
+    seam = ~(length > 1e-9 * size) | (size == 0)
+    return unit(torch.where(seam, stand_in, inside))
+
+
+def cone_edges(
+    normals: Float[Tensor, "*b 3"], tangent: Float[Tensor, "*b 3"], friction: float, edges: int
+) -> Float[Tensor, "*b e 3"]:
+    """Return the edges of the linearised friction cones: forces on the object with a normal part of 1.
+
+    Args:
+        normals: outward unit normals.
+        tangent: a unit tangent at each contact, along which the first edge leans.
+        friction: coefficient of friction.
+        edges: edges of each cone.
+    """
+    angle = torch.arange(edges, dtype=normals.dtype, device=normals.device) * (2 * math.pi / edges)
+    other = torch.linalg.cross(normals, tangent)
+    lean = angle.cos()[:, None] * tangent[..., None, :] + angle.sin()[:, None] * other[..., None, :]
+    return friction * lean - normals[..., None, :]
+
+
+def wrenches(
+    points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"], friction: float, edges: int = 8
+) -> Float[Tensor, "b 3 e 6"]:
+    """Return the primitive contact wrenches w of Eq. (13): force, then torque about the centre over the radius.
+
+    Args:
+        points: contacts in any unit of length.
+        normals: outward unit normals.
+        friction: coefficient of friction.
+        edges: edges of each linearised cone.
+
+    >>> wrenches(torch.eye(3)[None], torch.eye(3)[None], friction=0.5).shape
+    torch.Size([1, 3, 8, 6])
+    """
+    force = cone_edges(normals, tangents(points, normals), friction, edges)
+    centre, radius = centre_and_radius(points)
+    arm = ((points - centre) / radius)[:, :, None].expand_as(force)
+    return torch.cat([force, torch.linalg.cross(arm, force)], -1)
+
+
+def rank_ratio(wrench: Float[Tensor, "b 3 e 6"]) -> Float[Tensor, "b"]:
+    """Return the smallest over the largest singular value of the 6 x 3e wrench matrix of each row."""
+    values = torch.linalg.svdvals(wrench.flatten(1, 2))
+    return values[:, -1] / values[:, 0]
+
+
+def balance(
+    wrench: Float[Tensor, "b 3 e 6"], steps: int = 40
+) -> tuple[Float[Tensor, "b 3 e"], Float[Tensor, "b"]]:
+    """Return the coefficients phi > 0, sum phi = 1 of Eq. (13) of the greatest entropy, and the largest |W phi| left.
+
+    They are phi = softmax(W^T y) with y the minimum of log sum exp(W^T y), which exists if and only if the origin is
+    inside the hull of the wrenches: a smooth convex problem in six unknowns. Rows without closure keep a residual.
+    """
+    matrix = wrench.flatten(1, 2).double()  # (b, 3e, 6)
+    y = matrix.new_zeros(len(matrix), 6)
+    for _ in range(steps):
+        phi = torch.softmax((matrix @ y[..., None])[..., 0], -1)
+        weighted = phi[..., None] * matrix
+        slope = weighted.sum(1)
+        curvature = matrix.mT @ weighted - slope[:, :, None] * slope[:, None, :]
+        newton, _ = torch.linalg.solve_ex(curvature, slope)
+        decrement = (newton * slope).sum(-1, keepdim=True)
+        # The damped step of self-concordant minimisation; a row whose curvature has vanished has no balance and stays.
+        step = newton / (1 + decrement.clamp(min=0.0).sqrt())
+        y = torch.where(torch.isfinite(step).all(-1, keepdim=True) & (decrement >= 0), y - step, y)
+    phi = torch.softmax((matrix @ y[..., None])[..., 0], -1)
+    residual = (phi[:, None] @ matrix)[:, 0].abs().amax(-1)
+    return phi.unflatten(1, wrench.shape[1:3]).to(wrench.dtype), residual.to(wrench.dtype)
+
+
+def closed_exact(
+    points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"], friction: float
+) -> Bool[Tensor, "b"]:
+    """Tell which triples have frictional form closure with round cones, exactly: Eq. (13) as edges go to infinity.
+
+    Three forces in balance lie in the plane of the contacts. What each cone cuts from that plane is an angle about
+    the projected normal, and the six planar wrenches at its ends must positively span the plane's wrenches: no plane
+    through two of them may have all others on one side.
+
+    Args:
+        points: contacts in any unit of length.
+        normals: outward unit normals.
+        friction: coefficient of friction; degenerate and non-finite rows are not closed.
+    """
+    centre, radius = centre_and_radius(points)
+    arm = (points - centre) / radius
+    across = unit(torch.linalg.cross(arm[:, 1] - arm[:, 0], arm[:, 2] - arm[:, 0]))
+    along = unit(arm[:, 1] - arm[:, 0])
+    basis = torch.stack([along, torch.linalg.cross(across, along)], -1)  # (b, 3, 2)
+    inward, position = -normals @ basis, arm @ basis
+    projected = torch.linalg.vector_norm(inward, dim=-1)
+    cone = math.cos(math.atan(friction))
+    half = torch.arccos((cone / projected).clamp(max=1.0))
+    middle = torch.atan2(inward[..., 1], inward[..., 0])
+    angle = torch.stack([middle - half, middle + half], -1)  # (b, 3, 2)
+    c, s = angle.cos(), angle.sin()
+    planar = torch.stack([c, s, position[..., 0, None] * s - position[..., 1, None] * c], -1).flatten(1, 2)
+    first, second = torch.tensor(list(itertools.combinations(range(6), 2)), device=points.device).unbind(-1)
+    plane = torch.linalg.cross(planar[:, first], planar[:, second])  # (b, 15, 3)
+    side = plane @ planar.mT  # (b, 15, 6)
+    spans = torch.linalg.vector_norm(plane, dim=-1) > PARALLEL
+    both = (side.amax(-1) > PARALLEL) & (side.amin(-1) < -PARALLEL)
+    spanned = (both | ~spans).all(-1) & spans.any(-1)
+    return spanned & (projected > cone).all(-1) & ~degenerate(points)
