@@ -1,0 +1,99 @@
+"""Expectation-maximisation against scikit-learn and closed forms."""
+
+import numpy as np
+import pytest
+import torch
+from sklearn.mixture import GaussianMixture
+
+from torchgrasp.errors import IndefiniteCovariance
+from torchgrasp.hand.em import (
+    Components,
+    coefficients_from_components,
+    components_from_sums,
+    expectation_maximisation,
+    features_from_data,
+    start_components,
+)
+
+
+def clustered(n: int = 6000, d: int = 5, m: int = 4) -> torch.Tensor:
+    """Standardised draws of overlapping Gaussians."""
+    rng = np.random.default_rng(3)
+    turn = rng.normal(size=(m, d, d)) * 0.5
+    which = rng.integers(m, size=n)
+    x = rng.normal(size=(m, d))[which] * 2 + np.einsum("nij,nj->ni", turn[which], rng.normal(size=(n, d)))
+    return torch.from_numpy((x - x.mean(0)) / x.std(0))
+
+
+def test_eq19_features_give_the_gaussian_density(generator):
+    d, m = 4, 3
+    root = torch.randn(m, d, d, generator=generator, dtype=torch.float64)
+    covariances = root @ root.transpose(1, 2) + 0.1 * torch.eye(d, dtype=torch.float64)
+    means = torch.randn(m, d, generator=generator, dtype=torch.float64)
+    weights = torch.tensor([0.2, 0.3, 0.5], dtype=torch.float64)
+    x = torch.randn(50, d, generator=generator, dtype=torch.float64)
+    found = coefficients_from_components(Components(weights, means, covariances)) @ features_from_data(x)
+    for k in range(m):
+        gaussian = torch.distributions.MultivariateNormal(means[k], covariances[k])
+        torch.testing.assert_close(found[k], gaussian.log_prob(x) + weights[k].log(), rtol=1e-9, atol=1e-9)
+
+
+def test_eq20_one_component_is_the_sample_mean_and_covariance():
+    x = clustered()
+    found = components_from_sums(features_from_data(x).sum(1)[None], len(x), 0.0)
+    torch.testing.assert_close(found.weights, torch.ones(1, dtype=torch.float64))
+    torch.testing.assert_close(found.means[0], x.mean(0), atol=1e-12, rtol=0)
+    torch.testing.assert_close(found.covariances[0], torch.cov(x.T, correction=0))
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+def test_eq20_em_equals_scikit_learn_from_the_same_start():
+    x, m, steps = clustered(), 6, 15
+    start = start_components(x, m, seed=0, regularisation=1e-6)
+    ours = expectation_maximisation(x, start, steps, tolerance=0.0, regularisation=1e-6)
+    theirs = GaussianMixture(
+        m,
+        weights_init=start.weights.numpy(),
+        means_init=start.means.numpy(),
+        precisions_init=torch.linalg.inv(start.covariances).numpy(),
+        reg_covar=1e-6,
+        tol=0.0,
+        max_iter=steps,
+    ).fit(x.numpy())
+    np.testing.assert_allclose(ours.components.weights, theirs.weights_, atol=1e-6)
+    np.testing.assert_allclose(ours.components.means, theirs.means_, atol=1e-6)
+    np.testing.assert_allclose(ours.components.covariances, theirs.covariances_, atol=1e-6)
+    np.testing.assert_allclose(float(ours.log_likelihood[-1]), theirs.score(x.numpy()), atol=1e-9)
+
+
+@pytest.mark.parametrize("m", [1, 3, 9])
+def test_log_likelihood_never_decreases(m):
+    x = clustered()
+    fit = expectation_maximisation(x, start_components(x, m, 1, 1e-6), 60, tolerance=0.0, regularisation=1e-6)
+    assert float(fit.log_likelihood.diff().min()) >= -1e-9
+    # The last entry belongs to the components that are returned.
+    again = expectation_maximisation(x, fit.components, 1, tolerance=0.0, regularisation=1e-6)
+    torch.testing.assert_close(again.log_likelihood[0], fit.log_likelihood[-1])
+
+
+def test_start_is_the_same_for_the_same_seed():
+    x = clustered()
+    first, second = (start_components(x, 5, 7, 1e-6) for _ in range(2))
+    assert torch.equal(first.means, second.means)
+    assert not torch.equal(first.means, start_components(x, 5, 8, 1e-6).means)
+
+
+def test_start_finds_separate_clusters(generator):
+    centres = torch.tensor([[-2.0, 0], [2, 0], [0, 3]], dtype=torch.float64)
+    x = (centres[:, None] + 0.05 * torch.randn(3, 200, 2, generator=generator, dtype=torch.float64)).flatten(0, 1)
+    start = start_components(x, 3, 0, 0.0)
+    torch.testing.assert_close(start.weights, torch.full((3,), 1 / 3, dtype=torch.float64))
+    assert float(torch.cdist(centres, start.means).amin(1).max()) < 0.02
+
+
+def test_a_collapsed_component_is_an_error_not_a_repair():
+    x = clustered()
+    start = start_components(x, 3, 0, 1e-6)
+    flat = Components(start.weights, start.means, start.covariances * torch.tensor([1.0, 1, 0])[:, None, None])
+    with pytest.raises(IndefiniteCovariance, match="fewer components"):
+        expectation_maximisation(x, flat, 5, 0.0, 0.0)

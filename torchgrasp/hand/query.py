@@ -1,0 +1,92 @@
+"""From planned contacts to postures of the hand that may touch them (Eqs. 21-24)."""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchgrasp.errors import BadArgument
+from torchgrasp.frames import apply, degenerate, inverse, rotate, virtual_frame
+from torchgrasp.hand.code import encode
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.mixture import DEFAULT_REACH, GraspMixture
+from torchgrasp.values import Contacts, GraspGuess
+
+WRONG_SIDE = 0.3
+"""A fingertip whose outward normal has a cosine above this with the object's touches it from inside. Codes do not
+know the side (`hand_code`), so that such guesses occur; they are ranked last."""
+
+
+def query_hand(
+    contacts: Contacts, hand: Hand, mixture: GraspMixture, guesses: int = 4, max_reach: float = DEFAULT_REACH
+) -> GraspGuess:
+    """Ask the learned model for postures that touch the contacts, in all six assignments (Eqs. 21-24).
+
+    For every assignment within reach (Eq. 21) the joints are guessed by their conditional mean (Eq. 23) and by the
+    means of the most responsible components. A Gaussian knows no joint limits: a guess outside them is projected
+    onto them, which is part of the model. The hand is placed by Eq. (24), the virtual frame of its fingertips on that
+    of the contacts. Guesses keep the errors of the model, centimetres at the fingertips; refinement is another step.
+
+    Args:
+        contacts: contact triples on the object.
+        hand: the hand.
+        mixture: its model.
+        guesses: postures for each assignment, at most one more than the mixture has components.
+        max_reach: threshold on the least f_i of Eq. (21); `PAPER_REACH` is the paper's.
+
+    Returns:
+        The guesses, in the order of the contacts' rows; within a row those with the fingertips on the right side of
+        the surface come first, each group by its largest tip error. A row without guesses is degenerate or out of
+        reach.
+
+    Raises:
+        BadArgument: a mixture of another hand, a number outside its range, or malformed contacts.
+    """
+    if mixture.joint_names != tuple(hand.joint_names):
+        raise BadArgument(
+            "mixture", f"joints {mixture.joint_names}", f"the joints {tuple(hand.joint_names)} of the hand"
+        )
+    if not 1 <= guesses <= len(mixture.weights) + 1:
+        raise BadArgument("guesses", guesses, f"1 to {len(mixture.weights) + 1}")
+    if not max_reach > 0:
+        raise BadArgument("max_reach", max_reach, "a positive number")
+    dtype = contacts.points.dtype
+    code = encode((contacts.points.double(), contacts.normals.double()))
+    reach = mixture.reach(code)
+    row, assignment = torch.nonzero(reach < max_reach, as_tuple=True)  # NaN is not less
+    order = torch.tensor(code.permutation, device=row.device)[assignment]  # (a, 3)
+    joints = _guess_joints(mixture, code.q[row, assignment], guesses)
+    joints = joints.clamp(hand.lower.to(joints), hand.upper.to(joints))
+
+    # From here on one row a guess.
+    row, order, reach, frame = (
+        x.repeat_interleave(guesses, 0) for x in (row, order, reach[row, assignment], code.obj_from_vf[row, assignment])
+    )
+    joints = joints.flatten(0, 1)
+    tips, tip_normals = hand.fingertips(joints)
+    framed = ~degenerate(tips)
+    joints, row, order, reach, frame = joints[framed], row[framed], order[framed], reach[framed], frame[framed]
+    tips, tip_normals = tips[framed], tip_normals[framed]
+
+    obj_from_hand = frame @ inverse(virtual_frame(tips))  # Eq. (24)
+    wanted = contacts.points.double()[row[:, None], order]
+    outward = contacts.normals.double()[row[:, None], order]
+    tip_error = torch.linalg.vector_norm(apply(obj_from_hand, tips) - wanted, dim=-1)
+    side = (rotate(obj_from_hand, tip_normals) * outward).sum(-1).mean(-1)
+    rank = _rank(row, side > WRONG_SIDE, tip_error.amax(-1))
+    found = GraspGuess(joints.to(dtype), obj_from_hand.to(dtype), row, order, reach.to(dtype), tip_error.to(dtype))
+    return found[rank]
+
+
+def _guess_joints(mixture: GraspMixture, q: Float[Tensor, "a 6"], guesses: int) -> Float[Tensor, "a k h"]:
+    """Return the conditional mean of each code, then its most responsible components' means."""
+    mean = mixture.joints(q)[:, None]
+    if guesses == 1:
+        return mean
+    return torch.cat([mean, mixture.modes(q, guesses - 1)[0]], dim=1)
+
+
+def _rank(row: Int[Tensor, "g"], wrong: Bool[Tensor, "g"], error: Float[Tensor, "g"]) -> Int[Tensor, "g"]:
+    """Return the order by row, then side, then error; stable, so that equal guesses keep the model's order."""
+    order = torch.argsort(error, stable=True)
+    order = order[torch.argsort(wrong[order].long(), stable=True)]
+    return order[torch.argsort(row[order], stable=True)]
