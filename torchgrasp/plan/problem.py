@@ -6,7 +6,6 @@ Normals are not unknowns: Eq. (11) defines them by the points. Every inequality 
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -16,7 +15,7 @@ from torch import Tensor
 from torchgrasp.frames import skew
 from torchgrasp.linalg import unit
 from torchgrasp.plan.wrench import cone_edges
-from torchgrasp.values import ContactSpec, Value
+from torchgrasp.values import Batch, ContactSpec, Value
 
 UNIFORM_SHARE = 0.05
 """Least coefficient of a plan as a share of the uniform 1 / (3 e): the least margin of its certificate. Without it the
@@ -58,7 +57,7 @@ class Shape(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
-class TripleJet(Value):
+class TripleJet(Batch):
     """The shape at the three points of each triple."""
 
     distance: Float[Tensor, "b 3"]
@@ -73,20 +72,11 @@ class TripleJet(Value):
         return unit(self.gradient)
 
 
-def triple_jet(shape: Shape, points: Float[Tensor, "b 3 3"], chunk: int = 3072) -> TripleJet:
-    """Evaluate the shape at all points of all triples, at most `chunk` points at a time."""
-    parts = [shape.jet(x) for x in points.flatten(0, 1).split(chunk)]
-
-    def join(of: Callable[[Jet], Tensor]) -> Tensor:
-        return torch.cat([of(part) for part in parts]).unflatten(0, (-1, 3))
-
-    return TripleJet(
-        join(lambda j: j.distance),
-        join(lambda j: j.gradient),
-        join(lambda j: j.hessian),
-        join(lambda j: j.variance),
-        join(lambda j: j.variance_gradient),
-    )
+def triple_jet(shape: Shape, points: Float[Tensor, "b 3 3"]) -> TripleJet:
+    """Evaluate the shape at all points of all triples."""
+    jet = shape.jet(points.flatten(0, 1))
+    fields = (jet.distance, jet.gradient, jet.hessian, jet.variance, jet.variance_gradient)
+    return TripleJet(*(f.unflatten(0, points.shape[:2]) for f in fields))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -93,9 +93,7 @@ def rank_ratio(wrench: Float[Tensor, "b 3 e 6"]) -> Float[Tensor, "b"]:
     return values[:, -1] / values[:, 0]
 
 
-def balance(
-    wrench: Float[Tensor, "b 3 e 6"], steps: int = 40
-) -> tuple[Float[Tensor, "b 3 e"], Float[Tensor, "b"]]:
+def balance(wrench: Float[Tensor, "b 3 e 6"], steps: int = 40) -> tuple[Float[Tensor, "b 3 e"], Float[Tensor, "b"]]:
     """Return the coefficients phi > 0, sum phi = 1 of Eq. (13) of the greatest entropy, and the largest |W phi| left.
 
     They are phi = softmax(W^T y) with y the minimum of log sum exp(W^T y), which exists if and only if the origin is
@@ -118,9 +116,7 @@ def balance(
     return phi.unflatten(1, wrench.shape[1:3]).to(wrench.dtype), residual.to(wrench.dtype)
 
 
-def closed_exact(
-    points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"], friction: float
-) -> Bool[Tensor, "b"]:
+def closed_exact(points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"], friction: float) -> Bool[Tensor, "b"]:
     """Tell which triples have frictional form closure with round cones, exactly: Eq. (13) as edges go to infinity.
 
     Three forces in balance lie in the plane of the contacts. What each cone cuts from that plane is an angle about

@@ -1,0 +1,181 @@
+"""From a shape with uncertainty to contact triples: Eqs. (10)-(14) solved from many starts at once."""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchgrasp.errors import BadArgument, Status
+from torchgrasp.frames import degenerate
+from torchgrasp.linalg import unit
+from torchgrasp.plan.descend import (
+    Weights,
+    descend,
+    no_multipliers,
+    raise_multipliers,
+    start_state,
+)
+from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet
+from torchgrasp.plan.wrench import BALANCED, balance, cone_edges, rank_ratio, tangents, wrenches
+from torchgrasp.values import ContactPlan, Contacts, ContactSpec, check_tensor
+
+MIN_RANK_RATIO = 1e-3
+"""Least ratio of the singular values of the wrench matrix; Eq. (13) alone also holds for contacts on a line."""
+
+ON_SURFACE = 1e-6
+"""Largest |f_d| of a contact on the surface, in normalised units."""
+
+RING_RADIUS = 0.008
+"""Radius [m] of the patch around a contact whose normals `ContactSpec.flatness` compares."""
+
+RING_POINTS = 8
+
+SETTLE = (Weights(centre=0.1, surface=3.0, closure=0.1, bounds=3.0), 10)
+"""First onto the surface and into the certain part of it: closure sought there first ends in fewer local minima."""
+
+PLAN = (
+    (Weights(centre=0.3, surface=3.0, closure=3.0, bounds=3.0), 16),
+    (Weights(centre=0.3, surface=3.0, closure=3.0, bounds=3.0), 10),
+    (Weights(centre=0.1, surface=3.0, closure=3.0, bounds=3.0), 10),
+    (Weights(centre=0.1, surface=3.0, closure=3.0, bounds=3.0), 10),
+)
+"""Stages of the augmented Lagrangian, with the multipliers raised after each."""
+
+FINISH = (Weights(centre=0.0, surface=3.0, closure=3.0, bounds=3.0), 12)
+"""Last, feasibility alone: without the objective every residual can vanish."""
+
+
+def plan_contacts(
+    shape: Shape,
+    spec: ContactSpec | None = None,
+    starts: int | Float[Tensor, "b 3 3"] = 1000,
+    seed: int = 0,
+) -> ContactPlan:
+    """Plan three contacts from each of many starts, Eqs. (10)-(14): one row a start, in the order of the starts.
+
+    A row that fails carries the `Status` of the first constraint that it violates. Points are in metres and the
+    frame of the cloud, normals outward.
+
+    Args:
+        shape: a `ShapeGP`, or another implicit surface with the same methods.
+        spec: what the contacts must satisfy; `ContactSpec()` by default.
+        starts: the number of starts, each three points drawn from the sphere of `spec.start_radius` about the
+            shape's centre (Sec. 6.2), or the starting points themselves [m].
+        seed: seed of the draw.
+
+    Raises:
+        BadArgument: `starts` is not positive, of a wrong shape, or outside the shape's domain.
+    """
+    spec = ContactSpec() if spec is None else spec
+    points = start_points(shape, spec, starts, seed)
+    problem = ContactProblem.of(shape, spec)
+    points = project(shape, points, steps=6)
+
+    state = start_state(shape, problem, points)
+    weights, steps = SETTLE
+    multipliers = no_multipliers(problem.rows(state.points, state.z, state.tangent, state.jet))
+    state, _ = descend(shape, problem, state, multipliers, weights, steps)
+    for weights, steps in PLAN:
+        state, rows = descend(shape, problem, state, multipliers, weights, steps)
+        multipliers = raise_multipliers(rows, multipliers)
+    weights, steps = FINISH
+    state, _ = descend(shape, problem, state, no_multipliers(rows), weights, steps)
+    points = project(shape, state.points, steps=3)
+    return assess(shape, spec, points)
+
+
+def start_points(
+    shape: Shape, spec: ContactSpec, starts: int | Float[Tensor, "b 3 3"], seed: int
+) -> Float[Tensor, "b 3 3"]:
+    """Return the starts in normalised units: drawn from the sphere of `spec.start_radius`, or the given ones."""
+    if isinstance(starts, Tensor):
+        points = shape.normalise(check_tensor("starts", starts, (None, 3, 3)).double())
+        farthest = float(torch.linalg.vector_norm(points, dim=-1).max()) if len(points) else 0.0
+        if farthest > shape.domain_radius:
+            raise BadArgument(
+                "starts",
+                f"a point {farthest * float(shape.scale):.4g} m from the shape's centre",
+                f"at most {float(shape.domain_radius) * float(shape.scale):.4g} m, where the shape is known",
+            )
+        return points
+    if isinstance(starts, bool) or not isinstance(starts, int) or starts < 1:
+        raise BadArgument("starts", repr(starts), "a positive number, or starting points of shape b x 3 x 3 [m]")
+    if spec.start_radius > shape.domain_radius:
+        raise BadArgument("spec.start_radius", spec.start_radius, f"at most {float(shape.domain_radius):.4g}")
+    generator = torch.Generator().manual_seed(seed)
+    drawn = torch.randn(starts, 3, 3, generator=generator, dtype=torch.float64)
+    origin = shape.metres(torch.zeros(3, dtype=torch.float64))  # names the shape's device
+    return (spec.start_radius * unit(drawn)).to(origin.device)
+
+
+def project(shape: Shape, points: Float[Tensor, "b 3 3"], steps: int) -> Float[Tensor, "b 3 3"]:
+    """Move points along the gradient onto f_d = 0 by Newton steps of at most 0.3 each."""
+    for _ in range(steps):
+        jet = triple_jet(shape, points)
+        squared = (jet.gradient * jet.gradient).sum(-1, keepdim=True)
+        move = -jet.distance[..., None] / squared * jet.gradient
+        length = torch.linalg.vector_norm(move, dim=-1, keepdim=True)
+        points = points + move * (0.3 / length).clamp(max=1.0)
+    return points
+
+
+def assess(shape: Shape, spec: ContactSpec, points: Float[Tensor, "b 3 3"]) -> ContactPlan:
+    """Return triples at normalised `points` with the coefficients of their balance and the status of each.
+
+    Everything is evaluated anew at the points, so that the result does not depend on how they were found.
+    """
+    jet = triple_jet(shape, points)
+    normals, metres = jet.normals, shape.metres(points)
+    wrench = wrenches(points, normals, spec.planned_friction, spec.edges)
+    whole = torch.isfinite(wrench).flatten(1).all(1)
+    wrench = torch.where(whole[:, None, None, None], wrench, 0.0)
+    coefficients, residual = balance(wrench)
+    closed = whole & (residual <= BALANCED) & (coefficients.flatten(1).amin(-1) > 0)
+    closed &= rank_ratio(wrench) >= MIN_RANK_RATIO  # 0 / 0 of a row that is not whole is False
+
+    apart = torch.linalg.vector_norm(metres - metres.roll(1, 1), dim=-1).amin(-1)
+    lowest = -torch.inf if spec.table is None else spec.table + spec.contact_height
+    good = {
+        Status.OUT_OF_DOMAIN: (torch.linalg.vector_norm(points, dim=-1) <= shape.domain_radius).all(-1),
+        Status.OFF_SURFACE: (jet.distance.abs() <= ON_SURFACE).all(-1),
+        Status.TOO_UNCERTAIN: ((jet.variance >= 0) & (jet.variance < spec.max_variance)).all(-1),
+        Status.BELOW_TABLE: (metres[..., 2] >= lowest).all(-1),
+        Status.TOO_CLOSE: apart >= spec.separation,
+        Status.DEGENERATE: ~degenerate(points),
+        Status.NOT_FLAT: closed,  # measured below, for rows that pass everything else
+        Status.NOT_CLOSED: closed,
+    }
+    passed = torch.stack(list(good.values())).all(0)
+    good[Status.NOT_FLAT] = torch.ones_like(passed)
+    if spec.flatness is not None and bool(passed.any()):
+        rows = torch.nonzero(passed)[:, 0]
+        flat = bend(shape, points[rows], normals[rows]) <= spec.flatness
+        good[Status.NOT_FLAT] = torch.ones_like(passed).index_put((rows,), flat)
+    return ContactPlan(
+        Contacts(metres, normals, jet.variance, shape.std_factor * shape.scale * jet.variance.sqrt()),
+        coefficients,
+        torch.linalg.vector_norm(points.mean(1), dim=-1) * shape.scale,
+        first_violation(good),
+    )
+
+
+def bend(shape: Shape, points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b"]:
+    """Return the largest angle [rad] between a contact's normal and those on a ring of `RING_RADIUS` around it."""
+    first = tangents(points, normals)
+    # A cone of friction 1 less its axis is a ring of unit tangents.
+    around = cone_edges(normals, first, 1.0, RING_POINTS) + normals[:, :, None]
+    ring = points[:, :, None] + RING_RADIUS / shape.scale * around
+    x = ring.flatten(0, 2)
+    jet = shape.jet(x)
+    squared = (jet.gradient * jet.gradient).sum(-1, keepdim=True)
+    on_surface = x - jet.distance[:, None] / squared * jet.gradient
+    there = unit(shape.jet(on_surface).gradient).unflatten(0, ring.shape[:3])
+    here = normals[:, :, None].expand_as(there)
+    sine = torch.linalg.vector_norm(torch.linalg.cross(here, there), dim=-1)
+    return torch.atan2(sine, (here * there).sum(-1)).flatten(1).amax(-1)
+
+
+def first_violation(good: dict[Status, Bool[Tensor, "b"]]) -> Int[Tensor, "b"]:
+    """Return the first status, in the order of the dictionary, whose condition a row does not meet; OK without."""
+    met = torch.stack(list(good.values()))
+    codes = torch.tensor([*good, Status.OK], device=met.device)
+    return codes[torch.where(met.all(0), len(good), (~met).to(torch.uint8).argmax(0))]
