@@ -1,0 +1,106 @@
+"""A sphere cover of the hand's links, for penalties against the object and the table.
+
+It is made from the collision shapes of the URDF, which are what the simulator sees. Each shape is cut into cells and
+each cell gets a sphere that reaches its corners up to 1 mm. Spheres stand out of flat faces by 2 to 3 mm.
+"""
+
+import dataclasses
+import itertools
+import math
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchgrasp.hand.spec import HandSpec
+from torchgrasp.hand.urdf import Shape, Urdf
+from torchgrasp.values import Value
+
+PITCH = 0.014
+"""Longest cell of a finger [m]."""
+PALM_PITCH = 0.020
+"""Longest cell of the palm [m]."""
+THICK = 0.025
+"""A shape thinner than this [m] has one layer of cells across."""
+BULGE = 0.003
+"""How far a sphere may stand out of the shape's thinnest faces [m]."""
+SHORT = 0.001
+"""How far a sphere may stay short of its cell's corners [m]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SphereCover(Value):
+    """Spheres fixed to links: `center` [m] in the link's frame, `radius` [m].
+
+    `finger` is the grasp-order index of the finger, -1 for the palm and -2 for parked fingers; `touching` marks the
+    fingertips that are meant to touch the object.
+    """
+
+    link_index: Int[Tensor, " s"]
+    center: Float[Tensor, "s 3"]
+    radius: Float[Tensor, " s"]
+    finger: Int[Tensor, " s"]
+    touching: Bool[Tensor, " s"]
+
+
+def cover_from_urdf(urdf: Urdf, spec: HandSpec) -> SphereCover:
+    """Cover every collision shape of a URDF with spheres, labelled with the finger they belong to."""
+    above = {j.child: j for j in urdf.joints}
+    owner = {joint: i for i, f in enumerate(spec.fingers) for joint in f.joints}
+    tips = [f.tip_link for f in spec.fingers]
+    rows: list[tuple[int, tuple[float, ...], float, int, bool]] = []
+    for index, link in enumerate(urdf.links):
+        finger, name = -1, link.name
+        while name in above and finger == -1:  # the first movable joint above the link tells whose it is
+            if above[name].kind != "fixed":
+                finger = owner.get(above[name].name, -2)
+            name = above[name].parent
+        for shape in link.shapes:
+            pitch = PALM_PITCH if finger == -1 else PITCH
+            for center, radius in _spheres(shape, pitch):
+                rows.append((index, center, radius, finger, link.name in tips))
+    return SphereCover(
+        torch.tensor([r[0] for r in rows], dtype=torch.long),
+        torch.tensor([r[1] for r in rows], dtype=torch.float64).reshape(-1, 3),
+        torch.tensor([r[2] for r in rows], dtype=torch.float64),
+        torch.tensor([r[3] for r in rows], dtype=torch.long),
+        torch.tensor([r[4] for r in rows], dtype=torch.bool),
+    )
+
+
+def _spheres(shape: Shape, pitch: float) -> list[tuple[tuple[float, ...], float]]:
+    """Cover one shape: a sphere by itself, a box and a cylinder (by its bounding box, corners spared) by cells."""
+    if shape.kind == "sphere":
+        return [(shape.xyz, shape.size[0])]
+    round_shape = shape.kind == "cylinder"
+    size = (2 * shape.size[0], 2 * shape.size[0], shape.size[1]) if round_shape else shape.size
+    counts = [1 if s == min(size) and s < THICK else math.ceil(s / pitch) for s in size]
+    half = [s / n / 2 for s, n in zip(size, counts, strict=True)]
+    radius = min(math.hypot(*half) - SHORT, min(half) + (BULGE if 1 in counts else math.inf))
+    local = []
+    for cell in itertools.product(*(range(n) for n in counts)):
+        if all(0 < c < n - 1 for c, n in zip(cell, counts, strict=True)):
+            continue  # an inner cell: the outer ones meet the object first
+        center = [(2 * c + 1 - n) * h for c, n, h in zip(cell, counts, half, strict=True)]
+        # spheres are pulled in until they stand out of a face by no more than the bulge
+        reach = [max(0.0, s / 2 + BULGE - radius) for s in size]
+        center = [math.copysign(min(abs(c), r), c) for c, r in zip(center, reach, strict=True)]
+        if round_shape:
+            rim, out = max(0.0, shape.size[0] + BULGE - radius), math.hypot(center[0], center[1])
+            if out > rim:
+                center[:2] = [center[0] * rim / out, center[1] * rim / out]
+        local.append(center)
+    turned = torch.tensor(local, dtype=torch.float64) @ rotation_from_rpy(shape.rpy).T
+    placed = turned + torch.tensor(shape.xyz, dtype=torch.float64)
+    return [((p[0], p[1], p[2]), radius) for p in placed.tolist()]
+
+
+def rotation_from_rpy(rpy: tuple[float, float, float]) -> Float[Tensor, "3 3"]:
+    """Return the rotation of URDF's fixed-axis roll, pitch and yaw [rad]."""
+    (cr, cp, cy), (sr, sp, sy) = [math.cos(a) for a in rpy], [math.sin(a) for a in rpy]
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return torch.tensor(rows, dtype=torch.float64)
