@@ -1,0 +1,158 @@
+"""Convex parts of a mesh for the simulator, decomposed once and cached.
+
+A simulator of rigid bodies takes a mesh for its convex hull: a jug would be solid. CoACD cuts it into convex parts
+(threshold 0.05, seeded, so the same mesh always gives the same parts); that takes seconds, hence the cache.
+"""
+
+import contextlib
+import hashlib
+import logging
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+
+from torchgrasp.errors import MeshError, MissingExtra, ModelFileError, OutputError
+from torchgrasp.files import load_tensors, save_tensors
+
+THRESHOLD = 0.05
+"""Concavity at which CoACD stops cutting (0.01-1; its own default)."""
+
+_NAMES = {"vertices", "faces", "vertex_counts", "face_counts"}
+_log = logging.getLogger(__name__)
+
+
+def read_mesh(mesh: trimesh.Trimesh | Path | str) -> trimesh.Trimesh:
+    """Return a closed mesh [m] from a file or a trimesh, checked and never repaired.
+
+    Raises:
+        MeshError: no mesh in the file, non-finite vertices, an open surface, or no positive volume.
+
+    >>> len(read_mesh(trimesh.creation.box((0.1, 0.1, 0.1))).faces)
+    12
+    """
+    name = "a mesh"
+    if not isinstance(mesh, trimesh.Trimesh):
+        path, name = Path(mesh), str(mesh)
+        if not path.is_file():
+            raise MeshError("mesh", f"{path}, which is no file", "a mesh file (ply, obj, stl, ...)")
+        try:
+            loaded = trimesh.load_mesh(path)
+        except Exception as error:  # the readers of trimesh raise whatever their format runs into
+            raise MeshError("mesh", f"{path}: {error}", "a mesh file (ply, obj, stl, ...)") from error
+        if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
+            raise MeshError("mesh", f"{path}, which holds no faces", "a closed triangle mesh")
+        mesh = loaded
+    if len(mesh.faces) == 0:
+        raise MeshError("mesh", f"{name} without faces", "a closed triangle mesh")
+    if not np.isfinite(mesh.vertices).all():
+        raise MeshError("mesh", f"{name} with a non-finite vertex", "finite vertices [m]")
+    if not mesh.is_watertight:
+        raise MeshError("mesh", f"{name} with an open surface", "a closed (watertight) mesh")
+    if not mesh.volume > 1e-12:
+        raise MeshError("mesh", f"{name} of volume {mesh.volume:.3g} m^3", "a positive volume, faces turned outward")
+    return mesh
+
+
+def convex_parts(mesh: trimesh.Trimesh | Path | str, cache: Path | str | None = None) -> list[trimesh.Trimesh]:
+    """Return convex parts that together fill a closed mesh; a convex mesh is its own only part.
+
+    The parts are kept in `cache`, by default `$XDG_CACHE_HOME/torchgrasp` or `~/.cache/torchgrasp`, under the SHA-256
+    of the vertices, the faces and the threshold. A damaged file there is made anew; a folder that cannot be written
+    costs the time of the next decomposition and nothing else.
+
+    Raises:
+        MeshError: the mesh is open, empty, not finite, or without volume.
+        MissingExtra: the mesh is not convex and CoACD is not installed.
+
+    >>> len(convex_parts(trimesh.creation.box((0.1, 0.1, 0.1))))
+    1
+    """
+    mesh = read_mesh(mesh)
+    if mesh.is_convex:
+        return [mesh.convex_hull]
+    path = (_cache_folder() if cache is None else Path(cache)) / f"{_fingerprint(mesh)}.safetensors"
+    if path.is_file():
+        try:
+            return _load(path)
+        except (ModelFileError, ValueError):
+            _log.warning("%s is damaged and will be made anew", path)
+    parts = _decompose(mesh)
+    try:
+        _save(parts, path)
+    except OutputError as error:
+        _log.warning("convex parts are not kept: %s", error)
+    return parts
+
+
+def check_parts(parts: Sequence[trimesh.Trimesh]) -> list[trimesh.Trimesh]:
+    """Return parts given by the caller as they are, or raise `MeshError` when one is no convex body."""
+    for index, part in enumerate(parts):
+        read_mesh(part)
+        if not part.is_convex:
+            raise MeshError("parts", f"part {index}, which is not convex", "convex meshes")
+    if not parts:
+        raise MeshError("parts", "no part", "at least one convex mesh")
+    return list(parts)
+
+
+def _decompose(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
+    """Cut a mesh into convex parts with CoACD, quietly."""
+    try:
+        import coacd
+    except ImportError as error:
+        raise MissingExtra("coacd", "sim") from error
+    coacd.set_log_level("off")
+    with _silence():
+        pieces = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), threshold=THRESHOLD, seed=0)
+    return [trimesh.Trimesh(np.asarray(v), np.asarray(f)).convex_hull for v, f in pieces]
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Send the process's standard output to nowhere: CoACD's C++ code prints through the file descriptor."""
+    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+        os.close(nowhere)
+
+
+def _cache_folder() -> Path:
+    """Return the folder of the user's cache."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchgrasp"
+
+
+def _fingerprint(mesh: trimesh.Trimesh) -> str:
+    """Return the SHA-256 of what the parts depend on."""
+    digest = hashlib.sha256(f"coacd {THRESHOLD}".encode())
+    digest.update(np.ascontiguousarray(mesh.vertices, dtype="<f8").tobytes())
+    digest.update(np.ascontiguousarray(mesh.faces, dtype="<i8").tobytes())
+    return digest.hexdigest()
+
+
+def _save(parts: list[trimesh.Trimesh], path: Path) -> None:
+    """Write parts as one safetensors file, end to end with their counts."""
+    tensors = {
+        "vertices": torch.cat([torch.from_numpy(np.array(p.vertices, dtype=np.float64)) for p in parts]),
+        "faces": torch.cat([torch.from_numpy(np.array(p.faces, dtype=np.int64)) for p in parts]),
+        "vertex_counts": torch.tensor([len(p.vertices) for p in parts]),
+        "face_counts": torch.tensor([len(p.faces) for p in parts]),
+    }
+    save_tensors(path, "parts", tensors, {})
+
+
+def _load(path: Path) -> list[trimesh.Trimesh]:
+    """Read parts that `_save` wrote."""
+    tensors, _ = load_tensors(path, "parts", _NAMES)
+    vertices = torch.split(tensors["vertices"], tensors["vertex_counts"].tolist())
+    faces = torch.split(tensors["faces"], tensors["face_counts"].tolist())
+    return check_parts(
+        [trimesh.Trimesh(v.numpy(), f.numpy(), process=False) for v, f in zip(vertices, faces, strict=True)]
+    )

@@ -1,0 +1,298 @@
+"""One simulated trial: the hand opens around the true object, closes on it under the law, lifts it and holds it."""
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.close.control import Closing, Plant, Sight, Squeeze, Stopping
+from torchgrasp.close.law import closing_gains
+from torchgrasp.close.parts import check_parts, convex_parts, read_mesh
+from torchgrasp.close.scene import Scene
+from torchgrasp.close.sensor import sense, untouched
+from torchgrasp.errors import Status
+from torchgrasp.frames import apply, inverse, rotate, rotation_angle
+from torchgrasp.hand.hand import Hand
+from torchgrasp.values import ClosingGains, ClosureResult, Grasps, TrialSpec
+
+START_TOLERANCE = 1e-3
+"""Overlap [m] of the hand with object or table that still counts as none: convex parts bulge by as much."""
+
+CLOSING_TIME = 4.0
+"""Longest time [s] that closing may take before the hand lifts with what it has."""
+
+PRESSING_TIME = 0.5
+"""Time [s] between the end of closing and the start of the lift, in which the squeeze builds up."""
+
+LIFT_TIME = 1.0
+"""Time [s] in which the hand rises, by a smooth step."""
+
+PUSHED = 0.05
+"""Motion [m] of the object's centre while the hand closes from which on it counts as pushed out."""
+
+LOST = 0.5
+"""Distance [m] from its start at which the object is gone and the trial over."""
+
+
+def close_hand(
+    grasp: Grasps,
+    hand: Hand,
+    mesh: trimesh.Trimesh | Path | str,
+    spec: TrialSpec | None = None,
+    seed: int = 0,
+    *,
+    parts: Sequence[trimesh.Trimesh] | None = None,
+) -> ClosureResult:
+    """Close a hand on the true object, lift it and hold it, in a fresh simulation.
+
+    The object stands on a table where its mesh is lowest, in the frame of the grasp. The hand starts at the grasp's
+    pre-grasp, closes until the forces settle (`CLOSING_TIME` at most), presses with balanced forces, rises by
+    `spec.lift_height` and holds. The object is **held** when at the end its centre has risen by at least half the
+    lift and at least two fingers touch it. `object_motion` is against the hand, so that stricter rules can be
+    counted from it. The same arguments give the same result to the last bit.
+
+    Args:
+        grasp: one row.
+        hand: the hand that the grasp was planned for.
+        mesh: the true object [m], closed: a trimesh or a file.
+        spec: of the trial; None: `TrialSpec()`.
+        seed: of the tactile sensor's noise.
+        parts: convex bodies to use for the mesh instead of its own decomposition (`convex_parts`).
+
+    Raises:
+        BadArgument: not exactly one row, or a grasp of another hand.
+        MeshError: the mesh is missing, open or without volume.
+        MissingExtra: the simulator is not installed.
+    """
+    started = time.perf_counter()
+    spec = TrialSpec() if spec is None else spec
+    grasp = grasp.to("cpu", torch.float64)
+    gains = closing_gains(grasp, hand, spec.force)
+    mesh = read_mesh(mesh)
+    bodies = convex_parts(mesh) if parts is None else check_parts(parts)
+    trial = _Trial(grasp, hand, mesh, bodies, spec, seed)
+    status = trial.run(gains)
+    return trial.result(status, time.perf_counter() - started)
+
+
+class _Lost(Exception):
+    """The object is gone, or the numbers are: the trial is over before its time."""
+
+
+class _Trial:
+    """The state of one trial: the scene, the sensor, and the record of every tick."""
+
+    def __init__(
+        self,
+        grasp: Grasps,
+        hand: Hand,
+        mesh: trimesh.Trimesh,
+        parts: list[trimesh.Trimesh],
+        spec: TrialSpec,
+        seed: int,
+    ) -> None:
+        self.spec = spec
+        start = {name: float(q) for name, q in hand.expand(grasp.pregrasp[0]).items()}
+        self.scene = Scene(
+            hand.urdf_path,
+            grasp.obj_from_hand[0].numpy(),
+            start,
+            joint_drives(hand),
+            tuple(hand.tip_links),
+            mesh,
+            parts,
+            spec.mass,
+            spec.friction,
+            spec.gravity,
+            spec.timestep,
+            spec.lift_height,
+        )
+        self.plant = plant_from_hand(hand, grasp, self.scene.joint_names)
+        self.link_from_centre = _centres_in_links(hand, grasp.pregrasp)
+        self.substeps = max(1, round(1 / (spec.control_rate * spec.timestep)))
+        self.period = self.substeps * spec.timestep
+        self.touch = untouched()
+        self.generator = torch.Generator().manual_seed(seed) if spec.noise else None
+        self.steps, self.first_touch = 0, [float("inf")] * 3
+        self.time: list[float] = []
+        self.forces: list[np.ndarray] = []
+        self.object_pose: list[np.ndarray] = []
+        self.hand_pose: list[np.ndarray] = []
+        self.joints: list[np.ndarray] = []
+        self.fingers = 0
+        self.pushed = 0.0
+
+    # ------------------------------------------------------------------------------------------------- the phases
+
+    def run(self, gains: ClosingGains) -> Status:
+        """Close, press, lift and hold; return what became of it."""
+        overlap = self.scene.penetration()
+        self._record(np.zeros(3))
+        if not overlap <= START_TOLERANCE:
+            return Status.START_OVERLAP
+        try:
+            sight = self._tick(self.plant.expand(self.plant.pregrasp))
+            controller = Closing(self.plant, gains) if self.spec.controller == "uncertainty" else None
+            controller = controller or Stopping(self.plant, gains)
+            targets = self.plant.expand(self.plant.pregrasp)
+            for _ in range(self._ticks(CLOSING_TIME)):
+                targets = controller(sight, self.period)
+                sight = self._tick(targets)
+                if controller.done:
+                    break
+            self.pushed = float(np.linalg.norm(self._centre(-1) - self._centre(0)))
+            hold: Callable[[Sight, float], Float[Tensor, j]]
+            if self.spec.controller == "uncertainty":
+                hold = Squeeze(self.plant, gains, sight, targets)
+            else:
+                hold = _frozen(targets)
+            for _ in range(self._ticks(PRESSING_TIME)):
+                sight = self._tick(hold(sight, self.period))
+            rising = self._ticks(LIFT_TIME)
+            for k in range(rising + self._ticks(self.spec.hold_time)):
+                share = min((k + 1) / rising, 1.0)
+                self.scene.lift(self.spec.lift_height * share * share * (3 - 2 * share))
+                sight = self._tick(hold(sight, self.period))
+        except _Lost as lost:
+            if lost.args:
+                return Status.UNSTABLE
+        return self._verdict()
+
+    def _tick(self, targets: Float[Tensor, "j"]) -> Sight:
+        """Drive the joints for one control period, record it, and return what the robot then knows."""
+        self.scene.drive(targets.numpy())
+        impulse, moment, weight = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
+        finger = np.zeros(3, dtype=bool)
+        for _ in range(self.substeps):
+            seen = self.scene.step()
+            self.steps += 1
+            impulse += seen.impulse
+            moment += seen.moment
+            weight += seen.weight
+            finger = seen.finger
+            for i in np.flatnonzero(seen.weight > 0):
+                self.first_touch[i] = min(self.first_touch[i], self.steps)
+        self.fingers = int(finger.sum())
+        force = np.linalg.norm(impulse, axis=-1) / self.period
+        self._record(force)
+        moved = float(np.linalg.norm(self._centre(-1) - self._centre(0)))
+        if not np.isfinite(self.joints[-1]).all() or not np.isfinite(moved):
+            raise _Lost(Status.UNSTABLE)
+        if moved > LOST + self.spec.lift_height:
+            self.pushed = self.pushed or moved
+            raise _Lost
+        self.touch = sense(self.touch, torch.from_numpy(force), self.period, self.generator)
+        return self._sight(impulse, moment, weight)
+
+    def _sight(self, impulse: np.ndarray, moment: np.ndarray, weight: np.ndarray) -> Sight:
+        """Return the hand's own knowledge, in its frame."""
+        hand_from_world = inverse(torch.from_numpy(self.hand_pose[-1]))
+        centres = (self.scene.tip_poses() @ self.link_from_centre[:, :, None])[:, :3, 0]
+        jacobian = torch.from_numpy(self.scene.jacobian(centres))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            points = moment / weight[:, None]
+            normals = -impulse / np.linalg.norm(impulse, axis=-1, keepdims=True)
+        return Sight(
+            joints=torch.from_numpy(self.joints[-1]),
+            tips=apply(hand_from_world, torch.from_numpy(centres)),
+            jacobian=hand_from_world[:3, :3] @ jacobian,
+            reading=self.touch.reading,
+            contact=self.touch.contact,
+            points=apply(hand_from_world, torch.from_numpy(points)),
+            normals=rotate(hand_from_world, torch.from_numpy(normals)),
+        )
+
+    # ------------------------------------------------------------------------------------------------ the record
+
+    def _record(self, force: np.ndarray) -> None:
+        """Append one tick."""
+        self.time.append(self.steps * self.spec.timestep)
+        self.forces.append(force)
+        self.object_pose.append(self.scene.object_pose())
+        self.hand_pose.append(self.scene.hand_pose())
+        self.joints.append(self.scene.joints())
+
+    def _ticks(self, seconds: float) -> int:
+        """Count the control ticks in a time [s]."""
+        return max(1, round(seconds / self.period))
+
+    def _centre(self, tick: int) -> np.ndarray:
+        """Return the object's mass centre [m] in the world at a tick."""
+        pose = self.object_pose[tick]
+        return pose[:3, :3] @ self.scene.centre + pose[:3, 3]
+
+    def _verdict(self) -> Status:
+        """Return the status of a finished trial: held, or the earliest thing that went wrong."""
+        rise = np.array([self._centre(k)[2] - self._centre(0)[2] for k in range(len(self.time))])
+        half = 0.5 * self.spec.lift_height
+        if rise[-1] >= half and self.fingers >= 2:
+            return Status.OK
+        if not np.isfinite(self.first_touch).all():
+            return Status.NO_CONTACT
+        if self.pushed > PUSHED:
+            return Status.EJECTED
+        return Status.DROPPED if rise.max() >= half else Status.NOT_LIFTED
+
+    def result(self, status: Status, seconds: float) -> ClosureResult:
+        """Return the record as a value."""
+        object_pose, hand_pose = (
+            torch.from_numpy(np.stack(self.object_pose)),
+            torch.from_numpy(np.stack(self.hand_pose)),
+        )
+        hand_from_object = inverse(hand_pose) @ object_pose
+        centre = torch.from_numpy(self.scene.centre)[None]
+        ends = apply(hand_from_object[[0, -1]], centre.expand(2, 1, 3))[:, 0]
+        turned = hand_from_object[0, :3, :3].T @ hand_from_object[-1, :3, :3]
+        touched = [i for i in range(3) if np.isfinite(self.first_touch[i])]
+        return ClosureResult(
+            held=status is Status.OK,
+            status=status,
+            time=torch.tensor(self.time, dtype=torch.float64),
+            forces=torch.from_numpy(np.stack(self.forces)),
+            object_pose=object_pose,
+            hand_pose=hand_pose,
+            joints=torch.from_numpy(np.stack(self.joints)),
+            joint_names=self.scene.joint_names,
+            contact_order=tuple(sorted(touched, key=lambda i: self.first_touch[i])),
+            object_motion=(float(torch.linalg.vector_norm(ends[1] - ends[0])), float(rotation_angle(turned))),
+            seconds=seconds,
+        )
+
+
+def plant_from_hand(hand: Hand, grasp: Grasps, names: tuple[str, ...]) -> Plant:
+    """Return what the controllers need of a hand, its joints in the order of `names`."""
+    h = len(hand.joint_names)
+    unit = torch.cat([torch.zeros(1, h), torch.eye(h)]).double()
+    expanded = hand.expand(unit)
+    table = torch.stack([expanded[name] for name in names], dim=-1)  # (1 + h, j)
+    drive = joint_drives(hand)
+    return Plant(
+        coupling=(table[1:] - table[0]).T.contiguous(),
+        offset=table[0],
+        actuated=tuple(names.index(name) for name in hand.joint_names),
+        kp=torch.tensor([drive[name].kp for name in names], dtype=torch.float64),
+        lower=hand.lower.double(),
+        upper=hand.upper.double(),
+        radius=hand.tip_radius.double(),
+        normals=rotate(inverse(grasp.obj_from_hand), grasp.contacts.normals)[0],
+        joints=grasp.joints[0],
+        pregrasp=grasp.pregrasp[0],
+    )
+
+
+def _centres_in_links(hand: Hand, joints: Float[Tensor, "1 h"]) -> np.ndarray:
+    """Return each fingertip's centre in its link, homogeneous (3, 4): it does not depend on the joints."""
+    poses = hand.link_poses(joints)[0]
+    tips = poses[[hand.link_names.index(name) for name in hand.tip_links]]
+    centres = apply(inverse(tips), hand.tip_centres(joints)[0][:, None])[:, 0]
+    return torch.cat([centres, torch.ones(3, 1, dtype=centres.dtype)], dim=-1).numpy()
+
+
+def _frozen(targets: Float[Tensor, "j"]) -> Callable[[Sight, float], Float[Tensor, "j"]]:
+    """Return a controller that keeps its targets."""
+    return lambda sight, period: targets
