@@ -207,9 +207,10 @@ class _Whitening:
 
 
 def load_mixture(name_or_path: Path | str) -> GraspMixture:
-    """Read the mixture of a shipped hand by the hand's name, or any mixture file by its path.
+    """Read the mixture of a hand by the hand's name or folder, or any mixture by the path of its .safetensors file.
 
     Raises:
+        HandFileError: there is no such hand.
         ModelFileError: the file is missing or malformed, its weights do not sum to 1, a covariance is indefinite.
     """
     path = mixture_path(name_or_path)
@@ -228,10 +229,13 @@ def load_mixture(name_or_path: Path | str) -> GraspMixture:
 
 
 def mixture_path(name_or_path: Path | str) -> Path:
-    """Return the file of a hand's mixture: a path as it is, a bare name inside the folder of shipped hands."""
-    given = Path(name_or_path)
-    if given.suffix or len(given.parts) != 1:
-        return given
-    from torchgrasp.hand.hand import hand_folder
+    """Return the file of a hand's mixture: a .safetensors path as it is, else mixture.safetensors in a hand's folder.
 
-    return hand_folder(str(name_or_path)) / "mixture.safetensors"
+    Raises:
+        HandFileError: neither such a path nor a hand.
+    """
+    if Path(name_or_path).suffix == ".safetensors":
+        return Path(name_or_path)
+    from torchgrasp.hand.hand import find_hand
+
+    return find_hand(name_or_path) / "mixture.safetensors"

@@ -41,10 +41,8 @@ def query_hand(
     Raises:
         BadArgument: a mixture of another hand, a number outside its range, or malformed contacts.
     """
-    if mixture.joint_names != tuple(hand.joint_names):
-        raise BadArgument(
-            "mixture", f"joints {mixture.joint_names}", f"the joints {tuple(hand.joint_names)} of the hand"
-        )
+    if mixture.joint_names != hand.joint_names:
+        raise BadArgument("mixture", f"joints {mixture.joint_names}", f"the joints {hand.joint_names} of the hand")
     if not 1 <= guesses <= len(mixture.weights) + 1:
         raise BadArgument("guesses", guesses, f"1 to {len(mixture.weights) + 1}")
     if not max_reach > 0:

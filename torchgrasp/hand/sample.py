@@ -21,7 +21,7 @@ CHUNK = 10_000
 
 @dataclasses.dataclass(frozen=True)
 class HandSamples(Batch):
-    """Postures `joints` [rad] of one hand and their codes `q` (Eq. 18); `meta` tells hand, hash and seed."""
+    """Postures `joints` [rad] of one hand and their codes `q` (Eq. 18); `meta` tells hand, fingers, hash and seed."""
 
     joints: Float[Tensor, "n h"]
     q: Float[Tensor, "n 6"]
@@ -60,8 +60,8 @@ def sample_configurations(hand: Hand, n: int, seed: int = 0, workers: int = 1) -
             raise BadArgument("hand", f"{have} free of {(i + 1) * CHUNK} postures", "a hand that can move freely")
     joints = torch.cat(found)[:n]
     q = torch.cat([hand_code(*hand.fingertips(part)) for part in joints.split(CHUNK)])
-    meta = {"hand": hand.name, "hand_hash": hand.hash, "seed": str(seed)}
-    return HandSamples(joints, q, tuple(hand.joint_names), meta)
+    meta = {"hand": hand.name, "fingers": hand.option, "hand_sha256": hand.sha256, "seed": str(seed)}
+    return HandSamples(joints, q, hand.joint_names, meta)
 
 
 def _chunks(hand: Hand, seed: int, workers: int) -> Iterator[Tensor]:

@@ -1,0 +1,59 @@
+"""Sampled postures are free, within limits, and do not depend on the number of workers."""
+
+import pytest
+import torch
+
+from torchgrasp.errors import BadArgument
+from torchgrasp.hand.code import hand_code
+from torchgrasp.hand.hand import load_hand
+from torchgrasp.hand.sample import sample_configurations
+
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch):
+    """Chunks of 1000 draws: several of them in little time."""
+    monkeypatch.setattr("torchgrasp.hand.sample.CHUNK", 1000)
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett"])
+def test_samples_are_free_within_limits_and_coded(name):
+    hand = load_hand(name)
+    samples = sample_configurations(hand, 2000, seed=3)
+    assert len(samples) == 2000
+    assert samples.joint_names == tuple(hand.joint_names)
+    assert samples.joints.dtype == torch.float64
+    assert bool(((samples.joints >= hand.lower) & (samples.joints <= hand.upper)).all())
+    assert bool((hand.self_clearance(samples.joints) > 0).all())
+    torch.testing.assert_close(samples.q, hand_code(*hand.fingertips(samples.joints)))
+    assert samples.rows().shape == (2000, len(hand.joint_names) + 6)
+
+
+def test_same_seed_same_samples_for_any_number_of_workers():
+    hand = load_hand("barrett")
+    n = 2500  # more than one chunk
+    one = sample_configurations(hand, n, seed=5, workers=1)
+    two = sample_configurations(hand, n, seed=5, workers=2)
+    assert torch.equal(one.joints, two.joints)
+    assert torch.equal(one.q, two.q)
+    fewer = sample_configurations(hand, 100, seed=5)
+    assert torch.equal(fewer.joints, one.joints[:100])
+    assert not torch.equal(fewer.joints, sample_configurations(hand, 100, seed=6).joints)
+
+
+def test_samples_are_uniform_among_the_free_postures():
+    # The oracle rejects draws of another generator, and takes them all at once.
+    hand = load_hand("barrett")
+    samples = sample_configurations(hand, 4000).joints
+    draws = torch.rand(6000, 4, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
+    free = hand.lower + (hand.upper - hand.lower) * draws
+    free = free[hand.self_clearance(free) > 0]
+    for power in (1, 2):
+        moments = [(x**power).mean(0) for x in (samples, free)]
+        error = sum((x**power).var(0) / len(x) for x in (samples, free)) ** 0.5
+        assert bool(((moments[0] - moments[1]).abs() < 4 * error).all())
+
+
+@pytest.mark.parametrize(("name", "value"), [("n", 0), ("seed", -1), ("workers", 0)])
+def test_bad_arguments(name, value):
+    with pytest.raises(BadArgument, match=f"{name}: found {value}"):
+        sample_configurations(load_hand("barrett"), **{"n": 10, name: value})
