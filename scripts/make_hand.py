@@ -28,18 +28,14 @@ def report_held_out(mixture: GraspMixture, held_out: HandSamples) -> dict[str, s
         print(f"  {name:20s} {mean:.3f} +- {deviation:.3f}")
     print(f"  {'all joints':20s} {float(error.mean()):.3f}; the nearest of 4 modes {float(best.mean()):.3f}")
     reach = mixture.reach(held_out.q)
-    accepted = {
-        name: float((reach < t).double().mean()) for name, t in (("paper", PAPER_REACH), ("default", DEFAULT_REACH))
-    }
-    print(
-        f"accepted by reach < {PAPER_REACH:g} (paper): {accepted['paper']:.4f}; < {DEFAULT_REACH:.3f}: {accepted['default']:.4f}"
-    )
+    paper, default = (float((reach < threshold).double().mean()) for threshold in (PAPER_REACH, DEFAULT_REACH))
+    print(f"within reach: {paper:.4f} at the paper's {PAPER_REACH:g}, {default:.4f} at the default {DEFAULT_REACH:.3f}")
     per_sample = float(mixture.log_prob(held_out.rows()).mean())
     print(f"log-likelihood a posture: {mixture.meta['log_likelihood']} fitted, {per_sample:.6f} held out")
     return {
         "held_out": str(len(held_out)),
-        "acceptance_paper_reach": f"{accepted['paper']:.4f}",
-        "acceptance_default_reach": f"{accepted['default']:.4f}",
+        "acceptance_paper_reach": f"{paper:.4f}",
+        "acceptance_default_reach": f"{default:.4f}",
         "mean_absolute_error": f"{float(error.mean()):.4f}",
     }
 
