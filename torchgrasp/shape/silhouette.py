@@ -1,0 +1,162 @@
+"""What a single view says of the hidden side: the object stays within its outline and behind its seen surface."""
+
+import dataclasses
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.linalg import unit
+from torchgrasp.values import PointCloud, Value
+
+CELLS = 4.0
+"""Cells of the raster for the typical spacing of the cloud's pixels."""
+GROW, SHRINK = 2.0, 1.65
+"""The outline is the union of discs of 2 spacings about the pixels, shrunk by 1.65: holes close, the rim stays."""
+MAX_CELLS = 320
+"""Cells of the raster along the cloud's longer side, at most."""
+FRONT_MARGIN = 0.002
+"""How far [m] a point may lie in front of the seen surface: noise of the camera."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Silhouette(Value):
+    """The outline and the seen depth of a cloud in a raster of the camera's plane at depth 1.
+
+    `outside` is the signed distance to the outline (positive outside), in the plane at depth 1; `depth` [m] is that
+    of the nearest seen pixel. `rim` and `rim_normals` are points of the outline at the seen depth, in the cloud's frame,
+    with the normals of the cone that the outline and the camera span.
+    """
+
+    viewpoint: Float[Tensor, "3"]
+    axes: Float[Tensor, "3 3"]
+    corner: Float[Tensor, "2"]
+    cell: float
+    outside: Float[Tensor, "h w"]
+    depth: Float[Tensor, "h w"]
+    rim: Float[Tensor, "k 3"]
+    rim_normals: Float[Tensor, "k 3"]
+
+    def hull_distance(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+        """Return the signed distance [m] to the visual hull: positive where the object would have been seen."""
+        outside, _, depth = self._look_up(points)
+        return outside * depth
+
+    def violation(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+        """Return how far [m] points stand out of the hull, or else in front of the seen surface; 0 where hidden."""
+        outside, seen, depth = self._look_up(points)
+        in_front = (seen - depth - FRONT_MARGIN).clamp_min(0)
+        return torch.where(outside > 0, outside * depth, in_front)
+
+    def _look_up(self, points: Float[Tensor, "*b 3"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return outline distance, seen depth and own depth of points."""
+        local = (points - self.viewpoint) @ self.axes.T
+        depth = local[..., 2].clamp_min(1e-9)  # behind the camera is far outside
+        place = (local[..., :2] / depth[..., None] - self.corner) / self.cell
+        limit = torch.tensor(self.outside.shape, dtype=place.dtype, device=place.device).flip(0) - 1
+        clamped = torch.minimum(place.clamp_min(0), limit)
+        column, row = torch.round(clamped).long().unbind(-1)
+        beyond = torch.linalg.vector_norm(place - clamped, dim=-1) * self.cell
+        return self.outside[row, column] + beyond, self.depth[row, column], depth
+
+
+def silhouette(cloud: PointCloud, viewpoint: Float[Tensor, "3"], n_rim: int = 16) -> Silhouette:
+    """Return the silhouette of a cloud seen from a viewpoint, from the cloud alone.
+
+    Args:
+        cloud: points [m] of one view.
+        viewpoint: the camera's position [m].
+        n_rim: number of points on the outline, evenly spread.
+    """
+    from scipy.ndimage import distance_transform_edt
+    from scipy.spatial import KDTree
+
+    points, viewpoint = cloud.points.double().cpu(), viewpoint.double().cpu()
+    axes = _camera_axes((points.amax(0) + points.amin(0)) / 2 - viewpoint)
+    local = (points - viewpoint) @ axes.T
+    pixels = (local[:, :2] / local[:, 2:]).numpy()
+    depths = local[:, 2].numpy()
+    distance, _ = KDTree(pixels).query(pixels, k=min(5, len(pixels)))
+    spacing = float(np.median(distance[:, -1]))
+    low, high = pixels.min(0), pixels.max(0)
+    extent = float((high - low).max())
+    cell = max(spacing / CELLS, extent / MAX_CELLS)
+    margin = int(np.ceil(GROW * spacing / cell)) + int(0.25 * extent / cell) + 2
+    shape = tuple(np.ceil((high - low) / cell).astype(int)[::-1] + 2 * margin + 1)
+    corner = low - margin * cell
+    column, row = np.round((pixels - corner) / cell).astype(int).T
+    order = np.argsort(-depths)  # where pixels share a cell the nearest to the camera is written last
+    seen = np.zeros(shape)
+    seen[row[order], column[order]] = depths[order]
+    away, nearest = distance_transform_edt(seen == 0, return_indices=True)
+    grown = away * cell <= GROW * spacing
+    inside = distance_transform_edt(grown) * cell > SHRINK * spacing
+    outside = np.where(inside, -distance_transform_edt(inside), distance_transform_edt(~inside)) * cell
+    outside += np.where(inside, 0.5, -0.5) * cell  # the outline runs between two cells
+    rim, rim_normals = _rim(outside, corner, cell, pixels, depths, n_rim)
+    return Silhouette(
+        viewpoint=viewpoint,
+        axes=axes,
+        corner=torch.from_numpy(corner),
+        cell=cell,
+        outside=torch.from_numpy(outside),
+        depth=torch.from_numpy(seen[tuple(nearest)]),
+        rim=torch.from_numpy(rim) @ axes + viewpoint,
+        rim_normals=torch.from_numpy(rim_normals) @ axes,
+    )
+
+
+def farthest_points(points: Float[Tensor, "n 3"], n: int) -> Tensor:
+    """Return the indices of at most n points, each the farthest from those before it, beginning at the first.
+
+    >>> farthest_points(torch.tensor([[0.0, 0, 0], [1, 0, 0], [9, 0, 0]]), 2)
+    tensor([0, 2])
+    """
+    picks = [0] if len(points) else []
+    distance = torch.full((len(points),), torch.inf, dtype=points.dtype, device=points.device)
+    while len(picks) < min(n, len(points)):
+        distance = torch.minimum(distance, torch.linalg.vector_norm(points - points[picks[-1]], dim=-1))
+        picks.append(int(distance.argmax()))
+    return torch.tensor(picks, dtype=torch.long, device=points.device)
+
+
+def seen_from_one_side(cloud: PointCloud, viewpoint: Float[Tensor, "3"]) -> Bool[Tensor, ""]:
+    """Tell whether the cloud's normals face the viewpoint, as those of a single view do (9 of 10 of them)."""
+    assert cloud.normals is not None
+    facing = ((viewpoint - cloud.points) * cloud.normals).sum(-1) > 0
+    return facing.double().mean() >= 0.9
+
+
+def _camera_axes(forward: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """Return right, down and forward axes of a camera that looks along `forward`, as rows."""
+    forward = unit(forward)
+    helper = torch.zeros_like(forward)
+    helper[forward.abs().argmin()] = 1.0
+    right = unit(torch.linalg.cross(forward, helper))
+    return torch.stack([right, torch.linalg.cross(forward, right), forward])
+
+
+def _rim(
+    outside: np.ndarray, corner: np.ndarray, cell: float, pixels: np.ndarray, depths: np.ndarray, n: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return n points of the outline in the camera's frame, at the depth of the seen pixels nearby, and normals."""
+    from scipy.ndimage import gaussian_filter
+    from scipy.spatial import KDTree
+
+    row, column = np.nonzero(np.abs(outside) <= 0.75 * cell)
+    slope_row, slope_column = np.gradient(gaussian_filter(outside, 3.0), cell)
+    slope = np.stack([slope_column[row, column], slope_row[row, column]], -1)
+    slope /= np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-12)
+    place = corner + cell * np.stack([column, row], -1)
+    if len(place) == 0:
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    flat = torch.from_numpy(np.concatenate([place, np.zeros((len(place), 1))], -1))
+    picks = farthest_points(flat, n).numpy()
+    place, slope = place[picks], slope[picks]
+    _, index = KDTree(pixels).query(place, k=min(4, len(pixels)))
+    depth = np.median(depths[index].reshape(len(place), -1), axis=-1)
+    ray = np.concatenate([place, np.ones((len(place), 1))], -1)
+    # The cone's normal is perpendicular to the ray and to the outline's tangent, and leans with the slope.
+    across = np.concatenate([slope, -(slope * place).sum(-1, keepdims=True)], -1)
+    return ray * depth[:, None], across / np.linalg.norm(across, axis=-1, keepdims=True)
