@@ -70,7 +70,7 @@ def complete_cloud(
 
     >>> eye = torch.tensor([0.0, 0.0, 1.0]).double()
     >>> cap = unit(torch.rand(300, 3).double() - torch.tensor([0.5, 0.5, 0.0]).double())
-    >>> bool((complete_cloud(PointCloud(0.05 * cap, cap), eye).points[:, 2] < 0.01).all())
+    >>> bool(complete_cloud(PointCloud(0.05 * cap, cap), eye).points[:, 2].min() < -0.02)
     True
     """
     from scipy.spatial import KDTree

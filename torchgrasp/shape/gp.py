@@ -134,11 +134,8 @@ class ShapeGP(Value):
             covariance=spread,
             std_m=self.std_factor * self.scale * torch.sqrt(variance),
         )
-        batch = points.shape[:-1]
-        shaped = {
-            f.name: (t := getattr(found, f.name)).reshape(*batch, *t.shape[1:]).to(points.dtype)
-            for f in dataclasses.fields(found)
-        }
+        fields = {f.name: getattr(found, f.name).to(points.dtype) for f in dataclasses.fields(found)}
+        shaped = {name: t.reshape(points.shape[:-1] + t.shape[1:]) for name, t in fields.items()}
         return ShapeEstimate(**shaped)
 
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:

@@ -25,8 +25,8 @@ class Silhouette(Value):
     """The outline and the seen depth of a cloud in a raster of the camera's plane at depth 1.
 
     `outside` is the signed distance to the outline (positive outside), in the plane at depth 1; `depth` [m] is that
-    of the nearest seen pixel. `rim` and `rim_normals` are points of the outline at the seen depth, in the cloud's frame,
-    with the normals of the cone that the outline and the camera span.
+    of the nearest seen pixel. `rim` and `rim_normals` are points of the outline at the seen depth, in the cloud's
+    frame, with the normals of the cone that the outline and the camera span.
     """
 
     viewpoint: Float[Tensor, "3"]
@@ -89,10 +89,9 @@ def silhouette(cloud: PointCloud, viewpoint: Float[Tensor, "3"], n_rim: int = 16
     order = np.argsort(-depths)  # where pixels share a cell the nearest to the camera is written last
     seen = np.zeros(shape)
     seen[row[order], column[order]] = depths[order]
-    away, nearest = distance_transform_edt(seen == 0, return_indices=True)
-    grown = away * cell <= GROW * spacing
-    inside = distance_transform_edt(grown) * cell > SHRINK * spacing
-    outside = np.where(inside, -distance_transform_edt(inside), distance_transform_edt(~inside)) * cell
+    nearest = np.asarray(distance_transform_edt(seen == 0, return_distances=False, return_indices=True))
+    inside = _distance(_distance(seen == 0) * cell <= GROW * spacing) * cell > SHRINK * spacing
+    outside = (_distance(~inside) - _distance(inside)) * cell
     outside += np.where(inside, 0.5, -0.5) * cell  # the outline runs between two cells
     rim, rim_normals = _rim(outside, corner, cell, pixels, depths, n_rim)
     return Silhouette(
@@ -137,6 +136,13 @@ def _camera_axes(forward: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     return torch.stack([right, torch.linalg.cross(forward, right), forward])
 
 
+def _distance(mask: np.ndarray) -> np.ndarray:
+    """Return the distance of each cell of the mask to the nearest cell outside it, in cells."""
+    from scipy.ndimage import distance_transform_edt
+
+    return np.asarray(distance_transform_edt(mask))
+
+
 def _rim(
     outside: np.ndarray, corner: np.ndarray, cell: float, pixels: np.ndarray, depths: np.ndarray, n: int
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -145,8 +151,8 @@ def _rim(
     from scipy.spatial import KDTree
 
     row, column = np.nonzero(np.abs(outside) <= 0.75 * cell)
-    slope_row, slope_column = np.gradient(gaussian_filter(outside, 3.0), cell)
-    slope = np.stack([slope_column[row, column], slope_row[row, column]], -1)
+    smooth = gaussian_filter(outside, 3.0)
+    slope = np.stack([np.gradient(smooth, axis=axis)[row, column] for axis in (1, 0)], -1)
     slope /= np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-12)
     place = corner + cell * np.stack([column, row], -1)
     if len(place) == 0:
