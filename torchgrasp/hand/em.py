@@ -17,7 +17,7 @@ from torchgrasp.errors import IndefiniteCovariance
 from torchgrasp.linalg import cholesky
 from torchgrasp.values import Value
 
-ROWS = 4096
+ROWS = 1024
 """Rows of one pass: features and responsibilities of so many rows stay in the cache."""
 
 
@@ -94,9 +94,12 @@ def expectation(x: Float[Tensor, "n d"], components: Components) -> tuple[Float[
     for rows in x.split(ROWS):
         features = features_from_data(rows)
         log_joint = coefficients @ features  # (m, rows)
-        log_density = torch.logsumexp(log_joint, dim=0)
-        sums += (log_joint - log_density).exp() @ features.T
-        total += log_density.sum()
+        # log-sum-exp by hand: its exponentials are the responsibilities but for a division
+        largest = log_joint.amax(0)
+        scaled = (log_joint - largest).exp()
+        density = scaled.sum(0)
+        sums += (scaled / density) @ features.T
+        total += (density.log() + largest).sum()
     return sums, total
 
 

@@ -16,7 +16,7 @@ def fit_mixture(
     components: int,
     seed: int = 0,
     iterations: int = 300,
-    tolerance: float = 1e-4,
+    tolerance: float = 1e-3,
     regularisation: float = 1e-6,
 ) -> GraspMixture:
     """Fit the mixture of Eqs. (19)-(20) to sampled postures by expectation-maximisation from a k-means start.
