@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.plan.problem import ContactProblem, Rows, Shape, TripleJet, triple_jet
+from torchgrasp.plan.flat import BendGuide, bend_guide
+from torchgrasp.plan.problem import ContactProblem, Rows, Shape, TripleJet, carry, triple_jet
 from torchgrasp.plan.wrench import tangents
 from torchgrasp.values import Batch, SomeValue, Value
 
@@ -23,6 +24,10 @@ LONGEST_TURN = 3.0
 
 Z_DAMPING = 0.1
 """Damping of the logits relative to that of the points: logits range over about 10, points over about 1."""
+
+
+GUIDE_EVERY = 4
+"""Steps between two evaluations of the rows for flat surface."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,13 +81,19 @@ def raise_multipliers(rows: Rows, multipliers: Multipliers) -> Multipliers:
     )
 
 
+def shift_bounds(rows: Rows, multipliers: Multipliers) -> Float[Tensor, "b k"]:
+    """Return the bounds plus their multipliers; rows of a guide come last and have none."""
+    known = multipliers.bounds.shape[1]
+    return torch.cat([rows.bounds[:, :known] + multipliers.bounds, rows.bounds[:, known:]], 1)
+
+
 def cost(rows: Rows, multipliers: Multipliers, weights: Weights) -> Float[Tensor, "b"]:
     """Return the augmented Lagrangian of each triple."""
     shifted = (
         weights.centre * rows.centre,
         weights.surface * (rows.surface + multipliers.surface),
         weights.closure * (rows.closure + multipliers.closure),
-        weights.bounds * (rows.bounds + multipliers.bounds).clamp(min=0.0),
+        weights.bounds * shift_bounds(rows, multipliers).clamp(min=0.0),
     )
     return torch.cat(shifted, 1).square().sum(1) / 2
 
@@ -91,7 +102,7 @@ def step(
     rows: Rows, multipliers: Multipliers, weights: Weights, damping: Float[Tensor, "b"]
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b m"]]:
     """Return the damped Gauss-Newton step of the points and the logits."""
-    active = rows.bounds + multipliers.bounds
+    active = shift_bounds(rows, multipliers)
     on = weights.bounds * (active > 0)
     value = torch.cat(
         [weights.centre * rows.centre, weights.surface * (rows.surface + multipliers.surface), on * active], 1
@@ -122,6 +133,16 @@ def step(
     return points_step / shrink[:, None, None], z_step / shrink[:, None]
 
 
+def join_guide(rows: Rows, guide: BendGuide | None, points: Float[Tensor, "b 3 3"]) -> Rows:
+    """Return the rows with those of the guide at `points` among the bounds."""
+    if guide is None:
+        return rows
+    bounds = torch.cat([rows.bounds, guide.rows(points)], 1)
+    return dataclasses.replace(
+        rows, bounds=bounds, bounds_by_points=torch.cat([rows.bounds_by_points, guide.by_points], 1)
+    )
+
+
 def pick(choose: Bool[Tensor, "b"], new: SomeValue, old: SomeValue) -> SomeValue:
     """Return the new rows of a value where `choose`, the old ones elsewhere."""
 
@@ -133,22 +154,34 @@ def pick(choose: Bool[Tensor, "b"], new: SomeValue, old: SomeValue) -> SomeValue
 
 
 def descend(
-    shape: Shape, problem: ContactProblem, state: State, multipliers: Multipliers, weights: Weights, steps: int
+    shape: Shape,
+    problem: ContactProblem,
+    state: State,
+    multipliers: Multipliers,
+    weights: Weights,
+    steps: int,
+    flatness: float | None = None,
 ) -> tuple[State, Rows]:
     """Take `steps` Levenberg-Marquardt steps with constant weights and multipliers; one shape evaluation each.
 
-    Returns the state, with each tangent carried to its new normal, and its rows.
+    With `flatness`, rows for flat surface around the contacts join, evaluated anew every `GUIDE_EVERY` steps. Tangents
+    are carried along with their normals. Returns the state and its rows.
     """
     rows = problem.rows(state.points, state.z, state.tangent, state.jet)
-    for _ in range(steps):
-        points_step, z_step = step(rows, multipliers, weights, state.damping)
+    guide = None
+    for i in range(steps):
+        if flatness is not None and i % GUIDE_EVERY == 0:
+            guide = bend_guide(shape, state.points, state.jet, flatness)
+        joined = join_guide(rows, guide, state.points)
+        points_step, z_step = step(joined, multipliers, weights, state.damping)
         points, z = state.points + points_step, state.z + z_step.unflatten(1, state.z.shape[1:])
-        tried = State(points, z, state.tangent, triple_jet(shape, points), state.damping / 4)
-        tried_rows = problem.rows(points, z, state.tangent, tried.jet)
-        before, after = cost(rows, multipliers, weights), cost(tried_rows, multipliers, weights)
+        jet = triple_jet(shape, points)
+        tried = State(points, z, carry(state.tangent, jet.normals), jet, (state.damping / 4).clamp(min=1e-9))
+        tried_rows = problem.rows(points, z, tried.tangent, jet)
+        before = cost(joined, multipliers, weights)
+        after = cost(join_guide(tried_rows, guide, points), multipliers, weights)
         inside = torch.linalg.vector_norm(points, dim=-1).amax(-1) < problem.domain_radius
         better = (after <= before) & inside  # a comparison with NaN is False: such a step is refused
         refused = dataclasses.replace(state, damping=(state.damping * 6).clamp(max=1e8))
-        tried = dataclasses.replace(tried, damping=tried.damping.clamp(min=1e-9))
         state, rows = pick(better, tried, refused), pick(better, tried_rows, rows)
     return state, rows

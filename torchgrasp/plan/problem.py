@@ -152,7 +152,7 @@ class ContactProblem:
         """
         b = len(points)
         normals = jet.normals
-        first = unit(tangent - (tangent * normals).sum(-1, keepdim=True) * normals)
+        first = carry(tangent, normals)
         edge = cone_edges(normals, first, self.friction, self.edges)  # (b, 3, e, 3)
         phi = self.coefficients(z)
         wrench = torch.cat([edge, torch.linalg.cross(points[:, :, None].expand_as(edge), edge)], -1).flatten(1, 2)
@@ -209,6 +209,11 @@ class ContactProblem:
             down[..., 2] = -1.0
             slopes.append(_one_point_each(down))
         return torch.cat(values, 1), torch.cat(slopes, 1)
+
+
+def carry(tangent: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
+    """Carry tangents to turned normals without spin (parallel transport for small turns)."""
+    return unit(tangent - (tangent * normals).sum(-1, keepdim=True) * normals)
 
 
 def _one_point_each(slope: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 9"]:

@@ -14,8 +14,9 @@ from torchgrasp.plan.descend import (
     raise_multipliers,
     start_state,
 )
+from torchgrasp.plan.flat import bend
 from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet
-from torchgrasp.plan.wrench import BALANCED, balance, cone_edges, rank_ratio, tangents, wrenches
+from torchgrasp.plan.wrench import BALANCED, balance, rank_ratio, wrenches
 from torchgrasp.values import ContactPlan, Contacts, ContactSpec, check_tensor
 
 MIN_RANK_RATIO = 1e-3
@@ -23,11 +24,6 @@ MIN_RANK_RATIO = 1e-3
 
 ON_SURFACE = 1e-6
 """Largest |f_d| of a contact on the surface, in normalised units."""
-
-RING_RADIUS = 0.008
-"""Radius [m] of the patch around a contact whose normals `ContactSpec.flatness` compares."""
-
-RING_POINTS = 8
 
 SETTLE = (Weights(centre=0.1, surface=3.0, closure=0.1, bounds=3.0), 10)
 """First onto the surface and into the certain part of it: closure sought there first ends in fewer local minima."""
@@ -73,12 +69,12 @@ def plan_contacts(
     state = start_state(shape, problem, points)
     weights, steps = SETTLE
     multipliers = no_multipliers(problem.rows(state.points, state.z, state.tangent, state.jet))
-    state, _ = descend(shape, problem, state, multipliers, weights, steps)
+    state, _ = descend(shape, problem, state, multipliers, weights, steps, spec.flatness)
     for weights, steps in PLAN:
-        state, rows = descend(shape, problem, state, multipliers, weights, steps)
+        state, rows = descend(shape, problem, state, multipliers, weights, steps, spec.flatness)
         multipliers = raise_multipliers(rows, multipliers)
     weights, steps = FINISH
-    state, _ = descend(shape, problem, state, no_multipliers(rows), weights, steps)
+    state, _ = descend(shape, problem, state, no_multipliers(rows), weights, steps, spec.flatness)
     points = project(shape, state.points, steps=3)
     return assess(shape, spec, points)
 
@@ -148,7 +144,7 @@ def assess(shape: Shape, spec: ContactSpec, points: Float[Tensor, "b 3 3"]) -> C
     good[Status.NOT_FLAT] = torch.ones_like(passed)
     if spec.flatness is not None and bool(passed.any()):
         rows = torch.nonzero(passed)[:, 0]
-        flat = bend(shape, points[rows], normals[rows]) <= spec.flatness
+        flat = bend(shape, points[rows], normals[rows]).amax(-1) <= spec.flatness
         good[Status.NOT_FLAT] = torch.ones_like(passed).index_put((rows,), flat)
     return ContactPlan(
         Contacts(metres, normals, jet.variance, shape.std_factor * shape.scale * jet.variance.sqrt()),
@@ -156,22 +152,6 @@ def assess(shape: Shape, spec: ContactSpec, points: Float[Tensor, "b 3 3"]) -> C
         torch.linalg.vector_norm(points.mean(1), dim=-1) * shape.scale,
         first_violation(good),
     )
-
-
-def bend(shape: Shape, points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b"]:
-    """Return the largest angle [rad] between a contact's normal and those on a ring of `RING_RADIUS` around it."""
-    first = tangents(points, normals)
-    # A cone of friction 1 less its axis is a ring of unit tangents.
-    around = cone_edges(normals, first, 1.0, RING_POINTS) + normals[:, :, None]
-    ring = points[:, :, None] + RING_RADIUS / shape.scale * around
-    x = ring.flatten(0, 2)
-    jet = shape.jet(x)
-    squared = (jet.gradient * jet.gradient).sum(-1, keepdim=True)
-    on_surface = x - jet.distance[:, None] / squared * jet.gradient
-    there = unit(shape.jet(on_surface).gradient).unflatten(0, ring.shape[:3])
-    here = normals[:, :, None].expand_as(there)
-    sine = torch.linalg.vector_norm(torch.linalg.cross(here, there), dim=-1)
-    return torch.atan2(sine, (here * there).sum(-1)).flatten(1).amax(-1)
 
 
 def first_violation(good: dict[Status, Bool[Tensor, "b"]]) -> Int[Tensor, "b"]:
