@@ -1,6 +1,8 @@
 """Refusals for a cloud that no grasp can be planned on, each with its own name."""
 
 import torch
+from jaxtyping import Float, Int
+from torch import Tensor
 
 from torchgrasp.errors import BadArgument, SuspiciousScale, TooFewPoints
 from torchgrasp.values import PointCloud, check_tensor
@@ -43,9 +45,7 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
         raise SuspiciousScale(
             "points", f"an extent of {extent:.4g} m", f"{MIN_EXTENT:g} m to {MAX_EXTENT:g} m; {_remedy(extent)}"
         )
-    distinct = len(keep_distinct(cloud))
-    if distinct < MIN_POINTS:
-        raise TooFewPoints("points", f"{distinct} distinct points", f"at least {MIN_POINTS} distinct points")
+    keep_distinct(cloud)
     spread = torch.linalg.svdvals((points - points.mean(0)).double())
     if float(spread[1]) < LINE_RATIO * float(spread[0]):
         raise BadArgument("points", f"{len(points)} points on one line", "points of a surface")
@@ -61,21 +61,38 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
 def keep_distinct(cloud: PointCloud) -> PointCloud:
     """Return the cloud with each group of coincident points reduced to its first; the order is kept.
 
-    Coincident copies would count as independent measurements and pull the surface towards themselves.
+    Coincident copies would count as independent measurements and pull the surface towards themselves. Points are
+    coincident when they are closer than 1e-9 of the cloud's extent.
+
+    Raises:
+        TooFewPoints: fewer than 4 distinct points.
 
     >>> len(keep_distinct(PointCloud(torch.rand(10, 3).repeat(3, 1))))
     10
     """
-    low = cloud.points.amin(0)
-    step = max(float((cloud.points.amax(0) - low).max()) * SAME_POINT, 1e-300)
-    cells = torch.round((cloud.points - low).double() / step)
-    _, cell = torch.unique(cells, dim=0, return_inverse=True)
-    order = torch.arange(len(cell), device=cell.device)
-    first = torch.full_like(order, len(order)).scatter_reduce(0, cell, order, "amin")
-    rows = torch.sort(first[first < len(order)]).values
-    if len(rows) == len(cell):
+    rows = _distinct_rows(cloud.points)
+    if len(rows) < MIN_POINTS:
+        raise TooFewPoints("points", f"{len(rows)} distinct points", f"at least {MIN_POINTS} distinct points")
+    if len(rows) == len(cloud):
         return cloud
     return PointCloud(cloud.points[rows], None if cloud.normals is None else cloud.normals[rows], cloud.viewpoint)
+
+
+def _distinct_rows(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:
+    """Return the ascending indices of the first point of each group of coincident points."""
+    from scipy.spatial import KDTree
+
+    _, group = torch.unique(points, dim=0, return_inverse=True)
+    order = torch.arange(len(group), device=group.device)
+    first = torch.full_like(order, len(order)).scatter_reduce(0, group, order, "amin")
+    rows = torch.sort(first[first < len(order)]).values
+    # Exact copies are gone, so that even many near copies of one point make few pairs.
+    unique = points[rows].detach().cpu().double()
+    reach = SAME_POINT * float((unique.amax(0) - unique.amin(0)).max())
+    pairs = torch.from_numpy(KDTree(unique.numpy()).query_pairs(reach, output_type="ndarray")).to(rows.device)
+    keep = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
+    keep[pairs[:, 1]] = False  # the first index of a pair is the smaller one
+    return rows[keep]
 
 
 def _remedy(extent: float) -> str:

@@ -16,7 +16,7 @@ from torchgrasp.cloud.pcd import parse_pcd
 from torchgrasp.cloud.ply import format_ply, parse_ply
 from torchgrasp.errors import BadArgument, CloudFileError, TooFewPoints
 from torchgrasp.files import write_atomically
-from torchgrasp.values import PointCloud
+from torchgrasp.values import PointCloud, check_tensor
 
 MAX_BYTES = 512 * 2**20
 """Largest file, and largest unpacked content, that is read."""
@@ -26,7 +26,7 @@ SUFFIXES = (".ply", ".pcd", ".npz", ".npy", ".xyz")
 """The formats, by suffix."""
 
 
-def read_cloud(path: Path | str, viewpoint: Sequence[float] | Tensor | None = None) -> PointCloud:
+def read_cloud(path: Path | str, viewpoint: Sequence[float | int] | Tensor | None = None) -> PointCloud:
     """Read the point cloud of one object from a file; numbers come back as float64, lengths are metres.
 
     * `.ply`, ascii or binary: x y z, optionally nx ny nz; the camera's position from a header line
@@ -70,7 +70,7 @@ def read_cloud(path: Path | str, viewpoint: Sequence[float] | Tensor | None = No
     if len(points) < 4:
         raise TooFewPoints("path", f"{path} with {len(points)} points", "at least 4 points")
     if viewpoint is not None:
-        arrays["viewpoint"] = torch.as_tensor(viewpoint, dtype=torch.float64)
+        arrays["viewpoint"] = check_tensor("viewpoint", torch.as_tensor(viewpoint, dtype=torch.float64), (3,))
     return check_cloud(PointCloud(points, normals, arrays.get("viewpoint")))
 
 

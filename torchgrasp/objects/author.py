@@ -17,7 +17,7 @@ SEGMENTS = 96
 FINE, COARSE = 48, 20
 """Sides of the equator of an ellipsoid in the mesh and in the parts (102 corners, 200 faces)."""
 
-Vector = Sequence[float] | np.ndarray
+Vector = Sequence[float | int] | np.ndarray
 
 
 class Solid(NamedTuple):
@@ -52,18 +52,18 @@ def _cylinder() -> tuple[m3.Manifold, list[m3.Manifold]]:
 def _rabbit() -> tuple[m3.Manifold, list[m3.Manifold]]:
     """A sitting rabbit that looks along x, 155 mm high and 72 mm wide, flat underneath."""
     solids = [
-        _ellipsoid((-0.004, 0, 0.040), (0.048, 0.034, 0.042), pitch=-22),  # body
-        _ellipsoid((0.020, 0, 0.052), (0.026, 0.026, 0.036), pitch=12),  # chest
-        _ellipsoid((0.034, 0, 0.088), (0.028, 0.023, 0.023), pitch=10),  # head
+        _ellipsoid((-0.004, 0, 0.040), (0.048, 0.034, 0.042), pitch=-22.0),  # body
+        _ellipsoid((0.020, 0, 0.052), (0.026, 0.026, 0.036), pitch=12.0),  # chest
+        _ellipsoid((0.034, 0, 0.088), (0.028, 0.023, 0.023), pitch=10.0),  # head
         _ellipsoid((0.055, 0, 0.081), (0.012, 0.013, 0.011)),  # muzzle
         _ellipsoid((-0.050, 0, 0.022), (0.013, 0.013, 0.013)),  # tail
     ]
     for side in (-1, 1):
         solids += [
-            _ellipsoid((0.020, 0.012 * side, 0.125), (0.008, 0.011, 0.032), pitch=-18, roll=-12 * side),  # ear
+            _ellipsoid((0.020, 0.012 * side, 0.125), (0.008, 0.011, 0.032), pitch=-18.0, roll=-12.0 * side),  # ear
             _ellipsoid((-0.018, 0.024 * side, 0.024), (0.028, 0.012, 0.026)),  # haunch
             _ellipsoid((0.008, 0.026 * side, 0.006), (0.028, 0.010, 0.010)),  # hind foot
-            _ellipsoid((0.036, 0.013 * side, 0.022), (0.010, 0.009, 0.030), pitch=-14),  # foreleg
+            _ellipsoid((0.036, 0.013 * side, 0.022), (0.010, 0.009, 0.030), pitch=-14.0),  # foreleg
             _ellipsoid((0.046, 0.013 * side, 0.006), (0.013, 0.009, 0.009)),  # fore paw
         ]
     above = m3.Manifold.cube((1.0, 1.0, 1.0), True).translate((0, 0, 0.5))

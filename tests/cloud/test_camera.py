@@ -1,0 +1,101 @@
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from torchgrasp.cloud.camera import default_intrinsics, look_at, partial_view, render_depth
+from torchgrasp.cloud.depth import cloud_from_depth
+from torchgrasp.errors import BadArgument, MeshError
+from torchgrasp.frames import inverse
+
+
+@pytest.fixture(scope="module")
+def box():
+    return trimesh.creation.box([0.06, 0.08, 0.10])
+
+
+def test_look_at_is_a_rigid_upright_camera():
+    for azimuth, elevation in [(0.0, 0.0), (123.0, 40.0), (-77.0, -20.0)]:
+        pose = look_at(azimuth, elevation, 0.7, torch.tensor([0.1, 0.2, 0.3]))
+        torch.testing.assert_close(pose @ inverse(pose), torch.eye(4, dtype=torch.float64))
+        assert abs(torch.linalg.det(pose[:3, :3]).item() - 1) < 1e-12
+        target = pose[:3, 3] + 0.7 * pose[:3, 2]
+        torch.testing.assert_close(target, torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64), atol=1e-7, rtol=0)
+        assert pose[2, 1] < 0  # down in the image is down in the world
+        assert abs(pose[2, 0]) < 1e-12  # and the horizon is level
+
+
+def test_depth_of_a_sphere_agrees_with_the_closed_form():
+    ball = trimesh.creation.icosphere(subdivisions=6, radius=0.05)
+    depth = render_depth(ball, look_at(30.0, 20.0, 0.5))
+    v, u = torch.nonzero(depth > 0, as_tuple=True)
+    k = default_intrinsics()
+    ray = torch.stack([(u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], torch.ones(len(u)).double()], -1)
+    # |z ray - (0, 0, d)| = r
+    a, b, c = (ray**2).sum(-1), -2 * 0.5, 0.5**2 - 0.05**2
+    root = b**2 - 4 * a * c
+    inner = root > 0.001
+    exact = (-b - root.clamp_min(0).sqrt()) / (2 * a)
+    assert inner.float().mean() > 0.9
+    assert (depth[v, u] - exact)[inner].abs().max() < 1e-4
+    # the disc of its image: the cone that touches the sphere
+    radius = k[0, 0] * 0.05 / np.sqrt(0.5**2 - 0.05**2)
+    assert abs(len(u) / (np.pi * radius**2) - 1) < 0.01
+
+
+def test_an_exact_view_lies_on_the_mesh_and_faces_the_camera(box):
+    cloud = partial_view(box, 35.0, 25.0, noise=False)
+    assert len(cloud) == 1000
+    assert cloud.normals is None
+    _, distance, face = trimesh.proximity.closest_point(box, cloud.points.numpy())
+    assert distance.max() < 1e-9
+    toward = ((cloud.viewpoint - cloud.points).numpy() * box.face_normals[face]).sum(-1)
+    assert toward.min() > 0
+    assert abs(torch.linalg.vector_norm(cloud.viewpoint).item() - 0.5) < 1e-9
+
+
+def test_noise_has_the_documented_size_and_is_repeatable(box):
+    cloud, again, other = (partial_view(box, 35.0, 25.0, seed=s) for s in (0, 0, 1))
+    assert torch.equal(cloud.points, again.points)
+    assert not torch.equal(cloud.points, other.points)
+    distance = 1e3 * trimesh.proximity.closest_point(box, cloud.points.numpy())[1]
+    assert 0.2 < np.median(distance) < 1.0
+    assert 0.6 < np.percentile(distance, 90) < 2.5
+    # errors act along the rays: the direction from the camera stays that of a pixel that sees the box
+    pose = look_at(35.0, 25.0, 0.5)
+    x, y, z = (cloud.points @ inverse(pose)[:3, :3].T + inverse(pose)[:3, 3]).unbind(-1)
+    u, v = 616 * x / z + 319.5, 616 * y / z + 239.5
+    assert (u - u.round()).abs().max() < 1e-6
+    assert (render_depth(box, pose)[v.round().long(), u.round().long()] > 0).all()
+
+
+def test_grazing_surfaces_fade_out():
+    plate = trimesh.creation.box([0.2, 0.2, 0.01])
+    shares = []
+    for elevation in (60.0, 10.0, 2.0):
+        exact = partial_view(plate, 0.0, elevation, n=10**6, noise=False)
+        noisy = partial_view(plate, 0.0, elevation, n=10**6)
+        shares.append(len(noisy) / len(exact))
+        if elevation == 2.0:  # only the rim of the plate, seen head on, is left
+            assert (noisy.points[:, 0] > 0.05).float().mean() > 0.9
+    assert shares[0] > 0.85
+    assert shares[1] < 0.75 * shares[0]
+
+
+def test_fewer_pixels_than_points_give_all_pixels(box):
+    far = partial_view(box, 0.0, 0.0, distance=8.0, noise=False)
+    depth = render_depth(box, look_at(0.0, 0.0, 8.0))
+    assert len(far) == int((depth > 0).sum()) == len(cloud_from_depth(depth, default_intrinsics())) < 1000
+
+
+def test_refusals(box):
+    with pytest.raises(BadArgument, match="elevation"):
+        partial_view(box, 0.0, 90.0)
+    with pytest.raises(BadArgument, match="distance"):
+        partial_view(box, 0.0, 0.0, distance=-1.0)
+    with pytest.raises(BadArgument, match="n: found 3"):
+        partial_view(box, 0.0, 0.0, n=3)
+    with pytest.raises(BadArgument, match="size"):
+        render_depth(box, look_at(0.0, 0.0, 0.5), size=(0, 640))
+    with pytest.raises(MeshError):
+        render_depth(trimesh.Trimesh(), look_at(0.0, 0.0, 0.5))

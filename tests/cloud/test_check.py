@@ -1,0 +1,49 @@
+import pytest
+import torch
+
+from torchgrasp.cloud.check import check_cloud, keep_distinct
+from torchgrasp.errors import BadArgument, SuspiciousScale, TooFewPoints
+from torchgrasp.values import PointCloud
+
+
+def cloud(n=50, scale=0.1):
+    return torch.rand(n, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * scale
+
+
+def test_a_good_cloud_passes_unchanged():
+    for points in (cloud(), cloud() * torch.tensor([1.0, 1.0, 0.0]), cloud().float() + 3):
+        value = PointCloud(points, torch.ones_like(points), torch.ones_like(points[0]))
+        assert check_cloud(value) is value
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e-3, 0.04, 25.0, 1e3, 1e6])
+def test_a_wrong_unit_is_named(factor):
+    with pytest.raises(SuspiciousScale, match="mm" if factor > 1 else "normalised"):
+        check_cloud(PointCloud(cloud() * factor))
+
+
+def test_coincident_few_and_collinear_points_are_refused():
+    with pytest.raises(BadArgument, match="coincide"):
+        check_cloud(PointCloud(cloud(1).repeat(50, 1)))
+    with pytest.raises(TooFewPoints, match="3 distinct"):
+        check_cloud(PointCloud(cloud(3).repeat(50, 1)))
+    with pytest.raises(BadArgument, match="one line"):
+        check_cloud(PointCloud(torch.linspace(0, 0.1, 50).double()[:, None] * torch.tensor([1.0, 2.0, -1.0]).double()))
+    with pytest.raises(BadArgument, match="length zero"):
+        check_cloud(PointCloud(cloud(), torch.zeros(50, 3)))
+
+
+def test_numbers_spoilt_after_the_value_was_made_are_found():
+    value = PointCloud(cloud())
+    value.points[3, 1] = float("inf")
+    with pytest.raises(BadArgument, match=r"index \[3, 1\]"):
+        check_cloud(value)
+
+
+def test_duplicates_are_reduced_to_the_first_in_order():
+    points, copies = cloud(40), torch.randint(0, 40, (200,), generator=torch.Generator().manual_seed(1))
+    order = torch.cat([torch.arange(40).flip(0), copies])
+    jitter = 1e-12 * torch.randn(240, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    kept = keep_distinct(PointCloud((points[order] + jitter), points[order] + 1, points[0]))
+    torch.testing.assert_close(kept.points, points.flip(0), rtol=0, atol=1e-11)
+    torch.testing.assert_close(kept.normals, points.flip(0) + 1)

@@ -1,0 +1,124 @@
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from torchgrasp.cloud.camera import partial_view
+from torchgrasp.cloud.normals import clean_cloud, estimate_normals, estimate_viewpoint
+from torchgrasp.errors import TooFewPoints
+from torchgrasp.linalg import unit
+from torchgrasp.objects import list_objects, load_object
+from torchgrasp.values import PointCloud
+
+
+def truth(mesh, points):
+    _, distance, face = trimesh.proximity.closest_point(mesh, points.numpy())
+    return torch.from_numpy(mesh.face_normals[face]), torch.from_numpy(distance)
+
+
+@pytest.fixture(scope="module")
+def ball_view():
+    return partial_view(trimesh.creation.icosphere(subdivisions=5, radius=0.04), 20.0, 30.0, noise=False)
+
+
+def test_normals_of_a_sphere_agree_with_the_closed_form(ball_view):
+    cloud = estimate_normals(ball_view)
+    cosine = (cloud.normals * unit(cloud.points)).sum(-1)
+    assert torch.rad2deg(torch.arccos(cosine.clamp(-1, 1))).median() < 2.0
+    assert (cosine > 0.9).all()
+    torch.testing.assert_close(torch.linalg.vector_norm(cloud.normals, dim=-1), torch.ones(1000).double())
+
+
+def test_an_exact_plane_has_its_exact_normal_and_stays_where_it_is():
+    generator = torch.Generator().manual_seed(0)
+    flat = torch.rand(300, 2, generator=generator, dtype=torch.float64) * 0.1
+    points = torch.cat([flat, flat @ torch.tensor([[0.3], [-0.2]], dtype=torch.float64)], -1)
+    normal = torch.tensor([-0.3, 0.2, 1.0], dtype=torch.float64) / np.sqrt(1.13)
+    cloud = clean_cloud(PointCloud(points, None, torch.tensor([0.0, 0.0, 1.0]).double()))
+    torch.testing.assert_close(cloud.normals, normal.expand(len(cloud), 3), atol=1e-6, rtol=0)
+    assert (cloud.points @ normal).abs().max() < 1e-12
+
+
+@pytest.mark.parametrize("name", list_objects())
+def test_nearly_all_normals_are_outward_with_and_without_the_viewpoint(name):
+    thing = load_object(name)
+    outward, _ = truth(thing.mesh, thing.view.points)
+    known = estimate_normals(thing.view)
+    guessed = estimate_normals(PointCloud(thing.view.points))
+    assert ((known.normals * outward).sum(-1) > 0).double().mean() > 0.96
+    assert ((guessed.normals * known.normals).sum(-1) > 0).double().mean() > 0.97
+    assert torch.equal(known.viewpoint, thing.view.viewpoint)
+    assert guessed.viewpoint is not None
+
+
+def test_the_guess_follows_a_rigid_motion_and_finds_the_camera(ball_view):
+    for seed in range(3):
+        turn = torch.from_numpy(Rotation.random(random_state=seed).as_matrix())
+        moved = PointCloud(ball_view.points @ turn.T + 0.3)
+        camera = ball_view.viewpoint @ turn.T
+        guess = estimate_viewpoint(moved) - 0.3
+        angle = torch.arccos(guess @ camera / torch.linalg.vector_norm(guess) / torch.linalg.vector_norm(camera))
+        assert torch.rad2deg(angle) < 25
+
+
+def test_a_cloud_in_the_frame_of_its_camera_was_seen_from_the_origin():
+    from torchgrasp.cloud.camera import look_at
+    from torchgrasp.frames import apply, inverse
+
+    thing = load_object("jug")
+    pose = look_at(60.0, 35.0, 0.5, torch.from_numpy(thing.mesh.bounds.mean(0)))
+    torch.testing.assert_close(pose[:3, 3], thing.view.viewpoint, atol=1e-6, rtol=0)
+    assert estimate_viewpoint(PointCloud(apply(inverse(pose), thing.view.points))).tolist() == [0, 0, 0]
+
+
+def test_given_normals_decide_the_side_of_a_cloud_seen_from_all_around():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.04)
+    points = torch.from_numpy(np.array(ball.vertices))
+    cloud = estimate_normals(PointCloud(points, 3 * points))
+    assert ((cloud.normals * points).sum(-1) > 0).all()
+    assert cloud.viewpoint is None
+    inward = clean_cloud(PointCloud(points, -points))
+    assert ((inward.normals * inward.points).sum(-1) < 0).all()
+
+
+def test_stray_points_go_and_the_others_come_closer_to_the_surface():
+    for name in list_objects():
+        thing = load_object(name)
+        generator = torch.Generator().manual_seed(0)
+        stray = thing.view.points[:20] + torch.tensor([0.0, 0.0, 0.08]).double()
+        stray = stray + 0.05 * torch.randn(20, 3, generator=generator, dtype=torch.float64)
+        _, far = truth(thing.mesh, stray)
+        stray = stray[far > 0.02]
+        dirty = PointCloud(torch.cat([thing.view.points, stray]), None, thing.view.viewpoint)
+        cloud = clean_cloud(dirty)
+        assert 0.9 * 1000 < len(cloud) <= 1000
+        _, before = truth(thing.mesh, thing.view.points)
+        _, after = truth(thing.mesh, cloud.points)
+        assert after.max() < 0.012
+        assert after.square().mean().sqrt() < before.square().mean().sqrt()
+
+
+def test_duplicates_change_nothing(ball_view):
+    twice = PointCloud(ball_view.points.repeat(3, 1), None, ball_view.viewpoint)
+    for function in (estimate_normals, clean_cloud):
+        once, thrice = function(ball_view), function(twice)
+        assert len(once) == len(thrice)
+        torch.testing.assert_close(once.points, thrice.points)
+        torch.testing.assert_close(once.normals, thrice.normals)
+
+
+def test_results_scale_with_the_cloud_and_keep_its_dtype(ball_view):
+    small, large = clean_cloud(ball_view), clean_cloud(PointCloud(7 * ball_view.points, None, 7 * ball_view.viewpoint))
+    torch.testing.assert_close(7 * small.points, large.points, atol=1e-12, rtol=1e-9)
+    torch.testing.assert_close(small.normals, large.normals, atol=1e-7, rtol=0)
+    single = clean_cloud(PointCloud(ball_view.points.float(), None, ball_view.viewpoint.float()))
+    assert single.points.dtype == single.normals.dtype == torch.float32
+
+
+def test_the_smallest_cloud_and_a_cloud_of_strays():
+    points = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]], dtype=torch.float64)
+    normals = estimate_normals(PointCloud(points, None, torch.ones(3, dtype=torch.float64))).normals
+    assert torch.isfinite(normals).all()
+    with pytest.raises(TooFewPoints, match="distinct"):
+        estimate_normals(PointCloud(points[[0, 1, 2, 2, 1]]))
