@@ -39,24 +39,24 @@ def fit_mixture(
     """
     x = samples.rows().double()
     n, d = x.shape
-    least = d + 2
-    if not 1 <= components <= max(n // least, 1):
-        raise BadArgument("components", components, f"1 to {n // least} ({n} samples, {least} for each component)")
+    least = d + 2  # a covariance of d dimensions from fewer samples is singular
+    if n < least:
+        raise BadArgument("samples", f"{n} samples", f"at least {least}")
+    check_tensor("samples", x, (n, d))
     for name, value, low, high in [
+        ("components", components, 1, n // least),
         ("iterations", iterations, 1, 100_000),
         ("tolerance", tolerance, 0.0, 1.0),
         ("regularisation", regularisation, 0.0, 1e-2),
     ]:
         if not low <= value <= high:
             raise BadArgument(name, value, f"a number in [{low:g}, {high:g}]")
-    if n < least:
-        raise BadArgument("samples", f"{n} samples", f"at least {least}")
-    check_tensor("samples", x, (n, d))
     centre, scale = x.mean(0), x.std(0, correction=0)
     names = (*samples.joint_names, *CODE_NAMES)
-    if bool((scale <= 1e-9 * (1 + centre.abs())).any()):
-        constant = [name for name, s in zip(names, scale.tolist(), strict=True) if s <= 1e-9]
-        raise BadArgument("samples", f"no variation in {', '.join(constant)}", "samples that vary in every dimension")
+    constant = (scale <= 1e-9 * (1 + centre.abs())).tolist()
+    if any(constant):
+        found = ", ".join(name for name, c in zip(names, constant, strict=True) if c)
+        raise BadArgument("samples", f"no variation in {found}", "samples that vary in every dimension")
     standard = (x - centre) / scale
     start = start_components(standard, components, seed, regularisation)
     fit = expectation_maximisation(standard, start, iterations, tolerance, regularisation)
