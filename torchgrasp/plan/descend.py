@@ -171,7 +171,7 @@ def descend(
     guide = None
     for i in range(steps):
         if flatness is not None and i % GUIDE_EVERY == 0:
-            guide = bend_guide(shape, state.points, state.jet, flatness)
+            guide = bend_guide(shape, state.points, state.tangent, state.jet, flatness)
         joined = join_guide(rows, guide, state.points)
         points_step, z_step = step(joined, multipliers, weights, state.damping)
         points, z = state.points + points_step, state.z + z_step.unflatten(1, state.z.shape[1:])

@@ -23,17 +23,21 @@ GUIDE_POINTS = 4
 
 
 def ring(
-    shape: Shape, points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"], count: int
+    shape: Shape,
+    points: Float[Tensor, "b 3 3"],
+    normals: Float[Tensor, "b 3 3"],
+    tangent: Float[Tensor, "b 3 3"],
+    count: int,
 ) -> tuple[Float[Tensor, "b 3 k 3"], Float[Tensor, "b 3 k 3"]]:
     """Return points at `RING_RADIUS` in the tangent plane of each contact, and the unit directions to them."""
     # A cone of friction 1 without its axis is a ring of unit tangents.
-    around = cone_edges(normals, tangents(points, normals), 1.0, count) + normals[:, :, None]
+    around = cone_edges(normals, tangent, 1.0, count) + normals[:, :, None]
     return points[:, :, None] + RING_RADIUS / float(shape.scale) * around, around
 
 
 def bend(shape: Shape, points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3"]:
     """Return the largest angle [rad] between the normal of a contact and those on the ring, moved onto the surface."""
-    place, _ = ring(shape, points, normals, RING_POINTS)
+    place, _ = ring(shape, points, normals, tangents(points, normals), RING_POINTS)
     x = place.flatten(0, 2)
     jet = shape.jet(x)
     squared = (jet.gradient * jet.gradient).sum(-1, keepdim=True)
@@ -60,13 +64,16 @@ class BendGuide(Batch):
         return self.value + (self.by_points @ (points - self.at).flatten(1)[..., None])[..., 0]
 
 
-def bend_guide(shape: Shape, points: Float[Tensor, "b 3 3"], jet: TripleJet, flatness: float) -> BendGuide:
+def bend_guide(
+    shape: Shape, points: Float[Tensor, "b 3 3"], tangent: Float[Tensor, "b 3 3"], jet: TripleJet, flatness: float
+) -> BendGuide:
     """Evaluate the chord |n - n_k| of the normals at a contact and on its ring, less that of the angle `flatness`.
 
-    Rows are lengths: chords times the ring's radius. The ring is carried along with its contact.
+    Rows are lengths: chords times the ring's radius. The ring starts at the unit
+    `tangent` of each contact and is carried along with it.
     """
     normals = jet.normals
-    place, around = ring(shape, points, normals, GUIDE_POINTS)
+    place, around = ring(shape, points, normals, tangent, GUIDE_POINTS)
     there = shape.jet(place.flatten(0, 2))
     identity = torch.eye(3, dtype=points.dtype, device=points.device)
 
