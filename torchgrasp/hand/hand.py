@@ -145,7 +145,7 @@ class Hand(Value):
             link_index: the link each point is fixed to, an index into `link_names`.
             points: where the points are now, in the palm's frame [m].
         """
-        axes, origins = self._screws(poses)
+        axes, origins = self.screws(poses)
         arm = points[..., None, :, :] - origins[..., :, None, :]
         column = torch.linalg.cross(axes[..., :, None, :].expand_as(arm), arm)
         slide = self.prismatic.to(poses)[:, None, None]
@@ -157,7 +157,7 @@ class Hand(Value):
         self, poses: Float[Tensor, "*b l 4 4"], link_index: Int[Tensor, " p"], directions: Float[Tensor, "*b p 3"]
     ) -> Float[Tensor, "*b p 3 h"]:
         """Return the derivative of directions fixed to links (given in the palm's frame) by the actuated joints."""
-        axes, _ = self._screws(poses)
+        axes, _ = self.screws(poses)
         turning = axes * (1 - self.prismatic.to(poses))[:, None]
         arm = directions[..., None, :, :].expand(*turning.shape[:-1], *directions.shape[-2:])
         column = torch.linalg.cross(turning[..., :, None, :].expand_as(arm), arm)
@@ -173,7 +173,7 @@ class Hand(Value):
         cover = self.collision_spheres
         return _map(poses[..., cover.link_index, :, :], cover.center.to(poses))
 
-    def self_clearance(self, joints: Float[Tensor, "*b h"], chunk: int = 4096) -> Float[Tensor, "*b"]:
+    def self_clearance(self, joints: Float[Tensor, "*b h"], chunk: int = 512) -> Float[Tensor, "*b"]:
         """Return the signed least distance [m] between links that can meet; negative: they overlap.
 
         Parked fingers and the palm are included; the pairs are those of hand.toml. Rows are taken in chunks, which
@@ -184,10 +184,10 @@ class Hand(Value):
         parts = [self.self_collision.clearance(self.link_poses(part)) for part in rows.split(chunk)]
         return torch.cat(parts).reshape(joints.shape[:-1]) if parts else rows.new_zeros(joints.shape[:-1])
 
-    def _screws(self, poses: Float[Tensor, "*b l 4 4"]) -> tuple[Float[Tensor, "*b j 3"], Float[Tensor, "*b j 3"]]:
+    def screws(self, poses: Float[Tensor, "*b l 4 4"]) -> tuple[Float[Tensor, "*b j 3"], Float[Tensor, "*b j 3"]]:
         """Return the axes and origins of all movable joints in the palm's frame."""
         frames = poses[..., self.child, :, :]
-        return (frames[..., :3, :3] @ self.axis.to(poses)[:, :, None])[..., 0], frames[..., :3, 3]
+        return _turn(frames, self.axis.to(poses)), frames[..., :3, 3]
 
     def _check_shape(self, joints: Tensor) -> None:
         """Refuse joints of another count or dtype before any work."""
@@ -199,12 +199,13 @@ class Hand(Value):
 
 def _map(poses: Float[Tensor, "*b p 4 4"], local: Float[Tensor, "p 3"]) -> Float[Tensor, "*b p 3"]:
     """Map one point per pose into the palm's frame."""
-    return (poses[..., :3, :3] @ local[:, :, None])[..., 0] + poses[..., :3, 3]
+    return _turn(poses, local) + poses[..., :3, 3]
 
 
 def _turn(poses: Float[Tensor, "*b p 4 4"], local: Float[Tensor, "p 3"]) -> Float[Tensor, "*b p 3"]:
     """Map one direction per pose into the palm's frame."""
-    return (poses[..., :3, :3] @ local[:, :, None])[..., 0]
+    x, y, z = local[:, :, None].unbind(1)  # many small matrix products are slower than three long sums
+    return poses[..., :3, 0] * x + poses[..., :3, 1] * y + poses[..., :3, 2] * z
 
 
 def hands_folder() -> Path:
@@ -256,9 +257,8 @@ def hand_from_files(spec: HandSpec, urdf: Urdf) -> Hand:
     _check_names(spec, urdf, set(movable), set(links))
     names = tuple(dict.fromkeys(j for f in spec.fingers for j in f.joints if j not in spec.coupling))
     coupling, offset = _coupling(spec, tuple(movable), names)
-    real = {"dtype": torch.float64}
-    limits = torch.tensor([[movable[n].lower, movable[n].upper] for n in names], **real)
-    limits = limits + torch.tensor([spec.limit_margin, -spec.limit_margin], **real)
+    limits = torch.tensor([[movable[n].lower, movable[n].upper] for n in names], dtype=torch.float64)
+    limits = limits + torch.tensor([spec.limit_margin, -spec.limit_margin], dtype=torch.float64)
     kinematics = kinematics_from_urdf(urdf)
     fingers = spec.fingers
     return Hand(
@@ -275,16 +275,16 @@ def hand_from_files(spec: HandSpec, urdf: Urdf) -> Hand:
         link_names=kinematics.link_names,
         coupling=coupling,
         offset=offset,
-        approach=torch.tensor(spec.approach, **real),
+        approach=torch.tensor(spec.approach, dtype=torch.float64),
         tip_index=torch.tensor([links[f.tip_link] for f in fingers]),
-        contact=torch.tensor([f.contact for f in fingers], **real),
-        normal=torch.tensor([f.normal for f in fingers], **real),
-        center=torch.tensor([f.center for f in fingers], **real),
-        tip_radius=torch.tensor([f.radius for f in fingers], **real),
-        axis=torch.tensor([j.axis for j in movable.values()], **real),
-        prismatic=torch.tensor([float(j.kind == "prismatic") for j in movable.values()], **real),
+        contact=torch.tensor([f.contact for f in fingers], dtype=torch.float64),
+        normal=torch.tensor([f.normal for f in fingers], dtype=torch.float64),
+        center=torch.tensor([f.center for f in fingers], dtype=torch.float64),
+        tip_radius=torch.tensor([f.radius for f in fingers], dtype=torch.float64),
+        axis=torch.tensor([j.axis for j in movable.values()], dtype=torch.float64),
+        prismatic=torch.tensor([float(j.kind == "prismatic") for j in movable.values()], dtype=torch.float64),
         child=torch.tensor([links[j.child] for j in movable.values()]),
-        moves=torch.tensor(ancestor_mask(urdf), **real),
+        moves=torch.tensor(ancestor_mask(urdf), dtype=torch.float64),
         actuators={n: Actuator(j.effort, j.velocity, spec.kp, spec.kd) for n, j in movable.items()},
         collision_spheres=cover_from_urdf(urdf, spec),
         self_collision=self_collision_from_spec(urdf, spec),

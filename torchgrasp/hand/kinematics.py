@@ -33,8 +33,8 @@ class Kinematics:
             chain = pytorch_kinematics.build_chain_from_urdf(self.xml).to(dtype=values.dtype, device=values.device)
             order = [self.joint_names.index(n) for n in chain.get_joint_parameter_names()]
             frames = [chain.frame_to_idx[n] for n in self.link_names]
-            index = {"device": values.device, "dtype": torch.long}
-            self.chains[key] = (chain, torch.tensor(order, **index), torch.tensor(frames, **index))
+            index = (torch.tensor(x, device=values.device) for x in (order, frames))
+            self.chains[key] = (chain, *index)
         chain, order, frames = self.chains[key]
         poses = chain.forward_kinematics_tensor(values[:, order], analytical_grad=False)
         return poses[frames].transpose(0, 1)

@@ -36,36 +36,55 @@ class SelfCollision(Value):
     def clearance(self, poses: Float[Tensor, "n l 4 4"]) -> Float[Tensor, " n"]:
         """Return the signed least distance [m] over all pairs; infinite for a hand without pairs."""
         least = poses.new_full((len(poses),), torch.inf)
-        capsules, boxes = self.capsule_distances(poses), self.box_distances(poses)
-        for distances in (capsules, boxes):
-            if distances.shape[1]:
-                least = torch.minimum(least, distances.amin(1))
+        for distances in (self.capsule_distances(poses), self.box_distances(poses)):
+            if len(distances):
+                least = torch.minimum(least, distances.amin(0))
         return least
 
     def axes(self, poses: Float[Tensor, "n l 4 4"]) -> tuple[Float[Tensor, "n c 3"], Float[Tensor, "n c 3"]]:
-        """Return the ends of the capsules' axes in the palm's frame."""
-        frames = poses[:, self.capsule_link]
-        rotation, origin = frames[..., :3, :3], frames[..., :3, 3]
-        start, end = self.start.to(poses)[:, :, None], self.end.to(poses)[:, :, None]
-        return (rotation @ start)[..., 0] + origin, (rotation @ end)[..., 0] + origin
+        """Return the ends of the capsules' axes in the palm's frame [m]."""
+        start, end = self._columns(poses)
+        return start.permute(2, 1, 0), end.permute(2, 1, 0)
 
-    def capsule_distances(self, poses: Float[Tensor, "n l 4 4"]) -> Float[Tensor, "n p"]:
+    def _columns(self, poses: Float[Tensor, "n l 4 4"]) -> tuple[Float[Tensor, "3 c n"], Float[Tensor, "3 c n"]]:
+        """Return the ends of the capsules' axes coordinate by coordinate, rows last: the fast layout here."""
+        frames = _frames(poses, self.capsule_link)
+        return _placed(frames, self.start.to(poses)), _placed(frames, self.end.to(poses))
+
+    def capsule_distances(self, poses: Float[Tensor, "n l 4 4"]) -> Float[Tensor, "p n"]:
         """Return the signed distance of each pair of capsules."""
-        start, end = self.axes(poses)
+        start, end = self._columns(poses)
         i, j = self.capsule_pairs.unbind(1)
         radius = self.radius.to(poses)
-        return segment_distance(start[:, i], end[:, i], start[:, j], end[:, j]) - radius[i] - radius[j]
+        a, b, c, d = (x.index_select(1, k).movedim(0, -1) for k in (i, j) for x in (start, end))
+        return segment_distance(a, b, c, d) - (radius[i] + radius[j])[:, None]
 
-    def box_distances(self, poses: Float[Tensor, "n l 4 4"]) -> Float[Tensor, "n q"]:
+    def box_distances(self, poses: Float[Tensor, "n l 4 4"]) -> Float[Tensor, "q n"]:
         """Return the signed distance of each capsule from each box, at points along the capsule's axis."""
-        start, end = self.axes(poses)
         i, j = self.box_pairs.unbind(1)
-        frames = poses[:, self.box_link[j]]
-        along = torch.linspace(0, 1, CAPSULE_POINTS, dtype=poses.dtype, device=poses.device)[:, None]
-        points = start[:, i, None] + along * (end - start)[:, i, None]
-        local = (points - frames[:, :, None, :3, 3]) @ frames[..., :3, :3] - self.box_center.to(poses)[j, None]
-        distance = box_distance(local, self.box_half.to(poses)[j, None].expand_as(local))
-        return distance.amin(-1) - self.radius.to(poses)[i]
+        frames = _frames(poses, self.box_link)
+        origin = _placed(frames, self.box_center.to(poses))
+        start, end = (x.index_select(1, i) - origin.index_select(1, j) for x in self._columns(poses))
+        turn = frames[:, :3].index_select(2, j)
+        start, end = (turn[0] * x[0] + turn[1] * x[1] + turn[2] * x[2] for x in (start, end))  # in the box's frame
+        half, least = self.box_half.to(poses)[j].T[:, :, None], None
+        for along in (k / (CAPSULE_POINTS - 1) for k in range(CAPSULE_POINTS)):
+            point = (start + along * (end - start)).movedim(0, -1)
+            distance = box_distance(point, half.expand_as(start).movedim(0, -1))
+            least = distance if least is None else torch.minimum(least, distance)
+        assert least is not None
+        return least - self.radius.to(poses)[i][:, None]
+
+
+def _frames(poses: Float[Tensor, "n l 4 4"], link: Int[Tensor, " c"]) -> Float[Tensor, "3 4 c n"]:
+    """Select link poses with every matrix entry's rows contiguous in memory."""
+    return poses[..., :3, :].permute(2, 3, 1, 0).contiguous().index_select(2, link)
+
+
+def _placed(frames: Float[Tensor, "3 4 c n"], local: Float[Tensor, "c 3"]) -> Float[Tensor, "3 c n"]:
+    """Map one point per frame into the palm's frame."""
+    x, y, z = local[:, :, None].unbind(1)
+    return frames[:, 0] * x + frames[:, 1] * y + frames[:, 2] * z + frames[:, 3]
 
 
 def self_collision_from_spec(urdf: Urdf, spec: HandSpec) -> SelfCollision:
@@ -93,15 +112,14 @@ def self_collision_from_spec(urdf: Urdf, spec: HandSpec) -> SelfCollision:
         for j in range(len(boxes))
         if frozenset((capsules[i].link, boxes[j].link)) in tested
     ]
-    real = {"dtype": torch.float64}
     return SelfCollision(
         capsule_link=torch.tensor([links[c.link] for c in capsules], dtype=torch.long),
-        start=torch.tensor([c.a for c in capsules], **real).reshape(-1, 3),
-        end=torch.tensor([c.b for c in capsules], **real).reshape(-1, 3),
-        radius=torch.tensor([c.radius for c in capsules], **real),
+        start=torch.tensor([c.a for c in capsules], dtype=torch.float64).reshape(-1, 3),
+        end=torch.tensor([c.b for c in capsules], dtype=torch.float64).reshape(-1, 3),
+        radius=torch.tensor([c.radius for c in capsules], dtype=torch.float64),
         box_link=torch.tensor([links[b.link] for b in boxes], dtype=torch.long),
-        box_center=torch.tensor([b.center for b in boxes], **real).reshape(-1, 3),
-        box_half=torch.tensor([b.size for b in boxes], **real).reshape(-1, 3) / 2,
+        box_center=torch.tensor([b.center for b in boxes], dtype=torch.float64).reshape(-1, 3),
+        box_half=torch.tensor([b.size for b in boxes], dtype=torch.float64).reshape(-1, 3) / 2,
         capsule_pairs=torch.tensor(capsule_pairs, dtype=torch.long).reshape(-1, 2),
         box_pairs=torch.tensor(box_pairs, dtype=torch.long).reshape(-1, 2),
     )
