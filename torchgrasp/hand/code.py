@@ -63,7 +63,7 @@ def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
         raise BadArgument("normals", f"a normal of length {worst:.6g}", "unit vectors")
     order = torch.tensor(PERMUTATIONS, device=points.device)
     ordered_points, ordered_normals = points[:, order], normals[:, order]  # (b, 6, 3, 3)
-    flat = degenerate(points)
+    flat = degenerate(ordered_points).any(1)  # of any order: at the threshold rounding may tell them apart
     bad = flat[:, None, None]
     # A row without a frame borrows a harmless triangle, so that the others can be framed in one call.
     harmless = torch.eye(3, dtype=points.dtype, device=points.device)

@@ -36,6 +36,11 @@ def fit_mixture(
     Raises:
         BadArgument: too few samples, a joint that does not vary, a number outside its range.
         IndefiniteCovariance: a component collapsed onto a few samples.
+
+    >>> import torch
+    >>> numbers = torch.rand(500, 7, generator=torch.Generator().manual_seed(0))
+    >>> fit_mixture(HandSamples(numbers[:, :1], numbers[:, 1:], ("knuckle",)), components=2).joint_names
+    ('knuckle',)
     """
     x = samples.rows().double()
     n, d = x.shape

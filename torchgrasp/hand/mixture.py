@@ -212,6 +212,9 @@ def load_mixture(name_or_path: Path | str) -> GraspMixture:
     Raises:
         HandFileError: there is no such hand.
         ModelFileError: the file is missing or malformed, its weights do not sum to 1, a covariance is indefinite.
+
+    >>> load_mixture("allegro").means.shape
+    torch.Size([41, 18])
     """
     path = mixture_path(name_or_path)
     tensors, meta = load_tensors(path, "mixture", {"weights", "means", "covariances"})

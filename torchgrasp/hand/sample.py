@@ -45,6 +45,10 @@ def sample_configurations(hand: Hand, n: int, seed: int = 0, workers: int = 1) -
 
     Raises:
         BadArgument: n, seed or workers outside their range, or a hand of which hardly any posture is free.
+
+    >>> from torchgrasp.hand.hand import load_hand
+    >>> sample_configurations(load_hand("barrett"), 100).q.shape
+    torch.Size([100, 6])
     """
     for name, value, low, high in [("n", n, 1, 10**9), ("seed", seed, 0, 2**63), ("workers", workers, 1, 1024)]:
         if not low <= value <= high:
