@@ -8,7 +8,7 @@ import dataclasses
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.plan.flat import BendGuide, bend_guide
@@ -25,6 +25,8 @@ LONGEST_TURN = 3.0
 Z_DAMPING = 0.1
 """Damping of the logits relative to that of the points: logits range over about 10, points over about 1."""
 
+
+FIRST_DAMPING = 1e-2
 
 GUIDE_EVERY = 4
 """Steps between two evaluations of the rows for flat surface."""
@@ -100,8 +102,8 @@ def cost(rows: Rows, multipliers: Multipliers, weights: Weights) -> Float[Tensor
 
 def step(
     rows: Rows, multipliers: Multipliers, weights: Weights, damping: Float[Tensor, "b"]
-) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b m"]]:
-    """Return the damped Gauss-Newton step of the points and the logits."""
+) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b m"], Float[Tensor, "b"]]:
+    """Return the damped Gauss-Newton step of the points and the logits, and the decrease of cost it promises."""
     active = shift_bounds(rows, multipliers)
     on = weights.bounds * (active > 0)
     value = torch.cat(
@@ -122,6 +124,8 @@ def step(
     soft = torch.eye(6, dtype=closure.dtype, device=closure.device) + by_z @ by_z.mT / z_damping
     factor = torch.linalg.cholesky(soft)
     whitened = torch.linalg.solve_triangular(factor, torch.cat([by_points, closure[..., None]], -1), upper=False)
+    outer_slope, outer_value = slope, value
+    before = (value.square().sum(1) + closure.square().sum(1)) / 2
     slope, value = torch.cat([slope, whitened[..., :9]], 1), torch.cat([value, whitened[..., 9]], 1)
     normal = slope.mT @ slope + damping[:, None, None] * torch.eye(9, dtype=slope.dtype, device=slope.device)
     points_step = -torch.cholesky_solve(slope.mT @ value[..., None], torch.linalg.cholesky(normal))
@@ -130,7 +134,11 @@ def step(
     points_step = points_step.unflatten(1, (3, 3))[..., 0]
     reach = torch.linalg.vector_norm(points_step, dim=-1).amax(-1)
     shrink = torch.maximum(reach / LONGEST_STEP, z_step.abs().amax(-1) / LONGEST_TURN).clamp(min=1.0)
-    return points_step / shrink[:, None, None], z_step / shrink[:, None]
+    points_step, z_step = points_step / shrink[:, None, None], z_step / shrink[:, None]
+    flat_step = points_step.flatten(1)[..., None]
+    closure = closure + (by_points @ flat_step + by_z @ z_step[..., None])[..., 0]
+    linear = torch.cat([outer_value + (outer_slope @ flat_step)[..., 0], closure], 1)
+    return points_step, z_step, before - linear.square().sum(1) / 2
 
 
 def join_guide(rows: Rows, guide: BendGuide | None, points: Float[Tensor, "b 3 3"]) -> Rows:
@@ -153,6 +161,16 @@ def pick(choose: Bool[Tensor, "b"], new: SomeValue, old: SomeValue) -> SomeValue
     return type(new)(**{f.name: merge(getattr(new, f.name), getattr(old, f.name)) for f in fields})
 
 
+def put(whole: SomeValue, at: Int[Tensor, "a"], part: SomeValue) -> SomeValue:
+    """Return a value with `part` in the rows `at`."""
+
+    def place(w: Any, p: Any) -> Any:
+        return put(w, at, p) if isinstance(w, Value) else w.index_copy(0, at, p)
+
+    fields = dataclasses.fields(whole)  # pyright: ignore[reportArgumentType]
+    return type(whole)(**{f.name: place(getattr(whole, f.name), getattr(part, f.name)) for f in fields})
+
+
 def descend(
     shape: Shape,
     problem: ContactProblem,
@@ -160,28 +178,42 @@ def descend(
     multipliers: Multipliers,
     weights: Weights,
     steps: int,
+    settled: float,
     flatness: float | None = None,
-) -> tuple[State, Rows]:
-    """Take `steps` Levenberg-Marquardt steps with constant weights and multipliers; one shape evaluation each.
+) -> State:
+    """Take up to `steps` Levenberg-Marquardt steps with constant weights and multipliers; one evaluation each.
 
-    With `flatness`, rows for flat surface around the contacts join, evaluated anew every `GUIDE_EVERY` steps. Tangents
-    are carried along with their normals. Returns the state and its rows.
+    Triples whose next step is shorter than `settled` are left alone from then on. With `flatness`, rows for flat
+    surface around the contacts join, evaluated anew every `GUIDE_EVERY` steps. Tangents are carried along.
     """
+    whole, at = state, torch.arange(len(state), device=state.points.device)
+    state = dataclasses.replace(state, damping=torch.full_like(state.damping, FIRST_DAMPING))
     rows = problem.rows(state.points, state.z, state.tangent, state.jet)
     guide = None
     for i in range(steps):
         if flatness is not None and i % GUIDE_EVERY == 0:
             guide = bend_guide(shape, state.points, state.tangent, state.jet, flatness)
         joined = join_guide(rows, guide, state.points)
-        points_step, z_step = step(joined, multipliers, weights, state.damping)
+        points_step, z_step, promised = step(joined, multipliers, weights, state.damping)
+        moves = points_step.abs().flatten(1).amax(-1) > settled
+        if not bool(moves.all()):
+            whole = put(whole, at, state)
+            if not bool(moves.any()):
+                return whole
+            at, state, rows, multipliers = at[moves], state[moves], rows[moves], multipliers[moves]
+            guide, joined = None if guide is None else guide[moves], joined[moves]
+            points_step, z_step, promised = points_step[moves], z_step[moves], promised[moves]
         points, z = state.points + points_step, state.z + z_step.unflatten(1, state.z.shape[1:])
         jet = triple_jet(shape, points)
-        tried = State(points, z, carry(state.tangent, jet.normals), jet, (state.damping / 4).clamp(min=1e-9))
-        tried_rows = problem.rows(points, z, tried.tangent, jet)
         before = cost(joined, multipliers, weights)
-        after = cost(join_guide(tried_rows, guide, points), multipliers, weights)
+        tried_tangent = carry(state.tangent, jet.normals)
+        tried_rows = problem.rows(points, z, tried_tangent, jet)
+        kept = (before - cost(join_guide(tried_rows, guide, points), multipliers, weights)) / promised
         inside = torch.linalg.vector_norm(points, dim=-1).amax(-1) < problem.domain_radius
-        better = (after <= before) & inside  # a comparison with NaN is False: such a step is refused
-        refused = dataclasses.replace(state, damping=(state.damping * 6).clamp(max=1e8))
+        better = (kept > 0) & inside  # a comparison with NaN is False: such a step is refused
+        # Nielsen's rule: the less of its promise a step keeps, the more the next is damped.
+        eased = state.damping * (1 - (2 * kept - 1) ** 3).clamp(min=1 / 5, max=2.0)
+        tried = State(points, z, tried_tangent, jet, eased.clamp(min=1e-9))
+        refused = dataclasses.replace(state, damping=(4 * state.damping).clamp(max=1e9))
         state, rows = pick(better, tried, refused), pick(better, tried_rows, rows)
-    return state, rows
+    return put(whole, at, state)

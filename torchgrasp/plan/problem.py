@@ -15,7 +15,7 @@ from torch import Tensor
 from torchgrasp.frames import skew
 from torchgrasp.linalg import unit
 from torchgrasp.plan.wrench import cone_edges
-from torchgrasp.values import Batch, ContactSpec, Value
+from torchgrasp.values import Batch, ContactSpec
 
 UNIFORM_SHARE = 0.05
 """Least coefficient of a plan as a share of the uniform 1 / (3 e): the least margin of its certificate. Without it the
@@ -80,7 +80,7 @@ def triple_jet(shape: Shape, points: Float[Tensor, "b 3 3"]) -> TripleJet:
 
 
 @dataclasses.dataclass(frozen=True)
-class Rows(Value):
+class Rows(Batch):
     """Values and Jacobians of the problem's rows at a batch of triples, linear in the step of the points and z."""
 
     surface: Float[Tensor, "b 3"]

@@ -25,18 +25,17 @@ MIN_RANK_RATIO = 1e-3
 ON_SURFACE = 1e-6
 """Largest |f_d| of a contact on the surface, in normalised units."""
 
-SETTLE = (Weights(centre=0.1, surface=3.0, closure=0.1, bounds=3.0), 10)
-"""First onto the surface and into the certain part of it: closure sought there first ends in fewer local minima."""
+SETTLE = (Weights(centre=0.1, surface=3.0, closure=0.1, bounds=3.0), 5)
+"""First into the certain part of the surface: closure sought there from the first step ends in more local minima."""
 
-PLAN = (
-    (Weights(centre=0.3, surface=3.0, closure=3.0, bounds=3.0), 16),
-    (Weights(centre=0.3, surface=3.0, closure=3.0, bounds=3.0), 10),
-    (Weights(centre=0.1, surface=3.0, closure=3.0, bounds=3.0), 10),
-    (Weights(centre=0.1, surface=3.0, closure=3.0, bounds=3.0), 10),
+STAGES = (
+    (Weights(centre=0.3, surface=3.0, closure=3.0, bounds=3.0), 12),
+    (Weights(centre=0.3, surface=3.0, closure=3.0, bounds=3.0), 8),
+    (Weights(centre=0.1, surface=3.0, closure=3.0, bounds=3.0), 8),
 )
 """Stages of the augmented Lagrangian, with the multipliers raised after each."""
 
-FINISH = (Weights(centre=0.0, surface=3.0, closure=3.0, bounds=3.0), 12)
+FINISH = (Weights(centre=0.0, surface=3.0, closure=3.0, bounds=3.0), 30)
 """Last, feasibility alone: without the objective every residual can vanish."""
 
 
@@ -67,14 +66,12 @@ def plan_contacts(
     points = project(shape, points, steps=6)
 
     state = start_state(shape, problem, points)
-    weights, steps = SETTLE
-    multipliers = no_multipliers(problem.rows(state.points, state.z, state.tangent, state.jet))
-    state, _ = descend(shape, problem, state, multipliers, weights, steps, spec.flatness)
-    for weights, steps in PLAN:
-        state, rows = descend(shape, problem, state, multipliers, weights, steps, spec.flatness)
-        multipliers = raise_multipliers(rows, multipliers)
-    weights, steps = FINISH
-    state, _ = descend(shape, problem, state, no_multipliers(rows), weights, steps, spec.flatness)
+    multipliers = none = no_multipliers(problem.rows(state.points, state.z, state.tangent, state.jet))
+    state = descend(shape, problem, state, none, *SETTLE, 1e-3, spec.flatness)
+    for weights, steps in STAGES:
+        state = descend(shape, problem, state, multipliers, weights, steps, 1e-3, spec.flatness)
+        multipliers = raise_multipliers(problem.rows(state.points, state.z, state.tangent, state.jet), multipliers)
+    state = descend(shape, problem, state, none, *FINISH, 1e-8, spec.flatness)
     points = project(shape, state.points, steps=3)
     return assess(shape, spec, points)
 
