@@ -1,3 +1,4 @@
+import contextlib
 import io
 import struct
 import zipfile
@@ -8,7 +9,7 @@ import torch
 import trimesh
 
 from torchgrasp.cloud.read import read_cloud, save_cloud
-from torchgrasp.errors import BadArgument, CloudFileError, OutputError, SuspiciousScale, TooFewPoints
+from torchgrasp.errors import BadArgument, CloudFileError, GraspError, OutputError, SuspiciousScale, TooFewPoints
 from torchgrasp.values import PointCloud
 
 
@@ -129,6 +130,26 @@ def test_every_truncation_is_refused(tmp_path, points, suffix):
         (tmp_path / f"b{suffix}").write_bytes(data[:stop])
         with pytest.raises(CloudFileError):
             read_cloud(tmp_path / f"b{suffix}")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".npz", ".npy", ".pcd", ".xyz"])
+def test_spoilt_bytes_are_refused_by_name_or_read(tmp_path, points, suffix):
+    path = tmp_path / f"a{suffix}"
+    if suffix in (".ply", ".npz"):
+        save_cloud(PointCloud(torch.from_numpy(points)), path)
+    elif suffix == ".npy":
+        np.save(path, points)
+    else:
+        header = "FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nWIDTH 60\nHEIGHT 1\nDATA ascii"
+        np.savetxt(path, points, header=header if suffix == ".pcd" else "", comments="")
+    data, rng = path.read_bytes(), np.random.default_rng(0)
+    for _ in range(100):
+        spoilt = bytearray(data)
+        for place in rng.integers(0, min(len(data), 300), 3):
+            spoilt[place] = rng.integers(0, 256)
+        path.write_bytes(spoilt)
+        with contextlib.suppress(GraspError):
+            assert torch.isfinite(read_cloud(path).points).all()
 
 
 def test_headers_that_promise_too_much_are_refused_before_memory_is_taken(tmp_path):

@@ -80,13 +80,14 @@ def estimate_viewpoint(cloud: PointCloud) -> Float[Tensor, "3"]:
     """Return a camera position [m] from which the cloud can have been seen in a single view.
 
     Every normal of a single view points into the hemisphere of the camera, and an object bulges: seen from the centre
-    of the cloud's box, most of its surface faces away. Among 400 directions v the one is taken that maximises
+    of the cloud's box along its principal axes, most of its surface faces away. Among 400 directions v the one is taken that maximises
     sum_i w_i tanh(n_i.v / 0.3), where n_i is the normal of either sign and w_i = n_i.(p_i - centre) is positive for
     the sign that bulges. The camera is put 4 radii of the cloud away. One exception: a cloud that was never moved out
     of its camera's frame (z forward, the cloud within 45 degrees of that axis and further than 2 radii from the
     origin) was seen from the origin, if that direction explains it at least 0.8 times as well.
 
-    On 24 noisy single views of eight objects 99.0 % of the normals come out right, as many as with the true camera.
+    On 24 noisy single views of eight objects, each turned 12 ways, 99.9 % of the normals come out as with the true
+    camera (at worst 99.5 % of a view).
     A single flat face, or the inside of a bowl, does not tell its two sides apart: give the viewpoint you know.
 
     Args:
@@ -106,7 +107,10 @@ def estimate_viewpoint(cloud: PointCloud) -> Float[Tensor, "3"]:
 
 def _guess_viewpoint(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
     """Return the viewpoint that best explains local planes with normals of unknown sign."""
-    centre = (points.amax(0) + points.amin(0)) / 2
+    # The box along the principal axes: a box along the frame's axes would make the guess depend on the frame.
+    axes = torch.linalg.svd(points - points.mean(0), full_matrices=False).Vh
+    along = points @ axes.T
+    centre = (along.amax(0) + along.amin(0)) / 2 @ axes
     radius = torch.linalg.vector_norm(points - centre, dim=-1).max()
     bulge = (normals * (points - centre)).sum(-1)
     directions = _spread_directions(DIRECTIONS, points)

@@ -63,8 +63,8 @@ def read_cloud(path: Path | str, viewpoint: Sequence[float | int] | Tensor | Non
     parse = {".ply": parse_ply, ".pcd": parse_pcd, ".npz": _parse_npz, ".npy": _parse_npy, ".xyz": _parse_text}[suffix]
     try:
         arrays = parse(path.read_bytes())
-    except (ValueError, KeyError, IndexError, OSError, EOFError, zipfile.BadZipFile, MemoryError, OverflowError) as e:
-        raise CloudFileError("path", f"{path}: {e}", f"a well-formed {suffix} file") from e
+    except Exception as error:  # zlib, zipfile, the tokenizer, numpy and trimesh each raise their own for spoilt bytes
+        raise CloudFileError("path", f"{path}: {error!r}", f"a well-formed {suffix} file") from error
     arrays = {name: _check_array(path, name, array) for name, array in arrays.items() if array is not None}
     points, normals = arrays["points"], arrays.get("normals")
     if len(points) < 4:
