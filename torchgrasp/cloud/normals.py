@@ -79,12 +79,12 @@ def clean_cloud(cloud: PointCloud) -> PointCloud:
 def estimate_viewpoint(cloud: PointCloud) -> Float[Tensor, "3"]:
     """Return a camera position [m] from which the cloud can have been seen in a single view.
 
-    Every normal of a single view points into the hemisphere of the camera, and an object bulges: seen from the centre
-    of the cloud's box along its principal axes, most of its surface faces away. Among 400 directions v the one is taken that maximises
-    sum_i w_i tanh(n_i.v / 0.3), where n_i is the normal of either sign and w_i = n_i.(p_i - centre) is positive for
-    the sign that bulges. The camera is put 4 radii of the cloud away. One exception: a cloud that was never moved out
-    of its camera's frame (z forward, the cloud within 45 degrees of that axis and further than 2 radii from the
-    origin) was seen from the origin, if that direction explains it at least 0.8 times as well.
+    Every normal of a single view points into the hemisphere of the camera, and an object bulges: most of its surface
+    faces away from the centre of the cloud's box (along the principal axes). Among 400 directions v the one is taken
+    that maximises sum_i w_i tanh(n_i.v / 0.3), where n_i is the normal of either sign and w_i = n_i.(p_i - centre) is
+    positive for the sign that bulges. The camera is put 4 radii of the cloud away. One exception: a cloud that was
+    never moved out of its camera's frame (z forward, the cloud within 45 degrees of that axis and further than 2
+    radii from the origin) was seen from the origin, if that direction explains it at least 0.8 times as well.
 
     On 24 noisy single views of eight objects, each turned 12 ways, 99.9 % of the normals come out as with the true
     camera (at worst 99.5 % of a view).
