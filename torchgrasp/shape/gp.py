@@ -151,6 +151,18 @@ class ShapeGP(Value):
         chunk = 256 if x.device.type == "cpu" else 16384
         return SurfaceJet(*_in_chunks(self._jet, x, chunk))
 
+    def mean(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q"]:
+        """Return the mean signed distance alone, normalised, at normalised points: for grids of many points."""
+
+        def evaluate(x: Tensor) -> tuple[Tensor]:
+            n, oriented = len(self.x), int(self.has_normal.sum())
+            b = self.weights[n:].reshape(3, oriented).T
+            r = torch.cdist(x, self.x, compute_mode="donot_use_mm_for_euclid_dist")
+            along = x @ b.T - (self.x[:oriented] * b).sum(-1)
+            return (thin_plate(r, self.psi) @ self.weights[:n] - (6.0 * (r[:, :oriented] - self.psi) * along).sum(1),)
+
+        return _in_chunks(evaluate, x, 2048)[0]
+
     def _estimate(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
         """Return the mean and the covariance of (d, w), Eqs. (7)-(8), normalised."""
         profile = partial(thin_plate, psi=self.psi)

@@ -1,0 +1,101 @@
+"""The zero level of the shape as a triangle mesh, Eq. (9): for pictures and for collision fields."""
+
+import dataclasses
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchgrasp.errors import BadArgument
+from torchgrasp.linalg import unit
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.values import Value
+
+NEWTON_STEPS = 3
+"""Steps that move the vertices of marching cubes onto the zero level."""
+MAX_STEP = 1.0
+"""Longest Newton step, in cells."""
+LEAST_SHARE = 0.02
+"""A sheet of the zero level is kept when at least this share of the cloud lies nearest to it (an ear, a handle)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Surface(Value):
+    """A closed or cut-off triangle mesh of the estimated surface, wound outward.
+
+    `normals` are unit gradients of the mean at the vertices; `std_m` [m] is how far the surface may be off there.
+    """
+
+    vertices: Float[Tensor, "v 3"]
+    faces: Int[Tensor, "f 3"]
+    normals: Float[Tensor, "v 3"]
+    std_m: Float[Tensor, "v"]
+
+
+def extract_surface(shape: ShapeGP, resolution: int = 48) -> Surface:
+    """Return the zero level of the mean that carries the cloud, Eq. (9), within the ball where the shape holds.
+
+    Marching cubes on a grid, then three Newton steps for each vertex. Of several sheets those are kept that carry at
+    least 2 % of the cloud; the others are artefacts far from all observations.
+
+    Args:
+        shape: the posterior.
+        resolution: cells along the diameter of the domain.
+
+    Raises:
+        BadArgument: a resolution outside [8, 256], or a mean without zero level.
+    """
+    from skimage.measure import marching_cubes
+
+    if not 8 <= resolution <= 256:
+        raise BadArgument("resolution", resolution, "an integer in [8, 256]")
+    radius, device = shape.domain_radius, shape.x.device
+    axis = torch.linspace(-radius, radius, resolution + 1, dtype=torch.float64, device=device)
+    grid = torch.cartesian_prod(axis, axis, axis)
+    inside = torch.linalg.vector_norm(grid, dim=-1) <= radius
+    distance = torch.full((len(grid),), torch.nan, dtype=torch.float64, device=device)
+    distance[inside] = shape.mean(grid[inside])
+    volume = distance.reshape([resolution + 1] * 3).cpu().numpy()
+    if not (np.nanmin(volume) < 0.0 < np.nanmax(volume)):
+        raise BadArgument("shape", "a mean that is nowhere zero", "a shape with a surface inside its domain")
+    step = 2.0 * radius / resolution
+    # Cells that touch the outside of the ball are left out by the mask, so no wall is built along its boundary.
+    corners, faces, _, _ = marching_cubes(
+        np.nan_to_num(volume, nan=1.0), 0.0, mask=~np.isnan(volume), spacing=(step,) * 3, gradient_direction="ascent"
+    )
+    keep = _carries_cloud(corners - radius, faces, shape)
+    used, faces = np.unique(faces[keep], return_inverse=True)
+    x = torch.from_numpy(corners[used].astype(np.float64) - radius).to(device)
+    faces = torch.from_numpy(faces.reshape(-1, 3).astype(np.int64)).to(device)
+    for _ in range(NEWTON_STEPS):
+        jet = shape.jet(x)
+        move = -jet.distance / (jet.gradient**2).sum(-1).clamp_min(1e-12)
+        move = move[:, None] * jet.gradient
+        length = torch.linalg.vector_norm(move, dim=-1, keepdim=True)
+        x = x + move * (MAX_STEP * step / length.clamp_min(MAX_STEP * step))
+    jet = shape.jet(x)
+    a, b, c = x[faces].unbind(1)
+    across = torch.linalg.cross(b - a, c - a)
+    outward = (across * jet.gradient[faces].sum(1)).sum() > 0
+    return Surface(
+        vertices=shape.metres(x),
+        faces=faces if bool(outward) else faces.flip(1),
+        normals=unit(jet.gradient),
+        std_m=shape.std_factor * shape.scale * torch.sqrt(jet.variance),
+    )
+
+
+def _carries_cloud(corners: np.ndarray, faces: np.ndarray, shape: ShapeGP) -> np.ndarray:
+    """Return which faces belong to sheets that carry enough of the cloud."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    graph = coo_matrix((np.ones(len(edges)), edges.T), shape=(len(corners), len(corners)))
+    _, label = connected_components(graph, directed=False)
+    seen = shape.normalise(shape.cloud.points.to(shape.x)).cpu().numpy()
+    _, nearest = KDTree(corners).query(seen)
+    share = np.bincount(label[nearest], minlength=label.max() + 1) / len(seen)
+    return (share >= min(LEAST_SHARE, share.max()))[label[faces[:, 0]]]
