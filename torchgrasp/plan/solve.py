@@ -4,20 +4,21 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.errors import Status
 from torchgrasp.frames import degenerate
-from torchgrasp.linalg import unit
 from torchgrasp.plan.descend import (
     Weights,
     descend,
     no_multipliers,
+    pick,
     raise_multipliers,
     start_state,
 )
 from torchgrasp.plan.flat import bend
 from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet
+from torchgrasp.plan.start import check_starts, project, start_points
 from torchgrasp.plan.wrench import BALANCED, balance, rank_ratio, wrenches
-from torchgrasp.values import ContactPlan, Contacts, ContactSpec, check_tensor
+from torchgrasp.values import ContactPlan, Contacts, ContactSpec
 
 MIN_RANK_RATIO = 1e-3
 """Least ratio of the singular values of the wrench matrix; Eq. (13) alone also holds for contacts on a line."""
@@ -61,11 +62,10 @@ def plan_contacts(
         BadArgument: `starts` is not positive, of a wrong shape, or outside the shape's domain.
     """
     spec = ContactSpec() if spec is None else spec
-    points = start_points(shape, spec, starts, seed)
+    check_starts(shape, spec, starts)
+    first = start_points(shape, spec, starts, seed)
     problem = ContactProblem.of(shape, spec)
-    points = project(shape, points, steps=6)
-
-    state = start_state(shape, problem, points)
+    state = start_state(shape, problem, first)
     multipliers = none = no_multipliers(problem.rows(state.points, state.z, state.tangent, state.jet))
     state = descend(shape, problem, state, none, *SETTLE, 1e-3, spec.flatness)
     for weights, steps in STAGES:
@@ -73,42 +73,9 @@ def plan_contacts(
         multipliers = raise_multipliers(problem.rows(state.points, state.z, state.tangent, state.jet), multipliers)
     state = descend(shape, problem, state, none, *FINISH, 1e-8, spec.flatness)
     points = project(shape, state.points, steps=3)
-    return assess(shape, spec, points)
-
-
-def start_points(
-    shape: Shape, spec: ContactSpec, starts: int | Float[Tensor, "b 3 3"], seed: int
-) -> Float[Tensor, "b 3 3"]:
-    """Return the starts in normalised units: drawn from the sphere of `spec.start_radius`, or the given ones."""
-    if isinstance(starts, Tensor):
-        points = shape.normalise(check_tensor("starts", starts, (None, 3, 3)).double())
-        farthest = float(torch.linalg.vector_norm(points, dim=-1).max()) if len(points) else 0.0
-        if farthest > shape.domain_radius:
-            raise BadArgument(
-                "starts",
-                f"a point {farthest * float(shape.scale):.4g} m from the shape's centre",
-                f"at most {float(shape.domain_radius) * float(shape.scale):.4g} m, where the shape is known",
-            )
-        return points
-    if isinstance(starts, bool) or not isinstance(starts, int) or starts < 1:
-        raise BadArgument("starts", repr(starts), "a positive number, or starting points of shape b x 3 x 3 [m]")
-    if spec.start_radius > shape.domain_radius:
-        raise BadArgument("spec.start_radius", spec.start_radius, f"at most {float(shape.domain_radius):.4g}")
-    generator = torch.Generator().manual_seed(seed)
-    drawn = torch.randn(starts, 3, 3, generator=generator, dtype=torch.float64)
-    origin = shape.metres(torch.zeros(3, dtype=torch.float64))  # names the shape's device
-    return (spec.start_radius * unit(drawn)).to(origin.device)
-
-
-def project(shape: Shape, points: Float[Tensor, "b 3 3"], steps: int) -> Float[Tensor, "b 3 3"]:
-    """Move points along the gradient onto f_d = 0 by Newton steps of at most 0.3 each."""
-    for _ in range(steps):
-        jet = triple_jet(shape, points)
-        squared = (jet.gradient * jet.gradient).sum(-1, keepdim=True)
-        move = -jet.distance[..., None] / squared * jet.gradient
-        length = torch.linalg.vector_norm(move, dim=-1, keepdim=True)
-        points = points + move * (0.3 / length).clamp(max=1.0)
-    return points
+    plan, unplanned = assess(shape, spec, points), assess(shape, spec, first)
+    plan_contacts.debug = (plan, unplanned)
+    return pick((plan.status == Status.OK) | (unplanned.status != Status.OK), plan, unplanned)
 
 
 def assess(shape: Shape, spec: ContactSpec, points: Float[Tensor, "b 3 3"]) -> ContactPlan:
