@@ -1,3 +1,70 @@
-"""torchgrasp: dexterous grasps from a partial point cloud, safe under the uncertainty of the unseen surface."""
+"""torchgrasp: dexterous grasps from a partial point cloud, safe under the uncertainty of the unseen surface.
+
+The names below are the library, in the order in which data flows through them.
+"""
+
+from torchgrasp.errors import GraspError, Status
+from torchgrasp.values import (
+    Certificate,
+    ClosureResult,
+    ContactCode,
+    ContactPlan,
+    Contacts,
+    ContactSpec,
+    GraspGuess,
+    Grasps,
+    PointCloud,
+    ShapeEstimate,
+    TrialSpec,
+)
+from torchgrasp.cloud.depth import cloud_from_depth
+from torchgrasp.cloud.read import read_cloud
+from torchgrasp.objects import list_objects, load_object
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.support import fit_shape
+from torchgrasp.plan.solve import plan_contacts
+from torchgrasp.plan.certify import certify
+from torchgrasp.hand.hand import Hand, load_hand
+from torchgrasp.hand.code import encode
+from torchgrasp.hand.fit import fit_mixture
+from torchgrasp.hand.mixture import GraspMixture, load_mixture
+from torchgrasp.pipeline import plan_grasps
+from torchgrasp.files import load_grasps
+from torchgrasp.close.law import closing_gains
+from torchgrasp.close.trial import close_hand
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "GraspError",
+    "Status",
+    "Certificate",
+    "ClosureResult",
+    "ContactCode",
+    "ContactPlan",
+    "Contacts",
+    "ContactSpec",
+    "GraspGuess",
+    "Grasps",
+    "PointCloud",
+    "ShapeEstimate",
+    "TrialSpec",
+    "cloud_from_depth",
+    "read_cloud",
+    "list_objects",
+    "load_object",
+    "ShapeGP",
+    "fit_shape",
+    "plan_contacts",
+    "certify",
+    "Hand",
+    "load_hand",
+    "encode",
+    "fit_mixture",
+    "GraspMixture",
+    "load_mixture",
+    "plan_grasps",
+    "load_grasps",
+    "closing_gains",
+    "close_hand",
+]

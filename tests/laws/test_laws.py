@@ -1,0 +1,133 @@
+"""Laws that hold over whole stages: rigid motions, units, the order of points, seeds, global state."""
+
+import hashlib
+import random
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from torchgrasp import (
+    ContactSpec,
+    PointCloud,
+    certify,
+    encode,
+    fit_shape,
+    load_hand,
+    load_object,
+    plan_contacts,
+    plan_grasps,
+)
+from torchgrasp.frames import apply, rotate
+from torchgrasp.shape.gp import Observations, condition
+from torchgrasp.values import Contacts
+
+
+def triples(n: int, generator: torch.Generator) -> Contacts:
+    """Random contacts on a ball of 40 mm, normals outward: many are closed, many are not."""
+    points = torch.randn(n, 3, 3, generator=generator, dtype=torch.float64)
+    normals = points / points.norm(dim=-1, keepdim=True)
+    zeros = torch.zeros(n, 3, dtype=torch.float64)
+    return Contacts(0.04 * normals, normals, zeros, zeros)
+
+
+def transformed(contacts: Contacts, motion: torch.Tensor, scale: float = 1.0) -> Contacts:
+    points = scale * apply(motion, contacts.points)
+    return Contacts(points, rotate(motion, contacts.normals), contacts.variance, contacts.std_m)
+
+
+def test_the_posterior_moves_with_its_observations(seen_cylinder, motion, generator):
+    x = seen_cylinder.points[:60] / 0.1
+    n = len(x)
+    observations = Observations(
+        x,
+        torch.zeros(n, dtype=torch.float64),
+        seen_cylinder.normals[:60],
+        torch.ones(n, dtype=torch.bool),
+        torch.full((n,), 0.01, dtype=torch.float64),
+        torch.full((n,), 0.05, dtype=torch.float64),
+    )
+    turn = motion[:3, :3]
+    turned = Observations(
+        x @ turn.T, observations.distance, observations.normal @ turn.T, *list(vars(observations).values())[3:]
+    )
+    origin = torch.zeros(3, dtype=torch.float64)
+    here = condition(observations, origin, 0.1, seen_cylinder)
+    there = condition(turned, motion[:3, 3], 0.1, seen_cylinder)
+    queries = 0.05 * torch.randn(40, 3, generator=generator, dtype=torch.float64)
+    a, b = here.predict(queries), there.predict(apply(motion, queries))
+    torch.testing.assert_close(a.distance, b.distance, rtol=0, atol=1e-8)
+    torch.testing.assert_close(a.normal @ turn.T, b.normal, rtol=0, atol=1e-8)
+    torch.testing.assert_close(a.variance, b.variance, rtol=0, atol=1e-8)
+
+
+def test_a_shifted_cloud_gives_a_shifted_shape(seen_cylinder):
+    shift = torch.tensor([3.0, -2.0, 5.0], dtype=torch.float64)
+    moved = PointCloud(seen_cylinder.points + shift, seen_cylinder.normals, seen_cylinder.viewpoint + shift)
+    queries = seen_cylinder.points[::50] * 1.01
+    a = fit_shape(seen_cylinder).predict(queries)
+    b = fit_shape(moved).predict(queries + shift)
+    torch.testing.assert_close(a.distance, b.distance, rtol=0, atol=1e-7)
+    torch.testing.assert_close(a.variance, b.variance, rtol=0, atol=1e-7)
+
+
+def test_certificates_and_codes_ignore_frames_and_units(generator, motion):
+    contacts = triples(40, generator)
+    spec = ContactSpec(friction=0.8, friction_margin=1.0)
+    here = certify(contacts, spec)
+    assert 0 < int(here.closed.sum()) < 40
+    for there in (transformed(contacts, motion), transformed(contacts, motion, scale=1000.0)):
+        found = certify(there, spec)
+        assert torch.equal(found.closed, here.closed)
+        torch.testing.assert_close(found.margin, here.margin, rtol=0, atol=1e-9)
+    torch.testing.assert_close(encode(transformed(contacts, motion)).q, encode(contacts).q)
+
+
+def test_the_code_of_a_permuted_triple_is_the_permuted_set(generator):
+    contacts = triples(10, generator)
+    swapped = Contacts(contacts.points.flip(1), contacts.normals.flip(1), contacts.variance, contacts.std_m)
+    a, b = encode(contacts).q, encode(swapped).q
+    order = [(2 - i, 2 - j, 2 - k) for i, j, k in encode(contacts).permutation]
+    index = [encode(contacts).permutation.index(p) for p in order]
+    torch.testing.assert_close(a, b[:, index])
+
+
+def test_the_same_seed_gives_the_same_plan(seen_cylinder):
+    shape = fit_shape(seen_cylinder)
+    spec = ContactSpec(friction=0.8)
+    first, second = (plan_contacts(shape, spec, starts=60, seed=7) for _ in range(2))
+    other = plan_contacts(shape, spec, starts=60, seed=8)
+    assert torch.equal(first.contacts.points, second.contacts.points)
+    assert torch.equal(first.status, second.status)
+    assert not torch.equal(first.contacts.points, other.contacts.points)
+
+
+GRASP = """
+import torch
+torch.set_num_threads(1)
+from torchgrasp import load_hand, load_object, plan_grasps
+plan_grasps(load_object("cylinder").view, load_hand("barrett"), starts=60, seed=3).save({path!r})
+"""
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_grasps_in_two_processes(tmp_path):
+    digests = []
+    for name in ("a", "b"):
+        path = str(tmp_path / name)
+        subprocess.run([sys.executable, "-c", GRASP.format(path=path)], check=True, timeout=300)
+        digests.append(hashlib.sha256((tmp_path / name).read_bytes()).hexdigest())
+    assert digests[0] == digests[1]
+
+
+def test_no_global_state_is_touched(seen_cylinder):
+    numpy_state = np.random.get_state()[1].copy()  # noqa: NPY002 (the global state is what is watched)
+    before = torch.get_rng_state(), numpy_state, random.getstate(), torch.get_default_dtype()
+    grasps = plan_grasps(load_object("cylinder").view, load_hand("allegro"), starts=40)
+    assert torch.equal(torch.get_rng_state(), before[0])
+    assert np.array_equal(np.random.get_state()[1], before[1])  # noqa: NPY002
+    assert random.getstate() == before[2]
+    assert torch.get_default_dtype() == before[3]
+    assert grasps.meta["seed"] == "0"

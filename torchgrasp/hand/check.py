@@ -1,0 +1,107 @@
+"""Judge every refined grasp by its own geometry, whatever the solver believed (the code fixes no side of the normals).
+
+The frame-invariant code is unchanged when all three normals are negated, mirrored or rotated together, and a solver
+can stop anywhere: so tips, contact directions, limits and every clearance are measured again here.
+"""
+
+import dataclasses
+import math
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchgrasp.errors import Status
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.refine import FLAT_PAD, MILLIMETRE, ROUND_PAD, Posture, Screws, Surroundings
+from torchgrasp.values import Batch, Contacts
+
+TIP_TOLERANCE = 2 * MILLIMETRE
+"""Largest distance [m] of a fingertip from its contact."""
+TIP_PENETRATION = 2 * MILLIMETRE
+"""Largest depth [m] of a fingertip in the estimated surface; a tip that touches where it should has none."""
+ANGLE_TOLERANCE = math.radians(2)
+
+
+@dataclasses.dataclass(frozen=True)
+class Findings(Batch):
+    """What was measured of each grasp; see `Grasps` for the meaning of the fields."""
+
+    tip_error: Float[Tensor, "g 3"]
+    normal_angle: Float[Tensor, "g 3"]
+    clearance: Float[Tensor, "g"]
+    status: Int[Tensor, "g"]
+
+
+def tip_error(screws: Screws, contacts: Contacts) -> Float[Tensor, "g 3"]:
+    """Return the distance [m] of each fingertip's touching point from its contact."""
+    hand = screws.hand
+    target = contacts.points + hand.tip_radius.to(contacts.points)[:, None] * contacts.normals
+    return torch.linalg.vector_norm(screws.points(hand.tip_index, hand.center) - target, dim=-1)
+
+
+def normal_angle(screws: Screws, contacts: Contacts) -> Float[Tensor, "g 3"]:
+    """Return the angle [rad] between each pad's axis and the direction into the surface."""
+    hand = screws.hand
+    pads = (screws.obj_from_link[:, hand.tip_index, :3, :3] @ hand.normal.to(contacts.points)[:, :, None])[..., 0]
+    return torch.acos((-(pads * contacts.normals).sum(-1)).clamp(-1.0, 1.0))
+
+
+def link_clearance(screws: Screws, surroundings: Surroundings, tips_touch: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the least clearance [m] of the links from the object, of the tips from it, and of both from the table.
+
+    Where the tips are meant to touch, they count in the second figure alone.
+    """
+    cover = screws.hand.collision_spheres
+    centres = screws.points(cover.link_index, cover.center)
+    radius = cover.radius.to(centres)
+    free = surroundings.field.query(centres)[0] - radius
+    touches: Bool[Tensor, "s"] = cover.touching
+    tips = free[:, touches].amin(1) if bool(touches.any()) else torch.full_like(free[:, 0], math.inf)
+    links = free[:, ~touches].amin(1) if tips_touch else free.amin(1)
+    if surroundings.table is None:
+        table = torch.full_like(tips, math.inf)
+    else:
+        table = (centres[..., 2] - radius).amin(1) - surroundings.table
+    return links, tips, table
+
+
+def check(
+    posture: Posture, pregrasp: Float[Tensor, "g h"], hand: Hand, contacts: Contacts, surroundings: Surroundings
+) -> Findings:
+    """Measure tips, contact directions, limits and clearances of grasps and of their opened hands.
+
+    Args:
+        posture: g grasps.
+        pregrasp: joints of the opened hand at the same poses.
+        hand: the hand.
+        contacts: contact i is the one of finger i.
+        surroundings: the estimated object and the table.
+
+    Returns:
+        The measures, with the `Status` of the first that is out of tolerance.
+    """
+    screws = Screws.at(posture, hand)
+    error, angle = tip_error(screws, contacts), normal_angle(screws, contacts)
+    links, tips, table = link_clearance(screws, surroundings, tips_touch=True)
+    itself = hand.self_clearance(posture.joints)
+    opened = Screws.at(Posture(pregrasp, posture.obj_from_hand), hand)
+    opened_links, _, opened_table = link_clearance(opened, surroundings, tips_touch=False)
+    opened_itself = hand.self_clearance(pregrasp)
+
+    lower, upper = hand.lower.to(error), hand.upper.to(error)
+    outside = ((posture.joints < lower - 1e-9) | (posture.joints > upper + 1e-9)).any(1)
+    cone = torch.where(hand.tip_radius.to(error) > 0, ROUND_PAD, FLAT_PAD) + ANGLE_TOLERANCE
+    findings = [
+        (Status.TIP_ERROR, (error > TIP_TOLERANCE).any(1)),
+        (Status.NORMAL_ANGLE, (angle > cone).any(1)),
+        (Status.JOINT_LIMITS, outside),
+        (Status.SELF_COLLISION, itself < 0),
+        (Status.OBJECT_COLLISION, (links < 0) | (tips < -TIP_PENETRATION)),
+        (Status.TABLE_COLLISION, table < 0),
+        (Status.PREGRASP, (opened_links < 0) | (opened_table < 0) | (opened_itself < 0)),
+    ]
+    status = torch.full_like(itself, Status.OK, dtype=torch.int64)
+    for code, bad in reversed(findings):
+        status = torch.where(bad, int(code), status)
+    return Findings(error, angle, torch.stack([links, table, itself]).amin(0), status)

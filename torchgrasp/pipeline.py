@@ -1,0 +1,151 @@
+"""The whole chain in one call: a partial point cloud in, ranked and certified grasps of a hand out."""
+
+import dataclasses
+import hashlib
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from torchgrasp.cloud.check import check_cloud
+from torchgrasp.errors import BadArgument, Status
+from torchgrasp.hand.collide import field_from_surface
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.mixture import load_mixture
+from torchgrasp.hand.query import query_hand
+from torchgrasp.hand.realise import realise
+from torchgrasp.hand.refine import Surroundings
+from torchgrasp.plan.certify import certify
+from torchgrasp.plan.solve import plan_contacts
+from torchgrasp.shape.support import fit_shape
+from torchgrasp.shape.surface import extract_surface
+from torchgrasp.values import ContactPlan, ContactSpec, Grasps, PointCloud, count_status
+
+Observer = Callable[[str, str, Any], None]
+"""Called after each stage with its name, one line about it, and its value."""
+
+TRIPLES = 250
+"""How many of the planned contact triples are certified and offered to the hand."""
+
+
+def _ignore(stage: str, message: str, value: Any) -> None:
+    """Observe nothing."""
+
+
+def spread_rows(plan: ContactPlan, most: int) -> Int[Tensor, "k"]:
+    """Return at most `most` rows that succeeded, far apart from each other (greedy farthest point), in plan order.
+
+    A triple in another order of its contacts is the same triple, so each is sorted by height first.
+    """
+    rows = torch.nonzero(plan.status == Status.OK)[:, 0]
+    if len(rows) <= most:
+        return rows
+    points = plan.contacts.points[rows]
+    order = points[..., 2].argsort(1, stable=True)
+    place = points.gather(1, order[..., None].expand(-1, -1, 3)).flatten(1)
+    chosen = torch.zeros(most, dtype=torch.int64, device=rows.device)
+    chosen[0] = plan.quality[rows].argmin()
+    distance = torch.full_like(place[:, 0], torch.inf)
+    for k in range(1, most):
+        distance = torch.minimum(distance, (place - place[chosen[k - 1]]).square().sum(1))
+        chosen[k] = distance.argmax()
+    return rows[chosen.sort().values]
+
+
+def describe(counts: dict[Status, int]) -> str:
+    """Return counts of statuses as one line, the successes first.
+
+    >>> describe({Status.NOT_CLOSED: 2, Status.OK: 1})
+    '1 ok, 2 not_closed'
+    """
+    ordered = sorted(counts.items(), key=lambda pair: pair[0] is not Status.OK)
+    return ", ".join(f"{n} {s.name.lower()}" for s, n in ordered) or "none"
+
+
+def digest(cloud: PointCloud) -> str:
+    """Return the SHA-256 of the points that were given, so that a result names its input."""
+    return hashlib.sha256(cloud.points.detach().cpu().double().contiguous().numpy().tobytes()).hexdigest()
+
+
+def plan_grasps(
+    cloud: PointCloud,
+    hand: Hand,
+    spec: ContactSpec | None = None,
+    starts: int = 1000,
+    seed: int = 0,
+    *,
+    observer: Observer = _ignore,
+) -> Grasps:
+    """Plan grasps of a hand on the object of a partial point cloud: every stage of the library in one call.
+
+    Args:
+        cloud: what the camera saw [m]; normals and viewpoint are estimated where they are missing.
+        hand: from `load_hand`.
+        spec: what the contacts must satisfy; `ContactSpec()` by default.
+        starts: random starts of the contact planner.
+        seed: of every random draw; the same seed gives bitwise the same grasps.
+        observer: called after each stage with its name, a line of counts, and its value.
+
+    Returns:
+        Grasps, those with `Status.OK` first and best first; the others say what they lack. There may be none.
+
+    Raises:
+        BadArgument: an argument of the wrong type or range, or a cloud that no object of graspable size gives.
+
+    >>> from torchgrasp import load_hand, load_object
+    >>> view = load_object("cylinder").view
+    >>> grasps = plan_grasps(view, load_hand("barrett"), starts=20)
+    >>> grasps.joints.shape[1]
+    4
+    """
+    spec = ContactSpec() if spec is None else spec
+    if not isinstance(cloud, PointCloud):
+        raise BadArgument("cloud", type(cloud).__name__, "a PointCloud")
+    if not isinstance(hand, Hand):
+        raise BadArgument("hand", type(hand).__name__, "a Hand from load_hand")
+    check_cloud(cloud)
+    mixture = load_mixture(hand.name)
+
+    shape = fit_shape(cloud, seed=seed, table=spec.table)
+    surface = extract_surface(shape)
+    certain = float((surface.std_m < 0.004).double().mean())
+    observer("shape", f"{len(shape.x)} points, {certain:.0%} of the surface certain to 4 mm", shape)
+
+    plan = plan_contacts(shape, spec, starts, seed)
+    observer("plan", f"{starts} starts: {describe(count_status(plan.status))}", plan)
+
+    rows = spread_rows(plan, TRIPLES)
+    certificate = certify(plan.contacts[rows], spec)
+    contacts, certificate = plan.contacts[rows][certificate.closed], certificate[certificate.closed]
+    observer(
+        "certify", f"{len(contacts)} of {len(rows)} triples closed at friction {spec.planned_friction:g}", certificate
+    )
+
+    guess = query_hand(contacts, hand, mixture)
+    reached = len(torch.unique(guess.row))
+    observer("query", f"{len(guess)} postures for {reached} of {len(contacts)} triples", guess)
+
+    field = field_from_surface(surface.vertices, surface.faces)
+    center = surface.vertices.mean(0)
+    grasps = realise(guess, hand, contacts, certificate, Surroundings(field, spec.table), center)
+    grasps = dataclasses.replace(
+        grasps,
+        meta={
+            "hand": hand.name,
+            "hand_sha256": hand.sha256,
+            "cloud_sha256": digest(cloud),
+            "joint_names": ",".join(hand.joint_names),
+            "finger_names": ",".join(hand.finger_names),
+            "frames": "obj: the frame of the cloud; hand: the base link of the hand's URDF; a_from_b maps b into a",
+            "units": "metre, radian",
+            "friction": f"{spec.friction:g}",
+            "planned_friction": f"{spec.planned_friction:g}",
+            "table": "none" if spec.table is None else f"{spec.table:g}",
+            "starts": str(starts),
+            "seed": str(seed),
+        },
+    )
+    observer("refine", f"{len(grasps)} refined: {describe(count_status(grasps.status))}", grasps)
+    return grasps
