@@ -47,7 +47,7 @@ def surface_covariance(
     """Return Sigma_cov of Eq. (27) [m^2]: the shape's deviation along the normal over an isotropic floor [m].
 
     >>> surface_covariance(torch.tensor([0.0, 0.0, 1.0]), torch.tensor(0.01), floor=0.002).diagonal() * 1e6
-    tensor([  4.0000,   4.0000, 104.0000])
+    tensor([  4.,   4., 104.])
     """
     along = normals[..., :, None] * normals[..., None, :] * std_m[..., None, None] ** 2
     return along + floor**2 * torch.eye(3, dtype=normals.dtype, device=normals.device)
@@ -85,7 +85,7 @@ def force_gain(covariance: Float[Tensor, "*b 3 3"], alpha_f: Float[Tensor, "*b"]
 
 
 def damped_inverse(jacobian: Float[Tensor, "*b m h"], damping: float = DAMPING) -> Float[Tensor, "*b h m"]:
-    """Return J^T (J J^T + damping I)^-1, finite for every J, by whichever of the two normal matrices is smaller."""
+    """Return J^T (J J^T + damping I)^-1, by whichever of the two normal matrices is smaller."""
     m, h = jacobian.shape[-2:]
     transposed = jacobian.transpose(-1, -2)
     if m <= h:
@@ -148,7 +148,8 @@ def tip_compliance(
     hand: Hand, joints: Float[Tensor, "*b h"], normals: Float[Tensor, "*b 3 3"]
 ) -> Float[Tensor, "*b 3"]:
     """Return how far each fingertip yields [m/N] along its normal when its joints are driven with the hand's kp."""
-    kp = actuator(hand, "kp").to(joints)
+    every = torch.tensor([hand.actuators[name].kp for name in hand.urdf_joint_names]).to(joints)
+    kp = (hand.coupling.to(joints) ** 2 * every[:, None]).sum(0)  # a motor also turns the joints coupled to it
     along = torch.einsum("...cih,...ci->...ch", hand.jacobian(joints), normals)
     return (along**2 / kp).sum(-1)
 

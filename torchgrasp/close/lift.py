@@ -1,12 +1,12 @@
 """The hand's URDF as the simulator takes it: hung on a vertical joint at the pose of the grasp, geometry only."""
 
 import math
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
-from lxml import etree
 
-from torchgrasp.errors import HandFileError
+from torchgrasp.hand.urdf import read_urdf
 
 LIFT_JOINT = "torchgrasp_lift"
 """Name of the prismatic joint that carries the hand along the world's z axis."""
@@ -24,38 +24,30 @@ def lifted_urdf(urdf_path: Path | str, world_from_hand: np.ndarray, travel: floa
         travel: of the lift joint [m], upwards.
 
     Raises:
-        HandFileError: the file is no URDF with one root link.
+        HandFileError: the file is no sound URDF (`read_urdf`).
     """
-    try:
-        parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, remove_comments=True)
-        robot = etree.fromstring(Path(urdf_path).read_bytes(), parser)
-    except (OSError, etree.XMLSyntaxError) as error:
-        raise HandFileError("urdf_path", f"{urdf_path}: {error}", "a readable URDF") from error
-    for tag in ("visual", "mimic", "transmission", "gazebo", "material"):
-        for element in list(robot.iter(tag)):
-            parent = element.getparent()
-            if parent is not None:
-                parent.remove(element)
-    children = {str(c.get("link")) for c in robot.iterfind("joint/child")}
-    roots = [str(link.get("name")) for link in robot.iterfind("link") if link.get("name") not in children]
-    if len(roots) != 1:
-        raise HandFileError("urdf_path", f"{urdf_path} with root links {roots}", "a URDF with one root link")
+    urdf = read_urdf(urdf_path)
+    robot = ET.fromstring(urdf.data)
+    for parent in list(robot.iter()):
+        for child in list(parent):
+            if child.tag in ("visual", "mimic", "transmission", "gazebo", "material"):
+                parent.remove(child)
     roll, pitch, yaw = euler_from_rotation(world_from_hand[:3, :3])
     x, y, z = world_from_hand[:3, 3]
     robot[:0] = list(
-        etree.fromstring(
+        ET.fromstring(
             f"""<stand>
   <link name="torchgrasp_world"/>
   <link name="torchgrasp_arm"><inertial><origin xyz="0 0 0"/><mass value="1"/>
     <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>
   <joint name="{LIFT_JOINT}" type="prismatic"><parent link="torchgrasp_world"/><child link="torchgrasp_arm"/>
     <axis xyz="0 0 1"/><limit lower="-0.01" upper="{travel + 0.05:.9g}" effort="1000" velocity="10"/></joint>
-  <joint name="torchgrasp_wrist" type="fixed"><parent link="torchgrasp_arm"/><child link="{roots[0]}"/>
+  <joint name="torchgrasp_wrist" type="fixed"><parent link="torchgrasp_arm"/><child link="{urdf.root}"/>
     <origin xyz="{x:.12g} {y:.12g} {z:.12g}" rpy="{roll:.12g} {pitch:.12g} {yaw:.12g}"/></joint>
 </stand>"""
         )
     )
-    return etree.tostring(robot, encoding="unicode")
+    return ET.tostring(robot, encoding="unicode")
 
 
 def euler_from_rotation(rotation: np.ndarray) -> tuple[float, float, float]:

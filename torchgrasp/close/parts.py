@@ -10,13 +10,16 @@ import logging
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-import trimesh
 
 from torchgrasp.errors import MeshError, MissingExtra, ModelFileError, OutputError
 from torchgrasp.files import load_tensors, save_tensors
+
+if TYPE_CHECKING:
+    import trimesh
 
 THRESHOLD = 0.05
 """Concavity at which CoACD stops cutting (0.01-1; its own default)."""
@@ -25,15 +28,18 @@ _NAMES = {"vertices", "faces", "vertex_counts", "face_counts"}
 _log = logging.getLogger(__name__)
 
 
-def read_mesh(mesh: trimesh.Trimesh | Path | str) -> trimesh.Trimesh:
+def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
     """Return a closed mesh [m] from a file or a trimesh, checked and never repaired.
 
     Raises:
         MeshError: no mesh in the file, non-finite vertices, an open surface, or no positive volume.
 
+    >>> import trimesh
     >>> len(read_mesh(trimesh.creation.box((0.1, 0.1, 0.1))).faces)
     12
     """
+    import trimesh
+
     name = "a mesh"
     if not isinstance(mesh, trimesh.Trimesh):
         path, name = Path(mesh), str(mesh)
@@ -57,7 +63,7 @@ def read_mesh(mesh: trimesh.Trimesh | Path | str) -> trimesh.Trimesh:
     return mesh
 
 
-def convex_parts(mesh: trimesh.Trimesh | Path | str, cache: Path | str | None = None) -> list[trimesh.Trimesh]:
+def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None = None) -> "list[trimesh.Trimesh]":
     """Return convex parts that together fill a closed mesh; a convex mesh is its own only part.
 
     The parts are kept in `cache`, by default `$XDG_CACHE_HOME/torchgrasp` or `~/.cache/torchgrasp`, under the SHA-256
@@ -68,6 +74,7 @@ def convex_parts(mesh: trimesh.Trimesh | Path | str, cache: Path | str | None = 
         MeshError: the mesh is open, empty, not finite, or without volume.
         MissingExtra: the mesh is not convex and CoACD is not installed.
 
+    >>> import trimesh
     >>> len(convex_parts(trimesh.creation.box((0.1, 0.1, 0.1))))
     1
     """
@@ -88,7 +95,7 @@ def convex_parts(mesh: trimesh.Trimesh | Path | str, cache: Path | str | None = 
     return parts
 
 
-def check_parts(parts: Sequence[trimesh.Trimesh]) -> list[trimesh.Trimesh]:
+def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
     """Return parts given by the caller as they are, or raise `MeshError` when one is no convex body."""
     for index, part in enumerate(parts):
         read_mesh(part)
@@ -99,8 +106,10 @@ def check_parts(parts: Sequence[trimesh.Trimesh]) -> list[trimesh.Trimesh]:
     return list(parts)
 
 
-def _decompose(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
+def _decompose(mesh: "trimesh.Trimesh") -> "list[trimesh.Trimesh]":
     """Cut a mesh into convex parts with CoACD, quietly."""
+    import trimesh
+
     try:
         import coacd
     except ImportError as error:
@@ -129,7 +138,7 @@ def _cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchgrasp"
 
 
-def _fingerprint(mesh: trimesh.Trimesh) -> str:
+def _fingerprint(mesh: "trimesh.Trimesh") -> str:
     """Return the SHA-256 of what the parts depend on."""
     digest = hashlib.sha256(f"coacd {THRESHOLD}".encode())
     digest.update(np.ascontiguousarray(mesh.vertices, dtype="<f8").tobytes())
@@ -137,7 +146,7 @@ def _fingerprint(mesh: trimesh.Trimesh) -> str:
     return digest.hexdigest()
 
 
-def _save(parts: list[trimesh.Trimesh], path: Path) -> None:
+def _save(parts: "list[trimesh.Trimesh]", path: Path) -> None:
     """Write parts as one safetensors file, end to end with their counts."""
     tensors = {
         "vertices": torch.cat([torch.from_numpy(np.array(p.vertices, dtype=np.float64)) for p in parts]),
@@ -148,8 +157,10 @@ def _save(parts: list[trimesh.Trimesh], path: Path) -> None:
     save_tensors(path, "parts", tensors, {})
 
 
-def _load(path: Path) -> list[trimesh.Trimesh]:
+def _load(path: Path) -> "list[trimesh.Trimesh]":
     """Read parts that `_save` wrote."""
+    import trimesh
+
     tensors, _ = load_tensors(path, "parts", _NAMES)
     vertices = torch.split(tensors["vertices"], tensors["vertex_counts"].tolist())
     faces = torch.split(tensors["faces"], tensors["face_counts"].tolist())

@@ -11,13 +11,16 @@ import dataclasses
 import tempfile
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 
 from torchgrasp.close.lift import LIFT_JOINT, lifted_urdf
 from torchgrasp.errors import BadArgument, MissingExtra
+from torchgrasp.hand.hand import Actuator
+
+if TYPE_CHECKING:
+    import trimesh
 
 PATCH_RADIUS = 0.005
 """Radius [m] of the patch in which a soft fingertip touches: its torsional friction is friction x force x 5 mm."""
@@ -27,15 +30,6 @@ ARMATURE = 1e-3
 
 TABLE = (2.0, 2.0, 0.1)
 """Size of the table [m]; its top is where the mesh is lowest."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Drive:
-    """How one joint is driven: stiffness kp [N m/rad], damping kd [N m s/rad], largest torque [N m]."""
-
-    kp: float
-    kd: float
-    effort: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +54,7 @@ class Scene:
         urdf_path: of the hand.
         world_from_hand: pose of the hand (4, 4).
         joints: start position of every joint of the URDF by name [rad].
-        drives: of every joint by name.
+        drives: stiffness, damping and largest torque of every joint by name.
         tip_links: the three fingertips' links, in the order of the fingers.
         mesh: the closed object, for its table height, mass centre and inertia.
         parts: convex bodies that make up its surface.
@@ -79,10 +73,10 @@ class Scene:
         urdf_path: Path | str,
         world_from_hand: np.ndarray,
         joints: dict[str, float],
-        drives: dict[str, Drive],
+        drives: dict[str, Actuator],
         tip_links: tuple[str, ...],
-        mesh: trimesh.Trimesh,
-        parts: list[trimesh.Trimesh],
+        mesh: "trimesh.Trimesh",
+        parts: "list[trimesh.Trimesh]",
         mass: float,
         friction: float = 0.8,
         gravity: float = 9.81,
@@ -111,7 +105,7 @@ class Scene:
         body.attach(shape)
         self._place("table", body, [0.0, 0.0, height - TABLE[2] / 2])
 
-    def _add_object(self, mesh: trimesh.Trimesh, parts: list[trimesh.Trimesh], mass: float) -> None:
+    def _add_object(self, mesh: "trimesh.Trimesh", parts: "list[trimesh.Trimesh]", mass: float) -> None:
         """Put the object where its mesh is; mass centre and inertia are those of the mesh, filled evenly."""
         body = self._physx.PhysxRigidDynamicComponent()
         for part in parts:
@@ -145,7 +139,7 @@ class Scene:
         urdf_path: Path | str,
         world_from_hand: np.ndarray,
         joints: dict[str, float],
-        drives: dict[str, Drive],
+        drives: dict[str, Actuator],
         tip_links: tuple[str, ...],
         travel: float,
     ) -> None:

@@ -1,12 +1,12 @@
 """One simulated trial: the hand opens around the true object, closes on it under the law, lifts it and holds it."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Float
 from torch import Tensor
 
@@ -19,6 +19,9 @@ from torchgrasp.errors import Status
 from torchgrasp.frames import apply, inverse, rotate, rotation_angle
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values import ClosingGains, ClosureResult, Grasps, TrialSpec
+
+if TYPE_CHECKING:
+    import trimesh
 
 START_TOLERANCE = 1e-3
 """Overlap [m] of the hand with object or table that still counts as none: convex parts bulge by as much."""
@@ -42,11 +45,11 @@ LOST = 0.5
 def close_hand(
     grasp: Grasps,
     hand: Hand,
-    mesh: trimesh.Trimesh | Path | str,
+    mesh: "trimesh.Trimesh | Path | str",
     spec: TrialSpec | None = None,
     seed: int = 0,
     *,
-    parts: Sequence[trimesh.Trimesh] | None = None,
+    parts: "Sequence[trimesh.Trimesh] | None" = None,
 ) -> ClosureResult:
     """Close a hand on the true object, lift it and hold it, in a fresh simulation.
 
@@ -91,8 +94,8 @@ class _Trial:
         self,
         grasp: Grasps,
         hand: Hand,
-        mesh: trimesh.Trimesh,
-        parts: list[trimesh.Trimesh],
+        mesh: "trimesh.Trimesh",
+        parts: "list[trimesh.Trimesh]",
         spec: TrialSpec,
         seed: int,
     ) -> None:
@@ -102,7 +105,7 @@ class _Trial:
             hand.urdf_path,
             grasp.obj_from_hand[0].numpy(),
             start,
-            joint_drives(hand),
+            hand.actuators,
             tuple(hand.tip_links),
             mesh,
             parts,
@@ -113,7 +116,7 @@ class _Trial:
             spec.lift_height,
         )
         self.plant = plant_from_hand(hand, grasp, self.scene.joint_names)
-        self.link_from_centre = _centres_in_links(hand, grasp.pregrasp)
+        self.centres = torch.cat([hand.center.double(), torch.ones(3, 1, dtype=torch.float64)], dim=-1).numpy()
         self.substeps = max(1, round(1 / (spec.control_rate * spec.timestep)))
         self.period = self.substeps * spec.timestep
         self.touch = untouched()
@@ -146,11 +149,7 @@ class _Trial:
                 if controller.done:
                     break
             self.pushed = float(np.linalg.norm(self._centre(-1) - self._centre(0)))
-            hold: Callable[[Sight, float], Float[Tensor, j]]
-            if self.spec.controller == "uncertainty":
-                hold = Squeeze(self.plant, gains, sight, targets)
-            else:
-                hold = _frozen(targets)
+            hold = Squeeze(self.plant, gains, sight, targets)
             for _ in range(self._ticks(PRESSING_TIME)):
                 sight = self._tick(hold(sight, self.period))
             rising = self._ticks(LIFT_TIME)
@@ -163,7 +162,7 @@ class _Trial:
                 return Status.UNSTABLE
         return self._verdict()
 
-    def _tick(self, targets: Float[Tensor, "j"]) -> Sight:
+    def _tick(self, targets: Float[Tensor, " j"]) -> Sight:
         """Drive the joints for one control period, record it, and return what the robot then knows."""
         self.scene.drive(targets.numpy())
         impulse, moment, weight = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
@@ -192,7 +191,7 @@ class _Trial:
     def _sight(self, impulse: np.ndarray, moment: np.ndarray, weight: np.ndarray) -> Sight:
         """Return the hand's own knowledge, in its frame."""
         hand_from_world = inverse(torch.from_numpy(self.hand_pose[-1]))
-        centres = (self.scene.tip_poses() @ self.link_from_centre[:, :, None])[:, :3, 0]
+        centres = (self.scene.tip_poses() @ self.centres[:, :, None])[:, :3, 0]
         jacobian = torch.from_numpy(self.scene.jacobian(centres))
         with np.errstate(invalid="ignore", divide="ignore"):
             points = moment / weight[:, None]
@@ -265,17 +264,13 @@ class _Trial:
 
 
 def plant_from_hand(hand: Hand, grasp: Grasps, names: tuple[str, ...]) -> Plant:
-    """Return what the controllers need of a hand, its joints in the order of `names`."""
-    h = len(hand.joint_names)
-    unit = torch.cat([torch.zeros(1, h), torch.eye(h)]).double()
-    expanded = hand.expand(unit)
-    table = torch.stack([expanded[name] for name in names], dim=-1)  # (1 + h, j)
-    drive = joint_drives(hand)
+    """Return what the controllers need of a hand, all its joints in the order of `names`."""
+    order = [hand.urdf_joint_names.index(name) for name in names]
     return Plant(
-        coupling=(table[1:] - table[0]).T.contiguous(),
-        offset=table[0],
+        coupling=hand.coupling[order].double(),
+        offset=hand.offset[order].double(),
         actuated=tuple(names.index(name) for name in hand.joint_names),
-        kp=torch.tensor([drive[name].kp for name in names], dtype=torch.float64),
+        kp=torch.tensor([hand.actuators[name].kp for name in names], dtype=torch.float64),
         lower=hand.lower.double(),
         upper=hand.upper.double(),
         radius=hand.tip_radius.double(),
@@ -283,16 +278,3 @@ def plant_from_hand(hand: Hand, grasp: Grasps, names: tuple[str, ...]) -> Plant:
         joints=grasp.joints[0],
         pregrasp=grasp.pregrasp[0],
     )
-
-
-def _centres_in_links(hand: Hand, joints: Float[Tensor, "1 h"]) -> np.ndarray:
-    """Return each fingertip's centre in its link, homogeneous (3, 4): it does not depend on the joints."""
-    poses = hand.link_poses(joints)[0]
-    tips = poses[[hand.link_names.index(name) for name in hand.tip_links]]
-    centres = apply(inverse(tips), hand.tip_centres(joints)[0][:, None])[:, 0]
-    return torch.cat([centres, torch.ones(3, 1, dtype=centres.dtype)], dim=-1).numpy()
-
-
-def _frozen(targets: Float[Tensor, "j"]) -> Callable[[Sight, float], Float[Tensor, "j"]]:
-    """Return a controller that keeps its targets."""
-    return lambda sight, period: targets

@@ -1,0 +1,117 @@
+"""The simulated scene against statics, rigid-body formulae and the hand's own kinematics."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from torchgrasp.close.lift import LIFT_JOINT, euler_from_rotation, lifted_urdf
+from torchgrasp.errors import HandFileError
+from torchgrasp.hand.hand import load_hand
+
+
+def test_euler_angles_rebuild_the_rotation():
+    rotations = Rotation.random(200, random_state=0).as_matrix()
+    level = [Rotation.from_euler("xyz", [0.3, s * math.pi / 2, 0.8]).as_matrix() for s in (1, -1)]
+    for matrix in [*rotations, *level, np.eye(3), np.diag([1.0, -1.0, -1.0])]:
+        again = Rotation.from_euler("xyz", euler_from_rotation(matrix)).as_matrix()
+        assert np.abs(again - matrix).max() < 1e-7
+
+
+def test_lifted_urdf_holds_geometry_and_one_more_joint():
+    text = lifted_urdf(load_hand("barrett").urdf_path, np.eye(4), 0.1)
+    assert LIFT_JOINT in text
+    assert "<mimic" not in text
+    assert "<visual" not in text
+    assert text.count("<collision") > 5
+
+
+def test_files_that_are_no_hand_are_refused(tmp_path):
+    with pytest.raises(HandFileError):
+        lifted_urdf(tmp_path / "none.urdf", np.eye(4), 0.1)
+    (tmp_path / "two.urdf").write_text('<robot name="r"><link name="a"/><link name="b"/></robot>')
+    with pytest.raises(HandFileError, match="one root link"):
+        lifted_urdf(tmp_path / "two.urdf", np.eye(4), 0.1)
+
+
+def build(name, mesh, **options):
+    """A scene with the hand half a metre above the object."""
+    pytest.importorskip("sapien")
+    from torchgrasp.close.scene import Scene
+
+    hand = load_hand(name)
+    joints = 0.5 * (hand.lower + hand.upper)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec([0.3, -0.8, 1.1]).as_matrix(), [0.05, -0.1, 0.6]
+    start = {k: float(v) for k, v in hand.expand(joints).items()}
+    args = (hand.urdf_path, pose, start, hand.actuators, hand.tip_links, mesh, [mesh.convex_hull], 0.36)
+    return hand, joints, torch.from_numpy(pose), Scene(*args, **options)
+
+
+def standing(radius=0.03, height=0.12):
+    mesh = trimesh.creation.cylinder(radius=radius, height=height)
+    mesh.apply_translation([0, 0, height / 2 + 0.2])
+    return mesh
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("timestep", [1 / 240, 1 / 500])
+def test_resting_weight(timestep):
+    *_, scene = build("barrett", standing(), timestep=timestep)
+    forces = []
+    for _ in range(200):
+        scene.step()
+        impulse = sum(np.asarray(p.impulse) for c in scene.system.get_contacts() for p in c.points)
+        forces.append(np.abs(impulse)[2] / timestep)
+    assert np.mean(forces[100:]) == pytest.approx(0.36 * 9.81, rel=5e-3)
+    assert np.abs(scene.object_pose() - np.eye(4)).max() < 1e-4
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+def test_object_has_the_mass_centre_and_inertia_of_its_mesh():
+    radius, height, mass = 0.03, 0.12, 0.36
+    mesh = standing(radius, height)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]))
+    *_, scene = build("barrett", mesh)
+    across, along = mass * (3 * radius**2 + height**2) / 12, mass * radius**2 / 2
+    assert np.sort(scene.body.inertia) == pytest.approx([along, across, across], rel=0.02)
+    assert np.asarray(scene.body.cmass_local_pose.p) == pytest.approx(mesh.center_mass, abs=1e-6)
+    frame = scene.body.cmass_local_pose.to_transformation_matrix()[:3, :3]
+    assert frame @ np.diag(scene.body.inertia) @ frame.T == pytest.approx(
+        np.asarray(mesh.moment_inertia) * mass / mesh.volume, rel=1e-3, abs=1e-8
+    )
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", ["allegro", "barrett"])
+def test_kinematics_are_those_of_the_hand(name):
+    hand, joints, world_from_hand, scene = build(name, standing())
+    assert scene.penetration() == 0.0
+    assert np.abs(scene.hand_pose() - world_from_hand.numpy()).max() < 1e-5
+    tips = world_from_hand @ hand.link_poses(joints)[hand.tip_index]
+    assert np.abs(scene.tip_poses() - tips.numpy()).max() < 1e-4
+    points, _ = hand.fingertips(joints)
+    world_points = points @ world_from_hand[:3, :3].T + world_from_hand[:3, 3]
+    order = [hand.urdf_joint_names.index(n) for n in scene.joint_names]
+    found = scene.jacobian(world_points.numpy()) @ hand.coupling[order].numpy()
+    assert np.abs(found - (world_from_hand[:3, :3] @ hand.jacobian(joints)).numpy()).max() < 1e-4
+    assert scene.joints() == pytest.approx(hand.expand_joints(joints).numpy()[order], abs=1e-4)
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+def test_the_hand_rises_with_its_joint_and_stays_where_it_is_driven():
+    hand, joints, world_from_hand, scene = build("allegro", standing(), travel=0.1)
+    for k in range(700):
+        scene.lift(0.1 * min(1.0, k / 200))
+        scene.step()
+    rise = scene.hand_pose()[:3, 3] - world_from_hand[:3, 3].numpy()
+    assert rise == pytest.approx([0, 0, 0.1], abs=5e-4)
+    order = [hand.urdf_joint_names.index(n) for n in scene.joint_names]
+    assert np.abs(scene.joints() - hand.expand_joints(joints).numpy()[order]).max() < 2e-3
