@@ -1,0 +1,112 @@
+"""Covariance blocks against a closed form of the thin plate, other kernels, and the definition by derivatives."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from sklearn.gaussian_process.kernels import RBF
+from torch import Tensor
+
+from torchgrasp.shape.kernel import covariance, radial_derivatives, thin_plate
+
+PSI = 3.6
+
+
+def _points(n: int, seed: int = 0) -> Tensor:
+    return torch.randn(n, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) * 0.5
+
+
+def _block(a: Tensor, b: Tensor, profile=partial(thin_plate, psi=PSI)) -> Tensor:
+    yes = torch.ones(1, dtype=torch.bool)
+    return covariance(a[None], b[None], yes, yes, profile)
+
+
+def _closed_form(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The thin plate's 4x4 block by hand, NumPy, one pair."""
+    d = a - b
+    r = np.linalg.norm(d)
+    block = np.empty((4, 4))
+    block[0, 0] = (PSI - r) ** 2 * (PSI + 2 * r)
+    block[1:, 0] = 6 * (r - PSI) * d
+    block[0, 1:] = -6 * (r - PSI) * d
+    block[1:, 1:] = 6 * (PSI - r) * np.eye(3) - (6 * np.outer(d, d) / r if r > 0 else 0)
+    return block
+
+
+def test_eq2_blocks_equal_the_closed_form_and_have_the_stated_order():
+    x, y = _points(7), _points(5, seed=1)
+    has, other = torch.arange(7) % 2 == 0, torch.arange(5) < 2
+    found = covariance(x, y, has, other, partial(thin_plate, psi=PSI))
+    rows = [(i, 0) for i in range(7)] + [(i, m) for m in (1, 2, 3) for i in range(7) if has[i]]
+    columns = [(j, 0) for j in range(5)] + [(j, m) for m in (1, 2, 3) for j in range(5) if other[j]]
+    wanted = [[_closed_form(x[i].numpy(), y[j].numpy())[m, n] for j, n in columns] for i, m in rows]
+    torch.testing.assert_close(found, torch.tensor(wanted, dtype=torch.float64), rtol=0, atol=1e-13)
+
+
+def test_eq3_covariance_of_distances_is_the_kernel():
+    a, b = _points(2)
+    torch.testing.assert_close(_block(a, b)[0, 0], thin_plate(torch.linalg.vector_norm(a - b), PSI))
+
+
+def test_eq4_covariance_of_normal_and_distance_is_the_derivative_in_the_normals_argument():
+    a, b = (p.requires_grad_() for p in _points(2))
+    k = thin_plate(torch.linalg.vector_norm(a - b), PSI)
+    da, db = torch.autograd.grad(k, (a, b))
+    block = _block(a.detach(), b.detach())
+    torch.testing.assert_close(block[1:, 0], da)
+    torch.testing.assert_close(block[0, 1:], db)
+
+
+def test_eq5_takes_one_derivative_in_each_argument():
+    a, b = _points(2)
+    step, fd = 1e-4, torch.empty(3, 3, dtype=torch.float64)
+    for m in range(3):
+        for n in range(3):
+            em, en = torch.eye(3, dtype=torch.float64)[[m, n]] * step
+            corners = [(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]
+            fd[m, n] = sum(w * thin_plate((a + s * em - b - t * en).norm(), PSI) for s, t, w in corners) / (4 * step**2)
+    torch.testing.assert_close(_block(a, b)[1:, 1:], fd, rtol=0, atol=1e-5)
+
+
+def test_eq5_matrix_is_symmetric_and_positive():
+    x = _points(40) / 3  # within a ball of diameter 3/4 psi
+    yes = torch.ones(40, dtype=torch.bool)
+    matrix = covariance(x, x, yes, yes, partial(thin_plate, psi=PSI))
+    torch.testing.assert_close(matrix, matrix.T)
+    assert torch.linalg.eigvalsh(matrix).min() > -1e-10
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-12, 1e-8, 1e-5, 9.9e-6, 1.01e-5, 1e-3])
+def test_blocks_are_right_at_and_near_coincident_points(gap: float):
+    a = _points(1)[0]
+    b = a + gap * torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
+    wanted = torch.tensor(_closed_form(a.numpy(), b.numpy()))
+    torch.testing.assert_close(_block(a, b), wanted, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-8, 1e-4, 0.3])
+def test_any_radial_profile_can_be_plugged_in(gap: float):
+    """Squared exponential: distances against scikit-learn, normals against the textbook's form."""
+    a = _points(1)[0]
+    d = gap * torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
+    found = _block(a, a + d, lambda r: torch.exp(-0.5 * r * r / 0.25))
+    k = RBF(0.5)(a[None].numpy(), (a + d)[None].numpy()).item()
+    wanted = k * (torch.eye(3, dtype=torch.float64) / 0.25 - torch.outer(d, d) / 0.25**2)
+    assert found[0, 0].item() == pytest.approx(k, abs=1e-12)
+    torch.testing.assert_close(found[1:, 1:], wanted, rtol=0, atol=1e-8)
+
+
+def test_eq6_thin_plate_is_the_polynomial_and_vanishes_with_its_slope_at_psi():
+    r = torch.linspace(0, PSI, 50, dtype=torch.float64)
+    torch.testing.assert_close(thin_plate(r, PSI), 2 * r**3 - 3 * PSI * r**2 + PSI**3)
+    k, slope, bend = radial_derivatives(partial(thin_plate, psi=PSI), r)
+    assert k[-1].abs() < 1e-12 and slope[-1].abs() < 1e-12
+    torch.testing.assert_close(slope, 6 * (r - PSI))
+    torch.testing.assert_close(bend, 12 * r - 6 * PSI)
+
+
+def test_a_linear_profile_has_no_curvature():
+    _, slope, bend = radial_derivatives(lambda r: 1 - r, torch.tensor([0.5, 1.0]))
+    torch.testing.assert_close(slope, torch.tensor([-2.0, -1.0]))
+    assert not bend.any()
