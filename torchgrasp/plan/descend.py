@@ -32,14 +32,18 @@ GUIDE_EVERY = 4
 """Steps between two evaluations of the rows for flat surface."""
 
 
+FEASIBILITY = 3.0
+"""Weight of the surface and of all bounds."""
+
+
 @dataclasses.dataclass(frozen=True)
-class Weights:
-    """Weights of the rows in a stage: constraints against the objective, and closure within the constraints."""
+class Stage:
+    """A number of steps with constant weights of the objective and of closure, after which multipliers may rise."""
 
     centre: float
-    surface: float
     closure: float
-    bounds: float
+    steps: int
+    keeps_multipliers: bool = True
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,36 +93,34 @@ def shift_bounds(rows: Rows, multipliers: Multipliers) -> Float[Tensor, "b k"]:
     return torch.cat([rows.bounds[:, :known] + multipliers.bounds, rows.bounds[:, known:]], 1)
 
 
-def cost(rows: Rows, multipliers: Multipliers, weights: Weights) -> Float[Tensor, "b"]:
+def cost(rows: Rows, multipliers: Multipliers, stage: Stage) -> Float[Tensor, "b"]:
     """Return the augmented Lagrangian of each triple."""
     shifted = (
-        weights.centre * rows.centre,
-        weights.surface * (rows.surface + multipliers.surface),
-        weights.closure * (rows.closure + multipliers.closure),
-        weights.bounds * shift_bounds(rows, multipliers).clamp(min=0.0),
+        stage.centre * rows.centre,
+        FEASIBILITY * (rows.surface + multipliers.surface),
+        stage.closure * (rows.closure + multipliers.closure),
+        FEASIBILITY * shift_bounds(rows, multipliers).clamp(min=0.0),
     )
     return torch.cat(shifted, 1).square().sum(1) / 2
 
 
 def step(
-    rows: Rows, multipliers: Multipliers, weights: Weights, damping: Float[Tensor, "b"]
+    rows: Rows, multipliers: Multipliers, stage: Stage, damping: Float[Tensor, "b"]
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b m"], Float[Tensor, "b"]]:
     """Return the damped Gauss-Newton step of the points and the logits, and the decrease of cost it promises."""
     active = shift_bounds(rows, multipliers)
-    on = weights.bounds * (active > 0)
-    value = torch.cat(
-        [weights.centre * rows.centre, weights.surface * (rows.surface + multipliers.surface), on * active], 1
-    )
+    on = FEASIBILITY * (active > 0)
+    value = torch.cat([stage.centre * rows.centre, FEASIBILITY * (rows.surface + multipliers.surface), on * active], 1)
     slope = torch.cat(
         [
-            weights.centre * rows.centre_by_points,
-            weights.surface * rows.surface_by_points,
+            stage.centre * rows.centre_by_points,
+            FEASIBILITY * rows.surface_by_points,
             on[..., None] * rows.bounds_by_points,
         ],
         1,
     )
-    closure = weights.closure * (rows.closure + multipliers.closure)
-    by_points, by_z = weights.closure * rows.closure_by_points, weights.closure * rows.closure_by_z
+    closure = stage.closure * (rows.closure + multipliers.closure)
+    by_points, by_z = stage.closure * rows.closure_by_points, stage.closure * rows.closure_by_z
     # min over dz of |closure + by_points dp + by_z dz|^2 + d |dz|^2 = |.|^2 in the metric (I + by_z by_z^T / d)^-1
     z_damping = Z_DAMPING * damping[:, None, None]
     soft = torch.eye(6, dtype=closure.dtype, device=closure.device) + by_z @ by_z.mT / z_damping
@@ -176,12 +178,11 @@ def descend(
     problem: ContactProblem,
     state: State,
     multipliers: Multipliers,
-    weights: Weights,
-    steps: int,
+    stage: Stage,
     settled: float,
     flatness: float | None = None,
 ) -> State:
-    """Take up to `steps` Levenberg-Marquardt steps with constant weights and multipliers; one evaluation each.
+    """Take up to `stage.steps` Levenberg-Marquardt steps of one evaluation each.
 
     Triples whose next step is shorter than `settled` are left alone from then on. With `flatness`, rows for flat
     surface around the contacts join, evaluated anew every `GUIDE_EVERY` steps. Tangents are carried along.
@@ -190,11 +191,11 @@ def descend(
     state = dataclasses.replace(state, damping=torch.full_like(state.damping, FIRST_DAMPING))
     rows = problem.rows(state.points, state.z, state.tangent, state.jet)
     guide = None
-    for i in range(steps):
+    for i in range(stage.steps):
         if flatness is not None and i % GUIDE_EVERY == 0:
             guide = bend_guide(shape, state.points, state.tangent, state.jet, flatness)
         joined = join_guide(rows, guide, state.points)
-        points_step, z_step, promised = step(joined, multipliers, weights, state.damping)
+        points_step, z_step, promised = step(joined, multipliers, stage, state.damping)
         moves = points_step.abs().flatten(1).amax(-1) > settled
         if not bool(moves.all()):
             whole = put(whole, at, state)
@@ -205,10 +206,10 @@ def descend(
             points_step, z_step, promised = points_step[moves], z_step[moves], promised[moves]
         points, z = state.points + points_step, state.z + z_step.unflatten(1, state.z.shape[1:])
         jet = triple_jet(shape, points)
-        before = cost(joined, multipliers, weights)
+        before = cost(joined, multipliers, stage)
         tried_tangent = carry(state.tangent, jet.normals)
         tried_rows = problem.rows(points, z, tried_tangent, jet)
-        kept = (before - cost(join_guide(tried_rows, guide, points), multipliers, weights)) / promised
+        kept = (before - cost(join_guide(tried_rows, guide, points), multipliers, stage)) / promised
         inside = torch.linalg.vector_norm(points, dim=-1).amax(-1) < problem.domain_radius
         better = (kept > 0) & inside  # a comparison with NaN is False: such a step is refused
         # Nielsen's rule: the less of its promise a step keeps, the more the next is damped.

@@ -7,7 +7,7 @@ from torch import Tensor
 from torchgrasp.errors import Status
 from torchgrasp.frames import degenerate
 from torchgrasp.plan.descend import (
-    Weights,
+    Stage,
     descend,
     no_multipliers,
     pick,
@@ -16,7 +16,7 @@ from torchgrasp.plan.descend import (
 )
 from torchgrasp.plan.flat import bend
 from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet
-from torchgrasp.plan.start import check_starts, project, start_points
+from torchgrasp.plan.start import check_starts, is_surveyed, project, start_points
 from torchgrasp.plan.wrench import BALANCED, balance, rank_ratio, wrenches
 from torchgrasp.values import ContactPlan, Contacts, ContactSpec
 
@@ -26,17 +26,19 @@ MIN_RANK_RATIO = 1e-3
 ON_SURFACE = 1e-6
 """Largest |f_d| of a contact on the surface, in normalised units."""
 
-SETTLE = (Weights(centre=0.1, surface=3.0, closure=0.1, bounds=3.0), 5)
-"""First into the certain part of the surface: closure sought there from the first step ends in more local minima."""
-
-STAGES = (
-    (Weights(centre=0.3, surface=3.0, closure=3.0, bounds=3.0), 12),
-    (Weights(centre=0.3, surface=3.0, closure=3.0, bounds=3.0), 8),
-    (Weights(centre=0.1, surface=3.0, closure=3.0, bounds=3.0), 8),
+SEARCH = (
+    Stage(centre=0.1, closure=0.1, steps=5, keeps_multipliers=False),
+    Stage(centre=0.3, closure=3.0, steps=12),
+    Stage(centre=0.3, closure=3.0, steps=8),
+    Stage(centre=0.1, closure=3.0, steps=8),
 )
-"""Stages of the augmented Lagrangian, with the multipliers raised after each."""
+"""Stages from starts anywhere. The first seeks the certain part of the surface: closure sought there from the first
+step ends in more local minima."""
 
-FINISH = (Weights(centre=0.0, surface=3.0, closure=3.0, bounds=3.0), 30)
+IMPROVE = (Stage(centre=0.3, closure=3.0, steps=8), Stage(centre=0.1, closure=3.0, steps=8))
+"""Stages from surveyed starts, most of which are feasible but for rounding: towards the centre, Eq. (14)."""
+
+FINISH = Stage(centre=0.0, closure=3.0, steps=30)
 """Last, feasibility alone: without the objective every residual can vanish."""
 
 
@@ -49,13 +51,14 @@ def plan_contacts(
     """Plan three contacts from each of many starts, Eqs. (10)-(14): one row a start, in the order of the starts.
 
     A row that fails carries the `Status` of the first constraint that it violates. Points are in metres and the
-    frame of the cloud, normals outward.
+    frame of the cloud, normals outward. With `spec.flatness` drawn starts are surveyed (see `start_points`); where
+    the descent from a feasible start fails, the start itself is the plan.
 
     Args:
         shape: a `ShapeGP`, or another implicit surface with the same methods.
         spec: what the contacts must satisfy; `ContactSpec()` by default.
-        starts: the number of starts, each three points drawn from the sphere of `spec.start_radius` about the
-            shape's centre (Sec. 6.2), or the starting points themselves [m].
+        starts: the number of starts, drawn from the sphere of `spec.start_radius` about the shape's centre
+            (Sec. 6.2), or the starting points themselves [m].
         seed: seed of the draw.
 
     Raises:
@@ -67,15 +70,15 @@ def plan_contacts(
     problem = ContactProblem.of(shape, spec)
     state = start_state(shape, problem, first)
     multipliers = none = no_multipliers(problem.rows(state.points, state.z, state.tangent, state.jet))
-    state = descend(shape, problem, state, none, *SETTLE, 1e-3, spec.flatness)
-    for weights, steps in STAGES:
-        state = descend(shape, problem, state, multipliers, weights, steps, 1e-3, spec.flatness)
-        multipliers = raise_multipliers(problem.rows(state.points, state.z, state.tangent, state.jet), multipliers)
-    state = descend(shape, problem, state, none, *FINISH, 1e-8, spec.flatness)
-    points = project(shape, state.points, steps=3)
-    plan, unplanned = assess(shape, spec, points), assess(shape, spec, first)
-    plan_contacts.debug = (plan, unplanned)
-    return pick((plan.status == Status.OK) | (unplanned.status != Status.OK), plan, unplanned)
+    for stage in IMPROVE if is_surveyed(spec, starts) else SEARCH:
+        state = descend(shape, problem, state, multipliers, stage, 1e-3, spec.flatness)
+        if stage.keeps_multipliers:
+            rows = problem.rows(state.points, state.z, state.tangent, state.jet)
+            multipliers = raise_multipliers(rows, multipliers)
+    state = descend(shape, problem, state, none, FINISH, 1e-8, spec.flatness)
+    found = assess(shape, spec, project(shape, state.points, steps=3))
+    begun = assess(shape, spec, first)
+    return pick((found.status == Status.OK) | (begun.status != Status.OK), found, begun)
 
 
 def assess(shape: Shape, spec: ContactSpec, points: Float[Tensor, "b 3 3"]) -> ContactPlan:

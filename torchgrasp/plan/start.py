@@ -1,7 +1,9 @@
 """Where planning starts: points on a sphere as in the paper, or triples surveyed on the surface, or given points."""
 
+import math
+
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument
@@ -15,8 +17,9 @@ SURVEY = 700
 """Triples of surface points that are surveyed for certain and flat places: 2100 points cover a hand-sized object in
 steps of about 4 mm."""
 
-DRAWS = 100
-"""Triples drawn for each start that is wanted; of those on certain and flat surface 2 to 10 % are closed."""
+DRAWS, ROUNDS = 20, 8
+"""Triples drawn for each start that is wanted, in each of at most so many rounds; of those on certain and flat
+surface 2 to 10 % are closed."""
 
 LONGEST_MOVE = 0.3
 """A Newton step onto the surface is at most this long, in normalised units."""
@@ -31,6 +34,11 @@ def project(shape: Shape, points: Float[Tensor, "b 3 3"], steps: int) -> Float[T
         length = torch.linalg.vector_norm(move, dim=-1, keepdim=True)
         points = points + move * (LONGEST_MOVE / length).clamp(max=1.0)
     return points
+
+
+def is_surveyed(spec: ContactSpec, starts: int | Tensor) -> bool:
+    """Tell whether starts are drawn from a survey of the surface."""
+    return spec.flatness is not None and not isinstance(starts, Tensor)
 
 
 def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor) -> None:
@@ -64,12 +72,11 @@ def start_points(
         return project(shape, shape.normalise(starts.double()), steps=6)
     generator = torch.Generator().manual_seed(seed)
     device = shape.metres(torch.zeros(3, dtype=torch.float64)).device
-    count = starts if spec.flatness is None else SURVEY
+    surveyed = is_surveyed(spec, starts)
+    count = SURVEY if surveyed else starts
     drawn = torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)
     points = project(shape, (spec.start_radius * unit(drawn)).to(device), steps=6)
-    if spec.flatness is None:
-        return points
-    return survey(shape, spec, points, starts, generator)
+    return survey(shape, spec, points, starts, generator) if surveyed else points
 
 
 def survey(
@@ -83,13 +90,22 @@ def survey(
     if problem.lowest is not None:
         good &= points[..., 2] > problem.lowest
     if spec.flatness is not None:
-        good &= bend(shape, points, jet.normals) < spec.flatness
+        good &= bend(shape, points, jet.normals) < 0.93 * spec.flatness  # the ring of another triple is turned
     places, normals = points[good], jet.normals[good]
     if len(places) < 3:  # nothing to choose from: descend from the survey's own triples
         return points.repeat(starts // len(points) + 1, 1, 1)[:starts]
-    choice = torch.randint(len(places), (DRAWS * starts, 3), generator=generator).to(places.device)
-    triples, outward = places[choice], normals[choice]
-    apart = torch.linalg.vector_norm(triples - triples.roll(1, 1), dim=-1).amin(-1)
-    closed: Bool[Tensor, d] = closed_exact(triples, outward, problem.friction) & (apart > problem.separation)
-    order = torch.argsort(~closed, stable=True)[:starts]
-    return triples[order]
+    # The certificate's cones have edges; those of a round cone of this friction fit inside them.
+    friction = problem.friction * math.cos(math.pi / problem.edges)
+    found, wanted = [], starts
+    for _ in range(ROUNDS):
+        choice = torch.randint(len(places), (DRAWS * starts, 3), generator=generator).to(places.device)
+        triple = places[choice]
+        choice = choice[torch.linalg.vector_norm(triple - triple.roll(1, 1), dim=-1).amin(-1) > problem.separation]
+        closed = choice[closed_exact(places[choice], normals[choice], friction)][:wanted]
+        found.append(places[closed])
+        wanted -= len(closed)
+        if wanted == 0:
+            break
+    # Too few are closed: the rest descend from triples that are not.
+    found.append(places[torch.randint(len(places), (wanted, 3), generator=generator).to(places.device)])
+    return torch.cat(found)
