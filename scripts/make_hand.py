@@ -45,6 +45,7 @@ def main(
     n: int = 200_000,
     components: int | None = None,
     seed: int = 0,
+    tolerance: float = 1e-3,
     held_out: int = 20_000,
     workers: int = 1,
     out: Path | None = None,
@@ -56,6 +57,7 @@ def main(
         n: free postures to learn from; the paper has 400000.
         components: Gaussians; default: the paper's number for its hands, 40 for others.
         seed: of postures and start.
+        tolerance: of the mean log-likelihood [nats] at which the fit stops.
         held_out: further postures to judge by.
         workers: threads that sample.
         out: file to write; default: mixture.safetensors in the hand's folder.
@@ -65,7 +67,8 @@ def main(
     samples = sample_configurations(robot, n + held_out, seed=seed, workers=workers)
     print(f"{robot.name}: {len(samples)} free postures in {time.perf_counter() - begin:.0f} s")
     begin = time.perf_counter()
-    mixture = fit_mixture(samples[:n], components or PAPER_COMPONENTS.get(robot.name, 40), seed=seed)
+    m = components or PAPER_COMPONENTS.get(robot.name, 40)
+    mixture = fit_mixture(samples[:n], m, seed=seed, tolerance=tolerance)
     meta = mixture.meta
     print(
         f"{len(mixture.weights)} components in {meta['iterations']} steps (converged: {meta['converged']}),"
