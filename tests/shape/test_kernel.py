@@ -8,16 +8,17 @@ import torch
 from sklearn.gaussian_process.kernels import RBF
 from torch import Tensor
 
-from torchgrasp.shape.kernel import covariance, radial_derivatives, thin_plate
+from torchgrasp.shape.kernel import Profile, covariance, radial_derivatives, thin_plate
 
 PSI = 3.6
+PLATE = partial(thin_plate, psi=PSI)
 
 
 def _points(n: int, seed: int = 0) -> Tensor:
     return torch.randn(n, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) * 0.5
 
 
-def _block(a: Tensor, b: Tensor, profile=partial(thin_plate, psi=PSI)) -> Tensor:
+def _block(a: Tensor, b: Tensor, profile: Profile = PLATE) -> Tensor:
     yes = torch.ones(1, dtype=torch.bool)
     return covariance(a[None], b[None], yes, yes, profile)
 

@@ -90,7 +90,8 @@ def silhouette(cloud: PointCloud, viewpoint: Float[Tensor, "3"], n_rim: int = 16
     seen = np.zeros(shape)
     seen[row[order], column[order]] = depths[order]
     nearest = np.asarray(distance_transform_edt(seen == 0, return_distances=False, return_indices=True))
-    inside = _distance(_distance(seen == 0) * cell <= GROW * spacing) * cell > SHRINK * spacing
+    grown = _fill_pores(_distance(seen == 0) * cell <= GROW * spacing, spacing / cell)
+    inside = _distance(grown) * cell > SHRINK * spacing
     outside = (_distance(~inside) - _distance(inside)) * cell
     outside += np.where(inside, 0.5, -0.5) * cell  # the outline runs between two cells
     rim, rim_normals = _rim(outside, corner, cell, pixels, depths, n_rim)
@@ -134,6 +135,18 @@ def _camera_axes(forward: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     helper[forward.abs().argmin()] = 1.0
     right = unit(torch.linalg.cross(forward, helper))
     return torch.stack([right, torch.linalg.cross(forward, right), forward])
+
+
+def _fill_pores(mask: np.ndarray, radius: float) -> np.ndarray:
+    """Return the mask without holes that no disc of the radius fits in: gaps between samples, not real holes."""
+    from scipy.ndimage import label
+
+    holes = np.zeros(mask.shape, dtype=np.int64)
+    label(~mask, output=holes)
+    widest = np.zeros(holes.max() + 1)
+    np.maximum.at(widest, holes, _distance(~mask))
+    widest[holes[0, 0]] = np.inf  # the surroundings
+    return mask | (widest[holes] < radius)
 
 
 def _distance(mask: np.ndarray) -> np.ndarray:

@@ -1,0 +1,124 @@
+"""Completion of shapes whose hidden side is known in closed form."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchgrasp.frames import apply, rotate
+from torchgrasp.shape.complete import complete_cloud
+from torchgrasp.shape.silhouette import farthest_points, seen_from_one_side, silhouette
+from torchgrasp.values import PointCloud
+
+CAMERA = torch.tensor([0.45, 0.0, 0.3], dtype=torch.float64)
+
+
+def _seen_box(half: tuple[float, float, float], camera: Tensor) -> PointCloud:
+    """The seen faces of a box that stands on z = 0, with exact normals."""
+    rng = torch.Generator().manual_seed(2)
+    size, points, normals = torch.tensor(half, dtype=torch.float64), [], []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            area = float(size.prod() / size[axis])
+            p = (2 * torch.rand(int(3e5 * area), 3, dtype=torch.float64, generator=rng) - 1) * size
+            p[:, axis] = sign * size[axis]
+            n = torch.zeros_like(p)
+            n[:, axis] = sign
+            points.append(p + torch.tensor([0.0, 0.0, half[2]], dtype=torch.float64))
+            normals.append(n)
+    p, n = torch.cat(points), torch.cat(normals)
+    seen = ((camera - p) * n).sum(-1) > 0.1 * torch.linalg.vector_norm(camera - p, dim=-1)
+    return PointCloud(p[seen], n[seen], camera)
+
+
+def _angles(found: Tensor, wanted: Tensor) -> Tensor:
+    return torch.rad2deg(torch.arccos((found * wanted).sum(-1).clamp(-1, 1)))
+
+
+def test_hidden_half_of_a_cylinder_is_found(seen_cylinder: PointCloud):
+    found = complete_cloud(seen_cylinder, CAMERA, table=0.0)
+    side = found.points[:, 2] < 0.11
+    error = torch.linalg.vector_norm(found.points[side, :2], dim=-1) - 0.03
+    assert len(found.points) >= 30 and (found.points[:, 0] < 0).double().mean() > 0.8
+    assert error.abs().median() < 0.0015 and error.abs().max() < 0.004
+    outward = found.points[side] * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
+    outward = outward / torch.linalg.vector_norm(outward, dim=-1, keepdim=True)
+    assert _angles(found.normals[side], outward).median() < 5
+    assert found.scores[0] > 0.3 and (found.noise >= 0.003).all()
+
+
+def test_back_of_a_box_is_found():
+    camera = torch.tensor([0.4, 0.2, 0.3], dtype=torch.float64)
+    found = complete_cloud(_seen_box((0.025, 0.04, 0.06), camera), camera, table=0.0)
+    half = torch.tensor([0.025, 0.04, 0.06], dtype=torch.float64)
+    off = ((found.points - torch.tensor([0.0, 0.0, 0.06], dtype=torch.float64)).abs() - half).amax(-1)
+    assert off.abs().median() < 0.004 and off.abs().max() < 0.006
+    assert (found.points[:, 0] < -0.02).any() and (found.points[:, 1] < -0.035).any()
+
+
+def test_hidden_half_is_found_without_a_table(seen_cylinder: PointCloud):
+    found = complete_cloud(seen_cylinder, CAMERA)
+    error = torch.linalg.vector_norm(found.points[:, :2], dim=-1) - 0.03
+    assert (found.points[:, 0] < -0.01).sum() > 10
+    assert error[found.points[:, 2] < 0.11].abs().median() < 0.003
+
+
+def test_completion_moves_with_the_object(seen_cylinder: PointCloud, motion: Tensor):
+    """Directions on a fixed grid do not turn with the object, but what they are refined to nearly does."""
+    assert seen_cylinder.normals is not None
+    moved = PointCloud(apply(motion, seen_cylinder.points), rotate(motion, seen_cylinder.normals))
+    found = complete_cloud(moved, apply(motion, CAMERA[None])[0])
+    back = (found.points - motion[:3, 3]) @ motion[:3, :3]
+    error = torch.linalg.vector_norm(back[:, :2], dim=-1) - 0.03
+    assert (back[:, 0] < -0.01).sum() > 10
+    assert error[back[:, 2] < 0.11].abs().median() < 0.003
+
+
+def test_mirrored_points_respect_cloud_outline_seen_surface_and_table(seen_cylinder: PointCloud):
+    found = complete_cloud(seen_cylinder, CAMERA, table=0.0)
+    assert found.points[:, 2].min() > -0.002
+    assert torch.cdist(found.points, seen_cylinder.points).min() > 0.006
+    assert found.outline.hull_distance(found.points).max() < 0.001
+    apart = torch.cdist(found.points, found.points) + torch.eye(len(found.points))
+    assert apart.min() > 0.004
+    assert len(complete_cloud(seen_cylinder, CAMERA, table=0.0, budget=7).points) == 7
+
+
+def test_noise_grows_with_the_distance_from_what_was_seen(seen_cylinder: PointCloud):
+    found = complete_cloud(seen_cylinder, CAMERA, table=0.0)
+    away = torch.cdist(found.points, seen_cylinder.points).amin(1)
+    assert (found.noise >= 0.003 + 0.08 * away - 1e-12).all()
+
+
+def test_silhouette_of_a_ball_is_its_circle():
+    rng = torch.Generator().manual_seed(4)
+    p = torch.randn(4000, 3, dtype=torch.float64, generator=rng)
+    p = 0.04 * p / torch.linalg.vector_norm(p, dim=-1, keepdim=True)
+    camera = torch.tensor([0.0, 0.5, 0.0], dtype=torch.float64)
+    cloud = PointCloud(p[((camera - p) * p).sum(-1) > 0])
+    outline = silhouette(cloud, camera)
+    # The tangent cone touches the ball on a circle of radius r sqrt(1 - (r/d)^2) at distance d - r^2/d.
+    ring = 0.04 * math.sqrt(1 - 0.08**2)
+    assert len(outline.rim) == 16
+    assert (torch.linalg.vector_norm(outline.rim[:, [0, 2]], dim=-1) - ring).abs().max() < 0.0025
+    assert _angles(outline.rim_normals, outline.rim / 0.04).max() < 20
+    probe = torch.tensor([[0.0, -0.2, 0.0], [0.2, 0.0, 0.0], [0.0, 0.03, 0.0], [0.0, 0.07, 0.0]], dtype=torch.float64)
+    hull = outline.hull_distance(probe)
+    assert hull[0] < 0 and hull[1].item() == pytest.approx(0.16, abs=0.004) and hull[2] < 0
+    violation = outline.violation(probe)
+    assert violation[0] == 0 and violation[2] == 0
+    assert violation[1] == hull[1] and violation[3].item() == pytest.approx(0.03 - 0.002, abs=0.002)
+
+
+def test_a_single_view_is_told_from_a_whole_surface(seen_cylinder: PointCloud):
+    assert seen_from_one_side(seen_cylinder, CAMERA)
+    assert seen_cylinder.normals is not None
+    turned = torch.cat([seen_cylinder.normals, -seen_cylinder.normals])
+    assert not seen_from_one_side(PointCloud(seen_cylinder.points.repeat(2, 1), turned), CAMERA)
+
+
+def test_farthest_points_are_all_points_when_there_are_few():
+    p = torch.rand(5, 3, generator=torch.Generator().manual_seed(0))
+    assert sorted(farthest_points(p, 9).tolist()) == [0, 1, 2, 3, 4]
+    assert len(farthest_points(p[:0], 9)) == 0

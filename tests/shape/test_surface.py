@@ -1,0 +1,55 @@
+"""The zero level of a sphere's posterior against the sphere."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from torchgrasp.errors import BadArgument
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.support import fit_shape
+from torchgrasp.shape.surface import extract_surface
+from torchgrasp.values import PointCloud
+
+RADIUS, CENTER = 0.04, torch.tensor([0.2, -0.1, 0.3], dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def ball() -> ShapeGP:
+    n = torch.randn(800, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    n = n / torch.linalg.vector_norm(n, dim=-1, keepdim=True)
+    return fit_shape(PointCloud(RADIUS * n + CENTER, n))
+
+
+def test_eq9_surface_is_the_zero_level_closed_and_wound_outward(ball: ShapeGP):
+    surface = extract_surface(ball, resolution=24)
+    found = ball.predict(surface.vertices)
+    assert found.distance.abs().max() < 1e-6
+    torch.testing.assert_close(surface.normals, found.normal, rtol=0, atol=1e-6)
+    torch.testing.assert_close(surface.std_m, found.std_m, rtol=1e-4, atol=1e-7)
+    mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy(), process=False)
+    assert mesh.is_watertight and mesh.body_count == 1
+    assert mesh.volume == pytest.approx(4 / 3 * math.pi * RADIUS**3, rel=0.1)
+    assert np.abs(np.linalg.norm(mesh.vertices - CENTER.numpy(), axis=1) - RADIUS).max() < 0.002
+
+
+def test_a_finer_grid_gives_more_triangles_on_the_same_surface(ball: ShapeGP):
+    coarse, fine = extract_surface(ball, 16), extract_surface(ball, 32)
+    assert len(fine.faces) > 3 * len(coarse.faces)
+    assert torch.cdist(coarse.vertices, fine.vertices).amin(1).max() < 0.006
+
+
+def test_surface_carries_the_cloud_of_one_view(seen_cylinder: PointCloud):
+    surface = extract_surface(fit_shape(seen_cylinder, table=0.0), resolution=32)
+    mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy(), process=False)
+    _, distance, _ = trimesh.proximity.closest_point(mesh, seen_cylinder.points[::10].numpy())
+    assert np.median(distance) < 0.001
+    assert mesh.volume == pytest.approx(math.pi * 0.03**2 * 0.12, rel=0.2)
+
+
+@pytest.mark.parametrize("resolution", [0, 7, 257])
+def test_a_resolution_out_of_range_is_refused(ball: ShapeGP, resolution: int):
+    with pytest.raises(BadArgument, match="resolution"):
+        extract_surface(ball, resolution)
