@@ -1,7 +1,8 @@
 """A sphere cover of the hand's links, for penalties against the object and the table.
 
 It is made from the collision shapes of the URDF, which are what the simulator sees. Each shape is cut into cells and
-each cell gets a sphere that reaches its corners up to 1 mm. Spheres stand out of flat faces by 2 to 3 mm.
+each cell gets a sphere. Spheres stand out of flat faces by at most 4 mm, so that nothing whose radius of curvature is
+25 mm or more can reach a face between them; edges of fingers stick out by up to 4 mm, corners of the palm by 9 mm.
 """
 
 import dataclasses
@@ -16,14 +17,14 @@ from torchgrasp.hand.spec import HandSpec
 from torchgrasp.hand.urdf import Shape, Urdf
 from torchgrasp.values import Value
 
-PITCH = 0.014
-"""Longest cell of a finger [m]."""
-PALM_PITCH = 0.020
-"""Longest cell of the palm [m]."""
+PITCH = 0.015
+"""Edge of a finger's cells [m]."""
+PALM_PITCH = 0.022
+"""Edge of the palm's cells [m]."""
 THICK = 0.025
 """A shape thinner than this [m] has one layer of cells across."""
-BULGE = 0.003
-"""How far a sphere may stand out of the shape's thinnest faces [m]."""
+BULGE = 0.004
+"""How far a sphere may stand out of a shape's faces [m]."""
 SHORT = 0.001
 """How far a sphere may stay short of its cell's corners [m]."""
 
@@ -74,9 +75,10 @@ def _spheres(shape: Shape, pitch: float) -> list[tuple[tuple[float, ...], float]
         return [(shape.xyz, shape.size[0])]
     round_shape = shape.kind == "cylinder"
     size = (2 * shape.size[0], 2 * shape.size[0], shape.size[1]) if round_shape else shape.size
-    counts = [1 if s == min(size) and s < THICK else math.ceil(s / pitch) for s in size]
-    half = [s / n / 2 for s, n in zip(size, counts, strict=True)]
-    radius = min(math.hypot(*half) - SHORT, min(half) + (BULGE if 1 in counts else math.inf))
+    counts = [1 if x == min(size) and x < THICK else max(1, round(x / pitch)) for x in size]
+    half = [x / n / 2 for x, n in zip(size, counts, strict=True)]
+    thinnest = min((x / 2 for x, n in zip(size, counts, strict=True) if n == 1), default=math.inf)
+    radius = min(math.hypot(*half) - SHORT, thinnest + BULGE)
     local = []
     for cell in itertools.product(*(range(n) for n in counts)):
         if all(0 < c < n - 1 for c, n in zip(cell, counts, strict=True)):

@@ -1,0 +1,221 @@
+"""The hand as a value: kinematics against yourdfpy, derivatives against finite differences, facts of the two hands."""
+
+import math
+
+import pytest
+import torch
+
+from torchgrasp.errors import BadArgument, HandFileError
+from torchgrasp.hand.hand import Hand, load_hand
+from torchgrasp.testing import largest_fk_error
+
+HANDS = [("allegro", "default"), ("allegro", "paper_literal"), ("barrett", "default")]
+
+
+@pytest.fixture(params=HANDS, ids=["-".join(h) for h in HANDS])
+def hand(request) -> Hand:
+    return load_hand(*request.param)
+
+
+def postures(hand: Hand, n: int, generator: torch.Generator) -> torch.Tensor:
+    share = torch.rand(n, hand.dof, generator=generator, dtype=torch.float64)
+    return hand.lower + (hand.upper - hand.lower) * share
+
+
+def test_fk_equals_yourdfpy_coupled_joints_included(hand, generator):
+    error, link = largest_fk_error(hand, postures(hand, 200, generator))
+    assert error < 1e-6, link
+
+
+def test_fk_float32_within_a_micrometre(hand, generator):
+    joints = postures(hand, 500, generator)
+    points, normals = hand.fingertips(joints)
+    points32, normals32 = hand.fingertips(joints.float())
+    assert points32.dtype == torch.float32
+    torch.testing.assert_close(points32.double(), points, atol=1e-6, rtol=0)
+    torch.testing.assert_close(normals32.double(), normals, atol=2e-6, rtol=0)
+
+
+def test_jacobian_equals_finite_differences(hand, generator):
+    joints = postures(hand, 20, generator)
+    jacobian, step = hand.jacobian(joints), 1e-5
+    for j in range(hand.dof):
+        shift = torch.zeros(hand.dof, dtype=torch.float64)
+        shift[j] = step
+        difference = (hand.fingertips(joints + shift)[0] - hand.fingertips(joints - shift)[0]) / (2 * step)
+        torch.testing.assert_close(jacobian[..., j], difference, atol=1e-7, rtol=1e-6)
+
+
+def test_point_and_direction_jacobians_equal_autograd(hand, generator):
+    joints = postures(hand, 1, generator)[0]
+    poses, cover = hand.link_poses(joints), hand.collision_spheres
+    found = hand.point_jacobian(poses, cover.link_index, hand.spheres(joints))
+    truth = torch.autograd.functional.jacobian(hand.spheres, joints)
+    torch.testing.assert_close(found, truth, atol=2e-8, rtol=1e-6)
+    found = hand.direction_jacobian(poses, hand.tip_index, hand.fingertips(joints)[1])
+    truth = torch.autograd.functional.jacobian(lambda q: hand.fingertips(q)[1], joints)
+    torch.testing.assert_close(found, truth, atol=1e-6, rtol=1e-6)
+
+
+def test_batch_equals_singles_and_keeps_its_shape(hand, generator):
+    joints = postures(hand, 6, generator).reshape(2, 3, hand.dof)
+    points, normals = hand.fingertips(joints)
+    assert points.shape == normals.shape == (2, 3, 3, 3)
+    assert hand.jacobian(joints).shape == (2, 3, 3, 3, hand.dof)
+    assert hand.self_clearance(joints).shape == (2, 3)
+    torch.testing.assert_close(points[1, 2], hand.fingertips(joints[1, 2])[0], atol=1e-12, rtol=0)
+    torch.testing.assert_close(hand.self_clearance(joints)[1, 2], hand.self_clearance(joints[1, 2]))
+    empty = joints[:0]
+    assert hand.fingertips(empty)[0].shape == (0, 3, 3, 3)
+    assert hand.self_clearance(empty).shape == (0, 3)
+
+
+def test_contact_lies_on_the_tips_sphere_along_the_normal(hand, generator):
+    joints = postures(hand, 50, generator)
+    points, normals = hand.fingertips(joints)
+    radius = hand.tip_radius[:, None]
+    torch.testing.assert_close(torch.linalg.vector_norm(normals, dim=-1), torch.ones(50, 3, dtype=torch.float64))
+    torch.testing.assert_close(hand.tip_centres(joints) + radius * normals, points, atol=1e-8, rtol=0)
+
+
+def test_expand_names_every_joint_and_couples_exactly():
+    hand = load_hand("barrett")
+    joints = torch.tensor([1.0, 0.3, 0.6, 0.9], dtype=torch.float64)
+    q = hand.expand(joints)
+    assert set(q) == set(hand.urdf_joint_names)
+    assert len(q) == 8
+    assert q["spread_mimic"] == q["spread"] == 1.0
+    for k, value in enumerate((0.1, 0.2, 0.3), start=1):
+        assert float(q[f"f{k}_distal"]) == pytest.approx(value, abs=1e-15)
+    allegro = load_hand("allegro").expand(torch.zeros(12))
+    assert float(allegro["joint_9"]) == pytest.approx(-0.196)  # the ring finger is parked
+
+
+def test_barrett_is_the_published_hand():
+    hand = load_hand("barrett")
+    poses = dict(zip(hand.link_names, hand.link_poses(torch.zeros(4, dtype=torch.float64)), strict=True))
+    expected = {"f1_dist": (-25.0, -119.94, 78.4), "f2_dist": (25.0, -119.94, 78.4), "f3_dist": (0.0, 119.94, 78.4)}
+    for link, mm in expected.items():
+        torch.testing.assert_close(poses[link][:3, 3] * 1e3, torch.tensor(mm).double(), atol=1e-3, rtol=0)
+    # spread by half a turn brings fingers 1 and 2 to the side of finger 3
+    joints = torch.tensor([math.pi, 0.5, 0.5, 0.5], dtype=torch.float64)
+    points, _ = hand.fingertips(joints)
+    assert bool((points[:, 1] > 0.05).all())
+    torch.testing.assert_close(points[0, 1:], points[2, 1:], atol=1e-6, rtol=0)
+
+
+def test_barrett_is_symmetric_left_to_right(generator):
+    hand = load_hand("barrett")
+    joints = postures(hand, 20, generator)
+    mirrored = joints[:, [0, 2, 1, 3]]
+    flip = torch.tensor([-1.0, 1, 1], dtype=torch.float64)
+    middle = torch.tensor([0.0, 0, 0.0006], dtype=torch.float64)  # the fingers' middle plane is 0.6 mm off their axis
+    points, _ = hand.fingertips(joints)
+    others, _ = hand.fingertips(mirrored)
+    torch.testing.assert_close(points[:, 2], others[:, 2] * flip, atol=2 * middle.norm().item() + 1e-6, rtol=0)
+    torch.testing.assert_close(points[:, 0], others[:, 1] * flip, atol=2 * middle.norm().item() + 1e-6, rtol=0)
+
+
+def test_allegro_thumb_opposes_the_fingers(generator):
+    hand = load_hand("allegro")
+    joints = postures(hand, 500, generator)
+    joints = joints[hand.self_clearance(joints) > 0]
+    _, normals = hand.fingertips(joints)
+    cosines = (normals[:, :2] * normals[:, 2:]).sum(-1)
+    assert float((cosines < -0.5).any(1).double().mean()) > 0.5
+    extended, _ = hand.fingertips(torch.zeros(12, dtype=torch.float64))
+    torch.testing.assert_close(
+        extended[0, 1] - extended[1, 1], torch.tensor(0.0435 + 0.0126).double(), atol=2e-3, rtol=0
+    )
+
+
+def test_self_collision_rates_are_those_of_the_hands(generator):
+    allegro, barrett = load_hand("allegro"), load_hand("barrett")
+    share = [
+        float((h.self_clearance(postures(h, 1500, generator).float()) < 0).double().mean()) for h in (allegro, barrett)
+    ]
+    assert 0.18 < share[0] < 0.28  # 0.346 by exact hulls with all four fingers moving; the ring finger is parked here
+    assert 0.15 < share[1] < 0.27  # 0.187 by exact hulls; boxes and capsules bulge
+
+
+def test_self_clearance_is_the_least_distance_of_sampled_capsules(hand, generator):
+    joints = postures(hand, 5, generator)
+    poses, c = hand.link_poses(joints), hand.self_collision
+    start, end = c.axes(poses)
+    along = torch.linspace(0, 1, 60, dtype=torch.float64)[:, None]
+    points = start[:, :, None] + along * (end - start)[:, :, None]
+    i, j = c.capsule_pairs.unbind(1)
+    sampled = torch.stack([torch.cdist(points[:, a], points[:, b]).amin((1, 2)) for a, b in zip(i, j, strict=True)])
+    sampled = sampled - (c.radius[i] + c.radius[j])[:, None]
+    exact = c.capsule_distances(poses)
+    assert float((exact - sampled).max()) < 1e-7
+    assert float((sampled - exact).max()) < 1.5e-3
+
+
+def test_clearance_gradient_equals_finite_differences(generator):
+    hand = load_hand("allegro")
+    joints = postures(hand, 40, generator).requires_grad_()
+    (gradient,) = torch.autograd.grad(hand.self_clearance(joints).sum(), joints)
+    step = 1e-6 * torch.randn(40, 12, generator=generator, dtype=torch.float64)
+    with torch.no_grad():
+        change = (hand.self_clearance(joints + step) - hand.self_clearance(joints - step)) / 2
+    same = (change - (gradient * step).sum(1)).abs() < 1e-3 * step.norm(dim=1)
+    assert float(same.double().mean()) > 0.9  # the rest: the closest pair changes within the step
+
+
+def test_spheres_cover_the_collision_shapes(hand):
+    from torchgrasp.hand.cover import rotation_from_rpy
+    from torchgrasp.hand.urdf import read_urdf
+
+    cover, generator = hand.collision_spheres, torch.Generator().manual_seed(0)
+    for index, link in enumerate(read_urdf(hand.urdf_path).links):
+        for shape in link.shapes:
+            if shape.kind != "box":
+                continue
+            half = torch.tensor(shape.size, dtype=torch.float64) / 2
+            points = (2 * torch.rand(500, 3, generator=generator, dtype=torch.float64) - 1) * half
+            side = torch.randint(3, (500,), generator=generator)
+            points[torch.arange(500), side] = half[side]  # on the faces
+            points = points @ rotation_from_rpy(shape.rpy).T + torch.tensor(shape.xyz, dtype=torch.float64)
+            mine = cover.link_index == index
+            gap = (torch.cdist(points, cover.center[mine]) - cover.radius[mine]).amin(1)
+            assert float(gap.max()) < (0.009 if link.name == "palm" else 0.004), link.name
+
+
+def test_touching_spheres_are_the_three_tips(hand):
+    cover = hand.collision_spheres
+    assert cover.link_index[cover.touching].tolist() == sorted(hand.tip_index.tolist())
+    assert set(cover.finger.tolist()) == ({-2, -1, 0, 1, 2} if hand.name == "allegro" else {-1, 0, 1, 2})
+
+
+def test_joints_outside_the_limits_are_named():
+    hand = load_hand("allegro")
+    joints = torch.zeros(2, 12)
+    joints[:, 8:] = 0.3
+    assert hand.check_joints(joints) is joints
+    joints[1, 9] = 2.0
+    with pytest.raises(BadArgument, match=r"joint_13.*1\.163"):
+        hand.check_joints(joints)
+    joints[1, 9] = torch.nan
+    with pytest.raises(BadArgument, match="nan for joint_13"):
+        hand.check_joints(joints)
+    with pytest.raises(BadArgument, match="12 joints"):
+        hand.fingertips(torch.zeros(2, 16))
+
+
+def test_unknown_hand_and_option_are_named(tmp_path):
+    with pytest.raises(HandFileError, match=r"allegro.*barrett"):
+        load_hand("shadow")
+    with pytest.raises(HandFileError, match=r"hand\.toml"):
+        load_hand(tmp_path)
+    with pytest.raises(BadArgument, match="paper_literal"):
+        load_hand("allegro", "thumbs")
+
+
+def test_to_moves_every_tensor_and_leaves_the_hand_as_it_was():
+    hand = load_hand("allegro")
+    moved = hand.to(torch.float32)
+    assert moved.lower.dtype == moved.collision_spheres.radius.dtype == torch.float32
+    assert hand.lower.dtype == torch.float64
+    assert moved.child.dtype == torch.int64
+    assert moved.fingertips(torch.zeros(1, 12))[0].shape == (1, 3, 3)
