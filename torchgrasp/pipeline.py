@@ -43,7 +43,7 @@ def spread_rows(plan: ContactPlan, most: int) -> Int[Tensor, "k"]:
     if len(rows) <= most:
         return rows
     points = plan.contacts.points[rows]
-    order = points[..., 2].argsort(1, stable=True)
+    order = torch.argsort(points[..., 2], dim=1, stable=True)
     place = points.gather(1, order[..., None].expand(-1, -1, 3)).flatten(1)
     chosen = torch.zeros(most, dtype=torch.int64, device=rows.device)
     chosen[0] = plan.quality[rows].argmin()

@@ -1,5 +1,6 @@
 """The mixture against torch.distributions, brute-force Bayes and Monte Carlo; its file against abuse."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -169,3 +170,23 @@ def test_bad_mixtures_do_not_exist():
         GraspMixture(good.weights, good.means, good.covariances, tuple("abcdefgh"))
     with pytest.raises(BadArgument, match="x: found shape"):
         good.log_prob(torch.zeros(3, 5))
+
+
+def test_a_loosened_mixture_is_the_one_of_noisy_codes(generator):
+    """Adding noise to samples of the mixture gives samples of the loosened one."""
+    mixture = load_mixture("barrett").loosened(0.0, 0.0)
+    assert torch.equal(mixture.covariances, load_mixture("barrett").covariances)
+    loose = mixture.loosened(0.01, 0.5)
+    added = torch.linalg.eigvalsh(loose.covariances - mixture.covariances)
+    assert float(added.min()) >= -1e-12
+    q = mixture.means[:, -6:]
+    assert bool((loose.reach(q + 0.01) <= mixture.reach(q + 0.01)).all())
+    # one component: the posterior of the joints is the regression on a noisy observation
+    noise = torch.diag(torch.tensor([0.01**2] * 3 + [0.5**2] * 3, dtype=torch.float64))
+    joint, code = slice(None, -6), slice(-6, None)
+    sigma, mean = mixture.covariances[0], mixture.means[0]
+    single = dataclasses.replace(
+        mixture, weights=torch.ones(1, dtype=torch.float64), means=mean[None], covariances=sigma[None]
+    ).loosened(0.01, 0.5)
+    expected = mean[joint] + sigma[joint, code] @ torch.linalg.solve(sigma[code, code] + noise, q[1] - mean[code])
+    torch.testing.assert_close(single.joints(q[1]), expected)

@@ -8,7 +8,7 @@ import dataclasses
 import math
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.errors import Status
@@ -56,7 +56,7 @@ def link_clearance(screws: Screws, surroundings: Surroundings, tips_touch: bool)
     centres = screws.points(cover.link_index, cover.center)
     radius = cover.radius.to(centres)
     free = surroundings.field.query(centres)[0] - radius
-    touches: Bool[Tensor, "s"] = cover.touching
+    touches = cover.touching
     tips = free[:, touches].amin(1) if bool(touches.any()) else torch.full_like(free[:, 0], math.inf)
     links = free[:, ~touches].amin(1) if tips_touch else free.amin(1)
     if surroundings.table is None:

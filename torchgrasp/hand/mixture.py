@@ -160,6 +160,26 @@ class GraspMixture(Value):
         found = torch.cat(joints).reshape(*shape, len(self.joint_names))
         return found.to(q.dtype), torch.cat(weights).reshape(shape).to(q.dtype)
 
+    def loosened(self, lengths: float, cosines: float) -> "GraspMixture":
+        """Return the mixture of codes observed with independent Gaussian noise: its variances are added to Sigma_q.
+
+        A round fingertip rolls: the code of what it can touch differs from that of its pad's middle by some
+        millimetres and by the pad's cone. Where codes fill a thin manifold (the Barrett hand's four joints), Eq. (21)
+        refuses almost every contact triple that the hand can take, unless this slack is granted.
+
+        Args:
+            lengths: standard deviation [m] of L1 L2 L3.
+            cosines: standard deviation of N1 N2 N3.
+
+        Raises:
+            BadArgument: a negative number.
+        """
+        if not (lengths >= 0 and cosines >= 0):
+            raise BadArgument("lengths, cosines", (lengths, cosines), "two numbers of at least 0")
+        noise = torch.zeros(len(self.names)).to(self.covariances)
+        noise[-6:-3], noise[-3:] = lengths**2, cosines**2
+        return dataclasses.replace(self, covariances=self.covariances + torch.diag(noise))
+
     def _log_responsibility(self, q: Float[Tensor, "n 6"]) -> Float[Tensor, "n m"]:
         """Return log h_i of Eq. (23); in logarithms a code far from every component still has its nearest."""
         return torch.log_softmax(self.weights.double().log() + self._marginal.log_densities(q), dim=-1)

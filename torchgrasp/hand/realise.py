@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchgrasp.errors import Status
 from torchgrasp.hand.check import check
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.rank import score
 from torchgrasp.hand.refine import Posture, Surroundings, badness, open_hand, refine
-from torchgrasp.errors import Status
-from torchgrasp.values import Certificate, Contacts, Grasps, GraspGuess
+from torchgrasp.values import Certificate, Contacts, GraspGuess, Grasps
 
 ROUNDS = ((1200, 4, 0), (500, 3, 12), (240, 2, 30))
 """Rows that enter each round, how many of them for one contact triple, and the iterations spent before it."""
