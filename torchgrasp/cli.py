@@ -1,0 +1,252 @@
+"""The command line: `torchgrasp grasp` goes from a cloud to grasps and on to a held object; `torchgrasp objects` lists.
+
+Exit codes: 0 the job is done; 1 no grasp is executable, or the object was not held; 2 a bad input, with one sentence
+on stderr; 130 interrupted.
+"""
+
+import contextlib
+import importlib.util
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+from tqdm import tqdm
+
+from torchgrasp.close.parts import read_mesh
+from torchgrasp.close.trial import close_hand
+from torchgrasp.cloud.read import read_cloud
+from torchgrasp.errors import BadArgument, GraspError, MissingExtra, OutputError
+from torchgrasp.files import sha256
+from torchgrasp.hand.hand import load_hand
+from torchgrasp.objects import DATA, MASSES, list_objects, load_object
+from torchgrasp.pipeline import plan_grasps
+from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows, write_report
+from torchgrasp.report.run import Run, Stage, verdict
+from torchgrasp.shape.surface import extract_surface
+from torchgrasp.values import ContactSpec, Grasps, TrialSpec
+
+if TYPE_CHECKING:
+    import trimesh
+
+PLANNING = ("shape", "plan", "certify", "query", "refine")
+"""The stages that `plan_grasps` reports, in their order."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code; every error of this library ends as one sentence on stderr."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given == ["--version"]:
+        from torchgrasp import __version__
+
+        print(f"torchgrasp {__version__}")
+        return 0
+    try:
+        return tyro.extras.subcommand_cli_from_dict(
+            {"grasp": grasp, "objects": objects},
+            prog="torchgrasp",
+            description="Dexterous fingertip grasps from a partial point cloud.",
+            args=given,
+            config=(tyro.conf.FlagCreatePairsOff,),
+        )
+    except GraspError as error:
+        print(f"torchgrasp: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("torchgrasp: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader of stdout went away; nobody is left to be told
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def objects() -> int:
+    """List the objects that come with torchgrasp: a noisy view to plan on and the true mesh to close on."""
+    for name in list_objects():
+        print(f"{name} ({MASSES[name]:g} kg)\n  view: {DATA / name / 'view.ply'}\n  mesh: {DATA / name / 'mesh.ply'}")
+    return 0
+
+
+def grasp(
+    cloud: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CLOUD")],
+    /,
+    hand: str,
+    out: Path,
+    mesh: Path | None = None,
+    close: bool = False,
+    seed: int = 0,
+    starts: int = 1000,
+    viewpoint: tuple[float, float, float] | None = None,
+    table: float | None = None,
+    no_table: bool = False,
+    friction: float = 0.8,
+) -> int:
+    """Plan grasps of the object of a partial point cloud, and close on it in simulation.
+
+    Writes grasps.safetensors and report.html into the output folder.
+
+    Args:
+        cloud: point cloud of one object in metres, z up (.ply, .pcd, .npy, .npz, .xyz).
+        hand: allegro, barrett, or the folder of another hand.
+        out: folder of the results; it is made where it does not exist.
+        mesh: true mesh of the object [m] in the frame of the cloud; only the simulator sees it.
+        close: close the best grasp on the mesh, lift it and hold it (needs the extra "sim").
+        seed: of every random draw; the same seed gives the same grasps.
+        starts: random starts of the contact planner.
+        viewpoint: position of the camera in the frame of the cloud; by default the file's, else it is estimated.
+        table: height of the table [m]; by default the lowest point of the cloud.
+        no_table: there is no table.
+        friction: coefficient of friction between fingertips and object.
+    """
+    with _naming("--out", "path"):
+        check_folder(out)
+    if close and mesh is None:
+        raise BadArgument("--close", "no --mesh", "--close together with --mesh")
+    if close and importlib.util.find_spec("sapien") is None:
+        raise MissingExtra("sapien", "sim")
+    if table is not None and no_table:
+        raise BadArgument("--table", f"{table:g} and --no-table", "one of the two")
+    if not 1 <= starts <= 1_000_000:
+        raise BadArgument("--starts", starts, "an integer in [1, 1000000]")
+    if not 0 <= seed < 2**63:
+        raise BadArgument("--seed", seed, "an integer in [0, 2^63)")
+    with _naming("--hand", "hand", "name"):
+        the_hand = load_hand(hand)
+    with _naming("CLOUD", "path", "points", "normals"), _naming("--viewpoint", "viewpoint"):
+        seen = read_cloud(cloud, viewpoint)
+    true_mesh, parts = None, None
+    if mesh is not None:
+        with _naming("--mesh", "mesh"):
+            true_mesh, parts = read_true_mesh(mesh)
+    height = None if no_table else float(seen.points[:, 2].min()) if table is None else table
+    with _naming("--friction", "friction"), _naming("--table", "table"):
+        spec = ContactSpec(friction=friction, table=height)
+        trial = TrialSpec(friction=friction)
+
+    extra = ("closing",) * close
+    with _Progress((*PLANNING, *extra, "report")) as progress:
+        origin = "no table" if height is None else f"table at z = {height:.3f} m"
+        origin += " (lowest point)" * (height is not None and table is None)
+        camera = "camera known" if seen.viewpoint is not None else "camera estimated"
+        progress.end("cloud", f"{len(seen)} points, {camera}, {origin}")
+        grasps = plan_grasps(seen, the_hand, spec, starts, seed, observer=progress.end)
+        surface = extract_surface(progress.values["shape"])
+        name = object_name(cloud if mesh is None else mesh)
+        run = Run(name, cloud, seen, the_hand, spec, surface, grasps, tuple(progress.stages))
+        if close and true_mesh is not None and len(run.executable):
+            closure = close_hand(run.executable[0], the_hand, true_mesh, trial, seed=seed, parts=parts)
+            progress.end("closing", f"{closure.time[-1]:.1f} s simulated, {closure.status.name.lower()}")
+            run = Run(name, cloud, seen, the_hand, spec, surface, grasps, tuple(progress.stages), true_mesh, closure)
+        with _naming("--out", "path"):
+            grasps.save(out / "grasps.safetensors")
+            write_report(out / "report.html", run)
+        progress.end("report", f"{out / 'grasps.safetensors'}, {out / 'report.html'}")
+    print_table(run.executable)
+    print(verdict(run))
+    done = bool(len(run.executable)) if not close else run.closure is not None and run.closure.held
+    return 0 if done else 1
+
+
+def check_folder(path: Path) -> None:
+    """Refuse a folder that cannot be made or written, by trying; whatever was made for the trial is removed.
+
+    Raises:
+        OutputError: the folder cannot be made or written.
+    """
+    made: list[Path] = []
+    try:
+        for folder in reversed([path, *path.parents]):
+            if not folder.exists():
+                folder.mkdir()
+                made.append(folder)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise OutputError("path", f"{path} ({error.strerror or error})", "a folder that can be written") from error
+    finally:
+        for folder in reversed(made):
+            folder.rmdir()
+
+
+def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] | None]":
+    """Read a closed mesh, and its convex parts when it is one of the objects that come with torchgrasp.
+
+    Raises:
+        MeshError: the mesh is missing, open, or without volume.
+    """
+    mesh, digest = read_mesh(path), sha256(path)
+    for name in list_objects():
+        if sha256(DATA / name / "mesh.ply") == digest:
+            return mesh, load_object(name).parts
+    return mesh, None
+
+
+def object_name(path: Path) -> str:
+    """Name an object by its file, or by the file's folder where the file has a generic name.
+
+    >>> object_name(Path("objects/jug/mesh.ply")), object_name(Path("mug.pcd"))
+    ('jug', 'mug')
+    """
+    generic = path.stem.rstrip("0123456789") in ("mesh", "view", "cloud", "model", "points")
+    return path.resolve().parent.name or "object" if generic else path.stem
+
+
+def print_table(grasps: Grasps, most: int = 5) -> None:
+    """Print the best grasps, one a line."""
+    if not len(grasps):
+        return
+    rows = [GRASP_COLUMNS, *grasp_rows(grasps, most)]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(GRASP_COLUMNS))]
+    print()
+    for row in rows:
+        print("  ".join(value.rjust(width) for value, width in zip(row, widths, strict=True)))
+    print()
+
+
+@contextlib.contextmanager
+def _naming(option: str, *names: str) -> Iterator[None]:
+    """Give an error that names one of `names` the name of the option that the value came from."""
+    try:
+        yield
+    except BadArgument as error:
+        if error.argument not in names:
+            raise
+        raise type(error)(option, error.found, error.allowed) from error
+
+
+class _Progress:
+    """A line on stdout for each stage that ended, and on a terminal a bar that names the stage under way."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.names = names
+        self.stages: list[Stage] = []
+        self.values: dict[str, Any] = {}
+
+    def __enter__(self) -> "_Progress":
+        """Start the clock and the bar."""
+        self.began = time.perf_counter()
+        # None: silent where stderr is no terminal.
+        self.bar = tqdm(total=len(self.names), desc=self.names[0], leave=False, delay=1, disable=None, unit="stage")
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Wipe the bar away."""
+        self.bar.close()
+
+    def end(self, name: str, message: str, value: Any = None) -> None:
+        """Note the end of a stage."""
+        now = time.perf_counter()
+        self.stages.append(Stage(name, message, now - self.began))
+        self.values[name] = value
+        with self.bar.external_write_mode(sys.stdout):
+            print(f"{name:8}{now - self.began:6.1f} s  {message}", flush=True)
+        self.began = now
+        if name in self.names:
+            self.bar.update()
+            following = self.names.index(name) + 1
+            if following < len(self.names):
+                self.bar.set_description(self.names[following])

@@ -1,0 +1,75 @@
+"""One run from cloud to grasps, and perhaps to a closure: what the report shows, and its verdicts in words."""
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from torchgrasp.errors import Status
+from torchgrasp.hand.hand import Hand
+from torchgrasp.shape.surface import Surface
+from torchgrasp.values import ClosureResult, ContactSpec, Grasps, PointCloud, count_status
+
+if TYPE_CHECKING:
+    import trimesh
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """A stage that ended: its name, one line about its result, and its wall time [s]."""
+
+    name: str
+    message: str
+    seconds: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """Everything that a report shows; `closure` was simulated with the true object `mesh`, or both are None."""
+
+    object_name: str
+    source: Path
+    cloud: PointCloud
+    hand: Hand
+    spec: ContactSpec
+    surface: Surface
+    grasps: Grasps
+    stages: tuple[Stage, ...]
+    mesh: "trimesh.Trimesh | None" = None
+    closure: ClosureResult | None = None
+
+    @property
+    def executable(self) -> Grasps:
+        """The grasps that passed every check, best first."""
+        return self.grasps[self.grasps.status == Status.OK]
+
+
+def verdict(run: Run) -> str:
+    """Say in one sentence what the run ended with."""
+    if run.closure is not None:
+        return closing_sentence(run.closure, run.hand.name, run.object_name)
+    found = len(run.executable)
+    if found:
+        return f"The {run.hand.name} hand has {found} executable grasp{'s' * (found > 1)} of the {run.object_name}."
+    return refusal(run.grasps, run.hand.name, run.object_name)
+
+
+def closing_sentence(closure: ClosureResult, hand_name: str, object_name: str) -> str:
+    """Say whether the object was held, how high it was lifted and how far it moved in the hand."""
+    if not closure.held:
+        return f"The {hand_name} hand did not hold the {object_name}: {closure.status.sentence}."
+    rise = float(closure.object_pose[-1, 2, 3] - closure.object_pose[0, 2, 3])
+    moved, angle = closure.object_motion
+    return (
+        f"The {hand_name} hand held the {object_name}: lifted {rise:.2f} m, "
+        f"moved {1e3 * moved:.0f} mm and {math.degrees(angle):.0f} deg in the hand."
+    )
+
+
+def refusal(grasps: Grasps, hand_name: str, object_name: str) -> str:
+    """Say why no grasp is executable: the number of candidates for each reason."""
+    counts = count_status(grasps.status) if len(grasps) else {}
+    if not counts:
+        return f"The {hand_name} hand has no executable grasp of the {object_name}: {Status.OUT_OF_REACH.sentence}."
+    reasons = "; ".join(f"{n} of {len(grasps)}: {status.sentence}" for status, n in counts.items())
+    return f"The {hand_name} hand has no executable grasp of the {object_name} ({reasons})."

@@ -1,0 +1,78 @@
+"""The hand as solids to draw: the collision shapes of its URDF in the poses of their links, each with its finger."""
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.urdf import Shape, read_urdf
+
+if TYPE_CHECKING:
+    import trimesh
+
+PARKED = -1
+"""Instead of a finger: a link that no grasping finger owns, such as the palm or a parked finger."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Solid:
+    """A triangle mesh in the frame of the picture, and the grasping finger (0, 1, 2) or `PARKED` that it is part of."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: np.ndarray
+    finger: int
+
+
+def solids_from_hand(
+    hand: Hand, joints: Float[Tensor, " j"], names: tuple[str, ...], obj_from_hand: Float[Tensor, "4 4"]
+) -> list[Solid]:
+    """Return the shapes of a hand at one posture.
+
+    Args:
+        hand: the hand.
+        joints: every movable joint of its URDF [rad].
+        names: the names of `joints`.
+        obj_from_hand: the pose of the hand's base in the frame of the picture.
+    """
+    values = torch.stack([joints[names.index(n)] for n in hand.urdf_joint_names]).double()
+    poses = (obj_from_hand.double() @ hand.kinematics.poses(values[None])[0]).cpu().numpy()
+    shapes = {link.name: link.shapes for link in read_urdf(hand.urdf_path).links}
+    fingers = finger_of_links(hand)
+    solids = []
+    for pose, name in zip(poses, hand.link_names, strict=True):
+        for shape in shapes[name]:
+            mesh = _mesh(shape)
+            vertices = np.asarray(mesh.vertices) @ pose[:3, :3].T + pose[:3, 3]
+            solids.append(Solid(vertices, np.asarray(mesh.faces), fingers[name]))
+    return solids
+
+
+def finger_of_links(hand: Hand) -> dict[str, int]:
+    """Return the finger of every link: the one whose fingertip is moved by all joints that move the link."""
+    moves = hand.moves.bool().cpu()
+    found = {}
+    for link, name in enumerate(hand.link_names):
+        mine = moves[link]
+        owners = [f for f in range(3) if bool(mine.any()) and bool(moves[hand.tip_index[f]][mine].all())]
+        found[name] = owners[0] if len(owners) == 1 else PARKED
+    return found
+
+
+def _mesh(shape: Shape) -> "trimesh.Trimesh":
+    """Return the mesh of a box, a cylinder or a sphere in the frame of its link."""
+    from trimesh import creation
+    from trimesh.transformations import euler_matrix
+
+    if shape.kind == "box":
+        mesh = creation.box(shape.size)
+    elif shape.kind == "sphere":
+        mesh = creation.uv_sphere(shape.size[0], count=[24, 24])
+    else:
+        mesh = creation.cylinder(shape.size[0], shape.size[1], sections=40)
+    place = euler_matrix(*shape.rpy, axes="sxyz")
+    place[:3, 3] = shape.xyz
+    return mesh.apply_transform(place)
