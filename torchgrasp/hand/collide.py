@@ -184,7 +184,7 @@ class _Surface:
     """Dense samples of a surface in a tree, for the distances of many points."""
 
     def __init__(self, vertices: Tensor, faces_or_normals: Tensor):
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
         points, other = vertices.detach().cpu().double().numpy(), faces_or_normals.detach().cpu().numpy()
         if other.ndim != 2 or other.shape[1] != 3 or len(other) == 0:
@@ -194,7 +194,7 @@ class _Surface:
                 raise BadArgument("faces_or_normals", f"{len(other)} normals", f"{len(points)}, one for each vertex")
             self.triangles, self.owner = None, np.arange(len(points))
             self.samples, self.normals = points, other / np.linalg.norm(other, axis=1, keepdims=True)
-            self.tree = cKDTree(self.samples)
+            self.tree = KDTree(self.samples)
             spread = self.tree.query(points, k=min(4, len(points)))[0]
             self.pitch = float(np.median(spread[:, -1]))
             return
@@ -214,7 +214,7 @@ class _Surface:
         self.owner = np.concatenate([np.arange(len(area)), owner])
         self.samples = np.concatenate([corners.mean(1), spread])
         self.triangles, self.normals = corners, _pseudonormals(corners)
-        self.tree, self.pitch = cKDTree(self.samples), 0.0
+        self.tree, self.pitch = KDTree(self.samples), 0.0
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Return the signed distances [m] of points (n, 3), in chunks that stay in the cache."""

@@ -17,8 +17,6 @@ from torchgrasp.hand.spec import HandSpec, read_hand_toml
 from torchgrasp.hand.urdf import Urdf, read_urdf
 from torchgrasp.values import Value
 
-OPTIONS = ("default", "paper_literal")
-
 
 class Actuator(NamedTuple):
     """Drive of one joint: largest torque [N m], largest speed [rad/s], stiffness [N m/rad], damping [N m s/rad]."""

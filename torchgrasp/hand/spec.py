@@ -15,7 +15,7 @@ from torchgrasp.errors import BadArgument, HandFileError
 if sys.version_info >= (3, 11):
     import tomllib
 else:
-    import tomli as tomllib
+    import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 MAX_BYTES = 1024 * 1024
 
