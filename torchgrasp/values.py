@@ -172,7 +172,7 @@ class ContactSpec(Value):
         flatness: largest angle [rad] between the normals of the surface within 8 mm of a contact; None: not checked.
         table: height [m] of the table's plane, whose normal is the z axis of the cloud's frame; None: no table.
         contact_height: least height of a contact above the table [m].
-        start_radius: radius of the sphere from which starts are drawn, in normalised units (Sec. 6.2).
+        start_radius: radius of the sphere from which starts are drawn, in normalised units (Sec. 6.2; the paper: 0.1).
 
     Raises:
         BadArgument: a number outside its range.
@@ -189,7 +189,7 @@ class ContactSpec(Value):
     flatness: float | None = 0.44
     table: float | None = None
     contact_height: float = 0.012
-    start_radius: float = 0.1
+    start_radius: float = 0.9
 
     def __post_init__(self) -> None:
         """Check every range once, where the value is made."""
@@ -216,7 +216,7 @@ class ContactSpec(Value):
     @classmethod
     def paper(cls, friction: float = 0.8, edges: int = 8, max_variance: float = 0.03) -> "ContactSpec":
         """Return the paper's own problem: full friction, no separation, flatness or table."""
-        return cls(friction, edges, max_variance, friction_margin=1.0, separation=0.0, flatness=None)
+        return cls(friction, edges, max_variance, friction_margin=1.0, separation=0.0, flatness=None, start_radius=0.1)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,14 +7,8 @@ from torch import Tensor
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import degenerate
-from torchgrasp.plan.wrench import rank_ratio, wrenches
+from torchgrasp.plan.wrench import MIN_MARGIN, MIN_RANK_RATIO, rank_ratio, wrenches
 from torchgrasp.values import Certificate, Contacts, ContactSpec
-
-MIN_RANK_RATIO = 1e-3
-"""Least singular value of the wrench matrix over its largest; Eq. (13) alone also holds for contacts on a line."""
-
-MIN_MARGIN = 1e-6
-"""Least margin called positive: the solver's own tolerance is 1e-7. Equal coefficients have the margin 1 / (3 e)."""
 
 MAX_RESIDUAL = 1e-6
 """Largest |W phi| of a balance, for wrenches of length about 1."""
@@ -38,6 +32,8 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
         BadArgument: `contacts` of a wrong shape, or with normals that are not of length 1 (to 1e-3).
     """
     spec = ContactSpec() if spec is None else spec
+    if not isinstance(spec, ContactSpec):
+        raise BadArgument("spec", type(spec).__name__, "a ContactSpec")
     points, normals = _checked(contacts)
     whole = torch.isfinite(points).flatten(1).all(-1) & torch.isfinite(normals).flatten(1).all(-1)
     margin, ratio, residual = (torch.full((len(points),), torch.nan, dtype=torch.float64) for _ in range(3))

@@ -36,13 +36,16 @@ def ring(
 
 
 def bend(shape: Shape, points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3"]:
-    """Return the largest angle [rad] between the normal of a contact and those on the ring, moved onto the surface."""
+    """Return the largest angle [rad] between the normal of a contact and those on the ring, moved onto the surface.
+
+    The normals at the moved points are those of the second order from the points on the ring.
+    """
     place, _ = ring(shape, points, normals, tangents(points, normals), RING_POINTS)
     x = place.flatten(0, 2)
     jet = shape.jet(x)
     squared = (jet.gradient * jet.gradient).sum(-1, keepdim=True)
-    on_surface = x - jet.distance[:, None] / squared * jet.gradient
-    there = unit(shape.jet(on_surface).gradient).unflatten(0, place.shape[:3])
+    move = -jet.distance[:, None] / squared * jet.gradient  # a Newton step, of which the Hessian tells the turn
+    there = unit(jet.gradient + (jet.hessian @ move[..., None])[..., 0]).unflatten(0, place.shape[:3])
     here = normals[:, :, None].expand_as(there)
     sine = torch.linalg.vector_norm(torch.linalg.cross(here, there), dim=-1)
     return torch.atan2(sine, (here * there).sum(-1)).amax(-1)

@@ -43,6 +43,8 @@ def is_surveyed(spec: ContactSpec, starts: int | Tensor) -> bool:
 
 def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor) -> None:
     """Refuse starts that are no positive number, of a wrong shape, or outside the shape's domain, by `BadArgument`."""
+    if not isinstance(spec, ContactSpec):
+        raise BadArgument("spec", type(spec).__name__, "a ContactSpec")
     if isinstance(starts, Tensor):
         points = shape.normalise(check_tensor("starts", starts, (None, 3, 3)))
         farthest = float(torch.linalg.vector_norm(points, dim=-1).max()) if len(points) else 0.0
@@ -90,7 +92,7 @@ def survey(
     if problem.lowest is not None:
         good &= points[..., 2] > problem.lowest
     if spec.flatness is not None:
-        good &= bend(shape, points, jet.normals) < 0.93 * spec.flatness  # the ring of another triple is turned
+        good &= bend(shape, points, jet.normals) < 0.9 * spec.flatness  # the ring of another triple is turned
     places, normals = points[good], jet.normals[good]
     if len(places) < 3:  # nothing to choose from: descend from the survey's own triples
         return points.repeat(starts // len(points) + 1, 1, 1)[:starts]

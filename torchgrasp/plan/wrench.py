@@ -17,6 +17,12 @@ from torchgrasp.linalg import unit
 BALANCED = 1e-9
 """Largest |W phi| of coefficients that are called balanced: rounding in float64, far below any wrench (about 1)."""
 
+MIN_MARGIN = 1e-6
+"""Least coefficient called positive, ten times the tolerance of the certificate's solver; equal ones are 1 / (3 e)."""
+
+MIN_RANK_RATIO = 1e-3
+"""Least singular value of the wrench matrix over its largest; Eq. (13) alone also holds for contacts on a line."""
+
 PARALLEL = 1e-9
 """Planar wrenches (of length about 1) whose cross product is shorter than this span no plane."""
 

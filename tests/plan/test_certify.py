@@ -1,0 +1,119 @@
+"""Certificates against a programme written from Eq. (13) alone, and the cases in which Eq. (13) is not enough."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import linprog
+from torch import Tensor
+
+from torchgrasp.errors import BadArgument
+from torchgrasp.frames import apply, rotate
+from torchgrasp.linalg import unit
+from torchgrasp.plan.certify import certify
+from torchgrasp.values import Contacts, ContactSpec
+
+SPEC = ContactSpec(friction=0.6, friction_margin=1.0)
+
+
+def contacts(points: Tensor, normals: Tensor) -> Contacts:
+    zero = torch.zeros(points.shape[:2], dtype=points.dtype)
+    return Contacts(points, normals, zero, zero)
+
+
+def triangle() -> Tensor:
+    angle = torch.tensor([0.1, 2.2, 4.3], dtype=torch.float64)
+    return torch.stack([angle.cos(), angle.sin(), torch.zeros(3, dtype=torch.float64)], -1)[None]
+
+
+def margin_of_eq13(points: np.ndarray, normals: np.ndarray, friction: float, edges: int) -> float:
+    """The largest s of W phi = 0, sum phi = 1, phi >= s, for edges that start at any tangent."""
+    columns = []
+    for p, n in zip(points - points.mean(0), -normals, strict=True):
+        t1 = np.linalg.svd(n[None])[2][1]
+        t2 = np.cross(n, t1)
+        for k in range(edges):
+            turn = 2 * math.pi * k / edges
+            force = n + friction * (math.cos(turn) * t1 + math.sin(turn) * t2)
+            columns.append(np.r_[force, np.cross(p, force)])
+    w = np.array(columns).T
+    m = w.shape[1]
+    found = linprog(
+        np.r_[np.zeros(m), -1],
+        A_ub=np.c_[-np.eye(m), np.ones(m)],
+        b_ub=np.zeros(m),
+        A_eq=np.r_[np.c_[w, np.zeros(6)], [np.r_[np.ones(m), 0]]],
+        b_eq=np.r_[np.zeros(6), 1],
+        bounds=(None, None),
+    )
+    return float(found.x[-1])
+
+
+def test_eq13_margins_agree_with_a_programme_written_from_the_equation_alone(generator):
+    points = torch.randn(60, 3, 3, generator=generator, dtype=torch.float64)
+    lean = torch.randn(60, 3, 3, generator=generator, dtype=torch.float64)
+    normals = unit(unit(points - points.mean(1, keepdim=True)) + 0.4 * lean)
+    found = certify(contacts(points, normals), ContactSpec(friction=0.6, friction_margin=1.0, edges=64))
+    oracle = [margin_of_eq13(p.numpy(), n.numpy(), 0.6, 64) for p, n in zip(points, normals, strict=True)]
+    # With 64 edges the margin hardly depends on the tangent from which they are counted.
+    torch.testing.assert_close(found.margin, torch.tensor(oracle, dtype=torch.float64), atol=2e-4, rtol=0.05)
+    clear = torch.tensor(oracle).abs() > 2e-4
+    assert torch.equal(found.closed[clear], (torch.tensor(oracle) > 0)[clear])
+    assert 10 < int(found.closed.sum()) < 50
+    assert float(found.residual.max()) < 1e-6
+
+
+def test_margin_is_at_most_uniform_and_free_of_units_and_frames(motion):
+    points = triangle()
+    found = certify(contacts(points, points), SPEC)
+    assert bool(found.closed)
+    assert 0 < float(found.margin) <= 1 / 24
+    moved = certify(contacts(apply(motion, 0.001 * points), rotate(motion, points)), SPEC)
+    torch.testing.assert_close(moved.margin, found.margin)
+    torch.testing.assert_close(moved.rank_ratio, found.rank_ratio)
+    single = certify(contacts(points.float(), points.float()), SPEC)
+    torch.testing.assert_close(single.margin, found.margin, atol=1e-6, rtol=1e-4)
+
+
+def test_planned_friction_decides():
+    tilt = math.radians(35)  # needs more than tan 35 = 0.70
+    up = torch.tensor([0.0, 0, 1], dtype=torch.float64)
+    normals = math.cos(tilt) * triangle() + math.sin(tilt) * up
+    assert not bool(certify(contacts(triangle(), normals), ContactSpec(friction=1.0, friction_margin=0.6)).closed)
+    assert bool(certify(contacts(triangle(), normals), ContactSpec(friction=1.0, friction_margin=0.9)).closed)
+
+
+def test_coincident_contacts_are_refused_though_eq13_holds_for_them():
+    points = torch.ones(1, 3, 3, dtype=torch.float64)
+    found = certify(contacts(points, triangle()), SPEC)
+    assert float(found.margin) > 0
+    assert float(found.rank_ratio) < 1e-9
+    assert not bool(found.closed)
+
+
+def test_collinear_contacts_are_refused_though_eq13_holds_for_them():
+    points = torch.tensor([[[-1.0, 0, 0], [1, 0, 0], [0.4, 0, 0]]], dtype=torch.float64)
+    normals = torch.tensor([[[-1.0, 0, 0], [1, 0, 0], [1, 0, 0]]], dtype=torch.float64)
+    found = certify(contacts(points, normals), SPEC)
+    assert float(found.margin) > 0
+    assert not bool(found.closed)
+
+
+def test_rows_that_are_not_finite_are_not_closed_and_harm_no_other():
+    points = triangle().repeat(3, 1, 1)
+    points[1, 0, 0] = torch.nan
+    normals = triangle().repeat(3, 1, 1)
+    normals[2, 1, 2] = torch.inf
+    normals[2, 1] = torch.nan
+    assert certify(contacts(points, normals), SPEC).closed.tolist() == [True, False, False]
+
+
+def test_no_rows_give_no_certificates():
+    empty = torch.zeros(0, 3, 3, dtype=torch.float64)
+    assert len(certify(contacts(empty, empty), SPEC)) == 0
+
+
+def test_bad_arguments_name_what_was_found():
+    with pytest.raises(BadArgument, match="unit vectors"):
+        certify(contacts(triangle(), 1.01 * triangle()), SPEC)

@@ -1,0 +1,139 @@
+"""Plans on an analytic shape: every constraint re-checked from outside, statuses, seeds, given starts."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from torchgrasp.errors import BadArgument, Status
+from torchgrasp.frames import degenerate
+from torchgrasp.linalg import unit
+from torchgrasp.plan.certify import certify
+from torchgrasp.plan.flat import bend
+from torchgrasp.plan.solve import assess, first_violation, plan_contacts
+from torchgrasp.plan.start import project
+from torchgrasp.plan.wrench import wrenches
+from torchgrasp.values import ContactSpec
+
+SPECS = {"paper": ContactSpec.paper(), "table": ContactSpec(table=0.472, contact_height=0.005, flatness=0.6)}
+
+
+@pytest.mark.parametrize("name", list(SPECS))
+def test_eq10_to_eq13_hold_for_every_row_that_is_ok(ellipsoid, name):
+    spec = SPECS[name]
+    plan = plan_contacts(ellipsoid, spec, starts=60, seed=3)
+    assert len(plan) == 60
+    assert int((plan.status == Status.OK).sum()) >= 45
+    good = plan[plan.status == Status.OK]
+    x = ellipsoid.normalise(good.contacts.points)
+    assert float(ellipsoid.value(x).abs().max()) <= 1e-6  # Eq. (10)
+    gradient = x / torch.tensor(ellipsoid.axes, dtype=torch.float64) ** 2
+    torch.testing.assert_close(good.contacts.normals, unit(gradient))  # Eq. (11)
+    torch.testing.assert_close(good.contacts.variance, ellipsoid.doubt_at(x))
+    torch.testing.assert_close(good.contacts.std_m, 0.65 * 0.06 * ellipsoid.doubt_at(x).sqrt())
+    assert float(good.contacts.variance.max()) < spec.max_variance  # Eq. (12)
+    assert bool(certify(good.contacts, spec).closed.all())  # Eq. (13)
+    w = wrenches(good.contacts.points, good.contacts.normals, spec.planned_friction, spec.edges)
+    assert float((good.coefficients[..., None] * w).sum((1, 2)).abs().max()) <= 1e-8
+    assert float(good.coefficients.min()) > 0
+    torch.testing.assert_close(good.coefficients.sum((1, 2)), torch.ones(len(good), dtype=torch.float64))
+    apart = torch.linalg.vector_norm(good.contacts.points - good.contacts.points.roll(1, 1), dim=-1)
+    assert float(apart.min()) >= spec.separation
+    assert not bool(degenerate(good.contacts.points).any())
+    if spec.table is not None:
+        assert float(good.contacts.points[..., 2].min()) >= spec.table + spec.contact_height
+    if spec.flatness is not None:
+        assert float(bend(ellipsoid, x, good.contacts.normals).max()) <= spec.flatness
+
+
+def test_eq14_centre_of_the_contacts_approaches_the_centre_of_the_shape(ellipsoid):
+    plan = plan_contacts(ellipsoid, ContactSpec.paper(), starts=60, seed=1)
+    good = plan[plan.status == Status.OK]
+    centre = good.contacts.points.mean(1) - torch.tensor(ellipsoid.center, dtype=torch.float64)
+    torch.testing.assert_close(good.quality, torch.linalg.vector_norm(centre, dim=-1))
+    assert float(good.quality.median()) < 0.002  # [m], of half axes of 30 to 60 mm
+
+
+def test_same_seed_gives_the_same_bits_and_another_seed_another_plan(ellipsoid):
+    spec = SPECS["table"]
+    one, two, other = (plan_contacts(ellipsoid, spec, starts=20, seed=s) for s in (5, 5, 6))
+    assert torch.equal(one.contacts.points, two.contacts.points)
+    assert torch.equal(one.status, two.status)
+    assert not torch.equal(one.contacts.points, other.contacts.points)
+
+
+def test_given_starts_keep_their_order_and_their_frame(ellipsoid, generator):
+    starts = ellipsoid.metres(0.1 * unit(torch.randn(12, 3, 3, generator=generator, dtype=torch.float64)))
+    forward = plan_contacts(ellipsoid, ContactSpec.paper(), starts)
+    backward = plan_contacts(ellipsoid, ContactSpec.paper(), starts.flip(0))
+    torch.testing.assert_close(forward.contacts.points, backward.contacts.points.flip(0), atol=1e-6, rtol=0)
+    elsewhere = dataclasses.replace(ellipsoid, center=(1.3, -0.2, 0.5))
+    moved = plan_contacts(elsewhere, ContactSpec.paper(), starts + torch.tensor([1.0, 0, 0], dtype=torch.float64))
+    torch.testing.assert_close(moved.quality, forward.quality, atol=1e-6, rtol=0)
+
+
+def test_a_feasible_start_is_never_lost(ellipsoid):
+    spec = SPECS["table"]
+    plan = plan_contacts(ellipsoid, spec, starts=40, seed=2)
+    feasible = plan.contacts.points[plan.status == Status.OK]
+    again = plan_contacts(ellipsoid, spec, feasible)
+    assert bool((again.status == Status.OK).all())
+
+
+def test_an_impossible_problem_names_the_constraint(ellipsoid):
+    doubtful = dataclasses.replace(ellipsoid, doubt=10.0)
+    plan = plan_contacts(doubtful, ContactSpec.paper(), starts=10)
+    assert set(plan.status.tolist()) == {int(Status.TOO_UNCERTAIN)}
+    high = plan_contacts(ellipsoid, ContactSpec(table=0.6), starts=10)
+    assert not bool((high.status == Status.OK).any())
+    slippery = plan_contacts(ellipsoid, ContactSpec.paper(friction=0.0), starts=10)
+    assert not bool((slippery.status == Status.OK).any())
+
+
+def test_statuses_name_the_first_violation(ellipsoid):
+    angle = torch.tensor([0.0, 2.1, 4.2], dtype=torch.float64)
+    around = torch.stack([angle.cos(), 0.6 * angle.sin(), torch.zeros(3, dtype=torch.float64)], -1)
+    spec = ContactSpec(friction_margin=1.0, flatness=None)
+    seen = dataclasses.replace(ellipsoid, doubt=1e-4)
+
+    def status(points: torch.Tensor, spec: ContactSpec = spec, shape=seen) -> Status:
+        return Status(int(assess(shape, spec, points[None]).status[0]))
+
+    assert status(around) is Status.OK
+    assert status(around * 1.4) is Status.OUT_OF_DOMAIN
+    assert status(around * torch.nan) is Status.OUT_OF_DOMAIN
+    assert status(around * 1.001) is Status.OFF_SURFACE
+    assert status(around, shape=ellipsoid) is Status.TOO_UNCERTAIN
+    assert status(around, dataclasses.replace(spec, table=0.5)) is Status.BELOW_TABLE
+    assert status(around, dataclasses.replace(spec, separation=0.09)) is Status.TOO_CLOSE
+    touching = around[[0, 0, 1]]
+    assert status(touching) is Status.TOO_CLOSE
+    assert status(touching, dataclasses.replace(spec, separation=0.0)) is Status.DEGENERATE
+    assert status(around, dataclasses.replace(spec, flatness=0.1)) is Status.NOT_FLAT
+    close = project(seen, torch.tensor([[[1.0, 0, 0], [0.8, 0.4, 0], [0.8, -0.4, 0]]], dtype=torch.float64), 8)[0]
+    assert status(close, dataclasses.replace(spec, friction=0.3, separation=0.01)) is Status.NOT_CLOSED
+
+
+def test_first_violation_is_the_first_in_order():
+    good = {
+        Status.OFF_SURFACE: torch.tensor([True, False, True, False]),
+        Status.NOT_CLOSED: torch.tensor([True, True, False, False]),
+    }
+    assert first_violation(good).tolist() == [Status.OK, Status.OFF_SURFACE, Status.NOT_CLOSED, Status.OFF_SURFACE]
+
+
+@pytest.mark.parametrize("starts", [0, -3, True])
+def test_bad_numbers_of_starts_are_refused(ellipsoid, starts):
+    with pytest.raises(BadArgument, match="starts"):
+        plan_contacts(ellipsoid, starts=starts)
+
+
+def test_bad_starting_points_are_refused(ellipsoid):
+    far = torch.zeros(2, 3, 3, dtype=torch.float64)
+    far[1, 2, 0] = 3.0
+    with pytest.raises(BadArgument, match=r"starts: .* from the shape's centre"):
+        plan_contacts(ellipsoid, starts=far)
+    with pytest.raises(BadArgument, match="finite"):
+        plan_contacts(ellipsoid, starts=far * torch.nan)
+    with pytest.raises(BadArgument, match="start_radius"):
+        plan_contacts(dataclasses.replace(ellipsoid, domain_radius=0.5))
