@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 THRESHOLD = 0.05
 """Concavity at which CoACD stops cutting (0.01-1; its own default)."""
 
+_SEARCH = {"mcts_iterations": 60, "mcts_max_depth": 2, "mcts_nodes": 10}
+"""A narrower search for the cuts than CoACD's own: volumes within 1-3 %, in a sixth of the time (1-22 s a scan)."""
+
 _NAMES = {"vertices", "faces", "vertex_counts", "face_counts"}
 _log = logging.getLogger(__name__)
 
@@ -116,7 +119,7 @@ def _decompose(mesh: "trimesh.Trimesh") -> "list[trimesh.Trimesh]":
         raise MissingExtra("coacd", "sim") from error
     coacd.set_log_level("off")
     with _silence():
-        pieces = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), threshold=THRESHOLD, seed=0)
+        pieces = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), threshold=THRESHOLD, seed=0, **_SEARCH)
     return [trimesh.Trimesh(np.asarray(v), np.asarray(f)).convex_hull for v, f in pieces]
 
 
@@ -140,7 +143,7 @@ def _cache_folder() -> Path:
 
 def _fingerprint(mesh: "trimesh.Trimesh") -> str:
     """Return the SHA-256 of what the parts depend on."""
-    digest = hashlib.sha256(f"coacd {THRESHOLD}".encode())
+    digest = hashlib.sha256(f"coacd {THRESHOLD} {sorted(_SEARCH.items())}".encode())
     digest.update(np.ascontiguousarray(mesh.vertices, dtype="<f8").tobytes())
     digest.update(np.ascontiguousarray(mesh.faces, dtype="<i8").tobytes())
     return digest.hexdigest()
