@@ -1,5 +1,6 @@
 """The closing law, Eqs. (25)-(28), against NumPy and closed forms; bounded and finite for any state."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -169,6 +170,16 @@ def test_gains_are_those_of_the_grasp_in_the_hands_frame(name):
     assert float(push.max()) == pytest.approx(5.0)
     here = rotate(inverse(grasp.obj_from_hand), -grasp.contacts.normals)[0]
     assert torch.allclose(here, pads[0])
+
+
+def test_contacts_without_balance_are_pressed_along_their_normals():
+    hand = load_hand("allegro")
+    grasp = grasp_of(hand)
+    same = grasp.contacts.normals[:, :1].expand(1, 3, 3).contiguous()
+    grasp = dataclasses.replace(grasp, contacts=dataclasses.replace(grasp.contacts, normals=same))
+    gains = closing_gains(grasp, hand, 5.0)
+    assert torch.allclose(gains.desired_force, -5.0 * rotate(inverse(grasp.obj_from_hand), same)[0])
+    assert torch.isfinite(gains.force_gain).all()
 
 
 def test_compliance_is_what_the_drives_yield():

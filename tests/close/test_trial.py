@@ -68,6 +68,7 @@ def pinch(name):
 
 
 def close(name, mesh=None, spec=None, **options):
+    pytest.importorskip("sapien")
     from torchgrasp.close.trial import close_hand
 
     hand, grasp = pinch(name)

@@ -157,6 +157,9 @@ def tip_compliance(
 def closing_gains(grasps: Grasps, hand: Hand, force: float = 4.0) -> ClosingGains:
     """Return target, gains and desired force of each finger for one grasp, in the hand's frame (Eqs. 26-28).
 
+    Desired forces are balanced. Contacts at which no balanced set presses (a certified grasp has none) are pressed
+    along their normals, each with `force`.
+
     Args:
         grasps: one row.
         hand: the hand that the grasp was planned for.
@@ -176,6 +179,7 @@ def closing_gains(grasps: Grasps, hand: Hand, force: float = 4.0) -> ClosingGain
     target, normals = move(hand_from_obj, contacts.points), rotate(hand_from_obj, contacts.normals)
     covariance = surface_covariance(normals, contacts.std_m)
     desired = balanced_forces(target, normals, force)
+    desired = torch.where(torch.isfinite(desired), desired, -force * normals)
     spread = force_covariance(desired, normals, FORCE_FLOOR)
     alpha_f = FORCE_BANDWIDTH * FORCE_FLOOR**2 * tip_compliance(hand, joints, normals)
     return ClosingGains(
