@@ -25,7 +25,8 @@ THRESHOLD = 0.05
 """Concavity at which CoACD stops cutting (0.01-1; its own default)."""
 
 _SEARCH: dict[str, Any] = {"mcts_iterations": 60, "mcts_max_depth": 2, "mcts_nodes": 10}
-"""A narrower search for the cuts than CoACD's own: volumes within 1-3 %, in a sixth of the time (1-22 s a scan)."""
+"""A narrower search for the cuts than CoACD's own. Scans of 800 to 16000 faces then took 1 to 22 s of CPU time, and
+the volumes of the parts summed to 1.02 to 1.03 of the mesh's."""
 
 _NAMES = {"vertices", "faces", "vertex_counts", "face_counts"}
 _log = logging.getLogger(__name__)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import trimesh
 
 START_TOLERANCE = 1e-3
-"""Overlap [m] of the hand with object or table that still counts as none: convex parts bulge by as much."""
+"""Overlap [m] of the hand with object or table that still counts as none: convex parts may bulge a little."""
 
 CLOSING_TIME = 4.0
 """Longest time [s] that closing may take before the hand lifts with what it has."""
