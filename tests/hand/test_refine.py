@@ -71,7 +71,7 @@ def test_jacobian_against_finite_differences(hand, ball):
 
     def rows(at):
         screws = Screws.at(at, hand)
-        return tip_rows(screws, contacts, 0.0), clearance_rows(screws, surroundings, tips_touch=True)
+        return tip_rows(screws, contacts, torch.zeros(6, 3, dtype=torch.float64)), clearance_rows(screws, surroundings, tips_touch=True)
 
     tips, links = rows(posture)
     h = 1e-6
@@ -155,7 +155,7 @@ def test_the_opened_hand_is_farther_and_clear(hand, ball):
     posture = random_postures(hand, 40)
     contacts = touched(hand, posture)
     away = Surroundings(ball, None)
-    opened = open_hand(posture, hand, contacts, away, gap=0.01)
+    opened = open_hand(posture, hand, contacts, away)
     before = hand.tip_centres(posture.joints)
     after = hand.tip_centres(opened)
     outward = -hand.fingertips(posture.joints)[1]

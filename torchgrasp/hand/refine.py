@@ -14,6 +14,7 @@ time; here collision is part of the problem, because that is where planned conta
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Float, Int
@@ -36,6 +37,8 @@ PAD_WEIGHT = 20.0
 WORST = 10
 """How many of the least clearances of each kind enter one step; the others are larger."""
 ITERATIONS = 40
+OPENING, OPENING_SIGMAS = 0.012, 3.0
+"""How far the pre-grasp's tips are from their contacts: metres, and standard deviations of the surface there."""
 LARGEST_STEP = 0.3
 """Largest step [m, rad] of any variable in one iteration."""
 
@@ -109,13 +112,13 @@ def moved(posture: Posture, step: Float[Tensor, "g d"], hand: Hand) -> Posture:
 Rows = tuple[Float[Tensor, "g m"], Float[Tensor, "g m d"]]
 
 
-def tip_rows(screws: Screws, contacts: Contacts, gap: float) -> Rows:
+def tip_rows(screws: Screws, contacts: Contacts, gap: Float[Tensor, "g 3"]) -> Rows:
     """Return residuals [mm] of the three tips, `gap` metres off their contacts, and of their contact directions."""
     hand = screws.hand
     g = len(contacts)
     links = hand.tip_index.expand(g, 3)
     radius = hand.tip_radius.to(contacts.points)
-    target = contacts.points + (radius + gap)[:, None] * contacts.normals
+    target = contacts.points + (radius + gap)[..., None] * contacts.normals
     tips = screws.points(hand.tip_index, hand.center)
     basis = torch.eye(3).to(tips).repeat(3, 1).expand(g, 9, 3)
     three = torch.arange(3).repeat_interleave(3)
@@ -189,34 +192,24 @@ def clearance_rows(screws: Screws, surroundings: Surroundings, tips_touch: bool)
     return torch.cat(residuals, 1), torch.cat(jacobians, 1)
 
 
-def badness(
-    posture: Posture, hand: Hand, contacts: Contacts, surroundings: Surroundings, gap: float = 0.0
-) -> Float[Tensor, "g"]:
+def badness(posture: Posture, hand: Hand, contacts: Contacts, surroundings: Surroundings) -> Float[Tensor, "g"]:
     """Return the sum of squared residuals of each row: what `refine` lowers."""
     screws = Screws.at(posture, hand)
-    tips, _ = tip_rows(screws, contacts, gap)
-    links, _ = clearance_rows(screws, surroundings, tips_touch=gap == 0)
+    tips, _ = tip_rows(screws, contacts, torch.zeros_like(contacts.std_m))
+    links, _ = clearance_rows(screws, surroundings, tips_touch=True)
     return (tips**2).sum(1) + (links**2).sum(1)
 
 
 def minimise(
     posture: Posture,
+    evaluate: Callable[[Posture], Rows],
     hand: Hand,
-    contacts: Contacts,
-    surroundings: Surroundings,
-    *,
-    gap: float,
-    pose_is_free: bool,
     iterations: int,
 ) -> Posture:
-    """Solve every row by Levenberg-Marquardt with its own damping; a step that does not lower the sum is undone."""
+    """Solve every row by Levenberg-Marquardt with its own damping; a step that does not lower the sum is undone.
 
-    def evaluate(at: Posture) -> tuple[Tensor, Tensor]:
-        screws = Screws.at(at, hand)
-        tips, links = tip_rows(screws, contacts, gap), clearance_rows(screws, surroundings, tips_touch=gap == 0)
-        jacobian = torch.cat([tips[1], links[1]], 1)
-        return torch.cat([tips[0], links[0]], 1), jacobian if pose_is_free else jacobian[..., 6:]
-
+    A Jacobian of h columns leaves the hand's pose as it is; one of 6 + h moves it too.
+    """
     residual, jacobian = evaluate(posture)
     damping = torch.full_like(residual[:, 0], 1e-2)
     for _ in range(iterations):
@@ -227,9 +220,8 @@ def minimise(
         step = -torch.cholesky_solve(jacobian.transpose(1, 2) @ residual[..., None], torch.linalg.cholesky(damped))
         step = step[..., 0]
         step = step * (LARGEST_STEP / step.abs().amax(1, keepdim=True).clamp_min(LARGEST_STEP))
-        if not pose_is_free:
-            step = torch.cat([step.new_zeros(len(step), 6), step], 1)
-        trial = moved(posture, step, hand)
+        still = step.new_zeros(len(step), 6 + posture.joints.shape[1] - step.shape[1])
+        trial = moved(posture, torch.cat([still, step], 1), hand)
         trial_residual, trial_jacobian = evaluate(trial)
         better = (trial_residual**2).sum(1) < (residual**2).sum(1)
         keep = better[:, None]
@@ -258,15 +250,28 @@ def refine(
     Returns:
         As many rows; whether each succeeded is for `check` to say.
     """
-    return minimise(posture, hand, contacts, surroundings, gap=0.0, pose_is_free=True, iterations=iterations)
+
+    def evaluate(at: Posture) -> Rows:
+        screws = Screws.at(at, hand)
+        tips = tip_rows(screws, contacts, torch.zeros_like(contacts.std_m))
+        links = clearance_rows(screws, surroundings, tips_touch=True)
+        return torch.cat([tips[0], links[0]], 1), torch.cat([tips[1], links[1]], 1)
+
+    return minimise(posture, evaluate, hand, iterations)
 
 
-def open_hand(
-    posture: Posture, hand: Hand, contacts: Contacts, surroundings: Surroundings, gap: float = 15 * MILLIMETRE
-) -> Float[Tensor, "g h"]:
-    """Return the joints of the pre-grasp: at the same pose, the tips `gap` metres off and everything clear.
+def open_hand(posture: Posture, hand: Hand, contacts: Contacts, surroundings: Surroundings) -> Float[Tensor, "g h"]:
+    """Return the joints of the pre-grasp: at the same pose, the tips off their contacts and everything clear.
 
-    Opening along the normals alone drives links into the object; here clearance is part of the problem.
+    Each tip opens by `OPENING` and three standard deviations of the surface at its contact, so that it starts outside
+    the object even where that is larger than it was thought to be. Opening along the normals alone drives links into
+    the object; here clearance is part of the problem.
     """
-    opened = minimise(posture, hand, contacts, surroundings, gap=gap, pose_is_free=False, iterations=ITERATIONS)
-    return opened.joints
+    gap = OPENING + OPENING_SIGMAS * contacts.std_m
+
+    def evaluate(at: Posture) -> Rows:
+        screws = Screws.at(at, hand)
+        tips, links = tip_rows(screws, contacts, gap), clearance_rows(screws, surroundings, tips_touch=False)
+        return torch.cat([tips[0], links[0]], 1), torch.cat([tips[1], links[1]], 1)[..., 6:]
+
+    return minimise(posture, evaluate, hand, ITERATIONS).joints
