@@ -30,6 +30,10 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
 
     Raises:
         BadArgument: `contacts` of a wrong shape, or with normals that are not of length 1 (to 1e-3).
+
+    >>> corners = torch.tensor([[[1.0, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0]]])
+    >>> certify(Contacts(corners, corners, torch.zeros(1, 3), torch.zeros(1, 3))).closed
+    tensor([True])
     """
     spec = ContactSpec() if spec is None else spec
     if not isinstance(spec, ContactSpec):

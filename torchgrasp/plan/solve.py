@@ -60,7 +60,15 @@ def plan_contacts(
         seed: seed of the draw.
 
     Raises:
-        BadArgument: `starts` is not positive, of a wrong shape, or outside the shape's domain.
+        BadArgument: `starts` is not positive, of a wrong shape, or outside the shape's domain; `spec` is no
+            `ContactSpec`.
+
+    Source of the scheme: augmented Lagrangian, Nocedal and Wright, Numerical Optimization, ch. 17.
+
+    >>> from torchgrasp import fit_shape, load_object
+    >>> plan = plan_contacts(fit_shape(load_object("jug").view), ContactSpec.paper(), starts=8)
+    >>> plan.contacts.points.shape
+    torch.Size([8, 3, 3])
     """
     spec = ContactSpec() if spec is None else spec
     check_starts(shape, spec, starts)
