@@ -70,8 +70,9 @@ def test_jacobian_against_finite_differences(hand, ball):
     surroundings = Surroundings(ball, -0.02)
 
     def rows(at):
+        touch = torch.zeros(6, 3, dtype=torch.float64)
         screws = Screws.at(at, hand)
-        return tip_rows(screws, contacts, torch.zeros(6, 3, dtype=torch.float64)), clearance_rows(screws, surroundings, tips_touch=True)
+        return tip_rows(screws, contacts, touch), clearance_rows(screws, surroundings, tips_touch=True)
 
     tips, links = rows(posture)
     h = 1e-6
