@@ -45,6 +45,7 @@ th, td { padding: 7px 12px; text-align: left; border-bottom: 1px solid #e7e5de; 
 th { font-size: 13px; font-weight: 600; color: #6a717b; white-space: nowrap }
 .n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap }
 .grid { display: grid; gap: 16px; grid-template-columns: repeat(auto-fit, minmax(320px, 1fr)) }
+.pairs { grid-template-columns: repeat(auto-fit, minmax(440px, 1fr)) }
 figure { margin: 0; background: #fcfcfa; border: 1px solid #e7e5de; border-radius: 6px; overflow: hidden }
 figure img { display: block; width: 100% }
 figcaption { padding: 10px 14px; font-size: 14px; color: #4b525b; border-top: 1px solid #e7e5de }
@@ -74,7 +75,7 @@ def draw_pictures(run: Run) -> dict[str, list[tuple[str, bytes]]]:
         "Seen and unseen": [
             ("The cloud from the camera's side, coloured by height.", draw_cloud(run.cloud, table)),
             ("The estimated surface from the camera's side.", draw_surface(run.surface, view, table)),
-            ("The same from behind, where nothing was seen.", draw_surface(run.surface, turned(view, 180), table)),
+            ("The same from behind, where nothing was seen.", draw_surface(run.surface, turned(view, 180.0), table)),
         ]
     }
     if len(best):
@@ -82,10 +83,10 @@ def draw_pictures(run: Run) -> dict[str, list[tuple[str, bytes]]]:
         sections["The best grasp"] = [
             ("Contacts with outward normals.", draw_contacts(run.surface, best.contacts[0], front, table)),
             ("The hand on the estimated surface.", draw_grasp(run.surface, run.hand, best[0], front, table)),
-            ("The same from another side.", draw_grasp(run.surface, run.hand, best[0], turned(front, 75), table)),
+            ("The same from another side.", draw_grasp(run.surface, run.hand, best[0], turned(front, 60.0), table)),
         ]
     if run.closure is not None and run.mesh is not None:
-        side = turned(facing(best), 20) if len(best) else view
+        side = turned(facing(best), 20.0) if len(best) else view
         sections["Closing on the true object"] = [
             ("Before closing.", draw_tick(run.mesh, run.hand, run.closure, 0, side)),
             ("At the end.", draw_tick(run.mesh, run.hand, run.closure, -1, side)),
@@ -98,7 +99,7 @@ def draw_pictures(run: Run) -> dict[str, list[tuple[str, bytes]]]:
 def format_page(run: Run, pictures: dict[str, list[tuple[str, bytes]]]) -> str:
     """Return the page of a run as text."""
     good = run.closure.held if run.closure is not None else len(run.executable) > 0
-    title = f"{run.hand.name} grasps {run.object_name}"
+    title = f"Grasps of the {run.object_name} with the {run.hand.name} hand"
     stages = [(s.name, s.message, f"{s.seconds:.1f}") for s in run.stages]
     stages.append(("total", "", f"{sum(s.seconds for s in run.stages):.1f}"))
     body = [
@@ -163,7 +164,8 @@ def _section(name: str, shots: Sequence[tuple[str, bytes]], run: Run) -> str:
         for caption, png in shots
     )
     fingers = f"<p>{legend}</p>" if name == "The best grasp" else ""
-    return f'<h2>{_text(name)}</h2>\n{fingers}<div class="grid">\n{figures}\n</div>'
+    pairs = " pairs" if len(shots) % 3 else ""
+    return f'<h2>{_text(name)}</h2>\n{fingers}<div class="grid{pairs}">\n{figures}\n</div>'
 
 
 def _table(

@@ -59,7 +59,8 @@ def draw_surface(surface: Surface, direction: Direction, table: float | None = N
     with _canvas() as canvas:
         bar = {"title": " ", "color": INK, "label_font_size": 20, "n_labels": 4, "fmt": "%.1f"}
         bar |= {"width": 0.56, "height": 0.07, "position_x": 0.22, "position_y": 0.015}
-        canvas.add_text("standard deviation of the surface [mm]", (0.27, 0.1), color=INK, viewport=True, font_size=11)
+        text = "standard deviation of the surface [mm]"
+        canvas.add_text(text, position=(0.27, 0.1), color=INK, viewport=True, font_size=11)
         limits = (0.0, max(float(np.quantile(std_mm, 0.99)), 1e-3))
         canvas.add_mesh(mesh, scalars=std_mm, cmap="viridis", clim=limits, smooth_shading=True, scalar_bar_args=bar)
         _add_table(canvas, vertices, table)
@@ -125,15 +126,22 @@ def view_of(cloud: PointCloud) -> Direction:
 
 
 def facing(grasp: Grasps) -> Direction:
-    """Return the direction from the palm of the first row to the object: seen from there, the palm hides nothing."""
-    x, y, z = (grasp.contacts.points[0].mean(0) - grasp.obj_from_hand[0, :3, 3]).tolist()
-    return (x, y, z)
+    """Return a direction from which the first row shows its fingers on both sides of the object, not behind the palm.
+
+    It is square to the horizontal direction along which the contacts press, on the side away from the palm.
+    """
+    normals = grasp.contacts.normals[0, :, :2].detach().cpu().double()
+    press = torch.linalg.eigh(normals.T @ normals).eigenvectors[:, 1]
+    across = torch.stack([-press[1], press[0]])
+    from_palm = grasp.contacts.points[0].mean(0).cpu().double() - grasp.obj_from_hand[0, :3, 3].cpu().double()
+    x, y = (across if float(across @ from_palm[:2]) >= 0.0 else -across).tolist()
+    return (x, y, 0.4)
 
 
 def turned(direction: Direction, degrees: float) -> Direction:
     """Return a direction turned about z.
 
-    >>> [round(x, 3) for x in turned((1.0, 0.0, 0.5), 90)]
+    >>> [round(x, 3) for x in turned((1.0, 0.0, 0.5), 90.0)]
     [0.0, 1.0, 0.5]
     """
     x, y, z = direction
@@ -198,8 +206,10 @@ def _add_contacts(canvas: Any, contacts: Contacts) -> None:
     points = contacts.points[0].detach().cpu().double().numpy()
     normals = contacts.normals[0].detach().cpu().double().numpy()
     for color, point, normal in zip(FINGERS, points, normals, strict=True):
-        canvas.add_mesh(pyvista.Sphere(0.004, point), color=color, smooth_shading=True)
-        arrow = pyvista.Arrow(point, normal, tip_length=0.3, tip_radius=0.07, shaft_radius=0.028, scale=0.045)
+        canvas.add_mesh(pyvista.Sphere(radius=0.004, center=point), color=color, smooth_shading=True)
+        arrow = pyvista.Arrow(
+            start=point, direction=normal, tip_length=0.3, tip_radius=0.07, shaft_radius=0.028, scale=0.045
+        )
         canvas.add_mesh(arrow, color=color, smooth_shading=True)
 
 
@@ -211,7 +221,8 @@ def _add_table(canvas: Any, corners: np.ndarray, table: float | None) -> None:
         return
     center = (corners.min(0) + corners.max(0)) / 2
     radius = 0.55 * float(np.linalg.norm(np.ptp(corners[:, :2], axis=0))) + 0.02
-    top = pyvista.Disc((center[0], center[1], table - 1e-3), inner=0.0, outer=radius, normal=(0, 0, 1), c_res=96)
+    middle = (center[0], center[1], table - 1e-3)
+    top = pyvista.Disc(center=middle, inner=0.0, outer=radius, normal=(0, 0, 1), c_res=96)
     canvas.add_mesh(top, color=TABLE, lighting=False)
 
 

@@ -37,10 +37,12 @@ def plot_motion(closure: ClosureResult) -> bytes:
         rise = 1e3 * (pose[:, 2, 3] - pose[0, 2, 3]).cpu().numpy()
         axes.plot(time, rise, color=color, linewidth=1.8, label=f"{name}: height above its start [mm]")
     axes.set_ylabel("height [mm]")
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.35 * (high - low))  # room for the legend
     right = axes.twinx()
     right.plot(time, turned, color="#8a4f9e", linewidth=1.3, linestyle="--", label="object: turn in the hand [deg]")
     right.set_ylabel("turn [deg]", color="#8a4f9e")
-    right.set_ylim(0.0, max(5.0, 1.2 * float(np.max(turned))))
+    right.set_ylim(0.0, max(5.0, 1.5 * float(np.max(turned))))
     right.spines[["top", "left"]].set_visible(False)
     lines = [*axes.get_lines(), *right.get_lines()]
     axes.legend(lines, [str(line.get_label()) for line in lines], frameon=False, loc="upper left")
@@ -52,7 +54,7 @@ def _figure() -> tuple[Any, Any]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7.2, 4.0), dpi=125, facecolor="#fcfcfa", layout="constrained")
+    figure = Figure(figsize=(6.4, 4.0), dpi=140, facecolor="#fcfcfa", layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot(facecolor="#fcfcfa")
     axes.set_xlabel("time [s]", color=INK)

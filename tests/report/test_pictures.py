@@ -1,0 +1,64 @@
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from torchgrasp.report.pictures import (
+    SIZE,
+    draw_cloud,
+    draw_contacts,
+    draw_grasp,
+    draw_surface,
+    draw_tick,
+    facing,
+    view_of,
+)
+from torchgrasp.report.plots import plot_forces, plot_motion
+
+
+def decode(png):
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
+
+
+def test_stills_have_their_size_and_show_something(run):
+    view = view_of(run.cloud)
+    stills = {
+        "cloud": draw_cloud(run.cloud, run.spec.table),
+        "surface": draw_surface(run.surface, view, run.spec.table),
+        "contacts": draw_contacts(run.surface, run.grasps.contacts, view),
+        "grasp": draw_grasp(run.surface, run.hand, run.grasps, facing(run.grasps), run.spec.table),
+    }
+    for name, png in stills.items():
+        pixels = decode(png)
+        assert pixels.shape == (SIZE[1], SIZE[0], 3), name
+        covered = (np.abs(pixels - pixels[0, 0]).sum(-1) > 20).mean()
+        assert 0.02 < covered < 0.95, (name, covered)
+
+
+def test_fingers_are_drawn_in_three_hues(run):
+    pixels = decode(draw_grasp(run.surface, run.hand, run.grasps, facing(run.grasps)))
+    red, green, blue = pixels[..., 0], pixels[..., 1], pixels[..., 2]
+    assert ((blue > red + 60) & (blue > green + 30)).sum() > 500
+    assert ((red > blue + 90) & (red > green + 50)).sum() > 500
+    assert ((green > red + 60) & (green > blue + 5)).sum() > 500
+
+
+def test_the_lifted_object_is_higher_in_the_picture(run):
+    def height(tick):
+        pixels = decode(draw_tick(run.mesh, run.hand, run.closure, tick, (1.0, 0.0, 0.3)))
+        sand = (pixels[..., 0] > pixels[..., 2] + 25) & (pixels[..., 0] < pixels[..., 1] + 45)
+        return np.nonzero(sand)[0].mean()
+
+    assert height(-1) < height(0) - 50
+
+
+def test_pictures_are_reproducible(run):
+    assert draw_cloud(run.cloud) == draw_cloud(run.cloud)
+
+
+@pytest.mark.parametrize("plot", ["forces", "motion"])
+def test_plots_decode_and_draw_lines(run, plot):
+    png = plot_forces(run.closure, run.hand.finger_names) if plot == "forces" else plot_motion(run.closure)
+    pixels = decode(png)
+    assert (np.abs(pixels - pixels[0, 0]).sum(-1) > 60).mean() > 0.01

@@ -1,0 +1,194 @@
+"""The command line: what a bad input ends with, and that nothing is left behind."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from torchgrasp import cli
+from torchgrasp.errors import MissingExtra
+from torchgrasp.objects import DATA
+
+VIEW = str(DATA / "cylinder" / "view.ply")
+MESH = str(DATA / "cylinder" / "mesh.ply")
+
+
+@pytest.fixture
+def refuse_work(monkeypatch):
+    """Fail the test if the work begins."""
+
+    def work(*args, **kwargs):
+        raise AssertionError("the work began")
+
+    monkeypatch.setattr(cli, "plan_grasps", work)
+
+
+def sphere(count, scale=0.04):
+    points = np.random.default_rng(0).normal(size=(count, 3))
+    return scale * points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def bad_inputs(folder):
+    """Name each bad input: its arguments, and words that the sentence must hold."""
+    np.save(folder / "two.npy", sphere(2))
+    np.save(folder / "mm.npy", sphere(200, 40.0))
+    np.save(folder / "nan.npy", np.where(np.arange(600).reshape(200, 3) == 7, np.nan, sphere(200)))
+    (folder / "empty.xyz").write_text("")
+    (folder / "empty.ply").write_bytes(b"")
+    (folder / "cloud.docx").write_text("x")
+    (folder / "file").write_text("x")
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.04)
+    ball.update_faces(np.arange(len(ball.faces)) > 0)
+    ball.export(folder / "open.ply")
+    hand = ["--hand", "allegro"]
+    return {
+        "missing cloud": ([folder / "none.ply", *hand], ["CLOUD", "no file"]),
+        "empty text": ([folder / "empty.xyz", *hand], ["CLOUD"]),
+        "empty ply": ([folder / "empty.ply", *hand], ["CLOUD"]),
+        "other suffix": ([folder / "cloud.docx", *hand], ["CLOUD", ".ply"]),
+        "two points": ([folder / "two.npy", *hand], ["CLOUD", "2 points", "at least 4"]),
+        "millimetres": ([folder / "mm.npy", *hand], ["CLOUD", "m"]),
+        "nan": ([folder / "nan.npy", *hand], ["CLOUD", "NaN", "finite"]),
+        "unknown hand": ([VIEW, "--hand", "shadow"], ["--hand", "'shadow'", "allegro", "barrett"]),
+        "open mesh": ([VIEW, *hand, "--mesh", folder / "open.ply", "--close"], ["--mesh", "open", "watertight"]),
+        "missing mesh": ([VIEW, *hand, "--mesh", folder / "no.stl", "--close"], ["--mesh", "no file"]),
+        "close without mesh": ([VIEW, *hand, "--close"], ["--close", "--mesh"]),
+        "two tables": ([VIEW, *hand, "--table", "0", "--no-table"], ["--table", "--no-table"]),
+        "no friction": ([VIEW, *hand, "--friction", "-1"], ["--friction", "-1"]),
+        "nan friction": ([VIEW, *hand, "--friction", "nan"], ["--friction", "nan"]),
+        "no starts": ([VIEW, *hand, "--starts", "0"], ["--starts", "0"]),
+        "negative seed": ([VIEW, *hand, "--seed", "-1"], ["--seed", "-1"]),
+        "nan viewpoint": ([VIEW, *hand, "--viewpoint", "nan", "0", "0"], ["--viewpoint", "nan"]),
+    }
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "missing cloud",
+        "empty text",
+        "empty ply",
+        "other suffix",
+        "two points",
+        "millimetres",
+        "nan",
+        "unknown hand",
+        "open mesh",
+        "missing mesh",
+        "close without mesh",
+        "two tables",
+        "no friction",
+        "nan friction",
+        "no starts",
+        "negative seed",
+        "nan viewpoint",
+    ],
+)
+def test_bad_input_ends_in_one_sentence_and_leaves_nothing(name, tmp_path, capsys, refuse_work):
+    arguments, words = bad_inputs(tmp_path)[name]
+    out = tmp_path / "made" / "out"
+    assert cli.main(["grasp", *map(str, arguments), "--out", str(out)]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("torchgrasp: ") and said.err.count("\n") == 1 and "Traceback" not in said.err
+    assert "found" in said.err and "allowed is" in said.err
+    for word in words:
+        assert word in said.err
+    assert not (tmp_path / "made").exists()
+
+
+@pytest.mark.parametrize("out", ["file", "file/deeper", "/proc/nothing/here"])
+def test_a_folder_that_cannot_be_written_is_refused_before_the_work(out, tmp_path, capsys, refuse_work):
+    (tmp_path / "file").write_text("x")
+    assert cli.main(["grasp", VIEW, "--hand", "allegro", "--out", str(tmp_path / out)]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("torchgrasp: --out: found") and said.count("\n") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_check_folder_leaves_a_folder_as_it_was(tmp_path):
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "kept" / "report.html").write_text("old")
+    cli.check_folder(tmp_path / "kept")
+    cli.check_folder(tmp_path / "new" / "deep")
+    assert [p.name for p in tmp_path.iterdir()] == ["kept"]
+    assert (tmp_path / "kept" / "report.html").read_text() == "old"
+
+
+def test_a_missing_simulator_is_named_before_the_work(tmp_path, capsys, monkeypatch, refuse_work):
+    monkeypatch.setattr(cli.importlib.util, "find_spec", lambda name: None)
+    arguments = [VIEW, "--hand", "allegro", "--mesh", MESH, "--close", "--out", str(tmp_path / "out")]
+    assert cli.main(["grasp", *arguments]) == 2
+    assert capsys.readouterr().err == f"torchgrasp: {MissingExtra('sapien', 'sim')}\n"
+
+
+def test_an_error_during_the_work_is_one_sentence_too(tmp_path, capsys, monkeypatch):
+    def fail(*args, **kwargs):
+        raise MissingExtra("a package\nwith two lines", "sim")
+
+    monkeypatch.setattr(cli, "plan_grasps", fail)
+    assert cli.main(["grasp", VIEW, "--hand", "allegro", "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_interrupt_ends_with_130_and_without_files(tmp_path, capsys, monkeypatch):
+    def interrupt(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "plan_grasps", interrupt)
+    assert cli.main(["grasp", VIEW, "--hand", "allegro", "--out", str(tmp_path / "out")]) == 130
+    assert capsys.readouterr().err == "torchgrasp: interrupted\n"
+    assert not (tmp_path / "out").exists()
+
+
+def test_objects_lists_files_that_exist(capsys):
+    assert cli.main(["objects"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    paths = [line.split(": ")[1] for line in lines if ": " in line]
+    assert len(paths) == 8 and all(Path(p).read_bytes()[:3] == b"ply" for p in paths)
+
+
+def test_the_table_is_the_lowest_point_unless_it_is_given(tmp_path, monkeypatch):
+    seen = []
+
+    def note(cloud, hand, spec, starts, seed, observer):
+        seen.append((spec.table, spec.friction, starts, seed, float(cloud.points[:, 2].min())))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "plan_grasps", note)
+    for extra in ([], ["--table", "-0.01"], ["--no-table", "--starts", "5", "--seed", "3", "--friction", "0.5"]):
+        cli.main(["grasp", VIEW, "--hand", "barrett", "--out", str(tmp_path / "out"), *extra])
+    assert seen[0][0] == seen[0][4] and seen[0][1:4] == (0.8, 1000, 0)
+    assert seen[1][0] == -0.01
+    assert seen[2][:4] == (None, 0.5, 5, 3)
+
+
+def test_a_shipped_mesh_comes_with_its_parts_wherever_it_lies(tmp_path):
+    copy = tmp_path / "copy.ply"
+    copy.write_bytes((DATA / "jug" / "mesh.ply").read_bytes())
+    mesh, parts = cli.read_true_mesh(copy)
+    assert parts is not None and len(parts) > 1
+    assert sum(p.volume for p in parts) == pytest.approx(mesh.volume, rel=0.35)
+    trimesh.creation.box((0.05, 0.05, 0.05)).export(tmp_path / "box.stl")
+    assert cli.read_true_mesh(tmp_path / "box.stl")[1] is None
+
+
+def test_grasp_from_cloud_to_files(tmp_path, capsys):
+    out = tmp_path / "out"
+    code = cli.main(["grasp", VIEW, "--hand", "barrett", "--out", str(out), "--starts", "60"])
+    said = capsys.readouterr()
+    assert said.err == ""  # no bar where there is no terminal
+    for stage in ("cloud", "shape", "plan", "certify", "query", "refine", "report"):
+        assert any(line.startswith(stage) for line in said.out.splitlines())
+    assert sorted(p.name for p in out.iterdir()) == ["grasps.safetensors", "report.html"]
+
+    from torchgrasp.files import load_grasps
+
+    grasps = load_grasps(out / "grasps.safetensors")
+    assert grasps.meta["hand"] == "barrett" and grasps.meta["seed"] == "0" and "metre" in grasps.meta["units"]
+    assert code == (0 if bool((grasps.status == 0).any()) else 1)
+    assert torch.isfinite(grasps.joints).all()
+    assert said.out.splitlines()[-1].startswith("The barrett hand has")

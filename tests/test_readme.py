@@ -1,0 +1,53 @@
+"""What the README shows runs: its Python as it stands, its commands as far as they exist and take their flags."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+
+
+def fenced(language):
+    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("code", fenced("python"))
+def test_python_of_the_readme_runs(code, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "README.md", "exec"), {})
+
+
+def test_first_example_is_short():
+    assert 1 <= len(fenced("python")[0].strip().splitlines()) <= 12
+
+
+@pytest.mark.parametrize("line", [line for block in fenced("bash") for line in block.splitlines() if line.strip()])
+def test_commands_of_the_readme_exist_and_take_their_flags(line, capsys):
+    from torchgrasp.cli import main
+
+    words = shlex.split(line, comments=True)
+    if words[0] == "torchgrasp":
+        with pytest.raises(SystemExit) as end:
+            main([words[1], "--help"])
+        assert end.value.code == 0
+        said = capsys.readouterr().out
+        assert [w for w in words if w.startswith("--") and w not in said] == []
+    elif words[0].startswith("scripts/"):
+        script = ROOT / words[0]
+        assert script.is_file() and script.stat().st_mode & 0o111
+    elif words[0] == "python":
+        assert (ROOT / words[1]).is_file()
+    else:
+        assert words[0] in ("git", "cd", "pip")
+
+
+def test_every_file_the_readme_names_exists():
+    links = re.findall(r"\]\(([^)#:]+)\)", README)
+    modules = re.findall(r"`((?:frames.py|cloud|shape|plan|hand|close|report|scripts|hands|tests)/[\w./]+)`", README)
+    missing = [p for p in links if not (ROOT / p).exists()]
+    missing += [p for p in modules if not (ROOT / p).exists() and not (ROOT / "torchgrasp" / p).exists()]
+    assert missing == []
+    assert "docs/overview.png" in links
