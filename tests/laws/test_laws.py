@@ -13,6 +13,7 @@ from torchgrasp import (
     certify,
     encode,
     fit_shape,
+    load_object,
     plan_contacts,
 )
 from torchgrasp.frames import apply, rotate
