@@ -18,8 +18,8 @@ import trimesh
 import tyro
 
 from torchgrasp import ContactSpec, PointCloud, Status, TrialSpec, close_hand, load_hand, plan_grasps, read_cloud
+from torchgrasp.base import count_status
 from torchgrasp.files import write_atomically
-from torchgrasp.values import count_status
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,8 +7,8 @@ import torch
 from safetensors.torch import save_file
 
 from torchgrasp.errors import ModelFileError, OutputError
-from torchgrasp.files import load_grasps, load_tensors, save_tensors, sha256, write_atomically
-from torchgrasp.values import Certificate, Contacts, Grasps
+from torchgrasp.files import load_tensors, save_tensors, sha256, write_atomically
+from torchgrasp.values import Certificate, Contacts, Grasps, load_grasps
 
 
 def some_grasps(g: int = 2, h: int = 4) -> Grasps:

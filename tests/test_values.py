@@ -5,8 +5,10 @@ import dataclasses
 import pytest
 import torch
 
+from torchgrasp.base import count_status
 from torchgrasp.errors import BadArgument, FailedRows, GraspError, Status, TooFewPoints
-from torchgrasp.values import Certificate, ContactPlan, Contacts, ContactSpec, PointCloud, TrialSpec, count_status
+from torchgrasp.specs import ContactSpec, TrialSpec
+from torchgrasp.values import Certificate, ContactPlan, Contacts, PointCloud
 
 
 def plan(status: list[int]) -> ContactPlan:

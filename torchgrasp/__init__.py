@@ -4,18 +4,17 @@ The names below are the library, in the order in which data flows through them.
 """
 
 from torchgrasp.errors import GraspError, Status
+from torchgrasp.specs import ContactSpec, TrialSpec
 from torchgrasp.values import (
     Certificate,
     ClosureResult,
     ContactCode,
     ContactPlan,
     Contacts,
-    ContactSpec,
     GraspGuess,
     Grasps,
     PointCloud,
     ShapeEstimate,
-    TrialSpec,
 )
 from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.cloud.read import read_cloud
@@ -29,7 +28,7 @@ from torchgrasp.hand.code import encode
 from torchgrasp.hand.fit import fit_mixture
 from torchgrasp.hand.mixture import GraspMixture, load_mixture
 from torchgrasp.pipeline import plan_grasps
-from torchgrasp.files import load_grasps
+from torchgrasp.values import load_grasps
 from torchgrasp.close.law import closing_gains
 from torchgrasp.close.trial import close_hand
 

@@ -28,7 +28,8 @@ from torchgrasp.pipeline import plan_grasps
 from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows, write_report
 from torchgrasp.report.run import Run, Stage, verdict
 from torchgrasp.shape.surface import extract_surface
-from torchgrasp.values import ContactSpec, Grasps, TrialSpec
+from torchgrasp.specs import ContactSpec, TrialSpec
+from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
     import trimesh

@@ -3,14 +3,12 @@
 There is no pickle anywhere: a file from a stranger can be malformed, but it cannot run code.
 """
 
-import dataclasses
 import hashlib
 import json
 import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -18,7 +16,6 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from torchgrasp.errors import ModelFileError, OutputError
-from torchgrasp.values import Certificate, Contacts, Grasps
 
 VERSION = "1"
 """Version of the layout of every file written here; readers refuse any other."""
@@ -91,39 +88,3 @@ def load_tensors(path: Path | str, kind: str, names: set[str]) -> tuple[dict[str
 def sha256(path: Path | str) -> str:
     """Return the SHA-256 of a file's bytes as hexadecimal digits."""
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()
-
-
-def _flatten(value: Any, prefix: str = "") -> dict[str, Tensor]:
-    """Name every tensor inside a value by its path of field names."""
-    tensors: dict[str, Tensor] = {}
-    for field in dataclasses.fields(value):
-        inner = getattr(value, field.name)
-        if isinstance(inner, Tensor):
-            tensors[prefix + field.name] = inner
-        elif dataclasses.is_dataclass(inner):
-            tensors |= _flatten(inner, f"{prefix}{field.name}.")
-    return tensors
-
-
-def save_grasps(grasps: Grasps, path: Path | str) -> Path:
-    """Write grasps with their metadata (names, frames, units, hashes, seed); see `Grasps.save`."""
-    return save_tensors(path, "grasps", _flatten(grasps), grasps.meta)
-
-
-def load_grasps(path: Path | str) -> Grasps:
-    """Read grasps that `Grasps.save` wrote.
-
-    Raises:
-        ModelFileError: the file is missing or malformed.
-    """
-    nested = {"contacts": Contacts, "certificate": Certificate}
-    plain = [f.name for f in dataclasses.fields(Grasps) if f.name not in (*nested, "meta")]
-    names = set(plain) | {f"{k}.{f.name}" for k, t in nested.items() for f in dataclasses.fields(t)}
-    tensors, meta = load_tensors(path, "grasps", names)
-    rows = {name: len(t) for name, t in tensors.items()}
-    if len(set(rows.values())) != 1:
-        raise ModelFileError("path", f"{path}: rows {rows}", "as many rows in every tensor")
-    values: dict[str, Any] = {name: tensors[name] for name in plain}
-    for name, kind in nested.items():
-        values[name] = kind(**{f.name: tensors[f"{name}.{f.name}"] for f in dataclasses.fields(kind)})
-    return Grasps(**values, meta={k: v for k, v in meta.items() if k not in ("kind", "version")})

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from torchgrasp.base import count_status
 from torchgrasp.cloud.check import check_cloud
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.hand.collide import field_from_surface
@@ -21,7 +22,8 @@ from torchgrasp.plan.certify import certify
 from torchgrasp.plan.solve import plan_contacts
 from torchgrasp.shape.support import fit_shape
 from torchgrasp.shape.surface import extract_surface
-from torchgrasp.values import ContactPlan, ContactSpec, Grasps, PointCloud, count_status
+from torchgrasp.specs import ContactSpec
+from torchgrasp.values import ContactPlan, Grasps, PointCloud
 
 Observer = Callable[[str, str, Any], None]
 """Called after each stage with its name, one line about it, and its value."""

@@ -1,4 +1,4 @@
-"""All value types of the data flow, in its order: the map of the library.
+"""All value types of the data flow, in its order: the map of the library. What a user asks for is in `specs`.
 
 Values are frozen dataclasses of tensors. They are complete when they exist, they never change, and `.to()`
 returns a new one. Lengths are metres and positions are in the cloud's frame ("obj") unless said otherwise;
@@ -8,95 +8,15 @@ Letters in shapes: n points, b batch rows, g grasps, e friction-cone edges, h ac
 """
 
 import dataclasses
-from collections.abc import Iterator
-from typing import Any, Literal, TypeVar
+from pathlib import Path
+from typing import Any
 
-import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.errors import BadArgument, FailedRows, Status, TooFewPoints
-
-SomeValue = TypeVar("SomeValue", bound="Value")
-SomeBatch = TypeVar("SomeBatch", bound="Batch")
-
-
-class Value:
-    """Base of all values: `.to()` maps every tensor inside, nested values included, into a new value."""
-
-    def to(self: SomeValue, *args: Any, **kwargs: Any) -> SomeValue:
-        """Return the value on another device or in another floating dtype; integers keep theirs."""
-
-        def move(x: Any) -> Any:
-            if isinstance(x, Value):
-                return x.to(*args, **kwargs)
-            if isinstance(x, Tensor):
-                moved = x.to(*args, **kwargs)
-                return moved if x.is_floating_point() else moved.to(x.dtype)
-            return x
-
-        fields = dataclasses.fields(self)  # pyright: ignore[reportArgumentType]
-        return type(self)(**{f.name: move(getattr(self, f.name)) for f in fields})
-
-
-class Batch(Value):
-    """A value whose tensors share a leading batch axis: indexing selects rows, `len` counts them."""
-
-    def __len__(self) -> int:
-        """Count the rows."""
-        return len(getattr(self, dataclasses.fields(self)[0].name))  # pyright: ignore[reportArgumentType]
-
-    def __getitem__(self: SomeBatch, rows: Any) -> SomeBatch:
-        """Select rows by a slice, a mask or an index tensor; an integer keeps the batch axis."""
-        if isinstance(rows, int):
-            rows = range(len(self))[rows]  # raises IndexError as a list would
-            rows = slice(rows, rows + 1)
-
-        def pick(x: Any) -> Any:
-            return x[rows] if isinstance(x, (Tensor, Batch)) else x
-
-        fields = dataclasses.fields(self)  # pyright: ignore[reportArgumentType]
-        return type(self)(**{f.name: pick(getattr(self, f.name)) for f in fields})
-
-    def __iter__(self: SomeBatch) -> Iterator[SomeBatch]:
-        """Iterate over the rows, each a batch of one."""
-        return (self[i] for i in range(len(self)))
-
-    def raise_for_status(self: SomeBatch) -> SomeBatch:
-        """Return the value itself when every row is `Status.OK`; raise `FailedRows` with counts otherwise."""
-        counts = count_status(getattr(self, "status"))  # noqa: B009
-        failed = {s: k for s, k in counts.items() if s is not Status.OK}
-        if failed:
-            raise FailedRows("; ".join(f"{k} of {len(self)} rows: {s.sentence}" for s, k in failed.items()))
-        return self
-
-
-def count_status(status: Int[Tensor, "*b"]) -> dict[Status, int]:
-    """Count the rows of each status, the most frequent first.
-
-    >>> count_status(torch.tensor([0, 13, 0]))
-    {<Status.OK: 0>: 2, <Status.NOT_CLOSED: 13>: 1}
-    """
-    codes, counts = torch.unique(status, return_counts=True)
-    pairs = sorted(zip(codes.tolist(), counts.tolist(), strict=True), key=lambda p: (-p[1], p[0]))
-    return {Status(code): count for code, count in pairs}
-
-
-def check_tensor(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
-    """Return `value` if it is a finite floating tensor of `shape` (None: any length); raise `BadArgument` otherwise."""
-    wanted = "x".join("any" if s is None else str(s) for s in shape)
-    if not isinstance(value, Tensor):
-        raise BadArgument(name, type(value).__name__, f"a torch tensor of shape {wanted}")
-    if value.ndim != len(shape) or any(s is not None and s != v for s, v in zip(shape, value.shape, strict=True)):
-        raise BadArgument(name, f"shape {tuple(value.shape)}", f"shape {wanted}")
-    if value.dtype not in (torch.float32, torch.float64):
-        raise BadArgument(name, str(value.dtype), "torch.float32 or torch.float64")
-    finite = torch.isfinite(value)
-    if not bool(finite.all()):
-        first = torch.nonzero(~finite)[0].tolist()
-        raise BadArgument(name, f"{value[tuple(first)].item()} at index {first}", "finite numbers")
-    return value
-
+from torchgrasp.base import Batch, Value, check_tensor
+from torchgrasp.errors import ModelFileError, Status, TooFewPoints
+from torchgrasp.files import load_tensors, save_tensors
 
 # ---------------------------------------------------------------------------------------------- what was seen
 
@@ -114,6 +34,7 @@ class PointCloud(Value):
         BadArgument: wrong shape, dtype or non-finite numbers.
         TooFewPoints: fewer than 4 points.
 
+    >>> import torch
     >>> len(PointCloud(torch.rand(100, 3)))
     100
     """
@@ -154,69 +75,6 @@ class ShapeEstimate(Value):
 
 
 # --------------------------------------------------------------------------------------------- where to touch
-
-
-@dataclasses.dataclass(frozen=True)
-class ContactSpec(Value):
-    """What a set of three contacts must satisfy (Eqs. 10-14). `ContactSpec.paper()` is the paper's own.
-
-    The margins beyond the paper each have a measured reason: a certificate on the estimated surface is lost on the
-    true one unless the contacts are planned with less friction than is there, on flat surface, a fingertip apart.
-
-    Args:
-        friction: coefficient of friction between fingertip and object, as it will be executed.
-        edges: edges of the linearised friction cone, at least 3.
-        max_variance: S_thresh of Eq. (12), a variance in normalised units.
-        friction_margin: contacts are planned and certified with `friction * friction_margin`.
-        separation: least distance between two contacts [m]; fingertips are 24 mm wide.
-        flatness: largest angle [rad] between the normals of the surface within 8 mm of a contact; None: not checked.
-        table: height [m] of the table's plane, whose normal is the z axis of the cloud's frame; None: no table.
-        contact_height: least height of a contact above the table [m].
-        start_radius: radius of the sphere from which starts are drawn, in normalised units (Sec. 6.2; the paper: 0.1).
-
-    Raises:
-        BadArgument: a number outside its range.
-
-    >>> ContactSpec(friction=0.8).planned_friction
-    0.4
-    """
-
-    friction: float = 0.8
-    edges: int = 8
-    max_variance: float = 0.03
-    friction_margin: float = 0.5
-    separation: float = 0.026
-    flatness: float | None = 0.44
-    table: float | None = None
-    contact_height: float = 0.012
-    start_radius: float = 0.9
-
-    def __post_init__(self) -> None:
-        """Check every range once, where the value is made."""
-        ranges: list[tuple[str, float, float, float]] = [
-            ("friction", self.friction, 0.0, 10.0),
-            ("edges", self.edges, 3, 1024),
-            ("max_variance", self.max_variance, 1e-12, 1e6),
-            ("friction_margin", self.friction_margin, 1e-3, 1.0),
-            ("separation", self.separation, 0.0, 1.0),
-            ("flatness", 0.1 if self.flatness is None else self.flatness, 1e-3, 3.1416),
-            ("table", 0.0 if self.table is None else self.table, -1e6, 1e6),
-            ("contact_height", self.contact_height, -1.0, 1.0),
-            ("start_radius", self.start_radius, 1e-6, 1.2),
-        ]
-        for name, value, low, high in ranges:
-            if not low <= value <= high:  # also refuses NaN
-                raise BadArgument(name, value, f"a number in [{low:g}, {high:g}]")
-
-    @property
-    def planned_friction(self) -> float:
-        """The friction with which contacts are planned and certified."""
-        return self.friction * self.friction_margin
-
-    @classmethod
-    def paper(cls, friction: float = 0.8, edges: int = 8, max_variance: float = 0.03) -> "ContactSpec":
-        """Return the paper's own problem: full friction, no separation, flatness or table."""
-        return cls(friction, edges, max_variance, friction_margin=1.0, separation=0.0, flatness=None, start_radius=0.1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -262,7 +120,7 @@ class Certificate(Batch):
 
 
 @dataclasses.dataclass(frozen=True)
-class ContactCode(Batch):
+class ContactCode(Value):
     """The frame-invariant code q = (L, N) of Eq. (18) for each of the six assignments of contacts to fingers.
 
     Finger i touches contact `permutation[k, i]` in assignment k. Degenerate rows hold NaN and say so in `status`.
@@ -271,7 +129,7 @@ class ContactCode(Batch):
     q: Float[Tensor, "b 6 6"]
     obj_from_vf: Float[Tensor, "b 6 4 4"]
     status: Int[Tensor, "b"]
-    permutation: tuple[tuple[int, int, int], ...]
+    permutation: Int[Tensor, "6 3"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -313,15 +171,44 @@ class Grasps(Batch):
     status: Int[Tensor, "g"]
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
 
-    def save(self, path: Any) -> None:
-        """Write the grasps as safetensors, atomically; `load_grasps` reads them back.
+    def save(self, path: Path | str) -> None:
+        """Write the grasps with their metadata as safetensors, atomically; `load_grasps` reads them back.
 
         Raises:
             OutputError: the file cannot be written; nothing half-written stays.
         """
-        from torchgrasp.files import save_grasps
+        save_tensors(path, "grasps", _flatten(self), self.meta)
 
-        save_grasps(self, path)
+
+def load_grasps(path: Path | str) -> Grasps:
+    """Read grasps that `Grasps.save` wrote.
+
+    Raises:
+        ModelFileError: the file is missing or malformed.
+    """
+    nested = {"contacts": Contacts, "certificate": Certificate}
+    plain = [f.name for f in dataclasses.fields(Grasps) if f.name not in (*nested, "meta")]
+    names = set(plain) | {f"{k}.{f.name}" for k, t in nested.items() for f in dataclasses.fields(t)}
+    tensors, meta = load_tensors(path, "grasps", names)
+    rows = {name: len(t) for name, t in tensors.items()}
+    if len(set(rows.values())) != 1:
+        raise ModelFileError("path", f"{path}: rows {rows}", "as many rows in every tensor")
+    values: dict[str, Any] = {name: tensors[name] for name in plain}
+    for name, kind in nested.items():
+        values[name] = kind(**{f.name: tensors[f"{name}.{f.name}"] for f in dataclasses.fields(kind)})
+    return Grasps(**values, meta={k: v for k, v in meta.items() if k not in ("kind", "version")})
+
+
+def _flatten(value: Any, prefix: str = "") -> dict[str, Tensor]:
+    """Name every tensor inside a value by its path of field names."""
+    tensors: dict[str, Tensor] = {}
+    for field in dataclasses.fields(value):
+        inner = getattr(value, field.name)
+        if isinstance(inner, Tensor):
+            tensors[prefix + field.name] = inner
+        elif dataclasses.is_dataclass(inner):
+            tensors |= _flatten(inner, f"{prefix}{field.name}.")
+    return tensors
 
 
 # -------------------------------------------------------------------------------------------------- closing on it
@@ -336,56 +223,6 @@ class ClosingGains(Value):
     position_gain: Float[Tensor, "3 3"]
     force_gain: Float[Tensor, "3 3"]
     desired_force: Float[Tensor, "3 3"]
-
-
-@dataclasses.dataclass(frozen=True)
-class TrialSpec(Value):
-    """One simulated trial: close on the true mesh, lift it off the table, hold it.
-
-    Args:
-        controller: "uncertainty" (Eqs. 25-28) or "position" (isotropic PI that stops at 0.5 N, the paper's baseline).
-        mass: of the object [kg].
-        friction: of every contact.
-        gravity: [m/s^2].
-        lift_height: [m].
-        hold_time: [s] after the lift.
-        force: desired normal force of the strongest finger [N].
-        noise: whether the tactile sensor has the paper's noise (0.1 N normal, 0.3 N tangential).
-        timestep: of the simulator [s].
-        control_rate: of the controller [Hz].
-
-    Raises:
-        BadArgument: a number outside its range or an unknown controller.
-    """
-
-    controller: Literal["uncertainty", "position"] = "uncertainty"
-    mass: float = 0.1
-    friction: float = 0.8
-    gravity: float = 9.81
-    lift_height: float = 0.1
-    hold_time: float = 2.0
-    force: float = 4.0
-    noise: bool = True
-    timestep: float = 1 / 500
-    control_rate: float = 100.0
-
-    def __post_init__(self) -> None:
-        """Check every range once, where the value is made."""
-        if self.controller not in ("uncertainty", "position"):
-            raise BadArgument("controller", repr(self.controller), "'uncertainty' or 'position'")
-        ranges = {
-            "mass": (1e-3, 10.0),
-            "friction": (0.0, 10.0),
-            "gravity": (0.0, 100.0),
-            "lift_height": (0.0, 1.0),
-            "hold_time": (0.0, 60.0),
-            "force": (0.01, 100.0),
-            "timestep": (1e-4, 1 / 60),
-            "control_rate": (10.0, 1000.0),
-        }
-        for name, (low, high) in ranges.items():
-            if not low <= getattr(self, name) <= high:
-                raise BadArgument(name, getattr(self, name), f"a number in [{low:g}, {high:g}]")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,8 @@ import trimesh
 from torchgrasp.errors import BadArgument, MeshError, Status
 from torchgrasp.frames import rigid, rotation_from_vector
 from torchgrasp.hand.hand import load_hand
-from torchgrasp.values import Certificate, Contacts, Grasps, TrialSpec
+from torchgrasp.specs import TrialSpec
+from torchgrasp.values import Certificate, Contacts, Grasps
 
 RADIUS, HEIGHT = 0.03, 0.18
 POSES = {  # rotation vector, translation, joints, opened joints: pinches of the cylinder, solved once

@@ -87,8 +87,8 @@ def test_the_code_of_a_permuted_triple_is_the_permuted_set(generator):
     contacts = triples(10, generator)
     swapped = Contacts(contacts.points.flip(1), contacts.normals.flip(1), contacts.variance, contacts.std_m)
     a, b = encode(contacts).q, encode(swapped).q
-    order = [(2 - i, 2 - j, 2 - k) for i, j, k in encode(contacts).permutation]
-    index = [encode(contacts).permutation.index(p) for p in order]
+    permutations = encode(contacts).permutation.tolist()
+    index = [permutations.index([2 - i, 2 - j, 2 - k]) for i, j, k in permutations]
     torch.testing.assert_close(a, b[:, index])
 
 

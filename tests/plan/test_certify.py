@@ -12,7 +12,8 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, rotate
 from torchgrasp.linalg import unit
 from torchgrasp.plan.certify import certify
-from torchgrasp.values import Contacts, ContactSpec
+from torchgrasp.specs import ContactSpec
+from torchgrasp.values import Contacts
 
 SPEC = ContactSpec(friction=0.6, friction_margin=1.0)
 

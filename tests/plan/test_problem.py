@@ -9,7 +9,7 @@ from torch import Tensor
 from torchgrasp.linalg import unit
 from torchgrasp.plan.problem import INSIDE, UNIFORM_SHARE, ContactProblem, Rows, triple_jet
 from torchgrasp.plan.wrench import tangents, wrenches
-from torchgrasp.values import ContactSpec
+from torchgrasp.specs import ContactSpec
 
 SPEC = ContactSpec(table=0.47, contact_height=0.012, separation=0.03)
 

@@ -13,7 +13,7 @@ from torchgrasp.plan.flat import bend
 from torchgrasp.plan.solve import assess, first_violation, plan_contacts
 from torchgrasp.plan.start import project
 from torchgrasp.plan.wrench import wrenches
-from torchgrasp.values import ContactSpec
+from torchgrasp.specs import ContactSpec
 
 SPECS = {"paper": ContactSpec.paper(), "table": ContactSpec(table=0.472, contact_height=0.005, flatness=0.6)}
 

@@ -19,7 +19,8 @@ from torchgrasp.plan.wrench import (
     tangents,
     wrenches,
 )
-from torchgrasp.values import Contacts, ContactSpec
+from torchgrasp.specs import ContactSpec
+from torchgrasp.values import Contacts
 
 
 def triples(generator: torch.Generator, count: int) -> tuple[Tensor, Tensor]:

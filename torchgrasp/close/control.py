@@ -9,9 +9,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.base import Value
 from torchgrasp.close.force import balanced_forces
 from torchgrasp.close.law import POSITION_RATE, blend, joint_step, tip_velocity
-from torchgrasp.values import ClosingGains, Value
+from torchgrasp.values import ClosingGains
 
 WAITING_FORCE = 0.3
 """Force [N] with which a finger that touches waits for the others: less than the table's friction on a light object."""

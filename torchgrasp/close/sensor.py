@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.values import Value
+from torchgrasp.base import Value
 
 NOISE = 0.1
 """Standard deviation of a reading of the normal force [N] (Sec. 6.5)."""

@@ -18,7 +18,8 @@ from torchgrasp.close.sensor import sense, untouched
 from torchgrasp.errors import Status
 from torchgrasp.frames import apply, inverse, rotate, rotation_angle
 from torchgrasp.hand.hand import Hand
-from torchgrasp.values import ClosingGains, ClosureResult, Grasps, TrialSpec
+from torchgrasp.specs import TrialSpec
+from torchgrasp.values import ClosingGains, ClosureResult, Grasps
 
 if TYPE_CHECKING:
     import trimesh

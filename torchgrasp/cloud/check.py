@@ -4,8 +4,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchgrasp.base import check_tensor
 from torchgrasp.errors import BadArgument, SuspiciousScale, TooFewPoints
-from torchgrasp.values import PointCloud, check_tensor
+from torchgrasp.values import PointCloud
 
 MIN_EXTENT = 0.005
 """Longest side [m] of the bounding box below which a cloud is no object for a hand."""

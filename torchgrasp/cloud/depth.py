@@ -4,10 +4,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.base import check_tensor
 from torchgrasp.cloud.check import check_cloud
 from torchgrasp.errors import BadArgument, TooFewPoints
 from torchgrasp.frames import apply
-from torchgrasp.values import PointCloud, check_tensor
+from torchgrasp.values import PointCloud
 
 
 def cloud_from_depth(

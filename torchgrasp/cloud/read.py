@@ -11,12 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgrasp.base import check_tensor
 from torchgrasp.cloud.check import check_cloud
 from torchgrasp.cloud.pcd import parse_pcd
 from torchgrasp.cloud.ply import format_ply, parse_ply
 from torchgrasp.errors import BadArgument, CloudFileError, TooFewPoints
 from torchgrasp.files import write_atomically
-from torchgrasp.values import PointCloud, check_tensor
+from torchgrasp.values import PointCloud
 
 MAX_BYTES = 512 * 2**20
 """Largest file, and largest unpacked content, that is read."""

@@ -11,10 +11,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchgrasp.base import Batch
 from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.refine import FLAT_PAD, MILLIMETRE, ROUND_PAD, Posture, Screws, Surroundings
-from torchgrasp.values import Batch, Contacts
+from torchgrasp.values import Contacts
 
 TIP_TOLERANCE = 2 * MILLIMETRE
 """Largest distance [m] of a fingertip from its contact."""

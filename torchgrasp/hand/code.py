@@ -6,9 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import check_tensor
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import degenerate, virtual_frame
-from torchgrasp.values import ContactCode, Contacts, check_tensor
+from torchgrasp.values import ContactCode, Contacts
 
 PERMUTATIONS: tuple[tuple[int, int, int], ...] = tuple(itertools.permutations(range(3)))  # pyright: ignore[reportAssignmentType]
 """The six ways to give three contacts to three fingers: finger i touches contact `PERMUTATIONS[k][i]`."""
@@ -73,5 +74,5 @@ def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
         q=torch.where(bad, nan, hand_code(ordered_points, ordered_normals)),
         obj_from_vf=torch.where(bad[..., None], nan, frames),
         status=torch.where(flat, int(Status.DEGENERATE), int(Status.OK)),
-        permutation=PERMUTATIONS,
+        permutation=order,
     )

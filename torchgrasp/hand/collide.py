@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
+from torchgrasp.base import Value, check_tensor
 from torchgrasp.errors import BadArgument
-from torchgrasp.values import Value, check_tensor
 
 TINY = 1e-18
 """Squared length [m2] below which a segment is a point (1e-9 m), and the floor under square roots."""

@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchgrasp.base import Value
 from torchgrasp.hand.spec import HandSpec
 from torchgrasp.hand.urdf import Shape, Urdf
-from torchgrasp.values import Value
 
 PITCH = 0.015
 """Edge of a finger's cells [m]."""

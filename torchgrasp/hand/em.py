@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import Value
 from torchgrasp.errors import IndefiniteCovariance
 from torchgrasp.linalg import cholesky
-from torchgrasp.values import Value
 
 ROWS = 1024
 """Rows of one pass: features and responsibilities of so many rows stay in the cache."""

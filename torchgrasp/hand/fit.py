@@ -3,12 +3,12 @@
 import dataclasses
 import math
 
+from torchgrasp.base import check_tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.code import CODE_NAMES
 from torchgrasp.hand.em import expectation_maximisation, start_components
 from torchgrasp.hand.mixture import GraspMixture
 from torchgrasp.hand.sample import HandSamples
-from torchgrasp.values import check_tensor
 
 
 def fit_mixture(

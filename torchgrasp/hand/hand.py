@@ -9,13 +9,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchgrasp.base import Value
 from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.cover import SphereCover, cover_from_urdf
 from torchgrasp.hand.kinematics import Kinematics, ancestor_mask, kinematics_from_urdf
 from torchgrasp.hand.selfcollide import SelfCollision, self_collision_from_spec
 from torchgrasp.hand.spec import HandSpec, read_hand_toml
 from torchgrasp.hand.urdf import Urdf, read_urdf
-from torchgrasp.values import Value
 
 
 class Actuator(NamedTuple):

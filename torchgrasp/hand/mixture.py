@@ -9,11 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import Value, check_tensor
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.hand.code import CODE_NAMES
 from torchgrasp.linalg import cholesky
-from torchgrasp.values import ContactCode, Value, check_tensor
+from torchgrasp.values import ContactCode
 
 PAPER_REACH = 2.0
 """The paper's threshold on f_i of Eq. (21). f is half a squared Mahalanobis distance, so that "two standard

@@ -62,7 +62,7 @@ def query_hand(
     code = encode((contacts.points.double(), contacts.normals.double()))
     reach = mixture.reach(code)
     row, assignment = torch.nonzero(reach < max_reach, as_tuple=True)  # NaN is not less
-    order = torch.tensor(code.permutation, device=row.device)[assignment]  # (a, 3)
+    order = code.permutation[assignment]  # (a, 3)
     joints = _guess_joints(mixture, code.q[row, assignment], guesses)
     joints = joints.clamp(hand.lower.to(joints), hand.upper.to(joints))
 

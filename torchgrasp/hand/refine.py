@@ -20,10 +20,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchgrasp.base import Value
 from torchgrasp.frames import apply, rigid, rotate, rotation_from_vector
 from torchgrasp.hand.collide import DistanceField, segment_closest
 from torchgrasp.hand.hand import Hand
-from torchgrasp.values import Contacts, Value
+from torchgrasp.values import Contacts
 
 MILLIMETRE = 1e-3
 CLEARANCE = 4 * MILLIMETRE

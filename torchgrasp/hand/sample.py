@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import Batch
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.code import hand_code
 from torchgrasp.hand.hand import Hand
-from torchgrasp.values import Batch
 
 CHUNK = 10_000
 """Postures drawn from one generator. It fixes what a seed means, so it is no argument."""

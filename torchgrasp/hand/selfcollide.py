@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchgrasp.base import Value
 from torchgrasp.hand.collide import box_distance, segment_distance
 from torchgrasp.hand.spec import HandSpec
 from torchgrasp.hand.urdf import Urdf
-from torchgrasp.values import Value
 
 CAPSULE_POINTS = 4
 """Points on a capsule's axis at which its distance from a box is taken."""

@@ -8,7 +8,8 @@ from torch import Tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import degenerate
 from torchgrasp.plan.wrench import MIN_MARGIN, MIN_RANK_RATIO, rank_ratio, wrenches
-from torchgrasp.values import Certificate, Contacts, ContactSpec
+from torchgrasp.specs import ContactSpec
+from torchgrasp.values import Certificate, Contacts
 
 MAX_RESIDUAL = 1e-6
 """Largest |W phi| of a balance, for wrenches of length about 1."""

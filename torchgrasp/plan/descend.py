@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchgrasp.base import Batch, SomeValue, Value
 from torchgrasp.plan.flat import BendGuide, bend_guide
 from torchgrasp.plan.problem import ContactProblem, Rows, Shape, TripleJet, carry, triple_jet
 from torchgrasp.plan.wrench import tangents
-from torchgrasp.values import Batch, SomeValue, Value
 
 LONGEST_STEP = 0.3
 """A point moves at most this far in a step, in normalised units: about the range in which the surface is smooth."""

@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import Batch
 from torchgrasp.linalg import unit
 from torchgrasp.plan.problem import Shape, TripleJet
 from torchgrasp.plan.wrench import cone_edges, tangents
-from torchgrasp.values import Batch
 
 RING_RADIUS = 0.008
 """Radius [m] of the ring around a contact; a fingertip's radius is 12 mm."""

@@ -12,10 +12,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import Batch
 from torchgrasp.frames import skew
 from torchgrasp.linalg import unit
 from torchgrasp.plan.wrench import cone_edges
-from torchgrasp.values import Batch, ContactSpec
+from torchgrasp.specs import ContactSpec
 
 UNIFORM_SHARE = 0.05
 """Least coefficient of a plan as a share of the uniform 1 / (3 e): the least margin of its certificate. Without it the

@@ -19,7 +19,8 @@ from torchgrasp.plan.flat import bend
 from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet
 from torchgrasp.plan.start import check_starts, is_surveyed, project, start_points
 from torchgrasp.plan.wrench import BALANCED, MIN_MARGIN, MIN_RANK_RATIO, balance, rank_ratio, wrenches
-from torchgrasp.values import ContactPlan, Contacts, ContactSpec
+from torchgrasp.specs import ContactSpec
+from torchgrasp.values import ContactPlan, Contacts
 
 ON_SURFACE = 1e-6
 """Largest |f_d| of a contact on the surface, in normalised units."""

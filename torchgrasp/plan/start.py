@@ -6,12 +6,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import check_tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
 from torchgrasp.plan.flat import bend
 from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet
 from torchgrasp.plan.wrench import closed_exact
-from torchgrasp.values import ContactSpec, check_tensor
+from torchgrasp.specs import ContactSpec
 
 SURVEY = 700
 """Triples of surface points that are surveyed for certain and flat places: 2100 points cover a hand-sized object in

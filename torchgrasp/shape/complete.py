@@ -8,9 +8,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.base import Value
 from torchgrasp.linalg import unit
 from torchgrasp.shape.silhouette import Silhouette, farthest_points, silhouette
-from torchgrasp.values import PointCloud, Value
+from torchgrasp.values import PointCloud
 
 TAU = 0.003
 """Distance [m] over which a mirrored point stops matching the cloud."""

@@ -9,10 +9,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.base import Value, check_tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import cholesky, unit
 from torchgrasp.shape.kernel import covariance, thin_plate
-from torchgrasp.values import PointCloud, ShapeEstimate, Value, check_tensor
+from torchgrasp.values import PointCloud, ShapeEstimate
 
 REMEDY = "use a psi_scale of at least 1.34: the thin plate kernel is a covariance only within 3/4 psi"
 LEAST_PSI = 4.0 / 3.0

@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.base import Value
 from torchgrasp.linalg import unit
-from torchgrasp.values import PointCloud, Value
+from torchgrasp.values import PointCloud
 
 CELLS = 4.0
 """Cells of the raster for the typical spacing of the cloud's pixels."""

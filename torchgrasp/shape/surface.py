@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchgrasp.base import Value
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.values import Value
 
 NEWTON_STEPS = 3
 """Steps that move the vertices of marching cubes onto the zero level."""

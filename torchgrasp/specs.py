@@ -1,0 +1,120 @@
+"""What a user asks of the contacts and of a simulated trial: numbers with names, units, ranges and defaults."""
+
+import dataclasses
+from typing import Literal
+
+from torchgrasp.base import Value
+from torchgrasp.errors import BadArgument
+
+
+@dataclasses.dataclass(frozen=True)
+class ContactSpec(Value):
+    """What a set of three contacts must satisfy (Eqs. 10-14). `ContactSpec.paper()` is the paper's own.
+
+    The margins beyond the paper each have a measured reason: a certificate on the estimated surface is lost on the
+    true one unless the contacts are planned with less friction than is there, on flat surface, a fingertip apart.
+
+    Args:
+        friction: coefficient of friction between fingertip and object, as it will be executed.
+        edges: edges of the linearised friction cone, at least 3.
+        max_variance: S_thresh of Eq. (12), a variance in normalised units.
+        friction_margin: contacts are planned and certified with `friction * friction_margin`.
+        separation: least distance between two contacts [m]; fingertips are 24 mm wide.
+        flatness: largest angle [rad] between the normals of the surface within 8 mm of a contact; None: not checked.
+        table: height [m] of the table's plane, whose normal is the z axis of the cloud's frame; None: no table.
+        contact_height: least height of a contact above the table [m].
+        start_radius: radius of the sphere from which starts are drawn, in normalised units (Sec. 6.2; the paper: 0.1).
+
+    Raises:
+        BadArgument: a number outside its range.
+
+    >>> ContactSpec(friction=0.8).planned_friction
+    0.4
+    """
+
+    friction: float = 0.8
+    edges: int = 8
+    max_variance: float = 0.03
+    friction_margin: float = 0.5
+    separation: float = 0.026
+    flatness: float | None = 0.44
+    table: float | None = None
+    contact_height: float = 0.012
+    start_radius: float = 0.9
+
+    def __post_init__(self) -> None:
+        """Check every range once, where the value is made."""
+        ranges: list[tuple[str, float, float, float]] = [
+            ("friction", self.friction, 0.0, 10.0),
+            ("edges", self.edges, 3, 1024),
+            ("max_variance", self.max_variance, 1e-12, 1e6),
+            ("friction_margin", self.friction_margin, 1e-3, 1.0),
+            ("separation", self.separation, 0.0, 1.0),
+            ("flatness", 0.1 if self.flatness is None else self.flatness, 1e-3, 3.1416),
+            ("table", 0.0 if self.table is None else self.table, -1e6, 1e6),
+            ("contact_height", self.contact_height, -1.0, 1.0),
+            ("start_radius", self.start_radius, 1e-6, 1.2),
+        ]
+        for name, value, low, high in ranges:
+            if not low <= value <= high:  # also refuses NaN
+                raise BadArgument(name, value, f"a number in [{low:g}, {high:g}]")
+
+    @property
+    def planned_friction(self) -> float:
+        """The friction with which contacts are planned and certified."""
+        return self.friction * self.friction_margin
+
+    @classmethod
+    def paper(cls, friction: float = 0.8, edges: int = 8, max_variance: float = 0.03) -> "ContactSpec":
+        """Return the paper's own problem: full friction, no separation, flatness or table."""
+        return cls(friction, edges, max_variance, friction_margin=1.0, separation=0.0, flatness=None, start_radius=0.1)
+
+
+@dataclasses.dataclass(frozen=True)
+class TrialSpec(Value):
+    """One simulated trial: close on the true mesh, lift it off the table, hold it.
+
+    Args:
+        controller: "uncertainty" (Eqs. 25-28) or "position" (isotropic PI that stops at 0.5 N, the paper's baseline).
+        mass: of the object [kg].
+        friction: of every contact.
+        gravity: [m/s^2].
+        lift_height: [m].
+        hold_time: [s] after the lift.
+        force: desired normal force of the strongest finger [N].
+        noise: whether the tactile sensor has the paper's noise (0.1 N normal, 0.3 N tangential).
+        timestep: of the simulator [s].
+        control_rate: of the controller [Hz].
+
+    Raises:
+        BadArgument: a number outside its range or an unknown controller.
+    """
+
+    controller: Literal["uncertainty", "position"] = "uncertainty"
+    mass: float = 0.1
+    friction: float = 0.8
+    gravity: float = 9.81
+    lift_height: float = 0.1
+    hold_time: float = 2.0
+    force: float = 4.0
+    noise: bool = True
+    timestep: float = 1 / 500
+    control_rate: float = 100.0
+
+    def __post_init__(self) -> None:
+        """Check every range once, where the value is made."""
+        if self.controller not in ("uncertainty", "position"):
+            raise BadArgument("controller", repr(self.controller), "'uncertainty' or 'position'")
+        ranges = {
+            "mass": (1e-3, 10.0),
+            "friction": (0.0, 10.0),
+            "gravity": (0.0, 100.0),
+            "lift_height": (0.0, 1.0),
+            "hold_time": (0.0, 60.0),
+            "force": (0.01, 100.0),
+            "timestep": (1e-4, 1 / 60),
+            "control_rate": (10.0, 1000.0),
+        }
+        for name, (low, high) in ranges.items():
+            if not low <= getattr(self, name) <= high:
+                raise BadArgument(name, getattr(self, name), f"a number in [{low:g}, {high:g}]")
