@@ -185,7 +185,7 @@ def test_grasp_from_cloud_to_files(tmp_path, capsys):
         assert any(line.startswith(stage) for line in said.out.splitlines())
     assert sorted(p.name for p in out.iterdir()) == ["grasps.safetensors", "report.html"]
 
-    from torchgrasp.files import load_grasps
+    from torchgrasp.values import load_grasps
 
     grasps = load_grasps(out / "grasps.safetensors")
     assert grasps.meta["hand"] == "barrett" and grasps.meta["seed"] == "0" and "metre" in grasps.meta["units"]

@@ -11,7 +11,8 @@ from torchgrasp.errors import Status
 from torchgrasp.hand.hand import load_hand
 from torchgrasp.report.run import Run, Stage
 from torchgrasp.shape.surface import Surface
-from torchgrasp.values import Certificate, ClosureResult, Contacts, ContactSpec, Grasps, PointCloud
+from torchgrasp.specs import ContactSpec
+from torchgrasp.values import Certificate, ClosureResult, Contacts, Grasps, PointCloud
 
 F64 = torch.float64
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from torchgrasp.report.canvas import SIZE
 from torchgrasp.report.pictures import (
-    SIZE,
     draw_cloud,
     draw_contacts,
     draw_grasp,

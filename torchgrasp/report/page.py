@@ -6,9 +6,10 @@ import math
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
+from torchgrasp.base import count_status
 from torchgrasp.files import write_atomically
+from torchgrasp.report.palette import FINGERS
 from torchgrasp.report.pictures import (
-    FINGERS,
     draw_cloud,
     draw_contacts,
     draw_grasp,
@@ -20,7 +21,7 @@ from torchgrasp.report.pictures import (
 )
 from torchgrasp.report.plots import plot_forces, plot_motion
 from torchgrasp.report.run import Run, verdict
-from torchgrasp.values import Grasps, count_status
+from torchgrasp.values import Grasps
 
 ROWS = 10
 """How many grasps the table lists."""

@@ -7,11 +7,8 @@ import numpy as np
 import torch
 
 from torchgrasp.frames import inverse, rotation_angle
-from torchgrasp.report.pictures import FINGERS, INK
+from torchgrasp.report.palette import FINGERS, GRID, INK, PAPER
 from torchgrasp.values import ClosureResult
-
-GRID = "#dcdad3"
-"""Colour of grid lines."""
 
 
 def plot_forces(closure: ClosureResult, finger_names: tuple[str, ...]) -> bytes:
@@ -54,9 +51,9 @@ def _figure() -> tuple[Any, Any]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(6.4, 4.0), dpi=140, facecolor="#fcfcfa", layout="constrained")
+    figure = Figure(figsize=(6.4, 4.0), dpi=140, facecolor=PAPER, layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.add_subplot(facecolor="#fcfcfa")
+    axes = figure.add_subplot(facecolor=PAPER)
     axes.set_xlabel("time [s]", color=INK)
     axes.grid(color=GRID, linewidth=0.7)
     axes.spines[["top", "right"]].set_visible(False)

@@ -5,10 +5,12 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from torchgrasp.base import count_status
 from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.shape.surface import Surface
-from torchgrasp.values import ClosureResult, ContactSpec, Grasps, PointCloud, count_status
+from torchgrasp.specs import ContactSpec
+from torchgrasp.values import ClosureResult, Grasps, PointCloud
 
 if TYPE_CHECKING:
     import trimesh

@@ -1,0 +1,166 @@
+"""A canvas for one still: collects meshes, points and a table top, frames them, and returns a PNG."""
+
+import io
+
+import numpy as np
+from jaxtyping import Float
+
+from torchgrasp.report.palette import INK, PAPER, rgb
+from torchgrasp.report.raster import Camera, Triangles, concatenate, render
+
+SIZE = (900, 720)
+"""Width and height of a still [pixels]."""
+
+VIEW_ANGLE = np.deg2rad(24.0)
+"""Vertical angle of view of the camera."""
+
+SHARP = np.deg2rad(40.0)
+"""Edges that bend by more are drawn sharp."""
+
+
+class Canvas:
+    """What one still shows."""
+
+    def __init__(self) -> None:
+        self.solid: list[Triangles] = []
+        self.sheer: list[Triangles] = []
+
+    def add_mesh(
+        self,
+        vertices: Float[np.ndarray, "v 3"],
+        faces: np.ndarray,
+        color: str,
+        normals: Float[np.ndarray, "v 3"] | None = None,
+        sheer: bool = False,
+    ) -> None:
+        """Add a mesh of one colour, smooth where it has `normals`, else with sharp edges where it bends much."""
+        corners = vertices[faces]
+        bent = _sharp_normals(vertices, faces) if normals is None else normals[faces]
+        triangles = _triangles(corners, bent, np.broadcast_to(rgb(color), corners.shape))
+        (self.sheer if sheer else self.solid).append(triangles)
+
+    def add_values(
+        self,
+        vertices: Float[np.ndarray, "v 3"],
+        faces: np.ndarray,
+        normals: Float[np.ndarray, "v 3"],
+        values: Float[np.ndarray, " v"],
+        most: float,
+        colors: str,
+    ) -> None:
+        """Add a smooth mesh coloured by values at its vertices, from 0 to `most`, by a colour map of matplotlib."""
+        self.solid.append(_triangles(vertices[faces], normals[faces], _mapped(values / most, colors)[faces]))
+
+    def add_points(self, points: Float[np.ndarray, "n 3"], values: Float[np.ndarray, " n"], colors: str) -> None:
+        """Add points as small balls, coloured by their values."""
+        from trimesh import creation
+
+        size = 0.006 * float(np.linalg.norm(np.ptp(points, axis=0)))
+        ball = creation.icosphere(subdivisions=1, radius=1.0)
+        corners = (points[:, None, None] + size * ball.vertices[ball.faces]).reshape(-1, 3, 3)
+        normals = np.tile(ball.vertices[ball.faces], (len(points), 1, 1))
+        shade = _mapped((values - values.min()) / max(float(np.ptp(values)), 1e-12), colors)
+        shades = np.broadcast_to(np.repeat(shade, len(ball.faces), 0)[:, None], corners.shape)
+        self.solid.append(_triangles(corners, normals, shades))
+
+    def add_disc(self, center: tuple[float, float, float], radius: float, color: str) -> None:
+        """Add a level disc without light and shade."""
+        angle = np.linspace(0.0, 2 * np.pi, 121)
+        rim = np.array(center) + radius * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], 1)
+        corners = np.stack([np.broadcast_to(center, (120, 3)), rim[:-1], rim[1:]], 1)
+        normals = np.broadcast_to((0.0, 0.0, 1.0), corners.shape)
+        shade = np.broadcast_to(rgb(color), corners.shape)
+        self.solid.append(Triangles(corners, normals, shade, np.zeros(len(corners), dtype=bool)))
+
+    def shoot(
+        self,
+        corners: Float[np.ndarray, "n 3"],
+        direction: tuple[float, float, float],
+        bar: tuple[str, float, str] | None = None,
+    ) -> bytes:
+        """Frame `corners` from a direction, slightly from above, and return the PNG.
+
+        Args:
+            corners: points that the frame holds [m].
+            direction: from them to the camera; its height is kept between 15 and 40 degrees.
+            bar: title, largest value and colour map of a bar at the bottom.
+        """
+        from PIL import Image
+
+        camera = frame_camera(corners, direction, 0.09 if bar else 0.0)
+        pixels = render(concatenate(self.solid), concatenate(self.sheer), camera, SIZE, rgb(PAPER))
+        image = Image.fromarray(pixels)
+        if bar:
+            _draw_bar(image, *bar)
+        buffer = io.BytesIO()
+        image.save(buffer, format="PNG")
+        return buffer.getvalue()
+
+
+def frame_camera(corners: Float[np.ndarray, "n 3"], direction: tuple[float, float, float], drop: float = 0.0) -> Camera:
+    """Return a camera that sees all `corners`; `drop` is the share of the picture left empty below them."""
+    x, y, z = direction
+    flat = float(np.hypot(x, y))
+    if flat < 1e-9:
+        x, y, flat = 1.0, -0.8, float(np.hypot(1.0, -0.8))
+    # A camera that looks straight down, or up from below the table, shows little.
+    back = np.array([x, y, np.clip(z, 0.27 * flat, 0.84 * flat)])
+    back /= np.linalg.norm(back)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    frame = np.stack([right, np.cross(back, right), back])
+    seen = corners @ frame.T
+    middle, half = (seen.min(0) + seen.max(0)) / 2, np.ptp(seen, axis=0) / 2
+    # The nearest corners look largest, so the distance is counted from them.
+    reach = max(half[1] / (1.0 - 1.5 * drop), half[0] * SIZE[1] / SIZE[0]) / np.tan(VIEW_ANGLE / 2)
+    distance = half[2] + 1.12 * reach
+    center = middle @ frame - frame[1] * drop * distance * np.tan(VIEW_ANGLE / 2)
+    return Camera(center + back * distance, frame, float(VIEW_ANGLE))
+
+
+def _triangles(corners: np.ndarray, normals: np.ndarray, colors: np.ndarray) -> Triangles:
+    """Return lit triangles."""
+    return Triangles(corners, normals, colors, np.ones(len(corners), dtype=bool))
+
+
+def _sharp_normals(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> Float[np.ndarray, "f 3 3"]:
+    """Return a normal for each corner of each face: the mean over the faces there that bend by less than `SHARP`."""
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    weighted = np.cross(b - a, c - a)  # as long as twice the face's area
+    flat = weighted / np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-300)
+    # Pair each corner with all corners at the same place, by the order of the places.
+    _, place = np.unique(np.round(vertices / 1e-7).astype(np.int64), axis=0, return_inverse=True)
+    at = place.reshape(-1)[faces].reshape(-1)
+    order = np.argsort(at, kind="stable")
+    counts = np.bincount(at)
+    start = np.cumsum(counts) - counts
+    corner = np.repeat(np.arange(len(at)), counts[at])
+    offset = np.arange(len(corner)) - np.repeat(np.cumsum(counts[at]) - counts[at], counts[at])
+    other = order[start[at[corner]] + offset]
+    near = (flat[corner // 3] * flat[other // 3]).sum(1) > np.cos(SHARP)
+    sums = np.zeros((len(at), 3))
+    np.add.at(sums, corner[near], weighted[other[near] // 3])
+    return (sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-300)).reshape(-1, 3, 3)
+
+
+def _mapped(values: np.ndarray, colors: str) -> np.ndarray:
+    """Return the colours of values in [0, 1] by a colour map of matplotlib."""
+    import matplotlib
+
+    return matplotlib.colormaps[colors](np.clip(values, 0.0, 1.0))[:, :3]
+
+
+def _draw_bar(image: object, title: str, most: float, colors: str) -> None:
+    """Draw a colour bar from 0 to `most` with its title at the bottom of a picture."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    assert isinstance(image, Image.Image)
+    left, right, top, bottom = 200, SIZE[0] - 200, SIZE[1] - 28, SIZE[1] - 12
+    ramp = _mapped(np.linspace(0.0, 1.0, right - left), colors)
+    strip = (255 * np.broadcast_to(ramp, (bottom - top, *ramp.shape)) + 0.5).astype(np.uint8)
+    image.paste(Image.fromarray(strip), (left, top))
+    draw, font = ImageDraw.Draw(image), ImageFont.load_default(23)
+    for i in range(4):
+        place = (left + i * (right - left) / 3, top - 5)
+        draw.text(place, f"{most * i / 3:.1f}", INK, font, anchor="ms")
+    draw.text(((left + right) / 2, top - 34), title, INK, font, anchor="ms")
