@@ -31,14 +31,14 @@ class Scene:
     mesh: trimesh.Trimesh
 
 
-def read_scene(folder: Path, entry: dict[str, Any], view: str) -> Scene:
+def read_scene(folder: Path, entry: dict[str, Any], view: str, camera_is_known: bool) -> Scene:
     """Read a noisy view without normals and the true mesh, both at the object's suggested scale."""
     scale = float(entry["suggested_scale"])
     cloud = read_cloud(folder / f"{view}_noisy.ply")
     camera = torch.tensor(entry["views"][view]["T_object_camera"], dtype=torch.float64)[:3, 3]
     mesh = trimesh.load(folder / "mesh.ply", force="mesh")
     mesh.apply_scale(scale)
-    return Scene(folder.name, PointCloud(cloud.points * scale, None, camera * scale), mesh)
+    return Scene(folder.name, PointCloud(cloud.points * scale, None, camera * scale if camera_is_known else None), mesh)
 
 
 def bench_one(scene: Scene, hand_name: str, starts: int, seed: int, close: int, spec: ContactSpec) -> dict[str, Any]:
@@ -78,21 +78,31 @@ def bench_one(scene: Scene, hand_name: str, starts: int, seed: int, close: int, 
     return row
 
 
-def print_table(rows: list[dict[str, Any]]) -> None:
-    """Print one line for each object and hand, then the counts."""
-    print(f"{'object':12}{'hand':9}{'s':>6}{'grasps':>8}{'tip mm':>8}{'clear mm':>9}  {'top':12}{'held of tried':>14}")
-    for r in rows:
-        top = r["trials"][0]["status"] if r["trials"] else "-"
-        held = f"{sum(t['held'] for t in r['trials'])}/{len(r['trials'])}"
-        print(
-            f"{r['object']:12}{r['hand']:9}{r['seconds']:6.1f}{r['grasps']:8}{r.get('tip_mm', '-')!s:>8}"
-            f"{r.get('clearance_mm', '-')!s:>9}  {top:12}{held:>14}"
-        )
+HEADER = f"{'object':12}{'hand':9}{'s':>6}{'grasps':>8}{'tip mm':>8}{'clear mm':>9}  {'top grasp':20}{'held':>7}"
+
+
+def table_line(r: dict[str, Any]) -> str:
+    """Return one line of the table: seconds to plan, executable grasps, the best one, and how many trials held."""
+    top = "-"
+    if r["trials"]:
+        first = r["trials"][0]
+        top = f"{first['status'].lower()} {first['moved_mm']:.0f} mm {first['turned_deg']:.0f} deg"
+    held = f"{sum(t['held'] for t in r['trials'])}/{len(r['trials'])}"
+    return (
+        f"{r['object']:12}{r['hand']:9}{r['seconds']:6.1f}{r['grasps']:8}{r.get('tip_mm', '-')!s:>8}"
+        f"{r.get('clearance_mm', '-')!s:>9}  {top:20}{held:>7}"
+    )
+
+
+def print_counts(rows: list[dict[str, Any]]) -> None:
+    """Print how many objects have a grasp and how many top grasps were held, for each hand."""
     for hand in sorted({r["hand"] for r in rows}):
         mine = [r for r in rows if r["hand"] == hand]
-        found = [r for r in mine if r["grasps"]]
+        found = sum(r["grasps"] > 0 for r in mine)
         held = sum(bool(r["trials"]) and r["trials"][0]["held"] for r in mine)
-        print(f"{hand}: {len(found)} of {len(mine)} objects with a grasp, top grasp held on {held} of {len(mine)}")
+        tried = [t for r in mine for t in r["trials"]]
+        all_held = f"{sum(t['held'] for t in tried)} of {len(tried)} trials held"
+        print(f"{hand}: {found} of {len(mine)} objects with a grasp, the top one held on {held}, {all_held}")
 
 
 def grasp(
@@ -103,6 +113,7 @@ def grasp(
     starts: int = 1000,
     seed: int = 0,
     close: int = 1,
+    camera: bool = True,
     out: Path = Path("out/bench_grasp.json"),
 ) -> None:
     """Plan from one noisy view of every object, for each hand, and close on the true mesh in simulation.
@@ -115,22 +126,25 @@ def grasp(
         starts: starts of the contact planner.
         seed: of every random draw.
         close: how many of the best grasps of each object and hand are closed.
+        camera: whether the camera's position is given, as in the manifest, or must be estimated.
         out: where the numbers are written as JSON.
     """
+    print(HEADER)
     entries = json.loads((objects / "manifest.json").read_text())["objects"]
     rows = []
     for name in sorted(entries):
         if only and name not in only:
             continue
-        scene = read_scene(objects / name, entries[name], view)
+        scene = read_scene(objects / name, entries[name], view, camera)
         for hand in hands:
             rows.append(bench_one(scene, hand, starts, seed, close, ContactSpec(table=0.0)))
-            print(json.dumps(rows[-1]), flush=True)
-    print_table(rows)
+            print(table_line(rows[-1]), flush=True)
+    print_counts(rows)
     threads = torch.get_num_threads()
     text = json.dumps({"bench": "grasp", "view": view, "seed": seed, "threads": threads, "rows": rows}, indent=1)
     write_atomically(out, lambda path: path.write_text(text) and None)
 
 
 if __name__ == "__main__":
+    torch.set_num_threads(1)  # the batches are small: a second thread brings nothing here
     tyro.extras.subcommand_cli_from_dict({"grasp": grasp})

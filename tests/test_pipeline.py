@@ -126,6 +126,7 @@ def test_the_file_names_everything(run, tmp_path):
     assert meta["hand"] == hand.name
     assert meta["joint_names"].split(",") == list(hand.joint_names)
     assert meta["hand_sha256"] == hand.sha256
+    assert len(meta["mixture_sha256"]) == 64
     assert meta["cloud_sha256"] == digest(load_object("cylinder").view)
     assert {"units", "frames", "seed", "friction", "table", "starts"} <= set(meta)
 

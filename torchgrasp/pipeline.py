@@ -12,9 +12,10 @@ from torch import Tensor
 from torchgrasp.base import count_status
 from torchgrasp.cloud.check import check_cloud
 from torchgrasp.errors import BadArgument, Status
+from torchgrasp.files import sha256
 from torchgrasp.hand.collide import field_from_surface
 from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.mixture import load_mixture
+from torchgrasp.hand.mixture import load_mixture, mixture_path
 from torchgrasp.hand.query import query_hand
 from torchgrasp.hand.realise import realise
 from torchgrasp.hand.refine import Surroundings
@@ -108,7 +109,9 @@ def plan_grasps(
     if not isinstance(hand, Hand):
         raise BadArgument("hand", type(hand).__name__, "a Hand from load_hand")
     check_cloud(cloud)
-    mixture = load_mixture(hand.name)
+    mixture_file = mixture_path(hand.urdf_path.parent)  # beside the hand, also when it is a user's own
+    device = cloud.points.device
+    hand, mixture = hand.to(device), load_mixture(mixture_file).to(device)
 
     shape = fit_shape(cloud, seed=seed, table=spec.table)
     surface = extract_surface(shape)
@@ -137,6 +140,7 @@ def plan_grasps(
         meta={
             "hand": hand.name,
             "hand_sha256": hand.sha256,
+            "mixture_sha256": sha256(mixture_file),
             "cloud_sha256": digest(cloud),
             "joint_names": ",".join(hand.joint_names),
             "finger_names": ",".join(hand.finger_names),
