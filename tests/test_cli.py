@@ -124,6 +124,18 @@ def test_a_missing_simulator_is_named_before_the_work(tmp_path, capsys, monkeypa
     assert capsys.readouterr().err == f"torchgrasp: {MissingExtra('sapien', 'sim')}\n"
 
 
+def test_a_simulator_without_its_libraries_is_named_before_the_work(tmp_path, capsys, monkeypatch, refuse_work):
+    def fail(name):
+        raise ImportError("libX11.so.6: cannot open shared object file")
+
+    monkeypatch.setattr(cli.importlib.util, "find_spec", lambda name: "found")
+    monkeypatch.setattr(cli.importlib, "import_module", fail)
+    arguments = [VIEW, "--hand", "allegro", "--mesh", MESH, "--close", "--out", str(tmp_path / "out")]
+    assert cli.main(["grasp", *arguments]) == 2
+    said = capsys.readouterr().err
+    assert "libX11" in said and said.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
 def test_an_error_during_the_work_is_one_sentence_too(tmp_path, capsys, monkeypatch):
     def fail(*args, **kwargs):
         raise MissingExtra("a package\nwith two lines", "sim")

@@ -5,11 +5,13 @@ on stderr; 130 interrupted.
 """
 
 import contextlib
+import importlib
 import importlib.util
 import os
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -107,8 +109,8 @@ def grasp(
         check_folder(out)
     if close and mesh is None:
         raise BadArgument("--close", "no --mesh", "--close together with --mesh")
-    if close and importlib.util.find_spec("sapien") is None:
-        raise MissingExtra("sapien", "sim")
+    if close:
+        check_simulator()
     if table is not None and no_table:
         raise BadArgument("--table", f"{table:g} and --no-table", "one of the two")
     if not 1 <= starts <= 1_000_000:
@@ -150,6 +152,24 @@ def grasp(
     print(verdict(run))
     done = bool(len(run.executable)) if not close else run.closure is not None and run.closure.held
     return 0 if done else 1
+
+
+def check_simulator() -> None:
+    """Refuse a simulator that is not installed, or that lacks a library of the system.
+
+    Raises:
+        MissingExtra: SAPIEN is not installed.
+        BadArgument: SAPIEN is installed and cannot be loaded.
+    """
+    if importlib.util.find_spec("sapien") is None:
+        raise MissingExtra("sapien", "sim")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a missing Vulkan does not concern physics
+            importlib.import_module("sapien")
+    except ImportError as error:
+        allowed = "one whose libraries are there (Debian and Ubuntu: apt-get install libx11-6)"
+        raise BadArgument("--close", f"a SAPIEN that cannot be loaded ({error})", allowed) from error
 
 
 def check_folder(path: Path) -> None:
