@@ -5,6 +5,7 @@ on stderr; 130 interrupted.
 """
 
 import contextlib
+import dataclasses
 import importlib
 import importlib.util
 import os
@@ -139,11 +140,12 @@ def grasp(
         grasps = plan_grasps(seen, the_hand, spec, starts, seed, observer=progress.end)
         surface = extract_surface(progress.values["shape"])
         name = object_name(cloud if mesh is None else mesh)
-        run = Run(name, cloud, seen, the_hand, spec, surface, grasps, tuple(progress.stages))
+        plan = progress.values["plan"]
+        run = Run(name, cloud, seen, the_hand, spec, surface, grasps, tuple(progress.stages), plan)
         if close and true_mesh is not None and len(run.executable):
             closure = close_hand(run.executable[0], the_hand, true_mesh, trial, seed=seed, parts=parts)
             progress.end("closing", f"{closure.time[-1]:.1f} s simulated, {closure.status.name.lower()}")
-            run = Run(name, cloud, seen, the_hand, spec, surface, grasps, tuple(progress.stages), true_mesh, closure)
+            run = dataclasses.replace(run, stages=tuple(progress.stages), mesh=true_mesh, closure=closure)
         with _naming("--out", "path"):
             grasps.save(out / "grasps.safetensors")
             write_report(out / "report.html", run)

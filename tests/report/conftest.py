@@ -12,7 +12,7 @@ from torchgrasp.hand.hand import load_hand
 from torchgrasp.report.run import Run, Stage
 from torchgrasp.shape.surface import Surface
 from torchgrasp.specs import ContactSpec
-from torchgrasp.values import Certificate, ClosureResult, Contacts, Grasps, PointCloud
+from torchgrasp.values import Certificate, ClosureResult, ContactPlan, Contacts, Grasps, PointCloud
 
 F64 = torch.float64
 
@@ -68,6 +68,8 @@ def run() -> Run:
         seconds=1.0,
     )
     cloud = PointCloud(vertices[vertices[:, 0] > 0], None, torch.tensor([0.5, 0.1, 0.3], dtype=F64))
+    failed = torch.tensor([Status.NOT_CLOSED, Status.NOT_CLOSED])
+    plan = ContactPlan(contacts, torch.ones(2, 3, 8, dtype=F64), one, failed)
     stages = (Stage("cloud", "321 points", 0.1), Stage("shape", "a <b>bold</b> claim", 1.25))
     source = Path("clouds/<odd> & 'quoted'.ply")
-    return Run("ball", source, cloud, hand, ContactSpec(table=-0.03), surface, grasps, stages, body, closure)
+    return Run("ball", source, cloud, hand, ContactSpec(table=-0.03), surface, grasps, stages, plan, body, closure)

@@ -77,7 +77,9 @@ def test_verdicts(run):
     planned = dataclasses.replace(run, closure=None)
     assert verdict(planned) == "The allegro hand has 1 executable grasp of the ball."
     none = dataclasses.replace(planned, grasps=run.grasps[1])
-    assert f"1 of 1: {Status.TIP_ERROR.sentence}" in verdict(none)
-    assert Status.OUT_OF_REACH.sentence in refusal(run.grasps[:0], "allegro", "ball")
+    assert f"1 of 1 postures: {Status.TIP_ERROR.sentence}" in verdict(none)
+    unplanned = dataclasses.replace(none, grasps=run.grasps[:0])
+    assert f"2 of 2 starts: {Status.NOT_CLOSED.sentence}" in refusal(unplanned)
+    assert Status.OUT_OF_REACH.sentence in refusal(dataclasses.replace(unplanned, plan=None))
     _, words = read(format_page(none, {}))
     assert "Best grasps" not in words

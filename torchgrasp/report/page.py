@@ -113,9 +113,12 @@ def format_page(run: Run, pictures: dict[str, list[tuple[str, bytes]]]) -> str:
     ]
     if len(run.executable):
         body += [f"<h2>Best grasps ({min(ROWS, len(run.executable))} of {len(run.executable)})</h2>", _grasps(run)]
+    if run.plan is not None:
+        rows = [(str(n), s.name.lower(), s.sentence) for s, n in count_status(run.plan.status).items()]
+        body += ["<h2>What became of every start</h2>", _table(("count", "status", "meaning"), rows, numbers={0})]
     if len(run.grasps):
         rows = [(str(n), s.name.lower(), s.sentence) for s, n in count_status(run.grasps.status).items()]
-        body += ["<h2>What became of every candidate</h2>", _table(("count", "status", "meaning"), rows, numbers={0})]
+        body += ["<h2>What became of every posture</h2>", _table(("count", "status", "meaning"), rows, numbers={0})]
     facts = [(name.replace("_", " "), value) for name, value in sorted(run.grasps.meta.items())]
     body += ["<h2>Provenance</h2>", _table(("what", "value"), facts, code={1})]
     head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{_text(title)}</title>'

@@ -10,7 +10,7 @@ from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.shape.surface import Surface
 from torchgrasp.specs import ContactSpec
-from torchgrasp.values import ClosureResult, Grasps, PointCloud
+from torchgrasp.values import ClosureResult, ContactPlan, Grasps, PointCloud
 
 if TYPE_CHECKING:
     import trimesh
@@ -37,6 +37,7 @@ class Run:
     surface: Surface
     grasps: Grasps
     stages: tuple[Stage, ...]
+    plan: ContactPlan | None = None
     mesh: "trimesh.Trimesh | None" = None
     closure: ClosureResult | None = None
 
@@ -53,7 +54,7 @@ def verdict(run: Run) -> str:
     found = len(run.executable)
     if found:
         return f"The {run.hand.name} hand has {found} executable grasp{'s' * (found > 1)} of the {run.object_name}."
-    return refusal(run.grasps, run.hand.name, run.object_name)
+    return refusal(run)
 
 
 def closing_sentence(closure: ClosureResult, hand_name: str, object_name: str) -> str:
@@ -68,10 +69,14 @@ def closing_sentence(closure: ClosureResult, hand_name: str, object_name: str) -
     )
 
 
-def refusal(grasps: Grasps, hand_name: str, object_name: str) -> str:
-    """Say why no grasp is executable: the number of candidates for each reason."""
-    counts = count_status(grasps.status) if len(grasps) else {}
-    if not counts:
-        return f"The {hand_name} hand has no executable grasp of the {object_name}: {Status.OUT_OF_REACH.sentence}."
-    reasons = "; ".join(f"{n} of {len(grasps)}: {status.sentence}" for status, n in counts.items())
-    return f"The {hand_name} hand has no executable grasp of the {object_name} ({reasons})."
+def refusal(run: Run) -> str:
+    """Say why no grasp is executable: the number of candidates, or of starts where there is none, for each reason."""
+    head = f"The {run.hand.name} hand has no executable grasp of the {run.object_name}"
+    if len(run.grasps):
+        failed, total = run.grasps.status, f"{len(run.grasps)} postures"
+    elif run.plan is not None and not bool((run.plan.status == Status.OK).any()):
+        failed, total = run.plan.status, f"{len(run.plan)} starts"
+    else:
+        return f"{head}: {Status.OUT_OF_REACH.sentence}."
+    reasons = "; ".join(f"{n} of {total}: {status.sentence}" for status, n in count_status(failed).items())
+    return f"{head} ({reasons})."
