@@ -17,6 +17,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import torch
 import tyro
 from tqdm import tqdm
 
@@ -49,6 +50,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         print(f"torchgrasp {__version__}")
         return 0
+    # The batches are small: a second thread costs more than it brings, and one gives the same bits on any machine.
+    torch.set_num_threads(1)
     try:
         return tyro.extras.subcommand_cli_from_dict(
             {"grasp": grasp, "objects": objects},
