@@ -91,6 +91,8 @@ def test_fewer_pixels_than_points_give_all_pixels(box):
 def test_refusals(box):
     with pytest.raises(BadArgument, match="elevation"):
         partial_view(box, 0.0, 90.0)
+    with pytest.raises(BadArgument, match="azimuth"):
+        look_at(float("nan"), 0.0, 0.5)
     with pytest.raises(BadArgument, match="distance"):
         partial_view(box, 0.0, 0.0, distance=-1.0)
     with pytest.raises(BadArgument, match="n: found 3"):

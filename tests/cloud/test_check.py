@@ -33,6 +33,15 @@ def test_coincident_few_and_collinear_points_are_refused():
         check_cloud(PointCloud(cloud(), torch.zeros(50, 3)))
 
 
+def test_what_is_no_cloud_and_what_requires_a_gradient_is_refused():
+    with pytest.raises((BadArgument, TypeError), match="cloud"):  # TypeError: the annotations are checked in tests
+        check_cloud(cloud())  # pyright: ignore[reportArgumentType]
+    with pytest.raises(BadArgument, match=r"points\.detach\(\)"):
+        check_cloud(PointCloud(cloud().requires_grad_()))
+    with pytest.raises(BadArgument, match=r"viewpoint\.detach\(\)"):
+        check_cloud(PointCloud(cloud(), None, cloud(1)[0].requires_grad_()))
+
+
 def test_numbers_spoilt_after_the_value_was_made_are_found():
     value = PointCloud(cloud())
     value.points[3, 1] = float("inf")
@@ -47,3 +56,13 @@ def test_duplicates_are_reduced_to_the_first_in_order():
     kept = keep_distinct(PointCloud((points[order] + jitter), points[order] + 1, points[0]))
     torch.testing.assert_close(kept.points, points.flip(0), rtol=0, atol=1e-11)
     torch.testing.assert_close(kept.normals, points.flip(0) + 1)
+
+
+def test_many_near_copies_of_one_point_are_one_point_and_points_a_little_apart_are_not():
+    """A pair of points for every two copies would be 5e9 pairs here."""
+    copies = cloud(1) + 1e-11 * torch.rand(100_000, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    apart = cloud(1) + 3e-10 * torch.arange(1, 4, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    kept = keep_distinct(PointCloud(torch.cat([cloud(9), copies, apart])))
+    assert torch.equal(kept.points, torch.cat([cloud(9), apart]))
+    with pytest.raises(TooFewPoints, match="1 distinct"):
+        keep_distinct(PointCloud(cloud(1).repeat(5, 1)))

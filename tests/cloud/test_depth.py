@@ -47,6 +47,10 @@ def test_refusals():
         cloud_from_depth(depth, K, torch.arange(48 * 64).reshape(48, 64) < 3)
     with pytest.raises(BadArgument, match="depths >= 0"):
         cloud_from_depth(-depth, K)
+    with pytest.raises((BadArgument, TypeError), match="depth"):  # TypeError: the annotations are checked in tests
+        cloud_from_depth(depth.tolist(), K)
+    with pytest.raises((BadArgument, TypeError), match="mask"):
+        cloud_from_depth(depth, K, (depth > 0).tolist())
     with pytest.raises(BadArgument, match="intrinsics"):
         cloud_from_depth(depth, K.T)
     for spoilt in (2 * eye, torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0])).double(), eye + torch.nan):

@@ -107,7 +107,10 @@ def test_arrays_and_text(tmp_path, points):
     np.save(tmp_path / "b.npy", np.asfortranarray(table))
     np.savetxt(tmp_path / "c.xyz", points, header="x y z")
     np.savetxt(tmp_path / "d.xyz", table, delimiter=",")
-    for name, normals in [("a.npy", False), ("b.npy", True), ("c.xyz", False), ("d.xyz", True)]:
+    np.savetxt(tmp_path / "e.xyz", points, newline="\r\n")
+    np.savetxt(tmp_path / "f.xyz", points, newline="\r")
+    kinds = [("a.npy", False), ("b.npy", True), ("c.xyz", False), ("d.xyz", True), ("e.xyz", False), ("f.xyz", False)]
+    for name, normals in kinds:
         cloud = read_cloud(tmp_path / name)
         np.testing.assert_allclose(cloud.points.numpy(), points, atol=1e-8)
         assert (cloud.normals is not None) == normals
@@ -200,6 +203,8 @@ def test_refusals(tmp_path, points):
         read_cloud(save(points + 1j))
     with pytest.raises(BadArgument, match="viewpoint"):
         read_cloud(save(points), viewpoint=[0.0, 1.0])
+    with pytest.raises((BadArgument, TypeError), match="viewpoint"):  # TypeError: the annotations are checked in tests
+        read_cloud(save(points), viewpoint=["x", 0.0, 1.0])  # pyright: ignore[reportArgumentType]
     with pytest.raises(BadArgument, match="length zero"):
         read_cloud(save(np.concatenate([points, 0 * points], axis=1)))
 

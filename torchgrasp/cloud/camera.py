@@ -41,20 +41,22 @@ def look_at(
 
     Args:
         azimuth: direction from the target to the camera, from x towards y [deg].
-        elevation: above the horizontal [deg], in (-90, 90).
-        distance: from the target to the camera [m].
+        elevation: above the horizontal [deg], in [-89.9, 89.9].
+        distance: from the target to the camera [m], in [0.01, 10].
         target: point (3,) [m] in the middle of the image; None: the origin.
 
     Raises:
-        BadArgument: an elevation or a distance outside its range.
+        BadArgument: an angle or a distance outside its range.
 
     >>> look_at(0.0, 0.0, 0.5)[:3, 3]
     tensor([0.5000, 0.0000, 0.0000], dtype=torch.float64)
     """
     if not -89.9 <= elevation <= 89.9:
         raise BadArgument("elevation", elevation, "a number of degrees in [-89.9, 89.9]")
-    if not 0.01 <= distance <= 10.0 or not math.isfinite(azimuth):
-        raise BadArgument("distance", f"{distance} at azimuth {azimuth}", "metres in [0.01, 10] at a finite azimuth")
+    if not math.isfinite(azimuth):
+        raise BadArgument("azimuth", azimuth, "a finite number of degrees")
+    if not 0.01 <= distance <= 10.0:
+        raise BadArgument("distance", distance, "metres in [0.01, 10]")
     a, e = math.radians(azimuth), math.radians(elevation)
     away = torch.tensor([math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)], dtype=torch.float64)
     right = torch.tensor([-math.sin(a), math.cos(a), 0.0], dtype=torch.float64)

@@ -29,16 +29,20 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
         cloud: points [m], with or without normals and viewpoint.
 
     Raises:
-        BadArgument: a non-finite number, points that all coincide or lie on a line, a normal of length zero.
+        BadArgument: no `PointCloud`, a non-finite number, a tensor that requires a gradient (nothing here has one),
+            points that all coincide or lie on a line, a normal of length zero.
         TooFewPoints: fewer than 4 distinct points.
         SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; most often the unit is mm.
 
     >>> check_cloud(PointCloud(torch.rand(50, 3))).viewpoint is None
     True
     """
+    if not isinstance(cloud, PointCloud):
+        raise BadArgument("cloud", type(cloud).__name__, "a PointCloud")
+    for name in ("points", "normals", "viewpoint"):
+        if getattr(cloud, name) is not None and getattr(cloud, name).requires_grad:
+            raise BadArgument(name, "a tensor that requires a gradient", f"a tensor without one: {name}.detach()")
     points = check_tensor("points", cloud.points, (None, 3))
-    if len(points) < MIN_POINTS:
-        raise TooFewPoints("points", f"{len(points)} points", f"at least {MIN_POINTS} points")
     extent = float((points.amax(0) - points.amin(0)).max())
     if extent == 0.0:
         raise BadArgument("points", f"{len(points)} points that all coincide", "points of a surface")
@@ -83,14 +87,17 @@ def _distinct_rows(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:
     """Return the ascending indices of the first point of each group of coincident points."""
     from scipy.spatial import KDTree
 
-    _, group = torch.unique(points, dim=0, return_inverse=True)
+    points = points.detach().double()
+    low = points.amin(0)
+    reach = SAME_POINT * float((points.amax(0) - low).max())
+    # Cells of half the reach: all points of one are coincident, and one point a cell makes few pairs however many
+    # near copies there are. In a cloud without extent every point falls into cell 0.
+    _, group = torch.unique(torch.floor((points - low) / max(reach / 2, 1e-300)), dim=0, return_inverse=True)
     order = torch.arange(len(group), device=group.device)
     first = torch.full_like(order, len(order)).scatter_reduce(0, group, order, "amin")
     rows = torch.sort(first[first < len(order)]).values
-    # Exact copies are gone, so that even many near copies of one point make few pairs.
-    unique = points[rows].detach().cpu().double()
-    reach = SAME_POINT * float((unique.amax(0) - unique.amin(0)).max())
-    pairs = torch.from_numpy(KDTree(unique.numpy()).query_pairs(reach, output_type="ndarray")).to(rows.device)
+    pairs = KDTree(points[rows].cpu().numpy()).query_pairs(reach, output_type="ndarray")
+    pairs = torch.from_numpy(pairs).to(rows.device)
     keep = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
     keep[pairs[:, 1]] = False  # the first index of a pair is the smaller one
     return rows[keep]

@@ -37,6 +37,8 @@ def cloud_from_depth(
     >>> cloud_from_depth(torch.full((48, 64), 0.5), K).viewpoint
     tensor([0., 0., 0.])
     """
+    if not isinstance(depth, Tensor):
+        raise BadArgument("depth", type(depth).__name__, "a torch tensor of shape (h, w), floating, in metres")
     if depth.ndim != 2 or depth.dtype not in (torch.float32, torch.float64):
         raise BadArgument("depth", f"shape {tuple(depth.shape)} of {depth.dtype}", "shape (h, w), floating, in metres")
     if bool((depth < 0).any()):
@@ -44,6 +46,8 @@ def cloud_from_depth(
     check_intrinsics(intrinsics)
     seen = torch.isfinite(depth) & (depth > 0)
     if mask is not None:
+        if not isinstance(mask, Tensor):
+            raise BadArgument("mask", type(mask).__name__, f"a torch tensor of bool of {tuple(depth.shape)}")
         if mask.shape != depth.shape or mask.dtype != torch.bool:
             raise BadArgument("mask", f"shape {tuple(mask.shape)} of {mask.dtype}", f"bool of {tuple(depth.shape)}")
         seen = seen & mask

@@ -113,10 +113,11 @@ def _guess_viewpoint(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]
     centre = (along.amax(0) + along.amin(0)) / 2 @ axes
     radius = torch.linalg.vector_norm(points - centre, dim=-1).max()
     bulge = (normals * (points - centre)).sum(-1)
-    directions = _spread_directions(DIRECTIONS, points)
+    directions = spread_directions(DIRECTIONS, points)
     origin = -centre / torch.linalg.vector_norm(centre).clamp_min(1e-300)
-    facing = torch.tanh(normals @ torch.cat([directions, origin[None]]).T / SOFTNESS)
-    score = (bulge[:, None] * facing).mean(0)
+    # In pieces, so that the memory for a cloud of a whole depth image stays bounded.
+    pieces = torch.cat([directions, origin[None]]).split(64)
+    score = torch.cat([(bulge[:, None] * torch.tanh(normals @ piece.T / SOFTNESS)).mean(0) for piece in pieces])
     best = score[:-1].argmax()
     in_camera_frame = (centre[2] > math.cos(math.pi / 4) * torch.linalg.vector_norm(centre)) & (
         torch.linalg.vector_norm(centre) > 2 * radius
@@ -126,8 +127,12 @@ def _guess_viewpoint(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]
     return centre + 4 * radius * directions[best]
 
 
-def _spread_directions(n: int, like: Tensor) -> Float[Tensor, "n 3"]:
-    """Return n unit vectors spread evenly over the sphere (a Fibonacci spiral)."""
+def spread_directions(n: int, like: Tensor) -> Float[Tensor, "n 3"]:
+    """Return n unit vectors spread evenly over the sphere (a Fibonacci spiral from +z), in the dtype of `like`.
+
+    >>> spread_directions(4, torch.zeros(0))[:, 2]
+    tensor([ 0.7500,  0.2500, -0.2500, -0.7500])
+    """
     k = torch.arange(n, dtype=like.dtype, device=like.device) + 0.5
     z = 1 - 2 * k / n
     turn = math.pi * (1 + math.sqrt(5)) * k

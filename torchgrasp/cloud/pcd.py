@@ -33,11 +33,9 @@ def parse_pcd(data: bytes) -> dict[str, Any]:
         words = body.split()
         if count < 0 or len(words) < count * sum(counts):
             raise ValueError(f"fewer numbers than {count} points have")
-        table = np.array(words[: count * sum(counts)]).reshape(count, sum(counts))
+        table = np.array(words[: count * sum(counts)], dtype=np.float64).reshape(count, sum(counts))
         starts = np.cumsum([0, *counts[:-1]])
-        columns = {
-            name: table[:, s].astype(np.float64) for name, s in zip(names, starts, strict=True) if name in wanted
-        }
+        columns = {name: table[:, s] for name, s in zip(names, starts, strict=True) if name in wanted}
     elif encoding == "binary":
         letters = {"F": "f", "I": "i", "U": "u"}
         # Padding fields are all called "_": the index makes the names of the dtype unique.

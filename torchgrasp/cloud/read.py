@@ -1,7 +1,6 @@
 """Point clouds from files and into files; a file from a stranger is refused by name, and runs no code."""
 
 import io
-import os
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -45,7 +44,8 @@ def read_cloud(path: Path | str, viewpoint: Sequence[float | int] | Tensor | Non
     Raises:
         CloudFileError: no such file, an unknown suffix, content that is not what the suffix says, more than
             512 MB or 5 million points.
-        BadArgument: a non-finite number (a pixel without depth belongs left out), or points on one line.
+        BadArgument: a viewpoint that is no three numbers, a non-finite number (a pixel without depth belongs left
+            out), or points on one line.
         TooFewPoints: fewer than 4 distinct points.
         SuspiciousScale: an extent outside [5 mm, 2 m].
 
@@ -53,6 +53,7 @@ def read_cloud(path: Path | str, viewpoint: Sequence[float | int] | Tensor | Non
     Traceback (most recent call last):
     torchgrasp.errors.CloudFileError: path: found scan.docx, allowed is a file ending in .ply, .pcd, .npz, .npy, .xyz
     """
+    position = None if viewpoint is None else _check_viewpoint(viewpoint)
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -70,8 +71,8 @@ def read_cloud(path: Path | str, viewpoint: Sequence[float | int] | Tensor | Non
     points, normals = arrays["points"], arrays.get("normals")
     if len(points) < 4:
         raise TooFewPoints("path", f"{path} with {len(points)} points", "at least 4 points")
-    if viewpoint is not None:
-        arrays["viewpoint"] = check_tensor("viewpoint", torch.as_tensor(viewpoint, dtype=torch.float64), (3,))
+    if position is not None:
+        arrays["viewpoint"] = position
     return check_cloud(PointCloud(points, normals, arrays.get("viewpoint")))
 
 
@@ -104,6 +105,15 @@ def save_cloud(cloud: PointCloud, path: Path | str) -> Path:
         temporary.write_bytes(content)
 
     return write_atomically(path, write)
+
+
+def _check_viewpoint(viewpoint: Any) -> Tensor:
+    """Return a position in float64, or refuse what is no three finite numbers."""
+    try:
+        position = torch.as_tensor(viewpoint, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise BadArgument("viewpoint", repr(viewpoint), "three numbers [m]") from error
+    return check_tensor("viewpoint", position, (3,))
 
 
 def _check_array(path: Path, name: str, array: Any) -> Tensor:
@@ -166,7 +176,7 @@ def _parse_npz(data: bytes) -> dict[str, Any]:
 def _parse_text(data: bytes) -> dict[str, Any]:
     """Parse text: three or six numbers a line, separated by blanks or commas; `#` starts a comment."""
     text = data.decode("ascii").replace(",", " ")
-    lines = [line for line in text.split(os.linesep if os.linesep in text else "\n") if line.split("#")[0].strip()]
+    lines = [line for line in text.splitlines() if line.split("#")[0].strip()]
     if not lines:
         raise ValueError("no numbers")
     return _split_columns(np.loadtxt(lines, ndmin=2))
