@@ -147,6 +147,16 @@ def test_a_point_outside_the_domain_is_refused_by_name(half_ball: ShapeGP):
         half_ball.predict(torch.stack([inside, outside]))
 
 
+def test_no_points_have_an_empty_estimate(half_ball: ShapeGP):
+    found = half_ball.predict(torch.zeros(2, 0, 3))
+    assert found.covariance.shape == (2, 0, 4, 4) and found.std_m.shape == (2, 0)
+
+
+def test_an_estimate_carries_no_gradient_that_would_be_wrong(half_ball: ShapeGP):
+    found = half_ball.predict(half_ball.metres(_queries(half_ball, 3)).requires_grad_())
+    assert not found.distance.requires_grad and not found.covariance.requires_grad
+
+
 def test_queries_that_are_not_finite_are_refused(half_ball: ShapeGP):
     with pytest.raises(BadArgument, match="points"):
         half_ball.predict(torch.full((2, 3), torch.nan))

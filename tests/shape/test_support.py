@@ -105,6 +105,29 @@ def test_a_whole_surface_needs_no_completion():
     assert found.std_m.max() < 0.006
 
 
+def test_a_viewpoint_does_not_turn_the_normals_of_a_whole_surface_inward():
+    rng = torch.Generator().manual_seed(0)
+    n = torch.randn(900, 3, generator=rng, dtype=torch.float64)
+    n = n / torch.linalg.vector_norm(n, dim=-1, keepdim=True)
+    shape = fit_shape(PointCloud(0.04 * n, n, torch.tensor([0.0, 0.0, 0.5], dtype=torch.float64)))
+    assert (shape.predict(0.04 * n).normal * n).sum(-1).min() > 0.98
+
+
+def test_a_viewpoint_within_a_single_view_is_refused():
+    cloud = _cylinder()
+    with pytest.raises(BadArgument, match=r"viewpoint: .* beside or behind it"):
+        fit_shape(PointCloud(cloud.points, None, cloud.points.mean(0)))
+
+
+def test_copies_of_points_with_normals_change_nothing_in_the_papers_support():
+    rng = torch.Generator().manual_seed(0)
+    n = torch.randn(300, 3, generator=rng, dtype=torch.float64)
+    n = n / torch.linalg.vector_norm(n, dim=-1, keepdim=True)
+    once = fit_shape(PointCloud(0.04 * n, n), support="paper")
+    twice = fit_shape(PointCloud(0.04 * torch.cat([n, n[:150]]), torch.cat([n, n[:150]])), support="paper")
+    assert torch.equal(once.weights, twice.weights)
+
+
 def test_a_float32_cloud_gives_a_float64_shape():
     cloud = _cylinder().to(torch.float32)
     shape = fit_shape(cloud)
@@ -134,6 +157,12 @@ def test_few_points_are_enough_for_a_shape():
 )
 def test_bad_arguments_are_refused_by_name(bad: dict[str, float]):
     with pytest.raises(BadArgument, match=next(iter(bad))):
+        fit_shape(_cylinder(), **bad)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("bad", [{"seed": 1.5}, {"budget": 70.5}])
+def test_numbers_that_are_no_integers_are_refused(bad: dict[str, float]):
+    with pytest.raises((BadArgument, TypeError), match=next(iter(bad))):  # TypeError: annotations, checked in tests
         fit_shape(_cylinder(), **bad)  # pyright: ignore[reportArgumentType]
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.cloud.normals import spread_directions
 from torchgrasp.linalg import unit
 from torchgrasp.shape.silhouette import Silhouette, farthest_points, silhouette
 from torchgrasp.values import PointCloud
@@ -26,7 +27,7 @@ DIRECTIONS = 80
 FACING = 0.35
 """A plane whose normal has less than this cosine with the view contains the view, and adds no hidden points."""
 MAX_PLANES = 4
-"""Mirror planes used, at most."""
+"""Mirror planes used, at most, besides the one across the view that is added when none of them is."""
 WITHIN = 0.12
 """Planes are used whose score is within this of the best one's."""
 APART = math.cos(math.radians(25.0))
@@ -60,8 +61,9 @@ def complete_cloud(
 
     A plane scores by how many mirrored points fall onto the cloud with the right normal, less twice how far they
     stand out of the outline, in front of the seen surface or below the table (each saturates). The planes come from a
-    grid, vertical ones when the table is known, and the up to four best are refined. The cloud is mirrored across
-    each, and across pairs; a point is kept where nothing was seen, the hull allows it and no better one is near.
+    grid, vertical ones when the table is known; the up to four best, and one across the view if none of those is,
+    are refined. The cloud is mirrored across each, and across pairs; a point is kept where nothing was seen, the hull
+    allows it and no better one is near.
 
     Args:
         cloud: clean points [m] of one view, with outward unit normals.
@@ -142,7 +144,7 @@ def _find_planes(scene: _Scene) -> tuple[Float[Tensor, "p 4"], Float[Tensor, "p"
     size = float((scene.points.amax(0) - scene.points.amin(0)).max())
     view = center - scene.outline.viewpoint
     if scene.table is None:
-        directions = _half_sphere(DIRECTIONS)
+        directions = spread_directions(2 * DIRECTIONS, scene.points)[:DIRECTIONS]  # a half sphere: n and -n are one
         rim_prior = 0.15
     else:
         angle = torch.arange(ANGLES, dtype=torch.float64) * math.pi / ANGLES
@@ -163,8 +165,7 @@ def _find_planes(scene: _Scene) -> tuple[Float[Tensor, "p 4"], Float[Tensor, "p"
         scores = scores - rim_prior * ((offsets - rim[:, None]) / (0.25 * size)) ** 2
 
     best, where = scores.max(1)
-    order = torch.argsort(-best).tolist()
-    order = [i for i in order if facing[i] > FACING]
+    order = [i for i in torch.argsort(best, descending=True, stable=True).tolist() if facing[i] > FACING]
     chosen: list[int] = []
     for i in order:
         if len(chosen) == MAX_PLANES or best[i] <= best[order[0]] - WITHIN:
@@ -182,7 +183,7 @@ def _find_planes(scene: _Scene) -> tuple[Float[Tensor, "p 4"], Float[Tensor, "p"
         return scene.points.new_zeros(0, 4), scene.points.new_zeros(0)
     refined = torch.stack([_refine(scene, grid[i, k], size) for i, k in picks])
     final, _ = scene.score(refined)
-    order = torch.argsort(-final)
+    order = torch.argsort(final, descending=True, stable=True)
     return refined[order], final[order]
 
 
@@ -264,11 +265,3 @@ def _reflect(points: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]) -> Flo
 def _turn(normals: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]) -> Float[Tensor, "*d 3"]:
     """Mirror directions across a plane."""
     return normals - 2.0 * (normals * plane[..., :3]).sum(-1, keepdim=True) * plane[..., :3]
-
-
-def _half_sphere(n: int) -> Float[Tensor, "n 3"]:
-    """Return directions spread evenly over a half sphere (a Fibonacci spiral)."""
-    k = torch.arange(n, dtype=torch.float64) + 0.5
-    z, turn = 1 - k / n, math.pi * (1 + math.sqrt(5)) * k
-    ring = torch.sqrt(1 - z * z)
-    return torch.stack([ring * torch.cos(turn), ring * torch.sin(turn), z], -1)

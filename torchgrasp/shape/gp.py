@@ -104,6 +104,8 @@ class ShapeGP(Value):
     def predict(self, points: Float[Tensor, "*b 3"]) -> ShapeEstimate:
         """Return signed distance, normal and their covariance at query points, Eqs. (7)-(8).
 
+        The estimate carries no gradient to the points; `jet` returns the derivatives.
+
         Args:
             points: query points [m] in the cloud's frame.
 
@@ -115,7 +117,7 @@ class ShapeGP(Value):
             The estimate in the dtype of `points`; see `ShapeEstimate` for units.
         """
         flat = _check_queries(points).reshape(-1, 3)
-        x = self.normalise(flat.double())
+        x = self.normalise(flat.detach().double())
         radius = torch.linalg.vector_norm(x, dim=-1)
         outside = radius > self.domain_radius
         if bool(outside.any()):
@@ -169,11 +171,11 @@ class ShapeGP(Value):
         profile = partial(thin_plate, psi=self.psi)
         everywhere = torch.ones(len(x), dtype=torch.bool, device=x.device)
         cross = covariance(x, self.x, everywhere, self.has_normal, profile)
-        mean = (cross @ self.weights).reshape(4, -1).T
+        mean = (cross @ self.weights).reshape(4, len(x)).T
         whitened = torch.linalg.solve_triangular(self.factor, cross.T, upper=False)
-        whitened = whitened.reshape(len(self.factor), 4, -1).permute(2, 1, 0)
-        here = torch.zeros(1, 3, dtype=x.dtype, device=x.device)
-        prior = covariance(here, here, everywhere[:1], everywhere[:1], profile)
+        whitened = whitened.reshape(len(self.factor), 4, len(x)).permute(2, 1, 0)
+        here, yes = x.new_zeros(1, 3), everywhere.new_ones(1)
+        prior = covariance(here, here, yes, yes, profile)
         return mean, prior - whitened @ whitened.transpose(-1, -2)
 
     def _jet(self, x: Float[Tensor, "q 3"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

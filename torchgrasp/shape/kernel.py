@@ -65,11 +65,15 @@ def covariance(
         has_normal, other_has_normal: which of them are observed with their normal.
         profile: the radial kernel, e.g. `functools.partial(thin_plate, psi=3.6)`.
 
+    Returns:
+        The blocks, without a gradient to the points.
+
     >>> x, mask = torch.rand(5, 3), torch.tensor([True, True, False, False, False])
     >>> covariance(x, x, mask, mask, lambda r: torch.exp(-(r**2))).shape
     torch.Size([11, 11])
     """
-    difference = x[:, None] - other[None]
+    # Detached as the derivatives of the profile are: a gradient through one factor alone would be wrong.
+    difference = (x[:, None] - other[None]).detach()
     r = safe_distance(difference)
     k, slope, bend = radial_derivatives(profile, r)
     # d2k/dx_m dx'_n = -(k'/r) delta_mn - (k'' - k'/r) u_m u_n with u = d/r; at r = 0 the second term has no

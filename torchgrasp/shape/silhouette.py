@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
@@ -67,7 +67,7 @@ def silhouette(cloud: PointCloud, viewpoint: Float[Tensor, "3"], n_rim: int = 16
 
     Args:
         cloud: points [m] of one view.
-        viewpoint: the camera's position [m].
+        viewpoint: the camera's position [m], all points in front of it.
         n_rim: number of points on the outline, evenly spread.
     """
     from scipy.ndimage import distance_transform_edt
@@ -122,11 +122,11 @@ def farthest_points(points: Float[Tensor, "n 3"], n: int) -> Tensor:
     return torch.tensor(picks, dtype=torch.long, device=points.device)
 
 
-def seen_from_one_side(cloud: PointCloud, viewpoint: Float[Tensor, "3"]) -> Bool[Tensor, ""]:
+def seen_from_one_side(cloud: PointCloud, viewpoint: Float[Tensor, "3"]) -> bool:
     """Tell whether the cloud's normals face the viewpoint, as those of a single view do (9 of 10 of them)."""
     assert cloud.normals is not None
     facing = ((viewpoint - cloud.points) * cloud.normals).sum(-1) > 0
-    return facing.double().mean() >= 0.9
+    return float(facing.double().mean()) >= 0.9
 
 
 def _camera_axes(forward: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:

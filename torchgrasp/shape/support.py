@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.cloud.check import check_cloud
-from torchgrasp.cloud.normals import clean_cloud, estimate_normals, estimate_viewpoint
+from torchgrasp.cloud.check import check_cloud, keep_distinct
+from torchgrasp.cloud.normals import clean_cloud, estimate_normals, estimate_viewpoint, spread_directions
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
 from torchgrasp.shape.complete import Completion, complete_cloud
@@ -54,7 +54,8 @@ def fit_shape(
     centre of the cloud at d = -1 and 20 random points on a sphere of 1.2 at d = +1.
 
     Args:
-        cloud: points [m] of one object. Normals and viewpoint are estimated where they are missing.
+        cloud: points [m] of one object. A missing viewpoint is estimated. "camera" fits normals anew; given ones
+            tell a whole surface from a single view, and "paper" observes them.
         noise: standard deviation of an observed signed distance, normalised; of normals too for "paper".
         budget: points of the observed set: the one inside, 20 outside, and the rest the most informative ones of
             the cloud. Rim and mirrored points of "camera" come on top.
@@ -64,7 +65,8 @@ def fit_shape(
         table: height [m] of a table that the object stands on, with normal z; only "camera" uses it.
 
     Raises:
-        BadArgument: an argument out of range, or a cloud that `check_cloud` refuses.
+        BadArgument: an argument out of range, a cloud that `check_cloud` refuses, or a viewpoint that has not the
+            whole of a single view in front of it.
         IndefiniteCovariance: `psi_scale` is too small.
 
     >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
@@ -81,8 +83,7 @@ def fit_shape(
 
 def _fit_paper(cloud: PointCloud, noise: float, budget: int, psi_scale: float, generator: torch.Generator) -> ShapeGP:
     """Return the shape from the paper's own observations (Sec. 3.1)."""
-    if cloud.normals is None:
-        cloud = estimate_normals(cloud)
+    cloud = estimate_normals(cloud) if cloud.normals is None else keep_distinct(cloud)
     points, normals = _candidates(cloud, generator)
     center = points.mean(0)
     scale = float(torch.linalg.vector_norm(points - center, dim=-1).max())
@@ -105,6 +106,9 @@ def _fit_camera(
     table: float | None,
 ) -> ShapeGP:
     """Return the shape from metric distances, the outline and the mirrored cloud."""
+    if cloud.normals is not None and cloud.viewpoint is not None and not seen_from_one_side(cloud, cloud.viewpoint):
+        # A whole surface: turned towards a viewpoint its far side would be inside out.
+        cloud = PointCloud(cloud.points, cloud.normals)
     cloud = clean_cloud(cloud)
     points, normals = _candidates(cloud, generator)
     low, high = points.amin(0), points.amax(0)
@@ -113,12 +117,13 @@ def _fit_camera(
     viewpoint = estimate_viewpoint(cloud) if cloud.viewpoint is None else cloud.viewpoint
     parts: list[Observations] = []
     inside = True
-    if bool(seen_from_one_side(cloud, viewpoint)):  # else it is a whole surface, and nothing is hidden
+    if seen_from_one_side(cloud, viewpoint):  # else it is a whole surface, and nothing is hidden
+        _check_viewpoint(points, viewpoint.to(points))
         found = complete_cloud(PointCloud(points, normals), viewpoint, table)
         parts = _observe_completion(found, center, scale)
         inside = float(found.outline.violation(center.cpu())) == 0.0  # not so for an arch or a bowl
 
-    sphere = OUTER_RADIUS * _spread_sphere(OUTER_POINTS).to(points)
+    sphere = OUTER_RADIUS * spread_directions(OUTER_POINTS, points)
     anchors = torch.cat([torch.zeros_like(center)[None], sphere]) if inside else sphere
     away = torch.cdist(anchors, (points - center) / scale).amin(1)
     away = torch.cat([-away[:1], away[1:]]) if inside else away
@@ -189,25 +194,26 @@ def _candidates(cloud: PointCloud, generator: torch.Generator) -> tuple[Float[Te
     return points, normals
 
 
-def _spread_sphere(n: int) -> Float[Tensor, "n 3"]:
-    """Return directions spread evenly over the sphere (a Fibonacci spiral)."""
-    k = torch.arange(n, dtype=torch.float64) + 0.5
-    z, turn = 1 - 2 * k / n, math.pi * (1 + math.sqrt(5)) * k
-    ring = torch.sqrt(1 - z * z)
-    return torch.stack([ring * torch.cos(turn), ring * torch.sin(turn), z], -1)
+def _check_viewpoint(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> None:
+    """Refuse a viewpoint from which part of a single view lies beside or behind the camera."""
+    forward = (points.amax(0) + points.amin(0)) / 2 - viewpoint
+    behind = int(((points - viewpoint) @ forward <= 0).sum())
+    if behind:
+        found = f"{viewpoint.tolist()} m, with {behind} of {len(points)} points beside or behind it"
+        raise BadArgument("viewpoint", found, "the position of a camera that has the whole cloud in front of it")
 
 
 def _check_arguments(noise: float, budget: int, psi_scale: float, support: str, seed: int, table: float | None) -> None:
     """Refuse arguments out of range, before any work."""
     if not 0.0 < noise <= 1.0:  # also refuses NaN
         raise BadArgument("noise", noise, "a number in (0, 1], normalised")
-    if not OUTER_POINTS + 1 + 4 <= budget <= 1000:
+    if not isinstance(budget, int) or not OUTER_POINTS + 1 + 4 <= budget <= 1000:
         raise BadArgument("budget", budget, f"{OUTER_POINTS + 1 + 4} to 1000 points")
     if not 1.0 <= psi_scale <= 100.0:
         raise BadArgument("psi_scale", psi_scale, "a number in [1, 100]; 1.34 and more are safe")
     if support not in ("camera", "paper"):
         raise BadArgument("support", repr(support), "'camera' or 'paper'")
-    if not 0 <= seed < 2**63:
+    if not isinstance(seed, int) or not 0 <= seed < 2**63:
         raise BadArgument("seed", seed, "an integer from 0")
     if table is not None and not math.isfinite(table):
         raise BadArgument("table", table, "a height in metres, or None")
