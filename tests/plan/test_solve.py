@@ -80,6 +80,19 @@ def test_a_feasible_start_is_never_lost(ellipsoid):
     assert bool((again.status == Status.OK).all())
 
 
+@pytest.mark.parametrize("spec", [ContactSpec.paper(), ContactSpec()])
+def test_a_start_without_a_gradient_is_named_and_harms_no_other(ellipsoid, generator, spec):
+    around = 0.3 * unit(torch.randn(4, 3, 3, generator=generator, dtype=torch.float64))
+    around[1, 0] = 0.0  # the gradient vanishes in the centre, so no step to the surface is defined
+    plan, alone = (plan_contacts(ellipsoid, spec, ellipsoid.metres(s)) for s in (around, around[[0, 2, 3]]))
+    assert plan.status[1] == Status.OUT_OF_DOMAIN
+    torch.testing.assert_close(plan.contacts.points[[0, 2, 3]], alone.contacts.points)
+
+
+def test_no_starts_give_no_rows(ellipsoid):
+    assert len(plan_contacts(ellipsoid, ContactSpec(), torch.zeros(0, 3, 3))) == 0
+
+
 def test_an_impossible_problem_names_the_constraint(ellipsoid):
     doubtful = dataclasses.replace(ellipsoid, doubt=10.0)
     plan = plan_contacts(doubtful, ContactSpec.paper(), starts=10)
@@ -126,6 +139,18 @@ def test_first_violation_is_the_first_in_order():
 def test_bad_numbers_of_starts_are_refused(ellipsoid, starts):
     with pytest.raises(BadArgument, match="starts"):
         plan_contacts(ellipsoid, starts=starts)
+
+
+def test_what_is_no_shape_specification_or_seed_is_refused(ellipsoid):
+    with pytest.raises(BadArgument, match="seed: found -1"):
+        plan_contacts(ellipsoid, starts=3, seed=-1)
+    wrong = (BadArgument, TypeError)  # TypeError: the annotations are checked in tests
+    with pytest.raises(wrong, match="shape"):
+        plan_contacts(None)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(wrong, match="spec"):
+        plan_contacts(ellipsoid, 0.8)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(wrong, match="seed"):
+        plan_contacts(ellipsoid, starts=3, seed=1.5)  # pyright: ignore[reportArgumentType]
 
 
 def test_bad_starting_points_are_refused(ellipsoid):

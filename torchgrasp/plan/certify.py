@@ -1,4 +1,4 @@
-"""Certificates of frictional form closure, Eq. (13), by a solver that shares nothing with the planner."""
+"""Certificates of frictional form closure, Eq. (13), by a solver of its own; only the wrenches are the planner's."""
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
         spec: friction and edges; `ContactSpec()` by default.
 
     Raises:
-        BadArgument: `contacts` of a wrong shape, or with normals that are not of length 1 (to 1e-3).
+        BadArgument: `contacts` of a wrong shape, or with normals that are not of length 1 (to 1e-3); no `ContactSpec`.
 
     >>> corners = torch.tensor([[[1.0, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0]]])
     >>> certify(Contacts(corners, corners, torch.zeros(1, 3), torch.zeros(1, 3))).closed

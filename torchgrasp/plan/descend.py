@@ -25,12 +25,11 @@ LONGEST_TURN = 3.0
 Z_DAMPING = 0.1
 """Damping of the logits relative to that of the points: logits range over about 10, points over about 1."""
 
-
 FIRST_DAMPING = 1e-2
+"""Damping at the start of each stage."""
 
 GUIDE_EVERY = 4
 """Steps between two evaluations of the rows for flat surface."""
-
 
 FEASIBILITY = 3.0
 """Weight of the surface and of all bounds."""
@@ -70,7 +69,7 @@ def start_state(shape: Shape, problem: ContactProblem, points: Float[Tensor, "b 
     """Return the state of triples at `points` with equal coefficients."""
     jet = triple_jet(shape, points)
     z = points.new_zeros(len(points), 3, problem.edges)
-    return State(points, z, tangents(points, jet.normals), jet, points.new_full((len(points),), 1e-2))
+    return State(points, z, tangents(points, jet.normals), jet, points.new_full((len(points),), FIRST_DAMPING))
 
 
 def no_multipliers(rows: Rows) -> Multipliers:
@@ -107,7 +106,10 @@ def cost(rows: Rows, multipliers: Multipliers, stage: Stage) -> Float[Tensor, "b
 def step(
     rows: Rows, multipliers: Multipliers, stage: Stage, damping: Float[Tensor, "b"]
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b m"], Float[Tensor, "b"]]:
-    """Return the damped Gauss-Newton step of the points and the logits, and the decrease of cost it promises."""
+    """Return the damped Gauss-Newton step of the points and the logits, and the decrease of cost it promises.
+
+    The step is NaN where the system is not positive definite, as in a row that is not finite.
+    """
     active = shift_bounds(rows, multipliers)
     on = FEASIBILITY * (active > 0)
     value = torch.cat([stage.centre * rows.centre, FEASIBILITY * (rows.surface + multipliers.surface), on * active], 1)
@@ -124,13 +126,15 @@ def step(
     # min over dz of |closure + by_points dp + by_z dz|^2 + d |dz|^2 = |.|^2 in the metric (I + by_z by_z^T / d)^-1
     z_damping = Z_DAMPING * damping[:, None, None]
     soft = torch.eye(6, dtype=closure.dtype, device=closure.device) + by_z @ by_z.mT / z_damping
-    factor = torch.linalg.cholesky(soft)
+    factor, failed = torch.linalg.cholesky_ex(soft)
     whitened = torch.linalg.solve_triangular(factor, torch.cat([by_points, closure[..., None]], -1), upper=False)
     outer_slope, outer_value = slope, value
     before = (value.square().sum(1) + closure.square().sum(1)) / 2
     slope, value = torch.cat([slope, whitened[..., :9]], 1), torch.cat([value, whitened[..., 9]], 1)
     normal = slope.mT @ slope + damping[:, None, None] * torch.eye(9, dtype=slope.dtype, device=slope.device)
-    points_step = -torch.cholesky_solve(slope.mT @ value[..., None], torch.linalg.cholesky(normal))
+    outer_factor, outer_failed = torch.linalg.cholesky_ex(normal)
+    points_step = -torch.cholesky_solve(slope.mT @ value[..., None], outer_factor)
+    points_step = torch.where(((failed == 0) & (outer_failed == 0))[:, None, None], points_step, torch.nan)
     left = torch.cholesky_solve(closure[..., None] + by_points @ points_step, factor)
     z_step = -(by_z.mT @ left / z_damping)[..., 0]
     points_step = points_step.unflatten(1, (3, 3))[..., 0]
@@ -184,8 +188,9 @@ def descend(
 ) -> State:
     """Take up to `stage.steps` Levenberg-Marquardt steps of one evaluation each.
 
-    Triples whose next step is shorter than `settled` are left alone from then on. With `flatness`, rows for flat
-    surface around the contacts join, evaluated anew every `GUIDE_EVERY` steps. Tangents are carried along.
+    Triples whose next step is shorter than `settled`, or not finite, are left alone from then on. With `flatness`,
+    rows for flat surface around the contacts join, evaluated anew every `GUIDE_EVERY` steps. Tangents are carried
+    along.
     """
     whole, at = state, torch.arange(len(state), device=state.points.device)
     state = dataclasses.replace(state, damping=torch.full_like(state.damping, FIRST_DAMPING))

@@ -61,8 +61,8 @@ def plan_contacts(
         seed: seed of the draw.
 
     Raises:
-        BadArgument: `starts` is not positive, of a wrong shape, or outside the shape's domain; `spec` is no
-            `ContactSpec`.
+        BadArgument: `starts` is not positive, of a wrong shape, or outside the shape's domain; `shape`, `spec` or
+            `seed` is not what it should be.
 
     Source of the scheme: augmented Lagrangian, Nocedal and Wright, Numerical Optimization, ch. 17.
 
@@ -72,7 +72,7 @@ def plan_contacts(
     torch.Size([8, 3, 3])
     """
     spec = ContactSpec() if spec is None else spec
-    check_starts(shape, spec, starts)
+    check_starts(shape, spec, starts, seed)
     first = start_points(shape, spec, starts, seed)
     problem = ContactProblem.of(shape, spec)
     state = start_state(shape, problem, first)

@@ -42,8 +42,15 @@ def is_surveyed(spec: ContactSpec, starts: int | Tensor) -> bool:
     return spec.flatness is not None and not isinstance(starts, Tensor)
 
 
-def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor) -> None:
-    """Refuse starts that are no positive number, of a wrong shape, or outside the shape's domain, by `BadArgument`."""
+def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor, seed: int) -> None:
+    """Refuse starts that are no positive number, of a wrong shape, or outside the shape's domain, by `BadArgument`.
+
+    What is no shape, specification or seed is refused, too.
+    """
+    if not isinstance(shape, Shape):
+        raise BadArgument("shape", type(shape).__name__, "a ShapeGP, or an implicit surface with the same methods")
+    if not isinstance(seed, int) or not 0 <= seed < 2**63:
+        raise BadArgument("seed", seed, "an integer from 0")
     if not isinstance(spec, ContactSpec):
         raise BadArgument("spec", type(spec).__name__, "a ContactSpec")
     if isinstance(starts, Tensor):
