@@ -78,10 +78,10 @@ def start_points(
     inside and above the table, and closed ones come first. The centre of a flat grasp may lie 30 mm from the
     object's, and a descent from the paper's starts rarely finds its way there.
     """
+    device = getattr(shape, "device", torch.device("cpu"))  # a stand-in without one lives on the CPU
     if isinstance(starts, Tensor):
-        return project(shape, shape.normalise(starts.double()), steps=6)
+        return project(shape, shape.normalise(starts.detach().to(device, torch.float64)), steps=6)
     generator = torch.Generator().manual_seed(seed)
-    device = shape.metres(torch.zeros(3, dtype=torch.float64)).device
     surveyed = is_surveyed(spec, starts)
     count = SURVEY if surveyed else starts
     drawn = torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)

@@ -89,6 +89,11 @@ class ShapeGP(Value):
         device = torch.empty(0, device=self.x.device).to(*args, **kwargs).device
         return super().to(device)
 
+    @property
+    def device(self) -> torch.device:
+        """Where the shape lives; planners put their points there."""
+        return self.x.device
+
     def normalise(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
         """Map points [m] of the cloud's frame to the normalised frame."""
         return (points - self.center.to(points)) / self.scale
