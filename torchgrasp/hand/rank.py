@@ -1,8 +1,11 @@
 """Which of the executable grasps to try first.
 
-The paper ranks by the sum of the contacts' variances, which predicts success no better than chance. The score here
-adds up what was seen to decide simulated lifts: how certain the surface is at the contacts, how near their centre is
-to the object's, how little of the squeeze must be carried by friction, and how centrally the pads touch.
+The paper ranks by the sum of the contacts' variances. The score here adds up how certain the surface is at the
+contacts, how near their centre is to the object's, how little of the squeeze must be carried by friction, and how
+centrally the pads touch. The weights are a choice, not a fit, and the evidence for them is thin: over eight scanned
+objects and both hands, 8 grasps of each spread over the ranks, the best-ranked one was held 15 times of 16 and the last
+12 of 16; of the 44 pairs of a held and a lost grasp of the same object and hand it orders 75 % rightly, the sum of
+variances 68 %.
 """
 
 import torch
