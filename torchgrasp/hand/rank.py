@@ -42,5 +42,8 @@ def score(contacts: Contacts, found: Findings, center: Float[Tensor, "3"]) -> Fl
     """
     offset = torch.linalg.vector_norm(contacts.points.mean(1) - center, dim=-1)
     return -(
-        offset / OFFSET + contacts.std_m.amax(1) / STD + tangential_ratio(contacts) + found.normal_angle.amax(1) / PAD
+        offset / OFFSET
+        + (contacts.std_m.amax(1) / STD) ** 2
+        + tangential_ratio(contacts)
+        + found.normal_angle.amax(1) / PAD
     )
