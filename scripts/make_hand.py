@@ -11,7 +11,7 @@ import tyro
 
 from torchgrasp.errors import GraspError
 from torchgrasp.hand.fit import bic, fit_mixture
-from torchgrasp.hand.hand import load_hand
+from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.mixture import DEFAULT_REACH, PAPER_REACH, GraspMixture, mixture_path
 from torchgrasp.hand.sample import HandSamples, sample_configurations
 

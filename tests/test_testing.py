@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from torchgrasp.errors import HandFileError
-from torchgrasp.hand.hand import hands_folder
+from torchgrasp.hand.load import hands_folder
 from torchgrasp.testing import check_hand
 
 

@@ -23,7 +23,8 @@ from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.support import fit_shape
 from torchgrasp.plan.solve import plan_contacts
 from torchgrasp.plan.certify import certify
-from torchgrasp.hand.hand import Hand, load_hand
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.code import encode
 from torchgrasp.hand.fit import fit_mixture
 from torchgrasp.hand.mixture import GraspMixture, load_mixture

@@ -26,7 +26,7 @@ from torchgrasp.close.trial import close_hand
 from torchgrasp.cloud.read import read_cloud
 from torchgrasp.errors import BadArgument, GraspError, MissingExtra, OutputError
 from torchgrasp.files import sha256
-from torchgrasp.hand.hand import load_hand
+from torchgrasp.hand.load import load_hand
 from torchgrasp.objects import DATA, MASSES, list_objects, load_object
 from torchgrasp.pipeline import plan_grasps
 from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows, write_report

@@ -6,7 +6,8 @@ import numpy as np
 import torch
 
 from torchgrasp.errors import HandFileError
-from torchgrasp.hand.hand import Hand, find_hand, load_hand
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import find_hand, load_hand
 from torchgrasp.hand.spec import HandSpec, read_hand_toml
 from torchgrasp.hand.urdf import Urdf, read_urdf
 

@@ -25,7 +25,7 @@ from torchgrasp.close.law import (
 )
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.frames import apply, inverse, rigid, rotate, rotation_from_vector
-from torchgrasp.hand.hand import load_hand
+from torchgrasp.hand.load import load_hand
 from torchgrasp.values import Certificate, Contacts, Grasps
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from torchgrasp.close.lift import LIFT_JOINT, euler_from_rotation, lifted_urdf
 from torchgrasp.errors import HandFileError
-from torchgrasp.hand.hand import load_hand
+from torchgrasp.hand.load import load_hand
 
 
 def test_euler_angles_rebuild_the_rotation():

@@ -11,7 +11,7 @@ import trimesh
 
 from torchgrasp.errors import BadArgument, MeshError, Status
 from torchgrasp.frames import rigid, rotation_from_vector
-from torchgrasp.hand.hand import load_hand
+from torchgrasp.hand.load import load_hand
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import Certificate, Contacts, Grasps
 

@@ -4,12 +4,13 @@ from pathlib import Path
 
 import pytest
 
+BALL = '<collision><geometry><sphere radius="0.01"/></geometry></collision>'
 BODY = '<inertial><mass value="0.1"/><inertia ixx="1e-4" ixy="0" ixz="0" iyy="1e-4" iyz="0" izz="1e-4"/></inertial>'
 
 
 @pytest.fixture
 def toy_hand(tmp_path: Path) -> Path:
-    links = "".join(f'<link name="{n}">{BODY}</link>' for n in ("palm", "t1", "t2", "t3"))
+    links = "".join(f'<link name="{n}">{BODY}{BALL}</link>' for n in ("palm", "t1", "t2", "t3"))
     joints = "".join(
         f'<joint name="j{k}" type="revolute"><parent link="palm"/><child link="t{k}"/>'
         f'<origin xyz="0.0{k} 0 0"/><axis xyz="0 1 0"/>'

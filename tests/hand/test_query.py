@@ -10,7 +10,8 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, inverse, rigid, rotate, virtual_frame
 from torchgrasp.hand.code import PERMUTATIONS
 from torchgrasp.hand.fit import fit_mixture
-from torchgrasp.hand.hand import Hand, load_hand
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.mixture import DEFAULT_REACH, PAPER_REACH, GraspMixture, load_mixture
 from torchgrasp.hand.query import WRONG_SIDE, query_hand
 from torchgrasp.hand.sample import HandSamples, sample_configurations

@@ -7,7 +7,7 @@ from torchgrasp.errors import Status
 from torchgrasp.frames import apply, rigid, rotate, rotation_from_vector
 from torchgrasp.hand.check import check, normal_angle, tip_error
 from torchgrasp.hand.collide import field_from_surface
-from torchgrasp.hand.hand import load_hand
+from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.refine import (
     MILLIMETRE,
     Posture,

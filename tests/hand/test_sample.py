@@ -5,7 +5,7 @@ import torch
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.code import hand_code
-from torchgrasp.hand.hand import load_hand
+from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.sample import sample_configurations
 
 

@@ -8,7 +8,7 @@ import torch
 import trimesh
 
 from torchgrasp.errors import Status
-from torchgrasp.hand.hand import load_hand
+from torchgrasp.hand.load import load_hand
 from torchgrasp.report.run import Run, Stage
 from torchgrasp.shape.surface import Surface
 from torchgrasp.specs import ContactSpec

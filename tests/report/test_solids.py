@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from torchgrasp.hand.hand import load_hand
+from torchgrasp.hand.load import load_hand
 from torchgrasp.report.solids import PARKED, finger_of_links, solids_from_hand
 
 

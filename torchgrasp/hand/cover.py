@@ -46,16 +46,12 @@ class SphereCover(Value):
 
 def cover_from_urdf(urdf: Urdf, spec: HandSpec) -> SphereCover:
     """Cover every collision shape of a URDF with spheres, labelled with the finger they belong to."""
-    above = {j.child: j for j in urdf.joints}
     owner = {joint: i for i, f in enumerate(spec.fingers) for joint in f.joints}
     tips = [f.tip_link for f in spec.fingers]
     rows: list[tuple[int, tuple[float, ...], float, int, bool]] = []
     for index, link in enumerate(urdf.links):
-        finger, name = -1, link.name
-        while name in above and finger == -1:  # the first movable joint above the link tells whose it is
-            if above[name].kind != "fixed":
-                finger = owner.get(above[name].name, -2)
-            name = above[name].parent
+        movers = [j.name for j in urdf.joints_above(link.name) if j.kind != "fixed"]
+        finger = owner.get(movers[0], -2) if movers else -1  # the nearest joint tells whose link it is
         for shape in link.shapes:
             pitch = PALM_PITCH if finger == -1 else PITCH
             for center, radius in _spheres(shape, pitch):

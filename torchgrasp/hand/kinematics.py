@@ -48,13 +48,6 @@ def kinematics_from_urdf(urdf: Urdf) -> Kinematics:
 
 def ancestor_mask(urdf: Urdf) -> list[list[bool]]:
     """Tell for each link (rows) which movable joints (columns) move it."""
-    above = {j.child: j for j in urdf.joints}
     joints = [j.name for j in urdf.joints if j.kind != "fixed"]
-    rows = []
-    for link in urdf.links:
-        moving, name = set(), link.name
-        while name in above:
-            moving.add(above[name].name)
-            name = above[name].parent
-        rows.append([j in moving for j in joints])
-    return rows
+    movers = [{j.name for j in urdf.joints_above(link.name)} for link in urdf.links]
+    return [[name in above for name in joints] for above in movers]

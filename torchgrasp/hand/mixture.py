@@ -13,6 +13,7 @@ from torchgrasp.base import Value, check_tensor
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.hand.code import CODE_NAMES
+from torchgrasp.hand.load import find_hand
 from torchgrasp.linalg import cholesky
 from torchgrasp.values import ContactCode
 
@@ -101,7 +102,7 @@ class GraspMixture(Value):
         Raises:
             BadArgument: rows of another length than the mixture has dimensions.
         """
-        if x.shape[-1] != len(self.names):
+        if x.ndim < 1 or x.shape[-1] != len(self.names):
             raise BadArgument("x", f"shape {tuple(x.shape)}", f"rows of {len(self.names)} numbers")
         rows = x.reshape(-1, x.shape[-1]).double()
         log_weights = self.weights.double().log()
@@ -117,8 +118,11 @@ class GraspMixture(Value):
         Returns:
             Half the squared Mahalanobis distance from the nearest component; compare with `DEFAULT_REACH` or
             `PAPER_REACH`.
+
+        Raises:
+            BadArgument: codes of another length than 6.
         """
-        q = code.q if isinstance(code, ContactCode) else code
+        q = _checked(code)
         rows = q.reshape(-1, 6).double()
         parts = [0.5 * self._marginal.squared(part).amin(-1) for part in rows.split(ROWS)]
         return torch.cat(parts).reshape(q.shape[:-1]).to(q.dtype)
@@ -128,8 +132,11 @@ class GraspMixture(Value):
 
         Args:
             code: a `ContactCode` or bare codes q. A code of NaN has joints of NaN.
+
+        Raises:
+            BadArgument: codes of another length than 6.
         """
-        q = code.q if isinstance(code, ContactCode) else code
+        q = _checked(code)
         rows = q.reshape(-1, 6).double()
         parts = []
         for part in rows.split(ROWS):
@@ -147,8 +154,9 @@ class GraspMixture(Value):
             k: how many, at most the number of components.
 
         Raises:
-            BadArgument: k outside [1, m].
+            BadArgument: k outside [1, m], or codes of another length than 6.
         """
+        q = _checked(q)
         if not 1 <= k <= len(self.weights):
             raise BadArgument("k", k, f"1 to {len(self.weights)} (the mixture's components)")
         joints, weights = [], []
@@ -199,6 +207,14 @@ class GraspMixture(Value):
         tensors = {"weights": self.weights, "means": self.means, "covariances": self.covariances}
         meta = {**self.meta, "names": " ".join(self.names), "regularisation": repr(self.regularisation)}
         return save_tensors(path, "mixture", tensors, meta)
+
+
+def _checked(code: ContactCode | Tensor) -> Float[Tensor, "*b 6"]:
+    """Return the codes q of an argument, refusing rows that are not six numbers."""
+    q = code.q if isinstance(code, ContactCode) else code
+    if q.ndim < 1 or q.shape[-1] != 6:
+        raise BadArgument("code", f"shape {tuple(q.shape)}", "rows of 6 numbers, L and N")
+    return q
 
 
 @dataclasses.dataclass(frozen=True)
@@ -260,6 +276,4 @@ def mixture_path(name_or_path: Path | str) -> Path:
     """
     if Path(name_or_path).suffix == ".safetensors":
         return Path(name_or_path)
-    from torchgrasp.hand.hand import find_hand
-
     return find_hand(name_or_path) / "mixture.safetensors"

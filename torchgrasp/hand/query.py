@@ -46,7 +46,7 @@ def query_hand(
     Raises:
         BadArgument: a mixture of another hand, a number outside its range, or malformed contacts.
 
-    >>> from torchgrasp.hand.hand import load_hand
+    >>> from torchgrasp.hand.load import load_hand
     >>> from torchgrasp.hand.mixture import load_mixture
     >>> points, zero = 0.05 * torch.eye(3)[None], torch.zeros(1, 3)
     >>> guess = query_hand(Contacts(points, 20 * points, zero, zero), load_hand("allegro"), load_mixture("allegro"))

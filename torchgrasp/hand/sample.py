@@ -46,7 +46,7 @@ def sample_configurations(hand: Hand, n: int, seed: int = 0, workers: int = 1) -
     Raises:
         BadArgument: n, seed or workers outside their range, or a hand of which hardly any posture is free.
 
-    >>> from torchgrasp.hand.hand import load_hand
+    >>> from torchgrasp.hand.load import load_hand
     >>> sample_configurations(load_hand("barrett"), 100).q.shape
     torch.Size([100, 6])
     """

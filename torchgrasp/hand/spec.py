@@ -80,6 +80,16 @@ class HandSpec:
     data: bytes
 
 
+def _finite(value: Any) -> float | None:
+    """Return a number as a float, or None for what is no finite number."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return None
+    try:
+        return float(value) if math.isfinite(value) else None
+    except OverflowError:  # an integer of more than 308 digits
+        return None
+
+
 class _Table:
     """A toml table that names itself in every complaint and knows which of its keys were read."""
 
@@ -97,7 +107,7 @@ class _Table:
         """Read a word."""
         self.read.add(key)
         value = self.table.get(key)
-        if not isinstance(value, str) or not 0 < len(value) <= 200:
+        if not isinstance(value, str) or not 0 < len(value) <= 200 or not value.isprintable():
             raise self.wrong(key, "a text of 1 to 200 letters")
         return value
 
@@ -112,24 +122,20 @@ class _Table:
     def number(self, key: str, low: float = -math.inf, high: float = math.inf) -> float:
         """Read a finite number in a range."""
         self.read.add(key)
-        value = self.table.get(key)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-            raise self.wrong(key, f"a number in [{low:g}, {high:g}]")
-        if not math.isfinite(value):
-            raise self.wrong(key, "a finite number")
-        return float(value)
+        value = _finite(self.table.get(key))
+        if value is None or not low <= value <= high:
+            raise self.wrong(key, f"a finite number in [{low:g}, {high:g}]")
+        return value
 
     def triple(self, key: str) -> Triple:
         """Read three finite numbers."""
         self.read.add(key)
-        v = self.table.get(key)
-        if (
-            not isinstance(v, list)
-            or len(v) != 3
-            or not all(isinstance(x, (int, float)) and math.isfinite(x) for x in v)
-        ):
+        value = self.table.get(key)
+        found = [_finite(x) for x in value] if isinstance(value, list) and len(value) == 3 else [None]
+        if None in found:
             raise self.wrong(key, "three finite numbers")
-        return (float(v[0]), float(v[1]), float(v[2]))
+        x, y, z = (v for v in found if v is not None)
+        return x, y, z
 
     def inner(self, key: str, optional: bool = False) -> "_Table":
         """Read a table inside."""
@@ -177,6 +183,8 @@ def read_hand_toml(path: Path | str, fingers: str = "default") -> HandSpec:
     kp, kd = actuators.number("kp", 1e-6, 1e6), actuators.number("kd", 0.0, 1e6)
     actuators.done()
     known = tuple(_finger(t) for t in top.tables("finger"))
+    if len({f.name for f in known}) < len(known):
+        raise HandFileError("hand.toml", f"{path}: fingers {[f.name for f in known]}", "every name once")
     chosen, parked = _option(top, known, fingers)
     coupling = _coupling(top)
     capsules, boxes, pairs = _collision(top)
@@ -252,9 +260,9 @@ def _collision(top: _Table) -> tuple[tuple[Capsule, ...], tuple[Box, ...], tuple
         table.read.add("pairs")
         rows = table.table["pairs"]
         if not isinstance(rows, list) or not all(
-            isinstance(r, list) and len(r) == 2 and all(isinstance(x, str) for x in r) for r in rows
+            isinstance(r, list) and len(r) == 2 and all(isinstance(x, str) for x in r) and r[0] != r[1] for r in rows
         ):
-            raise table.wrong("pairs", "a list of pairs of links")
+            raise table.wrong("pairs", "a list of pairs of different links")
         pairs = tuple((r[0], r[1]) for r in rows)
     table.done()
     return tuple(capsules), tuple(boxes), pairs

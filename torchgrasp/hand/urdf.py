@@ -1,20 +1,18 @@
-"""Safe reading of a URDF: bounds before parsing, a checked tree, no file but the URDF itself is opened."""
+"""A URDF as values: links, joints and shapes of a checked tree; no file but the URDF itself is opened."""
 
 import dataclasses
 import math
-import re
 import xml.etree.ElementTree as ET
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 from torchgrasp.errors import HandFileError
+from torchgrasp.hand.safe_xml import parse_urdf
 
 MAX_BYTES = 4 * 1024 * 1024
 MAX_LINKS = 512
-MAX_DEPTH = 64
-MAX_ELEMENTS = 50_000
 KINDS = ("revolute", "prismatic", "fixed")
-IGNORED = {"material", "transmission", "gazebo"}
 
 Triple = tuple[float, float, float]
 
@@ -69,6 +67,14 @@ class Urdf:
     joints: tuple[Joint, ...]
     data: bytes
 
+    def joints_above(self, link: str) -> tuple[Joint, ...]:
+        """Return the joints between a link and the root, fixed ones included, those nearest to the link first."""
+        above, chain = {j.child: j for j in self.joints}, []
+        while link in above:
+            chain.append(above[link])
+            link = above[link].parent
+        return tuple(chain)
+
     def kinematic_xml(self) -> bytes:
         """Write the tree alone (links and joints, nothing unknown), as bytes without an encoding declaration."""
         robot = ET.Element("robot", name=self.name)
@@ -86,26 +92,6 @@ class Urdf:
         return ET.tostring(robot)
 
 
-class _BoundedBuilder(ET.TreeBuilder):
-    """A tree builder that stops at too deep or too many elements."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.depth = self.count = 0
-
-    def start(self, tag: Any, attrs: Any) -> Any:
-        """Count an element in."""
-        self.depth, self.count = self.depth + 1, self.count + 1
-        if self.depth > MAX_DEPTH or self.count > MAX_ELEMENTS:
-            raise HandFileError("urdf", "a too large XML tree", f"depth {MAX_DEPTH}, {MAX_ELEMENTS} elements at most")
-        return super().start(tag, attrs)
-
-    def end(self, tag: Any) -> Any:
-        """Count an element out."""
-        self.depth -= 1
-        return super().end(tag)
-
-
 def read_urdf(path: Path | str) -> Urdf:
     """Read and check a URDF file; meshes it names are neither opened nor allowed outside the file's folder.
 
@@ -121,49 +107,11 @@ def read_urdf(path: Path | str) -> Urdf:
     if path.stat().st_size > MAX_BYTES:
         raise HandFileError("urdf", f"{path}: {path.stat().st_size} bytes", f"at most {MAX_BYTES} bytes")
     data = path.read_bytes()
-    robot = _parse(path, data)
+    robot = parse_urdf(path, data)
     links = tuple(_link(path, e) for e in robot if e.tag == "link")
     joints = tuple(_joint(path, e) for e in robot if e.tag == "joint")
     root = _check_tree(path, links, joints)
     return Urdf(path, robot.get("name", ""), root, links, joints, data)
-
-
-def _parse(path: Path, data: bytes) -> ET.Element:
-    """Parse bytes that hold no declaration through which XML could reach other files or explode."""
-    # anywhere, comments included: what looks like a comment may be hidden in a processing instruction
-    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-        raise HandFileError("urdf", f"{path}: a DOCTYPE or ENTITY declaration", "no declarations")
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise HandFileError("urdf", f"{path}: {error.reason} at byte {error.start}", "UTF-8 text") from error
-    declared = re.match(r"""\s*<\?xml[^>]*encoding\s*=\s*["']([^"']*)""", text)
-    if "\0" in text or (declared and declared.group(1).lower() not in ("utf-8", "us-ascii", "ascii")):
-        raise HandFileError("urdf", f"{path}: another encoding", "UTF-8 text")
-    try:
-        robot = ET.fromstring(data, ET.XMLParser(target=_BoundedBuilder()))
-    except (ET.ParseError, ValueError) as error:
-        if isinstance(error, HandFileError):
-            raise
-        raise HandFileError("urdf", f"{path}: {error}", "well-formed XML") from error
-    if robot.tag != "robot":
-        raise HandFileError("urdf", f"{path}: <{robot.tag}>", "<robot>")
-    for element in robot:
-        if element.tag not in {"link", "joint"} | IGNORED:
-            raise HandFileError("urdf", f"{path}: <{element.tag}>", f"<link>, <joint> or one of {sorted(IGNORED)}")
-    for mesh in robot.iter("mesh"):
-        _check_mesh_name(path, mesh.get("filename", ""))
-    return robot
-
-
-def _check_mesh_name(path: Path, name: str) -> None:
-    """Refuse a mesh outside the hand's folder; the mesh itself is not opened."""
-    allowed = "a relative .stl or .obj inside the hand's folder"
-    if not 0 < len(name) <= 255 or ":" in name or "\\" in name or Path(name).suffix.lower() not in (".stl", ".obj"):
-        raise HandFileError("urdf", f"{path}: mesh {name[:80]!r}", allowed)
-    folder = path.parent.resolve()
-    if not (folder / name).resolve().is_relative_to(folder):
-        raise HandFileError("urdf", f"{path}: mesh {name[:80]!r}", allowed)
 
 
 def _numbers(path: Path, where: str, text: str | None, default: tuple[float, ...] | None, n: int) -> Any:
@@ -211,20 +159,17 @@ def _link(path: Path, element: ET.Element) -> Link:
         found = {} if tensor is None else tensor.attrib
         keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
         inertia = tuple(_numbers(path, f"{where} {k}", found.get(k), None, 1)[0] for k in keys)
-    shapes = [_shape(path, name, c) for c in element.findall("collision")]
-    return Link(name, mass, com, inertia, tuple(s for s in shapes if s is not None))
+    return Link(name, mass, com, inertia, tuple(_shape(path, name, c) for c in element.findall("collision")))
 
 
-def _shape(path: Path, link: str, collision: ET.Element) -> Shape | None:
-    """Read one collision shape; a mesh gives None: its link needs capsules and boxes in hand.toml."""
+def _shape(path: Path, link: str, collision: ET.Element) -> Shape:
+    """Read one collision shape; a mesh is refused, because neither the planner nor the simulator would see it."""
     where = f"link {link} collision"
     xyz, rpy = _origin(path, where, collision)
     geometry = collision.find("geometry")
     if geometry is None or len(geometry) != 1:
-        raise HandFileError("urdf", f"{path}: {where} without one geometry", "box, cylinder, sphere or mesh")
+        raise HandFileError("urdf", f"{path}: {where} without one geometry", "box, cylinder or sphere")
     g = geometry[0]
-    if g.tag == "mesh":
-        return None
     if g.tag == "box":
         size = _numbers(path, where, g.get("size"), None, 3)
     elif g.tag == "sphere":
@@ -232,7 +177,7 @@ def _shape(path: Path, link: str, collision: ET.Element) -> Shape | None:
     elif g.tag == "cylinder":
         size = tuple(_numbers(path, where, g.get(k), None, 1)[0] for k in ("radius", "length"))
     else:
-        raise HandFileError("urdf", f"{path}: {where} <{g.tag}>", "box, cylinder, sphere or mesh")
+        raise HandFileError("urdf", f"{path}: {where} <{g.tag}>", "box, cylinder or sphere")
     if min(size) <= 0:
         raise HandFileError("urdf", f"{path}: {where} of size {size}", "positive lengths")
     return Shape(g.tag, size, xyz, rpy)
@@ -273,17 +218,18 @@ def _joint(path: Path, element: ET.Element) -> Joint:
 def _check_tree(path: Path, links: tuple[Link, ...], joints: tuple[Joint, ...]) -> str:
     """Return the root of a tree in which every link is reached exactly once."""
     names = [x.name for x in links]
+    known = set(names)
     if not 0 < len(links) <= MAX_LINKS:
         raise HandFileError("urdf", f"{path}: {len(links)} links", f"1 to {MAX_LINKS} links")
     for what, found in (("link", names), ("joint", [j.name for j in joints]), ("child", [j.child for j in joints])):
-        twice = sorted({n for n in found if found.count(n) > 1})
+        twice = sorted(n for n, times in Counter(found).items() if times > 1)
         if twice:
             raise HandFileError("urdf", f"{path}: {what} {twice[0]!r} twice", f"every {what} once")
     for j in joints:
         for link in (j.parent, j.child):
-            if link not in names:
+            if link not in known:
                 raise HandFileError("urdf", f"{path}: joint {j.name} names link {link!r}", "a link of the file")
-    roots = sorted(set(names) - {j.child for j in joints})
+    roots = sorted(known - {j.child for j in joints})
     if len(roots) != 1:
         found = f"roots {roots}" if roots else "a cycle and no root"
         raise HandFileError("urdf", f"{path}: {found}", "exactly one root link")
@@ -292,7 +238,7 @@ def _check_tree(path: Path, links: tuple[Link, ...], joints: tuple[Joint, ...]) 
         front = [j.child for j in joints if j.parent in front]
         reached |= set(front)
     if len(reached) < len(names):
-        raise HandFileError("urdf", f"{path}: a cycle around {sorted(set(names) - reached)[0]!r}", "a tree")
+        raise HandFileError("urdf", f"{path}: a cycle around {sorted(known - reached)[0]!r}", "a tree")
     by_name = {j.name: j for j in joints}
     for j in joints:
         if j.mimic is not None and (j.mimic[0] not in by_name or by_name[j.mimic[0]].kind == "fixed"):

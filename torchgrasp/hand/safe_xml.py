@@ -1,0 +1,84 @@
+"""Safe parsing of a URDF's XML: bounds before and while parsing, no declarations, no mesh outside the folder."""
+
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+from torchgrasp.errors import HandFileError
+
+MAX_DEPTH = 64
+MAX_ELEMENTS = 50_000
+IGNORED = {"material", "transmission", "gazebo"}
+"""Elements of a robot, beside links and joints, that a hand does without."""
+
+
+class _BoundedBuilder(ET.TreeBuilder):
+    """A tree builder that stops at too deep or too many elements."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.depth = self.count = 0
+
+    def start(self, tag: Any, attrs: Any) -> Any:
+        """Count an element in."""
+        self.depth, self.count = self.depth + 1, self.count + 1
+        if self.depth > MAX_DEPTH or self.count > MAX_ELEMENTS:
+            raise HandFileError("urdf", "a too large XML tree", f"depth {MAX_DEPTH}, {MAX_ELEMENTS} elements at most")
+        return super().start(tag, attrs)
+
+    def end(self, tag: Any) -> Any:
+        """Count an element out."""
+        self.depth -= 1
+        return super().end(tag)
+
+
+def parse_urdf(path: Path, data: bytes) -> ET.Element:
+    """Parse a URDF's bytes that hold no declaration through which XML could reach other files or explode.
+
+    Args:
+        path: of the file, for the messages; meshes must lie in its folder, and are not opened.
+        data: its bytes, UTF-8.
+
+    Raises:
+        HandFileError: a declaration, another encoding, malformed or too deep XML, an unknown element, or a mesh
+            outside the folder.
+    """
+    # anywhere, comments included: what looks like a comment may be hidden in a processing instruction
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
+        raise HandFileError("urdf", f"{path}: a DOCTYPE or ENTITY declaration", "no declarations")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise HandFileError("urdf", f"{path}: {error.reason} at byte {error.start}", "UTF-8 text") from error
+    declared = re.match(r"""\s*<\?xml[^>]*encoding\s*=\s*["']([^"']*)""", text)
+    if "\0" in text or (declared and declared.group(1).lower() not in ("utf-8", "us-ascii", "ascii")):
+        raise HandFileError("urdf", f"{path}: another encoding", "UTF-8 text")
+    try:
+        robot = ET.fromstring(data, ET.XMLParser(target=_BoundedBuilder()))
+    except (ET.ParseError, ValueError) as error:
+        if isinstance(error, HandFileError):
+            raise
+        raise HandFileError("urdf", f"{path}: {error}", "well-formed XML") from error
+    if robot.tag != "robot":
+        raise HandFileError("urdf", f"{path}: <{robot.tag}>", "<robot>")
+    for element in robot:
+        if element.tag not in {"link", "joint"} | IGNORED:
+            raise HandFileError("urdf", f"{path}: <{element.tag}>", f"<link>, <joint> or one of {sorted(IGNORED)}")
+    for mesh in robot.iter("mesh"):
+        _check_mesh_name(path, mesh.get("filename", ""))
+    return robot
+
+
+def _check_mesh_name(path: Path, name: str) -> None:
+    """Refuse a mesh outside the hand's folder; the mesh itself is not opened."""
+    allowed = "a relative .stl or .obj inside the hand's folder"
+    if not 0 < len(name) <= 255 or ":" in name or "\\" in name or Path(name).suffix.lower() not in (".stl", ".obj"):
+        raise HandFileError("urdf", f"{path}: mesh {name[:80]!r}", allowed)
+    folder = path.parent.resolve()
+    try:
+        inside = (folder / name).resolve().is_relative_to(folder)
+    except (OSError, RuntimeError):  # a loop of symbolic links, a name that the file system does not take
+        inside = False
+    if not inside:
+        raise HandFileError("urdf", f"{path}: mesh {name[:80]!r}", allowed)
