@@ -2,22 +2,17 @@
 
 import math
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.cloud.check import check_cloud, keep_distinct
-from torchgrasp.errors import TooFewPoints
+from torchgrasp.cloud.filter import nearest, remove_outliers, select_rows
 from torchgrasp.linalg import unit
 from torchgrasp.values import PointCloud
 
 PLANE_NEIGHBOURS = 25
 """Neighbours, the point itself included, that fix a local plane."""
-OUTLIER_NEIGHBOURS = 8
-"""Neighbours whose mean distance tells a stray point."""
-OUTLIER_RATIO = 2.5
-"""A point is stray when that distance is more than so many times the median one."""
 OFFSET_RATIO = 4.5
 """A point is stray when its distance from its plane is more than so many times the median spread of the planes."""
 DIRECTIONS = 400
@@ -43,7 +38,7 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
     torch.Size([90, 3])
     """
     cloud = keep_distinct(check_cloud(cloud))
-    normals, _, _ = _fit_planes(cloud.points.double())
+    normals, _, _ = fit_planes(cloud.points.double())
     return _orient(cloud, cloud.points, normals)
 
 
@@ -64,16 +59,13 @@ def clean_cloud(cloud: PointCloud) -> PointCloud:
     >>> len(clean_cloud(PointCloud(torch.rand(500, 3), viewpoint=torch.tensor([0.5, 0.5, 9.0])))) <= 500
     True
     """
-    cloud = keep_distinct(check_cloud(cloud))
-    neighbour, _ = _nearest(cloud.points.double(), OUTLIER_NEIGHBOURS + 1)
-    spacing = neighbour[:, 1:].mean(-1)
-    cloud = _select(cloud, spacing <= OUTLIER_RATIO * spacing.median())
+    cloud = remove_outliers(cloud)
     points = cloud.points.double()
-    normals, offset, spread = _fit_planes(points)
+    normals, offset, spread = fit_planes(points)
     keep = offset.abs() <= OFFSET_RATIO * spread.median() + 1e-12
     moved = (points - offset[:, None] * normals).to(cloud.points.dtype)
     # The normals of the unmoved points serve the moved ones: planes are fitted once.
-    return _orient(_select(cloud, keep), moved[keep], normals[keep])
+    return _orient(select_rows(cloud, keep, "points that are not stray"), moved[keep], normals[keep])
 
 
 def estimate_viewpoint(cloud: PointCloud) -> Float[Tensor, "3"]:
@@ -101,7 +93,7 @@ def estimate_viewpoint(cloud: PointCloud) -> Float[Tensor, "3"]:
     """
     cloud = keep_distinct(check_cloud(cloud))
     points = cloud.points.double()
-    normals, _, _ = _fit_planes(points)
+    normals, _, _ = fit_planes(points)
     return _guess_viewpoint(points, normals).to(cloud.points.dtype)
 
 
@@ -153,27 +145,11 @@ def _orient(cloud: PointCloud, points: Float[Tensor, "n 3"], normals: Float[Tens
     return PointCloud(points, unit(sign * normals).to(points.dtype), viewpoint)
 
 
-def _select(cloud: PointCloud, keep: Bool[Tensor, "n"]) -> PointCloud:
-    """Return the points of a mask; refuse to leave fewer than a surface needs."""
-    if int(keep.sum()) < 4:
-        raise TooFewPoints("points", f"{int(keep.sum())} points that are not stray", "at least 4")
-    return PointCloud(cloud.points[keep], None if cloud.normals is None else cloud.normals[keep], cloud.viewpoint)
-
-
-def _nearest(points: Float[Tensor, "n 3"], k: int) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
-    """Return distances and indices of the k nearest points of each point, itself first; fewer in a small cloud."""
-    from scipy.spatial import KDTree
-
-    array = points.detach().cpu().numpy()
-    distance, index = KDTree(array).query(array, k=min(k, len(array)))
-    return torch.from_numpy(distance).to(points), torch.from_numpy(np.asarray(index, dtype=np.int64)).to(points.device)
-
-
-def _fit_planes(
+def fit_planes(
     points: Float[Tensor, "n 3"],
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]:
     """Return unit normals of unknown sign, the points' offsets from their planes, and the planes' weighted rms [m]."""
-    distance, index = _nearest(points, PLANE_NEIGHBOURS)
+    distance, index = nearest(points, PLANE_NEIGHBOURS)
     weight = torch.exp(-((distance / (0.7 * distance[:, -1:])) ** 2))
     weight = weight / weight.sum(-1, keepdim=True)
     near = points[index]

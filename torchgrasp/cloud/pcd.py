@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from torchgrasp.cloud.text import MAX_POINTS, read_table
+
 FIELDS = ("FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 
 
@@ -26,14 +28,13 @@ def parse_pcd(data: bytes) -> dict[str, Any]:
     if not len(names) == len(counts) == len(sizes) == len(kinds) or min(counts) < 1 or max(counts) > 4096:
         raise ValueError("FIELDS, SIZE, TYPE and COUNT that do not match")
     count = int(header["POINTS"][0]) if "POINTS" in header else int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
+    if not 0 <= count <= MAX_POINTS:
+        raise ValueError(f"{count} points, not up to {MAX_POINTS}")
     encoding = header["DATA"][0].lower()
     wanted = ("x", "y", "z", "normal_x", "normal_y", "normal_z")
     columns: dict[str, np.ndarray] = {}
     if encoding == "ascii":
-        words = body.split()
-        if count < 0 or len(words) < count * sum(counts):
-            raise ValueError(f"fewer numbers than {count} points have")
-        table = np.array(words[: count * sum(counts)], dtype=np.float64).reshape(count, sum(counts))
+        table = read_table(body, count, sum(counts))
         starts = np.cumsum([0, *counts[:-1]])
         columns = {name: table[:, s] for name, s in zip(names, starts, strict=True) if name in wanted}
     elif encoding == "binary":
@@ -45,7 +46,7 @@ def parse_pcd(data: bytes) -> dict[str, Any]:
                 for i, (k, s, c) in enumerate(zip(kinds, sizes, counts, strict=True))
             ]
         )
-        if count < 0 or count * dtype.itemsize > len(body):
+        if count * dtype.itemsize > len(body):
             raise ValueError(f"{len(body)} bytes, fewer than {count} points have")
         rows = np.frombuffer(body, dtype=dtype, count=count)
         columns = {name: rows[f"{i}"][:, 0].astype(np.float64) for i, name in enumerate(names) if name in wanted}

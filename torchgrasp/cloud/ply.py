@@ -5,6 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from torchgrasp.cloud.text import MAX_POINTS, read_table
+
+MAX_MESH_TEXT = 64 * 2**20
+"""Bytes of the largest mesh that is read from text: the parser makes some 20 bytes of each."""
 MESH_POINTS = 2000
 """Points drawn from the surface of a mesh."""
 
@@ -43,7 +47,12 @@ def parse_ply(data: bytes) -> dict[str, Any]:
                 raise ValueError(f"the header line {line!r}")
     if encoding not in ("ascii", "binary_little_endian", "binary_big_endian"):
         raise ValueError(f"the encoding {encoding!r}")
+    # Before anything is made of the body: a mesh has twice as many faces as corners.
+    if any(not 0 <= count <= 2 * MAX_POINTS for _, count, _ in elements):
+        raise ValueError(f"elements {[(name, count) for name, count, _ in elements]}; at most {MAX_POINTS} points")
     if any(name == "face" and count > 0 for name, count, _ in elements):
+        if encoding == "ascii" and len(body) > MAX_MESH_TEXT:
+            raise ValueError(f"a mesh of {len(body)} bytes of text, more than {MAX_MESH_TEXT}; a binary one may have")
         points, normals = _sample_mesh(data)
         return {"points": points, "normals": normals, "viewpoint": viewpoint}
     if not elements or elements[0][0] != "vertex" or any(kind == "list" for _, kind in elements[0][2]):
@@ -81,13 +90,10 @@ def _split_header(data: bytes) -> tuple[list[str], bytes]:
 def _read_columns(body: bytes, encoding: str, count: int, properties: list[tuple[str, str]]) -> dict[str, np.ndarray]:
     """Return the columns of the vertex element by name."""
     names = [name for name, _ in properties]
-    if len(set(names)) != len(names) or count < 0:
+    if len(set(names)) != len(names) or not 0 <= count <= MAX_POINTS:
         raise ValueError(f"the properties {names} of {count} vertices")
     if encoding == "ascii":
-        words = body.split(maxsplit=min(count * len(names), len(body)))[: count * len(names)]
-        if len(words) < count * len(names):
-            raise ValueError(f"fewer numbers than {count} vertices have")
-        table = np.array(words, dtype=np.float64).reshape(count, len(names))
+        table = read_table(body, count, len(names))
         return {name: table[:, i] for i, name in enumerate(names)}
     order = "<" if encoding == "binary_little_endian" else ">"
     dtype = np.dtype([(name, order + kind) for name, kind in properties])

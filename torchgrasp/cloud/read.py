@@ -14,14 +14,13 @@ from torchgrasp.base import check_tensor
 from torchgrasp.cloud.check import check_cloud
 from torchgrasp.cloud.pcd import parse_pcd
 from torchgrasp.cloud.ply import format_ply, parse_ply
+from torchgrasp.cloud.text import MAX_POINTS, read_lines
 from torchgrasp.errors import BadArgument, CloudFileError, TooFewPoints
 from torchgrasp.files import write_atomically
 from torchgrasp.values import PointCloud
 
 MAX_BYTES = 512 * 2**20
 """Largest file, and largest unpacked content, that is read."""
-MAX_POINTS = 5_000_000
-"""Most points that are read."""
 SUFFIXES = (".ply", ".pcd", ".npz", ".npy", ".xyz")
 """The formats, by suffix."""
 
@@ -175,8 +174,4 @@ def _parse_npz(data: bytes) -> dict[str, Any]:
 
 def _parse_text(data: bytes) -> dict[str, Any]:
     """Parse text: three or six numbers a line, separated by blanks or commas; `#` starts a comment."""
-    text = data.decode("ascii").replace(",", " ")
-    lines = [line for line in text.splitlines() if line.split("#")[0].strip()]
-    if not lines:
-        raise ValueError("no numbers")
-    return _split_columns(np.loadtxt(lines, ndmin=2))
+    return _split_columns(read_lines(data))

@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.cloud.check import check_cloud, keep_distinct
+from torchgrasp.cloud.check import keep_distinct
 from torchgrasp.cloud.normals import clean_cloud, estimate_normals, estimate_viewpoint, spread_directions
+from torchgrasp.cloud.orientation import drop_unoriented
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
 from torchgrasp.shape.complete import Completion, complete_cloud
@@ -55,7 +56,8 @@ def fit_shape(
 
     Args:
         cloud: points [m] of one object. A missing viewpoint is estimated. "camera" fits normals anew; given ones
-            tell a whole surface from a single view, and "paper" observes them.
+            tell a whole surface from a single view, and "paper" observes them; their signs must agree with each
+            other (`check_normals`), else they are left aside.
         noise: standard deviation of an observed signed distance, normalised; of normals too for "paper".
         budget: points of the observed set: the one inside, 20 outside, and the rest the most informative ones of
             the cloud. Rim and mirrored points of "camera" come on top.
@@ -74,7 +76,7 @@ def fit_shape(
     tensor(True)
     """
     _check_arguments(noise, budget, psi_scale, support, seed, table)
-    check_cloud(cloud)
+    cloud = drop_unoriented(cloud)
     generator = torch.Generator().manual_seed(seed)
     if support == "paper":
         return _fit_paper(cloud, noise, budget, psi_scale, generator)

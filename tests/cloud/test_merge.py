@@ -1,0 +1,75 @@
+import pytest
+import torch
+import trimesh
+
+from torchgrasp.cloud.camera import partial_view
+from torchgrasp.cloud.merge import merge_clouds
+from torchgrasp.errors import BadArgument
+from torchgrasp.frames import apply, inverse
+from torchgrasp.linalg import unit
+from torchgrasp.objects import load_object
+from torchgrasp.shape.support import fit_shape
+from torchgrasp.values import PointCloud
+
+EYE = torch.eye(4, dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def two_views():
+    mesh = load_object("jug").mesh
+    return [partial_view(mesh, azimuth, 35.0, n=600) for azimuth in (60.0, 240.0)]
+
+
+def in_own_frames(views, motion):
+    """Move each view into the frame of its camera and return the poses that bring it back."""
+    poses = [motion, inverse(motion) @ motion @ motion]
+    moved = [
+        PointCloud(apply(inverse(p), v.points), None, apply(inverse(p), v.viewpoint[None])[0])
+        for v, p in zip(views, poses, strict=True)
+    ]
+    return moved, poses
+
+
+def test_views_come_together_with_outward_normals_wherever_their_frames_were(two_views, motion):
+    merged = merge_clouds(two_views, [EYE, EYE])
+    moved, poses = in_own_frames(two_views, motion)
+    again = merge_clouds(moved, torch.stack(poses))
+    assert len(merged) == 1200 and merged.viewpoint is None
+    torch.testing.assert_close(again.points, merged.points, atol=1e-12, rtol=0)
+    assert float(((again.normals * merged.normals).sum(-1) > 0.999).double().mean()) > 0.999
+    _, _, face = trimesh.proximity.closest_point(load_object("jug").mesh, merged.points.numpy())
+    outward = torch.from_numpy(load_object("jug").mesh.face_normals[face].copy())
+    assert float(((merged.normals * outward).sum(-1) > 0).double().mean()) > 0.96
+
+
+def test_a_second_view_uncovers_the_hidden_side():
+    mesh = load_object("spray").mesh
+    views = [partial_view(mesh, azimuth, 35.0, n=600) for azimuth in (60.0, 240.0)]
+    points, face = trimesh.sample.sample_surface(mesh, 400, seed=0)
+    side = torch.from_numpy(points[mesh.face_normals[face][:, 2] > -0.5].copy())
+
+    def error(cloud):
+        shape = fit_shape(cloud, table=0.0)
+        return float((shape.scale * shape.predict(side).distance).abs().quantile(0.9))
+
+    assert error(merge_clouds(views, [EYE, EYE])) < 0.5 * error(views[0])
+
+
+def test_one_view_keeps_its_viewpoint_and_given_normals_turn_along(motion):
+    points = 0.1 * torch.rand(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    cloud = PointCloud(points, 2 * points + 1, points[0] + 1)
+    alone = merge_clouds([cloud], [motion])
+    torch.testing.assert_close(alone.viewpoint, apply(motion, cloud.viewpoint[None])[0])
+    torch.testing.assert_close(alone.normals @ motion[:3, :3], unit(cloud.normals))
+    assert merge_clouds([cloud.to(torch.float32)], [motion]).points.dtype == torch.float32
+
+
+def test_refusals(two_views):
+    with pytest.raises(BadArgument, match="clouds: found none"):
+        merge_clouds([], [])
+    with pytest.raises(BadArgument, match="poses: found 1 for 2"):
+        merge_clouds(two_views, [EYE])
+    with pytest.raises(BadArgument, match=r"poses\[1\].*rigid"):
+        merge_clouds(two_views, [EYE, 2 * EYE])
+    with pytest.raises(BadArgument, match="one dtype"):
+        merge_clouds([two_views[0], two_views[1].to(torch.float32)], [EYE, EYE])

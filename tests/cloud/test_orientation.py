@@ -1,0 +1,61 @@
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from torchgrasp.cloud.normals import estimate_normals
+from torchgrasp.cloud.orientation import check_normals, drop_unoriented
+from torchgrasp.errors import BadArgument
+from torchgrasp.objects import list_objects, load_object
+from torchgrasp.shape.support import fit_shape
+from torchgrasp.values import PointCloud
+
+
+def surface(mesh, n, seed=0):
+    points, face = trimesh.sample.sample_surface(mesh, n, seed=seed)
+    return PointCloud(torch.from_numpy(np.asarray(points)), torch.from_numpy(mesh.face_normals[face].copy()))
+
+
+def flip(cloud, share, seed=0):
+    """Flip a share of the normals, and tell which."""
+    flipped = torch.rand(len(cloud), generator=torch.Generator().manual_seed(seed), dtype=torch.float64) < share
+    return PointCloud(
+        cloud.points, torch.where(flipped[:, None], -cloud.normals, cloud.normals), cloud.viewpoint
+    ), flipped
+
+
+@pytest.mark.parametrize("name", list_objects())
+def test_i8_flips_are_reported_and_good_normals_are_not(name):
+    thing = load_object(name)
+    for cloud in (surface(thing.mesh, 1000), estimate_normals(thing.view)):
+        good = check_normals(cloud)
+        assert good.oriented and good.scaled == 0 and good.opposed < 0.03
+        assert float(good.flipped.double().mean()) < 0.04
+        spoilt, flipped = flip(cloud, 0.1)
+        found = check_normals(spoilt)
+        assert found.oriented and 0.1 < found.opposed < 0.25
+        assert float((found.flipped == flipped).double().mean()) > 0.95
+        assert not check_normals(flip(cloud, 0.5)[0]).oriented
+
+
+def test_a_thin_plate_and_a_coarse_ball_are_oriented():
+    assert check_normals(surface(trimesh.creation.box((0.15, 0.2, 0.002)), 1000)).oriented
+    axes = torch.cat([torch.eye(3), -torch.eye(3)]).double()
+    assert check_normals(PointCloud(0.05 * axes, axes)).oriented
+
+
+def test_a_view_with_normals_of_random_signs_is_still_a_view():
+    view = load_object("cylinder").view
+    signs, _ = flip(estimate_normals(view), 0.5)
+    dropped = drop_unoriented(signs)
+    assert dropped.normals is None and torch.equal(dropped.viewpoint, view.viewpoint)
+    probes = view.points[:20] * torch.tensor([-1.0, -1.0, 1.0]).double()
+    found, wanted = fit_shape(signs, table=0.0).predict(probes), fit_shape(view, table=0.0).predict(probes)
+    torch.testing.assert_close(found.distance, wanted.distance, atol=1e-6, rtol=0)
+
+
+def test_lengths_are_counted_and_a_cloud_without_normals_is_refused():
+    ball = surface(trimesh.creation.icosphere(radius=0.05), 300)
+    assert check_normals(PointCloud(ball.points, 3 * ball.normals)).scaled == 300
+    with pytest.raises(BadArgument, match="no normals"):
+        check_normals(PointCloud(ball.points))

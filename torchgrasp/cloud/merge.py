@@ -1,0 +1,65 @@
+"""Several views of one object become one cloud."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.cloud.check import check_cloud
+from torchgrasp.cloud.depth import check_rigid
+from torchgrasp.cloud.normals import estimate_normals
+from torchgrasp.errors import BadArgument
+from torchgrasp.frames import apply, rotate
+from torchgrasp.linalg import unit
+from torchgrasp.values import PointCloud
+
+
+def merge_clouds(
+    clouds: Sequence[PointCloud], poses: Sequence[Float[Tensor, "4 4"]] | Float[Tensor, "k 4 4"]
+) -> PointCloud:
+    """Return the points of several views in one frame, with normals, each turned towards the camera of its view.
+
+    A view without normals gets them by `estimate_normals`, on its own: afterwards nothing tells which camera saw
+    which point. The result has no viewpoint, unless there is only one view. Points seen twice stay twice; `thin_cloud`
+    evens the density.
+
+    Args:
+        clouds: points [m] of the views, each in a frame of its own.
+        poses: obj_from_cloud for each view, rigid; the identity where a cloud is in the frame of the result.
+
+    Raises:
+        BadArgument: no cloud, another number of poses, a pose that is not rigid, clouds of different dtype or on
+            different devices; see also `check_cloud`.
+        TooFewPoints, SuspiciousScale: see `check_cloud`; for the views and for the result.
+
+    >>> view = PointCloud(0.1 * torch.rand(90, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))
+    >>> len(merge_clouds([view, view], [torch.eye(4), torch.eye(4)]))
+    180
+    """
+    if not len(clouds):
+        raise BadArgument("clouds", "none", "at least one PointCloud")
+    if len(poses) != len(clouds):
+        raise BadArgument("poses", f"{len(poses)} for {len(clouds)} clouds", "one pose a cloud")
+    for cloud in clouds:
+        check_cloud(cloud)
+    for i, pose in enumerate(poses):
+        check_rigid(f"poses[{i}]", pose)
+    kinds = {(str(c.points.dtype), str(c.points.device)) for c in clouds}
+    if len(kinds) > 1:
+        raise BadArgument("clouds", f"points of {sorted(kinds)}", "one dtype on one device")
+    views = [_view_in_frame(cloud, pose) for cloud, pose in zip(clouds, poses, strict=True)]
+    if len(views) == 1:
+        return views[0]
+    normals = [v.normals for v in views if v.normals is not None]
+    return check_cloud(PointCloud(torch.cat([v.points for v in views]), torch.cat(normals)))
+
+
+def _view_in_frame(cloud: PointCloud, obj_from_cloud: Float[Tensor, "4 4"]) -> PointCloud:
+    """Return a view with unit normals in the frame of the result; the motion is done in float64."""
+    cloud = estimate_normals(cloud) if cloud.normals is None else cloud
+    assert cloud.normals is not None
+    pose, kind = obj_from_cloud.to(cloud.points).double(), cloud.points.dtype
+    points, normals = apply(pose, cloud.points.double()), rotate(pose, unit(cloud.normals.double()))
+    viewpoint = None if cloud.viewpoint is None else apply(pose, cloud.viewpoint.double()[None])[0].to(kind)
+    return PointCloud(points.to(kind), normals.to(kind), viewpoint)

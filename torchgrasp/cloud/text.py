@@ -1,0 +1,68 @@
+"""Numbers from text, in memory of the order of the file: a list of its words would be ten times as large."""
+
+import io
+import warnings
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float
+
+MAX_POINTS = 5_000_000
+"""Most points that are read."""
+MAX_COLUMNS = 16
+"""Most numbers a point of a text file may have, beside which position and normal are lost."""
+MAX_LINE = 4096
+"""Longest line [characters] of a plain text file."""
+
+
+def read_table(data: bytes, rows: int, columns: int) -> Float[np.ndarray, "rows columns"]:
+    r"""Return the first rows of a table of numbers that are separated by white space.
+
+    Raises:
+        ValueError: more rows or columns than are read, fewer numbers, or something that is no number.
+
+    >>> read_table(b"1 2\n3 4\n5 6", 2, 2).tolist()
+    [[1.0, 2.0], [3.0, 4.0]]
+    """
+    if not (0 <= rows <= MAX_POINTS and 1 <= columns <= MAX_COLUMNS):
+        raise ValueError(f"{rows} points of {columns} numbers, not up to {MAX_POINTS} of {MAX_COLUMNS}")
+    wanted = rows * columns
+    if 2 * wanted > len(data) + 1:  # a number is a digit and a space at least
+        raise ValueError(f"fewer numbers than {rows} points have")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # at a word that is no number; the count tells
+        numbers = np.fromstring(data, dtype=np.float64, count=wanted, sep=" ") if wanted else np.zeros(0)
+    if len(numbers) < wanted:
+        raise ValueError(f"fewer numbers than {rows} points have, or a word that is none")
+    return numbers.reshape(rows, columns)
+
+
+def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
+    r"""Return the numbers of text, a row a line: separated by blanks or commas, `#` starts a comment.
+
+    Raises:
+        ValueError: no numbers, lines of different length, a line or a file that is too long.
+
+    >>> read_lines(b"# x y z\n1, 2, 3\n").tolist()
+    [[1.0, 2.0, 3.0]]
+    """
+
+    def lines() -> Iterator[str]:
+        stream = io.TextIOWrapper(io.BytesIO(data), encoding="ascii")
+        count = 0
+        while line := stream.readline(MAX_LINE + 1):
+            if len(line) > MAX_LINE:
+                raise ValueError(f"a line of more than {MAX_LINE} characters")
+            line = line.split("#")[0].replace(",", " ")
+            if not line.isspace() and line:
+                count += 1
+                if count > MAX_POINTS:
+                    raise ValueError(f"more than {MAX_POINTS} lines of numbers")
+                yield line
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of a file without numbers, which has its own sentence here
+        table = np.loadtxt(lines(), ndmin=2)
+    if not table.size:
+        raise ValueError("no numbers")
+    return table
