@@ -1,0 +1,165 @@
+"""What must hold exactly: a covariance without jitter, the picks of a refit, the laws of motion, units and order."""
+
+import math
+from functools import partial
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from benchmarks.common import Row, median_seconds, random_view
+from benchmarks.peers import select_by_refitting
+from torchgrasp.cloud.normals import spread_directions
+from torchgrasp.errors import IndefiniteCovariance
+from torchgrasp.frames import rotation_from_vector
+from torchgrasp.linalg import cholesky
+from torchgrasp.shape.gp import Observations, ShapeGP, condition, longest_distance
+from torchgrasp.shape.kernel import covariance, thin_plate
+from torchgrasp.shape.select import select_points
+from torchgrasp.values import PointCloud
+
+PSI_SCALE = 1.5
+"""The default of `fit_shape`."""
+NOISE = 0.01
+"""The paper's sigma: of distances and, in `observe`, of normals too."""
+
+
+def observe(x: Tensor, normals: Tensor, noise: float = NOISE) -> Observations:
+    """Return observations of points on the surface with their normals."""
+    sigma = torch.full((len(x),), noise, dtype=torch.float64)
+    yes = torch.ones(len(x), dtype=torch.bool)
+    return Observations(x, torch.zeros_like(sigma), normals, yes, sigma, sigma)
+
+
+def observe_support(x: Tensor) -> Observations:
+    """Return the origin and 20 points on a sphere of 1.2 with their signed distances to a view, without normals."""
+    anchors = torch.cat([torch.zeros(1, 3, dtype=torch.float64), 1.2 * spread_directions(20, x)])
+    away = torch.cdist(anchors, x).amin(1)
+    away[0] = -away[0]
+    sigma = torch.full_like(away, NOISE)
+    return Observations(anchors, away, torch.zeros_like(anchors), sigma > 1, sigma, sigma)
+
+
+def posterior(n: int, seed: int = 0) -> ShapeGP:
+    """Return the shape from n points with normals of a random view, in normalised units."""
+    x, normals = random_view(n, torch.Generator().manual_seed(seed))
+    origin = torch.zeros(3, dtype=torch.float64)
+    return condition(observe(x, normals), origin, 1.0, PointCloud(x, normals), PSI_SCALE)
+
+
+def queries_in(shape: ShapeGP, count: int, seed: int = 1) -> Tensor:
+    """Return points spread evenly over the inner nine tenths of the ball in which the posterior is valid."""
+    generator = torch.Generator().manual_seed(seed)
+    direction = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    direction = direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
+    radius = torch.rand(count, 1, generator=generator, dtype=torch.float64) ** (1 / 3)
+    return shape.metres(0.9 * shape.domain_radius * radius * direction)
+
+
+def bench_cholesky(clouds: int, seed: int) -> Row:
+    """Factor K + 0.1 sigma^2 I for random partial clouds.
+
+    Where that succeeds the smallest eigenvalue of K + sigma^2 I is at least 0.9 sigma^2. The number of points is spread
+    evenly in its logarithm over 20..1000. Every second cloud has the origin and the 20 points around it as well.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    failed: list[tuple[int, int]] = []
+    largest = 0
+    for i in tqdm(range(clouds), desc="random clouds", disable=None, leave=False):
+        n = round(20 * math.exp(math.log(50) * float(torch.rand(1, generator=generator, dtype=torch.float64))))
+        x, _ = random_view(n, generator)
+        has_normal = torch.ones(n, dtype=torch.bool)
+        if i % 2:
+            support = observe_support(x)
+            x, has_normal = torch.cat([support.x, x]), torch.cat([support.has_normal, has_normal])
+        largest = max(largest, n)
+        matrix = covariance(x, x, has_normal, has_normal, partial(thin_plate, psi=PSI_SCALE * longest_distance(x)))
+        matrix.diagonal().add_(0.1 * NOISE**2)
+        try:
+            cholesky(matrix, f"cloud {i}", "none")
+        except IndefiniteCovariance:
+            failed.append((i, n))
+    return Row(
+        f"Cholesky without jitter, {clouds} random partial clouds of 20..{largest} points (even in log n)",
+        "all, smallest eigenvalue >= 0.9 sigma^2",
+        f"{clouds - len(failed)} of {clouds}",
+        not failed,
+        {"clouds": clouds, "failed": failed},
+    )
+
+
+def bench_selection(seeds: int = 5) -> list[Row]:
+    """Select 65 of 1000 points, greedily and by refitting, on random views."""
+    same, ratios, ours = [], [], []
+    for seed in range(seeds):
+        x, _ = random_view(1000, torch.Generator().manual_seed(seed))
+        known = observe_support(x)
+        psi = PSI_SCALE * longest_distance(torch.cat([known.x, x]))
+        picks = select_points(x, known, 65, psi, NOISE, NOISE)
+        same.append(torch.equal(picks, select_by_refitting(x, known, 65, psi, NOISE, NOISE)))
+        fast = median_seconds(partial(select_points, x, known, 65, psi, NOISE, NOISE))
+        slow = median_seconds(partial(select_by_refitting, x, known, 65, psi, NOISE, NOISE), repeats=1)
+        ours.append(fast)
+        ratios.append(slow / fast)
+    x, normals = random_view(70, torch.Generator().manual_seed(0))
+    seen, origin = observe(x, normals), torch.zeros(3, dtype=torch.float64)
+    fit = median_seconds(lambda: condition(seen, origin, 1.0, PointCloud(x, normals), PSI_SCALE), repeats=21)
+    y, noise = seen.rows()
+    psi = PSI_SCALE * longest_distance(x)
+    matrix = covariance(x, x, seen.has_normal, seen.has_normal, partial(thin_plate, psi=psi)) + torch.diag_embed(noise)
+    solve = median_seconds(lambda: torch.cholesky_solve(y[:, None], torch.linalg.cholesky(matrix)), repeats=21)
+    least, middle = min(ratios), sorted(ratios)[len(ratios) // 2]
+    return [
+        Row(
+            f"selection of 65 of 1000 points against a refit for each pick (closed form), {seeds} views",
+            "identical picks; >= 8x faster",
+            f"identical in {sum(same)} of {seeds}; {middle:.1f}x (least {least:.1f}x), {1e3 * min(ours):.0f} ms",
+            all(same) and middle >= 8,
+            {"identical": same, "ratios": ratios, "seconds": ours},
+        ),
+        Row(
+            "solve at n = 70 (280 rows)",
+            "<= 2 ms",
+            f"{1e3 * solve:.2f} ms; with assembly and all that a shape keeps {1e3 * fit:.2f} ms",
+            solve <= 2e-3,
+            {"solve_s": solve, "condition_s": fit},
+        ),
+    ]
+
+
+def bench_laws(seeds: int = 10) -> Row:
+    """Move, scale (by 1024, exact in floating point) and reorder what is observed; compare the posterior."""
+    worst = {"motion": 0.0, "units": 0.0, "order": 0.0}
+    for seed in range(seeds):
+        generator = torch.Generator().manual_seed(seed)
+        x, normals = random_view(150, generator)
+        here = condition(observe(x, normals), x.new_zeros(3), 0.1, PointCloud(x, normals), PSI_SCALE)
+        points = queries_in(here, 300)
+        known = here.predict(points)
+
+        turn = rotation_from_vector(torch.randn(3, generator=generator, dtype=torch.float64))
+        shift = torch.randn(3, generator=generator, dtype=torch.float64)
+        moved = condition(observe(x @ turn.T, normals @ turn.T), shift, 0.1, here.cloud, PSI_SCALE)
+        found = moved.predict(points @ turn.T + shift)
+        change = [
+            (found.distance - known.distance),
+            (found.normal @ turn - known.normal),
+            found.variance - known.variance,
+        ]
+        worst["motion"] = max(worst["motion"], *(float(c.abs().max()) for c in change))
+
+        scaled = condition(observe(x, normals), x.new_zeros(3), 102.4, here.cloud, PSI_SCALE).predict(1024 * points)
+        change = [scaled.distance - known.distance, scaled.normal - known.normal, scaled.std_m / 1024 - known.std_m]
+        worst["units"] = max(worst["units"], *(float(c.abs().max()) for c in change))
+
+        order = torch.randperm(len(x), generator=generator)
+        again = condition(observe(x[order], normals[order]), x.new_zeros(3), 0.1, here.cloud, PSI_SCALE).predict(points)
+        change = [again.distance - known.distance, again.normal - known.normal, again.variance - known.variance]
+        worst["order"] = max(worst["order"], *(float(c.abs().max()) for c in change))
+    return Row(
+        f"rigid motion, units, order of the observations, {seeds} views of 150 points",
+        "1e-8 / exact scaling / 1e-9",
+        " / ".join(f"{worst[name]:.1e}" for name in ("motion", "units", "order")),
+        worst["motion"] <= 1e-8 and worst["units"] == 0 and worst["order"] <= 1e-9,
+        worst,
+    )
