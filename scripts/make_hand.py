@@ -9,7 +9,7 @@ from typing import Annotated
 import torch
 import tyro
 
-from torchgrasp.errors import GraspError
+from torchgrasp.errors import BadArgument, GraspError
 from torchgrasp.hand.fit import bic, fit_mixture
 from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.mixture import DEFAULT_REACH, PAPER_REACH, GraspMixture, mixture_path
@@ -62,12 +62,14 @@ def main(
         workers: threads that sample.
         out: file to write; default: mixture.safetensors in the hand's folder.
     """
+    if held_out < 2:
+        raise BadArgument("held_out", held_out, "at least 2 postures")
     robot = load_hand(hand)
     begin = time.perf_counter()
     samples = sample_configurations(robot, n + held_out, seed=seed, workers=workers)
     print(f"{robot.name}: {len(samples)} free postures in {time.perf_counter() - begin:.0f} s")
     begin = time.perf_counter()
-    m = components or PAPER_COMPONENTS.get(robot.name, 40)
+    m = PAPER_COMPONENTS.get(robot.name, 40) if components is None else components
     mixture = fit_mixture(samples[:n], m, seed=seed, tolerance=tolerance)
     meta = mixture.meta
     print(

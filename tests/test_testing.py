@@ -35,12 +35,38 @@ def copy_of(name: str, tmp_path: Path, file: str, old: str, new: str) -> Path:
         ("allegro", "hand.urdf", 'effort="0.7"', 'effort="0"', "effort"),
         ("allegro", "hand.toml", "joint_9 = -0.196", "joint_9 = -1.0", "joint_9"),
         ("barrett", "hand.toml", "ratio = 0.3333333333333333", "ratio = 0.3443", "coupling"),
+        ("allegro", "hand.toml", "[0.01039230485, 0, 0.006]", "[-0.01039230485, 0, -0.006]", "center"),
         ("barrett", "hand.toml", '["f3_flex", "f3_distal"]', '["f3_distal", "f3_flex"]', "in order"),
     ],
 )
 def test_broken_hands_are_told_why(tmp_path, name, file, old, new, match):
     with pytest.raises(HandFileError, match=match):
         check_hand(copy_of(name, tmp_path, file, old, new))
+
+
+@pytest.mark.parametrize(
+    ("shape", "depth"), [('<box size="0.04 0.02 0.02"/>', 0.02), ('<cylinder radius="0.01" length="0.04"/>', 0.02)]
+)
+def test_a_contact_inside_its_tip_is_told(tmp_path, shape, depth):
+    """A tip 40 mm long, turned by 90 degrees so that it reaches along z; its end is the pad."""
+    turn = "0 1.5707963267948966 0" if "box" in shape else "0 0 0"
+    text = (hands_folder() / "allegro" / "hand.urdf").read_text()
+    start = text.index('<link name="index_tip">')
+    end = text.index("</link>", start)
+    link = text[start:end]
+    kept = link[: link.index("<collision>")]
+    collision = f'<collision><origin xyz="0 0 0" rpy="{turn}"/><geometry>{shape}</geometry></collision>'
+    (tmp_path / "hand.urdf").write_text(text[:start] + kept + collision + text[end:])
+    toml = (hands_folder() / "allegro" / "hand.toml").read_text()
+    pad = 'contact = [0.01039230485, 0, 0.006]\nnormal = [0.8660254037844387, 0.0, 0.5]\ntip = "sphere"\n'
+    pad += "center = [0, 0, 0]\nradius = 0.012"
+    assert pad in toml
+    point = 'contact = [0, 0, {}]\nnormal = [0.0, 0.0, 1.0]\ntip = "point"'
+    (tmp_path / "hand.toml").write_text(toml.replace(pad, point.format(depth), 1))
+    assert check_hand(tmp_path).tip_radius[0] == 0
+    (tmp_path / "hand.toml").write_text(toml.replace(pad, point.format(depth - 0.001), 1))
+    with pytest.raises(HandFileError, match="inside"):
+        check_hand(tmp_path)
 
 
 def test_a_hand_of_ones_own_is_accepted(tmp_path):

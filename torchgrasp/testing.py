@@ -6,10 +6,11 @@ import numpy as np
 import torch
 
 from torchgrasp.errors import HandFileError
+from torchgrasp.hand.cover import rotation_from_rpy
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import find_hand, load_hand
 from torchgrasp.hand.spec import HandSpec, read_hand_toml
-from torchgrasp.hand.urdf import Urdf, read_urdf
+from torchgrasp.hand.urdf import Shape, Urdf, read_urdf
 
 POSTURES = 50
 """Random postures in which the kinematics are compared."""
@@ -20,8 +21,8 @@ FK_TOLERANCE = 1e-6
 def check_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
     """Check a hand's files and return the hand: the public law for hands.
 
-    The tree, the coupling, the limits and drives, masses and inertias, the pads, the parked posture, and the forward
-    kinematics against yourdfpy, coupled joints included.
+    The tree, the coupling, the limits and drives, masses and inertias, the pads, the parked posture, self-collision,
+    and the forward kinematics against yourdfpy, which applies `<mimic>` by itself.
 
     Args:
         name_or_path: a shipped hand, or the folder of another one.
@@ -29,7 +30,8 @@ def check_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
 
     Raises:
         HandFileError: a file breaks a rule; the message names the file, what was found and what is allowed.
-        AssertionError: a law of the library does not hold for this hand.
+        BadArgument: the hand has no such option.
+        AssertionError: the library places a link elsewhere than yourdfpy does.
 
     >>> check_hand("barrett").name
     'barrett'
@@ -42,10 +44,12 @@ def check_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
     generator = torch.Generator().manual_seed(0)
     share = torch.rand(POSTURES, hand.dof, generator=generator, dtype=torch.float64)
     joints = hand.lower + (hand.upper - hand.lower) * share
-    _check_coupling(hand, joints)
-    _check_kinematics(hand, joints)
-    free = hand.self_clearance(joints) > 0
-    assert bool(free.any()), f"{spec.path}: none of {POSTURES} random postures is free of self-collision"
+    if not bool((hand.self_clearance(joints) > 0).any()):
+        found = f"{spec.path}: links that meet in all of {POSTURES} random postures"
+        raise HandFileError("hand.toml", found, "pairs of self_collision that can part")
+    worst, where = largest_fk_error(hand, joints)
+    if not worst < FK_TOLERANCE:
+        raise AssertionError(f"{hand.name}: link {where} differs by {worst:.3g} from yourdfpy's pose")
     return hand
 
 
@@ -80,40 +84,36 @@ def _check_joints(urdf: Urdf, spec: HandSpec, hand: Hand) -> None:
 
 
 def _check_pads(urdf: Urdf, spec: HandSpec) -> None:
-    """Refuse a fingertip that its own joints do not move, and a normal that points into the tip's shape."""
-    above = {j.child: j for j in urdf.joints}
+    """Refuse a fingertip that its own joints do not move, and a contact that lies inside the tip's own shapes."""
     shapes = {x.name: x.shapes for x in urdf.links}
     for finger in spec.all_fingers:
-        chain, link = [], finger.tip_link
-        while link in above:
-            chain.append(above[link].name)
-            link = above[link].parent
-        moving = [j for j in reversed(chain) if above and any(u.name == j and u.kind != "fixed" for u in urdf.joints)]
+        moving = [j.name for j in reversed(urdf.joints_above(finger.tip_link)) if j.kind != "fixed"]
         if list(finger.joints) != moving:
             found = f"{spec.path}: finger {finger.name} of joints {list(finger.joints)}"
             raise HandFileError("hand.toml", found, f"the joints above {finger.tip_link} in order, {moving}")
         outside = np.array(finger.contact) + 1e-4 * np.array(finger.normal)
-        for shape in shapes[finger.tip_link]:
-            if shape.kind == "sphere" and np.linalg.norm(outside - shape.xyz) < shape.size[0]:
-                found = f"{spec.path}: the contact of finger {finger.name} lies inside its tip's sphere"
-                raise HandFileError("hand.toml", found, "a contact on the surface, its normal outward")
+        if any(_inside(outside, shape) for shape in shapes[finger.tip_link]):
+            found = f"{spec.path}: the contact of finger {finger.name} lies inside its tip's shape"
+            raise HandFileError("hand.toml", found, "a contact on the surface, its normal outward")
 
 
-def _check_coupling(hand: Hand, joints: torch.Tensor) -> None:
-    """Assert that every joint is linear in the actuated ones."""
-    half = hand.expand_joints(joints / 2 + joints.flip(0) / 2)
-    mean = (hand.expand_joints(joints) + hand.expand_joints(joints.flip(0))) / 2
-    assert torch.allclose(half, mean, rtol=0, atol=1e-12), f"{hand.name}: the coupling is not linear"
-
-
-def _check_kinematics(hand: Hand, joints: torch.Tensor) -> None:
-    """Assert that yourdfpy, which applies `<mimic>` by itself, places every link in the same pose."""
-    worst, where = largest_fk_error(hand, joints)
-    assert worst < FK_TOLERANCE, f"{hand.name}: link {where} differs by {worst:.3g} from yourdfpy's pose"
+def _inside(point: np.ndarray, shape: Shape) -> bool:
+    """Tell whether a point of a link lies in one of its shapes."""
+    x, y, z = rotation_from_rpy(shape.rpy).numpy().T @ (point - shape.xyz)
+    if shape.kind == "box":
+        return bool((2 * np.abs([x, y, z]) < shape.size).all())
+    if shape.kind == "cylinder":
+        return bool(np.hypot(x, y) < shape.size[0] and 2 * abs(z) < shape.size[1])
+    return bool(np.linalg.norm([x, y, z]) < shape.size[0])
 
 
 def largest_fk_error(hand: Hand, joints: torch.Tensor) -> tuple[float, str]:
-    """Return the largest difference of a link pose from yourdfpy's over postures (n, h), and the link."""
+    """Return the largest difference of a link's pose [m, and entries of rotations] from yourdfpy's, and the link.
+
+    Args:
+        hand: the hand.
+        joints: postures (n, h) [rad].
+    """
     import yourdfpy
 
     robot = yourdfpy.URDF.load(str(hand.urdf_path), load_meshes=False, load_collision_meshes=False)

@@ -40,7 +40,7 @@ def test_parts_of_a_concave_mesh_fill_it_and_leave_the_gap(tmp_path, capfd):
     again = convex_parts(mesh, tmp_path)
     assert len(again) == len(parts)
     for a, b in zip(parts, again, strict=True):
-        assert np.array_equal(np.sort(a.vertices, axis=0), np.sort(b.vertices, axis=0))
+        assert np.array_equal(a.vertices, b.vertices)  # to the last bit, or a trial would depend on the cache
     files[0].write_bytes(b"damaged")
     assert len(convex_parts(mesh, tmp_path)) == len(parts)
     assert files[0].stat().st_size > 100

@@ -104,6 +104,39 @@ def test_kinematics_are_those_of_the_hand(name):
     assert scene.joints() == pytest.approx(hand.expand_joints(joints).numpy()[order], abs=1e-4)
 
 
+SLIDING = """<robot name="r"><link name="pal&lt;m">{body}</link>{fingers}</robot>"""
+SLIDER = """<link name="t{k}">{body}</link>
+  <joint name="j{k}" type="{kind}"><parent link="pal&lt;m"/><child link="t{k}"/>
+  <origin xyz="0 0 {k}"/><axis xyz="{axis}"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>"""
+BODY = """<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
+  <collision><geometry><sphere radius="0.1"/></geometry></collision>"""
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+def test_sliding_joints_move_their_tips_along_their_axes(tmp_path):
+    pytest.importorskip("sapien")
+    from torchgrasp.close.scene import Scene
+    from torchgrasp.hand.hand import Actuator
+
+    kinds = [("prismatic", "1 0 0"), ("prismatic", "0 0 1"), ("revolute", "0 1 0")]
+    fingers = "".join(SLIDER.format(k=k, kind=d, axis=x, body=BODY) for k, (d, x) in enumerate(kinds, start=1))
+    (tmp_path / "hand.urdf").write_text(SLIDING.format(body=BODY, fingers=fingers))
+    names, mesh = ("j1", "j2", "j3"), standing()
+    start, drives = dict.fromkeys(names, 0.0), dict.fromkeys(names, Actuator(1.0, 1.0, 1.0, 0.1))
+    pose = np.eye(4)
+    pose[0, 3] = 5.0
+    urdf = tmp_path / "hand.urdf"
+    scene = Scene(urdf, pose, start, drives, ("t1", "t2", "t3"), mesh, [mesh.convex_hull], 0.36)
+    scene.step()
+    assert set(scene.joint_names) == set(names)
+    points = scene.tip_poses()[:, :3, 3] + [0.0, 0.0, 0.5]
+    found = scene.jacobian(points)[:, :, [scene.joint_names.index(n) for n in names]]
+    expected = np.zeros((3, 3, 3))
+    expected[0, :, 0], expected[1, :, 1], expected[2, :, 2] = [1, 0, 0], [0, 0, 1], [0.5, 0, 0]
+    assert np.abs(found - expected).max() < 1e-3
+
+
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
 def test_the_hand_rises_with_its_joint_and_stays_where_it_is_driven():

@@ -151,6 +151,10 @@ def test_bad_arguments_are_refused():
     mesh = cylinder()
     with pytest.raises(MeshError, match="open surface"):
         close_hand(grasp, hand, trimesh.Trimesh(mesh.vertices, mesh.faces[:-1]))
+    with pytest.raises(BadArgument, match="control_rate: found 1000 Hz"):
+        close_hand(grasp, hand, mesh, TrialSpec(control_rate=1000.0))
+    with pytest.raises(BadArgument, match="joints: found 9 for"):
+        close_hand(dataclasses.replace(grasp, pregrasp=grasp.pregrasp * 0 + 9), hand, mesh)
     with pytest.raises(MeshError, match="parts"):
         close_hand(grasp, hand, mesh, parts=[])
     assert np.isfinite(mesh.vertices).all()

@@ -122,12 +122,22 @@ def test_distance_field_follows_the_dtype_and_shape_of_the_points():
     torch.testing.assert_close(field.to(torch.float32).query(torch.zeros(2, 3, 4, 3))[0], distance)
 
 
+def test_distance_field_of_a_flat_patch_without_margin():
+    vertices = torch.tensor([[0.0, 0, 0], [0.03, 0, 0], [0, 0.03, 0]], dtype=torch.float64)
+    field = field_from_surface(vertices, torch.tensor([[0, 1, 2]]), margin=0.0)
+    distance, _ = field.query(torch.tensor([[0.008, 0.008, 0.004]], dtype=torch.float64))
+    assert float(distance) == pytest.approx(0.004, abs=1e-6)
+
+
 def test_bad_surfaces_are_named():
     vertices = torch.eye(3, dtype=torch.float64)
     with pytest.raises(BadArgument, match="faces"):
         field_from_surface(vertices, torch.tensor([[0, 1, 3]]))
     with pytest.raises(BadArgument, match="normals"):
         field_from_surface(vertices, torch.ones(2, 3))
+    for spoilt in (0.0, float("nan")):
+        with pytest.raises(BadArgument, match="normal of length 0 or NaN"):
+            field_from_surface(vertices, vertices * torch.tensor([1.0, 1.0, spoilt], dtype=torch.float64))
     with pytest.raises(BadArgument, match="without area"):
         field_from_surface(vertices, torch.tensor([[0, 1, 1]]))
     with pytest.raises(BadArgument, match="spacing"):

@@ -5,7 +5,7 @@ import pytest
 import torch
 from sklearn.mixture import GaussianMixture
 
-from torchgrasp.errors import IndefiniteCovariance
+from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.hand.em import (
     Components,
     coefficients_from_components,
@@ -89,6 +89,12 @@ def test_start_finds_separate_clusters(generator):
     start = start_components(x, 3, 0, 0.0)
     torch.testing.assert_close(start.weights, torch.full((3,), 1 / 3, dtype=torch.float64))
     assert float(torch.cdist(centres, start.means).amin(1).max()) < 0.02
+
+
+def test_fewer_different_rows_than_components_are_named():
+    rows = torch.tensor([[0.0, 1.0], [1.0, 0.0]], dtype=torch.float64).repeat(50, 1)
+    with pytest.raises(BadArgument, match="components: found 3, allowed is at most 2"):
+        start_components(rows, 3, 0, 1e-6)
 
 
 def test_a_collapsed_component_is_an_error_not_a_repair():

@@ -3,11 +3,19 @@
 import math
 
 import torch
+import trimesh
 
+from torchgrasp.errors import Status
+from torchgrasp.frames import apply
 from torchgrasp.hand.check import Findings
+from torchgrasp.hand.collide import field_from_surface
+from torchgrasp.hand.load import load_hand
+from torchgrasp.hand.mixture import load_mixture
+from torchgrasp.hand.query import query_hand
 from torchgrasp.hand.rank import score, tangential_ratio
-from torchgrasp.hand.realise import assign, best_rows
-from torchgrasp.values import Contacts, GraspGuess
+from torchgrasp.hand.realise import assign, best_rows, realise
+from torchgrasp.hand.refine import Surroundings
+from torchgrasp.values import Certificate, Contacts, GraspGuess
 
 
 def test_best_rows_keeps_few_of_each_group(generator):
@@ -47,6 +55,34 @@ def test_assign_gives_finger_i_its_contact(generator):
     torch.testing.assert_close(taken.points[0, 0], points[3, 2])
     torch.testing.assert_close(taken.normals[0, 2], -points[3, 1])
     torch.testing.assert_close(taken.std_m[1], flat[1])
+
+
+def test_realised_grasps_are_checked_and_ranked():
+    """Contacts on a ball that Barrett postures touch, disturbed: the executable ones come first, best first."""
+    hand = load_hand("barrett")
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.035)
+    field = field_from_surface(torch.tensor(mesh.vertices), torch.tensor(mesh.faces))
+    turn = torch.linspace(0, 1.5, 6, dtype=torch.float64)
+    flat = torch.full((6, 3), 0.001, dtype=torch.float64)
+    angle = turn[:, None] + torch.tensor([0.0, 2.1, 4.2], dtype=torch.float64)
+    normals = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
+    contacts = Contacts(0.035 * normals, normals, flat, flat)
+    ones = torch.ones(6, dtype=torch.float64)
+    certificate = Certificate(torch.arange(6, dtype=torch.float64), ones, ones, ones > 0)
+    surroundings, center = Surroundings(field, None), torch.zeros(3, dtype=torch.float64)
+    guess = query_hand(contacts, hand, load_mixture("barrett"))
+    found = realise(guess, hand, contacts, certificate, surroundings, center)
+    good = found.status == Status.OK
+    assert good.sum() >= 3
+    assert not (good[1:] & ~good[:-1]).any()
+    for part in (found[good], found[~good]):
+        assert (part.score.diff() <= 0).all()
+    row = certificate.margin.tolist().index(float(found.certificate.margin[0]))
+    torch.testing.assert_close(found.contacts.points[0], contacts.points[row, found.permutation[0]])
+    tips = apply(found.obj_from_hand, hand.tip_centres(found.joints))[good]
+    gap = torch.linalg.vector_norm(tips, dim=-1) - 0.035 - hand.tip_radius
+    assert float(gap.abs().max()) < 2.1e-3
+    assert len(realise(guess[:0], hand, contacts, certificate, surroundings, center)) == 0
 
 
 def triple(height: float = 0.0, tilt: float = 0.0, std: float = 0.001) -> Contacts:

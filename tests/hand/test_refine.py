@@ -1,5 +1,7 @@
 """Refinement: Jacobians against finite differences, postures recovered, limits and clearances kept."""
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -148,7 +150,22 @@ def test_check_names_what_is_wrong(hand, ball):
         posture.joints, rigid(posture.obj_from_hand[:, :3, :3], torch.zeros_like(away).expand(len(free[free]), 3))
     )
     hit = check(onto, posture.joints, hand, touched(hand, onto), Surroundings(ball, None))
-    assert (hit.clearance < 0).any()
+    inside = hit.clearance < 0
+    assert inside.any()
+    assert (hit.status[inside] == Status.OBJECT_COLLISION).all()
+
+    crossed = random_postures(hand, 60).joints
+    crossed = crossed[hand.self_clearance(crossed) < 0]
+    n = min(len(crossed), len(posture.joints))
+    assert n > 3
+    few, bent = Posture(posture.joints[:n], posture.obj_from_hand[:n]), crossed[:n]
+    itself = Posture(bent, few.obj_from_hand)
+    status = check(itself, few.joints, hand, touched(hand, itself), far(ball)).status
+    assert (status == Status.SELF_COLLISION).all()
+    assert (check(few, bent, hand, contacts[:n], far(ball)).status == Status.PREGRASP).all()
+
+    nowhere = dataclasses.replace(contacts, points=contacts.points * float("nan"))
+    assert (check(posture, posture.joints, hand, nowhere, far(ball)).status == Status.TIP_ERROR).all()
 
 
 def test_the_opened_hand_is_farther_and_clear(hand, ball):

@@ -46,7 +46,8 @@ class Plant(Value):
 
     `actuated` picks the actuated joints out of all; `kp` [N m/rad] belongs to all; `lower` and `upper` [rad] are the
     limits of the actuated ones; `radius` [m] of the round fingertips (0: the contact point itself is the tip);
-    `normals` are the planned outward contact normals in the hand's frame.
+    `normals` are the planned outward contact normals in the hand's frame; `joints` and `pregrasp` the planned posture
+    and the opened one [rad].
     """
 
     coupling: Float[Tensor, "j h"]
@@ -69,7 +70,8 @@ class Plant(Value):
 class Sight(Value):
     """What a robot knows at a tick, in the hand's frame: all joints, fingertip centres and Jacobian, touch.
 
-    `points` [m] and outward `normals` are the sensed contacts, NaN where nothing touches.
+    `points` [m] and outward `normals` are the sensed contacts, NaN where nothing touches. They are the simulator's own,
+    without the noise that a real fingertip has (1 to 2 mm).
     """
 
     joints: Float[Tensor, " j"]

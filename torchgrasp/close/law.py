@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import check_tensor
 from torchgrasp.close.force import balanced_forces, force_covariance
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply as move
@@ -166,7 +167,8 @@ def closing_gains(grasps: Grasps, hand: Hand, force: float = 4.0) -> ClosingGain
         force: normal force of the strongest finger [N].
 
     Raises:
-        BadArgument: not exactly one row, joints of another hand, or a force that is not positive.
+        BadArgument: not exactly one row, joints of another hand, a force that is not positive, or numbers in the
+            grasp that are not finite.
     """
     if len(grasps) != 1:
         raise BadArgument("grasps", f"{len(grasps)} rows", "exactly one: index the grasps, as in grasps[0]")
@@ -174,6 +176,12 @@ def closing_gains(grasps: Grasps, hand: Hand, force: float = 4.0) -> ClosingGain
         raise BadArgument("grasps", f"{grasps.joints.shape[-1]} joints", f"the {len(hand.joint_names)} of {hand.name}")
     if not 0.0 < force < 1e3:
         raise BadArgument("force", force, "a number in (0, 1000) [N]")
+    h = len(hand.joint_names)
+    check_tensor("grasps.joints", grasps.joints, (1, h))
+    check_tensor("grasps.obj_from_hand", grasps.obj_from_hand, (1, 4, 4))
+    check_tensor("grasps.contacts.points", grasps.contacts.points, (1, 3, 3))
+    check_tensor("grasps.contacts.normals", grasps.contacts.normals, (1, 3, 3))
+    check_tensor("grasps.contacts.std_m", grasps.contacts.std_m, (1, 3))
     joints, contacts = grasps.joints.double(), grasps.contacts.to(torch.float64)
     hand_from_obj = inverse(grasps.obj_from_hand.double())
     target, normals = move(hand_from_obj, contacts.points), rotate(hand_from_obj, contacts.normals)

@@ -3,6 +3,7 @@
 import math
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
@@ -15,8 +16,9 @@ LIFT_JOINT = "torchgrasp_lift"
 def lifted_urdf(urdf_path: Path | str, world_from_hand: np.ndarray, travel: float) -> str:
     """Return the URDF of a hand that stands at a pose in the world and can be lifted by `travel` [m].
 
-    `<visual>` is left out (it needs a render device), `<mimic>` and `<transmission>` too: the simulator transmits
-    force through mimic joints wrongly, so that coupled joints get targets of their own (`Hand.expand`).
+    `<visual>` and `<material>` are left out (they need a render device), `<mimic>`, `<transmission>` and `<gazebo>`
+    too: the simulator transmits force through mimic joints wrongly, so that coupled joints get targets of their own
+    (`Hand.expand`).
 
     Args:
         urdf_path: of the hand.
@@ -42,7 +44,7 @@ def lifted_urdf(urdf_path: Path | str, world_from_hand: np.ndarray, travel: floa
     <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>
   <joint name="{LIFT_JOINT}" type="prismatic"><parent link="torchgrasp_world"/><child link="torchgrasp_arm"/>
     <axis xyz="0 0 1"/><limit lower="-0.01" upper="{travel + 0.05:.9g}" effort="1000" velocity="10"/></joint>
-  <joint name="torchgrasp_wrist" type="fixed"><parent link="torchgrasp_arm"/><child link="{urdf.root}"/>
+  <joint name="torchgrasp_wrist" type="fixed"><parent link="torchgrasp_arm"/><child link={quoteattr(urdf.root)}/>
     <origin xyz="{x:.12g} {y:.12g} {z:.12g}" rpy="{roll:.12g} {pitch:.12g} {yaw:.12g}"/></joint>
 </stand>"""
         )

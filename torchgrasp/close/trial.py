@@ -15,7 +15,7 @@ from torchgrasp.close.law import closing_gains
 from torchgrasp.close.parts import check_parts, convex_parts, read_mesh
 from torchgrasp.close.scene import Scene
 from torchgrasp.close.sensor import sense, untouched
-from torchgrasp.errors import Status
+from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import apply, inverse, rotate, rotation_angle
 from torchgrasp.hand.hand import Hand
 from torchgrasp.specs import TrialSpec
@@ -69,14 +69,19 @@ def close_hand(
         parts: convex bodies to use for the mesh instead of its own decomposition (`convex_parts`).
 
     Raises:
-        BadArgument: not exactly one row, or a grasp of another hand.
+        BadArgument: not exactly one row, a grasp of another hand or with numbers that are not finite, a pre-grasp
+            outside the joint limits, or a controller faster than the simulator.
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
     """
     started = time.perf_counter()
     spec = TrialSpec() if spec is None else spec
-    grasp = grasp.to("cpu", torch.float64)
+    if not spec.control_rate * spec.timestep < 1 + 1e-9:
+        found = f"{spec.control_rate:g} Hz with a timestep of {spec.timestep:g} s"
+        raise BadArgument("control_rate", found, "a period of at least one timestep")
+    grasp, hand = grasp.to("cpu", torch.float64), hand.to("cpu", torch.float64)
     gains = closing_gains(grasp, hand, spec.force)
+    hand.check_joints(grasp.pregrasp)
     mesh = read_mesh(mesh)
     bodies = convex_parts(mesh) if parts is None else check_parts(parts)
     trial = _Trial(grasp, hand, mesh, bodies, spec, seed)

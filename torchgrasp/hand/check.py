@@ -22,6 +22,7 @@ TIP_TOLERANCE = 2 * MILLIMETRE
 TIP_PENETRATION = 2 * MILLIMETRE
 """Largest depth [m] of a fingertip in the estimated surface; a tip that touches where it should has none."""
 ANGLE_TOLERANCE = math.radians(2)
+"""How far [rad] beyond the pad's cone, which `refine` asks for, a contact direction may lie."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,17 +49,19 @@ def normal_angle(screws: Screws, contacts: Contacts) -> Float[Tensor, "g 3"]:
     return torch.acos((-(pads * contacts.normals).sum(-1)).clamp(-1.0, 1.0))
 
 
-def link_clearance(screws: Screws, surroundings: Surroundings, tips_touch: bool) -> tuple[Tensor, Tensor, Tensor]:
+def link_clearance(
+    screws: Screws, surroundings: Surroundings, tips_touch: bool
+) -> tuple[Float[Tensor, "g"], Float[Tensor, "g"], Float[Tensor, "g"]]:
     """Return the least clearance [m] of the links from the object, of the tips from it, and of both from the table.
 
-    Where the tips are meant to touch, they count in the second figure alone.
+    Where the tips are meant to touch, they count in the second figure alone. Without a table its clearance is infinite.
     """
     cover = screws.hand.collision_spheres
     centres = screws.points(cover.link_index, cover.center)
     radius = cover.radius.to(centres)
     free = surroundings.field.query(centres)[0] - radius
     touches = cover.touching
-    tips = free[:, touches].amin(1) if bool(touches.any()) else torch.full_like(free[:, 0], math.inf)
+    tips = free[:, touches].amin(1)
     links = free[:, ~touches].amin(1) if tips_touch else free.amin(1)
     if surroundings.table is None:
         table = torch.full_like(tips, math.inf)
@@ -91,18 +94,18 @@ def check(
     opened_itself = hand.self_clearance(pregrasp)
 
     lower, upper = hand.lower.to(error), hand.upper.to(error)
-    outside = ((posture.joints < lower - 1e-9) | (posture.joints > upper + 1e-9)).any(1)
+    within = ((posture.joints >= lower - 1e-9) & (posture.joints <= upper + 1e-9)).all(1)
     cone = torch.where(hand.tip_radius.to(error) > 0, ROUND_PAD, FLAT_PAD) + ANGLE_TOLERANCE
-    findings = [
-        (Status.TIP_ERROR, (error > TIP_TOLERANCE).any(1)),
-        (Status.NORMAL_ANGLE, (angle > cone).any(1)),
-        (Status.JOINT_LIMITS, outside),
-        (Status.SELF_COLLISION, itself < 0),
-        (Status.OBJECT_COLLISION, (links < 0) | (tips < -TIP_PENETRATION)),
-        (Status.TABLE_COLLISION, table < 0),
-        (Status.PREGRASP, (opened_links < 0) | (opened_table < 0) | (opened_itself < 0)),
+    findings = [  # each says what is right, so that a number that is none is wrong
+        (Status.TIP_ERROR, (error <= TIP_TOLERANCE).all(1)),
+        (Status.NORMAL_ANGLE, (angle <= cone).all(1)),
+        (Status.JOINT_LIMITS, within),
+        (Status.SELF_COLLISION, itself >= 0),
+        (Status.OBJECT_COLLISION, (links >= 0) & (tips >= -TIP_PENETRATION)),
+        (Status.TABLE_COLLISION, table >= 0),
+        (Status.PREGRASP, (opened_links >= 0) & (opened_table >= 0) & (opened_itself >= 0)),
     ]
     status = torch.full_like(itself, Status.OK, dtype=torch.int64)
-    for code, bad in reversed(findings):
-        status = torch.where(bad, int(code), status)
+    for code, right in reversed(findings):
+        status = torch.where(right, status, int(code))
     return Findings(error, angle, torch.stack([links, table, itself]).amin(0), status)

@@ -82,7 +82,7 @@ def box_distance(points: Float[Tensor, "*b 3"], half: Float[Tensor, "*b 3"]) -> 
 # -------------------------------------------------------------------------------------------- an object's surface
 
 BAND = 0.022
-"""Distance [m] from the surface within which the field is exact at every node; farther out it is interpolated."""
+"""Nodes whose interpolated distance [m] is below this are made exact; farther out it stays interpolated."""
 COARSE = 3
 """Nodes of the coarse grid are this many spacings apart."""
 NEAREST = 4
@@ -151,7 +151,7 @@ def field_from_surface(
     surface = _Surface(vertices, faces_or_normals)
     low, high = vertices.amin(0).double() - margin, vertices.amax(0).double() + margin
     # the coarse nodes are every third of the fine ones
-    counts = [COARSE * int(c) + 1 for c in torch.ceil((high - low) / (COARSE * spacing)).tolist()]
+    counts = [COARSE * max(1, int(c)) + 1 for c in torch.ceil((high - low) / (COARSE * spacing)).tolist()]
     if np.prod(np.array(counts, dtype=float)) > 2e7:
         raise BadArgument("spacing", spacing, f"a coarser grid than {counts} nodes")
     origin = low.cpu().numpy()
@@ -192,6 +192,8 @@ class _Surface:
         if faces_or_normals.is_floating_point():
             if len(other) != len(points):
                 raise BadArgument("faces_or_normals", f"{len(other)} normals", f"{len(points)}, one for each vertex")
+            if not np.linalg.norm(other, axis=1).min() > 0:  # NaN included
+                raise BadArgument("faces_or_normals", "a normal of length 0 or NaN", "normals with a direction")
             self.triangles, self.owner = None, np.arange(len(points))
             self.samples, self.normals = points, other / np.linalg.norm(other, axis=1, keepdims=True)
             self.tree = KDTree(self.samples)

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.errors import IndefiniteCovariance
+from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.linalg import cholesky
 
 ROWS = 1024
@@ -139,12 +139,18 @@ def nearest(x: Float[Tensor, "n d"], centres: Float[Tensor, "m d"]) -> Tensor:
 def start_components(
     x: Float[Tensor, "n d"], m: int, seed: int, regularisation: float, subsample: int = 20_000, rounds: int = 10
 ) -> Components:
-    """Return a start from k-means: centres by k-means++ on a subsample, then `rounds` of Lloyd on all the data."""
+    """Return a start from k-means: centres by k-means++ on a subsample, then `rounds` of Lloyd on all the data.
+
+    Raises:
+        BadArgument: fewer different rows than components.
+    """
     generator = torch.Generator().manual_seed(seed)
     pool = x[torch.randperm(len(x), generator=generator)[:subsample].to(x.device)]
     centres = pool[:1]
     squared = ((pool - centres) ** 2).sum(1)
-    for _ in range(m - 1):
+    for k in range(1, m):
+        if not bool((squared > 0).any()):
+            raise BadArgument("components", m, f"at most {k}, the number of different rows of the data")
         pick = torch.multinomial(squared.cpu(), 1, generator=generator).to(x.device)
         centres = torch.cat([centres, pool[pick]])
         squared = torch.minimum(squared, ((pool - pool[pick]) ** 2).sum(1))

@@ -98,6 +98,6 @@ def realise(
         score=ranking,
         status=found.status,
     )
-    failed = (grasps.status != Status.OK).to(ranking)
-    order = torch.argsort(failed * 1e6 - ranking, stable=True)
+    order = torch.argsort(-ranking, stable=True)
+    order = order[torch.argsort((grasps.status[order] != Status.OK).long(), stable=True)]
     return grasps[order]

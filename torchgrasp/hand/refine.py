@@ -6,7 +6,8 @@ pose and joints are solved together, every guess a row of one batch, with analyt
 * a round fingertip's centre one radius off the contact along its normal, so that the tip may roll; a tip that is not
   round brings its contact point itself to the contact,
 * the contact direction inside a cone about the pad's axis,
-* hinges on the clearance of the links' spheres from the object's field, from the table and from each other.
+* hinges on the clearance of the links' spheres from the object's field and from the table, and of the links' capsules
+  from each other. Boxes (the palm's) are left to `check`.
 
 Joint limits hold at every step by projection. The paper's COBYLA minimises the tip distances alone, one grasp at a
 time; here collision is part of the problem, because that is where planned contacts are lost.
@@ -218,8 +219,9 @@ def minimise(
         diagonal = normal.diagonal(dim1=1, dim2=2)
         # Relative damping alone would leave a joint that moves nothing undamped.
         damped = normal + torch.diag_embed(damping[:, None] * diagonal + 1e-3)
-        step = -torch.cholesky_solve(jacobian.transpose(1, 2) @ residual[..., None], torch.linalg.cholesky(damped))
-        step = step[..., 0]
+        factor, info = torch.linalg.cholesky_ex(damped)
+        step = -torch.cholesky_solve(jacobian.transpose(1, 2) @ residual[..., None], factor)[..., 0]
+        step = torch.where((info == 0)[:, None], step, 0.0)  # one row without a factor waits for more damping
         step = step * (LARGEST_STEP / step.abs().amax(1, keepdim=True).clamp_min(LARGEST_STEP))
         still = step.new_zeros(len(step), 6 + posture.joints.shape[1] - step.shape[1])
         trial = moved(posture, torch.cat([still, step], 1), hand)

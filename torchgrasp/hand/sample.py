@@ -51,7 +51,7 @@ def sample_configurations(hand: Hand, n: int, seed: int = 0, workers: int = 1) -
     torch.Size([100, 6])
     """
     for name, value, low, high in [("n", n, 1, 10**9), ("seed", seed, 0, 2**63), ("workers", workers, 1, 1024)]:
-        if not low <= value <= high:
+        if not low <= value <= high or value != int(value):
             raise BadArgument(name, value, f"a whole number in [{low}, {high}]")
     found: list[Tensor] = []
     have = 0

@@ -1,0 +1,155 @@
+"""The controllers without a simulator: when fingers wait, stop and press, and what the squeeze asks of the joints."""
+
+import pytest
+import torch
+
+from torchgrasp.close.control import (
+    LEAD,
+    PATIENCE,
+    RAMP,
+    SETTLED,
+    STOP_FORCE,
+    Closing,
+    Plant,
+    Sight,
+    Squeeze,
+    Stopping,
+    held_forces,
+)
+from torchgrasp.close.law import MAX_SPEED, surface_covariance
+from torchgrasp.values import ClosingGains
+
+PERIOD = 0.01
+FREE, TOUCHING = torch.zeros(3, dtype=torch.bool), torch.ones(3, dtype=torch.bool)
+
+
+def real(values) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+NORMALS = real([[1, 0, 0], [1, 0, 0], [-1, 0, 0]])
+TARGET = real([[0.03, 0, 0.02], [0.03, 0, -0.02], [-0.03, 0, 0]])
+
+
+def plant(coupling: torch.Tensor | None = None) -> Plant:
+    """Point fingers that slide along x, y and z: joint 3 i + k moves finger i along axis k."""
+    coupling = torch.eye(9).double() if coupling is None else coupling
+    h = coupling.shape[1]
+    ones, zero = torch.ones(h).double(), torch.zeros(h).double()
+    return Plant(
+        coupling=coupling,
+        offset=torch.zeros(9).double(),
+        actuated=tuple(range(h)),
+        kp=torch.full((9,), 2.0).double(),
+        lower=-ones,
+        upper=ones,
+        radius=real([0.01, 0.01, 0.01]),
+        normals=NORMALS,
+        joints=zero,
+        pregrasp=zero,
+    )
+
+
+GAINS = ClosingGains(
+    target=TARGET,
+    covariance=surface_covariance(NORMALS, torch.full((3,), 0.004).double()),
+    position_gain=torch.full((3, 3), 4.0).double(),
+    force_gain=torch.full((3, 3), 0.01).double(),
+    desired_force=-NORMALS * real([[2.0], [2.0], [4.0]]),
+)
+
+
+def sight(off: float = 0.02, reading=(0.0, 0.0, 0.0), contact=FREE, joints=None) -> Sight:
+    """Tips `off` metres away from their contacts along the normals; sensed contacts are the planned ones."""
+    touched = contact[:, None]
+    return Sight(
+        joints=torch.zeros(9).double() if joints is None else joints,
+        tips=TARGET + (0.01 + off) * NORMALS,
+        jacobian=torch.eye(9).double().reshape(3, 3, 9),
+        reading=real(reading),
+        contact=contact,
+        points=torch.where(touched, TARGET, torch.nan),
+        normals=torch.where(touched, NORMALS, torch.nan),
+    )
+
+
+def test_eq25_free_fingers_approach_their_contacts():
+    step = Closing(plant(), GAINS)(sight(), PERIOD).reshape(3, 3)
+    assert ((step * NORMALS).sum(-1) < 0).all()
+    assert step.norm(dim=-1).max() <= MAX_SPEED * PERIOD + 1e-12
+    assert step[:, 1:].abs().max() < 1e-9
+
+
+def test_a_touching_finger_keeps_the_waiting_force_whatever_its_position_error():
+    one = torch.tensor([True, False, False])
+    for reading, sign in ((0.0, -1), (1.0, 1)):
+        step = Closing(plant(), GAINS)(sight(0.02, (reading, 0, 0), one), PERIOD).reshape(3, 3)
+        assert float((step[0] * NORMALS[0]).sum()) * sign > 0
+
+
+def test_closing_ends_when_all_touch_or_patience_is_over():
+    controller = Closing(plant(), GAINS)
+    for contact, wait in ((TOUCHING, SETTLED), (torch.tensor([True, False, False]), PATIENCE)):
+        controller = Closing(plant(), GAINS)
+        ticks = 0
+        while not controller.done:
+            controller(sight(contact=contact), PERIOD)
+            ticks += 1
+        assert ticks * PERIOD == pytest.approx(wait, abs=1.5 * PERIOD)
+    controller = Closing(plant(), GAINS)
+    for _ in range(300):
+        controller(sight(), PERIOD)
+    assert not controller.done
+
+
+def test_targets_stay_within_limits_and_near_the_joints():
+    controller = Closing(plant(), GAINS)
+    for _ in range(500):
+        targets = controller(sight(0.5), PERIOD)
+    assert targets.abs().max() == pytest.approx(LEAD)
+    stopping = Stopping(plant(), GAINS)
+    for _ in range(5000):
+        targets = stopping(sight(0.5), PERIOD)
+    assert targets.abs().max() == pytest.approx(1.0)
+
+
+def test_the_baseline_stops_each_finger_by_itself_and_for_good():
+    controller = Stopping(plant(), GAINS)
+    first = controller(sight(0.02, (STOP_FORCE, 0.0, 0.0)), PERIOD).reshape(3, 3)
+    assert first[0].abs().max() == 0
+    assert (first[1:].abs().amax(-1) > 0).all()
+    later = controller(sight(0.02), PERIOD).reshape(3, 3)
+    assert later[0].abs().max() == 0
+    assert not controller.done
+    controller(sight(0.0005), PERIOD)
+    assert controller.done
+
+
+def test_held_forces_are_balanced_at_the_sensed_contacts():
+    forces, total = held_forces(plant(), GAINS, sight(contact=TOUCHING))
+    assert forces.sum(0).abs().max() < 1e-9
+    assert torch.linalg.cross(TARGET, forces).sum(0).abs().max() < 1e-9
+    assert total == pytest.approx(8.0, rel=0.02)
+    assert float((-(forces * NORMALS).sum(-1)).max()) == pytest.approx(4.0)
+    planned, total = held_forces(plant(), GAINS, sight(contact=torch.tensor([True, True, False])))
+    assert torch.equal(planned, GAINS.desired_force)
+    assert total == pytest.approx(8.0)
+
+
+def test_the_squeeze_rises_to_what_the_drives_turn_into_the_forces():
+    start = 0.01 * torch.ones(9).double()
+    seen = sight(0.0, contact=TOUCHING, reading=(2.0, 2.0, 4.0))
+    hold = Squeeze(plant(), GAINS, seen, start)
+    first = hold(seen, PERIOD)
+    assert (first - start).abs().max() < 0.1
+    for _ in range(round(RAMP / PERIOD)):
+        last = hold(seen, PERIOD)
+    forces, _ = held_forces(plant(), GAINS, seen)
+    assert torch.allclose(2.0 * last.reshape(3, 3), forces, atol=0.02)  # kp times the lead of sliding joints is force
+    weak = sight(0.0, contact=TOUCHING, reading=(1.0, 1.0, 2.0))
+    for _ in range(50):
+        more = hold(weak, PERIOD)
+    assert more.norm() > 1.1 * last.norm()
+    for _ in range(1000):
+        more = hold(weak, PERIOD)
+    assert more.norm() == pytest.approx(1.5 * float(forces.norm()) / 2.0, rel=1e-6)
