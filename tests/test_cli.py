@@ -8,6 +8,8 @@ import torch
 import trimesh
 
 from torchgrasp import cli
+from torchgrasp.cli import grasps
+from torchgrasp.cli.common import check_folder
 from torchgrasp.errors import MissingExtra
 from torchgrasp.objects import DATA
 
@@ -22,7 +24,7 @@ def refuse_work(monkeypatch):
     def work(*args, **kwargs):
         raise AssertionError("the work began")
 
-    monkeypatch.setattr(cli, "plan_grasps", work)
+    monkeypatch.setattr(grasps, "plan_grasps", work)
 
 
 def sphere(count, scale=0.04):
@@ -111,14 +113,14 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_work(out, tmp_pat
 def test_check_folder_leaves_a_folder_as_it_was(tmp_path):
     (tmp_path / "kept").mkdir()
     (tmp_path / "kept" / "report.html").write_text("old")
-    cli.check_folder(tmp_path / "kept")
-    cli.check_folder(tmp_path / "new" / "deep")
+    check_folder(tmp_path / "kept")
+    check_folder(tmp_path / "new" / "deep")
     assert [p.name for p in tmp_path.iterdir()] == ["kept"]
     assert (tmp_path / "kept" / "report.html").read_text() == "old"
 
 
 def test_a_missing_simulator_is_named_before_the_work(tmp_path, capsys, monkeypatch, refuse_work):
-    monkeypatch.setattr(cli.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(grasps.importlib.util, "find_spec", lambda name: None)
     arguments = [VIEW, "--hand", "allegro", "--mesh", MESH, "--close", "--out", str(tmp_path / "out")]
     assert cli.main(["grasp", *arguments]) == 2
     assert capsys.readouterr().err == f"torchgrasp: {MissingExtra('sapien', 'sim')}\n"
@@ -128,8 +130,8 @@ def test_a_simulator_without_its_libraries_is_named_before_the_work(tmp_path, ca
     def fail(name):
         raise ImportError("libX11.so.6: cannot open shared object file")
 
-    monkeypatch.setattr(cli.importlib.util, "find_spec", lambda name: "found")
-    monkeypatch.setattr(cli.importlib, "import_module", fail)
+    monkeypatch.setattr(grasps.importlib.util, "find_spec", lambda name: "found")
+    monkeypatch.setattr(grasps.importlib, "import_module", fail)
     arguments = [VIEW, "--hand", "allegro", "--mesh", MESH, "--close", "--out", str(tmp_path / "out")]
     assert cli.main(["grasp", *arguments]) == 2
     said = capsys.readouterr().err
@@ -140,7 +142,7 @@ def test_an_error_during_the_work_is_one_sentence_too(tmp_path, capsys, monkeypa
     def fail(*args, **kwargs):
         raise MissingExtra("a package\nwith two lines", "sim")
 
-    monkeypatch.setattr(cli, "plan_grasps", fail)
+    monkeypatch.setattr(grasps, "plan_grasps", fail)
     assert cli.main(["grasp", VIEW, "--hand", "allegro", "--out", str(tmp_path / "out")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "out").exists()
@@ -150,7 +152,7 @@ def test_interrupt_ends_with_130_and_without_files(tmp_path, capsys, monkeypatch
     def interrupt(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "plan_grasps", interrupt)
+    monkeypatch.setattr(grasps, "plan_grasps", interrupt)
     assert cli.main(["grasp", VIEW, "--hand", "allegro", "--out", str(tmp_path / "out")]) == 130
     assert capsys.readouterr().err == "torchgrasp: interrupted\n"
     assert not (tmp_path / "out").exists()
@@ -170,7 +172,7 @@ def test_the_table_is_the_lowest_point_unless_it_is_given(tmp_path, monkeypatch)
         seen.append((spec.table, spec.friction, starts, seed, float(cloud.points[:, 2].min())))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "plan_grasps", note)
+    monkeypatch.setattr(grasps, "plan_grasps", note)
     for extra in ([], ["--table", "-0.01"], ["--no-table", "--starts", "5", "--seed", "3", "--friction", "0.5"]):
         cli.main(["grasp", VIEW, "--hand", "barrett", "--out", str(tmp_path / "out"), *extra])
     assert seen[0][0] == seen[0][4] and seen[0][1:4] == (0.8, 1000, 0)
@@ -181,11 +183,11 @@ def test_the_table_is_the_lowest_point_unless_it_is_given(tmp_path, monkeypatch)
 def test_a_shipped_mesh_comes_with_its_parts_wherever_it_lies(tmp_path):
     copy = tmp_path / "copy.ply"
     copy.write_bytes((DATA / "jug" / "mesh.ply").read_bytes())
-    mesh, parts = cli.read_true_mesh(copy)
+    mesh, parts = grasps.read_true_mesh(copy)
     assert parts is not None and len(parts) > 1
     assert sum(p.volume for p in parts) == pytest.approx(mesh.volume, rel=0.35)
     trimesh.creation.box((0.05, 0.05, 0.05)).export(tmp_path / "box.stl")
-    assert cli.read_true_mesh(tmp_path / "box.stl")[1] is None
+    assert grasps.read_true_mesh(tmp_path / "box.stl")[1] is None
 
 
 def test_grasp_from_cloud_to_files(tmp_path, capsys):
@@ -199,8 +201,84 @@ def test_grasp_from_cloud_to_files(tmp_path, capsys):
 
     from torchgrasp.values import load_grasps
 
-    grasps = load_grasps(out / "grasps.safetensors")
-    assert grasps.meta["hand"] == "barrett" and grasps.meta["seed"] == "0" and "metre" in grasps.meta["units"]
-    assert code == (0 if bool((grasps.status == 0).any()) else 1)
-    assert torch.isfinite(grasps.joints).all()
+    found = load_grasps(out / "grasps.safetensors")
+    assert found.meta["hand"] == "barrett" and found.meta["seed"] == "0" and "metre" in found.meta["units"]
+    assert code == (0 if bool((found.status == 0).any()) else 1)
+    assert torch.isfinite(found.joints).all()
     assert said.out.splitlines()[-1].startswith("The barrett hand has")
+
+
+@pytest.mark.parametrize("words", [["cloud"], ["cloud", "--help"], ["shape", "-h"], ["cloud", "check", "--help"]])
+def test_groups_of_commands_have_help(words, capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.main(words)
+    assert end.value.code == 0 and " ".join(words[:1]) in capsys.readouterr().out
+
+
+def test_cloud_check_reports_a_view(capsys):
+    assert cli.main(["cloud", "check", VIEW]) == 0
+    said = capsys.readouterr().out
+    for word in ("points      1000", "mm", "spacing", "noise", "strays", "normals", "viewpoint   given"):
+        assert word in said
+
+
+def test_cloud_check_names_what_to_mend(tmp_path, capsys):
+    points = sphere(6000)
+    points[:3] += 0.3
+    np.save(tmp_path / "ball.npy", np.concatenate([points, points[:5]]))
+    assert cli.main(["cloud", "check", str(tmp_path / "ball.npy"), "--viewpoint", "0", "0", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "6005 (5 of them copies)" in said and "thin_cloud" in said
+    assert next(line for line in said.splitlines() if line.startswith("strays")).split()[1] == "3"
+
+
+@pytest.mark.parametrize("name", ["missing cloud", "empty ply", "other suffix", "two points", "millimetres", "nan"])
+def test_cloud_check_refuses_by_name(name, tmp_path, capsys):
+    path = bad_inputs(tmp_path)[name][0][0]
+    assert cli.main(["cloud", "check", str(path)]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.startswith("torchgrasp: FILE: found") and said.err.count("\n") == 1
+
+
+def test_cloud_render_writes_what_cloud_check_and_shape_surface_read(tmp_path, capsys):
+    out = tmp_path / "made" / "view.ply"
+    arguments = ["--azimuth", "200", "--elevation", "20", "--points", "300", "--seed", "4"]
+    assert cli.main(["cloud", "render", MESH, "--out", str(out), *arguments]) == 0
+    first = out.read_bytes()
+    assert cli.main(["cloud", "render", MESH, "--out", str(out), *arguments]) == 0
+    assert out.read_bytes() == first
+    assert cli.main(["cloud", "check", str(out)]) == 0
+    assert "300" in capsys.readouterr().out
+    for suffix in ("ply", "glb"):
+        surface = tmp_path / f"surface.{suffix}"
+        assert cli.main(["shape", "surface", str(out), "--out", str(surface), "--resolution", "24"]) == 0
+        mesh = trimesh.load(surface, force="mesh", process=False)
+        height = np.ptp(mesh.vertices, axis=0).max()
+        assert 0.7 < height / np.ptp(trimesh.load(MESH, force="mesh").vertices, axis=0).max() < 1.4
+        assert len(np.unique(mesh.visual.vertex_colors, axis=0)) > 20
+    assert "mm where it is yellow" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "start"),
+    [
+        (["cloud", "render", MESH, "--out", "a.pcd"], "--out: found a.pcd"),
+        (["cloud", "render", "none.stl", "--out", "a.ply"], "MESH: found none.stl"),
+        (["cloud", "render", MESH, "--out", "a.ply", "--elevation", "95"], "--elevation: found 95"),
+        (["cloud", "render", MESH, "--out", "a.ply", "--azimuth", "nan"], "--azimuth: found nan"),
+        (["cloud", "render", MESH, "--out", "a.ply", "--distance", "0"], "--distance: found 0"),
+        (["cloud", "render", MESH, "--out", "a.ply", "--points", "2"], "--points: found 2"),
+        (["cloud", "render", MESH, "--out", "a.ply", "--seed", "-1"], "--seed: found -1"),
+        (["shape", "surface", VIEW, "--out", "a.obj"], "--out: found a.obj"),
+        (["shape", "surface", VIEW, "--out", "a.ply", "--table", "0", "--no-table"], "--table"),
+        (["shape", "surface", "no.ply", "--out", "a.ply"], "CLOUD: found no.ply"),
+        (["shape", "surface", VIEW, "--out", "a.ply", "--resolution", "4"], "--resolution: found 4"),
+        (["shape", "calibrate", "--objects", "nowhere"], "--objects: found nowhere"),
+    ],
+)
+def test_bad_options_are_named_and_nothing_is_left(words, start, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(words) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.startswith(f"torchgrasp: {start}") and said.err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []

@@ -62,7 +62,7 @@ def check_normals(cloud: PointCloud) -> NormalCheck:
     against = compared & (cosine < 0)
     pairs = int(compared.sum())
     opposed = int(against.sum()) / pairs if pairs >= LEAST_PAIRS else 0.0
-    length: Float[Tensor, n] = torch.linalg.vector_norm(cloud.normals.double(), dim=-1)
+    length = torch.linalg.vector_norm(cloud.normals.double(), dim=-1)
     return NormalCheck(
         flipped=2 * against.sum(-1) > compared.sum(-1),
         opposed=opposed,

@@ -1,30 +1,23 @@
-"""The command line: `torchgrasp grasp` goes from a cloud to grasps and on to a held object; `torchgrasp objects` lists.
+"""`torchgrasp grasp`: from a cloud to grasps and on to a held object; `torchgrasp objects` lists what to try it on."""
 
-Exit codes: 0 the job is done; 1 no grasp is executable, or the object was not held; 2 a bad input, with one sentence
-on stderr; 130 interrupted.
-"""
-
-import contextlib
 import dataclasses
 import importlib
 import importlib.util
-import os
 import sys
-import tempfile
 import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import torch
 import tyro
 from tqdm import tqdm
 
+from torchgrasp.cli.common import check_folder, check_seed, check_table, naming, table_height
 from torchgrasp.close.parts import read_mesh
 from torchgrasp.close.trial import close_hand
 from torchgrasp.cloud.read import read_cloud
-from torchgrasp.errors import BadArgument, GraspError, MissingExtra, OutputError
+from torchgrasp.errors import BadArgument, MissingExtra
 from torchgrasp.files import sha256
 from torchgrasp.hand.load import load_hand
 from torchgrasp.objects import DATA, MASSES, list_objects, load_object
@@ -40,35 +33,6 @@ if TYPE_CHECKING:
 
 PLANNING = ("shape", "plan", "certify", "query", "refine")
 """The stages that `plan_grasps` reports, in their order."""
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code; every error of this library ends as one sentence on stderr."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    if given == ["--version"]:
-        from torchgrasp import __version__
-
-        print(f"torchgrasp {__version__}")
-        return 0
-    # The batches are small: a second thread costs more than it brings, and one gives the same bits on any machine.
-    torch.set_num_threads(1)
-    try:
-        return tyro.extras.subcommand_cli_from_dict(
-            {"grasp": grasp, "objects": objects},
-            prog="torchgrasp",
-            description="Dexterous fingertip grasps from a partial point cloud.",
-            args=given,
-            config=(tyro.conf.FlagCreatePairsOff,),
-        )
-    except GraspError as error:
-        print(f"torchgrasp: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("torchgrasp: interrupted", file=sys.stderr)
-        return 130
-    except BrokenPipeError:  # the reader of stdout went away; nobody is left to be told
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
 
 
 def objects() -> int:
@@ -109,28 +73,26 @@ def grasp(
         no_table: there is no table.
         friction: coefficient of friction between fingertips and object.
     """
-    with _naming("--out", "path"):
+    with naming("--out", "path"):
         check_folder(out)
     if close and mesh is None:
         raise BadArgument("--close", "no --mesh", "--close together with --mesh")
     if close:
         check_simulator()
-    if table is not None and no_table:
-        raise BadArgument("--table", f"{table:g} and --no-table", "one of the two")
+    check_table(table, no_table)
     if not 1 <= starts <= 1_000_000:
         raise BadArgument("--starts", starts, "an integer in [1, 1000000]")
-    if not 0 <= seed < 2**63:
-        raise BadArgument("--seed", seed, "an integer in [0, 2^63)")
-    with _naming("--hand", "hand", "name"):
+    check_seed(seed)
+    with naming("--hand", "hand", "name"):
         the_hand = load_hand(hand)
-    with _naming("CLOUD", "path", "points", "normals"), _naming("--viewpoint", "viewpoint"):
+    with naming("CLOUD", "path", "points", "normals"), naming("--viewpoint", "viewpoint"):
         seen = read_cloud(cloud, viewpoint)
     true_mesh, parts = None, None
     if mesh is not None:
-        with _naming("--mesh", "mesh"):
+        with naming("--mesh", "mesh"):
             true_mesh, parts = read_true_mesh(mesh)
-    height = None if no_table else float(seen.points[:, 2].min()) if table is None else table
-    with _naming("--friction", "friction"), _naming("--table", "table"):
+    height = table_height(seen, table, no_table)
+    with naming("--friction", "friction"), naming("--table", "table"):
         spec = ContactSpec(friction=friction, table=height)
         trial = TrialSpec(friction=friction)
 
@@ -149,7 +111,7 @@ def grasp(
             closure = close_hand(run.executable[0], the_hand, true_mesh, trial, seed=seed, parts=parts)
             progress.end("closing", f"{closure.time[-1]:.1f} s simulated, {closure.status.name.lower()}")
             run = dataclasses.replace(run, stages=tuple(progress.stages), mesh=true_mesh, closure=closure)
-        with _naming("--out", "path"):
+        with naming("--out", "path"):
             grasps.save(out / "grasps.safetensors")
             write_report(out / "report.html", run)
         progress.end("report", f"{out / 'grasps.safetensors'}, {out / 'report.html'}")
@@ -175,27 +137,6 @@ def check_simulator() -> None:
     except ImportError as error:
         allowed = "one whose libraries are there (Debian and Ubuntu: apt-get install libx11-6)"
         raise BadArgument("--close", f"a SAPIEN that cannot be loaded ({error})", allowed) from error
-
-
-def check_folder(path: Path) -> None:
-    """Refuse a folder that cannot be made or written, by trying; whatever was made for the trial is removed.
-
-    Raises:
-        OutputError: the folder cannot be made or written.
-    """
-    made: list[Path] = []
-    try:
-        for folder in reversed([path, *path.parents]):
-            if not folder.exists():
-                folder.mkdir()
-                made.append(folder)
-        with tempfile.TemporaryFile(dir=path):
-            pass
-    except OSError as error:
-        raise OutputError("path", f"{path} ({error.strerror or error})", "a folder that can be written") from error
-    finally:
-        for folder in reversed(made):
-            folder.rmdir()
 
 
 def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] | None]":
@@ -231,17 +172,6 @@ def print_table(grasps: Grasps, most: int = 5) -> None:
     for row in rows:
         print("  ".join(value.rjust(width) for value, width in zip(row, widths, strict=True)))
     print()
-
-
-@contextlib.contextmanager
-def _naming(option: str, *names: str) -> Iterator[None]:
-    """Give an error that names one of `names` the name of the option that the value came from."""
-    try:
-        yield
-    except BadArgument as error:
-        if error.argument not in names:
-            raise
-        raise type(error)(option, error.found, error.allowed) from error
 
 
 class _Progress:

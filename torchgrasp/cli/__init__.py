@@ -1,0 +1,66 @@
+"""The command line, one file a group of commands: grasps, clouds, shapes.
+
+Exit codes: 0 the job is done; 1 no grasp is executable, or the object was not held; 2 a bad input, with one sentence
+on stderr; 130 interrupted.
+"""
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+
+import torch
+import tyro
+
+from torchgrasp.cli import clouds, grasps, shapes
+from torchgrasp.errors import GraspError
+
+COMMANDS: dict[str, Callable[..., int]] = {
+    "grasp": grasps.grasp,
+    "objects": grasps.objects,
+    "cloud check": clouds.check,
+    "cloud render": clouds.render,
+    "shape surface": shapes.surface,
+    "shape calibrate": shapes.calibrate,
+}
+"""The commands by name."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code; every error of this library ends as one sentence on stderr."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given == ["--version"]:
+        from torchgrasp import __version__
+
+        print(f"torchgrasp {__version__}")
+        return 0
+    # The batches are small: a second thread costs more than it brings, and one gives the same bits on any machine.
+    torch.set_num_threads(1)
+    try:
+        return tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            prog="torchgrasp",
+            description="Dexterous fingertip grasps from a partial point cloud.",
+            args=_join_group(given),
+            config=(tyro.conf.FlagCreatePairsOff,),
+        )
+    except GraspError as error:
+        print(f"torchgrasp: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("torchgrasp: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader of stdout went away; nobody is left to be told
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def _join_group(given: list[str]) -> list[str]:
+    """Return the arguments with the name of a group and its command as one word; a group alone asks for help.
+
+    >>> _join_group(["cloud", "check", "a.ply"]), _join_group(["cloud"])
+    (['cloud check', 'a.ply'], ['--help'])
+    """
+    groups = {name.split()[0] for name in COMMANDS if " " in name}
+    if given and given[0] in groups and given[1:] in ([], ["--help"], ["-h"]):
+        return ["--help"]
+    return [" ".join(given[:2]), *given[2:]] if " ".join(given[:2]) in COMMANDS else given

@@ -1,0 +1,67 @@
+"""`torchgrasp cloud`: look at a cloud before it is grasped, or make one of a mesh."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from torchgrasp.cli.common import check_seed, naming
+from torchgrasp.close.parts import read_mesh
+from torchgrasp.cloud.camera import partial_view
+from torchgrasp.cloud.doctor import diagnose_cloud, format_report
+from torchgrasp.cloud.read import read_cloud, save_cloud
+from torchgrasp.errors import BadArgument
+
+
+def check(
+    cloud: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")],
+    /,
+    viewpoint: tuple[float, float, float] | None = None,
+) -> int:
+    """Say what a point cloud is like: unit, size, density, noise, strays, normals, viewpoint, and what to mend.
+
+    Args:
+        cloud: point cloud of one object in metres, z up (.ply, .pcd, .npy, .npz, .xyz).
+        viewpoint: position of the camera in the frame of the cloud; by default the file's, else it is estimated.
+    """
+    with naming("FILE", "path", "points", "normals"), naming("--viewpoint", "viewpoint"):
+        report = diagnose_cloud(read_cloud(cloud, viewpoint))
+    print(format_report(report))
+    return 0
+
+
+def render(
+    mesh: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MESH")],
+    /,
+    out: Path,
+    azimuth: float = 30.0,
+    elevation: float = 30.0,
+    distance: float = 0.5,
+    points: int = 1000,
+    no_noise: bool = False,
+    seed: int = 0,
+) -> int:
+    """Write what a depth camera sees of a mesh from one side, with the errors of an active stereo camera.
+
+    Args:
+        mesh: closed mesh of an object in metres, z up (.ply, .obj, .stl, ...).
+        out: point cloud to write (.npz or .ply), with the viewpoint.
+        azimuth: direction of the camera, from x towards y, in degrees.
+        elevation: of the camera above the horizontal, in degrees.
+        distance: from the centre of the mesh to the camera, in metres.
+        points: number of points; fewer if fewer pixels see the object.
+        no_noise: an exact camera.
+        seed: of the noise and of the choice of points.
+    """
+    check_seed(seed)
+    if out.suffix.lower() not in (".npz", ".ply"):
+        raise BadArgument("--out", out, "a file ending in .npz or .ply")
+    with naming("MESH", "mesh"):
+        solid = read_mesh(mesh)
+    options = [naming(f"--{name}", name) for name in ("azimuth", "elevation", "distance")]
+    with options[0], options[1], options[2], naming("--points", "n"), naming("MESH", "points", "depth"):
+        cloud = partial_view(solid, azimuth, elevation, distance, points, not no_noise, seed)
+    with naming("--out", "path"):
+        save_cloud(cloud, out)
+    print(f"{len(cloud)} points, {out}")
+    return 0

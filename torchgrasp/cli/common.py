@@ -1,0 +1,58 @@
+"""What the commands share: the checks of options, and errors that name the option."""
+
+import contextlib
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from torchgrasp.errors import BadArgument, OutputError
+from torchgrasp.values import PointCloud
+
+
+@contextlib.contextmanager
+def naming(option: str, *names: str) -> Iterator[None]:
+    """Give an error that names one of `names` the name of the option that the value came from."""
+    try:
+        yield
+    except BadArgument as error:
+        if error.argument not in names:
+            raise
+        raise type(error)(option, error.found, error.allowed) from error
+
+
+def check_folder(path: Path) -> None:
+    """Refuse a folder that cannot be made or written, by trying; whatever was made for the trial is removed.
+
+    Raises:
+        OutputError: the folder cannot be made or written.
+    """
+    made: list[Path] = []
+    try:
+        for folder in reversed([path, *path.parents]):
+            if not folder.exists():
+                folder.mkdir()
+                made.append(folder)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise OutputError("path", f"{path} ({error.strerror or error})", "a folder that can be written") from error
+    finally:
+        for folder in reversed(made):
+            folder.rmdir()
+
+
+def check_seed(seed: int) -> None:
+    """Refuse a seed that no generator takes."""
+    if not 0 <= seed < 2**63:
+        raise BadArgument("--seed", seed, "an integer in [0, 2^63)")
+
+
+def table_height(seen: PointCloud, table: float | None, no_table: bool) -> float | None:
+    """Return the height [m] of the table: the given one, none, or the lowest point of the cloud."""
+    return None if no_table else float(seen.points[:, 2].min()) if table is None else table
+
+
+def check_table(table: float | None, no_table: bool) -> None:
+    """Refuse a table that is there and is not."""
+    if table is not None and no_table:
+        raise BadArgument("--table", f"{table:g} and --no-table", "one of the two")

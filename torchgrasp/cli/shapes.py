@@ -1,0 +1,76 @@
+"""`torchgrasp shape`: the estimated surface as a mesh, and how true its uncertainty is."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from torchgrasp.cli.common import check_seed, check_table, naming, table_height
+from torchgrasp.cloud.read import read_cloud
+from torchgrasp.report.export import check_surface_path, largest_std, save_surface
+from torchgrasp.shape.calibrate import calibrate as calibrate_shapes
+from torchgrasp.shape.calibrate import format_table
+from torchgrasp.shape.support import fit_shape
+from torchgrasp.shape.surface import extract_surface
+
+
+def surface(
+    cloud: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CLOUD")],
+    /,
+    out: Path,
+    viewpoint: tuple[float, float, float] | None = None,
+    table: float | None = None,
+    no_table: bool = False,
+    support: Literal["camera", "paper"] = "camera",
+    resolution: int = 64,
+    seed: int = 0,
+) -> int:
+    """Write the estimated surface of the object of a partial point cloud, coloured by how far it may be off.
+
+    Args:
+        cloud: point cloud of one object in metres, z up (.ply, .pcd, .npy, .npz, .xyz).
+        out: mesh to write: .ply, with the standard deviation of each vertex as "std_m" in metres, or .glb.
+        viewpoint: position of the camera in the frame of the cloud; by default the file's, else it is estimated.
+        table: height of the table [m]; by default the lowest point of the cloud.
+        no_table: there is no table.
+        support: what is assumed of the hidden side: what the camera tells, or the paper's points.
+        resolution: cells along the diameter of the surface's domain, 8 to 256.
+        seed: of every random draw.
+    """
+    check_seed(seed)
+    check_table(table, no_table)
+    with naming("--out", "path"):
+        check_surface_path(out)
+    with naming("CLOUD", "path", "points", "normals"), naming("--viewpoint", "viewpoint"):
+        seen = read_cloud(cloud, viewpoint)
+        with naming("--table", "table"):
+            shape = fit_shape(seen, support=support, seed=seed, table=table_height(seen, table, no_table))
+    with naming("--resolution", "resolution"):
+        found = extract_surface(shape, resolution)
+    with naming("--out", "path"):
+        save_surface(found, out)
+    middle = float(found.std_m.median())
+    print(f"{len(found.vertices)} vertices, {len(found.faces)} faces, {out}")
+    print(f"standard deviation: median {1e3 * middle:.1f} mm, {1e3 * largest_std(found):.1f} mm where it is yellow")
+    return 0
+
+
+def calibrate(
+    objects: Path,
+    support: Literal["camera", "paper"] = "camera",
+    no_camera: bool = False,
+    no_table: bool = False,
+    only: tuple[str, ...] = (),
+) -> int:
+    """Print how far estimated surfaces are from true meshes, and how many points lie within 1, 2, 3 std_m.
+
+    Args:
+        objects: folder with manifest.json, and for each object mesh.ply and noisy views.
+        support: what is assumed of the hidden side: what the camera tells, or the paper's points.
+        no_camera: estimate the camera's position in place of taking the manifest's.
+        no_table: do not tell where the table is.
+        only: names of objects to keep; by default all.
+    """
+    with naming("--objects", "objects", "path"):
+        print(format_table(calibrate_shapes(objects, support, not no_camera, not no_table, only)))
+    return 0

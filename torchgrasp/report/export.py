@@ -1,0 +1,64 @@
+"""The estimated surface as a mesh file for other programs, coloured by how far it may be off."""
+
+from pathlib import Path
+
+import numpy as np
+
+from torchgrasp.errors import BadArgument
+from torchgrasp.files import write_atomically
+from torchgrasp.shape.surface import Surface
+
+SUFFIXES = (".ply", ".glb")
+"""The formats, by suffix."""
+COLORS = "viridis"
+"""Colour map of the standard deviation, that of the report."""
+
+
+def save_surface(surface: Surface, path: Path | str) -> Path:
+    """Write a surface as `.ply` or `.glb`, its vertices coloured by `std_m` from 0 (violet) to `largest_std` (yellow).
+
+    The `.ply` file also has the number itself, as the property `std_m` [m] of each vertex.
+
+    Raises:
+        BadArgument: another suffix.
+        OutputError: the file cannot be written.
+    """
+    import matplotlib
+    import trimesh
+
+    path = check_surface_path(path)
+    std = surface.std_m.detach().cpu().double().numpy()
+    colors = (255 * matplotlib.colormaps[COLORS](np.clip(std / largest_std(surface), 0.0, 1.0)) + 0.5).astype(np.uint8)
+    mesh = trimesh.Trimesh(
+        vertices=surface.vertices.detach().cpu().double().numpy(),
+        faces=surface.faces.cpu().numpy(),
+        vertex_normals=surface.normals.detach().cpu().double().numpy(),
+        vertex_colors=colors,
+        process=False,
+    )
+    if path.suffix.lower() == ".ply":
+        mesh.vertex_attributes["std_m"] = std.astype(np.float32)
+    content = mesh.export(file_type=path.suffix.lower()[1:])
+    assert isinstance(content, bytes)
+
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(content)
+
+    return write_atomically(path, write)
+
+
+def largest_std(surface: Surface) -> float:
+    """Return the standard deviation [m] that is drawn as the largest: that of 99 % of the vertices, at least 1 um."""
+    return max(float(surface.std_m.double().quantile(0.99)), 1e-6)
+
+
+def check_surface_path(path: Path | str) -> Path:
+    """Return the path of a mesh file that `save_surface` can write; raise `BadArgument` for another suffix.
+
+    >>> check_surface_path("a.glb").suffix
+    '.glb'
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise BadArgument("path", path, f"a file ending in {' or '.join(SUFFIXES)}")
+    return path
