@@ -1,8 +1,6 @@
-"""The shape as a Gaussian process over signed distance and normal, Eqs. (1), (7)-(9)."""
+"""The shape as a Gaussian process over signed distance and normal, Eqs. (1), (7)-(9), in metres."""
 
 import dataclasses
-from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import torch
@@ -12,71 +10,48 @@ from torch import Tensor
 from torchgrasp.base import Value, check_tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import cholesky, unit
-from torchgrasp.shape.kernel import covariance, thin_plate
+from torchgrasp.shape.joint import JointEstimate, draw_samples, joint_estimate
+from torchgrasp.shape.kernel import covariance
+from torchgrasp.shape.observe import Observations
+from torchgrasp.shape.posterior import Posterior
+from torchgrasp.shape.profiles import PLATE_REMEDY, Kernel, kernel_by_name
+from torchgrasp.shape.update import append_observations
 from torchgrasp.values import PointCloud, ShapeEstimate
 
-REMEDY = "use a psi_scale of at least 1.34: the thin plate kernel is a covariance only within 3/4 psi"
-LEAST_PSI = 4.0 / 3.0
-"""psi over the diameter of a ball on which the kernel is positive definite (dense limit 1.313)."""
+REMEDY = PLATE_REMEDY
 REACH = 1.25
 """The domain's radius over that of the observations, at most: the posterior says nothing further out."""
+MOST_JOINT = 1000
+"""Greatest number of points of one joint posterior, whose memory grows with their square."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Observations(Value):
-    """What is known of the surface at points: signed distances, and normals where `has_normal`.
+class ShapeDerivatives(Value):
+    """How an estimate changes with the query point, per metre.
 
-    All is normalised: positions and distances are divided by the shape's scale. `normal` is ignored elsewhere.
+    `distance` is the gradient of `ShapeEstimate.distance`, `normal[i, j]` the derivative of the i-th component of its
+    unit normal by the j-th coordinate, `variance` the gradient of its variance.
     """
 
-    x: Float[Tensor, "n 3"]
-    distance: Float[Tensor, "n"]
-    normal: Float[Tensor, "n 3"]
-    has_normal: Bool[Tensor, "n"]
-    distance_noise: Float[Tensor, "n"]
-    normal_noise: Float[Tensor, "n"]
-
-    def rows(self) -> tuple[Float[Tensor, "rows"], Float[Tensor, "rows"]]:
-        """Return the observed numbers and the noise variances in the order of `covariance`'s rows."""
-        y = torch.cat([self.distance, self.normal[self.has_normal].T.reshape(-1)])
-        noise = torch.cat([self.distance_noise, self.normal_noise[self.has_normal].repeat(3)])
-        return y, noise * noise
+    distance: Float[Tensor, "*b 3"]
+    normal: Float[Tensor, "*b 3 3"]
+    variance: Float[Tensor, "*b 3"]
 
 
 @dataclasses.dataclass(frozen=True)
-class SurfaceJet(Value):
-    """The posterior mean to second order and its variance to first, at normalised points; gradients are not unit."""
-
-    distance: Float[Tensor, "q"]
-    gradient: Float[Tensor, "q 3"]
-    hessian: Float[Tensor, "q 3 3"]
-    variance: Float[Tensor, "q"]
-    variance_gradient: Float[Tensor, "q 3"]
-
-
-@dataclasses.dataclass(frozen=True)
-class ShapeGP(Value):
+class ShapeGP(Posterior):
     """The posterior of an object's shape: g of Eq. (1), conditioned on observations. `fit_shape` makes it.
 
     Args:
-        x: observed points, normalised, those with normals first.
-        has_normal: which of them have normals.
-        weights: (K + noise)^-1 y, in the order of `covariance`'s rows.
-        factor: lower Cholesky factor of K + noise.
-        precision: (K + noise)^-1.
+        x, has_normal, weights, factor, order, kernel: see `Posterior`.
         center: origin of the normalised frame [m] in the cloud's frame.
-        psi: parameter of the thin plate kernel, normalised.
+        psi: length of the kernel, normalised: the thin plate's parameter.
         scale: length [m] of the normalised unit.
         domain_radius: radius, normalised, of the ball in which the posterior is valid.
         std_factor: ratio of the surface's real deviations to sqrt(variance), from held-out hidden sides.
-        cloud: what was seen, after cleaning.
+        cloud: what the camera saw, after cleaning.
     """
 
-    x: Float[Tensor, "n 3"]
-    has_normal: Bool[Tensor, "n"]
-    weights: Float[Tensor, "rows"]
-    factor: Float[Tensor, "rows rows"]
-    precision: Float[Tensor, "rows rows"]
     center: Float[Tensor, "3"]
     psi: float
     scale: float
@@ -121,19 +96,8 @@ class ShapeGP(Value):
         Returns:
             The estimate in the dtype of `points`; see `ShapeEstimate` for units.
         """
-        flat = _check_queries(points).reshape(-1, 3)
-        x = self.normalise(flat.detach().double())
-        radius = torch.linalg.vector_norm(x, dim=-1)
-        outside = radius > self.domain_radius
-        if bool(outside.any()):
-            first = int(torch.nonzero(outside)[0])
-            raise BadArgument(
-                "points",
-                f"{int(outside.sum())} of {len(flat)} points outside the domain, the first {flat[first].tolist()} m, "
-                f"{float(radius[first]) * self.scale:.4g} m from the centre",
-                f"points within {self.domain_radius * self.scale:.4g} m of {self.center.tolist()} m",
-            )
-        mean, spread = _in_chunks(self._estimate, x, 1024)
+        x = self._queries("points", points)
+        mean, spread = self.estimate(x)
         variance = spread[:, 0, 0]
         found = ShapeEstimate(
             distance=mean[:, 0],
@@ -142,87 +106,125 @@ class ShapeGP(Value):
             covariance=spread,
             std_m=self.std_factor * self.scale * torch.sqrt(variance),
         )
-        fields = {f.name: getattr(found, f.name).to(points.dtype) for f in dataclasses.fields(found)}
-        shaped = {name: t.reshape(points.shape[:-1] + t.shape[1:]) for name, t in fields.items()}
-        return ShapeEstimate(**shaped)
+        return _shaped(found, points)
 
-    def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
-        """Return the mean to second order and the variance to first, for planners: no check, no autograd.
-
-        With d = x - x_j, r = |d|, the mean is sum_j a_j k + 6 (psi - r) d.b_j, its weights being (a, b). The
-        gradient of the variance k0 - k*^T A k* is -2 times the gradient of the mean with weights A k*.
+    def differentiate(self, points: Float[Tensor, "*b 3"]) -> ShapeDerivatives:
+        """Return the derivatives of distance, normal and variance by the query points, in closed form.
 
         Args:
-            x: points in the normalised frame, float64.
+            points: query points [m] in the cloud's frame.
+
+        Raises:
+            BadArgument: as `predict`.
+
+        Returns:
+            The derivatives in the dtype of `points`.
         """
-        # Small chunks keep every temporary in the cache of a CPU core.
-        chunk = 256 if x.device.type == "cpu" else 16384
-        return SurfaceJet(*_in_chunks(self._jet, x, chunk))
+        jet = self.jet(self._queries("points", points))
+        length = torch.linalg.vector_norm(jet.gradient, dim=-1)[:, None, None]
+        normal = jet.gradient[:, :, None] / length
+        along = normal @ (normal.transpose(1, 2) @ jet.hessian)
+        found = ShapeDerivatives(
+            distance=jet.gradient / self.scale,
+            normal=(jet.hessian - along) / (length * self.scale),
+            variance=jet.variance_gradient / self.scale,
+        )
+        return _shaped(found, points)
 
-    def mean(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q"]:
-        """Return the mean signed distance alone, normalised, at normalised points: for grids of many points."""
+    def joint(self, points: Float[Tensor, "k 3"]) -> JointEstimate:
+        """Return the joint posterior of (d, w) at up to 1000 points: mean (k, 4), covariance (4k, 4k), normalised.
 
-        def evaluate(x: Tensor) -> tuple[Tensor]:
-            n, oriented = len(self.x), int(self.has_normal.sum())
-            b = self.weights[n:].reshape(3, oriented).T
-            r = torch.cdist(x, self.x, compute_mode="donot_use_mm_for_euclid_dist")
-            along = x @ b.T - (self.x[:oriented] * b).sum(-1)
-            return (thin_plate(r, self.psi) @ self.weights[:n] - (6.0 * (r[:, :oriented] - self.psi) * along).sum(1),)
+        Args:
+            points: query points [m] in the cloud's frame.
 
-        return _in_chunks(evaluate, x, 2048)[0]
+        Raises:
+            BadArgument: as `predict`, or too many points.
+        """
+        x = self._queries("points", check_tensor("points", points, (None, 3)))
+        if len(x) > MOST_JOINT:
+            raise BadArgument("points", f"{len(x)} points", f"at most {MOST_JOINT} points at once")
+        found = joint_estimate(self, x)
+        return JointEstimate(found.mean.to(points.dtype), found.covariance.to(points.dtype))
 
-    def _estimate(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
-        """Return the mean and the covariance of (d, w), Eqs. (7)-(8), normalised."""
-        profile = partial(thin_plate, psi=self.psi)
-        everywhere = torch.ones(len(x), dtype=torch.bool, device=x.device)
-        cross = covariance(x, self.x, everywhere, self.has_normal, profile)
-        mean = (cross @ self.weights).reshape(4, len(x)).T
-        whitened = torch.linalg.solve_triangular(self.factor, cross.T, upper=False)
-        whitened = whitened.reshape(len(self.factor), 4, len(x)).permute(2, 1, 0)
-        here, yes = x.new_zeros(1, 3), everywhere.new_ones(1)
-        prior = covariance(here, here, yes, yes, profile)
-        return mean, prior - whitened @ whitened.transpose(-1, -2)
+    def sample(self, points: Float[Tensor, "k 3"], n: int, seed: int = 0) -> Float[Tensor, "n k 4"]:
+        """Draw (d, w) at up to 1000 points jointly from the posterior, normalised; w is no unit vector.
 
-    def _jet(self, x: Float[Tensor, "q 3"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Return the fields of `SurfaceJet` for one chunk."""
-        n, oriented = len(self.x), int(self.has_normal.sum())
-        near = slice(0, oriented)  # the points with normals come first
-        a, b = self.weights[:n], self.weights[n:].reshape(3, oriented)
-        d = [x[:, m, None] - self.x[None, :, m] for m in range(3)]
-        squared = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
-        r = torch.sqrt(squared)
-        inverse = torch.where(r > 0, 1.0 / r, 0.0)
-        slope = 6.0 * (r - self.psi)  # k'/r
-        k = squared * (2.0 * r - 3.0 * self.psi) + self.psi**3
-        row = torch.cat([k] + [-slope[:, near] * d[m][:, near] for m in range(3)], 1)
-        distance = row @ self.weights
+        Args:
+            points: query points [m] in the cloud's frame.
+            n: number of samples.
+            seed: of the draws.
 
-        def gradient_of(a: Tensor, b: list[Tensor], along: Tensor) -> Tensor:
-            """Sum a_j k'/r d - 6 (d.b_j) d / r - k'/r b_j over the points; `along` is d.b_j."""
-            c = slope * a
-            c[:, near] -= 6.0 * inverse[:, near] * along
-            return torch.stack([(c * d[m]).sum(1) - (slope[:, near] * b[m]).sum(1) for m in range(3)], 1)
+        Raises:
+            BadArgument: as `joint`, or an `n` or a `seed` that is no integer from 0.
+        """
+        for name, value in (("n", n), ("seed", seed)):
+            if not isinstance(value, int) or not 0 <= value < 2**63:
+                raise BadArgument(name, value, "an integer from 0")
+        joint = self.joint(check_tensor("points", points, (None, 3)).double())
+        return draw_samples(joint, float(self.prior_block()[0, 0]), n, seed).to(points)
 
-        along = d[0][:, near] * b[0] + d[1][:, near] * b[1] + d[2][:, near] * b[2]
-        gradient = gradient_of(a, [b[0], b[1], b[2]], along)
+    def update(
+        self,
+        points: Float[Tensor, "m 3"],
+        normals: Float[Tensor, "m 3"] | None = None,
+        *,
+        noise: float = 0.001,
+        normal_noise: float = 0.05,
+    ) -> "ShapeGP":
+        """Return the shape given further points of the surface, too: a finger's touch, a second view.
 
-        trace = slope @ a - 6.0 * (inverse[:, near] * along).sum(1)
-        outer = 6.0 * inverse * a
-        outer[:, near] += 6.0 * inverse[:, near] ** 3 * along
-        tilt = 6.0 * inverse[:, near]
-        hessian = torch.empty(len(x), 3, 3, dtype=x.dtype, device=x.device)
-        scaled = [outer * d[m] for m in range(3)]
-        tilted = [(tilt * d[m][:, near]) @ b.T for m in range(3)]
-        for m in range(3):
-            for p in range(m, 3):
-                entry = (scaled[m] * d[p]).sum(1) - tilted[m][:, p] - tilted[p][:, m]
-                hessian[:, m, p] = hessian[:, p, m] = entry + trace if m == p else entry
+        The factor is extended, not computed anew: the posterior is that of all observations at once, with the kernel
+        and the domain of this one. `cloud` stays what the camera saw.
 
-        solved = row @ self.precision
-        variance = self.psi**3 - (solved * row).sum(1)
-        u = [solved[:, n + m * oriented : n + (m + 1) * oriented] for m in range(3)]
-        along = d[0][:, near] * u[0] + d[1][:, near] * u[1] + d[2][:, near] * u[2]
-        return distance, gradient, hessian, variance, -2.0 * gradient_of(solved[:, :n], u, along)
+        Args:
+            points: on the surface [m], in the cloud's frame.
+            normals: outward, of any length; None: not known.
+            noise: standard deviation of a point [m] across the surface.
+            normal_noise: standard deviation of the components of a unit normal.
+
+        Raises:
+            BadArgument: a wrong argument, or a point outside the ball in which the posterior is valid.
+
+        >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
+        >>> from torchgrasp import fit_shape
+        >>> touched = fit_shape(PointCloud(0.04 * ball, ball)).update(torch.tensor([[0.0, 0.0, 0.045]]))
+        >>> touched.predict(torch.tensor([0.0, 0.0, 0.045])).distance.abs() < 0.01
+        tensor(True)
+        """
+        x = self._queries("points", check_tensor("points", points, (None, 3)))
+        for name, value in (("noise", noise), ("normal_noise", normal_noise)):
+            if not 0.0 < value < float("inf"):  # also refuses NaN
+                raise BadArgument(name, value, "a positive number")
+        direction = torch.zeros_like(x)
+        if normals is not None:
+            direction = unit(check_tensor("normals", normals, (len(x), 3)).to(x))
+            check_tensor("normals", direction, (len(x), 3))  # a normal of length 0 has become NaN
+        new = Observations(
+            x,
+            torch.zeros_like(x[:, 0]),
+            direction,
+            torch.full_like(x[:, 0], float(normals is not None), dtype=torch.bool),
+            torch.full_like(x[:, 0], noise / self.scale),
+            torch.full_like(x[:, 0], normal_noise),
+        )
+        longer = append_observations(self, new)
+        return dataclasses.replace(self, **{f.name: getattr(longer, f.name) for f in dataclasses.fields(Posterior)})
+
+    def _queries(self, name: str, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "q 3"]:
+        """Return query points [m] as a list in the normalised frame; refuse what lies outside the domain."""
+        flat = _check_queries(points).reshape(-1, 3)
+        x = self.normalise(flat.detach().double().to(self.device))
+        radius = torch.linalg.vector_norm(x, dim=-1)
+        outside = radius > self.domain_radius
+        if bool(outside.any()):
+            first = int(torch.nonzero(outside)[0])
+            raise BadArgument(
+                name,
+                f"{int(outside.sum())} of {len(flat)} points outside the domain, the first {flat[first].tolist()} m, "
+                f"{float(radius[first]) * self.scale:.4g} m from the centre",
+                f"points within {self.domain_radius * self.scale:.4g} m of {self.center.tolist()} m",
+            )
+        return x
 
 
 def condition(
@@ -232,6 +234,7 @@ def condition(
     cloud: PointCloud,
     psi_scale: float = 1.5,
     std_factor: float = 1.0,
+    kernel: str | Kernel = "thin_plate",
 ) -> ShapeGP:
     """Return the posterior given observations, with psi = `psi_scale` times their longest distance.
 
@@ -242,33 +245,37 @@ def condition(
         cloud: what was seen.
         psi_scale: 1 is the paper's psi, for which the covariance is indefinite.
         std_factor: see `ShapeGP`.
+        kernel: "thin_plate", "matern52", "rbf" (see `kernel_by_name`), or any `Kernel` of normalised distances.
 
     Raises:
+        BadArgument: an unknown kernel.
         IndefiniteCovariance: psi is too small for these observations.
     """
-    order = torch.argsort(~observations.has_normal, stable=True)
-    fields = {f.name: getattr(observations, f.name)[order].to(center) for f in dataclasses.fields(observations)}
-    fields["has_normal"] = observations.has_normal[order].to(center.device)
-    observations = Observations(**fields)
+    observations = observations.to(center).with_normals_first()
     x, has_normal = observations.x, observations.has_normal
-    psi = psi_scale * longest_distance(x)
-    prior = covariance(x, x, has_normal, has_normal, partial(thin_plate, psi=psi))
+    longest = longest_distance(x)
+    psi = psi_scale * longest
+    kernel = kernel_by_name(kernel, psi) if isinstance(kernel, str) else kernel
+    prior = covariance(x, x, has_normal, has_normal, kernel.profile)
     y, noise = observations.rows()
-    if psi_scale < LEAST_PSI:
+    if longest > kernel.diameter:
         # Generous noise on some rows can hide a kernel that is no covariance; the least noise must suffice.
-        cholesky(prior + torch.diag_embed(torch.full_like(noise, float(noise.min()))), "the covariance K", REMEDY)
-    factor = cholesky(prior + torch.diag_embed(noise), "the covariance K + sigma^2 I", REMEDY)
+        cholesky(
+            prior + torch.diag_embed(torch.full_like(noise, float(noise.min()))), "the covariance K", kernel.remedy
+        )
+    factor = cholesky(prior + torch.diag_embed(noise), "the covariance K + sigma^2 I", kernel.remedy)
     radius = REACH * float(torch.linalg.vector_norm(x, dim=-1).max())
     return ShapeGP(
         x=x,
         has_normal=has_normal,
         weights=torch.cholesky_solve(y[:, None], factor)[:, 0],
         factor=factor,
-        precision=torch.cholesky_inverse(factor),
+        order=None,
+        kernel=kernel,
         center=center,
         psi=psi,
         scale=scale,
-        domain_radius=min(psi / (2.0 * LEAST_PSI), radius),
+        domain_radius=min(kernel.diameter / 2.0, radius),
         std_factor=std_factor,
         cloud=cloud,
     )
@@ -292,7 +299,7 @@ def _check_queries(points: Any) -> Float[Tensor, "*b 3"]:
     return points
 
 
-def _in_chunks(evaluate: Callable[[Tensor], tuple[Tensor, ...]], x: Tensor, size: int) -> tuple[Tensor, ...]:
-    """Evaluate a function of the leading axis piece by piece, so that memory stays bounded."""
-    parts = [evaluate(piece) for piece in x.split(size)] if len(x) else [evaluate(x)]
-    return tuple(torch.cat(column) for column in zip(*parts, strict=True))
+def _shaped(found: Any, points: Float[Tensor, "*b 3"]) -> Any:
+    """Return a value of rows in the dtype, on the device and with the batch shape of the query points."""
+    fields = {f.name: getattr(found, f.name).to(points) for f in dataclasses.fields(found)}
+    return type(found)(**{name: t.reshape(points.shape[:-1] + t.shape[1:]) for name, t in fields.items()})

@@ -1,0 +1,66 @@
+"""The joint posterior of distances and normals at several points, and samples of it."""
+
+import dataclasses
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.base import Value
+from torchgrasp.errors import IndefiniteCovariance
+from torchgrasp.shape.kernel import covariance
+from torchgrasp.shape.posterior import Posterior
+
+ROUNDING = 1e-8
+"""Eigenvalues of a posterior covariance above minus this times the prior variance are zeros, rounded."""
+
+
+@dataclasses.dataclass(frozen=True)
+class JointEstimate(Value):
+    """The joint posterior of (d, w) at k points, normalised: `mean` and `covariance`, point by point.
+
+    `w` is the gradient of the distance, not of unit length. `covariance.reshape(k, 4, k, 4)` has the block of points
+    i and j at [i, :, j].
+    """
+
+    mean: Float[Tensor, "k 4"]
+    covariance: Float[Tensor, "rows rows"]
+
+
+def joint_estimate(posterior: Posterior, x: Float[Tensor, "k 3"]) -> JointEstimate:
+    """Return the mean and the 4k x 4k covariance of (d, w) at normalised points, Eqs. (7)-(8) for all at once."""
+    k = len(x)
+    cross = posterior.cross(x)
+    mean = (cross @ posterior.weights).T
+    if posterior.order is not None:
+        cross = cross[..., posterior.order]
+    by_point = cross.transpose(0, 1).reshape(4 * k, -1)
+    whitened = torch.linalg.solve_triangular(posterior.factor, by_point.T, upper=False)
+    yes = torch.ones(k, dtype=torch.bool, device=x.device)
+    prior = covariance(x, x, yes, yes, posterior.kernel.profile)
+    prior = prior.reshape(4, k, 4, k).permute(1, 0, 3, 2).reshape(4 * k, 4 * k)
+    return JointEstimate(mean, prior - whitened.T @ whitened)
+
+
+def draw_samples(joint: JointEstimate, prior: float, n: int, seed: int) -> Float[Tensor, "n k 4"]:
+    """Draw from a joint posterior with the symmetric root of its covariance, which no choice of basis changes.
+
+    Points that coincide, or that are known exactly, leave eigenvalues of zero, which rounding makes negative: those
+    within `ROUNDING` of zero are zero.
+
+    Args:
+        joint: what to draw from.
+        prior: the prior variance of a distance, the scale of rounding.
+        n: number of samples.
+        seed: of the draws.
+
+    Raises:
+        IndefiniteCovariance: an eigenvalue is negative by more than rounding.
+    """
+    values, vectors = torch.linalg.eigh(joint.covariance)
+    if len(values) and not float(values[0]) >= -ROUNDING * prior:
+        raise IndefiniteCovariance("the joint covariance", float(values[0]), "query points within the domain")
+    root = (vectors * torch.sqrt(torch.where(values > 0, values, 0.0))) @ vectors.T
+    generator = torch.Generator().manual_seed(seed)
+    draws = torch.randn(n, len(values), dtype=torch.float64, generator=generator).to(root)
+    return joint.mean + (draws @ root).reshape(n, -1, 4)
