@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import statistics
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -30,8 +29,8 @@ class Row:
         return f"{verdict:7} {self.what}\n        bar {self.bar}\n        is  {self.measured}"
 
 
-def median_seconds(action: Callable[[], object], repeats: int = 3, limit: float = 5.0) -> float:
-    """Return the median of the wall time of an action [s], after one call that is not counted.
+def least_seconds(action: Callable[[], object], repeats: int = 5, limit: float = 5.0) -> float:
+    """Return the least wall time of an action [s], after one call that is not counted: more is the load of others.
 
     That first call alone counts when it takes more than `limit` seconds.
     """
@@ -42,7 +41,7 @@ def median_seconds(action: Callable[[], object], repeats: int = 3, limit: float 
         times.append(time.perf_counter() - began)
         if len(times) == 1 and times[0] > limit:
             return times[0]
-    return statistics.median(times[1:])
+    return min(times[1:])
 
 
 def peak_mib() -> float | None:

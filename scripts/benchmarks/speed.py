@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.common import Row, median_seconds, peak_mib, random_view
+from benchmarks.common import Row, least_seconds, peak_mib, random_view
 from benchmarks.exact import NOISE, PSI_SCALE, observe, posterior, queries_in
 from benchmarks.peers import gpytorch_posterior, product_floor
 from torchgrasp.shape.gp import condition
@@ -29,11 +29,11 @@ def bench_queries(n: int, least_ratio: float, queries: int) -> list[Row]:
     shape = posterior(n)
     points = queries_in(shape, queries)
     predict, multiply = partial(shape.predict, points), product_floor(4 * n, 4 * queries)
-    floor, ours = median_seconds(multiply), median_seconds(predict)
+    floor, ours = least_seconds(multiply), least_seconds(predict)
     theirs = time_gpytorch(n, points, dense=False)
     factored = time_gpytorch(n, points, dense=True) if 4 * n > 800 else theirs
-    floor = min(floor, median_seconds(multiply)) / 2  # half: the factor is triangular
-    ours = min(ours, median_seconds(predict))
+    floor = min(floor, least_seconds(multiply)) / 2  # half: the factor is triangular
+    ours = min(ours, least_seconds(predict))
     ratio = min(theirs.values()) / ours
     numbers = {"n": n, "seconds": ours, "floor_s": floor, "gpytorch_s": theirs, "gpytorch_factored_s": factored}
     told = f"; told to factor {min(factored.values()):.0f} s, {min(factored.values()) / ours:.1f}x"
@@ -61,7 +61,7 @@ def time_gpytorch(n: int, points: Tensor, dense: bool) -> dict[int, float]:
     query = gpytorch_posterior(x, torch.cat([torch.zeros_like(x[:, :1]), normals], 1), NOISE, dense)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of negative variances, which its conjugate gradients leave
-        return {c: median_seconds(partial(query, points[:c])) * len(points) / c for c in CHUNKS}
+        return {c: least_seconds(partial(query, points[:c])) * len(points) / c for c in CHUNKS}
 
 
 def bench_memory(queries: int, threads: int) -> Row:
@@ -93,10 +93,10 @@ def bench_raw(queries: int) -> Row:
     """Fit to 1000 raw points with normals, then ask for means and normals."""
     x, normals = random_view(1000, torch.Generator().manual_seed(0))
     seen, cloud = observe(x, normals), PointCloud(x, normals)
-    fit = median_seconds(lambda: condition(seen, x.new_zeros(3), 1.0, cloud, PSI_SCALE), repeats=1)
+    fit = least_seconds(lambda: condition(seen, x.new_zeros(3), 1.0, cloud, PSI_SCALE), repeats=2)
     shape = condition(seen, x.new_zeros(3), 1.0, cloud, PSI_SCALE)
     points = queries_in(shape, queries)
-    means = median_seconds(lambda: shape.predict(points[: len(points) // 50]), repeats=1)
+    means = least_seconds(lambda: shape.slope(shape.normalise(points)), repeats=2)
     return Row(
         f"1000 raw points, no selection (4000 rows): fit and {queries} means and normals",
         "<= 3 s on two cores",
@@ -113,10 +113,10 @@ def bench_growth(out: Path) -> Row:
     for n in GROWTH:
         x, normals = random_view(n, torch.Generator().manual_seed(0))
         seen, cloud = observe(x, normals), PointCloud(x, normals)
-        fit = median_seconds(partial(condition, seen, x.new_zeros(3), 1.0, cloud, PSI_SCALE), 1 if n > 300 else 3)
+        fit = least_seconds(partial(condition, seen, x.new_zeros(3), 1.0, cloud, PSI_SCALE), 2 if n > 300 else 5)
         shape = posterior(n)
         points = queries_in(shape, count)
-        query = median_seconds(partial(shape.predict, points), 1 if n > 300 else 3)
+        query = least_seconds(partial(shape.predict, points), 2 if n > 300 else 5)
         rows.append({"n": n, "fit_s": fit, "queries_per_s": count / query})
     draw_growth(rows, out)
     last, before = rows[-1], rows[-2]
