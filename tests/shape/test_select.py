@@ -6,11 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchgrasp.errors import IndefiniteCovariance
+from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.linalg import unit
-from torchgrasp.shape.gp import Observations
 from torchgrasp.shape.kernel import covariance, thin_plate
-from torchgrasp.shape.select import select_points
+from torchgrasp.shape.observe import Observations
+from torchgrasp.shape.profiles import kernel_by_name
+from torchgrasp.shape.select import Criterion, select_points
 
 PSI = 3.6
 
@@ -73,3 +74,54 @@ def test_a_psi_too_small_is_named():
     x, known = _scene(50)
     with pytest.raises(IndefiniteCovariance, match="psi_scale"):
         select_points(x, known, 20, 1.5, 0.01, 0.05)
+
+
+@pytest.mark.parametrize("kernel", ["thin_plate", "matern52"])
+@pytest.mark.parametrize("criterion", ["error", "both"])
+def test_picks_by_error_are_those_of_refitting_every_time(criterion: Criterion, kernel: str):
+    x, known = _scene(120)
+    normals = unit(x / torch.tensor([1.0, 0.25, 0.64], dtype=torch.float64))
+    profile = kernel_by_name(kernel, PSI).profile
+    none, wanted = torch.zeros(len(x), dtype=torch.bool), []
+    for _ in range(20):
+        m = len(wanted)
+        seen = Observations(
+            torch.cat([known.x, x[wanted]]),
+            torch.cat([known.distance, torch.zeros(m, dtype=torch.float64)]),
+            torch.cat([known.normal, normals[wanted]]),
+            torch.cat([known.has_normal, torch.ones(m, dtype=torch.bool)]),
+            torch.cat([known.distance_noise, torch.full((m,), 0.01, dtype=torch.float64)]),
+            torch.cat([known.normal_noise, torch.full((m,), 0.05, dtype=torch.float64)]),
+        )
+        y, noise = seen.rows()
+        k = covariance(seen.x, seen.x, seen.has_normal, seen.has_normal, profile) + torch.diag(noise)
+        star = covariance(x, seen.x, none, seen.has_normal, profile)
+        score = (star @ torch.linalg.solve(k, y)).abs()
+        if criterion == "both":
+            score = score + 2.0 * (PSI**3 - (star * torch.linalg.solve(k, star.T).T).sum(1)).sqrt()
+        score[wanted] = -torch.inf
+        wanted.append(int(score.argmax()))
+    picks = select_points(x, known, 20, PSI, 0.01, 0.05, kernel=kernel, criterion=criterion, normals=normals)
+    assert picks.tolist() == wanted
+
+
+def test_picking_stops_when_every_point_is_as_certain_as_asked():
+    x, known = _scene(300)
+    picks = select_points(x, known, 300, PSI, 0.01, 0.05, stop=0.01)
+    assert picks.tolist() == select_points(x, known, len(picks), PSI, 0.01, 0.05).tolist()
+    assert 10 < len(picks) < 100
+    profile, none = partial(thin_plate, psi=PSI), torch.zeros(len(x), dtype=torch.bool)
+    for rows, certain in ((picks, True), (picks[:-1], False)):
+        has = torch.cat([known.has_normal, torch.ones(len(rows), dtype=torch.bool)])
+        seen = torch.cat([known.x, x[rows]])
+        noise = torch.cat([torch.full((len(seen),), 0.01), torch.full((int(has.sum()),), 0.05).repeat(3)]).double() ** 2
+        k = covariance(seen, seen, has, has, profile) + torch.diag(noise)
+        star = covariance(x, seen, none, has, profile)
+        worst = (PSI**3 - (star * torch.linalg.solve(k, star.T).T).sum(1)).max().item()
+        assert (worst <= 0.01) == certain
+
+
+def test_a_criterion_that_cannot_be_judged_is_named():
+    x, known = _scene(30)
+    with pytest.raises(BadArgument, match="normals"):
+        select_points(x, known, 5, PSI, 0.01, 0.05, criterion="both")

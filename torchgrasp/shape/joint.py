@@ -34,7 +34,7 @@ def joint_estimate(posterior: Posterior, x: Float[Tensor, "k 3"]) -> JointEstima
     mean = (cross @ posterior.weights).T
     if posterior.order is not None:
         cross = cross[..., posterior.order]
-    by_point = cross.transpose(0, 1).reshape(4 * k, -1)
+    by_point = cross.transpose(0, 1).flatten(0, 1)
     whitened = torch.linalg.solve_triangular(posterior.factor, by_point.T, upper=False)
     yes = torch.ones(k, dtype=torch.bool, device=x.device)
     prior = covariance(x, x, yes, yes, posterior.kernel.profile)
@@ -63,4 +63,4 @@ def draw_samples(joint: JointEstimate, prior: float, n: int, seed: int) -> Float
     root = (vectors * torch.sqrt(torch.where(values > 0, values, 0.0))) @ vectors.T
     generator = torch.Generator().manual_seed(seed)
     draws = torch.randn(n, len(values), dtype=torch.float64, generator=generator).to(root)
-    return joint.mean + (draws @ root).reshape(n, -1, 4)
+    return joint.mean + (draws @ root).reshape(n, *joint.mean.shape)

@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.shape.kernel import covariance
 from torchgrasp.shape.profiles import Kernel
 
 BLOCK = 2**27
@@ -69,7 +68,7 @@ class Posterior(Value):
         def evaluate(x: Tensor) -> tuple[Tensor]:
             n, near = len(self.x), self.oriented
             b = self.weights[n:].reshape(3, near).T
-            k, slope, _, _ = self.kernel.slopes(_distances(x, self.x))
+            k, slope = self.kernel.slopes(_distances(x, self.x), 2)
             along = x @ b.T - (self.x[:near] * b).sum(-1)
             return (k @ self.weights[:n] - (slope[:, :near] * along).sum(1),)
 
@@ -84,7 +83,7 @@ class Posterior(Value):
         def evaluate(x: Tensor) -> tuple[Tensor, Tensor]:
             n, near = len(self.x), self.oriented
             a, b = self.weights[:n], self.weights[n:].reshape(3, near).T
-            k, slope, bend, _ = self.kernel.slopes(_distances(x, self.x))
+            k, slope, bend = self.kernel.slopes(_distances(x, self.x), 3)
             along = x @ b.T - (self.x[:near] * b).sum(-1)
             distance = k @ a - (slope[:, :near] * along).sum(1)
             c = slope * a
@@ -131,33 +130,17 @@ class Posterior(Value):
 
     def prior_block(self) -> Float[Tensor, "4 4"]:
         """Return the prior covariance of (d, w) at any one point."""
-        here, yes = self.x.new_zeros(1, 3), self.has_normal.new_ones(1)
-        return covariance(here, here, yes, yes, self.kernel.profile)
+        here = self.x.new_zeros(1, 3)
+        return cross_covariance(self.kernel, here, here, 1)[:, 0]
 
     def cross(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "4 q rows"]:
         """Return the covariance of (d, w) at points with the observations, in the order of `covariance`'s columns."""
-        n, near = len(self.x), self.oriented
-        d = [x[:, m, None] - self.x[None, :, m] for m in range(3)]
-        k, slope, bend, _ = self.kernel.slopes(torch.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]))
-        out = x.new_empty(4, len(x), n + 3 * near)
-        out[0, :, :n] = k
-        inner = -slope[:, :near]
-        for m in range(3):
-            columns = slice(n + m * near, n + (m + 1) * near)
-            torch.mul(inner, d[m][:, :near], out=out[0, :, columns])
-            torch.mul(slope, d[m], out=out[m + 1, :, :n])
-            tilted = bend[:, :near] * d[m][:, :near]
-            torch.addcmul(inner, tilted, d[m][:, :near], value=-1.0, out=out[m + 1, :, columns])
-            for p in range(m):
-                block = slice(n + p * near, n + (p + 1) * near)
-                torch.mul(tilted, -d[p][:, :near], out=out[m + 1, :, block])
-                out[p + 1, :, columns] = out[m + 1, :, block]
-        return out
+        return cross_covariance(self.kernel, x, self.x, self.oriented)
 
     def _chunk(self, x: Tensor) -> int:
         """Return how many points to query at once."""
         if x.device.type == "cpu":
-            return 256
+            return 512
         return max(BLOCK // (32 * len(self.factor)), 64)
 
     def _jet(self, x: Float[Tensor, "q 3"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -166,7 +149,7 @@ class Posterior(Value):
         near = slice(0, oriented)  # the points with normals come first
         a, b = self.weights[:n], self.weights[n:].reshape(3, oriented)
         d = [x[:, m, None] - self.x[None, :, m] for m in range(3)]
-        k, slope, bend, third = self.kernel.slopes(torch.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]))
+        k, slope, bend, third = self.kernel.slopes(torch.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), 4)
         row = torch.cat([k] + [-slope[:, near] * d[m][:, near] for m in range(3)], 1)
         distance = row @ self.weights
 
@@ -196,6 +179,32 @@ class Posterior(Value):
         u = [solved[:, n + m * oriented : n + (m + 1) * oriented] for m in range(3)]
         along = d[0][:, near] * u[0] + d[1][:, near] * u[1] + d[2][:, near] * u[2]
         return distance, gradient, hessian, variance, -2.0 * gradient_of(solved[:, :n], u, along)
+
+
+def cross_covariance(
+    kernel: Kernel, x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"], near: int
+) -> Float[Tensor, "4 q rows"]:
+    """Return what `covariance` does for points x with normals, in closed form: of points y the first `near` have some.
+
+    For millions of queries, or for few: it has neither the memory nor the overhead of autograd.
+    """
+    n = len(y)
+    d = [x[:, m, None] - y[None, :, m] for m in range(3)]
+    k, slope, bend = kernel.slopes(torch.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), 3)
+    out = x.new_empty(4, len(x), n + 3 * near)
+    out[0, :, :n] = k
+    inner = -slope[:, :near]
+    for m in range(3):
+        columns = slice(n + m * near, n + (m + 1) * near)
+        torch.mul(inner, d[m][:, :near], out=out[0, :, columns])
+        torch.mul(slope, d[m], out=out[m + 1, :, :n])
+        tilted = bend[:, :near] * d[m][:, :near]
+        torch.addcmul(inner, tilted, d[m][:, :near], value=-1.0, out=out[m + 1, :, columns])
+        for p in range(m):
+            block = slice(n + p * near, n + (p + 1) * near)
+            torch.mul(tilted, -d[p][:, :near], out=out[m + 1, :, block])
+            out[p + 1, :, columns] = out[m + 1, :, block]
+    return out
 
 
 def in_chunks(evaluate: Callable[[Tensor], tuple[Any, ...]], x: Tensor, size: int) -> tuple[Any, ...]:

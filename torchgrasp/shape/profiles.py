@@ -24,9 +24,9 @@ NOISE_REMEDY = "use more noise, or a shorter length of the kernel"
 class Kernel:
     """A radial kernel k(r) of normalised distances, with what the posterior's fast path needs of it.
 
-    With u = r^2 / 2, `slopes` returns (k, dk/du, d2k/du2, d3k/du3): every derivative of the posterior mean up to the
-    Hessian is a polynomial in them and in the difference of two points. A third or fourth number that is infinite at
-    r = 0 is 0 there, since the differences that multiply it vanish faster.
+    With u = r^2 / 2, `slopes(r, 4)` returns (k, dk/du, d2k/du2, d3k/du3) and `slopes(r, 2)` the first two. Every
+    derivative of the posterior mean up to the Hessian is a polynomial in them and in the difference of two points. A
+    third or fourth number that is infinite at r = 0 is 0 there: the differences that multiply it vanish faster.
 
     Args:
         profile: k(r), elementwise and differentiable; the covariance is derived from it by autograd.
@@ -36,7 +36,7 @@ class Kernel:
     """
 
     profile: Profile
-    slopes: Callable[[Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]
+    slopes: Callable[[Tensor, int], tuple[Tensor, ...]]
     diameter: float = math.inf
     remedy: str = NOISE_REMEDY
 
@@ -45,7 +45,7 @@ class Kernel:
         """Return the kernel of any profile, thrice differentiable by autograd where r > 0, with k'(0) = 0.
 
         >>> kernel = Kernel.from_profile(lambda r: (1 + r) * torch.exp(-r))
-        >>> [round(float(s), 4) for s in kernel.slopes(torch.ones(1, dtype=torch.float64))]
+        >>> [round(float(s), 4) for s in kernel.slopes(torch.ones(1, dtype=torch.float64), 4)]
         [0.7358, -0.3679, 0.3679, -0.7358]
         """
         return cls(profile, partial(differentiate_profile, profile), diameter)
@@ -87,12 +87,13 @@ def matern52_kernel(length: float, variance: float = 1.0) -> Kernel:
         s = rate * r
         return variance * (1.0 + s + s * s / 3.0) * torch.exp(-s)
 
-    def slopes(r: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def slopes(r: Tensor, count: int) -> tuple[Tensor, ...]:
         s = rate * r
         decay = (variance * rate**2 / 3.0) * torch.exp(-s)
-        inverse = torch.where(r > 0, 1.0 / r, 0.0)
-        k = decay * (3.0 + 3.0 * s + s * s) / rate**2
-        return k, -decay * (1.0 + s), rate**2 * decay, -(rate**3) * decay * inverse
+        found = [decay * (3.0 + 3.0 * s + s * s) / rate**2, -decay * (1.0 + s)]
+        if count > 2:
+            found += [rate**2 * decay, -(rate**3) * decay * torch.where(r > 0, 1.0 / r, 0.0)]
+        return tuple(found[:count])
 
     return Kernel(profile, slopes)
 
@@ -108,17 +109,15 @@ def rbf_kernel(length: float, variance: float = 1.0) -> Kernel:
     def profile(r: Tensor) -> Tensor:
         return variance * torch.exp(r * r * (-0.5 / length**2))
 
-    def slopes(r: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def slopes(r: Tensor, count: int) -> tuple[Tensor, ...]:
         k = profile(r)
-        return k, k * (-1.0 / length**2), k * (1.0 / length**4), k * (-1.0 / length**6)
+        return tuple(k * (-1.0 / length**2) ** i for i in range(count))
 
     return Kernel(profile, slopes)
 
 
-def differentiate_profile(
-    profile: Profile, r: Float[Tensor, "*s"]
-) -> tuple[Float[Tensor, "*s"], Float[Tensor, "*s"], Float[Tensor, "*s"], Float[Tensor, "*s"]]:
-    """Return k and its first three derivatives in r^2 / 2 by autograd; see `Kernel` for r = 0."""
+def differentiate_profile(profile: Profile, r: Float[Tensor, "*s"], count: int) -> tuple[Float[Tensor, "*s"], ...]:
+    """Return k and its first derivatives in r^2 / 2, `count` in all, by autograd; see `Kernel` for r = 0."""
     k, slope, _ = radial_derivatives(profile, r)
     near = r < NEAR
     with torch.enable_grad():
@@ -128,14 +127,18 @@ def differentiate_profile(
         for _ in range(3):
             (found,) = torch.autograd.grad(found.sum(), u, create_graph=True, materialize_grads=True)
             higher.append(found.detach().masked_fill(near, 0.0))
-    return k, slope, higher[1], higher[2]
+    return (k, slope, *higher[1:])[:count]
 
 
-def _slopes_of_plate(psi: float, r: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _slopes_of_plate(psi: float, r: Tensor, count: int) -> tuple[Tensor, ...]:
     """Return the slopes of the thin plate; the last two are infinite at r = 0, and given as 0."""
-    inverse = torch.where(r > 0, 1.0 / r, 0.0)
-    bend = 6.0 * inverse
-    return r * r * (2.0 * r - 3.0 * psi) + psi**3, 6.0 * (r - psi), bend, -bend * inverse * inverse
+    found = [r * r * (2.0 * r - 3.0 * psi) + psi**3, 6.0 * (r - psi)]
+    if count > 2:
+        inverse = torch.where(r > 0, 1.0 / r, 0.0)
+        found.append(6.0 * inverse)
+        if count > 3:
+            found.append(-6.0 * inverse * inverse * inverse)
+    return tuple(found)
 
 
 def _check_positive(length: float, variance: float) -> None:

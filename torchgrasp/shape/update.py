@@ -1,13 +1,12 @@
 """Later observations: rows appended to the Cholesky factor of a posterior, at O(rows^2) each."""
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.linalg import cholesky
-from torchgrasp.shape.kernel import covariance
 from torchgrasp.shape.observe import Observations
-from torchgrasp.shape.posterior import Posterior
+from torchgrasp.shape.posterior import Posterior, cross_covariance
 
 
 def append_observations(posterior: Posterior, new: Observations) -> Posterior:
@@ -23,14 +22,15 @@ def append_observations(posterior: Posterior, new: Observations) -> Posterior:
     Raises:
         IndefiniteCovariance: the new points are too far away for the kernel.
     """
-    profile, old = posterior.kernel.profile, len(posterior.factor)
+    kernel, old = posterior.kernel, len(posterior.factor)
     new = new.with_normals_first()
     y, noise = new.rows()
-    cross = covariance(posterior.x, new.x, posterior.has_normal, new.has_normal, profile)
+    fresh = int(new.has_normal.sum())
+    cross = _rows(cross_covariance(kernel, new.x, posterior.x, posterior.oriented), fresh).T
+    own = _rows(cross_covariance(kernel, new.x, new.x, fresh), fresh) + torch.diag_embed(noise)
     order = torch.arange(old, device=y.device) if posterior.order is None else posterior.order
     before = torch.linalg.solve_triangular(posterior.factor, cross[order], upper=False)
-    own = covariance(new.x, new.x, new.has_normal, new.has_normal, profile) + torch.diag_embed(noise)
-    corner = cholesky(own - before.T @ before, "the covariance of new observations", posterior.kernel.remedy)
+    corner = cholesky(own - before.T @ before, "the covariance of new observations", kernel.remedy)
     factor = torch.cat([torch.cat([posterior.factor, torch.zeros_like(before)], 1), torch.cat([before.T, corner], 1)])
 
     # L^-1 y of the old rows is L^T times their weights; the observed numbers themselves need not be kept.
@@ -44,7 +44,12 @@ def append_observations(posterior: Posterior, new: Observations) -> Posterior:
     order = _row_of_each(posterior.has_normal, new.has_normal)[order]
     weights = torch.empty_like(solved)
     weights[order] = solved
-    return Posterior(torch.cat([posterior.x, new.x])[points], has[points], weights, factor, order, posterior.kernel)
+    return Posterior(torch.cat([posterior.x, new.x])[points], has[points], weights, factor, order, kernel)
+
+
+def _rows(block: Float[Tensor, "4 q columns"], oriented: int) -> Float[Tensor, "rows columns"]:
+    """Return the rows of points of which the first `oriented` only have normals."""
+    return torch.cat([block[0], block[1:, :oriented].flatten(0, 1)])
 
 
 def _row_of_each(old: Bool[Tensor, "n"], new: Bool[Tensor, "m"]) -> Int[Tensor, "rows"]:
