@@ -91,7 +91,7 @@ class Canvas:
         pixels = render(concatenate(self.solid), concatenate(self.sheer), camera, SIZE, rgb(PAPER))
         image = Image.fromarray(pixels)
         if bar:
-            _draw_bar(image, *bar)
+            draw_bar(image, *bar)
         buffer = io.BytesIO()
         image.save(buffer, format="PNG")
         return buffer.getvalue()
@@ -150,12 +150,13 @@ def _mapped(values: np.ndarray, colors: str) -> np.ndarray:
     return matplotlib.colormaps[colors](np.clip(values, 0.0, 1.0))[:, :3]
 
 
-def _draw_bar(image: object, title: str, most: float, colors: str) -> None:
+def draw_bar(image: object, title: str, most: float, colors: str) -> None:
     """Draw a colour bar from 0 to `most` with its title at the bottom of a picture."""
     from PIL import Image, ImageDraw, ImageFont
 
     assert isinstance(image, Image.Image)
-    left, right, top, bottom = 200, SIZE[0] - 200, SIZE[1] - 28, SIZE[1] - 12
+    width, height = image.size
+    left, right, top, bottom = 200, width - 200, height - 28, height - 12
     ramp = _mapped(np.linspace(0.0, 1.0, right - left), colors)
     strip = (255 * np.broadcast_to(ramp, (bottom - top, *ramp.shape)) + 0.5).astype(np.uint8)
     image.paste(Image.fromarray(strip), (left, top))
