@@ -37,7 +37,8 @@ def shape(
         only: subjects to measure, of selection, laws, update, queries, memory, raw, growth, objects, cholesky.
         clouds: random partial clouds whose covariance is factored; 10^4 take about ten minutes.
         queries: points at which the shape is asked; ten times as many for the memory.
-        threads: of torch, for the library and its peers alike. Times are the least of some calls.
+        threads: of torch, for the library and its peers alike. Times are the least of some
+            calls: of the processor on one thread, which other load does not touch, of the wall on several.
         seed: of the random clouds.
         quick: a hundredth of the clouds and a tenth of the queries.
         out: where the numbers are written as JSON, and beside it the growth as a picture.
@@ -58,7 +59,15 @@ def shape(
         "objects": lambda: bench_objects(objects) if objects else [],
         "cholesky": lambda: [bench_cholesky(clouds, seed)],
     }
-    settings = {"threads": threads, "clouds": clouds, "queries": queries, "seed": seed, "torch": torch.__version__}
+    clock = "processor" if threads == 1 else "wall"
+    settings = {
+        "threads": threads,
+        "clock": clock,
+        "clouds": clouds,
+        "queries": queries,
+        "seed": seed,
+        "torch": torch.__version__,
+    }
     print(", ".join(f"{name} {value}" for name, value in settings.items()))
     rows: list[Row] = []
     for name in SUBJECTS:
