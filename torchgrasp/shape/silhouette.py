@@ -19,6 +19,8 @@ MAX_CELLS = 320
 """Cells of the raster along the cloud's longer side, at most."""
 FRONT_MARGIN = 0.002
 """How far [m] a point may lie in front of the seen surface: noise of the camera."""
+TIE = 1e-9
+"""Relative difference of two distances that rounding can make."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,7 +120,8 @@ def farthest_points(points: Float[Tensor, "n 3"], n: int) -> Tensor:
     distance = torch.full((len(points),), torch.inf, dtype=points.dtype, device=points.device)
     while len(picks) < min(n, len(points)):
         distance = torch.minimum(distance, torch.linalg.vector_norm(points - points[picks[-1]], dim=-1))
-        picks.append(int(distance.argmax()))
+        # Of points equally far, as on a raster, the first: not the one that rounding favours in this frame.
+        picks.append(int(torch.nonzero(distance >= (1.0 - TIE) * distance.max())[0]))
     return torch.tensor(picks, dtype=torch.long, device=points.device)
 
 
