@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from torchgrasp.shape.kernel import covariance, thin_plate
+from torchgrasp.shape.profiles import kernel_by_name
 from torchgrasp.shape.select import select_points
 
 SCRIPTS = str(Path(__file__).resolve().parents[1] / "scripts")
@@ -34,10 +35,10 @@ def test_the_selection_picks_what_a_refit_for_each_pick_does(scripts, generator)
     from benchmarks.exact import observe_support
     from benchmarks.peers import select_by_refitting
 
-    x, _ = random_view(120, generator)
+    x, normals = random_view(120, generator)
     known = observe_support(x)
-    settings = (x, known, 40, 3.6, 0.01, 0.05)
-    assert torch.equal(select_points(*settings), select_by_refitting(*settings))
+    found = select_points(x, normals, known, kernel_by_name("thin_plate", 3.6), 40, 0.01, 0.05)
+    assert torch.equal(found.picks, select_by_refitting(x, known, 40, 3.6, 0.01, 0.05))
 
 
 @pytest.mark.parametrize("body", ["ellipsoid", "box", "cylinder", "torus"])

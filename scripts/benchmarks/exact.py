@@ -1,6 +1,5 @@
 """What must hold exactly: a covariance without jitter, the picks of a refit, the laws of motion, units and order."""
 
-import dataclasses
 import math
 from functools import partial
 
@@ -14,8 +13,11 @@ from torchgrasp.cloud.normals import spread_directions
 from torchgrasp.errors import IndefiniteCovariance
 from torchgrasp.frames import rotation_from_vector
 from torchgrasp.linalg import cholesky
-from torchgrasp.shape.gp import Observations, ShapeGP, condition, longest_distance
-from torchgrasp.shape.kernel import covariance, thin_plate
+from torchgrasp.shape.blocks import gram
+from torchgrasp.shape.condition import condition, longest_distance
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.observe import Observations, join, off_surface, on_surface
+from torchgrasp.shape.profiles import kernel_by_name
 from torchgrasp.shape.select import select_points
 from torchgrasp.values import PointCloud
 
@@ -27,9 +29,7 @@ NOISE = 0.01
 
 def observe(x: Tensor, normals: Tensor, noise: float = NOISE) -> Observations:
     """Return observations of points on the surface with their normals."""
-    sigma = torch.full((len(x),), noise, dtype=torch.float64)
-    yes = torch.ones(len(x), dtype=torch.bool)
-    return Observations(x, torch.zeros_like(sigma), normals, yes, sigma, sigma)
+    return on_surface(x, normals, torch.full_like(x[:, 0], noise), noise)
 
 
 def observe_support(x: Tensor) -> Observations:
@@ -37,8 +37,7 @@ def observe_support(x: Tensor) -> Observations:
     anchors = torch.cat([torch.zeros(1, 3, dtype=torch.float64), 1.2 * spread_directions(20, x)])
     away = torch.cdist(anchors, x).amin(1)
     away[0] = -away[0]
-    sigma = torch.full_like(away, NOISE)
-    return Observations(anchors, away, torch.zeros_like(anchors), sigma > 1, sigma, sigma)
+    return off_surface(anchors, away, NOISE)
 
 
 def posterior(n: int, seed: int = 0) -> ShapeGP:
@@ -69,12 +68,10 @@ def bench_cholesky(clouds: int, seed: int) -> Row:
     for i in tqdm(range(clouds), desc="random clouds", disable=None, leave=False):
         n = round(20 * math.exp(math.log(50) * float(torch.rand(1, generator=generator, dtype=torch.float64))))
         x, _ = random_view(n, generator)
-        has_normal = torch.ones(n, dtype=torch.bool)
         if i % 2:
-            support = observe_support(x)
-            x, has_normal = torch.cat([support.x, x]), torch.cat([support.has_normal, has_normal])
+            x = torch.cat([x, observe_support(x).x])
         largest = max(largest, n)
-        matrix = covariance(x, x, has_normal, has_normal, partial(thin_plate, psi=PSI_SCALE * longest_distance(x)))
+        matrix = gram(kernel_by_name("thin_plate", PSI_SCALE * longest_distance(x)), x, n)
         matrix.diagonal().add_(0.1 * NOISE**2)
         try:
             cholesky(matrix, f"cloud {i}", "none")
@@ -93,13 +90,13 @@ def bench_selection(seeds: int = 5) -> list[Row]:
     """Select 65 of 1000 points, greedily and by refitting, on random views."""
     same, ratios, ours = [], [], []
     for seed in range(seeds):
-        x, _ = random_view(1000, torch.Generator().manual_seed(seed))
+        x, normals = random_view(1000, torch.Generator().manual_seed(seed))
         known = observe_support(x)
         psi = PSI_SCALE * longest_distance(torch.cat([known.x, x]))
-        picks = select_points(x, known, 65, psi, NOISE, NOISE)
-        same.append(torch.equal(picks, select_by_refitting(x, known, 65, psi, NOISE, NOISE)))
-        fast = least_seconds(partial(select_points, x, known, 65, psi, NOISE, NOISE))
-        slow = least_seconds(partial(select_by_refitting, x, known, 65, psi, NOISE, NOISE), repeats=1)
+        select = partial(select_points, x, normals, known, kernel_by_name("thin_plate", psi), 65, NOISE, NOISE)
+        refit = partial(select_by_refitting, x, known, 65, psi, NOISE, NOISE)
+        same.append(torch.equal(select().picks, refit()))
+        fast, slow = least_seconds(select), least_seconds(refit, repeats=2)
         ours.append(fast)
         ratios.append(slow / fast)
     x, normals = random_view(70, torch.Generator().manual_seed(0))
@@ -107,7 +104,7 @@ def bench_selection(seeds: int = 5) -> list[Row]:
     fit = least_seconds(lambda: condition(seen, origin, 1.0, PointCloud(x, normals), PSI_SCALE), repeats=21)
     y, noise = seen.rows()
     psi = PSI_SCALE * longest_distance(x)
-    matrix = covariance(x, x, seen.has_normal, seen.has_normal, partial(thin_plate, psi=psi)) + torch.diag_embed(noise)
+    matrix = gram(kernel_by_name("thin_plate", psi), x, len(x)) + torch.diag_embed(noise)
     solve = least_seconds(lambda: torch.cholesky_solve(y[:, None], torch.linalg.cholesky(matrix)), repeats=21)
     least, middle = min(ratios), sorted(ratios)[len(ratios) // 2]
     return [
@@ -194,9 +191,3 @@ def bench_update(n: int = 70, seeds: int = 10) -> Row:
         difference <= 1e-9 and middle <= 2e-3,
         {"difference": difference, "seconds": seconds, "refit_s": refits},
     )
-
-
-def join(first: Observations, second: Observations) -> Observations:
-    """Concatenate observations."""
-    parts = ((getattr(part, f.name) for part in (first, second)) for f in dataclasses.fields(Observations))
-    return Observations(*(torch.cat(list(pair)) for pair in parts))

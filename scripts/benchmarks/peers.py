@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchgrasp.shape.gp import Observations
+from torchgrasp.shape.observe import Observations
 
 
 def gpytorch_posterior(x: Tensor, y: Tensor, noise: float, dense: bool) -> Callable[[Tensor], tuple[Tensor, Tensor]]:

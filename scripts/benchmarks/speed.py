@@ -12,7 +12,7 @@ from torch import Tensor
 from benchmarks.common import Row, least_seconds, peak_mib, random_view
 from benchmarks.exact import NOISE, PSI_SCALE, observe, posterior, queries_in
 from benchmarks.peers import gpytorch_posterior, product_floor
-from torchgrasp.shape.gp import condition
+from torchgrasp.shape.condition import condition
 from torchgrasp.values import PointCloud
 
 CHUNKS = (30, 100, 300)

@@ -17,7 +17,8 @@ from torchgrasp import (
     plan_contacts,
 )
 from torchgrasp.frames import apply, rotate
-from torchgrasp.shape.gp import Observations, condition
+from torchgrasp.shape.condition import condition
+from torchgrasp.shape.observe import Observations
 from torchgrasp.values import Contacts
 
 

@@ -7,7 +7,9 @@ import torch
 import trimesh
 
 from torchgrasp.plan.survive import closure_survival
-from torchgrasp.shape.gp import Observations, ShapeGP, condition
+from torchgrasp.shape.condition import condition
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.observe import Observations
 from torchgrasp.values import PointCloud
 
 RADIUS = 0.04

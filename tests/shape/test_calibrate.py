@@ -12,7 +12,9 @@ import trimesh
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.shape.calibrate import calibrate, format_table, mean_row, measure_shape, nearest_on_mesh, sample_mesh
-from torchgrasp.shape.gp import Observations, ShapeGP, condition
+from torchgrasp.shape.condition import condition
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.observe import Observations
 from torchgrasp.values import PointCloud
 
 RADIUS = 0.04

@@ -8,8 +8,10 @@ from torch import Tensor
 
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.linalg import unit
-from torchgrasp.shape.gp import Observations, ShapeGP, condition, longest_distance
+from torchgrasp.shape.condition import condition, longest_distance
+from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.kernel import covariance, thin_plate
+from torchgrasp.shape.observe import Observations
 from torchgrasp.values import PointCloud
 
 NOISE = 0.01

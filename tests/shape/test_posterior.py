@@ -10,11 +10,12 @@ from torch import Tensor
 
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.linalg import unit
-from torchgrasp.shape.gp import ShapeGP, condition
+from torchgrasp.shape.blocks import cross_covariance
+from torchgrasp.shape.condition import condition
+from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.joint import JointEstimate, draw_samples
 from torchgrasp.shape.kernel import covariance, radial_derivatives, thin_plate
 from torchgrasp.shape.observe import Observations
-from torchgrasp.shape.posterior import cross_covariance
 from torchgrasp.shape.profiles import Kernel, kernel_by_name, matern52_kernel, rbf_kernel
 from torchgrasp.values import PointCloud
 

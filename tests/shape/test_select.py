@@ -1,19 +1,22 @@
 """Greedy selection against refitting the posterior for every pick."""
 
+import math
 from functools import partial
 
 import pytest
 import torch
 from torch import Tensor
 
-from torchgrasp.errors import BadArgument, IndefiniteCovariance
+from torchgrasp.errors import IndefiniteCovariance
 from torchgrasp.linalg import unit
+from torchgrasp.shape.condition import posterior_given
 from torchgrasp.shape.kernel import covariance, thin_plate
-from torchgrasp.shape.observe import Observations
+from torchgrasp.shape.observe import Observations, join, on_surface
 from torchgrasp.shape.profiles import kernel_by_name
-from torchgrasp.shape.select import Criterion, select_points
+from torchgrasp.shape.select import Criterion, Selection, select_points
 
 PSI = 3.6
+PLATE = kernel_by_name("thin_plate", PSI)
 
 
 def _scene(n: int) -> tuple[Tensor, Observations]:
@@ -24,6 +27,16 @@ def _scene(n: int) -> tuple[Tensor, Observations]:
     some = torch.arange(21) < 3  # a few known normals, too
     sigma = torch.full((21,), 0.01, dtype=torch.float64)
     return x, Observations(anchors, sigma, anchors, some, sigma, 5 * sigma)
+
+
+def _normals(x: Tensor) -> Tensor:
+    return unit(x / torch.tensor([1.0, 0.25, 0.64], dtype=torch.float64))
+
+
+def _select(
+    x: Tensor, known: Observations, budget: int, criterion: Criterion = "variance", stop: float = -math.inf
+) -> Selection:
+    return select_points(x, _normals(x), known, PLATE, budget, 0.01, 0.05, criterion=criterion, stop=stop)
 
 
 def _refit(x: Tensor, known: Observations, budget: int) -> list[int]:
@@ -46,13 +59,12 @@ def _refit(x: Tensor, known: Observations, budget: int) -> list[int]:
 
 def test_picks_are_those_of_refitting_every_time():
     x, known = _scene(150)
-    picks = select_points(x, known, 25, PSI, 0.01, 0.05)
-    assert picks.tolist() == _refit(x, known, 25)
+    assert _select(x, known, 25).picks.tolist() == _refit(x, known, 25)
 
 
 def test_every_candidate_is_picked_once_when_there_are_few():
     x, known = _scene(6)
-    assert sorted(select_points(x, known, 50, PSI, 0.01, 0.05).tolist()) == list(range(6))
+    assert sorted(_select(x, known, 50).picks.tolist()) == list(range(6))
 
 
 def test_informative_points_leave_less_variance_than_random_ones():
@@ -67,21 +79,21 @@ def test_informative_points_leave_less_variance_than_random_ones():
         return float((PSI**3 - (star * torch.linalg.solve(k, star.T).T).sum(1)).max())
 
     random = torch.randperm(300, generator=torch.Generator().manual_seed(1))[:30]
-    assert worst(select_points(x, known, 30, PSI, 0.01, 0.05)) < 0.5 * worst(random)
+    assert worst(_select(x, known, 30).picks) < 0.5 * worst(random)
 
 
 def test_a_psi_too_small_is_named():
     x, known = _scene(50)
     with pytest.raises(IndefiniteCovariance, match="psi_scale"):
-        select_points(x, known, 20, 1.5, 0.01, 0.05)
+        select_points(x, _normals(x), known, kernel_by_name("thin_plate", 1.5), 20, 0.01, 0.05)
 
 
 @pytest.mark.parametrize("kernel", ["thin_plate", "matern52"])
 @pytest.mark.parametrize("criterion", ["error", "both"])
 def test_picks_by_error_are_those_of_refitting_every_time(criterion: Criterion, kernel: str):
     x, known = _scene(120)
-    normals = unit(x / torch.tensor([1.0, 0.25, 0.64], dtype=torch.float64))
-    profile = kernel_by_name(kernel, PSI).profile
+    normals, chosen = _normals(x), kernel_by_name(kernel, PSI)
+    profile = chosen.profile
     none, wanted = torch.zeros(len(x), dtype=torch.bool), []
     for _ in range(20):
         m = len(wanted)
@@ -101,14 +113,14 @@ def test_picks_by_error_are_those_of_refitting_every_time(criterion: Criterion, 
             score = score + 2.0 * (PSI**3 - (star * torch.linalg.solve(k, star.T).T).sum(1)).sqrt()
         score[wanted] = -torch.inf
         wanted.append(int(score.argmax()))
-    picks = select_points(x, known, 20, PSI, 0.01, 0.05, kernel=kernel, criterion=criterion, normals=normals)
-    assert picks.tolist() == wanted
+    found = select_points(x, normals, known, chosen, 20, 0.01, 0.05, criterion=criterion)
+    assert found.picks.tolist() == wanted
 
 
 def test_picking_stops_when_every_point_is_as_certain_as_asked():
     x, known = _scene(300)
-    picks = select_points(x, known, 300, PSI, 0.01, 0.05, stop=0.01)
-    assert picks.tolist() == select_points(x, known, len(picks), PSI, 0.01, 0.05).tolist()
+    picks = _select(x, known, 300, stop=0.01).picks
+    assert torch.equal(picks, _select(x, known, len(picks)).picks)
     assert 10 < len(picks) < 100
     profile, none = partial(thin_plate, psi=PSI), torch.zeros(len(x), dtype=torch.bool)
     for rows, certain in ((picks, True), (picks[:-1], False)):
@@ -121,7 +133,27 @@ def test_picking_stops_when_every_point_is_as_certain_as_asked():
         assert (worst <= 0.01) == certain
 
 
-def test_a_criterion_that_cannot_be_judged_is_named():
+@pytest.mark.parametrize("criterion", ["variance", "both"])
+def test_the_factor_of_the_selection_is_that_of_the_posterior(criterion: Criterion):
+    x, known = _scene(120)
+    found = _select(x, known, 20, criterion)
+    sigma = torch.full((20,), 0.01, dtype=torch.float64)
+    every = join(known, on_surface(x[found.picks], _normals(x)[found.picks], sigma, 0.05))
+    grown, fresh = found.posterior, posterior_given(every, PLATE)
+    assert torch.equal(grown.x, fresh.x) and torch.equal(grown.has_normal, fresh.has_normal)
+    torch.testing.assert_close(grown.weights, fresh.weights, rtol=0, atol=1e-7)
+    order = grown.order
+    assert order is not None
+    noise = every.with_normals_first().rows()[1]
+    wanted = covariance(grown.x, grown.x, grown.has_normal, grown.has_normal, PLATE.profile) + torch.diag(noise)
+    assert torch.equal(grown.factor, grown.factor.tril())
+    torch.testing.assert_close(grown.factor @ grown.factor.T, wanted[order][:, order], rtol=0, atol=1e-10)
+    (mean, spread), (other_mean, other_spread) = grown.estimate(x), fresh.estimate(x)
+    torch.testing.assert_close(mean, other_mean, rtol=0, atol=1e-9)
+    torch.testing.assert_close(spread, other_spread, rtol=0, atol=1e-9)
+
+
+def test_nothing_is_picked_where_everything_is_certain():
     x, known = _scene(30)
-    with pytest.raises(BadArgument, match="normals"):
-        select_points(x, known, 5, PSI, 0.01, 0.05, criterion="both")
+    found = _select(x, known, 5, stop=1e3)
+    assert len(found.picks) == 0 and len(found.posterior.x) == len(known.x)

@@ -1,11 +1,15 @@
 """Shapes of partial clouds whose true surface is known in closed form."""
 
+from typing import Literal
+
 import pytest
 import torch
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument, IndefiniteCovariance, SuspiciousScale
 from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.profiles import Kernel, KernelName, matern52_kernel
+from torchgrasp.shape.select import Criterion
 from torchgrasp.shape.support import fit_shape
 from torchgrasp.values import PointCloud
 
@@ -164,6 +168,31 @@ def test_bad_arguments_are_refused_by_name(bad: dict[str, float]):
 def test_numbers_that_are_no_integers_are_refused(bad: dict[str, float]):
     with pytest.raises((BadArgument, TypeError), match=next(iter(bad))):  # TypeError: annotations, checked in tests
         fit_shape(_cylinder(), **bad)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("bad", [{"kernel": "cubic"}, {"criterion": "chance"}])
+def test_an_unknown_kernel_or_criterion_is_refused(bad: dict[str, str]):
+    with pytest.raises((BadArgument, TypeError), match=next(iter(bad))):  # TypeError: annotations, checked in tests
+        fit_shape(_cylinder(), **bad)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("support", ["camera", "paper"])
+@pytest.mark.parametrize("criterion", ["variance", "error", "both"])
+def test_without_a_budget_points_are_taken_until_the_whole_cloud_is_certain(
+    criterion: Criterion, support: Literal["camera", "paper"]
+):
+    cloud = _cylinder()
+    shape = fit_shape(cloud, budget=None, support=support, criterion=criterion)
+    assert shape.predict(shape.cloud.points).variance.max() <= 0.01
+    few = fit_shape(cloud, budget=30, support=support, criterion=criterion)
+    assert len(few.x) < len(shape.x) and few.predict(few.cloud.points).variance.max() > 0.01
+
+
+@pytest.mark.parametrize("kernel", ["matern52", "rbf", matern52_kernel(0.8, 5.0)])
+def test_other_kernels_find_the_seen_surface(kernel: KernelName | Kernel):
+    cloud = _cylinder()
+    shape = fit_shape(cloud, kernel=kernel)
+    assert shape.predict(cloud.points).distance.abs().mean() < 0.03
 
 
 def test_an_unknown_support_is_refused():

@@ -9,18 +9,13 @@ from torch import Tensor
 
 from torchgrasp.base import Value, check_tensor
 from torchgrasp.errors import BadArgument
-from torchgrasp.linalg import cholesky, unit
+from torchgrasp.linalg import unit
 from torchgrasp.shape.joint import JointEstimate, draw_samples, joint_estimate
-from torchgrasp.shape.kernel import covariance
 from torchgrasp.shape.observe import Observations
 from torchgrasp.shape.posterior import Posterior
-from torchgrasp.shape.profiles import PLATE_REMEDY, Kernel, kernel_by_name
 from torchgrasp.shape.update import append_observations
 from torchgrasp.values import PointCloud, ShapeEstimate
 
-REMEDY = PLATE_REMEDY
-REACH = 1.25
-"""The domain's radius over that of the observations, at most: the posterior says nothing further out."""
 MOST_JOINT = 1000
 """Greatest number of points of one joint posterior, whose memory grows with their square."""
 
@@ -225,69 +220,6 @@ class ShapeGP(Posterior):
                 f"points within {self.domain_radius * self.scale:.4g} m of {self.center.tolist()} m",
             )
         return x
-
-
-def condition(
-    observations: Observations,
-    center: Float[Tensor, "3"],
-    scale: float,
-    cloud: PointCloud,
-    psi_scale: float = 1.5,
-    std_factor: float = 1.0,
-    kernel: str | Kernel = "thin_plate",
-) -> ShapeGP:
-    """Return the posterior given observations, with psi = `psi_scale` times their longest distance.
-
-    Args:
-        observations: of the surface, normalised.
-        center: origin of the normalised frame [m].
-        scale: length [m] of the normalised unit.
-        cloud: what was seen.
-        psi_scale: 1 is the paper's psi, for which the covariance is indefinite.
-        std_factor: see `ShapeGP`.
-        kernel: "thin_plate", "matern52", "rbf" (see `kernel_by_name`), or any `Kernel` of normalised distances.
-
-    Raises:
-        BadArgument: an unknown kernel.
-        IndefiniteCovariance: psi is too small for these observations.
-    """
-    observations = observations.to(center).with_normals_first()
-    x, has_normal = observations.x, observations.has_normal
-    longest = longest_distance(x)
-    psi = psi_scale * longest
-    kernel = kernel_by_name(kernel, psi) if isinstance(kernel, str) else kernel
-    prior = covariance(x, x, has_normal, has_normal, kernel.profile)
-    y, noise = observations.rows()
-    if longest > kernel.diameter:
-        # Generous noise on some rows can hide a kernel that is no covariance; the least noise must suffice.
-        cholesky(
-            prior + torch.diag_embed(torch.full_like(noise, float(noise.min()))), "the covariance K", kernel.remedy
-        )
-    factor = cholesky(prior + torch.diag_embed(noise), "the covariance K + sigma^2 I", kernel.remedy)
-    radius = REACH * float(torch.linalg.vector_norm(x, dim=-1).max())
-    return ShapeGP(
-        x=x,
-        has_normal=has_normal,
-        weights=torch.cholesky_solve(y[:, None], factor)[:, 0],
-        factor=factor,
-        order=None,
-        kernel=kernel,
-        center=center,
-        psi=psi,
-        scale=scale,
-        domain_radius=min(kernel.diameter / 2.0, radius),
-        std_factor=std_factor,
-        cloud=cloud,
-    )
-
-
-def longest_distance(x: Float[Tensor, "n 3"]) -> float:
-    """Return the longest distance between two of the points.
-
-    >>> longest_distance(torch.tensor([[0.0, 0, 0], [0, 3, 4]]))
-    5.0
-    """
-    return float(torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist").max())
 
 
 def _check_queries(points: Any) -> Float[Tensor, "*b 3"]:

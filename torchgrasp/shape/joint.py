@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.errors import IndefiniteCovariance
-from torchgrasp.shape.kernel import covariance
+from torchgrasp.shape.blocks import gram
 from torchgrasp.shape.posterior import Posterior
 
 ROUNDING = 1e-8
@@ -32,12 +32,9 @@ def joint_estimate(posterior: Posterior, x: Float[Tensor, "k 3"]) -> JointEstima
     k = len(x)
     cross = posterior.cross(x)
     mean = (cross @ posterior.weights).T
-    if posterior.order is not None:
-        cross = cross[..., posterior.order]
-    by_point = cross.transpose(0, 1).flatten(0, 1)
-    whitened = torch.linalg.solve_triangular(posterior.factor, by_point.T, upper=False)
-    yes = torch.ones(k, dtype=torch.bool, device=x.device)
-    prior = covariance(x, x, yes, yes, posterior.kernel.profile)
+    by_point = posterior.ordered(cross.transpose(0, 1).flatten(0, 1).T)
+    whitened = torch.linalg.solve_triangular(posterior.factor, by_point, upper=False)
+    prior = gram(posterior.kernel, x, k)
     prior = prior.reshape(4, k, 4, k).permute(1, 0, 3, 2).reshape(4 * k, 4 * k)
     return JointEstimate(mean, prior - whitened.T @ whitened)
 

@@ -29,7 +29,33 @@ class Observations(Value):
         noise = torch.cat([self.distance_noise, self.normal_noise[self.has_normal].repeat(3)])
         return y, noise * noise
 
+    @property
+    def least_noise(self) -> float:
+        """Return the least standard deviation of anything observed."""
+        return float(torch.cat([self.distance_noise, self.normal_noise[self.has_normal]]).min())
+
     def with_normals_first(self) -> "Observations":
         """Return the observations with the points that have normals before the others, else in their order."""
         order = torch.argsort(~self.has_normal, stable=True)
         return Observations(**{f.name: getattr(self, f.name)[order] for f in dataclasses.fields(self)})
+
+
+def on_surface(
+    x: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], noise: Float[Tensor, "n"], normal_noise: float
+) -> Observations:
+    """Return observations of points on the surface with their normals."""
+    yes = torch.ones(len(x), dtype=torch.bool, device=x.device)
+    return Observations(x, torch.zeros_like(noise), normals, yes, noise, torch.full_like(noise, normal_noise))
+
+
+def off_surface(x: Float[Tensor, "n 3"], distance: Float[Tensor, "n"], noise: float) -> Observations:
+    """Return observations of points off the surface, where no normal is defined."""
+    no = torch.zeros(len(x), dtype=torch.bool, device=x.device)
+    sigma = torch.full_like(distance, noise)
+    return Observations(x, distance, torch.zeros_like(x), no, sigma, sigma)
+
+
+def join(*parts: Observations) -> Observations:
+    """Concatenate observations."""
+    names = (f.name for f in dataclasses.fields(Observations))
+    return Observations(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})

@@ -6,10 +6,11 @@ from functools import cached_property
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.shape.blocks import cross_covariance
 from torchgrasp.shape.profiles import Kernel
 
 BLOCK = 2**27
@@ -61,6 +62,10 @@ class Posterior(Value):
     def oriented(self) -> int:
         """Number of observed points with normals."""
         return int(self.has_normal.sum())
+
+    def ordered(self, rows: Shaped[Tensor, "rows *c"]) -> Shaped[Tensor, "rows *c"]:
+        """Return what is given by `covariance`'s rows in the order of the factor's."""
+        return rows if self.order is None else rows[self.order]
 
     def mean(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q"]:
         """Return the mean signed distance alone, normalised, at normalised points: for grids of many points."""
@@ -179,32 +184,6 @@ class Posterior(Value):
         u = [solved[:, n + m * oriented : n + (m + 1) * oriented] for m in range(3)]
         along = d[0][:, near] * u[0] + d[1][:, near] * u[1] + d[2][:, near] * u[2]
         return distance, gradient, hessian, variance, -2.0 * gradient_of(solved[:, :n], u, along)
-
-
-def cross_covariance(
-    kernel: Kernel, x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"], near: int
-) -> Float[Tensor, "4 q rows"]:
-    """Return what `covariance` does for points x with normals, in closed form: of points y the first `near` have some.
-
-    For millions of queries, or for few: it has neither the memory nor the overhead of autograd.
-    """
-    n = len(y)
-    d = [x[:, m, None] - y[None, :, m] for m in range(3)]
-    k, slope, bend = kernel.slopes(torch.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), 3)
-    out = x.new_empty(4, len(x), n + 3 * near)
-    out[0, :, :n] = k
-    inner = -slope[:, :near]
-    for m in range(3):
-        columns = slice(n + m * near, n + (m + 1) * near)
-        torch.mul(inner, d[m][:, :near], out=out[0, :, columns])
-        torch.mul(slope, d[m], out=out[m + 1, :, :n])
-        tilted = bend[:, :near] * d[m][:, :near]
-        torch.addcmul(inner, tilted, d[m][:, :near], value=-1.0, out=out[m + 1, :, columns])
-        for p in range(m):
-            block = slice(n + p * near, n + (p + 1) * near)
-            torch.mul(tilted, -d[p][:, :near], out=out[m + 1, :, block])
-            out[p + 1, :, columns] = out[m + 1, :, block]
-    return out
 
 
 def in_chunks(evaluate: Callable[[Tensor], tuple[Any, ...]], x: Tensor, size: int) -> tuple[Any, ...]:

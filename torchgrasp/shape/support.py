@@ -1,7 +1,8 @@
 """From a cloud to a shape: what is observed, and where, to fix the seen and the hidden side."""
 
+import dataclasses
 import math
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -13,10 +14,14 @@ from torchgrasp.cloud.orientation import drop_unoriented
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
 from torchgrasp.shape.complete import Completion, complete_cloud
+from torchgrasp.shape.condition import as_shape, check_kernel, longest_distance
 from torchgrasp.shape.free import free_space, trespasses
-from torchgrasp.shape.gp import Observations, ShapeGP, condition, longest_distance
-from torchgrasp.shape.select import select_points
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.observe import Observations, join, off_surface, on_surface
+from torchgrasp.shape.profiles import Kernel, KernelName, kernel_by_name
+from torchgrasp.shape.select import Criterion, select_points
 from torchgrasp.shape.silhouette import seen_from_one_side
+from torchgrasp.shape.update import append_observations
 from torchgrasp.values import PointCloud
 
 OUTER_RADIUS = 1.2
@@ -40,17 +45,21 @@ FREE_ROUNDS = 3
 """Times that a shape is pushed out of free space."""
 CANDIDATES = 2000
 """Points of a cloud among which the informative ones are sought, at most."""
+MOST_BUDGET = 1000
+"""Greatest budget, and the limit where there is none."""
 
 
 def fit_shape(
     cloud: PointCloud,
     noise: float = 0.01,
-    budget: int = 70,
+    budget: int | None = 70,
     psi_scale: float = 1.5,
     support: Literal["camera", "paper"] = "camera",
     seed: int = 0,
     *,
     table: float | None = None,
+    kernel: KernelName | Kernel = "thin_plate",
+    criterion: Criterion = "variance",
 ) -> ShapeGP:
     """Return the posterior of an object's shape given a partial cloud, Eqs. (2)-(9).
 
@@ -66,53 +75,63 @@ def fit_shape(
             other (`check_normals`), else they are left aside.
         noise: standard deviation of an observed signed distance, normalised; of normals too for "paper".
         budget: points of the observed set: the one inside, 20 outside, and the rest the most informative ones of
-            the cloud. Rim and mirrored points of "camera" come on top.
+            the cloud. Rim and mirrored points of "camera" come on top. None: points of the cloud are taken until
+            the variance at none of them exceeds `noise`, the paper's rule, and 1000 at most in all.
         psi_scale: psi over the longest distance of the observations; below 1.34 the covariance may be indefinite.
         support: "camera" or "paper".
         seed: of the random draws.
         table: height [m] of a table that the object stands on, with normal z; only "camera" uses it.
+        kernel: "thin_plate", "matern52" or "rbf" of the length that psi tells (see `kernel_by_name`), or a `Kernel` of
+            normalised distances.
+        criterion: which point of the cloud is the most informative: that of the greatest "variance", of the greatest
+            "error", its mean signed distance, or of the greatest |error| + 2 sqrt(variance), "both".
 
     Raises:
         BadArgument: an argument out of range, a cloud that `check_cloud` refuses, or a viewpoint that has not the
             whole of a single view in front of it.
-        IndefiniteCovariance: `psi_scale` is too small.
+        IndefiniteCovariance: `psi_scale` is too small, or the kernel too long for the noise.
 
     >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
     >>> fit_shape(PointCloud(0.04 * ball, ball)).predict(torch.tensor([0.0, 0.0, 0.04])).std_m < 0.002
     tensor(True)
     """
     _check_arguments(noise, budget, psi_scale, support, seed, table)
+    _check_model(kernel, criterion)
+    model = _Model(noise, budget, psi_scale, kernel, criterion)
     cloud = drop_unoriented(cloud)
     generator = torch.Generator().manual_seed(seed)
     if support == "paper":
-        return _fit_paper(cloud, noise, budget, psi_scale, generator)
-    return _fit_camera(cloud, noise, budget, psi_scale, generator, table)
+        return _fit_paper(cloud, model, generator)
+    return _fit_camera(cloud, model, generator, table)
 
 
-def _fit_paper(cloud: PointCloud, noise: float, budget: int, psi_scale: float, generator: torch.Generator) -> ShapeGP:
+@dataclasses.dataclass(frozen=True)
+class _Model:
+    """The arguments of `fit_shape` that say how the posterior follows from what is observed."""
+
+    noise: float
+    budget: int | None
+    psi_scale: float
+    kernel: KernelName | Kernel
+    criterion: Criterion
+
+
+def _fit_paper(cloud: PointCloud, model: _Model, generator: torch.Generator) -> ShapeGP:
     """Return the shape from the paper's own observations (Sec. 3.1)."""
     cloud = estimate_normals(cloud) if cloud.normals is None else keep_distinct(cloud)
     points, normals = _candidates(cloud, generator)
     center = points.mean(0)
     scale = float(torch.linalg.vector_norm(points - center, dim=-1).max())
     sphere = unit(torch.randn(OUTER_POINTS, 3, dtype=torch.float64, generator=generator)).to(points)
-    support = _without_normals(
+    support = off_surface(
         torch.cat([torch.zeros_like(center)[None], OUTER_RADIUS * sphere]),
         torch.cat([-torch.ones_like(center[:1]), torch.ones_like(sphere[:, 0])]),
-        noise,
+        model.noise,
     )
-    seen = _select(points, normals, center, scale, support, budget, psi_scale, noise, noise)
-    return condition(_join(support, seen), center, scale, cloud, psi_scale)
+    return _condition(points, normals, support, [], model, model.noise, center, scale, cloud)
 
 
-def _fit_camera(
-    cloud: PointCloud,
-    noise: float,
-    budget: int,
-    psi_scale: float,
-    generator: torch.Generator,
-    table: float | None,
-) -> ShapeGP:
+def _fit_camera(cloud: PointCloud, model: _Model, generator: torch.Generator, table: float | None) -> ShapeGP:
     """Return the shape from metric distances, the outline and the mirrored cloud."""
     if cloud.normals is not None and cloud.viewpoint is not None and not seen_from_one_side(cloud, cloud.viewpoint):
         # A whole surface: turned towards a viewpoint its far side would be inside out.
@@ -137,16 +156,14 @@ def _fit_camera(
     anchors = torch.cat([torch.zeros_like(center)[None], sphere]) if inside else sphere
     away = torch.cdist(anchors, (points - center) / scale).amin(1)
     away = torch.cat([-away[:1], away[1:]]) if inside else away
-    support = _without_normals(anchors, away, noise)
-    seen = _select(points, normals, center, scale, support, budget, psi_scale, noise, NORMAL_NOISE)
-    observed = _join(support, seen, *parts)
-    shape = condition(observed, center, scale, cloud, psi_scale, CAMERA_STD_FACTOR)
+    support = off_surface(anchors, away, model.noise)
+    shape = _condition(points, normals, support, parts, model, NORMAL_NOISE, center, scale, cloud, CAMERA_STD_FACTOR)
     for x, least in FREE_ROUNDS * free:
         rows = trespasses(shape, x, least)
         if not len(rows):
             break
-        observed = _join(observed, _without_normals(x[rows], least[rows], FREE_NOISE / scale))
-        shape = condition(observed, center, scale, cloud, psi_scale, CAMERA_STD_FACTOR)
+        longer = append_observations(shape, off_surface(x[rows], least[rows], FREE_NOISE / scale))
+        shape = as_shape(longer, center, scale, cloud, shape.psi, CAMERA_STD_FACTOR)
     return shape
 
 
@@ -155,7 +172,7 @@ def _observe_completion(found: Completion, center: Float[Tensor, "3"], scale: fl
     outline = found.outline
     rim_noise = torch.full_like(outline.rim[:, 0], RIM_NOISE)
     return [
-        _on_surface((p.to(center) - center) / scale, n.to(center), s.to(center) / scale, normal_noise)
+        on_surface((p.to(center) - center) / scale, n.to(center), s.to(center) / scale, normal_noise)
         for p, n, s, normal_noise in (
             (outline.rim, outline.rim_normals, rim_noise, RIM_NORMAL_NOISE),
             (found.points, found.normals, found.noise, MIRROR_NORMAL_NOISE),
@@ -163,43 +180,35 @@ def _observe_completion(found: Completion, center: Float[Tensor, "3"], scale: fl
     ]
 
 
-def _select(
+def _condition(
     points: Float[Tensor, "n 3"],
     normals: Float[Tensor, "n 3"],
+    support: Observations,
+    parts: list[Observations],
+    model: _Model,
+    normal_noise: float,
     center: Float[Tensor, "3"],
     scale: float,
-    support: Observations,
-    budget: int,
-    psi_scale: float,
-    distance_noise: float,
-    normal_noise: float,
-) -> Observations:
-    """Return the most informative points of the cloud as observations, `support` being known."""
+    cloud: PointCloud,
+    std_factor: float = 1.0,
+) -> ShapeGP:
+    """Return the shape given `support`, the most informative points of the cloud and then other `parts`.
+
+    The kernel's length is that of all candidates from the start, so that one factor grows from the first to the last.
+    """
     x = (points - center) / scale
-    psi = psi_scale * longest_distance(torch.cat([support.x, x]))
-    picks = select_points(x, support, max(budget - len(support.x), 1), psi, distance_noise, normal_noise)
-    return _on_surface(x[picks], normals[picks], torch.full_like(x[picks, 0], distance_noise), normal_noise)
-
-
-def _on_surface(
-    x: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], noise: Float[Tensor, "n"], normal_noise: float
-) -> Observations:
-    """Return observations of points on the surface with their normals."""
-    yes = torch.ones(len(x), dtype=torch.bool, device=x.device)
-    return Observations(x, torch.zeros_like(noise), normals, yes, noise, torch.full_like(noise, normal_noise))
-
-
-def _without_normals(x: Float[Tensor, "n 3"], distance: Float[Tensor, "n"], noise: float) -> Observations:
-    """Return observations of points off the surface, where no normal is defined."""
-    no = torch.zeros(len(x), dtype=torch.bool, device=x.device)
-    sigma = torch.full_like(distance, noise)
-    return Observations(x, distance, torch.zeros_like(x), no, sigma, sigma)
-
-
-def _join(*parts: Observations) -> Observations:
-    """Concatenate observations."""
-    names = ("x", "distance", "normal", "has_normal", "distance_noise", "normal_noise")
-    return Observations(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
+    every = join(support, on_surface(x, normals, torch.full_like(x[:, 0], model.noise), normal_noise), *parts)
+    psi = model.psi_scale * longest_distance(every.x)
+    kernel = kernel_by_name(model.kernel, psi) if isinstance(model.kernel, str) else model.kernel
+    budget, stop = (MOST_BUDGET, model.noise) if model.budget is None else (model.budget, -math.inf)
+    budget = max(budget - len(support.x), 1)
+    found = select_points(
+        x, normals, support, kernel, budget, model.noise, normal_noise, criterion=model.criterion, stop=stop
+    ).posterior
+    if parts:
+        found = append_observations(found, join(*parts))
+    check_kernel(found, every.least_noise)
+    return as_shape(found, center, scale, cloud, psi, std_factor)
 
 
 def _candidates(cloud: PointCloud, generator: torch.Generator) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
@@ -221,12 +230,15 @@ def _check_viewpoint(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]
         raise BadArgument("viewpoint", found, "the position of a camera that has the whole cloud in front of it")
 
 
-def _check_arguments(noise: float, budget: int, psi_scale: float, support: str, seed: int, table: float | None) -> None:
+def _check_arguments(
+    noise: float, budget: int | None, psi_scale: float, support: str, seed: int, table: float | None
+) -> None:
     """Refuse arguments out of range, before any work."""
     if not 0.0 < noise <= 1.0:  # also refuses NaN
         raise BadArgument("noise", noise, "a number in (0, 1], normalised")
-    if not isinstance(budget, int) or not OUTER_POINTS + 1 + 4 <= budget <= 1000:
-        raise BadArgument("budget", budget, f"{OUTER_POINTS + 1 + 4} to 1000 points")
+    least = OUTER_POINTS + 1 + 4
+    if budget is not None and not (isinstance(budget, int) and least <= budget <= MOST_BUDGET):
+        raise BadArgument("budget", budget, f"{least} to {MOST_BUDGET} points, or None")
     if not 1.0 <= psi_scale <= 100.0:
         raise BadArgument("psi_scale", psi_scale, "a number in [1, 100]; 1.34 and more are safe")
     if support not in ("camera", "paper"):
@@ -235,3 +247,11 @@ def _check_arguments(noise: float, budget: int, psi_scale: float, support: str, 
         raise BadArgument("seed", seed, "an integer from 0")
     if table is not None and not math.isfinite(table):
         raise BadArgument("table", table, "a height in metres, or None")
+
+
+def _check_model(kernel: KernelName | Kernel, criterion: Criterion) -> None:
+    """Refuse a kernel or a criterion that is unknown, before any work."""
+    if not isinstance(kernel, Kernel):
+        kernel_by_name(kernel, 1.0)
+    if criterion not in get_args(Criterion):
+        raise BadArgument("criterion", repr(criterion), "'variance', 'error' or 'both'")

@@ -5,8 +5,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.linalg import cholesky
+from torchgrasp.shape.blocks import covariance_rows, gram
 from torchgrasp.shape.observe import Observations
-from torchgrasp.shape.posterior import Posterior, cross_covariance
+from torchgrasp.shape.posterior import Posterior
 
 
 def append_observations(posterior: Posterior, new: Observations) -> Posterior:
@@ -22,34 +23,49 @@ def append_observations(posterior: Posterior, new: Observations) -> Posterior:
     Raises:
         IndefiniteCovariance: the new points are too far away for the kernel.
     """
-    kernel, old = posterior.kernel, len(posterior.factor)
+    kernel = posterior.kernel
     new = new.with_normals_first()
     y, noise = new.rows()
     fresh = int(new.has_normal.sum())
-    cross = _rows(cross_covariance(kernel, new.x, posterior.x, posterior.oriented), fresh).T
-    own = _rows(cross_covariance(kernel, new.x, new.x, fresh), fresh) + torch.diag_embed(noise)
-    order = torch.arange(old, device=y.device) if posterior.order is None else posterior.order
-    before = torch.linalg.solve_triangular(posterior.factor, cross[order], upper=False)
+    cross = covariance_rows(kernel, posterior.x, posterior.oriented, new.x, fresh)
+    own = gram(kernel, new.x, fresh) + torch.diag_embed(noise)
+    before = torch.linalg.solve_triangular(posterior.factor, posterior.ordered(cross), upper=False)
     corner = cholesky(own - before.T @ before, "the covariance of new observations", kernel.remedy)
     factor = torch.cat([torch.cat([posterior.factor, torch.zeros_like(before)], 1), torch.cat([before.T, corner], 1)])
 
     # L^-1 y of the old rows is L^T times their weights; the observed numbers themselves need not be kept.
-    whitened = posterior.factor.T @ posterior.weights[order]
-    rest = torch.linalg.solve_triangular(corner, (y - before.T @ whitened)[:, None], upper=False)
-    solved = torch.linalg.solve_triangular(factor.T, torch.cat([whitened[:, None], rest]), upper=True)[:, 0]
+    whitened = posterior.factor.T @ posterior.ordered(posterior.weights)
+    rest = torch.linalg.solve_triangular(corner, (y - before.T @ whitened)[:, None], upper=False)[:, 0]
+    return extend_posterior(posterior, new, factor, torch.cat([whitened, rest]))
 
-    has = torch.cat([posterior.has_normal, new.has_normal])
-    points = torch.argsort(~has, stable=True)
-    order = torch.cat([order, old + torch.arange(len(y), device=y.device)])
-    order = _row_of_each(posterior.has_normal, new.has_normal)[order]
+
+def extend_posterior(
+    posterior: Posterior,
+    new: Observations,
+    factor: Float[Tensor, "rows rows"],
+    whitened: Float[Tensor, "rows"],
+    new_order: Int[Tensor, "fresh"] | None = None,
+) -> Posterior:
+    """Return the posterior given `new` observations, too, whose rows have been appended to the factor already.
+
+    Args:
+        posterior: given the old observations.
+        new: the later ones, those with normals first.
+        factor: of old and new rows.
+        whitened: L^-1 y of old and new rows.
+        new_order: row of `Observations.rows` that each of the factor's new rows stands for; None: the same.
+    """
+    old, total = len(posterior.factor), len(factor)
+    solved = torch.linalg.solve_triangular(factor.T, whitened[:, None], upper=True)[:, 0]
+    line = torch.arange(total, device=factor.device)
+    later = line[old:] if new_order is None else old + new_order
+    order = _row_of_each(posterior.has_normal, new.has_normal)[torch.cat([posterior.ordered(line[:old]), later])]
     weights = torch.empty_like(solved)
     weights[order] = solved
-    return Posterior(torch.cat([posterior.x, new.x])[points], has[points], weights, factor, order, kernel)
-
-
-def _rows(block: Float[Tensor, "4 q columns"], oriented: int) -> Float[Tensor, "rows columns"]:
-    """Return the rows of points of which the first `oriented` only have normals."""
-    return torch.cat([block[0], block[1:, :oriented].flatten(0, 1)])
+    has = torch.cat([posterior.has_normal, new.has_normal])
+    points = torch.argsort(~has, stable=True)
+    x = torch.cat([posterior.x, new.x])[points]
+    return Posterior(x, has[points], weights, factor, order, posterior.kernel)
 
 
 def _row_of_each(old: Bool[Tensor, "n"], new: Bool[Tensor, "m"]) -> Int[Tensor, "rows"]:

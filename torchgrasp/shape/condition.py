@@ -1,0 +1,113 @@
+"""From observations to the posterior of a shape: the kernel's length, the factor and the weights, Eqs. (7)-(9)."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.linalg import cholesky
+from torchgrasp.shape.blocks import gram
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.observe import Observations
+from torchgrasp.shape.posterior import Posterior
+from torchgrasp.shape.profiles import Kernel, kernel_by_name
+from torchgrasp.values import PointCloud
+
+REACH = 1.25
+"""The domain's radius over that of the observations, at most: the posterior says nothing further out."""
+
+
+def condition(
+    observations: Observations,
+    center: Float[Tensor, "3"],
+    scale: float,
+    cloud: PointCloud,
+    psi_scale: float = 1.5,
+    std_factor: float = 1.0,
+    kernel: str | Kernel = "thin_plate",
+) -> ShapeGP:
+    """Return the shape given observations, with psi = `psi_scale` times their longest distance.
+
+    Args:
+        observations: of the surface, normalised.
+        center: origin of the normalised frame [m].
+        scale: length [m] of the normalised unit.
+        cloud: what was seen.
+        psi_scale: 1 is the paper's psi, for which the covariance is indefinite.
+        std_factor: see `ShapeGP`.
+        kernel: "thin_plate", "matern52", "rbf" (see `kernel_by_name`), or any `Kernel` of normalised distances.
+
+    Raises:
+        BadArgument: an unknown kernel.
+        IndefiniteCovariance: psi is too small for these observations.
+    """
+    observations = observations.to(center)
+    psi = psi_scale * longest_distance(observations.x)
+    kernel = kernel_by_name(kernel, psi) if isinstance(kernel, str) else kernel
+    posterior = posterior_given(observations, kernel)
+    check_kernel(posterior, observations.least_noise)
+    return as_shape(posterior, center, scale, cloud, psi, std_factor)
+
+
+def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
+    """Return the posterior given observations, by one Cholesky factorisation of their covariance.
+
+    Raises:
+        IndefiniteCovariance: the points are too far apart for the kernel.
+    """
+    observations = observations.with_normals_first()
+    y, noise = observations.rows()
+    matrix = gram(kernel, observations.x, int(observations.has_normal.sum()))
+    matrix.diagonal().add_(noise)
+    factor = cholesky(matrix, "the covariance K + sigma^2 I", kernel.remedy)
+    weights = torch.cholesky_solve(y[:, None], factor)[:, 0]
+    return Posterior(observations.x, observations.has_normal, weights, factor, None, kernel)
+
+
+def as_shape(
+    posterior: Posterior,
+    center: Float[Tensor, "3"],
+    scale: float,
+    cloud: PointCloud,
+    psi: float,
+    std_factor: float = 1.0,
+) -> ShapeGP:
+    """Return the shape that a normalised posterior describes, valid as far as its observations and kernel reach."""
+    radius = REACH * float(torch.linalg.vector_norm(posterior.x, dim=-1).max())
+    return ShapeGP(
+        x=posterior.x,
+        has_normal=posterior.has_normal,
+        weights=posterior.weights,
+        factor=posterior.factor,
+        order=posterior.order,
+        kernel=posterior.kernel,
+        center=center,
+        psi=psi,
+        scale=scale,
+        domain_radius=min(posterior.kernel.diameter / 2.0, radius),
+        std_factor=std_factor,
+        cloud=cloud,
+    )
+
+
+def check_kernel(posterior: Posterior, least_noise: float) -> None:
+    """Refuse a kernel that is no covariance at observations further apart than its diameter.
+
+    Generous noise on some rows can hide that from the factorisation; `least_noise`, a standard deviation, must suffice.
+
+    Raises:
+        IndefiniteCovariance: it does not.
+    """
+    kernel = posterior.kernel
+    if longest_distance(posterior.x) > kernel.diameter:
+        matrix = gram(kernel, posterior.x, posterior.oriented)
+        matrix.diagonal().add_(least_noise**2)
+        cholesky(matrix, "the covariance K", kernel.remedy)
+
+
+def longest_distance(x: Float[Tensor, "n 3"]) -> float:
+    """Return the longest distance between two of the points.
+
+    >>> longest_distance(torch.tensor([[0.0, 0, 0], [0, 3, 4]]))
+    5.0
+    """
+    return float(torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist").max())
