@@ -1,14 +1,22 @@
 """The benchmarks' own oracles agree with the library: what they call identical is."""
 
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from torchgrasp.linalg import unit
+from torchgrasp.plan.certify import certify
+from torchgrasp.plan.margin import balance_and_witness
+from torchgrasp.plan.wrench import wrenches
 from torchgrasp.shape.kernel import covariance, thin_plate
 from torchgrasp.shape.profiles import kernel_by_name
 from torchgrasp.shape.select import select_points
+from torchgrasp.specs import ContactSpec
+from torchgrasp.values import Contacts
 
 SCRIPTS = str(Path(__file__).resolve().parents[1] / "scripts")
 
@@ -50,6 +58,29 @@ def test_a_random_view_has_unit_normals_that_face_one_side(scripts, generator, b
     assert float(torch.linalg.vector_norm(x, dim=-1).max()) == pytest.approx(1.0)
     torch.testing.assert_close(normals.norm(dim=-1), torch.ones(200, dtype=torch.float64))
     assert float(torch.linalg.vector_norm(normals.mean(0))) > 0.3
+
+
+def test_rational_arithmetic_confirms_margins_and_both_verdicts(scripts, generator):
+    from benchmarks.rational import exact_margin, proves_margin_above, proves_margin_below, solve, wrench_matrix
+
+    points = torch.randn(20, 3, 3, generator=generator, dtype=torch.float64)
+    lean = torch.randn(20, 3, 3, generator=generator, dtype=torch.float64)
+    normals = unit(unit(points - points.mean(1, keepdim=True)) + 0.4 * lean)
+    none = torch.zeros(20, 3, dtype=torch.float64)
+    found = certify(Contacts(points, normals, none, none), ContactSpec(friction=0.6, friction_margin=1.0))
+    phi, _ = balance_and_witness(wrenches(points, normals, 0.6, 8).flatten(1, 2))
+    assert 3 < int(found.closed.sum()) < 17
+    for i in range(20):
+        matrix = wrench_matrix(points[i].numpy(), normals[i].numpy(), 0.6, 8)
+        exact = exact_margin(matrix)
+        assert float(exact) == pytest.approx(float(found.margin[i]), abs=1e-12)
+        little, witness = Fraction(1, 10**9), found.witness[i].numpy()
+        assert proves_margin_above(matrix, phi[i].numpy(), exact - little)
+        assert not proves_margin_above(matrix, phi[i].numpy(), exact + little)
+        assert proves_margin_below(matrix, witness, exact + little)
+        assert not proves_margin_below(matrix, witness, exact - little)
+    assert solve(np.array([[2, 1], [1, 3]]), np.array([1, 1])) == [Fraction(2, 5), Fraction(1, 5)]
+    assert solve(np.array([[2, 1], [4, 2]]), np.array([1, 1])) is None
 
 
 def test_a_row_says_whether_its_bar_is_met(scripts):

@@ -24,7 +24,7 @@ def some_grasps(g: int = 2, h: int = 4) -> Grasps:
         tip_error=rand(g, 3),
         clearance=rand(g),
         normal_angle=rand(g, 3),
-        certificate=Certificate(rand(g), rand(g), rand(g), torch.ones(g, dtype=torch.bool)),
+        certificate=Certificate(rand(g), rand(g), rand(g), torch.ones(g, dtype=torch.bool), rand(g, 6)),
         score=rand(g),
         status=torch.zeros(g, dtype=torch.int64),
         meta={"hand": "toy", "unit": "metre"},

@@ -51,7 +51,9 @@ def test_to_returns_a_new_value_and_keeps_integers():
     after = before.to(torch.float64)
     assert after.contacts.points.dtype == torch.float64 and before.contacts.points.dtype == torch.float32
     assert after.status.dtype == torch.int64
-    certificate = Certificate(*(torch.rand(2) for _ in range(3)), torch.tensor([True, False])).to(torch.float64)
+    certificate = Certificate(*(torch.rand(2) for _ in range(3)), torch.tensor([True, False]), torch.rand(2, 6)).to(
+        torch.float64
+    )
     assert certificate.closed.dtype == torch.bool
 
 

@@ -103,17 +103,20 @@ class ContactPlan(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class Certificate(Batch):
-    """Frictional form closure (Eq. 13), proven by an independent linear programme and a rank test.
+    """Frictional form closure (Eq. 13) or its absence, with what proves either; see `certify`.
 
     `margin` is the largest s with W phi = 0, sum phi = 1, phi >= s; `rank_ratio` the smallest over the largest
     singular value of W with torques divided by the contacts' radius; `residual` the largest |W phi|. `closed` needs
-    margin > 0 and full rank: Eq. (13) alone holds for coincident and for collinear contacts.
+    margin > 0 and full rank: Eq. (13) alone holds for coincident and for collinear contacts. `witness` is a unit
+    wrench (force, torque about the contacts' centre over their radius) whose product with every edge wrench is at
+    least -margin: a row that is not closed has none against it, and cannot resist it.
     """
 
     margin: Float[Tensor, "b"]
     rank_ratio: Float[Tensor, "b"]
     residual: Float[Tensor, "b"]
     closed: Bool[Tensor, "b"]
+    witness: Float[Tensor, "b 6"]
 
 
 # ------------------------------------------------------------------------------------- how this hand can touch

@@ -59,7 +59,7 @@ def grasp_of(hand, std=0.004):
         tip_error=torch.zeros(1, 3, dtype=torch.float64),
         clearance=one,
         normal_angle=torch.zeros(1, 3, dtype=torch.float64),
-        certificate=Certificate(one, one, one, torch.tensor([True])),
+        certificate=Certificate(one, one, one, torch.tensor([True]), torch.zeros(1, 6)),
         score=one,
         status=torch.zeros(1, dtype=torch.int64),
     )

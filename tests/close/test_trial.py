@@ -62,7 +62,7 @@ def pinch(name):
         tip_error=0 * three,
         clearance=0.01 * one,
         normal_angle=0 * three,
-        certificate=Certificate(one, one, 0 * one, torch.tensor([True])),
+        certificate=Certificate(one, one, 0 * one, torch.tensor([True]), torch.zeros(1, 6)),
         score=one,
         status=torch.zeros(1, dtype=torch.int64),
     )

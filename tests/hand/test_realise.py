@@ -68,7 +68,7 @@ def test_realised_grasps_are_checked_and_ranked():
     normals = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
     contacts = Contacts(0.035 * normals, normals, flat, flat)
     ones = torch.ones(6, dtype=torch.float64)
-    certificate = Certificate(torch.arange(6, dtype=torch.float64), ones, ones, ones > 0)
+    certificate = Certificate(torch.arange(6, dtype=torch.float64), ones, ones, ones > 0, ones[:, None].expand(6, 6))
     surroundings, center = Surroundings(field, None), torch.zeros(3, dtype=torch.float64)
     guess = query_hand(contacts, hand, load_mixture("barrett"))
     found = realise(guess, hand, contacts, certificate, surroundings, center)

@@ -1,6 +1,7 @@
 """Certificates against a programme written from Eq. (13) alone, and the cases in which Eq. (13) is not enough."""
 
 import math
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from torch import Tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, rotate
 from torchgrasp.linalg import unit
-from torchgrasp.plan.certify import certify
+from torchgrasp.plan import margin
+from torchgrasp.plan.certify import bound_margin, certify
+from torchgrasp.plan.wrench import wrenches
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts
 
@@ -65,6 +68,76 @@ def test_eq13_margins_agree_with_a_programme_written_from_the_equation_alone(gen
     assert float(found.residual.max()) < 1e-6
 
 
+def leaning(generator: torch.Generator, count: int) -> tuple[Tensor, Tensor]:
+    """Triples of which about half are closed."""
+    points = torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)
+    lean = torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)
+    return points, unit(unit(points - points.mean(1, keepdim=True)) + 0.4 * lean)
+
+
+def exact_products(wrench: Tensor, witness: Tensor) -> list[Fraction]:
+    """The products of a wrench with the edges in rational arithmetic: no rounding."""
+    rows, w = wrench.tolist(), [Fraction(x) for x in witness.tolist()]
+    return [sum((Fraction(x) * y for x, y in zip(row, w, strict=True)), Fraction(0)) for row in rows]
+
+
+def test_open_rows_carry_a_wrench_that_no_contact_opposes(generator):
+    points, normals = leaning(generator, 200)
+    found = certify(contacts(points, normals), SPEC)
+    edges = wrenches(points, normals, 0.6, 8).flatten(1, 2)
+    torch.testing.assert_close(torch.linalg.vector_norm(found.witness, dim=-1), torch.ones(200, dtype=torch.float64))
+    open_rows = torch.nonzero(~found.closed)[:, 0].tolist()
+    assert len(open_rows) > 50
+    for row in open_rows:
+        products = exact_products(edges[row], found.witness[row])
+        # A margin of 0 is no rarity: two contacts balance by themselves, and the third has nothing to push against.
+        assert min(products) > (0 if float(found.margin[row]) < -1e-12 else -1e-15)
+        assert max(products) > 1e-3
+    closed = exact_products(edges[found.closed][0], found.witness[found.closed][0])
+    assert min(closed) < 0 < max(closed)
+
+
+def test_margin_and_witness_bound_each_other_so_that_neither_can_be_improved(generator):
+    points, normals = leaning(generator, 500)
+    found = certify(contacts(points, normals), SPEC)
+    edges = wrenches(points, normals, 0.6, 8).flatten(1, 2)
+    torch.testing.assert_close(bound_margin(edges, found.witness), found.margin, rtol=0, atol=1e-12)
+    other = torch.randn(500, 6, generator=generator, dtype=torch.float64)
+    assert bool((bound_margin(edges, other) >= found.margin - 1e-12).all())
+
+
+@pytest.mark.parametrize("edges", [3, 8, 32])
+def test_highs_gives_the_same_certificates_where_the_batch_gives_none(generator, monkeypatch, edges):
+    points, normals = leaning(generator, 40)
+    spec = ContactSpec(friction=0.6, friction_margin=1.0, edges=edges)
+    batch = certify(contacts(points, normals), spec)
+    monkeypatch.setattr(margin, "PIVOTS", 0)
+    alone = certify(contacts(points, normals), spec)
+    assert torch.equal(batch.closed, alone.closed)
+    torch.testing.assert_close(batch.margin, alone.margin, rtol=0, atol=1e-7)
+    w = wrenches(points, normals, 0.6, edges).flatten(1, 2)
+    torch.testing.assert_close(bound_margin(w, alone.witness), alone.margin, rtol=0, atol=1e-7)
+
+
+def test_a_certificate_does_not_depend_on_the_rows_beside_it(generator):
+    points, normals = leaning(generator, 30)
+    every = certify(contacts(points, normals), SPEC)
+    some = certify(contacts(points[7:9], normals[7:9]), SPEC)
+    for name in ("margin", "rank_ratio", "witness"):
+        torch.testing.assert_close(getattr(some, name), getattr(every, name)[7:9], rtol=0, atol=1e-12)
+
+
+def test_parallel_normals_and_no_friction_leave_no_balance_at_all(generator):
+    up = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand(1, 3, 3)
+    for found in (
+        certify(contacts(triangle(), up), SPEC),
+        certify(contacts(triangle(), up), ContactSpec(friction=0.0)),
+    ):
+        assert float(found.margin) == -math.inf and not bool(found.closed)
+        # Every force has the same part along -z: it pushes down, whatever is asked of it.
+        torch.testing.assert_close(found.witness[0, 2], torch.tensor(-1.0, dtype=torch.float64))
+
+
 def test_margin_is_at_most_uniform_and_free_of_units_and_frames(motion):
     points = triangle()
     found = certify(contacts(points, points), SPEC)
@@ -91,6 +164,7 @@ def test_coincident_contacts_are_refused_though_eq13_holds_for_them():
     assert float(found.margin) > 0
     assert float(found.rank_ratio) < 1e-9
     assert not bool(found.closed)
+    assert float((wrenches(points, triangle(), 0.6) @ found.witness[0]).abs().max()) < 1e-9
 
 
 def test_collinear_contacts_are_refused_though_eq13_holds_for_them():
@@ -99,6 +173,8 @@ def test_collinear_contacts_are_refused_though_eq13_holds_for_them():
     found = certify(contacts(points, normals), SPEC)
     assert float(found.margin) > 0
     assert not bool(found.closed)
+    # No contact on the x axis can turn the object about it.
+    torch.testing.assert_close(found.witness.abs(), torch.eye(6, dtype=torch.float64)[3:4])
 
 
 def test_rows_that_are_not_finite_are_not_closed_and_harm_no_other():
@@ -107,7 +183,9 @@ def test_rows_that_are_not_finite_are_not_closed_and_harm_no_other():
     normals = triangle().repeat(3, 1, 1)
     normals[2, 1, 2] = torch.inf
     normals[2, 1] = torch.nan
-    assert certify(contacts(points, normals), SPEC).closed.tolist() == [True, False, False]
+    found = certify(contacts(points, normals), SPEC)
+    assert found.closed.tolist() == [True, False, False]
+    assert found.witness.isnan().all(-1).tolist() == [False, True, True]
 
 
 def test_no_rows_give_no_certificates():

@@ -33,7 +33,7 @@ def run() -> Run:
     joints = ((hand.lower + hand.upper) / 2).to(F64).expand(2, -1).clone()
     pose = torch.eye(4, dtype=F64).repeat(2, 1, 1)
     pose[:, 2, 3] = 0.1
-    certificate = Certificate(0.02 * one, 0.3 * one, 1e-12 * one, torch.ones(2, dtype=torch.bool))
+    certificate = Certificate(0.02 * one, 0.3 * one, 1e-12 * one, one > 0, torch.zeros(2, 6))
     status = torch.tensor([Status.OK, Status.TIP_ERROR])
     grasps = Grasps(
         joints,

@@ -1,0 +1,115 @@
+"""Verdicts on closure in rational arithmetic: what is proven here is not subject to rounding.
+
+The wrenches are written anew from Eq. (13) and rounded to multiples of 2^-60, which is finer than their own rounding;
+from there on all is exact. A proof needs no trust in who proposes it.
+"""
+
+from fractions import Fraction
+
+import numpy as np
+
+GRID = 60
+"""Wrenches are integers over 2 to this power, witnesses and coefficients over 2 to the power of 50."""
+
+
+def wrench_matrix(points: np.ndarray, normals: np.ndarray, friction: float, edges: int) -> np.ndarray:
+    """Return the m x 6 wrenches of three contacts with outward normals, from the definition, as integers.
+
+    The first edge of each cone leans along the plane of the contacts, as the library's does. Torques are about the
+    centre, over the root-mean-square distance from it.
+    """
+    arm = points - points.mean(0)
+    arm = arm / np.sqrt((arm**2).sum() / 3)
+    plane = np.cross(points[1] - points[0], points[2] - points[0])
+    rows = []
+    for p, n in zip(arm, normals, strict=True):
+        along = np.cross(plane, n)
+        along = along / np.linalg.norm(along)
+        across = np.cross(n, along)
+        for k in range(edges):
+            turn = 2 * np.pi * k / edges
+            force = friction * (np.cos(turn) * along + np.sin(turn) * across) - n
+            rows.append(np.concatenate([force, np.cross(p, force)]))
+    return _integers(np.array(rows), GRID)
+
+
+def proves_margin_below(wrench: np.ndarray, witness: np.ndarray, bound: Fraction) -> bool:
+    """Tell whether a wrench proves that no balance has a margin of `bound`.
+
+    With g the products of the witness with the wrenches, 0 = sum phi g >= s sum g + (1 - m s) min g for phi >= s.
+    """
+    product = wrench @ _integers(witness, 50)
+    least = min(product)
+    return -least < bound * sum(g - least for g in product)
+
+
+def proves_margin_above(wrench: np.ndarray, phi: np.ndarray, bound: Fraction) -> bool:
+    """Tell whether coefficients near `phi` balance exactly with a margin above `bound`, by six of full rank."""
+    m = len(wrench)
+    integers = _integers(phi, 50)
+    base = sorted(range(m), key=lambda k: -phi[k])[:6]
+    rest = [k for k in range(m) if k not in set(base)]
+    solved = solve(wrench[base].T, -(wrench[rest].T @ integers[rest]))
+    if solved is None:
+        return False
+    exact = [*solved, *(Fraction(int(integers[k])) for k in rest)]
+    return min(exact) > bound * sum(exact)
+
+
+def exact_margin(wrench: np.ndarray) -> Fraction:
+    """Return the largest s of W phi = 0, sum phi = 1, phi >= s as a fraction: a simplex method begun where HiGHS ends.
+
+    Raises:
+        ArithmeticError: no coefficients balance, or the basis of HiGHS is not feasible.
+    """
+    from scipy.optimize import linprog
+
+    m = len(wrench)
+    matrix = wrench.astype(np.float64) / 2.0**GRID
+    # phi = s + psi: seven equations in psi >= 0 and s.
+    equations = np.zeros((7, m + 1))
+    equations[:6, :m], equations[:6, m] = matrix.T, matrix.sum(0)
+    equations[6, :m], equations[6, m] = 1.0, m
+    objective, right = np.r_[np.zeros(m), -1.0], np.r_[np.zeros(6), 1.0]
+    found = linprog(objective, A_eq=equations, b_eq=right, bounds=[(0, None)] * m + [(None, None)], method="highs")
+    if found.x is None:
+        raise ArithmeticError("no coefficients balance")
+    base = sorted(range(m), key=lambda k: -found.x[k])[:6]
+    whole = np.zeros((7, m + 1), dtype=object)
+    whole[:6, :m], whole[:6, m] = wrench.T, [sum(column) for column in wrench.T]
+    whole[6, :m], whole[6, m] = 1, m
+    last = np.array([0] * 6 + [1], dtype=object)
+    columns = [*base, m]
+    while True:
+        primal, dual = solve(whole[:, columns], last), solve(whole[:, columns].T, last)
+        if primal is None or dual is None or min(primal[:6]) < 0:
+            raise ArithmeticError("the basis is not feasible")
+        entering = next((k for k in range(m) if sum(y * a for y, a in zip(dual, whole[:, k], strict=True)) < 0), None)
+        if entering is None:
+            return primal[6]
+        change = solve(whole[:, columns], whole[:, entering])
+        assert change is not None
+        lengths = {i: primal[i] / change[i] for i in range(6) if change[i] > 0}
+        columns[min(lengths, key=lambda i: (lengths[i], columns[i]))] = entering
+
+
+def solve(matrix: np.ndarray, right: np.ndarray) -> list[Fraction] | None:
+    """Solve a system of integers exactly, by elimination without fractions (Bareiss); None where it is singular."""
+    n = len(matrix)
+    rows = [[*map(int, matrix[i]), int(right[i])] for i in range(n)]
+    last = 1
+    for k in range(n):
+        at = next((i for i in range(k, n) if rows[i][k]), None)
+        if at is None:
+            return None
+        rows[k], rows[at] = rows[at], rows[k]
+        for i in range(n):
+            if i != k:
+                rows[i] = [(rows[k][k] * x - rows[i][k] * y) // last for x, y in zip(rows[i], rows[k], strict=True)]
+        last = rows[k][k]
+    return [Fraction(rows[i][n], rows[i][i]) for i in range(n)]
+
+
+def _integers(values: np.ndarray, power: int) -> np.ndarray:
+    """Return the nearest multiples of 2^-power as Python integers."""
+    return np.vectorize(round, otypes=[object])(values * 2.0**power)
