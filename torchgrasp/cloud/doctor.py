@@ -10,7 +10,8 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.cloud.check import check_cloud, keep_distinct
 from torchgrasp.cloud.filter import nearest, remove_outliers
-from torchgrasp.cloud.normals import clean_cloud, fit_planes
+from torchgrasp.cloud.local import fit_planes
+from torchgrasp.cloud.normals import clean_cloud
 from torchgrasp.cloud.orientation import NormalCheck, check_normals
 from torchgrasp.values import PointCloud
 
