@@ -28,7 +28,8 @@ class PointCloud(Value):
     Args:
         points: surface points [m], at least 4 of them.
         normals: outward normals, or None. Non-unit normals are normalised by the functions that use them.
-        viewpoint: the camera's position [m] in the cloud's frame, or None when it is not known.
+        viewpoint: the camera's position [m] in the cloud's frame, of shape (3,), or of shape (n, 3) that of the camera
+            which saw each point, for several views in one cloud; None when it is not known.
 
     Raises:
         BadArgument: wrong shape, dtype or non-finite numbers.
@@ -41,7 +42,7 @@ class PointCloud(Value):
 
     points: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"] | None = None
-    viewpoint: Float[Tensor, "3"] | None = None
+    viewpoint: Float[Tensor, "3"] | Float[Tensor, "n 3"] | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and numbers once, where the value is made."""
@@ -51,11 +52,33 @@ class PointCloud(Value):
         if self.normals is not None:
             check_tensor("normals", self.normals, (len(self.points), 3))
         if self.viewpoint is not None:
-            check_tensor("viewpoint", self.viewpoint, (3,))
+            each = isinstance(self.viewpoint, Tensor) and self.viewpoint.ndim == 2
+            check_tensor("viewpoint", self.viewpoint, (len(self.points), 3) if each else (3,))
 
     def __len__(self) -> int:
         """Count the points."""
         return len(self.points)
+
+    def select(self, rows: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> "PointCloud":
+        """Return some of the points, with what is known of them.
+
+        Args:
+            rows: a mask, or indices in the order wanted.
+        """
+        normals, eye = self.normals, self.viewpoint
+        return PointCloud(
+            points=self.points[rows],
+            normals=None if normals is None else normals[rows],
+            viewpoint=eye if eye is None or eye.ndim == 1 else eye[rows],
+        )
+
+    def split_views(self) -> "list[PointCloud]":
+        """Return the part that each camera saw, with its viewpoint (3,), in the order of their first points."""
+        if self.viewpoint is None or self.viewpoint.ndim == 1:
+            return [self]
+        _, view = self.viewpoint.unique(dim=0, return_inverse=True)
+        parts = [self.select(view == k) for k in dict.fromkeys(view.tolist())]
+        return [PointCloud(p.points, p.normals, p.viewpoint[0]) for p in parts if p.viewpoint is not None]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,8 +3,12 @@ import torch
 import trimesh
 
 from torchgrasp.cloud.camera import partial_view
+from torchgrasp.cloud.doctor import diagnose_cloud, format_report
+from torchgrasp.cloud.filter import remove_outliers, thin_cloud
 from torchgrasp.cloud.merge import merge_clouds
-from torchgrasp.errors import BadArgument
+from torchgrasp.cloud.normals import clean_cloud
+from torchgrasp.cloud.read import read_cloud, save_cloud
+from torchgrasp.errors import BadArgument, TooFewPoints
 from torchgrasp.frames import apply, inverse
 from torchgrasp.linalg import unit
 from torchgrasp.objects import load_object
@@ -34,7 +38,8 @@ def test_views_come_together_with_outward_normals_wherever_their_frames_were(two
     merged = merge_clouds(two_views, [EYE, EYE])
     moved, poses = in_own_frames(two_views, motion)
     again = merge_clouds(moved, torch.stack(poses))
-    assert len(merged) == 1200 and merged.viewpoint is None
+    assert len(merged) == 1200 and [len(view) for view in merged.split_views()] == [600, 600]
+    torch.testing.assert_close(again.viewpoint, merged.viewpoint, atol=1e-12, rtol=0)
     torch.testing.assert_close(again.points, merged.points, atol=1e-12, rtol=0)
     assert float(((again.normals * merged.normals).sum(-1) > 0.999).double().mean()) > 0.999
     _, _, face = trimesh.proximity.closest_point(load_object("jug").mesh, merged.points.numpy())
@@ -53,6 +58,43 @@ def test_a_second_view_uncovers_the_hidden_side():
         return float((shape.scale * shape.predict(side).distance).abs().quantile(0.9))
 
     assert error(merge_clouds(views, [EYE, EYE])) < 0.5 * error(views[0])
+
+
+def test_the_hidden_side_of_two_views_is_completed_too(two_views):
+    """Each camera has an outline of its own; a cloud that does not say who saw what has none."""
+    merged = merge_clouds(two_views, [EYE, EYE])
+    points, face = trimesh.sample.sample_surface(load_object("jug").mesh, 3000, seed=0)
+    side = torch.from_numpy(points[load_object("jug").mesh.face_normals[face][:, 2] > -0.5].copy())
+    hidden = side[torch.cdist(side, merged.points).amin(1) > 0.006]
+
+    def error(cloud):
+        shape = fit_shape(cloud, table=0.0)
+        return float((shape.scale * shape.predict(hidden).distance).abs().median())
+
+    assert error(merged) < 0.5 * error(PointCloud(merged.points, merged.normals))
+
+
+def test_the_cameras_of_a_merged_cloud_are_kept_in_files_and_by_every_filter(two_views, tmp_path):
+    merged = merge_clouds(two_views, [EYE, EYE])
+    back = read_cloud(save_cloud(merged, tmp_path / "merged.npz"))
+    assert torch.equal(back.viewpoint, merged.viewpoint) and torch.equal(back.normals, merged.normals)
+    with pytest.raises(BadArgument, match=r"\.npz, for a cloud of several views"):
+        save_cloud(merged, tmp_path / "merged.ply")
+    for cloud in (thin_cloud(merged, 0.004), clean_cloud(merged), remove_outliers(merged)):
+        eyes = [view.viewpoint for view in cloud.split_views()]
+        assert all(torch.equal(a, b.viewpoint) for a, b in zip(eyes, two_views, strict=True))
+    assert "0.1" in format_report(diagnose_cloud(merged))
+
+
+def test_a_merged_cloud_without_a_view_worth_the_name_is_refused(two_views):
+    points = two_views[0].points
+    each = points + 1.0  # a camera for each point
+    with pytest.raises(BadArgument, match="600 different cameras, allowed is at most 16"):
+        fit_shape(PointCloud(points, viewpoint=each))
+    few = two_views[0].viewpoint.expand(600, 3).clone()
+    few[:5] += 0.1
+    with pytest.raises(TooFewPoints, match="5 points of one view"):
+        fit_shape(PointCloud(points, viewpoint=few))
 
 
 def test_one_view_keeps_its_viewpoint_and_given_normals_turn_along(motion):

@@ -37,7 +37,7 @@ def _angles(found: Tensor, wanted: Tensor) -> Tensor:
 
 
 def test_hidden_half_of_a_cylinder_is_found(seen_cylinder: PointCloud):
-    found = complete_cloud(seen_cylinder, CAMERA, table=0.0)
+    found = complete_cloud(seen_cylinder, table=0.0)
     side = found.points[:, 2] < 0.11
     error = torch.linalg.vector_norm(found.points[side, :2], dim=-1) - 0.03
     assert len(found.points) >= 30 and (found.points[:, 0] < 0).double().mean() > 0.8
@@ -50,7 +50,7 @@ def test_hidden_half_of_a_cylinder_is_found(seen_cylinder: PointCloud):
 
 def test_back_of_a_box_is_found():
     camera = torch.tensor([0.4, 0.2, 0.3], dtype=torch.float64)
-    found = complete_cloud(_seen_box((0.025, 0.04, 0.06), camera), camera, table=0.0)
+    found = complete_cloud(_seen_box((0.025, 0.04, 0.06), camera), table=0.0)
     half = torch.tensor([0.025, 0.04, 0.06], dtype=torch.float64)
     off = ((found.points - torch.tensor([0.0, 0.0, 0.06], dtype=torch.float64)).abs() - half).amax(-1)
     assert off.abs().median() < 0.004 and off.abs().max() < 0.006
@@ -58,7 +58,7 @@ def test_back_of_a_box_is_found():
 
 
 def test_hidden_half_is_found_without_a_table(seen_cylinder: PointCloud):
-    found = complete_cloud(seen_cylinder, CAMERA)
+    found = complete_cloud(seen_cylinder)
     error = torch.linalg.vector_norm(found.points[:, :2], dim=-1) - 0.03
     assert (found.points[:, 0] < -0.01).sum() > 10
     assert error[found.points[:, 2] < 0.11].abs().median() < 0.003
@@ -67,8 +67,10 @@ def test_hidden_half_is_found_without_a_table(seen_cylinder: PointCloud):
 def test_completion_moves_with_the_object(seen_cylinder: PointCloud, motion: Tensor):
     """Directions on a fixed grid do not turn with the object, but what they are refined to nearly does."""
     assert seen_cylinder.normals is not None
-    moved = PointCloud(apply(motion, seen_cylinder.points), rotate(motion, seen_cylinder.normals))
-    found = complete_cloud(moved, apply(motion, CAMERA[None])[0])
+    camera = apply(motion, CAMERA[None])[0]
+    found = complete_cloud(
+        PointCloud(apply(motion, seen_cylinder.points), rotate(motion, seen_cylinder.normals), camera)
+    )
     back = (found.points - motion[:3, 3]) @ motion[:3, :3]
     error = torch.linalg.vector_norm(back[:, :2], dim=-1) - 0.03
     assert (back[:, 0] < -0.01).sum() > 10
@@ -76,17 +78,17 @@ def test_completion_moves_with_the_object(seen_cylinder: PointCloud, motion: Ten
 
 
 def test_mirrored_points_respect_cloud_outline_seen_surface_and_table(seen_cylinder: PointCloud):
-    found = complete_cloud(seen_cylinder, CAMERA, table=0.0)
+    found = complete_cloud(seen_cylinder, table=0.0)
     assert found.points[:, 2].min() > -0.002
     assert torch.cdist(found.points, seen_cylinder.points).min() > 0.006
     assert found.outline.hull_distance(found.points).max() < 0.001
     apart = torch.cdist(found.points, found.points) + torch.eye(len(found.points))
     assert apart.min() > 0.004
-    assert len(complete_cloud(seen_cylinder, CAMERA, table=0.0, budget=7).points) == 7
+    assert len(complete_cloud(seen_cylinder, table=0.0, budget=7).points) == 7
 
 
 def test_noise_grows_with_the_distance_from_what_was_seen(seen_cylinder: PointCloud):
-    found = complete_cloud(seen_cylinder, CAMERA, table=0.0)
+    found = complete_cloud(seen_cylinder, table=0.0)
     away = torch.cdist(found.points, seen_cylinder.points).amin(1)
     assert (found.noise >= 0.003 + 0.08 * away - 1e-12).all()
 

@@ -5,7 +5,7 @@ import math
 import torch
 
 from torchgrasp.shape.free import free_space, trespasses
-from torchgrasp.shape.silhouette import silhouette
+from torchgrasp.shape.silhouette import silhouettes
 from torchgrasp.shape.support import fit_shape
 from torchgrasp.values import PointCloud
 
@@ -14,7 +14,7 @@ CENTER = torch.tensor([0.0, 0.0, 0.06], dtype=torch.float64)
 
 def test_free_space_is_free_and_its_least_distance_is_a_lower_bound(seen_cylinder: PointCloud):
     assert seen_cylinder.viewpoint is not None
-    outline = silhouette(seen_cylinder, seen_cylinder.viewpoint)
+    outline = silhouettes(seen_cylinder)
     x, least = free_space(outline, CENTER, 0.07, table=0.0)
     points, least = 0.07 * x + CENTER, 0.07 * least
     assert len(x) > 100 and torch.linalg.vector_norm(x, dim=-1).max() < 1.15

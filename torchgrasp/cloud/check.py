@@ -59,7 +59,7 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
         if bool(zero.any()):
             raise BadArgument("normals", f"{int(zero.sum())} normals of length zero", "normals with a direction")
     if cloud.viewpoint is not None:
-        check_tensor("viewpoint", cloud.viewpoint, (3,))
+        check_tensor("viewpoint", cloud.viewpoint, (3,) if cloud.viewpoint.ndim == 1 else (len(points), 3))
     return cloud
 
 
@@ -80,7 +80,7 @@ def keep_distinct(cloud: PointCloud) -> PointCloud:
         raise TooFewPoints("points", f"{len(rows)} distinct points", f"at least {MIN_POINTS} distinct points")
     if len(rows) == len(cloud):
         return cloud
-    return PointCloud(cloud.points[rows], None if cloud.normals is None else cloud.normals[rows], cloud.viewpoint)
+    return cloud.select(rows)
 
 
 def _distinct_rows(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:

@@ -54,7 +54,7 @@ class CloudReport(Value):
     copies: int
     strays: int
     normals: NormalCheck | None
-    viewpoint: Float[Tensor, "3"] | None
+    viewpoint: Float[Tensor, "*points 3"] | None
     viewpoint_given: bool
     facing: float
     advice: tuple[str, ...]
@@ -83,10 +83,11 @@ def diagnose_cloud(cloud: PointCloud) -> CloudReport:
     clean = clean_cloud(distinct)
     assert clean.normals is not None
     # Given normals tell a whole surface; those of the clean cloud were turned towards the viewpoint.
-    normals, at = (clean.normals, clean.points) if distinct.normals is None else (distinct.normals, distinct.points)
+    told = clean if distinct.normals is None else distinct
+    eye = clean.viewpoint if told.viewpoint is None else told.viewpoint
     facing = 0.0
-    if clean.viewpoint is not None:
-        facing = float((((clean.viewpoint - at) * normals).sum(-1) > 0).double().mean())
+    if eye is not None and told.normals is not None:
+        facing = float((((eye - told.points) * told.normals).sum(-1) > 0).double().mean())
     side = (points.amax(0) - points.amin(0)).tolist()
     report = CloudReport(
         points=len(cloud),
@@ -139,9 +140,10 @@ def _describe_viewpoint(report: CloudReport) -> str:
     """Describe the viewpoint in words."""
     if report.viewpoint is None:
         return "none; the normals tell inside from outside"
-    x, y, z = report.viewpoint.tolist()
+    eyes = report.viewpoint.reshape(-1, 3).unique(dim=0).tolist()
+    places = " and ".join(f"({x:.3f}, {y:.3f}, {z:.3f})" for x, y, z in eyes)
     origin = "given" if report.viewpoint_given else "estimated"
-    return f"{origin}, ({x:.3f}, {y:.3f}, {z:.3f}) m; {100 * report.facing:.0f} % of the normals face it"
+    return f"{origin}, {places} m; {100 * report.facing:.0f} % of the normals face it"
 
 
 def _advise(report: CloudReport, clean: PointCloud) -> list[str]:

@@ -76,7 +76,7 @@ def select_rows(cloud: PointCloud, keep: Bool[Tensor, "n"], what: str) -> PointC
     """Return the points of a mask; refuse to leave fewer than a surface needs, calling them `what`."""
     if int(keep.sum()) < 4:
         raise TooFewPoints("points", f"{int(keep.sum())} {what}", "at least 4")
-    return PointCloud(cloud.points[keep], None if cloud.normals is None else cloud.normals[keep], cloud.viewpoint)
+    return cloud.select(keep)
 
 
 def nearest(points: Float[Tensor, "n 3"], k: int) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:

@@ -20,9 +20,10 @@ def merge_clouds(
 ) -> PointCloud:
     """Return the points of several views in one frame, with normals, each turned towards the camera of its view.
 
-    A view without normals gets them by `estimate_normals`, on its own: afterwards nothing tells which camera saw
-    which point. The result has no viewpoint, unless there is only one view. Points seen twice stay twice; `thin_cloud`
-    evens the density.
+    A view without normals gets them by `estimate_normals`, on its own. The result has a viewpoint for each point: every
+    camera saw free space and an outline of its own, which `fit_shape` uses. Points seen twice stay twice; `thin_cloud`
+    evens the density. A view that has normals but no viewpoint, such as a part of a scan from all sides, leaves the
+    result without any.
 
     Args:
         clouds: points [m] of the views, each in a frame of its own.
@@ -52,7 +53,9 @@ def merge_clouds(
     if len(views) == 1:
         return views[0]
     normals = [v.normals for v in views if v.normals is not None]
-    return check_cloud(PointCloud(torch.cat([v.points for v in views]), torch.cat(normals)))
+    eyes = [v.viewpoint.expand(len(v), 3) for v in views if v.viewpoint is not None]
+    viewpoint = torch.cat(eyes) if len(eyes) == len(views) else None
+    return check_cloud(PointCloud(torch.cat([v.points for v in views]), torch.cat(normals), viewpoint))
 
 
 def _view_in_frame(cloud: PointCloud, obj_from_cloud: Float[Tensor, "4 4"]) -> PointCloud:
@@ -61,5 +64,7 @@ def _view_in_frame(cloud: PointCloud, obj_from_cloud: Float[Tensor, "4 4"]) -> P
     assert cloud.normals is not None
     pose, kind = obj_from_cloud.to(cloud.points).double(), cloud.points.dtype
     points, normals = apply(pose, cloud.points.double()), rotate(pose, unit(cloud.normals.double()))
-    viewpoint = None if cloud.viewpoint is None else apply(pose, cloud.viewpoint.double()[None])[0].to(kind)
+    viewpoint = None if cloud.viewpoint is None else apply(pose, cloud.viewpoint.double().reshape(-1, 3)).to(kind)
+    if viewpoint is not None and len(viewpoint) == 1:
+        viewpoint = viewpoint[0]
     return PointCloud(points.to(kind), normals.to(kind), viewpoint)

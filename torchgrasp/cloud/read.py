@@ -33,7 +33,7 @@ def read_cloud(path: Path | str, viewpoint: Sequence[float | int] | Tensor | Non
       with their outward normals where the mesh is closed.
     * `.pcd`, ascii or binary: x y z, optionally normal_x normal_y normal_z; the camera's position from VIEWPOINT,
       except from the default `0 0 0 1 0 0 0` when that point lies within the cloud's bounding box.
-    * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3) and `viewpoint` (3,).
+    * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3) and `viewpoint` (3,), or (n, 3) of several views.
     * `.npy`, `.xyz` (text): an (n, 3) array, or (n, 6) with normals.
 
     Args:
@@ -81,7 +81,7 @@ def save_cloud(cloud: PointCloud, path: Path | str) -> Path:
     Both keep normals and viewpoint, and `read_cloud` reads both back.
 
     Raises:
-        BadArgument: another suffix.
+        BadArgument: another suffix, or several views for `.ply`, which has one viewpoint.
         OutputError: the file cannot be written.
 
     >>> save_cloud(PointCloud(torch.rand(9, 3)), "cloud.txt")
@@ -96,6 +96,8 @@ def save_cloud(cloud: PointCloud, path: Path | str) -> Path:
         np.savez_compressed(buffer, **arrays)  # pyright: ignore[reportArgumentType]
         content = buffer.getvalue()
     elif path.suffix.lower() == ".ply":
+        if cloud.viewpoint is not None and cloud.viewpoint.ndim == 2:
+            raise BadArgument("path", path, "a file ending in .npz, for a cloud of several views")
         content = format_ply(**arrays)
     else:
         raise BadArgument("path", path, "a file ending in .npz or .ply")
@@ -118,11 +120,13 @@ def _check_viewpoint(viewpoint: Any) -> Tensor:
 def _check_array(path: Path, name: str, array: Any) -> Tensor:
     """Return a numeric array of a file as float64, or refuse the file."""
     array = np.asarray(array)
-    shape = (3,) if name == "viewpoint" else (None, 3)
+    shape = (3,) if name == "viewpoint" and array.ndim == 1 else (None, 3)
     if array.dtype.kind not in "fiu":
         raise CloudFileError("path", f"{path}: {name} of type {array.dtype}", "real numbers")
     if len(array.shape) != len(shape) or array.shape[-1] != 3:
-        raise CloudFileError("path", f"{path}: {name} of shape {array.shape}", "shape (n, 3), and (3,) for a viewpoint")
+        raise CloudFileError(
+            "path", f"{path}: {name} of shape {array.shape}", "shape (n, 3), or (3,) for one viewpoint"
+        )
     if len(array) > MAX_POINTS:
         raise CloudFileError("path", f"{path} with {len(array)} points", f"at most {MAX_POINTS} points")
     bad = int((~np.isfinite(array)).reshape(-1, 3).any(1).sum())

@@ -102,9 +102,10 @@ def draw_tick(
 
 def view_of(cloud: PointCloud) -> Direction:
     """Return the direction from the cloud to its camera, or a default that looks down from the front."""
-    if cloud.viewpoint is None:
+    first = cloud.split_views()[0].viewpoint
+    if first is None:
         return (1.0, -0.8, 0.6)
-    x, y, z = (cloud.viewpoint - cloud.points.mean(0)).tolist()
+    x, y, z = (first - cloud.points.mean(0)).tolist()
     return (x, y, z)
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.cloud.normals import spread_directions
 from torchgrasp.linalg import unit
-from torchgrasp.shape.silhouette import Silhouette, farthest_points, silhouette
+from torchgrasp.shape.silhouette import Outlines, farthest_points, silhouettes
 from torchgrasp.values import PointCloud
 
 TAU = 0.003
@@ -51,12 +51,10 @@ class Completion(Value):
     noise: Float[Tensor, "m"]
     planes: Float[Tensor, "p 4"]
     scores: Float[Tensor, "p"]
-    outline: Silhouette
+    outline: Outlines
 
 
-def complete_cloud(
-    cloud: PointCloud, viewpoint: Float[Tensor, "3"], table: float | None = None, budget: int = 50
-) -> Completion:
+def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 50) -> Completion:
     """Return the hidden side that the cloud's symmetry suggests, with honest noise.
 
     A plane scores by how many mirrored points fall onto the cloud with the right normal, less twice how far they
@@ -66,21 +64,21 @@ def complete_cloud(
     allows it and no better one is near.
 
     Args:
-        cloud: clean points [m] of one view, with outward unit normals.
-        viewpoint: the camera's position [m].
+        cloud: clean points [m] of one view or of several, with outward unit normals and the viewpoint.
         table: height [m] of the table, whose normal is z; None: not known.
         budget: greatest number of points.
 
     >>> eye = torch.tensor([0.0, 0.0, 1.0]).double()
     >>> cap = unit(torch.rand(300, 3).double() - torch.tensor([0.5, 0.5, 0.0]).double())
-    >>> bool(complete_cloud(PointCloud(0.05 * cap, cap), eye).points[:, 2].min() < -0.02)
+    >>> bool(complete_cloud(PointCloud(0.05 * cap, cap, eye)).points[:, 2].min() < -0.02)
     True
     """
     from scipy.spatial import KDTree
 
     assert cloud.normals is not None
-    points, normals = cloud.points.double().cpu(), cloud.normals.double().cpu()
-    outline = silhouette(PointCloud(points, normals), viewpoint)
+    cloud = cloud.to("cpu", torch.float64)
+    points, normals, outline = cloud.points, cloud.normals, silhouettes(cloud)
+    assert normals is not None
     tree = KDTree(points.numpy())
     probes = farthest_points(points, PROBES)
     scene = _Scene(points, normals, tree, outline, table, points[probes], normals[probes])
@@ -112,7 +110,7 @@ class _Scene:
     points: Tensor
     normals: Tensor
     tree: object
-    outline: Silhouette
+    outline: Outlines
     table: float | None
     probes: Tensor
     probe_normals: Tensor
@@ -142,7 +140,7 @@ def _find_planes(scene: _Scene) -> tuple[Float[Tensor, "p 4"], Float[Tensor, "p"
     """Return the mirror planes of a scene, best first, and their scores."""
     center = (scene.points.amax(0) + scene.points.amin(0)) / 2
     size = float((scene.points.amax(0) - scene.points.amin(0)).max())
-    view = center - scene.outline.viewpoint
+    view = center - scene.outline.views[0].viewpoint
     if scene.table is None:
         directions = spread_directions(2 * DIRECTIONS, scene.points)[:DIRECTIONS]  # a half sphere: n and -n are one
         rim_prior = 0.15
@@ -152,7 +150,9 @@ def _find_planes(scene: _Scene) -> tuple[Float[Tensor, "p 4"], Float[Tensor, "p"
         view = view * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
         rim_prior = 0.0
     level = bool(torch.linalg.vector_norm(view) > 1e-6 * size)  # seen from straight above every vertical plane may do
-    facing = (directions @ unit(view)).abs() if level else torch.ones(len(directions), dtype=torch.float64)
+    # With several views no direction is hidden alone, and every plane may add points.
+    told = level and len(scene.outline.views) == 1
+    facing = (directions @ unit(view)).abs() if told else torch.ones(len(directions), dtype=torch.float64)
     along = scene.points @ directions.T
     low, high = along.amin(0), along.amax(0)
     middle, half = (low + high) / 2, ((high - low) / 2).clamp_min(0.15 * size)

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.silhouette import Silhouette, farthest_points
+from torchgrasp.shape.silhouette import Outlines, Silhouette, farthest_points
 
 OUTLINE_ERROR = 0.005
 """How far [m] the object may stand out of the outline: a camera loses rims. Of 24 true surfaces 99 % stay within
@@ -29,7 +29,7 @@ MOST = 16
 
 
 def free_space(
-    outline: Silhouette, center: Float[Tensor, "3"], scale: float, table: float | None = None
+    outline: Outlines, center: Float[Tensor, "3"], scale: float, table: float | None = None
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
     """Return points beside the outline and under the table, normalised, and the least signed distance there.
 
@@ -38,17 +38,13 @@ def free_space(
     to its visual hull. See `trespasses`.
 
     Args:
-        outline: of the single view.
+        outline: of the views.
         center: origin of the normalised frame [m].
         scale: length [m] of the normalised unit.
         table: height [m] of the table, whose normal is z; None: not known.
     """
     origin = center.double().cpu()
-    depth = float(outline.depth.median())
-    rays = [_rays_beside(outline, offset / depth) for offset in OFFSETS]
-    middle = float((origin - outline.viewpoint) @ outline.axes[2])
-    depths = middle + scale * torch.linspace(-1.0, 1.0, DEPTHS, dtype=torch.float64)
-    points = (torch.cat(rays)[:, None] * depths[:, None]).reshape(-1, 3) @ outline.axes + outline.viewpoint
+    points = torch.cat([_points_beside(view, origin, scale) for view in outline.views])
     least = outline.hull_distance(points) - OUTLINE_ERROR
     if table is not None:
         side = scale * torch.linspace(-0.9, 0.9, TABLE_GRID, dtype=torch.float64)
@@ -75,6 +71,15 @@ def trespasses(shape: ShapeGP, x: Float[Tensor, "n 3"], least: Float[Tensor, "n"
     rows = torch.nonzero(short < -TOLERANCE / shape.scale)[:, 0]
     rows = rows[torch.argsort(short[rows], stable=True)]
     return rows[farthest_points(x[rows], MOST)]
+
+
+def _points_beside(outline: Silhouette, origin: Float[Tensor, "3"], scale: float) -> Float[Tensor, "n 3"]:
+    """Return points [m] along the rays beside an outline, about as deep as the object can be."""
+    depth = float(outline.depth.median())
+    rays = [_rays_beside(outline, offset / depth) for offset in OFFSETS]
+    middle = float((origin - outline.viewpoint) @ outline.axes[2])
+    depths = middle + scale * torch.linspace(-1.0, 1.0, DEPTHS, dtype=torch.float64)
+    return (torch.cat(rays)[:, None] * depths[:, None]).reshape(-1, 3) @ outline.axes + outline.viewpoint
 
 
 def _rays_beside(outline: Silhouette, offset: float) -> Float[Tensor, "k 3"]:

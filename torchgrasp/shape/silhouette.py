@@ -1,4 +1,4 @@
-"""What a single view says of the hidden side: the object stays within its outline and behind its seen surface."""
+"""What each view says of the hidden side: the object stays within its outline and behind its seen surface."""
 
 import dataclasses
 
@@ -64,6 +64,45 @@ class Silhouette(Value):
         return self.outside[row, column] + beyond, self.depth[row, column], depth
 
 
+@dataclasses.dataclass(frozen=True)
+class Outlines(Value):
+    """The silhouettes of all views of one object: what one of them rules out is ruled out.
+
+    `rim` and `rim_normals` are those of all views.
+    """
+
+    views: tuple[Silhouette, ...]
+
+    @property
+    def rim(self) -> Float[Tensor, "k 3"]:
+        """Points of the outlines [m]."""
+        return torch.cat([view.rim for view in self.views])
+
+    @property
+    def rim_normals(self) -> Float[Tensor, "k 3"]:
+        """Normals there."""
+        return torch.cat([view.rim_normals for view in self.views])
+
+    def hull_distance(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+        """Return the signed distance [m] to the visual hull: positive where some camera would have seen the object."""
+        return torch.stack([view.hull_distance(points) for view in self.views]).amax(0)
+
+    def violation(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+        """Return how far [m] points stand out of the hull or in front of a seen surface, the worst view's."""
+        return torch.stack([view.violation(points) for view in self.views]).amax(0)
+
+
+def silhouettes(cloud: PointCloud) -> Outlines:
+    """Return the silhouette of every view of a cloud, whose viewpoints are known.
+
+    >>> cap = torch.rand(99, 3).double() - 0.5
+    >>> len(silhouettes(PointCloud(cap, viewpoint=torch.tensor([0.0, 0.0, 9.0]).double())).views)
+    1
+    """
+    parts = [(part, part.viewpoint) for part in cloud.split_views()]
+    return Outlines(tuple(silhouette(part, eye) for part, eye in parts if eye is not None))
+
+
 def silhouette(cloud: PointCloud, viewpoint: Float[Tensor, "3"], n_rim: int = 16) -> Silhouette:
     """Return the silhouette of a cloud seen from a viewpoint, from the cloud alone.
 
@@ -125,8 +164,8 @@ def farthest_points(points: Float[Tensor, "n 3"], n: int) -> Tensor:
     return torch.tensor(picks, dtype=torch.long, device=points.device)
 
 
-def seen_from_one_side(cloud: PointCloud, viewpoint: Float[Tensor, "3"]) -> bool:
-    """Tell whether the cloud's normals face the viewpoint, as those of a single view do (9 of 10 of them)."""
+def seen_from_one_side(cloud: PointCloud, viewpoint: Float[Tensor, "*points 3"]) -> bool:
+    """Tell whether the normals face the camera that saw them, as those of a view do (9 of 10 of them)."""
     assert cloud.normals is not None
     facing = ((viewpoint - cloud.points) * cloud.normals).sum(-1) > 0
     return float(facing.double().mean()) >= 0.9

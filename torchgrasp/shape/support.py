@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgrasp.cloud.check import keep_distinct
 from torchgrasp.cloud.normals import clean_cloud, estimate_normals, estimate_viewpoint, spread_directions
 from torchgrasp.cloud.orientation import drop_unoriented
-from torchgrasp.errors import BadArgument
+from torchgrasp.errors import BadArgument, TooFewPoints
 from torchgrasp.linalg import unit
 from torchgrasp.shape.complete import Completion, complete_cloud
 from torchgrasp.shape.condition import as_shape, check_kernel, longest_distance
@@ -43,6 +43,8 @@ FREE_NOISE = 0.003
 """Standard deviation [m] of the least distance observed where the shape reached into free space."""
 FREE_ROUNDS = 3
 """Times that a shape is pushed out of free space."""
+MOST_VIEWS, LEAST_SEEN = 16, 10
+"""Cameras of a merged cloud, at most, and points that each must have seen."""
 CANDIDATES = 2000
 """Points of a cloud among which the informative ones are sought, at most."""
 MOST_BUDGET = 1000
@@ -70,9 +72,9 @@ def fit_shape(
     centre of the cloud at d = -1 and 20 random points on a sphere of 1.2 at d = +1.
 
     Args:
-        cloud: points [m] of one object. A missing viewpoint is estimated. "camera" fits normals anew; given ones
-            tell a whole surface from a single view, and "paper" observes them; their signs must agree with each
-            other (`check_normals`), else they are left aside.
+        cloud: points [m] of one object, of one view or of several (`merge_clouds`). A missing viewpoint is estimated.
+            "camera" fits normals anew; given ones tell a whole surface from a single view, and "paper" observes them;
+            their signs must agree with each other (`check_normals`), else they are left aside.
         noise: standard deviation of an observed signed distance, normalised; of normals too for "paper".
         budget: points of the observed set: the one inside, 20 outside, and the rest the most informative ones of
             the cloud. Rim and mirrored points of "camera" come on top. None: points of the cloud are taken until
@@ -87,8 +89,9 @@ def fit_shape(
             "error", its mean signed distance, or of the greatest |error| + 2 sqrt(variance), "both".
 
     Raises:
-        BadArgument: an argument out of range, a cloud that `check_cloud` refuses, or a viewpoint that has not the
-            whole of a single view in front of it.
+        BadArgument: an argument out of range, a cloud that `check_cloud` refuses, a viewpoint that has not the
+            whole of its view in front of it, or more than 16 of them.
+        TooFewPoints: fewer than 10 points of one of several views.
         IndefiniteCovariance: `psi_scale` is too small, or the kernel too long for the noise.
 
     >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
@@ -99,6 +102,7 @@ def fit_shape(
     _check_model(kernel, criterion)
     model = _Model(noise, budget, psi_scale, kernel, criterion)
     cloud = drop_unoriented(cloud)
+    _check_views(cloud)
     generator = torch.Generator().manual_seed(seed)
     if support == "paper":
         return _fit_paper(cloud, model, generator)
@@ -119,7 +123,7 @@ class _Model:
 def _fit_paper(cloud: PointCloud, model: _Model, generator: torch.Generator) -> ShapeGP:
     """Return the shape from the paper's own observations (Sec. 3.1)."""
     cloud = estimate_normals(cloud) if cloud.normals is None else keep_distinct(cloud)
-    points, normals = _candidates(cloud, generator)
+    points, normals = _known(_candidates(cloud, generator))
     center = points.mean(0)
     scale = float(torch.linalg.vector_norm(points - center, dim=-1).max())
     sphere = unit(torch.randn(OUTER_POINTS, 3, dtype=torch.float64, generator=generator)).to(points)
@@ -137,17 +141,21 @@ def _fit_camera(cloud: PointCloud, model: _Model, generator: torch.Generator, ta
         # A whole surface: turned towards a viewpoint its far side would be inside out.
         cloud = PointCloud(cloud.points, cloud.normals)
     cloud = clean_cloud(cloud)
-    points, normals = _candidates(cloud, generator)
+    seen = _candidates(cloud, generator)
+    points, normals = _known(seen)
     low, high = points.amin(0), points.amax(0)
     center = (low + high) / 2
     scale = float(torch.linalg.vector_norm(points - center, dim=-1).max())
-    viewpoint = estimate_viewpoint(cloud) if cloud.viewpoint is None else cloud.viewpoint
+    if seen.viewpoint is None:
+        seen = PointCloud(points, normals, estimate_viewpoint(cloud).to(points))
+    assert seen.viewpoint is not None
     parts: list[Observations] = []
     free: list[tuple[Tensor, Tensor]] = []
     inside = True
-    if seen_from_one_side(cloud, viewpoint):  # else it is a whole surface, and nothing is hidden
-        _check_viewpoint(points, viewpoint.to(points))
-        found = complete_cloud(PointCloud(points, normals), viewpoint, table)
+    if seen_from_one_side(seen, seen.viewpoint):  # else it is a whole surface, and nothing is hidden
+        for view in seen.split_views():
+            _check_viewpoint(view)
+        found = complete_cloud(seen, table)
         parts = _observe_completion(found, center, scale)
         free = [free_space(found.outline, center, scale, table)]
         inside = float(found.outline.violation(center.cpu())) == 0.0  # not so for an arch or a bowl
@@ -211,23 +219,41 @@ def _condition(
     return as_shape(found, center, scale, cloud, psi, std_factor)
 
 
-def _candidates(cloud: PointCloud, generator: torch.Generator) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Return points and unit normals in float64, a random part of a cloud that is very dense."""
+def _candidates(cloud: PointCloud, generator: torch.Generator) -> PointCloud:
+    """Return the cloud in float64, with unit normals; a random part of it if it is very dense."""
+    cloud = cloud.to(torch.float64)
+    if len(cloud) > CANDIDATES:
+        cloud = cloud.select(torch.randperm(len(cloud), generator=generator)[:CANDIDATES].to(cloud.points.device))
     assert cloud.normals is not None
-    points, normals = cloud.points.double(), unit(cloud.normals.double())
-    if len(points) > CANDIDATES:
-        rows = torch.randperm(len(points), generator=generator)[:CANDIDATES].to(points.device)
-        points, normals = points[rows], normals[rows]
-    return points, normals
+    return PointCloud(cloud.points, unit(cloud.normals), cloud.viewpoint)
 
 
-def _check_viewpoint(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> None:
-    """Refuse a viewpoint from which part of a single view lies beside or behind the camera."""
+def _known(cloud: PointCloud) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Return points and normals of a cloud that has both."""
+    assert cloud.normals is not None
+    return cloud.points, cloud.normals
+
+
+def _check_viewpoint(view: PointCloud) -> None:
+    """Refuse a viewpoint from which part of its view lies beside or behind the camera."""
+    points, viewpoint = view.points, view.viewpoint
+    assert viewpoint is not None
     forward = (points.amax(0) + points.amin(0)) / 2 - viewpoint
     behind = int(((points - viewpoint) @ forward <= 0).sum())
     if behind:
         found = f"{viewpoint.tolist()} m, with {behind} of {len(points)} points beside or behind it"
         raise BadArgument("viewpoint", found, "the position of a camera that has the whole cloud in front of it")
+
+
+def _check_views(cloud: PointCloud) -> None:
+    """Refuse more cameras than an object has sides, and views that are too small to have an outline."""
+    if cloud.viewpoint is None or cloud.viewpoint.ndim == 1:
+        return
+    _, count = cloud.viewpoint.unique(dim=0, return_counts=True)
+    if len(count) > MOST_VIEWS:
+        raise BadArgument("viewpoint", f"{len(count)} different cameras", f"at most {MOST_VIEWS}")
+    if int(count.min()) < LEAST_SEEN:
+        raise TooFewPoints("points", f"{int(count.min())} points of one view", f"at least {LEAST_SEEN} of each")
 
 
 def _check_arguments(
