@@ -26,6 +26,8 @@ DIRECTIONS = 80
 """Directions of planes tried when it is not."""
 FACING = 0.35
 """A plane whose normal has less than this cosine with the view contains the view, and adds no hidden points."""
+ONE_SIDED = 0.05
+"""Length of the mean of the directions of view (level ones when gravity is known) from which one side was not seen."""
 MAX_PLANES = 4
 """Mirror planes used, at most, besides the one across the view that is added when none of them is."""
 WITHIN = 0.12
@@ -140,7 +142,7 @@ def _find_planes(scene: _Scene) -> tuple[Float[Tensor, "p 4"], Float[Tensor, "p"
     """Return the mirror planes of a scene, best first, and their scores."""
     center = (scene.points.amax(0) + scene.points.amin(0)) / 2
     size = float((scene.points.amax(0) - scene.points.amin(0)).max())
-    view = center - scene.outline.views[0].viewpoint
+    view = torch.stack([unit(center - seen.viewpoint) for seen in scene.outline.views]).mean(0)
     if scene.table is None:
         directions = spread_directions(2 * DIRECTIONS, scene.points)[:DIRECTIONS]  # a half sphere: n and -n are one
         rim_prior = 0.15
@@ -149,9 +151,8 @@ def _find_planes(scene: _Scene) -> tuple[Float[Tensor, "p 4"], Float[Tensor, "p"
         directions = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
         view = view * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
         rim_prior = 0.0
-    level = bool(torch.linalg.vector_norm(view) > 1e-6 * size)  # seen from straight above every vertical plane may do
-    # With several views no direction is hidden alone, and every plane may add points.
-    told = level and len(scene.outline.views) == 1
+    # Seen from above, or from sides that are far apart, no direction is hidden alone, and every plane may add points.
+    told = float(torch.linalg.vector_norm(view)) > ONE_SIDED
     facing = (directions @ unit(view)).abs() if told else torch.ones(len(directions), dtype=torch.float64)
     along = scene.points @ directions.T
     low, high = along.amin(0), along.amax(0)
