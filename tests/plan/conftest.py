@@ -46,6 +46,9 @@ class Ellipsoid:
             -2 * self.doubt * behind[:, None] * view,
         )
 
+    def slope(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        return self.value(x), x / x.new_tensor(self.axes) ** 2
+
     def normalise(self, points: Tensor) -> Tensor:
         return (points - points.new_tensor(self.center)) / self.scale
 

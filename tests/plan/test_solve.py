@@ -9,9 +9,9 @@ from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import degenerate
 from torchgrasp.linalg import unit
 from torchgrasp.plan.certify import certify
+from torchgrasp.plan.descend import project
 from torchgrasp.plan.flat import bend
 from torchgrasp.plan.solve import assess, first_violation, plan_contacts
-from torchgrasp.plan.start import project
 from torchgrasp.plan.wrench import wrenches
 from torchgrasp.specs import ContactSpec
 
@@ -83,7 +83,7 @@ def test_a_feasible_start_is_never_lost(ellipsoid):
 @pytest.mark.parametrize("spec", [ContactSpec.paper(), ContactSpec()])
 def test_a_start_without_a_gradient_is_named_and_harms_no_other(ellipsoid, generator, spec):
     around = 0.3 * unit(torch.randn(4, 3, 3, generator=generator, dtype=torch.float64))
-    around[1, 0] = 0.0  # the gradient vanishes in the centre, so no step to the surface is defined
+    around[1] = 0.0  # the gradient vanishes in the centre, so no step to the surface is defined
     plan, alone = (plan_contacts(ellipsoid, spec, ellipsoid.metres(s)) for s in (around, around[[0, 2, 3]]))
     assert plan.status[1] == Status.OUT_OF_DOMAIN
     torch.testing.assert_close(plan.contacts.points[[0, 2, 3]], alone.contacts.points)

@@ -1,4 +1,4 @@
-"""Wrenches, their balance and the exact closure test, each against its own definition or another method."""
+"""Wrenches and the exact closure test, each against its own definition or another method."""
 
 import math
 
@@ -10,8 +10,6 @@ from torchgrasp.frames import apply, rotate
 from torchgrasp.linalg import unit
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.wrench import (
-    BALANCED,
-    balance,
     centre_and_radius,
     closed_exact,
     cone_edges,
@@ -73,20 +71,6 @@ def test_tangents_are_finite_on_their_seam_and_for_degenerate_contacts():
         torch.testing.assert_close(torch.linalg.vector_norm(tangent, dim=-1), torch.ones(1, 3, dtype=torch.float64))
         torch.testing.assert_close((tangent * z).sum(-1), torch.zeros(1, 3, dtype=torch.float64))
         assert torch.isfinite(wrenches(points, z, 0.5)).all()
-
-
-def test_eq13_balance_finds_positive_coefficients_exactly_for_closed_triples(generator):
-    points, normals = triples(generator, 200)
-    w = wrenches(points, normals, 0.5)
-    phi, residual = balance(w)
-    margin = certify(contacts(points, normals), ContactSpec(friction=0.5, friction_margin=1.0)).margin
-    clear = margin.abs() > 1e-4  # nearer to 0 the two solvers' tolerances decide
-    assert 30 < int((margin > 0).sum()) < 170
-    assert torch.equal((residual <= BALANCED)[clear], (margin > 0)[clear])
-    closed = (residual <= BALANCED) & clear
-    assert bool((phi[closed] > 0).all())
-    torch.testing.assert_close(phi.sum((1, 2)), torch.ones(200, dtype=torch.float64))
-    torch.testing.assert_close(residual, (phi[..., None] * w).sum((1, 2)).abs().amax(-1))
 
 
 def test_exact_closure_agrees_with_a_programme_of_64_edges(generator):

@@ -1,7 +1,7 @@
-"""Batched Levenberg-Marquardt steps of an augmented Lagrangian on the rows of a `ContactProblem`.
+"""Batched Levenberg-Marquardt steps on the rows of a `ContactProblem`, along the surface.
 
-Every triple has its own damping; a step that does not lower its own cost is refused. The logits z enter the six
-closure rows alone, so they are eliminated exactly: what is solved per triple is a 6 x 6 and a 9 x 9 system.
+Every triple has its own damping; a step that does not lower its own cost is refused. After each step the points are
+brought back to the surface by the mean alone, which costs a fraction of a full evaluation and lets steps be long.
 """
 
 import dataclasses
@@ -12,149 +12,100 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch, SomeValue, Value
-from torchgrasp.plan.flat import BendGuide, bend_guide
-from torchgrasp.plan.problem import ContactProblem, Rows, Shape, TripleJet, carry, triple_jet
-from torchgrasp.plan.wrench import tangents
+from torchgrasp.plan.problem import ContactProblem, Rows, Shape, TripleJet, balanced_forces, triple_jet
 
 LONGEST_STEP = 0.3
 """A point moves at most this far in a step, in normalised units: about the range in which the surface is smooth."""
 
-LONGEST_TURN = 3.0
-"""A logit changes at most this much in a step."""
-
-Z_DAMPING = 0.1
-"""Damping of the logits relative to that of the points: logits range over about 10, points over about 1."""
+TENSION_DAMPING = 0.1
+"""Damping of the tensions relative to that of the points."""
 
 FIRST_DAMPING = 1e-2
 """Damping at the start of each stage."""
 
-GUIDE_EVERY = 4
-"""Steps between two evaluations of the rows for flat surface."""
-
 FEASIBILITY = 3.0
-"""Weight of the surface and of all bounds."""
+"""Weight of the surface and of all bounds but the cones."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """A number of steps with constant weights of the objective and of closure, after which multipliers may rise."""
+    """A number of steps with constant weights of the objective and of the cones.
+
+    A triple whose next step is shorter than `settled` is left alone for the rest of the stage.
+    """
 
     centre: float
-    closure: float
+    cones: float
     steps: int
-    keeps_multipliers: bool = True
-
-
-@dataclasses.dataclass(frozen=True)
-class Multipliers(Batch):
-    """Scaled multipliers: each row is shifted by its own before it is squared."""
-
-    surface: Float[Tensor, "b 3"]
-    closure: Float[Tensor, "b 6"]
-    bounds: Float[Tensor, "b k"]
+    settled: float = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
 class State(Batch):
-    """The triples with the shape at their points, the tangents that are carried along, and their damping."""
+    """The triples with the tensions of their sides, the shape at their points, and their damping."""
 
     points: Float[Tensor, "b 3 3"]
-    z: Float[Tensor, "b 3 e"]
-    tangent: Float[Tensor, "b 3 3"]
+    tension: Float[Tensor, "b 3"]
     jet: TripleJet
     damping: Float[Tensor, "b"]
 
 
-def start_state(shape: Shape, problem: ContactProblem, points: Float[Tensor, "b 3 3"]) -> State:
-    """Return the state of triples at `points` with equal coefficients."""
-    jet = triple_jet(shape, points)
-    z = points.new_zeros(len(points), 3, problem.edges)
-    return State(points, z, tangents(points, jet.normals), jet, points.new_full((len(points),), FIRST_DAMPING))
+def project(shape: Shape, points: Float[Tensor, "b k 3"], steps: int) -> Float[Tensor, "b k 3"]:
+    """Move normalised points along the gradient onto f_d = 0 by Newton steps of the mean alone."""
+    x = points.flatten(0, 1)
+    for _ in range(steps):
+        distance, gradient = shape.slope(x)
+        move = -(distance / (gradient * gradient).sum(-1))[:, None] * gradient
+        length = torch.linalg.vector_norm(move, dim=-1, keepdim=True)
+        x = x + move * (LONGEST_STEP / length).clamp(max=1.0)
+    return x.view_as(points)
 
 
-def no_multipliers(rows: Rows) -> Multipliers:
-    """Return multipliers of zero."""
-    return Multipliers(*(torch.zeros_like(r) for r in (rows.surface, rows.closure, rows.bounds)))
+def start_state(shape: Shape, points: Float[Tensor, "b 3 3"]) -> State:
+    """Return the state of triples at `points` with equal tensions: each force points to the contacts' centre."""
+    tension = level(points, points.new_ones(len(points), 3))
+    return State(points, tension, triple_jet(shape, points), points.new_full((len(points),), FIRST_DAMPING))
 
 
-def raise_multipliers(rows: Rows, multipliers: Multipliers) -> Multipliers:
-    """Return the multipliers after a stage of constant weights: equalities add up, inequalities never pull."""
-    return Multipliers(
-        multipliers.surface + rows.surface,
-        multipliers.closure + rows.closure,
-        (multipliers.bounds + rows.bounds).clamp(min=0.0),
-    )
+def level(points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
+    """Return the tensions over the mean size of the forces, which no row depends on."""
+    force, _ = balanced_forces(points, tension)
+    return tension / torch.linalg.vector_norm(force, dim=-1).mean(-1, keepdim=True)
 
 
-def shift_bounds(rows: Rows, multipliers: Multipliers) -> Float[Tensor, "b k"]:
-    """Return the bounds plus their multipliers; rows of a guide come last and have none."""
-    known = multipliers.bounds.shape[1]
-    return torch.cat([rows.bounds[:, :known] + multipliers.bounds, rows.bounds[:, known:]], 1)
-
-
-def cost(rows: Rows, multipliers: Multipliers, stage: Stage) -> Float[Tensor, "b"]:
-    """Return the augmented Lagrangian of each triple."""
-    shifted = (
-        stage.centre * rows.centre,
-        FEASIBILITY * (rows.surface + multipliers.surface),
-        stage.closure * (rows.closure + multipliers.closure),
-        FEASIBILITY * shift_bounds(rows, multipliers).clamp(min=0.0),
-    )
-    return torch.cat(shifted, 1).square().sum(1) / 2
-
-
-def step(
-    rows: Rows, multipliers: Multipliers, stage: Stage, damping: Float[Tensor, "b"]
-) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b m"], Float[Tensor, "b"]]:
-    """Return the damped Gauss-Newton step of the points and the logits, and the decrease of cost it promises.
-
-    The step is NaN where the system is not positive definite, as in a row that is not finite.
-    """
-    active = shift_bounds(rows, multipliers)
-    on = FEASIBILITY * (active > 0)
-    value = torch.cat([stage.centre * rows.centre, FEASIBILITY * (rows.surface + multipliers.surface), on * active], 1)
-    slope = torch.cat(
+def residual(rows: Rows, stage: Stage) -> tuple[Float[Tensor, "b r"], Float[Tensor, "b r"]]:
+    """Return the weighted rows, of which bounds that hold are 0, and their weights."""
+    weight = torch.full_like(rows.bounds, FEASIBILITY)
+    weight[:, :3] = stage.cones
+    weight = torch.cat(
         [
-            stage.centre * rows.centre_by_points,
-            FEASIBILITY * rows.surface_by_points,
-            on[..., None] * rows.bounds_by_points,
+            torch.full_like(rows.centre, stage.centre),
+            torch.full_like(rows.surface, FEASIBILITY),
+            weight * (rows.bounds > 0),
         ],
         1,
     )
-    closure = stage.closure * (rows.closure + multipliers.closure)
-    by_points, by_z = stage.closure * rows.closure_by_points, stage.closure * rows.closure_by_z
-    # min over dz of |closure + by_points dp + by_z dz|^2 + d |dz|^2 = |.|^2 in the metric (I + by_z by_z^T / d)^-1
-    z_damping = Z_DAMPING * damping[:, None, None]
-    soft = torch.eye(6, dtype=closure.dtype, device=closure.device) + by_z @ by_z.mT / z_damping
-    factor, failed = torch.linalg.cholesky_ex(soft)
-    whitened = torch.linalg.solve_triangular(factor, torch.cat([by_points, closure[..., None]], -1), upper=False)
-    outer_slope, outer_value = slope, value
-    before = (value.square().sum(1) + closure.square().sum(1)) / 2
-    slope, value = torch.cat([slope, whitened[..., :9]], 1), torch.cat([value, whitened[..., 9]], 1)
-    normal = slope.mT @ slope + damping[:, None, None] * torch.eye(9, dtype=slope.dtype, device=slope.device)
-    outer_factor, outer_failed = torch.linalg.cholesky_ex(normal)
-    points_step = -torch.cholesky_solve(slope.mT @ value[..., None], outer_factor)
-    points_step = torch.where(((failed == 0) & (outer_failed == 0))[:, None, None], points_step, torch.nan)
-    left = torch.cholesky_solve(closure[..., None] + by_points @ points_step, factor)
-    z_step = -(by_z.mT @ left / z_damping)[..., 0]
-    points_step = points_step.unflatten(1, (3, 3))[..., 0]
-    reach = torch.linalg.vector_norm(points_step, dim=-1).amax(-1)
-    shrink = torch.maximum(reach / LONGEST_STEP, z_step.abs().amax(-1) / LONGEST_TURN).clamp(min=1.0)
-    points_step, z_step = points_step / shrink[:, None, None], z_step / shrink[:, None]
-    flat_step = points_step.flatten(1)[..., None]
-    closure = closure + (by_points @ flat_step + by_z @ z_step[..., None])[..., 0]
-    linear = torch.cat([outer_value + (outer_slope @ flat_step)[..., 0], closure], 1)
-    return points_step, z_step, before - linear.square().sum(1) / 2
+    return weight * torch.cat([rows.centre, rows.surface, rows.bounds], 1), weight
 
 
-def join_guide(rows: Rows, guide: BendGuide | None, points: Float[Tensor, "b 3 3"]) -> Rows:
-    """Return the rows with those of the guide at `points` among the bounds."""
-    if guide is None:
-        return rows
-    bounds = torch.cat([rows.bounds, guide.rows(points)], 1)
-    return dataclasses.replace(
-        rows, bounds=bounds, bounds_by_points=torch.cat([rows.bounds_by_points, guide.by_points], 1)
-    )
+def step(
+    rows: Rows, stage: Stage, damping: Float[Tensor, "b"]
+) -> tuple[Float[Tensor, "b 12"], Float[Tensor, "b"], Float[Tensor, "b"]]:
+    """Return the damped Gauss-Newton step, how far it moves a point at most, and the decrease of cost it promises.
+
+    The step is NaN where the system is not positive definite, as in a row that is not finite.
+    """
+    value, weight = residual(rows, stage)
+    slope = weight[..., None] * torch.cat([rows.centre_by_x, rows.surface_by_x, rows.bounds_by_x], 1)
+    scale = torch.tensor([1.0] * 9 + [TENSION_DAMPING] * 3, dtype=slope.dtype, device=slope.device)
+    factor, failed = torch.linalg.cholesky_ex(slope.mT @ slope + torch.diag_embed(damping[:, None] * scale))
+    x = -torch.cholesky_solve(slope.mT @ value[..., None], factor)[..., 0]
+    x = torch.where((failed == 0)[:, None], x, torch.nan)
+    reach = torch.linalg.vector_norm(x[:, :9].unflatten(1, (3, 3)), dim=-1).amax(-1)
+    shrink = (reach / LONGEST_STEP).clamp(min=1.0)
+    x = x / shrink[:, None]
+    linear = value + (slope @ x[..., None])[..., 0]
+    return x, reach / shrink, (value.square().sum(1) - linear.square().sum(1)) / 2
 
 
 def pick(choose: Bool[Tensor, "b"], new: SomeValue, old: SomeValue) -> SomeValue:
@@ -177,49 +128,33 @@ def put(whole: SomeValue, at: Int[Tensor, "a"], part: SomeValue) -> SomeValue:
     return type(whole)(**{f.name: place(getattr(whole, f.name), getattr(part, f.name)) for f in fields})
 
 
-def descend(
-    shape: Shape,
-    problem: ContactProblem,
-    state: State,
-    multipliers: Multipliers,
-    stage: Stage,
-    settled: float,
-    flatness: float | None = None,
-) -> State:
+def descend(shape: Shape, problem: ContactProblem, state: State, stage: Stage) -> State:
     """Take up to `stage.steps` Levenberg-Marquardt steps of one evaluation each.
 
-    Triples whose next step is shorter than `settled`, or not finite, are left alone from then on. With `flatness`,
-    rows for flat surface around the contacts join, evaluated anew every `GUIDE_EVERY` steps. Tangents are carried
-    along.
+    Triples that have settled, or whose step is not finite, are left alone from then on.
     """
     whole, at = state, torch.arange(len(state), device=state.points.device)
     state = dataclasses.replace(state, damping=torch.full_like(state.damping, FIRST_DAMPING))
-    rows = problem.rows(state.points, state.z, state.tangent, state.jet)
-    guide = None
-    for i in range(stage.steps):
-        if flatness is not None and i % GUIDE_EVERY == 0:
-            guide = bend_guide(shape, state.points, state.tangent, state.jet, flatness)
-        joined = join_guide(rows, guide, state.points)
-        points_step, z_step, promised = step(joined, multipliers, stage, state.damping)
-        moves = points_step.abs().flatten(1).amax(-1) > settled
+    rows = problem.rows(state.points, state.tension, state.jet)
+    for _ in range(stage.steps):
+        x, reach, promised = step(rows, stage, state.damping)
+        moves = reach > stage.settled  # a comparison with NaN is False: such a row stays
         if not bool(moves.all()):
             whole = put(whole, at, state)
             if not bool(moves.any()):
                 return whole
-            at, state, rows, multipliers = at[moves], state[moves], rows[moves], multipliers[moves]
-            guide, joined = None if guide is None else guide[moves], joined[moves]
-            points_step, z_step, promised = points_step[moves], z_step[moves], promised[moves]
-        points, z = state.points + points_step, state.z + z_step.unflatten(1, state.z.shape[1:])
+            at, state, rows, x, promised = at[moves], state[moves], rows[moves], x[moves], promised[moves]
+        points = project(shape, state.points + x[:, :9].unflatten(1, (3, 3)), steps=1)
+        tension = level(points, state.tension + x[:, 9:])
         jet = triple_jet(shape, points)
-        before = cost(joined, multipliers, stage)
-        tried_tangent = carry(state.tangent, jet.normals)
-        tried_rows = problem.rows(points, z, tried_tangent, jet)
-        kept = (before - cost(join_guide(tried_rows, guide, points), multipliers, stage)) / promised
+        tried_rows = problem.rows(points, tension, jet)
+        before, after = (residual(r, stage)[0].square().sum(1) / 2 for r in (rows, tried_rows))
+        kept = (before - after) / promised
         inside = torch.linalg.vector_norm(points, dim=-1).amax(-1) < problem.domain_radius
-        better = (kept > 0) & inside  # a comparison with NaN is False: such a step is refused
+        better = (kept > 0) & inside  # False for NaN: such a step is refused
         # Nielsen's rule: the less of its promise a step keeps, the more the next is damped.
         eased = state.damping * (1 - (2 * kept - 1) ** 3).clamp(min=1 / 5, max=2.0)
-        tried = State(points, z, tried_tangent, jet, eased.clamp(min=1e-9))
+        tried = State(points, tension, jet, eased.clamp(min=1e-9))
         refused = dataclasses.replace(state, damping=(4 * state.damping).clamp(max=1e9))
         state, rows = pick(better, tried, refused), pick(better, tried_rows, rows)
     return put(whole, at, state)

@@ -1,11 +1,14 @@
 """The contact planning problem, Eqs. (10)-(14), for a batch of contact triples: rows and their analytic Jacobian.
 
-Unknowns of a triple are its points (3, 3) in normalised units and the logits z (3, e) of its coefficients
-phi = floor + (1 - 3 e floor) softmax(z): their sum is 1 and every one is positive, exactly, as Eq. (13) wants.
-Normals are not unknowns: Eq. (11) defines them by the points. Every inequality is written as a row <= 0.
+Unknowns x of a triple are its points (3, 3) in normalised units and the tensions (3) of the sides of its triangle.
+Eq. (13) asks for forces in the friction cones that balance. Three forces balance if and only if each is the sum of
+the pulls along the two sides that meet at its contact (internal forces: Yoshikawa and Nagai, IEEE Trans. Robotics and
+Automation 7, 1991), so that W phi = 0 holds by construction, whatever the tensions, and only the cones are left: a
+row for each contact. Normals are no unknowns: Eq. (11) defines them. Every inequality is written as a row <= 0.
 """
 
 import dataclasses
+import math
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -13,17 +16,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Batch
-from torchgrasp.frames import skew
 from torchgrasp.linalg import unit
-from torchgrasp.plan.wrench import cone_edges
 from torchgrasp.specs import ContactSpec
-
-UNIFORM_SHARE = 0.05
-"""Least coefficient of a plan as a share of the uniform 1 / (3 e): the least margin of its certificate. Without it the
-smallest coefficient ends near 1e-10, closure in name only."""
 
 INSIDE = 0.99
 """Inequalities are solved to this share of their bound, so that the last steps onto the surface stay inside."""
+
+CONE_MARGIN = 0.02
+"""By so much the cosine between force and inward normal must exceed that of the cone: strictly inside, as phi > 0."""
+
+LEAST_SIDE = 0.05
+"""Least distance of two contacts, normalised: coincident ones balance, but their wrenches do not span (rank 6)."""
 
 
 @runtime_checkable
@@ -53,6 +56,7 @@ class Shape(Protocol):
     @property
     def std_factor(self) -> float: ...  # noqa: D102
     def jet(self, x: Float[Tensor, "q 3"]) -> Jet: ...  # noqa: D102
+    def slope(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]: ...  # noqa: D102
     def normalise(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]: ...  # noqa: D102
     def metres(self, x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]: ...  # noqa: D102
 
@@ -82,28 +86,40 @@ def triple_jet(shape: Shape, points: Float[Tensor, "b 3 3"]) -> TripleJet:
 
 @dataclasses.dataclass(frozen=True)
 class Rows(Batch):
-    """Values and Jacobians of the problem's rows at a batch of triples, linear in the step of the points and z."""
+    """Values and Jacobians (the nine coordinates, then the three tensions) of the rows at a batch of triples.
 
-    surface: Float[Tensor, "b 3"]
-    closure: Float[Tensor, "b 6"]
+    `bounds` are, three each: cones, variances, the domain's ball, sides, and with a table heights.
+    """
+
     centre: Float[Tensor, "b 3"]
+    surface: Float[Tensor, "b 3"]
     bounds: Float[Tensor, "b k"]
-    surface_by_points: Float[Tensor, "b 3 9"]
-    closure_by_points: Float[Tensor, "b 6 9"]
-    closure_by_z: Float[Tensor, "b 6 m"]
-    centre_by_points: Float[Tensor, "b 3 9"]
-    bounds_by_points: Float[Tensor, "b k 9"]
+    centre_by_x: Float[Tensor, "b 3 12"]
+    surface_by_x: Float[Tensor, "b 3 12"]
+    bounds_by_x: Float[Tensor, "b k 12"]
+
+
+def balanced_forces(
+    points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"]
+) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3 3"]]:
+    """Return the forces on the object at the contacts and the sides, each from a contact to the next.
+
+    The tension of a side pulls its two ends towards each other in proportion to its length: no net force or torque.
+    """
+    sides = points.roll(-1, 1) - points
+    pull = tension[..., None] * sides
+    return pull - pull.roll(1, 1), sides
 
 
 @dataclasses.dataclass(frozen=True)
 class ContactProblem:
     """Eqs. (10)-(14) and the margins of `ContactSpec`, in the normalised units of one shape.
 
-    `lowest` is the least z coordinate of a contact, or None without a table; `separation` 0 means none.
+    `friction` is that of the round cone inside the cone with edges; `separation` is at least `LEAST_SIDE`; `lowest`
+    is the least z coordinate of a contact, or None without a table.
     """
 
     friction: float
-    edges: int
     max_variance: float
     domain_radius: float
     separation: float
@@ -117,107 +133,83 @@ class ContactProblem:
             level = torch.tensor([0.0, 0.0, spec.table + spec.contact_height], dtype=torch.float64)
             lowest = float(shape.normalise(level)[2])
         return cls(
-            friction=spec.planned_friction,
-            edges=spec.edges,
+            friction=spec.planned_friction * math.cos(math.pi / spec.edges),
             max_variance=spec.max_variance,
             domain_radius=float(shape.domain_radius),
-            separation=spec.separation / float(shape.scale),
+            separation=max(spec.separation / float(shape.scale), LEAST_SIDE),
             lowest=lowest,
         )
 
-    @property
-    def floor(self) -> float:
-        """The least coefficient."""
-        return UNIFORM_SHARE / (3 * self.edges)
-
-    def coefficients(self, z: Float[Tensor, "b 3 e"]) -> Float[Tensor, "b 3 e"]:
-        """Return phi of the logits: at least `floor`, of sum 1."""
-        soft = torch.softmax(z.flatten(1), -1).unflatten(1, z.shape[1:])
-        return self.floor + (1 - UNIFORM_SHARE) * soft
-
-    def rows(
-        self,
-        points: Float[Tensor, "b 3 3"],
-        z: Float[Tensor, "b 3 e"],
-        tangent: Float[Tensor, "b 3 3"],
-        jet: TripleJet,
-    ) -> Rows:
+    def rows(self, points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"], jet: TripleJet) -> Rows:
         """Evaluate all rows and their Jacobians.
 
         Args:
             points: contacts, normalised.
-            z: logits of the coefficients.
-            tangent: a tangent at each contact; it is made perpendicular to the normal, and carried along (parallel
-                transport) by the Jacobian, so that no seam of a frame field enters the derivatives.
+            tension: of the side from each contact to the next.
             jet: the shape at the points.
         """
         b = len(points)
-        normals = jet.normals
-        first = carry(tangent, normals)
-        edge = cone_edges(normals, first, self.friction, self.edges)  # (b, 3, e, 3)
-        phi = self.coefficients(z)
-        wrench = torch.cat([edge, torch.linalg.cross(points[:, :, None].expand_as(edge), edge)], -1).flatten(1, 2)
-        force = (phi[..., None] * edge).sum(2)  # (b, 3, 3)
-        torque = torch.linalg.cross(points, force)
-        closure = torch.cat([force, torque], -1).sum(1)
-
-        # Each force turns with its normal: dF = (push I - n lean^T) dn, for push along n and the tangential lean.
-        push = (force * normals).sum(-1)
-        lean = force - push[..., None] * normals
         identity = torch.eye(3, dtype=points.dtype, device=points.device)
-        by_normal = push[..., None, None] * identity - normals[..., :, None] * lean[..., None, :]
-        length = torch.linalg.vector_norm(jet.gradient, dim=-1)[..., None, None]
-        turn = (identity - normals[..., :, None] * normals[..., None, :]) @ jet.hessian / length
-        force_by_point = by_normal @ turn
-        torque_by_point = skew(points) @ force_by_point - skew(force)
-        closure_by_points = torch.cat([force_by_point, torque_by_point], 2).permute(0, 2, 1, 3).reshape(b, 6, 9)
-
-        soft = torch.softmax(z.flatten(1), -1)
-        mean = (soft[..., None] * wrench).sum(1, keepdim=True)
-        closure_by_z = (1 - UNIFORM_SHARE) * (soft[..., None] * (wrench - mean)).mT
-
-        bounds, bounds_by_points = self._bounds(points, jet)
-        return Rows(
-            surface=jet.distance,
-            closure=closure,
-            centre=points.mean(1),
-            bounds=bounds,
-            surface_by_points=_one_point_each(jet.gradient),
-            closure_by_points=closure_by_points,
-            closure_by_z=closure_by_z,
-            centre_by_points=identity.repeat(1, 3).expand(b, 3, 9) / 3,
-            bounds_by_points=bounds_by_points,
-        )
-
-    def _bounds(
-        self, points: Float[Tensor, "b 3 3"], jet: TripleJet
-    ) -> tuple[Float[Tensor, "b k"], Float[Tensor, "b k 9"]]:
-        """Return the inequality rows, each scaled to a length near its bound: variance, ball, separation, table."""
         threshold, ball = self.max_variance * INSIDE, self.domain_radius * INSIDE
         half_slope = 2 * threshold**0.5  # the slope of variance at the threshold, for a deviation that grows linearly
-        values = [(jet.variance - threshold) / half_slope, ((points * points).sum(-1) - ball**2) / (2 * ball)]
-        slopes = [_one_point_each(jet.variance_gradient / half_slope), _one_point_each(points / ball)]
-        if self.separation > 0:
-            wanted = self.separation / INSIDE
-            after = points.roll(-1, 1)
-            apart = points - after
-            values.append((wanted**2 - (apart * apart).sum(-1)) / (2 * wanted))
-            blocks = _one_point_each(-apart / wanted)
-            slopes.append(blocks - blocks.unflatten(2, (3, 3)).roll(1, 2).flatten(2))
+        sides = points.roll(-1, 1) - points
+        length = torch.linalg.vector_norm(sides, dim=-1)
+        along = sides / length[..., None]
+        cones, cones_by_x = self._cones(points, tension, jet)
+        values = [
+            cones,
+            (jet.variance - threshold) / half_slope,
+            ((points * points).sum(-1) - ball**2) / (2 * ball),
+            self.separation / INSIDE - length,
+        ]
+        apart = _own(along)
+        apart = apart - apart.unflatten(2, (4, 3))[:, :, [2, 0, 1, 3]].flatten(2)  # of a side's end
+        slopes = [cones_by_x, _own(jet.variance_gradient / half_slope), _own(points / ball), apart]
         if self.lowest is not None:
             values.append(self.lowest - points[..., 2] + (1 - INSIDE) * 0.1)
-            down = torch.zeros_like(points)
-            down[..., 2] = -1.0
-            slopes.append(_one_point_each(down))
-        return torch.cat(values, 1), torch.cat(slopes, 1)
+            slopes.append(_own(-identity[2].expand_as(points)))
+        return Rows(
+            centre=points.mean(1),
+            surface=jet.distance,
+            bounds=torch.cat(values, 1),
+            centre_by_x=torch.cat([identity.repeat(1, 3) / 3, torch.zeros_like(identity)], 1).expand(b, 3, 12),
+            surface_by_x=_own(jet.gradient),
+            bounds_by_x=torch.cat(slopes, 1),
+        )
+
+    def _cones(
+        self, points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"], jet: TripleJet
+    ) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 3 12"]]:
+        """Return for each contact by how much its force leaves its cone: cosines, which no size of forces changes.
+
+        With u = f / |f| the row is n.u + cosine, df = (1 - u u^T) / |f| of n its slope by the force, and u dn by the
+        normal, which turns with its own point.
+        """
+        normals = jet.normals
+        force, sides = balanced_forces(points, tension)
+        size = torch.linalg.vector_norm(force, dim=-1, keepdim=True)
+        direction = force / size
+        outward = (normals * direction).sum(-1, keepdim=True)
+        by_force = (normals - outward * direction) / size
+        steep = torch.linalg.vector_norm(jet.gradient, dim=-1, keepdim=True)
+        turned = (direction - outward * normals) / steep  # (1 - n n^T) u / |g|, which the Hessian carries to the point
+        by_normal = (turned[..., None, :] @ jet.hessian)[..., 0, :]
+        before = tension.roll(1, 1)
+        blocks = by_force.new_zeros(len(points), 3, 4, 3)
+        for i in range(3):
+            after, other = (i + 1) % 3, (i + 2) % 3
+            blocks[:, i, i] = by_normal[:, i] - (tension[:, i] + before[:, i])[:, None] * by_force[:, i]
+            blocks[:, i, after] = tension[:, i, None] * by_force[:, i]
+            blocks[:, i, other] = before[:, i, None] * by_force[:, i]
+            blocks[:, i, 3, i] = (by_force[:, i] * sides[:, i]).sum(-1)
+            blocks[:, i, 3, other] = -(by_force[:, i] * sides[:, other]).sum(-1)
+        cosine = 1 / math.sqrt(1 + self.friction**2)
+        return outward[..., 0] + cosine + CONE_MARGIN, blocks.flatten(2)
 
 
-def carry(tangent: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
-    """Carry tangents to turned normals without spin (parallel transport for small turns)."""
-    return unit(tangent - (tangent * normals).sum(-1, keepdim=True) * normals)
-
-
-def _one_point_each(slope: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 9"]:
+def _own(slope: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 12"]:
     """Lay out the Jacobian of three rows of which row i depends on point i alone."""
-    identity = torch.eye(3, dtype=slope.dtype, device=slope.device)
-    return torch.einsum("bij,ik->bikj", slope, identity).flatten(2)
+    whole = slope.new_zeros(len(slope), 3, 12)
+    for i in range(3):
+        whole[:, i, 3 * i : 3 * i + 3] = slope[:, i]
+    return whole

@@ -6,19 +6,12 @@ from torch import Tensor
 
 from torchgrasp.errors import Status
 from torchgrasp.frames import degenerate
-from torchgrasp.plan.descend import (
-    Stage,
-    descend,
-    no_multipliers,
-    pick,
-    put,
-    raise_multipliers,
-    start_state,
-)
+from torchgrasp.plan.descend import Stage, descend, pick, project, put, start_state
 from torchgrasp.plan.flat import bend
+from torchgrasp.plan.margin import balance_and_witness
 from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet
-from torchgrasp.plan.start import check_starts, is_surveyed, project, start_points
-from torchgrasp.plan.wrench import BALANCED, MIN_MARGIN, MIN_RANK_RATIO, balance, rank_ratio, wrenches
+from torchgrasp.plan.start import check_starts, is_surveyed, start_points
+from torchgrasp.plan.wrench import BALANCED, MIN_MARGIN, MIN_RANK_RATIO, rank_ratio, wrenches
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan, Contacts
 
@@ -26,18 +19,18 @@ ON_SURFACE = 1e-6
 """Largest |f_d| of a contact on the surface, in normalised units."""
 
 SEARCH = (
-    Stage(centre=0.1, closure=0.1, steps=5, keeps_multipliers=False),
-    Stage(centre=0.3, closure=3.0, steps=12),
-    Stage(centre=0.3, closure=3.0, steps=8),
-    Stage(centre=0.1, closure=3.0, steps=8),
+    Stage(centre=0.1, cones=0.1, steps=5),
+    Stage(centre=1.0, cones=1.0, steps=20),
+    Stage(centre=0.3, cones=3.0, steps=8),
 )
-"""Stages from starts anywhere. The first seeks the certain part of the surface: closure sought there from the first
-step ends in more local minima."""
+"""Stages from starts anywhere: the certain part of the surface first, then centre and closure with equal weight, as
+if Eq. (14) were a constraint, which most often it can be: the centre of three contacts that are free to move about
+a body can lie in its centre. What cannot is relaxed by the third."""
 
-IMPROVE = (Stage(centre=0.3, closure=3.0, steps=8),)
+IMPROVE = (Stage(centre=0.3, cones=3.0, steps=8),)
 """Stages from surveyed starts, most of which are feasible but for rounding: towards the centre, Eq. (14)."""
 
-FINISH = Stage(centre=0.0, closure=3.0, steps=20)
+FINISH = Stage(centre=0.0, cones=3.0, steps=20, settled=1e-8)
 """Last, feasibility alone: without the objective every residual can vanish."""
 
 
@@ -64,7 +57,7 @@ def plan_contacts(
         BadArgument: `starts` is not positive, of a wrong shape, or outside the shape's domain; `shape`, `spec` or
             `seed` is not what it should be.
 
-    Source of the scheme: augmented Lagrangian, Nocedal and Wright, Numerical Optimization, ch. 17.
+    Source of the scheme: penalties and Levenberg-Marquardt, Nocedal and Wright, Numerical Optimization, ch. 10, 17.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> plan = plan_contacts(fit_shape(load_object("jug").view), ContactSpec.paper(), starts=8)
@@ -75,15 +68,10 @@ def plan_contacts(
     check_starts(shape, spec, starts, seed)
     first = start_points(shape, spec, starts, seed)
     problem = ContactProblem.of(shape, spec)
-    state = start_state(shape, problem, first)
-    multipliers = none = no_multipliers(problem.rows(state.points, state.z, state.tangent, state.jet))
-    for stage in IMPROVE if is_surveyed(spec, starts) else SEARCH:
-        state = descend(shape, problem, state, multipliers, stage, 1e-3, spec.flatness)
-        if stage.keeps_multipliers:
-            rows = problem.rows(state.points, state.z, state.tangent, state.jet)
-            multipliers = raise_multipliers(rows, multipliers)
-    state = descend(shape, problem, state, none, FINISH, 1e-8, spec.flatness)
-    found = assess(shape, spec, project(shape, state.points, steps=6))
+    state = start_state(shape, first)
+    for stage in (*(IMPROVE if is_surveyed(spec, starts) else SEARCH), FINISH):
+        state = descend(shape, problem, state, stage)
+    found = assess(shape, spec, project(shape, state.points, steps=3))
     lost = torch.nonzero(found.status != Status.OK)[:, 0]
     begun = assess(shape, spec, first[lost])
     return put(found, lost, pick(begun.status == Status.OK, begun, found[lost]))
@@ -99,8 +87,10 @@ def assess(shape: Shape, spec: ContactSpec, points: Float[Tensor, "b 3 3"]) -> C
     wrench = wrenches(points, normals, spec.planned_friction, spec.edges)
     whole = torch.isfinite(wrench).flatten(1).all(1)
     wrench = torch.where(whole[:, None, None, None], wrench, 0.0)
-    coefficients, residual = balance(wrench)
-    closed = whole & (residual <= BALANCED) & (coefficients.flatten(1).amin(-1) >= MIN_MARGIN)
+    flat = wrench.flatten(1, 2)
+    coefficients, _ = balance_and_witness(flat)
+    residual = (coefficients[:, None] @ flat)[:, 0].abs().amax(-1)
+    closed = whole & (residual <= BALANCED) & (coefficients.amin(-1) >= MIN_MARGIN)
     closed &= rank_ratio(wrench) >= MIN_RANK_RATIO  # 0 / 0 of a row that is not whole is False
 
     apart = torch.linalg.vector_norm(metres - metres.roll(1, 1), dim=-1).amin(-1)
@@ -121,7 +111,7 @@ def assess(shape: Shape, spec: ContactSpec, points: Float[Tensor, "b 3 3"]) -> C
     good[Status.NOT_CLOSED] = closed
     return ContactPlan(
         Contacts(metres, normals, jet.variance, shape.std_factor * shape.scale * jet.variance.sqrt()),
-        coefficients,
+        coefficients.unflatten(1, wrench.shape[1:3]),
         torch.linalg.vector_norm(points.mean(1), dim=-1) * shape.scale,
         first_violation(good),
     )

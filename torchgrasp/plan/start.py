@@ -1,7 +1,5 @@
 """Where planning starts: points on a sphere as in the paper, or triples surveyed on the surface, or given points."""
 
-import math
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -9,6 +7,7 @@ from torch import Tensor
 from torchgrasp.base import check_tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
+from torchgrasp.plan.descend import project
 from torchgrasp.plan.flat import bend
 from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet
 from torchgrasp.plan.wrench import closed_exact
@@ -18,23 +17,15 @@ SURVEY = 700
 """Triples of surface points that are surveyed for certain and flat places: 2100 points cover a hand-sized object in
 steps of about 4 mm."""
 
+FAR = 0.1
+"""A start with a point further than this from the surface (normalised signed distance) is no guess of contacts."""
+
+NEAR_CENTRE = 0.1
+"""Such a start is drawn in to this distance from the centre (the paper's radius), about which it is shifted."""
+
 DRAWS, ROUNDS = 20, 8
 """Triples drawn for each start that is wanted, in each of at most so many rounds; of those on certain and flat
 surface 2 to 10 % are closed."""
-
-LONGEST_MOVE = 0.3
-"""A Newton step onto the surface is at most this long, in normalised units."""
-
-
-def project(shape: Shape, points: Float[Tensor, "b 3 3"], steps: int) -> Float[Tensor, "b 3 3"]:
-    """Move normalised points along the gradient onto f_d = 0 by Newton steps."""
-    for _ in range(steps):
-        jet = triple_jet(shape, points)
-        squared = (jet.gradient * jet.gradient).sum(-1, keepdim=True)
-        move = -jet.distance[..., None] / squared * jet.gradient
-        length = torch.linalg.vector_norm(move, dim=-1, keepdim=True)
-        points = points + move * (LONGEST_MOVE / length).clamp(max=1.0)
-    return points
 
 
 def is_surveyed(spec: ContactSpec, starts: int | Tensor) -> bool:
@@ -80,13 +71,30 @@ def start_points(
     """
     device = getattr(shape, "device", torch.device("cpu"))  # a stand-in without one lives on the CPU
     if isinstance(starts, Tensor):
-        return project(shape, shape.normalise(starts.detach().to(device, torch.float64)), steps=6)
+        return project(shape, draw_in(shape, shape.normalise(starts.detach().to(device, torch.float64))), steps=6)
     generator = torch.Generator().manual_seed(seed)
     surveyed = is_surveyed(spec, starts)
     count = SURVEY if surveyed else starts
     drawn = torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)
-    points = project(shape, (spec.start_radius * unit(drawn)).to(device), steps=6)
-    return survey(shape, spec, points, starts, generator) if surveyed else points
+    points = (spec.start_radius * unit(drawn)).to(device)
+    if not surveyed:
+        return project(shape, draw_in(shape, points), steps=6)
+    return survey(shape, spec, project(shape, points, steps=6), starts, generator)
+
+
+def draw_in(shape: Shape, points: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
+    """Return normalised starts of which those off the surface are shifted to the centre and drawn in towards it.
+
+    A point off the surface is only a direction to look in. From far away each contact ends on the part of the surface
+    that is nearest to it, uncertain or not; from near the centre the three spread over what faces them, and their
+    own centre, Eq. (14), begins where it should end. Starts on the surface are guesses of contacts and stay.
+    """
+    distance, _ = shape.slope(points.flatten(0, 1))
+    far = distance.view(points.shape[:2]).abs().amax(-1) > FAR
+    shifted = points - points.mean(1, keepdim=True)
+    longest = torch.linalg.vector_norm(shifted, dim=-1).amax(-1)
+    drawn = shifted * (NEAR_CENTRE / longest).clamp(max=1.0)[:, None, None]
+    return torch.where(far[:, None, None], drawn, points)
 
 
 def survey(
@@ -104,14 +112,12 @@ def survey(
     places, normals = points[good], jet.normals[good]
     if len(places) < 3:  # nothing to choose from: descend from the survey's own triples
         return points.repeat(starts // len(points) + 1, 1, 1)[:starts]
-    # The certificate's cones have edges; those of a round cone of this friction fit inside them.
-    friction = problem.friction * math.cos(math.pi / problem.edges)
     found, wanted = [], starts
     for _ in range(ROUNDS):
         choice = torch.randint(len(places), (DRAWS * starts, 3), generator=generator).to(places.device)
         triple = places[choice]
         choice = choice[torch.linalg.vector_norm(triple - triple.roll(1, 1), dim=-1).amin(-1) > problem.separation]
-        closed = choice[closed_exact(places[choice], normals[choice], friction)][:wanted]
+        closed = choice[closed_exact(places[choice], normals[choice], problem.friction)][:wanted]
         found.append(places[closed])
         wanted -= len(closed)
         if wanted == 0:

@@ -1,4 +1,4 @@
-"""Contact wrenches of three frictional contacts, their balance, and the exact closure test (Eq. 13).
+"""Contact wrenches of three frictional contacts, and the exact closure test (Eq. 13).
 
 All normals given here are the outward ones of the surface; a fingertip pushes along their negative. Torques are
 taken about the contacts' centre and divided by the contacts' radius, so that nothing depends on units or origin.
@@ -97,29 +97,6 @@ def rank_ratio(wrench: Float[Tensor, "b 3 e 6"]) -> Float[Tensor, "b"]:
     """Return the smallest over the largest singular value of the 6 x 3e wrench matrix of each row."""
     values = torch.linalg.svdvals(wrench.flatten(1, 2))
     return values[:, -1] / values[:, 0]
-
-
-def balance(wrench: Float[Tensor, "b 3 e 6"], steps: int = 40) -> tuple[Float[Tensor, "b 3 e"], Float[Tensor, "b"]]:
-    """Return the coefficients phi > 0, sum phi = 1 of Eq. (13) of the greatest entropy, and the largest |W phi| left.
-
-    They are phi = softmax(W^T y) with y the minimum of log sum exp(W^T y), which exists if and only if the origin is
-    inside the hull of the wrenches: a smooth convex problem in six unknowns. Rows without closure keep a residual.
-    """
-    matrix = wrench.flatten(1, 2).double()  # (b, 3e, 6)
-    y = matrix.new_zeros(len(matrix), 6)
-    for _ in range(steps):
-        phi = torch.softmax((matrix @ y[..., None])[..., 0], -1)
-        weighted = phi[..., None] * matrix
-        slope = weighted.sum(1)
-        curvature = matrix.mT @ weighted - slope[:, :, None] * slope[:, None, :]
-        newton, _ = torch.linalg.solve_ex(curvature, slope)
-        decrement = (newton * slope).sum(-1, keepdim=True)
-        # The damped step of self-concordant minimisation; a row whose curvature has vanished has no balance and stays.
-        step = newton / (1 + decrement.clamp(min=0.0).sqrt())
-        y = torch.where(torch.isfinite(step).all(-1, keepdim=True) & (decrement >= 0), y - step, y)
-    phi = torch.softmax((matrix @ y[..., None])[..., 0], -1)
-    residual = (phi[:, None] @ matrix)[:, 0].abs().amax(-1)
-    return phi.unflatten(1, wrench.shape[1:3]).to(wrench.dtype), residual.to(wrench.dtype)
 
 
 def closed_exact(points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"], friction: float) -> Bool[Tensor, "b"]:
