@@ -11,7 +11,11 @@ from torchgrasp.shape.profiles import Kernel
 
 
 def cross_covariance(
-    kernel: Kernel, x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"], near: int
+    kernel: Kernel,
+    x: Float[Tensor, "q 3"],
+    y: Float[Tensor, "n 3"],
+    near: int,
+    out: Float[Tensor, "4 q rows"] | None = None,
 ) -> Float[Tensor, "4 q rows"]:
     """Return the covariance of (d, w) at points x with what is observed at points y, Eqs. (2)-(5).
 
@@ -23,30 +27,38 @@ def cross_covariance(
         x: points, normalised.
         y: points, of which the first `near` are observed with normals.
         near: see `y`.
+        out: where to write the result; new memory costs more than the arithmetic.
 
     Returns:
         For each component of (d, w) at x a matrix with the columns of `covariance`: first all d, then w1, w2, w3.
     """
     n = len(y)
-    d = [x[:, m, None] - y[None, :, m] for m in range(3)]
-    k, slope, bend = kernel.slopes(torch.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), 3)
-    out = x.new_empty(4, len(x), n + 3 * near)
+    d, r = separations(x, y)
+    k, slope, bend = kernel.slopes(r, 3)
+    if out is None:
+        out = x.new_empty(4, len(x), n + 3 * near)
     out[0, :, :n] = k
     for m in range(3):
         torch.mul(slope, d[m], out=out[m + 1, :, :n])
     if not near:
         return out
-    inner, bend, d = -slope[:, :near], bend[:, :near], [part[:, :near] for part in d]
+    d, slope, bend = [part[:, :near] for part in d], -slope[:, :near], -bend[:, :near]
     for m in range(3):
         columns = slice(n + m * near, n + (m + 1) * near)
-        torch.mul(inner, d[m], out=out[0, :, columns])
+        torch.mul(slope, d[m], out=out[0, :, columns])
         tilted = bend * d[m]
-        torch.addcmul(inner, tilted, d[m], value=-1.0, out=out[m + 1, :, columns])
+        torch.addcmul(slope, tilted, d[m], out=out[m + 1, :, columns])
         for p in range(m):
             block = out[m + 1, :, n + p * near : n + (p + 1) * near]
-            torch.mul(tilted, d[p], out=block).neg_()
+            torch.mul(tilted, d[p], out=block)
             out[p + 1, :, columns] = block
     return out
+
+
+def separations(x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"]) -> tuple[list[Tensor], Float[Tensor, "q n"]]:
+    """Return x - y component by component, and its length, without the cancellation of |x|^2 - 2 x.y + |y|^2."""
+    d = [x[:, m, None] - y[None, :, m] for m in range(3)]
+    return d, (d[0] * d[0]).addcmul_(d[1], d[1]).addcmul_(d[2], d[2]).sqrt_()
 
 
 def covariance_rows(

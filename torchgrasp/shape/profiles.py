@@ -132,12 +132,12 @@ def differentiate_profile(profile: Profile, r: Float[Tensor, "*s"], count: int) 
 
 def _slopes_of_plate(psi: float, r: Tensor, count: int) -> tuple[Tensor, ...]:
     """Return the slopes of the thin plate; the last two are infinite at r = 0, and given as 0."""
-    found = [r * r * (2.0 * r - 3.0 * psi) + psi**3, 6.0 * (r - psi)]
+    found = [(2.0 * r).sub_(3.0 * psi).mul_(r).mul_(r).add_(psi**3), (6.0 * r).sub_(6.0 * psi)]
     if count > 2:
-        inverse = torch.where(r > 0, 1.0 / r, 0.0)
+        inverse = torch.reciprocal(r).masked_fill_(r == 0, 0.0)
         found.append(6.0 * inverse)
         if count > 3:
-            found.append(-6.0 * inverse * inverse * inverse)
+            found.append((inverse * inverse).mul_(inverse).mul_(-6.0))
     return tuple(found)
 
 
