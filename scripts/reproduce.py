@@ -13,7 +13,7 @@ import trimesh
 import tyro
 from PIL import Image, ImageDraw, ImageFont
 
-from torchgrasp import PointCloud, fit_shape, list_objects, load_object
+from torchgrasp import PointCloud, ShapeGP, fit_shape, list_objects, load_object
 from torchgrasp.files import write_atomically
 from torchgrasp.report.canvas import Canvas, draw_bar
 from torchgrasp.report.palette import INK, PAPER
@@ -27,12 +27,16 @@ POINTS = 1000
 BUDGET = 200
 """Observations of a whole cloud; a partial one has some 160, with those that complete it."""
 ROWS = ("whole cloud", "shape from the whole cloud", "partial cloud", "shape from the partial cloud")
+ARROW = 0.07
+"""Length of the observed normals over the object's diagonal."""
 TURN = 70.0
 """Angle [deg] from the camera of the partial cloud to the eye of the figure: both sides show."""
 
 
 def fig4(out: Path, seed: int = 0) -> None:
     """Draw Fig. 4: four objects as whole and partial clouds, and their shapes coloured by standard deviation.
+
+    Arrows are the points that a shape observes on the surface, of the cloud and of its completion, with its normals.
 
     Args:
         out: folder of fig4.png; it is made where it does not exist.
@@ -46,18 +50,20 @@ def fig4(out: Path, seed: int = 0) -> None:
         whole = fit_shape(clouds[0], budget=BUDGET, support="paper", seed=seed)
         shapes = [whole, fit_shape(clouds[1], seed=seed, table=0.0)]
         surfaces = [extract_surface(shape, 64) for shape in shapes]
+        arrows = [observed_normals(shape) for shape in shapes]
         for kind, surface in zip(("whole", "partial"), surfaces, strict=True):
             std = 1e3 * surface.std_m
             print(f"{name:10}{kind:9} std [mm]: median {std.median():.1f}, 99 % {std.quantile(0.99):.1f}")
-        scenes.append((thing, clouds, surfaces))
+        scenes.append((thing, clouds, surfaces, arrows))
     # One scale for all: the whole clouds' surfaces are sure, and it shows.
-    most = 1e3 * max(float(surface.std_m.quantile(0.99)) for _, _, surfaces in scenes for surface in surfaces)
+    most = 1e3 * max(float(surface.std_m.quantile(0.99)) for _, _, surfaces, _ in scenes for surface in surfaces)
     sheet = Image.new("RGB", (TILE[0] * len(scenes), TILE[1] * len(ROWS) + 110), PAPER)
-    for column, (thing, clouds, surfaces) in enumerate(scenes):
+    for column, (thing, clouds, surfaces, arrows) in enumerate(scenes):
         eye = turned(view_of(thing.view), TURN)
         corners = np.asarray(thing.mesh.vertices)
-        for row, what in enumerate((clouds[0], surfaces[0], clouds[1], surfaces[1])):
-            sheet.paste(draw(what, most, corners, eye), (column * TILE[0], row * TILE[1] + 30))
+        rows = ((clouds[0], None), (surfaces[0], arrows[0]), (clouds[1], None), (surfaces[1], arrows[1]))
+        for row, (what, normals) in enumerate(rows):
+            sheet.paste(draw(what, normals, most, corners, eye), (column * TILE[0], row * TILE[1] + 30))
     pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(22)
     for row, title in enumerate(ROWS):
         pen.text((12, row * TILE[1] + 10), title, INK, font)
@@ -72,8 +78,20 @@ def sample_whole(mesh: trimesh.Trimesh, seed: int) -> PointCloud:
     return PointCloud(torch.from_numpy(np.array(points)), torch.from_numpy(np.array(mesh.face_normals[faces])))
 
 
-def draw(what: PointCloud | Surface, most: float, corners: np.ndarray, eye: tuple[float, float, float]) -> Image.Image:
-    """Draw points by height, or a surface by its standard deviation up to `most` [mm]."""
+def observed_normals(shape: ShapeGP) -> tuple[np.ndarray, np.ndarray]:
+    """Return the observed points [m] of the surface and the shape's normals there."""
+    points = shape.metres(shape.x[shape.has_normal])
+    return points.numpy(), shape.predict(points).normal.numpy()
+
+
+def draw(
+    what: PointCloud | Surface,
+    arrows: tuple[np.ndarray, np.ndarray] | None,
+    most: float,
+    corners: np.ndarray,
+    eye: tuple[float, float, float],
+) -> Image.Image:
+    """Draw points by height, or a surface by its standard deviation up to `most` [mm] with arrows on it."""
     canvas = Canvas()
     if isinstance(what, PointCloud):
         points = what.points.numpy()
@@ -82,6 +100,8 @@ def draw(what: PointCloud | Surface, most: float, corners: np.ndarray, eye: tupl
         vertices, faces, normals = what.vertices.numpy(), what.faces.numpy(), what.normals.numpy()
         canvas.add_values(vertices, faces, normals, 1e3 * what.std_m.numpy(), most, "viridis")
         corners = np.concatenate([corners, vertices])
+    if arrows:
+        canvas.add_arrows(*arrows, ARROW * float(np.linalg.norm(np.ptp(corners, axis=0))), INK)
     picture = Image.open(io.BytesIO(canvas.shoot(corners, eye)))
     width, height = round(picture.width * TILE[1] / picture.height), TILE[1]
     left = (width - TILE[0]) // 2  # the objects are taller than wide

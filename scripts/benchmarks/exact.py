@@ -10,7 +10,7 @@ from tqdm import tqdm
 from benchmarks.common import Row, least_seconds, random_view
 from benchmarks.peers import select_by_refitting
 from torchgrasp.cloud.normals import spread_directions
-from torchgrasp.errors import IndefiniteCovariance
+from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.frames import rotation_from_vector
 from torchgrasp.linalg import cholesky
 from torchgrasp.shape.blocks import gram
@@ -19,6 +19,7 @@ from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.observe import Observations, join, off_surface, on_surface
 from torchgrasp.shape.profiles import kernel_by_name
 from torchgrasp.shape.select import select_points
+from torchgrasp.shape.support import fit_shape
 from torchgrasp.values import PointCloud
 
 PSI_SCALE = 1.5
@@ -191,3 +192,37 @@ def bench_update(n: int = 70, seeds: int = 10) -> Row:
         difference <= 1e-9 and middle <= 2e-3,
         {"difference": difference, "seconds": seconds, "refit_s": refits},
     )
+
+
+def bench_refusals(points: int = 2000) -> Row:
+    """Give bad clouds to the fit, and take the time until they are refused."""
+    x, normals = random_view(points, torch.Generator().manual_seed(0))
+    x, along = 0.05 * x, torch.linspace(0, 0.1, points, dtype=torch.float64)[:, None]
+    spoilt = PointCloud(x.clone(), normals)
+    spoilt.points[points // 2] = torch.nan  # after the value was made, which refuses it, too
+    zero = PointCloud(x, torch.where(torch.arange(points)[:, None] == 7, 0.0, normals))
+    bad = {
+        "not finite": spoilt,
+        "a normal of length 0": zero,
+        "copies of three points": PointCloud(x[:3].repeat(points // 3, 1)),
+        "on a line": PointCloud(along * x.new_tensor([1.0, 2.0, -1.0])),
+        "in mm": PointCloud(1000 * x, normals),
+    }
+    seconds = {name: least_seconds(partial(_refuse, cloud)) for name, cloud in bad.items()}
+    slowest = max(seconds, key=lambda name: seconds[name])
+    return Row(
+        f"bad clouds of {points} points, refused by name",
+        "<= 50 ms",
+        f"{1e3 * seconds[slowest]:.1f} ms ({slowest})",
+        seconds[slowest] <= 0.05,
+        seconds,
+    )
+
+
+def _refuse(cloud: PointCloud) -> None:
+    """Fit a shape, which must be refused."""
+    try:
+        fit_shape(cloud)
+    except BadArgument:
+        return
+    raise AssertionError("a bad cloud was accepted")

@@ -10,14 +10,14 @@ import torch
 from tqdm import tqdm
 
 from benchmarks.common import Row, least_seconds, write_rows
-from benchmarks.exact import bench_cholesky, bench_laws, bench_selection, bench_update
+from benchmarks.exact import bench_cholesky, bench_laws, bench_refusals, bench_selection, bench_update
 from benchmarks.speed import bench_growth, bench_memory, bench_queries, bench_raw
 from torchgrasp.plan.survive import closure_survival
 from torchgrasp.shape.calibrate import Row as View
 from torchgrasp.shape.calibrate import format_table, mean_row, measure_shape, read_views
 from torchgrasp.shape.support import fit_shape
 
-SUBJECTS = ("selection", "laws", "update", "queries", "memory", "raw", "growth", "objects", "cholesky")
+SUBJECTS = ("refusals", "selection", "laws", "update", "queries", "memory", "raw", "growth", "objects", "cholesky")
 
 
 def shape(
@@ -34,7 +34,7 @@ def shape(
 
     Args:
         objects: folder with manifest.json and a folder for each object; without it the hidden side is not measured.
-        only: subjects to measure, of selection, laws, update, queries, memory, raw, growth, objects, cholesky.
+        only: subjects to measure: refusals, selection, laws, update, queries, memory, raw, growth, objects, cholesky.
         clouds: random partial clouds whose covariance is factored; 10^4 take about ten minutes.
         queries: points at which the shape is asked; ten times as many for the memory.
         threads: of torch, for the library and its peers alike. Times are the least of some
@@ -49,6 +49,7 @@ def shape(
     torch.set_num_threads(threads)
     clouds, queries = (clouds // 100, queries // 10) if quick else (clouds, queries)
     subjects: dict[str, Callable[[], list[Row]]] = {
+        "refusals": lambda: [bench_refusals()],
         "selection": lambda: bench_selection(2 if quick else 5),
         "laws": lambda: [bench_laws()],
         "update": lambda: [bench_update()],
