@@ -12,8 +12,10 @@ from torchgrasp.plan.certify import certify
 from torchgrasp.plan.descend import project
 from torchgrasp.plan.flat import bend
 from torchgrasp.plan.solve import assess, first_violation, plan_contacts
+from torchgrasp.plan.start import draw_in, drawn_starts
 from torchgrasp.plan.wrench import wrenches
 from torchgrasp.specs import ContactSpec
+from torchgrasp.values import PointCloud
 
 SPECS = {"paper": ContactSpec.paper(), "table": ContactSpec(table=0.472, contact_height=0.005, flatness=0.6)}
 
@@ -89,6 +91,54 @@ def test_a_start_without_a_gradient_is_named_and_harms_no_other(ellipsoid, gener
     torch.testing.assert_close(plan.contacts.points[[0, 2, 3]], alone.contacts.points)
 
 
+def test_a_warm_start_comes_first_and_keeps_what_was_found(ellipsoid):
+    spec = SPECS["table"]
+    plan = plan_contacts(ellipsoid, spec, starts=30, seed=2)
+    warm = int((plan.status == Status.OK).sum())
+    again = plan_contacts(ellipsoid, spec, starts=5, seed=9, warm_start=plan)
+    assert len(again) == warm + 5
+    assert bool((again.status[:warm] == Status.OK).all())
+    fresh = plan_contacts(ellipsoid, spec, starts=5, seed=9)
+    torch.testing.assert_close(again.contacts.points[warm:], fresh.contacts.points)
+
+
+def test_a_time_budget_ends_after_a_chunk_and_changes_no_row(ellipsoid, monkeypatch):
+    monkeypatch.setattr("torchgrasp.plan.start.CHUNK", 4)
+    whole = plan_contacts(ellipsoid, ContactSpec.paper(), starts=10)
+    part = plan_contacts(ellipsoid, ContactSpec.paper(), starts=10, time_budget=1e-9)
+    assert len(whole) == 10
+    assert len(part) == 4
+    torch.testing.assert_close(part.contacts.points, whole.contacts.points[:4])
+
+
+def test_more_starts_only_add_rows(ellipsoid, monkeypatch):
+    monkeypatch.setattr("torchgrasp.plan.start.CHUNK", 5)
+    for spec in SPECS.values():
+        few, many = (plan_contacts(ellipsoid, spec, starts=count) for count in (10, 15))
+        torch.testing.assert_close(few.contacts.points, many.contacts.points[:10])
+
+
+def test_starts_are_drawn_from_the_cloud(ellipsoid, generator):
+    around = unit(torch.randn(400, 3, generator=generator, dtype=torch.float64)) * torch.tensor(ellipsoid.axes)
+    seen = dataclasses.replace(ellipsoid, cloud=PointCloud(ellipsoid.metres(around[around[:, 1] > 0])))
+    for spec in SPECS.values():
+        first = torch.cat(list(drawn_starts(seen, spec, 8, 0, "cloud")))
+        assert first.shape == (8, 3, 3)
+        assert float(seen.value(first).abs().max()) < 1e-9
+        assert float(first[..., 1].min()) > -1e-6
+    assert len(plan_contacts(seen, ContactSpec.paper(), starts=8, start_from="cloud")) == 8
+    with pytest.raises(BadArgument, match="holds no cloud"):
+        plan_contacts(ellipsoid, starts=8, start_from="cloud")
+
+
+def test_far_starts_are_drawn_in_and_those_on_the_surface_stay(ellipsoid, generator):
+    on = project(ellipsoid, 0.9 * unit(torch.randn(3, 3, 3, generator=generator, dtype=torch.float64)), 8)
+    torch.testing.assert_close(draw_in(ellipsoid, on), on)
+    drawn = draw_in(ellipsoid, 2 * on)
+    torch.testing.assert_close(drawn.mean(1), torch.zeros(3, 3, dtype=torch.float64))
+    assert float(torch.linalg.vector_norm(drawn, dim=-1).max()) <= 0.1 + 1e-12
+
+
 def test_no_starts_give_no_rows(ellipsoid):
     assert len(plan_contacts(ellipsoid, ContactSpec(), torch.zeros(0, 3, 3))) == 0
 
@@ -142,6 +192,9 @@ def test_bad_numbers_of_starts_are_refused(ellipsoid, starts):
 
 
 def test_what_is_no_shape_specification_or_seed_is_refused(ellipsoid):
+    for seconds in (0.0, float("nan")):
+        with pytest.raises(BadArgument, match="time_budget"):
+            plan_contacts(ellipsoid, starts=3, time_budget=seconds)
     with pytest.raises(BadArgument, match="seed: found -1"):
         plan_contacts(ellipsoid, starts=3, seed=-1)
     wrong = (BadArgument, TypeError)  # TypeError: the annotations are checked in tests

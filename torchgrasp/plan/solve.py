@@ -1,16 +1,19 @@
 """From a shape with uncertainty to contact triples: Eqs. (10)-(14) solved from many starts at once."""
 
+import time
+from collections.abc import Iterator
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.errors import Status
+from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import degenerate
-from torchgrasp.plan.descend import Stage, descend, pick, project, put, start_state
+from torchgrasp.plan.descend import Stage, descend, join, pick, project, put, start_state
 from torchgrasp.plan.flat import bend
 from torchgrasp.plan.margin import balance_and_witness
 from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet
-from torchgrasp.plan.start import check_starts, is_surveyed, start_points
+from torchgrasp.plan.start import StartFrom, check_starts, drawn_starts, given_starts
 from torchgrasp.plan.wrench import BALANCED, MIN_MARGIN, MIN_RANK_RATIO, rank_ratio, wrenches
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan, Contacts
@@ -39,23 +42,32 @@ def plan_contacts(
     spec: ContactSpec | None = None,
     starts: int | Float[Tensor, "b 3 3"] = 1000,
     seed: int = 0,
+    *,
+    start_from: StartFrom = "sphere",
+    warm_start: ContactPlan | None = None,
+    time_budget: float | None = None,
 ) -> ContactPlan:
     """Plan three contacts from each of many starts, Eqs. (10)-(14): one row a start, in the order of the starts.
 
-    A row that fails carries the `Status` of the first constraint that it violates. Points are in metres and the
-    frame of the cloud, normals outward. With `spec.flatness` drawn starts are surveyed (see `start_points`); where
-    the descent from a feasible start fails, the start itself is the plan.
+    A row that fails carries the `Status` of the first constraint that it violates; where no contacts can satisfy them
+    all rows do. Points are in metres and the frame of the cloud, normals outward. With `spec.flatness` drawn starts
+    are surveyed (see `drawn_starts`); where the descent from a feasible start fails, the start itself is the plan. The
+    result is deterministic without `time_budget`, and the first rows of a plan from more starts are the same.
 
     Args:
         shape: a `ShapeGP`, or another implicit surface with the same methods.
         spec: what the contacts must satisfy; `ContactSpec()` by default.
-        starts: the number of starts, drawn from the sphere of `spec.start_radius` about the shape's centre
-            (Sec. 6.2), or the starting points themselves [m].
+        starts: the number of starts, drawn by `start_from`, or the starting points themselves [m].
         seed: seed of the draw.
+        start_from: "sphere": that of `spec.start_radius` about the shape's centre (Sec. 6.2); "cloud": what was seen.
+        warm_start: an earlier plan, also for another estimate of the same object: its OK rows are the first starts,
+            before all others.
+        time_budget: seconds of wall time after which no further 500 starts are begun: the rows found until then are
+            the plan. None: all starts.
 
     Raises:
-        BadArgument: `starts` is not positive, of a wrong shape, or outside the shape's domain; `shape`, `spec` or
-            `seed` is not what it should be.
+        BadArgument: `starts` is not positive, of a wrong shape, or outside the shape's domain; another argument is
+            not what it should be.
 
     Source of the scheme: penalties and Levenberg-Marquardt, Nocedal and Wright, Numerical Optimization, ch. 10, 17.
 
@@ -65,11 +77,47 @@ def plan_contacts(
     torch.Size([8, 3, 3])
     """
     spec = ContactSpec() if spec is None else spec
-    check_starts(shape, spec, starts, seed)
-    first = start_points(shape, spec, starts, seed)
+    check_starts(shape, spec, starts, seed, start_from)
+    if time_budget is not None and not time_budget > 0:  # also refuses NaN
+        raise BadArgument("time_budget", time_budget, "a positive number of seconds, or None")
+    began = time.monotonic()
+    found: list[ContactPlan] = []
+    for first, stages in _chunks(shape, spec, starts, seed, start_from, warm_start):
+        if found and time_budget is not None and time.monotonic() - began > time_budget:
+            break
+        found.append(plan_chunk(shape, spec, first, stages))
+    return join(found)
+
+
+def _chunks(
+    shape: Shape,
+    spec: ContactSpec,
+    starts: int | Float[Tensor, "b 3 3"],
+    seed: int,
+    start_from: StartFrom,
+    warm_start: ContactPlan | None,
+) -> Iterator[tuple[Float[Tensor, "_ 3 3"], tuple[Stage, ...]]]:
+    """Yield normalised starts on the surface and the stages from there, chunk by chunk."""
+    if warm_start is not None:
+        warm = warm_start.contacts.points[warm_start.status == Status.OK]
+        check_starts(shape, spec, warm, seed, start_from)
+        for first in given_starts(shape, warm):
+            yield first, IMPROVE
+    if isinstance(starts, Tensor):
+        for first in given_starts(shape, starts):
+            yield first, SEARCH
+    else:
+        for first in drawn_starts(shape, spec, starts, seed, start_from):
+            yield first, SEARCH if spec.flatness is None else IMPROVE
+
+
+def plan_chunk(
+    shape: Shape, spec: ContactSpec, first: Float[Tensor, "b 3 3"], stages: tuple[Stage, ...]
+) -> ContactPlan:
+    """Plan from normalised starts on the surface; a feasible start from which nothing is found is itself the plan."""
     problem = ContactProblem.of(shape, spec)
     state = start_state(shape, first)
-    for stage in (*(IMPROVE if is_surveyed(spec, starts) else SEARCH), FINISH):
+    for stage in (*stages, FINISH):
         state = descend(shape, problem, state, stage)
     found = assess(shape, spec, project(shape, state.points, steps=3))
     lost = torch.nonzero(found.status != Status.OK)[:, 0]

@@ -1,5 +1,8 @@
 """Where planning starts: points on a sphere as in the paper, or triples surveyed on the surface, or given points."""
 
+from collections.abc import Iterator
+from typing import Literal, get_args
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -12,6 +15,7 @@ from torchgrasp.plan.flat import bend
 from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet
 from torchgrasp.plan.wrench import closed_exact
 from torchgrasp.specs import ContactSpec
+from torchgrasp.values import PointCloud
 
 SURVEY = 700
 """Triples of surface points that are surveyed for certain and flat places: 2100 points cover a hand-sized object in
@@ -28,12 +32,13 @@ DRAWS, ROUNDS = 20, 8
 surface 2 to 10 % are closed."""
 
 
-def is_surveyed(spec: ContactSpec, starts: int | Tensor) -> bool:
-    """Tell whether starts are drawn from a survey of the surface."""
-    return spec.flatness is not None and not isinstance(starts, Tensor)
+CHUNK = 500
+"""Starts that are planned at once: memory is bounded, and results come early."""
+
+StartFrom = Literal["sphere", "cloud"]
 
 
-def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor, seed: int) -> None:
+def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor, seed: int, start_from: str) -> None:
     """Refuse starts that are no positive number, of a wrong shape, or outside the shape's domain, by `BadArgument`.
 
     What is no shape, specification or seed is refused, too.
@@ -44,6 +49,10 @@ def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor, seed: in
         raise BadArgument("seed", seed, "an integer from 0")
     if not isinstance(spec, ContactSpec):
         raise BadArgument("spec", type(spec).__name__, "a ContactSpec")
+    if start_from not in get_args(StartFrom):
+        raise BadArgument("start_from", repr(start_from), "'sphere' or 'cloud'")
+    if start_from == "cloud" and not isinstance(getattr(shape, "cloud", None), PointCloud):
+        raise BadArgument("start_from", "'cloud'", "'sphere' for a shape that holds no cloud")
     if isinstance(starts, Tensor):
         points = shape.normalise(check_tensor("starts", starts, (None, 3, 3)))
         farthest = float(torch.linalg.vector_norm(points, dim=-1).max()) if len(points) else 0.0
@@ -59,27 +68,43 @@ def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor, seed: in
         raise BadArgument("spec.start_radius", spec.start_radius, f"at most {float(shape.domain_radius):.4g}")
 
 
-def start_points(
-    shape: Shape, spec: ContactSpec, starts: int | Float[Tensor, "b 3 3"], seed: int
-) -> Float[Tensor, "b 3 3"]:
-    """Return normalised starts on the surface: from the given points [m], or from as many as `starts` says.
+def given_starts(shape: Shape, starts: Float[Tensor, "b 3 3"]) -> Iterator[Float[Tensor, "_ 3 3"]]:
+    """Yield normalised starts on the surface from given points [m], chunk by chunk."""
+    device = getattr(shape, "device", torch.device("cpu"))  # a stand-in without one lives on the CPU
+    for points in starts.detach().to(device, torch.float64).split(CHUNK):
+        yield project(shape, draw_in(shape, shape.normalise(points)), steps=6)
+
+
+def drawn_starts(
+    shape: Shape, spec: ContactSpec, starts: int, seed: int, start_from: StartFrom = "sphere"
+) -> Iterator[Float[Tensor, "_ 3 3"]]:
+    """Yield as many normalised starts on the surface as `starts` says, chunk by chunk.
 
     Without `spec.flatness` each is three points of the sphere of `spec.start_radius`, moved onto the surface
-    (Sec. 6.2). With it the sphere's points are surveyed first: starts are triples of those that are certain, flat,
-    inside and above the table, and closed ones come first. The centre of a flat grasp may lie 30 mm from the
-    object's, and a descent from the paper's starts rarely finds its way there.
+    (Sec. 6.2), or three of the observed cloud. With it such points are surveyed first: starts are triples of those
+    that are certain, flat, inside and above the table, and closed ones come first in each chunk. The centre of a flat
+    grasp may lie 30 mm from the object's, and a descent from the paper's starts rarely finds its way there.
     """
-    device = getattr(shape, "device", torch.device("cpu"))  # a stand-in without one lives on the CPU
-    if isinstance(starts, Tensor):
-        return project(shape, draw_in(shape, shape.normalise(starts.detach().to(device, torch.float64))), steps=6)
+    device = getattr(shape, "device", torch.device("cpu"))
     generator = torch.Generator().manual_seed(seed)
-    surveyed = is_surveyed(spec, starts)
-    count = SURVEY if surveyed else starts
-    drawn = torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)
-    points = (spec.start_radius * unit(drawn)).to(device)
-    if not surveyed:
-        return project(shape, draw_in(shape, points), steps=6)
-    return survey(shape, spec, project(shape, points, steps=6), starts, generator)
+
+    def draw(count: int) -> Float[Tensor, "_ 3 3"]:
+        if start_from == "sphere":
+            drawn = spec.start_radius * unit(torch.randn(count, 3, 3, generator=generator, dtype=torch.float64))
+            return drawn.to(device)
+        seen: PointCloud = shape.cloud  # pyright: ignore[reportAttributeAccessIssue] - `check_starts` has asked
+        rows = torch.randint(len(seen), (count, 3), generator=generator)
+        return shape.normalise(seen.points.to(device, torch.float64)[rows.to(device)])
+
+    places = None
+    if spec.flatness is not None:
+        places = survey(shape, spec, project(shape, draw(SURVEY), steps=6))
+    for begin in range(0, starts, CHUNK):
+        count = min(CHUNK, starts - begin)
+        if places is None:
+            yield project(shape, draw_in(shape, draw(count)), steps=6)
+        else:
+            yield surveyed_triples(shape, spec, *places, count, generator)
 
 
 def draw_in(shape: Shape, points: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
@@ -98,9 +123,9 @@ def draw_in(shape: Shape, points: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 
 
 
 def survey(
-    shape: Shape, spec: ContactSpec, points: Float[Tensor, "s 3 3"], starts: int, generator: torch.Generator
-) -> Float[Tensor, "b 3 3"]:
-    """Return triples of the good ones among surface points, closed and separate ones first."""
+    shape: Shape, spec: ContactSpec, points: Float[Tensor, "s 3 3"]
+) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]]:
+    """Return the good places among surface points, with their normals; all of them where there are less than three."""
     problem = ContactProblem.of(shape, spec)
     jet = triple_jet(shape, points)
     good = (jet.distance.abs() < 1e-4) & (jet.variance >= 0) & (jet.variance < spec.max_variance)
@@ -109,9 +134,21 @@ def survey(
         good &= points[..., 2] > problem.lowest
     if spec.flatness is not None:
         good &= bend(shape, points, jet.normals) < 0.9 * spec.flatness  # the ring of another triple is turned
-    places, normals = points[good], jet.normals[good]
-    if len(places) < 3:  # nothing to choose from: descend from the survey's own triples
-        return points.repeat(starts // len(points) + 1, 1, 1)[:starts]
+    if int(good.sum()) < 3:  # nothing to choose from
+        good = torch.ones_like(good)
+    return points[good], jet.normals[good]
+
+
+def surveyed_triples(
+    shape: Shape,
+    spec: ContactSpec,
+    places: Float[Tensor, "p 3"],
+    normals: Float[Tensor, "p 3"],
+    starts: int,
+    generator: torch.Generator,
+) -> Float[Tensor, "b 3 3"]:
+    """Return triples of places, closed and separate ones first."""
+    problem = ContactProblem.of(shape, spec)
     found, wanted = [], starts
     for _ in range(ROUNDS):
         choice = torch.randint(len(places), (DRAWS * starts, 3), generator=generator).to(places.device)
