@@ -32,12 +32,27 @@ MAX_PLANES = 4
 """Mirror planes used, at most, besides the one across the view that is added when none of them is."""
 WITHIN = 0.12
 """Planes are used whose score is within this of the best one's."""
+SQUARE, SQUARE_PRIOR = 0.1, 0.1
+"""Greatest cosine between planes at right angles, and what a plane's score gains by one with the best of all: most
+things with two planes of symmetry have them so, and the view may well show only one."""
 APART = math.cos(math.radians(25.0))
 """Cosine of the least angle between two planes."""
 HULL_MARGIN, SEEN_MARGIN, TABLE_MARGIN = 0.001, 0.002, 0.002
 """How far [m] a mirrored point may stand out of the hull, in front of the seen surface, below the table."""
 NEW, SPACING = 0.006, 0.004
 """Least distance [m] of a mirrored point from the cloud and from another one."""
+
+LEAST_NOISE = 0.003
+"""Standard deviation [m] of a mirrored point, were the object symmetric about that very plane."""
+GOOD, ASYMMETRY = 0.4, 0.024
+"""Score from which on an object counts as symmetric, and how much further [m] mirrored points are off for each 1 that
+is missing."""
+TEMPERATURE = 0.05
+"""Planes are as probable as exp(score / temperature): those that score nearly as well tell how well one is known."""
+SHARED = 1.5
+"""Factor on the deviations between such planes: points of one image share them, and do not average them out."""
+SPREAD_STEPS, SPREAD_TURN, SPREAD_SHIFT = 5, 0.15, 0.045
+"""Planes tried about one for its spread: along each axis, to that turn [rad], and to that share of the cloud's size."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,15 +100,12 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
     probes = farthest_points(points, PROBES)
     scene = _Scene(points, normals, tree, outline, table, points[probes], normals[probes])
     planes, scores = _find_planes(scene)
-    mirrored = [(_reflect(points, p), _turn(normals, p), s) for p, s in zip(planes, scores, strict=True)]
-    for i in range(min(2, len(planes))):
-        for j in range(len(planes)):
-            if i != j:
-                once, turned, _ = mirrored[i]
-                pair = torch.minimum(scores[i], scores[j]) - 0.05
-                mirrored.append((_reflect(once, planes[j]), _turn(turned, planes[j]), pair))
-    mirrored.sort(key=lambda m: -float(m[2]))
-    kept = _keep(scene, mirrored)
+    mirrors = [_Mirror.of(scene, p, s) for p, s in zip(planes, scores, strict=True)]
+    seen = _Image(points, normals, math.inf, torch.zeros_like(points[:, 0]))
+    images = [mirror.image(seen) for mirror in mirrors]
+    images += [mirrors[j].image(images[i]) for i in range(min(2, len(planes))) for j in range(len(planes)) if i != j]
+    images.sort(key=lambda image: -image.score)
+    kept = _keep(scene, images)
     chosen = farthest_points(kept[0], budget)
     return Completion(
         points=kept[0][chosen],
@@ -117,6 +129,16 @@ class _Scene:
     probes: Tensor
     probe_normals: Tensor
 
+    @property
+    def center(self) -> Tensor:
+        """The centre of the cloud's box."""
+        return (self.points.amax(0) + self.points.amin(0)) / 2
+
+    @property
+    def size(self) -> float:
+        """The longest side of the cloud's box [m]."""
+        return float((self.points.amax(0) - self.points.amin(0)).max())
+
     def nearest(self, points: Tensor, limit: float = math.inf) -> tuple[Tensor, Tensor]:
         """Return distance [m] and index of the nearest point of the cloud; infinity and 0 beyond the limit."""
         distance, index = self.tree.query(points.reshape(-1, 3).numpy(), distance_upper_bound=limit)  # pyright: ignore
@@ -138,11 +160,46 @@ class _Scene:
         return match - 2.0 * bad, bad
 
 
+@dataclasses.dataclass(frozen=True)
+class _Image:
+    """A mirrored cloud [m], the score that supports it (infinite: seen itself), and the variance [m^2] of its points across the surface."""
+
+    points: Tensor
+    normals: Tensor
+    score: float
+    variance: Tensor
+
+
+@dataclasses.dataclass(frozen=True)
+class _Mirror:
+    """A plane, its score, and the planes near it with the probability of each, given the scores."""
+
+    plane: Tensor
+    score: float
+    near: Tensor
+    weight: Tensor
+
+    @classmethod
+    def of(cls, scene: _Scene, plane: Float[Tensor, "4"], score: Float[Tensor, ""]) -> "_Mirror":
+        """Return the mirror of a plane in a scene."""
+        steps = torch.linspace(-1.0, 1.0, SPREAD_STEPS, dtype=plane.dtype)
+        near = _planes_near(scene, plane, SPREAD_TURN * steps, SPREAD_SHIFT * scene.size * steps)
+        return cls(plane, float(score), near, torch.softmax(scene.score(near)[0] / TEMPERATURE, 0))
+
+    def image(self, of: _Image) -> _Image:
+        """Return the mirror image of a cloud; that of an image is a little less sure than the less sure of both."""
+        points, normals = _reflect(of.points, self.plane), _turn(of.normals, self.plane)
+        shift = ((_reflect(of.points, self.near[:, None]) - points) * normals).sum(-1)
+        asymmetry = ASYMMETRY * max(GOOD - self.score, 0.0)
+        variance = of.variance + SHARED**2 * (self.weight @ shift**2) + asymmetry**2
+        score = self.score if math.isinf(of.score) else min(of.score, self.score) - 0.05
+        return _Image(points, normals, score, variance)
+
+
 def _find_planes(scene: _Scene) -> tuple[Float[Tensor, "p 4"], Float[Tensor, "p"]]:
     """Return the mirror planes of a scene, best first, and their scores."""
-    center = (scene.points.amax(0) + scene.points.amin(0)) / 2
-    size = float((scene.points.amax(0) - scene.points.amin(0)).max())
-    view = torch.stack([unit(center - seen.viewpoint) for seen in scene.outline.views]).mean(0)
+    size = scene.size
+    view = torch.stack([unit(scene.center - seen.viewpoint) for seen in scene.outline.views]).mean(0)
     if scene.table is None:
         directions = spread_directions(2 * DIRECTIONS, scene.points)[:DIRECTIONS]  # a half sphere: n and -n are one
         rim_prior = 0.15
@@ -165,6 +222,8 @@ def _find_planes(scene: _Scene) -> tuple[Float[Tensor, "p 4"], Float[Tensor, "p"
         rim = (scene.outline.rim @ directions.T).median(0).values
         scores = scores - rim_prior * ((offsets - rim[:, None]) / (0.25 * size)) ** 2
 
+    strongest = directions[scores.max(1).values.argmax()]
+    scores = scores + SQUARE_PRIOR * ((directions @ strongest).abs() < SQUARE)[:, None]
     best, where = scores.max(1)
     order = [i for i in torch.argsort(best, descending=True, stable=True).tolist() if facing[i] > FACING]
     chosen: list[int] = []
@@ -182,56 +241,52 @@ def _find_planes(scene: _Scene) -> tuple[Float[Tensor, "p 4"], Float[Tensor, "p"
             picks.append((across // OFFSETS, across % OFFSETS))
     if not picks:
         return scene.points.new_zeros(0, 4), scene.points.new_zeros(0)
-    refined = torch.stack([_refine(scene, grid[i, k], size) for i, k in picks])
+    refined = torch.stack([_refine(scene, grid[i, k]) for i, k in picks])
     final, _ = scene.score(refined)
     order = torch.argsort(final, descending=True, stable=True)
     return refined[order], final[order]
 
 
-def _refine(scene: _Scene, plane: Float[Tensor, "4"], size: float) -> Float[Tensor, "4"]:
+def _refine(scene: _Scene, plane: Float[Tensor, "4"]) -> Float[Tensor, "4"]:
     """Return the plane after three searches on a grid of turns and offsets, each half as wide as the last."""
-    turn, shift = 0.06, 0.04 * size
-    center = (scene.points.amax(0) + scene.points.amin(0)) / 2
     steps = torch.tensor([-1.0, 0.0, 1.0], dtype=plane.dtype)
-    for _ in range(3):
-        normal = plane[:3]
-        if scene.table is not None:
-            sideways = torch.stack([-normal[1], normal[0], torch.zeros_like(normal[0])])[None]
-        else:
-            sideways = torch.linalg.svd(normal[None], full_matrices=True).Vh[1:]
-        turns = torch.cartesian_prod(*[steps] * len(sideways)).reshape(-1, len(sideways)) * turn
-        normals = unit(normal + turns @ sideways)
-        # Turn about the cloud's centre, not about a frame's origin that may be far away.
-        offsets = plane[3] + (normals - normal) @ center
-        candidates = torch.cat(
-            [
-                normals.repeat_interleave(3, 0),
-                (offsets[:, None] + shift * steps).reshape(-1, 1),
-            ],
-            1,
-        )
-        scores, _ = scene.score(candidates)
-        plane = candidates[scores.argmax()]
-        turn, shift = turn / 2, shift / 2
+    for width in (1.0, 0.5, 0.25):
+        near = _planes_near(scene, plane, 0.06 * width * steps, 0.04 * scene.size * width * steps)
+        plane = near[scene.score(near)[0].argmax()]
     return plane
 
 
-def _keep(scene: _Scene, mirrored: list[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return points, normals and noise [m] of the mirrored points that nothing speaks against, best planes first."""
+def _planes_near(
+    scene: _Scene, plane: Float[Tensor, "4"], turns: Float[Tensor, "t"], shifts: Float[Tensor, "s"]
+) -> Float[Tensor, "p 4"]:
+    """Return a plane turned about each of its free axes [rad] and shifted [m]; a table leaves the vertical axis."""
+    normal = plane[:3]
+    if scene.table is not None:
+        sideways = torch.stack([-normal[1], normal[0], torch.zeros_like(normal[0])])[None]
+    else:
+        sideways = torch.linalg.svd(normal[None], full_matrices=True).Vh[1:]
+    turned = torch.cartesian_prod(*[turns] * len(sideways)).reshape(-1, len(sideways))
+    normals = unit(normal + turned @ sideways)
+    # Turn about the cloud's centre, not about a frame's origin that may be far away.
+    offsets = plane[3] + (normals - normal) @ scene.center
+    return torch.cat([normals.repeat_interleave(len(shifts), 0), (offsets[:, None] + shifts).reshape(-1, 1)], 1)
+
+
+def _keep(scene: _Scene, images: list[_Image]) -> tuple[Tensor, Tensor, Tensor]:
+    """Return points, normals and noise [m] of the mirrored points that nothing speaks against, best images first."""
     from scipy.spatial import KDTree
 
     kept: list[tuple[Tensor, Tensor, Tensor]] = []
-    for points, normals, score in mirrored:
-        distance, _ = scene.nearest(points)
-        fine = (distance > NEW) & _allowed(scene, points)
-        points, normals, distance = points[fine], normals[fine], distance[fine]
+    for image in images:
+        distance, _ = scene.nearest(image.points)
+        fine = (distance > NEW) & _allowed(scene, image.points)
+        points, normals, variance = image.points[fine], image.normals[fine], image.variance[fine]
         if kept and len(points):
             before, _ = KDTree(torch.cat([k[0] for k in kept]).numpy()).query(points.numpy())
             new = torch.from_numpy(before) > SPACING
-            points, normals, distance = points[new], normals[new], distance[new]
+            points, normals, variance = points[new], normals[new], variance[new]
         thin = _thin(points)
-        noise = 0.003 + 0.08 * distance[thin] + 0.006 * (0.4 - score).clamp_min(0)
-        kept.append((points[thin], normals[thin], noise))
+        kept.append((points[thin], normals[thin], torch.sqrt(LEAST_NOISE**2 + variance[thin])))
     if not kept:
         empty = scene.points.new_zeros(0, 3)
         return empty, empty, empty[:, 0]
