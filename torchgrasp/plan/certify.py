@@ -84,7 +84,7 @@ def _prove(
     margin, residual = torch.where(none, -torch.inf, margin), torch.where(none, torch.inf, residual)
     proven = (residual <= EXACT) & (most - margin <= GAP) & ((margin - MIN_MARGIN).abs() > 2 * GAP)
     for row in torch.nonzero(~(proven | none))[:, 0].tolist():
-        margin[row], residual[row], found = _solve_by_highs(wrench[row].numpy())
+        margin[row], residual[row], found = solve_by_highs(wrench[row].numpy())
         witness[row] = witness[row] if found is None else torch.from_numpy(found)
     return margin, residual, witness
 
@@ -122,7 +122,7 @@ def _checked(contacts: Contacts) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, 
     return points, normals
 
 
-def _solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None]:
+def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None]:
     """Return the largest s of one wrench matrix (m, 6), the largest |W phi| of its solution, and a witness.
 
     With phi = s + psi and psi >= 0 the programme has seven equations and no inequality.

@@ -39,6 +39,16 @@ def joint_estimate(posterior: Posterior, x: Float[Tensor, "k 3"]) -> JointEstima
     return JointEstimate(mean, prior - whitened.T @ whitened)
 
 
+def distance_covariance(posterior: Posterior, x: Float[Tensor, "b k 3"]) -> Float[Tensor, "b k k"]:
+    """Return the covariances of the distances alone at each of many sets of normalised points, Eq. (8)."""
+    b, k = x.shape[:2]
+    cross = posterior.cross(x.flatten(0, 1))[0]
+    whitened = torch.linalg.solve_triangular(posterior.factor, posterior.ordered(cross.T), upper=False)
+    whitened = whitened.T.reshape(b, k, len(posterior.factor))
+    prior = posterior.kernel.profile(torch.linalg.vector_norm(x[:, :, None] - x[:, None], dim=-1))
+    return prior - whitened @ whitened.mT
+
+
 def draw_samples(joint: JointEstimate, prior: float, n: int, seed: int) -> Float[Tensor, "n k 4"]:
     """Draw from a joint posterior with the symmetric root of its covariance, which no choice of basis changes.
 
