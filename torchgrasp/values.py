@@ -115,7 +115,7 @@ class ContactPlan(Batch):
     """The planner's rows, one for each start, in the order of the starts.
 
     `coefficients` are the planner's own phi of Eq. (13); `quality` is Eq. (14) [m]: the distance of the contacts'
-    centre from the centre of the cloud.
+    centre from the centre of the cloud, or the cost that was asked for; less is better.
     """
 
     contacts: Contacts

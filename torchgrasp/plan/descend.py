@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch, SomeValue, Value
+from torchgrasp.plan.objective import Cost, differentiate_cost
 from torchgrasp.plan.problem import ContactProblem, Rows, Shape, TripleJet, balanced_forces, triple_jet
 
 LONGEST_STEP = 0.3
@@ -23,6 +24,9 @@ TENSION_DAMPING = 0.1
 
 FIRST_DAMPING = 1e-2
 """Damping at the start of each stage."""
+
+PULL = 0.1
+"""Length of the weighted gradient of a user's objective where its stage begins."""
 
 FEASIBILITY = 3.0
 """Weight of the surface and of all bounds but the cones."""
@@ -49,6 +53,23 @@ class State(Batch):
     tension: Float[Tensor, "b 3"]
     jet: TripleJet
     damping: Float[Tensor, "b"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Extra(Batch):
+    """A cost that joins the squared rows: its weight, and its value and gradient, weighted."""
+
+    weight: Float[Tensor, "b"]
+    value: Float[Tensor, "b"]
+    gradient: Float[Tensor, "b 12"]
+
+
+def first_extra(objective: Cost, shape: Shape, state: State) -> Extra:
+    """Return the cost at a state, with the weight that it keeps."""
+    value, gradient = differentiate_cost(objective, shape, state.points, state.jet)
+    length = torch.linalg.vector_norm(gradient, dim=-1)
+    weight = PULL / torch.where(length > 0, length, 1.0)
+    return Extra(weight, weight * value, weight[:, None] * gradient)
 
 
 def project(shape: Shape, points: Float[Tensor, "b k 3"], steps: int) -> Float[Tensor, "b k 3"]:
@@ -90,23 +111,27 @@ def residual(rows: Rows, stage: Stage) -> tuple[Float[Tensor, "b r"], Float[Tens
 
 
 def step(
-    rows: Rows, stage: Stage, damping: Float[Tensor, "b"]
+    rows: Rows, stage: Stage, damping: Float[Tensor, "b"], downhill: Float[Tensor, "b 12"] | None = None
 ) -> tuple[Float[Tensor, "b 12"], Float[Tensor, "b"], Float[Tensor, "b"]]:
     """Return the damped Gauss-Newton step, how far it moves a point at most, and the decrease of cost it promises.
 
-    The step is NaN where the system is not positive definite, as in a row that is not finite.
+    `downhill` is the negative gradient of a cost that joins the squared rows, linearly. The step is NaN where the
+    system is not positive definite, as in a row that is not finite.
     """
     value, weight = residual(rows, stage)
     slope = weight[..., None] * torch.cat([rows.centre_by_x, rows.surface_by_x, rows.bounds_by_x], 1)
     scale = torch.tensor([1.0] * 9 + [TENSION_DAMPING] * 3, dtype=slope.dtype, device=slope.device)
     factor, failed = torch.linalg.cholesky_ex(slope.mT @ slope + torch.diag_embed(damping[:, None] * scale))
-    x = -torch.cholesky_solve(slope.mT @ value[..., None], factor)[..., 0]
+    pull = -(slope.mT @ value[..., None])
+    pull = pull if downhill is None else pull + downhill[..., None]
+    x = torch.cholesky_solve(pull, factor)[..., 0]
     x = torch.where((failed == 0)[:, None], x, torch.nan)
     reach = torch.linalg.vector_norm(x[:, :9].unflatten(1, (3, 3)), dim=-1).amax(-1)
     shrink = (reach / LONGEST_STEP).clamp(min=1.0)
     x = x / shrink[:, None]
     linear = value + (slope @ x[..., None])[..., 0]
-    return x, reach / shrink, (value.square().sum(1) - linear.square().sum(1)) / 2
+    promised = (value.square().sum(1) - linear.square().sum(1)) / 2
+    return x, reach / shrink, promised if downhill is None else promised + (downhill * x).sum(1)
 
 
 def pick(choose: Bool[Tensor, "b"], new: SomeValue, old: SomeValue) -> SomeValue:
@@ -139,27 +164,35 @@ def join(parts: Sequence[SomeValue]) -> SomeValue:
     return type(parts[0])(**{f.name: chain([getattr(p, f.name) for p in parts]) for f in fields})
 
 
-def descend(shape: Shape, problem: ContactProblem, state: State, stage: Stage) -> State:
+def descend(shape: Shape, problem: ContactProblem, state: State, stage: Stage, objective: Cost | None = None) -> State:
     """Take up to `stage.steps` Levenberg-Marquardt steps of one evaluation each.
 
-    Triples that have settled, or whose step is not finite, are left alone from then on.
+    Triples that have settled, or whose step is not finite, are left alone from then on. An `objective` joins the rows
+    with a weight at which its first gradient has the length `PULL`, so that its unit does not matter.
     """
     whole, at = state, torch.arange(len(state), device=state.points.device)
     state = dataclasses.replace(state, damping=torch.full_like(state.damping, FIRST_DAMPING))
     rows = problem.rows(state.points, state.tension, state.jet)
+    extra = None if objective is None else first_extra(objective, shape, state)
     for _ in range(stage.steps):
-        x, reach, promised = step(rows, stage, state.damping)
+        x, reach, promised = step(rows, stage, state.damping, None if extra is None else -extra.gradient)
         moves = reach > stage.settled  # a comparison with NaN is False: such a row stays
         if not bool(moves.all()):
             whole = put(whole, at, state)
             if not bool(moves.any()):
                 return whole
             at, state, rows, x, promised = at[moves], state[moves], rows[moves], x[moves], promised[moves]
+            extra = None if extra is None else extra[moves]
         points = project(shape, state.points + x[:, :9].unflatten(1, (3, 3)), steps=1)
         tension = level(points, state.tension + x[:, 9:])
         jet = triple_jet(shape, points)
         tried_rows = problem.rows(points, tension, jet)
         before, after = (residual(r, stage)[0].square().sum(1) / 2 for r in (rows, tried_rows))
+        tried_extra = None
+        if extra is not None and objective is not None:
+            value, gradient = differentiate_cost(objective, shape, points, jet)
+            tried_extra = Extra(extra.weight, extra.weight * value, extra.weight[:, None] * gradient)
+            before, after = before + extra.value, after + tried_extra.value
         kept = (before - after) / promised
         inside = torch.linalg.vector_norm(points, dim=-1).amax(-1) < problem.domain_radius
         better = (kept > 0) & inside  # False for NaN: such a step is refused
@@ -168,4 +201,5 @@ def descend(shape: Shape, problem: ContactProblem, state: State, stage: Stage) -
         tried = State(points, tension, jet, eased.clamp(min=1e-9))
         refused = dataclasses.replace(state, damping=(4 * state.damping).clamp(max=1e9))
         state, rows = pick(better, tried, refused), pick(better, tried_rows, rows)
+        extra = None if extra is None or tried_extra is None else pick(better, tried_extra, extra)
     return put(whole, at, state)

@@ -1,5 +1,6 @@
 """From a shape with uncertainty to contact triples: Eqs. (10)-(14) solved from many starts at once."""
 
+import dataclasses
 import time
 from collections.abc import Iterator
 
@@ -9,9 +10,10 @@ from torch import Tensor
 
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import degenerate
-from torchgrasp.plan.descend import Stage, descend, join, pick, project, put, start_state
+from torchgrasp.plan.descend import Stage, State, descend, join, pick, project, put, start_state
 from torchgrasp.plan.flat import bend
 from torchgrasp.plan.margin import balance_and_witness
+from torchgrasp.plan.objective import Cost, Objective, cost_of, evaluate_cost
 from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet
 from torchgrasp.plan.start import StartFrom, check_starts, drawn_starts, given_starts
 from torchgrasp.plan.wrench import BALANCED, MIN_MARGIN, MIN_RANK_RATIO, rank_ratio, wrenches
@@ -33,6 +35,9 @@ a body can lie in its centre. What cannot is relaxed by the third."""
 IMPROVE = (Stage(centre=0.3, cones=3.0, steps=8),)
 """Stages from surveyed starts, most of which are feasible but for rounding: towards the centre, Eq. (14)."""
 
+LOWER = Stage(centre=0.0, cones=3.0, steps=15)
+"""Down an objective other than Eq. (14), from where that was reached."""
+
 FINISH = Stage(centre=0.0, cones=3.0, steps=20, settled=1e-8)
 """Last, feasibility alone: without the objective every residual can vanish."""
 
@@ -43,6 +48,7 @@ def plan_contacts(
     starts: int | Float[Tensor, "b 3 3"] = 1000,
     seed: int = 0,
     *,
+    objective: Objective = "center",
     start_from: StartFrom = "sphere",
     warm_start: ContactPlan | None = None,
     time_budget: float | None = None,
@@ -59,6 +65,11 @@ def plan_contacts(
         spec: what the contacts must satisfy; `ContactSpec()` by default.
         starts: the number of starts, drawn by `start_from`, or the starting points themselves [m].
         seed: seed of the draw.
+        objective: what is minimised: "center", Eq. (14); "epsilon", minus the radius of the largest ball in the hull of
+            the wrenches (Ferrari and Canny 1992; 0.1 s a start); "min_weight", minus the greatest margin of the
+            certificate; or a function of contacts (b, 3, 3) [m] and outward unit normals (b, 3, 3) that returns costs
+            (b,), each of its own row alone, differentiable by autograd, in any unit. `quality` holds its values. All
+            but "center" begin where that ends, and a row only changes for a lower cost.
         start_from: "sphere": that of `spec.start_radius` about the shape's centre (Sec. 6.2); "cloud": what was seen.
         warm_start: an earlier plan, also for another estimate of the same object: its OK rows are the first starts,
             before all others.
@@ -66,8 +77,8 @@ def plan_contacts(
             the plan. None: all starts.
 
     Raises:
-        BadArgument: `starts` is not positive, of a wrong shape, or outside the shape's domain; another argument is
-            not what it should be.
+        BadArgument: `starts` is not positive, of a wrong shape, or outside the shape's domain; an unknown objective,
+            or a cost that returns no number for each row or has no gradient; another argument is not what it should be.
 
     Source of the scheme: penalties and Levenberg-Marquardt, Nocedal and Wright, Numerical Optimization, ch. 10, 17.
 
@@ -80,12 +91,13 @@ def plan_contacts(
     check_starts(shape, spec, starts, seed, start_from)
     if time_budget is not None and not time_budget > 0:  # also refuses NaN
         raise BadArgument("time_budget", time_budget, "a positive number of seconds, or None")
+    cost = cost_of(objective, spec, shape)
     began = time.monotonic()
     found: list[ContactPlan] = []
     for first, stages in _chunks(shape, spec, starts, seed, start_from, warm_start):
         if found and time_budget is not None and time.monotonic() - began > time_budget:
             break
-        found.append(plan_chunk(shape, spec, first, stages))
+        found.append(plan_chunk(shape, spec, first, stages, cost))
     return join(found)
 
 
@@ -112,7 +124,7 @@ def _chunks(
 
 
 def plan_chunk(
-    shape: Shape, spec: ContactSpec, first: Float[Tensor, "b 3 3"], stages: tuple[Stage, ...]
+    shape: Shape, spec: ContactSpec, first: Float[Tensor, "b 3 3"], stages: tuple[Stage, ...], cost: Cost | None = None
 ) -> ContactPlan:
     """Plan from normalised starts on the surface; a feasible start from which nothing is found is itself the plan."""
     problem = ContactProblem.of(shape, spec)
@@ -122,7 +134,25 @@ def plan_chunk(
     found = assess(shape, spec, project(shape, state.points, steps=3))
     lost = torch.nonzero(found.status != Status.OK)[:, 0]
     begun = assess(shape, spec, first[lost])
-    return put(found, lost, pick(begun.status == Status.OK, begun, found[lost]))
+    found = put(found, lost, pick(begun.status == Status.OK, begun, found[lost]))
+    return found if cost is None else lower_cost(shape, spec, state, found, cost)
+
+
+def lower_cost(shape: Shape, spec: ContactSpec, state: State, plan: ContactPlan, cost: Cost) -> ContactPlan:
+    """Return the plan with its OK rows improved in a cost of the contacts, which then is the `quality` of all."""
+    problem = ContactProblem.of(shape, spec)
+    good = torch.nonzero(plan.status == Status.OK)[:, 0]
+    points = shape.normalise(plan.contacts.points[good])
+    state = dataclasses.replace(state[good], points=points, jet=triple_jet(shape, points))
+    for stage, objective in ((LOWER, cost), (FINISH, None)):
+        state = descend(shape, problem, state, stage, objective)
+    lower = assess(shape, spec, project(shape, state.points, steps=3))
+    plan, lower = (
+        dataclasses.replace(p, quality=evaluate_cost(cost, p.contacts.points, p.contacts.normals))
+        for p in (plan, lower)
+    )
+    better = (lower.status == Status.OK) & (lower.quality < plan.quality[good])
+    return put(plan, good, pick(better, lower, plan[good]))
 
 
 def assess(shape: Shape, spec: ContactSpec, points: Float[Tensor, "b 3 3"]) -> ContactPlan:
