@@ -67,21 +67,21 @@ class Canvas:
         self, starts: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"], length: float, color: str
     ) -> None:
         """Add arrows of one length [m] in unit directions, each from a small ball: observed points with normals."""
-        from trimesh import creation, util
+        from trimesh import creation
 
-        upright = util.concatenate(
-            [
-                creation.icosphere(subdivisions=1, radius=0.13),
-                creation.cylinder(radius=0.035, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, 0.75]], sections=8),
-                creation.cone(radius=0.1, height=0.35, sections=8).apply_translation([0.0, 0.0, 0.65]),
-            ]
+        head = creation.cone(radius=0.1, height=0.35, sections=8)
+        head.apply_translation([0.0, 0.0, 0.65])
+        upright = (
+            creation.icosphere(subdivisions=1, radius=0.13),
+            creation.cylinder(radius=0.035, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, 0.75]], sections=8),
+            head,
         )
-        vertices, faces = length * np.asarray(upright.vertices), np.asarray(upright.faces)
         for start, direction in zip(starts, directions, strict=True):
             side = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
             side /= np.linalg.norm(side)
             turn = np.stack([side, np.cross(direction, side), direction])
-            self.add_mesh(vertices @ turn + start, faces, color)
+            for part in upright:
+                self.add_mesh(length * np.asarray(part.vertices) @ turn + start, np.asarray(part.faces), color)
 
     def add_disc(self, center: tuple[float, float, float], radius: float, color: str) -> None:
         """Add a level disc without light and shade."""

@@ -63,7 +63,7 @@ def select_points(
     """
     start, n, budget = posterior_given(known, kernel), len(x), min(budget, len(x))
     old, rows = len(start.factor), len(start.factor) + 4 * budget
-    factor = x.new_zeros(rows, rows)
+    factor = x.new_zeros(rows, rows).T  # by columns, as the solver wants it: it copies any other matrix
     factor[:old, :old] = start.factor
     with_known = start.cross(x)
     whitened = x.new_empty(rows, n + 1)  # L^-1 [K(observed, distances of candidates), y]
