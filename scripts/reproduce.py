@@ -1,7 +1,9 @@
 #!/usr/bin/env python
-"""Reproduce figures of the paper with the objects of torchgrasp.
+"""Reproduce figures and tables of the paper with the objects of torchgrasp.
 
 python scripts/reproduce.py fig4 --out DIR    whole and partial clouds, and the shapes that follow from them
+python scripts/reproduce.py table4 --out DIR  how many of 1000 starts end in a grasp, how fast and how near the centre
+python scripts/reproduce.py fig5 --out DIR    planned contacts on the objects
 """
 
 import io
@@ -12,6 +14,7 @@ import torch
 import trimesh
 import tyro
 from PIL import Image, ImageDraw, ImageFont
+from planned import fig5, table4
 
 from torchgrasp import PointCloud, ShapeGP, fit_shape, list_objects, load_object
 from torchgrasp.files import write_atomically
@@ -109,4 +112,5 @@ def draw(
 
 
 if __name__ == "__main__":
-    tyro.extras.subcommand_cli_from_dict({"fig4": fig4}, prog="reproduce.py", description="Figures of the paper.")
+    commands = {"fig4": fig4, "table4": table4, "fig5": fig5}
+    tyro.extras.subcommand_cli_from_dict(commands, prog="reproduce.py", description="Figures and tables of the paper.")
