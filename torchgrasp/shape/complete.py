@@ -61,6 +61,7 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
         table: height [m] of the table, whose normal is z; None: not known.
         budget: greatest number of points.
 
+    >>> from torchgrasp.linalg import unit
     >>> eye = torch.tensor([0.0, 0.0, 1.0]).double()
     >>> cap = unit(torch.rand(300, 3).double() - torch.tensor([0.5, 0.5, 0.0]).double())
     >>> bool(complete_cloud(PointCloud(0.05 * cap, cap, eye)).points[:, 2].min() < -0.02)
