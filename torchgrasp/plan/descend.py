@@ -28,8 +28,11 @@ FIRST_DAMPING = 1e-2
 PULL = 0.1
 """Length of the weighted gradient of a user's objective where its stage begins."""
 
-FEASIBILITY = 3.0
-"""Weight of the surface and of all bounds but the cones."""
+SURFACE = 10.0
+"""Weight of the surface: a step that leaves it would be undone by the way back, which the cones then resist."""
+
+BOUNDS = 3.0
+"""Weight of all bounds but the cones."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,12 +100,12 @@ def level(points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"]) -> Floa
 
 def residual(rows: Rows, stage: Stage) -> tuple[Float[Tensor, "b r"], Float[Tensor, "b r"]]:
     """Return the weighted rows, of which bounds that hold are 0, and their weights."""
-    weight = torch.full_like(rows.bounds, FEASIBILITY)
+    weight = torch.full_like(rows.bounds, BOUNDS)
     weight[:, :3] = stage.cones
     weight = torch.cat(
         [
             torch.full_like(rows.centre, stage.centre),
-            torch.full_like(rows.surface, FEASIBILITY),
+            torch.full_like(rows.surface, SURFACE),
             weight * (rows.bounds > 0),
         ],
         1,
@@ -142,6 +145,16 @@ def pick(choose: Bool[Tensor, "b"], new: SomeValue, old: SomeValue) -> SomeValue
 
     fields = dataclasses.fields(new)  # pyright: ignore[reportArgumentType]
     return type(new)(**{f.name: merge(getattr(new, f.name), getattr(old, f.name)) for f in fields})
+
+
+def average_slopes(rows: Rows, refused: Rows) -> Rows:
+    """Return rows with the mean of their slopes and those where a step was refused.
+
+    Near an observation the normals of a thin plate turn about it in a cusp, so that slopes on its two sides differ,
+    and the step from each leads over it to the other. Along their mean the way down is found (a bundle of gradients).
+    """
+    names = ("surface_by_x", "bounds_by_x")
+    return dataclasses.replace(rows, **{n: (getattr(rows, n) + getattr(refused, n)) / 2 for n in names})
 
 
 def put(whole: SomeValue, at: Int[Tensor, "a"], part: SomeValue) -> SomeValue:
@@ -200,6 +213,6 @@ def descend(shape: Shape, problem: ContactProblem, state: State, stage: Stage, o
         eased = state.damping * (1 - (2 * kept - 1) ** 3).clamp(min=1 / 5, max=2.0)
         tried = State(points, tension, jet, eased.clamp(min=1e-9))
         refused = dataclasses.replace(state, damping=(4 * state.damping).clamp(max=1e9))
-        state, rows = pick(better, tried, refused), pick(better, tried_rows, rows)
+        state, rows = pick(better, tried, refused), pick(better, tried_rows, average_slopes(rows, tried_rows))
         extra = None if extra is None or tried_extra is None else pick(better, tried_extra, extra)
     return put(whole, at, state)

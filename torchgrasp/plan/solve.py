@@ -23,14 +23,14 @@ from torchgrasp.values import ContactPlan, Contacts
 ON_SURFACE = 1e-6
 """Largest |f_d| of a contact on the surface, in normalised units."""
 
-SEARCH = (
-    Stage(centre=0.1, cones=0.1, steps=5),
-    Stage(centre=1.0, cones=1.0, steps=20),
+SEARCH = (Stage(centre=3.0, cones=0.3, steps=10), Stage(centre=1.0, cones=3.0, steps=6)) * 4 + (
+    Stage(centre=0.3, cones=0.3, steps=8),
     Stage(centre=0.3, cones=3.0, steps=8),
 )
-"""Stages from starts anywhere: the certain part of the surface first, then centre and closure with equal weight, as
-if Eq. (14) were a constraint, which most often it can be: the centre of three contacts that are free to move about
-a body can lie in its centre. What cannot is relaxed by the third."""
+"""Stages from starts anywhere: centre and closure by turns, as if Eq. (14) were a constraint, which most often it can
+be: contacts that are free to move about a body can have their centre in its centre. Each turn leads out of places
+where the other is stuck, and triples with both are left alone. Where the centre cannot be reached the last two stages
+give way."""
 
 IMPROVE = (Stage(centre=0.3, cones=3.0, steps=8),)
 """Stages from surveyed starts, most of which are feasible but for rounding: towards the centre, Eq. (14)."""
@@ -38,7 +38,7 @@ IMPROVE = (Stage(centre=0.3, cones=3.0, steps=8),)
 LOWER = Stage(centre=0.0, cones=3.0, steps=15)
 """Down an objective other than Eq. (14), from where that was reached."""
 
-FINISH = Stage(centre=0.0, cones=3.0, steps=20, settled=1e-8)
+FINISH = Stage(centre=0.0, cones=3.0, steps=30, settled=1e-8)
 """Last, feasibility alone: without the objective every residual can vanish."""
 
 
