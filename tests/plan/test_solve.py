@@ -102,6 +102,17 @@ def test_a_warm_start_comes_first_and_keeps_what_was_found(ellipsoid):
     torch.testing.assert_close(again.contacts.points[warm:], fresh.contacts.points)
 
 
+def test_a_plan_follows_the_surface_to_a_later_estimate(ellipsoid):
+    plan = plan_contacts(ellipsoid, SPECS["table"], starts=30, seed=2)
+    good = plan.contacts.points[plan.status == Status.OK]
+    later = dataclasses.replace(ellipsoid, axes=(1.02, 0.63, 0.48))
+    warm = plan_contacts(later, SPECS["table"], starts=1, warm_start=plan)[: len(good)]
+    held = warm.status == Status.OK
+    assert float(held.double().mean()) >= 0.9
+    moved = torch.linalg.vector_norm(warm.contacts.points - good, dim=-1)[held]
+    assert float(moved.median()) < 0.005  # [m]: the estimate has moved by 2 mm
+
+
 def test_a_time_budget_ends_after_a_chunk_and_changes_no_row(ellipsoid, monkeypatch):
     monkeypatch.setattr("torchgrasp.plan.start.CHUNK", 4)
     whole = plan_contacts(ellipsoid, ContactSpec.paper(), starts=10)
