@@ -11,7 +11,7 @@ from torchgrasp.linalg import unit
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.descend import project
 from torchgrasp.plan.flat import bend
-from torchgrasp.plan.solve import assess, first_violation, plan_contacts
+from torchgrasp.plan.solve import assess, first_violation, plan_chunk, plan_contacts
 from torchgrasp.plan.start import draw_in, drawn_starts
 from torchgrasp.plan.wrench import wrenches
 from torchgrasp.specs import ContactSpec
@@ -113,13 +113,22 @@ def test_a_plan_follows_the_surface_to_a_later_estimate(ellipsoid):
     assert float(moved.median()) < 0.005  # [m]: the estimate has moved by 2 mm
 
 
-def test_a_time_budget_ends_after_a_chunk_and_changes_no_row(ellipsoid, monkeypatch):
-    monkeypatch.setattr("torchgrasp.plan.start.CHUNK", 4)
-    whole = plan_contacts(ellipsoid, ContactSpec.paper(), starts=10)
-    part = plan_contacts(ellipsoid, ContactSpec.paper(), starts=10, time_budget=1e-9)
-    assert len(whole) == 10
-    assert len(part) == 4
-    torch.testing.assert_close(part.contacts.points, whole.contacts.points[:4])
+def test_a_time_budget_bounds_how_many_starts_are_planned_and_changes_no_row(ellipsoid, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("torchgrasp.plan.solve.time.monotonic", lambda: now[0])
+    whole = plan_contacts(ellipsoid, ContactSpec.paper(), starts=120)
+
+    def slow(shape, spec, first, stages, cost, plan=plan_chunk):
+        now[0] += 0.01 * len(first)  # [s]: a hundred starts a second
+        return plan(shape, spec, first, stages, cost)
+
+    monkeypatch.setattr("torchgrasp.plan.solve.plan_chunk", slow)
+    for seconds, rows in ((1e-9, 25), (0.3, 25), (0.5, 50), (1.0, 100), (9.0, 120)):
+        now[0] = 0.0
+        part = plan_contacts(ellipsoid, ContactSpec.paper(), starts=120, time_budget=seconds)
+        assert len(part) == rows
+        assert now[0] <= max(seconds, 0.25) + 1e-6
+        torch.testing.assert_close(part.contacts.points, whole.contacts.points[:rows])
 
 
 def test_more_starts_only_add_rows(ellipsoid, monkeypatch):

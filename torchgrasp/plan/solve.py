@@ -35,6 +35,11 @@ give way."""
 IMPROVE = (Stage(centre=0.3, cones=3.0, steps=8),)
 """Stages from surveyed starts, most of which are feasible but for rounding: towards the centre, Eq. (14)."""
 
+FEW = 25
+"""Starts of which the first tell the pace where time is limited: with less the overhead of each step outweighs them."""
+
+Chunk = tuple[Float[Tensor, "_ 3 3"], tuple[Stage, ...]]
+
 LOWER = Stage(centre=0.0, cones=3.0, steps=15)
 """Down an objective other than Eq. (14), from where that was reached."""
 
@@ -73,8 +78,8 @@ def plan_contacts(
         start_from: "sphere": that of `spec.start_radius` about the shape's centre (Sec. 6.2); "cloud": what was seen.
         warm_start: an earlier plan, also for another estimate of the same object: its OK rows are the first starts,
             before all others.
-        time_budget: seconds of wall time after which no further 500 starts are begun: the rows found until then are
-            the plan. None: all starts.
+        time_budget: seconds of wall time for the call: of all starts as many are planned as will fit, at the pace of
+            those before, and never less than 25. None: all.
 
     Raises:
         BadArgument: `starts` is not positive, of a wrong shape, or outside the shape's domain; an unknown objective,
@@ -92,13 +97,24 @@ def plan_contacts(
     if time_budget is not None and not time_budget > 0:  # also refuses NaN
         raise BadArgument("time_budget", time_budget, "a positive number of seconds, or None")
     cost = cost_of(objective, spec, shape)
-    began = time.monotonic()
-    found: list[ContactPlan] = []
-    for first, stages in _chunks(shape, spec, starts, seed, start_from, warm_start):
-        if found and time_budget is not None and time.monotonic() - began > time_budget:
-            break
-        found.append(plan_chunk(shape, spec, first, stages, cost))
-    return join(found)
+    chunks = _chunks(shape, spec, starts, seed, start_from, warm_start)
+    if time_budget is not None:
+        chunks = _within(time_budget, chunks)
+    return join([plan_chunk(shape, spec, first, stages, cost) for first, stages in chunks])
+
+
+def _within(seconds: float, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
+    """Yield as much of the chunks as will be planned in time, at the pace of what was."""
+    began, done, fits = time.monotonic(), 0, FEW
+    for first, stages in chunks:
+        while len(first) > 0:
+            if done:
+                used = time.monotonic() - began
+                fits = int((seconds - used) * done / used)
+            if fits < FEW:
+                return
+            yield first[:fits], stages
+            done, first = done + len(first[:fits]), first[fits:]
 
 
 def _chunks(
@@ -108,7 +124,7 @@ def _chunks(
     seed: int,
     start_from: StartFrom,
     warm_start: ContactPlan | None,
-) -> Iterator[tuple[Float[Tensor, "_ 3 3"], tuple[Stage, ...]]]:
+) -> Iterator[Chunk]:
     """Yield normalised starts on the surface and the stages from there, chunk by chunk."""
     if warm_start is not None:
         warm = warm_start.contacts.points[warm_start.status == Status.OK]
