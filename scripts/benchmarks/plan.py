@@ -3,21 +3,19 @@
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from benchmarks.common import Row, least_seconds, write_rows
 from benchmarks.pace import bench_anytime, bench_growth, bench_memory
 from benchmarks.tries import POINTS, bench_peers
+from benchmarks.truth import bench_fields, bench_truth
 from torchgrasp import ContactSpec, Status, certify, fit_shape, plan_contacts
-from torchgrasp.plan.wrench import closed_exact
-from torchgrasp.shape.calibrate import nearest_on_mesh, read_views
+from torchgrasp.shape.calibrate import read_views
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.values import PointCloud
 
-SUBJECTS = ("call", "peers", "truth", "growth", "memory", "anytime")
+SUBJECTS = ("call", "peers", "truth", "fields", "growth", "memory", "anytime")
 
 
 def plan(
@@ -34,7 +32,7 @@ def plan(
 
     Args:
         objects: folder with manifest.json and a folder for each object.
-        only: subjects to measure, of call, peers, truth, growth, memory, anytime.
+        only: subjects to measure, of call, peers, truth, fields, growth, memory, anytime.
         starts: of the planner, for each view and radius.
         tries: the first of them that IPOPT gets, for each view and radius.
         threads: of torch. IPOPT with MUMPS, as casadi brings it, has one; on two it is counted as two processes that
@@ -53,6 +51,7 @@ def plan(
         "call": lambda: bench_call(views[0][2], starts),
         "peers": lambda: bench_peers(views, starts, tries, seed, threads),
         "truth": lambda: [bench_truth(views, starts, seed)],
+        "fields": lambda: [bench_fields(views, max(starts // 5, 1), seed)],
         "growth": lambda: [bench_growth(4 if quick else 5, out.with_name("bench_plan_growth.png"))],
         "memory": lambda: [bench_memory(10 * starts if quick else 100 * starts, threads)],
         "anytime": lambda: [bench_anytime(2.0 if quick else 10.0, out.with_name("bench_plan_anytime.png"))],
@@ -108,34 +107,3 @@ def _first(shape: ShapeGP, spec: ContactSpec) -> None:
     found = plan_contacts(shape, spec, 10)
     if not bool(certify(found[found.status == Status.OK].contacts, spec).closed.any()):
         raise RuntimeError("no certified grasp from ten starts")
-
-
-def bench_truth(views: list[Any], starts: int, seed: int) -> Row:
-    """Move certified grasps to the nearest points of the true surface and judge them there at friction 0.6."""
-    settings = {
-        "default": (ContactSpec(table=0.0), {"table": 0.0}),
-        "paper": (ContactSpec.paper(), {"support": "paper"}),
-    }
-    shares: dict[str, dict[str, float]] = {name: {} for name in settings}
-    okay: dict[str, list[float]] = {name: [] for name in settings}
-    for name, view, cloud, mesh in tqdm(views, desc="truth", disable=None, leave=False):
-        for label, (spec, options) in settings.items():
-            found = plan_contacts(fit_shape(cloud, **options), spec, starts, seed)
-            good = found[found.status == Status.OK].contacts
-            okay[label].append(len(good) / starts)
-            if len(good):
-                points, normals = nearest_on_mesh(mesh, good.points.flatten(0, 1))
-                closed = closed_exact(points.view_as(good.points), normals.view_as(good.points), 0.6)
-                shares[label][f"{name}/{view}"] = float(closed.double().mean())
-    mean = {label: sum(s.values()) / len(s) for label, s in shares.items()}
-    lowest = sorted(shares["default"].items(), key=lambda item: item[1])[:4]
-    done = {label: sum(values) / len(values) for label, values in okay.items()}
-    return Row(
-        f"certified grasps closed on the true surface at friction 0.6, {len(views)} views, mean over views",
-        ">= 0.80 with the default specification",
-        f"{mean['default']:.2f} (paper's specification on the paper's shape {mean['paper']:.2f}); least "
-        f"{', '.join(f'{n} {s:.2f}' for n, s in lowest)}; certified {done['default']:.1%} of the starts "
-        f"(paper {done['paper']:.1%})",
-        mean["default"] >= 0.8,
-        {"shares": shares, "certified": okay},
-    )

@@ -8,10 +8,11 @@ import torch
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import degenerate
 from torchgrasp.linalg import unit
+from torchgrasp.plan.assess import assess, first_violation
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.descend import project
 from torchgrasp.plan.flat import bend
-from torchgrasp.plan.solve import assess, first_violation, plan_chunk, plan_contacts
+from torchgrasp.plan.solve import plan_chunk, plan_contacts
 from torchgrasp.plan.start import draw_in, drawn_starts
 from torchgrasp.plan.wrench import wrenches
 from torchgrasp.specs import ContactSpec

@@ -48,6 +48,10 @@ class Stage:
     settled: float = 1e-3
 
 
+FINISH = Stage(centre=0.0, cones=3.0, steps=30, settled=1e-8)
+"""Last, feasibility alone: without an objective every residual can vanish."""
+
+
 @dataclasses.dataclass(frozen=True)
 class State(Batch):
     """The triples with the tensions of their sides, the shape at their points, and their damping."""

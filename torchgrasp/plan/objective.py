@@ -1,8 +1,6 @@
-"""What a plan minimises instead of Eq. (14): Ferrari and Canny's epsilon, the least weight, or a user's own cost."""
+"""Costs of contacts and their gradients: Ferrari and Canny's epsilon, the least weight, or a user's own."""
 
 from collections.abc import Callable
-from functools import partial
-from typing import Literal
 
 import numpy as np
 import torch
@@ -20,27 +18,6 @@ Cost = Callable[[Tensor, Tensor], Tensor]
 
 ON_FACET = 1e-9
 """Distance from a facet within which a wrench is one of its corners, for wrenches of about unit length."""
-
-Objective = Literal["center", "epsilon", "min_weight"] | Cost
-
-
-def cost_of(objective: Objective, spec: ContactSpec, shape: Shape) -> Cost | None:
-    """Return the cost of an objective, or None for "center", which the rows of the problem hold.
-
-    A user's cost is tried on two triples about the centre of the shape.
-
-    Raises:
-        BadArgument: an unknown name, or a cost that returns no number for each row or has no gradient.
-    """
-    named = {"center": None, "epsilon": partial(epsilon_cost, spec), "min_weight": partial(min_weight_cost, spec)}
-    if callable(objective):
-        outward = torch.tensor([[1.0, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0]], dtype=torch.float64)
-        outward = outward.to(getattr(shape, "device", "cpu")).repeat(2, 1, 1)
-        slope_of(objective, shape.metres(outward), outward)
-        return objective
-    if objective not in named:
-        raise BadArgument("objective", repr(objective), "'center', 'epsilon', 'min_weight' or a cost of contacts")
-    return named[objective]
 
 
 def min_weight_cost(

@@ -102,7 +102,7 @@ def closure_probability(
         if not isinstance(value, int) or not least <= value < 2**63:
             raise BadArgument(name, value, f"an integer from {least}")
     planes = touched_planes(shape, contacts)
-    closed = _count_closed(planes, spec.friction, n, seed, float(shape.prior_block()[0, 0]))
+    closed = count_closed(planes, spec.friction, n, seed, float(shape.prior_block()[0, 0]))
     middle = (closed + 1) / (n + 2)
     return ClosureProbability(
         closed / n,
@@ -155,7 +155,7 @@ def touch(planes: TouchedPlanes, drawn: Float[Tensor, "b n 12"]) -> tuple[Float[
     return planes.points[:, None] + motion * normals, unit(gradient + motion * planes.bends[:, None])
 
 
-def _count_closed(planes: TouchedPlanes, friction: float, n: int, seed: int, prior: float) -> Float[Tensor, "b"]:
+def count_closed(planes: TouchedPlanes, friction: float, n: int, seed: int, prior: float) -> Float[Tensor, "b"]:
     """Draw planes at the contacts and count the draws that are closed."""
     values, vectors = torch.linalg.eigh(planes.covariance)
     if len(values) and not float(values.min()) >= -ROUNDING * prior:
