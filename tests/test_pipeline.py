@@ -15,13 +15,13 @@ from torchgrasp.values import ContactPlan, Contacts
 SPEC = ContactSpec(friction=0.8, table=0.0)
 
 
-@pytest.fixture(scope="module", params=["allegro", "barrett"])
+@pytest.fixture(scope="module", params=[("allegro", "together"), ("barrett", "together"), ("barrett", "contact_first")])
 def run(request):
     stages = {}
-    hand = load_hand(request.param)
-    grasps = plan_grasps(
-        load_object("cylinder").view, hand, SPEC, starts=150, seed=1, observer=lambda s, text, v: stages.update({s: v})
-    )
+    name, mode = request.param
+    hand, view = load_hand(name), load_object("cylinder").view
+    note = lambda stage, text, value: stages.update({stage: value})  # noqa: E731
+    grasps = plan_grasps(view, hand, SPEC, starts=150, seed=1, mode=mode, observer=note)
     return hand, grasps, stages
 
 
@@ -126,7 +126,8 @@ def test_the_file_names_everything(run, tmp_path):
     assert meta["hand"] == hand.name
     assert meta["joint_names"].split(",") == list(hand.joint_names)
     assert meta["hand_sha256"] == hand.sha256
-    assert len(meta["mixture_sha256"]) == 64
+    model = {"together": 4, "contact_first": 64}[meta["mode"]]  # "none", since none is asked, or its hash
+    assert len(meta["mixture_sha256"]) == model
     assert meta["cloud_sha256"] == digest(load_object("cylinder").view)
     assert {"units", "frames", "seed", "friction", "table", "starts"} <= set(meta)
 
@@ -143,6 +144,8 @@ def test_bad_arguments_are_refused_before_any_work():
         plan_grasps(view, "barrett")
     with pytest.raises((BadArgument, TypeError), match="starts"):
         plan_grasps(view, hand, starts=0)
+    with pytest.raises((BadArgument, TypeError), match="mode"):
+        plan_grasps(view, hand, mode="paper")  # pyright: ignore[reportArgumentType]
 
 
 def test_no_triples_is_an_answer():

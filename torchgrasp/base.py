@@ -1,7 +1,7 @@
 """What every value is made of: frozen dataclasses of tensors, batches with rows, checks and counts."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
 import torch
@@ -62,6 +62,18 @@ class Batch(Value):
         if failed:
             raise FailedRows("; ".join(f"{k} of {len(self)} rows: {s.sentence}" for s, k in failed.items()))
         return self
+
+
+def join(parts: Sequence[SomeBatch]) -> SomeBatch:
+    """Put the rows of batches of one kind one below the other; what has no rows is the first one's."""
+
+    def together(values: list[Any]) -> Any:
+        if isinstance(values[0], Tensor):
+            return torch.cat(values)
+        return join(values) if isinstance(values[0], Value) else values[0]
+
+    fields = dataclasses.fields(parts[0])  # pyright: ignore[reportArgumentType]
+    return type(parts[0])(**{f.name: together([getattr(part, f.name) for part in parts]) for f in fields})
 
 
 def count_status(status: Int[Tensor, "*b"]) -> dict[Status, int]:

@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
 from jaxtyping import Int
@@ -13,12 +13,14 @@ from torchgrasp.base import count_status
 from torchgrasp.cloud.check import check_cloud
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.files import sha256
+from torchgrasp.hand.clear import Surroundings
 from torchgrasp.hand.collide import field_from_surface
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.mixture import load_mixture, mixture_path
+from torchgrasp.hand.nearest import PostureSet, nearest_postures
 from torchgrasp.hand.query import query_hand
 from torchgrasp.hand.realise import realise
-from torchgrasp.hand.refine import Surroundings
+from torchgrasp.hand.together import realise_together
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.solve import plan_contacts
 from torchgrasp.shape.support import fit_shape
@@ -28,6 +30,14 @@ from torchgrasp.values import ContactPlan, Grasps, PointCloud
 
 Observer = Callable[[str, str, Any], None]
 """Called after each stage with its name, one line about it, and its value."""
+
+Mode = Literal["together", "contact_first"]
+"""How planned contacts become grasps.
+
+* "together": from the hand's own postures near each triple; where a hand that reaches it touches something, contacts,
+  pose and joints are solved together.
+* "contact_first": as in the paper, from the learned model's postures onto the contacts as they are.
+"""
 
 TRIPLES = 250
 """How many of the planned contact triples are certified and offered to the hand."""
@@ -79,6 +89,7 @@ def plan_grasps(
     starts: int = 1000,
     seed: int = 0,
     *,
+    mode: Mode = "together",
     observer: Observer = _ignore,
 ) -> Grasps:
     """Plan grasps of a hand on the object of a partial point cloud: every stage of the library in one call.
@@ -89,6 +100,7 @@ def plan_grasps(
         spec: what the contacts must satisfy; `ContactSpec()` by default.
         starts: random starts of the contact planner.
         seed: of every random draw; the same seed gives bitwise the same grasps.
+        mode: how planned contacts become grasps, see `Mode`. Only "contact_first" needs the hand's learned model.
         observer: called after each stage with its name, a line of counts, and its value.
 
     Returns:
@@ -108,10 +120,14 @@ def plan_grasps(
         raise BadArgument("cloud", type(cloud).__name__, "a PointCloud")
     if not isinstance(hand, Hand):
         raise BadArgument("hand", type(hand).__name__, "a Hand from load_hand")
+    if mode not in get_args(Mode):
+        raise BadArgument("mode", repr(mode), "'together' or 'contact_first'")
     check_cloud(cloud)
-    mixture_file = mixture_path(hand.urdf_path.parent)  # beside the hand, also when it is a user's own
-    device = cloud.points.device
-    hand, mixture = hand.to(device), load_mixture(mixture_file).to(device)
+    hand = hand.to(cloud.points.device)
+    model = None
+    if mode == "contact_first":
+        mixture_file = mixture_path(hand.urdf_path.parent)  # beside the hand, also when it is a user's own
+        model = load_mixture(mixture_file).to(cloud.points.device), sha256(mixture_file)
 
     shape = fit_shape(cloud, seed=seed, table=spec.table)
     surface = extract_surface(shape)
@@ -128,19 +144,23 @@ def plan_grasps(
         "certify", f"{len(contacts)} of {len(rows)} triples closed at friction {spec.planned_friction:g}", certificate
     )
 
-    guess = query_hand(contacts, hand, mixture)
+    surroundings = Surroundings(field_from_surface(surface.vertices, surface.faces), spec.table)
+    if model is None:
+        guess = nearest_postures(contacts, PostureSet.of(hand, seed=seed), surroundings)
+    else:
+        guess = query_hand(contacts, hand, model[0])
     reached = len(torch.unique(guess.row))
     observer("query", f"{len(guess)} postures for {reached} of {len(contacts)} triples", guess)
 
-    field = field_from_surface(surface.vertices, surface.faces)
-    center = surface.vertices.mean(0)
-    grasps = realise(guess, hand, contacts, certificate, Surroundings(field, spec.table), center)
+    given = guess, hand, contacts, certificate, surroundings, surface.vertices.mean(0)
+    grasps = realise_together(*given, shape, spec) if model is None else realise(*given)
     grasps = dataclasses.replace(
         grasps,
         meta={
             "hand": hand.name,
             "hand_sha256": hand.sha256,
-            "mixture_sha256": sha256(mixture_file),
+            "mode": mode,
+            "mixture_sha256": "none" if model is None else model[1],
             "cloud_sha256": digest(cloud),
             "joint_names": ",".join(hand.joint_names),
             "finger_names": ",".join(hand.finger_names),

@@ -23,6 +23,7 @@ class ContactSpec(Value):
         flatness: largest angle [rad] between the normals of the surface within 8 mm of a contact; None: not checked.
         table: height [m] of the table's plane, whose normal is the z axis of the cloud's frame; None: no table.
         contact_height: least height of a contact above the table [m].
+        tip_radius: of the fingertips [m], which must lie above the table, too; 0: they are points.
         start_radius: radius of the sphere from which starts are drawn, in normalised units (Sec. 6.2; the paper: 0.1).
 
     Raises:
@@ -40,6 +41,7 @@ class ContactSpec(Value):
     flatness: float | None = 0.44
     table: float | None = None
     contact_height: float = 0.012
+    tip_radius: float = 0.012
     start_radius: float = 0.9
 
     def __post_init__(self) -> None:
@@ -53,6 +55,7 @@ class ContactSpec(Value):
             ("flatness", 0.1 if self.flatness is None else self.flatness, 1e-3, 3.1416),
             ("table", 0.0 if self.table is None else self.table, -1e6, 1e6),
             ("contact_height", self.contact_height, -1.0, 1.0),
+            ("tip_radius", self.tip_radius, 0.0, 1.0),
             ("start_radius", self.start_radius, 1e-6, 1.2),
         ]
         for name, value, low, high in ranges:

@@ -160,10 +160,11 @@ class ContactCode(Value):
 
 @dataclasses.dataclass(frozen=True)
 class GraspGuess(Batch):
-    """Postures from the learned model, aligned with the contacts by their virtual frames (Eqs. 23-24).
+    """Postures of the learned model or of the hand's own, aligned with the contacts by their virtual frames (Eq. 24).
 
     `row` names the row of the contact plan and `permutation` the contact of each finger; `reach` is the least f_i of
-    Eq. (21); `tip_error` [m] is the distance of each fingertip from its contact before refinement.
+    Eq. (21), of a posture of the hand's own half its squared distance; `tip_error` [m] is the distance of each
+    fingertip from its contact before refinement.
     """
 
     joints: Float[Tensor, "g h"]

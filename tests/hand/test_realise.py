@@ -8,35 +8,25 @@ import trimesh
 from torchgrasp.errors import Status
 from torchgrasp.frames import apply
 from torchgrasp.hand.check import Findings
+from torchgrasp.hand.clear import Surroundings
 from torchgrasp.hand.collide import field_from_surface
 from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.mixture import load_mixture
 from torchgrasp.hand.query import query_hand
 from torchgrasp.hand.rank import score, tangential_ratio
-from torchgrasp.hand.realise import assign, best_rows, realise
-from torchgrasp.hand.refine import Surroundings
+from torchgrasp.hand.realise import assign, rank_in_group, realise
 from torchgrasp.values import Certificate, Contacts, GraspGuess
 
 
-def test_best_rows_keeps_few_of_each_group(generator):
-    badness = torch.rand(200, generator=generator)
+def test_rank_in_group_against_brute_force(generator):
+    badness = torch.randint(0, 40, (200,), generator=generator).double()  # with ties
     group = torch.randint(0, 30, (200,), generator=generator)
-    kept = best_rows(badness, group, most=40, each=2)
-    assert len(kept) == 40
-    assert torch.equal(badness[kept], badness[kept].sort().values)
-    assert int(torch.bincount(group[kept]).max()) <= 2
-    # brute force: walk in order and take while the group has room
-    taken, room = [], {}
-    for i in badness.argsort().tolist():
-        g = int(group[i])
-        if room.get(g, 0) < 2 and len(taken) < 40:
-            taken.append(i)
-            room[g] = room.get(g, 0) + 1
-    assert kept.tolist() == taken
-
-
-def test_best_rows_of_nothing():
-    assert len(best_rows(torch.zeros(0), torch.zeros(0, dtype=torch.int64), 5, 2)) == 0
+    place, seen = torch.zeros(200, dtype=torch.int64), {}
+    for i in sorted(range(200), key=lambda i: (float(badness[i]), i)):
+        place[i] = seen.get(int(group[i]), 0)
+        seen[int(group[i])] = int(place[i]) + 1
+    assert torch.equal(rank_in_group(badness, group), place)
+    assert len(rank_in_group(badness[:0], group[:0])) == 0
 
 
 def test_assign_gives_finger_i_its_contact(generator):

@@ -8,20 +8,11 @@ import torch
 from torchgrasp.errors import Status
 from torchgrasp.frames import apply, rigid, rotate, rotation_from_vector
 from torchgrasp.hand.check import check, normal_angle, tip_error
+from torchgrasp.hand.clear import MILLIMETRE, Surroundings, clearance_rows
 from torchgrasp.hand.collide import field_from_surface
 from torchgrasp.hand.load import load_hand
-from torchgrasp.hand.refine import (
-    MILLIMETRE,
-    Posture,
-    Screws,
-    Surroundings,
-    badness,
-    clearance_rows,
-    moved,
-    open_hand,
-    refine,
-    tip_rows,
-)
+from torchgrasp.hand.motion import Posture, Screws
+from torchgrasp.hand.refine import badness, open_hand, refine, tip_rows, tip_targets
 from torchgrasp.values import Contacts
 
 
@@ -72,16 +63,15 @@ def test_jacobian_against_finite_differences(hand, ball):
     surroundings = Surroundings(ball, -0.02)
 
     def rows(at):
-        touch = torch.zeros(6, 3, dtype=torch.float64)
-        screws = Screws.at(at, hand)
-        return tip_rows(screws, contacts, touch), clearance_rows(screws, surroundings, tips_touch=True)
+        screws, target = Screws.at(at, hand), tip_targets(hand, contacts)
+        return tip_rows(screws, target, contacts.normals), clearance_rows(screws, surroundings, tips_touch=True)
 
     tips, links = rows(posture)
     h = 1e-6
     for k in range(6 + hand.dof):
         step = torch.zeros(6, 6 + hand.dof, dtype=torch.float64)
         step[:, k] = h
-        plus, minus = rows(moved(posture, step, hand)), rows(moved(posture, -step, hand))
+        plus, minus = rows(posture.moved(step, hand)), rows(posture.moved(-step, hand))
         difference = (plus[0][0] - minus[0][0]) / (2 * h)
         torch.testing.assert_close(tips[1][..., k], difference, rtol=1e-5, atol=2e-3)
         # hinges come sorted by depth, so that only the sum of squares compares row by row
@@ -108,7 +98,7 @@ def test_disturbed_postures_come_back(hand, ball):
     contacts = touched(hand, truth)  # a metre away from the ball: reach alone is tested
     g = len(truth.joints)
     scale = torch.cat([torch.full((3,), 0.005), torch.full((3,), 0.17), torch.full((hand.dof,), 0.15)]).double()
-    start = moved(truth, torch.randn(g, 6 + hand.dof, generator=rng, dtype=torch.float64) * scale, hand)
+    start = truth.moved(torch.randn(g, 6 + hand.dof, generator=rng, dtype=torch.float64) * scale, hand)
     found = refine(start, hand, contacts, far(ball))
     error = tip_error(Screws.at(found, hand), contacts).amax(1)
     assert float((error < MILLIMETRE).double().mean()) > 0.95

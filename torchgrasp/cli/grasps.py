@@ -21,7 +21,7 @@ from torchgrasp.errors import BadArgument, MissingExtra
 from torchgrasp.files import sha256
 from torchgrasp.hand.load import load_hand
 from torchgrasp.objects import DATA, MASSES, list_objects, load_object
-from torchgrasp.pipeline import plan_grasps
+from torchgrasp.pipeline import Mode, plan_grasps
 from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows, write_report
 from torchgrasp.report.run import Run, Stage, verdict
 from torchgrasp.shape.surface import extract_surface
@@ -55,6 +55,7 @@ def grasp(
     table: float | None = None,
     no_table: bool = False,
     friction: float = 0.8,
+    mode: Mode = "together",
 ) -> int:
     """Plan grasps of the object of a partial point cloud, and close on it in simulation.
 
@@ -72,6 +73,7 @@ def grasp(
         table: height of the table [m]; by default the lowest point of the cloud.
         no_table: there is no table.
         friction: coefficient of friction between fingertips and object.
+        mode: contacts, pose and joints together, or contacts first and the learned model after, as in the paper.
     """
     with naming("--out", "path"):
         check_folder(out)
@@ -102,7 +104,7 @@ def grasp(
         origin += " (lowest point)" * (height is not None and table is None)
         camera = "camera known" if seen.viewpoint is not None else "camera estimated"
         progress.end("cloud", f"{len(seen)} points, {camera}, {origin}")
-        grasps = plan_grasps(seen, the_hand, spec, starts, seed, observer=progress.end)
+        grasps = plan_grasps(seen, the_hand, spec, starts, seed, mode=mode, observer=progress.end)
         surface = extract_surface(progress.values["shape"])
         name = object_name(cloud if mesh is None else mesh)
         plan = progress.values["plan"]

@@ -13,11 +13,13 @@ from torch import Tensor
 
 from torchgrasp.base import Batch
 from torchgrasp.errors import Status
+from torchgrasp.hand.clear import MILLIMETRE, Surroundings, link_clearance
 from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.refine import FLAT_PAD, MILLIMETRE, ROUND_PAD, Posture, Screws, Surroundings
+from torchgrasp.hand.motion import Posture, Screws
+from torchgrasp.hand.refine import FLAT_PAD, ROUND_PAD, tip_targets
 from torchgrasp.values import Contacts
 
-TIP_TOLERANCE = 2 * MILLIMETRE
+TIP_TOLERANCE = 1 * MILLIMETRE
 """Largest distance [m] of a fingertip from its contact."""
 TIP_PENETRATION = 2 * MILLIMETRE
 """Largest depth [m] of a fingertip in the estimated surface; a tip that touches where it should has none."""
@@ -38,36 +40,14 @@ class Findings(Batch):
 def tip_error(screws: Screws, contacts: Contacts) -> Float[Tensor, "g 3"]:
     """Return the distance [m] of each fingertip's touching point from its contact."""
     hand = screws.hand
-    target = contacts.points + hand.tip_radius.to(contacts.points)[:, None] * contacts.normals
-    return torch.linalg.vector_norm(screws.points(hand.tip_index, hand.center) - target, dim=-1)
+    return torch.linalg.vector_norm(screws.points(hand.tip_index, hand.center) - tip_targets(hand, contacts), dim=-1)
 
 
 def normal_angle(screws: Screws, contacts: Contacts) -> Float[Tensor, "g 3"]:
     """Return the angle [rad] between each pad's axis and the direction into the surface."""
     hand = screws.hand
-    pads = (screws.obj_from_link[:, hand.tip_index, :3, :3] @ hand.normal.to(contacts.points)[:, :, None])[..., 0]
+    pads = screws.directions(hand.tip_index, hand.normal)
     return torch.acos((-(pads * contacts.normals).sum(-1)).clamp(-1.0, 1.0))
-
-
-def link_clearance(
-    screws: Screws, surroundings: Surroundings, tips_touch: bool
-) -> tuple[Float[Tensor, "g"], Float[Tensor, "g"], Float[Tensor, "g"]]:
-    """Return the least clearance [m] of the links from the object, of the tips from it, and of both from the table.
-
-    Where the tips are meant to touch, they count in the second figure alone. Without a table its clearance is infinite.
-    """
-    cover = screws.hand.collision_spheres
-    centres = screws.points(cover.link_index, cover.center)
-    radius = cover.radius.to(centres)
-    free = surroundings.field.query(centres)[0] - radius
-    touches = cover.touching
-    tips = free[:, touches].amin(1)
-    links = free[:, ~touches].amin(1) if tips_touch else free.amin(1)
-    if surroundings.table is None:
-        table = torch.full_like(tips, math.inf)
-    else:
-        table = (centres[..., 2] - radius).amin(1) - surroundings.table
-    return links, tips, table
 
 
 def check(

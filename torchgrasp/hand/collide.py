@@ -97,6 +97,17 @@ class DistanceField(Value):
     spacing: float
     values: Float[Tensor, "x y z"]
 
+    def nearest(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+        """Return the value [m] at the node nearest to each point: at most 0.87 spacings off inside the grid.
+
+        Outside it is the value at the border, which is too small.
+        """
+        flat = 0
+        for x, low, count in zip(points.unbind(-1), self.origin.tolist(), self.values.shape, strict=True):
+            node = torch.round((x - low) / self.spacing).clamp_(0, count - 1)
+            flat = node.long() if isinstance(flat, int) else flat * count + node.long()
+        return self.values.reshape(-1)[flat].to(points)
+
     def query(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
         """Return the signed distance [m] and its gradient at points [m], trilinearly; the gradient is its derivative.
 

@@ -8,7 +8,7 @@ from torchgrasp.errors import Status
 from torchgrasp.frames import degenerate
 from torchgrasp.plan.flat import bend
 from torchgrasp.plan.margin import balance_and_witness
-from torchgrasp.plan.problem import Shape, triple_jet
+from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet
 from torchgrasp.plan.wrench import BALANCED, MIN_MARGIN, MIN_RANK_RATIO, rank_ratio, wrenches
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan, Contacts
@@ -34,12 +34,12 @@ def assess(shape: Shape, spec: ContactSpec, points: Float[Tensor, "b 3 3"]) -> C
     closed &= rank_ratio(wrench) >= MIN_RANK_RATIO  # 0 / 0 of a row that is not whole is False
 
     apart = torch.linalg.vector_norm(metres - metres.roll(1, 1), dim=-1).amin(-1)
-    lowest = -torch.inf if spec.table is None else spec.table + spec.contact_height
+    lowest = ContactProblem.of(shape, spec).least_height(normals)
     good = {
         Status.OUT_OF_DOMAIN: (torch.linalg.vector_norm(points, dim=-1) <= shape.domain_radius).all(-1),
         Status.OFF_SURFACE: (jet.distance.abs() <= ON_SURFACE).all(-1),
         Status.TOO_UNCERTAIN: ((jet.variance >= 0) & (jet.variance < spec.max_variance)).all(-1),
-        Status.BELOW_TABLE: (metres[..., 2] >= lowest).all(-1),
+        Status.BELOW_TABLE: (points[..., 2] >= lowest).all(-1),
         Status.TOO_CLOSE: apart >= spec.separation,
         Status.DEGENERATE: ~degenerate(points),
     }

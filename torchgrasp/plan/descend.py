@@ -5,7 +5,6 @@ brought back to the surface by the mean alone, which costs a fraction of a full 
 """
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -169,16 +168,6 @@ def put(whole: SomeValue, at: Int[Tensor, "a"], part: SomeValue) -> SomeValue:
 
     fields = dataclasses.fields(whole)  # pyright: ignore[reportArgumentType]
     return type(whole)(**{f.name: place(getattr(whole, f.name), getattr(part, f.name)) for f in fields})
-
-
-def join(parts: Sequence[SomeValue]) -> SomeValue:
-    """Return the rows of all parts, one after the other."""
-
-    def chain(pieces: list[Any]) -> Any:
-        return join(pieces) if isinstance(pieces[0], Value) else torch.cat(pieces)
-
-    fields = dataclasses.fields(parts[0])  # pyright: ignore[reportArgumentType]
-    return type(parts[0])(**{f.name: chain([getattr(p, f.name) for p in parts]) for f in fields})
 
 
 def descend(shape: Shape, problem: ContactProblem, state: State, stage: Stage, objective: Cost | None = None) -> State:

@@ -76,6 +76,12 @@ class TripleJet(Batch):
         """The outward unit normals, Eq. (11): the posterior gradient is not of length 1 and is normalised."""
         return unit(self.gradient)
 
+    @property
+    def turn(self) -> Float[Tensor, "b 3 3 3"]:
+        """The derivative of each normal by its point: (1 - n n^T) H / |g|."""
+        n, steep = self.normals, torch.linalg.vector_norm(self.gradient, dim=-1)[..., None, None]
+        return (self.hessian - n[..., :, None] * (n[..., None, :] @ self.hessian)) / steep
+
 
 def triple_jet(shape: Shape, points: Float[Tensor, "b 3 3"]) -> TripleJet:
     """Evaluate the shape at all points of all triples."""
@@ -115,30 +121,37 @@ def balanced_forces(
 class ContactProblem:
     """Eqs. (10)-(14) and the margins of `ContactSpec`, in the normalised units of one shape.
 
-    `friction` is that of the round cone inside the cone with edges; `separation` is at least `LEAST_SIDE`; `lowest`
-    is the least z coordinate of a contact, or None without a table.
+    `friction` is that of the round cone inside the cone with edges; `separation` is at least `LEAST_SIDE`; `table` is
+    the z coordinate of its plane, -inf without one.
     """
 
     friction: float
     max_variance: float
     domain_radius: float
     separation: float
-    lowest: float | None
+    table: float
+    contact_height: float
+    tip_radius: float
 
     @classmethod
     def of(cls, shape: Shape, spec: ContactSpec) -> "ContactProblem":
         """Return the problem of a shape and a specification."""
-        lowest = None
+        table = -math.inf
         if spec.table is not None:
-            level = torch.tensor([0.0, 0.0, spec.table + spec.contact_height], dtype=torch.float64)
-            lowest = float(shape.normalise(level)[2])
+            table = float(shape.normalise(torch.tensor([0.0, 0.0, spec.table], dtype=torch.float64))[2])
         return cls(
             friction=spec.planned_friction * math.cos(math.pi / spec.edges),
             max_variance=spec.max_variance,
             domain_radius=float(shape.domain_radius),
             separation=max(spec.separation / float(shape.scale), LEAST_SIDE),
-            lowest=lowest,
+            table=table,
+            contact_height=spec.contact_height / float(shape.scale),
+            tip_radius=spec.tip_radius / float(shape.scale),
         )
+
+    def least_height(self, normals: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+        """Return the least z coordinate of contacts with these normals, at which a round fingertip is on the table."""
+        return self.table + (self.tip_radius * (1 - normals[..., 2])).clamp_min(self.contact_height)
 
     def rows(self, points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"], jet: TripleJet) -> Rows:
         """Evaluate all rows and their Jacobians.
@@ -165,9 +178,11 @@ class ContactProblem:
         apart = _own(along)
         apart = apart - apart.unflatten(2, (4, 3))[:, :, [2, 0, 1, 3]].flatten(2)  # of a side's end
         slopes = [cones_by_x, _own(jet.variance_gradient / half_slope), _own(points / ball), apart]
-        if self.lowest is not None:
-            values.append(self.lowest - points[..., 2] + (1 - INSIDE) * 0.1)
-            slopes.append(_own(-identity[2].expand_as(points)))
+        if self.table > -math.inf:
+            lowest = self.least_height(jet.normals)
+            values.append(lowest - points[..., 2] + (1 - INSIDE) * 0.1)
+            by_tip = self.tip_radius * (lowest > self.table + self.contact_height)[..., None]
+            slopes.append(_own(-identity[2] - by_tip * jet.turn[..., 2, :]))
         return Rows(
             centre=points.mean(1),
             surface=jet.distance,

@@ -7,9 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import join
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.plan.assess import assess
-from torchgrasp.plan.descend import FINISH, Stage, descend, join, pick, project, put, start_state
+from torchgrasp.plan.descend import FINISH, Stage, descend, pick, project, put, start_state
 from torchgrasp.plan.improve import Improve, Objective, improver
 from torchgrasp.plan.problem import ContactProblem, Shape
 from torchgrasp.plan.start import StartFrom, check_starts, drawn_starts, given_starts

@@ -130,8 +130,7 @@ def survey(
     jet = triple_jet(shape, points)
     good = (jet.distance.abs() < 1e-4) & (jet.variance >= 0) & (jet.variance < spec.max_variance)
     good &= torch.linalg.vector_norm(points, dim=-1) < problem.domain_radius
-    if problem.lowest is not None:
-        good &= points[..., 2] > problem.lowest
+    good &= points[..., 2] > problem.least_height(jet.normals)
     if spec.flatness is not None:
         good &= bend(shape, points, jet.normals) < 0.9 * spec.flatness  # the ring of another triple is turned
     if int(good.sum()) < 3:  # nothing to choose from

@@ -1,0 +1,123 @@
+"""What the links of a hand must stay clear of: the object, the table, and each other."""
+
+import dataclasses
+import math
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchgrasp.base import Value
+from torchgrasp.hand.collide import DistanceField, segment_closest
+from torchgrasp.hand.cover import SphereCover
+from torchgrasp.hand.minimise import Rows
+from torchgrasp.hand.motion import Screws, wrench_of
+
+MILLIMETRE = 1e-3
+CLEARANCE = 4 * MILLIMETRE
+"""Clearance [m] that the links are asked to keep of the object and the table; `check` accepts any above zero."""
+SELF_CLEARANCE = 1 * MILLIMETRE
+"""Clearance [m] that the links are asked to keep of each other."""
+WORST = 8
+"""How many of the least clearances of each kind enter one step; the others are larger."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Surroundings(Value):
+    """What the links must not touch: the object's `field` and the height [m] of the `table`, None without one."""
+
+    field: DistanceField
+    table: float | None
+
+
+def hinge(clearance: Float[Tensor, "g k"], jacobian: Float[Tensor, "g k d"], margin: float) -> Rows:
+    """Return max(0, margin - clearance) [mm] and its derivative."""
+    active = (clearance < margin).to(clearance)
+    return active * (margin - clearance) / MILLIMETRE, -active[..., None] * jacobian / MILLIMETRE
+
+
+def least(clearance: Float[Tensor, "g s"]) -> Int[Tensor, "g k"]:
+    """Return where the `WORST` least clearances of each row are."""
+    return clearance.topk(min(WORST, clearance.shape[1]), dim=1, largest=False, sorted=False).indices
+
+
+def crowding(centres: Float[Tensor, "*b s 3"], cover: SphereCover, surroundings: Surroundings) -> Float[Tensor, "*b"]:
+    """Return the sum of squares [mm2] of what a touching hand's spheres lack of clearance, by the nearest node."""
+    radius = cover.radius.to(centres)
+    object_lack = (CLEARANCE + radius - surroundings.field.nearest(centres)) * ~cover.touching
+    lack = object_lack.clamp_min(0).square().sum(-1)
+    if surroundings.table is not None:
+        table_lack = surroundings.table + CLEARANCE * ~cover.touching + radius - centres[..., 2]
+        lack = lack + table_lack.clamp_min(0).square().sum(-1)
+    return lack / MILLIMETRE**2
+
+
+def clearance_rows(screws: Screws, surroundings: Surroundings, tips_touch: bool) -> Rows:
+    """Return hinges on the least clearances from the object, from the table and between the links."""
+    hand, cover = screws.hand, screws.hand.collision_spheres
+    centres = screws.points(cover.link_index, cover.center)
+    radius = cover.radius.to(centres)
+    at = torch.arange(len(centres), device=centres.device)[:, None]
+
+    rough = surroundings.field.nearest(centres) - radius
+    if tips_touch:
+        rough = torch.where(cover.touching, math.inf, rough)
+    index = least(rough)
+    near = centres[at, index]
+    distance, gradient = surroundings.field.query(near)
+    wrenches, links = [wrench_of(near, gradient)], [cover.link_index[index]]
+    clearance = [distance - radius[index] + torch.where(torch.isinf(rough[at, index]), 1.0, 0.0)]
+
+    if surroundings.table is not None:
+        above = centres[..., 2] - radius - surroundings.table
+        if tips_touch:  # such a tip is where its contact is
+            above = above + CLEARANCE * cover.touching
+        index = least(above)
+        up = torch.tensor([0.0, 0.0, 1.0]).to(centres).expand(*index.shape, 3)
+        wrenches.append(wrench_of(centres[at, index], up))
+        links.append(cover.link_index[index])
+        clearance.append(above[at, index])
+
+    capsules = hand.self_collision
+    first, second = capsules.capsule_pairs.unbind(1)
+    ends = screws.columns(capsules.capsule_link.repeat(2), torch.cat([capsules.start, capsules.end]))
+    pair = [end.index_select(0, k).mT for k in (first, second) for end in ends.chunk(2)]
+    here, there = segment_closest(*pair)
+    thick = capsules.radius.to(centres)[capsules.capsule_pairs].sum(1)
+    gap = (here - there).unbind(-1)
+    between = torch.sqrt(gap[0] * gap[0] + gap[1] * gap[1] + gap[2] * gap[2]) - thick[:, None]
+    index = least(between.T)
+    between = between.T[at, index]
+    here, there = here[index, at], there[index, at]
+    # Axes that cross have no direction; such a pair keeps a zero row and leaves it to the others to part them.
+    direction = (here - there) / (between + thick[index])[..., None].clamp_min(1e-9)
+    k = index.shape[1]
+    wrenches += [wrench_of(here, direction), wrench_of(there, -direction)]
+    links += [capsules.capsule_link[first[index]], capsules.capsule_link[second[index]]]
+
+    jacobian = screws.jacobian(torch.cat(wrenches, 1), torch.cat(links, 1))
+    outside, apart = jacobian[:, : -2 * k], jacobian[:, -2 * k : -k] + jacobian[:, -k:]
+    outer = hinge(torch.cat(clearance, 1), outside, CLEARANCE)
+    inner = hinge(between, apart, SELF_CLEARANCE)
+    return torch.cat([outer[0], inner[0]], 1), torch.cat([outer[1], inner[1]], 1)
+
+
+def link_clearance(
+    screws: Screws, surroundings: Surroundings, tips_touch: bool
+) -> tuple[Float[Tensor, "g"], Float[Tensor, "g"], Float[Tensor, "g"]]:
+    """Return the least clearance [m] of the links from the object, of the tips from it, and of both from the table.
+
+    Where the tips are meant to touch, they count in the second figure alone. Without a table its clearance is infinite.
+    """
+    cover = screws.hand.collision_spheres
+    centres = screws.points(cover.link_index, cover.center)
+    radius = cover.radius.to(centres)
+    free = surroundings.field.query(centres)[0] - radius
+    touches = cover.touching
+    tips = free[:, touches].amin(1)
+    links = free[:, ~touches].amin(1) if tips_touch else free.amin(1)
+    if surroundings.table is None:
+        table = torch.full_like(tips, math.inf)
+    else:
+        table = (centres[..., 2] - radius).amin(1) - surroundings.table
+    return links, tips, table
