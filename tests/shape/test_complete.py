@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchgrasp.frames import apply, rotate
-from torchgrasp.shape.complete import complete_cloud
+from torchgrasp.shape.complete import Completion, complete_cloud
 from torchgrasp.shape.silhouette import farthest_points, seen_from_one_side, silhouette
 from torchgrasp.values import PointCloud
 
@@ -87,16 +87,30 @@ def test_mirrored_points_respect_cloud_outline_seen_surface_and_table(seen_cylin
     assert len(complete_cloud(seen_cylinder, table=0.0, budget=7).points) == 7
 
 
-def test_noise_covers_the_error_and_is_least_near_the_plane(seen_cylinder: PointCloud):
-    """An uncertain plane turns and shifts what is far from it the most."""
+def test_noise_covers_the_error_and_grows_without_symmetry(seen_cylinder: PointCloud):
     found = complete_cloud(seen_cylinder, table=0.0)
     side = found.points[:, 2] < 0.11
     error = (torch.linalg.vector_norm(found.points[side, :2], dim=-1) - 0.03).abs()
-    assert (error < found.noise[side]).double().mean() > 0.9
-    assert (found.noise >= 0.003).all() and found.noise.median() < 0.008
+    assert (error < _deviation(found)[side]).double().mean() > 0.9
+    assert (found.noise >= 0.003).all() and _deviation(found).median() < 0.008
     poor = complete_cloud(_without_symmetry(seen_cylinder), table=0.0)
     assert poor.scores[0] < found.scores[0]
-    assert poor.noise.median() > found.noise.median()
+    assert _deviation(poor).median() > _deviation(found).median()
+
+
+@pytest.mark.parametrize("table", [0.0, None])
+def test_shared_errors_are_those_of_a_moved_plane(seen_cylinder: PointCloud, table: float | None):
+    """A plane's shift moves all its points along its normal, a turn those further away more: the rank stays small."""
+    found = complete_cloud(seen_cylinder, table=table)
+    free = 2 if table is not None else 3  # a shift and one or two turns
+    values = torch.linalg.svdvals(found.shared)
+    assert float((values[free * len(found.planes) :] ** 2).sum()) < 0.02 * float((values**2).sum())
+    assert torch.linalg.vector_norm(found.shared, dim=1).min() > 0
+
+
+def _deviation(found: Completion) -> Tensor:
+    """The standard deviation [m] of each point's whole error."""
+    return torch.sqrt(found.noise**2 + (found.shared**2).sum(1))
 
 
 def _without_symmetry(cloud: PointCloud) -> PointCloud:

@@ -11,12 +11,13 @@ from torch import Tensor
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.linalg import unit
 from torchgrasp.shape.blocks import cross_covariance
-from torchgrasp.shape.condition import condition
+from torchgrasp.shape.condition import condition, posterior_given
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.joint import JointEstimate, draw_samples
 from torchgrasp.shape.kernel import covariance, radial_derivatives, thin_plate
 from torchgrasp.shape.observe import Observations
 from torchgrasp.shape.profiles import Kernel, kernel_by_name, matern52_kernel, rbf_kernel
+from torchgrasp.shape.update import append_observations
 from torchgrasp.values import PointCloud
 
 SCALE = 0.05
@@ -204,6 +205,29 @@ def test_updates_equal_a_refit(name: str, with_normals: bool):
     torch.testing.assert_close(
         updated.joint(points[:4]).covariance, refit.joint(points[:4]).covariance, atol=1e-9, rtol=0
     )
+
+
+def test_errors_that_new_observations_share_equal_a_dense_solve():
+    """Some of the new points have normals, and the errors of their distances two common causes."""
+    known, kernel = _known(30, extra=6), kernel_by_name("thin_plate", 3.6)
+    known = Observations(**{**vars(known), "has_normal": known.has_normal & (torch.arange(len(known.x)) % 3 > 0)})
+    old, new = _part(known, slice(0, -6)), _part(known, slice(-6, None))
+    rng = torch.Generator().manual_seed(1)
+    shared = 0.1 * torch.randn(6, 2, dtype=torch.float64, generator=rng)
+    found = append_observations(posterior_given(old, kernel), new, shared)
+    y, noise = known.rows()
+    extra = torch.zeros(len(y), len(y), dtype=torch.float64)
+    extra[len(old.x) : len(known.x), len(old.x) : len(known.x)] = shared @ shared.T
+    x = 0.9 * unit(torch.randn(20, 3, dtype=torch.float64, generator=rng))
+    yes = torch.ones(len(x), dtype=torch.bool)
+    k = covariance(known.x, known.x, known.has_normal, known.has_normal, kernel.profile) + torch.diag(noise) + extra
+    star = covariance(x, known.x, yes, known.has_normal, kernel.profile)
+    mean, spread = found.estimate(x)
+    torch.testing.assert_close(mean, (star @ torch.linalg.solve(k, y)).reshape(4, 20).T, rtol=0, atol=1e-8)
+    left = kernel.profile(x.new_zeros(())) - (star[:20] * torch.linalg.solve(k, star[:20].T).T).sum(1)
+    torch.testing.assert_close(spread[:, 0, 0], left, rtol=0, atol=1e-8)
+    alone = append_observations(posterior_given(old, kernel), new).estimate(x)[1]
+    assert (spread[:, 0, 0] > alone[:, 0, 0] - 1e-12).all()
 
 
 def test_a_touch_on_the_hidden_side_makes_it_certain():

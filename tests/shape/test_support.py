@@ -66,6 +66,17 @@ def test_the_hidden_side_is_better_than_with_the_papers_support(shape: ShapeGP):
     assert ours.variance.median() < theirs.variance.median()
 
 
+def test_what_is_observed_outside_allows_for_the_hidden_side(shape: ShapeGP):
+    """Measured to the cloud alone, points behind the object would be a diameter too far away, and shrink it."""
+    outside = shape.metres(shape.x[torch.linalg.vector_norm(shape.x, dim=-1).sub(1.2).abs() < 1e-9])
+    assert len(outside) == 20
+    radial = torch.linalg.vector_norm(outside[:, :2], dim=-1) - 0.03
+    axial = torch.maximum(outside[:, 2] - 0.12, -outside[:, 2])
+    true = torch.where(radial < 0, axial, torch.hypot(radial.clamp_min(0), axial.clamp_min(0)))
+    error = shape.predict(outside).distance * shape.scale - true
+    assert error.abs().max() < 0.012 and error.median().abs() < 0.003
+
+
 def test_signed_distance_is_metric(shape: ShapeGP):
     axis = torch.tensor([[0.045, 0.0, 0.06], [0.03, 0.0, 0.06], [0.02, 0.0, 0.06]], dtype=torch.float64)
     distance = shape.predict(axis).distance * shape.scale

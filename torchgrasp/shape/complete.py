@@ -21,17 +21,19 @@ LEAST_NOISE = 0.003
 GOOD, ASYMMETRY = 0.4, 0.024
 """Score from which on an object counts as symmetric, and how much further [m] mirrored points are off for each 1 that
 is missing."""
-TEMPERATURE = 0.05
+TEMPERATURE = 0.1
 """Planes are as probable as exp(score / temperature): those that score nearly as well tell how well one is known."""
-SHARED = 1.5
-"""Factor on the deviations between such planes: points of one image share them, and do not average them out."""
 SPREAD_STEPS, SPREAD_TURN, SPREAD_SHIFT = 5, 0.15, 0.045
 """Planes tried about one for its spread: along each axis, to that turn [rad], and to that share of the cloud's size."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Completion(Value):
-    """Points of the hidden side [m] with normals, and how far each may be off (`noise`, a standard deviation [m]).
+    """Points of the hidden side [m] with normals, and how far they may be off.
+
+    Each has an error of its own across the surface (`noise`, a standard deviation [m]) and one that it shares with the
+    points of the same plane, which is known no better than its score tells: the covariance of all the errors is
+    diag(noise^2) + shared shared^T [m^2]. Points that share an error do not average it out.
 
     `planes` are rows (n, o) of the planes n.x = o that were used, best first, and `scores` what supports them: 1 for
     a mirror image that lies on the cloud wholly, below .15 for none to speak of.
@@ -40,6 +42,7 @@ class Completion(Value):
     points: Float[Tensor, "m 3"]
     normals: Float[Tensor, "m 3"]
     noise: Float[Tensor, "m"]
+    shared: Float[Tensor, "m c"]
     planes: Float[Tensor, "p 4"]
     scores: Float[Tensor, "p"]
     outline: Outlines
@@ -52,9 +55,9 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
     stand out of the outline, in front of the seen surface or below the table (each saturates). The planes come from a
     grid, vertical ones when the table is known, those at right angles to the best being likelier; the up to four
     best, and one across the view if none of those is, are refined. The cloud is mirrored across each, and across
-    pairs; a point is kept where nothing was seen, the hull allows it and no better one is near. Its noise is that of
-    its plane: how far the planes that score nearly as well would move it across the surface, and how asymmetric the
-    object looks.
+    pairs; a point is kept where nothing was seen, the hull allows it and no better one is near. Its noise is how
+    asymmetric the object looks; the points of a plane share how far the planes that score nearly as well would move
+    them across the surface.
 
     Args:
         cloud: clean points [m] of one view or of several, with outward unit normals and the viewpoint.
@@ -77,17 +80,20 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
     probes = farthest_points(points, PROBES)
     scene = Scene(points, normals, tree, outline, table, points[probes], normals[probes])
     planes, scores = find_planes(scene)
-    mirrors = [_Mirror.of(scene, p, s) for p, s in zip(planes, scores, strict=True)]
-    seen = _Image(points, normals, math.inf, torch.zeros_like(points[:, 0]))
+    mirrors = [_Mirror.of(scene, i, planes[i], scores[i]) for i in range(len(planes))]
+    near = len(mirrors[0].near) if mirrors else 0
+    none = torch.zeros_like(points[:, 0])
+    seen = _Image(points, normals, math.inf, none, none.new_zeros(len(points), len(planes), near))
     images = [mirror.image(seen) for mirror in mirrors]
     images += [mirrors[j].image(images[i]) for i in range(min(2, len(planes))) for j in range(len(planes)) if i != j]
     images.sort(key=lambda image: -image.score)
-    kept = _keep(scene, images)
-    chosen = farthest_points(kept[0], budget)
+    kept = _keep(scene, seen.select(torch.arange(0)), images)
+    kept = kept.select(farthest_points(kept.points, budget))
     return Completion(
-        points=kept[0][chosen],
-        normals=kept[1][chosen],
-        noise=kept[2][chosen],
+        points=kept.points,
+        normals=kept.normals,
+        noise=torch.sqrt(LEAST_NOISE**2 + kept.variance),
+        shared=kept.shared.flatten(1),
         planes=planes,
         scores=scores,
         outline=outline,
@@ -96,60 +102,73 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
 
 @dataclasses.dataclass(frozen=True)
 class _Image:
-    """A mirrored cloud [m], its score, infinite if it is no mirror image, and its points' variance [m^2]."""
+    """A mirrored cloud [m], its score, infinite if it is no mirror image, and the errors of its points.
+
+    `variance` [m^2] is that of their own errors; `shared` [m] tells, for each plane and each one near it, how far a
+    point moves across the surface with it, times the root of its probability.
+    """
 
     points: Tensor
     normals: Tensor
     score: float
-    variance: Tensor
+    variance: Float[Tensor, "n"]
+    shared: Float[Tensor, "n planes near"]
+
+    def select(self, rows: Tensor) -> "_Image":
+        """Return some of the points."""
+        return _Image(self.points[rows], self.normals[rows], self.score, self.variance[rows], self.shared[rows])
+
+    def join(self, other: "_Image") -> "_Image":
+        """Return the points of this one and of another, with this one's score."""
+        return _Image(
+            torch.cat([self.points, other.points]),
+            torch.cat([self.normals, other.normals]),
+            self.score,
+            torch.cat([self.variance, other.variance]),
+            torch.cat([self.shared, other.shared]),
+        )
 
 
 @dataclasses.dataclass(frozen=True)
 class _Mirror:
-    """A plane, its score, and the planes near it with the probability of each, given the scores."""
+    """A plane, its number and score, and the planes near it with the probability of each, given the scores."""
 
+    number: int
     plane: Tensor
     score: float
     near: Tensor
     weight: Tensor
 
     @classmethod
-    def of(cls, scene: Scene, plane: Float[Tensor, "4"], score: Float[Tensor, ""]) -> "_Mirror":
+    def of(cls, scene: Scene, number: int, plane: Float[Tensor, "4"], score: Float[Tensor, ""]) -> "_Mirror":
         """Return the mirror of a plane in a scene."""
         steps = torch.linspace(-1.0, 1.0, SPREAD_STEPS, dtype=plane.dtype)
         near = planes_near(scene, plane, SPREAD_TURN * steps, SPREAD_SHIFT * scene.size * steps)
-        return cls(plane, float(score), near, torch.softmax(scene.score(near)[0] / TEMPERATURE, 0))
+        return cls(number, plane, float(score), near, torch.softmax(scene.score(near)[0] / TEMPERATURE, 0))
 
     def image(self, of: _Image) -> _Image:
         """Return the mirror image of a cloud; that of an image is a little less sure than the less sure of both."""
         points, normals = reflect(of.points, self.plane), turn(of.normals, self.plane)
         shift = ((reflect(of.points, self.near[:, None]) - points) * normals).sum(-1)
-        asymmetry = ASYMMETRY * max(GOOD - self.score, 0.0)
-        variance = of.variance + SHARED**2 * (self.weight @ shift**2) + asymmetry**2
+        shared = of.shared.clone()  # a mirror leaves errors across the surface as they are
+        shared[:, self.number] += (self.weight.sqrt()[:, None] * shift).T
+        variance = of.variance + (ASYMMETRY * max(GOOD - self.score, 0.0)) ** 2
         score = self.score if math.isinf(of.score) else min(of.score, self.score) - 0.05
-        return _Image(points, normals, score, variance)
+        return _Image(points, normals, score, variance, shared)
 
 
-def _keep(scene: Scene, images: list[_Image]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return points, normals and noise [m] of the mirrored points that nothing speaks against, best images first."""
+def _keep(scene: Scene, kept: _Image, images: list[_Image]) -> _Image:
+    """Return what is kept already and the mirrored points that nothing speaks against, of the best images first."""
     from scipy.spatial import KDTree
 
-    kept: list[tuple[Tensor, Tensor, Tensor]] = []
     for image in images:
         distance, _ = scene.nearest(image.points)
-        fine = (distance > NEW) & _allowed(scene, image.points)
-        points, normals, variance = image.points[fine], image.normals[fine], image.variance[fine]
-        if kept and len(points):
-            before, _ = KDTree(torch.cat([k[0] for k in kept]).numpy()).query(points.numpy())
-            new = torch.from_numpy(before) > SPACING
-            points, normals, variance = points[new], normals[new], variance[new]
-        thin = _thin(points)
-        kept.append((points[thin], normals[thin], torch.sqrt(LEAST_NOISE**2 + variance[thin])))
-    if not kept:
-        empty = scene.points.new_zeros(0, 3)
-        return empty, empty, empty[:, 0]
-    points, normals, noise = (torch.cat(c) for c in zip(*kept, strict=True))
-    return points, normals, noise
+        fine = image.select((distance > NEW) & _allowed(scene, image.points))
+        if len(kept.points) and len(fine.points):
+            before, _ = KDTree(kept.points.numpy()).query(fine.points.numpy())
+            fine = fine.select(torch.from_numpy(before) > SPACING)
+        kept = kept.join(fine.select(_thin(fine.points)))
+    return kept
 
 
 def _allowed(scene: Scene, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:

@@ -10,7 +10,9 @@ from torchgrasp.shape.observe import Observations
 from torchgrasp.shape.posterior import Posterior
 
 
-def append_observations(posterior: Posterior, new: Observations) -> Posterior:
+def append_observations(
+    posterior: Posterior, new: Observations, shared: Float[Tensor, "n c"] | None = None
+) -> Posterior:
     """Return the posterior given `new` observations, too; it equals the one of all observations at once.
 
     With B = L^-1 K(old, new), the factor grows by the rows [B^T, C], C being the Cholesky factor of what the old
@@ -19,16 +21,22 @@ def append_observations(posterior: Posterior, new: Observations) -> Posterior:
     Args:
         posterior: the one to extend.
         new: normalised, float64, on the posterior's device.
+        shared: errors that the new distances have in common, a column of deviations for each independent cause; they
+            add shared shared^T to the covariance of the distances' own noise. None: there are none.
 
     Raises:
         IndefiniteCovariance: the new points are too far away for the kernel.
     """
     kernel = posterior.kernel
+    if shared is not None:
+        shared = shared[torch.argsort(~new.has_normal, stable=True)]
     new = new.with_normals_first()
     y, noise = new.rows()
     fresh = int(new.has_normal.sum())
     cross = covariance_rows(kernel, posterior.x, posterior.oriented, new.x, fresh)
     own = gram(kernel, new.x, fresh) + torch.diag_embed(noise)
+    if shared is not None:
+        own[: len(new.x), : len(new.x)] += shared @ shared.T
     before = torch.linalg.solve_triangular(posterior.factor, posterior.ordered(cross), upper=False)
     corner = cholesky(own - before.T @ before, "the covariance of new observations", kernel.remedy)
     factor = torch.cat([torch.cat([posterior.factor, torch.zeros_like(before)], 1), torch.cat([before.T, corner], 1)])
