@@ -114,7 +114,7 @@ def test_a_whole_surface_needs_no_completion():
     n = torch.randn(900, 3, generator=rng, dtype=torch.float64)
     n = n / torch.linalg.vector_norm(n, dim=-1, keepdim=True)
     shape = fit_shape(PointCloud(0.04 * n, n))
-    assert len(shape.x) == 70
+    assert len(shape.x) == 85
     found = shape.predict(0.04 * n)
     assert (found.distance.abs() * shape.scale).max() < 0.002
     assert found.std_m.max() < 0.006
@@ -164,6 +164,7 @@ def test_few_points_are_enough_for_a_shape():
         {"noise": float("nan")},
         {"budget": 3},
         {"budget": 0},
+        {"budget": 1001},
         {"psi_scale": 0.9},
         {"psi_scale": float("inf")},
         {"seed": -1},
@@ -181,19 +182,17 @@ def test_numbers_that_are_no_integers_are_refused(bad: dict[str, float]):
         fit_shape(_cylinder(), **bad)  # pyright: ignore[reportArgumentType]
 
 
-@pytest.mark.parametrize("bad", [{"kernel": "cubic"}, {"criterion": "chance"}])
-def test_an_unknown_kernel_or_criterion_is_refused(bad: dict[str, str]):
+@pytest.mark.parametrize("bad", [{"kernel": "cubic"}, {"criterion": "chance"}, {"budget": "many"}])
+def test_an_unknown_kernel_criterion_or_budget_is_refused(bad: dict[str, str]):
     with pytest.raises((BadArgument, TypeError), match=next(iter(bad))):  # TypeError: annotations, checked in tests
         fit_shape(_cylinder(), **bad)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("support", ["camera", "paper"])
 @pytest.mark.parametrize("criterion", ["variance", "error", "both"])
-def test_without_a_budget_points_are_taken_until_the_whole_cloud_is_certain(
-    criterion: Criterion, support: Literal["camera", "paper"]
-):
+def test_points_are_taken_until_the_whole_cloud_is_certain(criterion: Criterion, support: Literal["camera", "paper"]):
     cloud = _cylinder()
-    shape = fit_shape(cloud, budget=None, support=support, criterion=criterion)
+    shape = fit_shape(cloud, budget="sure", support=support, criterion=criterion)
     assert shape.predict(shape.cloud.points).variance.max() <= 0.01
     few = fit_shape(cloud, budget=30, support=support, criterion=criterion)
     assert len(few.x) < len(shape.x) and few.predict(few.cloud.points).variance.max() > 0.01
