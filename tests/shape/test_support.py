@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument, IndefiniteCovariance, SuspiciousScale
+from torchgrasp.linalg import unit
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.profiles import Kernel, KernelName, matern52_kernel
 from torchgrasp.shape.select import Criterion
@@ -126,6 +127,15 @@ def test_a_viewpoint_does_not_turn_the_normals_of_a_whole_surface_inward():
     n = n / torch.linalg.vector_norm(n, dim=-1, keepdim=True)
     shape = fit_shape(PointCloud(0.04 * n, n, torch.tensor([0.0, 0.0, 0.5], dtype=torch.float64)))
     assert (shape.predict(0.04 * n).normal * n).sum(-1).min() > 0.98
+
+
+@pytest.mark.parametrize("viewpoint", [None, torch.tensor([0.3, 0.1, 0.4], dtype=torch.float64)])
+def test_a_whole_surface_without_normals_is_refused_and_not_turned_inside_out(viewpoint: Tensor | None):
+    rng = torch.Generator().manual_seed(0)
+    ball = 0.04 * unit(torch.randn(900, 3, generator=rng, dtype=torch.float64))
+    for shape in (torch.tensor([1.0, 1.0, 1.0]), torch.tensor([0.4, 1.0, 2.0])):
+        with pytest.raises(BadArgument, match=r"cloud: .* behind others.* outward normals"):
+            fit_shape(PointCloud(ball * shape.double(), None, viewpoint))
 
 
 def test_a_viewpoint_within_a_single_view_is_refused():

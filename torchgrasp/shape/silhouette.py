@@ -19,6 +19,9 @@ MAX_CELLS = 320
 """Cells of the raster along the cloud's longer side, at most."""
 FRONT_MARGIN = 0.002
 """How far [m] a point may lie in front of the seen surface: noise of the camera."""
+BEHIND, PIXELS = 0.3, 6
+"""A point lies behind one of its six nearest pixels when it is deeper by so many radii of the cloud than a slope of 45
+degrees would explain."""
 TIE = 1e-9
 """Relative difference of two distances that rounding can make."""
 
@@ -169,6 +172,24 @@ def seen_from_one_side(cloud: PointCloud, viewpoint: Float[Tensor, "*points 3"])
     assert cloud.normals is not None
     facing = ((viewpoint - cloud.points) * cloud.normals).sum(-1) > 0
     return float(facing.double().mean()) >= 0.9
+
+
+def share_behind(cloud: PointCloud, viewpoint: Float[Tensor, "3"]) -> float:
+    """Return the share of the points that lie behind others: of a single view few, of a whole surface about half.
+
+    Of 63 noisy views of 21 objects, of 40 points or more, it is .15 at most, of 14 whole surfaces .23 at least; but of
+    a plate seen face on it is 0.
+    """
+    from scipy.spatial import KDTree
+
+    points, viewpoint = cloud.points.double().cpu(), viewpoint.double().cpu()
+    middle = (points.amax(0) + points.amin(0)) / 2
+    local = (points - viewpoint) @ _camera_axes(middle - viewpoint).T
+    depth, pixels = local[:, 2], local[:, :2] / local[:, 2:]
+    apart, index = KDTree(pixels.numpy()).query(pixels.numpy(), k=min(PIXELS, len(pixels)))
+    deeper = depth[:, None] - depth[torch.from_numpy(index)] - torch.from_numpy(apart) * depth[:, None]
+    radius = torch.linalg.vector_norm(points - middle, dim=-1).max()
+    return float((deeper.amax(1) > BEHIND * radius).double().mean())
 
 
 def _camera_axes(forward: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:

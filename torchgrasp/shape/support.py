@@ -20,7 +20,7 @@ from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.observe import Observations, join, off_surface, on_surface
 from torchgrasp.shape.profiles import Kernel, KernelName, kernel_by_name
 from torchgrasp.shape.select import Criterion, select_points
-from torchgrasp.shape.silhouette import seen_from_one_side
+from torchgrasp.shape.silhouette import seen_from_one_side, share_behind
 from torchgrasp.shape.update import append_observations
 from torchgrasp.values import PointCloud
 
@@ -49,6 +49,8 @@ MOST_VIEWS, LEAST_SEEN = 16, 10
 """Cameras of a merged cloud, at most, and points that each must have seen."""
 Part = tuple[Observations, Tensor | None]
 """Later observations, and the errors that their distances share; see `append_observations`."""
+MOST_BEHIND = 0.2
+"""Share of points behind others from which a cloud is no single view."""
 CANDIDATES = 2000
 """Points of a cloud among which the informative ones are sought, at most."""
 BUDGETS = {"camera": 85, "paper": 70}
@@ -82,7 +84,8 @@ def fit_shape(
     Args:
         cloud: points [m] of one object, of one view or of several (`merge_clouds`). A missing viewpoint is estimated.
             "camera" fits normals anew; given ones tell a whole surface from a single view, and "paper" observes them;
-            their signs must agree with each other (`check_normals`), else they are left aside.
+            their signs must agree with each other (`check_normals`), else they are left aside. Walls thinner than the
+            cloud's spacing merge.
         noise: standard deviation of an observed signed distance, normalised; of normals too for "paper".
         budget: points of the observed set: the one inside, 20 outside, and the rest the most informative ones of
             the cloud; None: 85 for "camera", whose rim and mirrored points come on top, and 70 for "paper".
@@ -99,7 +102,7 @@ def fit_shape(
 
     Raises:
         BadArgument: an argument out of range, a cloud that `check_cloud` refuses, a viewpoint that has not the
-            whole of its view in front of it, or more than 16 of them.
+            whole of its view in front of it, or more than 16 of them; for "camera" a whole surface without normals.
         TooFewPoints: fewer than 10 points of one of several views.
         IndefiniteCovariance: `psi_scale` is too small, or the kernel too long for the noise.
 
@@ -251,7 +254,7 @@ def _known(cloud: PointCloud) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"
 
 
 def _check_viewpoint(view: PointCloud) -> None:
-    """Refuse a viewpoint from which part of its view lies beside or behind the camera."""
+    """Refuse a viewpoint from which part of its view lies beside or behind the camera, or behind other parts."""
     points, viewpoint = view.points, view.viewpoint
     assert viewpoint is not None
     forward = (points.amax(0) + points.amin(0)) / 2 - viewpoint
@@ -259,6 +262,10 @@ def _check_viewpoint(view: PointCloud) -> None:
     if behind:
         found = f"{viewpoint.tolist()} m, with {behind} of {len(points)} points beside or behind it"
         raise BadArgument("viewpoint", found, "the position of a camera that has the whole cloud in front of it")
+    share = share_behind(view, viewpoint)
+    if share > MOST_BEHIND:
+        found = f"{share:.0%} of the points behind others, which no camera sees at once"
+        raise BadArgument("cloud", found, "a single view, the viewpoint of each point, or outward normals")
 
 
 def _check_views(cloud: PointCloud) -> None:
