@@ -25,6 +25,7 @@ WITHOUT = {
     "flatness None": dataclasses.replace(DEFAULT, flatness=None),
     "flatness 0.3": dataclasses.replace(DEFAULT, flatness=0.3),
     "table None": dataclasses.replace(DEFAULT, table=None),
+    "tip_radius 0": dataclasses.replace(DEFAULT, tip_radius=0.0),
     "max_variance 0.1": dataclasses.replace(DEFAULT, max_variance=0.1),
     "max_variance 0.01": dataclasses.replace(DEFAULT, max_variance=0.01),
 }
