@@ -11,13 +11,26 @@ from tqdm import tqdm
 
 from benchmarks.common import Row, least_seconds, write_rows
 from benchmarks.exact import bench_cholesky, bench_laws, bench_refusals, bench_selection, bench_update
+from benchmarks.inputs import bench_inputs
 from benchmarks.speed import bench_growth, bench_memory, bench_queries, bench_raw
 from torchgrasp.plan.survive import closure_survival
 from torchgrasp.shape.calibrate import Row as View
 from torchgrasp.shape.calibrate import format_table, mean_row, measure_shape, read_views
 from torchgrasp.shape.support import fit_shape
 
-SUBJECTS = ("refusals", "selection", "laws", "update", "queries", "memory", "raw", "growth", "objects", "cholesky")
+SUBJECTS = (
+    "refusals",
+    "selection",
+    "laws",
+    "update",
+    "queries",
+    "memory",
+    "raw",
+    "growth",
+    "objects",
+    "inputs",
+    "cholesky",
+)
 
 
 def shape(
@@ -34,7 +47,8 @@ def shape(
 
     Args:
         objects: folder with manifest.json and a folder for each object; without it the hidden side is not measured.
-        only: subjects to measure: refusals, selection, laws, update, queries, memory, raw, growth, objects, cholesky.
+        only: subjects to measure: refusals, selection, laws, update, queries, memory, raw, growth, objects, inputs,
+            cholesky.
         clouds: random partial clouds whose covariance is factored; 10^4 take about ten minutes.
         queries: points at which the shape is asked; ten times as many for the memory.
         threads: of torch, for the library and its peers alike. Times are the least of some
@@ -58,6 +72,7 @@ def shape(
         "raw": lambda: [bench_raw(queries)],
         "growth": lambda: [bench_growth(out.with_name("bench_shape_growth.png"))],
         "objects": lambda: bench_objects(objects) if objects else [],
+        "inputs": lambda: bench_inputs(objects) if objects else [],
         "cholesky": lambda: [bench_cholesky(clouds, seed)],
     }
     clock = "processor" if threads == 1 else "wall"
