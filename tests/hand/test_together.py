@@ -25,7 +25,7 @@ def scene():
     """What the pipeline makes of one view of a jug with a handle, up to certified contacts and guesses for them."""
     hand, shape = load_hand("allegro"), fit_shape(load_object("jug").view, seed=0, table=0.0)
     surface = extract_surface(shape)
-    plan = plan_contacts(shape, SPEC, starts=40, seed=2)
+    plan = plan_contacts(shape, SPEC, starts=24, seed=2)
     certificate = certify(plan.contacts, SPEC)
     good = (plan.status == Status.OK) & certificate.closed
     contacts, certificate = plan.contacts[good], certificate[good]

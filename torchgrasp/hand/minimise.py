@@ -39,7 +39,7 @@ def minimise(
     """
     whole, at = state, torch.arange(len(state))
     residual, jacobian = evaluate(state, at)
-    cost = residual.square().sum(1)
+    cost, at = residual.square().sum(1), at.to(residual.device)
     damping = torch.full_like(cost, 1e-2)
     done = cost < SOLVED
     for _ in range(iterations):

@@ -111,7 +111,8 @@ def try_guesses(guess: GraspGuess, rank: Int[Tensor, "g"], triples: int, rounds:
     """Try guesses in rounds, each on the triples without a grasp so far, and return one grasp a triple, best first.
 
     A round is how many more guesses of each triple are tried, and the attempt; an attempt of another kind than the
-    one before starts again from the first guess. Of a triple without a grasp the last failure is returned.
+    one before starts again from the first guess. Of a triple without a grasp the failure of best score is returned, if
+    there is one of certified contacts, of these.
     """
     waiting = torch.ones(triples, dtype=torch.bool, device=rank.device)
     tried: list[Grasps] = []
