@@ -10,13 +10,13 @@ from benchmarks.common import Row, least_seconds, write_rows
 from benchmarks.executable import bench_executable
 from benchmarks.pace import bench_anytime, bench_growth, bench_memory
 from benchmarks.tries import POINTS, bench_peers
-from benchmarks.truth import bench_fields, bench_truth
+from benchmarks.truth import bench_fields, bench_objectives, bench_truth
 from torchgrasp import ContactSpec, Status, certify, fit_shape, plan_contacts
 from torchgrasp.shape.calibrate import read_views
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.values import PointCloud
 
-SUBJECTS = ("call", "peers", "truth", "fields", "executable", "growth", "memory", "anytime")
+SUBJECTS = ("call", "peers", "truth", "fields", "objectives", "executable", "growth", "memory", "anytime")
 
 
 def plan(
@@ -33,7 +33,7 @@ def plan(
 
     Args:
         objects: folder with manifest.json and a folder for each object.
-        only: subjects to measure, of call, peers, truth, fields, executable, growth, memory, anytime.
+        only: subjects to measure, of call, peers, truth, fields, objectives, executable, growth, memory, anytime.
         starts: of the planner, for each view and radius.
         tries: the first of them that IPOPT gets, for each view and radius.
         threads: of torch. IPOPT with MUMPS, as casadi brings it, has one; on two it is counted as two processes that
@@ -53,6 +53,7 @@ def plan(
         "peers": lambda: bench_peers(views, starts, tries, seed, threads),
         "truth": lambda: [bench_truth(views, starts, seed)],
         "fields": lambda: [bench_fields(views, max(starts // 5, 1), seed)],
+        "objectives": lambda: [bench_objectives(views, max(starts // 40, 4), seed)],
         "executable": lambda: bench_executable(views, starts, seed),
         "growth": lambda: [bench_growth(4 if quick else 5, out.with_name("bench_plan_growth.png"))],
         "memory": lambda: [bench_memory(10 * starts if quick else 100 * starts, threads)],
