@@ -1,5 +1,6 @@
 """The whole chain on a shipped view: every returned grasp is judged again, by code of its own."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.optimize import linprog
 
 from torchgrasp import ContactSpec, PointCloud, Status, load_grasps, load_hand, load_object, plan_grasps
 from torchgrasp.errors import BadArgument, SuspiciousScale
+from torchgrasp.hand.rank import rank_by_closure
 from torchgrasp.pipeline import describe, digest, spread_rows
 from torchgrasp.values import ContactPlan, Contacts
 
@@ -74,6 +76,19 @@ def test_the_best_come_first(run):
     assert bool((good[:-1] | ~good[1:]).all())  # none good after a bad one
     scores = grasps.score[good]
     assert bool((scores[:-1] >= scores[1:]).all())
+
+
+def test_of_equal_grasps_the_likelier_closed_one_ranks_first_and_failures_stay_last(run):
+    _, grasps, _ = run
+    equal = dataclasses.replace(grasps, score=torch.zeros_like(grasps.score))
+    likely = torch.rand(len(grasps), generator=torch.Generator().manual_seed(0)).to(grasps.score)
+    ranked = rank_by_closure(equal, likely)
+    good = ranked.status == Status.OK
+    assert int(good.sum()) == int((grasps.status == Status.OK).sum())
+    assert not bool(good[int(good.sum()) :].any())
+    most = float(likely[grasps.status == Status.OK].max())
+    assert float(ranked.score[0]) == pytest.approx(2 * math.log(most / (1 - most)))
+    assert bool((ranked.score[good].diff() <= 0).all())
 
 
 def test_tips_limits_and_clearances_hold(run):

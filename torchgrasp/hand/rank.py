@@ -1,24 +1,28 @@
 """Which of the executable grasps to try first.
 
-The paper ranks by the sum of the contacts' variances. The score here adds up how certain the surface is at the
-contacts, how near their centre is to the object's, how little of the squeeze must be carried by friction, and how
-centrally the pads touch. The weights are a choice, not a fit. The evidence for them is thin,
-and older than the last changes of the shape: of eight scanned objects and both hands, 8 grasps each, spread over all
-ranks, were closed in simulation; 116 of 126 were held, and of the 44 pairs of a held and a lost grasp of the same
-object and hand the score orders 77 % rightly, the sum of variances 68 %.
+The paper ranks by the sum of the contacts' variances. Here the log-odds of closure on the uncertain surface come first
+(`plan.probability`, which holds the variances and the normals' too), then how near the contacts' centre is to the
+object's, how little of the squeeze must be carried by friction, and how centrally the pads touch. The weights are a
+choice, not a fit. The evidence: of the ten best Allegro grasps of 16 noisy views of eight scanned objects 93 % are
+closed on the true surface at friction 0.6, of all grasps 87 %; with the square of the largest standard deviation
+instead of the log-odds, as before, 89 %.
 """
+
+import dataclasses
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.errors import Status
 from torchgrasp.hand.check import Findings
 from torchgrasp.linalg import unit
-from torchgrasp.values import Contacts
+from torchgrasp.values import Contacts, Grasps
 
-OFFSET, STD, PAD = 0.02, 0.004, 0.8
-"""Offset of the contacts' centre [m], surface standard deviation [m] and pad angle [rad] that each cost one point. The
-second is squared: the error of the surface grows from 2 mm where 4 mm are expected to 10 mm where 6 mm are."""
+OFFSET, PAD = 0.02, 0.8
+"""Offset of the contacts' centre [m] and pad angle [rad] that each cost one point."""
+ODDS, LEAST = 2.0, 1e-3
+"""Points for each unit of the log-odds of closure; probabilities within `LEAST` of 0 and 1 count as that."""
 
 
 def tangential_ratio(contacts: Contacts) -> Float[Tensor, "g"]:
@@ -33,7 +37,7 @@ def tangential_ratio(contacts: Contacts) -> Float[Tensor, "g"]:
 
 
 def score(contacts: Contacts, found: Findings, center: Float[Tensor, "3"]) -> Float[Tensor, "g"]:
-    """Return the score of each grasp; larger is better, and differences of one are large.
+    """Return the score of each grasp if all are as surely closed; larger is better, and differences of one are large.
 
     Args:
         contacts: in the order of the fingers.
@@ -41,9 +45,12 @@ def score(contacts: Contacts, found: Findings, center: Float[Tensor, "3"]) -> Fl
         center: estimated centre of the object [m].
     """
     offset = torch.linalg.vector_norm(contacts.points.mean(1) - center, dim=-1)
-    return -(
-        offset / OFFSET
-        + (contacts.std_m.amax(1) / STD) ** 2
-        + tangential_ratio(contacts)
-        + found.normal_angle.amax(1) / PAD
-    )
+    return -(offset / OFFSET + tangential_ratio(contacts) + found.normal_angle.amax(1) / PAD)
+
+
+def rank_by_closure(grasps: Grasps, probability: Float[Tensor, "g"]) -> Grasps:
+    """Return grasps with the log-odds of closure added to their score, those with `Status.OK` first and best first."""
+    odds = torch.logit(probability.to(grasps.score), eps=LEAST)
+    ranked = dataclasses.replace(grasps, score=grasps.score + ODDS * odds)
+    order = torch.argsort(ranked.score, descending=True, stable=True)
+    return ranked[order[torch.argsort((ranked.status != Status.OK)[order].to(torch.uint8), stable=True)]]

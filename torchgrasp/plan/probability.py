@@ -18,7 +18,7 @@ holds for normals as well: on 16 views of scanned objects 68 % of the errors of 
 import dataclasses
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Batch, check_tensor
@@ -111,6 +111,12 @@ def closure_probability(
     )
 
 
+def well_inside(shape: ShapeGP, contacts: Contacts) -> Bool[Tensor, "b"]:
+    """Tell which triples are at least a footprint inside the domain of the shape, where closure has a probability."""
+    radius = torch.linalg.vector_norm(shape.normalise(contacts.points.detach().double().to(shape.device)), dim=-1)
+    return (radius + FOOTPRINT / shape.scale <= shape.domain_radius).all(-1)
+
+
 def touched_planes(shape: ShapeGP, contacts: Contacts) -> TouchedPlanes:
     """Return the posterior of the surface as the fingers meet it, with real deviations.
 
@@ -125,12 +131,11 @@ def touched_planes(shape: ShapeGP, contacts: Contacts) -> TouchedPlanes:
     if bool(((torch.linalg.vector_norm(normals, dim=-1) - 1).abs() > UNIT_TOLERANCE).any()):
         raise BadArgument("contacts.normals", "lengths other than 1", "unit vectors (to 1e-3)")
     width = FOOTPRINT / shape.scale
+    if not bool(well_inside(shape, contacts).all()):
+        raise BadArgument("contacts.points", "a contact at the edge of the domain", "contacts further inside")
     first = tangents(points, normals)
     axes = torch.stack([normals, first, torch.linalg.cross(normals, first)], 2)  # (b, contact, axis, 3)
-    offsets = torch.cat([torch.zeros_like(axes[:, :, :1]), axes, -axes], 2) * width
-    asked = points[:, :, None] + offsets
-    if bool((torch.linalg.vector_norm(asked, dim=-1) > shape.domain_radius).any()):
-        raise BadArgument("contacts.points", "a contact at the edge of the domain", "contacts further inside")
+    asked = points[:, :, None] + torch.cat([torch.zeros_like(axes[:, :, :1]), axes, -axes], 2) * width
     # (d, w) of a contact from d at its seven points: d itself, and differences along three axes.
     weights = points.new_zeros(*points.shape[:2], 4, 7)
     weights[..., 0, 0] = 1.0
