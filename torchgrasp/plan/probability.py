@@ -10,7 +10,7 @@ Two choices make the deviations real ones. All covariances are taken times `std_
 the same process with that much less amplitude and noise: real surfaces deviate that much less than sqrt(variance),
 the paper's measure of doubt. And the deviation of the slope from its mean, the gradient of the posterior mean, is that
 over a fingertip's width. A sample of the thin plate is rough: the gradient at its points turns by 25 degrees where the
-errors of true normals are 10, and no finger would feel that. Over 24 mm the factor that was found for distances, 0.65,
+errors of true normals are 10, and no finger would feel that. Over 24 mm the factor that was found for distances, 0.62,
 holds for normals as well: on 16 views of scanned objects 68 % of the errors of a normal's components lie within 0.58
 (hidden side, median of the views) and 0.67 (seen side) of their sqrt(variance).
 """
