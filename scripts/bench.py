@@ -5,11 +5,10 @@ python scripts/bench.py grasp --objects DIR    cloud to held object, for every o
 python scripts/bench.py plan --objects DIR     the contact planner against IPOPT, on the true surface, and as it grows
 python scripts/bench.py proof --objects DIR    certificates and the probability of closure, against exact references
 python scripts/bench.py shape --objects DIR    exactness, speed, memory and calibration of the shape, beside its bars
+
+Times on two threads are for a quiet machine. Beside other work set OMP_WAIT_POLICY=PASSIVE: threads then sleep where
+they would spin, which takes a plan twice as long on a quiet one.
 """
-
-import os
-
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads cost more than they bring on shared machines
 
 import tyro
 from benchmarks.grasp import grasp

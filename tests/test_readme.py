@@ -1,4 +1,4 @@
-"""What the README shows runs: its Python as it stands, its commands as far as they exist and take their flags."""
+"""What README and guides show runs: the Python as it stands, the commands as far as they exist and take their flags."""
 
 import re
 import shlex
@@ -8,14 +8,15 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
+GUIDES = [path.read_text() for path in sorted((ROOT / "docs").glob("*.md"))]
 
 
-def fenced(language):
-    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+def fenced(language, text=README):
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.parametrize("code", fenced("python"))
-def test_python_of_the_readme_runs(code, tmp_path, monkeypatch):
+@pytest.mark.parametrize("code", [code for text in (README, *GUIDES) for code in fenced("python", text)])
+def test_python_of_the_readme_and_the_guides_runs(code, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "README.md", "exec"), {})
 

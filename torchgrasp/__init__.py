@@ -17,12 +17,14 @@ from torchgrasp.values import (
     ShapeEstimate,
 )
 from torchgrasp.cloud.depth import cloud_from_depth
+from torchgrasp.cloud.merge import merge_clouds
 from torchgrasp.cloud.read import read_cloud
 from torchgrasp.objects import list_objects, load_object
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.support import fit_shape
 from torchgrasp.plan.solve import plan_contacts
 from torchgrasp.plan.certify import certify
+from torchgrasp.plan.probability import closure_probability
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.code import encode
@@ -50,6 +52,7 @@ __all__ = [
     "ShapeEstimate",
     "TrialSpec",
     "cloud_from_depth",
+    "merge_clouds",
     "read_cloud",
     "list_objects",
     "load_object",
@@ -57,6 +60,7 @@ __all__ = [
     "fit_shape",
     "plan_contacts",
     "certify",
+    "closure_probability",
     "Hand",
     "load_hand",
     "encode",
