@@ -5,11 +5,14 @@ from there on all is exact. A proof needs no trust in who proposes it.
 """
 
 from fractions import Fraction
+from itertools import combinations
 
 import numpy as np
 
 GRID = 60
 """Wrenches are integers over 2 to this power, witnesses and coefficients over 2 to the power of 50."""
+NEAR_BASIS = 10
+"""The largest coefficients of HiGHS among which a feasible basis is sought."""
 
 
 def wrench_matrix(points: np.ndarray, normals: np.ndarray, friction: float, edges: int) -> np.ndarray:
@@ -74,16 +77,17 @@ def exact_margin(wrench: np.ndarray) -> Fraction:
     found = linprog(objective, A_eq=equations, b_eq=right, bounds=[(0, None)] * m + [(None, None)], method="highs")
     if found.x is None:
         raise ArithmeticError("no coefficients balance")
-    base = sorted(range(m), key=lambda k: -found.x[k])[:6]
     whole = np.zeros((7, m + 1), dtype=object)
     whole[:6, :m], whole[:6, m] = wrench.T, [sum(column) for column in wrench.T]
     whole[6, :m], whole[6, m] = 1, m
     last = np.array([0] * 6 + [1], dtype=object)
-    columns = [*base, m]
+    largest = sorted(range(m), key=lambda k: -found.x[k])[:NEAR_BASIS]  # of equal ones, not every six are a basis
+    columns = next(([*six, m] for six in combinations(largest, 6) if _feasible(whole[:, [*six, m]], last)), None)
+    if columns is None:
+        raise ArithmeticError("the basis is not feasible")
     while True:
         primal, dual = solve(whole[:, columns], last), solve(whole[:, columns].T, last)
-        if primal is None or dual is None or min(primal[:6]) < 0:
-            raise ArithmeticError("the basis is not feasible")
+        assert primal is not None and dual is not None
         entering = next((k for k in range(m) if sum(y * a for y, a in zip(dual, whole[:, k], strict=True)) < 0), None)
         if entering is None:
             return primal[6]
@@ -91,6 +95,12 @@ def exact_margin(wrench: np.ndarray) -> Fraction:
         assert change is not None
         lengths = {i: primal[i] / change[i] for i in range(6) if change[i] > 0}
         columns[min(lengths, key=lambda i: (lengths[i], columns[i]))] = entering
+
+
+def _feasible(basis: np.ndarray, right: np.ndarray) -> bool:
+    """Tell whether a basis has a solution without negative coefficients; the margin, its last unknown, is free."""
+    found = solve(basis, right)
+    return found is not None and min(found[:-1]) >= 0
 
 
 def solve(matrix: np.ndarray, right: np.ndarray) -> list[Fraction] | None:

@@ -26,6 +26,9 @@ GAP = 1e-9
 MAX_RESIDUAL = 1e-6
 """Largest |W phi| of a balance that HiGHS found, for wrenches of length about 1."""
 
+STRICT = 1e-10
+"""Tolerances of HiGHS, the least it takes. By its own, 1e-7, margins come out 1e-8 off, on the wrong side of 1e-6."""
+
 UNIT_TOLERANCE = 1e-3
 """How far the length of a given normal may be from 1."""
 
@@ -139,6 +142,7 @@ def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None]
         b_eq=np.r_[np.zeros(6), 1.0],
         bounds=[(0, None)] * m + [(None, None)],
         method="highs",
+        options={"primal_feasibility_tolerance": STRICT, "dual_feasibility_tolerance": STRICT},
     )
     if found.x is None:
         return -np.inf, np.inf, None
