@@ -11,6 +11,7 @@ import numpy as np
 
 GRID = 60
 """Wrenches are integers over 2 to this power, witnesses and coefficients over 2 to the power of 50."""
+TOLERANCES = ("primal_feasibility_tolerance", "dual_feasibility_tolerance")
 NEAR_BASIS = 10
 """The largest coefficients of HiGHS among which a feasible basis is sought."""
 
@@ -74,7 +75,8 @@ def exact_margin(wrench: np.ndarray) -> Fraction:
     equations[:6, :m], equations[:6, m] = matrix.T, matrix.sum(0)
     equations[6, :m], equations[6, m] = 1.0, m
     objective, right = np.r_[np.zeros(m), -1.0], np.r_[np.zeros(6), 1.0]
-    found = linprog(objective, A_eq=equations, b_eq=right, bounds=[(0, None)] * m + [(None, None)], method="highs")
+    bounds, strict = [(0, None)] * m + [(None, None)], dict.fromkeys(TOLERANCES, 1e-10)
+    found = linprog(objective, A_eq=equations, b_eq=right, bounds=bounds, method="highs", options=strict)
     if found.x is None:
         raise ArithmeticError("no coefficients balance")
     whole = np.zeros((7, m + 1), dtype=object)
