@@ -52,7 +52,7 @@ class Joined(Batch):
 
 def contacts_at(shape: Shape, points: Float[Tensor, "g 3 3"], jet: TripleJet) -> Contacts:
     """Return contacts at normalised points [m]."""
-    std = shape.std_factor * shape.scale * jet.variance.clamp_min(0.0).sqrt()
+    std = shape.std_factor * shape.scale * jet.variance.sqrt()
     return Contacts(shape.metres(points), jet.normals, jet.variance, std)
 
 
