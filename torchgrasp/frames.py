@@ -4,6 +4,8 @@ Every transform is named `a_from_b` and maps coordinates of frame b into frame a
 `obj_from_hand = obj_from_vf @ vf_from_hand` (Eq. 24).
 """
 
+import math
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -58,6 +60,21 @@ def rotation_from_vector(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     True
     """
     return torch.linalg.matrix_exp(skew(v))
+
+
+def rotation_from_rpy(rpy: tuple[float, float, float]) -> Float[Tensor, "3 3"]:
+    """Return the rotation of URDF's fixed-axis roll, pitch and yaw [rad].
+
+    >>> torch.round(rotation_from_rpy((0.0, 0.0, torch.pi / 2)))[0]
+    tensor([ 0., -1.,  0.], dtype=torch.float64)
+    """
+    (cr, cp, cy), (sr, sp, sy) = [math.cos(a) for a in rpy], [math.sin(a) for a in rpy]
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return torch.tensor(rows, dtype=torch.float64)
 
 
 def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:

@@ -22,7 +22,7 @@ def check_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
     """Check a hand's files and return the hand: the public law for hands.
 
     The tree, the coupling, the limits and drives, masses and inertias, the pads, the parked posture, self-collision,
-    and the forward kinematics against yourdfpy, which applies `<mimic>` by itself.
+    and the forward kinematics against pytorch-kinematics and yourdfpy, which applies `<mimic>` by itself.
 
     Args:
         name_or_path: a shipped hand, or the folder of another one.
@@ -31,7 +31,7 @@ def check_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
     Raises:
         HandFileError: a file breaks a rule; the message names the file, what was found and what is allowed.
         BadArgument: the hand has no such option.
-        AssertionError: the library places a link elsewhere than yourdfpy does.
+        AssertionError: the library places a link elsewhere than they do.
 
     >>> check_hand("barrett").name
     'barrett'
@@ -50,6 +50,9 @@ def check_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
     worst, where = largest_fk_error(hand, joints)
     if not worst < FK_TOLERANCE:
         raise AssertionError(f"{hand.name}: link {where} differs by {worst:.3g} from yourdfpy's pose")
+    reference = hand.kinematics.reference_poses(hand.expand_joints(joints))
+    if not float((hand.link_poses(joints) - reference).abs().max()) < FK_TOLERANCE:
+        raise AssertionError(f"{hand.name}: a link is placed elsewhere than by pytorch-kinematics")
     return hand
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.frames import rotation_from_rpy
 from torchgrasp.hand.spec import HandSpec
 from torchgrasp.hand.urdf import Shape, Urdf
 
@@ -91,14 +92,3 @@ def _spheres(shape: Shape, pitch: float) -> list[tuple[tuple[float, ...], float]
     turned = torch.tensor(local, dtype=torch.float64) @ rotation_from_rpy(shape.rpy).T
     placed = turned + torch.tensor(shape.xyz, dtype=torch.float64)
     return [((p[0], p[1], p[2]), radius) for p in placed.tolist()]
-
-
-def rotation_from_rpy(rpy: tuple[float, float, float]) -> Float[Tensor, "3 3"]:
-    """Return the rotation of URDF's fixed-axis roll, pitch and yaw [rad]."""
-    (cr, cp, cy), (sr, sp, sy) = [math.cos(a) for a in rpy], [math.sin(a) for a in rpy]
-    rows = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    return torch.tensor(rows, dtype=torch.float64)

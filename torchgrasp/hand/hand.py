@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.cover import SphereCover
-from torchgrasp.hand.kinematics import Kinematics
+from torchgrasp.hand.kinematics import Kinematics, placed, turned
 from torchgrasp.hand.selfcollide import SelfCollision
 
 
@@ -96,6 +96,11 @@ class Hand(Value):
         self._check(joints)
         return joints @ self.coupling.to(joints).T + self.offset.to(joints)
 
+    def frames(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "3 4 l n"]:
+        """Return `link_poses` without their last row, all postures in one last axis: the fast layout."""
+        values = self.expand_joints(joints)
+        return self.kinematics.frames(values.reshape(-1, values.shape[-1]).T.contiguous())
+
     def link_poses(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b l 4 4"]:
         """Return `hand_from_link` of every link, in the order of `link_names`."""
         values = self.expand_joints(joints)
@@ -110,22 +115,21 @@ class Hand(Value):
         >>> points.shape, normals.shape
         (torch.Size([5, 3, 3]), torch.Size([5, 3, 3]))
         """
-        tips = self.link_poses(joints)[..., self.tip_index, :, :]
-        return _map(tips, self.contact.to(tips)), _turn(tips, self.normal.to(tips))
+        tips = self.frames(joints).index_select(2, self.tip_index)
+        return _rows(placed(tips, self.contact), joints), _rows(turned(tips, self.normal), joints)
 
     def tip_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b 3 3"]:
         """Return the centres [m] of the tips' spheres of `tip_radius`; the contact points where the radius is 0."""
-        poses = self.link_poses(joints)
-        return _map(poses[..., self.tip_index, :, :], self.center.to(poses))
+        return _rows(placed(self.frames(joints).index_select(2, self.tip_index), self.center), joints)
 
     def jacobian(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b 3 3 h"]:
         """Return the derivative of the contact points by the actuated joints, coupling included [m/rad].
 
         The axes are: finger, coordinate, joint.
         """
-        poses = self.link_poses(joints)
-        points = _map(poses[..., self.tip_index, :, :], self.contact.to(poses))
-        return self.point_jacobian(poses, self.tip_index, points)
+        frames = self.frames(joints)
+        points = placed(frames.index_select(2, self.tip_index), self.contact)
+        return _rows(self._derivative(frames, self.tip_index, points), joints)
 
     def point_jacobian(
         self, poses: Float[Tensor, "*b l 4 4"], link_index: Int[Tensor, " p"], points: Float[Tensor, "*b p 3"]
@@ -137,18 +141,32 @@ class Hand(Value):
             link_index: the link each point is fixed to, an index into `link_names`.
             points: where the points are now, in the palm's frame [m].
         """
-        axes, origins = self.screws(poses)
-        arm = points[..., None, :, :] - origins[..., :, None, :]
-        column = torch.linalg.cross(axes[..., :, None, :].expand_as(arm), arm)
-        slide = self.prismatic.to(poses)[:, None, None]
-        column = column * (1 - slide) + axes[..., :, None, :] * slide
-        column = column * self.moves[link_index].T.to(poses)[:, :, None]
-        return torch.einsum("...jpi,jh->...pih", column, self.coupling.to(poses))
+        columns = points.reshape(-1, *points.shape[-2:]).permute(2, 1, 0)
+        return _rows(self._derivative(_frames(poses), link_index, columns), points[..., 0, :])
+
+    def _derivative(
+        self, frames: Float[Tensor, "3 4 l n"], link_index: Int[Tensor, " p"], points: Float[Tensor, "3 p n"]
+    ) -> Float[Tensor, "h 3 p n"]:
+        """Return the derivative of points: of each by the joints between its link and the palm alone."""
+        coupling = self.coupling.to(points)
+        acts = self.moves[link_index][:, :, None] * self.coupling  # on a point, through a joint, by an actuated joint
+        point, joint, actuated = torch.nonzero(acts, as_tuple=True)
+        ratio = coupling[joint, actuated][:, None]
+        chains = frames.index_select(2, self.child)
+        axes = turned(chains, self.axis).index_select(1, joint) * ratio
+        arm = points.index_select(1, point) - chains[:, 3].index_select(1, joint)
+        (ax, ay, az), (x, y, z) = axes, arm
+        column = torch.stack([ay * z - az * y, az * x - ax * z, ax * y - ay * x])
+        if self.kinematics.slides:
+            column = torch.where(self.prismatic[joint][:, None] > 0, axes, column)
+        size = (3, points.shape[1] * self.dof, points.shape[2])
+        summed = points.new_zeros(size).index_add(1, point * self.dof + actuated, column)
+        return summed.unflatten(1, (-1, self.dof)).movedim(2, 0)
 
     def spheres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b s 3"]:
         """Return the centres [m] of `collision_spheres` in the palm's frame."""
-        cover, poses = self.collision_spheres, self.link_poses(joints)
-        return _map(poses[..., cover.link_index, :, :], cover.center.to(poses))
+        cover = self.collision_spheres
+        return _rows(placed(self.frames(joints).index_select(2, cover.link_index), cover.center), joints)
 
     def self_clearance(self, joints: Float[Tensor, "*b h"], chunk: int = 512) -> Float[Tensor, "*b"]:
         """Return the signed least distance [m] between links that can meet; negative: they overlap.
@@ -163,8 +181,9 @@ class Hand(Value):
 
     def screws(self, poses: Float[Tensor, "*b l 4 4"]) -> tuple[Float[Tensor, "*b j 3"], Float[Tensor, "*b j 3"]]:
         """Return the axes and origins of all movable joints in the palm's frame."""
-        frames = poses[..., self.child, :, :]
-        return _turn(frames, self.axis.to(poses)), frames[..., :3, 3]
+        chains = _frames(poses).index_select(2, self.child)
+        like = poses[..., 0, 0, :]
+        return _rows(turned(chains, self.axis), like), _rows(chains[:, 3], like)
 
     def _check(self, joints: Tensor) -> None:
         """Refuse joints of another count or dtype, and numbers that are none, before any work."""
@@ -179,12 +198,11 @@ class Hand(Value):
             raise BadArgument("joints", found, "finite numbers")
 
 
-def _map(poses: Float[Tensor, "*b p 4 4"], local: Float[Tensor, "p 3"]) -> Float[Tensor, "*b p 3"]:
-    """Map one point per pose into the palm's frame."""
-    return _turn(poses, local) + poses[..., :3, 3]
+def _frames(poses: Float[Tensor, "*b l 4 4"]) -> Float[Tensor, "3 4 l n"]:
+    """Return the first three rows of poses with all postures in one last axis."""
+    return poses.reshape(-1, *poses.shape[-3:])[..., :3, :].permute(2, 3, 1, 0)
 
 
-def _turn(poses: Float[Tensor, "*b p 4 4"], local: Float[Tensor, "p 3"]) -> Float[Tensor, "*b p 3"]:
-    """Map one direction per pose into the palm's frame."""
-    x, y, z = local[:, :, None].unbind(1)  # many small matrix products are slower than three long sums
-    return poses[..., :3, 0] * x + poses[..., :3, 1] * y + poses[..., :3, 2] * z
+def _rows(columns: Tensor, like: Float[Tensor, "*b h"]) -> Tensor:
+    """Return what was computed for all postures in one last axis with its axes reversed, as the rows of `like`."""
+    return columns.permute(*range(columns.ndim - 1, -1, -1)).reshape(*like.shape[:-1], *columns.shape[-2::-1])

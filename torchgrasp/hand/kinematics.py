@@ -1,49 +1,136 @@
-"""Forward kinematics of a URDF tree: the one place that talks to pytorch-kinematics.
+"""Forward kinematics of a URDF tree, all links of one depth at a time.
 
-pytorch-kinematics ignores `<mimic>`, so it is given every joint's value; it builds offsets in float32, which leaves
-about 1e-8 m; its `.to()` works in place and keeps indices on the old device, so each device and dtype has a chain of
-its own here; its analytical backward is wrong in second derivatives, so plain autograd is used.
+A joint's child stands in its parent at `constant + sine sin q + cosine cos q + slide q`, entry by entry. These tables
+are made once, from the same tree that pytorch-kinematics reads. A posture then takes one product of 3 by 3 entries for
+each depth of the tree, with all postures last in memory, where pytorch-kinematics multiplies a small matrix for each
+posture and link. That is kept as the reference by which `torchgrasp.testing.check_hand` checks every hand; it ignores
+`<mimic>`, builds offsets in float32, which leaves about 1e-8 m, and its analytical backward has no second derivative.
 """
 
 import dataclasses
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.hand.urdf import Urdf
+from torchgrasp.base import Value
+from torchgrasp.frames import rotation_from_rpy, skew
+from torchgrasp.hand.urdf import Joint, Urdf
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Kinematics:
-    """The tree of a URDF: link and joint names, and chains for the dtypes and devices met so far."""
+class Kinematics(Value):
+    """The tree of a URDF: names of links and movable joints in the order of the file, and tables for each link.
+
+    The tables `constant`, `sine`, `cosine` and `slide` hold the link's frame in its parent's by the value of `joint`,
+    an index into `joint_names` (0 for fixed links, whose tables but the first are zero); `slides` tells whether any
+    `slide` is not. Links stand there by depth: `depths` counts those of each depth, `parent` is the place of a link's
+    parent within the depth before, and `place` where each of `link_names` stands.
+    """
 
     xml: bytes
     link_names: tuple[str, ...]
     joint_names: tuple[str, ...]
-    chains: dict[tuple[torch.dtype, torch.device], Any] = dataclasses.field(default_factory=dict, repr=False)
+    depths: tuple[int, ...]
+    slides: bool
+    constant: Float[Tensor, "3 4 l 1"]
+    sine: Float[Tensor, "3 4 l 1"]
+    cosine: Float[Tensor, "3 4 l 1"]
+    slide: Float[Tensor, "3 4 l 1"]
+    joint: Int[Tensor, " l"]
+    parent: Int[Tensor, " l"]
+    place: Int[Tensor, " l"]
+
+    def frames(self, values: Float[Tensor, "j n"]) -> Float[Tensor, "3 4 l n"]:
+        """Return `root_from_link` of every link without its last row; see `poses`."""
+        by_sine, by_cosine = (x[self.joint] for x in (values.sin(), values.cos()))
+        local = torch.addcmul(self.constant.to(values), self.sine.to(values), by_sine)
+        local = torch.addcmul(local, self.cosine.to(values), by_cosine)
+        if self.slides:
+            local = torch.addcmul(local, self.slide.to(values), values[self.joint])
+        levels = local.split(self.depths, 2)
+        found = list(levels[:2])  # the root is the identity
+        for level, parent in zip(levels[2:], self.parent.split(self.depths)[2:], strict=True):
+            above = found[-1].index_select(2, parent)
+            frame = above[:, 0, None] * level[0]
+            frame = torch.addcmul(frame, above[:, 1, None], level[1])
+            frame = torch.addcmul(frame, above[:, 2, None], level[2])
+            origin = frame[:, 3:] + above[:, 3:]
+            found.append(torch.cat([frame[:, :3], origin], 1))
+        return torch.cat(found, 2).index_select(2, self.place)
 
     def poses(self, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
         """Return `root_from_link` of every link for the values of every movable joint [rad or m]."""
-        key = (values.dtype, values.device)
-        if key not in self.chains:
-            import pytorch_kinematics
+        frames = self.frames(values.T.contiguous())
+        last = frames.new_tensor([0.0, 0.0, 0.0, 1.0])[:, None, None].expand(1, 4, *frames.shape[2:])
+        return torch.cat([frames, last]).permute(3, 2, 0, 1)
 
-            chain = pytorch_kinematics.build_chain_from_urdf(self.xml).to(dtype=values.dtype, device=values.device)
-            order = [self.joint_names.index(n) for n in chain.get_joint_parameter_names()]
-            frames = [chain.frame_to_idx[n] for n in self.link_names]
-            index = (torch.tensor(x, device=values.device) for x in (order, frames))
-            self.chains[key] = (chain, *index)
-        chain, order, frames = self.chains[key]
+    def reference_poses(self, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
+        """Return `poses` by pytorch-kinematics' chain of the same tree, which is good to 1e-8 m."""
+        import pytorch_kinematics
+
+        chain: Any = pytorch_kinematics.build_chain_from_urdf(self.xml).to(dtype=values.dtype, device=values.device)
+        order = [self.joint_names.index(name) for name in chain.get_joint_parameter_names()]
         poses = chain.forward_kinematics_tensor(values[:, order], analytical_grad=False)
-        return poses[frames].transpose(0, 1)
+        return poses[[chain.frame_to_idx[name] for name in self.link_names]].transpose(0, 1)
+
+
+def placed(frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]) -> Float[Tensor, "3 p n"]:
+    """Map one point of each frame into the root's."""
+    return turned(frames, local) + frames[:, 3]
+
+
+def turned(frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]) -> Float[Tensor, "3 p n"]:
+    """Map one direction of each frame into the root's."""
+    x, y, z = local.to(frames)[:, :, None].unbind(1)
+    return torch.addcmul(torch.addcmul(frames[:, 0] * x, frames[:, 1], y), frames[:, 2], z)
 
 
 def kinematics_from_urdf(urdf: Urdf) -> Kinematics:
-    """Name the links and the movable joints of a URDF, in the order of the file."""
-    joints = tuple(j.name for j in urdf.joints if j.kind != "fixed")
-    return Kinematics(urdf.kinematic_xml(), tuple(x.name for x in urdf.links), joints)
+    """Tabulate the tree of a URDF."""
+    above = {j.child: j for j in urdf.joints}
+    movable = [j.name for j in urdf.joints if j.kind != "fixed"]
+    rows = [[urdf.root]]
+    while below := [x.name for x in urdf.links if x.name in above and above[x.name].parent in rows[-1]]:
+        rows.append(below)
+    names = [name for row in rows for name in row]
+    tables = [_tables(above.get(name)) for name in names]
+    moved = [movable.index(above[n].name) if n in above and above[n].kind != "fixed" else 0 for n in names]
+    parents = [rows[k - 1].index(above[n].parent) if k else 0 for k, row in enumerate(rows) for n in row]
+    constant, sine, cosine, slide = (torch.stack(table, -1)[..., None] for table in zip(*tables, strict=True))
+    return Kinematics(
+        xml=urdf.kinematic_xml(),
+        link_names=tuple(x.name for x in urdf.links),
+        joint_names=tuple(movable),
+        depths=tuple(len(row) for row in rows),
+        slides=any(j.kind == "prismatic" for j in urdf.joints),
+        constant=constant,
+        sine=sine,
+        cosine=cosine,
+        slide=slide,
+        joint=torch.tensor(moved),
+        parent=torch.tensor(parents),
+        place=torch.tensor([names.index(x.name) for x in urdf.links]),
+    )
+
+
+def _tables(joint: Joint | None) -> list[Float[Tensor, "3 4"]]:
+    """Return what the child's frame in the parent's is made of; none: the root's, which is the identity."""
+    constant, sine, cosine, slide = torch.zeros(4, 3, 4, dtype=torch.float64).unbind()
+    if joint is None:
+        constant[:, :3] = torch.eye(3)
+        return [constant, sine, cosine, slide]
+    turn = rotation_from_rpy(joint.rpy)
+    constant[:, :3], constant[:, 3] = turn, torch.tensor(joint.xyz, dtype=torch.float64)
+    axis = torch.tensor(joint.axis, dtype=torch.float64)
+    if joint.kind == "prismatic":
+        slide[:, 3] = turn @ axis
+    elif joint.kind == "revolute":  # Rodrigues: I + K sin q + K^2 (1 - cos q), K the cross product with the axis
+        cross = skew(axis)
+        sine[:, :3], cosine[:, :3] = turn @ cross, -turn @ cross @ cross
+        constant[:, :3] -= cosine[:, :3]
+    return [constant, sine, cosine, slide]
 
 
 def ancestor_mask(urdf: Urdf) -> list[list[bool]]:

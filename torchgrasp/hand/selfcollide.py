@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.hand.collide import box_distance, segment_distance
+from torchgrasp.hand.kinematics import placed
 from torchgrasp.hand.spec import HandSpec
 from torchgrasp.hand.urdf import Urdf
 
@@ -49,7 +50,7 @@ class SelfCollision(Value):
     def _columns(self, poses: Float[Tensor, "n l 4 4"]) -> tuple[Float[Tensor, "3 c n"], Float[Tensor, "3 c n"]]:
         """Return the ends of the capsules' axes coordinate by coordinate, rows last: the fast layout here."""
         frames = _frames(poses, self.capsule_link)
-        return _placed(frames, self.start.to(poses)), _placed(frames, self.end.to(poses))
+        return placed(frames, self.start), placed(frames, self.end)
 
     def capsule_distances(self, poses: Float[Tensor, "n l 4 4"]) -> Float[Tensor, "p n"]:
         """Return the signed distance of each pair of capsules."""
@@ -63,7 +64,7 @@ class SelfCollision(Value):
         """Return the signed distance of each capsule from each box, at points along the capsule's axis."""
         i, j = self.box_pairs.unbind(1)
         frames = _frames(poses, self.box_link)
-        origin = _placed(frames, self.box_center.to(poses))
+        origin = placed(frames, self.box_center)
         start, end = (x.index_select(1, i) - origin.index_select(1, j) for x in self._columns(poses))
         turn = frames[:, :3].index_select(2, j)
         start, end = (turn[0] * x[0] + turn[1] * x[1] + turn[2] * x[2] for x in (start, end))  # in the box's frame
@@ -79,12 +80,6 @@ class SelfCollision(Value):
 def _frames(poses: Float[Tensor, "n l 4 4"], link: Int[Tensor, " c"]) -> Float[Tensor, "3 4 c n"]:
     """Select link poses with every matrix entry's rows contiguous in memory."""
     return poses[..., :3, :].permute(2, 3, 1, 0).contiguous().index_select(2, link)
-
-
-def _placed(frames: Float[Tensor, "3 4 c n"], local: Float[Tensor, "c 3"]) -> Float[Tensor, "3 c n"]:
-    """Map one point per frame into the palm's frame."""
-    x, y, z = local[:, :, None].unbind(1)
-    return frames[:, 0] * x + frames[:, 1] * y + frames[:, 2] * z + frames[:, 3]
 
 
 def self_collision_from_spec(urdf: Urdf, spec: HandSpec) -> SelfCollision:

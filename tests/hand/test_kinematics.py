@@ -1,0 +1,104 @@
+"""Kinematics against three other readers of the same URDF, by joint name, and its derivatives of both orders."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.kinematics import kinematics_from_urdf
+from torchgrasp.hand.load import load_hand
+from torchgrasp.hand.urdf import read_urdf
+
+BRANCHED = """<robot name="branched">
+  <link name="tip"/><link name="base"/><link name="slider"/><link name="arm"/><link name="side"/><link name="bolt"/>
+  <joint name="fix" type="fixed"><parent link="arm"/><child link="bolt"/>
+    <origin xyz="0.1 0 0.2" rpy="0.4 -0.3 2"/></joint>
+  <joint name="end" type="revolute"><origin xyz="0 0.2 0" rpy="0 1 0"/><parent link="slider"/><child link="tip"/>
+    <axis xyz="0.6 0 -0.8"/><limit lower="-3" upper="3"/></joint>
+  <joint name="turn" type="revolute"><origin xyz="0 0 0.3" rpy="1 2 3"/><parent link="base"/><child link="arm"/>
+    <axis xyz="0 -1 0"/><limit lower="-3" upper="3"/></joint>
+  <joint name="slide" type="prismatic"><origin xyz="0.5 0 0" rpy="0 0 -1"/><parent link="bolt"/><child link="slider"/>
+    <axis xyz="0 0.6 0.8"/><limit lower="-1" upper="1"/></joint>
+  <joint name="away" type="revolute"><parent link="base"/><child link="side"/><limit lower="-3" upper="3"/></joint>
+</robot>"""
+
+
+@pytest.fixture(params=["allegro", "barrett"])
+def hand(request) -> Hand:
+    return load_hand(request.param)
+
+
+def postures(hand: Hand, n: int, generator: torch.Generator) -> torch.Tensor:
+    share = torch.rand(n, hand.dof, generator=generator, dtype=torch.float64)
+    return hand.lower + (hand.upper - hand.lower) * share
+
+
+def assert_same_poses(found: torch.Tensor, truth: torch.Tensor) -> None:
+    assert float((found - truth)[..., :3, 3].abs().max()) < 1e-6  # [m]
+    turn = found[..., :3, :3].mT @ truth[..., :3, :3]
+    sine = torch.stack([turn[..., 2, 1], turn[..., 0, 2], turn[..., 1, 0]], -1) - torch.stack(
+        [turn[..., 1, 2], turn[..., 2, 0], turn[..., 0, 1]], -1
+    )
+    assert float(sine.norm(dim=-1).max()) / 2 < 1e-6  # [rad]
+    assert float((turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 3).abs().max()) < 1e-6
+
+
+def test_fk_equals_pytorch_kinematics(hand, generator):
+    joints = postures(hand, 1000, generator)
+    assert_same_poses(hand.link_poses(joints), hand.kinematics.reference_poses(hand.expand_joints(joints)))
+
+
+def test_fk_and_jacobian_equal_pinocchios_by_joint_name(hand, generator):
+    pin = pytest.importorskip("pinocchio")
+    model = pin.buildModelFromUrdf(str(hand.urdf_path))
+    data, joints = model.createData(), postures(hand, 1000, generator)
+    every = {name: values.tolist() for name, values in hand.expand(joints).items()}
+    order = [every[name] for name in list(model.names)[1:]]
+    frames = [model.getFrameId(name) for name in hand.link_names]
+    truth = torch.zeros(1000, len(frames), 4, 4, dtype=torch.float64)
+    column = [hand.urdf_joint_names.index(name) for name in list(model.names)[1:]]
+    found, at = hand.jacobian(joints), [frames[k] for k in hand.tip_index.tolist()]
+    for row in range(1000):
+        q = np.array([values[row] for values in order])
+        pin.framesForwardKinematics(model, data, q)
+        for k, frame in enumerate(frames):
+            truth[row, k] = torch.from_numpy(data.oMf[frame].homogeneous)
+        if row % 20:
+            continue
+        for finger, frame in enumerate(at):
+            twist = torch.from_numpy(pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED))
+            arm = torch.from_numpy(data.oMf[frame].rotation) @ hand.contact[finger]
+            moved = twist[:3] + torch.linalg.cross(twist[3:], arm[:, None].expand(3, len(q)), dim=0)
+            torch.testing.assert_close(found[row, finger], moved @ hand.coupling[column], atol=1e-12, rtol=0)
+    assert_same_poses(hand.link_poses(joints), truth)
+    assert float((hand.link_poses(joints) - truth).abs().max()) < 1e-12
+
+
+def test_fk_is_differentiable_twice(hand, generator):
+    joints = postures(hand, 1, generator).requires_grad_()
+    for action in (hand.link_poses, hand.fingertips, hand.jacobian):
+        assert torch.autograd.gradcheck(action, joints)
+        assert torch.autograd.gradgradcheck(action, joints)
+
+
+def test_derivative_of_the_jacobian_is_symmetric(hand, generator):
+    second = torch.func.jacfwd(hand.jacobian)(postures(hand, 1, generator)[0])
+    torch.testing.assert_close(second, second.mT, atol=1e-12, rtol=0)  # as second derivatives are
+
+
+def test_a_tree_of_every_kind_of_joint_is_that_of_pytorch_kinematics(tmp_path, generator):
+    path = tmp_path / "hand.urdf"
+    path.write_text(BRANCHED)
+    tree = kinematics_from_urdf(read_urdf(path))
+    assert tree.joint_names == ("end", "turn", "slide", "away")
+    values = torch.randn(50, 4, generator=generator, dtype=torch.float64)
+    assert_same_poses(tree.poses(values), tree.reference_poses(values))
+    assert torch.autograd.gradgradcheck(tree.poses, values[:1].requires_grad_())
+
+
+def test_kinematics_keeps_dtype_and_follows_the_hand(hand, generator):
+    joints = postures(hand, 3, generator)
+    moved = hand.to(torch.float32)
+    assert moved.kinematics.constant.dtype == torch.float32
+    torch.testing.assert_close(moved.link_poses(joints.float()), hand.link_poses(joints.float()), atol=1e-7, rtol=0)
+    assert hand.link_poses(joints[0]).shape == (len(hand.link_names), 4, 4)
