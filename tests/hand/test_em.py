@@ -1,5 +1,7 @@
 """Expectation-maximisation against scikit-learn and closed forms."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -7,13 +9,17 @@ from sklearn.mixture import GaussianMixture
 
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.hand.em import (
+    RESEEDS,
     Components,
+    Progress,
     coefficients_from_components,
     components_from_sums,
+    expectation,
     expectation_maximisation,
     features_from_data,
-    start_components,
+    maximisation,
 )
+from torchgrasp.hand.kmeans import start_components
 
 
 def clustered(n: int = 6000, d: int = 5, m: int = 4) -> torch.Tensor:
@@ -51,11 +57,12 @@ def test_eq20_em_equals_scikit_learn_from_the_same_start():
     x, m, steps = clustered(), 6, 15
     start = start_components(x, m, seed=0, regularisation=1e-6)
     ours = expectation_maximisation(x, start, steps, tolerance=0.0, regularisation=1e-6)
+    first = start.components
     theirs = GaussianMixture(
         m,
-        weights_init=start.weights.numpy(),
-        means_init=start.means.numpy(),
-        precisions_init=torch.linalg.inv(start.covariances).numpy(),
+        weights_init=first.weights.numpy(),
+        means_init=first.means.numpy(),
+        precisions_init=torch.linalg.inv(first.covariances).numpy(),
         reg_covar=1e-6,
         tol=0.0,
         max_iter=steps,
@@ -72,21 +79,21 @@ def test_log_likelihood_never_decreases(m):
     fit = expectation_maximisation(x, start_components(x, m, 1, 1e-6), 60, tolerance=0.0, regularisation=1e-6)
     assert float(fit.log_likelihood.diff().min()) >= -1e-9
     # The last entry belongs to the components that are returned.
-    again = expectation_maximisation(x, fit.components, 1, tolerance=0.0, regularisation=1e-6)
-    torch.testing.assert_close(again.log_likelihood[0], fit.log_likelihood[-1])
+    _, log_likelihood = expectation(x, fit.components)
+    torch.testing.assert_close(log_likelihood / len(x), fit.log_likelihood[-1])
 
 
 def test_start_is_the_same_for_the_same_seed():
     x = clustered()
     first, second = (start_components(x, 5, 7, 1e-6) for _ in range(2))
-    assert torch.equal(first.means, second.means)
-    assert not torch.equal(first.means, start_components(x, 5, 8, 1e-6).means)
+    assert torch.equal(first.components.means, second.components.means)
+    assert not torch.equal(first.components.means, start_components(x, 5, 8, 1e-6).components.means)
 
 
 def test_start_finds_separate_clusters(generator):
     centres = torch.tensor([[-2.0, 0], [2, 0], [0, 3]], dtype=torch.float64)
     x = (centres[:, None] + 0.05 * torch.randn(3, 200, 2, generator=generator, dtype=torch.float64)).flatten(0, 1)
-    start = start_components(x, 3, 0, 0.0)
+    start = start_components(x, 3, 0, 0.0).components
     torch.testing.assert_close(start.weights, torch.full((3,), 1 / 3, dtype=torch.float64))
     assert float(torch.cdist(centres, start.means).amin(1).max()) < 0.02
 
@@ -97,9 +104,51 @@ def test_fewer_different_rows_than_components_are_named():
         start_components(rows, 3, 0, 1e-6)
 
 
-def test_a_collapsed_component_is_an_error_not_a_repair():
+def test_an_indefinite_start_is_an_error_not_a_repair():
     x = clustered()
     start = start_components(x, 3, 0, 1e-6)
-    flat = Components(start.weights, start.means, start.covariances * torch.tensor([1.0, 1, 0])[:, None, None])
+    flat = start.components.covariances * torch.tensor([1.0, 1, 0])[:, None, None]
+    components = Components(start.components.weights, start.components.means, flat)
     with pytest.raises(IndefiniteCovariance, match="fewer components"):
-        expectation_maximisation(x, flat, 5, 0.0, 0.0)
+        expectation_maximisation(x, Progress(components, start.reseeded, start.log_likelihood), 5, 0.0, 0.0)
+
+
+def test_i11_a_collapsed_component_is_placed_anew_and_the_fit_recovers():
+    x = clustered()
+    start = start_components(x, 3, 0, 1e-6)
+    # A component so far away that no row belongs to it: it takes half of the heaviest one.
+    means = start.components.means.index_fill(0, torch.tensor([1]), 50.0)
+    lost = Progress(dataclasses.replace(start.components, means=means), start.reseeded, start.log_likelihood)
+    steps: list[Progress] = []
+    fit = expectation_maximisation(x, lost, 200, 1e-6, 1e-6, observe=steps.append)
+    assert fit.reseeded.tolist() == [0, 1, 0]
+    assert [step.jumped for step in steps[:2]] == [True, False]
+    assert fit.converged
+    assert float(fit.components.weights.min()) > 0.05
+    assert float(fit.log_likelihood[1:].diff().min()) >= -1e-9
+    usual = expectation_maximisation(x, start, 200, 1e-6, 1e-6)
+    assert abs(float(fit.log_likelihood[-1] - usual.log_likelihood[-1])) < 0.05
+
+
+def test_i11_a_component_is_placed_anew_three_times_and_no_more():
+    x = clustered()
+    components = start_components(x, 3, 0, 1e-6).components
+    sums, _ = expectation(x, components)
+    sums[2] = 0.0
+    for before in range(RESEEDS):
+        found, reseeded = maximisation(sums, len(x), 0.0, torch.tensor([0, 0, before]))
+        assert reseeded.tolist() == [0, 0, before + 1]
+        heaviest = int(components_from_sums(sums, len(x), 0.0).weights.argmax())
+        torch.testing.assert_close(found.weights[2], found.weights[heaviest])
+        # half of the heaviest each, to either side: its mean is kept
+        middle = (found.means[2] + found.means[heaviest]) / 2
+        torch.testing.assert_close(middle, sums[heaviest, 1:6] / sums[heaviest, 0])
+    with pytest.raises(IndefiniteCovariance, match="component 2, which collapsed 4 times"):
+        maximisation(sums, len(x), 0.0, torch.tensor([0, 0, RESEEDS]))
+
+
+def test_i11_data_that_span_no_covariance_are_an_error_at_once():
+    x = clustered()
+    x = torch.cat([x, x[:, :1]], 1)  # a column twice
+    with pytest.raises(IndefiniteCovariance, match="collapsed 1 times"):
+        start_components(x, 3, 0, 0.0)

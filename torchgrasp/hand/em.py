@@ -2,23 +2,31 @@
 
 Both steps are one matrix product each over the features [1, x, x_i x_j]: the log-density of a Gaussian is linear in
 them, and their responsibility-weighted sums are all that the maximisation needs. That halves the work of whitening
-and keeps the statistics of a step small enough to be summed over machines. The features cancel unless every column
+and keeps the statistics of a step small enough to be summed over processes. The features cancel unless every column
 of the data has mean 0 and variance 1, which the caller sees to.
 """
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.errors import BadArgument, IndefiniteCovariance
+from torchgrasp.errors import IndefiniteCovariance
+from torchgrasp.hand.processes import Total, own
 from torchgrasp.linalg import cholesky
 
-ROWS = 1024
+ROWS = 2048
 """Rows of one pass: features and responsibilities of so many rows stay in the cache."""
+
+SINGULAR = 1e-12
+"""A variance, given the dimensions before it, that is rounding beside the data's variance of 1."""
+
+RESEEDS = 3
+"""How often a component that collapses is placed anew before that is an error."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,26 +39,103 @@ class Components(Value):
 
 
 @dataclasses.dataclass(frozen=True)
-class Fit(Value):
-    """A fitted mixture and the mean log-likelihood before each step, the last one after the last step."""
+class Progress(Value):
+    """Where a fit stands: all that its next step depends on but for the data.
+
+    Args:
+        components: after the steps so far.
+        reseeded: how often each component was placed anew.
+        log_likelihood: the mean over the data before each of those steps [nats].
+        jumped: whether the last step placed a component anew, after which the likelihood may have fallen.
+    """
 
     components: Components
+    reseeded: Int[Tensor, "m"]
     log_likelihood: Float[Tensor, "t"]
-    converged: bool
+    jumped: bool = False
 
 
-def features_from_data(x: Float[Tensor, "n d"]) -> Float[Tensor, "f n"]:
-    """Return [1, x_i, x_i x_j (i <= j)] of every row, one column a row."""
-    columns = x.T
-    i, j = torch.triu_indices(x.shape[1], x.shape[1], device=x.device)
-    return torch.cat([torch.ones_like(columns[:1]), columns, columns[i] * columns[j]])
+@dataclasses.dataclass(frozen=True)
+class Fit(Progress):
+    """A fitted mixture; the last log-likelihood is that of the components themselves."""
+
+    converged: bool = False
+
+
+def expectation_maximisation(
+    x: Float[Tensor, "n d"],
+    start: Progress,
+    iterations: int,
+    tolerance: float,
+    regularisation: float,
+    total: Total = own,
+    observe: Callable[[Progress], None] = lambda progress: None,
+) -> Fit:
+    """Iterate until the mean log-likelihood gains less than `tolerance` in a step.
+
+    Args:
+        x: standardised data, or this process's share of them.
+        start: where to begin, or to go on.
+        iterations: most steps, those already taken included.
+        tolerance: of the mean log-likelihood [nats].
+        regularisation: added to every diagonal of a covariance, relative to the data's variance of 1.
+        total: how sums over the data are summed over processes.
+        observe: called after every step.
+
+    Raises:
+        IndefiniteCovariance: a component collapsed more than `RESEEDS` times, or the start is indefinite.
+    """
+    n = int(total(x.new_tensor(len(x))))
+    state = start
+    while True:
+        sums, log_likelihood = expectation(x, state.components, total)
+        history = torch.cat([state.log_likelihood, (log_likelihood / n)[None]])
+        converged = len(history) > 1 and not state.jumped and float(history[-1] - history[-2]) < tolerance
+        if converged or len(history) > iterations:
+            return Fit(state.components, state.reseeded, history, state.jumped, converged)
+        components, reseeded = maximisation(sums, n, regularisation, state.reseeded)
+        jumped = not torch.equal(reseeded, state.reseeded)
+        state = Progress(components, reseeded, history, jumped)
+        observe(state)
+
+
+def expectation(
+    x: Float[Tensor, "n d"], components: Components, total: Total = own
+) -> tuple[Float[Tensor, "m f"], Float[Tensor, ""]]:
+    """Return the responsibility-weighted sums of the features, and the total log-likelihood of Eq. (19)."""
+    coefficients = coefficients_from_components(components)
+    sums, log_likelihood = torch.zeros_like(coefficients), x.new_zeros(())
+    features = x.new_empty(coefficients.shape[1], min(ROWS, len(x)))  # written anew in every pass, and kept in cache
+    joint = x.new_empty(len(coefficients), min(ROWS, len(x)))
+    for rows in x.split(ROWS):
+        phi = features_from_data(rows, features[:, : len(rows)])
+        responsibility = torch.mm(coefficients, phi, out=joint[:, : len(rows)])  # log joint density (m, rows), so far
+        # log-sum-exp by hand: its exponentials are the responsibilities but for a division
+        largest = responsibility.amax(0)
+        density = responsibility.sub_(largest).exp_().sum(0)
+        sums.addmm_(responsibility.div_(density), phi.T)
+        log_likelihood += (density.log() + largest).sum()
+    both = total(torch.cat([sums.flatten(), log_likelihood[None]]))
+    return both[:-1].reshape(sums.shape), both[-1]
+
+
+def features_from_data(x: Float[Tensor, "n d"], out: Float[Tensor, "f n"] | None = None) -> Float[Tensor, "f n"]:
+    """Return [1, x_i, x_i x_j (i <= j)] of every row, one column a row, in `out` where it is given."""
+    n, d = x.shape
+    out = x.new_empty(1 + d + d * (d + 1) // 2, n) if out is None else out
+    out[0] = 1
+    columns = out[1 : 1 + d].copy_(x.T)
+    products = out[1 + d :].split(list(range(d, 0, -1)))
+    for i, product in enumerate(products):
+        torch.mul(columns[i:], columns[i], out=product)
+    return out
 
 
 def coefficients_from_components(components: Components) -> Float[Tensor, "m f"]:
     """Return the coefficients that turn features into log(weight) + log N(x | mean, covariance), Eq. (19).
 
     Raises:
-        IndefiniteCovariance: a component collapsed.
+        IndefiniteCovariance: a covariance is not positive definite.
     """
     means, d = components.means, components.means.shape[1]
     factor = cholesky(components.covariances, "a component's covariance", "use fewer components or more samples")
@@ -69,13 +154,45 @@ def coefficients_from_components(components: Components) -> Float[Tensor, "m f"]
     return torch.cat([constant[:, None], linear, quadratic], dim=1)
 
 
+def maximisation(
+    sums: Float[Tensor, "m f"], n: int, regularisation: float, reseeded: Int[Tensor, "m"]
+) -> tuple[Components, Int[Tensor, "m"]]:
+    """Return the components of greatest likelihood for the weighted sums, the collapsed ones placed anew.
+
+    A component has collapsed when the responsibilities for it add up to less than the d + 1 rows that span a
+    covariance, or when its covariance is singular. It then takes half of the heaviest component, which is split
+    across its longest axis. No data are needed for that, so that every process does the same.
+
+    Raises:
+        IndefiniteCovariance: every component collapsed, or one of them more than `RESEEDS` times.
+    """
+    components = components_from_sums(sums, n, regularisation)
+    weights, means, covariances = components.weights.clone(), components.means.clone(), components.covariances.clone()
+    factor, info = torch.linalg.cholesky_ex(covariances)
+    regular = (info == 0) & (factor.diagonal(dim1=-2, dim2=-1) ** 2 > SINGULAR).all(-1)
+    collapsed = (sums[:, 0] < means.shape[1] + 1) | ~regular
+    reseeded = reseeded + collapsed
+    if bool(collapsed.all()) or int(reseeded.max()) > RESEEDS:
+        worst = covariances[int(reseeded.argmax())]
+        smallest = float(torch.linalg.eigvalsh(worst).min()) if bool(worst.isfinite().all()) else 0.0
+        what = f"the covariance of component {int(reseeded.argmax())}, which collapsed {int(reseeded.max())} times,"
+        raise IndefiniteCovariance(what, smallest, "use fewer components or more samples")
+    weights[collapsed] = 0
+    for k in collapsed.nonzero()[:, 0].tolist():
+        heaviest = int(weights.argmax())
+        spread, axes = torch.linalg.eigh(covariances[heaviest])
+        half = 0.5 * spread[-1].sqrt() * axes[:, -1]
+        weights[[k, heaviest]] = weights[heaviest] / 2
+        means[k], means[heaviest] = means[heaviest] + half, means[heaviest] - half
+        covariances[k] = covariances[heaviest]
+    return Components(weights / weights.sum(), means, covariances), reseeded
+
+
 def components_from_sums(sums: Float[Tensor, "m f"], n: int, regularisation: float) -> Components:
-    """Maximise: weights, means and covariances from the weighted sums of the features."""
+    """Return weights, means and covariances from the weighted sums of the features; a component without data is NaN."""
     # The features determine d: 1 + d + d (d + 1) / 2 of them.
     d = round((math.sqrt(8 * sums.shape[1] + 1) - 3) / 2)
     count = sums[:, :1]
-    if bool((count[:, 0] < 1e-8).any()):
-        raise IndefiniteCovariance("the covariance of a component without data", 0.0, "use fewer components")
     means = sums[:, 1 : d + 1] / count
     i, j = torch.triu_indices(d, d, device=sums.device)
     second = sums.new_zeros(len(sums), d, d)
@@ -84,83 +201,3 @@ def components_from_sums(sums: Float[Tensor, "m f"], n: int, regularisation: flo
     covariances = second - means[:, :, None] * means[:, None, :]
     covariances = covariances + regularisation * torch.eye(d, dtype=sums.dtype, device=sums.device)
     return Components(count[:, 0] / n, means, covariances)
-
-
-def expectation(x: Float[Tensor, "n d"], components: Components) -> tuple[Float[Tensor, "m f"], Float[Tensor, ""]]:
-    """Return the responsibility-weighted sums of the features, and the total log-likelihood of Eq. (19)."""
-    coefficients = coefficients_from_components(components)
-    sums = torch.zeros_like(coefficients)
-    total = x.new_zeros(())
-    for rows in x.split(ROWS):
-        features = features_from_data(rows)
-        log_joint = coefficients @ features  # (m, rows)
-        # log-sum-exp by hand: its exponentials are the responsibilities but for a division
-        largest = log_joint.amax(0)
-        scaled = (log_joint - largest).exp()
-        density = scaled.sum(0)
-        sums += (scaled / density) @ features.T
-        total += (density.log() + largest).sum()
-    return sums, total
-
-
-def expectation_maximisation(
-    x: Float[Tensor, "n d"], start: Components, iterations: int, tolerance: float, regularisation: float
-) -> Fit:
-    """Iterate until the mean log-likelihood gains less than `tolerance` in a step.
-
-    Args:
-        x: standardised data.
-        start: where to begin.
-        iterations: most steps.
-        tolerance: of the mean log-likelihood [nats].
-        regularisation: added to every diagonal of a covariance, relative to the data's variance of 1.
-
-    Raises:
-        IndefiniteCovariance: a component collapsed.
-    """
-    components, history, converged = start, [], False
-    for _ in range(iterations):
-        sums, total = expectation(x, components)
-        history.append(total / len(x))
-        if len(history) > 1 and float(history[-1] - history[-2]) < tolerance:
-            converged = True
-            break
-        components = components_from_sums(sums, len(x), regularisation)
-    if not converged:
-        history.append(expectation(x, components)[1] / len(x))
-    return Fit(components, torch.stack(history), converged)
-
-
-def nearest(x: Float[Tensor, "n d"], centres: Float[Tensor, "m d"]) -> Tensor:
-    """Return the index of the nearest centre of every row."""
-    return torch.cat([(0.5 * (centres**2).sum(1) - rows @ centres.T).argmin(1) for rows in x.split(ROWS)])
-
-
-def start_components(
-    x: Float[Tensor, "n d"], m: int, seed: int, regularisation: float, subsample: int = 20_000, rounds: int = 10
-) -> Components:
-    """Return a start from k-means: centres by k-means++ on a subsample, then `rounds` of Lloyd on all the data.
-
-    Raises:
-        BadArgument: fewer different rows than components.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    pool = x[torch.randperm(len(x), generator=generator)[:subsample].to(x.device)]
-    centres = pool[:1]
-    squared = ((pool - centres) ** 2).sum(1)
-    for k in range(1, m):
-        if not bool((squared > 0).any()):
-            raise BadArgument("components", m, f"at most {k}, the number of different rows of the data")
-        pick = torch.multinomial(squared.cpu(), 1, generator=generator).to(x.device)
-        centres = torch.cat([centres, pool[pick]])
-        squared = torch.minimum(squared, ((pool - pool[pick]) ** 2).sum(1))
-    for _ in range(rounds):
-        label = nearest(x, centres)
-        count = torch.bincount(label, minlength=m)[:, None]
-        moved = torch.zeros_like(centres).index_add(0, label, x) / count
-        centres = torch.where(count > 0, moved, centres)  # a centre without data stays where it is
-    label = nearest(x, centres)
-    sums = torch.zeros(m, 1 + x.shape[1] * (x.shape[1] + 3) // 2, dtype=x.dtype, device=x.device)
-    for rows, labels in zip(x.split(ROWS), label.split(ROWS), strict=True):
-        sums = sums.index_add(0, labels, features_from_data(rows).T)
-    return components_from_sums(sums, len(x), regularisation)

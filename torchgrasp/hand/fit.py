@@ -2,13 +2,25 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from torchgrasp.base import check_tensor
 from torchgrasp.errors import BadArgument
+from torchgrasp.hand.checkpoint import Checkpoint
 from torchgrasp.hand.code import CODE_NAMES
-from torchgrasp.hand.em import expectation_maximisation, start_components
+from torchgrasp.hand.em import Fit, Progress, expectation_maximisation
+from torchgrasp.hand.kmeans import start_components
 from torchgrasp.hand.mixture import GraspMixture
+from torchgrasp.hand.processes import Total, choose_total, place
 from torchgrasp.hand.sample import HandSamples
+
+LARGEST_REGULARISATION = 1e-6
+"""Most variance that may be added to a dimension of a component, relative to that dimension's over all samples."""
 
 
 def fit_mixture(
@@ -17,9 +29,15 @@ def fit_mixture(
     seed: int = 0,
     iterations: int = 300,
     tolerance: float = 1e-3,
-    regularisation: float = 1e-6,
+    regularisation: float = LARGEST_REGULARISATION,
+    *,
+    checkpoint: Path | str | None = None,
+    distributed: bool = False,
+    observer: Callable[[Progress], None] = lambda progress: None,
 ) -> GraspMixture:
     """Fit the mixture of Eqs. (19)-(20) to sampled postures by expectation-maximisation from a k-means start.
+
+    A component that collapses is placed anew, at most three times.
 
     Args:
         samples: postures and their codes, more of them than the mixture has free numbers in one component.
@@ -29,60 +47,69 @@ def fit_mixture(
         tolerance: stop when the mean log-likelihood gains less in a step [nats].
         regularisation: variance added to every dimension of a component, relative to that dimension's variance over
             all samples. It is kept in the result.
+        checkpoint: file in which the fit is kept after every step, and from which it goes on when the file exists:
+            to the same bits on the same machine. More iterations or another tolerance may be asked of it then.
+        distributed: whether `samples` are this process's share and sums go over all processes of torch.distributed's
+            default group, as under torchrun; every process gets the same mixture. The checkpoint, if any, must be a
+            file that all of them see.
+        observer: called after every step, to show how far the fit is.
 
     Returns:
-        The mixture; `meta` tells iterations, convergence, mean log-likelihood and BIC.
+        The mixture; `meta` tells iterations, convergence, components placed anew, mean log-likelihood and BIC.
 
     Raises:
-        BadArgument: too few samples, a joint that does not vary, a number outside its range.
-        IndefiniteCovariance: a component collapsed onto a few samples.
+        BadArgument: too few samples, a joint that does not vary, a number outside its range, the checkpoint of another
+            fit.
+        ModelFileError: a damaged checkpoint.
+        OutputError: the checkpoint cannot be written.
+        IndefiniteCovariance: a component collapsed onto a few samples more than three times.
 
     >>> import torch
     >>> numbers = torch.rand(500, 7, generator=torch.Generator().manual_seed(0))
     >>> fit_mixture(HandSamples(numbers[:, :1], numbers[:, 1:], ("knuckle",)), components=2).joint_names
     ('knuckle',)
     """
+    total = choose_total(distributed)
     x = samples.rows().double()
-    n, d = x.shape
+    check_tensor("samples", x, (len(samples), x.shape[1]))
+    n, d = int(total(x.new_tensor(len(x)))), x.shape[1]
     least = d + 2  # a covariance of d dimensions from fewer samples is singular
     if n < least:
         raise BadArgument("samples", f"{n} samples", f"at least {least}")
-    check_tensor("samples", x, (n, d))
     for name, value, low, high in [
         ("components", components, 1, n // least),
         ("iterations", iterations, 1, 100_000),
         ("tolerance", tolerance, 0.0, 1.0),
-        ("regularisation", regularisation, 0.0, 1e-2),
+        ("regularisation", regularisation, 0.0, LARGEST_REGULARISATION),
     ]:
         if not low <= value <= high:
             raise BadArgument(name, value, f"a number in [{low:g}, {high:g}]")
-    centre, scale = x.mean(0), x.std(0, correction=0)
     names = (*samples.joint_names, *CODE_NAMES)
-    constant = (scale <= 1e-9 * (1 + centre.abs())).tolist()
-    if any(constant):
-        found = ", ".join(name for name, c in zip(names, constant, strict=True) if c)
-        raise BadArgument("samples", f"no variation in {found}", "samples that vary in every dimension")
-    standard = (x - centre) / scale
-    start = start_components(standard, components, seed, regularisation)
-    fit = expectation_maximisation(standard, start, iterations, tolerance, regularisation)
+    centre, scale = _standardise(x, n, names, total)  # `rows` made a copy: the samples stay as they are
+
+    kept = None
+    if checkpoint is not None:
+        kept = Checkpoint(Path(checkpoint), n, centre, scale, components, seed, regularisation)
+    start = _agreed(kept.load() if kept else None, x, total)
+    if start is None:
+        start = start_components(x, components, seed, regularisation, total)
+
+    def observe(progress: Progress) -> None:
+        if kept and place(total)[0] == 0:
+            kept.save(progress)
+        observer(progress)
+
+    fit = expectation_maximisation(x, start, iterations, tolerance, regularisation, total, observe)
     found = fit.components
     mixture = GraspMixture(
-        weights=found.weights / found.weights.sum(),
+        weights=found.weights,
         means=found.means * scale + centre,
         covariances=found.covariances * scale[:, None] * scale,
         names=names,
         regularisation=regularisation,
     )
-    report = {
-        **samples.meta,
-        "samples": str(n),
-        "fit_seed": str(seed),
-        "iterations": str(len(fit.log_likelihood) - 1),
-        "converged": str(fit.converged).lower(),
-        "log_likelihood": f"{float(fit.log_likelihood[-1] - scale.log().sum()):.6f}",
-        "bic": f"{bic(mixture, samples):.1f}",
-    }
-    return dataclasses.replace(mixture, meta=report)
+    log_likelihood = float(fit.log_likelihood[-1] - scale.log().sum())
+    return dataclasses.replace(mixture, meta=samples.meta | _report(fit, seed, n, log_likelihood))
 
 
 def bic(mixture: GraspMixture, samples: HandSamples) -> float:
@@ -92,6 +119,47 @@ def bic(mixture: GraspMixture, samples: HandSamples) -> float:
     beside the error on held-out postures, not its minimum.
     """
     m, d = mixture.means.shape
+    return _criterion(float(mixture.log_prob(samples.rows().double()).sum()), m, d, len(samples))
+
+
+def _criterion(log_likelihood: float, m: int, d: int, n: int) -> float:
+    """Return -2 log-likelihood + free parameters x log(n) for m full covariances in d dimensions."""
     free = (m - 1) + m * d + m * d * (d + 1) // 2
-    x = samples.rows().double()
-    return float(-2 * mixture.log_prob(x).sum() + free * math.log(len(x)))
+    return -2 * log_likelihood + free * math.log(n)
+
+
+def _standardise(
+    x: Float[Tensor, "n d"], n: int, names: tuple[str, ...], total: Total
+) -> tuple[Float[Tensor, "d"], Float[Tensor, "d"]]:
+    """Give every column mean 0 and variance 1, in place, and return what they were; refuse one that does not vary."""
+    centre = total(x.sum(0)) / n
+    x.sub_(centre)
+    scale = (total(x.square().sum(0)) / n).sqrt()
+    constant = (scale <= 1e-9 * (1 + centre.abs())).tolist()
+    if any(constant):
+        found = ", ".join(name for name, c in zip(names, constant, strict=True) if c)
+        raise BadArgument("samples", f"no variation in {found}", "samples that vary in every dimension")
+    x.div_(scale)
+    return centre, scale
+
+
+def _agreed(progress: Progress | None, x: Tensor, total: Total) -> Progress | None:
+    """Return what a checkpoint held, refusing processes that found different ones: they would wait for ever."""
+    steps = x.new_tensor(len(progress.log_likelihood) if progress else 0)
+    if not torch.equal(total(steps), steps * place(total)[1]):
+        raise BadArgument("checkpoint", "a file that some processes see and others do not", "a file for all of them")
+    return progress
+
+
+def _report(fit: Fit, seed: int, n: int, log_likelihood: float) -> dict[str, str]:
+    """Return what a fit tells about itself; the mean log-likelihood is that in the samples' units."""
+    m, d = fit.components.means.shape
+    return {
+        "samples": str(n),
+        "fit_seed": str(seed),
+        "iterations": str(len(fit.log_likelihood) - 1),
+        "converged": str(fit.converged).lower(),
+        "reseeded": str(int(fit.reseeded.sum())),
+        "log_likelihood": f"{log_likelihood:.6f}",
+        "bic": f"{_criterion(n * log_likelihood, m, d, n):.1f}",
+    }
