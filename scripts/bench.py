@@ -2,6 +2,7 @@
 """Measure torchgrasp. Each command prints a table and writes the same numbers as JSON.
 
 python scripts/bench.py grasp --objects DIR    cloud to held object, for every object of a folder and both hands
+python scripts/bench.py hand                   the hands: kinematics, collision, the learned model, contacts to postures
 python scripts/bench.py plan --objects DIR     the contact planner against IPOPT, on the true surface, and as it grows
 python scripts/bench.py proof --objects DIR    certificates and the probability of closure, against exact references
 python scripts/bench.py shape --objects DIR    exactness, speed, memory and calibration of the shape, beside its bars
@@ -12,9 +13,10 @@ they would spin, which takes a plan twice as long on a quiet one.
 
 import tyro
 from benchmarks.grasp import grasp
+from benchmarks.hand import hand
 from benchmarks.plan import plan
 from benchmarks.proof import proof
 from benchmarks.shape import shape
 
 if __name__ == "__main__":
-    tyro.extras.subcommand_cli_from_dict({"grasp": grasp, "plan": plan, "proof": proof, "shape": shape})
+    tyro.extras.subcommand_cli_from_dict({"grasp": grasp, "hand": hand, "plan": plan, "proof": proof, "shape": shape})

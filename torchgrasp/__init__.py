@@ -30,6 +30,7 @@ from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.code import encode
 from torchgrasp.hand.fit import fit_mixture
 from torchgrasp.hand.mixture import GraspMixture, load_mixture
+from torchgrasp.hand.inverse import reach_contacts
 from torchgrasp.pipeline import plan_grasps
 from torchgrasp.values import load_grasps
 from torchgrasp.close.law import closing_gains
@@ -67,6 +68,7 @@ __all__ = [
     "fit_mixture",
     "GraspMixture",
     "load_mixture",
+    "reach_contacts",
     "plan_grasps",
     "load_grasps",
     "closing_gains",

@@ -50,17 +50,8 @@ def normal_angle(screws: Screws, contacts: Contacts) -> Float[Tensor, "g 3"]:
     return torch.acos((-(pads * contacts.normals).sum(-1)).clamp(-1.0, 1.0))
 
 
-def check(
-    posture: Posture, pregrasp: Float[Tensor, "g h"], hand: Hand, contacts: Contacts, surroundings: Surroundings
-) -> Findings:
-    """Measure tips, contact directions, limits and clearances of grasps and of their opened hands.
-
-    Args:
-        posture: g grasps.
-        pregrasp: joints of the opened hand at the same poses.
-        hand: the hand.
-        contacts: contact i is the one of finger i.
-        surroundings: the estimated object and the table.
+def measure(posture: Posture, hand: Hand, contacts: Contacts, surroundings: Surroundings) -> Findings:
+    """Measure tips, contact directions, limits and clearances of g grasps; contact i is the one of finger i.
 
     Returns:
         The measures, with the `Status` of the first that is out of tolerance.
@@ -69,10 +60,6 @@ def check(
     error, angle = tip_error(screws, contacts), normal_angle(screws, contacts)
     links, tips, table = link_clearance(screws, surroundings, tips_touch=True)
     itself = hand.self_clearance(posture.joints)
-    opened = Screws.at(Posture(pregrasp, posture.obj_from_hand), hand)
-    opened_links, _, opened_table = link_clearance(opened, surroundings, tips_touch=False)
-    opened_itself = hand.self_clearance(pregrasp)
-
     lower, upper = hand.lower.to(error), hand.upper.to(error)
     within = ((posture.joints >= lower - 1e-9) & (posture.joints <= upper + 1e-9)).all(1)
     cone = torch.where(hand.tip_radius.to(error) > 0, ROUND_PAD, FLAT_PAD) + ANGLE_TOLERANCE
@@ -83,9 +70,28 @@ def check(
         (Status.SELF_COLLISION, itself >= 0),
         (Status.OBJECT_COLLISION, (links >= 0) & (tips >= -TIP_PENETRATION)),
         (Status.TABLE_COLLISION, table >= 0),
-        (Status.PREGRASP, (opened_links >= 0) & (opened_table >= 0) & (opened_itself >= 0)),
     ]
     status = torch.full_like(itself, Status.OK, dtype=torch.int64)
     for code, right in reversed(findings):
         status = torch.where(right, status, int(code))
     return Findings(error, angle, torch.stack([links, table, itself]).amin(0), status)
+
+
+def check(
+    posture: Posture, pregrasp: Float[Tensor, "g h"], hand: Hand, contacts: Contacts, surroundings: Surroundings
+) -> Findings:
+    """Measure grasps as `measure` does, and whether their opened hands are clear of everything.
+
+    Args:
+        posture: g grasps.
+        pregrasp: joints of the opened hand at the same poses.
+        hand: the hand.
+        contacts: contact i is the one of finger i.
+        surroundings: the estimated object and the table.
+    """
+    found = measure(posture, hand, contacts, surroundings)
+    opened = Screws.at(Posture(pregrasp, posture.obj_from_hand), hand)
+    links, _, table = link_clearance(opened, surroundings, tips_touch=False)
+    clear = (links >= 0) & (table >= 0) & (hand.self_clearance(pregrasp) >= 0)
+    fine = (found.status != Status.OK) | clear
+    return dataclasses.replace(found, status=torch.where(fine, found.status, int(Status.PREGRASP)))

@@ -26,8 +26,8 @@ WORST = 8
 class Surroundings(Value):
     """What the links must not touch: the object's `field` and the height [m] of the `table`, None without one."""
 
-    field: DistanceField
-    table: float | None
+    field: DistanceField | None = None
+    table: float | None = None
 
 
 def hinge(clearance: Float[Tensor, "g k"], jacobian: Float[Tensor, "g k d"], margin: float) -> Rows:
@@ -44,8 +44,10 @@ def least(clearance: Float[Tensor, "g s"]) -> Int[Tensor, "g k"]:
 def crowding(centres: Float[Tensor, "*b s 3"], cover: SphereCover, surroundings: Surroundings) -> Float[Tensor, "*b"]:
     """Return the sum of squares [mm2] of what a touching hand's spheres lack of clearance, by the nearest node."""
     radius = cover.radius.to(centres)
-    object_lack = (CLEARANCE + radius - surroundings.field.nearest(centres)) * ~cover.touching
-    lack = object_lack.clamp_min(0).square().sum(-1)
+    lack = centres.new_zeros(centres.shape[:-2])
+    if surroundings.field is not None:
+        object_lack = (CLEARANCE + radius - surroundings.field.nearest(centres)) * ~cover.touching
+        lack = lack + object_lack.clamp_min(0).square().sum(-1)
     if surroundings.table is not None:
         table_lack = surroundings.table + CLEARANCE * ~cover.touching + radius - centres[..., 2]
         lack = lack + table_lack.clamp_min(0).square().sum(-1)
@@ -54,52 +56,64 @@ def crowding(centres: Float[Tensor, "*b s 3"], cover: SphereCover, surroundings:
 
 def clearance_rows(screws: Screws, surroundings: Surroundings, tips_touch: bool) -> Rows:
     """Return hinges on the least clearances from the object, from the table and between the links."""
-    hand, cover = screws.hand, screws.hand.collision_spheres
+    found = [self_rows(screws)]
+    if surroundings.field is not None:
+        found.append(object_rows(screws, surroundings.field, tips_touch))
+    if surroundings.table is not None:
+        found.append(table_rows(screws, surroundings.table, tips_touch))
+    residuals, jacobians = zip(*found, strict=True)
+    return torch.cat(residuals, 1), torch.cat(jacobians, 1)
+
+
+def object_rows(screws: Screws, field: DistanceField, tips_touch: bool) -> Rows:
+    """Return hinges on the least clearances of the links' spheres from the object."""
+    cover = screws.hand.collision_spheres
     centres = screws.points(cover.link_index, cover.center)
     radius = cover.radius.to(centres)
-    at = torch.arange(len(centres), device=centres.device)[:, None]
-
-    rough = surroundings.field.nearest(centres) - radius
+    rough = field.nearest(centres) - radius
     if tips_touch:
         rough = torch.where(cover.touching, math.inf, rough)
     index = least(rough)
+    at = torch.arange(len(centres), device=centres.device)[:, None]
     near = centres[at, index]
-    distance, gradient = surroundings.field.query(near)
-    wrenches, links = [wrench_of(near, gradient)], [cover.link_index[index]]
-    clearance = [distance - radius[index] + torch.where(torch.isinf(rough[at, index]), 1.0, 0.0)]
+    distance, gradient = field.query(near)
+    clearance = distance - radius[index] + torch.where(torch.isinf(rough[at, index]), 1.0, 0.0)
+    return hinge(clearance, screws.jacobian(wrench_of(near, gradient), cover.link_index[index]), CLEARANCE)
 
-    if surroundings.table is not None:
-        above = centres[..., 2] - radius - surroundings.table
-        if tips_touch:  # such a tip is where its contact is
-            above = above + CLEARANCE * cover.touching
-        index = least(above)
-        up = torch.tensor([0.0, 0.0, 1.0]).to(centres).expand(*index.shape, 3)
-        wrenches.append(wrench_of(centres[at, index], up))
-        links.append(cover.link_index[index])
-        clearance.append(above[at, index])
 
-    capsules = hand.self_collision
+def table_rows(screws: Screws, table: float, tips_touch: bool) -> Rows:
+    """Return hinges on the least clearances of the links' spheres from the table."""
+    cover = screws.hand.collision_spheres
+    centres = screws.points(cover.link_index, cover.center)
+    above = centres[..., 2] - cover.radius.to(centres) - table
+    if tips_touch:  # such a tip is where its contact is
+        above = above + CLEARANCE * cover.touching
+    index = least(above)
+    at = torch.arange(len(centres), device=centres.device)[:, None]
+    up = torch.tensor([0.0, 0.0, 1.0]).to(centres).expand(*index.shape, 3)
+    jacobian = screws.jacobian(wrench_of(centres[at, index], up), cover.link_index[index])
+    return hinge(above[at, index], jacobian, CLEARANCE)
+
+
+def self_rows(screws: Screws) -> Rows:
+    """Return hinges on the least clearances of the links' capsules from each other."""
+    capsules = screws.hand.self_collision
     first, second = capsules.capsule_pairs.unbind(1)
     ends = screws.columns(capsules.capsule_link.repeat(2), torch.cat([capsules.start, capsules.end]))
     pair = [end.index_select(0, k).mT for k in (first, second) for end in ends.chunk(2)]
     here, there = segment_closest(*pair)
-    thick = capsules.radius.to(centres)[capsules.capsule_pairs].sum(1)
+    thick = capsules.radius.to(here)[capsules.capsule_pairs].sum(1)
     gap = (here - there).unbind(-1)
     between = torch.sqrt(gap[0] * gap[0] + gap[1] * gap[1] + gap[2] * gap[2]) - thick[:, None]
     index = least(between.T)
+    at = torch.arange(len(index), device=here.device)[:, None]
     between = between.T[at, index]
     here, there = here[index, at], there[index, at]
     # Axes that cross have no direction; such a pair keeps a zero row and leaves it to the others to part them.
     direction = (here - there) / (between + thick[index])[..., None].clamp_min(1e-9)
-    k = index.shape[1]
-    wrenches += [wrench_of(here, direction), wrench_of(there, -direction)]
-    links += [capsules.capsule_link[first[index]], capsules.capsule_link[second[index]]]
-
-    jacobian = screws.jacobian(torch.cat(wrenches, 1), torch.cat(links, 1))
-    outside, apart = jacobian[:, : -2 * k], jacobian[:, -2 * k : -k] + jacobian[:, -k:]
-    outer = hinge(torch.cat(clearance, 1), outside, CLEARANCE)
-    inner = hinge(between, apart, SELF_CLEARANCE)
-    return torch.cat([outer[0], inner[0]], 1), torch.cat([outer[1], inner[1]], 1)
+    by_first = screws.jacobian(wrench_of(here, direction), capsules.capsule_link[first[index]])
+    by_second = screws.jacobian(wrench_of(there, -direction), capsules.capsule_link[second[index]])
+    return hinge(between, by_first + by_second, SELF_CLEARANCE)
 
 
 def link_clearance(
@@ -107,12 +121,14 @@ def link_clearance(
 ) -> tuple[Float[Tensor, "g"], Float[Tensor, "g"], Float[Tensor, "g"]]:
     """Return the least clearance [m] of the links from the object, of the tips from it, and of both from the table.
 
-    Where the tips are meant to touch, they count in the second figure alone. Without a table its clearance is infinite.
+    Where the tips are meant to touch, they count in the second figure alone. What is not there is infinitely far.
     """
     cover = screws.hand.collision_spheres
     centres = screws.points(cover.link_index, cover.center)
     radius = cover.radius.to(centres)
-    free = surroundings.field.query(centres)[0] - radius
+    free = torch.full_like(centres[..., 0], math.inf)
+    if surroundings.field is not None:
+        free = surroundings.field.query(centres)[0] - radius
     touches = cover.touching
     tips = free[:, touches].amin(1)
     links = free[:, ~touches].amin(1) if tips_touch else free.amin(1)

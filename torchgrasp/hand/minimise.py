@@ -17,7 +17,7 @@ Rows = tuple[Float[Tensor, "g m"], Float[Tensor, "g m d"]]
 LARGEST_STEP = 0.3
 """Largest step of any variable in one iteration."""
 SOLVED = 0.1
-"""A row whose sum of squared residuals is below this is done: 0.3 mm in the root."""
+"""A row whose sum of squared residuals is below this is done, unless it is to be more exact: 0.3 mm in the root."""
 STALLED = 0.02
 """A row whose sum falls by less than this share in a step is left alone, and so is one of more damping than `LOST`."""
 LOST = 30.0
@@ -28,6 +28,7 @@ def minimise(
     evaluate: Callable[[State, Int[Tensor, "a"]], Rows],
     move: Callable[[State, Float[Tensor, "a d"]], State],
     iterations: int,
+    solved: float = SOLVED,
 ) -> State:
     """Lower the sum of squared residuals of every row; a step that does not lower it is undone.
 
@@ -36,12 +37,13 @@ def minimise(
         evaluate: residuals and Jacobian of some of the rows at their states; the rows' numbers are given, too.
         move: the state after a step.
         iterations: at most.
+        solved: a row is done when the sum is below this.
     """
     whole, at = state, torch.arange(len(state))
     residual, jacobian = evaluate(state, at)
     cost, at = residual.square().sum(1), at.to(residual.device)
     damping = torch.full_like(cost, 1e-2)
-    done = cost < SOLVED
+    done = cost < solved
     for _ in range(iterations):
         if bool(done.any()):
             whole, going = put(whole, at, state), ~done
@@ -61,7 +63,7 @@ def minimise(
         trial_residual, trial_jacobian = evaluate(trial, at)
         trial_cost = trial_residual.square().sum(1)
         better = trial_cost < cost
-        done = (better & ((trial_cost < SOLVED) | (trial_cost > (1 - STALLED) * cost))) | (~better & (damping > LOST))
+        done = (better & ((trial_cost < solved) | (trial_cost > (1 - STALLED) * cost))) | (~better & (damping > LOST))
         state = pick(better, trial, state)
         residual = torch.where(better[:, None], trial_residual, residual)
         jacobian = torch.where(better[:, None, None], trial_jacobian, jacobian)

@@ -24,11 +24,14 @@ class Posture(Batch):
     obj_from_hand: Float[Tensor, "g 4 4"]
 
     def moved(self, step: Float[Tensor, "g d"], hand: Hand) -> "Posture":
-        """Return the posture after a step (translation [m], rotation vector, joints [rad]), projected on the limits."""
-        pose = self.obj_from_hand
-        turned = rotation_from_vector(step[:, 3:6]) @ pose[:, :3, :3]
-        joints = (self.joints + step[:, 6:]).clamp(hand.lower.to(pose), hand.upper.to(pose))
-        return Posture(joints, rigid(turned, pose[:, :3, 3] + step[:, :3]))
+        """Return the posture after a step (translation [m], rotation vector, joints [rad]), projected on the limits.
+
+        The step of the pose is in the hand's own axes, so that a solver's path does not depend on the object's frame.
+        """
+        turn, place = self.obj_from_hand[:, :3, :3], self.obj_from_hand[:, :3, 3]
+        joints = (self.joints + step[:, 6:]).clamp(hand.lower.to(place), hand.upper.to(place))
+        place = place + (turn @ step[:, :3, None])[..., 0]
+        return Posture(joints, rigid(turn @ rotation_from_vector(step[:, 3:6]), place))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +41,7 @@ class Screws(Value):
     hand: Hand
     obj_from_link: Float[Tensor, "g l 4 4"]
     twists: Float[Tensor, "g 6 j"]
-    origin: Float[Tensor, "g 3"]
+    pose: Float[Tensor, "g 4 4"]
 
     @classmethod
     def at(cls, posture: Posture, hand: Hand) -> "Screws":
@@ -48,7 +51,7 @@ class Screws(Value):
         axes, origins = rotate(pose, axes), apply(pose, origins)
         slide = hand.prismatic.to(axes)[:, None]
         twists = torch.cat([torch.linalg.cross(origins, axes) * (1 - slide) + axes * slide, axes * (1 - slide)], -1)
-        return cls(hand, pose[:, None] @ links, twists.mT, pose[:, :3, 3])
+        return cls(hand, pose[:, None] @ links, twists.mT, pose)
 
     def points(self, links: Int[Tensor, "k"], local: Float[Tensor, "k 3"]) -> Float[Tensor, "g k 3"]:
         """Return points that are fixed in links, in the object's frame."""
@@ -67,14 +70,15 @@ class Screws(Value):
 
     def directions(self, links: Int[Tensor, "k"], local: Float[Tensor, "k 3"]) -> Float[Tensor, "g k 3"]:
         """Return directions that are fixed in links, in the object's frame."""
-        return (self.obj_from_link[:, links, :3, :3] @ local.to(self.origin)[:, :, None])[..., 0]
+        return (self.obj_from_link[:, links, :3, :3] @ local.to(self.pose)[:, :, None])[..., 0]
 
     def jacobian(self, wrench: Float[Tensor, "g k 6"], links: Int[Tensor, "*g k"]) -> Float[Tensor, "g k d"]:
         """Return the derivative of rows, each the work of a wrench on a link, by pose and joints."""
         force, torque = wrench.split(3, -1)
-        about = torque - torch.linalg.cross(self.origin[:, None].expand_as(force), force)
+        turn, origin = self.pose[:, :3, :3], self.pose[:, :3, 3]
+        about = torque - torch.linalg.cross(origin[:, None].expand_as(force), force)
         joints = ((wrench @ self.twists) * self.hand.moves[links].to(wrench)) @ self.hand.coupling.to(wrench)
-        return torch.cat([force, about, joints], -1)
+        return torch.cat([force @ turn, about @ turn, joints], -1)
 
 
 def wrench_of(points: Float[Tensor, "g k 3"], directions: Float[Tensor, "g k 3"]) -> Float[Tensor, "g k 6"]:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchgrasp.base import join
 from torchgrasp.errors import Status
-from torchgrasp.hand.check import check
+from torchgrasp.hand.check import check, measure
 from torchgrasp.hand.clear import Surroundings
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.motion import Posture
@@ -84,9 +84,7 @@ def judge(
     """
     planned = torch.where((planned == Status.OK) & ~certificate.closed, int(Status.NOT_CLOSED), planned)
     pregrasp = posture.joints.clone()
-    # A hand that still touches is no pre-grasp: what is found before that is final.
-    status = check(posture, pregrasp, hand, contacts, surroundings).status
-    sound = (planned == Status.OK) & ((status == Status.OK) | (status == Status.PREGRASP))
+    sound = (planned == Status.OK) & (measure(posture, hand, contacts, surroundings).status == Status.OK)
     pregrasp[sound] = open_hand(posture[sound], hand, contacts[sound], surroundings)
     found = check(posture, pregrasp, hand, contacts, surroundings)
     return Grasps(

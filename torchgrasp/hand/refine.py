@@ -21,7 +21,7 @@ from torch import Tensor
 
 from torchgrasp.hand.clear import CLEARANCE, MILLIMETRE, Surroundings, clearance_rows
 from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.minimise import Rows, minimise
+from torchgrasp.hand.minimise import SOLVED, Rows, minimise
 from torchgrasp.hand.motion import Posture, Screws, wrench_of
 from torchgrasp.values import Contacts
 
@@ -82,7 +82,7 @@ def badness(posture: Posture, hand: Hand, contacts: Contacts, surroundings: Surr
 
 
 def refine(
-    posture: Posture, hand: Hand, contacts: Contacts, surroundings: Surroundings, iterations: int = ITERATIONS
+    posture: Posture, hand: Hand, contacts: Contacts, surroundings: Surroundings, solved: float = SOLVED
 ) -> Posture:
     """Return postures whose fingertips are on their contacts and whose links are clear, as far as each row allows.
 
@@ -91,7 +91,7 @@ def refine(
         hand: whose fingers, in grasp order, take the contacts in theirs.
         contacts: g rows; finger i takes contact i.
         surroundings: the estimated object and the table.
-        iterations: of the solver.
+        solved: sum of squared residuals [mm2] at which a row is left alone.
 
     Returns:
         As many rows; whether each succeeded is for `check` to say.
@@ -101,7 +101,7 @@ def refine(
     def evaluate(state: Posture, at: Int[Tensor, "a"]) -> Rows:
         return grasp_rows(state, hand, target[at], normals[at], surroundings, tips_touch=True)
 
-    return minimise(posture, evaluate, lambda state, step: state.moved(step, hand), iterations)
+    return minimise(posture, evaluate, lambda state, step: state.moved(step, hand), ITERATIONS, solved)
 
 
 def open_hand(posture: Posture, hand: Hand, contacts: Contacts, surroundings: Surroundings) -> Float[Tensor, "g h"]:
