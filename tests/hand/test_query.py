@@ -128,6 +128,38 @@ def test_bad_arguments():
         query_hand(contacts, load_hand("allegro"), mixture)
 
 
+def test_a_mixture_of_other_limits_fingers_or_fingertips_is_refused():
+    hand, samples, mixture = barrett()
+    contacts = contacts_of(hand, samples.joints[:2], torch.eye(4).double())
+    others = [
+        dataclasses.replace(hand, upper=hand.upper - 0.01),
+        dataclasses.replace(hand, contact=hand.contact + 1e-4),
+        dataclasses.replace(hand, normal=hand.normal.roll(1, 1)),
+        dataclasses.replace(hand, coupling=hand.coupling * 1.001),
+    ]
+    for other in others:
+        with pytest.raises(BadArgument, match="mixture: found the model of hand 'barrett' .*train it anew"):
+            query_hand(contacts, other, mixture)
+    spoilt = dataclasses.replace(mixture, meta=mixture.meta | {"hand_codes": "one two"})
+    with pytest.raises(BadArgument, match="mixture: found hand_codes"):
+        query_hand(contacts, hand, spoilt)
+    # What does not change the codes is no other hand, nor are single precision and samples that tell no hand.
+    for same in (dataclasses.replace(hand, sha256="0" * 64), hand.to(torch.float32)):
+        assert len(query_hand(contacts, same, mixture))
+    assert len(query_hand(contacts, hand, dataclasses.replace(mixture, meta={})))
+
+
+def test_many_triples_are_answered_as_each_alone(motion):
+    hand, samples, mixture = barrett()
+    contacts = contacts_of(hand, samples.joints[9000:9600], motion)  # more than one pass
+    found = query_hand(contacts, hand, mixture, guesses=2)
+    assert bool((found.row.diff() >= 0).all())
+    for k in (0, 255, 256, 599):
+        one, rows = query_hand(contacts[k], hand, mixture, guesses=2), found[found.row == k]
+        assert torch.equal(one.permutation, rows.permutation)
+        torch.testing.assert_close(one.joints, rows.joints, rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize(("name", "components"), [("allegro", 41), ("barrett", 36)])
 def test_shipped_mixtures_fit_their_hands(name, components):
     hand, mixture = load_hand(name), load_mixture(name)

@@ -2,19 +2,17 @@
 
 import dataclasses
 import functools
-import math
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value, check_tensor
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.hand.code import CODE_NAMES
+from torchgrasp.hand.gaussian import ROWS, GaussianMixture
 from torchgrasp.hand.load import find_hand
-from torchgrasp.linalg import cholesky
 from torchgrasp.values import ContactCode
 
 PAPER_REACH = 2.0
@@ -24,19 +22,15 @@ deviations" in six dimensions accept only 32 % of what a single component itself
 DEFAULT_REACH = 8.405946915
 """Half the 99 % quantile of chi-square with six degrees of freedom: a component accepts 99 % of its own codes."""
 
-ROWS = 8192
-"""Rows evaluated in one pass, to bound memory at rows x components x dimensions."""
-
 
 @dataclasses.dataclass(frozen=True)
-class GraspMixture(Value):
+class GraspMixture(GaussianMixture):
     """The joint density of joints and codes of one hand, a Gaussian mixture (Eqs. 19-20).
 
-    A dimension is a joint [rad], in the order of the hand, or one of L1 L2 L3 [m] N1 N2 N3, which come last. All
-    evaluation is in float64.
+    A dimension is a joint [rad], in the order of the hand, or one of L1 L2 L3 [m] N1 N2 N3, which come last.
 
     Args:
-        weights: pi_i, positive, of sum 1.
+        weights: pi_i, none negative, of sum 1.
         means: mu_i.
         covariances: Sigma_i, symmetric and positive definite.
         names: of the dimensions.
@@ -45,36 +39,17 @@ class GraspMixture(Value):
         meta: what it was fitted on: hand, its hash, samples, seed, and what the fit reported.
 
     Raises:
-        BadArgument: shapes that do not agree, weights that are not positive or do not sum to 1, an indefinite or
-            asymmetric covariance.
+        BadArgument: what `GaussianMixture` refuses, or names that do not end with those of a code.
     """
 
-    weights: Float[Tensor, "m"]
-    means: Float[Tensor, "m d"]
-    covariances: Float[Tensor, "m d d"]
-    names: tuple[str, ...]
     regularisation: float = 0.0
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
 
     def __post_init__(self) -> None:
         """Check everything once, where the value is made."""
-        m, d = len(self.weights), len(self.names)
-        check_tensor("weights", self.weights, (m,))
-        check_tensor("means", self.means, (m, d))
-        check_tensor("covariances", self.covariances, (m, d, d))
-        if m < 1 or not bool((self.weights > 0).all()) or abs(float(self.weights.double().sum()) - 1) > 1e-6:
-            found = f"{m} weights of least {self.weights.min() if m else None} and sum {float(self.weights.sum())}"
-            raise BadArgument("weights", found, "at least one, all positive, of sum 1 within 1e-6")
-        if self.names[-6:] != CODE_NAMES or d < 7:
+        super().__post_init__()
+        if self.names[-6:] != CODE_NAMES or len(self.names) < 7:
             raise BadArgument("names", self.names, f"the joints' names, then {', '.join(CODE_NAMES)}")
-        scale = self.covariances.diagonal(dim1=-2, dim2=-1).abs().sqrt()
-        skewness = (self.covariances - self.covariances.transpose(-1, -2)).abs()
-        if bool((skewness > 1e-6 * scale[:, :, None] * scale[:, None, :]).any()):
-            raise BadArgument("covariances", "an asymmetric matrix", "symmetric positive definite matrices")
-        _, info = torch.linalg.cholesky_ex(self.covariances.double())
-        if bool((info != 0).any()):
-            found = f"an indefinite matrix in component {int(info.nonzero()[0])}"
-            raise BadArgument("covariances", found, "symmetric positive definite matrices")
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -82,32 +57,21 @@ class GraspMixture(Value):
         return self.names[:-6]
 
     @functools.cached_property
-    def _full(self) -> "_Whitening":
-        return _Whitening.of(self.means, self.covariances)
-
-    @functools.cached_property
-    def _marginal(self) -> "_Whitening":
+    def _code(self) -> GaussianMixture:
         """The density of the code alone, Eq. (22)."""
-        return _Whitening.of(self.means[:, -6:], self.covariances[:, -6:, -6:])
+        return self.marginal(CODE_NAMES)
 
     @functools.cached_property
     def _regression(self) -> Float[Tensor, "m h 6"]:
         """Sigma_(Theta,q) Sigma_q^-1 of Eq. (23)."""
-        whitening = self._marginal.whitening
+        whitening = self._code.whitening.matrix
         return self.covariances[:, :-6, -6:].double() @ whitening.transpose(-1, -2) @ whitening
 
-    def log_prob(self, x: Float[Tensor, "*b d"]) -> Float[Tensor, "*b"]:
-        """Return the log-density of rows (joints, L, N), Eq. (19).
-
-        Raises:
-            BadArgument: rows of another length than the mixture has dimensions.
-        """
-        if x.ndim < 1 or x.shape[-1] != len(self.names):
-            raise BadArgument("x", f"shape {tuple(x.shape)}", f"rows of {len(self.names)} numbers")
-        rows = x.reshape(-1, x.shape[-1]).double()
-        log_weights = self.weights.double().log()
-        parts = [torch.logsumexp(log_weights + self._full.log_densities(part), -1) for part in rows.split(ROWS)]
-        return torch.cat(parts).reshape(x.shape[:-1]).to(x.dtype)
+    @functools.cached_property
+    def _lines(self) -> Float[Tensor, "k h"]:
+        """The conditional mean of every component as a linear function of (q, 1), one below the other."""
+        at_zero = self.means[:, :-6].double() - (self._regression @ self.means[:, -6:, None].double())[..., 0]
+        return torch.cat([self._regression.transpose(1, 2), at_zero[:, None]], 1).flatten(0, 1)
 
     def reach(self, code: ContactCode | Float[Tensor, "*b 6"]) -> Float[Tensor, "*b"]:
         """Return the least f_i of Eq. (21), by which a code is within the hand's reach or not.
@@ -124,7 +88,7 @@ class GraspMixture(Value):
         """
         q = _checked(code)
         rows = q.reshape(-1, 6).double()
-        parts = [0.5 * self._marginal.squared(part).amin(-1) for part in rows.split(ROWS)]
+        parts = [0.5 * self._code.whitening.squared(part).amin(-1) for part in rows.split(ROWS)]
         return torch.cat(parts).reshape(q.shape[:-1]).to(q.dtype)
 
     def joints(self, code: ContactCode | Float[Tensor, "*b 6"]) -> Float[Tensor, "*b h"]:
@@ -141,7 +105,9 @@ class GraspMixture(Value):
         parts = []
         for part in rows.split(ROWS):
             responsibility = self._log_responsibility(part).exp()
-            parts.append((responsibility[..., None] * self._conditional_means(part)).sum(-2))
+            # the sum over components of h_i times a linear function of q, as one product
+            weighted = responsibility[:, :, None] * torch.cat([part, torch.ones_like(part[:, :1])], 1)[:, None]
+            parts.append(weighted.flatten(1) @ self._lines)
         return torch.cat(parts).reshape(*q.shape[:-1], len(self.joint_names)).to(q.dtype)
 
     def modes(self, q: Float[Tensor, "*b 6"], k: int) -> tuple[Float[Tensor, "*b k h"], Float[Tensor, "*b k"]]:
@@ -191,7 +157,7 @@ class GraspMixture(Value):
 
     def _log_responsibility(self, q: Float[Tensor, "n 6"]) -> Float[Tensor, "n m"]:
         """Return log h_i of Eq. (23); in logarithms a code far from every component still has its nearest."""
-        return torch.log_softmax(self.weights.double().log() + self._marginal.log_densities(q), dim=-1)
+        return torch.log_softmax(self._code.log_joint(q), dim=-1)
 
     def _conditional_means(self, q: Float[Tensor, "n 6"]) -> Float[Tensor, "n m h"]:
         """Return each component's mean of the joints given the code, the bracket of Eq. (23)."""
@@ -215,32 +181,6 @@ def _checked(code: ContactCode | Tensor) -> Float[Tensor, "*b 6"]:
     if q.ndim < 1 or q.shape[-1] != 6:
         raise BadArgument("code", f"shape {tuple(q.shape)}", "rows of 6 numbers, L and N")
     return q
-
-
-@dataclasses.dataclass(frozen=True)
-class _Whitening:
-    """Gaussians of m components, ready to be evaluated: W with W^T W = Sigma^-1, and W mu."""
-
-    whitening: Float[Tensor, "m d d"]
-    whitened_means: Float[Tensor, "m d"]
-    log_scale: Float[Tensor, "m"]
-
-    @staticmethod
-    def of(means: Float[Tensor, "m d"], covariances: Float[Tensor, "m d d"]) -> "_Whitening":
-        factor = cholesky(covariances.double(), "a component's covariance", "fit with fewer components")
-        eye = torch.eye(means.shape[1], dtype=torch.float64, device=means.device)
-        whitening = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)
-        log_scale = whitening.diagonal(dim1=-2, dim2=-1).log().sum(-1) - 0.5 * means.shape[1] * math.log(2 * math.pi)
-        return _Whitening(whitening, (whitening @ means.double()[..., None])[..., 0], log_scale)
-
-    def squared(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
-        """Return the squared Mahalanobis distance of every row from every component."""
-        m, d = self.whitened_means.shape
-        whitened = (x @ self.whitening.reshape(m * d, d).T).reshape(-1, m, d) - self.whitened_means
-        return (whitened * whitened).sum(-1)
-
-    def log_densities(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
-        return self.log_scale - 0.5 * self.squared(x)
 
 
 def load_mixture(name_or_path: Path | str) -> GraspMixture:

@@ -1,13 +1,17 @@
 """From planned contacts to postures of the hand that may touch them (Eqs. 21-24)."""
 
+import dataclasses
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchgrasp.base import join
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, degenerate, inverse, rotate, virtual_frame
 from torchgrasp.hand.code import encode
 from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.identity import check_same_hand
 from torchgrasp.hand.mixture import DEFAULT_REACH, GraspMixture
 from torchgrasp.values import Contacts, GraspGuess
 
@@ -18,6 +22,10 @@ know the side (`hand_code`), so that such guesses occur; they are ranked last.""
 LENGTH_SLACK, COSINE_SLACK = 0.01, 0.5
 """Noise of a planned code against that of the pads' middles, in L [m] and N: what a rolling tip makes up for. Of
 certified triples on a can, the Barrett hand's share within reach rises from 1 to 99 %, and most then refine."""
+
+
+ROWS = 256
+"""Contact triples answered in one pass: their postures stay in the cache."""
 
 
 def query_hand(
@@ -44,20 +52,27 @@ def query_hand(
         reach.
 
     Raises:
-        BadArgument: a mixture of another hand, a number outside its range, or malformed contacts.
+        BadArgument: a mixture of another hand, or of other limits or fingertips of it, a number outside its range, or malformed contacts.
 
     >>> from torchgrasp.hand.load import load_hand
     >>> from torchgrasp.hand.mixture import load_mixture
     >>> points, zero = 0.05 * torch.eye(3)[None], torch.zeros(1, 3)
     >>> guess = query_hand(Contacts(points, 20 * points, zero, zero), load_hand("allegro"), load_mixture("allegro"))
     """
-    if mixture.joint_names != hand.joint_names:
-        raise BadArgument("mixture", f"joints {mixture.joint_names}", f"the joints {hand.joint_names} of the hand")
+    check_same_hand(mixture.meta, mixture.joint_names, hand)
     if not 1 <= guesses <= len(mixture.weights) + 1:
         raise BadArgument("guesses", guesses, f"1 to {len(mixture.weights) + 1}")
     if not max_reach > 0:
         raise BadArgument("max_reach", max_reach, "a positive number")
-    mixture = mixture.loosened(LENGTH_SLACK, COSINE_SLACK)
+    loose = mixture.loosened(LENGTH_SLACK, COSINE_SLACK)
+    firsts = range(0, max(len(contacts), 1), ROWS)
+    parts = [_query(contacts[k : k + ROWS], hand, loose, guesses, max_reach) for k in firsts]
+    rows = torch.cat([part.row + k for part, k in zip(parts, firsts, strict=True)])
+    return dataclasses.replace(join(parts), row=rows)
+
+
+def _query(contacts: Contacts, hand: Hand, mixture: GraspMixture, guesses: int, max_reach: float) -> GraspGuess:
+    """Query the postures for some contact triples."""
     dtype = contacts.points.dtype
     code = encode((contacts.points.double(), contacts.normals.double()))
     reach = mixture.reach(code)

@@ -14,6 +14,7 @@ from torchgrasp.base import Batch
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.code import hand_code
 from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.identity import describe_hand
 
 CHUNK = 10_000
 """Postures drawn from one generator. It fixes what a seed means, so it is no argument."""
@@ -64,8 +65,7 @@ def sample_configurations(hand: Hand, n: int, seed: int = 0, workers: int = 1) -
             raise BadArgument("hand", f"{have} free of {(i + 1) * CHUNK} postures", "a hand that can move freely")
     joints = torch.cat(found)[:n]
     q = torch.cat([hand_code(*hand.fingertips(part)) for part in joints.split(CHUNK)])
-    meta = {"hand": hand.name, "fingers": hand.option, "hand_sha256": hand.sha256, "seed": str(seed)}
-    return HandSamples(joints, q, hand.joint_names, meta)
+    return HandSamples(joints, q, hand.joint_names, describe_hand(hand) | {"seed": str(seed)})
 
 
 def _chunks(hand: Hand, seed: int, workers: int) -> Iterator[Tensor]:

@@ -1,0 +1,189 @@
+"""A Gaussian mixture over named dimensions: its density, samples, marginals and conditionals (Eqs. 19-20)."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.base import Value, check_tensor
+from torchgrasp.errors import BadArgument
+from torchgrasp.linalg import cholesky
+
+ROWS = 8192
+"""Rows evaluated in one pass, to bound memory at rows x components x dimensions."""
+
+
+@dataclasses.dataclass(frozen=True)
+class GaussianMixture(Value):
+    """A mixture of m Gaussians over d named dimensions (Eqs. 19-20). All evaluation is in float64.
+
+    Args:
+        weights: pi_i, none negative, of sum 1.
+        means: mu_i.
+        covariances: Sigma_i, symmetric and positive definite.
+        names: of the dimensions.
+
+    Raises:
+        BadArgument: shapes that do not agree, weights that are negative or do not sum to 1, an indefinite or
+            asymmetric covariance, a name twice.
+
+    >>> mixture = GaussianMixture(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None], ("a", "b"))
+    >>> mixture.condition({"b": 3.0}).means
+    tensor([[0.]], dtype=torch.float64)
+    """
+
+    weights: Float[Tensor, "m"]
+    means: Float[Tensor, "m d"]
+    covariances: Float[Tensor, "m d d"]
+    names: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        """Check everything once, where the value is made."""
+        m, d = len(self.weights), len(self.names)
+        check_tensor("weights", self.weights, (m,))
+        check_tensor("means", self.means, (m, d))
+        check_tensor("covariances", self.covariances, (m, d, d))
+        if m < 1 or not bool((self.weights >= 0).all()) or abs(float(self.weights.double().sum()) - 1) > 1e-6:
+            found = f"{m} weights of least {self.weights.min() if m else None} and sum {float(self.weights.sum())}"
+            raise BadArgument("weights", found, "at least one, none negative, of sum 1 within 1e-6")
+        if d < 1 or len(set(self.names)) < d:
+            raise BadArgument("names", self.names, "at least one, each once")
+        scale = self.covariances.diagonal(dim1=-2, dim2=-1).abs().sqrt()
+        skewness = (self.covariances - self.covariances.transpose(-1, -2)).abs()
+        if bool((skewness > 1e-6 * scale[:, :, None] * scale[:, None, :]).any()):
+            raise BadArgument("covariances", "an asymmetric matrix", "symmetric positive definite matrices")
+        _, info = torch.linalg.cholesky_ex(self.covariances.double())
+        if bool((info != 0).any()):
+            found = f"an indefinite matrix in component {int(info.nonzero()[0])}"
+            raise BadArgument("covariances", found, "symmetric positive definite matrices")
+
+    def log_prob(self, x: Float[Tensor, "*b d"]) -> Float[Tensor, "*b"]:
+        """Return the log-density of rows, Eq. (19).
+
+        Raises:
+            BadArgument: rows of another length than the mixture has dimensions.
+        """
+        if x.ndim < 1 or x.shape[-1] != len(self.names):
+            raise BadArgument("x", f"shape {tuple(x.shape)}", f"rows of {len(self.names)} numbers")
+        rows = x.reshape(-1, x.shape[-1]).double()
+        parts = [torch.logsumexp(self.log_joint(part), -1) for part in rows.split(ROWS)]
+        return torch.cat(parts).reshape(x.shape[:-1]).to(x.dtype)
+
+    def log_joint(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
+        """Return log(pi_i) + log N(x | mu_i, Sigma_i) of every row and component."""
+        return self.weights.double().log() + self.whitening.log_densities(x)
+
+    def sample(self, n: int, seed: int = 0) -> Float[Tensor, "n d"]:
+        """Draw n rows; the same seed gives the same rows.
+
+        Raises:
+            BadArgument: n or seed outside its range.
+        """
+        for name, value in (("n", n), ("seed", seed)):
+            if not 0 <= value < 2**63 or value != int(value):
+                raise BadArgument(name, value, "a whole number in [0, 2^63)")
+        generator = torch.Generator().manual_seed(seed)
+        weights, means = self.weights.double().cpu(), self.means.double().cpu()
+        # the sum of the weights is 1 to rounding only; the last one takes what is drawn above it
+        draw = torch.rand(n, generator=generator, dtype=torch.float64)
+        which = torch.searchsorted(weights.cumsum(0), draw, right=True).clamp(max=len(weights) - 1)
+        noise = torch.randn(n, len(self.names), generator=generator, dtype=torch.float64)
+        factor = torch.linalg.cholesky(self.covariances.double().cpu())
+        found = means[which]
+        for k in range(len(weights)):
+            found[which == k] += noise[which == k] @ factor[k].T
+        return found.to(self.means.device)
+
+    def marginal(self, names: Sequence[str]) -> "GaussianMixture":
+        """Return the density of some dimensions alone, in the order of `names`, Eq. (22).
+
+        Raises:
+            BadArgument: a name that the mixture does not have, or twice.
+        """
+        index = self._index(names)
+        means, covariances = self.means.double(), self.covariances.double()
+        block = covariances[:, index][:, :, index]
+        return GaussianMixture(self.weights.double(), means[:, index], block, tuple(names))
+
+    def condition(self, given: dict[str, float]) -> "GaussianMixture":
+        """Return the density of the other dimensions where some are given, the bracket of Eq. (23) and its h_i.
+
+        Args:
+            given: number of each observed dimension, by name.
+
+        Returns:
+            A mixture over the other dimensions, in their order; components that the observation rules out to the
+            last digit are left out.
+
+        Raises:
+            BadArgument: a name that the mixture does not have, a number that is not finite, or nothing left over.
+        """
+        seen = self._index(tuple(given))
+        rest = [i for i in range(len(self.names)) if i not in seen]
+        if not rest:
+            raise BadArgument("given", "every dimension", "some of them")
+        values = check_tensor("given", self.means.new_tensor(list(given.values()), dtype=torch.float64), (len(seen),))
+        if not seen:
+            return self.marginal(self.names)
+        part = self.marginal(tuple(given))
+        weights = torch.softmax(part.log_joint(values[None])[0], 0)
+        means, covariances = self.means.double(), self.covariances.double()
+        cross = covariances[:, rest][:, :, seen] @ part.whitening.matrix.transpose(-1, -2)  # (m, rest, seen), whitened
+        offset = part.whitening.matrix @ (values - part.means)[..., None]
+        moved = means[:, rest] + (cross @ offset)[..., 0]
+        left = covariances[:, rest][:, :, rest] - cross @ cross.transpose(-1, -2)
+        kept = weights > 0
+        names = tuple(self.names[i] for i in rest)
+        return GaussianMixture(weights[kept], moved[kept], (left + left.transpose(-1, -2))[kept] / 2, names)
+
+    def mean(self) -> Float[Tensor, "d"]:
+        """Return the expected value of every dimension."""
+        return self.weights.double() @ self.means.double()
+
+    @functools.cached_property
+    def whitening(self) -> "Whitening":
+        """The factors by which densities are evaluated."""
+        return Whitening.of(self.means, self.covariances)
+
+    def _index(self, names: Sequence[str]) -> list[int]:
+        """Return where dimensions are."""
+        unknown = [name for name in names if name not in self.names]
+        if unknown or len(set(names)) < len(names):
+            raise BadArgument("names", unknown or tuple(names), f"some of {', '.join(self.names)}, each once")
+        return [self.names.index(name) for name in names]
+
+
+@dataclasses.dataclass(frozen=True)
+class Whitening:
+    """Gaussians of m components, ready to be evaluated: `matrix` W with W^T W = Sigma^-1, and W mu."""
+
+    matrix: Float[Tensor, "m d d"]
+    means: Float[Tensor, "m d"]
+    log_scale: Float[Tensor, "m"]
+
+    @staticmethod
+    def of(means: Float[Tensor, "m d"], covariances: Float[Tensor, "m d d"]) -> "Whitening":
+        """Factor every covariance.
+
+        Raises:
+            IndefiniteCovariance: one is not positive definite.
+        """
+        factor = cholesky(covariances.double(), "a component's covariance", "fit with fewer components")
+        eye = torch.eye(means.shape[1], dtype=torch.float64, device=means.device)
+        matrix = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)
+        log_scale = matrix.diagonal(dim1=-2, dim2=-1).log().sum(-1) - 0.5 * means.shape[1] * math.log(2 * math.pi)
+        return Whitening(matrix, (matrix @ means.double()[..., None])[..., 0], log_scale)
+
+    def squared(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
+        """Return the squared Mahalanobis distance of every row from every component."""
+        m, d = self.means.shape
+        whitened = (x @ self.matrix.reshape(m * d, d).T).reshape(-1, m, d) - self.means
+        return (whitened * whitened).sum(-1)
+
+    def log_densities(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
+        """Return log N(x | mu_i, Sigma_i) of every row and component."""
+        return self.log_scale - 0.5 * self.squared(x)
