@@ -37,12 +37,8 @@ def check_same_hand(meta: dict[str, str], joint_names: tuple[str, ...], hand: Ha
     except ValueError as error:
         raise BadArgument("mixture", f"hand_codes {meta['hand_codes']!r}", "numbers") from error
     if theirs.shape != ours.shape or not torch.allclose(theirs.to(ours), ours, rtol=0, atol=TOLERANCE):
-        found = (
-            f"the model of hand {meta.get('hand')!r} (fingers {meta.get('fingers')!r}) of other limits or fingertips"
-        )
-        raise BadArgument(
-            "mixture", found, f"a model of {hand.name!r} (fingers {hand.option!r}) as it is: train it anew"
-        )
+        whose = f"hand {meta.get('hand')!r}, fingers {meta.get('fingers')!r}, of other limits or fingertips"
+        raise BadArgument("mixture", f"a model of {whose}", f"one of {hand.name!r}, {hand.option!r}: train it anew")
 
 
 def _probe(hand: Hand) -> Float[Tensor, "3 6"]:

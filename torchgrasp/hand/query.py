@@ -52,7 +52,8 @@ def query_hand(
         reach.
 
     Raises:
-        BadArgument: a mixture of another hand, or of other limits or fingertips of it, a number outside its range, or malformed contacts.
+        BadArgument: a mixture of another hand or of other limits or fingertips, a number outside its range, or
+            malformed contacts.
 
     >>> from torchgrasp.hand.load import load_hand
     >>> from torchgrasp.hand.mixture import load_mixture
