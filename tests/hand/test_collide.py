@@ -1,4 +1,4 @@
-"""Distances against closed forms, optimisation and analytic surfaces."""
+"""Distance fields against analytic surfaces."""
 
 import numpy as np
 import pytest
@@ -6,62 +6,12 @@ import torch
 import trimesh
 
 from torchgrasp.errors import BadArgument
+from torchgrasp.hand.boxes import box_distance
 from torchgrasp.hand.collide import (
-    box_distance,
     closest_on_triangles,
     field_from_mesh,
     field_from_surface,
-    segment_closest,
-    segment_distance,
 )
-
-
-def segments(n: int, generator: torch.Generator) -> list[torch.Tensor]:
-    return list(torch.randn(4, n, 3, generator=generator, dtype=torch.float64))
-
-
-def test_segment_distance_is_the_least_over_sampled_points(generator):
-    a, b, c, d = segments(200, generator)
-    t = torch.linspace(0, 1, 201, dtype=torch.float64)[:, None]
-    sampled = torch.cdist(a[:, None] + t * (b - a)[:, None], c[:, None] + t * (d - c)[:, None]).amin((1, 2))
-    exact = segment_distance(a, b, c, d)
-    assert float((exact - sampled).max()) < 1e-12
-    assert float((sampled - exact).max()) < 0.02
-    here, there = segment_closest(a, b, c, d)
-    torch.testing.assert_close(torch.linalg.vector_norm(here - there, dim=-1), exact)
-
-
-def test_segment_distance_closed_forms():
-    o = torch.zeros(3, dtype=torch.float64)
-    x, y, z = torch.eye(3, dtype=torch.float64)
-    for a, b, c, d, expected in [
-        (o, x, z, x + z, 1.0),  # parallel, side by side
-        (o, x, 3 * x, 2 * x, 1.0),  # on one line, apart
-        (o, x, 0.5 * x, 2 * x, 0.0),  # on one line, overlapping
-        (-x, x, z - y, z + y, 1.0),  # crossing
-        (o, x, 2 * x + y, 2 * x + 2 * y, 2**0.5),  # corner to corner
-        (o, o, x, x, 1.0),  # points
-        (o, o, x - y, x + y, 1.0),  # point and segment
-    ]:
-        assert float(segment_distance(a, b, c, d)) == pytest.approx(expected, abs=1e-8)
-        assert float(segment_distance(c, d, b, a)) == pytest.approx(expected, abs=1e-8)
-
-
-def test_segment_distance_gradient_equals_finite_differences(generator):
-    a, b, c, d = segments(50, generator)
-    inputs = [x.requires_grad_() for x in (a, b, c, d)]
-    assert torch.autograd.gradcheck(segment_distance, inputs, atol=1e-5)
-
-
-def test_box_distance_is_that_of_trimesh(generator):
-    half = torch.tensor([0.5, 1.0, 1.5], dtype=torch.float64)
-    points = 2 * torch.randn(300, 3, generator=generator, dtype=torch.float64)
-    box = trimesh.creation.box(extents=2 * half.numpy())
-    truth = -trimesh.proximity.signed_distance(box, points.numpy())
-    found = box_distance(points, half.expand_as(points))
-    torch.testing.assert_close(found, torch.tensor(truth), atol=1e-9, rtol=0)
-    points.requires_grad_()
-    assert torch.autograd.gradcheck(lambda p: box_distance(p, half.expand_as(p)), (points[:50],))
 
 
 def test_closest_on_triangles_is_that_of_trimesh():

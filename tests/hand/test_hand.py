@@ -127,40 +127,6 @@ def test_allegro_thumb_opposes_the_fingers(generator):
     )
 
 
-def test_self_collision_rates_are_those_of_the_hands(generator):
-    allegro, barrett = load_hand("allegro"), load_hand("barrett")
-    share = [
-        float((h.self_clearance(postures(h, 1500, generator).float()) < 0).double().mean()) for h in (allegro, barrett)
-    ]
-    assert 0.18 < share[0] < 0.28  # 0.346 by exact hulls with all four fingers moving; the ring finger is parked here
-    assert 0.15 < share[1] < 0.27  # 0.187 by exact hulls; boxes and capsules bulge
-
-
-def test_self_clearance_is_the_least_distance_of_sampled_capsules(hand, generator):
-    joints = postures(hand, 5, generator)
-    poses, c = hand.link_poses(joints), hand.self_collision
-    start, end = c.axes(poses)
-    along = torch.linspace(0, 1, 60, dtype=torch.float64)[:, None]
-    points = start[:, :, None] + along * (end - start)[:, :, None]
-    i, j = c.capsule_pairs.unbind(1)
-    sampled = torch.stack([torch.cdist(points[:, a], points[:, b]).amin((1, 2)) for a, b in zip(i, j, strict=True)])
-    sampled = sampled - (c.radius[i] + c.radius[j])[:, None]
-    exact = c.capsule_distances(poses)
-    assert float((exact - sampled).max()) < 1e-7
-    assert float((sampled - exact).max()) < 1.5e-3
-
-
-def test_clearance_gradient_equals_finite_differences(generator):
-    hand = load_hand("allegro")
-    joints = postures(hand, 40, generator).requires_grad_()
-    (gradient,) = torch.autograd.grad(hand.self_clearance(joints).sum(), joints)
-    step = 1e-6 * torch.randn(40, 12, generator=generator, dtype=torch.float64)
-    with torch.no_grad():
-        change = (hand.self_clearance(joints + step) - hand.self_clearance(joints - step)) / 2
-    same = (change - (gradient * step).sum(1)).abs() < 1e-3 * step.norm(dim=1)
-    assert float(same.double().mean()) > 0.9  # the rest: the closest pair changes within the step
-
-
 def test_spheres_cover_the_collision_shapes(hand):
     from torchgrasp.hand.cover import rotation_from_rpy
     from torchgrasp.hand.urdf import read_urdf

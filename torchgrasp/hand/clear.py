@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.hand.collide import DistanceField, segment_closest
+from torchgrasp.hand.collide import DistanceField
 from torchgrasp.hand.cover import SphereCover
 from torchgrasp.hand.minimise import Rows
 from torchgrasp.hand.motion import Screws, wrench_of
@@ -96,24 +96,14 @@ def table_rows(screws: Screws, table: float, tips_touch: bool) -> Rows:
 
 
 def self_rows(screws: Screws) -> Rows:
-    """Return hinges on the least clearances of the links' capsules from each other."""
-    capsules = screws.hand.self_collision
-    first, second = capsules.capsule_pairs.unbind(1)
-    ends = screws.columns(capsules.capsule_link.repeat(2), torch.cat([capsules.start, capsules.end]))
-    pair = [end.index_select(0, k).mT for k in (first, second) for end in ends.chunk(2)]
-    here, there = segment_closest(*pair)
-    thick = capsules.radius.to(here)[capsules.capsule_pairs].sum(1)
-    gap = (here - there).unbind(-1)
-    between = torch.sqrt(gap[0] * gap[0] + gap[1] * gap[1] + gap[2] * gap[2]) - thick[:, None]
-    index = least(between.T)
-    at = torch.arange(len(index), device=here.device)[:, None]
-    between = between.T[at, index]
-    here, there = here[index, at], there[index, at]
-    # Axes that cross have no direction; such a pair keeps a zero row and leaves it to the others to part them.
-    direction = (here - there) / (between + thick[index])[..., None].clamp_min(1e-9)
-    by_first = screws.jacobian(wrench_of(here, direction), capsules.capsule_link[first[index]])
-    by_second = screws.jacobian(wrench_of(there, -direction), capsules.capsule_link[second[index]])
-    return hinge(between, by_first + by_second, SELF_CLEARANCE)
+    """Return hinges on the least clearances of the links from each other."""
+    itself, frames = screws.hand.self_collision, screws.obj_from_link[:, :, :3].permute(2, 3, 1, 0).contiguous()
+    between = itself.separations(frames, SELF_CLEARANCE).T
+    index = least(between)
+    at = torch.arange(len(index), device=index.device)[:, None].expand_as(index)
+    apart = itself.wrenches(frames, index.flatten(), at.flatten()).T.unflatten(0, index.shape)
+    first, second = itself.link[itself.pairs[index]].unbind(-1)
+    return hinge(between[at, index], screws.jacobian(apart, second) - screws.jacobian(apart, first), SELF_CLEARANCE)
 
 
 def link_clearance(

@@ -168,15 +168,17 @@ class Hand(Value):
         cover = self.collision_spheres
         return _rows(placed(self.frames(joints).index_select(2, cover.link_index), cover.center), joints)
 
-    def self_clearance(self, joints: Float[Tensor, "*b h"], chunk: int = 512) -> Float[Tensor, "*b"]:
-        """Return the signed least distance [m] between links that can meet; negative: they overlap.
+    def self_clearance(self, joints: Float[Tensor, "*b h"], chunk: int = 1024) -> Float[Tensor, "*b"]:
+        """Return the signed least separation [m] between links that can meet; negative: they overlap.
 
-        Parked fingers and the palm are included; the pairs are those of hand.toml. Rows are taken in chunks, which
-        bounds the memory and keeps the work in the cache.
+        The links are the collision shapes of the URDF, parked fingers and the palm included, and the pairs those of
+        hand.toml. Where links overlap it is how far two must move to part, and where they face one another it is their
+        distance; corner to corner it is less. Rows are taken in chunks, which bounds the memory and keeps the work in
+        the cache.
         """
         self._check(joints)
         rows = joints.reshape(-1, joints.shape[-1])
-        parts = [self.self_collision.clearance(self.link_poses(part)) for part in rows.split(chunk)]
+        parts = [self.self_collision.clearance(self.frames(part)) for part in rows.split(chunk)]
         return torch.cat(parts).reshape(joints.shape[:-1]) if parts else rows.new_zeros(joints.shape[:-1])
 
     def screws(self, poses: Float[Tensor, "*b l 4 4"]) -> tuple[Float[Tensor, "*b j 3"], Float[Tensor, "*b j 3"]]:

@@ -11,7 +11,7 @@ from torchgrasp.errors import HandFileError
 from torchgrasp.hand.cover import cover_from_urdf
 from torchgrasp.hand.hand import Actuator, Hand
 from torchgrasp.hand.kinematics import ancestor_mask, kinematics_from_urdf
-from torchgrasp.hand.selfcollide import self_collision_from_spec
+from torchgrasp.hand.selfcollide import self_collision_from_urdf
 from torchgrasp.hand.spec import HandSpec, read_hand_toml
 from torchgrasp.hand.urdf import Urdf, read_urdf
 
@@ -105,7 +105,7 @@ def hand_from_files(spec: HandSpec, urdf: Urdf) -> Hand:
         moves=torch.tensor(ancestor_mask(urdf), dtype=torch.float64),
         actuators={n: Actuator(j.effort, j.velocity, spec.kp, spec.kd) for n, j in movable.items()},
         collision_spheres=cover_from_urdf(urdf, spec),
-        self_collision=self_collision_from_spec(urdf, spec),
+        self_collision=self_collision_from_urdf(urdf, spec.pairs),
         kinematics=kinematics,
     )
 
@@ -134,8 +134,7 @@ def _check_names(spec: HandSpec, urdf: Urdf, movable: set[str], links: set[str])
         raise HandFileError("hand.toml", f"{spec.path}: base_link {spec.base_link!r}", f"the URDF's root {urdf.root!r}")
     joints = [j for f in spec.all_fingers for j in f.joints] + list(spec.parked) + list(spec.coupling)
     joints += [source for source, _, _ in spec.coupling.values()]
-    named = [f.tip_link for f in spec.all_fingers] + [s.link for s in (*spec.capsules, *spec.boxes)]
-    named += [x for pair in spec.pairs or () for x in pair]
+    named = [f.tip_link for f in spec.all_fingers] + [x for pair in spec.pairs or () for x in pair]
     for kind, found, known in (("joint", joints, movable), ("link", named, links)):
         unknown = sorted(set(found) - known)
         if unknown:

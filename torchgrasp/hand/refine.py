@@ -6,7 +6,7 @@ pose and joints are solved together, every guess a row of one batch, with analyt
 * a round fingertip's centre one radius off the contact along its normal, so that the tip may roll; a tip that is not
   round brings its contact point itself to the contact,
 * the contact direction inside a cone about the pad's axis,
-* hinges on the clearance of the links' spheres from the object's field and from the table, and of the links' capsules
+* hinges on the clearance of the links' spheres from the object's field and from the table, and of the links' shapes
   from each other. Boxes (the palm's) are left to `check`.
 
 Joint limits hold at every step by projection. The paper's COBYLA minimises the tip distances alone, one grasp at a

@@ -1,7 +1,7 @@
 """Reading of hand.toml: what a URDF does not say about a grasping hand.
 
 Which fingers grasp and in which order, where their pads are, which joints follow others, where the unused ones are
-parked, and the capsules and boxes of the self-collision test.
+parked, and which links can meet.
 """
 
 import dataclasses
@@ -39,25 +39,6 @@ class Finger:
 
 
 @dataclasses.dataclass(frozen=True)
-class Capsule:
-    """A capsule from a to b [m] in a link's frame; a = b makes a sphere."""
-
-    link: str
-    a: Triple
-    b: Triple
-    radius: float
-
-
-@dataclasses.dataclass(frozen=True)
-class Box:
-    """An axis-parallel box [m] in a link's frame."""
-
-    link: str
-    center: Triple
-    size: Triple
-
-
-@dataclasses.dataclass(frozen=True)
 class HandSpec:
     """A hand.toml with one of its finger options chosen."""
 
@@ -74,8 +55,6 @@ class HandSpec:
     all_fingers: tuple[Finger, ...]
     parked: dict[str, float]
     coupling: dict[str, tuple[str, float, float]]
-    capsules: tuple[Capsule, ...]
-    boxes: tuple[Box, ...]
     pairs: tuple[tuple[str, str], ...] | None
     data: bytes
 
@@ -187,12 +166,11 @@ def read_hand_toml(path: Path | str, fingers: str = "default") -> HandSpec:
         raise HandFileError("hand.toml", f"{path}: fingers {[f.name for f in known]}", "every name once")
     chosen, parked = _option(top, known, fingers)
     coupling = _coupling(top)
-    capsules, boxes, pairs = _collision(top)
+    pairs = _pairs(top)
     top.done()
     return HandSpec(
-        path, name, urdf, base_link, approach, margin, kp, kd, fingers, chosen, known, parked, coupling, capsules,
-        boxes, pairs, data,
-    )  # fmt: skip
+        path, name, urdf, base_link, approach, margin, kp, kd, fingers, chosen, known, parked, coupling, pairs, data
+    )
 
 
 def _finger(table: _Table) -> Finger:
@@ -243,19 +221,9 @@ def _coupling(top: _Table) -> dict[str, tuple[str, float, float]]:
     return coupling
 
 
-def _collision(top: _Table) -> tuple[tuple[Capsule, ...], tuple[Box, ...], tuple[tuple[str, str], ...] | None]:
-    """Read the shapes of the self-collision test and the pairs of links to test (none given: all but neighbours)."""
-    table = top.inner("self_collision", optional=True)
-    capsules, boxes = [], []
-    for row in table.tables("capsules"):
-        capsules.append(Capsule(row.text("link"), row.triple("a"), row.triple("b"), row.number("radius", 1e-4, 1.0)))
-        row.done()
-    for row in table.tables("boxes"):
-        boxes.append(Box(row.text("link"), row.triple("center"), row.triple("size")))
-        if min(boxes[-1].size) <= 0:
-            raise row.wrong("size", "positive lengths")
-        row.done()
-    pairs = None
+def _pairs(top: _Table) -> tuple[tuple[str, str], ...] | None:
+    """Read the pairs of links that the self-collision test takes (none given: all but neighbours)."""
+    table, pairs = top.inner("self_collision", optional=True), None
     if "pairs" in table.table:
         table.read.add("pairs")
         rows = table.table["pairs"]
@@ -265,4 +233,4 @@ def _collision(top: _Table) -> tuple[tuple[Capsule, ...], tuple[Box, ...], tuple
             raise table.wrong("pairs", "a list of pairs of different links")
         pairs = tuple((r[0], r[1]) for r in rows)
     table.done()
-    return tuple(capsules), tuple(boxes), pairs
+    return pairs
