@@ -23,7 +23,8 @@ from torchgrasp.hand.rank import rank_by_closure
 from torchgrasp.hand.realise import realise
 from torchgrasp.hand.together import realise_together
 from torchgrasp.plan.certify import certify
-from torchgrasp.plan.probability import closure_probability, well_inside
+from torchgrasp.plan.lines import lines_of, well_inside
+from torchgrasp.plan.probability import closed_share
 from torchgrasp.plan.solve import plan_contacts
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.support import fit_shape
@@ -91,8 +92,8 @@ def closure_of(grasps: Grasps, shape: ShapeGP, spec: ContactSpec, seed: int) -> 
     """Return the probability of closure of the executable grasps, and 0 of all others."""
     probability = torch.zeros_like(grasps.score)
     rows = torch.nonzero((grasps.status == Status.OK) & well_inside(shape, grasps.contacts))[:, 0]
-    found = closure_probability(shape, grasps.contacts[rows], spec, DRAWS, seed)
-    probability[rows] = found.probability.to(probability)
+    share = closed_share(lines_of(shape, grasps.contacts[rows]), spec.friction, DRAWS, seed)
+    probability[rows] = share.to(probability)
     return probability
 
 

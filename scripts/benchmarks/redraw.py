@@ -1,22 +1,23 @@
-"""Closure on surfaces drawn anew, without linearising: what the probability of closure is held against.
+"""Closure on surfaces drawn anew, without rungs to be linear between: what the probability of closure is held against.
 
-Each surface is a sample of the posterior at a ladder of points along the line of every finger, with six neighbours a
-footprint away from each. The finger stops where the drawn distance first turns negative on its way in; the normal is
-that of the mean's gradient at that place and of the deviation from it over the footprint there.
+Each surface is a sample of the posterior at a close ladder of points along the line of every finger, with six
+neighbours a footprint away from each. The finger stops where the drawn distance turns negative on its way in, at the
+place nearest to the planned contact if there are several; the normal is that of the mean's gradient at that place and
+of the deviation from it over the footprint there.
 """
 
 import torch
 from torch import Tensor
 
 from torchgrasp.linalg import unit
-from torchgrasp.plan.probability import FOOTPRINT
+from torchgrasp.plan.lines import FOOTPRINT
 from torchgrasp.plan.wrench import closed_exact, tangents
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.joint import distance_covariance
 from torchgrasp.values import Contacts
 
 RUNGS = 37
-"""Points of a ladder, over 8 standard deviations to either side: the deviations grow away from what was seen."""
+"""Points of a ladder, over 12 standard deviations to either side: the deviations grow away from what was seen."""
 
 
 def redrawn_closure(shape: ShapeGP, contacts: Contacts, friction: float, n: int, seed: int) -> Tensor:

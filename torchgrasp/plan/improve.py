@@ -13,8 +13,9 @@ from torchgrasp.errors import BadArgument, Status
 from torchgrasp.linalg import unit
 from torchgrasp.plan.assess import assess
 from torchgrasp.plan.descend import FINISH, Stage, descend, pick, project, put, start_state
+from torchgrasp.plan.lines import lines_of, well_inside
 from torchgrasp.plan.objective import Cost, epsilon_cost, evaluate_cost, min_weight_cost, slope_of
-from torchgrasp.plan.probability import FOOTPRINT, count_closed, touched_planes
+from torchgrasp.plan.probability import closed_share
 from torchgrasp.plan.problem import ContactProblem, Shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec
@@ -107,8 +108,6 @@ def raise_probability(
 
 def _with_probability(shape: ShapeGP, spec: ContactSpec, seed: int, plan: ContactPlan) -> ContactPlan:
     """Return the plan with minus the probability of closure as its quality; 0 where a contact or its rim is unfit."""
-    rim = torch.linalg.vector_norm(shape.normalise(plan.contacts.points), dim=-1) + FOOTPRINT / shape.scale
-    fit = torch.nonzero((plan.status == Status.OK) & (rim < shape.domain_radius).all(-1))[:, 0]
-    planes = touched_planes(shape, plan.contacts[fit])
-    share = count_closed(planes, spec.friction, DRAWS, seed, float(shape.prior_block()[0, 0])) / DRAWS
+    fit = torch.nonzero((plan.status == Status.OK) & well_inside(shape, plan.contacts))[:, 0]
+    share = closed_share(lines_of(shape, plan.contacts[fit]), spec.friction, DRAWS, seed)
     return dataclasses.replace(plan, quality=torch.zeros_like(plan.quality).index_put((fit,), -share))
