@@ -6,14 +6,18 @@ from pathlib import Path
 import torch
 
 from benchmarks.common import Row, write_rows
+from benchmarks.components import bench_bic
+from benchmarks.mixture import bench_em, bench_mae, bench_queries
 from benchmarks.query import bench_codes
 
-SUBJECTS = ("codes",)
+SUBJECTS = ("codes", "em", "mae", "queries", "bic")
 
 
 def hand(
     only: tuple[str, ...] = SUBJECTS,
     codes: int = 10_000,
+    samples: int = 1_000_000,
+    queries: int = 100_000,
     peers: int = 100,
     threads: int = 1,
     seed: int = 0,
@@ -23,23 +27,31 @@ def hand(
     """Measure the hands against their bars and against peers, in one run and on the same threads.
 
     Args:
-        only: subjects to measure: codes.
+        only: subjects to measure: codes, em, mae, queries, bic.
         codes: held-out codes of each hand.
+        samples: free postures of each hand, of which the first four tenths are learned from.
+        queries: contact triples asked for in all six assignments.
         peers: how many of them COBYLA gets.
         threads: of torch, for the library and its peers alike.
         seed: of every draw.
         quick: a tenth of everything.
-        out: where the numbers are written as JSON.
+        out: where the numbers are written as JSON, and beside it the choice of components as a picture.
     """
     unknown = sorted(set(only) - set(SUBJECTS))
     if unknown:
         raise SystemExit(f"only: {unknown} are no subjects; {', '.join(SUBJECTS)} are")
     torch.set_num_threads(threads)
-    codes, peers = (codes // 10, peers // 10) if quick else (codes, peers)
+    if quick:
+        codes, peers, samples, queries = codes // 10, peers // 10, samples // 10, queries // 10
     subjects: dict[str, Callable[[], list[Row]]] = {
         "codes": lambda: bench_codes(codes, peers),
+        "em": lambda: bench_em(2 * samples // 5),
+        "mae": lambda: bench_mae(samples),
+        "queries": lambda: bench_queries(queries),
+        "bic": lambda: bench_bic(samples // 5, 2 if quick else 10, out.with_name("bench_hand_components.png")),
     }
-    settings = {"threads": threads, "codes": codes, "peers": peers, "seed": seed, "torch": torch.__version__}
+    settings = {"threads": threads, "codes": codes, "peers": peers, "samples": samples, "queries": queries}
+    settings |= {"seed": seed, "torch": torch.__version__}
     print(", ".join(f"{name} {value}" for name, value in settings.items()))
     rows: list[Row] = []
     for name in SUBJECTS:

@@ -173,9 +173,9 @@ def maximisation(
     collapsed = (sums[:, 0] < means.shape[1] + 1) | ~regular
     reseeded = reseeded + collapsed
     if bool(collapsed.all()) or int(reseeded.max()) > RESEEDS:
-        worst = covariances[int(reseeded.argmax())]
-        smallest = float(torch.linalg.eigvalsh(worst).min()) if bool(worst.isfinite().all()) else 0.0
-        what = f"the covariance of component {int(reseeded.argmax())}, which collapsed {int(reseeded.max())} times,"
+        k = int(reseeded.argmax())
+        smallest = float(torch.linalg.eigvalsh(covariances[k]).min()) if bool(covariances[k].isfinite().all()) else 0.0
+        what = f"the covariance of component {k}, of {float(sums[k, 0]):.1f} rows, collapsed {int(reseeded[k])} times,"
         raise IndefiniteCovariance(what, smallest, "use fewer components or more samples")
     weights[collapsed] = 0
     for k in collapsed.nonzero()[:, 0].tolist():
