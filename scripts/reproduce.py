@@ -4,6 +4,9 @@
 python scripts/reproduce.py fig4 --out DIR    whole and partial clouds, and the shapes that follow from them
 python scripts/reproduce.py table4 --out DIR  how many of 1000 starts end in a grasp, how fast and how near the centre
 python scripts/reproduce.py fig5 --out DIR    planned contacts on the objects
+python scripts/reproduce.py table5 --out DIR  errors of the Barrett hand's learned model; fig7: four of them drawn
+python scripts/reproduce.py fig8 --out DIR    errors of the Allegro hand's learned model
+python scripts/reproduce.py grasps --out DIR  Figs. 9-12: one contact triple by two postures and by two hands; grasps
 """
 
 import io
@@ -13,6 +16,8 @@ import numpy as np
 import torch
 import trimesh
 import tyro
+from grasped import grasps
+from learned import fig7, fig8, table5
 from PIL import Image, ImageDraw, ImageFont
 from planned import fig5, table4
 
@@ -113,4 +118,5 @@ def draw(
 
 if __name__ == "__main__":
     commands = {"fig4": fig4, "table4": table4, "fig5": fig5}
+    commands |= {"table5": table5, "fig7": fig7, "fig8": fig8, "grasps": grasps}
     tyro.extras.subcommand_cli_from_dict(commands, prog="reproduce.py", description="Figures and tables of the paper.")

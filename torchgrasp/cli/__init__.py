@@ -1,4 +1,4 @@
-"""The command line, one file a group of commands: grasps, clouds, shapes.
+"""The command line, one file a group of commands: grasps, clouds, hands, shapes.
 
 Exit codes: 0 the job is done; 1 no grasp is executable, or the object was not held; 2 a bad input, with one sentence
 on stderr; 130 interrupted.
@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import torch
 import tyro
 
-from torchgrasp.cli import clouds, grasps, shapes
+from torchgrasp.cli import clouds, grasps, hands, shapes
 from torchgrasp.errors import GraspError
 
 COMMANDS: dict[str, Callable[..., int]] = {
@@ -19,6 +19,8 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "objects": grasps.objects,
     "cloud check": clouds.check,
     "cloud render": clouds.render,
+    "hand new": hands.new,
+    "hand check": hands.check,
     "shape surface": shapes.surface,
     "shape calibrate": shapes.calibrate,
 }

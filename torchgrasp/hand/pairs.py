@@ -48,7 +48,7 @@ def active_pairs(
         return []
     links, owner = torch.unique(every.link[every.pairs].sort(1).values, dim=0, return_inverse=True)
     met, near = torch.zeros(2, len(links))
-    for values in _postures(urdf, coupling, n, seed).split(CHUNK, 1):
+    for values in draw_postures(urdf, coupling, n, seed).split(CHUNK, 1):
         apart = every.separations(tree.frames(values), NEAR)
         apart = apart.new_full((len(links), apart.shape[1]), torch.inf).scatter_reduce(
             0, owner[:, None].expand_as(apart), apart, "amin"
@@ -59,7 +59,9 @@ def active_pairs(
     return [(tree.link_names[i], tree.link_names[j]) for i, j in kept.tolist()]
 
 
-def _postures(urdf: Urdf, coupling: Mapping[str, tuple[str, float, float]], n: int, seed: int) -> Float[Tensor, "j n"]:
+def draw_postures(
+    urdf: Urdf, coupling: Mapping[str, tuple[str, float, float]], n: int, seed: int
+) -> Float[Tensor, "j n"]:
     """Draw every movable joint uniformly, but those that follow another."""
     movable = {j.name: j for j in urdf.joints if j.kind != "fixed"}
     unknown = sorted(({*coupling} | {source for source, _, _ in coupling.values()}) - set(movable))

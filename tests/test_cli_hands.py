@@ -1,0 +1,87 @@
+"""`torchgrasp hand`: a draft, every fault by name, a picture of a sound hand."""
+
+import io
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from torchgrasp.cli import main
+from torchgrasp.hand.load import hands_folder
+from torchgrasp.report.canvas import SIZE
+
+
+@pytest.fixture
+def barrett(tmp_path):
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    for file in ("hand.urdf", "hand.toml"):
+        shutil.copy(hands_folder() / "barrett" / file, folder)
+    return folder
+
+
+def test_new_writes_a_draft_that_check_takes_and_draws(barrett, capsys):
+    (barrett / "hand.toml").unlink()
+    assert main(["hand", "new", str(barrett / "hand.urdf"), "--name", "mine"]) == 0
+    assert "CHECK" in capsys.readouterr().out
+    picture = barrett / "hand.png"
+    assert main(["hand", "check", str(barrett), "--out", str(picture)]) == 0
+    said = capsys.readouterr().out
+    for words in ("mine, option default: 4 actuated of 8 joints", "spread", "f1_distal = 0.3333 f1_flex", "none"):
+        assert words in said
+    with Image.open(picture) as image:
+        assert image.width > SIZE[0] and len(np.unique(np.asarray(image).reshape(-1, 3), axis=0)) > 100
+    assert main(["hand", "new", str(barrett / "hand.urdf")]) == 2  # what is there is not overwritten
+    assert "exists" in capsys.readouterr().err
+
+
+def test_check_names_every_fault(barrett, capsys):
+    urdf, toml = barrett / "hand.urdf", barrett / "hand.toml"
+    text = urdf.read_text()
+    urdf.write_text(text.replace('<mass value="0.6086"/>', '<mass value="0"/>').replace('effort="2"', 'effort="0"'))
+    toml.write_text(toml.read_text().replace("ratio = 0.3333333333333333", "ratio = 0.3443", 1))
+    assert main(["hand", "check", str(barrett), "--out", str(barrett / "x.png")]) == 2
+    lines = capsys.readouterr().out.splitlines()
+    assert all(line.startswith("wrong: ") for line in lines)
+    for words in ("link palm of mass 0", "joint spread of effort 0", "joint f1_distal mimics"):
+        assert any(words in line for line in lines), words
+    assert not (barrett / "x.png").exists()
+    toml.write_text("name = 3")
+    assert main(["hand", "check", str(barrett)]) == 2
+    assert "hand.toml" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["check", "shadow"], "allegro"),
+        (["check", "barrett", "--fingers", "five"], "--fingers"),
+        (["check", "barrett", "--out", "hand.jpg"], "--out"),
+        (["new", "none.urdf"], "none.urdf"),
+        (["new", "none.urdf", "--seed", "-1"], "--seed"),
+    ],
+)
+def test_bad_arguments_end_with_one_sentence(arguments, word, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["hand", *arguments]) == 2
+    said = capsys.readouterr()
+    assert word in said.out + said.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_posture_is_drawn_with_every_finger(barrett):
+    import torch
+
+    from torchgrasp import load_hand
+    from torchgrasp.report.hands import draw_posture
+    from torchgrasp.report.palette import FINGERS, rgb
+
+    hand = load_hand(barrett)
+    image = Image.open(io.BytesIO(draw_posture(hand, torch.tensor([0.5, 0.8, 0.8, 0.8]).double(), (1.0, -0.8, 0.5))))
+    pixels = np.asarray(image).reshape(-1, 3) / 255
+    pixels = pixels[np.ptp(pixels, axis=1) > 0.15]
+    hue = pixels / np.linalg.norm(pixels, axis=1, keepdims=True)
+    for color in FINGERS:
+        wanted = np.array(rgb(color)) / np.linalg.norm(rgb(color))
+        assert (hue @ wanted > 0.99).sum() > 300

@@ -1,0 +1,137 @@
+"""`torchgrasp hand`: a first hand.toml for a URDF, and what is wrong with a hand or what it is like."""
+
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+
+from torchgrasp.cli.common import check_folder, check_seed, naming
+from torchgrasp.errors import BadArgument, GraspError, OutputError
+from torchgrasp.files import write_atomically
+from torchgrasp.hand.author import draft_hand
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import find_hand
+from torchgrasp.report.hands import draw_hand, opposed_posture
+from torchgrasp.testing import check_hand, find_faults, random_joints
+
+OPPOSED = -0.5
+"""Two pads whose normals have a cosine below this can hold something between them."""
+POSTURES = 5000
+"""Random postures that tell what a hand is like."""
+
+
+def new(
+    urdf: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="URDF")],
+    /,
+    tips: tuple[str, ...] = (),
+    name: str | None = None,
+    seed: int = 0,
+) -> int:
+    """Write a first hand.toml beside a URDF: fingers, pads, coupling and pairs of links that can meet.
+
+    Args:
+        urdf: the hand: boxes, cylinders and spheres as collision shapes, masses, limits, drives.
+        tips: links of the three grasping fingertips in grasp order, then those of fingers to park; by default the
+            ends of the tree's branches, where they are three.
+        name: of the hand; by default the robot's.
+        seed: of the random postures by which pads and pairs are guessed.
+    """
+    check_seed(seed)
+    target = urdf.parent / "hand.toml"
+    if target.exists():
+        raise OutputError("URDF", f"{target}, which exists", "a folder without a hand.toml")
+    with naming("--tips", "tips"), naming("URDF", "urdf"):
+        text = draft_hand(urdf, tips, name, seed)
+    _write(target, text.encode())
+    print(f"written: {target}; look over the lines marked CHECK, then: torchgrasp hand check {target.parent}")
+    return _print_faults(target.parent, "default")
+
+
+def check(
+    hand: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="HAND")],
+    /,
+    fingers: str = "default",
+    out: Path = Path("hand.png"),
+) -> int:
+    """Say by name what is wrong with a hand; a sound one is described and drawn.
+
+    Args:
+        hand: name of a shipped hand, or the folder of another.
+        fingers: the finger option of its hand.toml.
+        out: picture to write (.png): the pads, the frame of the palm, the limits.
+    """
+    if out.suffix.lower() != ".png":
+        raise BadArgument("--out", out, "a file ending in .png")
+    with naming("--fingers", "fingers"), naming("HAND", "hand"):
+        if _print_faults(hand, fingers):
+            return 2
+        sound = check_hand(hand, fingers)
+    with naming("--out", "path"):
+        check_folder(out.parent)
+    joints = random_joints(sound, POSTURES)
+    print(describe(sound, joints))
+    modelled = find_hand(hand) / "mixture.safetensors"
+    print(f"learned model: {modelled if modelled.exists() else f'none; python scripts/make_hand.py {hand} learns it'}")
+    _write(out, draw_hand(sound, opposed_posture(sound, joints)))
+    print(f"picture: {out}")
+    return 0
+
+
+def describe(hand: Hand, joints: torch.Tensor) -> str:
+    """Return what a hand is like: its fingers, and what it does in random postures.
+
+    Args:
+        hand: the hand.
+        joints: postures (n, h) [rad], uniform within the limits.
+    """
+    lines = [f"{hand.name}, option {hand.option}: {hand.dof} actuated of {len(hand.urdf_joint_names)} joints"]
+    ends = torch.rad2deg(torch.stack([hand.lower, hand.upper], 1)).tolist()
+    lines += [
+        f"  {n:24} {low:7.1f} to {high:6.1f} degrees" for n, (low, high) in zip(hand.joint_names, ends, strict=True)
+    ]
+    for k, finger in enumerate(hand.finger_names):
+        radius = float(hand.tip_radius[k])
+        tip = f"a sphere of {1e3 * radius:.1f} mm" if radius else "a point"
+        contact, normal = (", ".join(f"{x:.4g}" for x in v[k].tolist()) for v in (hand.contact, hand.normal))
+        lines.append(f"finger {finger}: {tip} on {hand.tip_links[k]}")
+        lines.append(f"  contact [{contact}] m, normal [{normal}]")
+    for j, name in enumerate(hand.urdf_joint_names):
+        row, offset = hand.coupling[j], float(hand.offset[j])
+        sources = torch.nonzero(row)[:, 0].tolist()
+        if not sources:
+            lines.append(f"joint {name} is parked at {offset:.4g}")
+        elif hand.joint_names[sources[0]] != name:
+            lines.append(f"joint {name} = {float(row[sources[0]]):.4g} {hand.joint_names[sources[0]]} + {offset:.4g}")
+    points, normals = hand.fingertips(joints)
+    free = hand.self_clearance(joints) > 0
+    sides = torch.linalg.vector_norm(points - points.roll(1, 1), dim=-1)[free]
+    pairs = (normals * normals.roll(1, 1)).sum(-1)[free]
+    share, opposed = 1 - float(free.double().mean()), float((pairs < OPPOSED).any(1).double().mean())
+    lines.append(f"{share:.1%} of {len(joints)} random postures collide with themselves")
+    lines.append(f"{opposed:.1%} of the free ones have two pads face to face (an angle above 120 degrees)")
+    least, most = (1e3 * float(sides.quantile(q)) for q in (0.01, 0.99))
+    lines.append(f"fingertips are {least:.0f} to {most:.0f} mm apart")
+    return "\n".join(lines)
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Write a file atomically."""
+
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(content)
+
+    write_atomically(path, write)
+
+
+def _print_faults(hand: str | Path, fingers: str) -> int:
+    """Print what is wrong with a hand's files, one line each; return 0 for nothing, else the exit code 2."""
+    try:
+        faults: list[GraspError] = list(find_faults(hand, fingers))
+    except BadArgument as error:
+        if error.argument == "fingers":
+            raise
+        faults = [error]
+    for fault in faults:
+        print(f"wrong: {' '.join(str(fault).split())}")
+    return 2 if faults else 0
