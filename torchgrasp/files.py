@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 from torchgrasp.errors import ModelFileError, OutputError
@@ -21,7 +21,7 @@ VERSION = "1"
 """Version of the layout of every file written here; readers refuse any other."""
 
 
-def write_atomically(path: Path | str, write: Callable[[Path], None]) -> Path:
+def write_atomically(path: Path | str, write: Callable[[Path], object]) -> Path:
     """Call `write` on a temporary file beside `path`, then move it into place; nothing half-written stays.
 
     Raises:
@@ -54,7 +54,8 @@ def save_tensors(path: Path | str, kind: str, tensors: dict[str, Tensor], meta: 
     contiguous = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
     # One JSON string: safetensors writes several metadata keys in random order, and equal values must give equal bytes.
     header = {"torchgrasp": json.dumps({**meta, "kind": kind, "version": VERSION}, sort_keys=True)}
-    return write_atomically(path, lambda temporary: save_file(contiguous, temporary, metadata=header))
+    # as bytes, since a full disk then is an OSError, which save_file makes an error of its own
+    return write_atomically(path, lambda temporary: temporary.write_bytes(save(contiguous, header)))
 
 
 def load_tensors(path: Path | str, kind: str, names: set[str]) -> tuple[dict[str, Tensor], dict[str, str]]:

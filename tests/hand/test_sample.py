@@ -1,5 +1,7 @@
 """Sampled postures are free, within limits, and do not depend on the number of workers."""
 
+import itertools
+
 import pytest
 import torch
 
@@ -11,8 +13,9 @@ from torchgrasp.hand.sample import sample_configurations
 
 @pytest.fixture(autouse=True)
 def small_chunks(monkeypatch):
-    """Chunks of 1000 draws: several of them in little time."""
+    """Chunks of 1000 postures: several of them in little time."""
     monkeypatch.setattr("torchgrasp.hand.sample.CHUNK", 1000)
+    monkeypatch.setattr("torchgrasp.hand.sample.BLOCK", 500)
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
@@ -51,6 +54,29 @@ def test_samples_are_uniform_among_the_free_postures():
         moments = [(x**power).mean(0) for x in (samples, free)]
         error = sum((x**power).var(0) / len(x) for x in (samples, free)) ** 0.5
         assert bool(((moments[0] - moments[1]).abs() < 4 * error).all())
+
+
+def test_opposed_samples_are_the_uniform_ones_in_which_two_pads_can_hold_something():
+    hand = load_hand("allegro")
+    samples = sample_configurations(hand, 900, seed=2, sampling="opposed")
+    points, normals = hand.fingertips(samples.joints)
+    held = torch.zeros(900, dtype=torch.bool)
+    for i, j in itertools.combinations(range(3), 2):
+        middle = (points[:, i] + points[:, j]) / 2  # a thin plate there is between the pads
+        towards = [((middle - points[:, k]) * normals[:, k]).sum(-1) for k in (i, j)]
+        angle = torch.rad2deg(torch.arccos((normals[:, i] * normals[:, j]).sum(-1)))
+        held |= (towards[0] > 0) & (towards[1] > 0) & (angle > 120)
+    assert bool(held.all())
+    uniform = sample_configurations(hand, 1000, seed=2)
+    rows = {tuple(row) for row in uniform.joints.tolist()}
+    shared = sum(tuple(row) in rows for row in samples.joints.tolist())
+    assert 0.2 < shared / 1000 < 0.8  # both take their postures from the same draws
+
+
+def test_a_hand_that_can_hardly_move_is_refused(monkeypatch):
+    monkeypatch.setattr("torchgrasp.hand.sample.OPPOSED", -2.0)
+    with pytest.raises(BadArgument, match="hand: found 0 kept of 5000 postures"):
+        sample_configurations(load_hand("barrett"), 10, sampling="opposed")
 
 
 @pytest.mark.parametrize(("name", "value"), [("n", 0), ("seed", -1), ("workers", 0)])

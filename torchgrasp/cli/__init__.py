@@ -21,6 +21,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "cloud render": clouds.render,
     "hand new": hands.new,
     "hand check": hands.check,
+    "hand sample": hands.sample,
     "shape surface": shapes.surface,
     "shape calibrate": shapes.calibrate,
 }

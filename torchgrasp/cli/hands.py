@@ -1,5 +1,6 @@
-"""`torchgrasp hand`: a first hand.toml for a URDF, and what is wrong with a hand or what it is like."""
+"""`torchgrasp hand`: a first hand.toml for a URDF, what is wrong with a hand or what it is like, and its postures."""
 
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -10,8 +11,10 @@ from torchgrasp.cli.common import check_folder, check_seed, naming
 from torchgrasp.errors import BadArgument, GraspError, OutputError
 from torchgrasp.files import write_atomically
 from torchgrasp.hand.author import draft_hand
+from torchgrasp.hand.dataset import write_samples
 from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.load import find_hand
+from torchgrasp.hand.load import find_hand, load_hand
+from torchgrasp.hand.sample import Sampling
 from torchgrasp.report.hands import draw_hand, opposed_posture
 from torchgrasp.testing import check_hand, find_faults, random_joints
 
@@ -122,6 +125,36 @@ def _write(path: Path, content: bytes) -> None:
         temporary.write_bytes(content)
 
     write_atomically(path, write)
+
+
+def sample(
+    hand: str,
+    out: Path,
+    n: int = 1_000_000,
+    fingers: str = "default",
+    sampling: Sampling = "uniform",
+    workers: int = 1,
+    seed: int = 0,
+) -> int:
+    """Write random postures of a hand that touch nothing of itself, with their codes; continues what was begun.
+
+    Args:
+        hand: name of a shipped hand, or the folder of another.
+        out: folder to write.
+        n: how many postures; the paper has 1,000,000.
+        fingers: which fingers grasp, one of the hand's options.
+        sampling: uniform as in the paper, or opposed: only postures in which two pads face each other.
+        workers: threads that draw at the same time.
+        seed: of every random draw.
+    """
+    check_seed(seed)
+    with naming("--hand", "hand"), naming("--fingers", "fingers"):
+        robot = load_hand(hand, fingers)
+    begin = time.perf_counter()
+    with naming("--out", "folder", "path"), naming("--n", "n"), naming("--workers", "workers"):
+        made = write_samples(robot, n, out, seed, workers, sampling, progress=True)
+    print(f"{len(made)} {sampling} postures of {robot.name} in {out}, {time.perf_counter() - begin:.0f} s")
+    return 0
 
 
 def _print_faults(hand: str | Path, fingers: str) -> int:

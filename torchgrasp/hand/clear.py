@@ -101,9 +101,12 @@ def self_rows(screws: Screws) -> Rows:
     between = itself.separations(frames, SELF_CLEARANCE).T
     index = least(between)
     at = torch.arange(len(index), device=index.device)[:, None].expand_as(index)
-    apart = itself.wrenches(frames, index.flatten(), at.flatten()).T.unflatten(0, index.shape)
+    between = between[at, index]
+    close = between < SELF_CLEARANCE  # the others' hinges are flat
+    apart = between.new_zeros(*index.shape, 6)
+    apart[close] = itself.wrenches(frames, index[close], at[close]).T
     first, second = itself.link[itself.pairs[index]].unbind(-1)
-    return hinge(between[at, index], screws.jacobian(apart, second) - screws.jacobian(apart, first), SELF_CLEARANCE)
+    return hinge(between, screws.jacobian(apart, second) - screws.jacobian(apart, first), SELF_CLEARANCE)
 
 
 def link_clearance(

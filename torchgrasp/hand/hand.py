@@ -168,7 +168,7 @@ class Hand(Value):
         cover = self.collision_spheres
         return _rows(placed(self.frames(joints).index_select(2, cover.link_index), cover.center), joints)
 
-    def self_clearance(self, joints: Float[Tensor, "*b h"], chunk: int = 1024) -> Float[Tensor, "*b"]:
+    def self_clearance(self, joints: Float[Tensor, "*b h"], chunk: int = 1000) -> Float[Tensor, "*b"]:
         """Return the signed least separation [m] between links that can meet; negative: they overlap.
 
         The links are the collision shapes of the URDF, parked fingers and the palm included, and the pairs those of
