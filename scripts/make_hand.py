@@ -27,6 +27,7 @@ def main(
     n: int = 400_000,
     components: int | None = None,
     seed: int = 0,
+    starts: int = 5,
     tolerance: float = 1e-3,
     held_out: int = 20_000,
     workers: int = 1,
@@ -40,6 +41,7 @@ def main(
         n: free postures to learn from; the paper's number.
         components: Gaussians; default: the paper's number for its hands, 40 for others.
         seed: of postures and start.
+        starts: of the fit, of which the likeliest goes on.
         tolerance: of the mean log-likelihood [nats] at which the fit stops.
         held_out: further postures to judge by.
         workers: threads that sample.
@@ -60,7 +62,9 @@ def main(
             bar.update()
             bar.set_postfix(log_likelihood=f"{float(progress.log_likelihood[-1]):.4f}")
 
-        mixture = fit_mixture(samples[:n], m, seed=seed, tolerance=tolerance, checkpoint=checkpoint, observer=show)
+        mixture = fit_mixture(
+            samples[:n], m, seed, tolerance=tolerance, starts=starts, checkpoint=checkpoint, observer=show
+        )
     meta = mixture.meta
     print(
         f"{len(mixture.weights)} components in {meta['iterations']} steps (converged: {meta['converged']},"

@@ -94,6 +94,7 @@ def test_the_checkpoint_of_another_fit_is_refused(tmp_path):
     for other, given in [
         (samples, {"components": 4}),
         (samples, {"components": 5, "seed": 1}),
+        (samples, {"components": 5, "starts": 2}),
         (samples, {"components": 5, "regularisation": 1e-7}),
         (samples[:-1], {"components": 5}),
         (moved, {"components": 5}),

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.hand.fit import bic, fit_mixture
+from torchgrasp.hand.fit import TRIAL_STEPS, bic, fit_mixture
 from torchgrasp.hand.sample import HandSamples
 
 
@@ -66,6 +66,18 @@ def test_same_seed_same_mixture():
     samples = banana(1500)
     first, second = fit_mixture(samples, 4, seed=2), fit_mixture(samples, 4, seed=2)
     assert torch.equal(first.covariances, second.covariances)
+
+
+def test_the_likeliest_of_several_starts_goes_on():
+    samples = banana(1500)
+    alone = [fit_mixture(samples, 6, seed=seed, iterations=TRIAL_STEPS, tolerance=0.0) for seed in (2, 3, 4)]
+    best = max(alone, key=lambda mixture: float(mixture.meta["log_likelihood"]))
+    together = fit_mixture(samples, 6, seed=2, iterations=TRIAL_STEPS, tolerance=0.0, starts=3)
+    assert len({mixture.meta["log_likelihood"] for mixture in alone}) == 3
+    assert torch.equal(together.covariances, best.covariances)
+    # The steps of the trial count, and more follow.
+    assert together.meta["iterations"] == str(TRIAL_STEPS)
+    assert fit_mixture(samples, 6, seed=2, iterations=30, tolerance=0.0, starts=3).meta["iterations"] == "30"
 
 
 def test_bad_arguments():

@@ -14,7 +14,7 @@ from torchgrasp.hand.em import Components, Progress
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """The file of one fit, and what tells that fit from others: data, components, seed and added variance.
+    """The file of one fit, and what tells that fit from others: data, components, seeds and added variance.
 
     The data are known by their number, mean and standard deviation in every dimension, which are equal to the last
     bit when they are the same.
@@ -25,7 +25,8 @@ class Checkpoint:
         centre: their mean.
         scale: their standard deviation.
         components: m.
-        seed: of the start.
+        seed: of the first start.
+        starts: how many there were.
         regularisation: relative added variance.
     """
 
@@ -35,6 +36,7 @@ class Checkpoint:
     scale: Float[Tensor, "d"]
     components: int
     seed: int
+    starts: int
     regularisation: float
 
     def save(self, progress: Progress) -> None:
@@ -91,6 +93,7 @@ class Checkpoint:
             "rows": str(self.rows),
             "components": str(self.components),
             "seed": str(self.seed),
+            "starts": str(self.starts),
             "regularisation": repr(self.regularisation),
         }
 

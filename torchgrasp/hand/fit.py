@@ -22,6 +22,9 @@ from torchgrasp.hand.sample import HandSamples
 LARGEST_REGULARISATION = 1e-6
 """Most variance that may be added to a dimension of a component, relative to that dimension's over all samples."""
 
+TRIAL_STEPS = 20
+"""Steps by which starts are compared, where there are several."""
+
 
 def fit_mixture(
     samples: HandSamples,
@@ -31,6 +34,7 @@ def fit_mixture(
     tolerance: float = 1e-3,
     regularisation: float = LARGEST_REGULARISATION,
     *,
+    starts: int = 1,
     checkpoint: Path | str | None = None,
     distributed: bool = False,
     observer: Callable[[Progress], None] = lambda progress: None,
@@ -47,8 +51,10 @@ def fit_mixture(
         tolerance: stop when the mean log-likelihood gains less in a step [nats].
         regularisation: variance added to every dimension of a component, relative to that dimension's variance over
             all samples. It is kept in the result.
-        checkpoint: file in which the fit is kept after every step, and from which it goes on when the file exists:
-            to the same bits on the same machine. More iterations or another tolerance may be asked of it then.
+        starts: how many k-means starts, of seeds one after the other, take `TRIAL_STEPS` steps each; the likeliest of
+            them goes on.
+        checkpoint: file in which the fit is kept after every further step, and from which it goes on when the file
+            exists: to the same bits on the same machine. More iterations or another tolerance may be asked of it then.
         distributed: whether `samples` are this process's share and sums go over all processes of torch.distributed's
             default group, as under torchrun; every process gets the same mixture. The checkpoint, if any, must be a
             file that all of them see.
@@ -79,6 +85,7 @@ def fit_mixture(
     for name, value, low, high in [
         ("components", components, 1, n // least),
         ("iterations", iterations, 1, 100_000),
+        ("starts", starts, 1, 1000),
         ("tolerance", tolerance, 0.0, 1.0),
         ("regularisation", regularisation, 0.0, LARGEST_REGULARISATION),
     ]:
@@ -89,10 +96,11 @@ def fit_mixture(
 
     kept = None
     if checkpoint is not None:
-        kept = Checkpoint(Path(checkpoint), n, centre, scale, components, seed, regularisation)
+        kept = Checkpoint(Path(checkpoint), n, centre, scale, components, seed, starts, regularisation)
     start = _agreed(kept.load() if kept else None, x, total)
     if start is None:
-        start = start_components(x, components, seed, regularisation, total)
+        begun = [start_components(x, components, seed + k, regularisation, total) for k in range(starts)]
+        start = _likeliest(x, begun, regularisation, total)
 
     def observe(progress: Progress) -> None:
         if kept and place(total)[0] == 0:
@@ -109,7 +117,7 @@ def fit_mixture(
         regularisation=regularisation,
     )
     log_likelihood = float(fit.log_likelihood[-1] - scale.log().sum())
-    return dataclasses.replace(mixture, meta=samples.meta | _report(fit, seed, n, log_likelihood))
+    return dataclasses.replace(mixture, meta=samples.meta | _report(fit, seed, starts, n, log_likelihood))
 
 
 def bic(mixture: GraspMixture, samples: HandSamples) -> float:
@@ -143,6 +151,15 @@ def _standardise(
     return centre, scale
 
 
+def _likeliest(x: Float[Tensor, "n d"], starts: list[Progress], regularisation: float, total: Total) -> Progress:
+    """Return the start whose likelihood is largest after some steps, with these steps taken."""
+    if len(starts) == 1:
+        return starts[0]
+    tried = [expectation_maximisation(x, start, TRIAL_STEPS, 0.0, regularisation, total) for start in starts]
+    best = max(tried, key=lambda fit: float(fit.log_likelihood[-1]))
+    return Progress(best.components, best.reseeded, best.log_likelihood[:-1], best.jumped)
+
+
 def _agreed(progress: Progress | None, x: Tensor, total: Total) -> Progress | None:
     """Return what a checkpoint held, refusing processes that found different ones: they would wait for ever."""
     steps = x.new_tensor(len(progress.log_likelihood) if progress else 0)
@@ -151,12 +168,13 @@ def _agreed(progress: Progress | None, x: Tensor, total: Total) -> Progress | No
     return progress
 
 
-def _report(fit: Fit, seed: int, n: int, log_likelihood: float) -> dict[str, str]:
+def _report(fit: Fit, seed: int, starts: int, n: int, log_likelihood: float) -> dict[str, str]:
     """Return what a fit tells about itself; the mean log-likelihood is that in the samples' units."""
     m, d = fit.components.means.shape
     return {
         "samples": str(n),
         "fit_seed": str(seed),
+        "fit_starts": str(starts),
         "iterations": str(len(fit.log_likelihood) - 1),
         "converged": str(fit.converged).lower(),
         "reseeded": str(int(fit.reseeded.sum())),
