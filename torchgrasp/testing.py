@@ -85,15 +85,12 @@ def _wrong_bodies(urdf: Urdf) -> Iterator[HandFileError]:
 
 
 def _wrong_joints(urdf: Urdf, spec: HandSpec, hand: Hand) -> Iterator[HandFileError]:
-    """Find drives that cannot move, parked and coupled joints beyond their limits, and a second coupling."""
+    """Find drives that cannot move, and parked and coupled joints beyond their limits."""
     joints = {j.name: j for j in urdf.joints if j.kind != "fixed"}
     for joint in joints.values():
         if not (joint.effort > 0 and joint.velocity > 0):
             found = f"{urdf.path}: joint {joint.name} of effort {joint.effort}, velocity {joint.velocity}"
             yield HandFileError("urdf", found, "positive effort and velocity")
-        if joint.mimic is not None and spec.coupling.get(joint.name) != joint.mimic:
-            found = f"{urdf.path}: joint {joint.name} mimics {joint.mimic}"
-            yield HandFileError("urdf", found, f"the coupling of hand.toml, {spec.coupling.get(joint.name)}")
     ends = {name: set[float]() for name in joints}
     for end in (hand.lower, hand.upper):
         for name, value in hand.expand(end).items():

@@ -68,6 +68,7 @@ def hand_from_files(spec: HandSpec, urdf: Urdf) -> Hand:
     movable = {j.name: j for j in urdf.joints if j.kind != "fixed"}
     links = {x.name: i for i, x in enumerate(urdf.links)}
     _check_names(spec, urdf, set(movable), set(links))
+    _check_coupling(spec, urdf)
     _check_shapes(spec, urdf)
     names = tuple(dict.fromkeys(j for f in spec.fingers for j in f.joints if j not in spec.coupling))
     coupling, offset = _coupling(spec, tuple(movable), names)
@@ -145,6 +146,14 @@ def _check_names(spec: HandSpec, urdf: Urdf, movable: set[str], links: set[str])
     if both:
         allowed = "joints that neither grasp nor follow another"
         raise HandFileError("hand.toml", f"{spec.path}: parked joint {both[0]!r}", allowed)
+
+
+def _check_coupling(spec: HandSpec, urdf: Urdf) -> None:
+    """Refuse a joint that follows another in the URDF and is free, or follows otherwise, in hand.toml."""
+    for joint in urdf.joints:
+        if joint.mimic is not None and spec.coupling.get(joint.name) != joint.mimic:
+            found = f"{spec.path}: joint {joint.name} follows {spec.coupling.get(joint.name, 'nothing')}"
+            raise HandFileError("hand.toml", found, f"the coupling of the URDF: {joint.mimic}")
 
 
 def _check_shapes(spec: HandSpec, urdf: Urdf) -> None:

@@ -9,6 +9,7 @@ from torchgrasp.errors import HandFileError
 
 MAX_DEPTH = 64
 MAX_ELEMENTS = 50_000
+MAX_MESH = 50 * 1024 * 1024
 IGNORED = {"material", "transmission", "gazebo"}
 """Elements of a robot, beside links and joints, that a hand does without."""
 
@@ -71,7 +72,7 @@ def parse_urdf(path: Path, data: bytes) -> ET.Element:
 
 
 def _check_mesh_name(path: Path, name: str) -> None:
-    """Refuse a mesh outside the hand's folder; the mesh itself is not opened."""
+    """Refuse a mesh outside the hand's folder, and what is no file there; the mesh itself is not opened."""
     allowed = "a relative .stl or .obj inside the hand's folder"
     if not 0 < len(name) <= 255 or ":" in name or "\\" in name or Path(name).suffix.lower() not in (".stl", ".obj"):
         raise HandFileError("urdf", f"{path}: mesh {name[:80]!r}", allowed)
@@ -82,3 +83,6 @@ def _check_mesh_name(path: Path, name: str) -> None:
         inside = False
     if not inside:
         raise HandFileError("urdf", f"{path}: mesh {name[:80]!r}", allowed)
+    mesh = folder / name
+    if mesh.exists() and not (mesh.is_file() and mesh.stat().st_size <= MAX_MESH):
+        raise HandFileError("urdf", f"{path}: mesh {name[:80]!r}", f"a regular file of at most {MAX_MESH} bytes")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 import xml.etree.ElementTree as ET
 from collections import Counter
 from pathlib import Path
@@ -12,6 +13,7 @@ from torchgrasp.hand.safe_xml import parse_urdf
 
 MAX_BYTES = 4 * 1024 * 1024
 MAX_LINKS = 512
+NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
 KINDS = ("revolute", "prismatic", "fixed")
 
 Triple = tuple[float, float, float]
@@ -118,11 +120,10 @@ def _numbers(path: Path, where: str, text: str | None, default: tuple[float, ...
     """Read n finite numbers from an attribute."""
     if text is None and default is not None:
         return default
-    try:
-        values = tuple(float(word) for word in (text or "").split())
-    except ValueError:
-        values = ()
-    if len(values) != n or not all(math.isfinite(v) for v in values):
+    words = (text or "").split()
+    # Python alone reads 1_0, other digits than ASCII's, and nan
+    values = tuple(float(word) for word in words if NUMBER.fullmatch(word))
+    if len(words) != n or len(values) != n or not all(math.isfinite(v) for v in values):
         raise HandFileError("urdf", f"{path}: {where} {(text or 'nothing')[:80]!r}", f"{n} finite number(s)")
     return values
 
