@@ -70,16 +70,17 @@ def load_tensors(path: Path | str, kind: str, names: set[str]) -> tuple[dict[str
     try:
         with safe_open(path, framework="pt") as file:
             meta = json.loads((file.metadata() or {}).get("torchgrasp", "{}"))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
+            found = set(file.keys())
+            tensors = {name: file.get_tensor(name) for name in found & names}  # nothing else is worth its memory
     except (SafetensorError, OSError, ValueError, KeyError) as error:
         raise ModelFileError("path", f"{path}: {error}", f"a safetensors file of kind {kind!r}") from error
     if not isinstance(meta, dict):
         meta = {}
     if meta.get("kind") != kind or meta.get("version") != VERSION:
-        found = f"kind {meta.get('kind')!r}, version {meta.get('version')!r}"
-        raise ModelFileError("path", f"{path}: {found}", f"kind {kind!r}, version {VERSION!r}")
-    if set(tensors) != names:
-        raise ModelFileError("path", f"{path}: tensors {sorted(tensors)}", f"tensors {sorted(names)}")
+        other = f"kind {meta.get('kind')!r}, version {meta.get('version')!r}"
+        raise ModelFileError("path", f"{path}: {other}", f"kind {kind!r}, version {VERSION!r}")
+    if found != names:
+        raise ModelFileError("path", f"{path}: tensors {sorted(found)}", f"tensors {sorted(names)}")
     for name, t in tensors.items():
         if t.is_floating_point() and not bool(torch.isfinite(t).all()):
             raise ModelFileError("path", f"{path}: a non-finite number in {name}", "finite numbers")
