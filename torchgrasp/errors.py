@@ -113,3 +113,4 @@ class Status(enum.IntEnum):
     NOT_LIFTED = 33, "the object stayed behind when the hand was lifted"
     EJECTED = 34, "the object was pushed out while the hand closed"
     UNSTABLE = 35, "the simulation did not stay finite"
+    MOVED = 36, "the object moved or turned too far in the hand when it was pulled"

@@ -12,10 +12,12 @@ import torch
 import tyro
 
 from torchgrasp.cli import clouds, grasps, hands, shapes
+from torchgrasp.cli.evaluate import evaluate
 from torchgrasp.errors import GraspError
 
 COMMANDS: dict[str, Callable[..., int]] = {
     "grasp": grasps.grasp,
+    "evaluate": evaluate,
     "objects": grasps.objects,
     "cloud check": clouds.check,
     "cloud render": clouds.render,

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import trimesh
 
 PATCH_RADIUS = 0.005
-"""Radius [m] of the patch in which a soft fingertip touches: its torsional friction is friction x force x 5 mm."""
+"""Radius [m] of the patch in which a soft fingertip touches."""
 
 ARMATURE = 1e-3
 """Inertia [kg m^2] that each motor's rotor adds to its joint."""
@@ -64,6 +64,8 @@ class Scene:
         gravity: [m/s^2].
         timestep: [s].
         travel: how far the hand can be lifted [m].
+        table: whether there is one.
+        patch: radius [m] of the patch in which a fingertip touches; its torsional friction is friction x force x patch.
 
     Raises:
         MissingExtra: SAPIEN is not installed.
@@ -83,6 +85,8 @@ class Scene:
         gravity: float = 9.81,
         timestep: float = 1 / 500,
         travel: float = 0.1,
+        table: bool = True,
+        patch: float = PATCH_RADIUS,
     ) -> None:
         sapien, physx = _import_sapien()
         physx.set_scene_config(gravity=np.array([0, 0, -gravity], np.float32), enable_tgs=True, enable_pcm=True)
@@ -92,8 +96,10 @@ class Scene:
         self.scene = sapien.Scene([self.system])
         self.scene.timestep = self.timestep = timestep
         self._material = physx.PhysxMaterial(friction, friction, 0.0)
-        self._sapien, self._physx = sapien, physx
-        self._add_table(float(mesh.bounds[0, 2]))
+        self._sapien, self._physx, self._patch = sapien, physx, patch
+        self._pull = np.zeros(3, np.float32)
+        if table:
+            self._add_table(float(mesh.bounds[0, 2]))
         self._add_object(mesh, parts, mass)
         self._add_hand(urdf_path, world_from_hand, joints, drives, tip_links, travel)
 
@@ -112,7 +118,7 @@ class Scene:
         for part in parts:
             vertices = np.asarray(part.vertices, np.float32)
             shape = self._physx.PhysxCollisionShapeConvexMesh(vertices, np.ones(3, np.float32), self._material)
-            shape.min_patch_radius = PATCH_RADIUS
+            shape.min_patch_radius = self._patch
             body.attach(shape)
         moments, axes = np.linalg.eigh(np.asarray(mesh.moment_inertia) * (mass / mesh.volume))
         axes = axes * np.array([1.0, 1.0, np.sign(np.linalg.det(axes))])
@@ -181,7 +187,7 @@ class Scene:
                 groups[2] |= 1  # shapes that share such a bit do not collide: the hand with itself
                 shape.set_collision_groups(groups)
                 if link.name in tip_links:
-                    shape.min_patch_radius = PATCH_RADIUS
+                    shape.min_patch_radius = self._patch
         root = next(j.child_link for j in self.hand.joints if j.name == "torchgrasp_wrist")
         self._hand_root = root
         self._map_contacts()
@@ -212,6 +218,8 @@ class Scene:
 
     def step(self) -> Reading:
         """Advance by one timestep and report the contacts between fingertips and object."""
+        if self._pull.any():
+            self.body.add_force_torque(self._pull, np.zeros(3, np.float32))
         self.scene.step()
         impulse, moment, weight = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
         finger = np.zeros(3, dtype=bool)
@@ -240,6 +248,10 @@ class Scene:
         """Set the target [rad] of every driven joint, in the order of `joint_names`."""
         for joint, target in zip(self._driven, targets, strict=True):
             joint.set_drive_target(float(target))
+
+    def pull(self, force: np.ndarray) -> None:
+        """Let a force [N] act on the object's mass centre from now on, in the world's axes."""
+        self._pull = np.asarray(force, np.float32)
 
     def lift(self, height: float) -> None:
         """Set the target of the lift joint [m]."""

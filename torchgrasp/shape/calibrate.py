@@ -70,6 +70,24 @@ def read_views(
     objects: Path, camera: bool = True, only: Sequence[str] = ()
 ) -> Iterator[tuple[str, str, PointCloud, "trimesh.Trimesh"]]:
     """Yield name, view, noisy cloud and true mesh of every view, at the object's suggested scale; see `calibrate`."""
+    for name, folder, entry, scale, mesh in _read_objects(objects, only):
+        for view in sorted(entry["views"]):
+            cloud = read_cloud(folder / f"{view}_noisy.ply")
+            eye = torch.tensor(entry["views"][view]["T_object_camera"], dtype=torch.float64)[:3, 3]
+            yield name, view, PointCloud(cloud.points * scale, None, eye * scale if camera else None), mesh
+
+
+def read_whole(objects: Path, only: Sequence[str] = ()) -> Iterator[tuple[str, str, PointCloud, "trimesh.Trimesh"]]:
+    """Yield name, "whole", the whole cloud with its normals, and the true mesh of every object."""
+    for name, folder, _, scale, mesh in _read_objects(objects, only):
+        cloud = read_cloud(folder / "full_normals.ply")
+        yield name, "whole", PointCloud(cloud.points * scale, cloud.normals), mesh
+
+
+def _read_objects(
+    objects: Path, only: Sequence[str]
+) -> "Iterator[tuple[str, Path, dict[str, Any], float, trimesh.Trimesh]]":
+    """Yield name, folder, entry of the manifest, scale and scaled mesh of the objects asked for."""
     import trimesh
 
     manifest = Path(objects) / "manifest.json"
@@ -83,10 +101,7 @@ def read_views(
         scale, folder = float(entries[name].get("suggested_scale", 1.0)), Path(objects) / name
         mesh = trimesh.load_mesh(folder / "mesh.ply")
         mesh.apply_scale(scale)
-        for view in sorted(entries[name]["views"]):
-            cloud = read_cloud(folder / f"{view}_noisy.ply")
-            eye = torch.tensor(entries[name]["views"][view]["T_object_camera"], dtype=torch.float64)[:3, 3]
-            yield name, view, PointCloud(cloud.points * scale, None, eye * scale if camera else None), mesh
+        yield name, folder, entries[name], scale, mesh
 
 
 def measure_shape(shape: ShapeGP, mesh: "trimesh.Trimesh", cloud: PointCloud, seed: int = 0) -> Row:

@@ -1,0 +1,131 @@
+"""Protocols on a pinched cylinder: what holds, what does not, and what statics says of how much it takes."""
+
+import dataclasses
+import json
+import math
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from torchgrasp import cli
+from torchgrasp.close.evaluate import ViewScore, share, summarise
+from torchgrasp.close.protocol import PROTOCOLS, PullResult, pull_grasp
+from torchgrasp.close.squeeze import joint_stiffness, squeeze_joints
+from torchgrasp.errors import BadArgument, Status
+from torchgrasp.frames import apply, inverse
+
+pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
+TRIAL = runpy.run_path(str(Path(__file__).with_name("test_trial.py")))
+pinch, cylinder = TRIAL["pinch"], TRIAL["cylinder"]
+QUICK = dataclasses.replace(PROTOCOLS["dexgraspbench"], seconds=0.2, mass=0.05)
+
+
+def pull(name, protocol, **options):
+    pytest.importorskip("sapien")
+    hand, grasp = pinch(name)
+    return pull_grasp(grasp, hand, cylinder(), protocol, **options)
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett"])
+def test_the_squeeze_presses_with_forces_that_cancel(name):
+    hand, grasp = pinch(name)
+    lead = squeeze_joints(grasp, hand, force=4.0)[0] - grasp.joints[0]
+    torque = joint_stiffness(hand) * lead
+    # Forces at the planned contacts, from the torques alone: J^T f = torque, of all f the one that cancels.
+    hand_from_obj = inverse(grasp.obj_from_hand)
+    points = apply(hand_from_obj, grasp.contacts.points)[0]
+    jacobian = hand.jacobian(grasp.joints)[0].flatten(0, 1)
+    still = torch.cat([torch.eye(3).double().repeat(1, 3), torch.cat([cross(p) for p in points], 1)])
+    system = torch.cat([jacobian.T, still])
+    wished = torch.cat([torque, torch.zeros(6, dtype=torch.float64)])
+    force = torch.linalg.lstsq(system, wished[:, None]).solution[:, 0]
+    torch.testing.assert_close(system @ force, wished, rtol=0, atol=1e-6)
+    push = -(force.reshape(3, 3) * (hand_from_obj[0, :3, :3] @ grasp.contacts.normals[0].T).T).sum(-1)
+    assert float(push.max()) == pytest.approx(4.0, rel=1e-6) and float(push.min()) > 1.0
+    twice = squeeze_joints(grasp, hand, force=4.0, kp=2 * hand.actuators[hand.joint_names[0]].kp)[0]
+    torch.testing.assert_close(twice - grasp.joints[0], lead / 2, rtol=1e-9, atol=1e-12)
+
+
+def cross(p):
+    x, y, z = p.tolist()
+    return torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+
+
+def test_a_pinched_cylinder_passes_and_the_same_numbers_come_twice():
+    first, second = (pull("allegro", QUICK, force=5.0) for _ in range(2))
+    assert first.passed and first.status is Status.OK and first.directions == 6
+    assert dataclasses.replace(first, seconds=0.0) == dataclasses.replace(second, seconds=0.0)
+    assert 2.0 < first.force < 5.0 and first.moved < 0.02
+
+
+def test_more_pull_than_friction_can_hold_moves_the_object():
+    """Three fingers of N newtons hold at most 3 mu N along the cylinder's axis."""
+    held = 3 * 0.6 * 4.0
+    strong = pull("allegro", dataclasses.replace(QUICK, pull=2 * held / QUICK.mass, seconds=1.0), force=4.0)
+    assert not strong.passed and strong.status is Status.MOVED
+    assert strong.moved >= QUICK.distance or strong.turned >= QUICK.angle
+    slippery = pull("allegro", dataclasses.replace(QUICK, friction=0.01), force=5.0)
+    assert not slippery.passed
+
+
+def test_a_hand_inside_the_object_is_refused():
+    hand, grasp = pinch("barrett")
+    result = pull_grasp(grasp, hand, cylinder((0.0, 0.05)), dataclasses.replace(QUICK, overlap=1e-3))
+    assert result.status is Status.START_OVERLAP and result.directions == 1 and math.isnan(result.force)
+
+
+def test_bad_arguments_are_named():
+    hand, grasp = pinch("allegro")
+    with pytest.raises(BadArgument, match="protocol: found 'best'"):
+        pull_grasp(grasp, hand, cylinder(), "best")
+    with pytest.raises(BadArgument, match="grasp: found 0 rows"):
+        pull_grasp(grasp[:0], hand, cylinder())
+    with pytest.raises(BadArgument, match="force: found -1"):
+        pull_grasp(grasp, hand, cylinder(), force=-1.0)
+    with pytest.raises(BadArgument, match="grasps: found 12 joints"):
+        squeeze_joints(grasp, pinch("barrett")[0])
+
+
+def test_shares_count_every_view():
+    good = PullResult(True, Status.OK, 6, 0.01, 0.1, 4.0, 1.0)
+    bad = dataclasses.replace(good, passed=False, status=Status.MOVED)
+    lost = dataclasses.replace(bad, status=Status.START_OVERLAP, force=math.nan)
+    scores = [
+        ViewScore("tin", "view0", 9, 2.0, (good, bad)),
+        ViewScore("tin", "view1", 0, 4.0, ()),
+        ViewScore("cup", "view0", 1, 3.0, (lost,)),
+    ]
+    found = summarise(scores)
+    assert found["gsr"][::3] == (1 / 3, 3) and found["top1"][::3] == (1 / 3, 3) and found["objects"][::3] == (0.5, 2)
+    assert found["refused"] == 1 and found["force_n"] == 4.0 and found["plan_cpu_s"] == 3.0
+    assert found["failures"] == {"MOVED": 1, "START_OVERLAP": 1}
+    low, high = share(8, 10)[1:3]  # Wilson (1927) by hand
+    z2 = 1.959963985**2
+    middle, half = (0.8 + z2 / 20) / (1 + z2 / 10), 1.959963985 * math.sqrt(0.16 / 10 + z2 / 400) / (1 + z2 / 10)
+    assert (low, high) == (pytest.approx(middle - half), pytest.approx(middle + half))
+
+
+def test_a_folder_is_evaluated_from_its_views(tmp_path, capsys):
+    pytest.importorskip("sapien")
+    (tmp_path / "tin").mkdir()
+    tin = trimesh.creation.cylinder(radius=0.03, height=0.12, sections=64)
+    tin.apply_translation([0, 0, 0.06])
+    tin.export(tmp_path / "tin" / "mesh.ply")
+    rng = np.random.default_rng(0)
+    angle, height = (rng.random(700) - 0.5) * 2.9, 0.12 * rng.random(700)
+    seen = np.stack([0.03 * np.cos(angle), 0.03 * np.sin(angle), height], -1)
+    trimesh.PointCloud(seen).export(tmp_path / "tin" / "view0_noisy.ply")
+    pose = np.eye(4)
+    pose[:3, 3] = [0.45, 0.0, 0.15]
+    entry = {"views": {"view0": {"T_object_camera": pose.tolist()}}}
+    (tmp_path / "manifest.json").write_text(json.dumps({"objects": {"tin": entry}}))
+    words = ["evaluate", "--objects", str(tmp_path), "--hand", "allegro", "--out", str(tmp_path / "out")]
+    assert cli.main([*words, "--grasps", "2", "--starts", "100"]) == 0
+    written = json.loads((tmp_path / "out" / "evaluate.json").read_text())
+    assert written["views"][0]["object"] == "tin" and len(written["views"][0]["results"]) == 2
+    assert written["summary"]["top1"][3] == 1 and written["asked"]["protocol"]["name"] == "dexgraspbench"
+    assert "grasps that pass" in capsys.readouterr().out

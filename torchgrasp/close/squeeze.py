@@ -1,0 +1,53 @@
+"""The third pose of a grasp: where the joints are driven so that compliant fingers press with balanced forces."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.close.force import balanced_forces
+from torchgrasp.errors import BadArgument
+from torchgrasp.frames import apply as move
+from torchgrasp.frames import inverse, rotate
+from torchgrasp.hand.hand import Hand
+from torchgrasp.values import Grasps
+
+
+def squeeze_joints(grasps: Grasps, hand: Hand, force: float = 4.0, kp: float | None = None) -> Float[Tensor, "g h"]:
+    """Return joint targets [rad] with which the fingers press at their planned contacts, by J^T f = kp (target - q).
+
+    The forces are balanced (`balanced_forces`): they need the least friction of all that cancel. Where no balanced set
+    presses at all three contacts each finger presses along its normal. Replayed open loop, pre-grasp, grasp and squeeze
+    close any hand whose joints are position-controlled; targets may lie past a limit by their lead.
+
+    Args:
+        grasps: g rows.
+        hand: the hand that they were planned for.
+        force: normal force of the strongest finger [N].
+        kp: stiffness of every joint's drive [N m/rad]; None: the hand's own.
+
+    Raises:
+        BadArgument: joints of another hand, or a force or stiffness that is not positive.
+
+    >>> grasps = load_grasps("grasps.safetensors")  # doctest: +SKIP
+    >>> squeeze_joints(grasps, load_hand("allegro"), force=5.0).shape  # doctest: +SKIP
+    torch.Size([212, 12])
+    """
+    if grasps.joints.shape[-1] != hand.dof:
+        raise BadArgument("grasps", f"{grasps.joints.shape[-1]} joints", f"the {hand.dof} of {hand.name}")
+    for name, value in (("force", force), ("kp", 1.0 if kp is None else kp)):
+        if not 0.0 < value < 1e6:
+            raise BadArgument(name, value, "a number in (0, 10^6)")
+    joints = grasps.joints.double()
+    hand_from_obj = inverse(grasps.obj_from_hand.double())
+    points = move(hand_from_obj, grasps.contacts.points.double())
+    normals = rotate(hand_from_obj, grasps.contacts.normals.double())
+    forces = balanced_forces(points, normals, force)
+    forces = torch.where(torch.isfinite(forces), forces, -force * normals)
+    torque = torch.einsum("gcih,gci->gh", hand.to(torch.float64).jacobian(joints), forces)
+    return joints + torque / joint_stiffness(hand, kp)
+
+
+def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, " h"]:
+    """Return the stiffness [N m/rad] of each actuated joint: that of its drive and of the joints that follow it."""
+    every = torch.tensor([hand.actuators[n].kp if kp is None else kp for n in hand.urdf_joint_names]).double()
+    return (hand.coupling.double() ** 2 * every[:, None]).sum(0)
