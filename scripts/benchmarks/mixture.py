@@ -7,6 +7,7 @@ import functools
 import multiprocessing
 import warnings
 from collections.abc import Callable
+from typing import get_args
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ from torchgrasp.hand.judge import Judgement, judge_mixture
 from torchgrasp.hand.kmeans import start_components
 from torchgrasp.hand.mixture import DEFAULT_REACH, PAPER_REACH
 from torchgrasp.hand.query import query_hand
-from torchgrasp.hand.sample import HandSamples, sample_configurations
+from torchgrasp.hand.sample import HandSamples, Sampling, sample_configurations
 
 COMPONENTS = {"allegro": 41, "barrett": 36}
 """The paper's numbers of Gaussians."""
@@ -39,9 +40,9 @@ SEED = 977
 
 
 @functools.cache
-def draw(name: str, n: int) -> HandSamples:
+def draw(name: str, n: int, sampling: Sampling = "uniform") -> HandSamples:
     """Draw free postures once for all subjects."""
-    return sample_configurations(load_hand(name), n)
+    return sample_configurations(load_hand(name), n, sampling=sampling)
 
 
 def bench_em(n: int) -> list[Row]:
@@ -156,15 +157,20 @@ def _fit_theirs(samples: HandSamples, m: int) -> None:
 
 
 def bench_mae(n: int) -> list[Row]:
-    """Judge the shipped models on the last six tenths of n postures, and any predictor on codes by their neighbours."""
+    """Judge models on the last six tenths of n postures, and any function of the code by its neighbours.
+
+    Of uniform postures it is the shipped model; for opposed fingertips one is fitted here.
+    """
     rows = []
-    for name in COMPONENTS:
-        samples, mixture = draw(name, n), load_mixture(name)
-        learned, held_out = samples[: 2 * n // 5], samples[2 * n // 5 :]
-        judged = judge_mixture(mixture, held_out)
-        print(judged)
-        rows.append(_errors_row(f"{name}, uniform postures, shipped model", name, judged))
-        rows.append(_floor_row(f"{name}, uniform postures", name, learned, held_out))
+    for name, m in COMPONENTS.items():
+        for sampling in get_args(Sampling):
+            samples = draw(name, n, sampling)
+            learned, held_out = samples[: 2 * n // 5], samples[2 * n // 5 :]
+            mixture = load_mixture(name) if sampling == "uniform" else fit_mixture(learned, m)
+            judged = judge_mixture(mixture, held_out)
+            print(judged)
+            rows.append(_errors_row(f"{name}, {sampling} postures", name, judged))
+            rows.append(_floor_row(f"{name}, {sampling} postures", learned, held_out))
     return rows
 
 
@@ -182,7 +188,7 @@ def _errors_row(what: str, name: str, judged: Judgement) -> Row:
     )
 
 
-def _floor_row(what: str, name: str, learned: HandSamples, held_out: HandSamples, queries: int = 20_000) -> Row:
+def _floor_row(what: str, learned: HandSamples, held_out: HandSamples, queries: int = 20_000) -> Row:
     """Return the error of the median over the nearest codes, as many of them as serve best.
 
     With more samples it goes to the least error that any function of the code can have: what the code leaves open.
