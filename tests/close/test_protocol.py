@@ -13,10 +13,10 @@ import trimesh
 
 from torchgrasp import cli
 from torchgrasp.close.evaluate import ViewScore, share, summarise
-from torchgrasp.close.protocol import PROTOCOLS, PullResult, pull_grasp
+from torchgrasp.close.protocol import PROTOCOLS, PullResult, draw_errors, pull_grasp
 from torchgrasp.close.squeeze import joint_stiffness, squeeze_joints
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.frames import apply, inverse
+from torchgrasp.frames import apply, inverse, rotation_angle
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 TRIAL = runpy.run_path(str(Path(__file__).with_name("test_trial.py")))
@@ -70,6 +70,27 @@ def test_more_pull_than_friction_can_hold_moves_the_object():
     assert strong.moved >= QUICK.distance or strong.turned >= QUICK.angle
     slippery = pull("allegro", dataclasses.replace(QUICK, friction=0.01), force=5.0)
     assert not slippery.passed
+
+
+@pytest.mark.parametrize("closing", ["uncertainty", "position"])
+def test_a_controller_closes_and_holds(closing):
+    result = pull("allegro", dataclasses.replace(QUICK, pull=2.0), force=4.0, closing=closing)
+    assert result.passed and 1.0 < result.force < 5.0
+
+
+def test_errors_of_the_pose_stay_within_the_protocol_s():
+    errors = draw_errors(dataclasses.replace(PROTOCOLS["pose-noise"], draws=200), 3, seed=1)
+    assert errors.shape == (3, 200, 4, 4)
+    assert 0.0048 < float(errors[..., :3, 3].abs().max()) <= 0.005
+    angle = rotation_angle(errors[..., :3, :3])
+    assert math.radians(5) < float(angle.max()) <= math.radians(5) * 3**0.5
+    assert torch.equal(errors, draw_errors(dataclasses.replace(PROTOCOLS["pose-noise"], draws=200), 3, seed=1))
+    still = draw_errors(PROTOCOLS["dexgraspbench"], 2, seed=0)
+    assert torch.equal(still, torch.eye(4, dtype=torch.float64).expand(2, 1, 4, 4))
+    aside = torch.eye(4, dtype=torch.float64)
+    aside[2, 3] = 0.2
+    hand, grasp = pinch("allegro")
+    assert not pull_grasp(grasp, hand, cylinder(), QUICK, error=aside).passed
 
 
 def test_a_hand_inside_the_object_is_refused():

@@ -9,7 +9,7 @@ from torchgrasp.cli.common import check_folder, check_seed, naming
 from torchgrasp.cli.grasps import check_simulator
 from torchgrasp.close.evaluate import ViewScore, summarise
 from torchgrasp.close.evaluate import evaluate as evaluate_views
-from torchgrasp.close.protocol import PROTOCOLS
+from torchgrasp.close.protocol import PROTOCOLS, Mode
 from torchgrasp.errors import Status
 from torchgrasp.files import write_atomically
 from torchgrasp.hand.load import load_hand
@@ -19,7 +19,8 @@ def evaluate(
     objects: Path,
     hand: str,
     out: Path,
-    protocol: Literal["multidex", "dexgraspbench", "dexgraspbench-hard"] = "dexgraspbench",
+    protocol: Literal["multidex", "dexgraspbench", "dexgraspbench-hard", "pose-noise"] = "dexgraspbench",
+    closing: Mode = "open_loop",
     grasps: int = 20,
     starts: int = 1000,
     force: float = 7.0,
@@ -36,6 +37,7 @@ def evaluate(
         hand: allegro, barrett, or the folder of another hand.
         out: folder of the results; it is made where it does not exist.
         protocol: which test: see torchgrasp.close.protocol.
+        closing: open loop through pre-grasp, grasp and squeeze, or by a controller that feels with the fingertips.
         grasps: the most that are tried of each view, the best first.
         starts: random starts of the contact planner.
         force: normal force of the strongest finger [N] in the squeeze.
@@ -51,12 +53,12 @@ def evaluate(
         the_hand = load_hand(hand)
     with naming("--objects", "objects", "path"), naming("--grasps", "grasps"), naming("--force", "force"):
         scores = evaluate_views(
-            objects, the_hand, protocol, grasps, starts, seed, force, complete, only, observer=print_score
+            objects, the_hand, protocol, grasps, starts, seed, force, closing, complete, only, print_score
         )
     summary = summarise(scores)
     print_summary(protocol, summary)
     asked = {"protocol": dataclasses.asdict(PROTOCOLS[protocol]), "hand": hand, "grasps": grasps, "starts": starts}
-    asked |= {"force": force, "complete": complete, "seed": seed}
+    asked |= {"force": force, "closing": closing, "complete": complete, "seed": seed}
     rows = [
         {**dataclasses.asdict(s), "results": [{**dataclasses.asdict(r), "status": r.status.name} for r in s.results]}
         for s in scores

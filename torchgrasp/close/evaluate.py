@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchgrasp.close.parts import convex_parts
-from torchgrasp.close.protocol import PROTOCOLS, PullProtocol, PullResult, pull_grasp
+from torchgrasp.close.protocol import PROTOCOLS, Mode, PullProtocol, PullResult, draw_errors, pull_grasp
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.pipeline import plan_grasps
 from torchgrasp.shape.calibrate import read_views, read_whole
 from torchgrasp.specs import ContactSpec
-from torchgrasp.values import PointCloud
+from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
     import trimesh
@@ -28,7 +28,8 @@ MOST_FRICTION = 1.0
 class ViewScore:
     """What became of the best grasps of one view of one object, in the order of their rank.
 
-    `executable` counts the grasps that the planner offered and `seconds` is the CPU time of planning all of them.
+    `executable` counts the grasps that the planner offered and `seconds` is the CPU time of planning all of them. Where
+    the protocol draws errors of the hand's pose, each grasp has as many results.
     """
 
     object: str
@@ -46,6 +47,7 @@ def evaluate(
     starts: int = 1000,
     seed: int = 0,
     force: float = 7.0,
+    closing: Mode = "open_loop",
     complete: bool = False,
     only: Sequence[str] = (),
     observer: Callable[[ViewScore], None] | None = None,
@@ -63,6 +65,7 @@ def evaluate(
         starts: of the contact planner.
         seed: of every random draw.
         force: normal force of the strongest finger [N] in the squeeze; the others balance it.
+        closing: how the hand closes.
         complete: plan on the whole cloud with its normals instead: what a perfect shape is worth.
         only: names of objects to keep; by default all.
         observer: called with each score as it is there.
@@ -80,34 +83,28 @@ def evaluate(
     spec = ContactSpec(friction=min(protocol.friction, MOST_FRICTION), table=0.0)
     scores = []
     for name, view, cloud, mesh in (read_whole if complete else read_views)(objects, only=only):
-        scores.append(score_view(name, view, cloud, mesh, hand, protocol, spec, grasps, starts, seed, force))
+        began = time.process_time()
+        found = plan_grasps(cloud, hand, spec, starts, seed)
+        found = found[found.status == Status.OK]
+        seconds = time.process_time() - began
+        results = try_grasps(found[:grasps], hand, mesh, protocol, force, closing, seed)
+        scores.append(ViewScore(name, view, len(found), seconds, results))
         if observer:
             observer(scores[-1])
     return scores
 
 
-def score_view(
-    name: str,
-    view: str,
-    cloud: PointCloud,
-    mesh: "trimesh.Trimesh",
-    hand: Hand,
-    protocol: PullProtocol,
-    spec: ContactSpec,
-    grasps: int,
-    starts: int,
-    seed: int,
-    force: float,
-) -> ViewScore:
-    """Plan on one cloud and try the best grasps."""
-    began = time.process_time()
-    found = plan_grasps(cloud, hand, spec, starts, seed)
-    found = found[found.status == Status.OK]
-    seconds = time.process_time() - began
+def try_grasps(
+    grasps: Grasps, hand: Hand, mesh: "trimesh.Trimesh", protocol: PullProtocol, force: float, closing: Mode, seed: int
+) -> tuple[PullResult, ...]:
+    """Return what becomes of each grasp with each of its drawn errors, grasp by grasp."""
     parts = convex_parts(mesh)
-    tried = range(min(grasps, len(found)))
-    results = tuple(pull_grasp(found[i], hand, mesh, protocol, force, parts=parts) for i in tried)
-    return ViewScore(name, view, len(found), seconds, results)
+    errors = draw_errors(protocol, len(grasps), seed)
+    return tuple(
+        pull_grasp(grasp, hand, mesh, protocol, force, closing, seed, error=error, parts=parts)
+        for grasp, drawn in zip(grasps, errors, strict=True)
+        for error in drawn
+    )
 
 
 def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:

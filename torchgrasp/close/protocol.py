@@ -1,31 +1,37 @@
 """Published tests of a grasp by pulling at the object in six directions, as their authors define them.
 
-The hand is fixed and nothing else is there: no table, no gravity. Open loop the joints go from pre-grasp to grasp to
-squeeze, then a constant force pulls at the object's mass centre along one axis of the world. Each direction starts
-anew; the grasp passes if in none the object moves or turns too far from where it was before the hand closed. PhysX has
-no torsional coefficient of friction: a contact patch of radius r resists friction x force x r, so that the protocol's
-torsional coefficient (a length) over its sliding one is r.
+The hand is fixed and nothing else is there: no table, no gravity. The hand closes, by default open loop from pre-grasp
+to grasp to squeeze, then a constant force pulls at the object's mass centre along one axis of the world. Each direction
+starts anew; the grasp passes if in none the object moves or turns too far from where it was before the hand closed.
+PhysX has no torsional coefficient of friction: a contact patch of radius r resists friction x force x r, so that the
+protocol's torsional coefficient (a length) over its sliding one is r.
 """
 
 import dataclasses
 import itertools
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.close.control import Closing, Squeeze, Stopping
+from torchgrasp.close.law import closing_gains
 from torchgrasp.close.parts import check_parts, convex_parts, read_mesh
+from torchgrasp.close.robot import Robot, plant_from_hand
 from torchgrasp.close.scene import Scene
 from torchgrasp.close.squeeze import squeeze_joints
+from torchgrasp.close.trial import CLOSING_TIME, PRESSING_TIME
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.frames import rotation_angle
+from torchgrasp.frames import rigid, rotation_angle, rotation_from_vector
 from torchgrasp.hand.hand import Hand
-from torchgrasp.values import Grasps
+from torchgrasp.values import ClosingGains, Grasps
 
 if TYPE_CHECKING:
     import trimesh
@@ -53,6 +59,9 @@ class PullProtocol(Value):
         angle: by which the object may turn [rad].
         kp: stiffness of all joint drives [N m/rad]; None: the hand's own.
         overlap: of hand and object at the pre-grasp that is refused [m].
+        shift: largest error of the hand's position along each of its axes [m].
+        turn: largest error of its orientation about each of its axes [rad].
+        draws: how many such errors are drawn for each grasp.
     """
 
     name: str
@@ -66,7 +75,16 @@ class PullProtocol(Value):
     angle: float
     kp: float | None
     overlap: float = 0.01
+    shift: float = 0.0
+    turn: float = 0.0
+    draws: int = 1
 
+
+Mode = Literal["open_loop", "uncertainty", "position"]
+"""How the hand closes: through its three poses, or by one of the controllers of `close_hand` at 100 Hz."""
+
+CONTROL_RATE = 100.0
+"""Of the controllers [Hz]."""
 
 CLOSE_SECONDS = 0.4
 """Time [s] from pre-grasp to grasp, and as much from grasp to squeeze."""
@@ -74,15 +92,18 @@ CLOSE_SECONDS = 0.4
 CHECK_SECONDS = 0.2
 """How often [s] the object is looked at while it is pulled."""
 
+_DEXGRASPBENCH = PullProtocol("dexgraspbench", 10.0, 0.1, 0.0, 0.6, 0.02 / 0.6, 2.0, 0.05, math.radians(15), 5.0)
 PROTOCOLS = {
     "multidex": PullProtocol("multidex", 0.5, None, 500.0, 3.0, 0.0, 1.0, 0.02, math.inf, None),
-    "dexgraspbench": PullProtocol("dexgraspbench", 10.0, 0.1, 0.0, 0.6, 0.02 / 0.6, 2.0, 0.05, math.radians(15), 5.0),
-    "dexgraspbench-hard": PullProtocol(
-        "dexgraspbench-hard", 10.0, 0.1, 0.0, 0.3, 0.002 / 0.3, 2.0, 0.05, math.radians(15), 5.0
+    "dexgraspbench": _DEXGRASPBENCH,
+    "dexgraspbench-hard": dataclasses.replace(
+        _DEXGRASPBENCH, name="dexgraspbench-hard", friction=0.3, patch=0.002 / 0.3
     ),
+    "pose-noise": dataclasses.replace(_DEXGRASPBENCH, name="pose-noise", shift=0.005, turn=math.radians(5), draws=20),
 }
 """By name: MultiDex as D(R,O) runs it (arXiv 2410.01702), DexGraspBench's force-closure test for floating objects
-(as of BODex, arXiv 2412.16490), and the same with halved friction as in Dexonomy (arXiv 2504.18829)."""
+(as of BODex, arXiv 2412.16490), the same with halved friction as in Dexonomy (arXiv 2504.18829), and the same with the
+hand put down beside where it was planned, by as much as in Get a Grip (arXiv 2410.23701)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,11 +128,14 @@ def pull_grasp(
     hand: Hand,
     mesh: "trimesh.Trimesh | Path | str",
     protocol: PullProtocol | str = "dexgraspbench",
-    force: float = 6.0,
+    force: float = 7.0,
+    closing: Mode = "open_loop",
+    seed: int = 0,
     *,
+    error: Float[Tensor, "4 4"] | None = None,
     parts: "Sequence[trimesh.Trimesh] | None" = None,
 ) -> PullResult:
-    """Close a hand on the true object open loop and pull at the object in six directions.
+    """Close a hand on the true object and pull at the object in six directions.
 
     Args:
         grasp: one row.
@@ -119,10 +143,13 @@ def pull_grasp(
         mesh: the true object [m], closed: a trimesh or a file.
         protocol: one of `PROTOCOLS` by name, or another.
         force: normal force of the strongest finger [N] in the squeeze.
+        closing: how the hand closes.
+        seed: of the noise of the fingertips that the controllers feel with.
+        error: where the hand really stands in its planned frame (`draw_errors`), of which it knows nothing.
         parts: convex bodies to use for the mesh instead of its own decomposition.
 
     Raises:
-        BadArgument: an unknown protocol, not exactly one row, or a grasp of another hand.
+        BadArgument: an unknown protocol or closing, not exactly one row, or a grasp of another hand.
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
     """
@@ -133,11 +160,15 @@ def pull_grasp(
         protocol = PROTOCOLS[protocol]
     if len(grasp) != 1:
         raise BadArgument("grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]")
+    if closing not in get_args(Mode):
+        raise BadArgument("closing", repr(closing), f"one of {', '.join(get_args(Mode))}")
     grasp, hand = grasp.to("cpu", torch.float64), hand.to("cpu", torch.float64)
-    poses = [grasp.pregrasp[0], grasp.joints[0], squeeze_joints(grasp, hand, force, protocol.kp)[0]]
+    gains = closing_gains(grasp, hand, force)
+    squeezed = squeeze_joints(grasp, hand, force, protocol.kp)[0]
     mesh = read_mesh(mesh)
     bodies = convex_parts(mesh) if parts is None else check_parts(parts)
-    trial = _Pull(grasp, hand, mesh, bodies, protocol, poses)
+    stands = grasp.obj_from_hand[0] if error is None else grasp.obj_from_hand[0] @ error.double()
+    trial = _Pull(grasp, hand, mesh, bodies, protocol, stands, closing, gains, squeezed, seed)
     status, moved, turned, pressed, tried = Status.OK, 0.0, 0.0, math.nan, 0
     for direction in DIRECTIONS:
         found, forces = trial.run(direction)
@@ -150,6 +181,15 @@ def pull_grasp(
     return PullResult(passed, status, tried, moved, turned, pressed, time.process_time() - began)
 
 
+def draw_errors(protocol: PullProtocol, grasps: int, seed: int) -> Float[Tensor, "g n 4 4"]:
+    """Return for each grasp the drawn places of the hand in its planned frame, uniform within the protocol's errors."""
+    generator = torch.Generator().manual_seed(seed)
+    most = torch.tensor([protocol.turn] * 3 + [protocol.shift] * 3, dtype=torch.float64)
+    drawn = 2 * torch.rand(grasps, protocol.draws, 6, generator=generator, dtype=torch.float64) - 1
+    turn, shift = (most * drawn).split(3, -1)
+    return rigid(rotation_from_vector(turn), shift)
+
+
 class _Pull:
     """One grasp under one protocol: a fresh scene for each direction, so that no run depends on another."""
 
@@ -160,48 +200,81 @@ class _Pull:
         mesh: "trimesh.Trimesh",
         parts: "list[trimesh.Trimesh]",
         protocol: PullProtocol,
-        poses: list[torch.Tensor],
+        stands: Float[Tensor, "4 4"],
+        closing: Mode,
+        gains: ClosingGains,
+        squeezed: Float[Tensor, "h"],
+        seed: int,
     ) -> None:
-        self.hand, self.mesh, self.parts, self.protocol = hand, mesh, parts, protocol
-        self.pose = grasp.obj_from_hand[0].numpy()
+        self.grasp, self.hand, self.mesh, self.parts, self.protocol = grasp, hand, mesh, parts, protocol
+        self.stands, self.closing, self.gains, self.seed = stands.numpy(), closing, gains, seed
         self.mass = protocol.density * float(mesh.volume) if protocol.mass is None else protocol.mass
-        self.poses = [{name: float(q) for name, q in hand.expand(pose).items()} for pose in poses]
-        drives = hand.actuators
+        self.poses = [hand.expand(pose) for pose in (grasp.pregrasp[0], grasp.joints[0], squeezed)]
+        self.drives = hand.actuators
         if protocol.kp is not None:
-            drives = {name: drive._replace(kp=protocol.kp) for name, drive in drives.items()}
-        self.drives = drives
+            self.drives = {name: drive._replace(kp=protocol.kp) for name, drive in self.drives.items()}
 
     def run(self, direction: np.ndarray) -> tuple[tuple[Status, float, float], float]:
         """Close, pull along one direction, and return status, motion [m], turn [rad] and the mean force [N] before."""
         rule = self.protocol
+        start = {name: float(q) for name, q in self.poses[0].items()}
         scene = Scene(
-            self.hand.urdf_path, self.pose, self.poses[0], self.drives, tuple(self.hand.tip_links), self.mesh,
-            self.parts, self.mass, rule.friction, 0.0, TIMESTEP, 0.0, table=False, patch=rule.patch,
+            self.hand.urdf_path, self.stands, start, self.drives, tuple(self.hand.tip_links), self.mesh, self.parts,
+            self.mass, rule.friction, 0.0, TIMESTEP, 0.0, table=False, patch=rule.patch,
         )  # fmt: skip
         if not scene.penetration() <= rule.overlap:
             return (Status.START_OVERLAP, 0.0, 0.0), math.nan
-        ladder = [np.array([pose[name] for name in scene.joint_names]) for pose in self.poses]
-        start, far = scene.object_pose(), (0.0, 0.0)
-        steps = round(CLOSE_SECONDS / TIMESTEP)
-        seen = np.zeros((3, 3))
-        for low, high in itertools.pairwise(ladder):
-            for k in range(steps):
-                scene.drive(low + (high - low) * (k + 1) / steps)
-                reading = scene.step()
-                seen = 0.98 * seen + 0.02 * reading.impulse / TIMESTEP
-        force = float(np.linalg.norm(seen, axis=-1).mean())
-        status = self._judge(scene, start)
+        generator = torch.Generator().manual_seed(self.seed)
+        plant = plant_from_hand(self.hand, self.grasp, scene.joint_names, self.drives)
+        robot = Robot(scene, self.hand, plant, CONTROL_RATE, generator)
+        before, far = scene.object_pose(), (0.0, 0.0)
+        hold = self._close(robot)
+        force = float(robot.force.mean())
+        status = self._judge(scene, before)
         if status[0] is not Status.OK:
             return (Status.EJECTED if status[0] is Status.MOVED else status[0], *status[1:]), force
         scene.pull(rule.pull * self.mass * direction)
         for _ in range(round(rule.seconds / CHECK_SECONDS)):
-            for _ in range(round(CHECK_SECONDS / TIMESTEP)):
-                scene.step()
-            status = self._judge(scene, start)
+            for _ in range(robot.ticks(CHECK_SECONDS)):
+                hold()
+            status = self._judge(scene, before)
             far = (max(far[0], status[1]), max(far[1], status[2]))
             if status[0] is not Status.OK:
                 break
         return (status[0], *far), force
+
+    def _close(self, robot: Robot) -> Callable[[], None]:
+        """Close the hand and return what holds it closed for one tick more."""
+        if self.closing == "open_loop":
+            ladder = [torch.stack([pose[name] for name in robot.scene.joint_names]) for pose in self.poses]
+            ticks = robot.ticks(CLOSE_SECONDS)
+            for low, high in itertools.pairwise(ladder):
+                for k in range(ticks):
+                    robot.tick(low + (high - low) * ((k + 1) / ticks))
+
+            def stay() -> None:
+                """Keep the squeeze."""
+                robot.tick(ladder[-1])
+
+            return stay
+        targets = robot.plant.expand(robot.plant.pregrasp)
+        sight = robot.tick(targets)
+        controller = (Closing if self.closing == "uncertainty" else Stopping)(robot.plant, self.gains)
+        for _ in range(robot.ticks(CLOSING_TIME)):
+            targets = controller(sight, robot.period)
+            sight = robot.tick(targets)
+            if controller.done:
+                break
+        squeeze = Squeeze(robot.plant, self.gains, sight, targets)
+
+        def hold() -> None:
+            """Press on."""
+            nonlocal sight
+            sight = robot.tick(squeeze(sight, robot.period))
+
+        for _ in range(robot.ticks(PRESSING_TIME)):
+            hold()
+        return hold
 
     def _judge(self, scene: Scene, start: np.ndarray) -> tuple[Status, float, float]:
         """Compare the object's pose with where it was."""

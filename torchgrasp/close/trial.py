@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.close.control import Closing, Plant, Sight, Squeeze, Stopping
+from torchgrasp.close.control import Closing, Sight, Squeeze, Stopping
 from torchgrasp.close.law import closing_gains
 from torchgrasp.close.parts import check_parts, convex_parts, read_mesh
+from torchgrasp.close.robot import Robot, plant_from_hand
 from torchgrasp.close.scene import Scene
-from torchgrasp.close.sensor import sense, untouched
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.frames import apply, inverse, rotate, rotation_angle
+from torchgrasp.frames import apply, inverse, rotation_angle
 from torchgrasp.hand.hand import Hand
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import ClosingGains, ClosureResult, Grasps
@@ -121,19 +121,14 @@ class _Trial:
             spec.timestep,
             spec.lift_height,
         )
-        self.plant = plant_from_hand(hand, grasp, self.scene.joint_names)
-        self.centres = torch.cat([hand.center.double(), torch.ones(3, 1, dtype=torch.float64)], dim=-1).numpy()
-        self.substeps = max(1, round(1 / (spec.control_rate * spec.timestep)))
-        self.period = self.substeps * spec.timestep
-        self.touch = untouched()
-        self.generator = torch.Generator().manual_seed(seed) if spec.noise else None
-        self.steps, self.first_touch = 0, [float("inf")] * 3
+        self.plant = plant_from_hand(hand, grasp, self.scene.joint_names, hand.actuators)
+        generator = torch.Generator().manual_seed(seed) if spec.noise else None
+        self.robot = Robot(self.scene, hand, self.plant, spec.control_rate, generator)
         self.time: list[float] = []
         self.forces: list[np.ndarray] = []
         self.object_pose: list[np.ndarray] = []
         self.hand_pose: list[np.ndarray] = []
         self.joints: list[np.ndarray] = []
-        self.fingers = 0
         self.pushed = 0.0
 
     # ------------------------------------------------------------------------------------------------- the phases
@@ -149,20 +144,20 @@ class _Trial:
             controller = Closing(self.plant, gains) if self.spec.controller == "uncertainty" else None
             controller = controller or Stopping(self.plant, gains)
             targets = self.plant.expand(self.plant.pregrasp)
-            for _ in range(self._ticks(CLOSING_TIME)):
-                targets = controller(sight, self.period)
+            for _ in range(self.robot.ticks(CLOSING_TIME)):
+                targets = controller(sight, self.robot.period)
                 sight = self._tick(targets)
                 if controller.done:
                     break
             self.pushed = float(np.linalg.norm(self._centre(-1) - self._centre(0)))
             hold = Squeeze(self.plant, gains, sight, targets)
-            for _ in range(self._ticks(PRESSING_TIME)):
-                sight = self._tick(hold(sight, self.period))
-            rising = self._ticks(LIFT_TIME)
-            for k in range(rising + self._ticks(self.spec.hold_time)):
+            for _ in range(self.robot.ticks(PRESSING_TIME)):
+                sight = self._tick(hold(sight, self.robot.period))
+            rising = self.robot.ticks(LIFT_TIME)
+            for k in range(rising + self.robot.ticks(self.spec.hold_time)):
                 share = min((k + 1) / rising, 1.0)
                 self.scene.lift(self.spec.lift_height * share * share * (3 - 2 * share))
-                sight = self._tick(hold(sight, self.period))
+                sight = self._tick(hold(sight, self.robot.period))
         except _Lost as lost:
             if lost.args:
                 return Status.UNSTABLE
@@ -170,61 +165,25 @@ class _Trial:
 
     def _tick(self, targets: Float[Tensor, " j"]) -> Sight:
         """Drive the joints for one control period, record it, and return what the robot then knows."""
-        self.scene.drive(targets.numpy())
-        impulse, moment, weight = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
-        finger = np.zeros(3, dtype=bool)
-        for _ in range(self.substeps):
-            seen = self.scene.step()
-            self.steps += 1
-            impulse += seen.impulse
-            moment += seen.moment
-            weight += seen.weight
-            finger = seen.finger
-            for i in np.flatnonzero(seen.weight > 0):
-                self.first_touch[i] = min(self.first_touch[i], self.steps)
-        self.fingers = int(finger.sum())
-        force = np.linalg.norm(impulse, axis=-1) / self.period
-        self._record(force)
+        sight = self.robot.tick(targets)
+        self._record(self.robot.force)
         moved = float(np.linalg.norm(self._centre(-1) - self._centre(0)))
         if not np.isfinite(self.joints[-1]).all() or not np.isfinite(moved):
             raise _Lost(Status.UNSTABLE)
         if moved > LOST + self.spec.lift_height:
             self.pushed = self.pushed or moved
             raise _Lost
-        self.touch = sense(self.touch, torch.from_numpy(force), self.period, self.generator)
-        return self._sight(impulse, moment, weight)
-
-    def _sight(self, impulse: np.ndarray, moment: np.ndarray, weight: np.ndarray) -> Sight:
-        """Return the hand's own knowledge, in its frame."""
-        hand_from_world = inverse(torch.from_numpy(self.hand_pose[-1]))
-        centres = (self.scene.tip_poses() @ self.centres[:, :, None])[:, :3, 0]
-        jacobian = torch.from_numpy(self.scene.jacobian(centres))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            points = moment / weight[:, None]
-            normals = -impulse / np.linalg.norm(impulse, axis=-1, keepdims=True)
-        return Sight(
-            joints=torch.from_numpy(self.joints[-1]),
-            tips=apply(hand_from_world, torch.from_numpy(centres)),
-            jacobian=hand_from_world[:3, :3] @ jacobian,
-            reading=self.touch.reading,
-            contact=self.touch.contact,
-            points=apply(hand_from_world, torch.from_numpy(points)),
-            normals=rotate(hand_from_world, torch.from_numpy(normals)),
-        )
+        return sight
 
     # ------------------------------------------------------------------------------------------------ the record
 
     def _record(self, force: np.ndarray) -> None:
         """Append one tick."""
-        self.time.append(self.steps * self.spec.timestep)
+        self.time.append(self.robot.steps * self.spec.timestep)
         self.forces.append(force)
         self.object_pose.append(self.scene.object_pose())
         self.hand_pose.append(self.scene.hand_pose())
         self.joints.append(self.scene.joints())
-
-    def _ticks(self, seconds: float) -> int:
-        """Count the control ticks in a time [s]."""
-        return max(1, round(seconds / self.period))
 
     def _centre(self, tick: int) -> np.ndarray:
         """Return the object's mass centre [m] in the world at a tick."""
@@ -235,9 +194,9 @@ class _Trial:
         """Return the status of a finished trial: held, or the earliest thing that went wrong."""
         rise = np.array([self._centre(k)[2] - self._centre(0)[2] for k in range(len(self.time))])
         half = 0.5 * self.spec.lift_height
-        if rise[-1] >= half and self.fingers >= 2:
+        if rise[-1] >= half and int(self.robot.finger.sum()) >= 2:
             return Status.OK
-        if not np.isfinite(self.first_touch).all():
+        if not np.isfinite(self.robot.first_touch).all():
             return Status.NO_CONTACT
         if self.pushed > PUSHED:
             return Status.EJECTED
@@ -253,7 +212,7 @@ class _Trial:
         centre = torch.from_numpy(self.scene.centre)[None]
         ends = apply(hand_from_object[[0, -1]], centre.expand(2, 1, 3))[:, 0]
         turned = hand_from_object[0, :3, :3].T @ hand_from_object[-1, :3, :3]
-        touched = [i for i in range(3) if np.isfinite(self.first_touch[i])]
+        touched = [i for i in range(3) if np.isfinite(self.robot.first_touch[i])]
         return ClosureResult(
             held=status is Status.OK,
             status=status,
@@ -263,24 +222,7 @@ class _Trial:
             hand_pose=hand_pose,
             joints=torch.from_numpy(np.stack(self.joints)),
             joint_names=self.scene.joint_names,
-            contact_order=tuple(sorted(touched, key=lambda i: self.first_touch[i])),
+            contact_order=tuple(sorted(touched, key=lambda i: self.robot.first_touch[i])),
             object_motion=(float(torch.linalg.vector_norm(ends[1] - ends[0])), float(rotation_angle(turned))),
             seconds=seconds,
         )
-
-
-def plant_from_hand(hand: Hand, grasp: Grasps, names: tuple[str, ...]) -> Plant:
-    """Return what the controllers need of a hand, all its joints in the order of `names`."""
-    order = [hand.urdf_joint_names.index(name) for name in names]
-    return Plant(
-        coupling=hand.coupling[order].double(),
-        offset=hand.offset[order].double(),
-        actuated=tuple(names.index(name) for name in hand.joint_names),
-        kp=torch.tensor([hand.actuators[name].kp for name in names], dtype=torch.float64),
-        lower=hand.lower.double(),
-        upper=hand.upper.double(),
-        radius=hand.tip_radius.double(),
-        normals=rotate(inverse(grasp.obj_from_hand), grasp.contacts.normals)[0],
-        joints=grasp.joints[0],
-        pregrasp=grasp.pregrasp[0],
-    )

@@ -1,0 +1,96 @@
+"""A hand in a simulated scene as its controllers know it: joint targets in, and a tick later what the robot sees."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.close.control import Plant, Sight
+from torchgrasp.close.scene import Scene
+from torchgrasp.close.sensor import sense, untouched
+from torchgrasp.frames import apply, inverse, rotate
+from torchgrasp.hand.hand import Actuator, Hand
+from torchgrasp.values import Grasps
+
+
+class Robot:
+    """The hand of a scene, with tactile fingertips.
+
+    After each tick `force` (3,) holds the true normal forces [N] averaged over it, `finger` which fingers touched in
+    its last step, `steps` counts the steps of the simulator so far, and `first_touch` tells at which of them each
+    fingertip first touched, infinite for none.
+
+    Args:
+        scene: at its start.
+        hand: its hand.
+        plant: what the controllers know of it.
+        control_rate: ticks a second [Hz].
+        generator: draws the noise of the fingertips; None: no noise.
+    """
+
+    def __init__(
+        self, scene: Scene, hand: Hand, plant: Plant, control_rate: float, generator: torch.Generator | None
+    ) -> None:
+        self.scene, self.plant, self.generator = scene, plant, generator
+        self.substeps = max(1, round(1 / (control_rate * scene.timestep)))
+        self.period = self.substeps * scene.timestep
+        self.steps, self.first_touch = 0, [float("inf")] * 3
+        self.force, self.finger = np.zeros(3), np.zeros(3, dtype=bool)
+        self._centres = torch.cat([hand.center.double(), torch.ones(3, 1, dtype=torch.float64)], dim=-1).numpy()
+        self._touch = untouched()
+
+    def tick(self, targets: Float[Tensor, " j"]) -> Sight:
+        """Drive the joints for one control period and return what the robot then knows."""
+        self.scene.drive(targets.numpy())
+        impulse, moment, weight = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
+        for _ in range(self.substeps):
+            seen = self.scene.step()
+            self.steps += 1
+            impulse += seen.impulse
+            moment += seen.moment
+            weight += seen.weight
+            self.finger = seen.finger
+            for i in np.flatnonzero(seen.weight > 0):
+                self.first_touch[i] = min(self.first_touch[i], self.steps)
+        self.force = np.linalg.norm(impulse, axis=-1) / self.period
+        self._touch = sense(self._touch, torch.from_numpy(self.force), self.period, self.generator)
+        return self._sight(impulse, moment, weight)
+
+    def ticks(self, seconds: float) -> int:
+        """Count the control ticks in a time [s]."""
+        return max(1, round(seconds / self.period))
+
+    def _sight(self, impulse: np.ndarray, moment: np.ndarray, weight: np.ndarray) -> Sight:
+        """Return the hand's own knowledge, in its frame."""
+        hand_from_world = inverse(torch.from_numpy(self.scene.hand_pose()))
+        centres = (self.scene.tip_poses() @ self._centres[:, :, None])[:, :3, 0]
+        jacobian = torch.from_numpy(self.scene.jacobian(centres))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            points = moment / weight[:, None]
+            normals = -impulse / np.linalg.norm(impulse, axis=-1, keepdims=True)
+        return Sight(
+            joints=torch.from_numpy(self.scene.joints()),
+            tips=apply(hand_from_world, torch.from_numpy(centres)),
+            jacobian=hand_from_world[:3, :3] @ jacobian,
+            reading=self._touch.reading,
+            contact=self._touch.contact,
+            points=apply(hand_from_world, torch.from_numpy(points)),
+            normals=rotate(hand_from_world, torch.from_numpy(normals)),
+        )
+
+
+def plant_from_hand(hand: Hand, grasp: Grasps, names: tuple[str, ...], drives: dict[str, Actuator]) -> Plant:
+    """Return what the controllers need of a hand, all its joints in the order of `names`, driven by `drives`."""
+    order = [hand.urdf_joint_names.index(name) for name in names]
+    return Plant(
+        coupling=hand.coupling[order].double(),
+        offset=hand.offset[order].double(),
+        actuated=tuple(names.index(name) for name in hand.joint_names),
+        kp=torch.tensor([drives[name].kp for name in names], dtype=torch.float64),
+        lower=hand.lower.double(),
+        upper=hand.upper.double(),
+        radius=hand.tip_radius.double(),
+        normals=rotate(inverse(grasp.obj_from_hand), grasp.contacts.normals)[0],
+        joints=grasp.joints[0],
+        pregrasp=grasp.pregrasp[0],
+    )
