@@ -7,10 +7,11 @@ import torch
 
 from benchmarks.common import Row, write_rows
 from benchmarks.components import bench_bic
+from benchmarks.kinematics import bench_collision, bench_fk, bench_samples
 from benchmarks.mixture import bench_em, bench_mae, bench_queries
 from benchmarks.query import bench_codes
 
-SUBJECTS = ("codes", "em", "mae", "queries", "bic")
+SUBJECTS = ("fk", "collision", "samples", "codes", "em", "mae", "queries", "bic")
 
 
 def hand(
@@ -27,7 +28,7 @@ def hand(
     """Measure the hands against their bars and against peers, in one run and on the same threads.
 
     Args:
-        only: subjects to measure: codes, em, mae, queries, bic.
+        only: subjects to measure: fk, collision, samples, codes, em, mae, queries, bic.
         codes: held-out codes of each hand.
         samples: free postures of each hand, of which the first four tenths are learned from.
         queries: contact triples asked for in all six assignments.
@@ -44,6 +45,9 @@ def hand(
     if quick:
         codes, peers, samples, queries = codes // 10, peers // 10, samples // 10, queries // 10
     subjects: dict[str, Callable[[], list[Row]]] = {
+        "fk": lambda: bench_fk(samples, threads),
+        "collision": lambda: bench_collision(samples // 5, threads),
+        "samples": lambda: bench_samples(samples, threads),
         "codes": lambda: bench_codes(codes, peers),
         "em": lambda: bench_em(2 * samples // 5),
         "mae": lambda: bench_mae(samples),

@@ -1,13 +1,13 @@
 """Self-collision against exact distances of the URDF's shapes (coal), and against its own definition."""
 
-import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import rotation_from_rpy, rotation_from_vector
+from torchgrasp.frames import rotation_from_vector
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.pairs import NEAR, active_pairs
@@ -29,42 +29,13 @@ def postures(hand: Hand, n: int, generator: torch.Generator) -> torch.Tensor:
     return hand.lower + (hand.upper - hand.lower) * share
 
 
-def exact_distances(hand: Hand, joints: torch.Tensor, skipped: set[frozenset[str]]) -> np.ndarray:
-    """Return the least distance of all pairs of links that do not share a joint, by coal on the URDF's own shapes."""
-    coal = pytest.importorskip("coal")
-    urdf = read_urdf(hand.urdf_path)
-    skipped = skipped | {frozenset((j.parent, j.child)) for j in urdf.joints}
-    make = {"box": coal.Box, "sphere": coal.Sphere, "cylinder": coal.Cylinder}
-    shapes = [
-        (i, make[s.kind](*s.size), rotation_from_rpy(s.rpy).numpy(), np.array(s.xyz))
-        for i, link in enumerate(urdf.links)
-        for s in link.shapes
-    ]
-    pairs = [
-        (one, two)
-        for one, two in itertools.combinations(range(len(shapes)), 2)
-        if shapes[one][0] != shapes[two][0]
-        and frozenset(hand.link_names[shapes[k][0]] for k in (one, two)) not in skipped
-    ]
-    request = coal.DistanceRequest()
-    request.enable_signed_distance = True
-    least = np.full(len(joints), np.inf)
-    for row, poses in enumerate(hand.link_poses(joints).numpy()):
-        places = [
-            coal.Transform3s(poses[i, :3, :3] @ r, poses[i, :3, :3] @ x + poses[i, :3, 3]) for i, _, r, x in shapes
-        ]
-        for one, two in pairs:
-            found = coal.distance(
-                shapes[one][1], places[one], shapes[two][1], places[two], request, coal.DistanceResult()
-            )
-            least[row] = min(least[row], found)
-    return least
+def test_self_collision_agrees_with_exact_hulls(hand, generator, monkeypatch):
+    pytest.importorskip("coal")
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "scripts"))
+    from benchmarks.hulls import exact_clearance
 
-
-def test_self_collision_agrees_with_exact_hulls(hand, generator):
     joints = postures(hand, 300, generator)
-    by_design = {frozenset(("palm", f"f{k}_med")) for k in (1, 2)}  # see hands/barrett/hand.toml
-    truth, found = exact_distances(hand, joints, by_design), hand.self_clearance(joints).numpy()
+    truth, found = exact_clearance(hand, joints), hand.self_clearance(joints).numpy()
     met, wrong = truth < 0, (truth < 0) != (found < 0)
     assert 0.1 < met.mean() < 0.5
     assert wrong.mean() < 0.01

@@ -35,7 +35,8 @@ class Hand(Value):
 
     `contact`, `normal` and `center` [m] are the pads in the frames of `tip_links`, `approach` points out of the palm,
     `axis`, `prismatic` and `child` (an index into `link_names`) describe the joints of the URDF, `moves` tells which
-    of them move a link, and `sha256` is that of both files.
+    of them move a link, and `sha256` is that of both files. `fingers` is that part of the tree which leads to the tips,
+    and `tip_place` where they stand in it.
     """
 
     name: str
@@ -64,7 +65,9 @@ class Hand(Value):
     actuators: dict[str, Actuator]
     collision_spheres: SphereCover
     self_collision: SelfCollision
+    tip_place: Int[Tensor, "3"]
     kinematics: Kinematics = dataclasses.field(repr=False)
+    fingers: Kinematics = dataclasses.field(repr=False)
 
     @property
     def dof(self) -> int:
@@ -98,8 +101,7 @@ class Hand(Value):
 
     def frames(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "3 4 l n"]:
         """Return `link_poses` without their last row, all postures in one last axis: the fast layout."""
-        values = self.expand_joints(joints)
-        return self.kinematics.frames(values.reshape(-1, values.shape[-1]).T.contiguous())
+        return self.kinematics.frames(self._columns(joints))
 
     def link_poses(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b l 4 4"]:
         """Return `hand_from_link` of every link, in the order of `link_names`."""
@@ -115,21 +117,20 @@ class Hand(Value):
         >>> points.shape, normals.shape
         (torch.Size([5, 3, 3]), torch.Size([5, 3, 3]))
         """
-        tips = self.frames(joints).index_select(2, self.tip_index)
+        tips = self._tips(self._columns(joints))[1]
         return _rows(placed(tips, self.contact), joints), _rows(turned(tips, self.normal), joints)
 
     def tip_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b 3 3"]:
         """Return the centres [m] of the tips' spheres of `tip_radius`; the contact points where the radius is 0."""
-        return _rows(placed(self.frames(joints).index_select(2, self.tip_index), self.center), joints)
+        return _rows(placed(self._tips(self._columns(joints))[1], self.center), joints)
 
     def jacobian(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b 3 3 h"]:
         """Return the derivative of the contact points by the actuated joints, coupling included [m/rad].
 
         The axes are: finger, coordinate, joint.
         """
-        frames = self.frames(joints)
-        points = placed(frames.index_select(2, self.tip_index), self.contact)
-        return _rows(self._derivative(frames, self.tip_index, points), joints)
+        frames, tips = self._tips(self._columns(joints))
+        return _rows(self._derivative(self.fingers, frames, self.tip_index, placed(tips, self.contact)), joints)
 
     def point_jacobian(
         self, poses: Float[Tensor, "*b l 4 4"], link_index: Int[Tensor, " p"], points: Float[Tensor, "*b p 3"]
@@ -142,22 +143,35 @@ class Hand(Value):
             points: where the points are now, in the palm's frame [m].
         """
         columns = points.reshape(-1, *points.shape[-2:]).permute(2, 1, 0)
-        return _rows(self._derivative(_frames(poses), link_index, columns), points[..., 0, :])
+        found = self._derivative(self.kinematics, _frames(poses), link_index, columns)
+        return _rows(found, points[..., 0, :])
+
+    def _columns(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "j n"]:
+        """Return every movable joint of the URDF, all postures in the last axis."""
+        values = self.expand_joints(joints)
+        return values.reshape(-1, values.shape[-1]).T.contiguous()
+
+    def _tips(self, values: Float[Tensor, "j n"]) -> tuple[Float[Tensor, "3 4 l n"], Float[Tensor, "3 4 3 n"]]:
+        """Return the frames of the links that lead to the tips, and those of the tips themselves."""
+        frames = self.fingers.frames(values)
+        return frames, frames.index_select(2, self.tip_place)
 
     def _derivative(
-        self, frames: Float[Tensor, "3 4 l n"], link_index: Int[Tensor, " p"], points: Float[Tensor, "3 p n"]
+        self,
+        tree: Kinematics,
+        frames: Float[Tensor, "3 4 l n"],
+        link_index: Int[Tensor, " p"],
+        points: Float[Tensor, "3 p n"],
     ) -> Float[Tensor, "h 3 p n"]:
         """Return the derivative of points: of each by the joints between its link and the palm alone."""
-        coupling = self.coupling.to(points)
         acts = self.moves[link_index][:, :, None] * self.coupling  # on a point, through a joint, by an actuated joint
         point, joint, actuated = torch.nonzero(acts, as_tuple=True)
-        ratio = coupling[joint, actuated][:, None]
-        chains = frames.index_select(2, self.child)
-        axes = turned(chains, self.axis).index_select(1, joint) * ratio
-        arm = points.index_select(1, point) - chains[:, 3].index_select(1, joint)
+        link, ratio = tree.child[joint], self.coupling.to(points)[joint, actuated][:, None]
+        axes = turned(frames, tree.axis).index_select(1, link) * ratio
+        arm = points.index_select(1, point) - frames[:, 3].index_select(1, link)
         (ax, ay, az), (x, y, z) = axes, arm
         column = torch.stack([ay * z - az * y, az * x - ax * z, ax * y - ay * x])
-        if self.kinematics.slides:
+        if tree.slides:
             column = torch.where(self.prismatic[joint][:, None] > 0, axes, column)
         size = (3, points.shape[1] * self.dof, points.shape[2])
         summed = points.new_zeros(size).index_add(1, point * self.dof + actuated, column)

@@ -8,6 +8,7 @@ posture and link. That is kept as the reference by which `torchgrasp.testing.che
 """
 
 import dataclasses
+from collections.abc import Collection
 from typing import Any
 
 import torch
@@ -21,44 +22,53 @@ from torchgrasp.hand.urdf import Joint, Urdf
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Kinematics(Value):
-    """The tree of a URDF: names of links and movable joints in the order of the file, and tables for each link.
+    """The tree of a URDF, or that part of it which leads to some links: names in the order of the file, and tables.
 
-    The tables `constant`, `sine`, `cosine` and `slide` hold the link's frame in its parent's by the value of `joint`,
-    an index into `joint_names` (0 for fixed links, whose tables but the first are zero); `slides` tells whether any
-    `slide` is not. Links stand there by depth: `depths` counts those of each depth, `parent` is the place of a link's
-    parent within the depth before, and `place` where each of `link_names` stands.
+    The tables `constant`, `sine`, `cosine` and `slide` hold each link's frame in its parent's by the value of `joint`,
+    an index into `used`, the movable joints of the tree (0 for fixed links, whose tables but the first are zero).
+    Links stand in the tables by depth: `depths` counts those of each depth, `parent` is the place of a link's parent
+    within the depth before, `straight` tells of which depths the parents are all of that, in order, and `places` are
+    depth and place of each of `link_names`. `child` is the link that each of `joint_names` moves, 0 if none of the
+    tree, and `axis` the joint's axis in the frame of each link; `slides` tells whether any joint is prismatic.
     """
 
     xml: bytes
     link_names: tuple[str, ...]
     joint_names: tuple[str, ...]
     depths: tuple[int, ...]
+    straight: tuple[bool, ...]
+    places: tuple[tuple[int, int], ...]
     slides: bool
     constant: Float[Tensor, "3 4 l 1"]
     sine: Float[Tensor, "3 4 l 1"]
     cosine: Float[Tensor, "3 4 l 1"]
     slide: Float[Tensor, "3 4 l 1"]
     joint: Int[Tensor, " l"]
+    used: Int[Tensor, " u"]
     parent: Int[Tensor, " l"]
-    place: Int[Tensor, " l"]
+    child: Int[Tensor, " j"]
+    axis: Float[Tensor, "l 3"]
 
     def frames(self, values: Float[Tensor, "j n"]) -> Float[Tensor, "3 4 l n"]:
-        """Return `root_from_link` of every link without its last row; see `poses`."""
-        by_sine, by_cosine = (x[self.joint] for x in (values.sin(), values.cos()))
+        """Return `root_from_link` of every link without its last row, for the values of all `joint_names`."""
+        values = values.index_select(0, self.used)
+        by_sine, by_cosine = (x.index_select(0, self.joint) for x in (values.sin(), values.cos()))
         local = torch.addcmul(self.constant.to(values), self.sine.to(values), by_sine)
         local = torch.addcmul(local, self.cosine.to(values), by_cosine)
         if self.slides:
-            local = torch.addcmul(local, self.slide.to(values), values[self.joint])
-        levels = local.split(self.depths, 2)
+            local = torch.addcmul(local, self.slide.to(values), values.index_select(0, self.joint))
+        levels, parents = local.split(self.depths, 2), self.parent.split(self.depths)
         found = list(levels[:2])  # the root is the identity
-        for level, parent in zip(levels[2:], self.parent.split(self.depths)[2:], strict=True):
-            above = found[-1].index_select(2, parent)
+        for k in range(2, len(levels)):
+            above, level = found[-1], levels[k]
+            if not self.straight[k]:
+                above = above.index_select(2, parents[k])
             frame = above[:, 0, None] * level[0]
             frame = torch.addcmul(frame, above[:, 1, None], level[1])
             frame = torch.addcmul(frame, above[:, 2, None], level[2])
-            origin = frame[:, 3:] + above[:, 3:]
-            found.append(torch.cat([frame[:, :3], origin], 1))
-        return torch.cat(found, 2).index_select(2, self.place)
+            frame[:, 3] += above[:, 3]
+            found.append(frame)
+        return torch.stack([found[depth][:, :, place] for depth, place in self.places], 2)
 
     def poses(self, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
         """Return `root_from_link` of every link for the values of every movable joint [rad or m]."""
@@ -87,31 +97,40 @@ def turned(frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]) -> Flo
     return torch.addcmul(torch.addcmul(frames[:, 0] * x, frames[:, 1], y), frames[:, 2], z)
 
 
-def kinematics_from_urdf(urdf: Urdf) -> Kinematics:
-    """Tabulate the tree of a URDF."""
+def kinematics_from_urdf(urdf: Urdf, ends: Collection[str] | None = None) -> Kinematics:
+    """Tabulate the tree of a URDF; with `ends`, the part of it that leads to those links."""
     above = {j.child: j for j in urdf.joints}
-    movable = [j.name for j in urdf.joints if j.kind != "fixed"]
+    kept = {x.name for x in urdf.links} if ends is None else {urdf.root, *ends}
+    kept |= {j.parent for end in ends or () for j in urdf.joints_above(end)}
     rows = [[urdf.root]]
-    while below := [x.name for x in urdf.links if x.name in above and above[x.name].parent in rows[-1]]:
+    while below := [x.name for x in urdf.links if x.name in kept & set(above) and above[x.name].parent in rows[-1]]:
         rows.append(below)
     names = [name for row in rows for name in row]
+    links = [x.name for x in urdf.links if x.name in kept]
+    movable = [j for j in urdf.joints if j.kind != "fixed"]
+    used = [k for k, j in enumerate(movable) if j.child in kept]
+    moved = {movable[k].child: place for place, k in enumerate(used)}
     tables = [_tables(above.get(name)) for name in names]
-    moved = [movable.index(above[n].name) if n in above and above[n].kind != "fixed" else 0 for n in names]
-    parents = [rows[k - 1].index(above[n].parent) if k else 0 for k, row in enumerate(rows) for n in row]
     constant, sine, cosine, slide = (torch.stack(table, -1)[..., None] for table in zip(*tables, strict=True))
+    parents = [[rows[k - 1].index(above[name].parent) if k else 0 for name in row] for k, row in enumerate(rows)]
+    axes = [above[name].axis if name in moved else (0.0, 0.0, 0.0) for name in links]
     return Kinematics(
         xml=urdf.kinematic_xml(),
-        link_names=tuple(x.name for x in urdf.links),
-        joint_names=tuple(movable),
+        link_names=tuple(links),
+        joint_names=tuple(j.name for j in movable),
         depths=tuple(len(row) for row in rows),
-        slides=any(j.kind == "prismatic" for j in urdf.joints),
+        straight=tuple(row == list(range(len(rows[max(k - 1, 0)]))) for k, row in enumerate(parents)),
+        places=tuple(next((k, row.index(name)) for k, row in enumerate(rows) if name in row) for name in links),
+        slides=any(movable[k].kind == "prismatic" for k in used),
         constant=constant,
         sine=sine,
         cosine=cosine,
         slide=slide,
-        joint=torch.tensor(moved),
-        parent=torch.tensor(parents),
-        place=torch.tensor([names.index(x.name) for x in urdf.links]),
+        joint=torch.tensor([moved.get(name, 0) for name in names]),
+        used=torch.tensor(used, dtype=torch.long),
+        parent=torch.tensor([place for row in parents for place in row]),
+        child=torch.tensor([links.index(j.child) if j.child in kept else 0 for j in movable], dtype=torch.long),
+        axis=torch.tensor(axes, dtype=torch.float64),
     )
 
 

@@ -79,6 +79,7 @@ def hand_from_files(spec: HandSpec, urdf: Urdf) -> Hand:
             found = f"{spec.path}: limit_margin {spec.limit_margin:g} leaves joint {name} [{low:g}, {high:g}]"
             raise HandFileError("hand.toml", found, "lower < upper")
     kinematics = kinematics_from_urdf(urdf)
+    leading = kinematics_from_urdf(urdf, [f.tip_link for f in spec.fingers])
     fingers = spec.fingers
     return Hand(
         name=spec.name,
@@ -102,12 +103,14 @@ def hand_from_files(spec: HandSpec, urdf: Urdf) -> Hand:
         tip_radius=torch.tensor([f.radius for f in fingers], dtype=torch.float64),
         axis=torch.tensor([j.axis for j in movable.values()], dtype=torch.float64),
         prismatic=torch.tensor([float(j.kind == "prismatic") for j in movable.values()], dtype=torch.float64),
-        child=torch.tensor([links[j.child] for j in movable.values()]),
+        child=kinematics.child,
         moves=torch.tensor(ancestor_mask(urdf), dtype=torch.float64),
         actuators={n: Actuator(j.effort, j.velocity, spec.kp, spec.kd) for n, j in movable.items()},
         collision_spheres=cover_from_urdf(urdf, spec),
         self_collision=self_collision_from_urdf(urdf, spec.pairs),
+        tip_place=torch.tensor([leading.link_names.index(f.tip_link) for f in spec.fingers]),
         kinematics=kinematics,
+        fingers=leading,
     )
 
 
