@@ -1,4 +1,8 @@
-"""Learn the model of a hand: sample free postures, fit the mixture, judge it on held-out postures, write it."""
+"""From a hand's URDF to its learned model: hand.toml if there is none, checks, postures, fit, errors, file.
+
+python scripts/make_hand.py hands/allegro                  a hand with its hand.toml
+python scripts/make_hand.py mine/hand.urdf --tips a b c    a URDF alone: a hand.toml is written beside it first
+"""
 
 import dataclasses
 import sys
@@ -11,12 +15,14 @@ import tyro
 from tqdm import tqdm
 
 from torchgrasp.errors import BadArgument, GraspError
+from torchgrasp.files import write_atomically
+from torchgrasp.hand.author import draft_hand
 from torchgrasp.hand.em import Progress
 from torchgrasp.hand.fit import fit_mixture
 from torchgrasp.hand.judge import judge_mixture
-from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.mixture import mixture_path
 from torchgrasp.hand.sample import sample_configurations
+from torchgrasp.testing import check_hand
 
 PAPER_COMPONENTS = {"allegro": 41, "barrett": 36}
 """The paper's numbers of Gaussians (Sec. 6.3); 40 for any other hand."""
@@ -24,6 +30,7 @@ PAPER_COMPONENTS = {"allegro": 41, "barrett": 36}
 
 def main(
     hand: Annotated[str, tyro.conf.Positional],
+    tips: tuple[str, ...] = (),
     n: int = 400_000,
     components: int | None = None,
     seed: int = 0,
@@ -34,10 +41,11 @@ def main(
     checkpoint: Path | None = None,
     out: Path | None = None,
 ) -> None:
-    """Sample, fit, judge and write.
+    """Check, sample, fit, judge and write.
 
     Args:
-        hand: name of a shipped hand, or the folder of another.
+        hand: name of a shipped hand, the folder of another, or a URDF.
+        tips: links of the fingertips as for `torchgrasp hand new`, where the URDF has no hand.toml beside it.
         n: free postures to learn from; the paper's number.
         components: Gaussians; default: the paper's number for its hands, 40 for others.
         seed: of postures and start.
@@ -50,9 +58,15 @@ def main(
     """
     if held_out < 2:
         raise BadArgument("held_out", held_out, "at least 2 postures")
-    robot = load_hand(hand)
+    hand = folder_of(hand, tips)
+    robot = check_hand(hand)
     begin = time.perf_counter()
-    samples = sample_configurations(robot, n + held_out, seed=seed, workers=workers)
+    with tqdm(desc="postures", total=n + held_out, unit_scale=True, disable=None) as bar:
+
+        def count(more: int) -> None:
+            bar.update(more)
+
+        samples = sample_configurations(robot, n + held_out, seed, workers, observer=count)
     print(f"{robot.name}: {len(samples)} free postures in {time.perf_counter() - begin:.0f} s")
     begin = time.perf_counter()
     m = PAPER_COMPONENTS.get(robot.name, 40) if components is None else components
@@ -76,6 +90,18 @@ def main(
     print(judged)
     mixture = dataclasses.replace(mixture, meta=meta | judged.meta())
     print(f"written: {mixture.save(out or mixture_path(hand))}")
+
+
+def folder_of(hand: str, tips: tuple[str, ...]) -> str:
+    """Return the folder of a URDF after writing a hand.toml there if there is none; any other name as it is."""
+    if Path(hand).suffix != ".urdf":
+        return hand
+    target = Path(hand).parent / "hand.toml"
+    if not target.exists():
+        text = draft_hand(hand, tips)
+        write_atomically(target, lambda path: path.write_text(text) and None)
+        print(f"written: {target}; look over the lines marked CHECK")
+    return str(target.parent)
 
 
 if __name__ == "__main__":

@@ -60,6 +60,10 @@ def test_a_tip_that_is_not_round_gets_a_pad_on_its_side(claw, tip):
         hand.contact[0], torch.tensor([depth, 0, 0.015 - (0.009 if "box" in tip else 0.008)]).double()
     )
     assert hand.normal[0].tolist() == [1, 0, 0] and hand.tip_radius[0] == 0
+    # what tells whether a tip is in the object reaches its contact and no farther
+    cover, first = hand.collision_spheres, hand.collision_spheres.link_index == hand.tip_index[0]
+    reach = (cover.center[first] @ hand.normal[0] + cover.radius[first]).max()
+    assert depth - 0.002 < float(reach) <= depth + 1e-9
 
 
 def test_what_cannot_be_guessed_is_asked_for(claw, tmp_path):
@@ -91,7 +95,9 @@ def test_a_third_hand_goes_the_whole_way(claw, mode):
     """From the URDF to grasps of a ball or a box, each checked again by what it says of itself."""
     folder = drafted(claw)
     hand = check_hand(folder)
-    samples = sample_configurations(hand, 4000, seed=3)
+    done: list[int] = []
+    samples = sample_configurations(hand, 4000, seed=3, observer=done.append)
+    assert sum(done) == 4000
     mixture = fit_mixture(samples, components=8, iterations=30)
     mixture.save(folder / "mixture.safetensors")
     assert float((mixture.joints(samples.q) - samples.joints).abs().mean()) < 0.35

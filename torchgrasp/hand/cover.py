@@ -25,7 +25,7 @@ PALM_PITCH = 0.022
 THICK = 0.025
 """A shape thinner than this [m] has one layer of cells across."""
 BULGE = 0.004
-"""How far a sphere may stand out of a shape's faces [m]."""
+"""How far a sphere may stand out of a shape's faces [m]; those of fingertips do not."""
 SHORT = 0.001
 """How far a sphere may stay short of its cell's corners [m]."""
 
@@ -54,9 +54,10 @@ def cover_from_urdf(urdf: Urdf, spec: HandSpec) -> SphereCover:
         movers = [j.name for j in urdf.joints_above(link.name) if j.kind != "fixed"]
         finger = owner.get(movers[0], -2) if movers else -1  # the nearest joint tells whose link it is
         for shape in link.shapes:
-            pitch = PALM_PITCH if finger == -1 else PITCH
-            for center, radius in _spheres(shape, pitch):
-                rows.append((index, center, radius, finger, link.name in tips))
+            pitch, touching = PALM_PITCH if finger == -1 else PITCH, link.name in tips
+            # where a tip touches is known exactly: its spheres must not touch before
+            for center, radius in _spheres(shape, pitch, 0.0 if touching else BULGE):
+                rows.append((index, center, radius, finger, touching))
     return SphereCover(
         torch.tensor([r[0] for r in rows], dtype=torch.long),
         torch.tensor([r[1] for r in rows], dtype=torch.float64).reshape(-1, 3),
@@ -66,7 +67,7 @@ def cover_from_urdf(urdf: Urdf, spec: HandSpec) -> SphereCover:
     )
 
 
-def _spheres(shape: Shape, pitch: float) -> list[tuple[tuple[float, ...], float]]:
+def _spheres(shape: Shape, pitch: float, bulge: float) -> list[tuple[tuple[float, ...], float]]:
     """Cover one shape: a sphere by itself, a box and a cylinder (by its bounding box, corners spared) by cells."""
     if shape.kind == "sphere":
         return [(shape.xyz, shape.size[0])]
@@ -75,17 +76,17 @@ def _spheres(shape: Shape, pitch: float) -> list[tuple[tuple[float, ...], float]
     counts = [1 if x == min(size) and x < THICK else max(1, round(x / pitch)) for x in size]
     half = [x / n / 2 for x, n in zip(size, counts, strict=True)]
     thinnest = min((x / 2 for x, n in zip(size, counts, strict=True) if n == 1), default=math.inf)
-    radius = min(math.hypot(*half) - SHORT, thinnest + BULGE)
+    radius = min(math.hypot(*half) - SHORT, thinnest + bulge)
     local = []
     for cell in itertools.product(*(range(n) for n in counts)):
         if all(0 < c < n - 1 for c, n in zip(cell, counts, strict=True)):
             continue  # an inner cell: the outer ones meet the object first
         center = [(2 * c + 1 - n) * h for c, n, h in zip(cell, counts, half, strict=True)]
         # spheres are pulled in until they stand out of a face by no more than the bulge
-        reach = [max(0.0, s / 2 + BULGE - radius) for s in size]
+        reach = [max(0.0, s / 2 + bulge - radius) for s in size]
         center = [math.copysign(min(abs(c), r), c) for c, r in zip(center, reach, strict=True)]
         if round_shape:
-            rim, out = max(0.0, shape.size[0] + BULGE - radius), math.hypot(center[0], center[1])
+            rim, out = max(0.0, shape.size[0] + bulge - radius), math.hypot(center[0], center[1])
             if out > rim:
                 center[:2] = [center[0] * rim / out, center[1] * rim / out]
         local.append(center)

@@ -1,7 +1,7 @@
 """Random postures of a hand that touch nothing of itself: what its model is learned from (Sec. 4.1)."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Literal, get_args
 
@@ -42,7 +42,12 @@ class HandSamples(Batch):
 
 
 def sample_configurations(
-    hand: Hand, n: int, seed: int = 0, workers: int = 1, sampling: Sampling = "uniform"
+    hand: Hand,
+    n: int,
+    seed: int = 0,
+    workers: int = 1,
+    sampling: Sampling = "uniform",
+    observer: Callable[[int], None] = lambda count: None,
 ) -> HandSamples:
     """Draw postures uniformly within the joint limits and keep those free of self-collision (Sec. 6.3).
 
@@ -54,6 +59,7 @@ def sample_configurations(
         workers: threads that draw at the same time.
         sampling: "uniform" as in the paper, or "opposed": of these only postures in which two pads face each other,
             as those that hold something do.
+        observer: called after every chunk with the number of its postures, to show how far the draw is.
 
     Raises:
         BadArgument: n, seed, workers or sampling outside their range, or a hand of which hardly any posture is kept.
@@ -64,8 +70,11 @@ def sample_configurations(
     """
     meta = check_sampling(hand, n, seed, workers, sampling)
     counts = chunk_counts(n)
+    parts = []
     with ThreadPoolExecutor(workers) as pool:
-        parts = list(pool.map(lambda i: draw_chunk(hand, seed, i, counts[i], sampling), range(len(counts))))
+        for part in pool.map(lambda i: draw_chunk(hand, seed, i, counts[i], sampling), range(len(counts))):
+            parts.append(part)
+            observer(len(part[0]))
     joints, q, _ = zip(*parts, strict=True)
     return HandSamples(torch.cat(joints), torch.cat(q), hand.joint_names, meta)
 
