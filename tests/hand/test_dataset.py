@@ -52,21 +52,22 @@ def test_a_folder_holds_what_sample_configurations_returns_for_any_number_of_wor
         found.read(1701)
 
 
-def test_a_killed_run_is_continued_to_the_same_bytes(tmp_path):
-    hand, n, folder = load_hand("barrett"), 70_000, tmp_path / "killed"
+def test_a_run_that_was_interrupted_and_killed_is_continued_to_the_same_bytes(tmp_path):
+    hand, n, folder = load_hand("barrett"), 120_000, tmp_path / "killed"
     arguments = ["hand", "sample", "--hand", "barrett", "--n", str(n), "--out", str(folder), "--workers", "2"]
     code = f"import sys; from torchgrasp.cli import main; sys.exit(main({arguments!r}))"
-    run = subprocess.Popen([sys.executable, "-c", code])
-    while run.poll() is None and not list(folder.glob("chunk-*")):
-        time.sleep(0.01)
-    os.kill(run.pid, signal.SIGKILL)
-    assert run.wait() == -signal.SIGKILL
-    assert 0 < len(list(folder.glob("chunk-*"))) < 7
+    for sign, expected in ((signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)):
+        before = {path: path.stat().st_mtime_ns for path in folder.glob("chunk-*")}
+        run = subprocess.Popen([sys.executable, "-c", code])
+        while run.poll() is None and len(list(folder.glob("chunk-*"))) == len(before):
+            time.sleep(0.01)
+        os.kill(run.pid, sign)
+        assert run.wait() == expected
+        assert len(before) < len(list(folder.glob("chunk-*"))) < 12
+        assert all(path.stat().st_mtime_ns == then for path, then in before.items())  # whole chunks were kept
     with pytest.raises(ModelFileError, match="without"):
         load_samples(folder)
-    before = {path: path.stat().st_mtime_ns for path in folder.glob("chunk-*")}
     write_samples(hand, n, folder)
-    assert all(path.stat().st_mtime_ns == then for path, then in before.items())  # whole chunks were kept
     write_samples(hand, n, tmp_path / "whole", workers=3)
     assert contents(folder) == contents(tmp_path / "whole")
 
