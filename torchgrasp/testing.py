@@ -25,7 +25,7 @@ def check_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
     """Check a hand's files and return the hand: the public law for hands.
 
     The tree, the coupling, the limits and drives, masses and inertias, the pads, the parked posture, self-collision,
-    and the forward kinematics against yourdfpy, which applies `<mimic>` by itself.
+    and the forward kinematics against pytorch-kinematics and yourdfpy, which applies `<mimic>` by itself.
 
     Args:
         name_or_path: a shipped hand, or the folder of another one.
@@ -34,7 +34,7 @@ def check_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
     Raises:
         HandFileError: a file breaks a rule; the message names the file, what was found and what is allowed.
         BadArgument: the hand has no such option.
-        AssertionError: the library places a link elsewhere than yourdfpy does.
+        AssertionError: the library places a link elsewhere than they do.
 
     >>> check_hand("barrett").name
     'barrett'
@@ -48,7 +48,7 @@ def check_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
         raise HandFileError("hand.toml", found, "pairs of self_collision that can part")
     worst, where = largest_fk_error(hand, joints)
     if not worst < FK_TOLERANCE:
-        raise AssertionError(f"{hand.name}: link {where} differs by {worst:.3g} from yourdfpy's pose")
+        raise AssertionError(f"{hand.name}: link {where} differs by {worst:.3g} from others' pose")
     return hand
 
 
@@ -132,7 +132,9 @@ def _inside(point: np.ndarray, shape: Shape) -> bool:
 
 
 def largest_fk_error(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[float, str]:
-    """Return the largest difference of a link's pose [m, and entries of rotations] from yourdfpy's, and the link.
+    """Return the largest difference of a link's pose [m, and entries of rotations] from others', and the link.
+
+    They are yourdfpy, and the chain of pytorch-kinematics that `Kinematics` is a fused evaluation of.
 
     Args:
         hand: the hand.
@@ -142,12 +144,14 @@ def largest_fk_error(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[float, s
 
     robot = yourdfpy.URDF.load(str(hand.urdf_path), load_meshes=False, load_collision_meshes=False)
     poses = hand.link_poses(joints).double().numpy()
+    chain = hand.kinematics.reference_poses(hand.expand_joints(joints)).double().numpy()
     worst, where = 0.0, ""
     for row in range(len(joints)):
         values = {n: float(v) for n, v in hand.expand(joints[row]).items()}
         robot.update_cfg([values[n] for n in robot.actuated_joint_names])
         for index, link in enumerate(hand.link_names):
-            error = float(np.abs(robot.get_transform(link) - poses[row, index]).max())
+            both = np.stack([robot.get_transform(link), chain[row, index]])
+            error = float(np.abs(both - poses[row, index]).max())
             if error > worst:
                 worst, where = error, link
     return worst, where
