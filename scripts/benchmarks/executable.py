@@ -7,24 +7,33 @@ processor's time of planning, certificates, guesses and solving; the shape and i
 """
 
 import time
+from pathlib import Path
 from typing import Any
 
+import torch
 from tqdm import tqdm
 
 from benchmarks.common import Row
-from torchgrasp import ContactSpec, Status, certify, fit_shape, load_hand, load_mixture, plan_contacts
-from torchgrasp.base import count_status
-from torchgrasp.hand.clear import Surroundings
+from torchgrasp import ContactSpec, Grasps, Hand, Status, certify, fit_shape, load_hand, load_mixture, plan_contacts
+from torchgrasp.frames import apply
+from torchgrasp.hand.check import TIP_PENETRATION
+from torchgrasp.hand.clear import CLEARANCE, SELF_CLEARANCE, Surroundings
 from torchgrasp.hand.collide import field_from_surface
+from torchgrasp.hand.motion import Posture
 from torchgrasp.hand.nearest import PostureSet, nearest_postures
 from torchgrasp.hand.query import query_hand
 from torchgrasp.hand.realise import realise
 from torchgrasp.hand.together import realise_together
+from torchgrasp.shape.calibrate import read_views
 from torchgrasp.shape.surface import extract_surface
 
 SPEC = ContactSpec(table=0.0)
 BARS = {("allegro", "contact_first"): 0.60, ("allegro", "together"): 0.85}
 """Least mean share of certified starts that become executable."""
+BLOCKERS = ("palm", "finger links", "self", "table", "tips", "reach", "pad", "opening", "contacts")
+"""What keeps a certified triple from a grasp. A solver that cannot have all leaves each a little: what its best failure
+lacks most of, of the clearances that it was asked for, blocks it. Where no clearance is lacking, the fingertips do not
+reach ("reach", "pad"), the hand cannot open, or contacts that slid have lost their certificate."""
 COST = 20.0
 """Most milliseconds of an executable grasp of the Allegro hand, mean over objects, solved together."""
 
@@ -59,9 +68,49 @@ def bench_executable(views: list[Any], starts: int, seed: int) -> list[Row]:
                     "executable": good,
                     "share": good / max(len(contacts), 1),
                     "ms": 1e3 * (planned + time.process_time() - began) / max(good, 1),
-                    "statuses": {status.name: count for status, count in count_status(grasps.status).items()},
+                    "blocked": count_blockers(grasps, hand, surroundings),
                 }
     return [_row(*key, objects, starts) for key, objects in found.items()]
+
+
+def count_blockers(grasps: Grasps, hand: Hand, surroundings: Surroundings) -> dict[str, float]:
+    """Return the share of triples that each of `BLOCKERS` kept from a grasp, by the best failure of each triple."""
+    posture = Posture(grasps.joints, grasps.obj_from_hand)
+    cover, centres = hand.collision_spheres, apply(posture.obj_from_hand, hand.spheres(posture.joints))
+    assert surroundings.field is not None and surroundings.table is not None
+    free = surroundings.field.query(centres)[0] - cover.radius
+    height = (centres[..., 2] - cover.radius - surroundings.table).amin(1)
+    parts = (cover.finger == -1, (cover.finger != -1) & ~cover.touching, cover.touching)
+    palm, links, tips = (torch.where(part, free, torch.inf).amin(1) for part in parts)
+    lack = torch.stack(
+        [
+            CLEARANCE - palm,
+            CLEARANCE - links,
+            SELF_CLEARANCE - hand.self_clearance(posture.joints),
+            -height,
+            -TIP_PENETRATION - tips,
+        ],
+        1,
+    )
+    status = grasps.status
+    blocker = torch.where(lack.amax(1) > 0, lack.argmax(1), torch.where(status == Status.NORMAL_ANGLE, 6, 5))
+    blocker = torch.where(status == Status.PREGRASP, 7, torch.where(status < Status.OUT_OF_REACH, 8, blocker))
+    counts = torch.bincount(blocker[status != Status.OK], minlength=len(BLOCKERS))
+    return dict(zip(BLOCKERS, (counts / max(len(grasps), 1)).tolist(), strict=True))
+
+
+def format_blockers(hand: str, mode: str, objects: dict[str, dict[str, Any]]) -> str:
+    """Return a table of what became of each object's certified triples, and what blocked the others, in percent."""
+    head = f"{f'{hand}, {mode}':26}{'certified':>10}{'grasps':>8}" + "".join(f"{name:>13}" for name in BLOCKERS)
+    mean = {key: sum(o["blocked"][key] for o in objects.values()) / len(objects) for key in BLOCKERS}
+    share = sum(o["share"] for o in objects.values()) / len(objects)
+    certified = sum(o["certified"] for o in objects.values()) / len(objects)
+    rows = [(name, o["certified"], o["share"], o["blocked"]) for name, o in objects.items()]
+    lines = [
+        f"  {name:24}{count:10.0f}{part:8.0%}" + "".join(f"{blocked[key]:13.1%}" for key in BLOCKERS)
+        for name, count, part, blocked in [*rows, ("mean", certified, share, mean)]
+    ]
+    return "\n".join([head, *lines])
 
 
 def _row(hand: str, mode: str, objects: dict[str, dict[str, Any]], starts: int) -> Row:
@@ -78,5 +127,13 @@ def _row(hand: str, mode: str, objects: dict[str, dict[str, Any]], starts: int) 
         " and ".join(wanted) or "none",
         f"{share:.3f}, {cost:.1f} ms a grasp; {counts}; {each}",
         None if bar is None else share >= bar and (mode != "together" or cost <= COST),
-        {"objects": objects},
+        {"hand": hand, "mode": mode, "objects": objects},
     )
+
+
+def bench_planned(objects: Path, starts: int, seed: int) -> list[Row]:
+    """Print what became of certified triples by object, hand and mode, and return the rows of the means."""
+    rows = bench_executable(list(read_views(objects)), starts, seed)
+    for row in rows:
+        print(format_blockers(row.numbers["hand"], row.numbers["mode"], row.numbers["objects"]), flush=True)
+    return rows

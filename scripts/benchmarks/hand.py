@@ -7,19 +7,22 @@ import torch
 
 from benchmarks.common import Row, write_rows
 from benchmarks.components import bench_bic
+from benchmarks.executable import bench_planned
 from benchmarks.kinematics import bench_collision, bench_fk, bench_samples
 from benchmarks.mixture import bench_em, bench_mae, bench_queries
 from benchmarks.query import bench_codes
 
-SUBJECTS = ("fk", "collision", "samples", "codes", "em", "mae", "queries", "bic")
+SUBJECTS = ("fk", "collision", "samples", "codes", "em", "mae", "queries", "bic", "planned")
 
 
 def hand(
+    objects: Path | None = None,
     only: tuple[str, ...] = SUBJECTS,
     codes: int = 10_000,
     samples: int = 1_000_000,
     queries: int = 100_000,
     peers: int = 100,
+    starts: int = 1000,
     threads: int = 1,
     seed: int = 0,
     quick: bool = False,
@@ -28,11 +31,13 @@ def hand(
     """Measure the hands against their bars and against peers, in one run and on the same threads.
 
     Args:
-        only: subjects to measure: fk, collision, samples, codes, em, mae, queries, bic.
+        objects: folder with manifest.json and a folder for each object; without it planned contacts are left out.
+        only: subjects to measure: fk, collision, samples, codes, em, mae, queries, bic, planned.
         codes: held-out codes of each hand.
         samples: free postures of each hand, of which the first four tenths are learned from.
         queries: contact triples asked for in all six assignments.
         peers: how many of them COBYLA gets.
+        starts: of the contact planner on each object.
         threads: of torch, for the library and its peers alike.
         seed: of every draw.
         quick: a tenth of everything.
@@ -43,7 +48,7 @@ def hand(
         raise SystemExit(f"only: {unknown} are no subjects; {', '.join(SUBJECTS)} are")
     torch.set_num_threads(threads)
     if quick:
-        codes, peers, samples, queries = codes // 10, peers // 10, samples // 10, queries // 10
+        codes, peers, samples, queries, starts = (x // 10 for x in (codes, peers, samples, queries, starts))
     subjects: dict[str, Callable[[], list[Row]]] = {
         "fk": lambda: bench_fk(samples, threads),
         "collision": lambda: bench_collision(samples // 5, threads),
@@ -53,8 +58,16 @@ def hand(
         "mae": lambda: bench_mae(samples),
         "queries": lambda: bench_queries(queries),
         "bic": lambda: bench_bic(samples // 5, 2 if quick else 10, out.with_name("bench_hand_components.png")),
+        "planned": lambda: bench_planned(objects, starts, seed) if objects else [],
     }
-    settings = {"threads": threads, "codes": codes, "peers": peers, "samples": samples, "queries": queries}
+    settings = {
+        "threads": threads,
+        "codes": codes,
+        "peers": peers,
+        "samples": samples,
+        "queries": queries,
+        "starts": starts,
+    }
     settings |= {"seed": seed, "torch": torch.__version__}
     print(", ".join(f"{name} {value}" for name, value in settings.items()))
     rows: list[Row] = []
