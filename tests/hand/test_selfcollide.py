@@ -50,6 +50,9 @@ def test_clearance_is_the_least_of_all_pairs(hand, generator):
     every = hand.self_collision.separations(hand.frames(joints), torch.inf)
     torch.testing.assert_close(hand.self_clearance(joints), every.amin(0), atol=1e-14, rtol=0)
     torch.testing.assert_close(hand.self_clearance(joints, chunk=7), every.amin(0), atol=1e-14, rtol=0)
+    for below in (0.0, 0.004):
+        found = hand.self_clearance(joints, below=below)
+        torch.testing.assert_close(found.clamp_max(below), every.amin(0).clamp_max(below), atol=1e-14, rtol=0)
     near = hand.self_collision.separations(hand.frames(joints), 0.002)
     torch.testing.assert_close(near.clamp_max(0.002), every.clamp_max(0.002), atol=1e-14, rtol=0)
 

@@ -1,6 +1,7 @@
 """The hand as a value: joints, fingers, pads, coupling; where its links and fingertips are and how they move."""
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -182,17 +183,24 @@ class Hand(Value):
         cover = self.collision_spheres
         return _rows(placed(self.frames(joints).index_select(2, cover.link_index), cover.center), joints)
 
-    def self_clearance(self, joints: Float[Tensor, "*b h"], chunk: int = 1000) -> Float[Tensor, "*b"]:
+    def self_clearance(
+        self, joints: Float[Tensor, "*b h"], below: float = math.inf, chunk: int = 1000
+    ) -> Float[Tensor, "*b"]:
         """Return the signed least separation [m] between links that can meet; negative: they overlap.
 
         The links are the collision shapes of the URDF, parked fingers and the palm included, and the pairs those of
         hand.toml. Where links overlap it is how far two must move to part, and where they face one another it is their
-        distance; corner to corner it is less. Rows are taken in chunks, which bounds the memory and keeps the work in
-        the cache.
+        distance; corner to corner it is less.
+
+        Args:
+            joints: postures [rad].
+            below: only values below this [m] are wanted, others may be any larger number: 0 for a verdict alone takes
+                half the time.
+            chunk: rows taken at a time, which bounds the memory and keeps the work in the cache.
         """
         self._check(joints)
         rows = joints.reshape(-1, joints.shape[-1])
-        parts = [self.self_collision.clearance(self.frames(part)) for part in rows.split(chunk)]
+        parts = [self.self_collision.clearance(self.frames(part), below) for part in rows.split(chunk)]
         return torch.cat(parts).reshape(joints.shape[:-1]) if parts else rows.new_zeros(joints.shape[:-1])
 
     def screws(self, poses: Float[Tensor, "*b l 4 4"]) -> tuple[Float[Tensor, "*b j 3"], Float[Tensor, "*b j 3"]]:

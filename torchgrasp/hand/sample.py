@@ -117,7 +117,7 @@ def _blocks(
     while have < count:
         uniform = torch.from_numpy(generator.random((BLOCK, hand.dof))).to(lower.device)
         joints = torch.lerp(lower, upper, uniform)
-        joints = joints[hand.self_clearance(joints) > 0]
+        joints = joints[hand.self_clearance(joints, below=0.0) > 0]
         points, normals = hand.fingertips(joints)
         if sampling == "opposed":
             facing = opposed(points, normals)

@@ -39,11 +39,11 @@ class SelfCollision(Value):
     pairs: Int[Tensor, "p 2"]
     kinds: tuple[int, int, int]
 
-    def clearance(self, frames: Float[Tensor, "3 4 l n"]) -> Float[Tensor, " n"]:
+    def clearance(self, frames: Float[Tensor, "3 4 l n"], below: float = torch.inf) -> Float[Tensor, " n"]:
         """Return the signed least separation [m] of the pairs; infinite for a hand without pairs.
 
         A pair is evaluated where it can be the least: where the balls around its shapes are not farther apart than
-        the balls inside the shapes of some pair.
+        the balls inside the shapes of some pair, nor than `below`. What is not below that is some larger number.
         """
         least = frames.new_full(frames.shape[3:], torch.inf)
         if not len(self.pairs):
@@ -52,7 +52,7 @@ class SelfCollision(Value):
         with torch.no_grad():
             distance = self._distances(shapes[1])
             inner = self.half.amin(1) + self.radius
-            limit = (distance - self._sums(inner, distance)).amin(0)
+            limit = (distance - self._sums(inner, distance)).amin(0).clamp_max(below)
             pair, row = torch.nonzero(distance - self._sums(self._outer(), distance) <= limit, as_tuple=True)
         return least.scatter_reduce(0, row, self._separations(shapes, pair, row), "amin")
 
