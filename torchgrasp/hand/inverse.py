@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Literal, get_args
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch, check_tensor, join
@@ -25,7 +25,8 @@ from torchgrasp.hand.motion import Posture
 from torchgrasp.hand.nearest import PostureSet, nearest_postures
 from torchgrasp.hand.query import query_hand
 from torchgrasp.hand.realise import assign, rank_in_group
-from torchgrasp.hand.refine import refine
+from torchgrasp.hand.refine import refine, settle
+from torchgrasp.plan.descend import pick
 from torchgrasp.values import Contacts, GraspGuess
 
 Method = Literal["levenberg_marquardt", "cobyla"]
@@ -36,6 +37,8 @@ LEARNED, OWN = 4, 8
 """How many starts of the learned model, and of the hand's own postures, are tried of a row before it is given up."""
 EXACT = 1e-6
 """Sum of squared residuals [mm2] at which a row is done: 0.5 um at a fingertip."""
+NEAR = 5e-5
+"""Error of the fingertips [m] above which a solved row is tried on: another posture may have none."""
 CHUNK = 512
 """Rows refined at a time: their temporaries stay in the cache."""
 
@@ -107,7 +110,7 @@ def reach_contacts(
     found = _nowhere(contacts, hand)
     sources = [(own, OWN)] if mixture is None else [(learned, LEARNED), (own, OWN)]
     for source, tries in sources:
-        waiting = torch.nonzero((found.status != Status.OK) & (found.status != Status.DEGENERATE))[:, 0]
+        waiting = torch.nonzero(~_done(found) & (found.status != Status.DEGENERATE))[:, 0]
         if not len(waiting):
             break
         found = _improve(found, waiting, source(contacts[waiting]), contacts, hand, around, move, tries)
@@ -115,8 +118,11 @@ def reach_contacts(
 
 
 def _refine(posture: Posture, hand: Hand, contacts: Contacts, surroundings: Surroundings) -> Posture:
-    """Refine until the tips are exact."""
-    return refine(posture, hand, contacts, surroundings, EXACT)
+    """Refine until the tips are exact; where a margin of clearance has kept them off, it is given up if all is well."""
+    refined = refine(posture, hand, contacts, surroundings, EXACT)
+    settled = settle(refined, hand, contacts, EXACT)
+    good = measure(settled, hand, contacts, surroundings).status == Status.OK
+    return pick(good, settled, refined)
 
 
 def _improve(
@@ -129,23 +135,30 @@ def _improve(
     move: Callable[[Posture, Hand, Contacts, Surroundings], Posture],
     tries: int,
 ) -> Reached:
-    """Try the guesses of rows one after the other until one solves the row, keeping the nearest failure.
+    """Try the guesses of rows one after the other until one solves the row exactly, keeping the best.
 
     `guess.row` points into `rows`.
     """
     guess = dataclasses.replace(guess, row=rows[guess.row])
     rank = rank_in_group(torch.zeros_like(guess.reach), guess.row)
     for k in range(tries):
-        chosen = guess[(rank == k) & (found.status[guess.row] != Status.OK)]
+        chosen = guess[(rank == k) & ~_done(found)[guess.row]]
         if not len(chosen):
             break
         tried = join([_try(part, contacts, hand, surroundings, move) for part in _chunks(chosen)])
         found.tries[chosen.row] += 1
         before = found[chosen.row]
         tried = dataclasses.replace(tried, tries=before.tries)
-        better = (tried.status == Status.OK) | ~(before.tip_error.amax(1) <= tried.tip_error.amax(1))
+        gain = (tried.status == Status.OK).long() - (before.status == Status.OK).long()
+        nearer = ~(before.tip_error.amax(1) <= tried.tip_error.amax(1))
+        better = (gain > 0) | ((gain == 0) & nearer)
         found = _put(found, chosen.row[better], tried[better])
     return found
+
+
+def _done(found: Reached) -> Bool[Tensor, "b"]:
+    """Tell which rows are solved, and exactly."""
+    return (found.status == Status.OK) & (found.tip_error.amax(1) <= NEAR)
 
 
 def _try(

@@ -104,6 +104,16 @@ def refine(
     return minimise(posture, evaluate, lambda state, step: state.moved(step, hand), ITERATIONS, solved)
 
 
+def settle(posture: Posture, hand: Hand, contacts: Contacts, solved: float) -> Posture:
+    """Return refined postures with their tips on their contacts, whatever clearance that costs: it is a last touch."""
+    target, normals = tip_targets(hand, contacts), contacts.normals
+
+    def evaluate(state: Posture, at: Int[Tensor, "a"]) -> Rows:
+        return tip_rows(Screws.at(state, hand), target[at], normals[at])
+
+    return minimise(posture, evaluate, lambda state, step: state.moved(step, hand), ITERATIONS, solved)
+
+
 def open_hand(posture: Posture, hand: Hand, contacts: Contacts, surroundings: Surroundings) -> Float[Tensor, "g h"]:
     """Return the joints of the pre-grasp: at the same pose, the tips off their contacts and everything clear.
 
