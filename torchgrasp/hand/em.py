@@ -107,12 +107,13 @@ def expectation(
     sums, log_likelihood = torch.zeros_like(coefficients), x.new_zeros(())
     features = x.new_empty(coefficients.shape[1], min(ROWS, len(x)))  # written anew in every pass, and kept in cache
     joint = x.new_empty(len(coefficients), min(ROWS, len(x)))
+    least = math.log(torch.finfo(x.dtype).tiny) / 2  # far below rounding; underflow and what is near it are slow
     for rows in x.split(ROWS):
         phi = features_from_data(rows, features[:, : len(rows)])
         responsibility = torch.mm(coefficients, phi, out=joint[:, : len(rows)])  # log joint density (m, rows), so far
         # log-sum-exp by hand: its exponentials are the responsibilities but for a division
         largest = responsibility.amax(0)
-        density = responsibility.sub_(largest).exp_().sum(0)
+        density = responsibility.sub_(largest).clamp_(min=least).exp_().sum(0)
         sums.addmm_(responsibility.div_(density), phi.T)
         log_likelihood += (density.log() + largest).sum()
     both = total(torch.cat([sums.flatten(), log_likelihood[None]]))
