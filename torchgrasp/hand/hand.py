@@ -1,6 +1,7 @@
 """The hand as a value: joints, fingers, pads, coupling; where its links and fingertips are and how they move."""
 
 import dataclasses
+import functools
 import math
 from pathlib import Path
 from typing import NamedTuple
@@ -36,8 +37,9 @@ class Hand(Value):
 
     `contact`, `normal` and `center` [m] are the pads in the frames of `tip_links`, `approach` points out of the palm,
     `axis`, `prismatic` and `child` (an index into `link_names`) describe the joints of the URDF, `moves` tells which
-    of them move a link, and `sha256` is that of both files. `fingers` is that part of the tree which leads to the tips,
-    and `tip_place` where they stand in it.
+    of them move a link, and `sha256` is that of both files. `fingers` is that part of the tree which leads to the
+    last links that joints move, `tip_place` where those that carry the tips stand in it, and `tip_pose` each tip's
+    frame in its carrier's.
     """
 
     name: str
@@ -67,6 +69,7 @@ class Hand(Value):
     collision_spheres: SphereCover
     self_collision: SelfCollision
     tip_place: Int[Tensor, "3"]
+    tip_pose: Float[Tensor, "3 4 3 1"]
     kinematics: Kinematics = dataclasses.field(repr=False)
     fingers: Kinematics = dataclasses.field(repr=False)
 
@@ -119,11 +122,12 @@ class Hand(Value):
         (torch.Size([5, 3, 3]), torch.Size([5, 3, 3]))
         """
         tips = self._tips(self._columns(joints))[1]
-        return _rows(placed(tips, self.contact), joints), _rows(turned(tips, self.normal), joints)
+        contact, normal, _ = self._pads
+        return _rows(placed(tips, contact), joints), _rows(turned(tips, normal), joints)
 
     def tip_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b 3 3"]:
         """Return the centres [m] of the tips' spheres of `tip_radius`; the contact points where the radius is 0."""
-        return _rows(placed(self._tips(self._columns(joints))[1], self.center), joints)
+        return _rows(placed(self._tips(self._columns(joints))[1], self._pads[2]), joints)
 
     def jacobian(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b 3 3 h"]:
         """Return the derivative of the contact points by the actuated joints, coupling included [m/rad].
@@ -131,7 +135,7 @@ class Hand(Value):
         The axes are: finger, coordinate, joint.
         """
         frames, tips = self._tips(self._columns(joints))
-        return _rows(self._derivative(self.fingers, frames, self.tip_index, placed(tips, self.contact)), joints)
+        return _rows(self._derivative(self.fingers, frames, self.tip_index, placed(tips, self._pads[0])), joints)
 
     def point_jacobian(
         self, poses: Float[Tensor, "*b l 4 4"], link_index: Int[Tensor, " p"], points: Float[Tensor, "*b p 3"]
@@ -152,8 +156,15 @@ class Hand(Value):
         values = self.expand_joints(joints)
         return values.reshape(-1, values.shape[-1]).T.contiguous()
 
+    @functools.cached_property
+    def _pads(self) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3 3"], Float[Tensor, "3 3"]]:
+        """The pads' contact points and normals and the tips' centres in the frames of the links that carry the tips."""
+        pose = self.tip_pose
+        contact, center = (placed(pose, x)[..., 0].T for x in (self.contact, self.center))
+        return contact, turned(pose, self.normal)[..., 0].T, center
+
     def _tips(self, values: Float[Tensor, "j n"]) -> tuple[Float[Tensor, "3 4 l n"], Float[Tensor, "3 4 3 n"]]:
-        """Return the frames of the links that lead to the tips, and those of the tips themselves."""
+        """Return the frames of the links that lead to the tips, and those of the links that carry the tips."""
         frames = self.fingers.frames(values)
         return frames, frames.index_select(2, self.tip_place)
 

@@ -134,6 +134,17 @@ def kinematics_from_urdf(urdf: Urdf, ends: Collection[str] | None = None) -> Kin
     )
 
 
+def fixed_to(urdf: Urdf, link: str) -> tuple[str, Float[Tensor, "3 4"]]:
+    """Return the link that carries another one without a joint that moves between them, and the other's frame in it."""
+    above = {j.child: j for j in urdf.joints}
+    pose = _tables(None)[0]
+    while link in above and above[link].kind == "fixed":
+        step = _tables(above[link])[0]
+        pose = torch.cat([step[:, :3] @ pose[:, :3], step[:, :3] @ pose[:, 3:] + step[:, 3:]], 1)
+        link = above[link].parent
+    return link, pose
+
+
 def _tables(joint: Joint | None) -> list[Float[Tensor, "3 4"]]:
     """Return what the child's frame in the parent's is made of; none: the root's, which is the identity."""
     constant, sine, cosine, slide = torch.zeros(4, 3, 4, dtype=torch.float64).unbind()

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchgrasp.errors import HandFileError
 from torchgrasp.hand.cover import cover_from_urdf
 from torchgrasp.hand.hand import Actuator, Hand
-from torchgrasp.hand.kinematics import ancestor_mask, kinematics_from_urdf
+from torchgrasp.hand.kinematics import ancestor_mask, fixed_to, kinematics_from_urdf
 from torchgrasp.hand.selfcollide import self_collision_from_urdf
 from torchgrasp.hand.spec import HandSpec, read_hand_toml
 from torchgrasp.hand.urdf import Urdf, read_urdf
@@ -79,7 +79,8 @@ def hand_from_files(spec: HandSpec, urdf: Urdf) -> Hand:
             found = f"{spec.path}: limit_margin {spec.limit_margin:g} leaves joint {name} [{low:g}, {high:g}]"
             raise HandFileError("hand.toml", found, "lower < upper")
     kinematics = kinematics_from_urdf(urdf)
-    leading = kinematics_from_urdf(urdf, [f.tip_link for f in spec.fingers])
+    carriers, poses = zip(*(fixed_to(urdf, f.tip_link) for f in spec.fingers), strict=True)
+    leading = kinematics_from_urdf(urdf, carriers)
     fingers = spec.fingers
     return Hand(
         name=spec.name,
@@ -108,7 +109,8 @@ def hand_from_files(spec: HandSpec, urdf: Urdf) -> Hand:
         actuators={n: Actuator(j.effort, j.velocity, spec.kp, spec.kd) for n, j in movable.items()},
         collision_spheres=cover_from_urdf(urdf, spec),
         self_collision=self_collision_from_urdf(urdf, spec.pairs),
-        tip_place=torch.tensor([leading.link_names.index(f.tip_link) for f in spec.fingers]),
+        tip_place=torch.tensor([leading.link_names.index(name) for name in carriers]),
+        tip_pose=torch.stack(poses, -1)[..., None],
         kinematics=kinematics,
         fingers=leading,
     )
