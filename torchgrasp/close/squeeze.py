@@ -28,9 +28,12 @@ def squeeze_joints(grasps: Grasps, hand: Hand, force: float = 4.0, kp: float | N
     Raises:
         BadArgument: joints of another hand, or a force or stiffness that is not positive.
 
-    >>> grasps = load_grasps("grasps.safetensors")  # doctest: +SKIP
-    >>> squeeze_joints(grasps, load_hand("allegro"), force=5.0).shape  # doctest: +SKIP
-    torch.Size([212, 12])
+    >>> from torchgrasp import ContactSpec, load_hand, load_object, plan_grasps
+    >>> hand = load_hand("allegro")
+    >>> grasps = plan_grasps(load_object("cylinder").view, hand, ContactSpec(table=0.0), starts=20)
+    >>> lead = squeeze_joints(grasps, hand, force=5.0) - grasps.joints
+    >>> lead.shape[1], bool((lead.abs().amax(1) > 0.01).all())
+    (12, True)
     """
     if grasps.joints.shape[-1] != hand.dof:
         raise BadArgument("grasps", f"{grasps.joints.shape[-1]} joints", f"the {hand.dof} of {hand.name}")
