@@ -177,3 +177,21 @@ def test_to_moves_every_tensor_and_leaves_the_hand_as_it_was():
     assert hand.lower.dtype == torch.float64
     assert moved.child.dtype == torch.int64
     assert moved.fingertips(torch.zeros(1, 12))[0].shape == (1, 3, 3)
+
+
+def test_tactile_fingertips_reach_23_mm_farther_and_change_nothing_else():
+    """Reach from the last joint with NVIDIA's model of the sensors: 61.8 mm, thumb 77.4 mm; stock 38.7 and 54.3 mm."""
+    stock, tactile = load_hand("allegro"), load_hand("allegro_biotac")
+    reach = []
+    for hand in (stock, tactile):
+        poses = hand.link_poses(torch.zeros(hand.dof, dtype=torch.float64))
+        tips = torch.linalg.inv(poses[[hand.link_names.index(f"{f}_distal") for f in hand.finger_names]])
+        centres = (tips @ poses[hand.tip_index])[:, :3, 3]
+        reach.append(centres[:, 2] + hand.tip_radius)
+    torch.testing.assert_close(reach[0], torch.tensor([0.0387, 0.0387, 0.0543]).double(), rtol=0, atol=1e-6)
+    torch.testing.assert_close(reach[1], torch.tensor([0.0618, 0.0618, 0.0774]).double(), rtol=0, atol=2e-4)
+    same = [name for name in stock.link_names if not name.endswith("tip")]
+    joints = 0.5 * (stock.lower + stock.upper)
+    for name in same:
+        found = [hand.link_poses(joints)[hand.link_names.index(name)] for hand in (stock, tactile)]
+        torch.testing.assert_close(*found, rtol=0, atol=1e-12)

@@ -34,7 +34,7 @@ def evaluate(
 
     Args:
         objects: folder with manifest.json, and for each object mesh.ply and noisy views.
-        hand: allegro, barrett, or the folder of another hand.
+        hand: allegro, allegro_biotac, barrett, or the folder of another hand.
         out: folder of the results; it is made where it does not exist.
         protocol: which test: see torchgrasp.close.protocol.
         closing: open loop through pre-grasp, grasp and squeeze, or by a controller that feels with the fingertips.

@@ -63,7 +63,7 @@ def grasp(
 
     Args:
         cloud: point cloud of one object in metres, z up (.ply, .pcd, .npy, .npz, .xyz).
-        hand: allegro, barrett, or the folder of another hand.
+        hand: allegro, allegro_biotac, barrett, or the folder of another hand.
         out: folder of the results; it is made where it does not exist.
         mesh: true mesh of the object [m] in the frame of the cloud; only the simulator sees it.
         close: close the best grasp on the mesh, lift it and hold it (needs the extra "sim").

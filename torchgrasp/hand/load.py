@@ -44,7 +44,7 @@ def load_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
     """Load a hand from its hand.toml and URDF, with one of the finger options that its hand.toml offers.
 
     Args:
-        name_or_path: a shipped hand ("allegro", "barrett"), or the folder of another one.
+        name_or_path: a shipped hand ("allegro", "allegro_biotac", "barrett"), or the folder of another one.
         fingers: "default", or for the Allegro "paper_literal" (index, middle and ring finger).
 
     Raises:
