@@ -32,7 +32,7 @@ from torchgrasp.hand.query import query_hand
 from torchgrasp.hand.realise import on_contacts, rank_guesses
 from torchgrasp.pipeline import spread_rows
 from torchgrasp.report.canvas import Canvas
-from torchgrasp.report.palette import FINGERS, HAND, INK, OBJECT, PAPER
+from torchgrasp.report.palette import AXES, FINGERS, HAND, INK, OBJECT, PAPER
 from torchgrasp.report.pictures import Direction, facing
 from torchgrasp.report.solids import PARKED, solids_from_hand
 from torchgrasp.shape.surface import Surface, extract_surface
@@ -42,8 +42,6 @@ TRIPLES, GUESSES, TRIED = 80, 6, 16
 """Certified triples of each object, guesses of the learned model for each assignment, and how many are refined."""
 TILE = (450, 360)
 """Width and height of one picture [pixels]."""
-AXES = ("#d62728", "#2ca02c", "#1f4fd8")
-"""Colours of the virtual frame's x, y and z."""
 APART = 0.1
 """Hands whose bases are nearer [m] are seen from the side of the first one's fingers."""
 NORMAL, FRAME = 0.035, 0.03

@@ -12,9 +12,10 @@ import torch
 import trimesh
 
 from torchgrasp import cli
-from torchgrasp.close.evaluate import ViewScore, share, summarise
-from torchgrasp.close.protocol import PROTOCOLS, PullResult, draw_errors, pull_grasp
-from torchgrasp.close.squeeze import joint_stiffness, squeeze_joints
+from torchgrasp.close.evaluate import ViewScore, evaluate, share, summarise
+from torchgrasp.close.law import joint_stiffness
+from torchgrasp.close.protocol import PROTOCOLS, PullResult, check_test, draw_errors, pull_grasp
+from torchgrasp.close.squeeze import squeeze_joints
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import apply, inverse, rotation_angle
 
@@ -107,6 +108,12 @@ def test_bad_arguments_are_named():
         pull_grasp(grasp[:0], hand, cylinder())
     with pytest.raises(BadArgument, match="force: found -1"):
         pull_grasp(grasp, hand, cylinder(), force=-1.0)
+    with pytest.raises(BadArgument, match="closing: found 'fast'"):
+        check_test("dexgraspbench", 5.0, "fast")
+    with pytest.raises(BadArgument, match="joints: found 9 for"):
+        pull_grasp(dataclasses.replace(grasp, pregrasp=grasp.pregrasp * 0 + 9), hand, cylinder())
+    with pytest.raises(BadArgument, match="force: found 0"):
+        evaluate(Path("nowhere"), hand, force=0.0)
     with pytest.raises(BadArgument, match="grasps: found 12 joints"):
         squeeze_joints(grasp, pinch("barrett")[0])
 

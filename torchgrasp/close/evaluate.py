@@ -1,6 +1,7 @@
 """How many of the library's grasps pass a published protocol, each planned on what one camera saw."""
 
 import dataclasses
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -8,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchgrasp.close.parts import convex_parts
-from torchgrasp.close.protocol import PROTOCOLS, Mode, PullProtocol, PullResult, draw_errors, pull_grasp
+from torchgrasp.close.protocol import Mode, PullProtocol, PullResult, check_test, draw_errors, pull_grasp
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.pipeline import plan_grasps
@@ -18,7 +19,6 @@ from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
     import trimesh
-
 
 MOST_FRICTION = 1.0
 """The most friction that grasps are planned for, however much a protocol grants."""
@@ -71,13 +71,10 @@ def evaluate(
         observer: called with each score as it is there.
 
     Raises:
-        BadArgument: an unknown protocol, a count that is not positive, or no objects.
+        BadArgument: an unknown protocol or closing, a force or count outside its range, or no objects.
         MissingExtra: the simulator is not installed.
     """
-    if isinstance(protocol, str):
-        if protocol not in PROTOCOLS:
-            raise BadArgument("protocol", repr(protocol), f"one of {', '.join(PROTOCOLS)}")
-        protocol = PROTOCOLS[protocol]
+    protocol = check_test(protocol, force, closing)
     if grasps < 1:
         raise BadArgument("grasps", grasps, "at least 1")
     spec = ContactSpec(friction=min(protocol.friction, MOST_FRICTION), table=0.0)
@@ -116,7 +113,7 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     every = [result for score in scores for result in score.results]
     names = sorted({score.object for score in scores})
     won = {score.object for score in scores if any(result.passed for result in score.results)}
-    forces = [result.force for result in every if result.force == result.force]
+    forces = [result.force for result in every if not math.isnan(result.force)]
     return {
         "gsr": share(sum(result.passed for result in every), len(every)),
         "top1": share(sum(bool(s.results) and s.results[0].passed for s in scores), len(scores)),

@@ -87,6 +87,14 @@ def balanced_forces(
     return torch.where(torch.isfinite(cost)[..., None, None], scaled, torch.nan)
 
 
+def desired_forces(
+    points: Float[Tensor, "*b 3 3"], normals: Float[Tensor, "*b 3 3"], strongest: float = 4.0
+) -> Float[Tensor, "*b 3 3"]:
+    """Return `balanced_forces`, or `strongest` along the normals where no balanced set presses at all contacts."""
+    balanced = balanced_forces(points, normals, strongest)
+    return torch.where(torch.isfinite(balanced), balanced, -strongest * normals)
+
+
 def force_covariance(
     forces: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"], floor: float
 ) -> Float[Tensor, "*b 3 3"]:

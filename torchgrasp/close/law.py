@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import check_tensor
-from torchgrasp.close.force import balanced_forces, force_covariance
+from torchgrasp.close.force import desired_forces, force_covariance
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply as move
 from torchgrasp.frames import inverse, rotate
@@ -145,14 +145,23 @@ def joint_step(
     return step * (max_step / largest.clamp_min(max_step))
 
 
+def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
+    """Return the stiffness [N m/rad] of each actuated joint: that of its drive and of the joints that follow it.
+
+    Args:
+        hand: the hand.
+        kp: of every drive [N m/rad]; None: the hand's own.
+    """
+    every = torch.tensor([hand.actuators[n].kp if kp is None else kp for n in hand.urdf_joint_names])
+    return (hand.coupling**2 * every.to(hand.coupling)[:, None]).sum(0)
+
+
 def tip_compliance(
     hand: Hand, joints: Float[Tensor, "*b h"], normals: Float[Tensor, "*b 3 3"]
 ) -> Float[Tensor, "*b 3"]:
     """Return how far each fingertip yields [m/N] along its normal when its joints are driven with the hand's kp."""
-    every = torch.tensor([hand.actuators[name].kp for name in hand.urdf_joint_names]).to(joints)
-    kp = (hand.coupling.to(joints) ** 2 * every[:, None]).sum(0)  # a motor also turns the joints coupled to it
     along = torch.einsum("...cih,...ci->...ch", hand.jacobian(joints), normals)
-    return (along**2 / kp).sum(-1)
+    return (along**2 / joint_stiffness(hand).to(joints)).sum(-1)
 
 
 def closing_gains(grasps: Grasps, hand: Hand, force: float = 4.0) -> ClosingGains:
@@ -186,8 +195,7 @@ def closing_gains(grasps: Grasps, hand: Hand, force: float = 4.0) -> ClosingGain
     hand_from_obj = inverse(grasps.obj_from_hand.double())
     target, normals = move(hand_from_obj, contacts.points), rotate(hand_from_obj, contacts.normals)
     covariance = surface_covariance(normals, contacts.std_m)
-    desired = balanced_forces(target, normals, force)
-    desired = torch.where(torch.isfinite(desired), desired, -force * normals)
+    desired = desired_forces(target, normals, force)
     spread = force_covariance(desired, normals, FORCE_FLOOR)
     alpha_f = FORCE_BANDWIDTH * FORCE_FLOOR**2 * tip_compliance(hand, joints, normals)
     return ClosingGains(

@@ -103,7 +103,7 @@ PROTOCOLS = {
 }
 """By name: MultiDex as D(R,O) runs it (arXiv 2410.01702), DexGraspBench's force-closure test for floating objects
 (as of BODex, arXiv 2412.16490), the same with halved friction as in Dexonomy (arXiv 2504.18829), and the same with the
-hand put down beside where it was planned, by as much as in Get a Grip (arXiv 2410.23701)."""
+hand put down beside where it was planned, by as much as in Get a Grip (CoRL 2024)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +111,8 @@ class PullResult(Value):
     """What became of one grasp under a protocol.
 
     `passed` tells whether all six directions did; `directions` counts those tried until the first failure; `moved` [m]
-    and `turned` [rad] are the largest of them; `force` [N] is the fingers' mean normal force before the first pull.
+    and `turned` [rad] are the largest of them; `force` [N] is the fingers' mean normal force before the first pull, NaN
+    where the hand never closed; `seconds` is CPU time.
     """
 
     passed: bool
@@ -149,20 +150,17 @@ def pull_grasp(
         parts: convex bodies to use for the mesh instead of its own decomposition.
 
     Raises:
-        BadArgument: an unknown protocol or closing, not exactly one row, or a grasp of another hand.
+        BadArgument: an unknown protocol or closing, a force outside (0, 1000) N, not exactly one row, a grasp of
+            another hand, or a pre-grasp outside the joint limits.
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
     """
     began = time.process_time()
-    if isinstance(protocol, str):
-        if protocol not in PROTOCOLS:
-            raise BadArgument("protocol", repr(protocol), f"one of {', '.join(PROTOCOLS)}")
-        protocol = PROTOCOLS[protocol]
+    protocol = check_test(protocol, force, closing)
     if len(grasp) != 1:
         raise BadArgument("grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]")
-    if closing not in get_args(Mode):
-        raise BadArgument("closing", repr(closing), f"one of {', '.join(get_args(Mode))}")
     grasp, hand = grasp.to("cpu", torch.float64), hand.to("cpu", torch.float64)
+    hand.check_joints(grasp.pregrasp)
     gains = closing_gains(grasp, hand, force)
     squeezed = squeeze_joints(grasp, hand, force, protocol.kp)[0]
     mesh = read_mesh(mesh)
@@ -179,6 +177,21 @@ def pull_grasp(
             break
     passed = status is Status.OK
     return PullResult(passed, status, tried, moved, turned, pressed, time.process_time() - began)
+
+
+def check_test(protocol: PullProtocol | str, force: float, closing: str) -> PullProtocol:
+    """Return the protocol, by its name or as it is, after checking what a test is asked for.
+
+    Raises:
+        BadArgument: an unknown protocol or closing, or a force outside (0, 1000) N.
+    """
+    if isinstance(protocol, str) and protocol not in PROTOCOLS:
+        raise BadArgument("protocol", repr(protocol), f"one of {', '.join(PROTOCOLS)}")
+    if closing not in get_args(Mode):
+        raise BadArgument("closing", repr(closing), f"one of {', '.join(get_args(Mode))}")
+    if not 0.0 < force < 1e3:
+        raise BadArgument("force", force, "a number in (0, 1000) [N]")
+    return PROTOCOLS[protocol] if isinstance(protocol, str) else protocol
 
 
 def draw_errors(protocol: PullProtocol, grasps: int, seed: int) -> Float[Tensor, "g n 4 4"]:

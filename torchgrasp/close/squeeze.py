@@ -4,7 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.close.force import balanced_forces
+from torchgrasp.close.force import desired_forces
+from torchgrasp.close.law import joint_stiffness
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply as move
 from torchgrasp.frames import inverse, rotate
@@ -15,7 +16,7 @@ from torchgrasp.values import Grasps
 def squeeze_joints(grasps: Grasps, hand: Hand, force: float = 4.0, kp: float | None = None) -> Float[Tensor, "g h"]:
     """Return joint targets [rad] with which the fingers press at their planned contacts, by J^T f = kp (target - q).
 
-    The forces are balanced (`balanced_forces`): they need the least friction of all that cancel. Where no balanced set
+    The forces are balanced (`desired_forces`): they need the least friction of all that cancel. Where no balanced set
     presses at all three contacts each finger presses along its normal. Replayed open loop, pre-grasp, grasp and squeeze
     close any hand whose joints are position-controlled; targets may lie past a limit by their lead.
 
@@ -44,13 +45,6 @@ def squeeze_joints(grasps: Grasps, hand: Hand, force: float = 4.0, kp: float | N
     hand_from_obj = inverse(grasps.obj_from_hand.double())
     points = move(hand_from_obj, grasps.contacts.points.double())
     normals = rotate(hand_from_obj, grasps.contacts.normals.double())
-    forces = balanced_forces(points, normals, force)
-    forces = torch.where(torch.isfinite(forces), forces, -force * normals)
+    forces = desired_forces(points, normals, force)
     torque = torch.einsum("gcih,gci->gh", hand.to(torch.float64).jacobian(joints), forces)
     return joints + torque / joint_stiffness(hand, kp)
-
-
-def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, " h"]:
-    """Return the stiffness [N m/rad] of each actuated joint: that of its drive and of the joints that follow it."""
-    every = torch.tensor([hand.actuators[n].kp if kp is None else kp for n in hand.urdf_joint_names]).double()
-    return (hand.coupling.double() ** 2 * every[:, None]).sum(0)

@@ -59,7 +59,10 @@ def closure_bound(lines: Lines, friction: float) -> Float[Tensor, "b"]:
     steps = torch.unique(unit(grid[grid.abs().sum(1) > 0]), dim=0)
     bounds = lines.points.new_zeros(len(lines))
     for rows in torch.arange(len(lines), device=bounds.device).split(AT_ONCE):
-        some = [_Stretches(lines[rows], beyond) for beyond in REACHES]
+        part = lines[rows]
+        spread = (part.root @ part.root).unflatten(-1, (3, -1, 4)).unflatten(1, (3, -1, 4)).diagonal(dim1=1, dim2=4)
+        spread = spread.movedim(-1, 1)  # (b, line, rung, 4, rung, 4)
+        some = [_Stretches(part, spread, reach) for reach in REACHES]
         forces = some[SOUGHT].bound(steps.expand(len(rows), -1, -1), friction, SEARCH)[1]
         for level in range(ROUNDS):
             around = unit(forces[:, None] + 0.4 * 0.5**level * steps)
@@ -72,14 +75,12 @@ def closure_bound(lines: Lines, friction: float) -> Float[Tensor, "b"]:
 class _Stretches:
     """Three stretches of lines about the contacts, and what internal forces prove while the fingers stop on them."""
 
-    def __init__(self, lines: Lines, reach: int) -> None:
+    def __init__(self, lines: Lines, spread: Float[Tensor, "b 3 k 4 k 4"], reach: int) -> None:
         self.points, self.normals = lines.points, lines.normals
         weights = refinement().to(lines.points)
         ends = [len(STEPS) - 1 - reach, len(STEPS) - 1 + reach]
         rungs = [i for i in range(ends[0] + 1, ends[1]) if bool((weights[i] == 1).any())]
         stations = weights[[*ends, *rungs]]
-        spread = (lines.root @ lines.root).unflatten(-1, (3, -1, 4)).unflatten(1, (3, -1, 4)).diagonal(dim1=1, dim2=4)
-        spread = spread.movedim(-1, 1)  # (b, line, rung, 4, rung, 4)
         self.slope = stations @ lines.slope
         self.spread = torch.einsum("sk,bikmjn,sj->bismn", stations, spread[..., 1:, :, 1:], stations)
         self.motion = lines.steps[..., ends[0]]

@@ -23,12 +23,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Batch, check_tensor
-from torchgrasp.errors import BadArgument, IndefiniteCovariance
+from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
 from torchgrasp.plan.certify import UNIT_TOLERANCE
 from torchgrasp.plan.wrench import tangents
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.joint import ROUNDING, distance_covariance
+from torchgrasp.shape.joint import distance_covariance, symmetric_root
 from torchgrasp.values import Contacts
 
 FOOTPRINT = 0.012
@@ -91,8 +91,7 @@ def interpolation(at: Float[Tensor, "*b"], rungs: Float[Tensor, "k"]) -> Float[T
     held = torch.minimum(torch.maximum(at, rungs[-1]), rungs[0])[..., None]
     gaps = rungs[:-1] - rungs[1:]
     share = ((rungs[:-1] - held) / gaps).clamp(0, 1)  # how far each gap has been passed
-    one = torch.ones_like(held)
-    return torch.cat([one, share], -1) - torch.cat([share, 0 * one], -1)
+    return torch.cat([torch.ones_like(held), share], -1) - torch.cat([share, torch.zeros_like(held)], -1)
 
 
 def well_inside(shape: ShapeGP, contacts: Contacts) -> Bool[Tensor, "b"]:
@@ -124,7 +123,8 @@ def lines_of(shape: ShapeGP, contacts: Contacts) -> Lines:
     slope = shape.slope((points[:, :, None] + rungs[..., None] * normals[:, :, None]).reshape(-1, 3))[1]
     steps = deviation[..., None] * finer_ladder().to(deviation)
     distance = shape.mean((points[:, :, None] + steps[..., None] * normals[:, :, None]).reshape(-1, 3))
-    root = square_root(shape.std_factor**2 * spread, float(shape.prior_block()[0, 0]))
+    prior = float(shape.prior_block()[0, 0])
+    root = symmetric_root(shape.std_factor**2 * spread, prior, "contacts within the domain")
     return Lines(points, normals, deviation, distance.reshape(steps.shape), slope.reshape(*rungs.shape, 3), root)
 
 
@@ -137,8 +137,8 @@ def deviations(
     """
     width = FOOTPRINT / shape.scale
     along = (points * normals).sum(-1)
-    half = (along**2 + (shape.domain_radius - width) ** 2 - (points**2).sum(-1)).sqrt()
-    rungs = torch.maximum(torch.minimum(rungs, (half - along)[..., None]), -(half + along)[..., None])
+    chord = (along**2 + (shape.domain_radius - width) ** 2 - (points**2).sum(-1)).sqrt()  # half of it
+    rungs = torch.maximum(torch.minimum(rungs, (chord - along)[..., None]), -(chord + along)[..., None])
     first = tangents(points, normals)
     axes = torch.stack([normals, first, torch.linalg.cross(normals, first)], 2)  # (b, line, axis, 3)
     around = torch.cat([torch.zeros_like(axes[:, :, :1]), axes, -axes], 2) * width
@@ -150,22 +150,6 @@ def deviations(
     values = distance_covariance(shape, asked.flatten(1, 3)).unflatten(2, (3, -1, 7)).unflatten(1, (3, -1, 7))
     half = torch.einsum("bimp,bikpjlq->bikmjlq", weights, values)
     return torch.einsum("bikmjlq,bjnq->bikmjln", half, weights).flatten(4).flatten(1, 3)
-
-
-def square_root(covariance: Float[Tensor, "b k k"], prior: float) -> Float[Tensor, "b k k"]:
-    """Return the symmetric root of each covariance, which no choice of basis among equal eigenvalues changes.
-
-    Args:
-        covariance: positive semidefinite to rounding.
-        prior: the prior variance of a distance, the scale of rounding.
-
-    Raises:
-        IndefiniteCovariance: an eigenvalue is negative by more than rounding.
-    """
-    values, vectors = torch.linalg.eigh(covariance)
-    if len(values) and not float(values.min()) >= -ROUNDING * prior:
-        raise IndefiniteCovariance("the joint covariance", float(values.min()), "contacts within the domain")
-    return (vectors * torch.where(values > 0, values, 0.0).sqrt()[:, None]) @ vectors.mT
 
 
 def touch(lines: Lines, drawn: Float[Tensor, "b n 60"]) -> tuple[Float[Tensor, "b n 3 3"], Float[Tensor, "b n 3 3"]]:

@@ -11,12 +11,10 @@ from torch import Tensor
 from torchgrasp.hand.hand import Hand
 from torchgrasp.linalg import unit
 from torchgrasp.report.canvas import SIZE, Canvas
-from torchgrasp.report.palette import FINGERS, GRID, HAND, INK, PAPER
+from torchgrasp.report.palette import AXES, FINGERS, GRID, HAND, INK, PAPER
 from torchgrasp.report.pictures import Direction, turned
 from torchgrasp.report.solids import PARKED, finger_of_links, solids_from_hand
 
-AXES = ("#d62728", "#2ca02c", "#1f4fd8")
-"""Colours of x, y and z."""
 TILE = (SIZE[0] * 3 // 4, SIZE[1] * 3 // 4)
 """Width and height of one of the four views [pixels]."""
 BAR = 30

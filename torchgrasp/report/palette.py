@@ -30,3 +30,7 @@ def rgb(color: str) -> tuple[float, float, float]:
     """
     red, green, blue = (int(color[i : i + 2], 16) / 255 for i in (1, 3, 5))
     return red, green, blue
+
+
+AXES = ("#d62728", "#2ca02c", "#1f4fd8")
+"""Colours of a frame's x, y and z."""

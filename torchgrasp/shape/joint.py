@@ -49,11 +49,28 @@ def distance_covariance(posterior: Posterior, x: Float[Tensor, "b k 3"]) -> Floa
     return prior - whitened @ whitened.mT
 
 
-def draw_samples(joint: JointEstimate, prior: float, n: int, seed: int) -> Float[Tensor, "n k 4"]:
-    """Draw from a joint posterior with the symmetric root of its covariance, which no choice of basis changes.
+def symmetric_root(covariance: Float[Tensor, "*b k k"], prior: float, remedy: str) -> Float[Tensor, "*b k k"]:
+    """Return the symmetric root of covariances, which no choice of basis among equal eigenvalues changes.
 
     Points that coincide, or that are known exactly, leave eigenvalues of zero, which rounding makes negative: those
     within `ROUNDING` of zero are zero.
+
+    Args:
+        covariance: positive semidefinite to rounding.
+        prior: the prior variance of a distance, the scale of rounding.
+        remedy: what to do about one that is not.
+
+    Raises:
+        IndefiniteCovariance: an eigenvalue is negative by more than rounding.
+    """
+    values, vectors = torch.linalg.eigh(covariance)
+    if values.numel() and not float(values.min()) >= -ROUNDING * prior:
+        raise IndefiniteCovariance("the joint covariance", float(values.min()), remedy)
+    return (vectors * torch.where(values > 0, values, 0.0).sqrt()[..., None, :]) @ vectors.mT
+
+
+def draw_samples(joint: JointEstimate, prior: float, n: int, seed: int) -> Float[Tensor, "n k 4"]:
+    """Draw from a joint posterior with the symmetric root of its covariance.
 
     Args:
         joint: what to draw from.
@@ -64,10 +81,7 @@ def draw_samples(joint: JointEstimate, prior: float, n: int, seed: int) -> Float
     Raises:
         IndefiniteCovariance: an eigenvalue is negative by more than rounding.
     """
-    values, vectors = torch.linalg.eigh(joint.covariance)
-    if len(values) and not float(values[0]) >= -ROUNDING * prior:
-        raise IndefiniteCovariance("the joint covariance", float(values[0]), "query points within the domain")
-    root = (vectors * torch.sqrt(torch.where(values > 0, values, 0.0))) @ vectors.T
+    root = symmetric_root(joint.covariance, prior, "query points within the domain")
     generator = torch.Generator().manual_seed(seed)
-    draws = torch.randn(n, len(values), dtype=torch.float64, generator=generator).to(root)
+    draws = torch.randn(n, len(root), dtype=torch.float64, generator=generator).to(root)
     return joint.mean + (draws @ root).reshape(n, *joint.mean.shape)
