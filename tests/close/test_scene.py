@@ -40,7 +40,7 @@ def test_files_that_are_no_hand_are_refused(tmp_path):
 def build(name, mesh, **options):
     """A scene with the hand half a metre above the object."""
     pytest.importorskip("sapien")
-    from torchgrasp.close.scene import Scene
+    from torchgrasp.close.scene import Setup, open_scene
 
     hand = load_hand(name)
     joints = 0.5 * (hand.lower + hand.upper)
@@ -48,7 +48,7 @@ def build(name, mesh, **options):
     pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec([0.3, -0.8, 1.1]).as_matrix(), [0.05, -0.1, 0.6]
     start = {k: float(v) for k, v in hand.expand(joints).items()}
     args = (hand.urdf_path, pose, start, hand.actuators, hand.tip_links, mesh, [mesh.convex_hull], 0.36)
-    return hand, joints, torch.from_numpy(pose), Scene(*args, **options)
+    return hand, joints, torch.from_numpy(pose), open_scene(Setup(*args, **options))
 
 
 def standing(radius=0.03, height=0.12):
@@ -116,7 +116,7 @@ BODY = """<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iy
 @pytest.mark.filterwarnings("ignore")
 def test_sliding_joints_move_their_tips_along_their_axes(tmp_path):
     pytest.importorskip("sapien")
-    from torchgrasp.close.scene import Scene
+    from torchgrasp.close.scene import Setup, open_scene
     from torchgrasp.hand.hand import Actuator
 
     kinds = [("prismatic", "1 0 0"), ("prismatic", "0 0 1"), ("revolute", "0 1 0")]
@@ -127,7 +127,7 @@ def test_sliding_joints_move_their_tips_along_their_axes(tmp_path):
     pose = np.eye(4)
     pose[0, 3] = 5.0
     urdf = tmp_path / "hand.urdf"
-    scene = Scene(urdf, pose, start, drives, ("t1", "t2", "t3"), mesh, [mesh.convex_hull], 0.36)
+    scene = open_scene(Setup(urdf, pose, start, drives, ("t1", "t2", "t3"), mesh, [mesh.convex_hull], 0.36))
     scene.step()
     assert set(scene.joint_names) == set(names)
     points = scene.tip_poses()[:, :3, 3] + [0.0, 0.0, 0.5]

@@ -12,6 +12,9 @@ from torchgrasp.hand.urdf import read_urdf
 LIFT_JOINT = "torchgrasp_lift"
 """Name of the prismatic joint that carries the hand along the world's z axis."""
 
+WRIST_JOINT = "torchgrasp_wrist"
+"""Name of the fixed joint by which the hand hangs on it."""
+
 
 def lifted_urdf(urdf_path: Path | str, world_from_hand: np.ndarray, travel: float) -> str:
     """Return the URDF of a hand that stands at a pose in the world and can be lifted by `travel` [m].
@@ -44,7 +47,7 @@ def lifted_urdf(urdf_path: Path | str, world_from_hand: np.ndarray, travel: floa
     <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>
   <joint name="{LIFT_JOINT}" type="prismatic"><parent link="torchgrasp_world"/><child link="torchgrasp_arm"/>
     <axis xyz="0 0 1"/><limit lower="-0.01" upper="{travel + 0.05:.9g}" effort="1000" velocity="10"/></joint>
-  <joint name="torchgrasp_wrist" type="fixed"><parent link="torchgrasp_arm"/><child link={quoteattr(urdf.root)}/>
+  <joint name="{WRIST_JOINT}" type="fixed"><parent link="torchgrasp_arm"/><child link={quoteattr(urdf.root)}/>
     <origin xyz="{x:.12g} {y:.12g} {z:.12g}" rpy="{roll:.12g} {pitch:.12g} {yaw:.12g}"/></joint>
 </stand>"""
         )

@@ -25,7 +25,7 @@ from torchgrasp.close.control import Closing, Squeeze, Stopping
 from torchgrasp.close.law import closing_gains
 from torchgrasp.close.parts import check_parts, convex_parts, read_mesh
 from torchgrasp.close.robot import Robot, plant_from_hand
-from torchgrasp.close.scene import Scene
+from torchgrasp.close.scene import Scene, Setup, open_scene
 from torchgrasp.close.squeeze import squeeze_joints
 from torchgrasp.close.trial import CLOSING_TIME, PRESSING_TIME
 from torchgrasp.errors import BadArgument, Status
@@ -231,10 +231,11 @@ class _Pull:
         """Close, pull along one direction, and return status, motion [m], turn [rad] and the mean force [N] before."""
         rule = self.protocol
         start = {name: float(q) for name, q in self.poses[0].items()}
-        scene = Scene(
+        setup = Setup(
             self.hand.urdf_path, self.stands, start, self.drives, tuple(self.hand.tip_links), self.mesh, self.parts,
             self.mass, rule.friction, 0.0, TIMESTEP, 0.0, table=False, patch=rule.patch,
         )  # fmt: skip
+        scene = open_scene(setup)
         if not scene.penetration() <= rule.overlap:
             return (Status.START_OVERLAP, 0.0, 0.0), math.nan
         generator = torch.Generator().manual_seed(self.seed)

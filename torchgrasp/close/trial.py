@@ -14,7 +14,7 @@ from torchgrasp.close.control import Closing, Sight, Squeeze, Stopping
 from torchgrasp.close.law import closing_gains
 from torchgrasp.close.parts import check_parts, convex_parts, read_mesh
 from torchgrasp.close.robot import Robot, plant_from_hand
-from torchgrasp.close.scene import Scene
+from torchgrasp.close.scene import Setup, open_scene
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import apply, inverse, rotation_angle
 from torchgrasp.hand.hand import Hand
@@ -107,7 +107,7 @@ class _Trial:
     ) -> None:
         self.spec = spec
         start = {name: float(q) for name, q in hand.expand(grasp.pregrasp[0]).items()}
-        self.scene = Scene(
+        setup = Setup(
             hand.urdf_path,
             grasp.obj_from_hand[0].numpy(),
             start,
@@ -121,6 +121,7 @@ class _Trial:
             spec.timestep,
             spec.lift_height,
         )
+        self.scene = open_scene(setup)
         self.plant = plant_from_hand(hand, grasp, self.scene.joint_names, hand.actuators)
         generator = torch.Generator().manual_seed(seed) if spec.noise else None
         self.robot = Robot(self.scene, hand, self.plant, spec.control_rate, generator)
