@@ -8,7 +8,7 @@ import trimesh
 
 from torchgrasp.cloud.camera import partial_view
 from torchgrasp.cloud.read import save_cloud
-from torchgrasp.files import write_atomically
+from torchgrasp.files import write_atomically, write_file
 from torchgrasp.objects import DATA, list_objects
 from torchgrasp.objects.author import author
 
@@ -24,7 +24,7 @@ def write_object(name: str) -> None:
     if not (mesh.is_volume and mesh.body_count == 1 and len(mesh.faces) <= 20_000):
         raise SystemExit(f"{name}: not one closed body of at most 20000 faces")
     content = mesh.export(file_type="ply", vertex_normal=False)
-    write_atomically(DATA / name / "mesh.ply", lambda path: path.write_bytes(content) and None)
+    write_file(DATA / name / "mesh.ply", content)
     columns = {
         "corners": np.concatenate(parts).astype(np.float32),
         "counts": np.array([len(p) for p in parts], dtype=np.int32),

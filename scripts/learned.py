@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from torchgrasp import Hand, load_hand, load_mixture
-from torchgrasp.files import write_atomically
+from torchgrasp.files import write_atomically, write_file
 from torchgrasp.hand.sample import sample_configurations
 from torchgrasp.report.canvas import Canvas
 from torchgrasp.report.palette import FINGERS, GRID, HAND, INK, PAPER
@@ -162,4 +162,4 @@ def _write(out: Path, name: str, content: dict[str, Any]) -> None:
     """Write numbers as JSON, with the paper's."""
     out.mkdir(parents=True, exist_ok=True)
     text = json.dumps(content | {"published": PUBLISHED}, indent=1)
-    write_atomically(out / f"{name}.json", lambda path: path.write_text(text) and None)
+    write_file(out / f"{name}.json", text)

@@ -15,7 +15,7 @@ import tyro
 from tqdm import tqdm
 
 from torchgrasp.errors import BadArgument, GraspError
-from torchgrasp.files import write_atomically
+from torchgrasp.files import write_file
 from torchgrasp.hand.author import draft_hand
 from torchgrasp.hand.em import Progress
 from torchgrasp.hand.fit import fit_mixture
@@ -99,7 +99,7 @@ def folder_of(hand: str, tips: tuple[str, ...]) -> str:
     target = Path(hand).parent / "hand.toml"
     if not target.exists():
         text = draft_hand(hand, tips)
-        write_atomically(target, lambda path: path.write_text(text) and None)
+        write_file(target, text)
         print(f"written: {target}; look over the lines marked CHECK")
     return str(target.parent)
 

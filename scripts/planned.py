@@ -21,7 +21,7 @@ from torchgrasp import (
     load_object,
     plan_contacts,
 )
-from torchgrasp.files import write_atomically
+from torchgrasp.files import write_atomically, write_file
 from torchgrasp.plan.probability import closure_probability
 from torchgrasp.report.canvas import Canvas, draw_bar
 from torchgrasp.report.palette import INK, PAPER
@@ -76,7 +76,7 @@ def table4(out: Path, starts: int = 1000, seed: int = 0) -> None:
                 print(line(row), flush=True)
     content = {"starts": starts, "seed": seed, "rows": rows, "published": PUBLISHED}
     out.mkdir(parents=True, exist_ok=True)
-    write_atomically(out / "table4.json", lambda path: path.write_text(json.dumps(content, indent=1)) and None)
+    write_file(out / "table4.json", json.dumps(content, indent=1))
 
 
 def count(shape: ShapeGP, spec: ContactSpec, starts: int, seed: int) -> dict[str, float]:

@@ -4,11 +4,17 @@ A bad *argument* raises a subclass of `GraspError` at the public function, befor
 that fails does not raise: it carries a `Status`, whose member holds the sentence for the user.
 """
 
+import copyreg
 import enum
+from typing import Any
 
 
 class GraspError(Exception):
     """Base of all errors raised by torchgrasp."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Travel between processes as what it is, whatever its class is made from."""
+        return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class BadArgument(GraspError, ValueError):
@@ -114,3 +120,6 @@ class Status(enum.IntEnum):
     EJECTED = 34, "the object was pushed out while the hand closed"
     UNSTABLE = 35, "the simulation did not stay finite"
     MOVED = 36, "the object moved or turned too far in the hand when it was pulled"
+    # the run
+    TIMED_OUT = 40, "it took longer than its limit and was ended"
+    WORKER_DIED = 41, "the process that worked on it died, twice"

@@ -45,6 +45,12 @@ def write_atomically(path: Path | str, write: Callable[[Path], object]) -> Path:
     return path
 
 
+def write_file(path: Path | str, content: str | bytes) -> Path:
+    """Write a whole file at once, text as UTF-8; see `write_atomically`."""
+    data = content.encode() if isinstance(content, str) else content
+    return write_atomically(path, lambda temporary: temporary.write_bytes(data))
+
+
 def save_tensors(path: Path | str, kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) -> Path:
     """Write named tensors and metadata as one safetensors file of a `kind` ("grasps", "mixture", ...).
 
@@ -55,7 +61,7 @@ def save_tensors(path: Path | str, kind: str, tensors: dict[str, Tensor], meta: 
     # One JSON string: safetensors writes several metadata keys in random order, and equal values must give equal bytes.
     header = {"torchgrasp": json.dumps({**meta, "kind": kind, "version": VERSION}, sort_keys=True)}
     # as bytes, since a full disk then is an OSError, which save_file makes an error of its own
-    return write_atomically(path, lambda temporary: temporary.write_bytes(save(contiguous, header)))
+    return write_file(path, save(contiguous, header))
 
 
 def load_tensors(path: Path | str, kind: str, names: set[str]) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchgrasp.files import write_atomically
+from torchgrasp.files import write_file
 from torchgrasp.linalg import unit
 
 
@@ -58,8 +58,7 @@ def peak_mib() -> float | None:
 def write_rows(out: Path, bench: str, settings: dict[str, Any], rows: Sequence[Row]) -> None:
     """Write rows and settings as JSON."""
     content = {"bench": bench, "settings": settings, "rows": [dataclasses.asdict(row) for row in rows]}
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(out, lambda path: path.write_text(json.dumps(content, indent=1, default=str)) and None)
+    write_file(out, json.dumps(content, indent=1, default=str))
 
 
 BODIES = ("ellipsoid", "box", "cylinder", "torus")

@@ -11,7 +11,7 @@ import trimesh
 
 from torchgrasp import ContactSpec, PointCloud, Status, TrialSpec, close_hand, load_hand, plan_grasps, read_cloud
 from torchgrasp.base import count_status
-from torchgrasp.files import write_atomically
+from torchgrasp.files import write_file
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,4 +135,4 @@ def grasp(
     print_counts(rows)
     threads = torch.get_num_threads()
     text = json.dumps({"bench": "grasp", "view": view, "seed": seed, "threads": threads, "rows": rows}, indent=1)
-    write_atomically(out, lambda path: path.write_text(text) and None)
+    write_file(out, text)

@@ -11,7 +11,7 @@ from torchgrasp.close.evaluate import ViewScore, summarise
 from torchgrasp.close.evaluate import evaluate as evaluate_views
 from torchgrasp.close.protocol import PROTOCOLS, Mode
 from torchgrasp.errors import Status
-from torchgrasp.files import write_atomically
+from torchgrasp.files import write_file
 from torchgrasp.hand.load import load_hand
 
 
@@ -64,12 +64,8 @@ def evaluate(
         for s in scores
     ]
     text = json.dumps({"asked": asked, "summary": summary, "views": rows}, indent=1)
-
-    def write(path: Path) -> None:
-        path.write_text(text)
-
     with naming("--out", "path"):
-        write_atomically(out / "evaluate.json", write)
+        write_file(out / "evaluate.json", text)
     return 0
 
 

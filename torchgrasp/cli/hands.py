@@ -9,7 +9,7 @@ import tyro
 
 from torchgrasp.cli.common import check_folder, check_seed, naming
 from torchgrasp.errors import BadArgument, GraspError, OutputError
-from torchgrasp.files import write_atomically
+from torchgrasp.files import write_file
 from torchgrasp.hand.author import draft_hand
 from torchgrasp.hand.dataset import write_samples
 from torchgrasp.hand.hand import Hand
@@ -46,7 +46,7 @@ def new(
         raise OutputError("URDF", f"{target}, which exists", "a folder without a hand.toml")
     with naming("--tips", "tips"), naming("URDF", "urdf"):
         text = draft_hand(urdf, tips, name, seed)
-    _write(target, text.encode())
+    write_file(target, text)
     print(f"written: {target}; look over the lines marked CHECK, then: torchgrasp hand check {target.parent}")
     return _print_faults(target.parent, "default")
 
@@ -76,7 +76,7 @@ def check(
     print(describe(sound, joints))
     modelled = find_hand(hand) / "mixture.safetensors"
     print(f"learned model: {modelled if modelled.exists() else f'none; python scripts/make_hand.py {hand} learns it'}")
-    _write(out, draw_hand(sound, opposed_posture(sound, joints)))
+    write_file(out, draw_hand(sound, opposed_posture(sound, joints)))
     print(f"picture: {out}")
     return 0
 
@@ -116,15 +116,6 @@ def describe(hand: Hand, joints: torch.Tensor) -> str:
     least, most = (1e3 * float(sides.quantile(q)) for q in (0.01, 0.99))
     lines.append(f"fingertips are {least:.0f} to {most:.0f} mm apart")
     return "\n".join(lines)
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Write a file atomically."""
-
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(content)
-
-    write_atomically(path, write)
 
 
 def sample(

@@ -16,7 +16,7 @@ from torchgrasp.cloud.pcd import parse_pcd
 from torchgrasp.cloud.ply import format_ply, parse_ply
 from torchgrasp.cloud.text import MAX_POINTS, read_lines
 from torchgrasp.errors import BadArgument, CloudFileError, TooFewPoints
-from torchgrasp.files import write_atomically
+from torchgrasp.files import write_file
 from torchgrasp.values import PointCloud
 
 MAX_BYTES = 512 * 2**20
@@ -101,11 +101,7 @@ def save_cloud(cloud: PointCloud, path: Path | str) -> Path:
         content = format_ply(**arrays)
     else:
         raise BadArgument("path", path, "a file ending in .npz or .ply")
-
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(content)
-
-    return write_atomically(path, write)
+    return write_file(path, content)
 
 
 def _check_viewpoint(viewpoint: Any) -> Tensor:

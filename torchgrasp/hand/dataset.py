@@ -18,7 +18,7 @@ from typing import Any
 
 from torchgrasp.base import join
 from torchgrasp.errors import BadArgument, ModelFileError, OutputError
-from torchgrasp.files import load_tensors, save_tensors, write_atomically
+from torchgrasp.files import load_tensors, save_tensors, write_file
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.sample import (
     CHUNK,
@@ -206,7 +206,7 @@ def _start(folder: Path, manifest: str) -> None:
     elif any(x.name != LOCK for x in folder.iterdir()):
         raise OutputError("folder", f"{folder}, which holds other files", "an empty folder")
     else:
-        write_atomically(path, lambda temporary: temporary.write_text(manifest, "utf-8"))
+        write_file(path, manifest)
     for half in folder.glob(".*.safetensors"):
         half.unlink()
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.files import write_atomically
+from torchgrasp.files import write_file
 from torchgrasp.shape.surface import Surface
 
 SUFFIXES = (".ply", ".glb")
@@ -40,11 +40,7 @@ def save_surface(surface: Surface, path: Path | str) -> Path:
         mesh.vertex_attributes["std_m"] = std.astype(np.float32)
     content = mesh.export(file_type=path.suffix.lower()[1:])
     assert isinstance(content, bytes)
-
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(content)
-
-    return write_atomically(path, write)
+    return write_file(path, content)
 
 
 def largest_std(surface: Surface) -> float:

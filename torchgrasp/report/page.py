@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 from torchgrasp.base import count_status
-from torchgrasp.files import write_atomically
+from torchgrasp.files import write_file
 from torchgrasp.report.palette import FINGERS
 from torchgrasp.report.pictures import (
     draw_cloud,
@@ -61,12 +61,7 @@ def write_report(path: Path | str, run: Run) -> Path:
     Raises:
         OutputError: the file cannot be written.
     """
-    page = format_page(run, draw_pictures(run))
-
-    def write(temporary: Path) -> None:
-        temporary.write_text(page, encoding="utf-8")
-
-    return write_atomically(path, write)
+    return write_file(path, format_page(run, draw_pictures(run)))
 
 
 def draw_pictures(run: Run) -> dict[str, list[tuple[str, bytes]]]:
