@@ -1,0 +1,140 @@
+"""Object-level impedance [6]: the grasp is a spring in the hand, and the fingers are springs to each other.
+
+The virtual frame of the three fingertips (Eqs. 15-17) stands for the object, which no sensor sees. A wrench pulls it
+back to where it was in the hand when the object was grasped; the fingers share that wrench. Internal forces press
+whatever the wrench: the desired ones, which turn with the frame, and springs along the sides of the triangle. These
+sides span the whole null space of the grasp map. Springs from the fingertips to the frame's origin, as in [6], balance
+only in the proportion of their lengths: two fingers against a thumb would press 30 to 45 degrees off their normals.
+
+[6] M. Li, H. Yin, K. Tahara and A. Billard, "Learning object-level impedance control for robust grasping and dexterous
+manipulation", ICRA 2014.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.close.control import RAMP, Plant, Sight, held_forces
+from torchgrasp.close.force import internal_forces
+from torchgrasp.close.law import damped_inverse
+from torchgrasp.frames import skew, virtual_frame
+from torchgrasp.values import ClosingGains
+
+TRANSLATION_STIFFNESS = 600.0
+"""Of the virtual frame's origin [N/m]: 0.1 kg sags by 2 mm."""
+
+ROTATION_STIFFNESS = 1.0
+"""Of the virtual frame's axes [N m/rad]."""
+
+GRASP_STIFFNESS = 100.0
+"""Of the spring along each side of the triangle of fingertips [N/m]."""
+
+MOST_SHARE = 0.5
+"""The wrench asks of no finger for more than this share of the strongest desired force."""
+
+
+def grasp_map(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 6 9"]:
+    """Return the matrix that turns three forces at `points` into force and torque about their centre.
+
+    >>> grasp_map(torch.eye(3)) @ internal_forces(torch.eye(3)).flatten(1).T
+    tensor([[0., 0., 0.],
+            [0., 0., 0.],
+            [0., 0., 0.],
+            [0., 0., 0.],
+            [0., 0., 0.],
+            [0., 0., 0.]])
+    """
+    arms = points - points.mean(-2, keepdim=True)
+    eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*arms.shape[:-2], 3, 3)
+    return torch.cat([torch.cat([eye] * 3, -1), torch.cat(skew(arms).unbind(-3), -1)], -2)
+
+
+def restoring_wrench(
+    hand_from_vf: Float[Tensor, "*b 4 4"],
+    rest: Float[Tensor, "*b 4 4"],
+    translation: float = TRANSLATION_STIFFNESS,
+    rotation: float = ROTATION_STIFFNESS,
+) -> Float[Tensor, "*b 6"]:
+    """Return the force [N] and torque [N m] about the virtual frame's origin that turn it back to `rest`.
+
+    The torque is along the axis of the turn and grows with the sine of its angle.
+
+    >>> restoring_wrench(torch.eye(4), torch.eye(4))
+    tensor([0., 0., 0., 0., 0., 0.])
+    """
+    axes, wanted = hand_from_vf[..., :3, :3].mT, rest[..., :3, :3].mT
+    turn = 0.5 * torch.linalg.cross(axes, wanted).sum(-2)
+    return torch.cat([translation * (rest[..., :3, 3] - hand_from_vf[..., :3, 3]), rotation * turn], -1)
+
+
+def shared_forces(
+    points: Float[Tensor, "*b 3 3"], wrench: Float[Tensor, "*b 6"], most: Float[Tensor, "*b"]
+) -> Float[Tensor, "*b 3 3"]:
+    """Return the smallest forces at `points` that add up to a wrench, scaled so that none exceeds `most` [N]."""
+    forces = (torch.linalg.pinv(grasp_map(points)) @ wrench[..., None])[..., 0].unflatten(-1, (3, 3))
+    largest = torch.linalg.vector_norm(forces, dim=-1).amax(-1)
+    return forces * (most / torch.maximum(largest, most))[..., None, None]
+
+
+def spring_forces(
+    points: Float[Tensor, "*b 3 3"], lengths: Float[Tensor, "*b 3"], stiffness: Float[Tensor, "*b 3"]
+) -> Float[Tensor, "*b 3 3"]:
+    """Return the forces of springs along the sides (0, 1), (1, 2) and (2, 0) of a triangle, which always balance.
+
+    Args:
+        points: fingertips [m].
+        lengths: of the sides at which the springs are free of force [m].
+        stiffness: of each spring [N/m].
+    """
+    return torch.einsum("...k,...kci->...ci", stiffness * (side_lengths(points) - lengths), internal_forces(points))
+
+
+def side_lengths(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
+    """Return the lengths of the sides (0, 1), (1, 2) and (2, 0) of a triangle [m]."""
+    return torch.linalg.vector_norm(points.roll(-1, dims=-2) - points, dim=-1)
+
+
+class Impedance:
+    """Hold what is grasped as a spring in the hand: the joints' torques are J^T f, set as targets q + J^T f / kp.
+
+    At rest in the grasp's pose the forces are the desired ones, balanced anew for the contacts that were really made.
+    One common factor keeps the sum of what the fingertips feel at what was asked for. Motions of the joints that move
+    no fingertip are held where they were.
+    """
+
+    def __init__(self, plant: Plant, gains: ClosingGains, sight: Sight, start: Float[Tensor, " j"]) -> None:
+        self.plant = plant
+        self.stiffness = (plant.coupling**2 * plant.kp[:, None]).sum(0)
+        forces, self.strength = held_forces(plant, gains, sight)
+        self.rest, self.lengths = virtual_frame(sight.tips), side_lengths(sight.tips)
+        self.desired = forces @ self.rest[:3, :3]  # in the virtual frame
+        self.posture = self._actuated(sight.joints)
+        self.lead = self._actuated(start) - self.posture
+        self.factor, self.time = 1.0, 0.0
+
+    def __call__(self, sight: Sight, period: float) -> Float[Tensor, " j"]:
+        """Return the targets of all joints for the next tick."""
+        self.time += period
+        share = min(self.time / RAMP, 1.0)
+        if share == 1.0:
+            lacking = 1 - float(sight.reading.sum()) / self.strength
+            self.factor = min(max(self.factor + period * lacking, 0.5), 1.5)
+        posture = self._actuated(sight.joints)
+        jacobian = (sight.jacobian @ self.plant.coupling).flatten(0, 1)
+        lead = jacobian.T @ self.forces(sight.tips).flatten() / self.stiffness
+        drift = self.posture - posture
+        drift = drift - damped_inverse(jacobian) @ (jacobian @ drift)
+        return self.plant.expand(posture + drift + self.lead + share * (lead - self.lead))
+
+    def forces(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+        """Return the forces of the fingers on the object [N], in the hand's frame, for where the fingertips are."""
+        frame = virtual_frame(tips)
+        desired = self.factor * self.desired @ frame[:3, :3].T
+        most = MOST_SHARE * torch.linalg.vector_norm(desired, dim=-1).amax()
+        springs = spring_forces(tips, self.lengths, torch.full_like(self.lengths, GRASP_STIFFNESS))
+        return desired + springs + shared_forces(tips, restoring_wrench(frame, self.rest), most)
+
+    def _actuated(self, joints: Float[Tensor, " j"]) -> Float[Tensor, " h"]:
+        """Return the actuated joints that come nearest to all joints, each weighted with its stiffness."""
+        weighted = self.plant.coupling * self.plant.kp[:, None]
+        return weighted.T @ (joints - self.plant.offset) / self.stiffness
