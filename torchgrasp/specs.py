@@ -1,7 +1,7 @@
 """What a user asks of the contacts and of a simulated trial: numbers with names, units, ranges and defaults."""
 
 import dataclasses
-from typing import Literal
+from typing import Literal, get_args
 
 from torchgrasp.base import Value
 from torchgrasp.errors import BadArgument
@@ -78,14 +78,18 @@ class TrialSpec(Value):
     """One simulated trial: close on the true mesh, lift it off the table, hold it.
 
     Args:
-        controller: "uncertainty" (Eqs. 25-28) or "position" (isotropic PI that stops at 0.5 N, the paper's baseline).
+        controller: how the hand closes: "uncertainty" (Eqs. 25-28), "fixed" (Eq. 25 with constant gains), "position"
+            (isotropic PI that stops at 0.5 N, the paper's baseline) or "open_loop" (pre-grasp, grasp, squeeze).
+        holding: how it presses from then on: "squeeze" (joints stay where they are) or "impedance" (the grasp is a
+            spring in the hand). The open loop keeps its squeeze.
         mass: of the object [kg].
         friction: of every contact.
         gravity: [m/s^2].
         lift_height: [m].
         hold_time: [s] after the lift.
+        shake: amplitude [m] of a vertical sinusoid of 5 Hz during the hold.
         force: desired normal force of the strongest finger [N].
-        noise: whether the tactile sensor has the paper's noise (0.1 N normal, 0.3 N tangential).
+        noise: whether the tactile sensor has noise (0.1 N normal, 0.3 N tangential, 1.5 mm of a contact's place).
         timestep: of the simulator [s].
         control_rate: of the controller [Hz].
 
@@ -93,12 +97,14 @@ class TrialSpec(Value):
         BadArgument: a number outside its range or an unknown controller.
     """
 
-    controller: Literal["uncertainty", "position"] = "uncertainty"
+    controller: Literal["open_loop", "position", "fixed", "uncertainty"] = "uncertainty"
+    holding: Literal["squeeze", "impedance"] = "squeeze"
     mass: float = 0.1
     friction: float = 0.8
     gravity: float = 9.81
     lift_height: float = 0.1
     hold_time: float = 2.0
+    shake: float = 0.0
     force: float = 4.0
     noise: bool = True
     timestep: float = 1 / 500
@@ -106,14 +112,17 @@ class TrialSpec(Value):
 
     def __post_init__(self) -> None:
         """Check every range once, where the value is made."""
-        if self.controller not in ("uncertainty", "position"):
-            raise BadArgument("controller", repr(self.controller), "'uncertainty' or 'position'")
+        fields = {field.name: field.type for field in dataclasses.fields(self)}
+        for name in ("controller", "holding"):
+            if getattr(self, name) not in get_args(fields[name]):
+                raise BadArgument(name, repr(getattr(self, name)), f"one of {', '.join(get_args(fields[name]))}")
         ranges = {
             "mass": (1e-3, 10.0),
             "friction": (0.0, 10.0),
             "gravity": (0.0, 100.0),
             "lift_height": (0.0, 1.0),
             "hold_time": (0.0, 60.0),
+            "shake": (0.0, 0.02),
             "force": (0.01, 100.0),
             "timestep": (1e-4, 1 / 60),
             "control_rate": (10.0, 1000.0),

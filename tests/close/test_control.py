@@ -1,22 +1,16 @@
 """The controllers without a simulator: when fingers wait, stop and press, and what the squeeze asks of the joints."""
 
+import dataclasses
+
 import pytest
 import torch
 
-from torchgrasp.close.control import (
-    LEAD,
-    PATIENCE,
-    RAMP,
-    SETTLED,
-    STOP_FORCE,
-    Closing,
-    Plant,
-    Sight,
-    Squeeze,
-    Stopping,
-    held_forces,
-)
-from torchgrasp.close.law import MAX_SPEED, surface_covariance
+from torchgrasp.close.closings import LEAD, PATIENCE, POSE_TIME, SETTLED, STOP_FORCE, Closing, FixedClosing, Stopping
+from torchgrasp.close.control import CLOSING_TIME, PRESSING_TIME, GraspController
+from torchgrasp.close.hold import RAMP, Squeeze, held_forces
+from torchgrasp.close.law import MAX_SPEED, POSITION_FLOOR, POSITION_RATE, surface_covariance
+from torchgrasp.close.sight import Plant, Sight
+from torchgrasp.errors import BadArgument
 from torchgrasp.values import ClosingGains
 
 PERIOD = 0.01
@@ -47,6 +41,7 @@ def plant(coupling: torch.Tensor | None = None) -> Plant:
         normals=NORMALS,
         joints=zero,
         pregrasp=zero,
+        squeeze=zero + 0.02,
     )
 
 
@@ -67,6 +62,7 @@ def sight(off: float = 0.02, reading=(0.0, 0.0, 0.0), contact=FREE, joints=None)
         tips=TARGET + (0.01 + off) * NORMALS,
         jacobian=torch.eye(9).double().reshape(3, 3, 9),
         reading=real(reading),
+        forces=-real(reading)[:, None] * NORMALS,
         contact=contact,
         points=torch.where(touched, TARGET, torch.nan),
         normals=torch.where(touched, NORMALS, torch.nan),
@@ -153,3 +149,45 @@ def test_the_squeeze_rises_to_what_the_drives_turn_into_the_forces():
     for _ in range(1000):
         more = hold(weak, PERIOD)
     assert more.norm() == pytest.approx(1.5 * float(forces.norm()) / 2.0, rel=1e-6)
+
+
+def run(controller: GraspController, seen: Sight, seconds: float) -> list[torch.Tensor]:
+    return [controller.step(seen, PERIOD) for _ in range(round(seconds / PERIOD))]
+
+
+def test_the_open_loop_goes_through_its_three_poses_whatever_is_felt():
+    opened = dataclasses.replace(plant(), pregrasp=plant().joints - 0.01)
+    controller = GraspController(opened, GAINS, "open_loop")
+    assert not controller.closed
+    path = torch.stack(run(controller, sight(contact=TOUCHING), 2 * POSE_TIME + 0.2))
+    assert torch.allclose(path[39], real(0.0), atol=1e-12) and torch.allclose(path[19], real(-0.005))
+    assert torch.allclose(path[79:], real(0.02)) and torch.allclose(path[59], real(0.01))
+    assert controller.closed
+
+
+@pytest.mark.parametrize("closing", ["position", "fixed", "uncertainty"])
+def test_closing_ends_in_time_and_a_holding_takes_over(closing):
+    controller = GraspController(plant(), GAINS, closing)
+    run(controller, sight(0.05), CLOSING_TIME - PERIOD)
+    assert controller.hold is None
+    run(controller, sight(0.05), 3 * PERIOD)
+    assert isinstance(controller.hold, Squeeze) and not controller.closed
+    run(controller, sight(0.05), PRESSING_TIME)
+    assert controller.closed
+
+
+def test_the_first_targets_are_the_opened_hand_and_unknown_names_are_refused():
+    assert torch.equal(GraspController(plant(), GAINS).targets, plant().pregrasp)
+    with pytest.raises((BadArgument, TypeError), match="slow"):
+        GraspController(plant(), GAINS, "slow")  # pyright: ignore[reportArgumentType]
+    with pytest.raises((BadArgument, TypeError), match="glue"):
+        GraspController(plant(), GAINS, "fixed", "glue")  # pyright: ignore[reportArgumentType]
+
+
+def test_fixed_gains_know_nothing_of_the_surface():
+    """Eq. 27 without uncertainty: each contact and each direction has the rate of the floor alone."""
+    gains = FixedClosing(plant(), GAINS).gains
+    assert torch.allclose(gains.position_gain, real(POSITION_RATE))
+    assert torch.allclose(gains.covariance, POSITION_FLOOR**2 * torch.eye(3).double())
+    assert (gains.force_gain == gains.force_gain[:, :1]).all()
+    assert torch.equal(gains.target, GAINS.target)

@@ -1,10 +1,10 @@
-"""The impedance of a held object: wrenches that restore, forces that balance, torques that the drives turn them into."""
+"""The impedance of a held object: wrenches that restore, forces that balance, what the drives make of both."""
 
 import pytest
 import torch
 
 from tests.close.test_control import GAINS, PERIOD, TOUCHING, plant, real, sight
-from torchgrasp.close.control import RAMP, held_forces
+from torchgrasp.close.hold import RAMP, held_forces
 from torchgrasp.close.impedance import (
     MOST_SHARE,
     Impedance,

@@ -123,6 +123,52 @@ def test_controllers_differ_and_waiting_keeps_the_object_still():
     assert aware.held
 
 
+def test_the_hand_may_stand_beside_where_it_was_planned_and_may_be_shaken():
+    aside = torch.eye(4, dtype=torch.float64)
+    aside[0, 3] = 0.004
+    result = close("allegro", spec=dataclasses.replace(QUICK, shake=0.003, hold_time=0.5), error=aside)
+    assert result.held
+    _, grasp = pinch("allegro")
+    planned = (grasp.obj_from_hand[0] @ aside)[:3, 3]
+    assert torch.allclose(result.hand_pose[1, :3, 3], planned, atol=1e-4)
+    height = result.hand_pose[-15:, 2, 3] - result.hand_pose[1, 2, 3] - TrialSpec().lift_height
+    assert float(height.max() - height.min()) == pytest.approx(0.006, rel=0.1)
+
+
+def test_all_a_fingertip_exerts_is_felt_friction_included():
+    """At rest the tips carry the object: their full forces sum to its weight, their normal parts are the readings."""
+    pytest.importorskip("sapien")
+    from torchgrasp.close.control import GraspController
+    from torchgrasp.close.law import closing_gains
+    from torchgrasp.close.parts import convex_parts
+    from torchgrasp.close.robot import Robot
+    from torchgrasp.close.scene import Setup, open_scene
+    from torchgrasp.close.sight import plant_from_hand, sight_from_joints
+
+    hand, grasp = pinch("allegro")
+    start = {name: float(q) for name, q in hand.expand(grasp.pregrasp[0]).items()}
+    stands, mesh = grasp.obj_from_hand[0].numpy(), cylinder()
+    tips = tuple(hand.tip_links)
+    scene = open_scene(Setup(hand.urdf_path, stands, start, hand.actuators, tips, mesh, convex_parts(mesh), 0.1))
+    plant = plant_from_hand(hand, grasp, 4.0, scene.joint_names)
+    robot = Robot(scene, hand, plant, 100.0, None)
+    controller = GraspController(plant, closing_gains(grasp, hand))
+    sight = robot.tick(controller.targets)
+    while not controller.closed:
+        sight = robot.tick(controller.step(sight, robot.period))
+    for k in range(200):
+        scene.lift(min(k, 100) * 5e-4)
+        sight = robot.tick(controller.step(sight, robot.period))
+    total = (grasp.obj_from_hand[0, :3, :3] @ sight.forces.T).sum(1)
+    assert torch.allclose(total, torch.tensor([0, 0, 0.981]).double(), atol=0.02)
+    assert torch.allclose(-(sight.forces * sight.normals).sum(-1), sight.reading, atol=0.02)
+    own = sight.joints[list(plant.actuated)]
+    alone = sight_from_joints(hand, own, robot._touch)
+    order = [hand.urdf_joint_names.index(name) for name in scene.joint_names]
+    assert torch.allclose(alone.tips, sight.tips, atol=1e-5)
+    assert torch.allclose(alone.jacobian[:, :, order], sight.jacobian, atol=1e-5)
+
+
 def test_a_hand_that_starts_in_the_object_is_refused():
     result = close("barrett", cylinder((0.0, 0.05)))
     assert result.status is Status.START_OVERLAP

@@ -7,9 +7,10 @@ from typing import Any, Literal
 
 from torchgrasp.cli.common import check_folder, check_seed, naming
 from torchgrasp.cli.grasps import check_simulator
+from torchgrasp.close.control import ClosingMode
 from torchgrasp.close.evaluate import ViewScore, summarise
 from torchgrasp.close.evaluate import evaluate as evaluate_views
-from torchgrasp.close.protocol import PROTOCOLS, Mode
+from torchgrasp.close.protocol import PROTOCOLS
 from torchgrasp.errors import Status
 from torchgrasp.files import write_file
 from torchgrasp.hand.load import load_hand
@@ -20,7 +21,7 @@ def evaluate(
     hand: str,
     out: Path,
     protocol: Literal["multidex", "dexgraspbench", "dexgraspbench-hard", "pose-noise"] = "dexgraspbench",
-    closing: Mode = "open_loop",
+    closing: ClosingMode = "open_loop",
     grasps: int = 20,
     starts: int = 1000,
     force: float = 7.0,

@@ -8,8 +8,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torchgrasp.close.control import ClosingMode
 from torchgrasp.close.parts import convex_parts
-from torchgrasp.close.protocol import Mode, PullProtocol, PullResult, check_test, draw_errors, pull_grasp
+from torchgrasp.close.protocol import PullProtocol, PullResult, check_test, draw_errors, pull_grasp
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.pipeline import plan_grasps
@@ -47,7 +48,7 @@ def evaluate(
     starts: int = 1000,
     seed: int = 0,
     force: float = 7.0,
-    closing: Mode = "open_loop",
+    closing: ClosingMode = "open_loop",
     complete: bool = False,
     only: Sequence[str] = (),
     observer: Callable[[ViewScore], None] | None = None,
@@ -92,7 +93,13 @@ def evaluate(
 
 
 def try_grasps(
-    grasps: Grasps, hand: Hand, mesh: "trimesh.Trimesh", protocol: PullProtocol, force: float, closing: Mode, seed: int
+    grasps: Grasps,
+    hand: Hand,
+    mesh: "trimesh.Trimesh",
+    protocol: PullProtocol,
+    force: float,
+    closing: ClosingMode,
+    seed: int,
 ) -> tuple[PullResult, ...]:
     """Return what becomes of each grasp with each of its drawn errors, grasp by grasp."""
     parts = convex_parts(mesh)

@@ -14,9 +14,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.close.control import RAMP, Plant, Sight, held_forces
 from torchgrasp.close.force import internal_forces
+from torchgrasp.close.hold import RAMP, held_forces
 from torchgrasp.close.law import damped_inverse
+from torchgrasp.close.sight import Plant, Sight
 from torchgrasp.frames import skew, virtual_frame
 from torchgrasp.values import ClosingGains
 

@@ -8,12 +8,11 @@ protocol's torsional coefficient (a length) over its sliding one is r.
 """
 
 import dataclasses
-import itertools
 import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -21,13 +20,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.close.control import Closing, Squeeze, Stopping
+from torchgrasp.close.control import CLOSINGS, HOLDINGS, ClosingMode, GraspController, HoldingMode
 from torchgrasp.close.law import closing_gains
 from torchgrasp.close.parts import check_parts, convex_parts, read_mesh
-from torchgrasp.close.robot import Robot, plant_from_hand
+from torchgrasp.close.robot import Robot
 from torchgrasp.close.scene import Scene, Setup, open_scene
-from torchgrasp.close.squeeze import squeeze_joints
-from torchgrasp.close.trial import CLOSING_TIME, PRESSING_TIME
+from torchgrasp.close.sight import plant_from_hand
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import rigid, rotation_angle, rotation_from_vector
 from torchgrasp.hand.hand import Hand
@@ -80,14 +78,8 @@ class PullProtocol(Value):
     draws: int = 1
 
 
-Mode = Literal["open_loop", "uncertainty", "position"]
-"""How the hand closes: through its three poses, or by one of the controllers of `close_hand` at 100 Hz."""
-
 CONTROL_RATE = 100.0
 """Of the controllers [Hz]."""
-
-CLOSE_SECONDS = 0.4
-"""Time [s] from pre-grasp to grasp, and as much from grasp to squeeze."""
 
 CHECK_SECONDS = 0.2
 """How often [s] the object is looked at while it is pulled."""
@@ -130,9 +122,10 @@ def pull_grasp(
     mesh: "trimesh.Trimesh | Path | str",
     protocol: PullProtocol | str = "dexgraspbench",
     force: float = 7.0,
-    closing: Mode = "open_loop",
+    closing: ClosingMode = "open_loop",
     seed: int = 0,
     *,
+    holding: HoldingMode = "squeeze",
     error: Float[Tensor, "4 4"] | None = None,
     parts: "Sequence[trimesh.Trimesh] | None" = None,
 ) -> PullResult:
@@ -144,29 +137,29 @@ def pull_grasp(
         mesh: the true object [m], closed: a trimesh or a file.
         protocol: one of `PROTOCOLS` by name, or another.
         force: normal force of the strongest finger [N] in the squeeze.
-        closing: how the hand closes.
+        closing: how the hand closes, at 100 Hz: through its three poses, or by one of the controllers (`CLOSINGS`).
         seed: of the noise of the fingertips that the controllers feel with.
+        holding: how it presses from then on, but for the open loop, which keeps its squeeze (`HOLDINGS`).
         error: where the hand really stands in its planned frame (`draw_errors`), of which it knows nothing.
         parts: convex bodies to use for the mesh instead of its own decomposition.
 
     Raises:
-        BadArgument: an unknown protocol or closing, a force outside (0, 1000) N, not exactly one row, a grasp of
-            another hand, or a pre-grasp outside the joint limits.
+        BadArgument: an unknown protocol, closing or holding, a force outside (0, 1000) N, not exactly one row, a
+            grasp of another hand, or a pre-grasp outside the joint limits.
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
     """
     began = time.process_time()
-    protocol = check_test(protocol, force, closing)
+    protocol = check_test(protocol, force, closing, holding)
     if len(grasp) != 1:
         raise BadArgument("grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]")
     grasp, hand = grasp.to("cpu", torch.float64), hand.to("cpu", torch.float64)
     hand.check_joints(grasp.pregrasp)
     gains = closing_gains(grasp, hand, force)
-    squeezed = squeeze_joints(grasp, hand, force, protocol.kp)[0]
     mesh = read_mesh(mesh)
     bodies = convex_parts(mesh) if parts is None else check_parts(parts)
     stands = grasp.obj_from_hand[0] if error is None else grasp.obj_from_hand[0] @ error.double()
-    trial = _Pull(grasp, hand, mesh, bodies, protocol, stands, closing, gains, squeezed, seed)
+    trial = _Pull(grasp, hand, mesh, bodies, protocol, stands, closing, holding, gains, force, seed)
     status, moved, turned, pressed, tried = Status.OK, 0.0, 0.0, math.nan, 0
     for direction in DIRECTIONS:
         found, forces = trial.run(direction)
@@ -179,16 +172,17 @@ def pull_grasp(
     return PullResult(passed, status, tried, moved, turned, pressed, time.process_time() - began)
 
 
-def check_test(protocol: PullProtocol | str, force: float, closing: str) -> PullProtocol:
+def check_test(protocol: PullProtocol | str, force: float, closing: str, holding: str = "squeeze") -> PullProtocol:
     """Return the protocol, by its name or as it is, after checking what a test is asked for.
 
     Raises:
-        BadArgument: an unknown protocol or closing, or a force outside (0, 1000) N.
+        BadArgument: an unknown protocol, closing or holding, or a force outside (0, 1000) N.
     """
     if isinstance(protocol, str) and protocol not in PROTOCOLS:
         raise BadArgument("protocol", repr(protocol), f"one of {', '.join(PROTOCOLS)}")
-    if closing not in get_args(Mode):
-        raise BadArgument("closing", repr(closing), f"one of {', '.join(get_args(Mode))}")
+    for name, value, table in (("closing", closing, CLOSINGS), ("holding", holding, HOLDINGS)):
+        if value not in table:
+            raise BadArgument(name, repr(value), f"one of {', '.join(table)}")
     if not 0.0 < force < 1e3:
         raise BadArgument("force", force, "a number in (0, 1000) [N]")
     return PROTOCOLS[protocol] if isinstance(protocol, str) else protocol
@@ -214,15 +208,19 @@ class _Pull:
         parts: "list[trimesh.Trimesh]",
         protocol: PullProtocol,
         stands: Float[Tensor, "4 4"],
-        closing: Mode,
+        closing: ClosingMode,
+        holding: HoldingMode,
         gains: ClosingGains,
-        squeezed: Float[Tensor, "h"],
+        force: float,
         seed: int,
     ) -> None:
         self.grasp, self.hand, self.mesh, self.parts, self.protocol = grasp, hand, mesh, parts, protocol
-        self.stands, self.closing, self.gains, self.seed = stands.numpy(), closing, gains, seed
+        self.closing: ClosingMode = closing
+        self.holding: HoldingMode = holding
+        self.stands = stands.numpy()
+        self.gains, self.force, self.seed = gains, force, seed
         self.mass = protocol.density * float(mesh.volume) if protocol.mass is None else protocol.mass
-        self.poses = [hand.expand(pose) for pose in (grasp.pregrasp[0], grasp.joints[0], squeezed)]
+        self.start = {name: float(q) for name, q in hand.expand(grasp.pregrasp[0]).items()}
         self.drives = hand.actuators
         if protocol.kp is not None:
             self.drives = {name: drive._replace(kp=protocol.kp) for name, drive in self.drives.items()}
@@ -230,16 +228,15 @@ class _Pull:
     def run(self, direction: np.ndarray) -> tuple[tuple[Status, float, float], float]:
         """Close, pull along one direction, and return status, motion [m], turn [rad] and the mean force [N] before."""
         rule = self.protocol
-        start = {name: float(q) for name, q in self.poses[0].items()}
         setup = Setup(
-            self.hand.urdf_path, self.stands, start, self.drives, tuple(self.hand.tip_links), self.mesh, self.parts,
-            self.mass, rule.friction, 0.0, TIMESTEP, 0.0, table=False, patch=rule.patch,
+            self.hand.urdf_path, self.stands, self.start, self.drives, tuple(self.hand.tip_links), self.mesh,
+            self.parts, self.mass, rule.friction, 0.0, TIMESTEP, 0.0, table=False, patch=rule.patch,
         )  # fmt: skip
         scene = open_scene(setup)
         if not scene.penetration() <= rule.overlap:
             return (Status.START_OVERLAP, 0.0, 0.0), math.nan
         generator = torch.Generator().manual_seed(self.seed)
-        plant = plant_from_hand(self.hand, self.grasp, scene.joint_names, self.drives)
+        plant = plant_from_hand(self.hand, self.grasp, self.force, scene.joint_names, rule.kp)
         robot = Robot(scene, self.hand, plant, CONTROL_RATE, generator)
         before, far = scene.object_pose(), (0.0, 0.0)
         hold = self._close(robot)
@@ -259,36 +256,17 @@ class _Pull:
 
     def _close(self, robot: Robot) -> Callable[[], None]:
         """Close the hand and return what holds it closed for one tick more."""
-        if self.closing == "open_loop":
-            ladder = [torch.stack([pose[name] for name in robot.scene.joint_names]) for pose in self.poses]
-            ticks = robot.ticks(CLOSE_SECONDS)
-            for low, high in itertools.pairwise(ladder):
-                for k in range(ticks):
-                    robot.tick(low + (high - low) * ((k + 1) / ticks))
+        controller = GraspController(robot.plant, self.gains, self.closing, self.holding)
+        sight = robot.tick(controller.targets)
 
-            def stay() -> None:
-                """Keep the squeeze."""
-                robot.tick(ladder[-1])
-
-            return stay
-        targets = robot.plant.expand(robot.plant.pregrasp)
-        sight = robot.tick(targets)
-        controller = (Closing if self.closing == "uncertainty" else Stopping)(robot.plant, self.gains)
-        for _ in range(robot.ticks(CLOSING_TIME)):
-            targets = controller(sight, robot.period)
-            sight = robot.tick(targets)
-            if controller.done:
-                break
-        squeeze = Squeeze(robot.plant, self.gains, sight, targets)
-
-        def hold() -> None:
-            """Press on."""
+        def go_on() -> None:
+            """Let the controller act for a tick."""
             nonlocal sight
-            sight = robot.tick(squeeze(sight, robot.period))
+            sight = robot.tick(controller.step(sight, robot.period))
 
-        for _ in range(robot.ticks(PRESSING_TIME)):
-            hold()
-        return hold
+        while not controller.closed:
+            go_on()
+        return go_on
 
     def _judge(self, scene: Scene, start: np.ndarray) -> tuple[Status, float, float]:
         """Compare the object's pose with where it was."""

@@ -5,12 +5,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.close.control import Plant, Sight
 from torchgrasp.close.scene import Scene
-from torchgrasp.close.sensor import sense, untouched
+from torchgrasp.close.sensor import Press, sense, untouched
+from torchgrasp.close.sight import Plant, Sight
 from torchgrasp.frames import apply, inverse, rotate
-from torchgrasp.hand.hand import Actuator, Hand
-from torchgrasp.values import Grasps
+from torchgrasp.hand.hand import Hand
 
 
 class Robot:
@@ -42,55 +41,45 @@ class Robot:
     def tick(self, targets: Float[Tensor, " j"]) -> Sight:
         """Drive the joints for one control period and return what the robot then knows."""
         self.scene.drive(targets.numpy())
-        impulse, moment, weight = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
+        impulse, moment, weight, force = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))
         for _ in range(self.substeps):
             seen = self.scene.step()
             self.steps += 1
             impulse += seen.impulse
             moment += seen.moment
             weight += seen.weight
+            force += seen.force / self.substeps
             self.finger = seen.finger
             for i in np.flatnonzero(seen.weight > 0):
                 self.first_touch[i] = min(self.first_touch[i], self.steps)
         self.force = np.linalg.norm(impulse, axis=-1) / self.period
-        self._touch = sense(self._touch, torch.from_numpy(self.force), self.period, self.generator)
-        return self._sight(impulse, moment, weight)
+        return self._sight(impulse, moment, weight, force)
 
     def ticks(self, seconds: float) -> int:
         """Count the control ticks in a time [s]."""
         return max(1, round(seconds / self.period))
 
-    def _sight(self, impulse: np.ndarray, moment: np.ndarray, weight: np.ndarray) -> Sight:
-        """Return the hand's own knowledge, in its frame."""
+    def _sight(self, impulse: np.ndarray, moment: np.ndarray, weight: np.ndarray, force: np.ndarray) -> Sight:
+        """Return the hand's own knowledge, in its frame: the true contacts only as the fingertips sense them."""
         hand_from_world = inverse(torch.from_numpy(self.scene.hand_pose()))
         centres = (self.scene.tip_poses() @ self._centres[:, :, None])[:, :3, 0]
         jacobian = torch.from_numpy(self.scene.jacobian(centres))
         with np.errstate(invalid="ignore", divide="ignore"):
             points = moment / weight[:, None]
             normals = -impulse / np.linalg.norm(impulse, axis=-1, keepdims=True)
+        directions = rotate(hand_from_world, torch.from_numpy(np.concatenate([force, normals])))
+        places = apply(hand_from_world, torch.from_numpy(np.concatenate([points, centres])))
+        press = Press(torch.from_numpy(self.force), directions[:3], places[:3], directions[3:])
+        self._touch = touch = sense(
+            self._touch, press, self.plant.normals, self.plant.radius, self.period, self.generator
+        )
         return Sight(
             joints=torch.from_numpy(self.scene.joints()),
-            tips=apply(hand_from_world, torch.from_numpy(centres)),
+            tips=places[3:],
             jacobian=hand_from_world[:3, :3] @ jacobian,
-            reading=self._touch.reading,
-            contact=self._touch.contact,
-            points=apply(hand_from_world, torch.from_numpy(points)),
-            normals=rotate(hand_from_world, torch.from_numpy(normals)),
+            reading=touch.reading,
+            forces=touch.forces,
+            contact=touch.contact,
+            points=touch.points,
+            normals=touch.normals,
         )
-
-
-def plant_from_hand(hand: Hand, grasp: Grasps, names: tuple[str, ...], drives: dict[str, Actuator]) -> Plant:
-    """Return what the controllers need of a hand, all its joints in the order of `names`, driven by `drives`."""
-    order = [hand.urdf_joint_names.index(name) for name in names]
-    return Plant(
-        coupling=hand.coupling[order].double(),
-        offset=hand.offset[order].double(),
-        actuated=tuple(names.index(name) for name in hand.joint_names),
-        kp=torch.tensor([drives[name].kp for name in names], dtype=torch.float64),
-        lower=hand.lower.double(),
-        upper=hand.upper.double(),
-        radius=hand.tip_radius.double(),
-        normals=rotate(inverse(grasp.obj_from_hand), grasp.contacts.normals)[0],
-        joints=grasp.joints[0],
-        pregrasp=grasp.pregrasp[0],
-    )

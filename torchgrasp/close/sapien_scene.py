@@ -101,9 +101,10 @@ class SapienScene:
         """Let a force [N] act on the object's mass centre from now on."""
         self._pull = np.asarray(force, np.float32)
 
-    def lift(self, height: float) -> None:
-        """Set the target of the lift joint [m]."""
+    def lift(self, height: float, speed: float = 0.0) -> None:
+        """Set the target of the lift joint [m], and the speed [m/s] at which that target moves."""
         self._lift.set_drive_target(float(height))
+        self._lift.set_drive_velocity_target(float(speed))
 
     def joints(self) -> np.ndarray:
         """Return the position of every driven joint [rad]."""

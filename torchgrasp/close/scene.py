@@ -106,8 +106,8 @@ class Scene(Protocol):
         """Let a force [N] act on the object's mass centre from now on."""
         ...
 
-    def lift(self, height: float) -> None:
-        """Set the target of the lift joint [m]."""
+    def lift(self, height: float, speed: float = 0.0) -> None:
+        """Set the target of the lift joint [m], and the speed [m/s] at which that target moves."""
         ...
 
     def joints(self) -> np.ndarray:

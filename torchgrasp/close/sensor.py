@@ -1,7 +1,10 @@
-"""A tactile fingertip: what the controller may know of the contact forces.
+"""A tactile fingertip: what the controller may know of a contact, from the simulator's truth.
 
-Only the normal force is sensed (Sec. 6.5). The reading lags by a 20 Hz low-pass and carries white noise of 0.1 N; the
-contact flag switches with hysteresis on a slower average, because a single noisy reading crosses 0.2 N twice a second.
+The force lags by a 20 Hz low-pass and carries white noise of the paper's size (Sec. 6.5), 0.1 N along the normal and
+0.3 N across it. The place of a contact on the tip is known to 1.5 mm; on a round tip the place is the normal, which is
+then known to 1.5 mm over the tip's radius (7 degrees on 12 mm). A fingertip samples at a rate of its own and holds the
+last sample in between. The contact flag switches with hysteresis on a slower average, because a single noisy reading
+crosses 0.2 N twice a second.
 """
 
 import dataclasses
@@ -12,12 +15,25 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.linalg import unit
+
+RATE = 100.0
+"""Samples a second [Hz] of a fingertip."""
 
 NOISE = 0.1
 """Standard deviation of a reading of the normal force [N] (Sec. 6.5)."""
 
+TANGENTIAL_NOISE = 0.3
+"""Standard deviation of each component of the force along the surface [N] (Sec. 6.5)."""
+
+PLACE_NOISE = 1.5e-3
+"""Standard deviation of a contact's place on the fingertip [m], in each direction along its surface."""
+
+FLAT_RADIUS = 0.012
+"""Radius [m] by which the noise of the place becomes that of the normal on a tip that is not round (radius 0)."""
+
 CUTOFF = 20.0
-"""Cut-off of the reading's first-order low-pass [Hz]: a lag of 8 ms."""
+"""Cut-off of the force's first-order low-pass [Hz]: a lag of 8 ms."""
 
 FLAG_CUTOFF = 5.0
 """Cut-off of the average behind the contact flag [Hz]; it leaves 0.04 N of the noise at 100 Hz."""
@@ -30,44 +46,88 @@ TOUCH_OFF = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
-class Touch(Value):
-    """What the fingertips report: the `reading` of the normal force [N] and whether they are in `contact`.
+class Press(Value):
+    """The truth of three fingertips, averaged over a tick, in any one frame.
 
-    `filtered` is the low-passed force before noise and `average` the slow mean of the readings: the sensor's memory.
+    `normal_force` [N] is along the contact normals, `forces` [N] all that the tips exert on the object. `points` [m]
+    and outward `normals` of the contacts are NaN where nothing touches.
+    """
+
+    normal_force: Float[Tensor, "*b 3"]
+    forces: Float[Tensor, "*b 3 3"]
+    points: Float[Tensor, "*b 3 3"]
+    normals: Float[Tensor, "*b 3 3"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Touch(Value):
+    """What the fingertips report: the last sample of the force and of the contact, and whether there is one.
+
+    `reading` [N] is the normal force, `forces` [N] the full one, `points` [m] and `normals` the sensed contact, NaN
+    where nothing touched. The sensor's memory: `lagged` [N] are normal force (first) and full force behind the
+    low-pass, `average` [N] the slow mean of the readings, `age` [s] the time since the sample.
     """
 
     reading: Float[Tensor, "*b 3"]
+    forces: Float[Tensor, "*b 3 3"]
     contact: Bool[Tensor, "*b 3"]
-    filtered: Float[Tensor, "*b 3"]
+    points: Float[Tensor, "*b 3 3"]
+    normals: Float[Tensor, "*b 3 3"]
+    lagged: Float[Tensor, "*b 3 4"]
     average: Float[Tensor, "*b 3"]
+    age: float
 
 
 def untouched(*batch: int) -> Touch:
-    """Return the state of three fingertips in the air.
+    """Return the state of three fingertips in the air, due to sample.
 
     >>> untouched().contact
     tensor([False, False, False])
     """
-    zero = torch.zeros(*batch, 3, dtype=torch.float64)
-    return Touch(zero, torch.zeros(*batch, 3, dtype=torch.bool), zero, zero)
+    lagged = torch.zeros(*batch, 3, 4, dtype=torch.float64)
+    zero, vectors = lagged[..., 0], lagged[..., 1:]
+    nothing = torch.full_like(vectors, torch.nan)
+    return Touch(zero, vectors, zero > 0, nothing, nothing, lagged, zero, 1 / RATE)
 
 
-def sense(touch: Touch, force: Float[Tensor, "*b 3"], period: float, generator: torch.Generator | None = None) -> Touch:
+def sense(
+    touch: Touch,
+    press: Press,
+    pads: Float[Tensor, "*#b 3 3"],
+    radius: Float[Tensor, "3"],
+    period: float,
+    generator: torch.Generator | None = None,
+) -> Touch:
     """Return what the fingertips report one tick later.
 
     Args:
         touch: their state before.
-        force: the true normal forces [N], averaged over the tick.
+        press: the truth, averaged over the tick.
+        pads: outward normals of a surface that the pads face: what is along and what across a force in the air.
+        radius: of the tips [m]; 0: not round (`FLAT_RADIUS`).
         period: of the tick [s].
         generator: draws the noise; None: no noise.
     """
-    filtered = touch.filtered + low_pass(CUTOFF, period) * (force - touch.filtered)
-    reading = filtered
+    force = torch.cat([press.normal_force[..., None], press.forces], dim=-1)
+    lagged = touch.lagged + low_pass(CUTOFF, period) * (force - touch.lagged)
+    age = touch.age + period
+    if age < 1 / RATE - 1e-9:
+        return dataclasses.replace(touch, lagged=lagged, age=age)
+    reading, forces = lagged[..., 0], lagged[..., 1:]
+    points, normals = press.points, press.normals
     if generator is not None:
-        reading = filtered + NOISE * torch.randn(filtered.shape, generator=generator, dtype=filtered.dtype)
-    average = touch.average + low_pass(FLAG_CUTOFF, period) * (reading - touch.average)
+        along = torch.where(torch.isfinite(normals), normals, pads)
+        drawn = torch.randn(2, *forces.shape, generator=generator, dtype=forces.dtype)
+        push = (drawn[0] * along).sum(-1, keepdim=True)
+        across = drawn - (drawn * along).sum(-1, keepdim=True) * along
+        reading = reading + NOISE * push[..., 0]
+        forces = forces - NOISE * push * along + TANGENTIAL_NOISE * across[0]
+        bend = torch.where(radius > 0, radius, FLAT_RADIUS)[:, None]
+        normals = unit(press.normals + PLACE_NOISE / bend * across[1])
+        points = press.points + bend * (press.normals - normals)
+    average = touch.average + low_pass(FLAG_CUTOFF, max(period, 1 / RATE)) * (reading - touch.average)
     contact = torch.where(touch.contact, average > TOUCH_OFF, average > TOUCH_ON)
-    return Touch(reading, contact, filtered, average)
+    return Touch(reading, forces, contact, points, normals, lagged, average, min(max(age - 1 / RATE, 0.0), 1 / RATE))
 
 
 def low_pass(cutoff: float, period: float) -> float:

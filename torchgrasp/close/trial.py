@@ -1,5 +1,6 @@
 """One simulated trial: the hand opens around the true object, closes on it under the law, lifts it and holds it."""
 
+import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,11 +11,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.close.control import Closing, Sight, Squeeze, Stopping
+from torchgrasp.close.control import GraspController
 from torchgrasp.close.law import closing_gains
 from torchgrasp.close.parts import check_parts, convex_parts, read_mesh
-from torchgrasp.close.robot import Robot, plant_from_hand
+from torchgrasp.close.robot import Robot
 from torchgrasp.close.scene import Setup, open_scene
+from torchgrasp.close.sight import Sight, plant_from_hand
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import apply, inverse, rotation_angle
 from torchgrasp.hand.hand import Hand
@@ -27,14 +29,14 @@ if TYPE_CHECKING:
 START_TOLERANCE = 1e-3
 """Overlap [m] of the hand with object or table that still counts as none: convex parts may bulge a little."""
 
-CLOSING_TIME = 4.0
-"""Longest time [s] that closing may take before the hand lifts with what it has."""
-
-PRESSING_TIME = 0.5
-"""Time [s] between the end of closing and the start of the lift, in which the squeeze builds up."""
-
 LIFT_TIME = 1.0
 """Time [s] in which the hand rises, by a smooth step."""
+
+SHAKE_RATE = 5.0
+"""Of the shaking [Hz]: 3 mm are then 3 m/s^2."""
+
+JUDGED_TIME = 0.2
+"""Time [s] at the end of the hold in which at least two fingers must touch, most of the time."""
 
 PUSHED = 0.05
 """Motion [m] of the object's centre while the hand closes from which on it counts as pushed out."""
@@ -50,15 +52,16 @@ def close_hand(
     spec: TrialSpec | None = None,
     seed: int = 0,
     *,
+    error: Float[Tensor, "4 4"] | None = None,
     parts: "Sequence[trimesh.Trimesh] | None" = None,
 ) -> ClosureResult:
     """Close a hand on the true object, lift it and hold it, in a fresh simulation.
 
     The object stands on a table where its mesh is lowest, in the frame of the grasp. The hand starts at the grasp's
-    pre-grasp, closes until the forces settle (`CLOSING_TIME` at most), presses with balanced forces, rises by
-    `spec.lift_height` and holds. The object is **held** when at the end its centre has risen by at least half the
-    lift and at least two fingers touch it. `object_motion` is against the hand, so that stricter rules can be
-    counted from it. The same arguments give the same result to the last bit.
+    pre-grasp, closes and presses (`GraspController`), rises by `spec.lift_height` and holds, shaken if
+    `spec.shake` says so. The object is **held** when at the end its centre has risen by at least half the lift and in
+    most of the last `JUDGED_TIME` at least two fingers touch it. `object_motion` is against the hand, so that stricter
+    rules can be counted from it. The same arguments give the same result to the last bit.
 
     Args:
         grasp: one row.
@@ -66,6 +69,7 @@ def close_hand(
         mesh: the true object [m], closed: a trimesh or a file.
         spec: of the trial; None: `TrialSpec()`.
         seed: of the tactile sensor's noise.
+        error: where the hand really stands in its planned frame, of which it knows nothing; None: where it was planned.
         parts: convex bodies to use for the mesh instead of its own decomposition (`convex_parts`).
 
     Raises:
@@ -84,7 +88,8 @@ def close_hand(
     hand.check_joints(grasp.pregrasp)
     mesh = read_mesh(mesh)
     bodies = convex_parts(mesh) if parts is None else check_parts(parts)
-    trial = _Trial(grasp, hand, mesh, bodies, spec, seed)
+    stands = grasp.obj_from_hand[0] if error is None else grasp.obj_from_hand[0] @ error.double().cpu()
+    trial = _Trial(grasp, hand, mesh, bodies, spec, stands, seed)
     status = trial.run(gains)
     return trial.result(status, time.perf_counter() - started)
 
@@ -103,13 +108,14 @@ class _Trial:
         mesh: "trimesh.Trimesh",
         parts: "list[trimesh.Trimesh]",
         spec: TrialSpec,
+        stands: Float[Tensor, "4 4"],
         seed: int,
     ) -> None:
         self.spec = spec
         start = {name: float(q) for name, q in hand.expand(grasp.pregrasp[0]).items()}
         setup = Setup(
             hand.urdf_path,
-            grasp.obj_from_hand[0].numpy(),
+            stands.numpy(),
             start,
             hand.actuators,
             tuple(hand.tip_links),
@@ -122,11 +128,12 @@ class _Trial:
             spec.lift_height,
         )
         self.scene = open_scene(setup)
-        self.plant = plant_from_hand(hand, grasp, self.scene.joint_names, hand.actuators)
+        self.plant = plant_from_hand(hand, grasp, spec.force, self.scene.joint_names)
         generator = torch.Generator().manual_seed(seed) if spec.noise else None
         self.robot = Robot(self.scene, hand, self.plant, spec.control_rate, generator)
         self.time: list[float] = []
         self.forces: list[np.ndarray] = []
+        self.touching: list[int] = []
         self.object_pose: list[np.ndarray] = []
         self.hand_pose: list[np.ndarray] = []
         self.joints: list[np.ndarray] = []
@@ -140,29 +147,30 @@ class _Trial:
         self._record(np.zeros(3))
         if not overlap <= START_TOLERANCE:
             return Status.START_OVERLAP
+        controller = GraspController(self.plant, gains, self.spec.controller, self.spec.holding)
+        period = self.robot.period
         try:
-            sight = self._tick(self.plant.expand(self.plant.pregrasp))
-            controller = Closing(self.plant, gains) if self.spec.controller == "uncertainty" else None
-            controller = controller or Stopping(self.plant, gains)
-            targets = self.plant.expand(self.plant.pregrasp)
-            for _ in range(self.robot.ticks(CLOSING_TIME)):
-                targets = controller(sight, self.robot.period)
-                sight = self._tick(targets)
-                if controller.done:
-                    break
+            sight = self._tick(controller.targets)
+            while not controller.closed:
+                sight = self._tick(controller.step(sight, period))
             self.pushed = float(np.linalg.norm(self._centre(-1) - self._centre(0)))
-            hold = Squeeze(self.plant, gains, sight, targets)
-            for _ in range(self.robot.ticks(PRESSING_TIME)):
-                sight = self._tick(hold(sight, self.robot.period))
             rising = self.robot.ticks(LIFT_TIME)
             for k in range(rising + self.robot.ticks(self.spec.hold_time)):
-                share = min((k + 1) / rising, 1.0)
-                self.scene.lift(self.spec.lift_height * share * share * (3 - 2 * share))
-                sight = self._tick(hold(sight, self.robot.period))
+                self.scene.lift(*self._height((k + 1) * period, rising * period))
+                sight = self._tick(controller.step(sight, period))
         except _Lost as lost:
             if lost.args:
                 return Status.UNSTABLE
         return self._verdict()
+
+    def _height(self, time: float, rising: float) -> tuple[float, float]:
+        """Return how high [m] the hand is to be some time [s] after it began to rise, and how fast [m/s]."""
+        share, rate = min(time / rising, 1.0), 2 * math.pi * SHAKE_RATE
+        height = self.spec.lift_height * share * share * (3 - 2 * share)
+        if share < 1.0 or self.spec.shake == 0.0:
+            return height, self.spec.lift_height * 6 * share * (1 - share) / rising
+        phase = rate * (time - rising)
+        return height + self.spec.shake * math.sin(phase), self.spec.shake * rate * math.cos(phase)
 
     def _tick(self, targets: Float[Tensor, " j"]) -> Sight:
         """Drive the joints for one control period, record it, and return what the robot then knows."""
@@ -182,6 +190,7 @@ class _Trial:
         """Append one tick."""
         self.time.append(self.robot.steps * self.spec.timestep)
         self.forces.append(force)
+        self.touching.append(int(self.robot.finger.sum()))
         self.object_pose.append(self.scene.object_pose())
         self.hand_pose.append(self.scene.hand_pose())
         self.joints.append(self.scene.joints())
@@ -195,7 +204,8 @@ class _Trial:
         """Return the status of a finished trial: held, or the earliest thing that went wrong."""
         rise = np.array([self._centre(k)[2] - self._centre(0)[2] for k in range(len(self.time))])
         half = 0.5 * self.spec.lift_height
-        if rise[-1] >= half and int(self.robot.finger.sum()) >= 2:
+        gripped = np.array(self.touching[-self.robot.ticks(JUDGED_TIME) :]) >= 2
+        if rise[-1] >= half and gripped.mean() > 0.5:
             return Status.OK
         if not np.isfinite(self.robot.first_touch).all():
             return Status.NO_CONTACT

@@ -1,0 +1,50 @@
+"""How a closed hand presses: with balanced forces at the contacts that were really made."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.close.force import balanced_forces
+from torchgrasp.close.sight import Plant, Sight
+from torchgrasp.values import ClosingGains
+
+RAMP = 0.4
+"""Time [s] in which the squeeze rises to the desired forces."""
+
+
+class Squeeze:
+    """Hold what is grasped: joints stay compliant about where they are and press with balanced forces, J^T f / kp.
+
+    The forces rise together and are balanced anew for the contacts that were really made. One common factor keeps
+    their sum at what was asked for. A force loop of its own for each finger would drift: the surplus of three slightly
+    unbalanced integrators pushes the object along.
+    """
+
+    def __init__(self, plant: Plant, gains: ClosingGains, sight: Sight, start: Float[Tensor, " j"]) -> None:
+        self.plant, self.start, self.still = plant, start, sight.joints
+        forces, self.strength = held_forces(plant, gains, sight)
+        self.lead = torch.einsum("cij,ci->j", sight.jacobian, forces) / plant.kp
+        self.factor, self.time = 1.0, 0.0
+
+    def __call__(self, sight: Sight, period: float) -> Float[Tensor, " j"]:
+        """Return the targets of all joints for the next tick."""
+        self.time += period
+        share = min(self.time / RAMP, 1.0)
+        if share == 1.0:
+            lacking = 1 - float(sight.reading.sum()) / self.strength
+            self.factor = min(max(self.factor + period * lacking, 0.5), 1.5)
+        return self.start + share * (self.still + self.factor * self.lead - self.start)
+
+
+def held_forces(plant: Plant, gains: ClosingGains, sight: Sight) -> tuple[Float[Tensor, "3 3"], float]:
+    """Return forces on the object [N] that are balanced for the contacts that were really made, and their normal sum.
+
+    The planned forces are kept unless all three fingers touch and some balanced set presses at their contacts.
+    """
+    forces, normals = gains.desired_force, plant.normals
+    if bool(torch.isfinite(sight.points).all()) and bool(torch.isfinite(sight.normals).all()):
+        strongest = float((-(forces * normals).sum(-1)).max())
+        balanced = balanced_forces(sight.points[None], sight.normals[None], strongest)[0]
+        if bool(torch.isfinite(balanced).all()):
+            forces, normals = balanced, sight.normals
+    return forces, float(-(forces * normals).sum())
