@@ -6,6 +6,9 @@ from typing import Literal, get_args
 from torchgrasp.base import Value
 from torchgrasp.errors import BadArgument
 
+Simulator = Literal["sapien", "mujoco"]
+"""What can simulate a scene."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ContactSpec(Value):
@@ -92,9 +95,10 @@ class TrialSpec(Value):
         noise: whether the tactile sensor has noise (0.1 N normal, 0.3 N tangential, 1.5 mm of a contact's place).
         timestep: of the simulator [s].
         control_rate: of the controller [Hz].
+        simulator: "sapien" or "mujoco".
 
     Raises:
-        BadArgument: a number outside its range or an unknown controller.
+        BadArgument: a number outside its range, or an unknown controller, holding or simulator.
     """
 
     controller: Literal["open_loop", "position", "fixed", "uncertainty"] = "uncertainty"
@@ -109,11 +113,12 @@ class TrialSpec(Value):
     noise: bool = True
     timestep: float = 1 / 500
     control_rate: float = 100.0
+    simulator: Simulator = "sapien"
 
     def __post_init__(self) -> None:
         """Check every range once, where the value is made."""
         fields = {field.name: field.type for field in dataclasses.fields(self)}
-        for name in ("controller", "holding"):
+        for name in ("controller", "holding", "simulator"):
             if getattr(self, name) not in get_args(fields[name]):
                 raise BadArgument(name, repr(getattr(self, name)), f"one of {', '.join(get_args(fields[name]))}")
         ranges = {
@@ -130,3 +135,9 @@ class TrialSpec(Value):
         for name, (low, high) in ranges.items():
             if not low <= getattr(self, name) <= high:
                 raise BadArgument(name, getattr(self, name), f"a number in [{low:g}, {high:g}]")
+
+
+def check_simulator(simulator: str) -> None:
+    """Raise `BadArgument` when there is no such simulator."""
+    if simulator not in get_args(Simulator):
+        raise BadArgument("simulator", repr(simulator), f"one of {', '.join(get_args(Simulator))}")

@@ -9,7 +9,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from torchgrasp.close.lift import LIFT_JOINT, euler_from_rotation, lifted_urdf
-from torchgrasp.errors import HandFileError
+from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.load import load_hand
 
 
@@ -37,9 +37,12 @@ def test_files_that_are_no_hand_are_refused(tmp_path):
         lifted_urdf(tmp_path / "two.urdf", np.eye(4), 0.1)
 
 
-def build(name, mesh, **options):
+SIMULATORS = ["sapien", "mujoco"]
+
+
+def build(name, mesh, simulator="sapien", **options):
     """A scene with the hand half a metre above the object."""
-    pytest.importorskip("sapien")
+    pytest.importorskip(simulator)
     from torchgrasp.close.scene import Setup, open_scene
 
     hand = load_hand(name)
@@ -48,7 +51,7 @@ def build(name, mesh, **options):
     pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec([0.3, -0.8, 1.1]).as_matrix(), [0.05, -0.1, 0.6]
     start = {k: float(v) for k, v in hand.expand(joints).items()}
     args = (hand.urdf_path, pose, start, hand.actuators, hand.tip_links, mesh, [mesh.convex_hull], 0.36)
-    return hand, joints, torch.from_numpy(pose), open_scene(Setup(*args, **options))
+    return hand, joints, torch.from_numpy(pose), open_scene(Setup(*args, **options), simulator)
 
 
 def standing(radius=0.03, height=0.12):
@@ -59,39 +62,54 @@ def standing(radius=0.03, height=0.12):
 
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("simulator", SIMULATORS)
 @pytest.mark.parametrize("timestep", [1 / 240, 1 / 500])
-def test_resting_weight(timestep):
-    *_, scene = build("barrett", standing(), timestep=timestep)
+def test_resting_weight(timestep, simulator):
+    *_, scene = build("barrett", standing(), simulator, timestep=timestep)
     forces = []
     for _ in range(200):
         scene.step()
-        impulse = sum(np.asarray(p.impulse) for c in scene.system.get_contacts() for p in c.points)
-        forces.append(np.abs(impulse)[2] / timestep)
+        forces.append(support(scene))
     assert np.mean(forces[100:]) == pytest.approx(0.36 * 9.81, rel=5e-3)
     assert np.abs(scene.object_pose() - np.eye(4)).max() < 1e-4
 
 
+def support(scene):
+    """The force [N] with which all contacts hold up the object."""
+    if hasattr(scene, "data"):
+        return scene.data.joint("torchgrasp_object").qfrc_constraint[2]
+    impulse = sum(np.asarray(p.impulse) for c in scene.system.get_contacts() for p in c.points)
+    return np.abs(impulse)[2] / scene.timestep
+
+
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
-def test_object_has_the_mass_centre_and_inertia_of_its_mesh():
+@pytest.mark.parametrize("simulator", SIMULATORS)
+def test_object_has_the_mass_centre_and_inertia_of_its_mesh(simulator):
     radius, height, mass = 0.03, 0.12, 0.36
     mesh = standing(radius, height)
     mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]))
-    *_, scene = build("barrett", mesh)
+    *_, scene = build("barrett", mesh, simulator)
+    if simulator == "sapien":
+        inertia, centre = scene.body.inertia, np.asarray(scene.body.cmass_local_pose.p)
+        frame = scene.body.cmass_local_pose.to_transformation_matrix()[:3, :3]
+    else:
+        body = scene.model.body("torchgrasp_object")
+        inertia, centre, frame = body.inertia, body.ipos, Rotation.from_quat(body.iquat, scalar_first=True).as_matrix()
     across, along = mass * (3 * radius**2 + height**2) / 12, mass * radius**2 / 2
-    assert np.sort(scene.body.inertia) == pytest.approx([along, across, across], rel=0.02)
-    assert np.asarray(scene.body.cmass_local_pose.p) == pytest.approx(mesh.center_mass, abs=1e-6)
-    frame = scene.body.cmass_local_pose.to_transformation_matrix()[:3, :3]
-    assert frame @ np.diag(scene.body.inertia) @ frame.T == pytest.approx(
+    assert np.sort(inertia) == pytest.approx([along, across, across], rel=0.02)
+    assert centre == pytest.approx(mesh.center_mass, abs=1e-6)
+    assert frame @ np.diag(inertia) @ frame.T == pytest.approx(
         np.asarray(mesh.moment_inertia) * mass / mesh.volume, rel=1e-3, abs=1e-8
     )
 
 
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("simulator", SIMULATORS)
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
-def test_kinematics_are_those_of_the_hand(name):
-    hand, joints, world_from_hand, scene = build(name, standing())
+def test_kinematics_are_those_of_the_hand(name, simulator):
+    hand, joints, world_from_hand, scene = build(name, standing(), simulator)
     assert scene.penetration() == 0.0
     assert np.abs(scene.hand_pose() - world_from_hand.numpy()).max() < 1e-5
     tips = world_from_hand @ hand.link_poses(joints)[hand.tip_index]
@@ -114,8 +132,9 @@ BODY = """<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iy
 
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
-def test_sliding_joints_move_their_tips_along_their_axes(tmp_path):
-    pytest.importorskip("sapien")
+@pytest.mark.parametrize("simulator", SIMULATORS)
+def test_sliding_joints_move_their_tips_along_their_axes(tmp_path, simulator):
+    pytest.importorskip(simulator)
     from torchgrasp.close.scene import Setup, open_scene
     from torchgrasp.hand.hand import Actuator
 
@@ -127,7 +146,7 @@ def test_sliding_joints_move_their_tips_along_their_axes(tmp_path):
     pose = np.eye(4)
     pose[0, 3] = 5.0
     urdf = tmp_path / "hand.urdf"
-    scene = open_scene(Setup(urdf, pose, start, drives, ("t1", "t2", "t3"), mesh, [mesh.convex_hull], 0.36))
+    scene = open_scene(Setup(urdf, pose, start, drives, ("t1", "t2", "t3"), mesh, [mesh.convex_hull], 0.36), simulator)
     scene.step()
     assert set(scene.joint_names) == set(names)
     points = scene.tip_poses()[:, :3, 3] + [0.0, 0.0, 0.5]
@@ -139,8 +158,9 @@ def test_sliding_joints_move_their_tips_along_their_axes(tmp_path):
 
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
-def test_the_hand_rises_with_its_joint_and_stays_where_it_is_driven():
-    hand, joints, world_from_hand, scene = build("allegro", standing(), travel=0.1)
+@pytest.mark.parametrize("simulator", SIMULATORS)
+def test_the_hand_rises_with_its_joint_and_stays_where_it_is_driven(simulator):
+    hand, joints, world_from_hand, scene = build("allegro", standing(), simulator, travel=0.1)
     for k in range(700):
         scene.lift(0.1 * min(1.0, k / 200))
         scene.step()
@@ -148,3 +168,35 @@ def test_the_hand_rises_with_its_joint_and_stays_where_it_is_driven():
     assert rise == pytest.approx([0, 0, 0.1], abs=5e-4)
     order = [hand.urdf_joint_names.index(n) for n in scene.joint_names]
     assert np.abs(scene.joints() - hand.expand_joints(joints).numpy()[order]).max() < 2e-3
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("simulator", SIMULATORS)
+def test_a_force_pulls_at_the_mass_centre_and_the_lift_follows_a_speed(simulator):
+    mesh = standing()
+    mesh.apply_translation([0.3, 0.0, 0.0])
+    *_, scene = build("allegro", mesh, simulator, gravity=0.0, table=False)
+    scene.pull(np.array([0.0, 0.072, 0.0]))
+    for k in range(250):
+        scene.lift(0.04 * (k + 1) * scene.timestep, 0.04)
+        scene.step()
+    moved = np.eye(4)
+    moved[1, 3] = 0.5 * (0.072 / 0.36) * 0.5**2
+    assert scene.object_pose() == pytest.approx(moved, abs=3e-4)  # turned nowhere, moved by F t^2 / 2 m
+    assert scene.hand_pose()[2, 3] - 0.6 == pytest.approx(0.02, abs=3e-4)
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("simulator", SIMULATORS)
+def test_joints_without_a_drive_are_named(simulator):
+    pytest.importorskip(simulator)
+    from torchgrasp.close.scene import Setup, open_scene
+
+    mesh, hand = standing(), load_hand("barrett")
+    setup = Setup(hand.urdf_path, np.eye(4), {}, hand.actuators, hand.tip_links, mesh, [mesh], 0.1)
+    with pytest.raises(BadArgument, match=r"no position or drive for .*spread"):
+        open_scene(setup, simulator)
+    with pytest.raises(BadArgument, match="simulator: found 'bullet'"):
+        open_scene(setup, "bullet")

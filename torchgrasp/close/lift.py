@@ -7,10 +7,14 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.urdf import read_urdf
 
 LIFT_JOINT = "torchgrasp_lift"
 """Name of the prismatic joint that carries the hand along the world's z axis."""
+
+LIFT_DRIVE = Actuator(effort=1e4, velocity=10.0, kp=1e4, kd=1e3)
+"""Its motor: force [N], speed [m/s], stiffness [N/m] and damping [N s/m]."""
 
 WRIST_JOINT = "torchgrasp_wrist"
 """Name of the fixed joint by which the hand hangs on it."""

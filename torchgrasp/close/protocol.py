@@ -29,6 +29,7 @@ from torchgrasp.close.sight import plant_from_hand
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import rigid, rotation_angle, rotation_from_vector
 from torchgrasp.hand.hand import Hand
+from torchgrasp.specs import Simulator, check_simulator
 from torchgrasp.values import ClosingGains, Grasps
 
 if TYPE_CHECKING:
@@ -128,6 +129,7 @@ def pull_grasp(
     holding: HoldingMode = "squeeze",
     error: Float[Tensor, "4 4"] | None = None,
     parts: "Sequence[trimesh.Trimesh] | None" = None,
+    simulator: Simulator = "sapien",
 ) -> PullResult:
     """Close a hand on the true object and pull at the object in six directions.
 
@@ -142,15 +144,17 @@ def pull_grasp(
         holding: how it presses from then on, but for the open loop, which keeps its squeeze (`HOLDINGS`).
         error: where the hand really stands in its planned frame (`draw_errors`), of which it knows nothing.
         parts: convex bodies to use for the mesh instead of its own decomposition.
+        simulator: "sapien" or "mujoco".
 
     Raises:
-        BadArgument: an unknown protocol, closing or holding, a force outside (0, 1000) N, not exactly one row, a
-            grasp of another hand, or a pre-grasp outside the joint limits.
+        BadArgument: an unknown protocol, closing, holding or simulator, a force outside (0, 1000) N, not exactly one
+            row, a grasp of another hand, or a pre-grasp outside the joint limits.
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
     """
     began = time.process_time()
     protocol = check_test(protocol, force, closing, holding)
+    check_simulator(simulator)
     if len(grasp) != 1:
         raise BadArgument("grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]")
     grasp, hand = grasp.to("cpu", torch.float64), hand.to("cpu", torch.float64)
@@ -159,7 +163,7 @@ def pull_grasp(
     mesh = read_mesh(mesh)
     bodies = convex_parts(mesh) if parts is None else check_parts(parts)
     stands = grasp.obj_from_hand[0] if error is None else grasp.obj_from_hand[0] @ error.double()
-    trial = _Pull(grasp, hand, mesh, bodies, protocol, stands, closing, holding, gains, force, seed)
+    trial = _Pull(grasp, hand, mesh, bodies, protocol, stands, closing, holding, gains, force, seed, simulator)
     status, moved, turned, pressed, tried = Status.OK, 0.0, 0.0, math.nan, 0
     for direction in DIRECTIONS:
         found, forces = trial.run(direction)
@@ -213,7 +217,9 @@ class _Pull:
         gains: ClosingGains,
         force: float,
         seed: int,
+        simulator: Simulator,
     ) -> None:
+        self.simulator: Simulator = simulator
         self.grasp, self.hand, self.mesh, self.parts, self.protocol = grasp, hand, mesh, parts, protocol
         self.closing: ClosingMode = closing
         self.holding: HoldingMode = holding
@@ -232,7 +238,7 @@ class _Pull:
             self.hand.urdf_path, self.stands, self.start, self.drives, tuple(self.hand.tip_links), self.mesh,
             self.parts, self.mass, rule.friction, 0.0, TIMESTEP, 0.0, table=False, patch=rule.patch,
         )  # fmt: skip
-        scene = open_scene(setup)
+        scene = open_scene(setup, self.simulator)
         if not scene.penetration() <= rule.overlap:
             return (Status.START_OVERLAP, 0.0, 0.0), math.nan
         generator = torch.Generator().manual_seed(self.seed)

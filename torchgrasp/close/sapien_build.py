@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchgrasp.close.lift import LIFT_JOINT, lifted_urdf
-from torchgrasp.close.scene import ARMATURE, TABLE, Setup
-from torchgrasp.errors import BadArgument, MissingExtra
+from torchgrasp.close.lift import LIFT_DRIVE, LIFT_JOINT, lifted_urdf
+from torchgrasp.close.scene import ARMATURE, TABLE, Setup, check_drives
+from torchgrasp.errors import MissingExtra
 
 
 class Built(NamedTuple):
@@ -95,20 +95,16 @@ def _hand(scene: Any, material: Any, setup: Setup) -> Any:
         file = Path(folder) / "hand.urdf"
         file.write_text(lifted_urdf(setup.urdf_path, setup.world_from_hand, setup.travel), encoding="utf-8")
         hand = loader.load(str(file))
-    names = [j.name for j in hand.active_joints if j.name != LIFT_JOINT]
-    missing = [n for n in names if n not in setup.joints or n not in setup.drives]
-    if missing:
-        raise BadArgument("joints", f"no position or drive for {missing}", "one for every joint of the URDF")
+    check_drives(setup, [j.name for j in hand.active_joints if j.name != LIFT_JOINT])
     start = []
     for joint in hand.active_joints:
         joint.set_friction(0.0)
         if joint.name == LIFT_JOINT:
-            joint.set_drive_properties(1e4, 1e3, force_limit=1e4)
-            position = 0.0
+            drive, position = LIFT_DRIVE, 0.0
         else:
             drive, position = setup.drives[joint.name], float(setup.joints[joint.name])
             joint.set_armature(np.array([ARMATURE], np.float32))
-            joint.set_drive_properties(drive.kp, drive.kd, force_limit=drive.effort)
+        joint.set_drive_properties(drive.kp, drive.kd, force_limit=drive.effort)
         joint.set_drive_target(position)
         start.append(position)
     hand.set_qpos(np.array(start, np.float32))

@@ -6,12 +6,13 @@ runs equal to the last bit. Positions are in the object's frame, which is the wo
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol, get_args, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand import Actuator
+from torchgrasp.specs import check_simulator
 
 if TYPE_CHECKING:
     import trimesh
@@ -24,9 +25,6 @@ ARMATURE = 1e-3
 
 TABLE = (2.0, 2.0, 0.1)
 """Size of the table [m]; its top is where the mesh is lowest."""
-
-Simulator = Literal["sapien"]
-"""What can simulate a scene."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,19 +129,30 @@ class Scene(Protocol):
         ...
 
     def penetration(self) -> float:
-        """Return how deep [m] the hand is in the object or the table after one step without the object's weight."""
+        """Return how deep [m] the hand is in the object or the table; to be asked before anything else moves."""
         ...
 
 
-def open_scene(setup: Setup, simulator: Simulator = "sapien") -> Scene:
+def open_scene(setup: Setup, simulator: str = "sapien") -> Scene:
     """Return a fresh scene at its start.
 
     Raises:
         BadArgument: an unknown simulator, or a joint of the hand without a position or drive.
+        HandFileError: the hand's URDF is no sound one.
         MissingExtra: the simulator is not installed.
     """
-    if simulator == "sapien":
-        from torchgrasp.close.sapien_scene import SapienScene
+    check_simulator(simulator)
+    if simulator == "mujoco":
+        from torchgrasp.close.mujoco_scene import MujocoScene
 
-        return SapienScene(setup)
-    raise BadArgument("simulator", repr(simulator), f"one of {', '.join(get_args(Simulator))}")
+        return MujocoScene(setup)
+    from torchgrasp.close.sapien_scene import SapienScene
+
+    return SapienScene(setup)
+
+
+def check_drives(setup: Setup, names: list[str]) -> None:
+    """Raise `BadArgument` when one of the hand's joints has no start or no drive."""
+    missing = [name for name in names if name not in setup.joints or name not in setup.drives]
+    if missing:
+        raise BadArgument("joints", f"no position or drive for {missing}", "one for every joint of the URDF")

@@ -127,7 +127,7 @@ class _Trial:
             spec.timestep,
             spec.lift_height,
         )
-        self.scene = open_scene(setup)
+        self.scene = open_scene(setup, spec.simulator)
         self.plant = plant_from_hand(hand, grasp, spec.force, self.scene.joint_names)
         generator = torch.Generator().manual_seed(seed) if spec.noise else None
         self.robot = Robot(self.scene, hand, self.plant, spec.control_rate, generator)

@@ -1,0 +1,79 @@
+"""The same pinched cylinder in both simulators: held in both, with the same forces, and each repeats itself."""
+
+import dataclasses
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torchgrasp.close.protocol import PROTOCOLS, pull_grasp
+from torchgrasp.errors import Status
+
+pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
+TRIAL = runpy.run_path(str(Path(__file__).with_name("test_trial.py")))
+pinch, cylinder, close, digest = (TRIAL[name] for name in ("pinch", "cylinder", "close", "digest"))
+QUICK = dataclasses.replace(TRIAL["QUICK"], simulator="mujoco")
+PULL = dataclasses.replace(PROTOCOLS["dexgraspbench"], seconds=0.2, mass=0.05)
+
+
+@pytest.fixture(autouse=True)
+def both():
+    pytest.importorskip("sapien")
+    pytest.importorskip("mujoco")
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett"])
+def test_both_hold_a_cylinder_with_the_same_forces(name):
+    spec = dataclasses.replace(QUICK, noise=False)
+    there, here = (close(name, spec=dataclasses.replace(spec, simulator=s)) for s in ("sapien", "mujoco"))
+    assert there.held and here.held
+    assert np.abs(here.forces[-1] - there.forces[-1]).max() < 0.6
+    assert np.abs(here.object_pose[-1] - there.object_pose[-1]).max() < 0.05
+    assert set(here.joint_names) == set(there.joint_names)
+
+
+def test_mujoco_gives_the_same_bits_here_and_in_another_process():
+    first = digest(close("allegro", spec=QUICK, seed=3))
+    assert first == digest(close("allegro", spec=QUICK, seed=3))
+    assert first != digest(close("allegro", spec=QUICK, seed=4))
+    code = "import runpy, warnings; warnings.simplefilter('ignore'); "
+    code += f"m = runpy.run_path({__file__!r}); print(m['digest'](m['close']('allegro', spec=m['QUICK'], seed=3)))"
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert answer.stdout.strip() == first
+
+
+def test_mujoco_tells_overlap_and_absence():
+    assert close("barrett", cylinder((0.0, 0.05)), QUICK).status is Status.START_OVERLAP
+    assert close("barrett", cylinder((0.4, 0.0)), QUICK).status is Status.NO_CONTACT
+    slippery = dataclasses.replace(QUICK, friction=0.02)
+    assert not close("allegro", spec=slippery).held
+
+
+@pytest.mark.parametrize("pull", [10.0, 300.0])
+def test_both_agree_on_a_pull(pull):
+    hand, grasp = pinch("allegro")
+    protocol = dataclasses.replace(PULL, pull=pull)
+    there, here = (pull_grasp(grasp, hand, cylinder(), protocol, simulator=s) for s in ("sapien", "mujoco"))
+    assert there.passed == here.passed == (pull < 100)
+    assert here.force == pytest.approx(there.force, rel=0.05)
+
+
+def test_the_scene_as_mjcf_is_a_model_of_its_own():
+    """What is exported opens without this library, and weighs what hand and object weigh."""
+    import mujoco
+
+    from torchgrasp.close.mjcf import scene_mjcf
+    from torchgrasp.close.scene import Setup
+
+    hand, grasp = pinch("allegro")
+    start = {k: float(v) for k, v in hand.expand(grasp.pregrasp[0]).items()}
+    mesh, where = cylinder(), grasp.obj_from_hand[0].numpy()
+    setup = Setup(hand.urdf_path, where, start, hand.actuators, hand.tip_links, mesh, [mesh], 0.1, patch=0.0)
+    model = mujoco.MjModel.from_xml_string(scene_mjcf(setup))
+    assert model.nu == len(hand.urdf_joint_names) + 1
+    assert model.body("torchgrasp_object").mass[0] == pytest.approx(0.1)
+    assert set(model.geom_condim) == {3}
+    assert model.actuator("joint_0").forcerange == pytest.approx([-0.7, 0.7])
