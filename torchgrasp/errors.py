@@ -121,5 +121,6 @@ class Status(enum.IntEnum):
     UNSTABLE = 35, "the simulation did not stay finite"
     MOVED = 36, "the object moved or turned too far in the hand when it was pulled"
     # the run
+    BAD_OBJECT = 39, "the files of the object are not what they should be"
     TIMED_OUT = 40, "it took longer than its limit and was ended"
     WORKER_DIED = 41, "the process that worked on it died, twice"

@@ -2,48 +2,64 @@
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 from typing import Any, Literal
 
 from torchgrasp.cli.common import check_folder, check_seed, naming
 from torchgrasp.cli.grasps import check_simulator
-from torchgrasp.close.control import ClosingMode
-from torchgrasp.close.evaluate import ViewScore, summarise
+from torchgrasp.close.attempt import PROTOCOLS, Execution
+from torchgrasp.close.control import ClosingMode, HoldingMode
+from torchgrasp.close.evaluate import Ranks
 from torchgrasp.close.evaluate import evaluate as evaluate_views
-from torchgrasp.close.protocol import PROTOCOLS
+from torchgrasp.close.score import ViewScore, summarise
 from torchgrasp.errors import Status
 from torchgrasp.files import write_file
 from torchgrasp.hand.load import load_hand
+from torchgrasp.report.evaluation import SHARE_NAMES, write_evaluation
 
 
 def evaluate(
     objects: Path,
     hand: str,
     out: Path,
-    protocol: Literal["multidex", "dexgraspbench", "dexgraspbench-hard", "pose-noise"] = "dexgraspbench",
-    closing: ClosingMode = "open_loop",
+    protocol: Literal[
+        "multidex", "dexgraspbench", "dexgraspbench-hard", "pose-noise", "paper", "tabletop"
+    ] = "dexgraspbench",
+    closing: ClosingMode | None = None,
+    holding: HoldingMode = "squeeze",
+    force: float | None = None,
     grasps: int = 20,
+    ranks: Ranks = "best",
     starts: int = 1000,
-    force: float = 7.0,
     complete: bool = False,
     only: tuple[str, ...] = (),
+    planned: Path | None = None,
+    workers: int = 1,
     seed: int = 0,
 ) -> int:
     """Plan on each noisy view of a folder's objects and put the best grasps through a protocol in simulation.
 
-    Prints a line for each view, then the shares with 95 % Wilson intervals, and writes evaluate.json.
+    Prints a line for each view, then the shares with 95 % Wilson intervals, and writes evaluate.json, evaluate.html,
+    and the grasps of each view into the folder grasps.
 
     Args:
         objects: folder with manifest.json, and for each object mesh.ply and noisy views.
         hand: allegro, allegro_biotac, barrett, or the folder of another hand.
         out: folder of the results; it is made where it does not exist.
-        protocol: which test: see torchgrasp.close.protocol.
-        closing: open loop through pre-grasp, grasp and squeeze, or by a controller that feels with the fingertips.
-        grasps: the most that are tried of each view, the best first.
+        protocol: which test: see torchgrasp.close.protocol and torchgrasp.close.attempt.
+        closing: open loop through pre-grasp, grasp and squeeze, or by a controller that feels with the fingertips; by
+            default open loop where the object is pulled at, and under uncertainty where it is lifted.
+        holding: how the hand presses from then on.
+        force: normal force of the strongest finger [N]; by default 7 where the object is pulled at, 4 where it is
+            lifted.
+        grasps: the most that are tried of each view.
+        ranks: which of them: the best, or as many spread over all ranks.
         starts: random starts of the contact planner.
-        force: normal force of the strongest finger [N] in the squeeze.
         complete: plan on the whole cloud instead of each view.
         only: names of objects to keep; by default all.
+        planned: folder "grasps" of an earlier run: its grasps are put to the test, and nothing is planned.
+        workers: processes that share the work; the results do not depend on how many.
         seed: of every random draw.
     """
     with naming("--out", "path"):
@@ -52,39 +68,64 @@ def evaluate(
     check_simulator()
     with naming("--hand", "hand", "name"):
         the_hand = load_hand(hand)
-    with naming("--objects", "objects", "path"), naming("--grasps", "grasps"), naming("--force", "force"):
+    execution = Execution(force, closing, holding)
+    with (
+        naming("--objects", "objects", "path"),
+        naming("--grasps", "grasps"),
+        naming("--force", "force"),
+        naming("--closing", "closing"),
+        naming("--workers", "workers"),
+    ):
         scores = evaluate_views(
-            objects, the_hand, protocol, grasps, starts, seed, force, closing, complete, only, print_score
-        )
+            objects, the_hand, protocol, execution, grasps, starts, seed, ranks=ranks, complete=complete, only=only,
+            workers=workers, folder=planned or out / "grasps", planned=planned is not None, observer=print_score,
+        )  # fmt: skip
     summary = summarise(scores)
     print_summary(protocol, summary)
-    asked = {"protocol": dataclasses.asdict(PROTOCOLS[protocol]), "hand": hand, "grasps": grasps, "starts": starts}
-    asked |= {"force": force, "closing": closing, "complete": complete, "seed": seed}
-    rows = [
-        {**dataclasses.asdict(s), "results": [{**dataclasses.asdict(r), "status": r.status.name} for r in s.results]}
-        for s in scores
-    ]
-    text = json.dumps({"asked": asked, "summary": summary, "views": rows}, indent=1)
+    used = dict(zip(("force", "closing"), execution.on(PROTOCOLS[protocol]), strict=True)) | {"holding": holding}
+    asked = {"protocol": dataclasses.asdict(PROTOCOLS[protocol]), "hand": hand, **used, "grasps": grasps}
+    asked |= {"ranks": ranks, "starts": starts, "complete": complete, "seed": seed, "hand_sha256": the_hand.sha256}
+    content = {"asked": asked, "summary": summary, "views": [dataclasses.asdict(score) for score in scores]}
     with naming("--out", "path"):
-        write_file(out / "evaluate.json", text)
+        write_file(out / "evaluate.json", json.dumps(_plain(content), indent=1))
+        write_evaluation(out / "evaluate.html", f"Grasps of the {hand} hand under {protocol}", asked, scores)
     return 0
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON has it: a status by its name, and null for what was never measured or has no end."""
+    if isinstance(value, dict):
+        return {key: _plain(x) for key, x in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(x) for x in value]
+    if isinstance(value, Status):
+        return value.name
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def print_score(score: ViewScore) -> None:
     """Print one line."""
-    failed = [result.status for result in score.results if result.status is not Status.OK]
+    failed = [attempt.status for attempt in score.attempts if attempt.status is not Status.OK]
     reasons = ", ".join(f"{failed.count(status)} {status.name.lower()}" for status in dict.fromkeys(failed))
-    passed = f"{sum(result.passed for result in score.results)}/{len(score.results)}"
+    reasons = reasons if score.attempts else score.note or score.refusal.sentence
+    passed = f"{sum(attempt.passed for attempt in score.attempts)}/{len(score.attempts)}"
     print(f"{score.object:14}{score.view:8}{score.executable:7}{passed:>9}  {reasons}", flush=True)
 
 
 def print_summary(protocol: str, summary: dict[str, Any]) -> None:
-    """Print the shares and what they cost."""
-    print()
-    for key, text in (("gsr", "grasps that pass"), ("top1", "best grasps that pass"), ("objects", "objects with one")):
+    """Print the shares, what failed at which stage, and what it cost."""
+    print(f"\n{protocol}")
+    for key, text in SHARE_NAMES.items():
         value, low, high, total = summary[key]
-        print(f"{text:22} {value:6.1%}  [{low:.1%}, {high:.1%}] of {total}")
-    print(f"{protocol}: {summary['refused']} views without a grasp, failures {summary['failures'] or 'none'}")
-    force = "-" if summary["force_n"] is None else f"{summary['force_n']:.2f} N"
-    plan, trial = summary["plan_cpu_s"], summary["trial_cpu_s"]
-    print(f"mean normal force of a finger {force}; CPU time {plan:.1f} s to plan a view, {trial:.2f} s to try a grasp")
+        print(f"{text:34}{value:6.1%}  [{low:.1%}, {high:.1%}] of {total}")
+    for stage, reasons in summary["failures"].items():
+        print(f"failed in {stage:24}{', '.join(f'{n} {name.lower()}' for name, n in reasons.items())}")
+    force, overlap, most = (_number(summary[key]) for key in ("force_n", "overlap_mm", "overlap_mm_max"))
+    print(f"mean normal force of a finger {force} N, overlap at the grasp {overlap} mm (most {most} mm)")
+    plan, trial = _number(summary["plan_cpu_s"]), _number(summary["trial_cpu_s"])
+    print(f"CPU time {plan} s to plan on a view, {trial} s for an attempt, {_number(summary['cpu_s'])} s in all")
+
+
+def _number(value: float | None) -> str:
+    """Return a number with two decimals, or a dash for none."""
+    return "-" if value is None else f"{value:.2f}"

@@ -8,7 +8,7 @@ import itertools
 import multiprocessing
 import os
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import TimeoutError
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -24,7 +24,7 @@ Result = TypeVar("Result")
 
 def run_tasks(
     function: Callable[..., Result], tasks: Iterable[tuple[Any, ...]], workers: int = 1, limit: float = 60.0
-) -> Iterator[Result | Status]:
+) -> Generator[Result | Status, None, None]:
     """Yield `function(*task)` for each task, in the order of the tasks whatever the number of workers.
 
     A task that is not done in time gives `Status.TIMED_OUT` and its process is killed; one whose process dies twice
@@ -50,14 +50,16 @@ def run_tasks(
         raise BadArgument("workers", workers, "at least 0")
     if not limit > 0:
         raise BadArgument("limit", limit, "a positive number of seconds")
-    # only the generator is lazy: a bad argument is named at once
-    return itertools.starmap(function, tasks) if workers == 0 else _results(function, tasks, workers, limit)
+    return _results(function, tasks, workers, limit)  # lazy, where a bad argument is named at once
 
 
 def _results(
     function: Callable[..., Result], tasks: Iterable[tuple[Any, ...]], workers: int, limit: float
-) -> Iterator[Result | Status]:
-    """Yield the results from worker processes."""
+) -> Generator[Result | Status, None, None]:
+    """Yield the results, of this process or of workers."""
+    if not workers:
+        yield from itertools.starmap(function, tasks)
+        return
     try:
         from pebble import ProcessPool
     except ImportError as error:

@@ -192,13 +192,13 @@ def check_test(protocol: PullProtocol | str, force: float, closing: str, holding
     return PROTOCOLS[protocol] if isinstance(protocol, str) else protocol
 
 
-def draw_errors(protocol: PullProtocol, grasps: int, seed: int) -> Float[Tensor, "g n 4 4"]:
-    """Return for each grasp the drawn places of the hand in its planned frame, uniform within the protocol's errors."""
+def draw_errors(shift: float, turn: float, grasps: int, draws: int, seed: int) -> Float[Tensor, "g n 4 4"]:
+    """Return drawn places of the hand in its planned frame, uniform within the largest errors [m, rad] of each axis."""
     generator = torch.Generator().manual_seed(seed)
-    most = torch.tensor([protocol.turn] * 3 + [protocol.shift] * 3, dtype=torch.float64)
-    drawn = 2 * torch.rand(grasps, protocol.draws, 6, generator=generator, dtype=torch.float64) - 1
-    turn, shift = (most * drawn).split(3, -1)
-    return rigid(rotation_from_vector(turn), shift)
+    most = torch.tensor([turn] * 3 + [shift] * 3, dtype=torch.float64)
+    drawn = 2 * torch.rand(grasps, draws, 6, generator=generator, dtype=torch.float64) - 1
+    angles, shifts = (most * drawn).split(3, -1)
+    return rigid(rotation_from_vector(angles), shifts)
 
 
 class _Pull:

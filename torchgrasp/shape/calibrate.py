@@ -70,38 +70,45 @@ def read_views(
     objects: Path, camera: bool = True, only: Sequence[str] = ()
 ) -> Iterator[tuple[str, str, PointCloud, "trimesh.Trimesh"]]:
     """Yield name, view, noisy cloud and true mesh of every view, at the object's suggested scale; see `calibrate`."""
-    for name, folder, entry, scale, mesh in _read_objects(objects, only):
-        for view in sorted(entry["views"]):
-            cloud = read_cloud(folder / f"{view}_noisy.ply")
-            eye = torch.tensor(entry["views"][view]["T_object_camera"], dtype=torch.float64)[:3, 3]
-            yield name, view, PointCloud(cloud.points * scale, None, eye * scale if camera else None), mesh
-
-
-def read_whole(objects: Path, only: Sequence[str] = ()) -> Iterator[tuple[str, str, PointCloud, "trimesh.Trimesh"]]:
-    """Yield name, "whole", the whole cloud with its normals, and the true mesh of every object."""
-    for name, folder, _, scale, mesh in _read_objects(objects, only):
-        cloud = read_cloud(folder / "full_normals.ply")
-        yield name, "whole", PointCloud(cloud.points * scale, cloud.normals), mesh
-
-
-def _read_objects(
-    objects: Path, only: Sequence[str]
-) -> "Iterator[tuple[str, Path, dict[str, Any], float, trimesh.Trimesh]]":
-    """Yield name, folder, entry of the manifest, scale and scaled mesh of the objects asked for."""
     import trimesh
 
+    for name, view in list_views(objects, only=only):
+        mesh = trimesh.load_mesh(Path(objects) / name / "mesh.ply").apply_scale(object_scale(objects, name))
+        yield name, view, read_view(objects, name, view, camera), mesh
+
+
+def list_views(objects: Path, whole: bool = False, only: Sequence[str] = ()) -> list[tuple[str, str]]:
+    """Return the name of each object with that of each of its views, or with "whole"; see `calibrate`."""
+    entries = _entries(objects, only)
+    return [(name, view) for name in entries for view in (["whole"] if whole else sorted(entries[name]["views"]))]
+
+
+def read_view(objects: Path, name: str, view: str, camera: bool = True) -> PointCloud:
+    """Return the noisy cloud of a view, or as "whole" the whole one with its normals, at the suggested scale."""
+    entry, folder, scale = _entries(objects, [name])[name], Path(objects) / name, object_scale(objects, name)
+    if view == "whole":
+        cloud = read_cloud(folder / "full_normals.ply")
+        return PointCloud(cloud.points * scale, cloud.normals)
+    cloud = read_cloud(folder / f"{view}_noisy.ply")
+    eye = torch.tensor(entry["views"][view]["T_object_camera"], dtype=torch.float64)[:3, 3]
+    return PointCloud(cloud.points * scale, None, eye * scale if camera else None)
+
+
+def object_scale(objects: Path, name: str) -> float:
+    """Return what an object's mesh and clouds are to be multiplied by, so that a hand can grasp it."""
+    return float(_entries(objects, [name])[name].get("suggested_scale", 1.0))
+
+
+def _entries(objects: Path, only: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Return what the manifest says of the objects asked for, by their names in order."""
     manifest = Path(objects) / "manifest.json"
     if not manifest.is_file():
         raise BadArgument("objects", str(objects), "a folder with a manifest.json")
     entries = json.loads(manifest.read_text()).get("objects", {})
-    names = [name for name in sorted(entries) if not only or name in only]
-    if not names:
+    found = {name: entries[name] for name in sorted(entries) if not only or name in only}
+    if not found:
         raise BadArgument("objects", f"{manifest} with {sorted(entries)}", "a manifest with the objects asked for")
-    for name in names:
-        scale, folder = float(entries[name].get("suggested_scale", 1.0)), Path(objects) / name
-        mesh = trimesh.load_mesh(folder / "mesh.ply")
-        mesh.apply_scale(scale)
-        yield name, folder, entries[name], scale, mesh
+    return found
 
 
 def measure_shape(shape: ShapeGP, mesh: "trimesh.Trimesh", cloud: PointCloud, seed: int = 0) -> Row:

@@ -1,0 +1,139 @@
+"""The results of an evaluation as a page: shares with their intervals, by object and view, and what went wrong."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from torchgrasp.close.score import Share, ViewScore, summarise
+from torchgrasp.errors import Status
+from torchgrasp.files import write_file
+from torchgrasp.report.document import Markup, escape, format_document, format_table
+
+WIDTH, HEIGHT = 180, 16
+"""Size of a bar [pixels]."""
+
+
+def write_evaluation(path: Path | str, title: str, asked: Mapping[str, object], scores: Sequence[ViewScore]) -> Path:
+    """Write the page of an evaluation, atomically.
+
+    Args:
+        path: of the HTML file.
+        title: of the page.
+        asked: what was evaluated, by name.
+        scores: of `evaluate`.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    return write_file(path, format_evaluation(title, asked, scores))
+
+
+def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[ViewScore]) -> str:
+    """Return the page of an evaluation as text."""
+    found = summarise(scores)
+    value, low, high, total = found["gsr"]
+    verdict = f"{value:.0%} of {total} attempts passed (95 % interval {low:.0%} to {high:.0%})."
+    body = [
+        f"<h1>{escape(title)}</h1>",
+        f'<p class="verdict{"" if value else " bad"}">{escape(verdict)}</p>',
+        "<h2>Shares</h2>",
+        format_table(SHARES, [_share_row(name, found[key]) for key, name in SHARE_NAMES.items()], numbers={1, 3, 4}),
+        "<h2>By object and view</h2>",
+        _objects(scores, found["by_object"]),
+        "<h2>What went wrong, by stage</h2>",
+        _failures(found["failures"]),
+        *_notes(scores),
+        "<h2>Forces, overlap and time</h2>",
+        format_table(("what", "value"), _figures(found), numbers={1}),
+        "<h2>What was asked</h2>",
+        format_table(("what", "value"), [(k.replace("_", " "), str(v)) for k, v in asked.items()], code={1}),
+    ]
+    return format_document(title, body)
+
+
+SHARE_NAMES = {
+    "gsr": "grasps that pass",
+    "top1": "best-ranked grasps that pass",
+    "objects": "objects with a grasp that passes",
+}
+"""The shares of a summary in words."""
+
+SHARES = ("what", "share", "with its 95 % interval, 0 to 100 %", "interval", "of")
+
+
+def bar(found: Share) -> Markup:
+    """Draw a share as a mark and its interval as a line, on a scale from 0 to 1.
+
+    >>> bar((0.5, 0.25, 0.75, 8)).count("<line")
+    2
+    """
+    value, low, high, _ = (x * (WIDTH - 8) + 4 for x in found)
+    middle = HEIGHT / 2
+    return Markup(
+        f'<svg class="bar" viewBox="0 0 {WIDTH} {HEIGHT}" role="img">'
+        f'<line x1="4" x2="{WIDTH - 4}" y1="{middle}" y2="{middle}" stroke="#e7e5de" stroke-width="8"/>'
+        f'<line x1="{low:.1f}" x2="{high:.1f}" y1="{middle}" y2="{middle}" stroke="#8fc8bb" stroke-width="8"/>'
+        f'<circle cx="{value:.1f}" cy="{middle}" r="4" fill="#23967f"/></svg>'
+    )
+
+
+def _share_row(name: str, found: Share) -> tuple[str, ...]:
+    """Return a share in numbers and drawn."""
+    value, low, high, total = found
+    return name, f"{value:.1%}", bar(found), f"{low:.1%} to {high:.1%}", str(total)
+
+
+def _objects(scores: Sequence[ViewScore], by_object: Mapping[str, Any]) -> str:
+    """Return the table of objects, with a column for each view."""
+    views = sorted({score.view for score in scores})
+    of = {(score.object, score.view): score for score in scores}
+    rows = []
+    for name, row in by_object.items():
+        cells = [_cell(of[name, view]) if (name, view) in of else "" for view in views]
+        value, low, high, total = row["gsr"]
+        shares = f"{value:.0%}", bar(row["gsr"]), f"{low:.0%} to {high:.0%}", str(total), f"{row['top1'][0]:.0%}"
+        rows.append((name, *shares, *cells))
+    heads = ("object", "pass", "with its 95 % interval", "interval", "of", "best-ranked", *views)
+    return format_table(heads, rows, numbers={1, 3, 4, 5, *range(6, 6 + len(views))})
+
+
+def _cell(score: ViewScore) -> str:
+    """Return how many of a view's attempts passed, or why there were none."""
+    passed = sum(attempt.passed for attempt in score.attempts)
+    return f"{passed} / {len(score.attempts)}" if score.attempts else score.refusal.name.lower()
+
+
+def _failures(found: Mapping[str, Mapping[str, int]]) -> str:
+    """Return the table of reasons, each with its sentence and a bar as long as it is frequent."""
+    most = max((n for reasons in found.values() for n in reasons.values()), default=1)
+    rows = [
+        (stage, name.lower(), str(n), _length(n / most), Status[name].sentence)
+        for stage, reasons in found.items()
+        for name, n in reasons.items()
+    ]
+    return format_table(("stage", "reason", "count", "", "meaning"), rows, numbers={2})
+
+
+def _length(part: float) -> Markup:
+    """Draw a part of 1 as a length."""
+    return Markup(f'<span class="swatch" style="width:{160 * part:.0f}px"></span>')
+
+
+def _notes(scores: Sequence[ViewScore]) -> list[str]:
+    """Return what more is known of views that were refused."""
+    rows = [(score.object, score.view, score.note) for score in scores if score.note]
+    return ["<h3>Refused</h3>", format_table(("object", "view", "why"), rows)] if rows else []
+
+
+def _figures(found: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return forces, overlap and times in words."""
+    names = {
+        "force_n": ("mean normal force of a finger [N]", ".2f"),
+        "overlap_mm": ("overlap of hand and object at the grasp, mean [mm]", ".1f"),
+        "overlap_mm_max": ("overlap of hand and object at the grasp, most [mm]", ".1f"),
+        "plan_cpu_s": ("CPU time to plan on a view [s]", ".1f"),
+        "trial_cpu_s": ("CPU time of an attempt [s]", ".2f"),
+        "cpu_s": ("CPU time in all [s]", ".0f"),
+    }
+    rows = [(text, "-" if found[key] is None else format(found[key], style)) for key, (text, style) in names.items()]
+    return [("views without a grasp", str(found["refused"])), ("grasps offered", str(found["executable"])), *rows]
