@@ -28,7 +28,7 @@ figure { margin: 0; background: #fcfcfa; border: 1px solid #e7e5de; border-radiu
 figure img { display: block; width: 100% }
 figcaption { padding: 10px 14px; font-size: 14px; color: #4b525b; border-top: 1px solid #e7e5de }
 .dot { display: inline-block; width: 10px; height: 10px; border-radius: 50%; margin: 0 5px 0 10px }
-.bar { display: block; width: 180px; height: 16px }
+.bar { display: block; width: 180px; height: 16px; margin: 4px 0 }
 .swatch { display: inline-block; height: 10px; background: #c2452d; border-radius: 2px }
 code { font: 13px/1.5 ui-monospace, "DejaVu Sans Mono", monospace; overflow-wrap: anywhere }
 """
