@@ -5,17 +5,19 @@ There is no pickle anywhere: a file from a stranger can be malformed, but it can
 
 import hashlib
 import json
+import math
 import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from torchgrasp.errors import ModelFileError, OutputError
+from torchgrasp.errors import ModelFileError, OutputError, Status
 
 VERSION = "1"
 """Version of the layout of every file written here; readers refuse any other."""
@@ -51,13 +53,33 @@ def write_file(path: Path | str, content: str | bytes) -> Path:
     return write_atomically(path, lambda temporary: temporary.write_bytes(data))
 
 
+def format_json(value: Any) -> str:
+    """Return a value as JSON: a status by its name, and null for a number that is not finite, which JSON lacks.
+
+    >>> format_json({"force": float("nan"), "status": Status.OK}).split()
+    ['{', '"force":', 'null,', '"status":', '"OK"', '}']
+    """
+    return json.dumps(_plain(value), indent=1)
+
+
+def _plain(value: Any) -> Any:
+    """Return a value without what JSON lacks."""
+    if isinstance(value, dict):
+        return {key: _plain(x) for key, x in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(x) for x in value]
+    if isinstance(value, Status):
+        return value.name
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def save_tensors(path: Path | str, kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) -> Path:
     """Write named tensors and metadata as one safetensors file of a `kind` ("grasps", "mixture", ...).
 
     Raises:
         OutputError: the file cannot be written.
     """
-    contiguous = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
+    contiguous = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}  # a file shares no memory
     # One JSON string: safetensors writes several metadata keys in random order, and equal values must give equal bytes.
     header = {"torchgrasp": json.dumps({**meta, "kind": kind, "version": VERSION}, sort_keys=True)}
     # as bytes, since a full disk then is an OSError, which save_file makes an error of its own

@@ -13,11 +13,13 @@ import tyro
 
 from torchgrasp.cli import clouds, grasps, hands, shapes
 from torchgrasp.cli.evaluate import evaluate
+from torchgrasp.cli.export import export
 from torchgrasp.errors import GraspError
 
 COMMANDS: dict[str, Callable[..., int]] = {
     "grasp": grasps.grasp,
     "evaluate": evaluate,
+    "export": export,
     "objects": grasps.objects,
     "cloud check": clouds.check,
     "cloud render": clouds.render,

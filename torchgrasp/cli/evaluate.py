@@ -1,8 +1,6 @@
 """`torchgrasp evaluate`: the library's grasps under published protocols, in simulation."""
 
 import dataclasses
-import json
-import math
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +12,7 @@ from torchgrasp.close.evaluate import Ranks
 from torchgrasp.close.evaluate import evaluate as evaluate_views
 from torchgrasp.close.score import ViewScore, summarise
 from torchgrasp.errors import Status
-from torchgrasp.files import write_file
+from torchgrasp.files import format_json, write_file
 from torchgrasp.hand.load import load_hand
 from torchgrasp.report.evaluation import SHARE_NAMES, write_evaluation
 
@@ -87,20 +85,9 @@ def evaluate(
     asked |= {"ranks": ranks, "starts": starts, "complete": complete, "seed": seed, "hand_sha256": the_hand.sha256}
     content = {"asked": asked, "summary": summary, "views": [dataclasses.asdict(score) for score in scores]}
     with naming("--out", "path"):
-        write_file(out / "evaluate.json", json.dumps(_plain(content), indent=1))
+        write_file(out / "evaluate.json", format_json(content))
         write_evaluation(out / "evaluate.html", f"Grasps of the {hand} hand under {protocol}", asked, scores)
     return 0
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as JSON has it: a status by its name, and null for what was never measured or has no end."""
-    if isinstance(value, dict):
-        return {key: _plain(x) for key, x in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(x) for x in value]
-    if isinstance(value, Status):
-        return value.name
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def print_score(score: ViewScore) -> None:

@@ -59,8 +59,8 @@ def scene_mjcf(setup: Setup) -> str:
     _add_object(asset, world, setup)
     _add_hand(world, setup, urdf)
     for name in movable:
-        _add_drive(actuator, name, setup.drives[name])
-    _add_drive(actuator, LIFT_JOINT, LIFT_DRIVE)
+        add_drive(actuator, name, setup.drives[name])
+    add_drive(actuator, LIFT_JOINT, LIFT_DRIVE)
     return ET.tostring(root, encoding="unicode")
 
 
@@ -76,14 +76,19 @@ def _add_object(asset: ET.Element, world: ET.Element, setup: Setup) -> None:
 
 
 def _add_hand(world: ET.Element, setup: Setup, urdf: Urdf) -> None:
-    """Hang the hand on the joint that lifts it, link by link from its root."""
-    links = {link.name: link for link in urdf.links}
+    """Hang the hand on the joint that lifts it."""
     arm = ET.SubElement(world, "body", name=LIFT_JOINT, gravcomp="1")
     _weigh(arm, 1.0, np.zeros(3), (0.01, 0.0, 0.0, 0.01, 0.0, 0.01))
     travel = _text((-0.01, setup.travel + 0.05))
     ET.SubElement(arm, "joint", name=LIFT_JOINT, type="slide", axis="0 0 1", range=travel)
-    hand = _add_link(arm, links[urdf.root], setup.world_from_hand[:3, 3], setup.world_from_hand[:3, :3])
-    bodies = {urdf.root: hand}
+    add_links(arm, urdf, setup.world_from_hand)
+
+
+def add_links(parent: ET.Element, urdf: Urdf, parent_from_root: np.ndarray) -> ET.Element:
+    """Add the tree of a hand to a body, link by link from its root, and return the root's body."""
+    links = {link.name: link for link in urdf.links}
+    root = _add_link(parent, links[urdf.root], parent_from_root[:3, 3], parent_from_root[:3, :3])
+    bodies = {urdf.root: root}
     while len(bodies) < len(links):
         for joint in urdf.joints:
             if joint.parent in bodies and joint.child not in bodies:
@@ -93,6 +98,7 @@ def _add_hand(world: ET.Element, setup: Setup, urdf: Urdf) -> None:
                     kind = "slide" if joint.kind == "prismatic" else "hinge"
                     limits = {"axis": _text(joint.axis), "range": _text((joint.lower, joint.upper))}
                     ET.SubElement(body, "joint", limits, name=joint.name, type=kind, armature=repr(ARMATURE))
+    return root
 
 
 def _add_link(parent: ET.Element, link: Link, place: Iterable[float], turn: np.ndarray) -> ET.Element:
@@ -108,7 +114,7 @@ def _add_link(parent: ET.Element, link: Link, place: Iterable[float], turn: np.n
     return body
 
 
-def _add_drive(actuator: ET.Element, joint: str, drive: Actuator) -> None:
+def add_drive(actuator: ET.Element, joint: str, drive: Actuator) -> None:
     """Let a motor hold a joint at its target: kp (target - q) - kd dq/dt, the effort at most."""
     gains = {"kp": repr(drive.kp), "kv": repr(drive.kd), "forcerange": _text((-drive.effort, drive.effort))}
     ET.SubElement(actuator, "position", gains, name=joint, joint=joint)

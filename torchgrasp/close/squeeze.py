@@ -1,5 +1,7 @@
 """The third pose of a grasp: where the joints are driven so that compliant fingers press with balanced forces."""
 
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -11,6 +13,14 @@ from torchgrasp.frames import apply as move
 from torchgrasp.frames import inverse, rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values import Grasps
+
+
+class Squeezed(NamedTuple):
+    """Joint targets [rad], the fingers' forces on the object in the hand's frame [N], and the joints' torques [N m]."""
+
+    joints: Float[Tensor, "g h"]
+    forces: Float[Tensor, "g 3 3"]
+    torques: Float[Tensor, "g h"]
 
 
 def squeeze_joints(grasps: Grasps, hand: Hand, force: float = 4.0, kp: float | None = None) -> Float[Tensor, "g h"]:
@@ -36,6 +46,11 @@ def squeeze_joints(grasps: Grasps, hand: Hand, force: float = 4.0, kp: float | N
     >>> lead.shape[1], bool((lead.abs().amax(1) > 0.01).all())
     (12, True)
     """
+    return squeeze(grasps, hand, force, kp).joints
+
+
+def squeeze(grasps: Grasps, hand: Hand, force: float = 4.0, kp: float | None = None) -> Squeezed:
+    """Return `squeeze_joints` with the forces and torques that they stand for; torques are of the actuated joints."""
     if grasps.joints.shape[-1] != hand.dof:
         raise BadArgument("grasps", f"{grasps.joints.shape[-1]} joints", f"the {hand.dof} of {hand.name}")
     for name, value in (("force", force), ("kp", 1.0 if kp is None else kp)):
@@ -46,5 +61,5 @@ def squeeze_joints(grasps: Grasps, hand: Hand, force: float = 4.0, kp: float | N
     points = move(hand_from_obj, grasps.contacts.points.double())
     normals = rotate(hand_from_obj, grasps.contacts.normals.double())
     forces = desired_forces(points, normals, force)
-    torque = torch.einsum("gcih,gci->gh", hand.to(torch.float64).jacobian(joints), forces)
-    return joints + torque / joint_stiffness(hand, kp)
+    torques = torch.einsum("gcih,gci->gh", hand.to(torch.float64).jacobian(joints), forces)
+    return Squeezed(joints + torques / joint_stiffness(hand, kp), forces, torques)

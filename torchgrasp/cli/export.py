@@ -1,0 +1,50 @@
+"""`torchgrasp export`: planned grasps in the formats of others."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from torchgrasp.cli.common import naming
+from torchgrasp.close.keyframes import format_keyframes
+from torchgrasp.close.replay import format_grasps
+from torchgrasp.errors import BadArgument, Status
+from torchgrasp.files import write_file
+from torchgrasp.hand.load import load_hand
+from torchgrasp.values import load_grasps
+
+
+def export(
+    grasps: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="GRASPS")],
+    /,
+    out: Path,
+    format: Literal["json", "mujoco"] = "json",
+    hand: str | None = None,
+    most: int = 20,
+    force: float = 4.0,
+) -> int:
+    """Write the best executable grasps of a file for replay: pre-grasp, grasp and squeeze, joints by their names.
+
+    Args:
+        grasps: grasps.safetensors of `torchgrasp grasp`, or a file of the folder grasps of `torchgrasp evaluate`.
+        out: file to write.
+        format: JSON with frames, units, forces and torques, or the hand as a MuJoCo model with keyframes.
+        hand: name or folder of the hand; by default the name in the file.
+        most: how many grasps, the best first.
+        force: normal force of the strongest finger [N] in the squeeze.
+    """
+    with naming("GRASPS", "path"):
+        found = load_grasps(grasps)
+    with naming("--hand", "hand", "name"):
+        robot = load_hand(found.meta.get("hand", "") if hand is None else hand)
+    if found.meta.get("hand_sha256") != robot.sha256:
+        raise BadArgument("--hand", f"{robot.name}, whose files are not those that were planned with", "the same hand")
+    if most < 1:
+        raise BadArgument("--most", most, "at least 1")
+    best = found[found.status == Status.OK][:most]
+    with naming("--force", "force"):
+        text = (format_grasps if format == "json" else format_keyframes)(best, robot, force)
+    with naming("--out", "path"):
+        write_file(out, text)
+    print(f"{len(best)} grasps of the {robot.name} hand: {out}")
+    return 0 if len(best) else 1
