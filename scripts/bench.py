@@ -1,6 +1,7 @@
 #!/usr/bin/env python
 """Measure torchgrasp. Each command prints a table and writes the same numbers as JSON.
 
+python scripts/bench.py close --objects DIR    closing the hand: the simulators against statics and against each other
 python scripts/bench.py grasp --objects DIR    cloud to held object, for every object of a folder and both hands
 python scripts/bench.py hand                   the hands: kinematics, collision, the learned model, contacts to postures
 python scripts/bench.py plan --objects DIR     the contact planner against IPOPT, on the true surface, and as it grows
@@ -12,6 +13,7 @@ they would spin, which takes a plan twice as long on a quiet one.
 """
 
 import tyro
+from benchmarks.close import close
 from benchmarks.grasp import grasp
 from benchmarks.hand import hand
 from benchmarks.plan import plan
@@ -19,4 +21,5 @@ from benchmarks.proof import proof
 from benchmarks.shape import shape
 
 if __name__ == "__main__":
-    tyro.extras.subcommand_cli_from_dict({"grasp": grasp, "hand": hand, "plan": plan, "proof": proof, "shape": shape})
+    subjects = {"close": close, "grasp": grasp, "hand": hand, "plan": plan, "proof": proof, "shape": shape}
+    tyro.extras.subcommand_cli_from_dict(subjects)

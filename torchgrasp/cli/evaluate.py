@@ -15,6 +15,7 @@ from torchgrasp.errors import Status
 from torchgrasp.files import format_json, write_file
 from torchgrasp.hand.load import load_hand
 from torchgrasp.report.evaluation import SHARE_NAMES, write_evaluation
+from torchgrasp.specs import Simulator
 
 
 def evaluate(
@@ -26,6 +27,7 @@ def evaluate(
     ] = "dexgraspbench",
     closing: ClosingMode | None = None,
     holding: HoldingMode = "squeeze",
+    simulator: Simulator = "sapien",
     force: float | None = None,
     grasps: int = 20,
     ranks: Ranks = "best",
@@ -49,6 +51,7 @@ def evaluate(
         closing: open loop through pre-grasp, grasp and squeeze, or by a controller that feels with the fingertips; by
             default open loop where the object is pulled at, and under uncertainty where it is lifted.
         holding: how the hand presses from then on.
+        simulator: sapien or mujoco.
         force: normal force of the strongest finger [N]; by default 7 where the object is pulled at, 4 where it is
             lifted.
         grasps: the most that are tried of each view.
@@ -63,10 +66,10 @@ def evaluate(
     with naming("--out", "path"):
         check_folder(out)
     check_seed(seed)
-    check_simulator()
+    check_simulator(simulator)
     with naming("--hand", "hand", "name"):
         the_hand = load_hand(hand)
-    execution = Execution(force, closing, holding)
+    execution = Execution(force, closing, holding, simulator)
     with (
         naming("--objects", "objects", "path"),
         naming("--grasps", "grasps"),
@@ -81,6 +84,7 @@ def evaluate(
     summary = summarise(scores)
     print_summary(protocol, summary)
     used = dict(zip(("force", "closing"), execution.on(PROTOCOLS[protocol]), strict=True)) | {"holding": holding}
+    used |= {"simulator": simulator}
     asked = {"protocol": dataclasses.asdict(PROTOCOLS[protocol]), "hand": hand, **used, "grasps": grasps}
     asked |= {"ranks": ranks, "starts": starts, "complete": complete, "seed": seed, "hand_sha256": the_hand.sha256}
     content = {"asked": asked, "summary": summary, "views": [dataclasses.asdict(score) for score in scores]}

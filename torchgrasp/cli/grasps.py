@@ -25,7 +25,7 @@ from torchgrasp.pipeline import Mode, plan_grasps
 from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows, write_report
 from torchgrasp.report.run import Run, Stage, verdict
 from torchgrasp.shape.surface import extract_surface
-from torchgrasp.specs import ContactSpec, TrialSpec
+from torchgrasp.specs import ContactSpec, Simulator, TrialSpec
 from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
@@ -123,22 +123,22 @@ def grasp(
     return 0 if done else 1
 
 
-def check_simulator() -> None:
+def check_simulator(name: Simulator = "sapien") -> None:
     """Refuse a simulator that is not installed, or that lacks a library of the system.
 
     Raises:
-        MissingExtra: SAPIEN is not installed.
-        BadArgument: SAPIEN is installed and cannot be loaded.
+        MissingExtra: it is not installed.
+        BadArgument: it is installed and cannot be loaded.
     """
-    if importlib.util.find_spec("sapien") is None:
-        raise MissingExtra("sapien", "sim")
+    if importlib.util.find_spec(name) is None:
+        raise MissingExtra(name, {"sapien": "sim", "mujoco": "mujoco"}[name])
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a missing Vulkan does not concern physics
-            importlib.import_module("sapien")
+            importlib.import_module(name)
     except ImportError as error:
         allowed = "one whose libraries are there (Debian and Ubuntu: apt-get install libx11-6)"
-        raise BadArgument("--close", f"a SAPIEN that cannot be loaded ({error})", allowed) from error
+        raise BadArgument("--close", f"a {name} that cannot be loaded ({error})", allowed) from error
 
 
 def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] | None]":

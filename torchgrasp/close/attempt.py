@@ -17,7 +17,7 @@ from torchgrasp.close.scene import Setup, open_scene
 from torchgrasp.close.trial import close_hand
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.hand.hand import Hand
-from torchgrasp.specs import TrialSpec
+from torchgrasp.specs import Simulator, TrialSpec, check_simulator
 from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
@@ -68,11 +68,13 @@ class Execution(Value):
         closing: how the hand closes; None: open loop where the object is pulled at, as the authors of those tests do,
             and under uncertainty where it is lifted.
         holding: how the hand presses from then on; the open loop keeps its squeeze.
+        simulator: "sapien" or "mujoco".
     """
 
     force: float | None = None
     closing: ClosingMode | None = None
     holding: HoldingMode = "squeeze"
+    simulator: Simulator = "sapien"
 
     def on(self, protocol: Protocol) -> tuple[float, ClosingMode]:
         """Return force and closing for a protocol."""
@@ -107,7 +109,7 @@ def find_protocol(protocol: Protocol | str, execution: Execution) -> Protocol:
     """Return a protocol, by its name or as it is, after checking that it can be executed so.
 
     Raises:
-        BadArgument: an unknown protocol or closing, or a force outside its range.
+        BadArgument: an unknown protocol, closing or simulator, or a force outside its range.
 
     >>> find_protocol("tabletop", Execution()).friction
     0.6
@@ -117,6 +119,7 @@ def find_protocol(protocol: Protocol | str, execution: Execution) -> Protocol:
             raise BadArgument("protocol", repr(protocol), f"one of {', '.join(PROTOCOLS)}")
         protocol = PROTOCOLS[protocol]
     force, closing = execution.on(protocol)
+    check_simulator(execution.simulator)
     if isinstance(protocol, PullProtocol):
         return check_test(protocol, force, closing, execution.holding)
     dataclasses.replace(protocol.trial, force=force, controller=closing, holding=execution.holding)  # checks itself
@@ -138,14 +141,16 @@ def attempt_grasp(
     began = time.process_time()
     force, closing = execution.on(protocol)
     grasp, hand = grasp.to("cpu", torch.float64), hand.to("cpu", torch.float64)
-    overlap = grasp_overlap(grasp, hand, mesh, parts, error)
+    overlap = grasp_overlap(grasp, hand, mesh, parts, error, execution.simulator)
     if isinstance(protocol, PullProtocol):
         pulled = pull_grasp(
-            grasp, hand, mesh, protocol, force, closing, seed, holding=execution.holding, error=error, parts=parts
-        )
+            grasp, hand, mesh, protocol, force, closing, seed,
+            holding=execution.holding, error=error, parts=parts, simulator=execution.simulator,
+        )  # fmt: skip
         status, moved, turned, pressed = pulled.status, pulled.moved, pulled.turned, pulled.force
     else:
-        spec = dataclasses.replace(protocol.trial, force=force, controller=closing, holding=execution.holding)
+        given = {"holding": execution.holding, "simulator": execution.simulator}
+        spec = dataclasses.replace(protocol.trial, force=force, controller=closing, **given)
         lifted = close_hand(grasp, hand, mesh, spec, seed, error=error, parts=parts)
         status, (moved, turned), pressed = lifted.status, lifted.object_motion, float(lifted.forces[-1].mean())
         pressed = math.nan if status is Status.START_OVERLAP else pressed
@@ -159,6 +164,7 @@ def grasp_overlap(
     mesh: "trimesh.Trimesh",
     parts: "list[trimesh.Trimesh]",
     error: Float[Tensor, "4 4"] | None = None,
+    simulator: Simulator = "sapien",
 ) -> float:
     """Return how deep [m] the simulated hand in its grasp pose is in the true object, fingertips included."""
     stands = grasp.obj_from_hand[0] if error is None else grasp.obj_from_hand[0] @ error
@@ -167,4 +173,4 @@ def grasp_overlap(
         hand.urdf_path, stands.numpy(), joints, hand.actuators, tuple(hand.tip_links), mesh, parts,
         mass=0.1, timestep=TIMESTEP, table=False,
     )  # fmt: skip
-    return open_scene(setup).penetration()
+    return open_scene(setup, simulator).penetration()

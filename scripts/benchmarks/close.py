@@ -1,0 +1,53 @@
+"""Closing the hand beside its bars: the simulators against statics, and against each other."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from benchmarks.agreement import bench_agreement
+from benchmarks.common import Row, write_rows
+
+SUBJECTS = ("agreement",)
+
+
+def close(
+    objects: Path | None = None,
+    only: tuple[str, ...] = SUBJECTS,
+    tries: int = 4,
+    starts: int = 1000,
+    workers: int = 1,
+    threads: int = 1,
+    seed: int = 0,
+    out: Path = Path("out/bench_close.json"),
+) -> None:
+    """Measure closing, lifting and pulling in simulation.
+
+    Args:
+        objects: folder with manifest.json and a folder for each object; without it what needs grasps is left out.
+        only: subjects to measure: agreement.
+        tries: grasps of each view, spread over all ranks.
+        starts: of the contact planner.
+        workers: processes that share the trials.
+        threads: of torch.
+        seed: of every draw.
+        out: where the numbers are written as JSON.
+    """
+    unknown = sorted(set(only) - set(SUBJECTS))
+    if unknown:
+        raise SystemExit(f"only: {unknown} are no subjects; {', '.join(SUBJECTS)} are")
+    torch.set_num_threads(threads)
+    subjects: dict[str, Callable[[], list[Row]]] = {
+        "agreement": lambda: bench_agreement(objects, tries, starts, seed, workers) if objects else [],
+    }
+    settings = {"tries": tries, "starts": starts, "threads": threads, "seed": seed, "torch": torch.__version__}
+    print(", ".join(f"{name} {value}" for name, value in settings.items()))
+    rows: list[Row] = []
+    for name in SUBJECTS:
+        if name in only:
+            found = subjects[name]()
+            print(*found, sep="\n", flush=True)
+            rows += found
+    met, missed = (sum(row.met is verdict for row in rows) for verdict in (True, False))
+    print(f"{met} bars met, {missed} missed, {len(rows) - met - missed} rows without one")
+    write_rows(out, "close", settings, rows)
