@@ -105,6 +105,7 @@ def plan_grasps(
     seed: int = 0,
     *,
     mode: Mode = "together",
+    shape: ShapeGP | None = None,
     observer: Observer = _ignore,
 ) -> Grasps:
     """Plan grasps of a hand on the object of a partial point cloud: every stage of the library in one call.
@@ -116,6 +117,8 @@ def plan_grasps(
         starts: random starts of the contact planner.
         seed: of every random draw; the same seed gives bitwise the same grasps.
         mode: how planned contacts become grasps, see `Mode`. Only "contact_first" needs the hand's learned model.
+        shape: the object's shape as it is believed to be, where it is known better than from the cloud, as after a
+            touch (`ShapeGP.update`); None: it is fitted to the cloud.
         observer: called after each stage with its name, a line of counts, and its value.
 
     Returns:
@@ -144,7 +147,7 @@ def plan_grasps(
         mixture_file = mixture_path(hand.urdf_path.parent)  # beside the hand, also when it is a user's own
         model = load_mixture(mixture_file).to(cloud.points.device), sha256(mixture_file)
 
-    shape = fit_shape(cloud, seed=seed, table=spec.table)
+    shape = fit_shape(cloud, seed=seed, table=spec.table) if shape is None else shape
     surface = extract_surface(shape)
     certain = float((surface.std_m < 0.004).double().mean())
     observer("shape", f"{len(shape.x)} points, {certain:.0%} of the surface certain to 4 mm", shape)

@@ -76,6 +76,13 @@ class ContactSpec(Value):
         return cls(friction, edges, max_variance, friction_margin=1.0, separation=0.0, flatness=None, start_radius=0.1)
 
 
+ClosingMode = Literal["open_loop", "position", "fixed", "uncertainty"]
+"""How a hand closes, see `TrialSpec`."""
+
+HoldingMode = Literal["squeeze", "impedance", "stay"]
+"""How a closed hand presses, see `TrialSpec`."""
+
+
 @dataclasses.dataclass(frozen=True)
 class TrialSpec(Value):
     """One simulated trial: close on the true mesh, lift it off the table, hold it.
@@ -83,8 +90,8 @@ class TrialSpec(Value):
     Args:
         controller: how the hand closes: "uncertainty" (Eqs. 25-28), "fixed" (Eq. 25 with constant gains), "position"
             (isotropic PI that stops at 0.5 N, the paper's baseline) or "open_loop" (pre-grasp, grasp, squeeze).
-        holding: how it presses from then on: "squeeze" (joints stay where they are) or "impedance" (the grasp is a
-            spring in the hand). The open loop keeps its squeeze.
+        holding: how it presses from then on: "squeeze" (joints stay where they are), "impedance" (the grasp is a spring
+            in the hand) or "stay" (no more than it does already). The open loop keeps its squeeze.
         mass: of the object [kg].
         friction: of every contact.
         gravity: [m/s^2].
@@ -101,8 +108,8 @@ class TrialSpec(Value):
         BadArgument: a number outside its range, or an unknown controller, holding or simulator.
     """
 
-    controller: Literal["open_loop", "position", "fixed", "uncertainty"] = "uncertainty"
-    holding: Literal["squeeze", "impedance"] = "squeeze"
+    controller: ClosingMode = "uncertainty"
+    holding: HoldingMode = "squeeze"
     mass: float = 0.1
     friction: float = 0.8
     gravity: float = 9.81

@@ -7,7 +7,6 @@ from typing import Any, Literal
 from torchgrasp.cli.common import check_folder, check_seed, naming
 from torchgrasp.cli.grasps import check_simulator
 from torchgrasp.close.attempt import PROTOCOLS, Execution
-from torchgrasp.close.control import ClosingMode, HoldingMode
 from torchgrasp.close.evaluate import Ranks
 from torchgrasp.close.evaluate import evaluate as evaluate_views
 from torchgrasp.close.score import ViewScore, summarise
@@ -15,7 +14,7 @@ from torchgrasp.errors import Status
 from torchgrasp.files import format_json, write_file
 from torchgrasp.hand.load import load_hand
 from torchgrasp.report.evaluation import SHARE_NAMES, write_evaluation
-from torchgrasp.specs import Simulator
+from torchgrasp.specs import ClosingMode, HoldingMode, Simulator
 
 
 def evaluate(

@@ -10,14 +10,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.close.control import ClosingMode, HoldingMode
 from torchgrasp.close.protocol import PROTOCOLS as PULLS
 from torchgrasp.close.protocol import TIMESTEP, PullProtocol, check_test, pull_grasp
 from torchgrasp.close.scene import Setup, open_scene
 from torchgrasp.close.trial import close_hand
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.hand.hand import Hand
-from torchgrasp.specs import Simulator, TrialSpec, check_simulator
+from torchgrasp.specs import ClosingMode, HoldingMode, Simulator, TrialSpec, check_simulator
 from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:

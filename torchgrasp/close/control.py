@@ -1,25 +1,18 @@
 """A grasp from the first motion of the fingers to the last of the hold: one state machine, without a simulator."""
 
-from typing import Literal
-
 from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.close.closings import Closing, FixedClosing, OpenLoop, Stopping
-from torchgrasp.close.hold import Squeeze
+from torchgrasp.close.hold import Squeeze, Stay
 from torchgrasp.close.impedance import Impedance
 from torchgrasp.close.sight import Plant, Sight
 from torchgrasp.errors import BadArgument
+from torchgrasp.specs import ClosingMode, HoldingMode
 from torchgrasp.values import ClosingGains
 
-ClosingMode = Literal["open_loop", "position", "fixed", "uncertainty"]
-"""Through three poses whatever is felt; the paper's baseline; Eq. 25 with constant gains; Eq. 25 (Sec. 5)."""
-
-HoldingMode = Literal["squeeze", "impedance"]
-"""How the closed hand presses: joints that stay where they are, or the grasp as a spring in the hand."""
-
 CLOSINGS = {"open_loop": OpenLoop, "position": Stopping, "fixed": FixedClosing, "uncertainty": Closing}
-HOLDINGS = {"squeeze": Squeeze, "impedance": Impedance}
+HOLDINGS = {"squeeze": Squeeze, "impedance": Impedance, "stay": Stay}
 
 CLOSING_TIME = 4.0
 """Longest time [s] that closing may take before the hand presses with what it has."""

@@ -36,6 +36,17 @@ class Squeeze:
         return self.start + share * (self.still + self.factor * self.lead - self.start)
 
 
+class Stay:
+    """Keep the joints' targets where closing left them: a hand that stops at a force lifts with that force."""
+
+    def __init__(self, plant: Plant, gains: ClosingGains, sight: Sight, start: Float[Tensor, " j"]) -> None:
+        self.start = start
+
+    def __call__(self, sight: Sight, period: float) -> Float[Tensor, " j"]:
+        """Return the targets of all joints for the next tick."""
+        return self.start
+
+
 def held_forces(plant: Plant, gains: ClosingGains, sight: Sight) -> tuple[Float[Tensor, "3 3"], float]:
     """Return forces on the object [N] that are balanced for the contacts that were really made, and their normal sum.
 

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.close.control import CLOSINGS, HOLDINGS, ClosingMode, GraspController, HoldingMode
+from torchgrasp.close.control import CLOSINGS, HOLDINGS, GraspController
 from torchgrasp.close.law import closing_gains
 from torchgrasp.close.parts import check_parts, convex_parts, read_mesh
 from torchgrasp.close.robot import Robot
@@ -29,7 +29,7 @@ from torchgrasp.close.sight import plant_from_hand
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import rigid, rotation_angle, rotation_from_vector
 from torchgrasp.hand.hand import Hand
-from torchgrasp.specs import Simulator, check_simulator
+from torchgrasp.specs import ClosingMode, HoldingMode, Simulator, check_simulator
 from torchgrasp.values import ClosingGains, Grasps
 
 if TYPE_CHECKING:

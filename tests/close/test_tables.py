@@ -1,0 +1,60 @@
+"""Tables 6 and 7: which grasps, where the object stands, and what the intervals are worth."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torchgrasp.close import tables
+from torchgrasp.close.tables import SHIFT, THRESHOLDS, TURN, Cell, difference, draw_places, threshold_cells, trend
+from torchgrasp.errors import Status
+
+
+def cells(row: str, held: dict[str, int], of: int = 10) -> list[Cell]:
+    """Return a cell for each object."""
+    return [Cell(o, "allegro", row, (Status.OK,) * n + (Status.DROPPED,) * (of - n), 0.01) for o, n in held.items()]
+
+
+def test_an_object_is_moved_on_its_table_and_turned_about_the_vertical() -> None:
+    pivot = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
+    places = draw_places(2000, pivot, seed=1)
+    moved = (places[:, :3, :3] @ pivot) + places[:, :3, 3] - pivot
+    assert moved[:, :2].abs().max() <= SHIFT
+    assert moved[:, 2].abs().max() < 1e-15
+    angle = torch.atan2(places[:, 1, 0], places[:, 0, 0])
+    assert angle.abs().max() <= TURN
+    assert torch.equal(places[:, 2, :3], torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(2000, 3))
+    # uniform: standard deviation a / sqrt(3), known to 2 % from 2000 draws
+    assert float(angle.std()) == pytest.approx(TURN / math.sqrt(3), rel=0.05)
+    assert float(moved[:, 0].std()) == pytest.approx(SHIFT / math.sqrt(3), rel=0.05)
+
+
+def test_a_difference_is_the_pooled_one_and_its_interval_that_of_resampled_objects() -> None:
+    first = cells("a", {"x": 9, "y": 8, "z": 10, "w": 7})
+    second = cells("b", {"x": 5, "y": 8, "z": 6, "w": 1})
+    value, low, high = difference(first, second)
+    assert value == pytest.approx((34 - 20) / 40)
+    # all 4^4 resamples of four objects, exactly
+    gains = np.array([4, 0, 4, 6]) / 10
+    every = np.array([gains[list(i)].mean() for i in np.ndindex(4, 4, 4, 4)])
+    exact = np.quantile(every, [0.025, 0.975])
+    assert [low, high] == pytest.approx(list(exact), abs=0.03)
+
+
+def test_a_trend_is_the_least_squares_line_through_the_shares() -> None:
+    rows = [cells("0.03", {"x": 9, "y": 9}), cells("0.06", {"x": 7, "y": 7}), cells("0.10", {"x": 4, "y": 4})]
+    value, low, high = trend(rows)
+    slope = np.polyfit(THRESHOLDS, [0.9, 0.7, 0.4], 1)[0]
+    assert value == pytest.approx(-slope * (THRESHOLDS[-1] - THRESHOLDS[0]))
+    assert low == pytest.approx(value)
+    assert high == pytest.approx(value)
+
+
+@pytest.mark.sim
+def test_a_greater_threshold_admits_less_certain_contacts(monkeypatch) -> None:
+    monkeypatch.setattr(tables, "THRESHOLDS", (0.03, 0.10))
+    (found,) = threshold_cells(None, only=("cylinder",), workers=0, trials=2, starts=16)
+    assert [cell.row for cell in found] == ["0.03", "0.10"]
+    assert all(len(cell.statuses) == 3 for cell in found)  # two trials at least, of three grasps equally many
+    assert found[0].std_m < found[1].std_m

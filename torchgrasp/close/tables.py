@@ -1,0 +1,272 @@
+"""The paper's Tables 6 and 7 in simulation: riskier contacts hold less often, and the closing law holds more often.
+
+A cell has at least 30 trials, as in Sec. 6.5: of each noisy view the three executable grasps whose contacts have the
+greatest summed variance below a threshold, all equally often. The paper repeats a grasp from the same start and lets
+chance do the rest; a simulator has none, so that each trial draws where the object really stands on its table, of which
+the hand knows nothing, and the noise of the fingertips.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.base import Value
+from torchgrasp.close.parts import convex_parts, read_mesh
+from torchgrasp.close.pool import run_tasks
+from torchgrasp.close.trial import close_hand
+from torchgrasp.errors import Status
+from torchgrasp.frames import inverse, rigid, rotation_from_vector
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import load_hand
+from torchgrasp.objects import list_objects, load_object
+from torchgrasp.pipeline import plan_grasps
+from torchgrasp.shape.calibrate import list_views, object_scale, read_view
+from torchgrasp.shape.support import fit_shape
+from torchgrasp.specs import ClosingMode, ContactSpec, HoldingMode, TrialSpec
+from torchgrasp.values import Grasps, PointCloud
+
+if TYPE_CHECKING:
+    import trimesh
+
+Support = Literal["camera", "paper"]
+Row = tuple[str, Support, float, ClosingMode, HoldingMode]
+"""A row of a table: its name, the shape's support, the threshold, and how the hand closes and holds."""
+
+THRESHOLDS = (0.03, 0.06, 0.10)
+"""S_thresh of Table 6."""
+
+GRASPS, TRIALS = 3, 30
+"""Grasps of each view, and trials of a cell, at least."""
+
+SHIFT, TURN = 0.005, math.radians(5)
+"""Largest error [m] of where the object stands along each axis of the table, and [rad] about the vertical."""
+
+MASS = 0.1
+"""Of objects that come without one [kg]."""
+
+CELL_SECONDS = 1800.0
+"""Wall time [s] after which a cell is given up."""
+
+RESAMPLES = 10_000
+"""Draws of the objects behind an interval."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell(Value):
+    """The trials of one object with one hand.
+
+    `row` is what the table compares: a threshold or a controller. `statuses` lists the trials, those of a grasp one
+    after the other; it is empty where nothing was executable. `std_m` is the mean over the grasps of their least
+    certain contact's standard deviation [m].
+    """
+
+    object: str
+    hand: str
+    row: str
+    statuses: tuple[Status, ...]
+    std_m: float
+
+    @property
+    def held(self) -> int:
+        """Count the trials that held."""
+        return sum(status is Status.OK for status in self.statuses)
+
+
+def threshold_cells(
+    objects: Path | None,
+    hands: Sequence[str] = ("allegro",),
+    only: Sequence[str] = (),
+    workers: int = 1,
+    seed: int = 0,
+    trials: int = TRIALS,
+    starts: int = 1000,
+) -> Iterator[tuple[Cell, ...]]:
+    """Yield for each object and hand the cells of Table 6: the paper's shape, `THRESHOLDS`, the closing law.
+
+    The thresholds are variances of the paper's shape (`support="paper"`): on the completed shape, the library's
+    default, hardly any contact reaches the first of them.
+
+    Args:
+        objects: folder of objects with their noisy views, besides the library's own; None: only those.
+        hands: by name.
+        only: names of objects to keep; by default all.
+        workers: processes; the cells do not depend on how many.
+        seed: of every random draw.
+        trials: of a cell, at least.
+        starts: of the contact planner.
+
+    Raises:
+        BadArgument: no such objects, or an unknown hand.
+    """
+    rows: list[Row] = [(f"{t:.2f}", "paper", t, "uncertainty", "squeeze") for t in THRESHOLDS]
+    return _cells(objects, hands, only, workers, seed, (trials, starts), rows)
+
+
+def controller_cells(
+    objects: Path | None,
+    hands: Sequence[str] = ("allegro", "barrett"),
+    only: Sequence[str] = (),
+    workers: int = 1,
+    seed: int = 0,
+    trials: int = TRIALS,
+    starts: int = 1000,
+) -> Iterator[tuple[Cell, ...]]:
+    """Yield for each object and hand the cells of Table 7: the first row of Table 6 under two controllers.
+
+    The shape is the library's default. All rows close the same grasps of the same wrongly placed objects. "position" is
+    the paper's baseline: it stops at 0.5 N and lifts so. "position, squeeze" goes on as the closing law does, with
+    balanced forces at the sensed contacts, so that the closing alone differs. See `threshold_cells` for the arguments.
+    """
+    certain = ("camera", THRESHOLDS[0])
+    rows: list[Row] = [
+        ("uncertainty", *certain, "uncertainty", "squeeze"),
+        ("position", *certain, "position", "stay"),
+        ("position, squeeze", *certain, "position", "squeeze"),
+    ]
+    return _cells(objects, hands, only, workers, seed, (trials, starts), rows)
+
+
+def riskiest(grasps: Grasps, most: int = GRASPS) -> Grasps:
+    """Return the executable grasps whose contacts' variances have the greatest sum (Sec. 6.5)."""
+    grasps = grasps[grasps.status == Status.OK]
+    return grasps[torch.argsort(grasps.contacts.std_m.square().sum(1), descending=True, stable=True)[:most]]
+
+
+def draw_places(count: int, pivot: Float[Tensor, "3"], seed: int) -> Float[Tensor, "n 4 4"]:
+    """Return where an object may really stand: moved on the table, and turned about the vertical through a pivot.
+
+    Uniform within `SHIFT` and `TURN`.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    drawn = 2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    rotation = rotation_from_vector(TURN * drawn[:, :1] * up)
+    shift = SHIFT * drawn[:, [1, 2, 2]] * (1 - up)
+    return rigid(rotation, shift + pivot - rotation @ pivot)
+
+
+def difference(first: Sequence[Cell], second: Sequence[Cell], seed: int = 0) -> tuple[float, float, float]:
+    """Return by how much the held share of the first cells is above that of the second, and its 95 % interval.
+
+    The cells are paired by object and hand. The interval resamples objects, not trials: the trials of one object are
+    alike.
+
+    >>> a = [Cell(o, "allegro", "a", (Status.OK, Status.OK), 0.0) for o in "xyz"]
+    >>> b = [Cell(o, "allegro", "b", (Status.OK, Status.DROPPED), 0.0) for o in "xyz"]
+    >>> difference(a, b)
+    (0.5, 0.5, 0.5)
+    """
+    return _interval(
+        {o: [_of(first, o), _of(second, o)] for o in {c.object for c in first}}, np.array([1.0, -1.0]), seed
+    )
+
+
+def trend(rows: Sequence[Sequence[Cell]], seed: int = 0) -> tuple[float, float, float]:
+    """Return the fall of the held share from the first to the last of `THRESHOLDS`, and its 95 % interval.
+
+    It is the line of least squares through the rows' pooled shares; see `difference` for the interval.
+    """
+    centred = np.array(THRESHOLDS) - np.mean(THRESHOLDS)
+    weights = -centred / (centred @ centred) * (THRESHOLDS[-1] - THRESHOLDS[0])
+    return _interval({o: [_of(row, o) for row in rows] for o in {c.object for c in rows[0]}}, weights, seed)
+
+
+def _of(cells: Sequence[Cell], name: str) -> tuple[int, int]:
+    """Return how many trials of an object held, and of how many."""
+    mine = [cell for cell in cells if cell.object == name]
+    return sum(cell.held for cell in mine), sum(len(cell.statuses) for cell in mine)
+
+
+def _interval(counts: dict[str, list[tuple[int, int]]], weights: np.ndarray, seed: int) -> tuple[float, float, float]:
+    """Return a weighted sum of rows' pooled shares, with the 2.5 % and 97.5 % quantiles over resampled objects."""
+    table = np.array([counts[name] for name in sorted(counts)], float)  # (objects, rows, 2)
+    drawn = np.random.default_rng(seed).integers(len(table), size=(RESAMPLES, len(table)))
+    sums = np.concatenate([table.sum(0)[None], table[drawn].sum(1)])
+    value = (sums[..., 0] / np.maximum(sums[..., 1], 1)) @ weights
+    low, high = np.quantile(value[1:], [0.025, 0.975])
+    return float(value[0]), float(low), float(high)
+
+
+# ------------------------------------------------------------------------------------------------- one object at a time
+
+
+def _cells(
+    objects: Path | None,
+    hands: Sequence[str],
+    only: Sequence[str],
+    workers: int,
+    seed: int,
+    effort: tuple[int, int],
+    rows: list[Row],
+) -> Iterator[tuple[Cell, ...]]:
+    """Yield the cells of each object and hand, a task of its own each."""
+    folder = None if objects is None else str(objects)
+    named = [(None, name) for name in list_objects() if not only or name in only]
+    if objects is not None:
+        named = [(folder, name) for name in dict.fromkeys(name for name, _ in list_views(objects, only=only))] + named
+    tasks = [(place, name, hand, rows, seed, *effort) for hand in hands for place, name in named]
+    for task, found in zip(tasks, run_tasks(_fill, tasks, workers, CELL_SECONDS), strict=True):
+        if isinstance(found, Status):
+            found = tuple(Cell(task[1], task[2], row[0], (found,) * effort[0], math.nan) for row in rows)
+        yield found
+
+
+def _fill(
+    folder: str | None,
+    name: str,
+    hand_name: str,
+    rows: list[Row],
+    seed: int,
+    trials: int,
+    starts: int,
+) -> tuple[Cell, ...]:
+    """Plan for one object and hand, and try what was found, row by row."""
+    clouds, mesh, parts, mass = _read(folder, name)
+    label = name if folder is not None else f"own {name}"
+    pivot = torch.from_numpy(np.asarray(mesh.center_mass, float))
+    hand, cells = load_hand(hand_name), []
+    planned: dict[tuple[str, float], list[Grasps]] = {}
+    for row, support, threshold, closing, holding in rows:
+        if (support, threshold) not in planned:
+            planned[support, threshold] = [_plan(cloud, hand, support, threshold, starts, seed) for cloud in clouds]
+        grasps = [grasp for found in planned[support, threshold] for grasp in found]
+        spec = TrialSpec(controller=closing, holding=holding, mass=mass)
+        draws = math.ceil(trials / max(len(grasps), 1))
+        places = draw_places(draws * len(grasps), pivot, seed)
+        statuses = []
+        for k, place in enumerate(places):
+            grasp = grasps[k // draws]
+            stands = grasp.obj_from_hand[0].double()
+            error = inverse(stands) @ inverse(place) @ stands
+            statuses.append(close_hand(grasp, hand, mesh, spec, seed + k, parts=parts, error=error).status)
+        stds = [float(grasp.contacts.std_m.amax()) for grasp in grasps]
+        std_m = sum(stds) / len(stds) if stds else math.nan
+        cells.append(Cell(label, hand_name, row, tuple(statuses), std_m))
+    return tuple(cells)
+
+
+def _plan(cloud: PointCloud, hand: Hand, support: Support, threshold: float, starts: int, seed: int) -> Grasps:
+    """Return the riskiest grasps of a view below a threshold."""
+    shape = fit_shape(cloud, support=support, seed=seed, table=0.0)
+    spec = ContactSpec(max_variance=threshold, table=0.0)
+    return riskiest(plan_grasps(cloud, hand, spec, starts, seed, shape=shape))
+
+
+def _read(
+    folder: str | None, name: str
+) -> "tuple[list[PointCloud], trimesh.Trimesh, Sequence[trimesh.Trimesh], float]":
+    """Return the noisy views, the true mesh, its convex parts and the mass of an object."""
+    if folder is None:
+        own = load_object(name)
+        return [own.view], own.mesh, own.parts, own.mass
+    objects = Path(folder)
+    mesh = read_mesh(objects / name / "mesh.ply").apply_scale(object_scale(objects, name))
+    clouds = [read_view(objects, name, view) for _, view in list_views(objects, only=[name])]
+    return clouds, mesh, convex_parts(mesh), MASS
