@@ -170,7 +170,9 @@ def test_all_a_fingertip_exerts_is_felt_friction_included():
 
 
 def test_a_hand_that_starts_in_the_object_is_refused():
-    result = close("barrett", cylinder((0.0, 0.05)))
+    forward = torch.eye(4, dtype=torch.float64)
+    forward[2, 3] = 0.2
+    result = close("barrett", error=forward)
     assert result.status is Status.START_OVERLAP
     assert not result.held
     assert len(result.time) == 1

@@ -6,7 +6,7 @@ Each turns what a robot knows at a tick (`Sight`) into joint targets and says wh
 import dataclasses
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.close.law import POSITION_FLOOR, POSITION_RATE, blend, joint_step, tip_velocity
@@ -33,6 +33,9 @@ STOP_DISTANCE = 1e-3
 
 INTEGRAL_RATE = 2.0
 """Integral gain [1/s^2] of the position baseline."""
+
+IMPATIENCE = 0.25
+"""Time [s] of waiting for a late finger in which its drives may press harder by as much as they may at first."""
 
 LEAD = 0.04
 """Largest lead [rad] of a joint's target over the joint while closing: a link that meets the object unfelt, elsewhere
@@ -80,14 +83,26 @@ class Closing:
         self.done = self.settled >= SETTLED or self.waiting >= PATIENCE
         wished = torch.where(sight.contact, WAITING_FORCE, self.strength)
         error = gains.target - (sight.tips - plant.radius[:, None] * plant.normals)
+        ahead = -(error * plant.normals).sum(-1)  # how far the planned contact still lies ahead of each fingertip
+        error = error + ahead.clamp_max(0.0)[:, None] * plant.normals
         share = torch.where(sight.contact, 1.0, blend(error, gains.covariance))
         force_error = -(wished - sight.reading)[:, None] * plant.normals
         velocity = tip_velocity(error, force_error, share, gains.position_gain, gains.force_gain)
+        velocity = velocity * self._pace(ahead, sight.contact)[:, None]
         step = joint_step(sight.jacobian @ plant.coupling, velocity, period, plant.joints - self.target)
         actuated = sight.joints[list(plant.actuated)]
-        target = torch.minimum(torch.maximum(self.target + step, actuated - LEAD), actuated + LEAD)
+        lead = LEAD * (1 + self.waiting / IMPATIENCE)
+        target = torch.minimum(torch.maximum(self.target + step, actuated - lead), actuated + lead)
         self.target = torch.minimum(torch.maximum(target, plant.lower), plant.upper)
         return plant.expand(self.target)
+
+
+    def _pace(self, ahead: Float[Tensor, "3"], contact: Bool[Tensor, "3"]) -> Float[Tensor, "3"]:
+        """Return the share of its speed that each finger may go, so that those in the air arrive together."""
+        if bool(contact.any()):
+            return torch.ones_like(ahead)
+        left = ahead.clamp_min(0.0) + POSITION_FLOOR
+        return left / left.max()
 
 
 class FixedClosing(Closing):

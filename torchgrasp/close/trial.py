@@ -26,7 +26,7 @@ from torchgrasp.values import ClosingGains, ClosureResult, Grasps
 if TYPE_CHECKING:
     import trimesh
 
-START_TOLERANCE = 1e-3
+START_TOLERANCE = 0.01
 """Overlap [m] of the hand with object or table that still counts as none: convex parts may bulge a little."""
 
 LIFT_TIME = 1.0
