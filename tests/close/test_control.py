@@ -191,3 +191,23 @@ def test_fixed_gains_know_nothing_of_the_surface():
     assert torch.allclose(gains.covariance, POSITION_FLOOR**2 * torch.eye(3).double())
     assert (gains.force_gain == gains.force_gain[:, :1]).all()
     assert torch.equal(gains.target, GAINS.target)
+
+
+def test_fingers_in_the_air_arrive_together():
+    seen = sight(0.2)
+    near = dataclasses.replace(seen, tips=TARGET + 0.01 * NORMALS + real([[0.2], [0.1], [0.2]]) * NORMALS)
+    step = Closing(plant(), GAINS)(near, PERIOD).reshape(3, 3)
+    speed = -(step * NORMALS).sum(-1)
+    assert float(speed[1] / speed[0]) == pytest.approx((0.1 + POSITION_FLOOR) / (0.2 + POSITION_FLOOR), rel=1e-3)
+    assert float(speed[2]) == pytest.approx(float(speed[0]))
+
+
+def test_a_late_finger_searches_on_beyond_its_planned_contact_and_presses_harder():
+    two = torch.tensor([True, True, False])
+    seen = sight(-0.03, (0.3, 0.3, 0.0), two)
+    controller = Closing(plant(), GAINS)
+    first = controller(seen, PERIOD).reshape(3, 3)
+    assert float(first[2] @ NORMALS[2]) < -0.5 * MAX_SPEED * PERIOD
+    for _ in range(250):
+        last = controller(seen, PERIOD)
+    assert last.abs().max() > 1.5 * LEAD  # the joints do not follow, as if blocked

@@ -61,7 +61,9 @@ class OpenLoop:
 class Closing:
     """The uncertainty-aware controller (Eqs. 25-28), with fingers that wait for each other.
 
-    A finger in the air searches for its desired force. One that feels contact is force-controlled whatever its
+    A finger in the air searches for its desired force, beyond the planned contact, too: along the normal Eq. (26)
+    tolerates a position error, and here it tolerates any as soon as the contact is passed. Before the first touch the
+    fingers keep pace, so that they arrive together. One that feels contact is force-controlled whatever its
     position error (its blend is 1): a calibrated shape is still wrong now and then, and Eq. (26) would press on
     towards the planned point. It waits with `WAITING_FORCE`, so that the object stays where it is, until all touch or
     `PATIENCE` is over. The full forces are left to the holding: raised by three separate loops they would not balance
@@ -95,7 +97,6 @@ class Closing:
         target = torch.minimum(torch.maximum(self.target + step, actuated - lead), actuated + lead)
         self.target = torch.minimum(torch.maximum(target, plant.lower), plant.upper)
         return plant.expand(self.target)
-
 
     def _pace(self, ahead: Float[Tensor, "3"], contact: Bool[Tensor, "3"]) -> Float[Tensor, "3"]:
         """Return the share of its speed that each finger may go, so that those in the air arrive together."""

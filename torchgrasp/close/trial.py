@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     import trimesh
 
 START_TOLERANCE = 0.01
-"""Overlap [m] of the hand with object or table that still counts as none: convex parts may bulge a little."""
+"""Overlap [m] of the hand with object or table up to which a trial starts, as in published tests: what lies in the way
+of a hand that stands a little beside its plan is pushed aside, at 1 m/s at most."""
 
 LIFT_TIME = 1.0
 """Time [s] in which the hand rises, by a smooth step."""
