@@ -6,9 +6,10 @@ from pathlib import Path
 import torch
 
 from benchmarks.agreement import bench_agreement
+from benchmarks.checks import bench_checks
 from benchmarks.common import Row, write_rows
 
-SUBJECTS = ("agreement",)
+SUBJECTS = ("checks", "agreement")
 
 
 def close(
@@ -25,7 +26,7 @@ def close(
 
     Args:
         objects: folder with manifest.json and a folder for each object; without it what needs grasps is left out.
-        only: subjects to measure: agreement.
+        only: subjects to measure: checks, agreement.
         tries: grasps of each view, spread over all ranks.
         starts: of the contact planner.
         workers: processes that share the trials.
@@ -38,6 +39,7 @@ def close(
         raise SystemExit(f"only: {unknown} are no subjects; {', '.join(SUBJECTS)} are")
     torch.set_num_threads(threads)
     subjects: dict[str, Callable[[], list[Row]]] = {
+        "checks": bench_checks,
         "agreement": lambda: bench_agreement(objects, tries, starts, seed, workers) if objects else [],
     }
     settings = {"tries": tries, "starts": starts, "threads": threads, "seed": seed, "torch": torch.__version__}

@@ -6,7 +6,7 @@ import numpy as np
 
 from torchgrasp.close.lift import LIFT_DRIVE, LIFT_JOINT
 from torchgrasp.close.mjcf import OBJECT, TABLE, scene_mjcf
-from torchgrasp.close.scene import Reading, Setup
+from torchgrasp.close.scene import STILL, Reading, Setup
 from torchgrasp.errors import HandFileError, MissingExtra
 from torchgrasp.hand.urdf import read_urdf
 
@@ -85,9 +85,9 @@ class MujocoScene:
         """Set the target [rad] of every driven joint."""
         self.data.ctrl[self._motors] = targets
 
-    def pull(self, force: np.ndarray) -> None:
-        """Let a force [N] act on the object's mass centre from now on."""
-        self.data.xfrc_applied[self._object, :3] = force
+    def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
+        """Let a force [N] at the object's mass centre and a torque [N m] act on it from now on."""
+        self.data.xfrc_applied[self._object] = [*force, *torque]
 
     def lift(self, height: float, speed: float = 0.0) -> None:
         """Set the target of the lift joint [m], and the speed [m/s] at which that target moves."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from torchgrasp.close.lift import LIFT_JOINT, WRIST_JOINT
 from torchgrasp.close.sapien_build import build
-from torchgrasp.close.scene import Reading, Setup
+from torchgrasp.close.scene import STILL, Reading, Setup
 
 
 class SapienScene:
@@ -23,7 +23,7 @@ class SapienScene:
         links = {link.name: link for link in self.hand.links}
         self.tips = [links[name] for name in setup.tip_links]
         self._root = next(j.child_link for j in self.hand.joints if j.name == WRIST_JOINT)
-        self._pull = np.zeros(3, np.float32)
+        self.pull(STILL)
         self._map_contacts()
         self._map_joints()
 
@@ -52,8 +52,8 @@ class SapienScene:
 
     def step(self) -> Reading:
         """Advance by one timestep and report the contacts between fingertips and object."""
-        if self._pull.any():
-            self.body.add_force_torque(self._pull, np.zeros(3, np.float32))
+        if self._pull.any() or self._turn.any():
+            self.body.add_force_torque(self._pull, self._turn)
         self.scene.step()
         impulse, moment, weight = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
         finger = np.zeros(3, dtype=bool)
@@ -97,9 +97,9 @@ class SapienScene:
         for joint, target in zip(self._driven, targets, strict=True):
             joint.set_drive_target(float(target))
 
-    def pull(self, force: np.ndarray) -> None:
-        """Let a force [N] act on the object's mass centre from now on."""
-        self._pull = np.asarray(force, np.float32)
+    def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
+        """Let a force [N] at the object's mass centre and a torque [N m] act on it from now on."""
+        self._pull, self._turn = np.asarray(force, np.float32), np.asarray(torque, np.float32)
 
     def lift(self, height: float, speed: float = 0.0) -> None:
         """Set the target of the lift joint [m], and the speed [m/s] at which that target moves."""

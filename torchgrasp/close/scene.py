@@ -27,6 +27,10 @@ TABLE = (2.0, 2.0, 0.1)
 """Size of the table [m]; its top is where the mesh is lowest."""
 
 
+STILL = np.zeros(3)
+"""No force, no torque."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Setup:
     """What a scene is made of.
@@ -100,8 +104,8 @@ class Scene(Protocol):
         """Set the target [rad] of every driven joint."""
         ...
 
-    def pull(self, force: np.ndarray) -> None:
-        """Let a force [N] act on the object's mass centre from now on."""
+    def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
+        """Let a force [N] at the object's mass centre and a torque [N m] act on it from now on."""
         ...
 
     def lift(self, height: float, speed: float = 0.0) -> None:
