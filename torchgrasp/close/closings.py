@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.close.belief import Belief
 from torchgrasp.close.law import POSITION_FLOOR, POSITION_RATE, blend, joint_step, tip_velocity
 from torchgrasp.close.sight import Plant, Sight
 from torchgrasp.values import ClosingGains
@@ -67,23 +68,25 @@ class Closing:
     position error (its blend is 1): a calibrated shape is still wrong now and then, and Eq. (26) would press on
     towards the planned point. It waits with `WAITING_FORCE`, so that the object stays where it is, until all touch or
     `PATIENCE` is over. The full forces are left to the holding: raised by three separate loops they would not balance
-    on the way, and a cylinder of 0.1 kg moves by 8 mm instead of 4 mm.
+    on the way, and a cylinder of 0.1 kg moves by 8 mm instead of 4 mm. With a `belief` a touch that surprises moves the
+    contacts of the others.
     """
 
-    def __init__(self, plant: Plant, gains: ClosingGains) -> None:
-        self.plant, self.gains = plant, gains
+    def __init__(self, plant: Plant, gains: ClosingGains, belief: Belief | None = None) -> None:
+        self.plant, self.gains, self.belief = plant, gains, belief
         self.target = plant.pregrasp
         self.waiting = self.settled = 0.0
         self.done = False
-        self.strength = -(gains.desired_force * plant.normals).sum(-1)
 
     def __call__(self, sight: Sight, period: float) -> Float[Tensor, " j"]:
         """Return the targets of all joints for the next tick."""
+        if self.belief is not None:
+            self.plant, self.gains = self.belief.revise(sight, self.plant, self.gains)
         plant, gains = self.plant, self.gains
         self.waiting = self.waiting + period if bool(sight.contact.any()) else 0.0
         self.settled = self.settled + period if bool(sight.contact.all()) else 0.0
         self.done = self.settled >= SETTLED or self.waiting >= PATIENCE
-        wished = torch.where(sight.contact, WAITING_FORCE, self.strength)
+        wished = torch.where(sight.contact, WAITING_FORCE, -(gains.desired_force * plant.normals).sum(-1))
         error = gains.target - (sight.tips - plant.radius[:, None] * plant.normals)
         ahead = -(error * plant.normals).sum(-1)  # how far the planned contact still lies ahead of each fingertip
         error = error + ahead.clamp_max(0.0)[:, None] * plant.normals
@@ -109,7 +112,7 @@ class Closing:
 class FixedClosing(Closing):
     """`Closing` with the same gains for every contact and direction: what the uncertainty's weights are measured by."""
 
-    def __init__(self, plant: Plant, gains: ClosingGains) -> None:
+    def __init__(self, plant: Plant, gains: ClosingGains, belief: Belief | None = None) -> None:
         same = torch.eye(3, dtype=gains.covariance.dtype).expand(3, 3, 3)
         isotropic = dataclasses.replace(
             gains,
@@ -117,7 +120,7 @@ class FixedClosing(Closing):
             position_gain=torch.full_like(gains.position_gain, POSITION_RATE),
             force_gain=gains.force_gain.amax(-1, keepdim=True).expand(3, 3),
         )
-        super().__init__(plant, isotropic)
+        super().__init__(plant, isotropic, belief)
 
 
 class Stopping:

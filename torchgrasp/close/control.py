@@ -3,6 +3,7 @@
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.close.belief import Belief
 from torchgrasp.close.closings import Closing, FixedClosing, OpenLoop, Stopping
 from torchgrasp.close.hold import Squeeze, Stay
 from torchgrasp.close.impedance import Impedance
@@ -33,9 +34,10 @@ class GraspController:
         gains: of the law, with targets and desired forces (`closing_gains`).
         closing: one of `CLOSINGS`.
         holding: one of `HOLDINGS`.
+        belief: lets touches revise the shape and the contacts of the fingers in the air, under the law (Eq. 25).
 
     Raises:
-        BadArgument: an unknown closing or holding.
+        BadArgument: an unknown closing or holding, or a belief for a closing that does not follow the law.
 
     A hand that is driven at 200 Hz; here joints follow at once and the object yields by 1 mm for 2 N:
 
@@ -57,13 +59,22 @@ class GraspController:
     """
 
     def __init__(
-        self, plant: Plant, gains: ClosingGains, closing: ClosingMode = "uncertainty", holding: HoldingMode = "squeeze"
+        self,
+        plant: Plant,
+        gains: ClosingGains,
+        closing: ClosingMode = "uncertainty",
+        holding: HoldingMode = "squeeze",
+        belief: Belief | None = None,
     ) -> None:
         for name, value, table in (("closing", closing, CLOSINGS), ("holding", holding, HOLDINGS)):
             if value not in table:
                 raise BadArgument(name, repr(value), f"one of {', '.join(table)}")
         self.plant, self.gains = plant, gains
-        self.closing, self._holding, self.hold = CLOSINGS[closing](plant, gains), HOLDINGS[holding], None
+        kind = CLOSINGS[closing]
+        if belief is not None and not issubclass(kind, Closing):
+            raise BadArgument("belief", f"one for {closing!r}", "None, or a closing under the law")
+        self.closing = kind(plant, gains, belief) if issubclass(kind, Closing) else kind(plant, gains)
+        self._holding, self.hold = HOLDINGS[holding], None
         self.targets = plant.expand(plant.pregrasp)
         self.time, self.pressed = 0.0, 0.0
 

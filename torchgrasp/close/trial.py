@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.close.belief import Belief
 from torchgrasp.close.control import GraspController
 from torchgrasp.close.law import closing_gains
 from torchgrasp.close.parts import check_parts, convex_parts, read_mesh
@@ -20,6 +21,7 @@ from torchgrasp.close.sight import Sight, plant_from_hand
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import apply, inverse, rotation_angle
 from torchgrasp.hand.hand import Hand
+from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import ClosingGains, ClosureResult, Grasps
 
@@ -54,6 +56,7 @@ def close_hand(
     seed: int = 0,
     *,
     error: Float[Tensor, "4 4"] | None = None,
+    belief: ShapeGP | None = None,
     parts: "Sequence[trimesh.Trimesh] | None" = None,
 ) -> ClosureResult:
     """Close a hand on the true object, lift it and hold it, in a fresh simulation.
@@ -71,11 +74,14 @@ def close_hand(
         spec: of the trial; None: `TrialSpec()`.
         seed: of the tactile sensor's noise.
         error: where the hand really stands in its planned frame, of which it knows nothing; None: where it was planned.
+        belief: the shape that the grasp was planned on: touches that surprise revise it while the hand closes, and the
+            contacts of the fingers still in the air; None: they do not.
         parts: convex bodies to use for the mesh instead of its own decomposition (`convex_parts`).
 
     Raises:
         BadArgument: not exactly one row, a grasp of another hand or with numbers that are not finite, a pre-grasp
-            outside the joint limits, or a controller faster than the simulator.
+            outside the joint limits, a controller faster than the simulator, or a belief for a
+            closing that does not follow the law (Eq. 25).
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
     """
@@ -91,7 +97,7 @@ def close_hand(
     bodies = convex_parts(mesh) if parts is None else check_parts(parts)
     stands = grasp.obj_from_hand[0] if error is None else grasp.obj_from_hand[0] @ error.double().cpu()
     trial = _Trial(grasp, hand, mesh, bodies, spec, stands, seed)
-    status = trial.run(gains)
+    status = trial.run(gains, None if belief is None else Belief(belief, grasp.obj_from_hand[0]))
     return trial.result(status, time.perf_counter() - started)
 
 
@@ -142,13 +148,13 @@ class _Trial:
 
     # ------------------------------------------------------------------------------------------------- the phases
 
-    def run(self, gains: ClosingGains) -> Status:
+    def run(self, gains: ClosingGains, belief: Belief | None) -> Status:
         """Close, press, lift and hold; return what became of it."""
         overlap = self.scene.penetration()
         self._record(np.zeros(3))
         if not overlap <= START_TOLERANCE:
             return Status.START_OVERLAP
-        controller = GraspController(self.plant, gains, self.spec.controller, self.spec.holding)
+        controller = GraspController(self.plant, gains, self.spec.controller, self.spec.holding, belief)
         period = self.robot.period
         try:
             sight = self._tick(controller.targets)

@@ -1,0 +1,113 @@
+"""What the hand believes of the surface while it closes: a touch that surprises moves it, and the contacts in the air.
+
+A fingertip that feels the object where the surface was not expected is an observation of it. It is added to the shape's
+posterior (`ShapeGP.update`), and each finger that is still in the air then aims where its own line, through its
+planned contact along the planned normal, meets the surface now. Where that is, how it faces and how certain it is are
+the target, the normal and the covariance of Eqs. (26-27) from then on. An update takes some milliseconds, once for
+each finger at most; a tick without one takes microseconds.
+"""
+
+import dataclasses
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.close.force import desired_forces
+from torchgrasp.close.law import position_gain, surface_covariance
+from torchgrasp.close.sensor import FLAT_RADIUS, PLACE_NOISE
+from torchgrasp.close.sight import Plant, Sight
+from torchgrasp.frames import apply, inverse, rotate
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.values import ClosingGains, ShapeEstimate
+
+SURPRISE = 2.0
+"""A contact surprises from this many standard deviations off the expected surface on."""
+
+FARTHEST = 0.02
+"""How far [m] along its line a contact may be moved; a line that meets no surface within it keeps its contact."""
+
+NEWTON_STEPS = 6
+"""Steps along a line towards the surface."""
+
+LEAST_SLOPE = 0.3
+"""Least cosine of a line and the normal with which a step is computed: a grazing line steps no further."""
+
+
+class Belief:
+    """The shape in the hand's frame, which touches revise.
+
+    Args:
+        shape: as it was planned on.
+        obj_from_hand: where the hand believes to stand.
+    """
+
+    def __init__(self, shape: ShapeGP, obj_from_hand: Float[Tensor, "4 4"]) -> None:
+        self.shape, self.obj_from_hand = shape, obj_from_hand.double()
+        self.hand_from_obj = inverse(self.obj_from_hand)
+        self.felt = torch.zeros(3, dtype=torch.bool)
+
+    def revise(self, sight: Sight, plant: Plant, gains: ClosingGains) -> tuple[Plant, ClosingGains]:
+        """Return plant and gains as they are, or replanned for the fingers in the air after a touch that surprised."""
+        fresh = sight.contact & ~self.felt & torch.isfinite(sight.points + sight.normals).all(-1)
+        if not bool(fresh.any()):
+            return plant, gains
+        self.felt = self.felt | fresh
+        points = apply(self.obj_from_hand, sight.points[fresh])
+        inside = self.shape.contains(points)
+        points, normals = points[inside], rotate(self.obj_from_hand, sight.normals[fresh])[inside]
+        if not len(points):
+            return plant, gains
+        along, found = self._meet(points, normals)
+        known = torch.hypot(found.std_m, found.std_m.new_tensor(PLACE_NOISE))
+        surprising = along.abs() > (SURPRISE * known).clamp_max(0.99 * FARTHEST)
+        if not bool(surprising.any()):
+            return plant, gains
+        self.shape = self.shape.update(
+            points[surprising],
+            normals[surprising],
+            noise=PLACE_NOISE,
+            normal_noise=PLACE_NOISE / FLAT_RADIUS,
+        )
+        return self._replan(~sight.contact, plant, gains)
+
+    def _replan(self, air: Bool[Tensor, "3"], plant: Plant, gains: ClosingGains) -> tuple[Plant, ClosingGains]:
+        """Return plant and gains with the contacts of the fingers in the air on the surface as it is believed now."""
+        start, line = apply(self.obj_from_hand, gains.target), rotate(self.obj_from_hand, plant.normals)
+        along, found = self._meet(start, line)
+        missed = self._distance(start + along[:, None] * line)[0].abs() > PLACE_NOISE
+        moved = (air & ~missed)[:, None]
+        target = torch.where(moved, apply(self.hand_from_obj, start + along[:, None] * line), gains.target)
+        normals = torch.where(moved, rotate(self.hand_from_obj, found.normal), plant.normals)
+        covariance = torch.where(moved[..., None], surface_covariance(normals, found.std_m), gains.covariance)
+        strongest = float((-(gains.desired_force * plant.normals).sum(-1)).max())
+        revised = dataclasses.replace(
+            gains,
+            target=target,
+            covariance=covariance,
+            position_gain=position_gain(covariance),
+            desired_force=desired_forces(target, normals, strongest),
+        )
+        return dataclasses.replace(plant, normals=normals), revised
+
+    def _meet(
+        self, points: Float[Tensor, "n 3"], lines: Float[Tensor, "n 3"]
+    ) -> tuple[Float[Tensor, "n"], ShapeEstimate]:
+        """Return how far [m] from points along lines the surface is met, `FARTHEST` at most, and the estimate there."""
+        along = torch.zeros_like(points[:, 0])
+        for _ in range(NEWTON_STEPS):
+            off, found = self._distance(points + along[:, None] * lines)
+            slope = (found.normal * lines).sum(-1).clamp_min(LEAST_SLOPE)
+            along = (along - off / slope).clamp(-FARTHEST, FARTHEST)
+        return along, self._distance(points + along[:, None] * lines)[1]
+
+    def _distance(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], ShapeEstimate]:
+        """Return how far points are outside the surface [m], and the estimate there.
+
+        A point outside the ball in which the posterior is valid is judged at the nearest one inside.
+        """
+        x = self.shape.normalise(points)
+        far = torch.linalg.vector_norm(x, dim=-1, keepdim=True) / (0.999 * self.shape.domain_radius)
+        points = self.shape.metres(x / far.clamp_min(1.0))
+        found = self.shape.predict(points)
+        return found.distance / torch.linalg.vector_norm(self.shape.differentiate(points).distance, dim=-1), found
