@@ -1,15 +1,17 @@
-"""Closing the hand beside its bars: the simulators against statics, and against each other."""
+"""Closing the hand beside its bars: simulators against statics and each other, the parts of the closing, its speed."""
 
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
 
+from benchmarks.ablation import bench_ablation
 from benchmarks.agreement import bench_agreement
 from benchmarks.checks import bench_checks
+from benchmarks.closing_speed import bench_closing_speed
 from benchmarks.common import Row, write_rows
 
-SUBJECTS = ("checks", "agreement")
+SUBJECTS = ("checks", "speed", "ablation", "agreement")
 
 
 def close(
@@ -26,7 +28,7 @@ def close(
 
     Args:
         objects: folder with manifest.json and a folder for each object; without it what needs grasps is left out.
-        only: subjects to measure: checks, agreement.
+        only: subjects to measure: checks, speed, ablation, agreement.
         tries: grasps of each view, spread over all ranks.
         starts: of the contact planner.
         workers: processes that share the trials.
@@ -40,6 +42,8 @@ def close(
     torch.set_num_threads(threads)
     subjects: dict[str, Callable[[], list[Row]]] = {
         "checks": bench_checks,
+        "speed": bench_closing_speed,
+        "ablation": lambda: bench_ablation(objects, tries, starts, seed, workers) if objects else [],
         "agreement": lambda: bench_agreement(objects, tries, starts, seed, workers) if objects else [],
     }
     settings = {"tries": tries, "starts": starts, "threads": threads, "seed": seed, "torch": torch.__version__}
