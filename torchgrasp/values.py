@@ -243,13 +243,17 @@ def _flatten(value: Any, prefix: str = "") -> dict[str, Tensor]:
 
 @dataclasses.dataclass(frozen=True)
 class ClosingGains(Value):
-    """Gains of the closing controller for each finger, in the hand's frame (Eqs. 26-28)."""
+    """Gains of the closing controller for each finger, in the hand's frame (Eqs. 26-28).
+
+    `force_source` tells where the desired forces come from: "analytic", or "learned" from stable grasps.
+    """
 
     target: Float[Tensor, "3 3"]
     covariance: Float[Tensor, "3 3 3"]
     position_gain: Float[Tensor, "3 3"]
     force_gain: Float[Tensor, "3 3"]
     desired_force: Float[Tensor, "3 3"]
+    force_source: str = "analytic"
 
 
 @dataclasses.dataclass(frozen=True)

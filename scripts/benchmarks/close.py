@@ -1,4 +1,4 @@
-"""Closing the hand beside its bars: simulators against statics and each other, the parts of the closing, its speed."""
+"""Closing the hand beside its bars: simulators against statics and each other, parts of the closing, speed, forces."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -10,8 +10,9 @@ from benchmarks.agreement import bench_agreement
 from benchmarks.checks import bench_checks
 from benchmarks.closing_speed import bench_closing_speed
 from benchmarks.common import Row, write_rows
+from benchmarks.force import bench_force
 
-SUBJECTS = ("checks", "speed", "ablation", "agreement")
+SUBJECTS = ("checks", "speed", "ablation", "agreement", "force")
 
 
 def close(
@@ -28,7 +29,7 @@ def close(
 
     Args:
         objects: folder with manifest.json and a folder for each object; without it what needs grasps is left out.
-        only: subjects to measure: checks, speed, ablation, agreement.
+        only: subjects to measure: checks, speed, ablation, agreement, force.
         tries: grasps of each view, spread over all ranks.
         starts: of the contact planner.
         workers: processes that share the trials.
@@ -45,6 +46,7 @@ def close(
         "speed": bench_closing_speed,
         "ablation": lambda: bench_ablation(objects, tries, starts, seed, workers) if objects else [],
         "agreement": lambda: bench_agreement(objects, tries, starts, seed, workers) if objects else [],
+        "force": lambda: bench_force(objects, tries, starts, seed) if objects else [],
     }
     settings = {"tries": tries, "starts": starts, "threads": threads, "seed": seed, "torch": torch.__version__}
     print(", ".join(f"{name} {value}" for name, value in settings.items()))

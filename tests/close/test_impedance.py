@@ -6,7 +6,11 @@ import torch
 from tests.close.test_control import GAINS, PERIOD, TOUCHING, plant, real, sight
 from torchgrasp.close.hold import RAMP, held_forces
 from torchgrasp.close.impedance import (
+    MOST_RAISE,
     MOST_SHARE,
+    ROTATION_STIFFNESS,
+    SETTLING,
+    TRANSLATION_STIFFNESS,
     Impedance,
     grasp_map,
     restoring_wrench,
@@ -14,6 +18,7 @@ from torchgrasp.close.impedance import (
     side_lengths,
     spring_forces,
 )
+from torchgrasp.close.stable import Wish
 from torchgrasp.frames import rigid, rotation_from_vector, virtual_frame
 
 
@@ -32,7 +37,7 @@ def energy(points: torch.Tensor, rest: torch.Tensor, turned: torch.Tensor) -> to
     frame = virtual_frame(points @ turned.T)
     slide = (frame[:3, 3] - rest[:3, 3]).square().sum()
     turn = 0.5 * (1 - (frame[:3, :3] * rest[:3, :3]).sum(0)).sum()
-    return 0.5 * 600.0 * slide + 1.0 * turn
+    return 0.5 * TRANSLATION_STIFFNESS * slide + ROTATION_STIFFNESS * turn
 
 
 def test_shared_forces_add_up_to_the_wrench_and_are_the_smallest():
@@ -64,7 +69,7 @@ def test_the_wrench_is_the_gradient_of_an_energy():
     points = triangles(1)[0]
     rest = virtual_frame(points @ rotation_from_vector(real([0.3, -0.2, 0.1])).T + real([0.004, -0.002, 0.001]))
     centre = points.mean(0)
-    wrench = restoring_wrench(virtual_frame(points), rest, 600.0, 1.0)
+    wrench = restoring_wrench(virtual_frame(points), rest)
 
     def moved(v: torch.Tensor) -> torch.Tensor:
         there = (points - centre) @ rotation_from_vector(v[3:]).T + centre + v[:3]
@@ -91,12 +96,12 @@ def test_a_shifted_or_turned_grasp_is_pulled_back_and_stays_pressed():
     hold = Impedance(plant(), GAINS, seen, torch.zeros(9).double())
     tips, rest = seen.tips, hold.forces(seen.tips)
     shift = real([0.0, 0.001, 0.0])
-    assert torch.allclose((hold.forces(tips + shift) - rest).sum(0), -600.0 * shift, atol=1e-9)
-    turn = rotation_from_vector(real([0.0, 0.0, 0.1]))
+    assert torch.allclose((hold.forces(tips + shift) - rest).sum(0), -TRANSLATION_STIFFNESS * shift, atol=1e-9)
+    turn = rotation_from_vector(real([0.0, 0.0, 0.05]))
     centre = tips.mean(0)
     there = (tips - centre) @ turn.T + centre
     torque = torch.linalg.cross(there - centre, hold.forces(there)).sum(0)
-    assert float(torque[2]) == pytest.approx(-0.0998, rel=0.01)
+    assert float(torque[2]) == pytest.approx(-ROTATION_STIFFNESS * 0.05, rel=0.01)
     far = hold.forces(tips + 100 * shift) - rest
     assert float(far.norm(dim=-1).max()) == pytest.approx(MOST_SHARE * float(rest.norm(dim=-1).max()))
 
@@ -110,6 +115,42 @@ def test_forces_turn_with_the_hand_frame():
     turned.rest = there @ hold.rest
     forces = turned.forces(moved @ there[:3, :3].T + there[:3, 3])
     assert torch.allclose(forces, hold.forces(moved) @ there[:3, :3].T, atol=1e-9)
+
+
+def test_tips_on_a_line_keep_the_last_frame():
+    seen = sight(0.0, contact=TOUCHING)
+    hold = Impedance(plant(), GAINS, seen, torch.zeros(9).double())
+    line = seen.tips.mean(0) + torch.arange(3)[:, None] * real([0.01, 0.0, 0.0])
+    assert torch.isfinite(hold.forces(line)).all()
+    assert torch.equal(hold.frame, hold.rest)
+
+
+def test_a_grasp_that_feels_unstable_becomes_firmer_and_another_does_not():
+    class Model:
+        """Stable is what presses with more than 5 N in all."""
+
+        def odds(self, state: torch.Tensor) -> torch.Tensor:
+            return state[6:].exp().sum() - 5.0
+
+        def wish(self, tips: torch.Tensor) -> Wish:
+            return Wish(torch.ones(3).double(), torch.eye(3).double(), torch.full((3,), 300.0).double())
+
+    def held(reading: tuple[float, float, float], springs: torch.Tensor | None = None) -> Impedance:
+        seen = sight(0.0, contact=TOUCHING, reading=reading)
+        body = plant()
+        object.__setattr__(body, "stable", Model())
+        hold = Impedance(body, GAINS, seen, torch.zeros(9).double(), springs)
+        for _ in range(round((RAMP + SETTLING + 1.0) / PERIOD)):
+            hold(seen, PERIOD)
+        return hold
+
+    firm, weak = held((2.0, 2.0, 4.0)), held((1.0, 1.0, 2.0))
+    assert firm.raised == 1.0
+    assert weak.raised == pytest.approx(MOST_RAISE, rel=0.01)
+    assert weak.springs.tolist() == pytest.approx([300.0] * 3, rel=0.01)
+    assert weak.forces(sight(0.0).tips).norm() > 1.9 * firm.forces(sight(0.0).tips).norm()
+    kept = held((1.0, 1.0, 2.0), torch.full((3,), 50.0).double())
+    assert (kept.raised, kept.springs.tolist()) == (1.0, [50.0] * 3)
 
 
 def test_coupled_joints_get_the_torque_of_their_actuator():

@@ -22,8 +22,11 @@ REFINEMENTS = 24
 EVENNESS = 0.01
 """Worth of equal normal forces against the friction angle (its tangent): it decides only between equally good sets."""
 
+LEANING = 0.2
+"""Worth of the wished proportions of the normal forces against the friction angle (its tangent)."""
+
 FORCE_SPREAD = 0.1
-"""Relative standard deviation of the desired normal force, in place of the learned model of Eq. (28)."""
+"""Relative standard deviation of the desired normal force, where no model of stable grasps gives that of Eq. (28)."""
 
 
 def internal_forces(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3 3"]:
@@ -50,7 +53,10 @@ def tangential_ratio(forces: Float[Tensor, "*b 3 3"], normals: Float[Tensor, "*b
 
 
 def balanced_forces(
-    points: Float[Tensor, "*b 3 3"], normals: Float[Tensor, "*b 3 3"], strongest: float = 4.0
+    points: Float[Tensor, "*b 3 3"],
+    normals: Float[Tensor, "*b 3 3"],
+    strongest: float = 4.0,
+    wish: Float[Tensor, "*#b 3"] | None = None,
 ) -> Float[Tensor, "*b 3 3"]:
     """Return forces of the fingers on the object [N] in equilibrium that need the least friction.
 
@@ -62,6 +68,7 @@ def balanced_forces(
         points: contacts [m].
         normals: outward unit normals of the object.
         strongest: normal force of the strongest finger [N].
+        wish: normal forces, whose proportions decide between sets that need nearly the same friction; None: equal ones.
 
     Returns:
         Forces; NaN rows where no balanced set pushes at all three contacts.
@@ -74,12 +81,13 @@ def balanced_forces(
     basis = internal_forces(points)
     spots = fibonacci_sphere(DIRECTIONS, points)
     shape = points.shape[:-2]
-    weights, cost = _best(spots.expand(*shape, -1, 3), basis, normals)
+    wish = None if wish is None else (wish / wish.amax(-1, keepdim=True))[..., None, :]
+    weights, cost = _best(spots.expand(*shape, -1, 3), basis, normals, wish)
     near, reach = fibonacci_sphere(64, points), 4 / math.sqrt(DIRECTIONS)
     for _ in range(REFINEMENTS):
         around = unit(weights[..., None, :] + reach * near)
         around = torch.cat([weights[..., None, :], around], dim=-2)
-        weights, cost = _best(around, basis, normals)
+        weights, cost = _best(around, basis, normals, wish)
         reach *= 0.75
     forces = torch.einsum("...k,...kci->...ci", weights, basis)
     push = -(forces * normals).sum(-1)
@@ -88,23 +96,33 @@ def balanced_forces(
 
 
 def desired_forces(
-    points: Float[Tensor, "*b 3 3"], normals: Float[Tensor, "*b 3 3"], strongest: float = 4.0
+    points: Float[Tensor, "*b 3 3"],
+    normals: Float[Tensor, "*b 3 3"],
+    strongest: float = 4.0,
+    wish: Float[Tensor, "*#b 3"] | None = None,
 ) -> Float[Tensor, "*b 3 3"]:
     """Return `balanced_forces`, or `strongest` along the normals where no balanced set presses at all contacts."""
-    balanced = balanced_forces(points, normals, strongest)
+    balanced = balanced_forces(points, normals, strongest, wish)
     return torch.where(torch.isfinite(balanced), balanced, -strongest * normals)
 
 
 def force_covariance(
-    forces: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"], floor: float
+    forces: Float[Tensor, "*b 3"],
+    normals: Float[Tensor, "*b 3"],
+    floor: float,
+    deviation: Float[Tensor, "*b"] | None = None,
 ) -> Float[Tensor, "*b 3 3"]:
-    """Return Sigma_fd of Eq. (28) [N^2], by an analytic stand-in: `FORCE_SPREAD` of the normal force along the normal.
+    """Return Sigma_fd of Eq. (28) [N^2]: the normal force's deviation along the normal over an isotropic floor.
 
-    The paper takes it from a model learned from human grasps; here a stronger force is less certain in proportion,
-    over an isotropic floor [N].
+    Args:
+        forces: desired [N].
+        normals: outward unit normals.
+        floor: standard deviation in every direction [N].
+        deviation: of the normal forces [N], from the model of stable grasps; None: the analytic stand-in, by which a
+            stronger force is less certain in proportion (`FORCE_SPREAD`).
     """
-    push = (forces * normals).sum(-1)
-    along = normals[..., :, None] * normals[..., None, :] * (FORCE_SPREAD * push[..., None, None]) ** 2
+    deviation = FORCE_SPREAD * (forces * normals).sum(-1) if deviation is None else deviation
+    along = normals[..., :, None] * normals[..., None, :] * deviation[..., None, None] ** 2
     return along + floor**2 * torch.eye(3, dtype=forces.dtype, device=forces.device)
 
 
@@ -118,14 +136,20 @@ def fibonacci_sphere(count: int, like: Tensor) -> Float[Tensor, "k 3"]:
 
 
 def _best(
-    weights: Float[Tensor, "*b k 3"], basis: Float[Tensor, "*b 3 3 3"], normals: Float[Tensor, "*b 3 3"]
+    weights: Float[Tensor, "*b k 3"],
+    basis: Float[Tensor, "*b 3 3 3"],
+    normals: Float[Tensor, "*b 3 3"],
+    wish: Float[Tensor, "*#b 1 3"] | None,
 ) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b"]]:
     """Return the combination that needs the least friction among k, and its cost (infinite: some contact pulls)."""
     forces = torch.einsum("...jk,...kci->...jci", weights, basis)
     normals = normals[..., None, :, :]
     push = -(forces * normals).sum(-1)
-    uneven = push.amax(-1) / push.amin(-1).clamp_min(1e-12)
-    cost = tangential_ratio(forces, normals.expand_as(forces)).amax(-1) + EVENNESS * uneven
+    if wish is None:
+        preference = EVENNESS * push.amax(-1) / push.amin(-1).clamp_min(1e-12)
+    else:
+        preference = LEANING * torch.linalg.vector_norm(push / push.amax(-1, keepdim=True) - wish, dim=-1)
+    cost = tangential_ratio(forces, normals.expand_as(forces)).amax(-1) + preference
     least = cost.argmin(-1)
     index = least[..., None, None].expand(*least.shape, 1, 3)
     return weights.gather(-2, index)[..., 0, :], cost.gather(-1, least[..., None])[..., 0]

@@ -54,8 +54,9 @@ def held_forces(plant: Plant, gains: ClosingGains, sight: Sight) -> tuple[Float[
     """
     forces, normals = gains.desired_force, plant.normals
     if bool(torch.isfinite(sight.points).all()) and bool(torch.isfinite(sight.normals).all()):
-        strongest = float((-(forces * normals).sum(-1)).max())
-        balanced = balanced_forces(sight.points[None], sight.normals[None], strongest)[0]
+        push = -(forces * normals).sum(-1)
+        wish = push[None] if gains.force_source == "learned" else None
+        balanced = balanced_forces(sight.points[None], sight.normals[None], float(push.max()), wish)[0]
         if bool(torch.isfinite(balanced).all()):
             forces, normals = balanced, sight.normals
     return forces, float(-(forces * normals).sum())

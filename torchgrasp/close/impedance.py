@@ -17,21 +17,35 @@ from torch import Tensor
 from torchgrasp.close.force import internal_forces
 from torchgrasp.close.hold import RAMP, held_forces
 from torchgrasp.close.law import damped_inverse
+from torchgrasp.close.sensor import low_pass
 from torchgrasp.close.sight import Plant, Sight
-from torchgrasp.frames import skew, virtual_frame
+from torchgrasp.close.stable import lengths_of, state_of
+from torchgrasp.frames import degenerate, rigid, skew, virtual_frame
 from torchgrasp.values import ClosingGains
 
-TRANSLATION_STIFFNESS = 600.0
-"""Of the virtual frame's origin [N/m]: 0.1 kg sags by 2 mm."""
+TRANSLATION_STIFFNESS = 1200.0
+"""Of the virtual frame's origin [N/m]: 0.1 kg sags by 1 mm."""
 
-ROTATION_STIFFNESS = 1.0
+ROTATION_STIFFNESS = 4.0
 """Of the virtual frame's axes [N m/rad]."""
 
 GRASP_STIFFNESS = 100.0
 """Of the spring along each side of the triangle of fingertips [N/m]."""
 
-MOST_SHARE = 0.5
+MOST_SHARE = 1.0
 """The wrench asks of no finger for more than this share of the strongest desired force."""
+
+MOST_RAISE = 2.0
+"""How many times the desired forces a grasp that turns unstable may ask for."""
+
+HASTE = 8.0
+"""Rate [1/s] at which an unstable grasp becomes firmer and stiffer."""
+
+FEELING = 2.0
+"""Cut-off [Hz] of the mean of the tactile readings by which stability is judged: noise must not look like a slip."""
+
+SETTLING = 0.3
+"""Time [s] after the squeeze has risen before stability is judged: by then the mean has followed it."""
 
 
 def grasp_map(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 6 9"]:
@@ -101,25 +115,50 @@ class Impedance:
     At rest in the grasp's pose the forces are the desired ones, balanced anew for the contacts that were really made.
     One common factor keeps the sum of what the fingertips feel at what was asked for. Motions of the joints that move
     no fingertip are held where they were.
+
+    A hand with a model of its stable grasps judges at every tick by what it feels whether this is one. While it is
+    rather not, the grasp becomes firmer, up to `MOST_RAISE` times, and its springs approach those of stable grasps of
+    the same lengths. It never loosens again: what it holds may still be heavy.
+
+    Args:
+        plant: the hand.
+        gains: of the closing before, for the desired forces.
+        sight: at the end of the closing.
+        start: its last joint targets [rad].
+        springs: stiffness [N/m] along the sides (0, 1), (1, 2) and (2, 0) of the triangle, then kept; None:
+            `GRASP_STIFFNESS`, and a grasp that looks unstable to the hand's own model adapts.
     """
 
-    def __init__(self, plant: Plant, gains: ClosingGains, sight: Sight, start: Float[Tensor, " j"]) -> None:
+    def __init__(
+        self,
+        plant: Plant,
+        gains: ClosingGains,
+        sight: Sight,
+        start: Float[Tensor, " j"],
+        springs: Float[Tensor, "3"] | None = None,
+    ) -> None:
         self.plant = plant
+        self.stable = plant.stable if springs is None else None
+        self.springs = torch.full_like(plant.radius, GRASP_STIFFNESS) if springs is None else springs
         self.stiffness = (plant.coupling**2 * plant.kp[:, None]).sum(0)
         forces, self.strength = held_forces(plant, gains, sight)
-        self.rest, self.lengths = virtual_frame(sight.tips), side_lengths(sight.tips)
+        self.frame = rigid(torch.eye(3).to(sight.tips), sight.tips.mean(0))
+        self.rest, self.lengths = self._frame(sight.tips), side_lengths(sight.tips)
         self.desired = forces @ self.rest[:3, :3]  # in the virtual frame
         self.posture = self._actuated(sight.joints)
         self.lead = self._actuated(start) - self.posture
-        self.factor, self.time = 1.0, 0.0
+        self.factor, self.raised, self.time = 1.0, 1.0, 0.0
+        self.felt = sight.reading
 
     def __call__(self, sight: Sight, period: float) -> Float[Tensor, " j"]:
         """Return the targets of all joints for the next tick."""
         self.time += period
         share = min(self.time / RAMP, 1.0)
+        self.felt = self.felt + low_pass(FEELING, period) * (sight.reading - self.felt)
         if share == 1.0:
-            lacking = 1 - float(sight.reading.sum()) / self.strength
+            lacking = 1 - float(sight.reading.sum()) / (self.raised * self.strength)
             self.factor = min(max(self.factor + period * lacking, 0.5), 1.5)
+            self._adapt(sight, period)
         posture = self._actuated(sight.joints)
         jacobian = (sight.jacobian @ self.plant.coupling).flatten(0, 1)
         lead = jacobian.T @ self.forces(sight.tips).flatten() / self.stiffness
@@ -127,13 +166,30 @@ class Impedance:
         drift = drift - damped_inverse(jacobian) @ (jacobian @ drift)
         return self.plant.expand(posture + drift + self.lead + share * (lead - self.lead))
 
+    def _adapt(self, sight: Sight, period: float) -> None:
+        """Become firmer and as stiff as stable grasps of these lengths are, as long as this one is rather unstable."""
+        if self.stable is None or self.time < RAMP + SETTLING:
+            return
+        state = state_of(self.springs, lengths_of(sight.tips), self.felt)
+        if float(self.stable.odds(state)) > 0:
+            return
+        wish, haste = self.stable.wish(sight.tips), min(HASTE * period, 1.0)
+        self.raised += haste * (MOST_RAISE - self.raised)
+        self.springs = self.springs * (wish.springs / self.springs) ** haste
+
     def forces(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
         """Return the forces of the fingers on the object [N], in the hand's frame, for where the fingertips are."""
-        frame = virtual_frame(tips)
-        desired = self.factor * self.desired @ frame[:3, :3].T
+        frame = self._frame(tips)
+        desired = self.raised * self.factor * self.desired @ frame[:3, :3].T
         most = MOST_SHARE * torch.linalg.vector_norm(desired, dim=-1).amax()
-        springs = spring_forces(tips, self.lengths, torch.full_like(self.lengths, GRASP_STIFFNESS))
+        springs = spring_forces(tips, self.lengths, self.springs)
         return desired + springs + shared_forces(tips, restoring_wrench(frame, self.rest), most)
+
+    def _frame(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "4 4"]:
+        """Return the virtual frame; tips on a line, as when the object is gone, keep the last one."""
+        if not bool(degenerate(tips)):
+            self.frame = virtual_frame(tips)
+        return self.frame
 
     def _actuated(self, joints: Float[Tensor, " j"]) -> Float[Tensor, " h"]:
         """Return the actuated joints that come nearest to all joints, each weighted with its stiffness."""

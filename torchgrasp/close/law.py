@@ -4,12 +4,15 @@ Everything here is pure and batched over leading axes. Gains are rates (position
 newton) and `joint_step` takes the control period, so that the same gains mean the same motion at 100 and at 250 Hz.
 """
 
+from typing import Literal, get_args
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import check_tensor
 from torchgrasp.close.force import desired_forces, force_covariance
+from torchgrasp.close.stable import load_stable
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply as move
 from torchgrasp.frames import inverse, rotate
@@ -164,7 +167,12 @@ def tip_compliance(
     return (along**2 / joint_stiffness(hand).to(joints)).sum(-1)
 
 
-def closing_gains(grasps: Grasps, hand: Hand, force: float = 4.0) -> ClosingGains:
+ForceSource = Literal["analytic", "learned"]
+"""Where desired forces come from: the balanced set of least friction, with a deviation in proportion; or the hand's
+model of stable grasps (`stable.load_stable`), whose proportions decide between sets that need nearly as little."""
+
+
+def closing_gains(grasps: Grasps, hand: Hand, force: float = 4.0, forces: ForceSource = "analytic") -> ClosingGains:
     """Return target, gains and desired force of each finger for one grasp, in the hand's frame (Eqs. 26-28).
 
     Desired forces are balanced. Contacts at which no balanced set presses (a certified grasp has none) are pressed
@@ -174,11 +182,14 @@ def closing_gains(grasps: Grasps, hand: Hand, force: float = 4.0) -> ClosingGain
         grasps: one row.
         hand: the hand that the grasp was planned for.
         force: normal force of the strongest finger [N].
+        forces: where the desired forces and their covariance come from; the gains tell it.
 
     Raises:
-        BadArgument: not exactly one row, joints of another hand, a force that is not positive, or numbers in the
-            grasp that are not finite.
+        BadArgument: not exactly one row, joints of another hand, a force that is not positive, numbers in the
+            grasp that are not finite, an unknown source of forces, or a hand without a model of stable grasps.
     """
+    if forces not in get_args(ForceSource):
+        raise BadArgument("forces", repr(forces), f"one of {', '.join(get_args(ForceSource))}")
     if len(grasps) != 1:
         raise BadArgument("grasps", f"{len(grasps)} rows", "exactly one: index the grasps, as in grasps[0]")
     if grasps.joints.shape[-1] != len(hand.joint_names):
@@ -195,8 +206,15 @@ def closing_gains(grasps: Grasps, hand: Hand, force: float = 4.0) -> ClosingGain
     hand_from_obj = inverse(grasps.obj_from_hand.double())
     target, normals = move(hand_from_obj, contacts.points), rotate(hand_from_obj, contacts.normals)
     covariance = surface_covariance(normals, contacts.std_m)
-    desired = desired_forces(target, normals, force)
-    spread = force_covariance(desired, normals, FORCE_FLOOR)
+    wish, deviation = None, None
+    if forces == "learned":
+        model = load_stable(hand)
+        if model is None:
+            raise BadArgument("forces", f"'learned' for {hand.name}, which has no stable.safetensors", "'analytic'")
+        wish = model.wish(target[0] + hand.tip_radius.to(normals)[:, None] * normals[0], force)
+        deviation = wish.covariance.diagonal()[None].sqrt()
+    desired = desired_forces(target, normals, force, None if wish is None else wish.forces[None])
+    spread = force_covariance(desired, normals, FORCE_FLOOR, deviation)
     alpha_f = FORCE_BANDWIDTH * FORCE_FLOOR**2 * tip_compliance(hand, joints, normals)
     return ClosingGains(
         target=target[0],
@@ -204,4 +222,5 @@ def closing_gains(grasps: Grasps, hand: Hand, force: float = 4.0) -> ClosingGain
         position_gain=position_gain(covariance)[0],
         force_gain=force_gain(spread, alpha_f)[0],
         desired_force=desired[0],
+        force_source=forces,
     )

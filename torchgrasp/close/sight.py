@@ -9,6 +9,7 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.close.sensor import Touch
 from torchgrasp.close.squeeze import squeeze_joints
+from torchgrasp.close.stable import StableGrasps, load_stable
 from torchgrasp.frames import inverse, rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values import Grasps
@@ -35,6 +36,7 @@ class Plant(Value):
     joints: Float[Tensor, " h"]
     pregrasp: Float[Tensor, " h"]
     squeeze: Float[Tensor, " h"]
+    stable: StableGrasps | None = None
 
     def expand(self, actuated: Float[Tensor, " h"]) -> Float[Tensor, " j"]:
         """Return all joints of the URDF."""
@@ -90,6 +92,7 @@ def plant_from_hand(
         joints=grasp.joints[0].double(),
         pregrasp=grasp.pregrasp[0].double(),
         squeeze=squeeze_joints(grasp, hand, force, kp)[0],
+        stable=load_stable(hand),
     )
 
 

@@ -144,6 +144,12 @@ class GaussianMixture(Value):
         """Return the expected value of every dimension."""
         return self.weights.double() @ self.means.double()
 
+    def covariance(self) -> Float[Tensor, "d d"]:
+        """Return the covariance of all dimensions: that within the components, and that of their means."""
+        apart = self.means.double() - self.mean()
+        within = torch.einsum("m,mij->ij", self.weights.double(), self.covariances.double())
+        return within + torch.einsum("m,mi,mj->ij", self.weights.double(), apart, apart)
+
     @functools.cached_property
     def whitening(self) -> "Whitening":
         """The factors by which densities are evaluated."""
