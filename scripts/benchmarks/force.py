@@ -94,9 +94,9 @@ def pull_at(grasp: Grasps, hand: Hand, model: StableGrasps, mesh, parts, seed: i
 
 def judged(trial: Disturbed, model: StableGrasps, desired: torch.Tensor) -> Held:
     """Return what a trial tells."""
-    rest = int((trial.pulled == 0).sum())
-    felt = trial.forces[max(rest - 2, 0) : rest].mean(0)
-    state = state_of(KEPT, lengths_of(trial.tips[max(rest - 1, 0)]), felt)
+    rest = max(int((trial.pulled == 0).sum()) - 1, 0)  # the forces have risen by then
+    felt = trial.forces[rest]
+    state = state_of(KEPT, lengths_of(trial.tips[rest]), felt)
     error = float(((felt - desired) / desired).abs().mean())
     return Held(float(trial.pulled[-1]) if trial.lost else MOST, float(model.odds(state)), error)
 

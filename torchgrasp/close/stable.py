@@ -116,13 +116,13 @@ class StableGrasps(Value):
         if force is not None:
             hardest = int(mean.argmax())
             given[FORCES[hardest]] = math.log(force)
-            rest, others = self.stable.condition(given), [i for i in range(3) if i != hardest]
+            others = [i for i in range(3) if i != hardest]
+            rest = self.stable.condition(given)
             part = rest.marginal([FORCES[i] for i in others])
             mean, covariance = torch.full_like(mean, math.log(force)), torch.zeros_like(covariance)
-            mean[others], covariance[torch.tensor(others)[:, None], torch.tensor(others)] = (
-                part.mean(),
-                part.covariance(),
-            )
+            mean[others] = part.mean()
+            rows, columns = torch.meshgrid(torch.tensor(others), torch.tensor(others), indexing="ij")
+            covariance[rows, columns] = part.covariance()
         forces = mean.exp()
         return Wish(forces, forces[:, None] * covariance * forces, rest.marginal(STIFFNESS).mean().exp())
 
@@ -134,7 +134,7 @@ class StableGrasps(Value):
         """
         stable, others = self._judged
         seen = torch.cat([state[..., :3], state[..., 6:]], -1)
-        return stable.log_prob(seen) - others.log_prob(seen) + torch.tensor(self.share).logit()
+        return stable.log_prob(seen) - others.log_prob(seen) + math.log(self.share / (1 - self.share))
 
     @functools.cached_property
     def _judged(self) -> tuple[GaussianMixture, GaussianMixture]:
