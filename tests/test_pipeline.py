@@ -1,6 +1,6 @@
 """The whole chain on a shipped view: every returned grasp is judged again, by code of its own."""
 
-import dataclasses
+import json
 import math
 
 import numpy as np
@@ -10,8 +10,11 @@ from scipy.optimize import linprog
 
 from torchgrasp import ContactSpec, PointCloud, Status, load_grasps, load_hand, load_object, plan_grasps
 from torchgrasp.errors import BadArgument, SuspiciousScale
-from torchgrasp.hand.rank import rank_by_closure
+from torchgrasp.hand.rank import rank_by_success
+from torchgrasp.hand.success import FEATURES, MODEL
 from torchgrasp.pipeline import describe, digest, spread_rows
+from torchgrasp.plan.probability import closure_probability
+from torchgrasp.shape.surface import extract_surface
 from torchgrasp.values import ContactPlan, Contacts
 
 SPEC = ContactSpec(friction=0.8, table=0.0)
@@ -78,17 +81,30 @@ def test_the_best_come_first(run):
     assert bool((scores[:-1] >= scores[1:]).all())
 
 
-def test_of_equal_grasps_the_likelier_closed_one_ranks_first_and_failures_stay_last(run):
+def test_the_likelier_success_ranks_first_and_failures_stay_last(run):
     _, grasps, _ = run
-    equal = dataclasses.replace(grasps, score=torch.zeros_like(grasps.score))
-    likely = torch.rand(len(grasps), generator=torch.Generator().manual_seed(0)).to(grasps.score)
-    ranked = rank_by_closure(equal, likely)
-    good = ranked.status == Status.OK
-    assert int(good.sum()) == int((grasps.status == Status.OK).sum())
-    assert not bool(good[int(good.sum()) :].any())
-    most = float(likely[grasps.status == Status.OK].max())
-    assert float(ranked.score[0]) == pytest.approx(2 * math.log(most / (1 - most)))
-    assert bool((ranked.score[good].diff() <= 0).all())
+    good = int((grasps.status == Status.OK).sum())
+    odds = torch.randn(good, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    ranked = rank_by_success(grasps, odds)
+    assert torch.equal(ranked.score[:good], odds.sort(descending=True).values.to(grasps.score))
+    assert bool((ranked.status[:good] == Status.OK).all()) and not bool((ranked.status[good:] == Status.OK).any())
+    torch.testing.assert_close(ranked.success[:good], torch.sigmoid(ranked.score[:good]))
+    assert not bool(ranked.success[good:].any())
+
+
+def test_success_is_what_the_model_says_of_the_surface_that_was_planned_on(run):
+    _, grasps, stages = run
+    shape = stages["shape"]
+    best = grasps[grasps.status == Status.OK][:5]
+    closed = closure_probability(shape, best.contacts, SPEC, n=600, seed=1).probability.clamp(1e-3, 1 - 1e-3)
+    offset = (best.contacts.points.mean(1) - extract_surface(shape).vertices.mean(0)).norm(dim=-1) / 0.02
+    inward = best.contacts.points.mean(1, keepdim=True) - best.contacts.points
+    lean = torch.acos((-(inward * best.contacts.normals).sum(-1) / inward.norm(dim=-1)).clamp(1e-3, 1)).amax(1)
+    cone = math.atan(SPEC.friction)
+    known = [closed.log() - (1 - closed).log(), offset, lean / cone, best.normal_angle.amax(1), 0 * lean + cone]
+    model = json.loads(MODEL.read_text())
+    odds = sum(model["weights"][name] * x for name, x in zip(FEATURES, known, strict=True)) + model["bias"]
+    torch.testing.assert_close(best.success, 1 / (1 + (-odds).exp()), rtol=1e-6, atol=1e-6)
 
 
 def test_tips_limits_and_clearances_hold(run):

@@ -19,8 +19,9 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.mixture import load_mixture, mixture_path
 from torchgrasp.hand.nearest import PostureSet, nearest_postures
 from torchgrasp.hand.query import query_hand
-from torchgrasp.hand.rank import rank_by_closure
+from torchgrasp.hand.rank import rank_by_success
 from torchgrasp.hand.realise import realise
+from torchgrasp.hand.success import success_features, success_odds
 from torchgrasp.hand.together import realise_together
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.lines import lines_of, well_inside
@@ -46,7 +47,7 @@ Mode = Literal["together", "contact_first"]
 TRIPLES = 250
 """How many of the planned contact triples are certified and offered to the hand."""
 DRAWS = 600
-"""Surfaces drawn for the probability of closure that ranks: known to 0.02."""
+"""Surfaces drawn for the probability of closure, which then is known to 0.02."""
 
 
 def _ignore(stage: str, message: str, value: Any) -> None:
@@ -88,13 +89,16 @@ def digest(cloud: PointCloud) -> str:
     return hashlib.sha256(cloud.points.detach().cpu().double().contiguous().numpy().tobytes()).hexdigest()
 
 
-def closure_of(grasps: Grasps, shape: ShapeGP, spec: ContactSpec, seed: int) -> Float[Tensor, "g"]:
-    """Return the probability of closure of the executable grasps, and 0 of all others."""
-    probability = torch.zeros_like(grasps.score)
-    rows = torch.nonzero((grasps.status == Status.OK) & well_inside(shape, grasps.contacts))[:, 0]
-    share = closed_share(lines_of(shape, grasps.contacts[rows]), spec.friction, DRAWS, seed)
-    probability[rows] = share.to(probability)
-    return probability
+def odds_of(
+    grasps: Grasps, shape: ShapeGP, center: Float[Tensor, "3"], spec: ContactSpec, seed: int
+) -> Float[Tensor, "k"]:
+    """Return the log-odds of success of the k executable grasps."""
+    good = grasps[grasps.status == Status.OK]
+    if not len(good):
+        return good.score
+    closure, inside = torch.zeros_like(good.score), well_inside(shape, good.contacts)
+    closure[inside] = closed_share(lines_of(shape, good.contacts[inside]), spec.friction, DRAWS, seed).to(closure)
+    return success_odds(success_features(good.contacts, closure, good.normal_angle, center, spec.friction))
 
 
 def plan_grasps(
@@ -170,9 +174,10 @@ def plan_grasps(
     reached = len(torch.unique(guess.row))
     observer("query", f"{len(guess)} postures for {reached} of {len(contacts)} triples", guess)
 
-    given = guess, hand, contacts, certificate, surroundings, surface.vertices.mean(0)
+    center = surface.vertices.mean(0)
+    given = guess, hand, contacts, certificate, surroundings, center
     grasps = realise_together(*given, shape, spec) if model is None else realise(*given)
-    grasps = rank_by_closure(grasps, closure_of(grasps, shape, spec, seed))
+    grasps = rank_by_success(grasps, odds_of(grasps, shape, center, spec, seed))
     grasps = dataclasses.replace(
         grasps,
         meta={

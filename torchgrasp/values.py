@@ -11,6 +11,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -182,7 +183,8 @@ class Grasps(Batch):
     Contact i is touched by finger i of the hand. `clearance` [m] is the least distance of the hand's links from the
     estimated surface (fingertips apart), from each other and from the table; `normal_angle` [rad] the angle between
     the contact direction and the pad's axis; `pregrasp` the joints of the opened hand at the same pose. `score`
-    ranks. `meta` holds names, units, hashes and the seed, as they are written to the file.
+    ranks; after `plan_grasps` it is the log-odds of `success` of those with `Status.OK`. `meta` holds names, units,
+    hashes and the seed, as they are written to the file.
     """
 
     joints: Float[Tensor, "g h"]
@@ -197,6 +199,11 @@ class Grasps(Batch):
     score: Float[Tensor, "g"]
     status: Int[Tensor, "g"]
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
+
+    @property
+    def success(self) -> Float[Tensor, "g"]:
+        """The predicted probability (`hand.success`) that each planned grasp holds; 0 where it cannot be executed."""
+        return torch.where(self.status == Status.OK, torch.sigmoid(self.score), 0.0)
 
     def save(self, path: Path | str) -> None:
         """Write the grasps with their metadata as safetensors, atomically; `load_grasps` reads them back.

@@ -11,14 +11,19 @@ from benchmarks.checks import bench_checks
 from benchmarks.closing_speed import bench_closing_speed
 from benchmarks.common import Row, write_rows
 from benchmarks.force import bench_force
+from benchmarks.noise import bench_noise
+from benchmarks.success import bench_success
+from benchmarks.workers import bench_workers
 
-SUBJECTS = ("checks", "speed", "ablation", "agreement", "force")
+SUBJECTS = ("checks", "speed", "ablation", "agreement", "force", "noise", "success", "workers")
 
 
 def close(
     objects: Path | None = None,
     only: tuple[str, ...] = SUBJECTS,
+    hands: tuple[str, ...] = ("allegro",),
     tries: int = 4,
+    draws: int = 5,
     starts: int = 1000,
     workers: int = 1,
     threads: int = 1,
@@ -29,8 +34,10 @@ def close(
 
     Args:
         objects: folder with manifest.json and a folder for each object; without it what needs grasps is left out.
-        only: subjects to measure: checks, speed, ablation, agreement, force.
-        tries: grasps of each view, spread over all ranks.
+        only: subjects to measure: checks, speed, ablation, agreement, force, noise, success, workers.
+        hands: of noise and success; agreement takes both.
+        tries: grasps of each view: the best for noise and workers, else spread over all ranks.
+        draws: errors of the hand's pose for each grasp.
         starts: of the contact planner.
         workers: processes that share the trials.
         threads: of torch.
@@ -47,6 +54,9 @@ def close(
         "ablation": lambda: bench_ablation(objects, tries, starts, seed, workers) if objects else [],
         "agreement": lambda: bench_agreement(objects, tries, starts, seed, workers) if objects else [],
         "force": lambda: bench_force(objects, tries, starts, seed) if objects else [],
+        "noise": lambda: bench_noise(objects, hands, tries, draws, starts, seed, workers) if objects else [],
+        "success": lambda: bench_success(objects, hands, tries, workers, out.parent / "success") if objects else [],
+        "workers": lambda: bench_workers(objects, tries, starts, seed) if objects else [],
     }
     settings = {"tries": tries, "starts": starts, "threads": threads, "seed": seed, "torch": torch.__version__}
     print(", ".join(f"{name} {value}" for name, value in settings.items()))

@@ -1,11 +1,9 @@
 """Which of the executable grasps to try first.
 
-The paper ranks by the sum of the contacts' variances. Here the log-odds of closure on the uncertain surface come first
-(`plan.probability`, which holds the variances and the normals' too), then how near the contacts' centre is to the
-object's, how little of the squeeze must be carried by friction, and how centrally the pads touch. The weights are a
-choice, not a fit. The evidence: of the ten best Allegro grasps of 16 noisy views of eight scanned objects 93 % are
-closed on the true surface at friction 0.6, of all grasps 87 %; with the square of the largest standard deviation
-instead of the log-odds, as before, 89 %.
+The paper ranks by the sum of the contacts' variances. Here candidates for the same contacts are ranked by how near the
+contacts' centre is to the object's, how little of the squeeze must be carried by friction, and how centrally the pads
+touch (`score`, whose weights are a choice); the executable grasps that come of it by how probably they hold
+(`hand.success`, whose weights are a fit).
 """
 
 import dataclasses
@@ -21,8 +19,6 @@ from torchgrasp.values import Contacts, Grasps
 
 OFFSET, PAD = 0.02, 0.8
 """Offset of the contacts' centre [m] and pad angle [rad] that each cost one point."""
-ODDS, LEAST = 2.0, 1e-3
-"""Points for each unit of the log-odds of closure; probabilities within `LEAST` of 0 and 1 count as that."""
 
 
 def tangential_ratio(contacts: Contacts) -> Float[Tensor, "g"]:
@@ -48,9 +44,11 @@ def score(contacts: Contacts, found: Findings, center: Float[Tensor, "3"]) -> Fl
     return -(offset / OFFSET + tangential_ratio(contacts) + found.normal_angle.amax(1) / PAD)
 
 
-def rank_by_closure(grasps: Grasps, probability: Float[Tensor, "g"]) -> Grasps:
-    """Return grasps with the log-odds of closure added to their score, those with `Status.OK` first and best first."""
-    odds = torch.logit(probability.to(grasps.score), eps=LEAST)
-    ranked = dataclasses.replace(grasps, score=grasps.score + ODDS * odds)
-    order = torch.argsort(ranked.score, descending=True, stable=True)
-    return ranked[order[torch.argsort((ranked.status != Status.OK)[order].to(torch.uint8), stable=True)]]
+def rank_by_success(grasps: Grasps, odds: Float[Tensor, "k"]) -> Grasps:
+    """Return grasps with the log-odds of success as the score of the k executable ones; these first, and best first."""
+    good = grasps.status == Status.OK
+    scored = grasps.score.clone()
+    scored[good] = odds.to(scored)
+    order = torch.argsort(scored, descending=True, stable=True)
+    order = order[torch.argsort((~good)[order].to(torch.uint8), stable=True)]
+    return dataclasses.replace(grasps, score=scored)[order]

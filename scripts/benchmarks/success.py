@@ -1,0 +1,216 @@
+"""Whether predicted success is true: trials of grasps of all ranks, and a fit judged on objects it has not seen."""
+
+import itertools
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import trimesh
+from sklearn.linear_model import LogisticRegression
+from sklearn.metrics import roc_auc_score
+from sklearn.preprocessing import StandardScaler
+from tqdm import tqdm
+
+from benchmarks.common import Row
+from torchgrasp.close.evaluate import evaluate
+from torchgrasp.close.protocol import PROTOCOLS
+from torchgrasp.close.score import ViewScore, share
+from torchgrasp.cloud.camera import partial_view
+from torchgrasp.cloud.read import save_cloud
+from torchgrasp.files import format_json, write_atomically, write_file
+from torchgrasp.hand.load import load_hand
+from torchgrasp.hand.success import success_features
+from torchgrasp.objects import list_objects, load_object
+from torchgrasp.pipeline import DRAWS
+from torchgrasp.plan.lines import lines_of
+from torchgrasp.plan.probability import closed_share
+from torchgrasp.shape.calibrate import list_views, read_view
+from torchgrasp.shape.support import fit_shape
+from torchgrasp.shape.surface import extract_surface
+from torchgrasp.values import load_grasps
+
+TESTS = ("dexgraspbench", "dexgraspbench-hard")
+"""The protocols of the trials: friction 0.6 and 0.3."""
+
+PENALTY = 0.1
+"""Inverse of the weight of the squared coefficients, of standardised features."""
+
+EDGES = np.linspace(0.0, 1.0, 6)
+"""Of the bins of predicted success in which reliability is looked at."""
+
+ENOUGH, NEAR = 20, 0.10
+"""Trials from which on a bin is judged, and how near the share that passed must then be to the prediction."""
+
+
+def bench_success(objects: Path, hands: tuple[str, ...], grasps: int, workers: int, folder: Path) -> list[Row]:
+    """Fit on all objects but one and judge on that one, for each in turn."""
+    trials = read_trials([objects], hands, grasps, workers, folder)
+    unseen, base = leave_one_out(trials)
+    draw_reliability(folder / "reliability.png", unseen, trials.passed)
+    print(*judge(unseen, base, trials), sep="\n")
+    mine, theirs = brier(unseen, trials.passed), brier(base, trials.passed)
+    numbers = {"trials": len(trials.passed), "brier": mine, "base": theirs}
+    bins = [x for x in reliability(unseen, trials.passed) if x[2] >= ENOUGH]
+    off = max(abs(mean - found[0]) for *_, mean, found in bins)
+    return [
+        Row("Brier score on objects not fitted on", f"below {theirs:.3f}", f"{mine:.3f}", mine < theirs, numbers),
+        Row(
+            f"reliability of predicted success in bins of {ENOUGH} trials or more",
+            f"within {NEAR:.2f}",
+            f"{off:.2f} off at most in {len(bins)} bins",
+            off <= NEAR,
+            {"bins": bins},
+        ),
+    ]
+
+
+class Trials(NamedTuple):
+    """Trials of grasps: `features` (n, 5), whether each `passed`, of which `object`, at which `friction`."""
+
+    features: np.ndarray
+    passed: np.ndarray
+    object: np.ndarray
+    friction: np.ndarray
+
+    def select(self, rows: np.ndarray) -> "Trials":
+        """Return some of the trials, by a mask."""
+        return Trials(*(column[rows] for column in self))
+
+
+def read_trials(objects: Sequence[Path], hands: Sequence[str], grasps: int, workers: int, folder: Path) -> Trials:
+    """Return trials on the library's own and simple bodies and on the objects of folders, running what is missing."""
+    author_views(folder / "authored")
+    rows = []
+    for hand in hands:
+        for source in (folder / "authored", *objects):
+            names = sorted({name for name, _ in list_views(source)})
+            for name in tqdm(names, desc=f"{hand}, {source.name}", disable=None, leave=False):
+                kept = folder / f"{hand}_{source.name}_{name}.json"
+                if not kept.exists():
+                    write_file(kept, format_json(try_object(source, name, hand, grasps, workers, folder)))
+                rows += json.loads(kept.read_text())
+    return Trials(*(np.array([row[name] for row in rows]) for name in Trials._fields))
+
+
+def author_views(folder: Path) -> None:
+    """Write the library's own objects and simple bodies as a folder of objects with one noisy view each."""
+    solids = {name: load_object(name).mesh for name in list_objects()}
+    for k, size in enumerate(((0.05, 0.05, 0.09), (0.04, 0.09, 0.14), (0.07, 0.12, 0.06))):
+        solids[f"box_{k}"] = trimesh.creation.box(size)
+    for k, (radius, height) in enumerate(((0.022, 0.16), (0.04, 0.07), (0.045, 0.15))):
+        solids[f"rod_{k}"] = trimesh.creation.cylinder(radius, height, sections=64)
+    for k, axes in enumerate(((0.03, 0.03, 0.03), (0.035, 0.05, 0.06))):
+        solids[f"egg_{k}"] = trimesh.creation.icosphere(subdivisions=2, radius=1.0).apply_scale(axes)
+    entries = {}
+    for k, (name, mesh) in enumerate(solids.items()):
+        mesh.apply_translation([0.0, 0.0, -mesh.bounds[0, 2]])
+        cloud = partial_view(mesh, azimuth=47.0 * k, elevation=30.0, seed=k)
+        pose = np.eye(4)
+        pose[:3, 3] = cloud.viewpoint.numpy()  # pyright: ignore[reportOptionalMemberAccess]
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        write_file(folder / name / "mesh.ply", mesh.export(file_type="ply"))
+        save_cloud(cloud, folder / name / "view0_noisy.ply")
+        entries[name] = {"views": {"view0": {"T_object_camera": pose.tolist()}}}
+    write_file(folder / "manifest.json", json.dumps({"objects": entries}))
+
+
+def try_object(source: Path, name: str, hand: str, grasps: int, workers: int, folder: Path) -> list[dict[str, Any]]:
+    """Return a row for each trial of an object: which it was, its features, and whether it passed."""
+    rows, shelf = [], folder / "grasps" / hand / source.name
+    for k, test in enumerate(TESTS):
+        scores = evaluate(
+            source, load_hand(hand), test, grasps=grasps, ranks="spread", only=[name], workers=workers, folder=shelf,
+            planned=k > 0,
+        )  # fmt: skip
+        rows += [row for score in scores for row in rows_of(source, score, PROTOCOLS[test].friction, hand, shelf)]
+    return rows
+
+
+def rows_of(source: Path, score: ViewScore, friction: float, hand: str, shelf: Path) -> list[dict[str, Any]]:
+    """Return the rows of one view."""
+    if not score.attempts:
+        return []
+    chosen = load_grasps(shelf / f"{score.object}_{score.view}.safetensors")[
+        torch.tensor([attempt.rank for attempt in score.attempts])
+    ]
+    shape = fit_shape(read_view(source, score.object, score.view), table=0.0)
+    center = extract_surface(shape).vertices.mean(0)
+    closure = closed_share(lines_of(shape, chosen.contacts), friction, DRAWS, 0)
+    features = success_features(chosen.contacts, closure, chosen.normal_angle, center, friction)
+    told = {"object": score.object, "view": score.view, "hand": hand, "friction": friction}
+    return [
+        {**told, "rank": attempt.rank, "features": known, "passed": attempt.passed}
+        for attempt, known in zip(score.attempts, features.tolist(), strict=True)
+    ]
+
+
+def fit(trials: Trials) -> tuple[list[float], float]:
+    """Return weights and bias of a logistic regression, of the features as they are."""
+    scaler = StandardScaler().fit(trials.features)
+    model = LogisticRegression(C=PENALTY, tol=1e-10, max_iter=1000)
+    model.fit(scaler.transform(trials.features), trials.passed)
+    weights = model.coef_[0] / scaler.scale_
+    return weights.tolist(), float(model.intercept_[0] - weights @ scaler.mean_)
+
+
+def leave_one_out(trials: Trials) -> tuple[np.ndarray, np.ndarray]:
+    """Return for each trial the prediction, and the base rate at its friction, by the other objects alone."""
+    predicted, base = np.zeros(len(trials.passed)), np.zeros(len(trials.passed))
+    for name in np.unique(trials.object):
+        mine = trials.object == name
+        others = trials.select(~mine)
+        weights, bias = fit(others)
+        predicted[mine] = 1 / (1 + np.exp(-(trials.features[mine] @ weights + bias)))
+        for mu in np.unique(trials.friction):
+            base[mine & (trials.friction == mu)] = others.passed[others.friction == mu].mean()
+    return predicted, base
+
+
+def judge(predicted: np.ndarray, base: np.ndarray, trials: Trials) -> list[str]:
+    """Return what is to be said of predictions: Brier scores, how they order, and reliability by bins."""
+    lines, y = [], trials.passed
+    for mu in (None, *np.unique(trials.friction)):
+        mine = np.ones(len(y), dtype=bool) if mu is None else trials.friction == mu
+        scores = f"Brier {brier(predicted[mine], y[mine]):.3f}, base rate {brier(base[mine], y[mine]):.3f}"
+        auc = roc_auc_score(y[mine], predicted[mine])
+        lines.append(f"{'all' if mu is None else f'friction {mu:g}':13}{mine.sum():5} trials  {scores}, AUC {auc:.2f}")
+    for low, high, count, mean, (value, least, most) in reliability(predicted, y):
+        found = f"predicted {mean:.2f}, passed {value:.2f} [{least:.2f}, {most:.2f}] of {count}"
+        lines.append(f"{low:.1f} to {high:.1f}: {found}")
+    return lines
+
+
+def reliability(predicted: np.ndarray, y: np.ndarray) -> list[tuple[float, float, int, float, tuple[float, ...]]]:
+    """Return for each bin its ends, count, mean prediction, and the share that passed with its Wilson interval."""
+    bins = []
+    for low, high in itertools.pairwise(EDGES):
+        mine = (predicted >= low) & ((predicted < high) | (high == EDGES[-1]))
+        if mine.any():
+            found = share(int(y[mine].sum()), int(mine.sum()))[:3]
+            bins.append((float(low), float(high), int(mine.sum()), float(predicted[mine].mean()), found))
+    return bins
+
+
+def brier(predicted: np.ndarray, y: np.ndarray) -> float:
+    """Return the mean squared error of probabilities."""
+    return float(((predicted - y) ** 2).mean())
+
+
+def draw_reliability(path: Path, predicted: np.ndarray, y: np.ndarray) -> None:
+    """Draw the share that passed over the prediction, with intervals and counts."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.2, 5.0), dpi=140, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot(xlabel="predicted success", ylabel="share that passed", xlim=(0, 1), ylim=(0, 1))
+    axes.plot([0, 1], [0, 1], color="#7c8591", linewidth=1)
+    axes.fill_between([0, 1], [-0.1, 0.9], [0.1, 1.1], color="#e7e5de", zorder=0)
+    for _, _, count, mean, (value, low, high) in reliability(predicted, y):
+        axes.errorbar([mean], [value], [[value - low], [high - value]], fmt="o", color="#23967f", capsize=3)
+        axes.annotate(f"{count}", (mean, value), (6, -12), textcoords="offset points", color="#4b525b")
+    axes.set_title(f"{len(y)} trials on objects not fitted on")
+    write_atomically(path, lambda temporary: figure.savefig(temporary, format="png"))

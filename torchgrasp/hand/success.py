@@ -1,0 +1,78 @@
+"""How probable it is that a planned grasp holds: a small model, calibrated on simulated trials.
+
+A trial is DexGraspBench's test by pulling (`close.protocol`) at the friction that was planned for: the hand closes open
+loop through pre-grasp, grasp and squeeze with 7 N, and the object must withstand its own weight from six sides. The
+model is logistic in five numbers that a planner knows without the true object. `scripts/make_success.py` fits it, on
+grasps of all ranks, and shows how well it is calibrated on objects that it was not fitted on.
+"""
+
+import functools
+import json
+import math
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.hand.rank import tangential_ratio
+from torchgrasp.values import Contacts
+
+FEATURES = (
+    "log-odds of closure",
+    "offset of the contacts' centre over 20 mm",
+    "angle of the forces over that of friction",
+    "angle of the worst pad",
+    "angle of friction",
+)
+"""What the model knows of a grasp, in this order."""
+
+OFFSET = 0.02
+"""Offset of the contacts' centre from the object's that counts as one [m]."""
+
+LEAST = 1e-3
+"""Probabilities of closure within this of 0 and 1 count as that."""
+
+MODEL = Path(__file__).with_name("success.json")
+"""Weights and bias, and what they were fitted on."""
+
+
+def success_features(
+    contacts: Contacts,
+    closure: Float[Tensor, "g"],
+    normal_angle: Float[Tensor, "g 3"],
+    center: Float[Tensor, "3"],
+    friction: float,
+) -> Float[Tensor, "g 5"]:
+    """Return `FEATURES` of each grasp.
+
+    Args:
+        contacts: in the order of the fingers [m].
+        closure: probability of closure at this friction (`closed_share`).
+        normal_angle: between contact direction and pad [rad].
+        center: estimated centre of the object [m].
+        friction: of the trial, positive.
+    """
+    offset = torch.linalg.vector_norm(contacts.points.mean(1) - center, dim=-1) / OFFSET
+    odds = torch.logit(closure.to(offset), eps=LEAST)
+    cone = math.atan(friction)
+    lean = torch.atan(tangential_ratio(contacts)) / cone
+    return torch.stack([odds, offset, lean, normal_angle.amax(1), torch.full_like(odds, cone)], dim=-1)
+
+
+def success_odds(features: Float[Tensor, "g 5"]) -> Float[Tensor, "g"]:
+    """Return the log-odds of success of each grasp: log p / (1 - p).
+
+    >>> good, bad = torch.tensor([[6.9, 0.3, 0.4, 0.3, 0.54], [-1.0, 1.5, 2.0, 0.9, 0.29]])
+    >>> success_odds(torch.stack([good, bad])).diff() < 0
+    tensor([True])
+    """
+    weights, bias = read_model()
+    return features @ features.new_tensor(weights) + bias
+
+
+@functools.cache
+def read_model() -> tuple[tuple[float, ...], float]:
+    """Return the weights of `FEATURES` and the bias."""
+    model = json.loads(MODEL.read_text("utf-8"))
+    return tuple(model["weights"][name] for name in FEATURES), model["bias"]
