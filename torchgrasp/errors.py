@@ -30,7 +30,7 @@ class TooFewPoints(BadArgument):
 
 
 class SuspiciousScale(BadArgument):
-    """A cloud's extent is no object that a hand could grasp: most often millimetres given as metres."""
+    """A cloud's or a mesh's extent is no object that a hand could grasp: most often millimetres given as metres."""
 
 
 class CloudFileError(BadArgument):
@@ -120,6 +120,7 @@ class Status(enum.IntEnum):
     EJECTED = 34, "the object was pushed out while the hand closed"
     UNSTABLE = 35, "the simulation did not stay finite"
     MOVED = 36, "the object moved or turned too far in the hand when it was pulled"
+    TOO_WEAK = 37, "the hand's drives were at their largest torque and the object was not held"
     # the run
     BAD_OBJECT = 39, "the files of the object are not what they should be"
     TIMED_OUT = 40, "it took longer than its limit and was ended"

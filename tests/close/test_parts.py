@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from torchgrasp.close.parts import check_parts, convex_parts, read_mesh
-from torchgrasp.errors import MeshError
+from torchgrasp.errors import MeshError, SuspiciousScale
 
 
 def bracket():
@@ -65,6 +65,19 @@ def inside_out():
     return trimesh.Trimesh(box.vertices, box.faces[:, ::-1], process=False)
 
 
+def flat():
+    """A closed surface around nothing."""
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    return trimesh.Trimesh(box.vertices * [1, 1, 0], box.faces, process=False)
+
+
+def one_face_turned():
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    faces = np.array(box.faces)
+    faces[0] = faces[0, ::-1]
+    return trimesh.Trimesh(box.vertices, faces, process=False)
+
+
 def not_finite():
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     vertices = np.array(box.vertices)
@@ -78,12 +91,20 @@ def not_finite():
         (open_box, "open surface"),
         (inside_out, "volume"),
         (not_finite, "non-finite"),
+        (flat, "volume"),
+        (one_face_turned, "volume"),
         (lambda: trimesh.Trimesh(), "without faces"),
     ],
 )
 def test_bad_meshes_are_refused(mesh, reason):
     with pytest.raises(MeshError, match=reason):
         convex_parts(mesh())
+
+
+@pytest.mark.parametrize("size", [1e-4, 10.0])
+def test_meshes_of_another_unit_are_refused(size):
+    with pytest.raises(SuspiciousScale, match="use metres"):
+        convex_parts(trimesh.creation.box((size, size, 2 * size)))
 
 
 def test_bad_files_are_refused(tmp_path):

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from torchgrasp.close.protocol import PROTOCOLS, pull_grasp
+from torchgrasp.close.trial import close_hand
 from torchgrasp.errors import Status
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
@@ -46,7 +48,9 @@ def test_mujoco_gives_the_same_bits_here_and_in_another_process():
 
 
 def test_mujoco_tells_overlap_and_absence():
-    assert close("barrett", cylinder((0.0, 0.05)), QUICK).status is Status.START_OVERLAP
+    forward = torch.eye(4, dtype=torch.float64)
+    forward[2, 3] = 0.2
+    assert close("barrett", spec=QUICK, error=forward).status is Status.START_OVERLAP
     assert close("barrett", cylinder((0.4, 0.0)), QUICK).status is Status.NO_CONTACT
     slippery = dataclasses.replace(QUICK, friction=0.02)
     assert not close("allegro", spec=slippery).held
@@ -59,6 +63,35 @@ def test_both_agree_on_a_pull(pull):
     there, here = (pull_grasp(grasp, hand, cylinder(), protocol, simulator=s) for s in ("sapien", "mujoco"))
     assert there.passed == here.passed == (pull < 100)
     assert here.force == pytest.approx(there.force, rel=0.05)
+
+
+@pytest.mark.parametrize("simulator", ["sapien", "mujoco"])
+@pytest.mark.parametrize(("effort", "held"), [(0.01, False), (0.7, True)])
+def test_drives_that_cannot_hold_the_weight_are_named(simulator, effort, held):
+    hand, grasp = pinch("allegro")
+    drives = {name: drive._replace(effort=effort) for name, drive in hand.actuators.items()}
+    spec = dataclasses.replace(QUICK, simulator=simulator)
+    result = close_hand(grasp, dataclasses.replace(hand, actuators=drives), cylinder(), spec)
+    assert result.status is (Status.OK if held else Status.TOO_WEAK)
+
+
+@pytest.mark.parametrize("simulator", ["sapien", "mujoco"])
+def test_what_leaves_all_bounds_or_starts_in_the_object_never_counts_as_held(simulator, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    hand, grasp = pinch("allegro")
+    wild = {name: drive._replace(kp=1e12, kd=0.0, effort=1e30) for name, drive in hand.actuators.items()}
+    protocol = dataclasses.replace(PULL, kp=None)
+    for closing in ("open_loop", "uncertainty"):
+        spec = dataclasses.replace(QUICK, simulator=simulator, controller=closing)
+        assert not close_hand(grasp, dataclasses.replace(hand, actuators=wild), cylinder(), spec).held
+        given = (grasp, dataclasses.replace(hand, actuators=wild), cylinder(), protocol, 7.0, closing)
+        assert pull_grasp(*given, simulator=simulator).status in (Status.UNSTABLE, Status.MOVED)
+    deep = cylinder((0.04, 0.04))
+    assert pull_grasp(grasp, hand, deep, PULL, simulator=simulator).status is Status.START_OVERLAP
+    within = dataclasses.replace(PULL, overlap=1.0)  # no overlap is refused: the object is thrown out
+    thrown = pull_grasp(grasp, hand, deep, within, simulator=simulator)
+    assert thrown.status in (Status.EJECTED, Status.MOVED) and not thrown.passed
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_scene_as_mjcf_is_a_model_of_its_own():

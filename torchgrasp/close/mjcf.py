@@ -2,7 +2,8 @@
 
 Joints have the same armature, drives and friction as in SAPIEN. Torsional friction is a length in MuJoCo: friction
 times the radius of the contact patch. The hand feels neither gravity nor itself. The table is a plane, on which a flat
-bottom gets several contacts.
+bottom gets several contacts. What leaves all bounds is not put back to its start, as MuJoCo does by default: what was
+lost would count as held.
 """
 
 import xml.etree.ElementTree as ET
@@ -44,7 +45,7 @@ def scene_mjcf(setup: Setup) -> str:
     root = ET.Element("mujoco", model="torchgrasp")
     ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     option = ET.SubElement(root, "option", OPTION, timestep=repr(setup.timestep), gravity=f"0 0 {-setup.gravity!r}")
-    ET.SubElement(option, "flag", multiccd="enable")
+    ET.SubElement(option, "flag", multiccd="enable", autoreset="disable")
     default = ET.SubElement(root, "default")
     friction = _text((setup.friction, setup.friction * setup.patch, 0.0))
     condim = "4" if setup.patch > 0 else "3"

@@ -53,9 +53,11 @@ class MujocoScene:
 
     def step(self) -> Reading:
         """Advance by one timestep and report the contacts between fingertips and object."""
-        self._mujoco.mj_step2(self.model, self.data)
         impulse, moment, weight = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
         finger, force = np.zeros(3, dtype=bool), np.zeros((3, 3))
+        if self._broken():
+            return Reading(impulse, moment, weight, finger, force)
+        self._mujoco.mj_step2(self.model, self.data)
         wrench, contacts = np.zeros(6), self.data.contact
         for k, (first, second) in enumerate(contacts.geom.tolist()):
             first, second = self._body_of[first], self._body_of[second]
@@ -124,6 +126,13 @@ class MujocoScene:
                 deepest = max(deepest, -float(distance))
         return deepest
 
+    def _broken(self) -> bool:
+        """Tell whether numbers have left all bounds; nothing moves from then on, and every pose is NaN."""
+        if self.data.warning.number[self._mujoco.mjtWarning.mjWARN_BADQPOS :].any():
+            self.data.qpos[:] = self.data.xpos[:] = np.nan
+            return True
+        return False
+
     def _pose(self, body: int) -> np.ndarray:
         """Return a body's pose (4, 4) in the world."""
         pose = np.eye(4)
@@ -132,9 +141,12 @@ class MujocoScene:
 
 
 def _import_mujoco() -> Any:
-    """Import MuJoCo."""
+    """Import MuJoCo; its warnings are counted (`_broken`), not written to a file in the working folder."""
     try:
         import mujoco
     except ImportError as error:
         raise MissingExtra("mujoco", "mujoco") from error
-    return mujoco
+    engine: Any = mujoco
+    if engine.get_mju_user_warning() is None:
+        engine.set_mju_user_warning(lambda text: None)
+    return engine

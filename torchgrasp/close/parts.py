@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from torchgrasp.errors import MeshError, MissingExtra, ModelFileError, OutputError
+from torchgrasp.cloud.check import MAX_EXTENT, MIN_EXTENT
+from torchgrasp.errors import MeshError, MissingExtra, ModelFileError, OutputError, SuspiciousScale
 from torchgrasp.files import load_tensors, save_tensors
 
 if TYPE_CHECKING:
@@ -38,7 +39,9 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
     """Return a closed mesh [m] from a file or a trimesh, checked and never repaired.
 
     Raises:
-        MeshError: no mesh in the file, non-finite vertices, an open surface, or no positive volume.
+        MeshError: no mesh in the file, non-finite vertices, an open surface, faces that are not all turned outward, or
+            no volume.
+        SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; most often the unit is mm.
 
     >>> import trimesh
     >>> len(read_mesh(trimesh.creation.box((0.1, 0.1, 0.1))).faces)
@@ -58,15 +61,25 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
         if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
             raise MeshError("mesh", f"{path}, which holds no faces", "a closed triangle mesh")
         mesh = loaded
+    _check_solid(mesh, name)
+    extent = float(mesh.extents.max())
+    if not MIN_EXTENT <= extent <= MAX_EXTENT:
+        raise SuspiciousScale("mesh", f"{name} of {extent:.4g} m", f"{MIN_EXTENT:g} m to {MAX_EXTENT:g} m: use metres")
+    return mesh
+
+
+def _check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
+    """Raise `MeshError` unless a mesh bounds a volume."""
     if len(mesh.faces) == 0:
         raise MeshError("mesh", f"{name} without faces", "a closed triangle mesh")
     if not np.isfinite(mesh.vertices).all():
         raise MeshError("mesh", f"{name} with a non-finite vertex", "finite vertices [m]")
     if not mesh.is_watertight:
         raise MeshError("mesh", f"{name} with an open surface", "a closed (watertight) mesh")
-    if not mesh.volume > LEAST_VOLUME:
-        raise MeshError("mesh", f"{name} of volume {mesh.volume:.3g} m^3", "a positive volume, faces turned outward")
-    return mesh
+    with np.errstate(invalid="ignore", divide="ignore"):  # trimesh divides by the volume
+        volume = mesh.volume
+    if not (mesh.is_winding_consistent and volume > LEAST_VOLUME):
+        raise MeshError("mesh", f"{name} of volume {volume:.3g} m^3", "a positive volume, faces turned outward")
 
 
 def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None = None) -> "list[trimesh.Trimesh]":
@@ -78,6 +91,7 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
 
     Raises:
         MeshError: the mesh is open, empty, not finite, or without volume.
+        SuspiciousScale: it is too small or too large (`read_mesh`).
         MissingExtra: the mesh is not convex and CoACD is not installed.
 
     >>> import trimesh
@@ -109,7 +123,7 @@ def _filled(parts: "list[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
 def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
     """Return parts given by the caller as they are, or raise `MeshError` when one is no convex body."""
     for index, part in enumerate(parts):
-        read_mesh(part)
+        _check_solid(part, f"part {index}")
         if not part.is_convex:
             raise MeshError("parts", f"part {index}, which is not convex", "convex meshes")
     if not parts:

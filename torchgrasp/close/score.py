@@ -13,7 +13,7 @@ from torchgrasp.errors import Status
 STAGES: dict[str, tuple[Status, ...]] = {
     "start": (Status.START_OVERLAP,),
     "closing": (Status.NO_CONTACT, Status.EJECTED),
-    "pulling or lifting": (Status.MOVED, Status.DROPPED, Status.NOT_LIFTED),
+    "pulling or lifting": (Status.MOVED, Status.DROPPED, Status.NOT_LIFTED, Status.TOO_WEAK),
     "simulation": (Status.UNSTABLE, Status.TIMED_OUT, Status.WORKER_DIED),
 }
 """Where an attempt can fail, in the order of time, by what it then is called."""

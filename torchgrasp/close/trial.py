@@ -144,7 +144,8 @@ class _Trial:
         self.object_pose: list[np.ndarray] = []
         self.hand_pose: list[np.ndarray] = []
         self.joints: list[np.ndarray] = []
-        self.pushed = 0.0
+        self.pushed, self.strained = 0.0, False
+        self.effort = torch.tensor([hand.actuators[name].effort for name in self.scene.joint_names])
 
     # ------------------------------------------------------------------------------------------------- the phases
 
@@ -161,6 +162,7 @@ class _Trial:
             while not controller.closed:
                 sight = self._tick(controller.step(sight, period))
             self.pushed = float(np.linalg.norm(self._centre(-1) - self._centre(0)))
+            self.strained = bool((self.plant.kp * (controller.targets - sight.joints).abs() >= self.effort).any())
             rising = self.robot.ticks(LIFT_TIME)
             for k in range(rising + self.robot.ticks(self.spec.hold_time)):
                 self.scene.lift(*self._height((k + 1) * period, rising * period))
@@ -218,6 +220,8 @@ class _Trial:
             return Status.NO_CONTACT
         if self.pushed > PUSHED:
             return Status.EJECTED
+        if self.strained:
+            return Status.TOO_WEAK
         return Status.DROPPED if rise.max() >= half else Status.NOT_LIFTED
 
     def result(self, status: Status, seconds: float) -> ClosureResult:
