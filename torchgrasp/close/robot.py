@@ -8,7 +8,6 @@ from torch import Tensor
 from torchgrasp.close.scene import Scene
 from torchgrasp.close.sensor import Press, sense, untouched
 from torchgrasp.close.sight import Plant, Sight
-from torchgrasp.frames import apply, inverse, rotate
 from torchgrasp.hand.hand import Hand
 
 
@@ -61,14 +60,14 @@ class Robot:
 
     def _sight(self, impulse: np.ndarray, moment: np.ndarray, weight: np.ndarray, force: np.ndarray) -> Sight:
         """Return the hand's own knowledge, in its frame: the true contacts only as the fingertips sense them."""
-        hand_from_world = inverse(torch.from_numpy(self.scene.hand_pose()))
+        stands = self.scene.hand_pose()
+        turn, origin = stands[:3, :3], stands[:3, 3]
         centres = (self.scene.tip_poses() @ self._centres[:, :, None])[:, :3, 0]
-        jacobian = torch.from_numpy(self.scene.jacobian(centres))
         with np.errstate(invalid="ignore", divide="ignore"):
             points = moment / weight[:, None]
             normals = -impulse / np.linalg.norm(impulse, axis=-1, keepdims=True)
-        directions = rotate(hand_from_world, torch.from_numpy(np.concatenate([force, normals])))
-        places = apply(hand_from_world, torch.from_numpy(np.concatenate([points, centres])))
+        directions = torch.from_numpy(np.concatenate([force, normals]) @ turn)
+        places = torch.from_numpy((np.concatenate([points, centres]) - origin) @ turn)
         press = Press(torch.from_numpy(self.force), directions[:3], places[:3], directions[3:])
         self._touch = touch = sense(
             self._touch, press, self.plant.normals, self.plant.radius, self.period, self.generator
@@ -76,7 +75,7 @@ class Robot:
         return Sight(
             joints=torch.from_numpy(self.scene.joints()),
             tips=places[3:],
-            jacobian=hand_from_world[:3, :3] @ jacobian,
+            jacobian=torch.from_numpy(turn.T @ self.scene.jacobian(centres)),
             reading=touch.reading,
             forces=touch.forces,
             contact=touch.contact,
