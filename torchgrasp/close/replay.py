@@ -55,7 +55,7 @@ def format_grasps(grasps: Grasps, hand: Hand, force: float = 4.0) -> str:
         {
             "rank": row,
             "status": Status(int(grasps.status[row])).name,
-            "score": float(grasps.score[row]),
+            "success": float(grasps.success[row]),
             "pose": _pose(grasps.obj_from_hand[row]),
             "joints": {name: {joint: float(q[row]) for joint, q in all_.items()} for name, all_ in named.items()},
             "torque": dict(zip(hand.joint_names, pressed.torques[row].tolist(), strict=True)),

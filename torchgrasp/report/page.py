@@ -99,7 +99,7 @@ def grasp_rows(grasps: Grasps, most: int = ROWS) -> list[tuple[str, ...]]:
         rows.append(
             (
                 str(rank),
-                f"{float(grasp.score[0]):.3f}",
+                f"{float(grasp.success[0]):.0%}",
                 f"{1e3 * float(grasp.tip_error[0].max()):.2f}",
                 f"{1e3 * float(grasp.clearance[0]):.1f}",
                 f"{math.degrees(float(grasp.normal_angle[0].max())):.0f}",
@@ -110,7 +110,7 @@ def grasp_rows(grasps: Grasps, most: int = ROWS) -> list[tuple[str, ...]]:
     return rows
 
 
-GRASP_COLUMNS = ("rank", "score", "tip error mm", "clearance mm", "pad angle deg", "closure margin", "surface std mm")
+GRASP_COLUMNS = ("rank", "success", "tip error mm", "clearance mm", "pad angle deg", "closure margin", "surface std mm")
 """Heads of `grasp_rows`; errors, angles and deviations are those of the worst finger."""
 
 
