@@ -5,6 +5,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.close.breakaway import Breakaway
 from torchgrasp.close.scene import Scene
 from torchgrasp.close.sensor import Press, sense, untouched
 from torchgrasp.close.sight import Plant, Sight
@@ -24,10 +25,17 @@ class Robot:
         plant: what the controllers know of it.
         control_rate: ticks a second [Hz].
         generator: draws the noise of the fingertips; None: no noise.
+        breakaway: torque [N m] at which its clutches let go (`Breakaway`); None: it has none.
     """
 
     def __init__(
-        self, scene: Scene, hand: Hand, plant: Plant, control_rate: float, generator: torch.Generator | None
+        self,
+        scene: Scene,
+        hand: Hand,
+        plant: Plant,
+        control_rate: float,
+        generator: torch.Generator | None,
+        breakaway: float | None = None,
     ) -> None:
         self.scene, self.plant, self.generator = scene, plant, generator
         self.substeps = max(1, round(1 / (control_rate * scene.timestep)))
@@ -36,9 +44,12 @@ class Robot:
         self.force, self.finger = np.zeros(3), np.zeros(3, dtype=bool)
         self._centres = torch.cat([hand.center.double(), torch.ones(3, 1, dtype=torch.float64)], dim=-1).numpy()
         self._touch = untouched()
+        self._clutch = None if breakaway is None else Breakaway(plant, breakaway)
 
     def tick(self, targets: Float[Tensor, " j"]) -> Sight:
         """Drive the joints for one control period and return what the robot then knows."""
+        if self._clutch is not None:
+            targets = self._clutch(targets, torch.from_numpy(self.scene.joints()))
         self.scene.drive(targets.numpy())
         impulse, moment, weight, force = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))
         for _ in range(self.substeps):

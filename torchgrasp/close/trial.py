@@ -137,7 +137,7 @@ class _Trial:
         self.scene = open_scene(setup, spec.simulator)
         self.plant = plant_from_hand(hand, grasp, spec.force, self.scene.joint_names)
         generator = torch.Generator().manual_seed(seed) if spec.noise else None
-        self.robot = Robot(self.scene, hand, self.plant, spec.control_rate, generator)
+        self.robot = Robot(self.scene, hand, self.plant, spec.control_rate, generator, spec.breakaway)
         self.time: list[float] = []
         self.forces: list[np.ndarray] = []
         self.touching: list[int] = []
