@@ -124,7 +124,12 @@ class FixedClosing(Closing):
 
 
 class Stopping:
-    """The paper's baseline: an isotropic PI position controller per fingertip that stops at `STOP_FORCE` (Table 7)."""
+    """The paper's baseline: an isotropic PI position controller per fingertip that stops at `STOP_FORCE` (Table 7).
+
+    Of 56 grasps of the library's and eight scanned objects with both hands, put down beside their plan by up to 5 mm
+    and 5 degrees about each axis, 9 held when it lifted as it had stopped (6 without the integral), because two thirds
+    end at their targets before some finger touches, and 55 when the squeeze followed.
+    """
 
     def __init__(self, plant: Plant, gains: ClosingGains) -> None:
         self.plant, self.gains = plant, gains
