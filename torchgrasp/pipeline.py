@@ -31,7 +31,7 @@ from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.support import fit_shape
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ContactSpec
-from torchgrasp.values import ContactPlan, Grasps, PointCloud
+from torchgrasp.values import ContactPlan, Contacts, Grasps, PointCloud
 
 Observer = Callable[[str, str, Any], None]
 """Called after each stage with its name, one line about it, and its value."""
@@ -89,6 +89,13 @@ def digest(cloud: PointCloud) -> str:
     return hashlib.sha256(cloud.points.detach().cpu().double().contiguous().numpy().tobytes()).hexdigest()
 
 
+def closure_of(contacts: Contacts, shape: ShapeGP, friction: float, seed: int) -> Float[Tensor, "k"]:
+    """Return the probability of closure of each triple, 0 of one at the edge of the shape's domain."""
+    closure, inside = torch.zeros_like(contacts.points[:, 0, 0]), well_inside(shape, contacts)
+    closure[inside] = closed_share(lines_of(shape, contacts[inside]), friction, DRAWS, seed).to(closure)
+    return closure
+
+
 def odds_of(
     grasps: Grasps, shape: ShapeGP, center: Float[Tensor, "3"], spec: ContactSpec, seed: int
 ) -> Float[Tensor, "k"]:
@@ -96,8 +103,7 @@ def odds_of(
     good = grasps[grasps.status == Status.OK]
     if not len(good):
         return good.score
-    closure, inside = torch.zeros_like(good.score), well_inside(shape, good.contacts)
-    closure[inside] = closed_share(lines_of(shape, good.contacts[inside]), spec.friction, DRAWS, seed).to(closure)
+    closure = closure_of(good.contacts, shape, spec.friction, seed)
     return success_odds(success_features(good.contacts, closure, good.normal_angle, center, spec.friction))
 
 

@@ -24,9 +24,7 @@ from torchgrasp.files import format_json, write_atomically, write_file
 from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.success import success_features
 from torchgrasp.objects import list_objects, load_object
-from torchgrasp.pipeline import DRAWS
-from torchgrasp.plan.lines import lines_of
-from torchgrasp.plan.probability import closed_share
+from torchgrasp.pipeline import closure_of
 from torchgrasp.shape.calibrate import list_views, read_view
 from torchgrasp.shape.support import fit_shape
 from torchgrasp.shape.surface import extract_surface
@@ -138,7 +136,7 @@ def rows_of(source: Path, score: ViewScore, friction: float, hand: str, shelf: P
     ]
     shape = fit_shape(read_view(source, score.object, score.view), table=0.0)
     center = extract_surface(shape).vertices.mean(0)
-    closure = closed_share(lines_of(shape, chosen.contacts), friction, DRAWS, 0)
+    closure = closure_of(chosen.contacts, shape, friction, 0)
     features = success_features(chosen.contacts, closure, chosen.normal_angle, center, friction)
     told = {"object": score.object, "view": score.view, "hand": hand, "friction": friction}
     return [
