@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from torchgrasp.close.score import share
-from torchgrasp.close.tables import SHIFT, TURN, Cell, controller_cells, difference, threshold_cells, trend
+from torchgrasp.close.tables import FREE, SHIFT, TURN, Cell, controller_cells, difference, threshold_cells, trend
 from torchgrasp.files import format_json, write_file
 
 PUBLISHED = {
@@ -87,6 +87,8 @@ def gather(cells: Iterator[tuple[Cell, ...]]) -> list[list[Cell]]:
         reasons = Counter(s.name.lower() for cell in row for s in cell.statuses if s.name != "OK")
         told = f"{value:6.1%} [{low:.1%}, {high:.1%}] of {total}; the paper: {PUBLISHED.get(row[0].row, '-')} %"
         print(f"{row[0].row:24}{told}; {', '.join(f'{n} {name}' for name, n in reasons.most_common())}")
+        free = sum(cell.held_free for cell in row) / max(total, 1)
+        print(f"{'':24}{free:6.1%} held and started less than {1e3 * FREE:.0f} mm in object or table")
     return rows
 
 

@@ -271,7 +271,8 @@ class ClosureResult(Value):
     the object's and the hand's frames in the world at each tick; `joints` every joint of the URDF in the order of
     `joint_names`. `contact_order` lists the fingers in the order of their first touch, those that never touched left
     out. `object_motion` is how far the object moved [m] and turned [rad] against the hand between the start and the
-    end. `held` is true when the object is still up with the hand at the end; `seconds` is the wall time.
+    end; `start_overlap` [m] how deep the opened hand was in object or table before. `held` is true when the object is
+    still up with the hand at the end; `seconds` is the wall time.
     """
 
     held: bool
@@ -284,4 +285,5 @@ class ClosureResult(Value):
     joint_names: tuple[str, ...]
     contact_order: tuple[int, ...]
     object_motion: tuple[float, float]
+    start_overlap: float
     seconds: float

@@ -13,7 +13,10 @@ from torchgrasp.errors import Status
 
 def cells(row: str, held: dict[str, int], of: int = 10) -> list[Cell]:
     """Return a cell for each object."""
-    return [Cell(o, "allegro", row, (Status.OK,) * n + (Status.DROPPED,) * (of - n), 0.01) for o, n in held.items()]
+    return [
+        Cell(o, "allegro", row, (Status.OK,) * n + (Status.DROPPED,) * (of - n), (0.0,) * of, 0.01)
+        for o, n in held.items()
+    ]
 
 
 def test_an_object_is_moved_on_its_table_and_turned_about_the_vertical() -> None:
@@ -28,6 +31,11 @@ def test_an_object_is_moved_on_its_table_and_turned_about_the_vertical() -> None
     # uniform: standard deviation a / sqrt(3), known to 2 % from 2000 draws
     assert float(angle.std()) == pytest.approx(TURN / math.sqrt(3), rel=0.05)
     assert float(moved[:, 0].std()) == pytest.approx(SHIFT / math.sqrt(3), rel=0.05)
+
+
+def test_a_trial_that_starts_in_the_object_can_be_told_from_one_that_starts_free() -> None:
+    cell = Cell("x", "allegro", "a", (Status.OK, Status.OK, Status.DROPPED), (0.0005, 0.004, 0.0), 0.01)
+    assert (cell.held, cell.held_free) == (2, 1)
 
 
 def test_a_difference_is_the_pooled_one_and_its_interval_that_of_resampled_objects() -> None:

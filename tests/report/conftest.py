@@ -65,6 +65,7 @@ def run() -> Run:
         joint_names=hand.urdf_joint_names,
         contact_order=(0, 1, 2),
         object_motion=(0.003, math.radians(2)),
+        start_overlap=0.0,
         seconds=1.0,
     )
     cloud = PointCloud(vertices[vertices[:, 0] > 0], None, torch.tensor([0.5, 0.1, 0.3], dtype=F64))

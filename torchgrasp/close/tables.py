@@ -48,6 +48,9 @@ GRASPS, TRIALS = 3, 30
 SHIFT, TURN = 0.005, math.radians(5)
 """Largest error [m] of where the object stands along each axis of the table, and [rad] about the vertical."""
 
+FREE = 1e-3
+"""Overlap [m] up to which a start counts as free: convex parts bulge a little."""
+
 MASS = 0.1
 """Of objects that come without one [kg]."""
 
@@ -63,20 +66,27 @@ class Cell(Value):
     """The trials of one object with one hand.
 
     `row` is what the table compares: a threshold or a controller. `statuses` lists the trials, those of a grasp one
-    after the other; it is empty where nothing was executable. `std_m` is the mean over the grasps of their least
-    certain contact's standard deviation [m].
+    after the other; it is empty where nothing was executable. `overlaps` [m] tells how deep the opened hand was in the
+    wrongly placed object or in the table before it closed. `std_m` is the mean over the grasps of their least certain
+    contact's standard deviation [m].
     """
 
     object: str
     hand: str
     row: str
     statuses: tuple[Status, ...]
+    overlaps: tuple[float, ...]
     std_m: float
 
     @property
     def held(self) -> int:
         """Count the trials that held."""
         return sum(status is Status.OK for status in self.statuses)
+
+    @property
+    def held_free(self) -> int:
+        """Count the trials that held and started free of object and table, to 1 mm."""
+        return sum(s is Status.OK and o <= FREE for s, o in zip(self.statuses, self.overlaps, strict=True))
 
 
 def threshold_cells(
@@ -158,8 +168,8 @@ def difference(first: Sequence[Cell], second: Sequence[Cell], seed: int = 0) -> 
     The cells are paired by object and hand. The interval resamples objects, not trials: the trials of one object are
     alike.
 
-    >>> a = [Cell(o, "allegro", "a", (Status.OK, Status.OK), 0.0) for o in "xyz"]
-    >>> b = [Cell(o, "allegro", "b", (Status.OK, Status.DROPPED), 0.0) for o in "xyz"]
+    >>> a = [Cell(o, "allegro", "a", (Status.OK, Status.OK), (0.0, 0.0), 0.0) for o in "xyz"]
+    >>> b = [Cell(o, "allegro", "b", (Status.OK, Status.DROPPED), (0.0, 0.0), 0.0) for o in "xyz"]
     >>> difference(a, b)
     (0.5, 0.5, 0.5)
     """
@@ -214,7 +224,9 @@ def _cells(
     tasks = [(place, name, hand, rows, seed, *effort) for hand in hands for place, name in named]
     for task, found in zip(tasks, run_tasks(_fill, tasks, workers, CELL_SECONDS), strict=True):
         if isinstance(found, Status):
-            found = tuple(Cell(task[1], task[2], row[0], (found,) * effort[0], math.nan) for row in rows)
+            found = tuple(
+                Cell(task[1], task[2], row[0], (found,) * effort[0], (0.0,) * effort[0], math.nan) for row in rows
+            )
         yield found
 
 
@@ -240,15 +252,16 @@ def _fill(
         spec = TrialSpec(controller=closing, holding=holding, mass=mass)
         draws = math.ceil(trials / max(len(grasps), 1))
         places = draw_places(draws * len(grasps), pivot, seed)
-        statuses = []
+        results = []
         for k, place in enumerate(places):
             grasp = grasps[k // draws]
             stands = grasp.obj_from_hand[0].double()
             error = inverse(stands) @ inverse(place) @ stands
-            statuses.append(close_hand(grasp, hand, mesh, spec, seed + k, parts=parts, error=error).status)
+            results.append(close_hand(grasp, hand, mesh, spec, seed + k, parts=parts, error=error))
         stds = [float(grasp.contacts.std_m.amax()) for grasp in grasps]
         std_m = sum(stds) / len(stds) if stds else math.nan
-        cells.append(Cell(label, hand_name, row, tuple(statuses), std_m))
+        statuses, overlaps = tuple(r.status for r in results), tuple(r.start_overlap for r in results)
+        cells.append(Cell(label, hand_name, row, statuses, overlaps, std_m))
     return tuple(cells)
 
 

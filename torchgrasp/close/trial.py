@@ -144,16 +144,16 @@ class _Trial:
         self.object_pose: list[np.ndarray] = []
         self.hand_pose: list[np.ndarray] = []
         self.joints: list[np.ndarray] = []
-        self.pushed, self.strained = 0.0, False
+        self.overlap, self.pushed, self.strained = 0.0, 0.0, False
         self.effort = torch.tensor([hand.actuators[name].effort for name in self.scene.joint_names])
 
     # ------------------------------------------------------------------------------------------------- the phases
 
     def run(self, gains: ClosingGains, belief: Belief | None) -> Status:
         """Close, press, lift and hold; return what became of it."""
-        overlap = self.scene.penetration()
+        self.overlap = self.scene.penetration()
         self._record(np.zeros(3))
-        if not overlap <= START_TOLERANCE:
+        if not self.overlap <= START_TOLERANCE:
             return Status.START_OVERLAP
         controller = GraspController(self.plant, gains, self.spec.controller, self.spec.holding, belief)
         period = self.robot.period
@@ -246,5 +246,6 @@ class _Trial:
             joint_names=self.scene.joint_names,
             contact_order=tuple(sorted(touched, key=lambda i: self.robot.first_touch[i])),
             object_motion=(float(torch.linalg.vector_norm(ends[1] - ends[0])), float(rotation_angle(turned))),
+            start_overlap=self.overlap,
             seconds=seconds,
         )
