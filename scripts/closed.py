@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from torchgrasp.close.attempt import PAPER
 from torchgrasp.close.score import share
-from torchgrasp.close.tables import FREE, SHIFT, TURN, Cell, controller_cells, difference, threshold_cells, trend
+from torchgrasp.close.tables import FREE, Cell, controller_cells, difference, threshold_cells, trend
 from torchgrasp.files import format_json, write_file
 
 PUBLISHED = {
@@ -74,7 +75,8 @@ def gather(cells: Iterator[tuple[Cell, ...]]) -> list[list[Cell]]:
     rows: list[list[Cell]] = []
     for found in cells:
         if not rows:
-            print(f"object stands within {1e3 * SHIFT:.0f} mm and {57.3 * TURN:.0f} deg of where it was seen; held of")
+            place = f"{1e3 * PAPER.shift:.0f} mm and {57.3 * PAPER.turn:.0f} deg of where it was seen"
+            print(f"the object stands within {place}; held of")
             print(f"{'object':16}{'hand':9}" + "".join(f"{cell.row:>24}" for cell in found))
             rows = [[] for _ in found]
         counts = "".join(f"{f'{c.held}/{len(c.statuses)} ({1e3 * c.std_m:.0f} mm)':>24}" for c in found)

@@ -8,11 +8,10 @@ import trimesh
 
 from benchmarks.common import Row
 from torchgrasp import Status, TrialSpec, close_hand, fit_shape, load_hand, plan_grasps
-from torchgrasp.close.attempt import PROTOCOLS, LiftProtocol
+from torchgrasp.close.attempt import PAPER, draw_error
 from torchgrasp.close.evaluate import choose_rows
 from torchgrasp.close.parts import convex_parts
 from torchgrasp.close.pool import run_tasks
-from torchgrasp.close.protocol import draw_errors
 from torchgrasp.close.score import share
 from torchgrasp.shape.calibrate import list_views, object_scale, read_view
 from torchgrasp.specs import ContactSpec
@@ -33,7 +32,7 @@ LIMIT = 3600.0
 
 
 def bench_ablation(objects: Path, tries: int, starts: int, seed: int, workers: int) -> list[Row]:
-    """Close and lift `tries` grasps of every view with both hands in every way, the hand put down beside its plan."""
+    """Close and lift `tries` grasps of every view with both hands in every way, the object beside its place."""
     tasks = [
         (objects, name, view, hand, tries, starts, seed)
         for hand in ("allegro", "barrett")
@@ -66,19 +65,17 @@ def _close_view(
 ) -> list[tuple[str, str, float, float]]:
     """Return part, status, motion in the hand [m] and CPU time [s] of every trial of one view and hand."""
     hand, cloud = load_hand(hand_name), read_view(objects, name, view)
-    protocol = PROTOCOLS["paper"]
-    assert isinstance(protocol, LiftProtocol)
     shape = fit_shape(cloud, seed=seed, table=0.0)
-    found = plan_grasps(cloud, hand, ContactSpec(friction=protocol.friction, table=0.0), starts, seed, shape=shape)
+    found = plan_grasps(cloud, hand, ContactSpec(friction=PAPER.friction, table=0.0), starts, seed, shape=shape)
     found = found[found.status == Status.OK]
     mesh = trimesh.load(objects / name / "mesh.ply", force="mesh").apply_scale(object_scale(objects, name))
     close = functools.partial(close_hand, hand=hand, mesh=mesh, parts=convex_parts(mesh))
-    errors = draw_errors(protocol.shift, protocol.turn, len(found), 1, seed)
     cases = []
     for row in choose_rows(len(found), tries, "spread"):
+        error = draw_error(PAPER, found[row], mesh, row, 0, seed)
         for part, (spec, revises) in PARTS.items():
             belief = shape if revises else None
             began = time.process_time()
-            result = close(found[row], spec=spec, seed=seed, error=errors[row, 0], belief=belief)
+            result = close(found[row], spec=spec, seed=seed, error=error, belief=belief)
             cases.append((part, result.status.name, result.object_motion[0], time.process_time() - began))
     return cases

@@ -32,8 +32,9 @@ from torchgrasp.close.parts import convex_parts
 from torchgrasp.close.pool import run_tasks
 from torchgrasp.close.robot import Robot
 from torchgrasp.close.sapien_scene import SapienScene
-from torchgrasp.close.scene import Scene, Setup, open_scene
+from torchgrasp.close.scene import Scene, Setup
 from torchgrasp.close.sight import plant_from_hand
+from torchgrasp.close.simulators import open_scene
 from torchgrasp.hand.hand import Actuator
 
 SIMULATORS = ("sapien", "mujoco")

@@ -142,8 +142,9 @@ def test_all_a_fingertip_exerts_is_felt_friction_included():
     from torchgrasp.close.law import closing_gains
     from torchgrasp.close.parts import convex_parts
     from torchgrasp.close.robot import Robot
-    from torchgrasp.close.scene import Setup, open_scene
+    from torchgrasp.close.scene import Setup
     from torchgrasp.close.sight import plant_from_hand, sight_from_joints
+    from torchgrasp.close.simulators import open_scene
 
     hand, grasp = pinch("allegro")
     start = {name: float(q) for name, q in hand.expand(grasp.pregrasp[0]).items()}

@@ -10,9 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.close.misplace import draw_errors, draw_places, error_of_place
 from torchgrasp.close.protocol import PROTOCOLS as PULLS
 from torchgrasp.close.protocol import TIMESTEP, PullProtocol, check_test, pull_grasp
-from torchgrasp.close.scene import Setup, open_scene
+from torchgrasp.close.scene import Setup
+from torchgrasp.close.simulators import open_scene
 from torchgrasp.close.trial import close_hand
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.hand.hand import Hand
@@ -30,8 +32,8 @@ class LiftProtocol(Value):
     Args:
         name: of the protocol.
         trial: friction, mass, gravity, lift, hold and shaking; how the hand closes is no part of it (`Execution`).
-        shift: largest error of the hand's position along each of its axes [m].
-        turn: largest error of its orientation about each of its axes [rad].
+        shift: largest error of where the object stands along each of the table's axes [m].
+        turn: largest error of its orientation about the vertical [rad].
         draws: how many such errors are drawn for each grasp.
     """
 
@@ -49,13 +51,16 @@ class LiftProtocol(Value):
 
 Protocol = PullProtocol | LiftProtocol
 
+PAPER = LiftProtocol("paper", TrialSpec(), shift=0.005, turn=math.radians(5))
+"""The paper's lift (Sec. 6.5), with an error of where the object stands instead of the real robot's chance."""
+
 PROTOCOLS: dict[str, Protocol] = {
     **PULLS,
-    "paper": LiftProtocol("paper", TrialSpec(), shift=0.005, turn=math.radians(5)),
+    "paper": PAPER,
     "tabletop": LiftProtocol("tabletop", TrialSpec(friction=0.6, shake=0.003)),
 }
-"""By name: those that pull (`torchgrasp.close.protocol`); the paper's lift at friction 0.8, with an error of the hand's
-pose; and a lift by 0.1 m at friction 0.6 that is held for 2 s while the hand shakes."""
+"""By name: those that pull (`torchgrasp.close.protocol`); the paper's lift at friction 0.8; and a lift by 0.1 m at
+friction 0.6 that is held for 2 s while the hand shakes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,6 +160,20 @@ def attempt_grasp(
         pressed = math.nan if status is Status.START_OVERLAP else pressed
     spent = time.process_time() - began
     return Attempt(0, 0, status is Status.OK, status, moved, turned, pressed, overlap, spent)
+
+
+def draw_error(
+    protocol: Protocol, grasp: Grasps, mesh: "trimesh.Trimesh", row: int, draw: int, seed: int
+) -> Float[Tensor, "4 4"]:
+    """Return where the hand really stands in its planned frame, in one draw for one row among a view's grasps.
+
+    Pull tests put the hand down beside its plan, in the air; in a lift the object stands elsewhere on its table.
+    """
+    if isinstance(protocol, PullProtocol):
+        return draw_errors(protocol.shift, protocol.turn, row + 1, protocol.draws, seed)[row, draw]
+    pivot = torch.tensor(mesh.center_mass.tolist(), dtype=torch.float64)
+    places = draw_places(protocol.shift, protocol.turn, pivot, (row + 1) * protocol.draws, seed)
+    return error_of_place(grasp.obj_from_hand[0].double(), places[row * protocol.draws + draw])
 
 
 def grasp_overlap(

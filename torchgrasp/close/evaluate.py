@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import torch
 
 from torchgrasp.base import count_status
-from torchgrasp.close.attempt import Attempt, Execution, Protocol, attempt_grasp, find_protocol
+from torchgrasp.close.attempt import Attempt, Execution, Protocol, attempt_grasp, draw_error, find_protocol
 from torchgrasp.close.parts import convex_parts, read_mesh
 from torchgrasp.close.pool import run_tasks
-from torchgrasp.close.protocol import draw_errors
 from torchgrasp.close.score import ViewScore
 from torchgrasp.errors import BadArgument, GraspError, MissingExtra, Status
 from torchgrasp.hand.hand import Hand
@@ -187,7 +186,7 @@ def _try(
     """Try one grasp with one drawn error of the hand's pose."""
     hand, grasps = load_hand(robot), load_grasps(view.file(shelf))
     mesh, parts = _solid(view.objects, view.object)
-    error = draw_errors(protocol.shift, protocol.turn, row + 1, protocol.draws, seed)[row, draw]
+    error = draw_error(protocol, grasps[row], mesh, row, draw, seed)
     attempt = attempt_grasp(grasps[row], hand, mesh, parts, protocol, execution, seed, error=error)
     return dataclasses.replace(attempt, rank=row, draw=draw)
 

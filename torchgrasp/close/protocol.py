@@ -24,10 +24,11 @@ from torchgrasp.close.control import CLOSINGS, HOLDINGS, GraspController
 from torchgrasp.close.law import closing_gains
 from torchgrasp.close.parts import check_parts, convex_parts, read_mesh
 from torchgrasp.close.robot import Robot
-from torchgrasp.close.scene import Scene, Setup, open_scene
+from torchgrasp.close.scene import Scene, Setup
 from torchgrasp.close.sight import plant_from_hand
+from torchgrasp.close.simulators import open_scene
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.frames import rigid, rotation_angle, rotation_from_vector
+from torchgrasp.frames import rotation_angle
 from torchgrasp.hand.hand import Hand
 from torchgrasp.specs import ClosingMode, HoldingMode, Simulator, check_simulator
 from torchgrasp.values import ClosingGains, Grasps
@@ -142,7 +143,7 @@ def pull_grasp(
         closing: how the hand closes, at 100 Hz: through its three poses, or by one of the controllers (`CLOSINGS`).
         seed: of the noise of the fingertips that the controllers feel with.
         holding: how it presses from then on, but for the open loop, which keeps its squeeze (`HOLDINGS`).
-        error: where the hand really stands in its planned frame (`draw_errors`), of which it knows nothing.
+        error: where the hand really stands in its planned frame (`misplace`), of which it knows nothing.
         parts: convex bodies to use for the mesh instead of its own decomposition.
         simulator: "sapien" or "mujoco".
 
@@ -190,15 +191,6 @@ def check_test(protocol: PullProtocol | str, force: float, closing: str, holding
     if not 0.0 < force < 1e3:
         raise BadArgument("force", force, "a number in (0, 1000) [N]")
     return PROTOCOLS[protocol] if isinstance(protocol, str) else protocol
-
-
-def draw_errors(shift: float, turn: float, grasps: int, draws: int, seed: int) -> Float[Tensor, "g n 4 4"]:
-    """Return drawn places of the hand in its planned frame, uniform within the largest errors [m, rad] of each axis."""
-    generator = torch.Generator().manual_seed(seed)
-    most = torch.tensor([turn] * 3 + [shift] * 3, dtype=torch.float64)
-    drawn = 2 * torch.rand(grasps, draws, 6, generator=generator, dtype=torch.float64) - 1
-    angles, shifts = (most * drawn).split(3, -1)
-    return rigid(rotation_from_vector(angles), shifts)
 
 
 class _Pull:

@@ -12,7 +12,6 @@ import numpy as np
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand import Actuator
-from torchgrasp.specs import check_simulator
 
 if TYPE_CHECKING:
     import trimesh
@@ -135,24 +134,6 @@ class Scene(Protocol):
     def penetration(self) -> float:
         """Return how deep [m] the hand is in the object or the table; to be asked before anything else moves."""
         ...
-
-
-def open_scene(setup: Setup, simulator: str = "sapien") -> Scene:
-    """Return a fresh scene at its start.
-
-    Raises:
-        BadArgument: an unknown simulator, or a joint of the hand without a position or drive.
-        HandFileError: the hand's URDF is no sound one.
-        MissingExtra: the simulator is not installed.
-    """
-    check_simulator(simulator)
-    if simulator == "mujoco":
-        from torchgrasp.close.mujoco_scene import MujocoScene
-
-        return MujocoScene(setup)
-    from torchgrasp.close.sapien_scene import SapienScene
-
-    return SapienScene(setup)
 
 
 def check_drives(setup: Setup, names: list[str]) -> None:

@@ -14,22 +14,21 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.close.attempt import PAPER
+from torchgrasp.close.misplace import draw_places, error_of_place
 from torchgrasp.close.parts import convex_parts, read_mesh
 from torchgrasp.close.pool import run_tasks
 from torchgrasp.close.trial import close_hand
 from torchgrasp.errors import Status
-from torchgrasp.frames import inverse, rigid, rotation_from_vector
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.objects import list_objects, load_object
 from torchgrasp.pipeline import plan_grasps
 from torchgrasp.shape.calibrate import list_views, object_scale, read_view
 from torchgrasp.shape.support import fit_shape
-from torchgrasp.specs import ClosingMode, ContactSpec, HoldingMode, TrialSpec
+from torchgrasp.specs import ClosingMode, ContactSpec, HoldingMode
 from torchgrasp.values import Grasps, PointCloud
 
 if TYPE_CHECKING:
@@ -44,9 +43,6 @@ THRESHOLDS = (0.03, 0.06, 0.10)
 
 GRASPS, TRIALS = 3, 30
 """Grasps of each view, and trials of a cell, at least."""
-
-SHIFT, TURN = 0.005, math.radians(5)
-"""Largest error [m] of where the object stands along each axis of the table, and [rad] about the vertical."""
 
 FREE = 1e-3
 """Overlap [m] up to which a start counts as free: convex parts bulge a little."""
@@ -149,19 +145,6 @@ def riskiest(grasps: Grasps, most: int = GRASPS) -> Grasps:
     return grasps[torch.argsort(grasps.contacts.std_m.square().sum(1), descending=True, stable=True)[:most]]
 
 
-def draw_places(count: int, pivot: Float[Tensor, "3"], seed: int) -> Float[Tensor, "n 4 4"]:
-    """Return where an object may really stand: moved on the table, and turned about the vertical through a pivot.
-
-    Uniform within `SHIFT` and `TURN`.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    drawn = 2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    rotation = rotation_from_vector(TURN * drawn[:, :1] * up)
-    shift = SHIFT * drawn[:, [1, 2, 2]] * (1 - up)
-    return rigid(rotation, shift + pivot - rotation @ pivot)
-
-
 def difference(first: Sequence[Cell], second: Sequence[Cell], seed: int = 0) -> tuple[float, float, float]:
     """Return by how much the held share of the first cells is above that of the second, and its 95 % interval.
 
@@ -249,14 +232,13 @@ def _fill(
         if (support, threshold) not in planned:
             planned[support, threshold] = [_plan(cloud, hand, support, threshold, starts, seed) for cloud in clouds]
         grasps = [grasp for found in planned[support, threshold] for grasp in found]
-        spec = TrialSpec(controller=closing, holding=holding, mass=mass)
+        spec = dataclasses.replace(PAPER.trial, controller=closing, holding=holding, mass=mass)
         draws = math.ceil(trials / max(len(grasps), 1))
-        places = draw_places(draws * len(grasps), pivot, seed)
+        places = draw_places(PAPER.shift, PAPER.turn, pivot, draws * len(grasps), seed)
         results = []
         for k, place in enumerate(places):
             grasp = grasps[k // draws]
-            stands = grasp.obj_from_hand[0].double()
-            error = inverse(stands) @ inverse(place) @ stands
+            error = error_of_place(grasp.obj_from_hand[0].double(), place)
             results.append(close_hand(grasp, hand, mesh, spec, seed + k, parts=parts, error=error))
         stds = [float(grasp.contacts.std_m.amax()) for grasp in grasps]
         std_m = sum(stds) / len(stds) if stds else math.nan

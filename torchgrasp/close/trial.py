@@ -16,8 +16,9 @@ from torchgrasp.close.control import GraspController
 from torchgrasp.close.law import closing_gains
 from torchgrasp.close.parts import check_parts, convex_parts, read_mesh
 from torchgrasp.close.robot import Robot
-from torchgrasp.close.scene import Setup, open_scene
+from torchgrasp.close.scene import Setup
 from torchgrasp.close.sight import Sight, plant_from_hand
+from torchgrasp.close.simulators import open_scene
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import apply, inverse, rotation_angle
 from torchgrasp.hand.hand import Hand
