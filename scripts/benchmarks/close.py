@@ -13,9 +13,8 @@ from benchmarks.common import Row, write_rows
 from benchmarks.force import bench_force
 from benchmarks.noise import bench_noise
 from benchmarks.success import bench_success
-from benchmarks.workers import bench_workers
 
-SUBJECTS = ("checks", "speed", "ablation", "agreement", "force", "noise", "success", "workers")
+SUBJECTS = ("checks", "speed", "ablation", "agreement", "force", "noise", "success")
 
 
 def close(
@@ -34,9 +33,9 @@ def close(
 
     Args:
         objects: folder with manifest.json and a folder for each object; without it what needs grasps is left out.
-        only: subjects to measure: checks, speed, ablation, agreement, force, noise, success, workers.
+        only: subjects to measure: checks, speed, ablation, agreement, force, noise, success.
         hands: of noise and success; agreement takes both.
-        tries: grasps of each view: the best for noise and workers, else spread over all ranks.
+        tries: grasps of each view: the best for noise, else spread over all ranks.
         draws: errors of the hand's pose for each grasp.
         starts: of the contact planner.
         workers: processes that share the trials.
@@ -56,7 +55,6 @@ def close(
         "force": lambda: bench_force(objects, tries, starts, seed) if objects else [],
         "noise": lambda: bench_noise(objects, hands, tries, draws, starts, seed, workers) if objects else [],
         "success": lambda: bench_success(objects, hands, tries, workers, out.parent / "success") if objects else [],
-        "workers": lambda: bench_workers(objects, tries, starts, seed) if objects else [],
     }
     settings = {"tries": tries, "starts": starts, "threads": threads, "seed": seed, "torch": torch.__version__}
     print(", ".join(f"{name} {value}" for name, value in settings.items()))

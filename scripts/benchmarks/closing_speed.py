@@ -17,7 +17,7 @@ from torchgrasp.objects import GraspObject
 SIMULATED = 5.0
 """Length of a trial [s]."""
 
-TASKS = 12
+TASKS = 48
 """Trials that the processes share."""
 
 
