@@ -8,7 +8,7 @@ from typing import Any
 
 from torchgrasp.close.attempt import PAPER
 from torchgrasp.close.score import share
-from torchgrasp.close.tables import FREE, Cell, controller_cells, difference, threshold_cells, trend
+from torchgrasp.close.tables import FREE, Cell, controller_cells, difference, threshold_cells, trend, trend_over_grasps
 from torchgrasp.files import format_json, write_file
 
 PUBLISHED = {
@@ -40,9 +40,9 @@ def table6(
         seed: of every random draw.
     """
     rows = gather(threshold_cells(objects, hands, only, workers, seed))
-    fall = trend(rows, seed)
-    print(f"fall from the first row to the last: {in_points(fall)}")
-    write(out / "table6.json", rows, {"fall": fall, "seed": seed})
+    fall, here = trend(rows, seed), trend_over_grasps(rows, seed)
+    print(f"fall from the first row to the last: {in_points(fall)}; over grasps of these [{in_interval(here)}]")
+    write(out / "table6.json", rows, {"fall": fall, "fall_over_grasps": here, "seed": seed})
 
 
 def table7(
@@ -101,7 +101,12 @@ def pooled(row: list[Cell]) -> tuple[float, float, float, int]:
 
 def in_points(value: tuple[float, float, float]) -> str:
     """Return a difference of shares and its interval as text."""
-    return f"{100 * value[0]:.1f} points, 95 % interval over objects [{100 * value[1]:.1f}, {100 * value[2]:.1f}]"
+    return f"{100 * value[0]:.1f} points, 95 % interval over objects [{in_interval(value)}]"
+
+
+def in_interval(value: tuple[float, float, float]) -> str:
+    """Return the ends of an interval in points."""
+    return f"{100 * value[1]:.1f}, {100 * value[2]:.1f}"
 
 
 def write(path: Path, rows: list[list[Cell]], more: dict[str, Any]) -> None:

@@ -4,20 +4,20 @@ import numpy as np
 import pytest
 
 from torchgrasp.close import tables
-from torchgrasp.close.tables import THRESHOLDS, Cell, difference, threshold_cells, trend
+from torchgrasp.close.tables import THRESHOLDS, Cell, difference, threshold_cells, trend, trend_over_grasps
 from torchgrasp.errors import Status
 
 
 def cells(row: str, held: dict[str, int], of: int = 10) -> list[Cell]:
     """Return a cell for each object."""
     return [
-        Cell(o, "allegro", row, (Status.OK,) * n + (Status.DROPPED,) * (of - n), (0.0,) * of, 0.01)
+        Cell(o, "allegro", row, (Status.OK,) * n + (Status.DROPPED,) * (of - n), (0.0,) * of, 5, 0.01)
         for o, n in held.items()
     ]
 
 
 def test_a_trial_that_starts_in_the_object_can_be_told_from_one_that_starts_free() -> None:
-    cell = Cell("x", "allegro", "a", (Status.OK, Status.OK, Status.DROPPED), (0.0005, 0.004, 0.0), 0.01)
+    cell = Cell("x", "allegro", "a", (Status.OK, Status.OK, Status.DROPPED), (0.0005, 0.004, 0.0), 1, 0.01)
     assert (cell.held, cell.held_free) == (2, 1)
 
 
@@ -40,6 +40,18 @@ def test_a_trend_is_the_least_squares_line_through_the_shares() -> None:
     assert value == pytest.approx(-slope * (THRESHOLDS[-1] - THRESHOLDS[0]))
     assert low == pytest.approx(value)
     assert high == pytest.approx(value)
+
+
+def test_the_interval_over_grasps_is_that_of_resampled_grasps() -> None:
+    """One object, two grasps in each row: one holds always, the other never; their share is 0, 1/2 or 1."""
+    rows = [cells(row, {"x": 5}) for row in ("0.03", "0.06", "0.10")]
+    value, low, high = trend_over_grasps(rows)
+    weights = np.linalg.lstsq(np.stack([np.ones(3), THRESHOLDS], 1), np.eye(3), rcond=None)[0][1] * -0.07
+    # the shares of the rows are independent, each 0, 1/2, 1 with odds 1 : 2 : 1
+    shares = np.array(np.meshgrid(*[[0.0, 0.5, 0.5, 1.0]] * 3)).reshape(3, -1)
+    exact = np.quantile(weights @ shares, [0.025, 0.975])
+    assert value == pytest.approx(0.0, abs=1e-12)
+    assert [low, high] == pytest.approx(list(exact), abs=0.1)
 
 
 @pytest.mark.sim

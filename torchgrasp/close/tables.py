@@ -61,9 +61,9 @@ RESAMPLES = 10_000
 class Cell(Value):
     """The trials of one object with one hand.
 
-    `row` is what the table compares: a threshold or a controller. `statuses` lists the trials, those of a grasp one
-    after the other; it is empty where nothing was executable. `overlaps` [m] tells how deep the opened hand was in the
-    wrongly placed object or in the table before it closed. `std_m` is the mean over the grasps of their least certain
+    `row` is what the table compares: a threshold or a controller. `statuses` lists the trials, `draws` of each grasp,
+    those of a grasp one after the other; it is empty where nothing was executable. `overlaps` [m] tells how deep the
+    opened hand was in object or table before it closed. `std_m` is the mean over the grasps of their least certain
     contact's standard deviation [m].
     """
 
@@ -72,6 +72,7 @@ class Cell(Value):
     row: str
     statuses: tuple[Status, ...]
     overlaps: tuple[float, ...]
+    draws: int
     std_m: float
 
     @property
@@ -151,8 +152,8 @@ def difference(first: Sequence[Cell], second: Sequence[Cell], seed: int = 0) -> 
     The cells are paired by object and hand. The interval resamples objects, not trials: the trials of one object are
     alike.
 
-    >>> a = [Cell(o, "allegro", "a", (Status.OK, Status.OK), (0.0, 0.0), 0.0) for o in "xyz"]
-    >>> b = [Cell(o, "allegro", "b", (Status.OK, Status.DROPPED), (0.0, 0.0), 0.0) for o in "xyz"]
+    >>> a = [Cell(o, "allegro", "a", (Status.OK, Status.OK), (0.0, 0.0), 1, 0.0) for o in "xyz"]
+    >>> b = [Cell(o, "allegro", "b", (Status.OK, Status.DROPPED), (0.0, 0.0), 1, 0.0) for o in "xyz"]
     >>> difference(a, b)
     (0.5, 0.5, 0.5)
     """
@@ -162,13 +163,31 @@ def difference(first: Sequence[Cell], second: Sequence[Cell], seed: int = 0) -> 
 
 
 def trend(rows: Sequence[Sequence[Cell]], seed: int = 0) -> tuple[float, float, float]:
-    """Return the fall of the held share from the first to the last of `THRESHOLDS`, and its 95 % interval.
+    """Return the fall of the held share from the first to the last of `THRESHOLDS`, and its 95 % interval over objects.
 
     It is the line of least squares through the rows' pooled shares; see `difference` for the interval.
     """
+    return _interval({o: [_of(row, o) for row in rows] for o in {c.object for c in rows[0]}}, _line(), seed)
+
+
+def trend_over_grasps(rows: Sequence[Sequence[Cell]], seed: int = 0) -> tuple[float, float, float]:
+    """Return `trend` with the interval of these very objects: the grasps of each cell are resampled."""
+    generator = np.random.default_rng(seed)
+    shares = []
+    for row in rows:
+        held = np.zeros(RESAMPLES + 1)
+        for cell in row:
+            passed = np.array([status is Status.OK for status in cell.statuses]).reshape(-1, cell.draws).sum(1)
+            drawn = generator.integers(max(len(passed), 1), size=(RESAMPLES, len(passed)))
+            held += np.concatenate([passed[None], passed[drawn]]).sum(1)
+        shares.append(held / max(sum(len(cell.statuses) for cell in row), 1))
+    return _quantiles(np.stack(shares, -1) @ _line())
+
+
+def _line() -> np.ndarray:
+    """Return the weights of the rows' shares that make the fall of the line of least squares through them."""
     centred = np.array(THRESHOLDS) - np.mean(THRESHOLDS)
-    weights = -centred / (centred @ centred) * (THRESHOLDS[-1] - THRESHOLDS[0])
-    return _interval({o: [_of(row, o) for row in rows] for o in {c.object for c in rows[0]}}, weights, seed)
+    return -centred / (centred @ centred) * (THRESHOLDS[-1] - THRESHOLDS[0])
 
 
 def _of(cells: Sequence[Cell], name: str) -> tuple[int, int]:
@@ -183,6 +202,11 @@ def _interval(counts: dict[str, list[tuple[int, int]]], weights: np.ndarray, see
     drawn = np.random.default_rng(seed).integers(len(table), size=(RESAMPLES, len(table)))
     sums = np.concatenate([table.sum(0)[None], table[drawn].sum(1)])
     value = (sums[..., 0] / np.maximum(sums[..., 1], 1)) @ weights
+    return _quantiles(value)
+
+
+def _quantiles(value: np.ndarray) -> tuple[float, float, float]:
+    """Return the first of the values, and the 2.5 % and 97.5 % quantiles of the others."""
     low, high = np.quantile(value[1:], [0.025, 0.975])
     return float(value[0]), float(low), float(high)
 
@@ -207,9 +231,8 @@ def _cells(
     tasks = [(place, name, hand, rows, seed, *effort) for hand in hands for place, name in named]
     for task, found in zip(tasks, run_tasks(_fill, tasks, workers, CELL_SECONDS), strict=True):
         if isinstance(found, Status):
-            found = tuple(
-                Cell(task[1], task[2], row[0], (found,) * effort[0], (0.0,) * effort[0], math.nan) for row in rows
-            )
+            lost, free = (found,) * effort[0], (0.0,) * effort[0]
+            found = tuple(Cell(task[1], task[2], row[0], lost, free, 1, math.nan) for row in rows)
         yield found
 
 
@@ -243,7 +266,7 @@ def _fill(
         stds = [float(grasp.contacts.std_m.amax()) for grasp in grasps]
         std_m = sum(stds) / len(stds) if stds else math.nan
         statuses, overlaps = tuple(r.status for r in results), tuple(r.start_overlap for r in results)
-        cells.append(Cell(label, hand_name, row, statuses, overlaps, std_m))
+        cells.append(Cell(label, hand_name, row, statuses, overlaps, draws, std_m))
     return tuple(cells)
 
 
