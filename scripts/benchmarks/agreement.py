@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from sklearn.metrics import cohen_kappa_score, confusion_matrix
 
 from benchmarks.common import Row
 from torchgrasp import load_hand
@@ -14,7 +15,7 @@ from torchgrasp.close.evaluate import evaluate
 from torchgrasp.close.score import ViewScore, share
 
 TESTS = ("dexgraspbench", "dexgraspbench-hard", "pose-noise", "paper")
-"""Three that pull and one that lifts, the last two with an error of the hand's pose."""
+"""Three that pull and one that lifts, the last two with an error of where hand or object stand."""
 
 SIMULATORS = ("sapien", "mujoco")
 
@@ -57,28 +58,17 @@ def bench_agreement(objects: Path, tries: int, starts: int, seed: int, workers: 
     return [*rows, agreement_row("all tests", cases), speed_row(cases)]
 
 
-def kappa(table: np.ndarray) -> float:
-    """Return Cohen's kappa of a table of counts (2, 2): agreement beyond what equal shares of passes would give.
-
-    >>> kappa(np.array([[20, 5], [10, 15]]))
-    0.4
-    """
-    shares = table / max(table.sum(), 1)
-    chance = float(shares.sum(0) @ shares.sum(1))
-    return round((float(np.trace(shares)) - chance) / (1 - chance), 6) if chance < 1 else 1.0
-
-
 def agreement_row(test: str, cases: list[Case]) -> Row:
     """Return the share of equal verdicts, and which way the others went."""
-    table = np.zeros((2, 2), int)
-    for case in cases:
-        table[int(not case.sapien.passed), int(not case.mujoco.passed)] += 1
+    verdicts = [[case.sapien.passed for case in cases], [case.mujoco.passed for case in cases]]
+    labels = [True, False]
+    table, kappa = confusion_matrix(*verdicts, labels=labels), float(cohen_kappa_score(*verdicts, labels=labels))
     found, low, high, count = share(int(np.trace(table)), int(table.sum()))
     measured = (
-        f"{found:.1%} of {count} [{low:.1%}, {high:.1%}], kappa {kappa(table):.2f}; both pass {table[0, 0]}, "
+        f"{found:.1%} of {count} [{low:.1%}, {high:.1%}], kappa {kappa:.2f}; both pass {table[0, 0]}, "
         f"both fail {table[1, 1]}, SAPIEN alone passes {table[0, 1]}, MuJoCo alone {table[1, 0]}"
     )
-    numbers = {"share": found, "low": low, "high": high, "count": count, "table": table.tolist(), "kappa": kappa(table)}
+    numbers = {"share": found, "low": low, "high": high, "count": count, "table": table.tolist(), "kappa": kappa}
     numbers["unequal"] = [_unequal(case) for case in cases if case.sapien.passed != case.mujoco.passed]
     return Row(f"agreement of SAPIEN and MuJoCo, {test}", f">= {BAR:.0%}", measured, found >= BAR, numbers)
 

@@ -9,7 +9,7 @@ from benchmarks.ablation import bench_ablation
 from benchmarks.agreement import bench_agreement
 from benchmarks.checks import bench_checks
 from benchmarks.closing_speed import bench_closing_speed
-from benchmarks.common import Row, write_rows
+from benchmarks.common import Row, measure
 from benchmarks.force import bench_force
 from benchmarks.noise import bench_noise
 from benchmarks.success import bench_success
@@ -43,9 +43,6 @@ def close(
         seed: of every draw.
         out: where the numbers are written as JSON.
     """
-    unknown = sorted(set(only) - set(SUBJECTS))
-    if unknown:
-        raise SystemExit(f"only: {unknown} are no subjects; {', '.join(SUBJECTS)} are")
     torch.set_num_threads(threads)
     subjects: dict[str, Callable[[], list[Row]]] = {
         "checks": bench_checks,
@@ -57,13 +54,4 @@ def close(
         "success": lambda: bench_success(objects, hands, tries, workers, out.parent / "success") if objects else [],
     }
     settings = {"tries": tries, "starts": starts, "threads": threads, "seed": seed, "torch": torch.__version__}
-    print(", ".join(f"{name} {value}" for name, value in settings.items()))
-    rows: list[Row] = []
-    for name in SUBJECTS:
-        if name in only:
-            found = subjects[name]()
-            print(*found, sep="\n", flush=True)
-            rows += found
-    met, missed = (sum(row.met is verdict for row in rows) for verdict in (True, False))
-    print(f"{met} bars met, {missed} missed, {len(rows) - met - missed} rows without one")
-    write_rows(out, "close", settings, rows)
+    measure("close", subjects, only, settings, out)

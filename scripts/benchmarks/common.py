@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +53,29 @@ def peak_mib() -> float | None:
         return None
     line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
     return int(line.split()[1]) / 1024
+
+
+def measure(
+    bench: str,
+    subjects: Mapping[str, Callable[[], list[Row]]],
+    only: Sequence[str],
+    settings: dict[str, Any],
+    out: Path,
+) -> None:
+    """Measure the subjects asked for, print their rows as they are there, and write all of them as JSON."""
+    unknown = sorted(set(only) - set(subjects))
+    if unknown:
+        raise SystemExit(f"only: {unknown} are no subjects; {', '.join(subjects)} are")
+    print(", ".join(f"{name} {value}" for name, value in settings.items()))
+    rows: list[Row] = []
+    for name, subject in subjects.items():
+        if name in only:
+            found = subject()
+            print(*found, sep="\n", flush=True)
+            rows += found
+    met, missed = (sum(row.met is verdict for row in rows) for verdict in (True, False))
+    print(f"{met} bars met, {missed} missed, {len(rows) - met - missed} rows without one")
+    write_rows(out, bench, settings, rows)
 
 
 def write_rows(out: Path, bench: str, settings: dict[str, Any], rows: Sequence[Row]) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.common import Row, write_rows
+from benchmarks.common import Row, measure
 from benchmarks.components import bench_bic
 from benchmarks.executable import bench_planned
 from benchmarks.kinematics import bench_collision, bench_fk, bench_samples
@@ -43,9 +43,6 @@ def hand(
         quick: a tenth of everything.
         out: where the numbers are written as JSON, and beside it the choice of components as a picture.
     """
-    unknown = sorted(set(only) - set(SUBJECTS))
-    if unknown:
-        raise SystemExit(f"only: {unknown} are no subjects; {', '.join(SUBJECTS)} are")
     torch.set_num_threads(threads)
     if quick:
         codes, peers, samples, queries, starts = (x // 10 for x in (codes, peers, samples, queries, starts))
@@ -69,13 +66,4 @@ def hand(
         "starts": starts,
     }
     settings |= {"seed": seed, "torch": torch.__version__}
-    print(", ".join(f"{name} {value}" for name, value in settings.items()))
-    rows: list[Row] = []
-    for name in SUBJECTS:
-        if name in only:
-            found = subjects[name]()
-            print(*found, sep="\n", flush=True)
-            rows += found
-    met, missed = (sum(row.met is verdict for row in rows) for verdict in (True, False))
-    print(f"{met} bars met, {missed} missed, {len(rows) - met - missed} rows without one")
-    write_rows(out, "hand", settings, rows)
+    measure("hand", subjects, only, settings, out)

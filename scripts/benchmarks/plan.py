@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.common import Row, least_seconds, write_rows
+from benchmarks.common import Row, least_seconds, measure
 from benchmarks.executable import bench_executable
 from benchmarks.pace import bench_anytime, bench_growth, bench_memory
 from benchmarks.tries import POINTS, bench_peers
@@ -42,9 +42,6 @@ def plan(
         quick: a tenth of starts and tries.
         out: where the numbers are written as JSON, and beside it growth and time budget as pictures.
     """
-    unknown = sorted(set(only) - set(SUBJECTS))
-    if unknown:
-        raise SystemExit(f"only: {unknown} are no subjects; {', '.join(SUBJECTS)} are")
     torch.set_num_threads(threads)
     starts, tries = (starts // 10, tries // 10) if quick else (starts, tries)
     views = [(name, view, cloud, mesh) for name, view, cloud, mesh in read_views(objects)]
@@ -61,16 +58,7 @@ def plan(
     }
     settings = {"threads": threads, "clock": "processor" if threads == 1 else "wall", "starts": starts, "tries": tries}
     settings |= {"seed": seed, "torch": torch.__version__}
-    print(", ".join(f"{name} {value}" for name, value in settings.items()))
-    rows: list[Row] = []
-    for name in SUBJECTS:
-        if name in only:
-            found = subjects[name]()
-            print(*found, sep="\n", flush=True)
-            rows += found
-    met, missed = (sum(row.met is verdict for row in rows) for verdict in (True, False))
-    print(f"{met} bars met, {missed} missed, {len(rows) - met - missed} rows without one")
-    write_rows(out, "plan", settings, rows)
+    measure("plan", subjects, only, settings, out)
 
 
 def bench_call(cloud: PointCloud, starts: int) -> list[Row]:

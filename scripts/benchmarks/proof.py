@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from benchmarks.common import Row, least_seconds, write_rows
+from benchmarks.common import Row, least_seconds, measure
 from benchmarks.rational import exact_margin, proves_margin_above, proves_margin_below, wrench_matrix
 from benchmarks.redraw import redrawn_closure
 from torchgrasp.errors import Status
@@ -60,13 +60,8 @@ def proof(
         "probability": lambda: bench_probability(grasps // 10, starts, seed),
         "objects": lambda: bench_objects(objects, starts, seed) if objects else [],
     }
-    rows: list[Row] = []
-    for name in SUBJECTS:
-        if name in only:
-            found = subjects[name]()
-            print(*found, sep="\n", flush=True)
-            rows += found
-    write_rows(out, "proof", {"grasps": grasps, "starts": starts, "seed": seed, "threads": 1}, rows)
+    settings = {"grasps": grasps, "starts": starts, "seed": seed, "threads": 1}
+    measure("proof", subjects, only, settings, out)
 
 
 # ------------------------------------------------------------------------------------------------- certificates

@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from tqdm import tqdm
 
-from benchmarks.common import Row, least_seconds, write_rows
+from benchmarks.common import Row, least_seconds, measure
 from benchmarks.exact import bench_cholesky, bench_laws, bench_refusals, bench_selection, bench_update
 from benchmarks.inputs import bench_inputs
 from benchmarks.speed import bench_growth, bench_memory, bench_queries, bench_raw
@@ -57,9 +57,6 @@ def shape(
         quick: a hundredth of the clouds and a tenth of the queries.
         out: where the numbers are written as JSON, and beside it the growth as a picture.
     """
-    unknown = sorted(set(only) - set(SUBJECTS))
-    if unknown:
-        raise SystemExit(f"only: {unknown} are no subjects; {', '.join(SUBJECTS)} are")
     torch.set_num_threads(threads)
     clouds, queries = (clouds // 100, queries // 10) if quick else (clouds, queries)
     subjects: dict[str, Callable[[], list[Row]]] = {
@@ -84,16 +81,7 @@ def shape(
         "seed": seed,
         "torch": torch.__version__,
     }
-    print(", ".join(f"{name} {value}" for name, value in settings.items()))
-    rows: list[Row] = []
-    for name in SUBJECTS:
-        if name in only:
-            found = subjects[name]()
-            print(*found, sep="\n", flush=True)
-            rows += found
-    met, missed = (sum(row.met is verdict for row in rows) for verdict in (True, False))
-    print(f"{met} bars met, {missed} missed, {len(rows) - met - missed} rows without one")
-    write_rows(out, "shape", settings, rows)
+    measure("shape", subjects, only, settings, out)
 
 
 def bench_objects(objects: Path) -> list[Row]:
