@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from torchgrasp.close.attempt import PAPER
-from torchgrasp.close.score import share
-from torchgrasp.close.tables import FREE, Cell, controller_cells, difference, threshold_cells, trend, trend_over_grasps
 from torchgrasp.files import format_json, write_file
+from torchgrasp.trials.attempt import PAPER
+from torchgrasp.trials.score import share
+from torchgrasp.trials.tables import FREE, Cell, controller_cells, difference, threshold_cells, trend, trend_over_grasps
 
 PUBLISHED = {
     "0.03": "40 63 57",

@@ -30,16 +30,16 @@ from torchgrasp import (
     plan_grasps,
 )
 from torchgrasp.base import Batch
-from torchgrasp.close.disturb import Disturbed, Pull, disturb_grasp
 from torchgrasp.close.impedance import Impedance
 from torchgrasp.close.law import closing_gains
-from torchgrasp.close.pool import run_tasks
 from torchgrasp.close.stable import StableGrasps, fit_stable, lengths_of, stable_path, state_of
 from torchgrasp.errors import GraspError
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.frames import rigid, rotation_from_vector
 from torchgrasp.hand.identity import describe_hand
 from torchgrasp.linalg import unit
+from torchgrasp.trials.disturb import Disturbed, Pull, disturb_grasp
+from torchgrasp.trials.pool import run_tasks
 
 SIZES = {
     "box": [(0.04, 0.06, 0.13), (0.05, 0.05, 0.05), (0.03, 0.09, 0.16), (0.07, 0.07, 0.10), (0.06, 0.10, 0.04)],

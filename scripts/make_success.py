@@ -46,7 +46,7 @@ def main(
         "weights": dict(zip(FEATURES, weights, strict=True)),
         "bias": bias,
         "fitted_on": f"{len(trials.passed)} trials of {bodies} objects with {', '.join(hands)}, {share:.0%} passed",
-        "trial": "torchgrasp.close.protocol, dexgraspbench and dexgraspbench-hard, open loop with 7 N",
+        "trial": "torchgrasp.trials.protocol, dexgraspbench and dexgraspbench-hard, open loop with 7 N",
         "brier_on_objects_not_fitted_on": round(brier(unseen, trials.passed), 4),
         "brier_of_the_base_rates": round(brier(base, trials.passed), 4),
     }

@@ -34,7 +34,7 @@ from torchgrasp.hand.inverse import reach_contacts
 from torchgrasp.pipeline import plan_grasps
 from torchgrasp.values import load_grasps
 from torchgrasp.close.law import closing_gains
-from torchgrasp.close.trial import close_hand
+from torchgrasp.trials.trial import close_hand
 
 __version__ = "0.1.0"
 

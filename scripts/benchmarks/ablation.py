@@ -8,13 +8,13 @@ import trimesh
 
 from benchmarks.common import Row
 from torchgrasp import Status, TrialSpec, close_hand, fit_shape, load_hand, plan_grasps
-from torchgrasp.close.attempt import PAPER, draw_error
-from torchgrasp.close.evaluate import choose_rows
-from torchgrasp.close.parts import convex_parts
-from torchgrasp.close.pool import run_tasks
-from torchgrasp.close.score import share
 from torchgrasp.shape.calibrate import list_views, object_scale, read_view
+from torchgrasp.simulate.parts import convex_parts
 from torchgrasp.specs import ContactSpec
+from torchgrasp.trials.attempt import PAPER, draw_error
+from torchgrasp.trials.evaluate import choose_rows
+from torchgrasp.trials.pool import run_tasks
+from torchgrasp.trials.score import share
 
 PARTS = {
     "open-loop squeeze": (TrialSpec(controller="open_loop"), False),

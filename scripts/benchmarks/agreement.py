@@ -10,9 +10,9 @@ from sklearn.metrics import cohen_kappa_score, confusion_matrix
 
 from benchmarks.common import Row
 from torchgrasp import load_hand
-from torchgrasp.close.attempt import PROTOCOLS, Attempt, Execution
-from torchgrasp.close.evaluate import evaluate
-from torchgrasp.close.score import ViewScore, share
+from torchgrasp.trials.attempt import PROTOCOLS, Attempt, Execution
+from torchgrasp.trials.evaluate import evaluate
+from torchgrasp.trials.score import ViewScore, share
 
 TESTS = ("dexgraspbench", "dexgraspbench-hard", "pose-noise", "paper")
 """Three that pull and one that lifts, the last two with an error of where hand or object stand."""

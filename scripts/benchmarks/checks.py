@@ -26,16 +26,16 @@ from torchgrasp import (
     plan_grasps,
 )
 from torchgrasp.close.control import GraspController
-from torchgrasp.close.mjcf import OBJECT
-from torchgrasp.close.mujoco_scene import MujocoScene
-from torchgrasp.close.parts import convex_parts
-from torchgrasp.close.pool import run_tasks
-from torchgrasp.close.robot import Robot
-from torchgrasp.close.sapien_scene import SapienScene
-from torchgrasp.close.scene import Scene, Setup
 from torchgrasp.close.sight import plant_from_hand
-from torchgrasp.close.simulators import open_scene
 from torchgrasp.hand.hand import Actuator
+from torchgrasp.simulate.mjcf import OBJECT
+from torchgrasp.simulate.mujoco_scene import MujocoScene
+from torchgrasp.simulate.parts import convex_parts
+from torchgrasp.simulate.robot import Robot
+from torchgrasp.simulate.sapien_scene import SapienScene
+from torchgrasp.simulate.scene import Scene, Setup
+from torchgrasp.simulate.simulators import open_scene
+from torchgrasp.trials.pool import run_tasks
 
 SIMULATORS = ("sapien", "mujoco")
 FRICTION, PUSH, SIZE, CONE = 0.8, 5.0, 0.05, 0.02

@@ -9,10 +9,10 @@ from benchmarks.common import Row, least_seconds
 from torchgrasp import ContactSpec, TrialSpec, close_hand, load_grasps, load_hand, load_object, plan_grasps
 from torchgrasp.close.control import GraspController
 from torchgrasp.close.law import closing_gains
-from torchgrasp.close.pool import run_tasks
 from torchgrasp.close.sensor import untouched
 from torchgrasp.close.sight import plant_from_hand, sight_from_joints
 from torchgrasp.objects import GraspObject
+from torchgrasp.trials.pool import run_tasks
 
 SIMULATED = 5.0
 """Length of a trial [s]."""

@@ -11,15 +11,15 @@ import torch
 
 from benchmarks.common import Row
 from torchgrasp import ContactSpec, Grasps, Hand, Status, load_hand, plan_grasps
-from torchgrasp.close.disturb import Disturbed, Pull, disturb_grasp
-from torchgrasp.close.evaluate import choose_rows
 from torchgrasp.close.hold import Squeeze
 from torchgrasp.close.impedance import GRASP_STIFFNESS, Impedance
 from torchgrasp.close.law import closing_gains
-from torchgrasp.close.parts import convex_parts
 from torchgrasp.close.stable import StableGrasps, lengths_of, load_stable, state_of
 from torchgrasp.linalg import unit
 from torchgrasp.shape.calibrate import read_views
+from torchgrasp.simulate.parts import convex_parts
+from torchgrasp.trials.disturb import Disturbed, Pull, disturb_grasp
+from torchgrasp.trials.evaluate import choose_rows
 
 if TYPE_CHECKING:
     pass

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from benchmarks.common import Row
 from torchgrasp import load_hand
-from torchgrasp.close.attempt import PROTOCOLS, Execution
-from torchgrasp.close.evaluate import evaluate
-from torchgrasp.close.protocol import PullProtocol
-from torchgrasp.close.score import share
+from torchgrasp.trials.attempt import PROTOCOLS, Execution
+from torchgrasp.trials.evaluate import evaluate
+from torchgrasp.trials.protocol import PullProtocol
+from torchgrasp.trials.score import share
 
 MOST_LOST = 0.10
 """Of the share that passes without errors."""

@@ -15,9 +15,6 @@ from sklearn.preprocessing import StandardScaler
 from tqdm import tqdm
 
 from benchmarks.common import Row
-from torchgrasp.close.evaluate import evaluate
-from torchgrasp.close.protocol import PROTOCOLS
-from torchgrasp.close.score import ViewScore, share
 from torchgrasp.cloud.camera import partial_view
 from torchgrasp.cloud.read import save_cloud
 from torchgrasp.files import format_json, write_atomically, write_file
@@ -28,6 +25,9 @@ from torchgrasp.pipeline import closure_of
 from torchgrasp.shape.calibrate import list_views, read_view
 from torchgrasp.shape.support import fit_shape
 from torchgrasp.shape.surface import extract_surface
+from torchgrasp.trials.evaluate import evaluate
+from torchgrasp.trials.protocol import PROTOCOLS
+from torchgrasp.trials.score import ViewScore, share
 from torchgrasp.values import load_grasps
 
 TESTS = ("dexgraspbench", "dexgraspbench-hard")

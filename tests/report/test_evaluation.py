@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from torchgrasp.close.score import share
 from torchgrasp.report.evaluation import WIDTH, bar, format_evaluation, write_evaluation
+from torchgrasp.trials.score import share
 
-SCORES = runpy.run_path(str(Path(__file__).parents[1] / "close" / "test_evaluate.py"))["SCORES"]
+SCORES = runpy.run_path(str(Path(__file__).parents[1] / "trials" / "test_evaluate.py"))["SCORES"]
 
 
 def test_page_shows_shares_objects_and_reasons(tmp_path):

@@ -6,11 +6,11 @@ from typing import Annotated, Literal
 import tyro
 
 from torchgrasp.cli.common import naming
-from torchgrasp.close.keyframes import format_keyframes
-from torchgrasp.close.replay import format_grasps
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.files import write_file
 from torchgrasp.hand.load import load_hand
+from torchgrasp.simulate.keyframes import format_keyframes
+from torchgrasp.simulate.replay import format_grasps
 from torchgrasp.values import load_grasps
 
 

@@ -14,8 +14,6 @@ import tyro
 from tqdm import tqdm
 
 from torchgrasp.cli.common import check_folder, check_seed, check_table, naming, table_height
-from torchgrasp.close.parts import read_mesh
-from torchgrasp.close.trial import close_hand
 from torchgrasp.cloud.read import read_cloud
 from torchgrasp.errors import BadArgument, MissingExtra
 from torchgrasp.files import sha256
@@ -25,7 +23,9 @@ from torchgrasp.pipeline import Mode, plan_grasps
 from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows, write_report
 from torchgrasp.report.run import Run, Stage, verdict
 from torchgrasp.shape.surface import extract_surface
+from torchgrasp.simulate.parts import read_mesh
 from torchgrasp.specs import ContactSpec, Simulator, TrialSpec
+from torchgrasp.trials.trial import close_hand
 from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:

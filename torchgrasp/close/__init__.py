@@ -1,1 +1,1 @@
-"""Closing on it: the compliant law, the desired forces, and a simulated trial."""
+"""Closing on it: the compliant law, the desired forces and the controllers, without a simulator."""

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchgrasp.close.breakaway import Breakaway
 from torchgrasp.close.sight import plant_from_hand
+from torchgrasp.simulate.breakaway import Breakaway
 
-TRIAL = runpy.run_path(str(Path(__file__).with_name("test_trial.py")))
+TRIAL = runpy.run_path(str(Path(__file__).parents[1] / "trials" / "test_trial.py"))
 
 
 def barrett():

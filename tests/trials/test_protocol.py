@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from torchgrasp.close.law import joint_stiffness
-from torchgrasp.close.protocol import PROTOCOLS, check_test, pull_grasp
 from torchgrasp.close.squeeze import squeeze_joints
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import apply, inverse
+from torchgrasp.trials.protocol import PROTOCOLS, check_test, pull_grasp
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 TRIAL = runpy.run_path(str(Path(__file__).with_name("test_trial.py")))

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from torchgrasp.close import tables
-from torchgrasp.close.tables import THRESHOLDS, Cell, difference, threshold_cells, trend, trend_over_grasps
 from torchgrasp.errors import Status
+from torchgrasp.trials import tables
+from torchgrasp.trials.tables import THRESHOLDS, Cell, difference, threshold_cells, trend, trend_over_grasps
 
 
 def cells(row: str, held: dict[str, int], of: int = 10) -> list[Cell]:

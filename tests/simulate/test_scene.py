@@ -8,9 +8,9 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from torchgrasp.close.lift import LIFT_JOINT, euler_from_rotation, lifted_urdf
 from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.load import load_hand
+from torchgrasp.simulate.lift import LIFT_JOINT, euler_from_rotation, lifted_urdf
 
 
 def test_euler_angles_rebuild_the_rotation():
@@ -43,8 +43,8 @@ SIMULATORS = ["sapien", "mujoco"]
 def build(name, mesh, simulator="sapien", **options):
     """A scene with the hand half a metre above the object."""
     pytest.importorskip(simulator)
-    from torchgrasp.close.scene import Setup
-    from torchgrasp.close.simulators import open_scene
+    from torchgrasp.simulate.scene import Setup
+    from torchgrasp.simulate.simulators import open_scene
 
     hand = load_hand(name)
     joints = 0.5 * (hand.lower + hand.upper)
@@ -136,9 +136,9 @@ BODY = """<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iy
 @pytest.mark.parametrize("simulator", SIMULATORS)
 def test_sliding_joints_move_their_tips_along_their_axes(tmp_path, simulator):
     pytest.importorskip(simulator)
-    from torchgrasp.close.scene import Setup
-    from torchgrasp.close.simulators import open_scene
     from torchgrasp.hand.hand import Actuator
+    from torchgrasp.simulate.scene import Setup
+    from torchgrasp.simulate.simulators import open_scene
 
     kinds = [("prismatic", "1 0 0"), ("prismatic", "0 0 1"), ("revolute", "0 1 0")]
     fingers = "".join(SLIDER.format(k=k, kind=d, axis=x, body=BODY) for k, (d, x) in enumerate(kinds, start=1))
@@ -194,8 +194,8 @@ def test_a_force_pulls_at_the_mass_centre_and_the_lift_follows_a_speed(simulator
 @pytest.mark.parametrize("simulator", SIMULATORS)
 def test_joints_without_a_drive_are_named(simulator):
     pytest.importorskip(simulator)
-    from torchgrasp.close.scene import Setup
-    from torchgrasp.close.simulators import open_scene
+    from torchgrasp.simulate.scene import Setup
+    from torchgrasp.simulate.simulators import open_scene
 
     mesh, hand = standing(), load_hand("barrett")
     setup = Setup(hand.urdf_path, np.eye(4), {}, hand.actuators, hand.tip_links, mesh, [mesh], 0.1)

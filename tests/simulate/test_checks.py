@@ -14,7 +14,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore"),
     pytest.mark.parametrize("simulator", ["sapien", "mujoco"]),
 ]
-TRIAL = runpy.run_path(str(Path(__file__).with_name("test_trial.py")))
+TRIAL = runpy.run_path(str(Path(__file__).parents[1] / "trials" / "test_trial.py"))
 pinch, cylinder = TRIAL["pinch"], TRIAL["cylinder"]
 
 

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from torchgrasp.close.misplace import draw_errors, draw_places, error_of_place
 from torchgrasp.frames import apply, inverse, rigid, rotation_angle, rotation_from_vector
+from torchgrasp.trials.misplace import draw_errors, draw_places, error_of_place
 
 
 def test_errors_of_the_pose_stay_within_the_protocol_s():

@@ -11,11 +11,11 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from torchgrasp.close.lift import LIFT_DRIVE, LIFT_JOINT
-from torchgrasp.close.scene import ARMATURE, Setup, check_drives
 from torchgrasp.frames import rotation_from_rpy
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.urdf import Link, Urdf, read_urdf
+from torchgrasp.simulate.lift import LIFT_DRIVE, LIFT_JOINT
+from torchgrasp.simulate.scene import ARMATURE, Setup, check_drives
 
 OBJECT, TABLE = "torchgrasp_object", "torchgrasp_table"
 """Names of the object (its body and the joint by which it floats) and of the table."""

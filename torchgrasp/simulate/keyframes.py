@@ -5,11 +5,11 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from torchgrasp.close.mjcf import add_drive, add_links
-from torchgrasp.close.replay import quaternion
 from torchgrasp.close.squeeze import squeeze
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
+from torchgrasp.simulate.mjcf import add_drive, add_links
+from torchgrasp.simulate.replay import quaternion
 from torchgrasp.values import Grasps
 
 FREE = "hand"

@@ -14,15 +14,15 @@ from torch import Tensor
 from torchgrasp.close.belief import Belief
 from torchgrasp.close.control import GraspController
 from torchgrasp.close.law import closing_gains
-from torchgrasp.close.parts import check_parts, convex_parts, read_mesh
-from torchgrasp.close.robot import Robot
-from torchgrasp.close.scene import Setup
 from torchgrasp.close.sight import Sight, plant_from_hand
-from torchgrasp.close.simulators import open_scene
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import apply, inverse, rotation_angle
 from torchgrasp.hand.hand import Hand
 from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.simulate.parts import check_parts, convex_parts, read_mesh
+from torchgrasp.simulate.robot import Robot
+from torchgrasp.simulate.scene import Setup
+from torchgrasp.simulate.simulators import open_scene
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import ClosingGains, ClosureResult, Grasps
 

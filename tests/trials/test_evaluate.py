@@ -11,12 +11,12 @@ import pytest
 import trimesh
 
 from torchgrasp import cli
-from torchgrasp.close.attempt import PROTOCOLS, Attempt, Execution, LiftProtocol, attempt_grasp, find_protocol
-from torchgrasp.close.evaluate import choose_rows, evaluate
-from torchgrasp.close.score import STAGES, ViewScore, share, summarise
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.hand.load import load_hand
 from torchgrasp.specs import TrialSpec
+from torchgrasp.trials.attempt import PROTOCOLS, Attempt, Execution, LiftProtocol, attempt_grasp, find_protocol
+from torchgrasp.trials.evaluate import choose_rows, evaluate
+from torchgrasp.trials.score import STAGES, ViewScore, share, summarise
 from torchgrasp.values import load_grasps
 
 GOOD = Attempt(0, 0, True, Status.OK, 0.01, 0.1, 4.0, 0.002, 1.0)

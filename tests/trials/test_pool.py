@@ -9,8 +9,8 @@ import time
 import pytest
 import torch
 
-from torchgrasp.close.pool import run_tasks
 from torchgrasp.errors import BadArgument, Status
+from torchgrasp.trials.pool import run_tasks
 
 pytest.importorskip("pebble")
 
@@ -65,7 +65,7 @@ def test_bad_arguments_are_named_at_once():
 
 SCRIPT = """
 import multiprocessing, sys, time
-from torchgrasp.close.pool import run_tasks
+from torchgrasp.trials.pool import run_tasks
 
 if __name__ == "__main__":
     results = run_tasks(time.sleep, [(0,), (600,), (600,)], workers=2)

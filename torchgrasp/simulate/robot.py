@@ -5,11 +5,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.close.breakaway import Breakaway
-from torchgrasp.close.scene import Scene
 from torchgrasp.close.sensor import Press, sense, untouched
 from torchgrasp.close.sight import Plant, Sight
 from torchgrasp.hand.hand import Hand
+from torchgrasp.simulate.breakaway import Breakaway
+from torchgrasp.simulate.scene import Scene
 
 
 class Robot:

@@ -16,11 +16,6 @@ import numpy as np
 import torch
 
 from torchgrasp.base import Value
-from torchgrasp.close.attempt import PAPER
-from torchgrasp.close.misplace import draw_places, error_of_place
-from torchgrasp.close.parts import convex_parts, read_mesh
-from torchgrasp.close.pool import run_tasks
-from torchgrasp.close.trial import close_hand
 from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
@@ -28,7 +23,12 @@ from torchgrasp.objects import list_objects, load_object
 from torchgrasp.pipeline import plan_grasps
 from torchgrasp.shape.calibrate import list_views, object_scale, read_view
 from torchgrasp.shape.support import fit_shape
+from torchgrasp.simulate.parts import convex_parts, read_mesh
 from torchgrasp.specs import ClosingMode, ContactSpec, HoldingMode
+from torchgrasp.trials.attempt import PAPER
+from torchgrasp.trials.misplace import draw_places, error_of_place
+from torchgrasp.trials.pool import run_tasks
+from torchgrasp.trials.trial import close_hand
 from torchgrasp.values import Grasps, PointCloud
 
 if TYPE_CHECKING:

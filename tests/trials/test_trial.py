@@ -70,7 +70,7 @@ def pinch(name):
 
 def close(name, mesh=None, spec=None, **options):
     pytest.importorskip("sapien")
-    from torchgrasp.close.trial import close_hand
+    from torchgrasp.trials.trial import close_hand
 
     hand, grasp = pinch(name)
     return close_hand(grasp, hand, cylinder() if mesh is None else mesh, spec, **options)
@@ -140,11 +140,11 @@ def test_all_a_fingertip_exerts_is_felt_friction_included():
     pytest.importorskip("sapien")
     from torchgrasp.close.control import GraspController
     from torchgrasp.close.law import closing_gains
-    from torchgrasp.close.parts import convex_parts
-    from torchgrasp.close.robot import Robot
-    from torchgrasp.close.scene import Setup
     from torchgrasp.close.sight import plant_from_hand, sight_from_joints
-    from torchgrasp.close.simulators import open_scene
+    from torchgrasp.simulate.parts import convex_parts
+    from torchgrasp.simulate.robot import Robot
+    from torchgrasp.simulate.scene import Setup
+    from torchgrasp.simulate.simulators import open_scene
 
     hand, grasp = pinch("allegro")
     start = {name: float(q) for name, q in hand.expand(grasp.pregrasp[0]).items()}
@@ -192,7 +192,7 @@ def test_too_little_friction_leaves_the_object_behind():
 
 
 def test_bad_arguments_are_refused():
-    from torchgrasp.close.trial import close_hand
+    from torchgrasp.trials.trial import close_hand
 
     hand, grasp = pinch("allegro")
     with pytest.raises(BadArgument, match="grasps: found 0 rows"):

@@ -1,6 +1,6 @@
 """The simulators of a scene, by name; each is loaded when it is asked for."""
 
-from torchgrasp.close.scene import Scene, Setup
+from torchgrasp.simulate.scene import Scene, Setup
 from torchgrasp.specs import check_simulator
 
 
@@ -14,9 +14,9 @@ def open_scene(setup: Setup, simulator: str = "sapien") -> Scene:
     """
     check_simulator(simulator)
     if simulator == "mujoco":
-        from torchgrasp.close.mujoco_scene import MujocoScene
+        from torchgrasp.simulate.mujoco_scene import MujocoScene
 
         return MujocoScene(setup)
-    from torchgrasp.close.sapien_scene import SapienScene
+    from torchgrasp.simulate.sapien_scene import SapienScene
 
     return SapienScene(setup)

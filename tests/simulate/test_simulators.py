@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from torchgrasp.close.protocol import PROTOCOLS, pull_grasp
-from torchgrasp.close.trial import close_hand
 from torchgrasp.errors import Status
+from torchgrasp.trials.protocol import PROTOCOLS, pull_grasp
+from torchgrasp.trials.trial import close_hand
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
-TRIAL = runpy.run_path(str(Path(__file__).with_name("test_trial.py")))
+TRIAL = runpy.run_path(str(Path(__file__).parents[1] / "trials" / "test_trial.py"))
 pinch, cylinder, close, digest = (TRIAL[name] for name in ("pinch", "cylinder", "close", "digest"))
 QUICK = dataclasses.replace(TRIAL["QUICK"], simulator="mujoco")
 PULL = dataclasses.replace(PROTOCOLS["dexgraspbench"], seconds=0.2, mass=0.05)
@@ -98,8 +98,8 @@ def test_the_scene_as_mjcf_is_a_model_of_its_own():
     """What is exported opens without this library, and weighs what hand and object weigh."""
     import mujoco
 
-    from torchgrasp.close.mjcf import scene_mjcf
-    from torchgrasp.close.scene import Setup
+    from torchgrasp.simulate.mjcf import scene_mjcf
+    from torchgrasp.simulate.scene import Setup
 
     hand, grasp = pinch("allegro")
     start = {k: float(v) for k, v in hand.expand(grasp.pregrasp[0]).items()}

@@ -4,12 +4,12 @@ import functools
 
 import pytest
 import torch
+from tests.trials.test_trial import cylinder, pinch
 
-from tests.close.test_trial import cylinder, pinch
-from torchgrasp.close.disturb import Disturbed, Pull, disturb_grasp
 from torchgrasp.close.impedance import GRASP_STIFFNESS, Impedance
 from torchgrasp.close.law import closing_gains
 from torchgrasp.close.stable import lengths_of, load_stable, state_of
+from torchgrasp.trials.disturb import Disturbed, Pull, disturb_grasp
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 

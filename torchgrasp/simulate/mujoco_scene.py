@@ -4,11 +4,11 @@ from typing import Any
 
 import numpy as np
 
-from torchgrasp.close.lift import LIFT_DRIVE, LIFT_JOINT
-from torchgrasp.close.mjcf import OBJECT, TABLE, scene_mjcf
-from torchgrasp.close.scene import STILL, Reading, Setup
 from torchgrasp.errors import HandFileError, MissingExtra
 from torchgrasp.hand.urdf import read_urdf
+from torchgrasp.simulate.lift import LIFT_DRIVE, LIFT_JOINT
+from torchgrasp.simulate.mjcf import OBJECT, TABLE, scene_mjcf
+from torchgrasp.simulate.scene import STILL, Reading, Setup
 
 
 class MujocoScene:

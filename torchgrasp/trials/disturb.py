@@ -11,12 +11,12 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.close.closings import Closing
-from torchgrasp.close.robot import Robot
-from torchgrasp.close.scene import Setup
 from torchgrasp.close.sight import Plant, Sight, plant_from_hand
-from torchgrasp.close.simulators import open_scene
 from torchgrasp.frames import rotation_angle
 from torchgrasp.hand.hand import Hand
+from torchgrasp.simulate.robot import Robot
+from torchgrasp.simulate.scene import Setup
+from torchgrasp.simulate.simulators import open_scene
 from torchgrasp.values import ClosingGains, Grasps
 
 if TYPE_CHECKING:

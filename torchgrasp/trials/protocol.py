@@ -22,14 +22,14 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.close.control import CLOSINGS, HOLDINGS, GraspController
 from torchgrasp.close.law import closing_gains
-from torchgrasp.close.parts import check_parts, convex_parts, read_mesh
-from torchgrasp.close.robot import Robot
-from torchgrasp.close.scene import Scene, Setup
 from torchgrasp.close.sight import plant_from_hand
-from torchgrasp.close.simulators import open_scene
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import rotation_angle
 from torchgrasp.hand.hand import Hand
+from torchgrasp.simulate.parts import check_parts, convex_parts, read_mesh
+from torchgrasp.simulate.robot import Robot
+from torchgrasp.simulate.scene import Scene, Setup
+from torchgrasp.simulate.simulators import open_scene
 from torchgrasp.specs import ClosingMode, HoldingMode, Simulator, check_simulator
 from torchgrasp.values import ClosingGains, Grasps
 

@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from torchgrasp.close.lift import LIFT_JOINT, WRIST_JOINT
-from torchgrasp.close.sapien_build import build
-from torchgrasp.close.scene import STILL, Reading, Setup
+from torchgrasp.simulate.lift import LIFT_JOINT, WRIST_JOINT
+from torchgrasp.simulate.sapien_build import build
+from torchgrasp.simulate.scene import STILL, Reading, Setup
 
 
 class SapienScene:

@@ -17,16 +17,16 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import torch
 
 from torchgrasp.base import count_status
-from torchgrasp.close.attempt import Attempt, Execution, Protocol, attempt_grasp, draw_error, find_protocol
-from torchgrasp.close.parts import convex_parts, read_mesh
-from torchgrasp.close.pool import run_tasks
-from torchgrasp.close.score import ViewScore
 from torchgrasp.errors import BadArgument, GraspError, MissingExtra, Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.pipeline import digest, plan_grasps
 from torchgrasp.shape.calibrate import list_views, object_scale, read_view
+from torchgrasp.simulate.parts import convex_parts, read_mesh
 from torchgrasp.specs import ContactSpec
+from torchgrasp.trials.attempt import Attempt, Execution, Protocol, attempt_grasp, draw_error, find_protocol
+from torchgrasp.trials.pool import run_tasks
+from torchgrasp.trials.score import ViewScore
 from torchgrasp.values import ContactPlan, Grasps, load_grasps
 
 if TYPE_CHECKING:

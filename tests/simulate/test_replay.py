@@ -11,13 +11,13 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from torchgrasp import cli
-from torchgrasp.close.keyframes import format_keyframes
-from torchgrasp.close.replay import format_grasps
 from torchgrasp.close.squeeze import squeeze
 from torchgrasp.frames import apply
 from torchgrasp.hand.load import load_hand
+from torchgrasp.simulate.keyframes import format_keyframes
+from torchgrasp.simulate.replay import format_grasps
 
-pinch = runpy.run_path(str(Path(__file__).with_name("test_trial.py")))["pinch"]
+pinch = runpy.run_path(str(Path(__file__).parents[1] / "trials" / "test_trial.py"))["pinch"]
 HANDS = ["allegro", "barrett"]
 
 

@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchgrasp.close.lift import LIFT_DRIVE, LIFT_JOINT, lifted_urdf
-from torchgrasp.close.scene import ARMATURE, TABLE, Setup, check_drives
 from torchgrasp.errors import MissingExtra
+from torchgrasp.simulate.lift import LIFT_DRIVE, LIFT_JOINT, lifted_urdf
+from torchgrasp.simulate.scene import ARMATURE, TABLE, Setup, check_drives
 
 
 class Built(NamedTuple):

@@ -10,15 +10,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.close.misplace import draw_errors, draw_places, error_of_place
-from torchgrasp.close.protocol import PROTOCOLS as PULLS
-from torchgrasp.close.protocol import TIMESTEP, PullProtocol, check_test, pull_grasp
-from torchgrasp.close.scene import Setup
-from torchgrasp.close.simulators import open_scene
-from torchgrasp.close.trial import close_hand
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.hand.hand import Hand
+from torchgrasp.simulate.scene import Setup
+from torchgrasp.simulate.simulators import open_scene
 from torchgrasp.specs import ClosingMode, HoldingMode, Simulator, TrialSpec, check_simulator
+from torchgrasp.trials.misplace import draw_errors, draw_places, error_of_place
+from torchgrasp.trials.protocol import PROTOCOLS as PULLS
+from torchgrasp.trials.protocol import TIMESTEP, PullProtocol, check_test, pull_grasp
+from torchgrasp.trials.trial import close_hand
 from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ PROTOCOLS: dict[str, Protocol] = {
     "paper": PAPER,
     "tabletop": LiftProtocol("tabletop", TrialSpec(friction=0.6, shake=0.003)),
 }
-"""By name: those that pull (`torchgrasp.close.protocol`); the paper's lift at friction 0.8; and a lift by 0.1 m at
+"""By name: those that pull (`torchgrasp.trials.protocol`); the paper's lift at friction 0.8; and a lift by 0.1 m at
 friction 0.6 that is held for 2 s while the hand shakes."""
 
 

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from torchgrasp.base import Value
-from torchgrasp.close.attempt import Attempt
 from torchgrasp.errors import Status
+from torchgrasp.trials.attempt import Attempt
 
 STAGES: dict[str, tuple[Status, ...]] = {
     "start": (Status.START_OVERLAP,),

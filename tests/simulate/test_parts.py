@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from torchgrasp.close.parts import check_parts, convex_parts, read_mesh
 from torchgrasp.errors import MeshError, SuspiciousScale
+from torchgrasp.simulate.parts import check_parts, convex_parts, read_mesh
 
 
 def bracket():
