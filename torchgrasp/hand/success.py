@@ -1,10 +1,10 @@
 """How probable it is that a planned grasp holds: a small model, calibrated on simulated trials.
 
-A trial is DexGraspBench's test by pulling (`trials.protocol`) at the friction that was planned for: the hand closes open
-loop through pre-grasp, grasp and squeeze with 7 N, and the object must withstand its own weight from six sides. The
-model is logistic in five numbers that a planner knows without the true object. `scripts/make_success.py` fits it, on
-grasps of all ranks, and shows how well it is calibrated on objects that it was not fitted on. The trials are those of
-the Allegro hand: the grasps of another are ranked by it, but nothing says that its probabilities hold for them.
+A trial is DexGraspBench's test by pulling (`trials.protocol`) at the friction that was planned for: the hand closes
+open loop through pre-grasp, grasp and squeeze with 7 N, and the object must withstand its own weight from six sides.
+The model is logistic in five numbers that a planner knows without the true object. `scripts/make_success.py` fits it,
+on grasps of all ranks, and shows how well it is calibrated on objects that it was not fitted on. The trials are those
+of the Allegro hand: the grasps of another are ranked by it, but nothing says that its probabilities hold for them.
 """
 
 import functools
