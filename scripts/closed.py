@@ -9,7 +9,7 @@ from typing import Any
 from torchgrasp.files import format_json, write_file
 from torchgrasp.trials.attempt import PAPER
 from torchgrasp.trials.score import share
-from torchgrasp.trials.tables import FREE, Cell, controller_cells, difference, threshold_cells, trend, trend_over_grasps
+from torchgrasp.trials.tables import Cell, controller_cells, difference, threshold_cells, trend, trend_over_grasps
 
 PUBLISHED = {
     "0.03": "40 63 57",
@@ -89,8 +89,6 @@ def gather(cells: Iterator[tuple[Cell, ...]]) -> list[list[Cell]]:
         reasons = Counter(s.name.lower() for cell in row for s in cell.statuses if s.name != "OK")
         told = f"{value:6.1%} [{low:.1%}, {high:.1%}] of {total}; the paper: {PUBLISHED.get(row[0].row, '-')} %"
         print(f"{row[0].row:24}{told}; {', '.join(f'{n} {name}' for name, n in reasons.most_common())}")
-        free = sum(cell.held_free for cell in row) / max(total, 1)
-        print(f"{'':24}{free:6.1%} held and started less than {1e3 * FREE:.0f} mm in object or table")
     return rows
 
 

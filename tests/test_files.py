@@ -18,6 +18,7 @@ def some_grasps(g: int = 2, h: int = 4) -> Grasps:
     return Grasps(
         joints=rand(g, h),
         pregrasp=rand(g, h),
+        approach=rand(g, 3),
         obj_from_hand=rand(g, 4, 4),
         contacts=Contacts(rand(g, 3, 3), rand(g, 3, 3), rand(g, 3), rand(g, 3)),
         permutation=torch.tensor([[0, 1, 2]] * g),

@@ -112,6 +112,7 @@ class Status(enum.IntEnum):
     OBJECT_COLLISION = 25, "a link of the hand would penetrate the object"
     TABLE_COLLISION = 26, "a link of the hand would penetrate the table"
     PREGRASP = 27, "the hand cannot open at this pose without touching something"
+    NO_APPROACH = 28, "the opened hand cannot come straight to this pose without touching something"
     # closing
     START_OVERLAP = 30, "the hand overlaps the object or the table before closing starts"
     NO_CONTACT = 31, "a fingertip never touched the object"

@@ -95,6 +95,7 @@ class TrialSpec(Value):
         mass: of the object [kg].
         friction: of every contact.
         gravity: [m/s^2].
+        approach: length [m] of the straight way on which the opened hand comes to its pre-grasp; 0: it is there.
         lift_height: [m].
         hold_time: [s] after the lift.
         shake: amplitude [m] of a vertical sinusoid of 5 Hz during the hold.
@@ -115,6 +116,7 @@ class TrialSpec(Value):
     mass: float = 0.1
     friction: float = 0.8
     gravity: float = 9.81
+    approach: float = 0.1
     lift_height: float = 0.1
     hold_time: float = 2.0
     shake: float = 0.0
@@ -135,6 +137,7 @@ class TrialSpec(Value):
             "mass": (1e-3, 10.0),
             "friction": (0.0, 10.0),
             "gravity": (0.0, 100.0),
+            "approach": (0.0, 1.0),
             "lift_height": (0.0, 1.0),
             "hold_time": (0.0, 60.0),
             "shake": (0.0, 0.02),

@@ -182,13 +182,14 @@ class Grasps(Batch):
 
     Contact i is touched by finger i of the hand. `clearance` [m] is the least distance of the hand's links from the
     estimated surface (fingertips apart), from each other and from the table; `normal_angle` [rad] the angle between
-    the contact direction and the pad's axis; `pregrasp` the joints of the opened hand at the same pose. `score`
-    ranks; after `plan_grasps` it is the log-odds of `success` of those with `Status.OK`. `meta` holds names, units,
-    hashes and the seed, as they are written to the file.
+    the contact direction and the pad's axis; `pregrasp` the joints of the opened hand at the same pose, and `approach`
+    the unit direction in which it comes there, straight. `score` ranks; after `plan_grasps` it is the log-odds of
+    `success` of those with `Status.OK`. `meta` holds names, units, hashes and the seed, as they are written to files.
     """
 
     joints: Float[Tensor, "g h"]
     pregrasp: Float[Tensor, "g h"]
+    approach: Float[Tensor, "g 3"]
     obj_from_hand: Float[Tensor, "g 4 4"]
     contacts: Contacts
     permutation: Int[Tensor, "g 3"]
@@ -270,9 +271,9 @@ class ClosureResult(Value):
     `time` [s] is the control ticks; `forces` [N] the normal force of each fingertip; `object_pose` and `hand_pose`
     the object's and the hand's frames in the world at each tick; `joints` every joint of the URDF in the order of
     `joint_names`. `contact_order` lists the fingers in the order of their first touch, those that never touched left
-    out. `object_motion` is how far the object moved [m] and turned [rad] against the hand between the start and the
-    end; `start_overlap` [m] how deep the opened hand was in object or table before. `held` is true when the object is
-    still up with the hand at the end; `seconds` is the wall time.
+    out. `object_motion` is how far the object moved [m] and turned [rad] against the hand from when the hand has come
+    to its pre-grasp to the end; `start_overlap` [m] how deep the opened hand was in object or table before it came.
+    `held` is true when the object is still up with the hand at the end; `seconds` is the wall time.
     """
 
     held: bool

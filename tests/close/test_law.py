@@ -53,6 +53,7 @@ def grasp_of(hand, std=0.004):
     return Grasps(
         joints=joints,
         pregrasp=joints,
+        approach=rotate(obj_from_hand, hand.approach[None].double())[:, 0],
         obj_from_hand=obj_from_hand,
         contacts=contacts,
         permutation=torch.tensor([[0, 1, 2]]),

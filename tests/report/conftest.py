@@ -38,6 +38,7 @@ def run() -> Run:
     grasps = Grasps(
         joints,
         joints,
+        out[:, 0],
         pose,
         contacts,
         torch.tensor([[0, 1, 2], [2, 1, 0]]),

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.load import load_hand
-from torchgrasp.simulate.lift import LIFT_JOINT, euler_from_rotation, lifted_urdf
+from torchgrasp.simulate.carriage import APPROACH_JOINT, LIFT_JOINT, carried_urdf, euler_from_rotation
+from torchgrasp.simulate.scene import Setup
 
 
 def test_euler_angles_rebuild_the_rotation():
@@ -21,9 +22,17 @@ def test_euler_angles_rebuild_the_rotation():
         assert np.abs(again - matrix).max() < 1e-7
 
 
-def test_lifted_urdf_holds_geometry_and_one_more_joint():
-    text = lifted_urdf(load_hand("barrett").urdf_path, np.eye(4), 0.1)
+def carried(urdf_path, **options):
+    ball = trimesh.creation.icosphere(radius=0.02)
+    return carried_urdf(Setup(urdf_path, np.eye(4), {}, {}, (), ball, [ball], 0.1, **options))
+
+
+def test_carried_urdf_holds_geometry_and_the_joints_of_the_carriage():
+    path = load_hand("barrett").urdf_path
+    assert APPROACH_JOINT not in carried(path)
+    text = carried(path, approach=(0.0, 0.06, -0.08))
     assert LIFT_JOINT in text
+    assert 'xyz="0 0.6 -0.8"' in text
     assert "<mimic" not in text
     assert "<visual" not in text
     assert text.count("<collision") > 5
@@ -31,10 +40,10 @@ def test_lifted_urdf_holds_geometry_and_one_more_joint():
 
 def test_files_that_are_no_hand_are_refused(tmp_path):
     with pytest.raises(HandFileError):
-        lifted_urdf(tmp_path / "none.urdf", np.eye(4), 0.1)
+        carried(tmp_path / "none.urdf")
     (tmp_path / "two.urdf").write_text('<robot name="r"><link name="a"/><link name="b"/></robot>')
     with pytest.raises(HandFileError, match="one root link"):
-        lifted_urdf(tmp_path / "two.urdf", np.eye(4), 0.1)
+        carried(tmp_path / "two.urdf")
 
 
 SIMULATORS = ["sapien", "mujoco"]

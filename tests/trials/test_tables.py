@@ -10,15 +10,7 @@ from torchgrasp.trials.tables import THRESHOLDS, Cell, difference, threshold_cel
 
 def cells(row: str, held: dict[str, int], of: int = 10) -> list[Cell]:
     """Return a cell for each object."""
-    return [
-        Cell(o, "allegro", row, (Status.OK,) * n + (Status.DROPPED,) * (of - n), (0.0,) * of, 5, 0.01)
-        for o, n in held.items()
-    ]
-
-
-def test_a_trial_that_starts_in_the_object_can_be_told_from_one_that_starts_free() -> None:
-    cell = Cell("x", "allegro", "a", (Status.OK, Status.OK, Status.DROPPED), (0.0005, 0.004, 0.0), 1, 0.01)
-    assert (cell.held, cell.held_free) == (2, 1)
+    return [Cell(o, "allegro", row, (Status.OK,) * n + (Status.DROPPED,) * (of - n), 5, 0.01) for o, n in held.items()]
 
 
 def test_a_difference_is_the_pooled_one_and_its_interval_that_of_resampled_objects() -> None:

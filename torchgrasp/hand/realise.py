@@ -1,4 +1,4 @@
-"""From guesses of the learned model to grasps that a hand can take: refine, open, check, rank.
+"""From guesses of the learned model to grasps that a hand can take: refine, open, check, approach, rank.
 
 Most guesses are hopeless and no look tells which, but the best of a triple's guesses often holds. So every triple's
 best guesses are refined first, and more of them only for triples that have no grasp yet.
@@ -12,6 +12,8 @@ from torch import Tensor
 
 from torchgrasp.base import join
 from torchgrasp.errors import Status
+from torchgrasp.frames import rotate
+from torchgrasp.hand.approach import find_approach
 from torchgrasp.hand.check import check, measure
 from torchgrasp.hand.clear import Surroundings
 from torchgrasp.hand.hand import Hand
@@ -70,7 +72,7 @@ def judge(
     surroundings: Surroundings,
     center: Float[Tensor, "3"],
 ) -> Grasps:
-    """Return checked grasps of postures, with their pre-grasps where all else is right.
+    """Return checked grasps of postures, with pre-grasps where all else is right, and the straight ways to these.
 
     Args:
         posture: g postures.
@@ -87,9 +89,14 @@ def judge(
     sound = (planned == Status.OK) & (measure(posture, hand, contacts, surroundings).status == Status.OK)
     pregrasp[sound] = open_hand(posture[sound], hand, contacts[sound], surroundings)
     found = check(posture, pregrasp, hand, contacts, surroundings)
+    status, way = found.status.clone(), rotate(posture.obj_from_hand, hand.approach.to(center)[None])[:, 0]
+    fine = status == Status.OK
+    way[fine], free = find_approach(Posture(pregrasp, posture.obj_from_hand)[fine], hand, surroundings)
+    status[fine] = torch.where(free >= 0, status[fine], int(Status.NO_APPROACH))
     return Grasps(
         joints=posture.joints,
         pregrasp=pregrasp,
+        approach=way,
         obj_from_hand=posture.obj_from_hand,
         contacts=contacts,
         permutation=permutation,
@@ -98,7 +105,7 @@ def judge(
         normal_angle=found.normal_angle,
         certificate=certificate,
         score=score(contacts, found, center),
-        status=torch.where(planned == Status.OK, found.status, planned),
+        status=torch.where(planned == Status.OK, status, planned),
     )
 
 

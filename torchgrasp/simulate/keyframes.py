@@ -6,6 +6,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from torchgrasp.close.squeeze import squeeze
+from torchgrasp.hand.approach import DISTANCE
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.simulate.mjcf import add_drive, add_links
@@ -17,11 +18,12 @@ FREE = "hand"
 
 
 def format_keyframes(grasps: Grasps, hand: Hand, force: float = 4.0) -> str:
-    """Return MJCF of the hand with three keyframes for each grasp: grasp_0_pregrasp, grasp_0_grasp, grasp_0_squeeze.
+    """Return MJCF of the hand with four keyframes for each grasp: grasp_0_approach, _pregrasp, _grasp, _squeeze.
 
     The world is the object's frame, in which the object may be added. `qpos` is the free joint and then the joints in
     the order of the model, `ctrl` the actuators' targets in theirs; both orders are written as text elements "qpos"
-    and "ctrl". In the squeeze the hand is in its grasp, and only the targets have gone on.
+    and "ctrl". The approach begins with the joints of the pre-grasp; in the squeeze the hand is in its grasp, and only
+    the targets have gone on.
 
     Args:
         grasps: g rows.
@@ -43,16 +45,18 @@ def format_keyframes(grasps: Grasps, hand: Hand, force: float = 4.0) -> str:
         add_drive(actuator, name, hand.actuators[name])
     ET.SubElement(custom, "text", name="qpos", data=" ".join([*(f"{FREE}/{axis}" for axis in POSE), *order]))
     ET.SubElement(custom, "text", name="ctrl", data=" ".join(order))
+    opened, closed = hand.expand(grasps.pregrasp.double()), hand.expand(grasps.joints.double())
     postures = (
-        ("pregrasp", hand.expand(grasps.pregrasp.double()), hand.expand(grasps.pregrasp.double())),
-        ("grasp", hand.expand(grasps.joints.double()), hand.expand(grasps.joints.double())),
-        ("squeeze", hand.expand(grasps.joints.double()), hand.expand(pressed.joints)),
+        ("approach", DISTANCE, opened, opened),
+        ("pregrasp", 0.0, opened, opened),
+        ("grasp", 0.0, closed, closed),
+        ("squeeze", 0.0, closed, hand.expand(pressed.joints)),
     )
     for row in range(len(grasps)):
         pose = grasps.obj_from_hand[row]
-        place = [*pose[:3, 3].tolist(), *quaternion(pose)]
-        for name, joints, targets in postures:
-            state = _text([*place, *(float(joints[joint][row]) for joint in order)])
+        for name, before, joints, targets in postures:
+            place = pose[:3, 3] - before * grasps.approach[row]
+            state = _text([*place.tolist(), *quaternion(pose), *(float(joints[joint][row]) for joint in order)])
             control = _text(float(targets[joint][row]) for joint in order)
             ET.SubElement(keys, "key", name=f"grasp_{row}_{name}", qpos=state, ctrl=control)
     ET.indent(root)

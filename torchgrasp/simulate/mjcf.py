@@ -14,7 +14,7 @@ import numpy as np
 from torchgrasp.frames import rotation_from_rpy
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.urdf import Link, Urdf, read_urdf
-from torchgrasp.simulate.lift import LIFT_DRIVE, LIFT_JOINT
+from torchgrasp.simulate.carriage import CARRIAGE_DRIVE, carriage
 from torchgrasp.simulate.scene import ARMATURE, Setup, check_drives
 
 OBJECT, TABLE = "torchgrasp_object", "torchgrasp_table"
@@ -33,7 +33,7 @@ SOLREF, SOLIMP = "0.005 1", "0.5 0.99 0.0001"
 def scene_mjcf(setup: Setup) -> str:
     """Return a scene of table, object and hand with all joints at zero.
 
-    Actuators are positional and named like their joints. The joint `LIFT_JOINT` carries the hand, `OBJECT` floats.
+    Actuators are positional and named like their joints. The joints of the `carriage` carry the hand, `OBJECT` floats.
 
     Raises:
         BadArgument: a joint of the hand without a position or drive.
@@ -61,7 +61,8 @@ def scene_mjcf(setup: Setup) -> str:
     _add_hand(world, setup, urdf)
     for name in movable:
         add_drive(actuator, name, setup.drives[name])
-    add_drive(actuator, LIFT_JOINT, LIFT_DRIVE)
+    for slide in carriage(setup):
+        add_drive(actuator, slide.name, CARRIAGE_DRIVE)
     return ET.tostring(root, encoding="unicode")
 
 
@@ -77,11 +78,13 @@ def _add_object(asset: ET.Element, world: ET.Element, setup: Setup) -> None:
 
 
 def _add_hand(world: ET.Element, setup: Setup, urdf: Urdf) -> None:
-    """Hang the hand on the joint that lifts it."""
-    arm = ET.SubElement(world, "body", name=LIFT_JOINT, gravcomp="1")
-    _weigh(arm, 1.0, np.zeros(3), (0.01, 0.0, 0.0, 0.01, 0.0, 0.01))
-    travel = _text((-0.01, setup.travel + 0.05))
-    ET.SubElement(arm, "joint", name=LIFT_JOINT, type="slide", axis="0 0 1", range=travel)
+    """Hang the hand on the joints that carry it."""
+    arm = world
+    for slide in carriage(setup):
+        arm = ET.SubElement(arm, "body", name=slide.name, gravcomp="1")
+        _weigh(arm, 1.0, np.zeros(3), (0.01, 0.0, 0.0, 0.01, 0.0, 0.01))
+        limits = {"axis": _text(slide.axis), "range": _text((slide.lower, slide.upper))}
+        ET.SubElement(arm, "joint", limits, name=slide.name, type="slide")
     add_links(arm, urdf, setup.world_from_hand)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from torchgrasp.errors import HandFileError, MissingExtra
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.simulate.lift import LIFT_DRIVE, LIFT_JOINT
+from torchgrasp.simulate.carriage import APPROACH_JOINT, CARRIAGE_DRIVE, LIFT_JOINT, carriage
 from torchgrasp.simulate.mjcf import OBJECT, TABLE, scene_mjcf
 from torchgrasp.simulate.scene import STILL, Reading, Setup
 
@@ -33,12 +33,14 @@ class MujocoScene:
         self._places = np.array([model.joint(name).qposadr[0] for name in self.joint_names])
         self._speeds = np.array([model.joint(name).dofadr[0] for name in self.joint_names])
         self._motors = np.array([model.actuator(name).id for name in self.joint_names])
-        self._lift = model.actuator(LIFT_JOINT).id
         self._root = model.body(urdf.root).id
         self._tips = [model.body(name).id for name in setup.tip_links]
         self._map_contacts(setup.table)
         data.qpos[self._places] = [setup.joints[name] for name in self.joint_names]
         self.drive(data.qpos[self._places])
+        for slide in carriage(setup):
+            data.qpos[model.joint(slide.name).qposadr[0]] = slide.start
+            self._carry(slide.name, slide.start, 0.0)
         mujoco.mj_step1(model, data)
 
     def _map_contacts(self, table: bool) -> None:
@@ -92,8 +94,17 @@ class MujocoScene:
         self.data.xfrc_applied[self._object] = [*force, *torque]
 
     def lift(self, height: float, speed: float = 0.0) -> None:
-        """Set the target of the lift joint [m], and the speed [m/s] at which that target moves."""
-        self.data.ctrl[self._lift] = height + speed * LIFT_DRIVE.kd / LIFT_DRIVE.kp
+        """Set the height [m] that the hand is to be lifted to, and the speed [m/s] at which that target moves."""
+        self._carry(LIFT_JOINT, height, speed)
+
+    def approach(self, left: float, speed: float = 0.0) -> None:
+        """Set what is to be left [m] of the hand's approach, and the speed [m/s] at which it goes on."""
+        self._carry(APPROACH_JOINT, -left, speed)
+
+    def _carry(self, name: str, target: float, speed: float) -> None:
+        """Set the target [m] of a joint of the carriage, and the speed [m/s] at which it moves."""
+        motor = self.model.actuator(name).id
+        self.data.ctrl[motor] = target + speed * CARRIAGE_DRIVE.kd / CARRIAGE_DRIVE.kp
 
     def joints(self) -> np.ndarray:
         """Return the position of every driven joint [rad]."""

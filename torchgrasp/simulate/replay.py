@@ -12,11 +12,12 @@ from torchgrasp.close.squeeze import squeeze
 from torchgrasp.errors import Status
 from torchgrasp.files import format_json
 from torchgrasp.frames import rotate
+from torchgrasp.hand.approach import DISTANCE
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.values import Grasps
 
-VERSION = 1
+VERSION = 2
 """Of the layout."""
 
 CONVENTIONS = {
@@ -26,6 +27,7 @@ CONVENTIONS = {
         "hand": "the root link of the hand's URDF",
     },
     "pose": "position p and unit quaternion (w, x, y, z) of the hand in the object's frame: x_object = R x_hand + p",
+    "approach": "unit direction in the object's frame in which the hand comes to its pose, opened, by the distance",
     "joints": "by the names of the hand's URDF, all that move: actuated, coupled and parked",
     "squeeze": "targets of position-controlled joints: stiffness (squeeze - grasp) = torque = J^T force",
     "force": "of the fingertip on the object at its contact, in the object's frame",
@@ -36,8 +38,8 @@ CONVENTIONS = {
 def format_grasps(grasps: Grasps, hand: Hand, force: float = 4.0) -> str:
     """Return grasps as JSON: for each the pose, three postures by joint name, contacts, forces, torques and checks.
 
-    The hand opens to "pregrasp" with its root at "pose", closes to "grasp" in the time given, and presses towards
-    "squeeze" in as much again, all joints moving evenly.
+    The hand comes to "pose" along "approach" with its joints at "pregrasp", closes to "grasp" in the time given, and
+    presses towards "squeeze" in as much again, all joints moving evenly.
 
     Args:
         grasps: g rows.
@@ -57,6 +59,7 @@ def format_grasps(grasps: Grasps, hand: Hand, force: float = 4.0) -> str:
             "status": Status(int(grasps.status[row])).name,
             "success": float(grasps.success[row]),
             "pose": _pose(grasps.obj_from_hand[row]),
+            "approach": {"direction": grasps.approach[row].tolist(), "distance": DISTANCE},
             "joints": {name: {joint: float(q[row]) for joint, q in all_.items()} for name, all_ in named.items()},
             "torque": dict(zip(hand.joint_names, pressed.torques[row].tolist(), strict=True)),
             "contacts": [

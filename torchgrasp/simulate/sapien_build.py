@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from torchgrasp.errors import MissingExtra
-from torchgrasp.simulate.lift import LIFT_DRIVE, LIFT_JOINT, lifted_urdf
+from torchgrasp.simulate.carriage import CARRIAGE_DRIVE, carriage, carried_urdf
 from torchgrasp.simulate.scene import ARMATURE, TABLE, Setup, check_drives
 
 
@@ -93,14 +93,15 @@ def _hand(scene: Any, material: Any, setup: Setup) -> Any:
     loader.set_material(material.static_friction, material.dynamic_friction, 0.0)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "hand.urdf"
-        file.write_text(lifted_urdf(setup.urdf_path, setup.world_from_hand, setup.travel), encoding="utf-8")
+        file.write_text(carried_urdf(setup), encoding="utf-8")
         hand = loader.load(str(file))
-    check_drives(setup, [j.name for j in hand.active_joints if j.name != LIFT_JOINT])
+    slides = {slide.name: slide for slide in carriage(setup)}
+    check_drives(setup, [j.name for j in hand.active_joints if j.name not in slides])
     start = []
     for joint in hand.active_joints:
         joint.set_friction(0.0)
-        if joint.name == LIFT_JOINT:
-            drive, position = LIFT_DRIVE, 0.0
+        if joint.name in slides:
+            drive, position = CARRIAGE_DRIVE, slides[joint.name].start
         else:
             drive, position = setup.drives[joint.name], float(setup.joints[joint.name])
             joint.set_armature(np.array([ARMATURE], np.float32))

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from torchgrasp.simulate.lift import LIFT_JOINT, WRIST_JOINT
+from torchgrasp.simulate.carriage import APPROACH_JOINT, LIFT_JOINT, WRIST_JOINT
 from torchgrasp.simulate.sapien_build import build
 from torchgrasp.simulate.scene import STILL, Reading, Setup
 
@@ -16,9 +16,9 @@ class SapienScene:
         self.timestep, self.centre = setup.timestep, np.asarray(setup.mesh.center_mass, float)
         self.system, self.scene, self.body, self.hand = build(setup)
         active = self.hand.active_joints
-        self._order = [k for k, j in enumerate(active) if j.name != LIFT_JOINT]
+        self._carriage = {j.name: j for j in active if j.name in (LIFT_JOINT, APPROACH_JOINT)}
+        self._order = [k for k, j in enumerate(active) if j.name not in self._carriage]
         self._driven = [active[k] for k in self._order]
-        self._lift = next(j for j in active if j.name == LIFT_JOINT)
         self.joint_names = tuple(j.name for j in self._driven)
         links = {link.name: link for link in self.hand.links}
         self.tips = [links[name] for name in setup.tip_links]
@@ -102,9 +102,17 @@ class SapienScene:
         self._pull, self._turn = np.asarray(force, np.float32), np.asarray(torque, np.float32)
 
     def lift(self, height: float, speed: float = 0.0) -> None:
-        """Set the target of the lift joint [m], and the speed [m/s] at which that target moves."""
-        self._lift.set_drive_target(float(height))
-        self._lift.set_drive_velocity_target(float(speed))
+        """Set the height [m] that the hand is to be lifted to, and the speed [m/s] at which that target moves."""
+        self._carry(LIFT_JOINT, height, speed)
+
+    def approach(self, left: float, speed: float = 0.0) -> None:
+        """Set what is to be left [m] of the hand's approach, and the speed [m/s] at which it goes on."""
+        self._carry(APPROACH_JOINT, -left, speed)
+
+    def _carry(self, name: str, target: float, speed: float) -> None:
+        """Set the target [m] of a joint of the carriage, and the speed [m/s] at which it moves."""
+        self._carriage[name].set_drive_target(float(target))
+        self._carriage[name].set_drive_velocity_target(float(speed))
 
     def joints(self) -> np.ndarray:
         """Return the position of every driven joint [rad]."""

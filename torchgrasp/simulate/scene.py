@@ -47,6 +47,7 @@ class Setup:
         gravity: [m/s^2].
         timestep: [s].
         travel: how far the hand can be lifted [m].
+        approach: the straight way [m] in the world on which the hand comes to its pose; it starts at its other end.
         table: whether there is one.
         patch: radius [m] of the patch in which a fingertip touches; its torsional friction is friction x force x patch.
     """
@@ -63,6 +64,7 @@ class Setup:
     gravity: float = 9.81
     timestep: float = 1 / 500
     travel: float = 0.1
+    approach: tuple[float, float, float] = (0.0, 0.0, 0.0)
     table: bool = True
     patch: float = PATCH_RADIUS
 
@@ -108,7 +110,11 @@ class Scene(Protocol):
         ...
 
     def lift(self, height: float, speed: float = 0.0) -> None:
-        """Set the target of the lift joint [m], and the speed [m/s] at which that target moves."""
+        """Set the height [m] that the hand is to be lifted to, and the speed [m/s] at which that target moves."""
+        ...
+
+    def approach(self, left: float, speed: float = 0.0) -> None:
+        """Set what is to be left [m] of the hand's approach, and the speed [m/s] at which it goes on."""
         ...
 
     def joints(self) -> np.ndarray:

@@ -44,9 +44,6 @@ THRESHOLDS = (0.03, 0.06, 0.10)
 GRASPS, TRIALS = 3, 30
 """Grasps of each view, and trials of a cell, at least."""
 
-FREE = 1e-3
-"""Overlap [m] up to which a start counts as free: convex parts bulge a little."""
-
 MASS = 0.1
 """Of objects that come without one [kg]."""
 
@@ -62,16 +59,14 @@ class Cell(Value):
     """The trials of one object with one hand.
 
     `row` is what the table compares: a threshold or a controller. `statuses` lists the trials, `draws` of each grasp,
-    those of a grasp one after the other; it is empty where nothing was executable. `overlaps` [m] tells how deep the
-    opened hand was in object or table before it closed. `std_m` is the mean over the grasps of their least certain
-    contact's standard deviation [m].
+    those of a grasp one after the other; it is empty where nothing was executable. `std_m` is the mean over the grasps
+    of their least certain contact's standard deviation [m].
     """
 
     object: str
     hand: str
     row: str
     statuses: tuple[Status, ...]
-    overlaps: tuple[float, ...]
     draws: int
     std_m: float
 
@@ -79,11 +74,6 @@ class Cell(Value):
     def held(self) -> int:
         """Count the trials that held."""
         return sum(status is Status.OK for status in self.statuses)
-
-    @property
-    def held_free(self) -> int:
-        """Count the trials that held and started free of object and table, to 1 mm."""
-        return sum(s is Status.OK and o <= FREE for s, o in zip(self.statuses, self.overlaps, strict=True))
 
 
 def threshold_cells(
@@ -152,8 +142,8 @@ def difference(first: Sequence[Cell], second: Sequence[Cell], seed: int = 0) -> 
     The cells are paired by object and hand. The interval resamples objects, not trials: the trials of one object are
     alike.
 
-    >>> a = [Cell(o, "allegro", "a", (Status.OK, Status.OK), (0.0, 0.0), 1, 0.0) for o in "xyz"]
-    >>> b = [Cell(o, "allegro", "b", (Status.OK, Status.DROPPED), (0.0, 0.0), 1, 0.0) for o in "xyz"]
+    >>> a = [Cell(o, "allegro", "a", (Status.OK, Status.OK), 1, 0.0) for o in "xyz"]
+    >>> b = [Cell(o, "allegro", "b", (Status.OK, Status.DROPPED), 1, 0.0) for o in "xyz"]
     >>> difference(a, b)
     (0.5, 0.5, 0.5)
     """
@@ -231,8 +221,8 @@ def _cells(
     tasks = [(place, name, hand, rows, seed, *effort) for hand in hands for place, name in named]
     for task, found in zip(tasks, run_tasks(_fill, tasks, workers, CELL_SECONDS), strict=True):
         if isinstance(found, Status):
-            lost, free = (found,) * effort[0], (0.0,) * effort[0]
-            found = tuple(Cell(task[1], task[2], row[0], lost, free, 1, math.nan) for row in rows)
+            lost = (found,) * effort[0]
+            found = tuple(Cell(task[1], task[2], row[0], lost, 1, math.nan) for row in rows)
         yield found
 
 
@@ -265,8 +255,7 @@ def _fill(
             results.append(close_hand(grasp, hand, mesh, spec, seed + k, parts=parts, error=error))
         stds = [float(grasp.contacts.std_m.amax()) for grasp in grasps]
         std_m = sum(stds) / len(stds) if stds else math.nan
-        statuses, overlaps = tuple(r.status for r in results), tuple(r.start_overlap for r in results)
-        cells.append(Cell(label, hand_name, row, statuses, overlaps, draws, std_m))
+        cells.append(Cell(label, hand_name, row, tuple(r.status for r in results), draws, std_m))
     return tuple(cells)
 
 

@@ -1,4 +1,4 @@
-"""One simulated trial: the hand opens around the true object, closes on it under the law, lifts it and holds it."""
+"""One simulated trial: the opened hand comes to the true object, closes under the law, lifts it and holds it."""
 
 import math
 import time
@@ -29,9 +29,11 @@ from torchgrasp.values import ClosingGains, ClosureResult, Grasps
 if TYPE_CHECKING:
     import trimesh
 
-START_TOLERANCE = 0.01
-"""Overlap [m] of the hand with object or table up to which a trial starts, as in published tests: what lies in the way
-of a hand that stands a little beside its plan is pushed aside, at 1 m/s at most."""
+START_TOLERANCE = 1e-3
+"""Overlap [m] of the hand with object or table up to which a trial starts: convex parts bulge a little."""
+
+APPROACH_SPEED = 0.2
+"""Of the hand on its way to the pre-grasp [m/s], on average."""
 
 LIFT_TIME = 1.0
 """Time [s] in which the hand rises, by a smooth step."""
@@ -62,11 +64,12 @@ def close_hand(
 ) -> ClosureResult:
     """Close a hand on the true object, lift it and hold it, in a fresh simulation.
 
-    The object stands on a table where its mesh is lowest, in the frame of the grasp. The hand starts at the grasp's
-    pre-grasp, closes and presses (`GraspController`), rises by `spec.lift_height` and holds, shaken if
-    `spec.shake` says so. The object is **held** when at the end its centre has risen by at least half the lift and in
-    most of the last `JUDGED_TIME` at least two fingers touch it. `object_motion` is against the hand, so that stricter
-    rules can be counted from it. The same arguments give the same result to the last bit.
+    The object stands on a table where its mesh is lowest, in the frame of the grasp. The opened hand comes the last
+    `spec.approach` of its way straight to its pre-grasp, pushing aside what it meets, closes and presses
+    (`GraspController`), rises by `spec.lift_height` and holds, shaken if `spec.shake` says so. The object is **held**
+    when at the end its centre has risen by at least half the lift and in most of the last `JUDGED_TIME` at least two
+    fingers touch it. `object_motion` is against the hand, so that stricter rules can be counted from it. The same
+    arguments give the same result to the last bit.
 
     Args:
         grasp: one row.
@@ -102,6 +105,15 @@ def close_hand(
     return trial.result(status, time.perf_counter() - started)
 
 
+def smooth_step(time: float) -> tuple[float, float]:
+    """Return how far a motion from 0 to 1 that starts and ends at rest has come by a time in [0, 1], and its speed.
+
+    >>> smooth_step(0.5)
+    (0.5, 1.5)
+    """
+    return time * time * (3 - 2 * time), 6 * time * (1 - time)
+
+
 class _Lost(Exception):
     """The object is gone, or the numbers are: the trial is over before its time."""
 
@@ -121,6 +133,7 @@ class _Trial:
     ) -> None:
         self.spec = spec
         start = {name: float(q) for name, q in hand.expand(grasp.pregrasp[0]).items()}
+        way = stands[:3, :3] @ grasp.obj_from_hand[0, :3, :3].T @ grasp.approach[0] * spec.approach
         setup = Setup(
             hand.urdf_path,
             stands.numpy(),
@@ -134,6 +147,7 @@ class _Trial:
             spec.gravity,
             spec.timestep,
             spec.lift_height,
+            tuple(way.tolist()),
         )
         self.scene = open_scene(setup, spec.simulator)
         self.plant = plant_from_hand(hand, grasp, spec.force, self.scene.joint_names)
@@ -145,13 +159,13 @@ class _Trial:
         self.object_pose: list[np.ndarray] = []
         self.hand_pose: list[np.ndarray] = []
         self.joints: list[np.ndarray] = []
-        self.overlap, self.pushed, self.strained = 0.0, 0.0, False
+        self.overlap, self.pushed, self.strained, self.arrived = 0.0, 0.0, False, 0
         self.effort = torch.tensor([hand.actuators[name].effort for name in self.scene.joint_names])
 
     # ------------------------------------------------------------------------------------------------- the phases
 
     def run(self, gains: ClosingGains, belief: Belief | None) -> Status:
-        """Close, press, lift and hold; return what became of it."""
+        """Approach, close, press, lift and hold; return what became of it."""
         self.overlap = self.scene.penetration()
         self._record(np.zeros(3))
         if not self.overlap <= START_TOLERANCE:
@@ -159,6 +173,12 @@ class _Trial:
         controller = GraspController(self.plant, gains, self.spec.controller, self.spec.holding, belief)
         period = self.robot.period
         try:
+            arriving = self.robot.ticks(self.spec.approach / APPROACH_SPEED) if self.spec.approach else 0
+            for k in range(arriving):
+                share, rate = smooth_step((k + 1) / arriving)
+                self.scene.approach(self.spec.approach * (1 - share), self.spec.approach * rate / (arriving * period))
+                self._tick(controller.targets)
+            self.arrived = len(self.time) - 1
             sight = self._tick(controller.targets)
             while not controller.closed:
                 sight = self._tick(controller.step(sight, period))
@@ -175,12 +195,13 @@ class _Trial:
 
     def _height(self, time: float, rising: float) -> tuple[float, float]:
         """Return how high [m] the hand is to be some time [s] after it began to rise, and how fast [m/s]."""
-        share, rate = min(time / rising, 1.0), 2 * math.pi * SHAKE_RATE
-        height = self.spec.lift_height * share * share * (3 - 2 * share)
-        if share < 1.0 or self.spec.shake == 0.0:
-            return height, self.spec.lift_height * 6 * share * (1 - share) / rising
-        phase = rate * (time - rising)
-        return height + self.spec.shake * math.sin(phase), self.spec.shake * rate * math.cos(phase)
+        share, rate = smooth_step(min(time / rising, 1.0))
+        height = self.spec.lift_height * share
+        if time < rising or self.spec.shake == 0.0:
+            return height, self.spec.lift_height * rate / rising
+        turning = 2 * math.pi * SHAKE_RATE
+        phase = turning * (time - rising)
+        return height + self.spec.shake * math.sin(phase), self.spec.shake * turning * math.cos(phase)
 
     def _tick(self, targets: Float[Tensor, " j"]) -> Sight:
         """Drive the joints for one control period, record it, and return what the robot then knows."""
@@ -233,8 +254,8 @@ class _Trial:
         )
         hand_from_object = inverse(hand_pose) @ object_pose
         centre = torch.from_numpy(self.scene.centre)[None]
-        ends = apply(hand_from_object[[0, -1]], centre.expand(2, 1, 3))[:, 0]
-        turned = hand_from_object[0, :3, :3].T @ hand_from_object[-1, :3, :3]
+        ends = apply(hand_from_object[[self.arrived, -1]], centre.expand(2, 1, 3))[:, 0]
+        turned = hand_from_object[self.arrived, :3, :3].T @ hand_from_object[-1, :3, :3]
         touched = [i for i in range(3) if np.isfinite(self.robot.first_touch[i])]
         return ClosureResult(
             held=status is Status.OK,
