@@ -41,6 +41,7 @@ def test_the_json_replays_to_the_planned_tips(name):
         tip = robot.get_transform(contact["link"], content["hand"]["root"])
         point = turn @ (tip @ np.append(hand.contact[i].numpy(), 1.0))[:3] + place
         np.testing.assert_allclose(point, planned_tips(hand, grasp)[i], atol=1e-9)
+    assert row["approach"] == {"direction": grasp.approach[0].tolist(), "distance": 0.1}
     joints = row["joints"]
     assert set(joints["squeeze"]) == set(hand.urdf_joint_names) and content["time"]["squeeze"] > 0
     for joint in content["actuated"]:  # stiffness x lead = torque
@@ -72,6 +73,9 @@ def test_mujoco_loads_the_keyframes_and_places_the_tips(name):
     mujoco.mj_resetDataKeyframe(model, data, model.key("grasp_0_pregrasp").id)
     for joint, q in hand.expand(grasp.pregrasp).items():
         assert data.joint(joint).qpos[0] == float(q[0])
+    start, arrived = (model.key(f"grasp_0_{pose}").qpos for pose in ("approach", "pregrasp"))
+    np.testing.assert_array_equal(start[3:], arrived[3:])
+    np.testing.assert_allclose(arrived[:3] - start[:3], 0.1 * grasp.approach[0].numpy(), atol=1e-12)
 
 
 def test_the_command_writes_both_and_names_what_is_wrong(tmp_path, capsys):
