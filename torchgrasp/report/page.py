@@ -59,7 +59,7 @@ def draw_pictures(run: Run) -> dict[str, list[tuple[str, bytes]]]:
     if run.closure is not None and run.mesh is not None:
         side = turned(facing(best), 20.0) if len(best) else view
         sections["Closing on the true object"] = [
-            ("Before closing.", draw_tick(run.mesh, run.hand, run.closure, 0, side)),
+            ("Before the hand comes.", draw_tick(run.mesh, run.hand, run.closure, 0, side)),
             ("At the end.", draw_tick(run.mesh, run.hand, run.closure, -1, side)),
             ("Normal force of each fingertip.", plot_forces(run.closure, run.hand.finger_names)),
             ("Motion of hand and object.", plot_motion(run.closure)),
