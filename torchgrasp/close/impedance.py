@@ -10,6 +10,8 @@ only in the proportion of their lengths: two fingers against a thumb would press
 manipulation", ICRA 2014.
 """
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -34,6 +36,9 @@ GRASP_STIFFNESS = 100.0
 
 MOST_SHARE = 1.0
 """The wrench asks of no finger for more than this share of the strongest desired force."""
+
+SURE = math.log(3)
+"""Log-odds of stability from which on a grasp is left as it is: a lost object costs more than a firmer grasp."""
 
 MOST_RAISE = 2.0
 """How many times the desired forces a grasp that turns unstable may ask for."""
@@ -116,9 +121,9 @@ class Impedance:
     One common factor keeps the sum of what the fingertips feel at what was asked for. Motions of the joints that move
     no fingertip are held where they were.
 
-    A hand with a model of its stable grasps judges at every tick by what it feels whether this is one. While it is
-    rather not, the grasp becomes firmer, up to `MOST_RAISE` times, and its springs approach those of stable grasps of
-    the same lengths. It never loosens again: what it holds may still be heavy.
+    A hand with a model of its stable grasps judges at every tick by what it feels whether this is one. While the odds
+    are less than three to one, the grasp becomes firmer, up to `MOST_RAISE` times, and its springs approach those of
+    stable grasps of the same lengths. It never loosens again: what it holds may still be heavy.
 
     Args:
         plant: the hand.
@@ -167,11 +172,11 @@ class Impedance:
         return self.plant.expand(posture + drift + self.lead + share * (lead - self.lead))
 
     def _adapt(self, sight: Sight, period: float) -> None:
-        """Become firmer and as stiff as stable grasps of these lengths are, as long as this one is rather unstable."""
+        """Become firmer and as stiff as stable grasps of these lengths are, as long as this one may be unstable."""
         if self.stable is None or self.time < RAMP + SETTLING:
             return
         state = state_of(self.springs, lengths_of(sight.tips), self.felt)
-        if float(self.stable.odds(state)) > 0:
+        if float(self.stable.odds(state)) > SURE:
             return
         wish, haste = self.stable.wish(sight.tips), min(HASTE * period, 1.0)
         self.raised += haste * (MOST_RAISE - self.raised)
