@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.shape.joint import symmetric_root
 from torchgrasp.shape.planes import PROBES, Scene, find_planes, planes_near, reflect, turn
 from torchgrasp.shape.silhouette import Outlines, farthest_points, silhouettes
 from torchgrasp.values import PointCloud
@@ -18,9 +19,11 @@ NEW, SPACING = 0.006, 0.004
 """Least distance [m] of a mirrored point from the cloud and from another one."""
 LEAST_NOISE = 0.003
 """Standard deviation [m] of a mirrored point, were the object symmetric about that very plane."""
-GOOD, ASYMMETRY = 0.4, 0.024
-"""Score from which on an object counts as symmetric, and how much further [m] mirrored points are off for each 1 that
-is missing."""
+GOOD, ASYMMETRY = 0.45, 0.052
+"""Score from which on an object counts as symmetric, and by how much [m] it deviates from its mirror image for each 1
+that is missing."""
+PART = 0.02
+"""Length [m] over which such deviations are alike: a part that is missing on the other side is missing as a whole."""
 TEMPERATURE = 0.1
 """Planes are as probable as exp(score / temperature): those that score nearly as well tell how well one is known."""
 SPREAD_STEPS, SPREAD_TURN, SPREAD_SHIFT = 5, 0.15, 0.045
@@ -31,9 +34,12 @@ SPREAD_STEPS, SPREAD_TURN, SPREAD_SHIFT = 5, 0.15, 0.045
 class Completion(Value):
     """Points of the hidden side [m] with normals, and how far they may be off.
 
-    Each has an error of its own across the surface (`noise`, a standard deviation [m]) and one that it shares with the
-    points of the same plane, which is known no better than its score tells: the covariance of all the errors is
-    diag(noise^2) + shared shared^T [m^2]. Points that share an error do not average it out.
+    Each has an error of its own across the surface (`noise`, a standard deviation [m]), one that it shares with the
+    points of the same plane (`shared`), which is known no better than its score tells, and one that it shares with the
+    points nearby: what stands out on one side may be missing on the other. `asymmetry` [m] is the deviation of the last
+    one, a field that is alike over `PART`. The covariance of all the errors is diag(noise^2) + deviations deviations^T
+    [m^2]. Points that share an error do not average it out: with an asymmetry of each point's own, twice as much of the
+    hidden surface was 10 mm off where less than 7 mm were claimed (5.5 % against 2.6 % of it, 24 views).
 
     `planes` are rows (n, o) of the planes n.x = o that were used, best first, and `scores` what supports them: 1 for
     a mirror image that lies on the cloud wholly, below .15 for none to speak of.
@@ -43,9 +49,20 @@ class Completion(Value):
     normals: Float[Tensor, "m 3"]
     noise: Float[Tensor, "m"]
     shared: Float[Tensor, "m c"]
+    asymmetry: Float[Tensor, "m"]
     planes: Float[Tensor, "p 4"]
     scores: Float[Tensor, "p"]
     outline: Outlines
+
+    @property
+    def deviations(self) -> Float[Tensor, "m k"]:
+        """The errors that points have in common, a column for each independent cause: of planes, and of parts.
+
+        The part of the asymmetry that a plane's spread hides is as local, and counts in both.
+        """
+        local = torch.sqrt(self.asymmetry**2 + (self.shared**2).sum(1))
+        alike = torch.exp(-0.5 * (torch.cdist(self.points, self.points) / PART) ** 2)
+        return torch.cat([self.shared, local[:, None] * symmetric_root(alike, 1.0, "keep mirrored points apart")], 1)
 
 
 def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 50) -> Completion:
@@ -92,8 +109,9 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
     return Completion(
         points=kept.points,
         normals=kept.normals,
-        noise=torch.sqrt(LEAST_NOISE**2 + kept.variance),
+        noise=torch.full_like(kept.variance, LEAST_NOISE),
         shared=kept.shared.flatten(1),
+        asymmetry=kept.variance.sqrt(),
         planes=planes,
         scores=scores,
         outline=outline,
