@@ -110,7 +110,18 @@ def test_shared_errors_are_those_of_a_moved_plane(seen_cylinder: PointCloud, tab
 
 def _deviation(found: Completion) -> Tensor:
     """The standard deviation [m] of each point's whole error."""
-    return torch.sqrt(found.noise**2 + (found.shared**2).sum(1))
+    return torch.sqrt(found.noise**2 + (found.deviations**2).sum(1))
+
+
+def test_neighbours_share_what_is_asymmetric_and_those_far_apart_do_not(seen_cylinder: PointCloud):
+    found = complete_cloud(_without_symmetry(seen_cylinder), table=0.0)
+    parts = found.deviations[:, found.shared.shape[1] :]
+    covariance = parts @ parts.T
+    scale = torch.sqrt(covariance.diagonal()[:, None] * covariance.diagonal())
+    apart = torch.cdist(found.points, found.points)
+    torch.testing.assert_close(covariance / scale, torch.exp(-0.5 * (apart / 0.02) ** 2), atol=1e-9, rtol=0)
+    own = found.asymmetry**2 + (found.shared**2).sum(1)
+    torch.testing.assert_close(covariance.diagonal(), own, atol=1e-12, rtol=1e-9)
 
 
 def _without_symmetry(cloud: PointCloud) -> PointCloud:
