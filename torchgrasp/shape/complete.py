@@ -19,7 +19,7 @@ NEW, SPACING = 0.006, 0.004
 """Least distance [m] of a mirrored point from the cloud and from another one."""
 LEAST_NOISE = 0.003
 """Standard deviation [m] of a mirrored point, were the object symmetric about that very plane."""
-GOOD, ASYMMETRY = 0.45, 0.052
+GOOD, ASYMMETRY = 0.45, 0.060
 """Score from which on an object counts as symmetric, and by how much [m] it deviates from its mirror image for each 1
 that is missing."""
 PART = 0.02
