@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.trials.test_trial import HEIGHT, RADIUS, cylinder, pinch
+from tests.pinch import HEIGHT, RADIUS, cylinder, pinch
 from torchgrasp.frames import rigid, rotate, rotation_from_vector
 from torchgrasp.hand.approach import DISTANCE, find_approach
 from torchgrasp.hand.clear import Surroundings

@@ -1,15 +1,12 @@
 """The page of an evaluation: every number of the summary is on it, and no text of a file becomes HTML."""
 
 import re
-import runpy
-from pathlib import Path
 
 import pytest
 
+from tests.trials.test_evaluate import SCORES
 from torchgrasp.report.evaluation import WIDTH, bar, format_evaluation, write_evaluation
 from torchgrasp.trials.score import share
-
-SCORES = runpy.run_path(str(Path(__file__).parents[1] / "trials" / "test_evaluate.py"))["SCORES"]
 
 
 def test_page_shows_shares_objects_and_reasons(tmp_path):

@@ -1,20 +1,17 @@
 """The clutch: coupled below the torque, the outer link alone above it, and coupled again once the finger opens."""
 
 import dataclasses
-import runpy
-from pathlib import Path
 
 import pytest
 import torch
 
+from tests.pinch import QUICK, close, pinch
 from torchgrasp.close.sight import plant_from_hand
 from torchgrasp.simulate.breakaway import Breakaway
 
-TRIAL = runpy.run_path(str(Path(__file__).parents[1] / "trials" / "test_trial.py"))
-
 
 def barrett():
-    hand, grasp = TRIAL["pinch"]("barrett")
+    hand, grasp = pinch("barrett")
     plant = plant_from_hand(hand, grasp)
     index = {name: k for k, name in enumerate(hand.urdf_joint_names)}
     return plant, index
@@ -38,7 +35,7 @@ def test_the_outer_link_takes_the_whole_turn_of_the_motor():
 
 
 def test_a_hand_without_geared_fingers_has_no_clutch():
-    hand, grasp = TRIAL["pinch"]("allegro")
+    hand, grasp = pinch("allegro")
     targets = torch.rand(len(hand.urdf_joint_names), dtype=torch.float64)
     assert torch.equal(Breakaway(plant_from_hand(hand, grasp), 1e-6)(targets, 0 * targets), targets)
 
@@ -46,10 +43,9 @@ def test_a_hand_without_geared_fingers_has_no_clutch():
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
 def test_the_clutch_is_an_option_of_a_trial():
-    quick = TRIAL["QUICK"]
-    plain = TRIAL["close"]("barrett", spec=quick)
-    never = TRIAL["close"]("barrett", spec=dataclasses.replace(quick, breakaway=50.0))
-    early = TRIAL["close"]("barrett", spec=dataclasses.replace(quick, breakaway=0.05))
+    plain = close("barrett", spec=QUICK)
+    never = close("barrett", spec=dataclasses.replace(QUICK, breakaway=50.0))
+    early = close("barrett", spec=dataclasses.replace(QUICK, breakaway=0.05))
     assert torch.equal(plain.joints, never.joints)
     assert not torch.equal(plain.joints, early.joints)
     ratio = lambda result: result.joints[-1][[result.joint_names.index(n) for n in ("f3_distal", "f3_flex")]]  # noqa: E731

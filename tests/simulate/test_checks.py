@@ -2,11 +2,11 @@
 
 import importlib
 import math
-import runpy
 from pathlib import Path
 
 import pytest
 
+from tests.pinch import cylinder, pinch
 from torchgrasp.hand.load import load_hand
 
 pytestmark = [
@@ -14,8 +14,6 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore"),
     pytest.mark.parametrize("simulator", ["sapien", "mujoco"]),
 ]
-TRIAL = runpy.run_path(str(Path(__file__).parents[1] / "trials" / "test_trial.py"))
-pinch, cylinder = TRIAL["pinch"], TRIAL["cylinder"]
 
 
 @pytest.fixture

@@ -2,14 +2,13 @@
 
 import dataclasses
 import json
-import runpy
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from tests.pinch import pinch
 from torchgrasp import cli
 from torchgrasp.close.squeeze import squeeze
 from torchgrasp.frames import apply
@@ -17,7 +16,6 @@ from torchgrasp.hand.load import load_hand
 from torchgrasp.simulate.keyframes import format_keyframes
 from torchgrasp.simulate.replay import format_grasps
 
-pinch = runpy.run_path(str(Path(__file__).parents[1] / "trials" / "test_trial.py"))["pinch"]
 HANDS = ["allegro", "barrett"]
 
 

@@ -1,23 +1,19 @@
 """The same pinched cylinder in both simulators: held in both, with the same forces, and each repeats itself."""
 
 import dataclasses
-import runpy
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from tests.pinch import QUICK as QUICK_SAPIEN
+from tests.pinch import close, cylinder, digest, digest_elsewhere, pinch
 from torchgrasp.errors import Status
 from torchgrasp.trials.protocol import PROTOCOLS, pull_grasp
 from torchgrasp.trials.trial import close_hand
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
-TRIAL = runpy.run_path(str(Path(__file__).parents[1] / "trials" / "test_trial.py"))
-pinch, cylinder, close, digest = (TRIAL[name] for name in ("pinch", "cylinder", "close", "digest"))
-QUICK = dataclasses.replace(TRIAL["QUICK"], simulator="mujoco")
+QUICK = dataclasses.replace(QUICK_SAPIEN, simulator="mujoco")
 PULL = dataclasses.replace(PROTOCOLS["dexgraspbench"], seconds=0.2, mass=0.05)
 
 
@@ -41,10 +37,7 @@ def test_mujoco_gives_the_same_bits_here_and_in_another_process():
     first = digest(close("allegro", spec=QUICK, seed=3))
     assert first == digest(close("allegro", spec=QUICK, seed=3))
     assert first != digest(close("allegro", spec=QUICK, seed=4))
-    code = "import runpy, warnings; warnings.simplefilter('ignore'); "
-    code += f"m = runpy.run_path({__file__!r}); print(m['digest'](m['close']('allegro', spec=m['QUICK'], seed=3)))"
-    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert answer.stdout.strip() == first
+    assert first == digest_elsewhere("allegro", "mujoco", 3)
 
 
 def test_mujoco_tells_overlap_and_absence():

@@ -5,7 +5,7 @@ import functools
 import pytest
 import torch
 
-from tests.trials.test_trial import cylinder, pinch
+from tests.pinch import cylinder, pinch
 from torchgrasp.close.impedance import GRASP_STIFFNESS, Impedance
 from torchgrasp.close.law import closing_gains
 from torchgrasp.close.stable import lengths_of, load_stable, state_of

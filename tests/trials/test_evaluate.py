@@ -3,13 +3,13 @@
 import dataclasses
 import json
 import math
-import runpy
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
+from tests.pinch import cylinder, pinch
 from torchgrasp import cli
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.hand.load import load_hand
@@ -133,10 +133,9 @@ def without_times(scores):
 @pytest.mark.filterwarnings("ignore")
 def test_a_pinched_cylinder_is_lifted():
     pytest.importorskip("sapien")
-    trial = runpy.run_path(str(Path(__file__).with_name("test_trial.py")))
-    hand, grasp = trial["pinch"]("allegro")
+    hand, grasp = pinch("allegro")
     protocol = LiftProtocol("quick", TrialSpec(friction=0.8, hold_time=0.2))
-    found = attempt_grasp(grasp, hand, trial["cylinder"](), [trial["cylinder"]()], protocol, Execution())
+    found = attempt_grasp(grasp, hand, cylinder(), [cylinder()], protocol, Execution())
     assert found.passed and found.status is Status.OK and found.force > 1.0 and found.moved < 0.01
     assert 0.0 <= found.overlap < 0.003
 

@@ -2,12 +2,11 @@
 
 import dataclasses
 import math
-import runpy
-from pathlib import Path
 
 import pytest
 import torch
 
+from tests.pinch import cylinder, pinch
 from torchgrasp.close.law import joint_stiffness
 from torchgrasp.close.squeeze import squeeze_joints
 from torchgrasp.errors import BadArgument, Status
@@ -15,8 +14,6 @@ from torchgrasp.frames import apply, inverse
 from torchgrasp.trials.protocol import PROTOCOLS, check_test, pull_grasp
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
-TRIAL = runpy.run_path(str(Path(__file__).with_name("test_trial.py")))
-pinch, cylinder = TRIAL["pinch"], TRIAL["cylinder"]
 QUICK = dataclasses.replace(PROTOCOLS["dexgraspbench"], seconds=0.2, mass=0.05)
 
 

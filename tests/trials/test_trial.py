@@ -1,91 +1,16 @@
 """Trials on a standing cylinder: held by both hands, repeatable to the last bit, and with the right reason if not."""
 
 import dataclasses
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 import torch
 import trimesh
 
+from tests.pinch import QUICK, close, cylinder, digest, digest_elsewhere, pinch
 from torchgrasp.errors import BadArgument, MeshError, Status
-from torchgrasp.frames import rigid, rotate, rotation_from_vector
 from torchgrasp.hand.load import load_hand
 from torchgrasp.specs import TrialSpec
-from torchgrasp.values import Certificate, Contacts, Grasps
-
-RADIUS, HEIGHT = 0.03, 0.18
-POSES = {  # rotation vector, translation, joints, opened joints: pinches of the cylinder, solved once
-    "allegro": (
-        [0.24253, -1.75703, -2.50589],
-        [0.1042, 0.014, 0.0964],
-        [-0.0667, 0.6228, 0.6892, 0.557, 0.0044, 0.7411, 0.7659, 0.5881, 1.1233, 0.4317, 0.4032, 0.6257],
-        [-0.1367, 0.6075, 0.5415, 0.4525, -0.0493, 0.6581, 0.6872, 0.5489, 1.0773, 0.5813, 0.1806, 0.8404],
-    ),
-    "barrett": (
-        [-3.12917, -0.02668, 0.00548],
-        [0.0007, -0.0085, 0.3262],
-        [0.0004, 1.231, 1.2386, 1.2678],
-        [0.1918, 1.1228, 1.1304, 1.1384],
-    ),
-}
-CONTACTS = {
-    "allegro": ([[0, 1, 0], [0, 1, 0], [0, -1, 0]], [0.1485, 0.1035, 0.126]),
-    "barrett": ([[-0.6311, 0.7757, 0], [0.6311, 0.7757, 0], [0, -1, 0]], [0.15, 0.15, 0.15]),
-}
-
-
-QUICK = TrialSpec(hold_time=0.1, control_rate=50.0)
-
-
-def cylinder(shift=(0.0, 0.0)):
-    mesh = trimesh.creation.cylinder(radius=RADIUS, height=HEIGHT)
-    mesh.apply_translation([*shift, HEIGHT / 2])
-    return mesh
-
-
-def pinch(name):
-    """The hand and its grasp of the cylinder."""
-    real = {"dtype": torch.float64}
-    vector, translation, joints, opened = (torch.tensor([v], **real) for v in POSES[name])
-    normals, heights = (torch.tensor(v, **real) for v in CONTACTS[name])
-    normals = normals / normals.norm(dim=-1, keepdim=True)
-    points = RADIUS * normals + heights[:, None] * torch.tensor([0.0, 0.0, 1.0], **real)
-    one, three = torch.ones(1, **real), torch.ones(1, 3, **real)
-    hand, pose = load_hand(name), rigid(rotation_from_vector(vector), translation)
-    return hand, Grasps(
-        joints=joints,
-        pregrasp=opened,
-        approach=rotate(pose, hand.approach[None].double())[:, 0],
-        obj_from_hand=pose,
-        contacts=Contacts(points[None], normals[None], 0.01 * three, 0.004 * three),
-        permutation=torch.tensor([[0, 1, 2]]),
-        tip_error=0 * three,
-        clearance=0.01 * one,
-        normal_angle=0 * three,
-        certificate=Certificate(one, one, 0 * one, torch.tensor([True]), torch.zeros(1, 6)),
-        score=one,
-        status=torch.zeros(1, dtype=torch.int64),
-    )
-
-
-def close(name, mesh=None, spec=None, **options):
-    pytest.importorskip("sapien")
-    from torchgrasp.trials.trial import close_hand
-
-    hand, grasp = pinch(name)
-    return close_hand(grasp, hand, cylinder() if mesh is None else mesh, spec, **options)
-
-
-def digest(result):
-    """Every number of a trial but its wall time."""
-    import hashlib
-
-    tensors = (getattr(result, f.name) for f in dataclasses.fields(result))
-    data = b"".join(t.numpy().tobytes() for t in tensors if isinstance(t, torch.Tensor))
-    return hashlib.sha256(data + repr((result.status, result.object_motion, result.contact_order)).encode()).hexdigest()
-
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 
@@ -110,10 +35,7 @@ def test_same_seed_same_bits_here_and_in_another_process():
     first, second = (close("allegro", spec=QUICK, seed=3) for _ in range(2))
     assert digest(first) == digest(second)
     assert digest(first) != digest(close("allegro", spec=QUICK, seed=4))
-    code = "import runpy, warnings; warnings.simplefilter('ignore'); "
-    code += f"m = runpy.run_path({__file__!r}); print(m['digest'](m['close']('allegro', spec=m['QUICK'], seed=3)))"
-    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert answer.stdout.strip() == digest(first)
+    assert digest_elsewhere("allegro", "sapien", 3) == digest(first)
 
 
 def test_controllers_differ_and_waiting_keeps_the_object_still():
