@@ -5,7 +5,17 @@ import dataclasses
 import pytest
 import torch
 
-from torchgrasp.close.closings import LEAD, PATIENCE, POSE_TIME, SETTLED, STOP_FORCE, Closing, FixedClosing, Stopping
+from torchgrasp.close.closings import (
+    AIM_DEPTH,
+    LEAD,
+    PATIENCE,
+    POSE_TIME,
+    SETTLED,
+    STOP_FORCE,
+    Closing,
+    FixedClosing,
+    Stopping,
+)
 from torchgrasp.close.control import CLOSING_TIME, PRESSING_TIME, GraspController
 from torchgrasp.close.hold import RAMP, Squeeze, held_forces
 from torchgrasp.close.law import MAX_SPEED, POSITION_FLOOR, POSITION_RATE, surface_covariance
@@ -117,7 +127,9 @@ def test_the_baseline_stops_each_finger_by_itself_and_for_good():
     later = controller(sight(0.02), PERIOD).reshape(3, 3)
     assert later[0].abs().max() == 0
     assert not controller.done
-    controller(sight(0.0005), PERIOD)
+    controller(sight(), PERIOD)  # at the planned contacts nothing is felt: it goes on
+    assert not controller.done
+    controller(sight(0.0005 - AIM_DEPTH), PERIOD)
     assert controller.done
 
 
