@@ -1,6 +1,7 @@
 """Trials on a standing cylinder: held by both hands, repeatable to the last bit, and with the right reason if not."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -141,6 +142,9 @@ def test_bad_arguments_are_refused():
         close_hand(grasp, hand, mesh, TrialSpec(control_rate=1000.0))
     with pytest.raises(BadArgument, match="joints: found 9 for"):
         close_hand(dataclasses.replace(grasp, pregrasp=grasp.pregrasp * 0 + 9), hand, mesh)
+    for wrong in (math.nan, 0.0, 2.0):
+        with pytest.raises(BadArgument, match="unit vector"):
+            close_hand(dataclasses.replace(grasp, approach=wrong * grasp.approach), hand, mesh)
     with pytest.raises(MeshError, match="parts"):
         close_hand(grasp, hand, mesh, parts=[])
     assert np.isfinite(mesh.vertices).all()

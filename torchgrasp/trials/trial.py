@@ -84,8 +84,8 @@ def close_hand(
 
     Raises:
         BadArgument: not exactly one row, a grasp of another hand or with numbers that are not finite, a pre-grasp
-            outside the joint limits, a controller faster than the simulator, or a belief for a
-            closing that does not follow the law (Eq. 25).
+            outside the joint limits, an approach that is no unit vector, a controller faster than the simulator, or a
+            belief for a closing that does not follow the law (Eq. 25).
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
     """
@@ -97,6 +97,8 @@ def close_hand(
     grasp, hand = grasp.to("cpu", torch.float64), hand.to("cpu", torch.float64)
     gains = closing_gains(grasp, hand, spec.force)
     hand.check_joints(grasp.pregrasp)
+    if spec.approach and not abs(float(torch.linalg.vector_norm(grasp.approach)) - 1) < 1e-4:
+        raise BadArgument("grasp", f"an approach along {grasp.approach[0].tolist()}", "a unit vector")
     mesh = read_mesh(mesh)
     bodies = convex_parts(mesh) if parts is None else check_parts(parts)
     stands = grasp.obj_from_hand[0] if error is None else grasp.obj_from_hand[0] @ error.double().cpu()
