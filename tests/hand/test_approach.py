@@ -1,14 +1,17 @@
 """The way to a pre-grasp against distances to solids in closed form."""
 
+import math
+
 import pytest
 import torch
 
 from tests.pinch import HEIGHT, RADIUS, cylinder, pinch
-from torchgrasp.frames import rigid, rotate, rotation_from_vector
-from torchgrasp.hand.approach import DISTANCE, find_approach
+from torchgrasp.frames import apply, rigid, rotation_from_vector
+from torchgrasp.hand.approach import DISTANCE, FINE_PLACES, _directions, find_approach
 from torchgrasp.hand.clear import Surroundings
 from torchgrasp.hand.collide import DistanceField, field_from_mesh
 from torchgrasp.hand.motion import Posture, Screws
+from torchgrasp.linalg import unit
 
 
 def spheres_on_the_way(posture, hand, direction, places=81):
@@ -34,13 +37,13 @@ def test_the_way_is_clear_of_the_object_and_the_table_as_said(name):
     direction, clearance = find_approach(posture, hand, Surroundings(field_from_mesh(cylinder()), 0.0))
     assert float(direction.norm()) == pytest.approx(1.0)
     centres, radius = spheres_on_the_way(posture, hand, direction)
-    away = centres[: 81 - 10]  # the last eighth is the pre-grasp's own matter
+    away = centres[: 81 - 5]  # the last sixteenth is the pre-grasp's own matter
     least = min(
         float((cylinder_distance(away) - radius).min()),
         float((away[..., 2] - radius).min()),
     )
     assert least > 0
-    assert float(clearance) == pytest.approx(least, abs=4e-3)
+    assert float(clearance) == pytest.approx(least, abs=5e-4)
 
 
 def field_of(distance, center, half=0.4, spacing=0.01):
@@ -61,9 +64,9 @@ def test_a_wall_is_avoided_and_a_cage_leaves_no_way():
 
     other, clearance = find_approach(posture, hand, Surroundings(field_of(wall, center), None))
     before = (wall(spheres_on_the_way(posture, hand, free)[0]) - hand.collision_spheres.radius).min()
-    after = (wall(spheres_on_the_way(posture, hand, other)[0]) - hand.collision_spheres.radius).min()
+    after = (wall(spheres_on_the_way(posture, hand, other)[0][:-5]) - hand.collision_spheres.radius).min()
     assert float(after) > float(before) + 0.02
-    assert float(clearance) == pytest.approx(float(after), abs=0.01)
+    assert float(clearance) == pytest.approx(float(after), abs=1e-12)
 
     def cage(points):
         """Distance to all that is more than 0.15 m from the middle of the hand."""
@@ -73,11 +76,58 @@ def test_a_wall_is_avoided_and_a_cage_leaves_no_way():
     assert float(none) < 0
 
 
+def wall_of(normal, origin):
+    """Distance to all that lies behind a plane."""
+    return lambda points: ((points - origin) * normal).sum(-1)
+
+
 def test_the_way_turns_with_hand_and_frame():
+    """A wall behind the hand that leans by 40 degrees leaves most room on the way that is tilted towards it."""
     hand, grasp = pinch("barrett")
-    turned = rigid(rotation_from_vector(torch.tensor([0.3, -0.8, 0.5]).double()), torch.zeros(3).double())
-    nothing = Surroundings(None, None)
-    first, infinite = find_approach(Posture(grasp.pregrasp, grasp.obj_from_hand), hand, nothing)
-    second, _ = find_approach(Posture(grasp.pregrasp, turned @ grasp.obj_from_hand), hand, nothing)
-    assert torch.isinf(infinite).all()
-    assert torch.allclose(second, rotate(turned[None], first[:, None])[:, 0], atol=1e-12)
+    posture = Posture(grasp.pregrasp, grasp.obj_from_hand)
+    axis, side = torch.eye(3).double()[[2, 0]]
+    tilted = math.sqrt(0.5) * (axis + side)
+    leaning = math.cos(math.radians(40)) * axis - math.sin(math.radians(40)) * side
+    assert torch.equal(hand.approach.double(), axis)
+    motion = rigid(rotation_from_vector(torch.tensor([0.3, -0.8, 0.5]).double()), torch.tensor([0.2, 0.1, -0.3]))
+    clearances = []
+    for turn in (torch.eye(4).double(), motion.double()):
+        turned = Posture(posture.joints, turn @ posture.obj_from_hand)
+        rotation = turned.obj_from_hand[0, :3, :3]
+        middle = apply(turned.obj_from_hand[0], 0.1 * axis[None])[0]
+        wall = wall_of(rotation @ leaning, middle - 0.25 * (rotation @ leaning))
+        field = field_of(wall, middle, half=0.35, spacing=0.005)
+        direction, clearance = find_approach(turned, hand, Surroundings(field, None))
+        assert torch.allclose(direction[0], rotation @ tilted, atol=1e-12)
+        centres, radius = spheres_on_the_way(turned, hand, direction)
+        # between the nodes of a plane's distance nothing is lost
+        assert float(clearance) == pytest.approx(float((wall(centres) - radius).min()), abs=1e-12)
+        clearances.append(float(clearance))
+    assert clearances[0] == pytest.approx(clearances[1], abs=1e-12)
+
+
+def test_what_is_called_free_is_free_where_the_nearest_node_errs(generator):
+    """Nodes 3 cm apart rank the ways badly; one that is free is found all the same, and its clearance is exact."""
+    hand, grasp = pinch("allegro")
+    posture = Posture(grasp.pregrasp, grasp.obj_from_hand)
+    centres = Screws.at(posture, hand).points(hand.collision_spheres.link_index, hand.collision_spheres.center)
+    middle, radius, erred = centres[0].mean(0), hand.collision_spheres.radius, 0
+    for _ in range(20):
+        normal = unit(torch.randn(3, generator=generator, dtype=torch.float64))
+        directions = _directions(posture, hand, None)[0]
+        ways = [spheres_on_the_way(posture, hand, d[None], FINE_PLACES + 1)[0][:-1] for d in directions]
+        room = torch.stack([(wall_of(normal, middle)(way) - radius).min() for way in ways])
+        field = field_of(wall_of(normal, middle + (room.max() - 1e-3) * normal), middle, half=0.42, spacing=0.03)
+        by_node = torch.stack([(field.nearest(way) - radius).min() for way in ways]).argmax()
+        erred += int(room[by_node] < room.max() - 1e-3)
+        found, clearance = find_approach(posture, hand, Surroundings(field, None))
+        which = (directions - found).norm(dim=1).argmin()
+        assert float(clearance) == pytest.approx(float(room[which] - room.max() + 1e-3), abs=1e-12)
+        assert float(clearance) >= 0
+    assert erred > 2
+
+
+def test_without_anything_around_the_hand_comes_along_its_own_axis():
+    hand, grasp = pinch("barrett")
+    direction, clearance = find_approach(Posture(grasp.pregrasp, grasp.obj_from_hand), hand, Surroundings(None, None))
+    assert torch.allclose(direction, grasp.approach, atol=1e-12) and torch.isinf(clearance).all()

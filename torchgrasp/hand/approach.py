@@ -8,25 +8,33 @@ from torch import Tensor
 
 from torchgrasp.frames import rotate
 from torchgrasp.hand.clear import Surroundings
+from torchgrasp.hand.collide import DistanceField
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.motion import Posture, Screws
 
 DISTANCE = 0.1
 """Length [m] of the straight way on which nothing may be touched."""
-PLACES = 8
-"""How many places on the way are looked at, evenly spaced: half a finger's width apart."""
 TILT = math.radians(45)
 """Angle [rad] between the hand's own approach axis and the other directions that are tried."""
 AROUND = 8
 """How many tilted directions are tried."""
+PLACES = 8
+"""How many places on each way are looked at to choose one, evenly spaced: half a finger's width apart."""
+FINE_PLACES = 16
+"""How many on the chosen way are looked at to tell whether it is free: between two of them a corner of the object
+comes less than 1 mm deeper into a link than at them."""
+SLACK = 1.2
+"""How many spacings of the field its `query` may be below its `nearest`."""
 
 
 def find_approach(
     opened: Posture, hand: Hand, surroundings: Surroundings
 ) -> tuple[Float[Tensor, "g 3"], Float[Tensor, "g"]]:
-    """Return the direction of each hand's way to where it stands with the most clearance, and that clearance [m].
+    """Return the direction of a way for each hand to where it stands, and how clear [m] of everything that way is.
 
     Tried are the hand's approach axis, directions tilted from it all around and, where there is a table, straight down.
+    They are ranked by their clearance to 3 mm, from the field's nearest nodes. Taken is the first whose clearance by
+    the field's interpolation is not negative or, where all touch, the one that has the most.
     The clearance is the least of all links along the way, of the object and of the table; infinite without both.
 
     Args:
@@ -36,14 +44,18 @@ def find_approach(
     """
     cover = hand.collision_spheres
     centres = Screws.at(opened, hand).points(cover.link_index, cover.center)
-    candidates = _directions(opened, hand, surroundings.table)
-    back = torch.arange(1, PLACES + 1).to(centres) * (DISTANCE / PLACES)
-    clearances = []
-    for direction in candidates.unbind(1):
-        way = centres[:, None] - back[:, None, None] * direction[:, None, None]
-        clearances.append(_clearance(way, cover.radius.to(centres), surroundings))
-    clearance, best = torch.stack(clearances, 1).max(1)
-    return candidates[torch.arange(len(best), device=best.device), best], clearance
+    radius, candidates = cover.radius.to(centres), _directions(opened, hand, surroundings.table)
+    ways = (_way(centres, direction, PLACES) for direction in candidates.unbind(1))
+    rough = torch.stack([_clearance(way, radius, surroundings, exact=False) for way in ways], 1)
+    order = torch.argsort(rough, dim=1, descending=True, stable=True)
+    chosen, clearance = candidates[:, 0].clone(), torch.full_like(rough[:, 0], -math.inf)
+    for choice in order.unbind(1):
+        touching = torch.nonzero(clearance < 0)[:, 0]
+        direction = candidates[touching, choice[touching]]
+        found = _clearance(_way(centres[touching], direction, FINE_PLACES), radius, surroundings, exact=True)
+        better = found > clearance[touching]
+        chosen[touching[better]], clearance[touching[better]] = direction[better], found[better]
+    return chosen, clearance
 
 
 def _directions(opened: Posture, hand: Hand, table: float | None) -> Float[Tensor, "g k 3"]:
@@ -64,13 +76,31 @@ def _directions(opened: Posture, hand: Hand, table: float | None) -> Float[Tenso
     return torch.cat([found, down], 1)
 
 
+def _way(centres: Float[Tensor, "g s 3"], direction: Float[Tensor, "g 3"], places: int) -> Float[Tensor, "g p s 3"]:
+    """Return where the spheres are at places along the way, the last of which, where they stand, is left out."""
+    back = torch.arange(1, places + 1).to(centres) * (DISTANCE / places)
+    return centres[:, None] - back[:, None, None] * direction[:, None, None]
+
+
 def _clearance(
-    way: Float[Tensor, "g p s 3"], radius: Float[Tensor, " s"], surroundings: Surroundings
+    way: Float[Tensor, "g p s 3"], radius: Float[Tensor, " s"], surroundings: Surroundings, exact: bool
 ) -> Float[Tensor, "g"]:
-    """Return the least clearance [m] of spheres along a way; of the object to 3 mm, by the field's nearest node."""
+    """Return the least clearance [m] of spheres along a way; of the object by the field's interpolation or nodes."""
     least = torch.full_like(way[:, 0, 0, 0], math.inf)
     if surroundings.field is not None:
-        least = torch.minimum(least, (surroundings.field.nearest(way) - radius).flatten(1).amin(1))
+        rough = (surroundings.field.nearest(way) - radius).flatten(1)
+        least = _exact_least(way, radius, rough, surroundings.field) if exact else rough.amin(1)
     if surroundings.table is not None:
         least = torch.minimum(least, (way[..., 2] - radius).flatten(1).amin(1) - surroundings.table)
     return least
+
+
+def _exact_least(
+    way: Float[Tensor, "g p s 3"], radius: Float[Tensor, " s"], rough: Float[Tensor, "g n"], field: DistanceField
+) -> Float[Tensor, "g"]:
+    """Return the least clearance [m] by the field's interpolation, which only the spheres that may have it need."""
+    points, radii = way.flatten(1, 2), radius.repeat(way.shape[1])
+    first = rough.argmin(1)
+    least = field.query(points[torch.arange(len(points), device=way.device), first])[0] - radii[first]
+    row, at = torch.nonzero(rough < least[:, None] + SLACK * field.spacing, as_tuple=True)
+    return least.scatter_reduce(0, row, field.query(points[row, at])[0] - radii[at], "amin")
