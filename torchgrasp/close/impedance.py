@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchgrasp.close.force import internal_forces
 from torchgrasp.close.hold import RAMP, held_forces
-from torchgrasp.close.law import damped_inverse
+from torchgrasp.close.law import actuated_stiffness, damped_inverse
 from torchgrasp.close.sensor import low_pass
 from torchgrasp.close.sight import Plant, Sight
 from torchgrasp.close.stable import lengths_of, state_of
@@ -145,7 +145,7 @@ class Impedance:
         self.plant = plant
         self.stable = plant.stable if springs is None else None
         self.springs = torch.full_like(plant.radius, GRASP_STIFFNESS) if springs is None else springs
-        self.stiffness = (plant.coupling**2 * plant.kp[:, None]).sum(0)
+        self.stiffness = actuated_stiffness(plant.coupling, plant.kp)
         forces, self.strength = held_forces(plant, gains, sight)
         self.frame = rigid(torch.eye(3).to(sight.tips), sight.tips.mean(0))
         self.rest, self.lengths = self._frame(sight.tips), side_lengths(sight.tips)

@@ -148,15 +148,29 @@ def joint_step(
     return step * (max_step / largest.clamp_min(max_step))
 
 
-def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
+def drive_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "j"]:
+    """Return the stiffness [N m/rad] of the drive of every joint of the URDF: the hand's own, or `kp` of all."""
+    every = [hand.actuators[name].kp if kp is None else kp for name in hand.urdf_joint_names]
+    return torch.tensor(every, dtype=torch.float64)
+
+
+def actuated_stiffness(coupling: Float[Tensor, "j h"], kp: Float[Tensor, " j"]) -> Float[Tensor, "h"]:
     """Return the stiffness [N m/rad] of each actuated joint: that of its drive and of the joints that follow it.
+
+    >>> actuated_stiffness(torch.tensor([[1.0], [0.5]]), torch.tensor([4.0, 4.0]))
+    tensor([5.])
+    """
+    return (coupling**2 * kp[:, None]).sum(0)
+
+
+def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
+    """Return the stiffness [N m/rad] of each actuated joint of a hand (`actuated_stiffness`).
 
     Args:
         hand: the hand.
         kp: of every drive [N m/rad]; None: the hand's own.
     """
-    every = torch.tensor([hand.actuators[n].kp if kp is None else kp for n in hand.urdf_joint_names])
-    return (hand.coupling**2 * every.to(hand.coupling)[:, None]).sum(0)
+    return actuated_stiffness(hand.coupling, drive_stiffness(hand, kp).to(hand.coupling))
 
 
 def tip_compliance(

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.close.law import drive_stiffness
 from torchgrasp.close.sensor import Touch
 from torchgrasp.close.squeeze import squeeze_joints
 from torchgrasp.close.stable import StableGrasps, load_stable
@@ -79,12 +80,11 @@ def plant_from_hand(
     """
     names = hand.urdf_joint_names if names is None else names
     order = [hand.urdf_joint_names.index(name) for name in names]
-    stiffness = [hand.actuators[name].kp if kp is None else kp for name in names]
     return Plant(
         coupling=hand.coupling[order].double(),
         offset=hand.offset[order].double(),
         actuated=tuple(names.index(name) for name in hand.joint_names),
-        kp=torch.tensor(stiffness, dtype=torch.float64),
+        kp=drive_stiffness(hand, kp)[order],
         lower=hand.lower.double(),
         upper=hand.upper.double(),
         radius=hand.tip_radius.double(),
