@@ -7,7 +7,7 @@ import torch
 from safetensors.torch import save_file
 
 from torchgrasp.errors import ModelFileError, OutputError
-from torchgrasp.files import load_tensors, save_tensors, sha256, write_atomically
+from torchgrasp.files import LOCK, hold_folder, load_tensors, save_tensors, sha256, write_atomically
 from torchgrasp.values import Certificate, Contacts, Grasps, load_grasps
 
 
@@ -108,3 +108,19 @@ def test_a_file_in_the_place_of_a_folder_is_named(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(OutputError, match="writable folder"):
         write_atomically(tmp_path / "file" / "x", lambda p: None)
+
+
+def test_a_folder_is_held_by_one_run_and_left_as_it_was(tmp_path):
+    with hold_folder(tmp_path / "new" / "deep"):
+        refused = rf"folder: found .*deep, in use by process {os.getpid()} on"
+        with pytest.raises(OutputError, match=refused), hold_folder(tmp_path / "new" / "deep"):
+            pytest.fail("held twice")
+    assert os.listdir(tmp_path) == []
+    with hold_folder(tmp_path / "new"):
+        (tmp_path / "new" / "result").write_text("kept")
+    assert os.listdir(tmp_path / "new") == ["result"]
+    with hold_folder(tmp_path / "new"):
+        assert sorted(os.listdir(tmp_path / "new")) == [LOCK, "result"]
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(OutputError, match="folder that can be written"), hold_folder(tmp_path / "file" / "x"):
+        pytest.fail("no folder")

@@ -1,14 +1,16 @@
-"""Files that torchgrasp writes and reads back: safetensors with JSON metadata, written atomically.
+"""Files that torchgrasp writes and reads back: safetensors with JSON metadata, written atomically; folders held.
 
 There is no pickle anywhere: a file from a stranger can be malformed, but it cannot run code.
 """
 
+import contextlib
 import hashlib
 import json
 import math
 import os
+import socket
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,46 @@ from torchgrasp.errors import ModelFileError, OutputError, Status
 
 VERSION = "1"
 """Version of the layout of every file written here; readers refuse any other."""
+
+LOCK = ".lock"
+"""The file in a folder by which a run holds it; it names the run."""
+
+
+@contextlib.contextmanager
+def hold_folder(folder: Path) -> Iterator[None]:
+    """Make a folder and hold it against other runs; the system lets go of it when the process ends, however it ends.
+
+    A folder that was made for this and is empty at the end is taken away again.
+
+    Raises:
+        OutputError: another run holds it, or it cannot be made or written.
+    """
+    import fcntl
+
+    path, made = folder / LOCK, [x for x in (folder, *folder.parents) if not x.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError as error:
+        raise OutputError("folder", f"{folder} ({error.strerror or error})", "a folder that can be written") from error
+    with os.fdopen(handle, "r+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not os.path.samestat(os.fstat(handle), os.stat(path)):
+                raise FileNotFoundError(path)  # a run that just ended took the file away that was opened here
+        except OSError as error:
+            holder = file.read(200).strip() or "another run"
+            raise OutputError("folder", f"{folder}, in use by {holder}", "a folder that no run writes") from error
+        try:
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {socket.gethostname()}")
+            file.flush()
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # not empty
+                for empty in made:
+                    empty.rmdir()
 
 
 def write_atomically(path: Path | str, write: Callable[[Path], object]) -> Path:

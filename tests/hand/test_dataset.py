@@ -14,7 +14,8 @@ import torch
 
 from torchgrasp.cli import main
 from torchgrasp.errors import BadArgument, ModelFileError, OutputError
-from torchgrasp.hand.dataset import _locked, load_samples, write_samples
+from torchgrasp.files import hold_folder
+from torchgrasp.hand.dataset import load_samples, write_samples
 from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.sample import check_sampling, sample_configurations
 
@@ -88,7 +89,7 @@ def test_half_a_chunk_is_never_taken_for_a_whole_one(tmp_path, small):
 
 def test_a_second_run_on_the_folder_is_refused(tmp_path, small):
     hand = load_hand("barrett")
-    with _locked(tmp_path), pytest.raises(OutputError, match=f"in use by process {os.getpid()} on"):
+    with hold_folder(tmp_path), pytest.raises(OutputError, match=f"in use by process {os.getpid()} on"):
         write_samples(hand, 100, tmp_path)
     (tmp_path / ".lock").write_text("process 1 on nowhere")  # left by a run that was killed: nobody holds it
     write_samples(hand, 100, tmp_path)

@@ -12,6 +12,7 @@ import trimesh
 from tests.pinch import cylinder, pinch
 from torchgrasp import cli
 from torchgrasp.errors import BadArgument, Status
+from torchgrasp.files import hold_folder
 from torchgrasp.hand.load import load_hand
 from torchgrasp.specs import TrialSpec
 from torchgrasp.trials.attempt import PROTOCOLS, Attempt, Execution, LiftProtocol, attempt_grasp, find_protocol
@@ -122,6 +123,16 @@ def test_n10_any_number_of_workers_gives_the_same_bits_and_a_bad_object_is_refus
     assert without_times(again) == without_times(one)
     other = evaluate(folder, load_hand("barrett"), quick, planned=True, **options)[0]
     assert other.refusal is Status.BAD_OBJECT and "another cloud or hand" in other.note
+
+
+def test_a_second_run_on_the_folder_is_refused_and_a_bad_input_leaves_none(tmp_path, capsys):
+    words = ["evaluate", "--objects", str(tmp_path / "none"), "--hand", "allegro", "--out", str(tmp_path / "out")]
+    with hold_folder(tmp_path / "out"):
+        assert cli.main(words) == 2
+        assert capsys.readouterr().err.startswith(f"torchgrasp: --out: found {tmp_path / 'out'}, in use by process")
+    assert cli.main(words) == 2
+    assert capsys.readouterr().err.startswith("torchgrasp: --objects: found")
+    assert list(tmp_path.iterdir()) == []
 
 
 def without_times(scores):

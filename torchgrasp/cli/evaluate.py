@@ -4,10 +4,10 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
-from torchgrasp.cli.common import check_folder, check_seed, naming
+from torchgrasp.cli.common import check_seed, naming
 from torchgrasp.cli.grasps import check_simulator
 from torchgrasp.errors import Status
-from torchgrasp.files import format_json, write_file
+from torchgrasp.files import format_json, hold_folder, write_file
 from torchgrasp.hand.load import load_hand
 from torchgrasp.report.evaluation import SHARE_NAMES, write_evaluation
 from torchgrasp.specs import ClosingMode, HoldingMode, Simulator
@@ -45,7 +45,7 @@ def evaluate(
     Args:
         objects: folder with manifest.json, and for each object mesh.ply and noisy views.
         hand: allegro, allegro_biotac, barrett, or the folder of another hand.
-        out: folder of the results; it is made where it does not exist.
+        out: folder of the results; it is made where it does not exist, and no other run may use it meanwhile.
         protocol: which test: see torchgrasp.trials.protocol and torchgrasp.trials.attempt.
         closing: open loop through pre-grasp, grasp and squeeze, or by a controller that feels with the fingertips; by
             default open loop where the object is pulled at, and under uncertainty where it is lifted.
@@ -62,32 +62,30 @@ def evaluate(
         workers: processes that share the work; the results do not depend on how many.
         seed: of every random draw.
     """
-    with naming("--out", "path"):
-        check_folder(out)
     check_seed(seed)
     check_simulator(simulator)
     with naming("--hand", "hand", "name"):
         the_hand = load_hand(hand)
     execution = Execution(force, closing, holding, simulator)
-    with (
-        naming("--objects", "objects", "path"),
-        naming("--grasps", "grasps"),
-        naming("--force", "force"),
-        naming("--closing", "closing"),
-        naming("--workers", "workers"),
-    ):
-        scores = evaluate_views(
-            objects, the_hand, protocol, execution, grasps, starts, seed, ranks=ranks, complete=complete, only=only,
-            workers=workers, folder=planned or out / "grasps", planned=planned is not None, observer=print_score,
-        )  # fmt: skip
-    summary = summarise(scores)
-    print_summary(protocol, summary)
-    used = dict(zip(("force", "closing"), execution.on(PROTOCOLS[protocol]), strict=True)) | {"holding": holding}
-    used |= {"simulator": simulator}
-    asked = {"protocol": dataclasses.asdict(PROTOCOLS[protocol]), "hand": hand, **used, "grasps": grasps}
-    asked |= {"ranks": ranks, "starts": starts, "complete": complete, "seed": seed, "hand_sha256": the_hand.sha256}
-    content = {"asked": asked, "summary": summary, "views": [dataclasses.asdict(score) for score in scores]}
-    with naming("--out", "path"):
+    with naming("--out", "folder", "path"), hold_folder(out):
+        with (
+            naming("--objects", "objects", "path"),
+            naming("--grasps", "grasps"),
+            naming("--force", "force"),
+            naming("--closing", "closing"),
+            naming("--workers", "workers"),
+        ):
+            scores = evaluate_views(
+                objects, the_hand, protocol, execution, grasps, starts, seed, ranks=ranks, complete=complete, only=only,
+                workers=workers, folder=planned or out / "grasps", planned=planned is not None, observer=print_score,
+            )  # fmt: skip
+        summary = summarise(scores)
+        print_summary(protocol, summary)
+        used = dict(zip(("force", "closing"), execution.on(PROTOCOLS[protocol]), strict=True)) | {"holding": holding}
+        used |= {"simulator": simulator}
+        asked = {"protocol": dataclasses.asdict(PROTOCOLS[protocol]), "hand": hand, **used, "grasps": grasps}
+        asked |= {"ranks": ranks, "starts": starts, "complete": complete, "seed": seed, "hand_sha256": the_hand.sha256}
+        content = {"asked": asked, "summary": summary, "views": [dataclasses.asdict(score) for score in scores]}
         write_file(out / "evaluate.json", format_json(content))
         write_evaluation(out / "evaluate.html", f"Grasps of the {hand} hand under {protocol}", asked, scores)
     return 0

@@ -5,12 +5,9 @@ written beside its place and moved there whole, and comes from (seed, chunk) alo
 continued by the same command, and the finished folder has the same bytes for any number of workers.
 """
 
-import contextlib
 import dataclasses
 import json
-import os
 import shutil
-import socket
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -18,7 +15,7 @@ from typing import Any
 
 from torchgrasp.base import join
 from torchgrasp.errors import BadArgument, ModelFileError, OutputError
-from torchgrasp.files import load_tensors, save_tensors, write_file
+from torchgrasp.files import LOCK, hold_folder, load_tensors, save_tensors, write_file
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.sample import (
     CHUNK,
@@ -31,7 +28,6 @@ from torchgrasp.hand.sample import (
 )
 
 MANIFEST = "samples.json"
-LOCK = ".lock"
 MAX_MANIFEST = 1024 * 1024
 TEXTS = ("hand", "fingers", "hand_sha256", "hand_codes", "seed", "sampling")
 
@@ -115,7 +111,7 @@ def write_samples(
     counts = chunk_counts(n)
     made = SampleFolder(folder, n, hand.joint_names, meta)
     content = {"torchgrasp": "samples", "version": 1, "n": n, "chunk": CHUNK, "joint_names": hand.joint_names, **meta}
-    with _locked(folder):
+    with hold_folder(folder):
         _start(folder, json.dumps(content, indent=1) + "\n")
         missing = [i for i in range(len(counts)) if not _is_whole(made, i)]
         needed = 8 * sum(counts[i] for i in missing) * (hand.dof + 6)
@@ -209,37 +205,6 @@ def _start(folder: Path, manifest: str) -> None:
         write_file(path, manifest)
     for half in folder.glob(".*.safetensors"):
         half.unlink()
-
-
-@contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Hold the folder: the system lets go of it when the process ends, however it ends.
-
-    Raises:
-        OutputError: another run holds it, or it cannot be made or written.
-    """
-    import fcntl
-
-    path = folder / LOCK
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    except OSError as error:
-        raise OutputError("folder", f"{folder} ({error.strerror or error})", "a folder that can be written") from error
-    with os.fdopen(handle, "r+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            os.stat(path)  # a run that just ended may have taken the file away
-        except OSError as error:
-            holder = file.read(200).strip() or "another run"
-            raise OutputError("folder", f"{folder}, in use by {holder}", "a folder that no run writes") from error
-        try:
-            file.truncate(0)
-            file.write(f"process {os.getpid()} on {socket.gethostname()}")
-            file.flush()
-            yield
-        finally:
-            path.unlink(missing_ok=True)
 
 
 def _shown(steps: Iterator[None], total: int, progress: bool) -> Iterator[None]:
