@@ -6,12 +6,14 @@ import math
 import pytest
 import torch
 
-from tests.pinch import cylinder, pinch
+from tests.pinch import HEIGHT, RADIUS, cylinder, pinch
+from torchgrasp import fit_shape
 from torchgrasp.close.law import joint_stiffness
 from torchgrasp.close.squeeze import squeeze_joints
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import apply, inverse
-from torchgrasp.trials.protocol import PROTOCOLS, check_test, pull_grasp
+from torchgrasp.trials.protocol import DIRECTIONS, PROTOCOLS, check_test, pull_grasp
+from torchgrasp.values import PointCloud
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 QUICK = dataclasses.replace(PROTOCOLS["dexgraspbench"], seconds=0.2, mass=0.05)
@@ -69,6 +71,23 @@ def test_more_pull_than_friction_can_hold_moves_the_object():
 def test_a_controller_closes_and_holds(closing):
     result = pull("allegro", dataclasses.replace(QUICK, pull=2.0), force=4.0, closing=closing)
     assert result.passed and 1.0 < result.force < 5.0
+
+
+def test_touches_revise_a_shape_that_was_believed_thinner_in_each_direction_anew(monkeypatch):
+    angle, height = torch.rand(2, 400, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    normals = torch.cat([torch.cos(2 * math.pi * angle), torch.sin(2 * math.pi * angle), 0 * angle], 1)
+    points = (RADIUS - 0.008) * normals + HEIGHT * height * normals.new_tensor([0.0, 0.0, 1.0])
+    shape, down = fit_shape(PointCloud(points, normals), seed=0), DIRECTIONS[4]
+
+    def pull_down(times, belief):
+        monkeypatch.setattr("torchgrasp.trials.protocol.DIRECTIONS", times * (down,))
+        return pull("allegro", QUICK, force=4.0, closing="uncertainty", belief=belief)
+
+    once, twice, unaware = pull_down(1, shape), pull_down(2, shape), pull_down(1, None)
+    assert once.passed and 1.0 < once.force < 5.0 and once.force != unaware.force
+    assert dataclasses.replace(twice, directions=1, seconds=once.seconds) == once
+    with pytest.raises(BadArgument, match="belief: found one for 'open_loop'"):
+        pull("allegro", QUICK, belief=shape)
 
 
 def test_a_hand_inside_the_object_is_refused():

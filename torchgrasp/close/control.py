@@ -22,6 +22,15 @@ PRESSING_TIME = 0.5
 """Time [s] between the end of closing and the moment at which the hand counts as closed: the forces build up."""
 
 
+def check_modes(closing: str, holding: str, belief: object = None) -> None:
+    """Refuse an unknown closing or holding, and a belief for a closing that does not follow the law (Eq. 25)."""
+    for name, value, table in (("closing", closing, CLOSINGS), ("holding", holding, HOLDINGS)):
+        if value not in table:
+            raise BadArgument(name, repr(value), f"one of {', '.join(table)}")
+    if belief is not None and not issubclass(CLOSINGS[closing], Closing):
+        raise BadArgument("belief", f"one for {closing!r}", "None, or a closing under the law")
+
+
 class GraspController:
     """Close a hand and hold what it grasped: what a robot knows at a tick goes in, joint targets come out.
 
@@ -66,13 +75,9 @@ class GraspController:
         holding: HoldingMode = "squeeze",
         belief: Belief | None = None,
     ) -> None:
-        for name, value, table in (("closing", closing, CLOSINGS), ("holding", holding, HOLDINGS)):
-            if value not in table:
-                raise BadArgument(name, repr(value), f"one of {', '.join(table)}")
+        check_modes(closing, holding, belief)
         self.plant, self.gains = plant, gains
         kind = CLOSINGS[closing]
-        if belief is not None and not issubclass(kind, Closing):
-            raise BadArgument("belief", f"one for {closing!r}", "None, or a closing under the law")
         self.closing = kind(plant, gains, belief) if issubclass(kind, Closing) else kind(plant, gains)
         self._holding, self.hold = HOLDINGS[holding], None
         self.targets = plant.expand(plant.pregrasp)

@@ -20,12 +20,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.close.control import CLOSINGS, HOLDINGS, GraspController
+from torchgrasp.close.belief import Belief
+from torchgrasp.close.control import GraspController, check_modes
 from torchgrasp.close.law import closing_gains
 from torchgrasp.close.sight import plant_from_hand
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import rotation_angle
 from torchgrasp.hand.hand import Hand
+from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.simulate.parts import check_parts, convex_parts, read_mesh
 from torchgrasp.simulate.robot import Robot
 from torchgrasp.simulate.scene import Scene, Setup
@@ -129,6 +131,7 @@ def pull_grasp(
     *,
     holding: HoldingMode = "squeeze",
     error: Float[Tensor, "4 4"] | None = None,
+    belief: ShapeGP | None = None,
     parts: "Sequence[trimesh.Trimesh] | None" = None,
     simulator: Simulator = "sapien",
 ) -> PullResult:
@@ -144,17 +147,21 @@ def pull_grasp(
         seed: of the noise of the fingertips that the controllers feel with.
         holding: how it presses from then on, but for the open loop, which keeps its squeeze (`HOLDINGS`).
         error: where the hand really stands in its planned frame (`misplace`), of which it knows nothing.
+        belief: the shape that the grasp was planned on, which touches revise while the hand closes (`close_hand`), in
+            each direction anew; None: they do not.
         parts: convex bodies to use for the mesh instead of its own decomposition.
         simulator: "sapien" or "mujoco".
 
     Raises:
         BadArgument: an unknown protocol, closing, holding or simulator, a force outside (0, 1000) N, not exactly one
-            row, a grasp of another hand, or a pre-grasp outside the joint limits.
+            row, a grasp of another hand, a pre-grasp outside the joint limits, or a belief for a closing that does not
+            follow the law (Eq. 25).
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
     """
     began = time.process_time()
     protocol = check_test(protocol, force, closing, holding)
+    check_modes(closing, holding, belief)
     check_simulator(simulator)
     if len(grasp) != 1:
         raise BadArgument("grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]")
@@ -164,7 +171,7 @@ def pull_grasp(
     mesh = read_mesh(mesh)
     bodies = convex_parts(mesh) if parts is None else check_parts(parts)
     stands = grasp.obj_from_hand[0] if error is None else grasp.obj_from_hand[0] @ error.double()
-    trial = _Pull(grasp, hand, mesh, bodies, protocol, stands, closing, holding, gains, force, seed, simulator)
+    trial = _Pull(grasp, hand, mesh, bodies, protocol, stands, closing, holding, gains, belief, force, seed, simulator)
     status, moved, turned, pressed, tried = Status.OK, 0.0, 0.0, math.nan, 0
     for direction in DIRECTIONS:
         found, forces = trial.run(direction)
@@ -185,9 +192,7 @@ def check_test(protocol: PullProtocol | str, force: float, closing: str, holding
     """
     if isinstance(protocol, str) and protocol not in PROTOCOLS:
         raise BadArgument("protocol", repr(protocol), f"one of {', '.join(PROTOCOLS)}")
-    for name, value, table in (("closing", closing, CLOSINGS), ("holding", holding, HOLDINGS)):
-        if value not in table:
-            raise BadArgument(name, repr(value), f"one of {', '.join(table)}")
+    check_modes(closing, holding)
     if not 0.0 < force < 1e3:
         raise BadArgument("force", force, "a number in (0, 1000) [N]")
     return PROTOCOLS[protocol] if isinstance(protocol, str) else protocol
@@ -207,6 +212,7 @@ class _Pull:
         closing: ClosingMode,
         holding: HoldingMode,
         gains: ClosingGains,
+        belief: ShapeGP | None,
         force: float,
         seed: int,
         simulator: Simulator,
@@ -216,7 +222,7 @@ class _Pull:
         self.closing: ClosingMode = closing
         self.holding: HoldingMode = holding
         self.stands = stands.numpy()
-        self.gains, self.force, self.seed = gains, force, seed
+        self.gains, self.belief, self.force, self.seed = gains, belief, force, seed
         self.mass = protocol.density * float(mesh.volume) if protocol.mass is None else protocol.mass
         self.start = {name: float(q) for name, q in hand.expand(grasp.pregrasp[0]).items()}
         self.drives = hand.actuators
@@ -254,7 +260,8 @@ class _Pull:
 
     def _close(self, robot: Robot) -> Callable[[], None]:
         """Close the hand and return what holds it closed for one tick more."""
-        controller = GraspController(robot.plant, self.gains, self.closing, self.holding)
+        belief = None if self.belief is None else Belief(self.belief, self.grasp.obj_from_hand[0])
+        controller = GraspController(robot.plant, self.gains, self.closing, self.holding, belief)
         sight = robot.tick(controller.targets)
 
         def go_on() -> None:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.close.belief import Belief
-from torchgrasp.close.control import GraspController
+from torchgrasp.close.control import GraspController, check_modes
 from torchgrasp.close.law import closing_gains
 from torchgrasp.close.sight import Sight, plant_from_hand
 from torchgrasp.errors import BadArgument, Status
@@ -91,6 +91,7 @@ def close_hand(
     """
     started = time.perf_counter()
     spec = TrialSpec() if spec is None else spec
+    check_modes(spec.controller, spec.holding, belief)
     if not spec.control_rate * spec.timestep < 1 + 1e-9:
         found = f"{spec.control_rate:g} Hz with a timestep of {spec.timestep:g} s"
         raise BadArgument("control_rate", found, "a period of at least one timestep")
