@@ -9,7 +9,8 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.shape.joint import symmetric_root
-from torchgrasp.shape.planes import PROBES, Scene, find_planes, planes_near, reflect, turn
+from torchgrasp.shape.planes import PROBES, Scene, find_plane_through, find_planes, planes_near, reflect, turn
+from torchgrasp.shape.revolve import find_revolution
 from torchgrasp.shape.silhouette import Outlines, farthest_points, silhouettes
 from torchgrasp.values import PointCloud
 
@@ -22,6 +23,8 @@ LEAST_NOISE = 0.003
 GOOD, ASYMMETRY = 0.45, 0.060
 """Score from which on an object counts as symmetric, and by how much [m] it deviates from its mirror image for each 1
 that is missing."""
+FEW = 20
+"""Points beside a body of revolution from which on they count as a part of its own."""
 PART = 0.02
 """Length [m] over which such deviations are alike: a part that is missing on the other side is missing as a whole."""
 TEMPERATURE = 0.1
@@ -94,17 +97,36 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
     points, normals, outline = cloud.points, cloud.normals, silhouettes(cloud)
     assert normals is not None
     tree = KDTree(points.numpy())
-    probes = farthest_points(points, PROBES)
-    scene = Scene(points, normals, tree, outline, table, points[probes], normals[probes])
-    planes, scores = find_planes(scene)
-    mirrors = [_Mirror.of(scene, i, planes[i], scores[i]) for i in range(len(planes))]
-    near = len(mirrors[0].near) if mirrors else 0
-    none = torch.zeros_like(points[:, 0])
-    seen = _Image(points, normals, math.inf, none, none.new_zeros(len(points), len(planes), near))
-    images = [mirror.image(seen) for mirror in mirrors]
-    images += [mirrors[j].image(images[i]) for i in range(min(2, len(planes))) for j in range(len(planes)) if i != j]
+
+    def scene_of(rows: Tensor) -> Scene:
+        probes = rows[farthest_points(points[rows], PROBES)]
+        return Scene(points, normals, tree, outline, table, points[probes], normals[probes])
+
+    every = torch.arange(len(points))
+    turned = None if table is None else find_revolution(points, normals)
+    if turned is None:
+        groups = [(every, *find_planes(scene_of(every)))]
+    else:
+        groups = [(every[turned.body], *find_planes(scene_of(every[turned.body])))]
+        rest = every[~turned.body]
+        if len(rest) >= FEW:
+            groups.append((rest, *find_plane_through(scene_of(rest), turned.center, points[rest])))
+    scene = scene_of(every)
+    planes, scores = torch.cat([g[1] for g in groups]), torch.cat([g[2] for g in groups])
+    near = SPREAD_STEPS**2 if table is not None else SPREAD_STEPS**3
+    images, number = [], 0
+    for rows, own, marks in groups:
+        part = scene_of(rows)
+        mirrors = [_Mirror.of(part, number + i, own[i], marks[i]) for i in range(len(own))]
+        number += len(own)
+        none = torch.zeros_like(points[rows, 0])
+        seen = _Image(points[rows], normals[rows], math.inf, none, none.new_zeros(len(rows), len(planes), near))
+        found = [mirror.image(seen) for mirror in mirrors]
+        found += [mirrors[j].image(found[i]) for i in range(min(2, len(own))) for j in range(len(own)) if i != j]
+        images += found
+    seen = _Image(points[:0], normals[:0], math.inf, points[:0, 0], points.new_zeros(0, len(planes), near))
     images.sort(key=lambda image: -image.score)
-    kept = _keep(scene, seen.select(torch.arange(0)), images)
+    kept = _keep(scene, seen, images)
     kept = kept.select(farthest_points(kept.points, budget))
     return Completion(
         points=kept.points,

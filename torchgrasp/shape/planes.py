@@ -131,6 +131,23 @@ def find_planes(scene: Scene) -> tuple[Float[Tensor, "p 4"], Float[Tensor, "p"]]
     return refined[order], final[order]
 
 
+def find_plane_through(
+    scene: Scene, center: Float[Tensor, "2"], part: Float[Tensor, "n 3"]
+) -> tuple[Float[Tensor, "1 4"], Float[Tensor, "1"]]:
+    """Return the plane through an upright axis that a part beside it is symmetric about, and its score.
+
+    Handles and spouts lie on the plane: what is least aside of it is favoured.
+    """
+    angle = torch.arange(4 * ANGLES, dtype=torch.float64) * math.pi / (4 * ANGLES)
+    normals = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
+    planes = torch.cat([normals, (normals[:, :2] @ center)[:, None]], -1)
+    out = part[:, :2] - center
+    aside = (out @ normals[:, :2].T).square().mean(0) / out.square().sum(1).mean()
+    scores, _ = scene.score(planes)
+    best = (scores - aside).argmax()
+    return planes[best][None], scores[best][None]
+
+
 def _refine(scene: Scene, plane: Float[Tensor, "4"]) -> Float[Tensor, "4"]:
     """Return the plane after three searches on a grid of turns and offsets, each half as wide as the last."""
     steps = torch.tensor([-1.0, 0.0, 1.0], dtype=plane.dtype)
