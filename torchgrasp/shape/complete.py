@@ -9,9 +9,9 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.shape.joint import symmetric_root
-from torchgrasp.shape.planes import PROBES, Scene, find_plane_through, find_planes, planes_near, reflect, turn
+from torchgrasp.shape.planes import Scene, find_planes, find_upright_plane, planes_near, reflect, turn
 from torchgrasp.shape.revolve import find_revolution
-from torchgrasp.shape.silhouette import Outlines, farthest_points, silhouettes
+from torchgrasp.shape.silhouette import Outlines, farthest_points
 from torchgrasp.values import PointCloud
 
 HULL_MARGIN, SEEN_MARGIN, TABLE_MARGIN = 0.001, 0.002, 0.002
@@ -23,8 +23,8 @@ LEAST_NOISE = 0.003
 GOOD, ASYMMETRY = 0.45, 0.060
 """Score from which on an object counts as symmetric, and by how much [m] it deviates from its mirror image for each 1
 that is missing."""
-FEW = 20
-"""Points beside a body of revolution from which on they count as a part of its own."""
+ATTACHED = 20
+"""Points beside a body of revolution from which on they are a part with a plane of its own."""
 PART = 0.02
 """Length [m] over which such deviations are alike: a part that is missing on the other side is missing as a whole."""
 TEMPERATURE = 0.1
@@ -37,12 +37,11 @@ SPREAD_STEPS, SPREAD_TURN, SPREAD_SHIFT = 5, 0.15, 0.045
 class Completion(Value):
     """Points of the hidden side [m] with normals, and how far they may be off.
 
-    Each has an error of its own across the surface (`noise`, a standard deviation [m]), one that it shares with the
-    points of the same plane (`shared`), which is known no better than its score tells, and one that it shares with the
-    points nearby: what stands out on one side may be missing on the other. `asymmetry` [m] is the deviation of the last
-    one, a field that is alike over `PART`. The covariance of all the errors is diag(noise^2) + deviations deviations^T
-    [m^2]. Points that share an error do not average it out: with an asymmetry of each point's own, twice as much of the
-    hidden surface was 10 mm off where less than 7 mm were claimed (5.5 % against 2.6 % of it, 24 views).
+    Each has an error of its own across the surface, `LEAST_NOISE`, one that it shares with the points of the same
+    plane (`shared`), which is known no better than its score tells, and one that it shares with the points nearby: what
+    stands out on one side may be missing on the other. `asymmetry` [m] is the deviation of the last one, a field that
+    is alike over `PART`. The covariance of all the errors is LEAST_NOISE^2 I + deviations deviations^T [m^2]: points
+    that share an error do not average it out.
 
     `planes` are rows (n, o) of the planes n.x = o that were used, best first, and `scores` what supports them: 1 for
     a mirror image that lies on the cloud wholly, below .15 for none to speak of.
@@ -50,7 +49,6 @@ class Completion(Value):
 
     points: Float[Tensor, "m 3"]
     normals: Float[Tensor, "m 3"]
-    noise: Float[Tensor, "m"]
     shared: Float[Tensor, "m c"]
     asymmetry: Float[Tensor, "m"]
     planes: Float[Tensor, "p 4"]
@@ -75,9 +73,13 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
     stand out of the outline, in front of the seen surface or below the table (each saturates). The planes come from a
     grid, vertical ones when the table is known, those at right angles to the best being likelier; the up to four
     best, and one across the view if none of those is, are refined. The cloud is mirrored across each, and across
-    pairs; a point is kept where nothing was seen, the hull allows it and no better one is near. Its noise is how
-    asymmetric the object looks; the points of a plane share how far the planes that score nearly as well would move
+    pairs; a point is kept where nothing was seen, the hull allows it and no better one is near. What misses in a
+    plane's score is the asymmetry of its points; they share how far the planes that score nearly as well would move
     them across the surface.
+
+    Any plane through the axis of a body of revolution explains it, so the body says nothing of the plane that its
+    handle has. On a table, where the axis is upright, the body and what is attached to it are parts with planes of
+    their own; what is attached is mirrored across one plane through the axis.
 
     Args:
         cloud: clean points [m] of one view or of several, with outward unit normals and the viewpoint.
@@ -90,61 +92,70 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
     >>> bool(complete_cloud(PointCloud(0.05 * cap, cap, eye)).points[:, 2].min() < -0.02)
     True
     """
-    from scipy.spatial import KDTree
-
-    assert cloud.normals is not None
     cloud = cloud.to("cpu", torch.float64)
-    points, normals, outline = cloud.points, cloud.normals, silhouettes(cloud)
-    assert normals is not None
-    tree = KDTree(points.numpy())
-
-    def scene_of(rows: Tensor) -> Scene:
-        probes = rows[farthest_points(points[rows], PROBES)]
-        return Scene(points, normals, tree, outline, table, points[probes], normals[probes])
-
-    every = torch.arange(len(points))
-    turned = None if table is None else find_revolution(points, normals)
-    if turned is None:
-        groups = [(every, *find_planes(scene_of(every)))]
-    else:
-        groups = [(every[turned.body], *find_planes(scene_of(every[turned.body])))]
-        rest = every[~turned.body]
-        if len(rest) >= FEW:
-            groups.append((rest, *find_plane_through(scene_of(rest), turned.center, points[rest])))
-    scene = scene_of(every)
-    planes, scores = torch.cat([g[1] for g in groups]), torch.cat([g[2] for g in groups])
-    near = SPREAD_STEPS**2 if table is not None else SPREAD_STEPS**3
-    images, number = [], 0
-    for rows, own, marks in groups:
-        part = scene_of(rows)
-        mirrors = [_Mirror.of(part, number + i, own[i], marks[i]) for i in range(len(own))]
-        number += len(own)
-        none = torch.zeros_like(points[rows, 0])
-        seen = _Image(points[rows], normals[rows], math.inf, none, none.new_zeros(len(rows), len(planes), near))
-        found = [mirror.image(seen) for mirror in mirrors]
-        found += [mirrors[j].image(found[i]) for i in range(min(2, len(own))) for j in range(len(own)) if i != j]
-        images += found
-    seen = _Image(points[:0], normals[:0], math.inf, points[:0, 0], points.new_zeros(0, len(planes), near))
+    scene = Scene.of(cloud, table)
+    parts = _split(scene)
+    planes, scores = torch.cat([part.planes for part in parts]), torch.cat([part.scores for part in parts])
+    images = _mirror_parts(parts)
     images.sort(key=lambda image: -image.score)
-    kept = _keep(scene, seen, images)
+    kept = _keep(scene, _Image.of(scene, torch.arange(0), len(planes)), images)
     kept = kept.select(farthest_points(kept.points, budget))
     return Completion(
         points=kept.points,
         normals=kept.normals,
-        noise=torch.full_like(kept.variance, LEAST_NOISE),
         shared=kept.shared.flatten(1),
         asymmetry=kept.variance.sqrt(),
         planes=planes,
         scores=scores,
-        outline=outline,
+        outline=scene.outline,
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Part:
+    """Points of the cloud that are symmetric about the same planes: the scene scored by them, and these planes."""
+
+    scene: Scene
+    rows: Tensor
+    planes: Float[Tensor, "p 4"]
+    scores: Float[Tensor, "p"]
+
+
+def _split(scene: Scene) -> list[_Part]:
+    """Return the cloud as one part; a body of revolution and what is attached to it as two."""
+    every = torch.arange(len(scene.points))
+    revolution = None if scene.table is None else find_revolution(scene.points, scene.normals)
+    if revolution is None:
+        return [_Part(scene, every, *find_planes(scene))]
+    rows, rest = every[revolution.body], every[~revolution.body]
+    body, attached = scene.scored_by(rows), scene.scored_by(rest)
+    parts = [_Part(body, rows, *find_planes(body))]
+    if len(rest) >= ATTACHED:
+        parts.append(_Part(attached, rest, *find_upright_plane(attached, revolution.center, scene.points[rest])))
+    return parts
+
+
+def _mirror_parts(parts: list[_Part]) -> list["_Image"]:
+    """Return the mirror images of each part across its planes, and across the best two and another one."""
+    total, images, before = sum(len(part.planes) for part in parts), [], 0
+    for part in parts:
+        seen = _Image.of(part.scene, part.rows, total)
+        mirrors = [
+            _Mirror.of(part.scene, before + i, plane, score)
+            for i, (plane, score) in enumerate(zip(part.planes, part.scores, strict=True))
+        ]
+        once = [mirror.image(seen) for mirror in mirrors]
+        twice = [m.image(image) for i, image in enumerate(once[:2]) for j, m in enumerate(mirrors) if i != j]
+        images += once + twice
+        before += len(mirrors)
+    return images
 
 
 @dataclasses.dataclass(frozen=True)
 class _Image:
     """A mirrored cloud [m], its score, infinite if it is no mirror image, and the errors of its points.
 
-    `variance` [m^2] is that of their own errors; `shared` [m] tells, for each plane and each one near it, how far a
+    `variance` [m^2] is that of their asymmetry; `shared` [m] tells, for each plane and each one near it, how far a
     point moves across the surface with it, times the root of its probability.
     """
 
@@ -153,6 +164,14 @@ class _Image:
     score: float
     variance: Float[Tensor, "n"]
     shared: Float[Tensor, "n planes near"]
+
+    @classmethod
+    def of(cls, scene: Scene, rows: Tensor, planes: int) -> "_Image":
+        """Return some points of a cloud as seen, without error, of which images across `planes` will be made."""
+        points = scene.points[rows]
+        near = SPREAD_STEPS ** (2 if scene.table is not None else 3)
+        shared = points.new_zeros(len(rows), planes, near)
+        return cls(points, scene.normals[rows], math.inf, torch.zeros_like(points[:, 0]), shared)
 
     def select(self, rows: Tensor) -> "_Image":
         """Return some of the points."""

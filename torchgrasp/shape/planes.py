@@ -5,12 +5,13 @@ import math
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.cloud.normals import spread_directions
 from torchgrasp.linalg import unit
-from torchgrasp.shape.silhouette import Outlines
+from torchgrasp.shape.silhouette import Outlines, farthest_points, silhouettes
+from torchgrasp.values import PointCloud
 
 TAU = 0.003
 """Distance [m] over which a mirrored point stops matching the cloud."""
@@ -18,8 +19,8 @@ PROBES = 150
 """Points of the cloud with which a plane is scored."""
 OFFSETS = 17
 """Offsets tried for each direction of a plane."""
-ANGLES = 24
-"""Vertical planes tried when gravity is known."""
+ANGLES, FINE_ANGLES = 24, 96
+"""Directions of vertical planes tried when gravity is known, and when an axis is, too."""
 DIRECTIONS = 80
 """Directions of planes tried when it is not."""
 FACING = 0.35
@@ -39,7 +40,7 @@ APART = math.cos(math.radians(25.0))
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """What planes are scored against."""
+    """What planes are scored against: the cloud, its outline and the table; and the points that they are scored by."""
 
     points: Tensor
     normals: Tensor
@@ -48,6 +49,21 @@ class Scene:
     table: float | None
     probes: Tensor
     probe_normals: Tensor
+
+    @classmethod
+    def of(cls, cloud: PointCloud, table: float | None) -> "Scene":
+        """Return the scene of a cloud with normals, scored by all of it."""
+        from scipy.spatial import KDTree
+
+        assert cloud.normals is not None
+        tree = KDTree(cloud.points.numpy())
+        whole = cls(cloud.points, cloud.normals, tree, silhouettes(cloud), table, cloud.points[:0], cloud.normals[:0])
+        return whole.scored_by(torch.arange(len(cloud)))
+
+    def scored_by(self, rows: Int[Tensor, "k"]) -> "Scene":
+        """Return the same scene, scored by some points of the cloud."""
+        rows = rows[farthest_points(self.points[rows], PROBES)]
+        return dataclasses.replace(self, probes=self.points[rows], probe_normals=self.normals[rows])
 
     @property
     def center(self) -> Tensor:
@@ -131,18 +147,18 @@ def find_planes(scene: Scene) -> tuple[Float[Tensor, "p 4"], Float[Tensor, "p"]]
     return refined[order], final[order]
 
 
-def find_plane_through(
+def find_upright_plane(
     scene: Scene, center: Float[Tensor, "2"], part: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "1 4"], Float[Tensor, "1"]]:
-    """Return the plane through an upright axis that a part beside it is symmetric about, and its score.
+    """Return the plane through an upright axis about which a part that stands out is symmetric, and its score.
 
-    Handles and spouts lie on the plane: what is least aside of it is favoured.
+    Handles and spouts lie on such a plane: what is less aside of it is favoured, even where their other half is hidden.
     """
-    angle = torch.arange(4 * ANGLES, dtype=torch.float64) * math.pi / (4 * ANGLES)
+    angle = torch.arange(FINE_ANGLES, dtype=torch.float64) * math.pi / FINE_ANGLES
     normals = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
     planes = torch.cat([normals, (normals[:, :2] @ center)[:, None]], -1)
-    out = part[:, :2] - center
-    aside = (out @ normals[:, :2].T).square().mean(0) / out.square().sum(1).mean()
+    arm = part[:, :2] - center
+    aside = (arm @ normals[:, :2].T).square().mean(0) / arm.square().sum(1).mean()
     scores, _ = scene.score(planes)
     best = (scores - aside).argmax()
     return planes[best][None], scores[best][None]

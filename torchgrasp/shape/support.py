@@ -20,7 +20,7 @@ from torchgrasp.shape.check import (
     check_viewpoint,
     check_views,
 )
-from torchgrasp.shape.complete import PART, Completion, complete_cloud
+from torchgrasp.shape.complete import LEAST_NOISE, PART, Completion, complete_cloud
 from torchgrasp.shape.condition import as_shape, check_kernel, longest_distance
 from torchgrasp.shape.free import free_space, trespasses
 from torchgrasp.shape.gp import ShapeGP
@@ -189,18 +189,17 @@ def _fit_camera(cloud: PointCloud, model: _Model, generator: torch.Generator, ta
 def _observe_completion(found: Completion, center: Float[Tensor, "3"], scale: float) -> list[Part]:
     """Return rim and mirrored points as observations of the surface."""
 
-    def observe(points: Tensor, normals: Tensor, noise: Tensor, normal_noise: float) -> Observations:
-        return on_surface(
-            (points.to(center) - center) / scale, normals.to(center), noise.to(center) / scale, normal_noise
-        )
+    def observe(points: Tensor, normals: Tensor, noise: float, normal_noise: float) -> Observations:
+        x = (points.to(center) - center) / scale
+        return on_surface(x, normals.to(center), torch.full_like(x[:, 0], noise / scale), normal_noise)
 
-    mirrored = observe(found.points, found.normals, found.noise, MIRROR_NORMAL_NOISE)
+    mirrored = observe(found.points, found.normals, LEAST_NOISE, MIRROR_NORMAL_NOISE)
     slope = (found.asymmetry / PART).to(center)  # of a field of that deviation, alike over that length
     mirrored = dataclasses.replace(mirrored, normal_noise=torch.hypot(mirrored.normal_noise, slope))
 
     rim, rim_normals = found.outline.rim, found.outline.rim_normals
     return [
-        (observe(rim, rim_normals, torch.full_like(rim[:, 0], RIM_NOISE), RIM_NORMAL_NOISE), None),
+        (observe(rim, rim_normals, RIM_NOISE, RIM_NORMAL_NOISE), None),
         (mirrored, found.deviations.to(center) / scale),
     ]
 
