@@ -1,4 +1,4 @@
-"""Bodies of revolution: the axis is found beside a handle, and a handle is not mirrored to where nothing speaks for it."""
+"""Bodies of revolution: the axis is found beside a handle, and a handle is not mirrored to where the body hides it."""
 
 import math
 

@@ -41,7 +41,7 @@ RIM_NORMAL_NOISE = 0.5
 """Standard deviation of a rim normal; a smaller one bends the seen side."""
 MIRROR_NORMAL_NOISE = 0.25
 """Standard deviation of a mirrored normal."""
-CAMERA_STD_FACTOR = 0.505
+CAMERA_STD_FACTOR = 0.5
 """Real deviations over the raw posterior's: one number, with which 97 % of the hidden sides of 24 noisy views of eight
 scanned objects lie within two std_m, and 75 % within one (mean over views), and at least 80 % of each within two. A
 wedge whose slope is hidden, of which nothing but a wrong plane of symmetry can be seen, has far less (33 %)."""
