@@ -3,15 +3,16 @@
 
 python scripts/make_success.py --objects DIR    trials on own, simple and given objects; the fit; the reliability
 
-Grasps of all ranks are planned on noisy views and pulled at, at two frictions. The model is fitted on all of them and
-judged on each object by a fit without it. Trials that are in the folder already are not run again.
+Grasps of all ranks are planned on noisy views and pulled at: closed open loop and under uncertainty, at two frictions,
+where they were planned and beside it. The model is fitted on all trials and judged on each object by a fit without it.
+Trials that are in the folder already are not run again.
 """
 
 from pathlib import Path
 
 import torch
 import tyro
-from benchmarks.success import brier, draw_reliability, fit, judge, leave_one_out, read_trials
+from benchmarks.success import TESTS, brier, draw_reliability, fit, judge, leave_one_out, read_trials
 
 from torchgrasp.files import format_json, write_file
 from torchgrasp.hand.success import FEATURES, MODEL
@@ -46,7 +47,7 @@ def main(
         "weights": dict(zip(FEATURES, weights, strict=True)),
         "bias": bias,
         "fitted_on": f"{len(trials.passed)} trials of {bodies} objects with {', '.join(hands)}, {share:.0%} passed",
-        "trial": "torchgrasp.trials.protocol, dexgraspbench and dexgraspbench-hard, open loop with 7 N",
+        "trial": "torchgrasp.trials.protocol with 7 N: " + "; ".join(f"{name}, {closing}" for name, closing in TESTS),
         "brier_on_objects_not_fitted_on": round(brier(unseen, trials.passed), 4),
         "brier_of_the_base_rates": round(brier(base, trials.passed), 4),
     }

@@ -1,5 +1,7 @@
 """Whether predicted success is true: trials of grasps of all ranks, and a fit judged on objects it has not seen."""
 
+import dataclasses
+import functools
 import itertools
 import json
 from collections.abc import Sequence
@@ -21,17 +23,25 @@ from torchgrasp.files import format_json, write_atomically, write_file
 from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.success import success_features
 from torchgrasp.objects import list_objects, load_object
-from torchgrasp.pipeline import closure_of
 from torchgrasp.shape.calibrate import list_views, read_view
 from torchgrasp.shape.support import fit_shape
 from torchgrasp.shape.surface import extract_surface
+from torchgrasp.specs import ClosingMode
+from torchgrasp.trials.attempt import Execution
 from torchgrasp.trials.evaluate import evaluate
 from torchgrasp.trials.protocol import PROTOCOLS
-from torchgrasp.trials.score import ViewScore, share
+from torchgrasp.trials.score import share
 from torchgrasp.values import load_grasps
 
-TESTS = ("dexgraspbench", "dexgraspbench-hard")
-"""The protocols of the trials: friction 0.6 and 0.3."""
+TESTS: tuple[tuple[str, ClosingMode], ...] = (
+    ("dexgraspbench", "open_loop"),
+    ("dexgraspbench", "uncertainty"),
+    ("dexgraspbench-hard", "open_loop"),
+    ("dexgraspbench-hard", "uncertainty"),
+    ("pose-noise", "uncertainty"),
+)
+"""Protocols, of friction 0.6 and 0.3, and closings of the trials: what an executed grasp may meet, alike in weight.
+Every grasp is put to each, to the errors of the hand's pose in one draw of its own."""
 
 PENALTY = 0.1
 """Inverse of the weight of the squared coefficients, of standardised features."""
@@ -66,12 +76,13 @@ def bench_success(objects: Path, hands: tuple[str, ...], grasps: int, workers: i
 
 
 class Trials(NamedTuple):
-    """Trials of grasps: `features` (n, 5), whether each `passed`, of which `object`, at which `friction`."""
+    """Trials of grasps: `features` (n, k), whether each `passed`, of which `object`, by which protocol and closing."""
 
     features: np.ndarray
     passed: np.ndarray
     object: np.ndarray
-    friction: np.ndarray
+    protocol: np.ndarray
+    closing: np.ndarray
 
     def select(self, rows: np.ndarray) -> "Trials":
         """Return some of the trials, by a mask."""
@@ -118,31 +129,31 @@ def author_views(folder: Path) -> None:
 def try_object(source: Path, name: str, hand: str, grasps: int, workers: int, folder: Path) -> list[dict[str, Any]]:
     """Return a row for each trial of an object: which it was, its features, and whether it passed."""
     rows, shelf = [], folder / "grasps" / hand / source.name
-    for k, test in enumerate(TESTS):
+    for k, (protocol, closing) in enumerate(TESTS):
+        test = PROTOCOLS[protocol]
         scores = evaluate(
-            source, load_hand(hand), test, grasps=grasps, ranks="spread", only=[name], workers=workers, folder=shelf,
-            planned=k > 0,
+            source, load_hand(hand), dataclasses.replace(test, draws=1), Execution(closing=closing), grasps,
+            ranks="spread", only=[name], workers=workers, folder=shelf, planned=k > 0,
         )  # fmt: skip
-        rows += [row for score in scores for row in rows_of(source, score, PROTOCOLS[test].friction, hand, shelf)]
+        for score in scores:
+            told = {"object": name, "view": score.view, "hand": hand, "protocol": protocol, "closing": closing}
+            known = known_of(source, name, score.view, shelf, test.friction) if score.attempts else []
+            rows += [{**told, "rank": x.rank, "features": known[x.rank], "passed": x.passed} for x in score.attempts]
     return rows
 
 
-def rows_of(source: Path, score: ViewScore, friction: float, hand: str, shelf: Path) -> list[dict[str, Any]]:
-    """Return the rows of one view."""
-    if not score.attempts:
-        return []
-    chosen = load_grasps(shelf / f"{score.object}_{score.view}.safetensors")[
-        torch.tensor([attempt.rank for attempt in score.attempts])
-    ]
-    shape = fit_shape(read_view(source, score.object, score.view), table=0.0)
-    center = extract_surface(shape).vertices.mean(0)
-    closure = closure_of(chosen.contacts, shape, friction, 0)
-    features = success_features(chosen.contacts, closure, chosen.normal_angle, center, friction)
-    told = {"object": score.object, "view": score.view, "hand": hand, "friction": friction}
-    return [
-        {**told, "rank": attempt.rank, "features": known, "passed": attempt.passed}
-        for attempt, known in zip(score.attempts, features.tolist(), strict=True)
-    ]
+@functools.lru_cache(maxsize=16)
+def known_of(source: Path, name: str, view: str, shelf: Path, friction: float) -> list[list[float]]:
+    """Return the features of all grasps of a view."""
+    grasps = load_grasps(shelf / f"{name}_{view}.safetensors")
+    center = center_of(source, name, view)
+    return success_features(grasps.contacts, grasps.normal_angle, center, friction).tolist()
+
+
+@functools.lru_cache(maxsize=8)
+def center_of(source: Path, name: str, view: str) -> torch.Tensor:
+    """Return the estimated centre of the object in a view [m]."""
+    return extract_surface(fit_shape(read_view(source, name, view), table=0.0)).vertices.mean(0)
 
 
 def fit(trials: Trials) -> tuple[list[float], float]:
@@ -155,29 +166,33 @@ def fit(trials: Trials) -> tuple[list[float], float]:
 
 
 def leave_one_out(trials: Trials) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each trial the prediction, and the base rate at its friction, by the other objects alone."""
+    """Return for each trial the prediction, and the base rate of its protocol, by the other objects alone."""
     predicted, base = np.zeros(len(trials.passed)), np.zeros(len(trials.passed))
     for name in np.unique(trials.object):
         mine = trials.object == name
         others = trials.select(~mine)
         weights, bias = fit(others)
         predicted[mine] = 1 / (1 + np.exp(-(trials.features[mine] @ weights + bias)))
-        for mu in np.unique(trials.friction):
-            base[mine & (trials.friction == mu)] = others.passed[others.friction == mu].mean()
+        for protocol in np.unique(trials.protocol):
+            base[mine & (trials.protocol == protocol)] = others.passed[others.protocol == protocol].mean()
     return predicted, base
 
 
 def judge(predicted: np.ndarray, base: np.ndarray, trials: Trials) -> list[str]:
-    """Return what is to be said of predictions: Brier scores, how they order, and reliability by bins."""
+    """Return what is to be said of predictions: Brier scores, how they order, and reliability by bins and closings."""
     lines, y = [], trials.passed
-    for mu in (None, *np.unique(trials.friction)):
-        mine = np.ones(len(y), dtype=bool) if mu is None else trials.friction == mu
+    tests = np.char.add(np.char.add(trials.protocol, ", "), trials.closing)
+    kinds = [("all", np.ones(len(y), dtype=bool))]
+    kinds += [(str(name), column == name) for column in (trials.closing, tests) for name in np.unique(column)]
+    for name, mine in kinds:
         scores = f"Brier {brier(predicted[mine], y[mine]):.3f}, base rate {brier(base[mine], y[mine]):.3f}"
-        auc = roc_auc_score(y[mine], predicted[mine])
-        lines.append(f"{'all' if mu is None else f'friction {mu:g}':13}{mine.sum():5} trials  {scores}, AUC {auc:.2f}")
-    for low, high, count, mean, (value, least, most) in reliability(predicted, y):
-        found = f"predicted {mean:.2f}, passed {value:.2f} [{least:.2f}, {most:.2f}] of {count}"
-        lines.append(f"{low:.1f} to {high:.1f}: {found}")
+        auc = f"AUC {roc_auc_score(y[mine], predicted[mine]):.2f}"
+        rates = f"predicted {predicted[mine].mean():.2f}, passed {y[mine].mean():.2f} of {mine.sum()}"
+        lines.append(f"{name}: {scores}, {auc}, {rates}")
+    for name, mine in kinds[: 1 + len(np.unique(trials.closing))]:
+        for low, high, count, mean, (value, least, most) in reliability(predicted[mine], y[mine]):
+            found = f"predicted {mean:.2f}, passed {value:.2f} [{least:.2f}, {most:.2f}] of {count}"
+            lines.append(f"{name}, {low:.1f} to {high:.1f}: {found}")
     return lines
 
 

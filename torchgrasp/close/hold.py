@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.close.force import balanced_forces
 from torchgrasp.close.sight import Plant, Sight
+from torchgrasp.plan.balance import balanced_forces
 from torchgrasp.values import ClosingGains
 
 RAMP = 0.4

@@ -16,13 +16,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.close.force import internal_forces
 from torchgrasp.close.hold import RAMP, held_forces
 from torchgrasp.close.law import actuated_stiffness, damped_inverse
 from torchgrasp.close.sensor import low_pass
 from torchgrasp.close.sight import Plant, Sight
 from torchgrasp.close.stable import lengths_of, state_of
 from torchgrasp.frames import degenerate, rigid, skew, virtual_frame
+from torchgrasp.plan.balance import internal_forces
 from torchgrasp.values import ClosingGains
 
 TRANSLATION_STIFFNESS = 1200.0
