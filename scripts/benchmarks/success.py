@@ -6,7 +6,7 @@ import itertools
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -29,6 +29,7 @@ from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ClosingMode
 from torchgrasp.trials.attempt import Execution
 from torchgrasp.trials.evaluate import evaluate
+from torchgrasp.trials.pool import run_tasks
 from torchgrasp.trials.protocol import PROTOCOLS
 from torchgrasp.trials.score import share
 from torchgrasp.values import load_grasps
@@ -42,6 +43,9 @@ TESTS: tuple[tuple[str, ClosingMode], ...] = (
 )
 """Protocols, of friction 0.6 and 0.3, and closings of the trials: what an executed grasp may meet, alike in weight.
 Every grasp is put to each, to the errors of the hand's pose in one draw of its own."""
+
+LIMIT = 3600.0
+"""Wall time [s] that the trials of one object may take."""
 
 PENALTY = 0.1
 """Inverse of the weight of the squared coefficients, of standardised features."""
@@ -90,18 +94,28 @@ class Trials(NamedTuple):
 
 
 def read_trials(objects: Sequence[Path], hands: Sequence[str], grasps: int, workers: int, folder: Path) -> Trials:
-    """Return trials on the library's own and simple bodies and on the objects of folders, running what is missing."""
+    """Return trials on the library's own and simple bodies and on the objects of folders, running what is missing.
+
+    Raises:
+        FileNotFoundError: the trials of an object came to no end.
+    """
     author_views(folder / "authored")
-    rows = []
-    for hand in hands:
-        for source in (folder / "authored", *objects):
-            names = sorted({name for name, _ in list_views(source)})
-            for name in tqdm(names, desc=f"{hand}, {source.name}", disable=None, leave=False):
-                kept = folder / f"{hand}_{source.name}_{name}.json"
-                if not kept.exists():
-                    write_file(kept, format_json(try_object(source, name, hand, grasps, workers, folder)))
-                rows += json.loads(kept.read_text())
+    tasks = [
+        (source, name, hand, grasps, folder)
+        for hand in hands
+        for source in (folder / "authored", *objects)
+        for name in sorted({name for name, _ in list_views(source)})
+    ]
+    missing = [task for task in tasks if not kept_at(*task).exists()]
+    for _ in tqdm(run_tasks(try_object, missing, workers, LIMIT), total=len(missing), disable=None, leave=False):
+        pass
+    rows = [row for task in tasks for row in json.loads(kept_at(*task).read_text())]
     return Trials(*(np.array([row[name] for row in rows]) for name in Trials._fields))
+
+
+def kept_at(source: Path, name: str, hand: str, grasps: int, folder: Path) -> Path:
+    """Return where the trials of an object are kept, however many grasps they are of."""
+    return folder / f"{hand}_{source.name}_{name}.json"
 
 
 def author_views(folder: Path) -> None:
@@ -126,20 +140,20 @@ def author_views(folder: Path) -> None:
     write_file(folder / "manifest.json", json.dumps({"objects": entries}))
 
 
-def try_object(source: Path, name: str, hand: str, grasps: int, workers: int, folder: Path) -> list[dict[str, Any]]:
-    """Return a row for each trial of an object: which it was, its features, and whether it passed."""
+def try_object(source: Path, name: str, hand: str, grasps: int, folder: Path) -> None:
+    """Keep a row for each trial of an object: which it was, its features, and whether it passed."""
     rows, shelf = [], folder / "grasps" / hand / source.name
     for k, (protocol, closing) in enumerate(TESTS):
         test = PROTOCOLS[protocol]
         scores = evaluate(
             source, load_hand(hand), dataclasses.replace(test, draws=1), Execution(closing=closing), grasps,
-            ranks="spread", only=[name], workers=workers, folder=shelf, planned=k > 0,
+            ranks="spread", only=[name], workers=0, folder=shelf, planned=k > 0,
         )  # fmt: skip
         for score in scores:
             told = {"object": name, "view": score.view, "hand": hand, "protocol": protocol, "closing": closing}
             known = known_of(source, name, score.view, shelf, test.friction) if score.attempts else []
             rows += [{**told, "rank": x.rank, "features": known[x.rank], "passed": x.passed} for x in score.attempts]
-    return rows
+    write_file(kept_at(source, name, hand, grasps, folder), format_json(rows))
 
 
 @functools.lru_cache(maxsize=16)
