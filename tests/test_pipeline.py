@@ -15,6 +15,7 @@ from torchgrasp.hand.success import FEATURES, MODEL
 from torchgrasp.linalg import unit
 from torchgrasp.pipeline import describe, digest, spread_rows
 from torchgrasp.plan.balance import balanced_forces
+from torchgrasp.plan.probability import closure_probability
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.values import ContactPlan, Contacts
 
@@ -96,13 +97,14 @@ def test_the_likelier_success_ranks_first_and_failures_stay_last(run):
 def test_success_is_what_the_model_says_of_the_surface_that_was_planned_on(run):
     _, grasps, stages = run
     best = grasps[grasps.status == Status.OK][:5]
+    closed = closure_probability(stages["shape"], best.contacts, SPEC, n=600, seed=1).probability.clamp(1e-3, 1 - 1e-3)
     points, normals = best.contacts.points, best.contacts.normals
     offset = (points.mean(1) - extract_surface(stages["shape"]).vertices.mean(0)).norm(dim=-1) / 0.02
     angle = [
         torch.acos((-(unit(forces) * normals).sum(-1)).clamp(0, 1)).amax(1) / math.atan(SPEC.friction)
         for forces in (balanced_forces(points, normals), points.mean(1, keepdim=True) - points)
     ]
-    known = [offset, *angle, best.normal_angle.mean(1)]
+    known = [closed.log() - (1 - closed).log(), offset, *angle, best.normal_angle.mean(1)]
     model = json.loads(MODEL.read_text())
     odds = sum(model["weights"][name] * x for name, x in zip(FEATURES, known, strict=True)) + model["bias"]
     torch.testing.assert_close(best.success, 1 / (1 + (-odds).exp()), rtol=1e-6, atol=1e-6)

@@ -23,7 +23,9 @@ from torchgrasp.files import format_json, write_atomically, write_file
 from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.success import success_features
 from torchgrasp.objects import list_objects, load_object
+from torchgrasp.pipeline import closure_of
 from torchgrasp.shape.calibrate import list_views, read_view
+from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.support import fit_shape
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ClosingMode
@@ -151,23 +153,33 @@ def try_object(source: Path, name: str, hand: str, grasps: int, folder: Path) ->
         )  # fmt: skip
         for score in scores:
             told = {"object": name, "view": score.view, "hand": hand, "protocol": protocol, "closing": closing}
-            known = known_of(source, name, score.view, shelf, test.friction) if score.attempts else []
-            rows += [{**told, "rank": x.rank, "features": known[x.rank], "passed": x.passed} for x in score.attempts]
+            ranks = tuple(attempt.rank for attempt in score.attempts)
+            known = known_of(source, name, score.view, shelf, test.friction, ranks)
+            rows += [
+                {**told, "rank": attempt.rank, "features": features, "passed": attempt.passed}
+                for attempt, features in zip(score.attempts, known, strict=True)
+            ]
     write_file(kept_at(source, name, hand, grasps, folder), format_json(rows))
 
 
 @functools.lru_cache(maxsize=16)
-def known_of(source: Path, name: str, view: str, shelf: Path, friction: float) -> list[list[float]]:
-    """Return the features of all grasps of a view."""
-    grasps = load_grasps(shelf / f"{name}_{view}.safetensors")
-    center = center_of(source, name, view)
-    return success_features(grasps.contacts, grasps.normal_angle, center, friction).tolist()
+def known_of(
+    source: Path, name: str, view: str, shelf: Path, friction: float, ranks: tuple[int, ...]
+) -> list[list[float]]:
+    """Return the features of some grasps of a view."""
+    if not ranks:
+        return []
+    grasps = load_grasps(shelf / f"{name}_{view}.safetensors")[torch.tensor(ranks)]
+    shape, center = shape_of(source, name, view)
+    closure = closure_of(grasps.contacts, shape, friction, 0)
+    return success_features(grasps.contacts, closure, grasps.normal_angle, center, friction).tolist()
 
 
 @functools.lru_cache(maxsize=8)
-def center_of(source: Path, name: str, view: str) -> torch.Tensor:
-    """Return the estimated centre of the object in a view [m]."""
-    return extract_surface(fit_shape(read_view(source, name, view), table=0.0)).vertices.mean(0)
+def shape_of(source: Path, name: str, view: str) -> tuple[ShapeGP, torch.Tensor]:
+    """Return the estimated shape of the object in a view, and its centre [m]."""
+    shape = fit_shape(read_view(source, name, view), table=0.0)
+    return shape, extract_surface(shape).vertices.mean(0)
 
 
 def fit(trials: Trials) -> tuple[list[float], float]:

@@ -11,13 +11,14 @@ from torchgrasp.values import Contacts
 
 CENTER = torch.tensor([0.0, 0.03, 0.0], dtype=torch.float64)
 PADS = torch.tensor([[0.1, 0.3, 0.2]], dtype=torch.float64)
-GOOD = torch.tensor([[0.3, 0.3, 0.5, 0.6]])
+CLOSED = torch.tensor([0.9], dtype=torch.float64)
+GOOD = torch.tensor([[4.0, 0.3, 0.3, 0.5, 0.6]])
 
 
 @pytest.mark.parametrize("name", FEATURES)
 def test_every_feature_counts_the_way_it_should(name):
     changed = GOOD.clone()
-    changed[0, FEATURES.index(name)] += 0.5
+    changed[0, FEATURES.index(name)] += -2.0 if name == "log-odds of closure" else 0.5
     assert float(success_odds(changed)) < float(success_odds(GOOD))
 
 
@@ -41,12 +42,12 @@ def ring(lift=0.0, shift=0.0):
 
 def test_features_of_a_triangle_by_hand():
     cone = math.atan(0.5)
-    found = success_features(ring(lift=0.2), PADS, CENTER, 0.5)[0]
+    found = success_features(ring(lift=0.2), CLOSED, PADS, CENTER, 0.5)[0]
     torch.testing.assert_close(
-        found, torch.tensor([1.5, 0.2 / cone, 0.2 / cone, 0.2], dtype=torch.float64), atol=1e-3, rtol=0
+        found, torch.tensor([math.log(9), 1.5, 0.2 / cone, 0.2 / cone, 0.2], dtype=torch.float64), atol=1e-3, rtol=0
     )
     # Forces that meet where the normals do need no friction; those to the centre, half a radius aside, do.
-    offset, least, lean, _ = success_features(ring(shift=0.01), PADS, CENTER, 0.5)[0]
+    _, offset, least, lean, _ = success_features(ring(shift=0.01), CLOSED, PADS, CENTER, 0.5)[0]
     aside = math.pi / 3 - math.atan2(math.sqrt(3) / 2, 5 / 6)
     assert float(least) < 0.02 and float(lean) * cone == pytest.approx(aside, abs=1e-6)
     assert float(offset) == pytest.approx(1.5)
@@ -58,8 +59,12 @@ def test_features_do_not_depend_on_the_frame_and_are_finite_where_nothing_balanc
     turned = turned * torch.linalg.det(turned)
     points, normals = contacts.points @ turned.T + 1.0, contacts.normals @ turned.T
     moved = Contacts(points, normals, contacts.variance, contacts.std_m)
-    again = success_features(moved, PADS, CENTER @ turned.T + 1.0, 0.5)
-    torch.testing.assert_close(again, success_features(contacts, PADS, CENTER, 0.5), atol=1e-3, rtol=0)
+    again = success_features(moved, CLOSED, PADS, CENTER @ turned.T + 1.0, 0.5)
+    torch.testing.assert_close(again, success_features(contacts, CLOSED, PADS, CENTER, 0.5), atol=1e-3, rtol=0)
+    certain = success_features(contacts, torch.ones_like(CLOSED), PADS, CENTER, 0.5)
+    assert bool(torch.isfinite(certain).all())
     alike = Contacts(points, normals[:, :1].expand(1, 3, 3).contiguous(), contacts.variance, contacts.std_m)
-    assert float(success_features(alike, PADS, CENTER, 0.5)[0, 1]) == pytest.approx(math.pi / 2 / math.atan(0.5))
-    assert success_features(contacts[:0], PADS[:0], CENTER, 0.5).shape == (0, 4)
+    assert float(success_features(alike, CLOSED, PADS, CENTER, 0.5)[0, 2]) == pytest.approx(
+        math.pi / 2 / math.atan(0.5)
+    )
+    assert success_features(contacts[:0], CLOSED[:0], PADS[:0], CENTER, 0.5).shape == (0, 5)
