@@ -13,7 +13,7 @@ from torchgrasp.hand.collide import field_from_surface
 from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.mixture import load_mixture
 from torchgrasp.hand.query import query_hand
-from torchgrasp.hand.rank import score, tangential_ratio
+from torchgrasp.hand.rank import centred_friction, score
 from torchgrasp.hand.realise import assign, rank_in_group, realise
 from torchgrasp.values import Certificate, Contacts, GraspGuess
 
@@ -85,12 +85,12 @@ def triple(height: float = 0.0, tilt: float = 0.0) -> Contacts:
     return Contacts((0.03 * radial + height * up)[None], normals[None], spread, spread)
 
 
-def test_tangential_ratio_is_the_tangent_of_the_tilt():
+def test_centred_friction_is_the_tangent_of_the_tilt():
     torch.testing.assert_close(
-        tangential_ratio(triple(tilt=0.0)), torch.zeros(1, dtype=torch.float64), atol=1e-6, rtol=0
+        centred_friction(triple(tilt=0.0)), torch.zeros(1, dtype=torch.float64), atol=1e-6, rtol=0
     )
     torch.testing.assert_close(
-        tangential_ratio(triple(tilt=0.3)), torch.tensor([0.3], dtype=torch.float64).tan(), atol=1e-6, rtol=0
+        centred_friction(triple(tilt=0.3)), torch.tensor([0.3], dtype=torch.float64).tan(), atol=1e-6, rtol=0
     )
 
 

@@ -21,10 +21,10 @@ OFFSET, PAD = 0.02, 0.8
 """Offset of the contacts' centre [m] and pad angle [rad] that each cost one point."""
 
 
-def tangential_ratio(contacts: Contacts) -> Float[Tensor, "g"]:
-    """Return the largest tangent of the angle between an inward normal and the line to the contacts' centre.
+def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
+    """Return the friction that suffices when the fingers press towards the contacts' centre.
 
-    Forces along those lines balance whatever their sizes are, so that this friction suffices to squeeze.
+    It is the largest tangent of the angle between an inward normal and the line to the centre, where such forces meet.
     """
     inward = unit(contacts.points.mean(1, keepdim=True) - contacts.points)
     cosine = -(inward * contacts.normals).sum(-1)
@@ -41,7 +41,7 @@ def score(contacts: Contacts, found: Findings, center: Float[Tensor, "3"]) -> Fl
         center: estimated centre of the object [m].
     """
     offset = torch.linalg.vector_norm(contacts.points.mean(1) - center, dim=-1)
-    return -(offset / OFFSET + tangential_ratio(contacts) + found.normal_angle.amax(1) / PAD)
+    return -(offset / OFFSET + centred_friction(contacts) + found.normal_angle.amax(1) / PAD)
 
 
 def rank_by_success(grasps: Grasps, odds: Float[Tensor, "k"]) -> Grasps:

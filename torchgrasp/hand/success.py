@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.hand import rank
+from torchgrasp.hand.rank import centred_friction
 from torchgrasp.plan.balance import balanced_forces, tangential_ratio
 from torchgrasp.values import Contacts
 
@@ -65,7 +65,7 @@ def success_features(
     """
     offset = torch.linalg.vector_norm(contacts.points.mean(1) - center, dim=-1) / OFFSET
     least = tangential_ratio(balanced_forces(contacts.points, contacts.normals), contacts.normals).amax(-1)
-    angles = torch.atan(torch.stack([least, rank.tangential_ratio(contacts)], dim=-1)) / math.atan(friction)
+    angles = torch.atan(torch.stack([least, centred_friction(contacts)], dim=-1)) / math.atan(friction)
     odds = torch.logit(closure.to(offset), eps=LEAST)
     return torch.cat([odds[:, None], offset[:, None], angles, normal_angle.mean(1, keepdim=True)], dim=-1)
 
