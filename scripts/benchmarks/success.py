@@ -116,8 +116,8 @@ def read_trials(objects: Sequence[Path], hands: Sequence[str], grasps: int, work
 
 
 def kept_at(source: Path, name: str, hand: str, grasps: int, folder: Path) -> Path:
-    """Return where the trials of an object are kept, however many grasps they are of."""
-    return folder / f"{hand}_{source.name}_{name}.json"
+    """Return where the trials of an object are kept: those of another number of grasps stay apart."""
+    return folder / f"{hand}_{source.name}_{name}_{grasps}.json"
 
 
 def author_views(folder: Path) -> None:

@@ -43,8 +43,8 @@ class Completion(Value):
     is alike over `PART`. The covariance of all the errors is LEAST_NOISE^2 I + deviations deviations^T [m^2]: points
     that share an error do not average it out.
 
-    `planes` are rows (n, o) of the planes n.x = o that were used, best first, and `scores` what supports them: 1 for
-    a mirror image that lies on the cloud wholly, below .15 for none to speak of.
+    `planes` are rows (n, o) of the planes n.x = o that were used, the best of each part first, and `scores` what
+    supports them: 1 for a mirror image that lies on the cloud wholly, below .15 for none to speak of.
     """
 
     points: Float[Tensor, "m 3"]

@@ -58,12 +58,12 @@ def find_revolution(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"])
         miss = height - across @ center
 
     radius = torch.linalg.vector_norm(points[:, :2] - center, dim=1)
-    share = miss.abs() / radius.clamp_min(LEAST_RADIUS)
-    meets = steep & (share < ASIDE)
+    aside = miss.abs() / radius.clamp_min(LEAST_RADIUS)
+    meets = steep & (aside < ASIDE)
     slices = ((points[:, 2:] - points[:, 2]).abs() < SLICE) & meets
     typical = torch.where(slices, radius, torch.nan).nanmedian(1).values
     body = torch.where(steep, meets & ((radius - typical).abs() < THICKNESS), radius < typical + THICKNESS)
     told = body & steep
-    stray, one_way = share[told].square().mean().sqrt(), torch.linalg.vector_norm(level[told].mean(0))
+    stray, one_way = aside[told].square().mean().sqrt(), torch.linalg.vector_norm(level[told].mean(0))
     fits = bool((body.double().mean() > SHARE) & (stray < STRAY) & (one_way < ONE_WAY))
     return Revolution(center, body) if fits else None

@@ -42,7 +42,7 @@ RIM_NORMAL_NOISE = 0.5
 MIRROR_NORMAL_NOISE = 0.25
 """Standard deviation of a mirrored normal."""
 CAMERA_STD_FACTOR = 0.5
-"""Real deviations over the raw posterior's: one number, with which 97 % of the hidden sides of 24 noisy views of eight
+"""Real deviations over the raw posterior's: one number, with which 96 % of the hidden sides of 24 noisy views of eight
 scanned objects lie within two std_m, and 75 % within one (mean over views), and at least 80 % of each within two. A
 wedge whose slope is hidden, of which nothing but a wrong plane of symmetry can be seen, has far less (33 %)."""
 FREE_NOISE = 0.003
@@ -75,7 +75,7 @@ def fit_shape(
     `support="camera"` cleans the cloud, adds the outline seen by the camera and the mirrored cloud as noisier
     observations, and takes every signed distance in metres over the scale, so that gradients agree with unit normals.
     Where the shape then reaches into space that the camera saw empty, or under the table, it is pushed out.
-    The hidden side is then off by 2.6 mm (median), not 7. `support="paper"` observes what the paper does: the
+    The hidden side is then off by 2.5 mm (median), not 7. `support="paper"` observes what the paper does: the
     centre of the cloud at d = -1 and 20 random points on a sphere of 1.2 at d = +1. Its `std_m` is the paper's own,
     std_factor 1, and wide: one and two of them hold 83 % and 96 % of the hidden surface, not 68 % and 95 %.
 
