@@ -13,12 +13,12 @@ they would spin, which takes a plan twice as long on a quiet one.
 """
 
 import tyro
-from benchmarks.close import close
-from benchmarks.grasp import grasp
-from benchmarks.hand import hand
-from benchmarks.plan import plan
-from benchmarks.proof import proof
-from benchmarks.shape import shape
+from benchmarks.close.suite import close
+from benchmarks.grasp.suite import grasp
+from benchmarks.hand.suite import hand
+from benchmarks.plan.suite import plan
+from benchmarks.proof.suite import proof
+from benchmarks.shape.suite import shape
 
 if __name__ == "__main__":
     subjects = {"close": close, "grasp": grasp, "hand": hand, "plan": plan, "proof": proof, "shape": shape}

@@ -17,11 +17,11 @@ import numpy as np
 import torch
 import trimesh
 import tyro
-from closed import table6, table7
-from grasped import grasps
-from learned import fig7, fig8, table5
+from paper.fig9_to_12 import grasps
+from paper.table4_fig5 import fig5, table4
+from paper.table5_fig7_fig8 import fig7, fig8, table5
+from paper.tables6_7 import table6, table7
 from PIL import Image, ImageDraw, ImageFont
-from planned import fig5, table4
 
 from torchgrasp import PointCloud, ShapeGP, fit_shape, list_objects, load_object
 from torchgrasp.files import write_atomically
@@ -112,7 +112,7 @@ def draw(
         corners = np.concatenate([corners, vertices])
     if arrows:
         canvas.add_arrows(*arrows, ARROW * float(np.linalg.norm(np.ptp(corners, axis=0))), INK)
-    picture = Image.open(io.BytesIO(canvas.shoot(corners, eye)))
+    picture = Image.open(io.BytesIO(canvas.render_png(corners, eye)))
     width, height = round(picture.width * TILE[1] / picture.height), TILE[1]
     left = (width - TILE[0]) // 2  # the objects are taller than wide
     return picture.resize((width, height), Image.Resampling.LANCZOS).crop((left, 0, left + TILE[0], height))

@@ -1,6 +1,7 @@
-"""Shared tolerances, generators and analytic shapes of the tests."""
+"""Generators, analytic shapes and small hands that several tests share."""
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -38,3 +39,84 @@ def seen_cylinder() -> PointCloud:
     points, normals = torch.cat([side, top]), torch.cat([side_normals, top_normals])
     seen = ((camera - points) * normals).sum(-1) > 0
     return PointCloud(points[seen], normals[seen], camera)
+
+
+BALL = '<collision><geometry><sphere radius="0.01"/></geometry></collision>'
+BODY = '<inertial><mass value="0.1"/><inertia ixx="1e-4" ixy="0" ixz="0" iyy="1e-4" iyz="0" izz="1e-4"/></inertial>'
+
+
+@pytest.fixture
+def toy_hand(tmp_path: Path) -> Path:
+    links = "".join(f'<link name="{n}">{BODY}{BALL}</link>' for n in ("palm", "t1", "t2", "t3"))
+    joints = "".join(
+        f'<joint name="j{k}" type="revolute"><parent link="palm"/><child link="t{k}"/>'
+        f'<origin xyz="0.0{k} 0 0"/><axis xyz="0 1 0"/>'
+        '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
+        for k in (1, 2, 3)
+    )
+    fingers = "".join(
+        f'\n[[finger]]\nname = "f{k}"\njoints = ["j{k}"]\ntip_link = "t{k}"\ncontact = [0, 0, 0.1]\n'
+        'normal = [0, 0, 1]\ntip = "point"\n'
+        for k in (1, 2, 3)
+    )
+    folder = tmp_path / "toy"
+    folder.mkdir()
+    (folder / "hand.urdf").write_text(f'<robot name="toy">{links}{joints}</robot>')
+    (folder / "hand.toml").write_text(
+        'name = "toy"\nurdf = "hand.urdf"\nbase_link = "palm"\napproach = [0, 0, 1]\nlimit_margin = 0.0\n'
+        '[actuators]\nkp = 1.0\nkd = 0.1\n[options.default]\nfingers = ["f1", "f2", "f3"]\n' + fingers
+    )
+    return folder
+
+
+def box(size: str, xyz: str) -> str:
+    return f'<collision><origin xyz="{xyz}"/><geometry><box size="{size}"/></geometry></collision>'
+
+
+def body(mass: float, inertia: float, com: str, shapes: str) -> str:
+    tensor = f'ixx="{inertia}" ixy="0" ixz="0" iyy="{inertia}" iyz="0" izz="{inertia}"'
+    return f'<inertial><origin xyz="{com}"/><mass value="{mass}"/><inertia {tensor}/></inertial>{shapes}'
+
+
+def claw_urdf() -> str:
+    """Three fingers, two against one: each swivels and bends, and its last joint follows by -0.7 times plus 0.1."""
+    parts = [f'<link name="base">{body(0.3, 3e-4, "0 0 0", box("0.11 0.1 0.03", "0 0 0"))}</link>']
+    for name, x, y, yaw in (
+        ("left", -0.045, -0.03, 0.0),
+        ("right", -0.045, 0.03, 0.0),
+        ("thumb", 0.045, 0.0, 3.14159265),
+    ):
+        tip = '<collision><geometry><sphere radius="0.011"/></geometry></collision>'
+        links = {
+            "root": body(0.02, 2e-6, "0 0 0", box("0.018 0.018 0.014", "0 0 0.009")),
+            "near": body(0.04, 2e-5, "0 0 0.03", box("0.016 0.02 0.056", "0 0 0.03")),
+            "far": body(0.02, 6e-6, "0 0 0.02", box("0.014 0.018 0.04", "0 0 0.022")),
+            "tip": body(0.005, 3e-7, "0 0 0", tip),
+        }
+        parts += [f'<link name="{name}_{k}">{v}</link>' for k, v in links.items()]
+        limit = '<limit lower="{}" upper="{}" effort="1.5" velocity="3"/>'
+        swivel, bend, follow = limit.format(-0.5, 0.5), limit.format(-0.5, 1.3), limit.format(-0.9, 0.5)
+        mimic = f'<mimic joint="{name}_bend" multiplier="-0.7" offset="0.1"/>'
+        for joint, parent, child, origin, axis, rest in (
+            ("swivel", "base", f"{name}_root", f'xyz="{x} {y} 0.015" rpy="0 0 {yaw}"', "0 0 1", swivel),
+            ("bend", f"{name}_root", f"{name}_near", 'xyz="0 0 0.018"', "0 1 0", bend),
+            ("follow", f"{name}_near", f"{name}_far", 'xyz="0 0 0.06"', "0 -1 0", follow + mimic),
+        ):
+            parts.append(
+                f'<joint name="{name}_{joint}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
+                f'<origin {origin}/><axis xyz="{axis}"/>{rest}</joint>'
+            )
+        parts.append(
+            f'<joint name="{name}_end" type="fixed"><parent link="{name}_far"/><child link="{name}_tip"/>'
+            '<origin xyz="0 0 0.048"/></joint>'
+        )
+    return f'<robot name="claw">{"".join(parts)}</robot>'
+
+
+@pytest.fixture
+def claw(tmp_path: Path) -> Path:
+    """The URDF of a hand with three fingers and a coupling unlike the shipped hands', in a folder of its own."""
+    folder = tmp_path / "claw"
+    folder.mkdir()
+    (folder / "claw.urdf").write_text(claw_urdf())
+    return folder / "claw.urdf"

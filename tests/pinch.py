@@ -10,10 +10,10 @@ import pytest
 import torch
 import trimesh
 
+from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.frames import rigid, rotate, rotation_from_vector
 from torchgrasp.hand.load import load_hand
 from torchgrasp.specs import TrialSpec
-from torchgrasp.trials.trial import close_hand
 from torchgrasp.values import Certificate, Contacts, Grasps
 
 RADIUS, HEIGHT = 0.03, 0.18

@@ -169,7 +169,7 @@ def test_the_table_is_the_lowest_point_unless_it_is_given(tmp_path, monkeypatch)
     seen = []
 
     def note(cloud, hand, spec, starts, seed, mode, observer):
-        assert mode == "together"
+        assert mode == "joint"
         seen.append((spec.table, spec.friction, starts, seed, float(cloud.points[:, 2].min())))
         raise KeyboardInterrupt
 

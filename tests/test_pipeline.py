@@ -10,19 +10,19 @@ from scipy.optimize import linprog
 
 from torchgrasp import ContactSpec, PointCloud, Status, load_grasps, load_hand, load_object, plan_grasps
 from torchgrasp.errors import BadArgument, SuspiciousScale
-from torchgrasp.hand.rank import rank_by_success
-from torchgrasp.hand.success import FEATURES, MODEL
+from torchgrasp.ik.ranking import rank_by_success
+from torchgrasp.ik.success import FEATURES, MODEL
 from torchgrasp.linalg import unit
 from torchgrasp.pipeline import describe, digest, spread_rows
-from torchgrasp.plan.balance import balanced_forces
-from torchgrasp.plan.probability import closure_probability
+from torchgrasp.plan.closure_probability import closure_probability
+from torchgrasp.plan.internal_forces import least_friction_forces
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.values import ContactPlan, Contacts
 
 SPEC = ContactSpec(friction=0.8, table=0.0)
 
 
-@pytest.fixture(scope="module", params=[("allegro", "together"), ("barrett", "together"), ("barrett", "contact_first")])
+@pytest.fixture(scope="module", params=[("allegro", "joint"), ("barrett", "joint"), ("barrett", "contact_first")])
 def run(request):
     stages = {}
     name, mode = request.param
@@ -102,7 +102,7 @@ def test_success_is_what_the_model_says_of_the_surface_that_was_planned_on(run):
     offset = (points.mean(1) - extract_surface(stages["shape"]).vertices.mean(0)).norm(dim=-1) / 0.02
     angle = [
         torch.acos((-(unit(forces) * normals).sum(-1)).clamp(0, 1)).amax(1) / math.atan(SPEC.friction)
-        for forces in (balanced_forces(points, normals), points.mean(1, keepdim=True) - points)
+        for forces in (least_friction_forces(points, normals), points.mean(1, keepdim=True) - points)
     ]
     known = [closed.log() - (1 - closed).log(), offset, *angle, best.normal_angle.mean(1)]
     model = json.loads(MODEL.read_text())
@@ -160,7 +160,7 @@ def test_the_file_names_everything(run, tmp_path):
     assert meta["hand"] == hand.name
     assert meta["joint_names"].split(",") == list(hand.joint_names)
     assert meta["hand_sha256"] == hand.sha256
-    model = {"together": 4, "contact_first": 64}[meta["mode"]]  # "none", since none is asked, or its hash
+    model = {"joint": 4, "contact_first": 64}[meta["mode"]]  # "none", since none is asked, or its hash
     assert len(meta["mixture_sha256"]) == model
     assert meta["cloud_sha256"] == digest(load_object("cylinder").view)
     assert {"units", "frames", "seed", "friction", "table", "starts"} <= set(meta)

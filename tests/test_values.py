@@ -98,7 +98,7 @@ def test_bad_specs_are_refused(bad):
         ContactSpec(**bad)
 
 
-@pytest.mark.parametrize("bad", [dict(controller="guess"), dict(mass=0.0), dict(timestep=1.0)])
+@pytest.mark.parametrize("bad", [dict(closing="guess"), dict(mass=0.0), dict(timestep=1.0)])
 def test_bad_trials_are_refused(bad):
     with pytest.raises((BadArgument, TypeError), match=next(iter(bad))):
         TrialSpec(**bad)

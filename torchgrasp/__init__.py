@@ -11,30 +11,30 @@ from torchgrasp.values import (
     ContactCode,
     ContactPlan,
     Contacts,
-    GraspGuess,
+    IKSeeds,
     Grasps,
     PointCloud,
     ShapeEstimate,
 )
 from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.cloud.merge import merge_clouds
-from torchgrasp.cloud.read import read_cloud
+from torchgrasp.cloud.io.read import read_cloud
 from torchgrasp.objects import list_objects, load_object
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.support import fit_shape
+from torchgrasp.shape.fit import fit_shape
 from torchgrasp.plan.solve import plan_contacts
 from torchgrasp.plan.certify import certify
-from torchgrasp.plan.probability import closure_probability
+from torchgrasp.plan.closure_probability import closure_probability
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
-from torchgrasp.hand.code import encode
-from torchgrasp.hand.fit import fit_mixture
-from torchgrasp.hand.mixture import GraspMixture, load_mixture
-from torchgrasp.hand.inverse import reach_contacts
+from torchgrasp.posture_model.encoding import encode
+from torchgrasp.posture_model.fit import fit_mixture
+from torchgrasp.posture_model.mixture import GraspMixture, load_mixture
+from torchgrasp.ik.solve import solve_ik
 from torchgrasp.pipeline import plan_grasps
 from torchgrasp.values import load_grasps
-from torchgrasp.close.law import closing_gains
-from torchgrasp.trials.trial import close_hand
+from torchgrasp.control.closing_law import closing_gains
+from torchgrasp.evaluation.lift import close_hand
 
 __version__ = "0.1.0"
 
@@ -47,7 +47,7 @@ __all__ = [
     "ContactPlan",
     "Contacts",
     "ContactSpec",
-    "GraspGuess",
+    "IKSeeds",
     "Grasps",
     "PointCloud",
     "ShapeEstimate",
@@ -68,7 +68,7 @@ __all__ = [
     "fit_mixture",
     "GraspMixture",
     "load_mixture",
-    "reach_contacts",
+    "solve_ik",
     "plan_grasps",
     "load_grasps",
     "closing_gains",

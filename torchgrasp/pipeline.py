@@ -13,22 +13,22 @@ from torchgrasp.base import count_status
 from torchgrasp.cloud.check import check_cloud
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.files import sha256
-from torchgrasp.hand.clear import Surroundings
-from torchgrasp.hand.collide import field_from_surface
 from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.mixture import load_mixture, mixture_path
-from torchgrasp.hand.nearest import PostureSet, nearest_postures
-from torchgrasp.hand.query import query_hand
-from torchgrasp.hand.rank import rank_by_success
-from torchgrasp.hand.realise import realise
-from torchgrasp.hand.success import success_features, success_odds
-from torchgrasp.hand.together import realise_together
+from torchgrasp.ik.clearance import CollisionWorld
+from torchgrasp.ik.contact_first import solve_contact_first
+from torchgrasp.ik.joint import solve_joint
+from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
+from torchgrasp.ik.query import query_mixture
+from torchgrasp.ik.ranking import rank_by_success
+from torchgrasp.ik.sdf import field_from_surface
+from torchgrasp.ik.success import success_features, success_odds
 from torchgrasp.plan.certify import certify
-from torchgrasp.plan.lines import lines_of, well_inside
-from torchgrasp.plan.probability import closed_share
+from torchgrasp.plan.closure_probability import closure_share
 from torchgrasp.plan.solve import plan_contacts
+from torchgrasp.plan.surface_samples import sample_surfaces, well_inside
+from torchgrasp.posture_model.mixture import load_mixture, mixture_path
+from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.support import fit_shape
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan, Contacts, Grasps, PointCloud
@@ -36,10 +36,10 @@ from torchgrasp.values import ContactPlan, Contacts, Grasps, PointCloud
 Observer = Callable[[str, str, Any], None]
 """Called after each stage with its name, one line about it, and its value."""
 
-Mode = Literal["together", "contact_first"]
+Mode = Literal["joint", "contact_first"]
 """How planned contacts become grasps.
 
-* "together": from the hand's own postures near each triple; where a hand that reaches it touches something, contacts,
+* "joint": from the hand's own postures near each triple; where a hand that reaches it touches something, contacts,
   pose and joints are solved together.
 * "contact_first": as in the paper, from the learned model's postures onto the contacts as they are.
 """
@@ -92,7 +92,7 @@ def digest(cloud: PointCloud) -> str:
 def closure_of(contacts: Contacts, shape: ShapeGP, friction: float, seed: int) -> Float[Tensor, "k"]:
     """Return the probability of closure of each triple, 0 of one at the edge of the shape's domain."""
     closure, inside = torch.zeros_like(contacts.points[:, 0, 0]), well_inside(shape, contacts)
-    closure[inside] = closed_share(lines_of(shape, contacts[inside]), friction, DRAWS, seed).to(closure)
+    closure[inside] = closure_share(sample_surfaces(shape, contacts[inside]), friction, DRAWS, seed).to(closure)
     return closure
 
 
@@ -114,7 +114,7 @@ def plan_grasps(
     starts: int = 1000,
     seed: int = 0,
     *,
-    mode: Mode = "together",
+    mode: Mode = "joint",
     shape: ShapeGP | None = None,
     observer: Observer = _ignore,
 ) -> Grasps:
@@ -149,7 +149,7 @@ def plan_grasps(
     if not isinstance(hand, Hand):
         raise BadArgument("hand", type(hand).__name__, "a Hand from load_hand")
     if mode not in get_args(Mode):
-        raise BadArgument("mode", repr(mode), "'together' or 'contact_first'")
+        raise BadArgument("mode", repr(mode), "'joint' or 'contact_first'")
     check_cloud(cloud)
     hand = hand.to(cloud.points.device)
     model = None
@@ -172,17 +172,17 @@ def plan_grasps(
         "certify", f"{len(contacts)} of {len(rows)} triples closed at friction {spec.planned_friction:g}", certificate
     )
 
-    surroundings = Surroundings(field_from_surface(surface.vertices, surface.faces), spec.table)
+    world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), spec.table)
     if model is None:
-        guess = nearest_postures(contacts, PostureSet.of(hand, seed=seed), surroundings)
+        guess = nearest_postures(contacts, PostureLibrary.of(hand, seed=seed), world)
     else:
-        guess = query_hand(contacts, hand, model[0])
+        guess = query_mixture(contacts, hand, model[0])
     reached = len(torch.unique(guess.row))
     observer("query", f"{len(guess)} postures for {reached} of {len(contacts)} triples", guess)
 
     center = surface.vertices.mean(0)
-    given = guess, hand, contacts, certificate, surroundings, center
-    grasps = realise_together(*given, shape, spec) if model is None else realise(*given)
+    given = guess, hand, contacts, certificate, world, center
+    grasps = solve_joint(*given, shape, spec) if model is None else solve_contact_first(*given)
     grasps = rank_by_success(grasps, odds_of(grasps, shape, center, spec, seed))
     grasps = dataclasses.replace(
         grasps,

@@ -79,7 +79,7 @@ class ContactSpec(Value):
 ClosingMode = Literal["open_loop", "position", "fixed", "uncertainty"]
 """How a hand closes, see `TrialSpec`."""
 
-HoldingMode = Literal["squeeze", "impedance", "stay"]
+HoldingMode = Literal["force", "impedance", "position"]
 """How a closed hand presses, see `TrialSpec`."""
 
 
@@ -88,10 +88,10 @@ class TrialSpec(Value):
     """One simulated trial: close on the true mesh, lift it off the table, hold it.
 
     Args:
-        controller: how the hand closes: "uncertainty" (Eqs. 25-28), "fixed" (Eq. 25 with constant gains), "position"
+        closing: how the hand closes: "uncertainty" (Eqs. 25-28), "fixed" (Eq. 25 with constant gains), "position"
             (isotropic PI that stops at 0.5 N, the paper's baseline) or "open_loop" (pre-grasp, grasp, squeeze).
-        holding: how it presses from then on: "squeeze" (joints stay where they are), "impedance" (the grasp is a spring
-            in the hand) or "stay" (no more than it does already). The open loop keeps its squeeze.
+        holding: how it presses from then on: "force" (joints stay where they are), "impedance" (the grasp is a spring
+            in the hand) or "position" (no more than it does already). The open loop keeps its squeeze.
         mass: of the object [kg].
         friction: of every contact.
         gravity: [m/s^2].
@@ -111,8 +111,8 @@ class TrialSpec(Value):
         BadArgument: a number outside its range, or an unknown controller, holding or simulator.
     """
 
-    controller: ClosingMode = "uncertainty"
-    holding: HoldingMode = "squeeze"
+    closing: ClosingMode = "uncertainty"
+    holding: HoldingMode = "force"
     mass: float = 0.1
     friction: float = 0.8
     gravity: float = 9.81
@@ -130,7 +130,7 @@ class TrialSpec(Value):
     def __post_init__(self) -> None:
         """Check every range once, where the value is made."""
         fields = {field.name: field.type for field in dataclasses.fields(self)}
-        for name in ("controller", "holding", "simulator"):
+        for name in ("closing", "holding", "simulator"):
             if getattr(self, name) not in get_args(fields[name]):
                 raise BadArgument(name, repr(getattr(self, name)), f"one of {', '.join(get_args(fields[name]))}")
         ranges = {

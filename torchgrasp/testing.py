@@ -9,10 +9,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.errors import HandFileError
-from torchgrasp.hand.cover import rotation_from_rpy
+from torchgrasp.hand.collision_spheres import rotation_from_rpy
 from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.hand_toml import HandSpec, read_hand_toml
 from torchgrasp.hand.load import find_hand, load_hand
-from torchgrasp.hand.spec import HandSpec, read_hand_toml
 from torchgrasp.hand.urdf import Joint, Shape, Urdf, read_urdf
 
 POSTURES = 50

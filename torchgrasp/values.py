@@ -160,10 +160,10 @@ class ContactCode(Value):
 
 
 @dataclasses.dataclass(frozen=True)
-class GraspGuess(Batch):
+class IKSeeds(Batch):
     """Postures of the learned model or of the hand's own, aligned with the contacts by their virtual frames (Eq. 24).
 
-    `row` names the row of the contact plan and `permutation` the contact of each finger; `reach` is the least f_i of
+    `row` names the row of the contact plan and `permutation` the contact of each finger; `energy` is the least f_i of
     Eq. (21), of a posture of the hand's own half its squared distance; `tip_error` [m] is the distance of each
     fingertip from its contact before refinement.
     """
@@ -172,7 +172,7 @@ class GraspGuess(Batch):
     obj_from_hand: Float[Tensor, "g 4 4"]
     row: Int[Tensor, "g"]
     permutation: Int[Tensor, "g 3"]
-    reach: Float[Tensor, "g"]
+    energy: Float[Tensor, "g"]
     tip_error: Float[Tensor, "g 3"]
 
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from torchgrasp.cloud.check import check_cloud, keep_distinct
+from torchgrasp.cloud.check import check_cloud, remove_duplicates
 from torchgrasp.errors import BadArgument, SuspiciousScale, TooFewPoints
 from torchgrasp.values import PointCloud
 
@@ -53,7 +53,7 @@ def test_duplicates_are_reduced_to_the_first_in_order():
     points, copies = cloud(40), torch.randint(0, 40, (200,), generator=torch.Generator().manual_seed(1))
     order = torch.cat([torch.arange(40).flip(0), copies])
     jitter = 1e-12 * torch.randn(240, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-    kept = keep_distinct(PointCloud((points[order] + jitter), points[order] + 1, points[0]))
+    kept = remove_duplicates(PointCloud((points[order] + jitter), points[order] + 1, points[0]))
     torch.testing.assert_close(kept.points, points.flip(0), rtol=0, atol=1e-11)
     torch.testing.assert_close(kept.normals, points.flip(0) + 1)
 
@@ -62,7 +62,7 @@ def test_many_near_copies_of_one_point_are_one_point_and_points_a_little_apart_a
     """A pair of points for every two copies would be 5e9 pairs here."""
     copies = cloud(1) + 1e-11 * torch.rand(100_000, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     apart = cloud(1) + 3e-10 * torch.arange(1, 4, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0.0, 0.0])
-    kept = keep_distinct(PointCloud(torch.cat([cloud(9), copies, apart])))
+    kept = remove_duplicates(PointCloud(torch.cat([cloud(9), copies, apart])))
     assert torch.equal(kept.points, torch.cat([cloud(9), apart]))
     with pytest.raises(TooFewPoints, match="1 distinct"):
-        keep_distinct(PointCloud(cloud(1).repeat(5, 1)))
+        remove_duplicates(PointCloud(cloud(1).repeat(5, 1)))

@@ -3,16 +3,16 @@ import torch
 import trimesh
 
 from torchgrasp.cloud.camera import partial_view
-from torchgrasp.cloud.doctor import diagnose_cloud, format_report
-from torchgrasp.cloud.filter import remove_outliers, thin_cloud
+from torchgrasp.cloud.diagnose import diagnose_cloud, format_report
+from torchgrasp.cloud.filter import remove_outliers, voxel_downsample
+from torchgrasp.cloud.io.read import read_cloud, save_cloud
 from torchgrasp.cloud.merge import merge_clouds
 from torchgrasp.cloud.normals import clean_cloud
-from torchgrasp.cloud.read import read_cloud, save_cloud
 from torchgrasp.errors import BadArgument, TooFewPoints
 from torchgrasp.frames import apply, inverse
 from torchgrasp.linalg import unit
 from torchgrasp.objects import load_object
-from torchgrasp.shape.support import fit_shape
+from torchgrasp.shape.fit import fit_shape
 from torchgrasp.values import PointCloud
 
 EYE = torch.eye(4, dtype=torch.float64)
@@ -81,7 +81,7 @@ def test_the_cameras_of_a_merged_cloud_are_kept_in_files_and_by_every_filter(two
     assert torch.equal(back.viewpoint, merged.viewpoint) and torch.equal(back.normals, merged.normals)
     with pytest.raises(BadArgument, match=r"\.npz, for a cloud of several views"):
         save_cloud(merged, tmp_path / "merged.ply")
-    for cloud in (thin_cloud(merged, 0.004), clean_cloud(merged), remove_outliers(merged)):
+    for cloud in (voxel_downsample(merged, 0.004), clean_cloud(merged), remove_outliers(merged)):
         eyes = [view.viewpoint for view in cloud.split_views()]
         assert all(torch.equal(a, b.viewpoint) for a, b in zip(eyes, two_views, strict=True))
     assert "0.1" in format_report(diagnose_cloud(merged))

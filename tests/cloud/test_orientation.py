@@ -7,7 +7,7 @@ from torchgrasp.cloud.normals import estimate_normals
 from torchgrasp.cloud.orientation import check_normals, drop_unoriented
 from torchgrasp.errors import BadArgument
 from torchgrasp.objects import list_objects, load_object
-from torchgrasp.shape.support import fit_shape
+from torchgrasp.shape.fit import fit_shape
 from torchgrasp.values import PointCloud
 
 

@@ -6,17 +6,17 @@ import math
 import pytest
 import torch
 
-from torchgrasp.cloud import doctor, filter, merge, normals, orientation
-from torchgrasp.cloud.check import check_cloud, keep_distinct
+from torchgrasp.cloud import diagnose, filter, merge, normals, orientation
+from torchgrasp.cloud.check import check_cloud, remove_duplicates
 from torchgrasp.errors import BadArgument, GraspError, SuspiciousScale, TooFewPoints
 from torchgrasp.linalg import unit
-from torchgrasp.shape.support import fit_shape
+from torchgrasp.shape.fit import fit_shape
 from torchgrasp.values import PointCloud
 
 FUNCTIONS = {
     "check_cloud": check_cloud,
-    "keep_distinct": keep_distinct,
-    "thin_cloud": lambda cloud: filter.thin_cloud(cloud, 0.004),
+    "keep_distinct": remove_duplicates,
+    "thin_cloud": lambda cloud: filter.voxel_downsample(cloud, 0.004),
     "remove_outliers": filter.remove_outliers,
     "estimate_normals": normals.estimate_normals,
     "clean_cloud": normals.clean_cloud,
@@ -24,7 +24,7 @@ FUNCTIONS = {
     "check_normals": lambda cloud: orientation.check_normals(cloud),
     "drop_unoriented": orientation.drop_unoriented,
     "merge_clouds": lambda cloud: merge.merge_clouds([cloud, cloud], [torch.eye(4).double()] * 2),
-    "diagnose_cloud": doctor.diagnose_cloud,
+    "diagnose_cloud": diagnose.diagnose_cloud,
     "fit_shape": fit_shape,
     "fit_shape paper": lambda cloud: fit_shape(cloud, support="paper"),
 }
@@ -88,8 +88,8 @@ def test_i3_copies_change_nothing(distance):
     copies = PointCloud(
         torch.cat([cloud.points, cloud.points.repeat(5, 1) + jitter]), cloud.normals.repeat(6, 1), cloud.viewpoint
     )
-    assert len(keep_distinct(copies)) == 91
-    assert doctor.diagnose_cloud(copies).copies == 5 * 91
+    assert len(remove_duplicates(copies)) == 91
+    assert diagnose.diagnose_cloud(copies).copies == 5 * 91
     for support in ("camera", "paper"):
         once, six = (fit_shape(c, support=support).predict(1.1 * cloud.points[:9]) for c in (cloud, copies))
         torch.testing.assert_close(six.distance, once.distance, atol=1e-6, rtol=0)
@@ -107,7 +107,7 @@ def test_i4_a_point_and_a_line_are_refused(name):
 def test_i4_a_flat_cloud_is_accepted_and_finite(thickness):
     points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     points = points * torch.tensor([0.1, 0.1, 0.1 * thickness]).double()
-    report = doctor.diagnose_cloud(PointCloud(points, None, EYE))
+    report = diagnose.diagnose_cloud(PointCloud(points, None, EYE))
     assert any("one plane" in text for text in report.advice) or thickness == 1e-3
     estimate = fit_shape(PointCloud(points, None, EYE)).predict(points[:20])
     for field in ("distance", "normal", "variance", "covariance", "std_m"):
@@ -126,13 +126,13 @@ def test_i5_a_wrong_unit_is_refused_by_name(name, factor):
 def test_i5_results_scale_with_the_cloud(factor):
     cloud = ball()
     large = PointCloud(factor * cloud.points, cloud.normals, factor * EYE)
-    one, other = doctor.diagnose_cloud(cloud), doctor.diagnose_cloud(large)
+    one, other = diagnose.diagnose_cloud(cloud), diagnose.diagnose_cloud(large)
     for name in ("spacing", "noise"):
         assert getattr(other, name) == pytest.approx(factor * getattr(one, name), rel=1e-9)
-    assert other.density == pytest.approx(one.density / factor**2, rel=1e-9) and other.strays == one.strays
+    assert other.density == pytest.approx(one.density / factor**2, rel=1e-9) and other.outliers == one.outliers
     a, b = normals.clean_cloud(cloud), normals.clean_cloud(large)
     torch.testing.assert_close(b.points, factor * a.points, rtol=1e-9, atol=1e-12)
-    small, big = filter.thin_cloud(cloud, 0.01), filter.thin_cloud(large, 0.01 * factor)
+    small, big = filter.voxel_downsample(cloud, 0.01), filter.voxel_downsample(large, 0.01 * factor)
     torch.testing.assert_close(big.points, factor * small.points, rtol=1e-9, atol=1e-12)
 
 
@@ -190,7 +190,7 @@ def test_i8_strays_go_lengths_do_not_matter_and_zero_is_refused():
 def test_every_function_on_clouds_is_in_the_table():
     public = {
         name
-        for module in (filter, merge, normals, orientation, doctor)
+        for module in (filter, merge, normals, orientation, diagnose)
         for name, function in inspect.getmembers(module, inspect.isfunction)
         if function.__module__ == module.__name__ and not name.startswith("_")
         if "cloud" in str(inspect.signature(function))

@@ -128,7 +128,7 @@ def test_allegro_thumb_opposes_the_fingers(generator):
 
 
 def test_spheres_cover_the_collision_shapes(hand):
-    from torchgrasp.hand.cover import rotation_from_rpy
+    from torchgrasp.hand.collision_spheres import rotation_from_rpy
     from torchgrasp.hand.urdf import read_urdf
 
     cover, generator = hand.collision_spheres, torch.Generator().manual_seed(0)

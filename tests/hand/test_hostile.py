@@ -18,9 +18,9 @@ import pytest
 import torch
 
 from torchgrasp.errors import GraspError, HandFileError, ModelFileError
-from torchgrasp.hand.author import draft_hand
+from torchgrasp.hand.draft import draft_hand
 from torchgrasp.hand.load import hands_folder, load_hand
-from torchgrasp.hand.mixture import load_mixture
+from torchgrasp.posture_model.mixture import load_mixture
 
 if sys.version_info >= (3, 11):
     import tomllib

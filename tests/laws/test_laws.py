@@ -18,7 +18,7 @@ from torchgrasp import (
 )
 from torchgrasp.frames import apply, rotate
 from torchgrasp.shape.condition import condition
-from torchgrasp.shape.observe import Observations
+from torchgrasp.shape.observations import Observations
 from torchgrasp.values import Contacts
 
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from train.object_shapes import author
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.objects import DATA, list_objects, load_object
-from torchgrasp.objects.author import author
 
 
 @pytest.fixture(scope="module", params=list_objects())

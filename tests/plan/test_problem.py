@@ -6,7 +6,15 @@ import torch
 from torch import Tensor
 
 from torchgrasp.linalg import unit
-from torchgrasp.plan.problem import CONE_MARGIN, INSIDE, LEAST_SIDE, ContactProblem, Rows, balanced_forces, triple_jet
+from torchgrasp.plan.problem import (
+    CONE_MARGIN,
+    INSIDE,
+    LEAST_SIDE,
+    Constraints,
+    ContactProblem,
+    forces_from_tensions,
+    triple_jet,
+)
 from torchgrasp.plan.wrench import closed_exact
 from torchgrasp.specs import ContactSpec
 
@@ -40,7 +48,7 @@ def test_eq12_variance_row_is_positive_exactly_where_the_variance_exceeds_the_th
 
 def test_eq13_forces_balance_whatever_the_tensions(ellipsoid, generator):
     _, points, tension, _ = problem_and_state(ellipsoid, generator)
-    force, _ = balanced_forces(points, tension)
+    force, _ = forces_from_tensions(points, tension)
     zero = torch.zeros(6, 3, dtype=torch.float64)
     torch.testing.assert_close(force.sum(1), zero)
     torch.testing.assert_close(torch.linalg.cross(points, force).sum(1), zero)
@@ -49,7 +57,7 @@ def test_eq13_forces_balance_whatever_the_tensions(ellipsoid, generator):
 def test_eq13_cone_rows_are_the_cosines_of_the_forces_and_imply_closure(ellipsoid, generator):
     problem, points, tension, jet = problem_and_state(ellipsoid, generator, ContactSpec.paper(), count=4000)
     rows = problem.rows(points, tension, jet).bounds[:, :3]
-    force, _ = balanced_forces(points, tension)
+    force, _ = forces_from_tensions(points, tension)
     cosine = -(unit(force) * jet.normals).sum(-1)
     cone = math.cos(math.atan(0.8 * math.cos(math.pi / 8)))
     torch.testing.assert_close(rows, cone + CONE_MARGIN - cosine)
@@ -88,7 +96,7 @@ def test_jacobian_of_every_row_against_automatic_differentiation(ellipsoid, gene
 
     def values(x: Tensor) -> tuple[Tensor, ...]:
         points = x[:, :9].unflatten(1, (3, 3))
-        r: Rows = problem.rows(points, x[:, 9:], triple_jet(ellipsoid, points))
+        r: Constraints = problem.rows(points, x[:, 9:], triple_jet(ellipsoid, points))
         return r.surface.sum(0), r.centre.sum(0), r.bounds.sum(0)
 
     wanted = torch.autograd.functional.jacobian(values, torch.cat([points.flatten(1), tension], 1))

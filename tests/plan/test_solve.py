@@ -8,12 +8,12 @@ import torch
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import degenerate
 from torchgrasp.linalg import unit
-from torchgrasp.plan.assess import assess, first_violation
 from torchgrasp.plan.certify import certify
-from torchgrasp.plan.descend import project
-from torchgrasp.plan.flat import bend
+from torchgrasp.plan.feasibility import check_feasibility, first_violation
+from torchgrasp.plan.normal_variation import normal_variation
 from torchgrasp.plan.solve import plan_chunk, plan_contacts
-from torchgrasp.plan.start import draw_in, drawn_starts
+from torchgrasp.plan.solver import project
+from torchgrasp.plan.starts import draw_in, drawn_starts
 from torchgrasp.plan.wrench import wrenches
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import PointCloud
@@ -49,7 +49,7 @@ def test_eq10_to_eq13_hold_for_every_row_that_is_ok(ellipsoid, name):
         tip = height + spec.tip_radius * (good.contacts.normals[..., 2] - 1)
         assert float(tip.min()) >= spec.table - 1e-12
     if spec.flatness is not None:
-        assert float(bend(ellipsoid, x, good.contacts.normals).max()) <= spec.flatness
+        assert float(normal_variation(ellipsoid, x, good.contacts.normals).max()) <= spec.flatness
 
 
 def test_eq14_centre_of_the_contacts_approaches_the_centre_of_the_shape(ellipsoid):
@@ -136,7 +136,7 @@ def test_a_time_budget_bounds_how_many_starts_are_planned_and_changes_no_row(ell
 
 
 def test_more_starts_only_add_rows(ellipsoid, monkeypatch):
-    monkeypatch.setattr("torchgrasp.plan.start.CHUNK", 5)
+    monkeypatch.setattr("torchgrasp.plan.starts.CHUNK", 5)
     for spec in SPECS.values():
         few, many = (plan_contacts(ellipsoid, spec, starts=count) for count in (10, 15))
         torch.testing.assert_close(few.contacts.points, many.contacts.points[:10])
@@ -184,7 +184,7 @@ def test_statuses_name_the_first_violation(ellipsoid):
     seen = dataclasses.replace(ellipsoid, doubt=1e-4)
 
     def status(points: torch.Tensor, spec: ContactSpec = spec, shape=seen) -> Status:
-        return Status(int(assess(shape, spec, points[None]).status[0]))
+        return Status(int(check_feasibility(shape, spec, points[None]).status[0]))
 
     assert status(around) is Status.OK
     assert status(around * 1.4) is Status.OUT_OF_DOMAIN

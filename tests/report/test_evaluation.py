@@ -4,9 +4,9 @@ import re
 
 import pytest
 
-from tests.trials.test_evaluate import SCORES
+from tests.evaluation.test_evaluate import SCORES
+from torchgrasp.evaluation.score import share
 from torchgrasp.report.evaluation import WIDTH, bar, format_evaluation, write_evaluation
-from torchgrasp.trials.score import share
 
 
 def test_page_shows_shares_objects_and_reasons(tmp_path):

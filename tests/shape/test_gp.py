@@ -11,7 +11,7 @@ from torchgrasp.linalg import unit
 from torchgrasp.shape.condition import condition, longest_distance
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.kernel import covariance, thin_plate
-from torchgrasp.shape.observe import Observations
+from torchgrasp.shape.observations import Observations
 from torchgrasp.values import PointCloud
 
 NOISE = 0.01

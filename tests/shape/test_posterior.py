@@ -10,13 +10,13 @@ from torch import Tensor
 
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.linalg import unit
-from torchgrasp.shape.blocks import cross_covariance
 from torchgrasp.shape.condition import condition, posterior_given
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.joint import JointEstimate, draw_samples
+from torchgrasp.shape.gradient_kernel import cross_covariance
+from torchgrasp.shape.joint_posterior import JointEstimate, draw_samples
 from torchgrasp.shape.kernel import covariance, radial_derivatives, thin_plate
-from torchgrasp.shape.observe import Observations
-from torchgrasp.shape.profiles import Kernel, kernel_by_name, matern52_kernel, rbf_kernel
+from torchgrasp.shape.kernels import Kernel, kernel_by_name, matern52_kernel, rbf_kernel
+from torchgrasp.shape.observations import Observations
 from torchgrasp.shape.update import append_observations
 from torchgrasp.values import PointCloud
 

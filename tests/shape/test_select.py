@@ -11,8 +11,8 @@ from torchgrasp.errors import IndefiniteCovariance
 from torchgrasp.linalg import unit
 from torchgrasp.shape.condition import posterior_given
 from torchgrasp.shape.kernel import covariance, thin_plate
-from torchgrasp.shape.observe import Observations, join, on_surface
-from torchgrasp.shape.profiles import kernel_by_name
+from torchgrasp.shape.kernels import kernel_by_name
+from torchgrasp.shape.observations import Observations, join, on_surface
 from torchgrasp.shape.select import Criterion, Selection, select_points
 
 PSI = 3.6

@@ -8,8 +8,8 @@ import torch
 import trimesh
 
 from torchgrasp.errors import BadArgument
+from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.support import fit_shape
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.values import PointCloud
 

@@ -27,7 +27,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "hand check": hands.check,
     "hand sample": hands.sample,
     "shape surface": shapes.surface,
-    "shape calibrate": shapes.calibrate,
+    "shape accuracy": shapes.measure_accuracy,
 }
 """The commands by name."""
 

@@ -7,10 +7,10 @@ import tyro
 
 from torchgrasp.cli.common import check_seed, naming
 from torchgrasp.cloud.camera import partial_view
-from torchgrasp.cloud.doctor import diagnose_cloud, format_report
-from torchgrasp.cloud.read import read_cloud, save_cloud
+from torchgrasp.cloud.diagnose import diagnose_cloud, format_report
+from torchgrasp.cloud.io.read import read_cloud, save_cloud
 from torchgrasp.errors import BadArgument
-from torchgrasp.simulate.parts import read_mesh
+from torchgrasp.sim.convex_parts import read_mesh
 
 
 def check(

@@ -7,14 +7,14 @@ from typing import Any, Literal
 from torchgrasp.cli.common import check_seed, naming
 from torchgrasp.cli.grasps import check_simulator
 from torchgrasp.errors import Status
+from torchgrasp.evaluation.evaluate import Ranks
+from torchgrasp.evaluation.evaluate import evaluate as evaluate_views
+from torchgrasp.evaluation.protocols import PROTOCOLS, Execution
+from torchgrasp.evaluation.score import ViewScore, summarise
 from torchgrasp.files import format_json, hold_folder, write_file
 from torchgrasp.hand.load import load_hand
 from torchgrasp.report.evaluation import SHARE_NAMES, write_evaluation
 from torchgrasp.specs import ClosingMode, HoldingMode, Simulator
-from torchgrasp.trials.attempt import PROTOCOLS, Execution
-from torchgrasp.trials.evaluate import Ranks
-from torchgrasp.trials.evaluate import evaluate as evaluate_views
-from torchgrasp.trials.score import ViewScore, summarise
 
 
 def evaluate(
@@ -25,7 +25,7 @@ def evaluate(
         "multidex", "dexgraspbench", "dexgraspbench-hard", "pose-noise", "paper", "tabletop"
     ] = "dexgraspbench",
     closing: ClosingMode | None = None,
-    holding: HoldingMode = "squeeze",
+    holding: HoldingMode = "force",
     simulator: Simulator = "sapien",
     force: float | None = None,
     grasps: int = 20,
@@ -46,7 +46,7 @@ def evaluate(
         objects: folder with manifest.json, and for each object mesh.ply and noisy views.
         hand: allegro, allegro_biotac, barrett, or the folder of another hand.
         out: folder of the results; it is made where it does not exist, and no other run may use it meanwhile.
-        protocol: which test: see torchgrasp.trials.protocol and torchgrasp.trials.attempt.
+        protocol: which test: see torchgrasp.evaluation.pull and torchgrasp.evaluation.protocols.
         closing: open loop through pre-grasp, grasp and squeeze, or by a controller that feels with the fingertips; by
             default open loop where the object is pulled at, and under uncertainty where it is lifted.
         holding: how the hand presses from then on.

@@ -7,10 +7,10 @@ import tyro
 
 from torchgrasp.cli.common import naming
 from torchgrasp.errors import BadArgument, Status
+from torchgrasp.export.grasp_json import format_grasps
+from torchgrasp.export.mujoco_keyframes import format_keyframes
 from torchgrasp.files import write_file
 from torchgrasp.hand.load import load_hand
-from torchgrasp.simulate.keyframes import format_keyframes
-from torchgrasp.simulate.replay import format_grasps
 from torchgrasp.values import load_grasps
 
 

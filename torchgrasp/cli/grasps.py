@@ -14,8 +14,9 @@ import tyro
 from tqdm import tqdm
 
 from torchgrasp.cli.common import check_folder, check_seed, check_table, naming, table_height
-from torchgrasp.cloud.read import read_cloud
+from torchgrasp.cloud.io.read import read_cloud
 from torchgrasp.errors import BadArgument, MissingExtra
+from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.files import sha256
 from torchgrasp.hand.load import load_hand
 from torchgrasp.objects import DATA, MASSES, list_objects, load_object
@@ -23,9 +24,8 @@ from torchgrasp.pipeline import Mode, plan_grasps
 from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows, write_report
 from torchgrasp.report.run import Run, Stage, verdict
 from torchgrasp.shape.surface import extract_surface
-from torchgrasp.simulate.parts import read_mesh
+from torchgrasp.sim.convex_parts import read_mesh
 from torchgrasp.specs import ContactSpec, Simulator, TrialSpec
-from torchgrasp.trials.trial import close_hand
 from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def grasp(
     table: float | None = None,
     no_table: bool = False,
     friction: float = 0.8,
-    mode: Mode = "together",
+    mode: Mode = "joint",
 ) -> int:
     """Plan grasps of the object of a partial point cloud, and close on it in simulation.
 

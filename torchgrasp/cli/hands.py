@@ -10,11 +10,11 @@ import tyro
 from torchgrasp.cli.common import check_folder, check_seed, naming
 from torchgrasp.errors import BadArgument, GraspError, OutputError
 from torchgrasp.files import write_file
-from torchgrasp.hand.author import draft_hand
-from torchgrasp.hand.dataset import write_samples
+from torchgrasp.hand.draft import draft_hand
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import find_hand, load_hand
-from torchgrasp.hand.sample import Sampling
+from torchgrasp.posture_model.dataset import write_samples
+from torchgrasp.posture_model.sample import Sampling
 from torchgrasp.report.hands import draw_hand, opposed_posture
 from torchgrasp.testing import check_hand, find_faults, random_joints
 

@@ -6,11 +6,11 @@ from typing import Annotated, Literal
 import tyro
 
 from torchgrasp.cli.common import check_seed, check_table, naming, table_height
-from torchgrasp.cloud.read import read_cloud
-from torchgrasp.report.export import check_surface_path, largest_std, save_surface
-from torchgrasp.shape.calibrate import calibrate as calibrate_shapes
-from torchgrasp.shape.calibrate import format_table
-from torchgrasp.shape.support import fit_shape
+from torchgrasp.cloud.io.read import read_cloud
+from torchgrasp.export.surface_mesh import check_surface_path, largest_std, save_surface
+from torchgrasp.shape.accuracy import format_table
+from torchgrasp.shape.accuracy import measure_accuracy as calibrate_shapes
+from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import extract_surface
 
 
@@ -55,7 +55,7 @@ def surface(
     return 0
 
 
-def calibrate(
+def measure_accuracy(
     objects: Path,
     support: Literal["camera", "paper"] = "camera",
     no_camera: bool = False,

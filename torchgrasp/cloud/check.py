@@ -50,7 +50,7 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
         raise SuspiciousScale(
             "points", f"an extent of {extent:.4g} m", f"{MIN_EXTENT:g} m to {MAX_EXTENT:g} m; {_remedy(extent)}"
         )
-    keep_distinct(cloud)
+    remove_duplicates(cloud)
     spread = torch.linalg.svdvals((points - points.mean(0)).double())
     if float(spread[1]) < LINE_RATIO * float(spread[0]):
         raise BadArgument("points", f"{len(points)} points on one line", "points of a surface")
@@ -63,7 +63,7 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
     return cloud
 
 
-def keep_distinct(cloud: PointCloud) -> PointCloud:
+def remove_duplicates(cloud: PointCloud) -> PointCloud:
     """Return the cloud with each group of coincident points reduced to its first; the order is kept.
 
     Coincident copies would count as independent measurements and pull the surface towards themselves. Points are
@@ -72,7 +72,7 @@ def keep_distinct(cloud: PointCloud) -> PointCloud:
     Raises:
         TooFewPoints: fewer than 4 distinct points.
 
-    >>> len(keep_distinct(PointCloud(torch.rand(10, 3).repeat(3, 1))))
+    >>> len(remove_duplicates(PointCloud(torch.rand(10, 3).repeat(3, 1))))
     10
     """
     rows = _distinct_rows(cloud.points)

@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.cloud.check import check_cloud, keep_distinct
+from torchgrasp.cloud.check import check_cloud, remove_duplicates
 from torchgrasp.errors import BadArgument, TooFewPoints
 from torchgrasp.values import PointCloud
 
@@ -17,7 +17,7 @@ MIN_VOXEL, MAX_VOXEL = 1e-5, 1.0
 """Sides [m] that a voxel may have."""
 
 
-def thin_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
+def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
     """Return the cloud with one point a voxel: the one nearest to the voxel's centre, as it was measured.
 
     The grid starts at the lowest corner of the cloud, so that the choice moves with it. Points are chosen, not
@@ -31,7 +31,7 @@ def thin_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
         BadArgument, SuspiciousScale: see `check_cloud`; a voxel outside its range.
         TooFewPoints: fewer than 4 voxels hold points.
 
-    >>> len(thin_cloud(PointCloud(0.1 * torch.rand(5000, 3)), 0.05)) <= 27
+    >>> len(voxel_downsample(PointCloud(0.1 * torch.rand(5000, 3)), 0.05)) <= 27
     True
     """
     cloud = check_cloud(cloud)
@@ -66,7 +66,7 @@ def remove_outliers(cloud: PointCloud) -> PointCloud:
     >>> bool(remove_outliers(PointCloud(points)).points.max() < 0.2)
     True
     """
-    cloud = keep_distinct(check_cloud(cloud))
+    cloud = remove_duplicates(check_cloud(cloud))
     neighbour, _ = nearest(cloud.points.double(), OUTLIER_NEIGHBOURS + 1)
     spacing = neighbour[:, 1:].mean(-1)
     return select_rows(cloud, spacing <= OUTLIER_RATIO * spacing.median(), "points that are not stray")

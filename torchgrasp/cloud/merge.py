@@ -21,7 +21,7 @@ def merge_clouds(
     """Return the points of several views in one frame, with normals, each turned towards the camera of its view.
 
     A view without normals gets them by `estimate_normals`, on its own. The result has a viewpoint for each point: every
-    camera saw free space and an outline of its own, which `fit_shape` uses. Points seen twice stay twice; `thin_cloud`
+    camera saw free space and an outline of its own, which `fit_shape` uses. Points seen twice stay twice; `voxel_downsample`
     evens the density. A view that has normals but no viewpoint, such as a part of a scan from all sides, leaves the
     result without any.
 

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.cloud.check import check_cloud, keep_distinct
+from torchgrasp.cloud.check import check_cloud, remove_duplicates
 from torchgrasp.cloud.filter import remove_outliers, select_rows
-from torchgrasp.cloud.local import fit_planes, fit_quadrics
+from torchgrasp.cloud.local_fit import fit_planes, fit_quadrics
 from torchgrasp.linalg import unit
 from torchgrasp.values import PointCloud
 
@@ -36,7 +36,7 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
     >>> estimate_normals(PointCloud(torch.rand(90, 3), viewpoint=torch.tensor([0.5, 0.5, 9.0]))).normals.shape
     torch.Size([90, 3])
     """
-    cloud = keep_distinct(check_cloud(cloud))
+    cloud = remove_duplicates(check_cloud(cloud))
     _, normals, _ = fit_quadrics(cloud.points.double())
     return _orient(cloud, cloud.points, normals)
 
@@ -89,7 +89,7 @@ def estimate_viewpoint(cloud: PointCloud) -> Float[Tensor, "3"]:
     >>> estimate_viewpoint(PointCloud(torch.rand(90, 3))).shape
     torch.Size([3])
     """
-    cloud = keep_distinct(check_cloud(cloud))
+    cloud = remove_duplicates(check_cloud(cloud))
     points = cloud.points.double()
     normals, _, _ = fit_planes(points)
     return _guess_viewpoint(points, normals).to(cloud.points.dtype)

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.errors import BadArgument
-from torchgrasp.hand.cover import SphereCover
+from torchgrasp.hand.collision_spheres import CollisionSpheres
 from torchgrasp.hand.kinematics import Kinematics, placed, turned
-from torchgrasp.hand.selfcollide import SelfCollision
+from torchgrasp.hand.self_collision import SelfCollision
 
 
 class Actuator(NamedTuple):
@@ -66,7 +66,7 @@ class Hand(Value):
     child: Int[Tensor, " j"]
     moves: Float[Tensor, "l j"]
     actuators: dict[str, Actuator]
-    collision_spheres: SphereCover
+    collision_spheres: CollisionSpheres
     self_collision: SelfCollision
     tip_place: Int[Tensor, "3"]
     tip_pose: Float[Tensor, "3 4 3 1"]
@@ -214,7 +214,7 @@ class Hand(Value):
         parts = [self.self_collision.clearance(self.frames(part), below) for part in rows.split(chunk)]
         return torch.cat(parts).reshape(joints.shape[:-1]) if parts else rows.new_zeros(joints.shape[:-1])
 
-    def screws(self, poses: Float[Tensor, "*b l 4 4"]) -> tuple[Float[Tensor, "*b j 3"], Float[Tensor, "*b j 3"]]:
+    def jacobians(self, poses: Float[Tensor, "*b l 4 4"]) -> tuple[Float[Tensor, "*b j 3"], Float[Tensor, "*b j 3"]]:
         """Return the axes and origins of all movable joints in the palm's frame."""
         chains = _frames(poses).index_select(2, self.child)
         like = poses[..., 0, 0, :]

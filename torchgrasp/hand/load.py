@@ -8,18 +8,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.errors import HandFileError
-from torchgrasp.hand.cover import cover_from_urdf
+from torchgrasp.hand.collision_spheres import spheres_from_urdf
 from torchgrasp.hand.hand import Actuator, Hand
+from torchgrasp.hand.hand_toml import HandSpec, read_hand_toml
 from torchgrasp.hand.kinematics import ancestor_mask, fixed_to, kinematics_from_urdf
-from torchgrasp.hand.selfcollide import self_collision_from_urdf
-from torchgrasp.hand.spec import HandSpec, read_hand_toml
+from torchgrasp.hand.self_collision import self_collision_from_urdf
 from torchgrasp.hand.urdf import Urdf, read_urdf
 
 
 def hands_folder() -> Path:
     """Return the folder of the shipped hands: inside the installed package, else beside it in a checkout."""
     package = Path(__file__).resolve().parents[1]
-    installed = package / "hands"
+    installed = package / "assets" / "hands"
     return installed if installed.is_dir() else package.parent / "hands"
 
 
@@ -107,7 +107,7 @@ def hand_from_files(spec: HandSpec, urdf: Urdf) -> Hand:
         child=kinematics.child,
         moves=torch.tensor(ancestor_mask(urdf), dtype=torch.float64),
         actuators={n: Actuator(j.effort, j.velocity, spec.kp, spec.kd) for n, j in movable.items()},
-        collision_spheres=cover_from_urdf(urdf, spec),
+        collision_spheres=spheres_from_urdf(urdf, spec),
         self_collision=self_collision_from_urdf(urdf, spec.pairs),
         tip_place=torch.tensor([leading.link_names.index(name) for name in carriers]),
         tip_pose=torch.stack(poses, -1)[..., None],

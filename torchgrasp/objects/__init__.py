@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from torchgrasp.cloud.read import read_cloud
+from torchgrasp.cloud.io.read import read_cloud
 from torchgrasp.errors import BadArgument
 from torchgrasp.values import PointCloud
 

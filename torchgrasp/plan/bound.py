@@ -30,7 +30,7 @@ from torch import Tensor
 
 from torchgrasp.frames import MIN_HEIGHT_RATIO
 from torchgrasp.linalg import unit
-from torchgrasp.plan.lines import STEPS, Lines, refinement
+from torchgrasp.plan.surface_samples import STEPS, SurfaceSamples, refinement
 
 REACHES = (4, 5, 6, 7, 8)
 """Bounds r of the contacts' motion that are tried: steps of the finer ladder to either side of the contact."""
@@ -48,7 +48,7 @@ AT_ONCE = 64
 """Triples that are bounded at a time."""
 
 
-def closure_bound(lines: Lines, friction: float) -> Float[Tensor, "b"]:
+def closure_bound(lines: SurfaceSamples, friction: float) -> Float[Tensor, "b"]:
     """Return a lower bound of the probability that fingers close on surfaces drawn along their lines, from 0 to 1.
 
     Args:
@@ -75,7 +75,7 @@ def closure_bound(lines: Lines, friction: float) -> Float[Tensor, "b"]:
 class _Stretches:
     """Three stretches of lines about the contacts, and what internal forces prove while the fingers stop on them."""
 
-    def __init__(self, lines: Lines, spread: Float[Tensor, "b 3 k 4 k 4"], reach: int) -> None:
+    def __init__(self, lines: SurfaceSamples, spread: Float[Tensor, "b 3 k 4 k 4"], reach: int) -> None:
         self.points, self.normals = lines.points, lines.normals
         weights = refinement().to(lines.points)
         ends = [len(STEPS) - 1 - reach, len(STEPS) - 1 + reach]

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import degenerate
-from torchgrasp.plan.margin import balance_and_witness
+from torchgrasp.plan.closure_lp import solve_closure_lp
 from torchgrasp.plan.wrench import MIN_MARGIN, MIN_RANK_RATIO, rank_ratio, wrenches
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Certificate, Contacts
@@ -80,7 +80,7 @@ def _prove(
     wrench: Float[Tensor, "b m 6"],
 ) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b 6"]]:
     """Return margin, residual and witness of each row, by HiGHS where those of the batch prove no verdict."""
-    phi, witness = balance_and_witness(wrench)
+    phi, witness = solve_closure_lp(wrench)
     residual = (phi[:, None] @ wrench)[:, 0].abs().amax(-1)
     margin, most = phi.amin(-1), bound_margin(wrench, witness)
     none = most < -1 / GAP

@@ -11,12 +11,12 @@ from torch import Tensor
 
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.linalg import unit
-from torchgrasp.plan.assess import assess
-from torchgrasp.plan.descend import FINISH, Stage, descend, pick, project, put, start_state
-from torchgrasp.plan.lines import lines_of, well_inside
-from torchgrasp.plan.objective import Cost, epsilon_cost, evaluate_cost, min_weight_cost, slope_of
-from torchgrasp.plan.probability import closed_share
+from torchgrasp.plan.closure_probability import closure_share
+from torchgrasp.plan.feasibility import check_feasibility
+from torchgrasp.plan.objectives import Cost, epsilon_cost, evaluate_cost, min_weight_cost, slope_of
 from torchgrasp.plan.problem import ContactProblem, Shape
+from torchgrasp.plan.solver import FINISH, Stage, descend, pick, project, put, start_state
+from torchgrasp.plan.surface_samples import sample_surfaces, well_inside
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan
@@ -75,7 +75,7 @@ def lower_cost(
     state = dataclasses.replace(state, tension=tension[good])
     for stage, objective in ((LOWER, cost), (FINISH, None)):
         state = descend(shape, problem, state, stage, objective)
-    lower = assess(shape, spec, project(shape, state.points, steps=3))
+    lower = check_feasibility(shape, spec, project(shape, state.points, steps=3))
     plan, lower = (
         dataclasses.replace(p, quality=evaluate_cost(cost, p.contacts.points, p.contacts.normals))
         for p in (plan, lower)
@@ -101,7 +101,7 @@ def raise_probability(
         normals = best.contacts.normals
         move = drawn - (drawn * normals).sum(-1, keepdim=True) * normals
         points = shape.normalise(best.contacts.points + LONGEST_MOVE * SHRINK**k * unit(move))
-        tried = _with_probability(shape, spec, seed, assess(shape, spec, project(shape, points, steps=4)))
+        tried = _with_probability(shape, spec, seed, check_feasibility(shape, spec, project(shape, points, steps=4)))
         best = pick(tried.quality < best.quality, tried, best)
     return put(plan, good, best)
 
@@ -109,5 +109,5 @@ def raise_probability(
 def _with_probability(shape: ShapeGP, spec: ContactSpec, seed: int, plan: ContactPlan) -> ContactPlan:
     """Return the plan with minus the probability of closure as its quality; 0 where a contact or its rim is unfit."""
     fit = torch.nonzero((plan.status == Status.OK) & well_inside(shape, plan.contacts))[:, 0]
-    share = closed_share(lines_of(shape, plan.contacts[fit]), spec.friction, DRAWS, seed)
+    share = closure_share(sample_surfaces(shape, plan.contacts[fit]), spec.friction, DRAWS, seed)
     return dataclasses.replace(plan, quality=torch.zeros_like(plan.quality).index_put((fit,), -share))

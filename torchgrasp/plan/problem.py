@@ -91,7 +91,7 @@ def triple_jet(shape: Shape, points: Float[Tensor, "b 3 3"]) -> TripleJet:
 
 
 @dataclasses.dataclass(frozen=True)
-class Rows(Batch):
+class Constraints(Batch):
     """Values and Jacobians (the nine coordinates, then the three tensions) of the rows at a batch of triples.
 
     `bounds` are, three each: cones, variances, the domain's ball, sides, and with a table heights.
@@ -105,7 +105,7 @@ class Rows(Batch):
     bounds_by_x: Float[Tensor, "b k 12"]
 
 
-def balanced_forces(
+def forces_from_tensions(
     points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"]
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3 3"]]:
     """Return the forces on the object at the contacts and the sides, each from a contact to the next.
@@ -153,7 +153,7 @@ class ContactProblem:
         """Return the least z coordinate of contacts with these normals, at which a round fingertip is on the table."""
         return self.table + (self.tip_radius * (1 - normals[..., 2])).clamp_min(self.contact_height)
 
-    def rows(self, points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"], jet: TripleJet) -> Rows:
+    def rows(self, points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"], jet: TripleJet) -> Constraints:
         """Evaluate all rows and their Jacobians.
 
         Args:
@@ -183,7 +183,7 @@ class ContactProblem:
             values.append(lowest - points[..., 2] + (1 - INSIDE) * 0.1)
             by_tip = self.tip_radius * (lowest > self.table + self.contact_height)[..., None]
             slopes.append(_own(-identity[2] - by_tip * jet.turn[..., 2, :]))
-        return Rows(
+        return Constraints(
             centre=points.mean(1),
             surface=jet.distance,
             bounds=torch.cat(values, 1),
@@ -201,7 +201,7 @@ class ContactProblem:
         normal, which turns with its own point.
         """
         normals = jet.normals
-        force, sides = balanced_forces(points, tension)
+        force, sides = forces_from_tensions(points, tension)
         size = torch.linalg.vector_norm(force, dim=-1, keepdim=True)
         direction = force / size
         outward = (normals * direction).sum(-1, keepdim=True)

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from torchgrasp.base import join
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.plan.assess import assess
-from torchgrasp.plan.descend import FINISH, Stage, descend, pick, project, put, start_state
+from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.improve import Improve, Objective, improver
 from torchgrasp.plan.problem import ContactProblem, Shape
-from torchgrasp.plan.start import StartFrom, check_starts, drawn_starts, given_starts
+from torchgrasp.plan.solver import FINISH, Stage, descend, pick, project, put, start_state
+from torchgrasp.plan.starts import StartFrom, check_starts, drawn_starts, given_starts
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan
 
@@ -141,8 +141,8 @@ def plan_chunk(
     state = start_state(shape, first)
     for stage in (*stages, FINISH):
         state = descend(shape, problem, state, stage)
-    found = assess(shape, spec, project(shape, state.points, steps=3))
+    found = check_feasibility(shape, spec, project(shape, state.points, steps=3))
     lost = torch.nonzero(found.status != Status.OK)[:, 0]
-    begun = assess(shape, spec, first[lost])
+    begun = check_feasibility(shape, spec, first[lost])
     found = put(found, lost, pick(begun.status == Status.OK, begun, found[lost]))
     return found if improve is None else improve(found, state.tension)

@@ -23,7 +23,7 @@ class Canvas:
 
     def __init__(self) -> None:
         self.solid: list[Triangles] = []
-        self.sheer: list[Triangles] = []
+        self.transparent: list[Triangles] = []
 
     def add_mesh(
         self,
@@ -31,13 +31,13 @@ class Canvas:
         faces: np.ndarray,
         color: str,
         normals: Float[np.ndarray, "v 3"] | None = None,
-        sheer: bool = False,
+        transparent: bool = False,
     ) -> None:
         """Add a mesh of one colour, smooth where it has `normals`, else with sharp edges where it bends much."""
         corners = vertices[faces]
         bent = _sharp_normals(vertices, faces) if normals is None else normals[faces]
         triangles = _triangles(corners, bent, np.broadcast_to(rgb(color), corners.shape))
-        (self.sheer if sheer else self.solid).append(triangles)
+        (self.transparent if transparent else self.solid).append(triangles)
 
     def add_values(
         self,
@@ -92,7 +92,7 @@ class Canvas:
         shade = np.broadcast_to(rgb(color), corners.shape)
         self.solid.append(Triangles(corners, normals, shade, np.zeros(len(corners), dtype=bool)))
 
-    def shoot(
+    def render_png(
         self,
         corners: Float[np.ndarray, "n 3"],
         direction: tuple[float, float, float],
@@ -108,7 +108,7 @@ class Canvas:
         from PIL import Image
 
         camera = frame_camera(corners, direction, 0.09 if bar else 0.0)
-        pixels = render(concatenate(self.solid), concatenate(self.sheer), camera, SIZE, rgb(PAPER))
+        pixels = render(concatenate(self.solid), concatenate(self.transparent), camera, SIZE, rgb(PAPER))
         image = Image.fromarray(pixels)
         if bar:
             draw_bar(image, *bar)

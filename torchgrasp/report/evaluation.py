@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from torchgrasp.errors import Status
+from torchgrasp.evaluation.score import Share, ViewScore, summarise
 from torchgrasp.files import write_file
 from torchgrasp.report.document import Markup, escape, format_document, format_table
-from torchgrasp.trials.score import Share, ViewScore, summarise
 
 WIDTH, HEIGHT = 180, 16
 """Size of a bar [pixels]."""

@@ -81,7 +81,7 @@ def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> byte
     for color, axis in zip(AXES, np.eye(3), strict=True):
         canvas.add_arrows(np.zeros((1, 3)), axis[None], frame, color)
     corners = [points[0], points[0] + NORMAL * normals[0], frame * np.eye(3), *(s.vertices for s in solids)]
-    return canvas.shoot(np.concatenate(corners), eye)
+    return canvas.render_png(np.concatenate(corners), eye)
 
 
 def _draw_limits(pen: object, hand: Hand, joints: Float[Tensor, "h"], top: int, font: object) -> None:

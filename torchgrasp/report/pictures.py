@@ -32,7 +32,7 @@ def draw_cloud(cloud: PointCloud, table: float | None = None) -> bytes:
     canvas = Canvas()
     canvas.add_points(points, points[:, 2], "cividis")
     _add_table(canvas, points, table)
-    return canvas.shoot(points, view_of(cloud))
+    return canvas.render_png(points, view_of(cloud))
 
 
 def draw_surface(surface: Surface, direction: Direction, table: float | None = None) -> bytes:
@@ -42,17 +42,17 @@ def draw_surface(surface: Surface, direction: Direction, table: float | None = N
     canvas = Canvas()
     canvas.add_values(vertices, surface.faces.cpu().numpy(), _array(surface.normals), std_mm, most, "viridis")
     _add_table(canvas, vertices, table)
-    return canvas.shoot(vertices, direction, bar=("standard deviation of the surface [mm]", most, "viridis"))
+    return canvas.render_png(vertices, direction, bar=("standard deviation of the surface [mm]", most, "viridis"))
 
 
 def draw_contacts(surface: Surface, contacts: Contacts, direction: Direction, table: float | None = None) -> bytes:
     """Draw the three contacts of the first row and their outward normals on the estimated surface."""
     vertices = _array(surface.vertices)
     canvas = Canvas()
-    canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, _array(surface.normals), sheer=True)
+    canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, _array(surface.normals), transparent=True)
     _add_contacts(canvas, contacts)
     _add_table(canvas, vertices, table)
-    return canvas.shoot(vertices, direction)
+    return canvas.render_png(vertices, direction)
 
 
 def draw_grasp(surface: Surface, hand: Hand, grasp: Grasps, direction: Direction, table: float | None = None) -> bytes:
@@ -66,7 +66,7 @@ def draw_grasp(surface: Surface, hand: Hand, grasp: Grasps, direction: Direction
     _add_solids(canvas, solids)
     corners = np.concatenate([vertices, *(s.vertices for s in solids)])
     _add_table(canvas, corners, table)
-    return canvas.shoot(corners, direction)
+    return canvas.render_png(corners, direction)
 
 
 def draw_tick(
@@ -97,7 +97,7 @@ def draw_tick(
     _add_solids(canvas, postures[tick])
     corners = np.concatenate([*places.values(), *(s.vertices for solids in postures.values() for s in solids)])
     _add_table(canvas, corners, float(places[ticks[0]][:, 2].min()))
-    return canvas.shoot(corners, direction)
+    return canvas.render_png(corners, direction)
 
 
 def view_of(cloud: PointCloud) -> Direction:

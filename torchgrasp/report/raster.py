@@ -61,7 +61,7 @@ def concatenate(parts: list[Triangles]) -> Triangles:
 
 def render(
     solid: Triangles,
-    sheer: Triangles,
+    transparent: Triangles,
     camera: Camera,
     size: tuple[int, int],
     background: tuple[float, float, float],
@@ -75,10 +75,10 @@ def render(
     image[hits.pixel] = _shade(solid, hits, camera)
     depth = np.full(width * height, np.inf)
     depth[hits.pixel] = hits.depth
-    veil = _cast(sheer, camera, width, height)
+    veil = _cast(transparent, camera, width, height)
     seen = veil.depth < depth[veil.pixel]
     veil = _Hits(veil.pixel[seen], veil.triangle[seen], veil.weights[seen], veil.depth[seen])
-    image[veil.pixel] += opacity * (_shade(sheer, veil, camera) - image[veil.pixel])
+    image[veil.pixel] += opacity * (_shade(transparent, veil, camera) - image[veil.pixel])
     grid = image.reshape(size[1], SAMPLES, size[0], SAMPLES, 3)
     boxes = sum(grid[:, i, :, j] for i in range(SAMPLES) for j in range(SAMPLES)) / SAMPLES**2
     return (255.0 * np.clip(boxes, 0.0, 1.0) + 0.5).astype(np.uint8)

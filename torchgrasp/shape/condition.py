@@ -5,11 +5,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.linalg import cholesky
-from torchgrasp.shape.blocks import gram
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.observe import Observations
+from torchgrasp.shape.gradient_kernel import gram
+from torchgrasp.shape.kernels import Kernel, kernel_by_name
+from torchgrasp.shape.observations import Observations
 from torchgrasp.shape.posterior import Posterior
-from torchgrasp.shape.profiles import Kernel, kernel_by_name
 from torchgrasp.values import PointCloud
 
 REACH = 1.25

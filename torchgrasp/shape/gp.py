@@ -10,8 +10,8 @@ from torch import Tensor
 from torchgrasp.base import Value, check_tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
-from torchgrasp.shape.joint import JointEstimate, draw_samples, joint_estimate
-from torchgrasp.shape.observe import Observations
+from torchgrasp.shape.joint_posterior import JointEstimate, draw_samples, joint_estimate
+from torchgrasp.shape.observations import Observations
 from torchgrasp.shape.posterior import Posterior
 from torchgrasp.shape.update import append_observations
 from torchgrasp.values import PointCloud, ShapeEstimate

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.shape.blocks import cross_covariance, separations
-from torchgrasp.shape.profiles import Kernel
+from torchgrasp.shape.gradient_kernel import cross_covariance, separations
+from torchgrasp.shape.kernels import Kernel
 
 BLOCK = 2**27
 """Bytes of the largest temporary of a query on an accelerator; memory stays bounded for any number of points."""

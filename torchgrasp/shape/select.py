@@ -10,11 +10,11 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.linalg import cholesky
-from torchgrasp.shape.blocks import cross_covariance
 from torchgrasp.shape.condition import posterior_given
-from torchgrasp.shape.observe import Observations, on_surface
+from torchgrasp.shape.gradient_kernel import cross_covariance
+from torchgrasp.shape.kernels import Kernel
+from torchgrasp.shape.observations import Observations, on_surface
 from torchgrasp.shape.posterior import Posterior
-from torchgrasp.shape.profiles import Kernel
 from torchgrasp.shape.update import extend_posterior
 
 Criterion = Literal["variance", "error", "both"]

@@ -5,8 +5,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.linalg import cholesky
-from torchgrasp.shape.blocks import covariance_rows, gram
-from torchgrasp.shape.observe import Observations
+from torchgrasp.shape.gradient_kernel import covariance_rows, gram
+from torchgrasp.shape.observations import Observations
 from torchgrasp.shape.posterior import Posterior
 
 

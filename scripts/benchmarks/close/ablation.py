@@ -1,0 +1,81 @@
+"""What each part of the closing is worth: the same grasps with the same errors, one part after the other."""
+
+import functools
+import time
+from pathlib import Path
+
+import trimesh
+
+from benchmarks.common import Row
+from torchgrasp import Status, TrialSpec, close_hand, fit_shape, load_hand, plan_grasps
+from torchgrasp.evaluation.evaluate import choose_rows
+from torchgrasp.evaluation.pool import run_tasks
+from torchgrasp.evaluation.protocols import PAPER, draw_error
+from torchgrasp.evaluation.score import share
+from torchgrasp.shape.accuracy import list_views, object_scale, read_view
+from torchgrasp.sim.convex_parts import convex_parts
+from torchgrasp.specs import ContactSpec
+
+PARTS = {
+    "open-loop squeeze": (TrialSpec(closing="open_loop"), False),
+    "position controller, stops at 0.5 N, then the squeeze": (TrialSpec(closing="position"), False),
+    "fixed gains": (TrialSpec(closing="fixed"), False),
+    "uncertainty-weighted": (TrialSpec(), False),
+    "+ belief update": (TrialSpec(), True),
+    "+ belief update + impedance hold": (TrialSpec(holding="impedance"), True),
+    "uncertainty-weighted + impedance hold": (TrialSpec(holding="impedance"), False),
+}
+"""Trials and whether touches revise the shape; each row differs from one above it by one part."""
+
+LIMIT = 3600.0
+"""Wall time [s] for one view and hand."""
+
+
+def bench_ablation(objects: Path, tries: int, starts: int, seed: int, workers: int) -> list[Row]:
+    """Close and lift `tries` grasps of every view with both hands in every way, the object beside its place."""
+    tasks = [
+        (objects, name, view, hand, tries, starts, seed)
+        for hand in ("allegro", "barrett")
+        for name, view in list_views(objects)
+    ]
+    cases = []
+    for task, found in zip(tasks, run_tasks(_close_view, tasks, workers, LIMIT), strict=True):
+        if isinstance(found, Status):
+            raise SystemExit(f"{task[1]} {task[2]} {task[3]}: {found.sentence}")
+        cases += [(task[3], *case) for case in found]
+    return [_row(part, [case for case in cases if case[1] == part]) for part in PARTS]
+
+
+def _row(part: str, cases: list[tuple[str, str, str, float, float]]) -> Row:
+    """Return the share that held, of all and of each hand, how far the object moved, and the CPU time."""
+    groups = {"all": cases} | {hand: [c for c in cases if c[0] == hand] for hand in ("allegro", "barrett")}
+    shares = {name: share(sum(c[2] == "OK" for c in group), len(group)) for name, group in groups.items()}
+    moved = sorted(case[3] for case in cases if case[2] == "OK")
+    middle = moved[len(moved) // 2] if moved else float("nan")
+    lost = {status: sum(c[2] == status for c in cases) for status in sorted({c[2] for c in cases} - {"OK"})}
+    words = "; ".join(f"{n} {s[0]:.1%} [{s[1]:.1%}, {s[2]:.1%}] of {s[3]}" for n, s in shares.items())
+    seconds = sum(case[4] for case in cases) / max(len(cases), 1)
+    measured = f"{words}; moved {1e3 * middle:.1f} mm (median of the held); {seconds:.2f} CPU s; lost {lost}"
+    numbers = {"shares": shares, "moved_mm": 1e3 * middle, "lost": lost, "seconds": seconds}
+    return Row(f"held, {part}", "-", measured, None, numbers)
+
+
+def _close_view(
+    objects: Path, name: str, view: str, hand_name: str, tries: int, starts: int, seed: int
+) -> list[tuple[str, str, float, float]]:
+    """Return part, status, motion in the hand [m] and CPU time [s] of every trial of one view and hand."""
+    hand, cloud = load_hand(hand_name), read_view(objects, name, view)
+    shape = fit_shape(cloud, seed=seed, table=0.0)
+    found = plan_grasps(cloud, hand, ContactSpec(friction=PAPER.friction, table=0.0), starts, seed, shape=shape)
+    found = found[found.status == Status.OK]
+    mesh = trimesh.load(objects / name / "mesh.ply", force="mesh").apply_scale(object_scale(objects, name))
+    close = functools.partial(close_hand, hand=hand, mesh=mesh, parts=convex_parts(mesh))
+    cases = []
+    for row in choose_rows(len(found), tries, "spread"):
+        error = draw_error(PAPER, found[row], mesh, row, 0, seed)
+        for part, (spec, revises) in PARTS.items():
+            belief = shape if revises else None
+            began = time.process_time()
+            result = close(found[row], spec=spec, seed=seed, error=error, belief=belief)
+            cases.append((part, result.status.name, result.object_motion[0], time.process_time() - began))
+    return cases

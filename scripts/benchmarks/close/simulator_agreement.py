@@ -1,0 +1,92 @@
+"""Whether two simulators judge the same grasps alike: under published pulls, and in lifts with the controller."""
+
+import dataclasses
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sklearn.metrics import cohen_kappa_score, confusion_matrix
+
+from benchmarks.common import Row
+from torchgrasp import load_hand
+from torchgrasp.evaluation.evaluate import evaluate
+from torchgrasp.evaluation.protocols import PROTOCOLS, Execution, ProtocolResult
+from torchgrasp.evaluation.score import ViewScore, share
+
+TESTS = ("dexgraspbench", "dexgraspbench-hard", "pose-noise", "paper")
+"""Three that pull and one that lifts, the last two with an error of where hand or object stand."""
+
+SIMULATORS = ("sapien", "mujoco")
+
+BAR = 0.85
+"""Least share of equal verdicts."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """One grasp in one test, in both simulators."""
+
+    test: str
+    hand: str
+    view: ViewScore
+    sapien: ProtocolResult
+    mujoco: ProtocolResult
+
+
+def bench_agreement(objects: Path, tries: int, starts: int, seed: int, workers: int) -> list[Row]:
+    """Put `tries` grasps of all ranks of every view of every object to each test, with both hands."""
+    cases = []
+    for hand in (load_hand("allegro"), load_hand("barrett")):
+        with tempfile.TemporaryDirectory() as shelf:
+            planned = False
+            for test in TESTS:
+                protocol = dataclasses.replace(PROTOCOLS[test], draws=1)
+                scores = []
+                for simulator in SIMULATORS:
+                    scores.append(
+                        evaluate(
+                            objects, hand, protocol, Execution(simulator=simulator), tries, starts, seed,
+                            ranks="spread", workers=workers, folder=Path(shelf), planned=planned,
+                        )
+                    )  # fmt: skip
+                    planned = True
+                for there, here in zip(*scores, strict=True):
+                    pairs = zip(there.attempts, here.attempts, strict=True)
+                    cases += [Case(test, hand.name, there, *pair) for pair in pairs]
+    rows = [agreement_row(test, [case for case in cases if case.test == test]) for test in TESTS]
+    return [*rows, agreement_row("all tests", cases), speed_row(cases)]
+
+
+def agreement_row(test: str, cases: list[Case]) -> Row:
+    """Return the share of equal verdicts, and which way the others went."""
+    verdicts = [[case.sapien.passed for case in cases], [case.mujoco.passed for case in cases]]
+    labels = [True, False]
+    table, kappa = confusion_matrix(*verdicts, labels=labels), float(cohen_kappa_score(*verdicts, labels=labels))
+    found, low, high, count = share(int(np.trace(table)), int(table.sum()))
+    measured = (
+        f"{found:.1%} of {count} [{low:.1%}, {high:.1%}], kappa {kappa:.2f}; both pass {table[0, 0]}, "
+        f"both fail {table[1, 1]}, SAPIEN alone passes {table[0, 1]}, MuJoCo alone {table[1, 0]}"
+    )
+    numbers = {"share": found, "low": low, "high": high, "count": count, "table": table.tolist(), "kappa": kappa}
+    numbers["unequal"] = [_unequal(case) for case in cases if case.sapien.passed != case.mujoco.passed]
+    return Row(f"agreement of SAPIEN and MuJoCo, {test}", f">= {BAR:.0%}", measured, found >= BAR, numbers)
+
+
+def _unequal(case: Case) -> dict[str, Any]:
+    """Return what there is to know of a grasp that is judged unequally."""
+    known = {"test": case.test, "hand": case.hand, "object": case.view.object, "view": case.view.view}
+    for name in SIMULATORS:
+        attempt = getattr(case, name)
+        known[name] = dataclasses.asdict(attempt) | {"status": attempt.status.name}
+    return known
+
+
+def speed_row(cases: list[Case]) -> Row:
+    """Return the mean CPU time of an attempt in either simulator, where both ran to the end."""
+    numbers = {}
+    for test in TESTS:
+        both = [c for c in cases if c.test == test and c.sapien.passed and c.mujoco.passed]
+        numbers[test] = [float(np.mean([getattr(c, s).seconds for c in both])) for s in SIMULATORS] if both else []
+    measured = ", ".join(f"{test} {' / '.join(f'{x:.2f}' for x in pair)} s" for test, pair in numbers.items())
+    return Row("CPU time of an attempt that passes, SAPIEN / MuJoCo", "-", measured, None, numbers)

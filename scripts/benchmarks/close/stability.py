@@ -1,0 +1,141 @@
+"""Forces and stability: what the model of stable grasps knows of unseen objects, and how hard held objects are lost."""
+
+import dataclasses
+import functools
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from train.pull_trials import Disturbed, Pull, disturb_grasp
+
+from benchmarks.common import Row
+from torchgrasp import ContactSpec, Grasps, Hand, Status, load_hand, plan_grasps
+from torchgrasp.control.adaptive.impedance import GRASP_STIFFNESS, Impedance
+from torchgrasp.control.adaptive.stability import StabilityModel, lengths_of, load_stability, state_of
+from torchgrasp.control.closing_law import closing_gains
+from torchgrasp.control.holding import ForceHold
+from torchgrasp.evaluation.evaluate import choose_rows
+from torchgrasp.linalg import unit
+from torchgrasp.shape.accuracy import read_views
+from torchgrasp.sim.convex_parts import convex_parts
+
+if TYPE_CHECKING:
+    pass
+
+FRICTION, STRENGTH = 0.6, (1.0, 8.0)
+"""Of every contact; and the strongest finger's desired force [N], drawn evenly in its logarithm for each grasp."""
+
+RATE, MOST, SECONDS = 4.0, 16.0, 4.0
+"""The pull rises by so much [N/s], to so much [N], in so long [s]."""
+
+AGAINST = 3.0
+"""The stability before the pull is to tell which grasps keep their object at this pull [N]."""
+
+KEPT = torch.full((3,), GRASP_STIFFNESS, dtype=torch.float64)
+HOLDINGS = {
+    "squeeze": (ForceHold, "analytic"),
+    "impedance": (functools.partial(Impedance, springs=KEPT), "analytic"),
+    "impedance that adapts": (Impedance, "analytic"),
+    "impedance that adapts, learned forces": (Impedance, "learned"),
+}
+"""What holds, and where its desired forces come from."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Held:
+    """One grasp under a rising pull: at which it was lost [N], the odds before it, and the error of its forces."""
+
+    lost_at: float
+    odds: float
+    error: float
+
+
+def bench_force(objects: Path, tries: int, starts: int, seed: int) -> list[Row]:
+    """Pull at `tries` grasps of the first view of every object until they are lost, with both hands."""
+    rows: list[Row] = []
+    for hand in (load_hand("allegro"), load_hand("barrett")):
+        model = load_stability(hand)
+        assert model is not None
+        found: dict[str, list[Held]] = {name: [] for name in HOLDINGS}
+        for _, view, cloud, mesh in read_views(objects):
+            if view != "view0":
+                continue
+            grasps = plan_grasps(cloud, hand, ContactSpec(friction=FRICTION, table=0.0), starts, seed)
+            grasps, parts = grasps[grasps.status == Status.OK], convex_parts(mesh)
+            for row in choose_rows(len(grasps), tries, "spread"):
+                held = pull_at(grasps[row], hand, model, mesh, parts, 1000 * seed + row)
+                for name, one in held.items():
+                    found[name].append(one)
+        rows += [likelihood_row(hand, model), odds_row(hand, found["impedance"]), error_row(hand, found)]
+        rows += [lost_row(hand, found)]
+    return rows
+
+
+def pull_at(grasp: Grasps, hand: Hand, model: StabilityModel, mesh, parts, seed: int) -> dict[str, Held]:
+    """Pull at one grasp under each holding, with the same draws; nothing where the hand starts in the object."""
+    generator = torch.Generator().manual_seed(seed)
+    share = float(torch.rand((), generator=generator, dtype=torch.float64))
+    strength = math.exp(math.log(STRENGTH[0]) + share * math.log(STRENGTH[1] / STRENGTH[0]))
+    pull = Pull(unit(torch.randn(3, generator=generator, dtype=torch.float64)), RATE, MOST, SECONDS)
+    held: dict[str, Held] = {}
+    grasp = grasp.to(dtype=torch.float64)
+    for name, (holding, source) in HOLDINGS.items():
+        gains = closing_gains(grasp, hand, strength, source)
+        trial = disturb_grasp(
+            grasp.to(dtype=torch.float64), hand, mesh, parts, gains, holding, pull, FRICTION, seed=seed
+        )
+        if trial.overlap:
+            return {}
+        held[name] = judged(trial, model, gains.desired_force.norm(dim=-1))
+    return held
+
+
+def judged(trial: Disturbed, model: StabilityModel, desired: torch.Tensor) -> Held:
+    """Return what a trial tells."""
+    rest = max(int((trial.pulled == 0).sum()) - 1, 0)  # the forces have risen by then
+    felt = trial.forces[rest]
+    state = state_of(KEPT, lengths_of(trial.tips[rest]), felt)
+    error = float(((felt - desired) / desired).abs().mean())
+    return Held(float(trial.pulled[-1]) if trial.lost else MOST, float(model.odds(state)), error)
+
+
+def likelihood_row(hand: Hand, model: StabilityModel) -> Row:
+    """Return what the training found on bodies left out."""
+    told = {name: float(model.meta[name]) for name in ("log_likelihood", "log_likelihood_of_one_gaussian", "auc")}
+    measured = (
+        f"{told['log_likelihood']:.2f} nats a state, one Gaussian {told['log_likelihood_of_one_gaussian']:.2f};"
+        f" AUC of the odds {told['auc']:.2f}, of the density alone {float(model.meta['auc_of_the_density']):.2f}"
+    )
+    return Row(f"{hand.name}: the model of stable grasps on authored bodies left out", "-", measured, None, told)
+
+
+def odds_row(hand: Hand, held: list[Held]) -> Row:
+    """Return how well the odds before the pull rank unseen grasps."""
+    kept, lost = ([h.odds for h in held if (h.lost_at > AGAINST) is which] for which in (True, False))
+    pairs = np.subtract.outer(kept, lost)
+    auc = float(((pairs > 0) + 0.5 * (pairs == 0)).mean()) if pairs.size else math.nan
+    measured = f"AUC {auc:.2f} over {len(held)} grasps, {len(lost)} of them lost below {AGAINST:g} N"
+    return Row(f"{hand.name}: odds of stability on unseen objects", "> 0.5", measured, auc > 0.5, {"auc": auc})
+
+
+def error_row(hand: Hand, found: dict[str, list[Held]]) -> Row:
+    """Return how far the forces at rest are from the desired ones."""
+    errors = {name: float(np.median([h.error for h in held])) for name, held in found.items()}
+    measured = ", ".join(f"{name} {error:.0%}" for name, error in errors.items())
+    return Row(f"{hand.name}: median error of the normal forces at rest", "-", measured, None, errors)
+
+
+def lost_row(hand: Hand, found: dict[str, list[Held]]) -> Row:
+    """Return the mean pull at which the object is lost, and the paired gain over the squeeze."""
+    pulls = {name: np.array([h.lost_at for h in held]) for name, held in found.items()}
+    base, parts, numbers = pulls["squeeze"], [], {}
+    for name, at in pulls.items():
+        gain = at - base
+        width = 1.96 * float(gain.std()) / math.sqrt(max(len(gain), 1))
+        numbers[name] = {"mean": float(at.mean()), "gain": float(gain.mean()), "width": width}
+        parts.append(f"{name} {at.mean():.2f} N ({gain.mean():+.2f} +- {width:.2f})")
+    best = numbers["impedance that adapts"]
+    title = f"{hand.name}: mean pull at which {len(base)} held objects are lost"
+    return Row(title, "adapting above the squeeze", "; ".join(parts), best["gain"] > best["width"], numbers)

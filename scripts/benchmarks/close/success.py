@@ -1,0 +1,255 @@
+"""Whether predicted success is true: trials of grasps of all ranks, and a fit judged on objects it has not seen."""
+
+import dataclasses
+import functools
+import itertools
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import trimesh
+from sklearn.linear_model import LogisticRegression
+from sklearn.metrics import roc_auc_score
+from sklearn.preprocessing import StandardScaler
+from tqdm import tqdm
+
+from benchmarks.common import Row
+from torchgrasp.cloud.camera import partial_view
+from torchgrasp.cloud.io.read import save_cloud
+from torchgrasp.evaluation.evaluate import evaluate
+from torchgrasp.evaluation.pool import run_tasks
+from torchgrasp.evaluation.protocols import Execution
+from torchgrasp.evaluation.pull import PROTOCOLS
+from torchgrasp.evaluation.score import share
+from torchgrasp.files import format_json, write_atomically, write_file
+from torchgrasp.hand.load import load_hand
+from torchgrasp.ik.success import success_features
+from torchgrasp.objects import list_objects, load_object
+from torchgrasp.pipeline import closure_of
+from torchgrasp.shape.accuracy import list_views, read_view
+from torchgrasp.shape.fit import fit_shape
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.surface import extract_surface
+from torchgrasp.specs import ClosingMode
+from torchgrasp.values import load_grasps
+
+TESTS: tuple[tuple[str, ClosingMode], ...] = (
+    ("dexgraspbench", "open_loop"),
+    ("dexgraspbench", "uncertainty"),
+    ("dexgraspbench-hard", "open_loop"),
+    ("dexgraspbench-hard", "uncertainty"),
+    ("pose-noise", "uncertainty"),
+)
+"""Protocols, of friction 0.6 and 0.3, and closings of the trials: what an executed grasp may meet, alike in weight.
+Every grasp is put to each, to the errors of the hand's pose in one draw of its own."""
+
+LIMIT = 3600.0
+"""Wall time [s] that the trials of one object may take."""
+
+PENALTY = 0.1
+"""Inverse of the weight of the squared coefficients, of standardised features."""
+
+EDGES = np.linspace(0.0, 1.0, 6)
+"""Of the bins of predicted success in which reliability is looked at."""
+
+ENOUGH, NEAR = 20, 0.10
+"""Trials from which on a bin is judged, and how near the share that passed must then be to the prediction."""
+
+
+def bench_success(objects: Path, hands: tuple[str, ...], grasps: int, workers: int, folder: Path) -> list[Row]:
+    """Fit on all objects but one and judge on that one, for each in turn."""
+    trials = read_trials([objects], hands, grasps, workers, folder)
+    unseen, base = leave_one_out(trials)
+    draw_reliability(folder / "reliability.png", unseen, trials.passed)
+    print(*judge(unseen, base, trials), sep="\n")
+    mine, theirs = brier(unseen, trials.passed), brier(base, trials.passed)
+    numbers = {"trials": len(trials.passed), "brier": mine, "base": theirs}
+    bins = [x for x in reliability(unseen, trials.passed) if x[2] >= ENOUGH]
+    off = max(abs(mean - found[0]) for *_, mean, found in bins)
+    return [
+        Row("Brier score on objects not fitted on", f"below {theirs:.3f}", f"{mine:.3f}", mine < theirs, numbers),
+        Row(
+            f"reliability of predicted success in bins of {ENOUGH} trials or more",
+            f"within {NEAR:.2f}",
+            f"{off:.2f} off at most in {len(bins)} bins",
+            off <= NEAR,
+            {"bins": bins},
+        ),
+    ]
+
+
+class Trials(NamedTuple):
+    """Trials of grasps: `features` (n, k), whether each `passed`, of which `object`, by which protocol and closing."""
+
+    features: np.ndarray
+    passed: np.ndarray
+    object: np.ndarray
+    protocol: np.ndarray
+    closing: np.ndarray
+
+    def select(self, rows: np.ndarray) -> "Trials":
+        """Return some of the trials, by a mask."""
+        return Trials(*(column[rows] for column in self))
+
+
+def read_trials(objects: Sequence[Path], hands: Sequence[str], grasps: int, workers: int, folder: Path) -> Trials:
+    """Return trials on the library's own and simple bodies and on the objects of folders, running what is missing.
+
+    Raises:
+        FileNotFoundError: the trials of an object came to no end.
+    """
+    author_views(folder / "authored")
+    tasks = [
+        (source, name, hand, grasps, folder)
+        for hand in hands
+        for source in (folder / "authored", *objects)
+        for name in sorted({name for name, _ in list_views(source)})
+    ]
+    missing = [task for task in tasks if not kept_at(*task).exists()]
+    for _ in tqdm(run_tasks(try_object, missing, workers, LIMIT), total=len(missing), disable=None, leave=False):
+        pass
+    rows = [row for task in tasks for row in json.loads(kept_at(*task).read_text())]
+    return Trials(*(np.array([row[name] for row in rows]) for name in Trials._fields))
+
+
+def kept_at(source: Path, name: str, hand: str, grasps: int, folder: Path) -> Path:
+    """Return where the trials of an object are kept: those of another number of grasps stay apart."""
+    return folder / f"{hand}_{source.name}_{name}_{grasps}.json"
+
+
+def author_views(folder: Path) -> None:
+    """Write the library's own objects and simple bodies as a folder of objects with one noisy view each."""
+    solids = {name: load_object(name).mesh for name in list_objects()}
+    for k, size in enumerate(((0.05, 0.05, 0.09), (0.04, 0.09, 0.14), (0.07, 0.12, 0.06))):
+        solids[f"box_{k}"] = trimesh.creation.box(size)
+    for k, (radius, height) in enumerate(((0.022, 0.16), (0.04, 0.07), (0.045, 0.15))):
+        solids[f"rod_{k}"] = trimesh.creation.cylinder(radius, height, sections=64)
+    for k, axes in enumerate(((0.03, 0.03, 0.03), (0.035, 0.05, 0.06))):
+        solids[f"egg_{k}"] = trimesh.creation.icosphere(subdivisions=2, radius=1.0).apply_scale(axes)
+    entries = {}
+    for k, (name, mesh) in enumerate(solids.items()):
+        mesh.apply_translation([0.0, 0.0, -mesh.bounds[0, 2]])
+        cloud = partial_view(mesh, azimuth=47.0 * k, elevation=30.0, seed=k)
+        pose = np.eye(4)
+        pose[:3, 3] = cloud.viewpoint.numpy()  # pyright: ignore[reportOptionalMemberAccess]
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        write_file(folder / name / "mesh.ply", mesh.export(file_type="ply"))
+        save_cloud(cloud, folder / name / "view0_noisy.ply")
+        entries[name] = {"views": {"view0": {"T_object_camera": pose.tolist()}}}
+    write_file(folder / "manifest.json", json.dumps({"objects": entries}))
+
+
+def try_object(source: Path, name: str, hand: str, grasps: int, folder: Path) -> None:
+    """Keep a row for each trial of an object: which it was, its features, and whether it passed."""
+    rows, shelf = [], folder / "grasps" / hand / source.name
+    for k, (protocol, closing) in enumerate(TESTS):
+        test = PROTOCOLS[protocol]
+        scores = evaluate(
+            source, load_hand(hand), dataclasses.replace(test, draws=1), Execution(closing=closing), grasps,
+            ranks="spread", only=[name], workers=0, folder=shelf, planned=k > 0,
+        )  # fmt: skip
+        for score in scores:
+            told = {"object": name, "view": score.view, "hand": hand, "protocol": protocol, "closing": closing}
+            ranks = tuple(attempt.rank for attempt in score.attempts)
+            known = known_of(source, name, score.view, shelf, test.friction, ranks)
+            rows += [
+                {**told, "rank": attempt.rank, "features": features, "passed": attempt.passed}
+                for attempt, features in zip(score.attempts, known, strict=True)
+            ]
+    write_file(kept_at(source, name, hand, grasps, folder), format_json(rows))
+
+
+@functools.lru_cache(maxsize=16)
+def known_of(
+    source: Path, name: str, view: str, shelf: Path, friction: float, ranks: tuple[int, ...]
+) -> list[list[float]]:
+    """Return the features of some grasps of a view."""
+    if not ranks:
+        return []
+    grasps = load_grasps(shelf / f"{name}_{view}.safetensors")[torch.tensor(ranks)]
+    shape, center = shape_of(source, name, view)
+    closure = closure_of(grasps.contacts, shape, friction, 0)
+    return success_features(grasps.contacts, closure, grasps.normal_angle, center, friction).tolist()
+
+
+@functools.lru_cache(maxsize=8)
+def shape_of(source: Path, name: str, view: str) -> tuple[ShapeGP, torch.Tensor]:
+    """Return the estimated shape of the object in a view, and its centre [m]."""
+    shape = fit_shape(read_view(source, name, view), table=0.0)
+    return shape, extract_surface(shape).vertices.mean(0)
+
+
+def fit(trials: Trials) -> tuple[list[float], float]:
+    """Return weights and bias of a logistic regression, of the features as they are."""
+    scaler = StandardScaler().fit(trials.features)
+    model = LogisticRegression(C=PENALTY, tol=1e-10, max_iter=1000)
+    model.fit(scaler.transform(trials.features), trials.passed)
+    weights = model.coef_[0] / scaler.scale_
+    return weights.tolist(), float(model.intercept_[0] - weights @ scaler.mean_)
+
+
+def leave_one_out(trials: Trials) -> tuple[np.ndarray, np.ndarray]:
+    """Return for each trial the prediction, and the base rate of its protocol, by the other objects alone."""
+    predicted, base = np.zeros(len(trials.passed)), np.zeros(len(trials.passed))
+    for name in np.unique(trials.object):
+        mine = trials.object == name
+        others = trials.select(~mine)
+        weights, bias = fit(others)
+        predicted[mine] = 1 / (1 + np.exp(-(trials.features[mine] @ weights + bias)))
+        for protocol in np.unique(trials.protocol):
+            base[mine & (trials.protocol == protocol)] = others.passed[others.protocol == protocol].mean()
+    return predicted, base
+
+
+def judge(predicted: np.ndarray, base: np.ndarray, trials: Trials) -> list[str]:
+    """Return what is to be said of predictions: Brier scores, how they order, and reliability by bins and closings."""
+    lines, y = [], trials.passed
+    tests = np.char.add(np.char.add(trials.protocol, ", "), trials.closing)
+    kinds = [("all", np.ones(len(y), dtype=bool))]
+    kinds += [(str(name), column == name) for column in (trials.closing, tests) for name in np.unique(column)]
+    for name, mine in kinds:
+        scores = f"Brier {brier(predicted[mine], y[mine]):.3f}, base rate {brier(base[mine], y[mine]):.3f}"
+        auc = f"AUC {roc_auc_score(y[mine], predicted[mine]):.2f}"
+        rates = f"predicted {predicted[mine].mean():.2f}, passed {y[mine].mean():.2f} of {mine.sum()}"
+        lines.append(f"{name}: {scores}, {auc}, {rates}")
+    for name, mine in kinds[: 1 + len(np.unique(trials.closing))]:
+        for low, high, count, mean, (value, least, most) in reliability(predicted[mine], y[mine]):
+            found = f"predicted {mean:.2f}, passed {value:.2f} [{least:.2f}, {most:.2f}] of {count}"
+            lines.append(f"{name}, {low:.1f} to {high:.1f}: {found}")
+    return lines
+
+
+def reliability(predicted: np.ndarray, y: np.ndarray) -> list[tuple[float, float, int, float, tuple[float, ...]]]:
+    """Return for each bin its ends, count, mean prediction, and the share that passed with its Wilson interval."""
+    bins = []
+    for low, high in itertools.pairwise(EDGES):
+        mine = (predicted >= low) & ((predicted < high) | (high == EDGES[-1]))
+        if mine.any():
+            found = share(int(y[mine].sum()), int(mine.sum()))[:3]
+            bins.append((float(low), float(high), int(mine.sum()), float(predicted[mine].mean()), found))
+    return bins
+
+
+def brier(predicted: np.ndarray, y: np.ndarray) -> float:
+    """Return the mean squared error of probabilities."""
+    return float(((predicted - y) ** 2).mean())
+
+
+def draw_reliability(path: Path, predicted: np.ndarray, y: np.ndarray) -> None:
+    """Draw the share that passed over the prediction, with intervals and counts."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.2, 5.0), dpi=140, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot(xlabel="predicted success", ylabel="share that passed", xlim=(0, 1), ylim=(0, 1))
+    axes.plot([0, 1], [0, 1], color="#7c8591", linewidth=1)
+    axes.fill_between([0, 1], [-0.1, 0.9], [0.1, 1.1], color="#e7e5de", zorder=0)
+    for _, _, count, mean, (value, low, high) in reliability(predicted, y):
+        axes.errorbar([mean], [value], [[value - low], [high - value]], fmt="o", color="#23967f", capsize=3)
+        axes.annotate(f"{count}", (mean, value), (6, -12), textcoords="offset points", color="#4b525b")
+    axes.set_title(f"{len(y)} trials on objects not fitted on")
+    write_atomically(path, lambda temporary: figure.savefig(temporary, format="png"))

@@ -1,0 +1,1 @@
+"""The hands and their posture models, beside their bars."""

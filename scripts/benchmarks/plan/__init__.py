@@ -1,0 +1,1 @@
+"""The contact planner, beside its bars."""

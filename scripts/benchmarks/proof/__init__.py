@@ -1,0 +1,1 @@
+"""Certificates and probabilities against exact references."""

@@ -1,0 +1,1 @@
+"""The shape, beside its bars."""

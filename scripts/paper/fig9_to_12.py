@@ -1,0 +1,173 @@
+"""Figs. 9 to 12 of the paper: contacts that hands take, in more than one way and with more than one hand."""
+
+import dataclasses
+import io
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from torchgrasp import (
+    Contacts,
+    ContactSpec,
+    Grasps,
+    Hand,
+    Status,
+    certify,
+    fit_shape,
+    list_objects,
+    load_hand,
+    load_mixture,
+    load_object,
+    plan_contacts,
+)
+from torchgrasp.files import write_atomically
+from torchgrasp.frames import virtual_frame
+from torchgrasp.ik.clearance import CollisionWorld
+from torchgrasp.ik.contact_first import rank_seeds, refinement_on_contacts
+from torchgrasp.ik.query import query_mixture
+from torchgrasp.ik.sdf import field_from_surface
+from torchgrasp.pipeline import spread_rows
+from torchgrasp.report.canvas import Canvas
+from torchgrasp.report.palette import AXES, FINGERS, HAND, INK, OBJECT, PAPER
+from torchgrasp.report.pictures import Direction, facing
+from torchgrasp.report.solids import PARKED, solids_from_hand
+from torchgrasp.shape.surface import Surface, extract_surface
+
+SPEC = ContactSpec(table=0.0)
+TRIPLES, GUESSES, TRIED = 80, 6, 16
+"""Certified triples of each object, guesses of the learned model for each assignment, and how many are refined."""
+TILE = (450, 360)
+"""Width and height of one picture [pixels]."""
+APART = 0.1
+"""Hands whose bases are nearer [m] are seen from the side of the first one's fingers."""
+NORMAL, FRAME = 0.035, 0.03
+"""Lengths of the contacts' normals and of the virtual frame [m]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Taken:
+    """Grasps of one hand on one object that passed every check, and the contact triple of each."""
+
+    hand: Hand
+    surface: Surface
+    grasps: Grasps
+    row: Int[Tensor, "g"]
+
+
+def grasps(out: Path, starts: int = 300, seed: int = 0) -> None:
+    """Draw Figs. 9 to 12 with the project's objects: the hands on the shapes that one side of each object gives.
+
+    fig9.png: one contact triple by two postures of the same hand. fig10.png: one triple by both hands. fig11.png and
+    fig12.png: grasps of the Barrett and of the Allegro hand. Every grasp drawn has passed every check.
+
+    Args:
+        out: folder of the pictures; it is made where it does not exist.
+        starts: of the contact planner.
+        seed: of every draw.
+    """
+    torch.set_num_threads(1)
+    taken = {name: take(name, starts, seed) for name in list_objects()}
+    for name, hands in taken.items():
+        counts = [f"{len(t.grasps)} {t.hand.name} grasps of {len(t.row.unique())} triples" for t in hands]
+        print(f"{name:10}{', '.join(counts)}")
+    pairs = [found for hands in taken.values() for t in hands if (found := unlike_pair(t)) is not None]
+    widest = sorted(pairs, key=lambda pair: -pair[3])[:2]
+    save([[(t, one), (t, two)] for t, one, two, _ in widest], out / "fig9.png")
+    save([found for hands in taken.values() if (found := shared_triple(*hands))][:2], out / "fig10.png")
+    for k, number in ((1, 11), (0, 12)):
+        best = [[(hands[k], int(hands[k].grasps.score.argmax()))] for hands in taken.values() if len(hands[k].grasps)]
+        save(best, out / f"fig{number}.png")
+
+
+def take(name: str, starts: int, seed: int) -> tuple[Taken, Taken]:
+    """Return the grasps of the Allegro and the Barrett hand on one object, from the learned models' guesses."""
+    shape = fit_shape(load_object(name).view, seed=seed, table=SPEC.table)
+    surface = extract_surface(shape)
+    world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), SPEC.table)
+    plan = plan_contacts(shape, SPEC, starts, seed)
+    contacts = plan.contacts[spread_rows(plan, TRIPLES)]
+    certificate = certify(contacts, SPEC)
+    contacts, certificate = contacts[certificate.closed], certificate[certificate.closed]
+    found = []
+    for hand in (load_hand("allegro"), load_hand("barrett")):
+        guess = query_mixture(contacts, hand, load_mixture(hand.name), GUESSES)
+        guess = guess[rank_seeds(guess, hand, contacts, world) < TRIED]
+        tried = refinement_on_contacts(hand, contacts, certificate, world, surface.vertices.mean(0))(guess)
+        good = tried.status == Status.OK
+        found.append(Taken(hand, surface, tried[good], guess.row[good]))
+    return found[0], found[1]
+
+
+def unlike_pair(taken: Taken) -> tuple[Taken, int, int, float] | None:
+    """Return the two grasps of one triple whose hands point apart the most, and the angle between them [rad]."""
+    same = (taken.row[:, None] == taken.row).triu(1)
+    if not bool(same.any()):
+        return None
+    approach = taken.grasps.obj_from_hand[:, :3, :3] @ taken.hand.approach
+    angle = torch.where(same, torch.acos((approach @ approach.T).clamp(-1, 1)), -1.0)
+    one, two = divmod(int(angle.argmax()), len(angle))
+    return taken, one, two, float(angle[one, two])
+
+
+def shared_triple(first: Taken, second: Taken) -> list[tuple[Taken, int]]:
+    """Return one grasp of each hand on a triple that both take, the one of the best score."""
+    both = [row for row in first.row.unique().tolist() if row in second.row]
+
+    def best(taken: Taken, row: int) -> int:
+        return int(torch.where(taken.row == row, taken.grasps.score, -torch.inf).argmax())
+
+    choices = [(t, best(t, row)) for row in both for t in (first, second)]
+    scores = np.array([float(t.grasps.score[index]) for t, index in choices]).reshape(-1, 2).sum(1)
+    return choices[2 * int(scores.argmax()) :][:2] if len(scores) else []
+
+
+def save(rows: list[list[tuple[Taken, int]]], path: Path) -> None:
+    """Draw grasps, those of one contact triple in a row and from one eye, else two in a row."""
+    shown = [(*one, eye_of(row)) for row in rows for one in row]
+    sheet = Image.new("RGB", (2 * TILE[0], max(-(-len(shown) // 2), 1) * TILE[1]), PAPER)
+    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(18)
+    for k, (taken, index, eye) in enumerate(shown):
+        corner = (k % 2 * TILE[0], k // 2 * TILE[1])
+        sheet.paste(draw(taken, index, eye).resize(TILE, Image.Resampling.LANCZOS), corner)
+        worst = 1e3 * float(taken.grasps.tip_error[index].max())
+        pen.text((corner[0] + 10, corner[1] + 8), f"{taken.hand.name}, tips within {worst:.2f} mm", INK, font)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, lambda temporary: sheet.save(temporary, format="PNG"))
+    print(path)
+
+
+def eye_of(row: list[tuple[Taken, int]]) -> Direction:
+    """Return the direction from which a grasp is seen well, or two whose hands are apart: square to their distance."""
+    poses = [taken.grasps.obj_from_hand[index, :2, 3] for taken, index in row]
+    x, y = (poses[0] - poses[-1]).tolist()
+    if np.hypot(x, y) < APART:
+        return facing(row[0][0].grasps[row[0][1]])
+    return (-y, x, 0.4 * float(np.hypot(x, y)))
+
+
+def draw(taken: Taken, index: int, eye: Direction) -> Image.Image:
+    """Draw one grasp with its contacts, their normals and their virtual frame on the estimated surface."""
+    hand, grasp, surface = taken.hand, taken.grasps[index], taken.surface
+    canvas, contacts = Canvas(), grasp.contacts
+    vertices = surface.vertices.numpy()
+    canvas.add_mesh(vertices, surface.faces.numpy(), OBJECT, surface.normals.numpy(), transparent=True)
+    joints = hand.expand_joints(grasp.joints[0])
+    solids = solids_from_hand(hand, joints, hand.urdf_joint_names, grasp.obj_from_hand[0])
+    for solid in solids:
+        canvas.add_mesh(solid.vertices, solid.faces, HAND if solid.finger == PARKED else FINGERS[solid.finger])
+    _add_frame(canvas, contacts)
+    corners = np.concatenate([vertices, *(s.vertices for s in solids)])
+    return Image.open(io.BytesIO(canvas.render_png(corners, eye)))
+
+
+def _add_frame(canvas: Canvas, contacts: Contacts) -> None:
+    """Add the normals of a triple and its virtual frame."""
+    for color, point, normal in zip(FINGERS, contacts.points[0].numpy(), contacts.normals[0].numpy(), strict=True):
+        canvas.add_arrows(point[None], normal[None], NORMAL, color)
+    frame = virtual_frame(contacts.points[0]).numpy()
+    for k, color in enumerate(AXES):
+        canvas.add_arrows(frame[None, :3, 3], frame[None, :3, k], FRAME, color)

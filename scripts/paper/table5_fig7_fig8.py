@@ -1,0 +1,165 @@
+"""Table 5, Fig. 7 and Fig. 8 of the paper: how far the learned model's joints are from true ones (Eq. 23)."""
+
+import dataclasses
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from torchgrasp import Hand, load_hand, load_mixture
+from torchgrasp.files import write_atomically, write_file
+from torchgrasp.posture_model.sample import sample_configurations
+from torchgrasp.report.canvas import Canvas
+from torchgrasp.report.palette import FINGERS, GRID, HAND, INK, PAPER
+from torchgrasp.report.pictures import Direction
+from torchgrasp.report.solids import PARKED, solids_from_hand
+
+PUBLISHED = {
+    "cases": [[0.03, 0.06, 0.27, 0.26], [0.17, 0.01, 0.27, 0.002], [0.04, 0.07, 0.25, 0.08], [0.03, 0.2, 0.06, 0.56]],
+    "overall": [(0.16, 0.01), (0.17, 0.01), (0.21, 0.007), (0.36, 0.02)],
+}
+"""The paper's Table 5 by joint: its four cases, and the mean over all test postures with its deviation [rad]."""
+PUBLISHED_ALLEGRO = 0.2
+"""What the paper says of Fig. 8: the average error is around this [rad]."""
+CASES = (0.1, 0.4, 0.7, 0.95)
+"""Where the four cases are among the test postures ordered by their error; the paper does not say what its own are."""
+TILE = (520, 416)
+"""Width and height of one picture of Fig. 7 [pixels]."""
+EYE: Direction = (1.0, -0.7, 0.55)
+
+
+@dataclasses.dataclass(frozen=True)
+class Errors:
+    """Test postures, what the model makes of their codes, and the distance between the two [rad]."""
+
+    hand: Hand
+    joints: Float[Tensor, "n h"]
+    found: Float[Tensor, "n h"]
+    error: Float[Tensor, "n h"]
+
+    def cases(self) -> list[int]:
+        """Return the rows of the four cases."""
+        order = self.error.mean(1).argsort()
+        return [int(order[int(share * (len(order) - 1))]) for share in CASES]
+
+
+def measure_errors(name: str, n: int, seed: int) -> Errors:
+    """Ask a shipped model for the joints of n test postures by their codes; the seed is not the one of its samples."""
+    hand, mixture = load_hand(name), load_mixture(name)
+    if str(seed) == mixture.meta["seed"]:
+        raise SystemExit(f"--seed {seed}: the model has learned from these postures; any other seed is a test")
+    samples = sample_configurations(hand, n, seed)
+    found = mixture.joints(samples.q)
+    return Errors(hand, samples.joints, found, (found - samples.joints).abs())
+
+
+def table5(out: Path, n: int = 600_000, seed: int = 1) -> None:
+    """Print Table 5: the Barrett model's mean absolute error by joint, with the paper's numbers beside ours.
+
+    Args:
+        out: folder of table5.json; it is made where it does not exist.
+        n: test postures, which the model has not seen.
+        seed: of their draw.
+    """
+    errors = measure_errors("barrett", n, seed)
+    cases, mean, spread = errors.error[errors.cases()].T, errors.error.mean(0), errors.error.std(0)
+    head = "".join(f"{f'case {k + 1}':>8}" for k in range(len(CASES)))
+    print(f"{'joint':12}{head}{'overall':>17}   the paper's{head}{'overall':>17}")
+    for k, joint in enumerate(errors.hand.joint_names):
+        ours = "".join(f"{float(x):8.3f}" for x in cases[k]) + f"{f'{mean[k]:.3f} +- {spread[k]:.3f}':>17}"
+        paper, (theirs, deviation) = PUBLISHED["cases"][k], PUBLISHED["overall"][k]
+        print(
+            f"{joint:12}{ours}   {f'J{k + 1}':11}"
+            + "".join(f"{x:8.3g}" for x in paper)
+            + f"{f'{theirs} +- {deviation}':>17}"
+        )
+    theirs = np.mean([m for m, _ in PUBLISHED["overall"]])
+    print(f"mean over joints {float(errors.error.mean()):.3f}; the paper's {theirs:.3f}")
+    print(f"cases: the postures at {', '.join(f'{c:.0%}' for c in CASES)} of all, ordered by error")
+    numbers = {"mean": mean.tolist(), "spread": spread.tolist(), "cases": cases.tolist()}
+    _write(out, "table5", {"n": n, "seed": seed} | numbers)
+
+
+def fig7(out: Path, n: int = 600_000, seed: int = 1) -> None:
+    """Draw Fig. 7: true (solid) and predicted (sheer) joints of the Barrett hand in the four cases of Table 5.
+
+    Args:
+        out: folder of fig7.png; it is made where it does not exist.
+        n: test postures, which the model has not seen.
+        seed: of their draw.
+    """
+    errors = measure_errors("barrett", n, seed)
+    sheet = Image.new("RGB", (2 * TILE[0], 2 * TILE[1]), PAPER)
+    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(19)
+    for k, row in enumerate(errors.cases()):
+        corner = (k % 2 * TILE[0], k // 2 * TILE[1])
+        picture = draw_both(errors.hand, errors.joints[row], errors.found[row])
+        sheet.paste(picture.resize(TILE, Image.Resampling.LANCZOS), corner)
+        numbers = ", ".join(f"{x:.2f}" for x in errors.error[row].tolist())
+        pen.text((corner[0] + 12, corner[1] + 10), f"case {k + 1}: off by {numbers} rad", INK, font)
+    _save(sheet, out / "fig7.png")
+
+
+def fig8(out: Path, n: int = 600_000, seed: int = 1) -> None:
+    """Draw Fig. 8: the Allegro model's mean absolute error of each of the 12 joints, with its deviation.
+
+    Args:
+        out: folder of fig8.png and fig8.json; it is made where it does not exist.
+        n: test postures, which the model has not seen.
+        seed: of their draw.
+    """
+    from matplotlib.figure import Figure
+
+    errors = measure_errors("allegro", n, seed)
+    mean, spread = errors.error.mean(0).numpy(), errors.error.std(0).numpy()
+    figure = Figure(figsize=(8.4, 4.2), dpi=140, facecolor=PAPER, layout="constrained")
+    axes = figure.add_subplot(facecolor=PAPER)
+    place, fingers = np.arange(len(mean)), np.repeat(FINGERS, 4)
+    axes.bar(place, mean, 0.65, yerr=[np.minimum(mean, spread), spread], color=fingers, ecolor=INK, capsize=3)
+    axes.axhline(PUBLISHED_ALLEGRO, color="#d62728", linestyle="--", linewidth=1.3, label="the paper: around 0.2 rad")
+    axes.axhline(float(mean.mean()), color=INK, linewidth=1.3, label=f"our mean {mean.mean():.3f} rad")
+    axes.set_xticks(place, [name.removeprefix("joint_") for name in errors.hand.joint_names])
+    axes.set_xlabel(f"joint ({', '.join(errors.hand.finger_names)})", color=INK)
+    axes.set_ylabel("mean absolute error [rad]", color=INK)
+    axes.grid(axis="y", color=GRID, linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.legend(frameon=False, loc="upper right")
+    axes.spines[["top", "right"]].set_visible(False)
+    out.mkdir(parents=True, exist_ok=True)
+    write_atomically(out / "fig8.png", lambda path: figure.savefig(path, format="png"))
+    for name, error, deviation in zip(errors.hand.joint_names, mean, spread, strict=True):
+        print(f"{name:10}{error:8.3f} +- {deviation:.3f}")
+    print(f"mean {mean.mean():.3f} rad; the paper's is around {PUBLISHED_ALLEGRO} rad")
+    _write(out, "fig8", {"n": n, "seed": seed, "mean": mean.tolist(), "spread": spread.tolist()})
+    print(out / "fig8.png")
+
+
+def draw_both(hand: Hand, true: Float[Tensor, "h"], found: Float[Tensor, "h"]) -> Image.Image:
+    """Draw a hand at its true joints, and sheer over it at those that were found."""
+    canvas, corners = Canvas(), []
+    for joints, transparent in ((true, False), (found, True)):
+        for solid in solids_from_hand(hand, hand.expand_joints(joints), hand.urdf_joint_names, torch.eye(4).double()):
+            color = HAND if solid.finger == PARKED else FINGERS[solid.finger]
+            canvas.add_mesh(solid.vertices, solid.faces, color, transparent=transparent)
+            corners.append(solid.vertices)
+    return Image.open(io.BytesIO(canvas.render_png(np.concatenate(corners), EYE)))
+
+
+def _save(sheet: Image.Image, path: Path) -> None:
+    """Write a picture and say where."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, lambda temporary: sheet.save(temporary, format="PNG"))
+    print(path)
+
+
+def _write(out: Path, name: str, content: dict[str, Any]) -> None:
+    """Write numbers as JSON, with the paper's."""
+    out.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(content | {"published": PUBLISHED}, indent=1)
+    write_file(out / f"{name}.json", text)

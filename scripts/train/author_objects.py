@@ -1,0 +1,40 @@
+"""Write the files of torchgrasp's own objects into torchgrasp/objects/data, the same bytes every time.
+
+Run it after a change of torchgrasp/objects/author.py or of the virtual camera; it needs the extra `dev`.
+"""
+
+import numpy as np
+import trimesh
+
+from torchgrasp.cloud.camera import partial_view
+from torchgrasp.cloud.io.read import save_cloud
+from torchgrasp.files import write_atomically, write_file
+from torchgrasp.objects import DATA, list_objects
+from train.object_shapes import author
+
+VIEWS = {"cylinder": (20.0, 30.0), "jug": (60.0, 35.0), "rabbit": (55.0, 30.0), "spray": (50.0, 25.0)}
+"""Azimuth and elevation [deg] of the camera that saw each object, by name."""
+
+
+def write_object(name: str) -> None:
+    solid, parts = author(name)
+    arrays = solid.to_mesh64()
+    corners = np.asarray(arrays.vert_properties)[:, :3].astype(np.float32)
+    mesh = trimesh.Trimesh(corners, np.asarray(arrays.tri_verts))
+    if not (mesh.is_volume and mesh.body_count == 1 and len(mesh.faces) <= 20_000):
+        raise SystemExit(f"{name}: not one closed body of at most 20000 faces")
+    content = mesh.export(file_type="ply", vertex_normal=False)
+    write_file(DATA / name / "mesh.ply", content)
+    columns = {
+        "corners": np.concatenate(parts).astype(np.float32),
+        "counts": np.array([len(p) for p in parts], dtype=np.int32),
+    }
+    write_atomically(DATA / name / "parts.npz", lambda path: np.savez_compressed(path, **columns))
+    azimuth, elevation = VIEWS[name]
+    save_cloud(partial_view(mesh, azimuth, elevation), DATA / name / "view.ply")
+    print(f"{name}: {len(mesh.faces)} faces, {mesh.volume * 1e6:.0f} cm3, {len(parts)} parts")
+
+
+if __name__ == "__main__":
+    for name in list_objects():
+        write_object(name)

@@ -1,0 +1,247 @@
+"""The learned model of a hand's stable grasps: bodies are grasped and pulled at, and a mixture learns those that held.
+
+python scripts/make_force.py allegro --workers 2
+"""
+
+import dataclasses
+import functools
+import math
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import trimesh
+import tyro
+from jaxtyping import Float
+from torch import Tensor
+from tqdm import tqdm
+
+from torchgrasp import (
+    ContactSpec,
+    Grasps,
+    Hand,
+    PointCloud,
+    Status,
+    list_objects,
+    load_hand,
+    load_object,
+    plan_grasps,
+)
+from torchgrasp.base import Batch
+from torchgrasp.control.adaptive.impedance import Impedance
+from torchgrasp.control.adaptive.stability import StabilityModel, fit_stability, lengths_of, stability_path, state_of
+from torchgrasp.control.closing_law import closing_gains
+from torchgrasp.errors import GraspError
+from torchgrasp.evaluation.pool import run_tasks
+from torchgrasp.files import load_tensors, save_tensors
+from torchgrasp.frames import rigid, rotation_from_vector
+from torchgrasp.linalg import unit
+from torchgrasp.posture_model.compatibility import describe_compatibility
+from train.pull_trials import Disturbed, Pull, disturb_grasp
+
+SIZES = {
+    "box": [(0.04, 0.06, 0.13), (0.05, 0.05, 0.05), (0.03, 0.09, 0.16), (0.07, 0.07, 0.10), (0.06, 0.10, 0.04)],
+    "cylinder": [(0.018, 0.14), (0.026, 0.17), (0.034, 0.10), (0.042, 0.13)],
+    "ellipsoid": [(0.025, 0.025, 0.06), (0.035, 0.035, 0.035), (0.045, 0.03, 0.055), (0.03, 0.05, 0.08)],
+}
+"""Edges, radius and height, and half axes of simple bodies [m]."""
+
+BODIES = (*(f"{kind}{k}" for kind, sizes in SIZES.items() for k in range(len(sizes))), *list_objects())
+
+POINTS, STARTS, GRASPS = 1000, 300, 16
+"""Points of the cloud on which each body's grasps are planned, starts of the planner, and the best grasps kept."""
+
+STRENGTH, SPRINGS, FRICTION, PULL = (1.0, 8.0), (20.0, 500.0), (0.4, 1.0), (0.5, 6.0)
+"""What is drawn for each trial: the strongest finger's force [N], the springs [N/m] (both evenly in their logarithm),
+friction, and the pull [N]."""
+
+SHIFT, TURN = 0.005, math.radians(5)
+"""Up to which the hand stands beside its plan, along and about each of its axes [m, rad]."""
+
+SLIP, TILT = 0.01, math.radians(15)
+"""Motion [m] and turn [rad] under the pull up to which a grasp counts as stable."""
+
+
+def body(name: str) -> tuple[trimesh.Trimesh, list[trimesh.Trimesh]]:
+    """Return a body's mesh [m], standing at z = 0, and its convex parts."""
+    if name in list_objects():
+        known = load_object(name)
+        return known.mesh, known.parts
+    kind, size = name[:-1], SIZES[name[:-1]][int(name[-1])]
+    if kind == "box":
+        mesh = trimesh.creation.box(size)
+    elif kind == "cylinder":
+        mesh = trimesh.creation.cylinder(radius=size[0], height=size[1], sections=64)
+    else:
+        mesh = trimesh.creation.icosphere(subdivisions=2)
+        mesh.apply_scale(size)
+    mesh.apply_translation([0, 0, -mesh.bounds[0, 2]])
+    return mesh, [mesh]
+
+
+def rehearse(hand_name: str, name: str, trials: int, seed: int) -> list[dict[str, Any]]:
+    """Disturb grasps of one body, and say of each what its state was before and under the pull, and how it ended."""
+    hand = load_hand(hand_name)
+    mesh, parts = body(name)
+    grasps = grasps_of(name, hand, mesh, seed)
+    found = []
+    for k in range(trials if len(grasps) else 0):
+        generator = torch.Generator().manual_seed(1_000_000 * seed + 1000 * BODIES.index(name) + k)
+        trial = rehearse_once(grasps, hand, mesh, parts, generator, k)
+        if not trial.overlap:
+            found.append({"body": float(BODIES.index(name)), **summary(trial)})
+    return found
+
+
+def grasps_of(name: str, hand: Hand, mesh: trimesh.Trimesh, seed: int) -> Grasps:
+    """Plan grasps of a body that is seen from all around."""
+    points, faces = trimesh.sample.sample_surface(mesh, POINTS, seed=seed)  # pyright: ignore[reportAssignmentType]
+    cloud = PointCloud(torch.from_numpy(np.array(points)), torch.from_numpy(np.array(mesh.face_normals[faces])))
+    found = plan_grasps(cloud, hand, ContactSpec(), STARTS, seed)
+    return found[found.status == Status.OK][:GRASPS]
+
+
+def rehearse_once(
+    grasps: Grasps,
+    hand: Hand,
+    mesh: trimesh.Trimesh,
+    parts: list[trimesh.Trimesh],
+    generator: torch.Generator,
+    seed: int,
+) -> Disturbed:
+    """Disturb one of the grasps; everything is drawn by the trial's own generator."""
+
+    def draw(low: float, high: float) -> float:
+        return low + (high - low) * float(torch.rand((), generator=generator, dtype=torch.float64))
+
+    grasp = grasps[int(torch.randint(len(grasps), (1,), generator=generator))]
+    strength = math.exp(draw(*map(math.log, STRENGTH)))
+    springs = torch.tensor([math.exp(draw(*map(math.log, SPRINGS))) for _ in range(3)], dtype=torch.float64)
+    friction, most = draw(*FRICTION), draw(*PULL)
+    direction = unit(torch.randn(3, generator=generator, dtype=torch.float64))
+    off = 2 * torch.rand(6, generator=generator, dtype=torch.float64) - 1
+    error = rigid(rotation_from_vector(TURN * off[:3]), SHIFT * off[3:])
+    gains = closing_gains(grasp, hand, strength)
+    holding = functools.partial(Impedance, springs=springs)
+    return disturb_grasp(
+        grasp, hand, mesh, parts, gains, holding, Pull(direction, most / 0.3, most, 0.8), friction, error, seed
+    )
+
+
+def summary(trial: Disturbed) -> dict[str, Any]:
+    """Return the states (log K, L, F) before the pull and at the last moment before the object slipped, and the end."""
+    rest = max(int((trial.pulled == 0).sum()), 1)
+    slipped = torch.nonzero(trial.moved[rest:] > SLIP)[:, 0]
+    last = rest + (int(slipped[0]) if len(slipped) else len(trial.moved) - rest)
+    stable = len(slipped) == 0 and float(trial.turned[-1]) < TILT and float(trial.forces[-1].min()) > 0.1
+    moments = {"before": slice(max(rest - 2, 0), rest), "late": slice(max(last - 2, 0), last)}
+    states = {
+        name: state_of(trial.springs[rows].mean(0), lengths_of(trial.tips[rows]).mean(0), trial.forces[rows].mean(0))
+        for name, rows in moments.items()
+    }
+    return {"lost": float(trial.lost), "stable": float(stable), **{name: x.tolist() for name, x in states.items()}}
+
+
+@dataclasses.dataclass(frozen=True)
+class Rehearsals(Batch):
+    """Trials: states before the pull and late under it, the body's number, and whether it was lost or stable."""
+
+    before: Float[Tensor, "n 9"]
+    late: Float[Tensor, "n 9"]
+    body: Float[Tensor, "n"]
+    lost: Float[Tensor, "n"]
+    stable: Float[Tensor, "n"]
+
+    def fit(self, components: int, seed: int, meta: dict[str, str] | None = None) -> StabilityModel:
+        """Learn from both moments of every trial."""
+        held = self.stable > 0
+        stable, others = (torch.cat([self.before[rows], self.late[rows]]) for rows in (held, ~held))
+        return fit_stability(stable, others, components, meta, seed)
+
+
+def rehearsals_of(hand: str, trials: int, seed: int, workers: int) -> Rehearsals:
+    """Rehearse on every body, in the same order whatever the number of workers."""
+    tasks = [(hand, name, trials, seed) for name in BODIES]
+    found: list[dict[str, Any]] = []
+    for rows in tqdm(run_tasks(rehearse, tasks, workers, limit=3600), "bodies", len(tasks), disable=None):
+        if isinstance(rows, Status):
+            raise GraspError(f"a body could not be rehearsed: {rows.sentence}")
+        found += rows
+    names = [field.name for field in dataclasses.fields(Rehearsals)]
+    return Rehearsals(*(torch.tensor([row[name] for row in found], dtype=torch.float64) for name in names))
+
+
+def judge(trials: Rehearsals, components: int, seed: int) -> dict[str, float]:
+    """Return what the model is worth on each body when it was fitted on all others, and a single Gaussian's density."""
+    odds, density, single = torch.zeros(3, len(trials), dtype=torch.float64)
+    for body in trials.body.unique():
+        out = trials.body == body
+        model, other = (trials[~out].fit(m, seed) for m in (components, 1))
+        late = trials.late[out]
+        odds[out], density[out], single[out] = (
+            model.odds(late),
+            model.stable.log_prob(late),
+            other.stable.log_prob(late),
+        )
+    stable, lost = trials.stable > 0, trials.lost > 0
+    return {
+        "auc": area(odds[stable], odds[lost]),
+        "auc_of_the_density": area(density[stable], density[lost]),
+        "log_likelihood": float(density[stable].mean()),
+        "log_likelihood_of_one_gaussian": float(single[stable].mean()),
+    }
+
+
+def area(high: Float[Tensor, "n"], low: Float[Tensor, "m"]) -> float:
+    """Return the share of pairs in which `high` is higher, half for ties: the area under the ROC curve."""
+    return float((high[:, None] > low).double().mean() + 0.5 * (high[:, None] == low).double().mean())
+
+
+def main(
+    hand: Annotated[str, tyro.conf.Positional],
+    trials: int = 20,
+    components: int | None = None,
+    seed: int = 0,
+    workers: int = 1,
+    rehearsals: Path | None = None,
+    out: Path | None = None,
+) -> None:
+    """Rehearse, fit, judge on bodies left out, and write.
+
+    Args:
+        hand: name of a shipped hand, or the folder of another.
+        trials: of each body.
+        components: Gaussians of each mixture; default: 1 to 3, whichever is likeliest on bodies left out.
+        seed: of every draw.
+        workers: processes that rehearse.
+        rehearsals: file in which the trials are kept, and from which they are taken where it exists.
+        out: file to write; default: stability.safetensors in the hand's folder.
+    """
+    robot = load_hand(hand)
+    names = [field.name for field in dataclasses.fields(Rehearsals)]
+    if rehearsals is not None and rehearsals.exists():
+        done = Rehearsals(**load_tensors(rehearsals, "rehearsals", set(names))[0])
+    else:
+        done = rehearsals_of(hand, trials, seed, workers)
+        if rehearsals is not None:
+            save_tensors(rehearsals, "rehearsals", {name: getattr(done, name) for name in names}, {"hand": hand})
+    stable, lost = int(done.stable.sum()), int(done.lost.sum())
+    print(f"{robot.name}: {len(done)} trials on {len(BODIES)} bodies, {stable} stable, {lost} lost")
+    tried = {m: judge(done, m, seed) for m in ((1, 2, 3) if components is None else (components,))}
+    components = max(tried, key=lambda m: tried[m]["log_likelihood"])
+    judged = tried[components]
+    print(f"{components} Gaussians: " + ", ".join(f"{name} {value:.3f}" for name, value in judged.items()))
+    meta = {**describe_compatibility(robot), "joint_names": ",".join(robot.joint_names), "bodies": ",".join(BODIES)}
+    meta |= {"trials": str(len(done)), "stable": str(stable), "seed": str(seed)}
+    model = done.fit(components, seed, meta | {k: f"{v:.4f}" for k, v in judged.items()})
+    print(f"written: {model.save(out or stability_path(hand))}")
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)  # small products: further threads only spin
+    try:
+        tyro.cli(main)
+    except GraspError as error:
+        sys.exit(f"make_force: {error}")

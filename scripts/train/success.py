@@ -1,0 +1,58 @@
+#!/usr/bin/env python
+"""Fit the model that predicts whether a grasp holds, and show how well it is calibrated.
+
+python scripts/make_success.py --objects DIR    trials on own, simple and given objects; the fit; the reliability
+
+Grasps of all ranks are planned on noisy views and pulled at: closed open loop and under uncertainty, at two frictions,
+where they were planned and beside it. The model is fitted on all trials and judged on each object by a fit without it.
+Trials that are in the folder already are not run again.
+"""
+
+from pathlib import Path
+
+import torch
+import tyro
+from benchmarks.close.success import TESTS, brier, draw_reliability, fit, judge, leave_one_out, read_trials
+
+from torchgrasp.files import format_json, write_file
+from torchgrasp.ik.success import FEATURES, MODEL
+
+
+def main(
+    objects: tuple[Path, ...] = (),
+    hands: tuple[str, ...] = ("allegro",),
+    grasps: int = 12,
+    workers: int = 1,
+    folder: Path = Path("out/success"),
+    model: Path = MODEL,
+) -> None:
+    """Run the trials that are missing, fit, judge, and write the model.
+
+    Args:
+        objects: folders of objects beside the library's own and simple bodies.
+        hands: names of hands.
+        grasps: of each view, spread over all ranks.
+        workers: processes.
+        folder: of grasps and trials, and of the picture.
+        model: file of the model.
+    """
+    torch.set_num_threads(1)
+    trials = read_trials(objects, hands, grasps, workers, folder)
+    unseen, base = leave_one_out(trials)
+    print(*judge(unseen, base, trials), sep="\n")
+    draw_reliability(folder / "reliability.png", unseen, trials.passed)
+    weights, bias = fit(trials)
+    bodies, share = len(set(trials.object)), trials.passed.mean()
+    content = {
+        "weights": dict(zip(FEATURES, weights, strict=True)),
+        "bias": bias,
+        "fitted_on": f"{len(trials.passed)} trials of {bodies} objects with {', '.join(hands)}, {share:.0%} passed",
+        "trial": "torchgrasp.evaluation.pull with 7 N: " + "; ".join(f"{name}, {closing}" for name, closing in TESTS),
+        "brier_on_objects_not_fitted_on": round(brier(unseen, trials.passed), 4),
+        "brier_of_the_base_rates": round(brier(base, trials.passed), 4),
+    }
+    print(write_file(model, format_json(content) + "\n"))
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

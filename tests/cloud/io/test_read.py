@@ -1,0 +1,215 @@
+import contextlib
+import io
+import struct
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from torchgrasp.cloud.io.read import read_cloud, save_cloud
+from torchgrasp.errors import BadArgument, CloudFileError, GraspError, OutputError, SuspiciousScale, TooFewPoints
+from torchgrasp.values import PointCloud
+
+
+@pytest.fixture
+def points():
+    return np.random.default_rng(0).uniform(-0.04, 0.04, (60, 3))
+
+
+def unit_rows(n):
+    v = np.random.default_rng(1).normal(size=(n, 3))
+    return v / np.linalg.norm(v, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("fields", ["points", "points normals", "points viewpoint", "points normals viewpoint"])
+@pytest.mark.parametrize(("suffix", "tolerance"), [(".npz", 0.0), (".ply", 1e-8)])
+def test_a_saved_cloud_reads_back(tmp_path, points, fields, suffix, tolerance):
+    arrays = {"points": points, "normals": unit_rows(60), "viewpoint": np.array([0.1, -0.2, 0.7])}
+    cloud = PointCloud(**{name: torch.from_numpy(arrays[name]) for name in fields.split()})
+    back = read_cloud(save_cloud(cloud, tmp_path / f"cloud{suffix}"))
+    for name in arrays:
+        wanted, found = getattr(cloud, name), getattr(back, name)
+        assert (wanted is None) == (found is None)
+        if wanted is not None:
+            assert found.dtype == torch.float64
+            # float32 of the file: relative 6e-8
+            assert (wanted - found).abs().max() <= tolerance * (10 if name == "normals" else 1)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+def test_ply_of_another_writer(tmp_path, points, encoding):
+    trimesh.PointCloud(points).export(tmp_path / "a.ply", encoding=encoding)
+    back = read_cloud(tmp_path / "a.ply", viewpoint=[0.0, 0.0, 1.0])
+    np.testing.assert_allclose(back.points.numpy(), points, atol=1e-8)
+    assert back.viewpoint.tolist() == [0, 0, 1]
+
+
+def test_ply_big_endian_with_other_properties(tmp_path, points):
+    header = "ply\nformat binary_big_endian 1.0\nelement vertex 60\nproperty uchar red\nproperty double x\n"
+    header += (
+        "property double y\nproperty double z\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    rows = b"".join(struct.pack(">Bddd", 7, *p) for p in points)
+    (tmp_path / "a.ply").write_bytes(header.encode() + rows)
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.ply").points.numpy(), points)
+
+
+def test_the_surface_of_a_mesh_is_sampled(tmp_path):
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
+    ball.export(tmp_path / "ball.ply")
+    cloud = read_cloud(tmp_path / "ball.ply")
+    radius = torch.linalg.vector_norm(cloud.points, dim=-1)
+    assert radius.min() > 0.0495
+    assert radius.max() <= 0.05 + 1e-7
+    assert ((cloud.normals * cloud.points).sum(-1) / radius > 0.99).all()
+    torch.testing.assert_close(read_cloud(tmp_path / "ball.ply").points, cloud.points, rtol=0, atol=0)
+    ball.faces = ball.faces[:-5]
+    ball.export(tmp_path / "open.ply")
+    assert read_cloud(tmp_path / "open.ply").normals is None
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+@pytest.mark.parametrize(("view", "found"), [("0.1 0.2 0.9 1 0 0 0", [0.1, 0.2, 0.9]), ("0 0 0 1 0 0 0", None)])
+def test_pcd(tmp_path, points, encoding, view, found):
+    normals = unit_rows(60)
+    header = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z _ normal_x normal_y normal_z\nSIZE 8 8 8 1 4 4 4\n"
+    header += (
+        f"TYPE F F F U F F F\nCOUNT 1 1 1 4 1 1 1\nWIDTH 60\nHEIGHT 1\nVIEWPOINT {view}\nPOINTS 60\nDATA {encoding}\n"
+    )
+    if encoding == "ascii":
+        body = "".join(
+            " ".join(map(repr, [*map(float, p), 0, 0, 0, 0, *map(float, n)])) + "\n"
+            for p, n in zip(points, normals, strict=True)
+        ).encode()
+    else:
+        body = b"".join(struct.pack("<ddd4Bfff", *p, 0, 0, 0, 0, *n) for p, n in zip(points, normals, strict=True))
+    (tmp_path / "a.pcd").write_bytes(header.encode() + body)
+    cloud = read_cloud(tmp_path / "a.pcd")
+    np.testing.assert_array_equal(cloud.points.numpy(), points)
+    np.testing.assert_allclose(cloud.normals.numpy(), normals, atol=1e-7)
+    assert (None if cloud.viewpoint is None else cloud.viewpoint.tolist()) == found
+
+
+def test_pcd_default_viewpoint_outside_the_cloud_is_believed(tmp_path, points):
+    header = (
+        "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 60\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nDATA ascii\n"
+    )
+    body = "".join(f"{x} {y} {z + 0.5}\n" for x, y, z in points)
+    (tmp_path / "a.pcd").write_text(header + body)
+    assert read_cloud(tmp_path / "a.pcd").viewpoint.tolist() == [0, 0, 0]
+
+
+def test_arrays_and_text(tmp_path, points):
+    table = np.concatenate([points, unit_rows(60)], axis=1)
+    np.save(tmp_path / "a.npy", points.astype(np.float32))
+    np.save(tmp_path / "b.npy", np.asfortranarray(table))
+    np.savetxt(tmp_path / "c.xyz", points, header="x y z")
+    np.savetxt(tmp_path / "d.xyz", table, delimiter=",")
+    np.savetxt(tmp_path / "e.xyz", points, newline="\r\n")
+    np.savetxt(tmp_path / "f.xyz", points, newline="\r")
+    kinds = [("a.npy", False), ("b.npy", True), ("c.xyz", False), ("d.xyz", True), ("e.xyz", False), ("f.xyz", False)]
+    for name, normals in kinds:
+        cloud = read_cloud(tmp_path / name)
+        np.testing.assert_allclose(cloud.points.numpy(), points, atol=1e-8)
+        assert (cloud.normals is not None) == normals
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".npz", ".npy", ".xyz"])
+@pytest.mark.parametrize(
+    "content", [b"", b"\x00\xff\xfe" * 50, b"ply\n", b"DATA ascii\n", b"PK\x03\x04", b"\x93NUMPY\x01\x00"]
+)
+def test_malformed_content_is_refused_by_name(tmp_path, suffix, content):
+    (tmp_path / f"a{suffix}").write_bytes(content)
+    with pytest.raises((CloudFileError, TooFewPoints), match="path: found"):
+        read_cloud(tmp_path / f"a{suffix}")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".npz"])
+def test_every_truncation_is_refused(tmp_path, points, suffix):
+    data = save_cloud(PointCloud(torch.from_numpy(points)), tmp_path / f"a{suffix}").read_bytes()
+    for stop in range(0, len(data) - 1, 37):
+        (tmp_path / f"b{suffix}").write_bytes(data[:stop])
+        with pytest.raises(CloudFileError):
+            read_cloud(tmp_path / f"b{suffix}")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".npz", ".npy", ".pcd", ".xyz"])
+def test_spoilt_bytes_are_refused_by_name_or_read(tmp_path, points, suffix):
+    path = tmp_path / f"a{suffix}"
+    if suffix in (".ply", ".npz"):
+        save_cloud(PointCloud(torch.from_numpy(points)), path)
+    elif suffix == ".npy":
+        np.save(path, points)
+    else:
+        header = "FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nWIDTH 60\nHEIGHT 1\nDATA ascii"
+        np.savetxt(path, points, header=header if suffix == ".pcd" else "", comments="")
+    data, rng = path.read_bytes(), np.random.default_rng(0)
+    for _ in range(100):
+        spoilt = bytearray(data)
+        for place in rng.integers(0, min(len(data), 300), 3):
+            spoilt[place] = rng.integers(0, 256)
+        path.write_bytes(spoilt)
+        with contextlib.suppress(GraspError):
+            assert torch.isfinite(read_cloud(path).points).all()
+
+
+def test_headers_that_promise_too_much_are_refused_before_memory_is_taken(tmp_path):
+    header = "ply\nformat binary_little_endian 1.0\nelement vertex 99999999999999\nproperty float x\n"
+    (tmp_path / "a.ply").write_text(header + "property float y\nproperty float z\nend_header\n")
+    buffer = io.BytesIO()
+    np.lib.format.write_array_header_1_0(buffer, {"descr": "<f8", "fortran_order": False, "shape": (10**13, 3)})
+    (tmp_path / "b.npy").write_bytes(buffer.getvalue())
+    with zipfile.ZipFile(tmp_path / "c.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("points.npy", buffer.getvalue() + bytes(1000))
+    (tmp_path / "d.pcd").write_text("FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 99999999999999\nDATA binary\n")
+    (tmp_path / "e.ply").write_text(
+        header.replace("binary_little_endian", "ascii") + "property float y\nproperty float z\nend_header\n1 2 3\n"
+    )
+    for name in ("a.ply", "b.npy", "c.npz", "d.pcd", "e.ply"):
+        with pytest.raises(CloudFileError):
+            read_cloud(tmp_path / name)
+
+
+def test_pickles_are_not_loaded(tmp_path):
+    np.save(tmp_path / "a.npy", np.array([{"code": 1}], dtype=object), allow_pickle=True)
+    np.savez(tmp_path / "b.npz", points=np.array([{"code": 1}], dtype=object))
+    for name in ("a.npy", "b.npz"):
+        with pytest.raises(CloudFileError):
+            read_cloud(tmp_path / name)
+
+
+def test_refusals(tmp_path, points):
+    def save(array):
+        np.save(tmp_path / "a.npy", array)
+        return tmp_path / "a.npy"
+
+    with pytest.raises(CloudFileError, match="no file"):
+        read_cloud(tmp_path / "missing.ply")
+    with pytest.raises(CloudFileError, match=r"\.ply, \.pcd"):
+        read_cloud(tmp_path / "scan.docx")
+    with pytest.raises(SuspiciousScale, match="mm"):
+        read_cloud(save(points * 1000))
+    with pytest.raises(SuspiciousScale, match="normalised"):
+        read_cloud(save(points * 1e-3))
+    with pytest.raises(BadArgument, match="1 rows of points with NaN"):
+        read_cloud(save(np.concatenate([points, [[0, np.nan, 0]]])))
+    with pytest.raises(TooFewPoints, match="3 points"):
+        read_cloud(save(points[:3]))
+    with pytest.raises(CloudFileError, match="shape"):
+        read_cloud(save(points[:, :2]))
+    with pytest.raises(CloudFileError, match="real numbers"):
+        read_cloud(save(points + 1j))
+    with pytest.raises(BadArgument, match="viewpoint"):
+        read_cloud(save(points), viewpoint=[0.0, 1.0])
+    with pytest.raises((BadArgument, TypeError), match="viewpoint"):  # TypeError: the annotations are checked in tests
+        read_cloud(save(points), viewpoint=["x", 0.0, 1.0])  # pyright: ignore[reportArgumentType]
+    with pytest.raises(BadArgument, match="length zero"):
+        read_cloud(save(np.concatenate([points, 0 * points], axis=1)))
+
+
+def test_saving_into_a_file_for_a_folder_is_refused(tmp_path, points):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError):
+        save_cloud(PointCloud(torch.from_numpy(points)), tmp_path / "file" / "a.npz")

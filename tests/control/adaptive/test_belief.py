@@ -1,0 +1,106 @@
+"""Touches that revise the shape: what was expected changes nothing, a surprise moves the contacts in the air."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from tests.control.test_controller import GAINS, PERIOD, model, observation, real
+from torchgrasp import fit_shape
+from torchgrasp.control.adaptive.belief import FARTHEST, Belief
+from torchgrasp.control.closing import UncertaintyClosing
+from torchgrasp.control.controller import GraspController
+from torchgrasp.errors import BadArgument
+from torchgrasp.frames import rigid, rotation_from_vector
+from torchgrasp.linalg import unit
+from torchgrasp.values import PointCloud
+
+EYE = torch.eye(4, dtype=torch.float64)
+FIRST = torch.tensor([True, False, False])
+BALL = 0.03 * unit(torch.randn(600, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
+NORMALS = unit(real([[1, 0, 0.3], [1, 0, -0.3], [-1, 0, 0]]))
+
+
+@pytest.fixture(scope="module")
+def shape():
+    """A ball of 30 mm, all seen but the side towards -x."""
+    seen = BALL[BALL[:, 0] > -0.01]
+    return fit_shape(PointCloud(seen, unit(seen), real([0.5, 0.0, 0.0])), seed=0)
+
+
+def at(radius: float, **changes):
+    """Gains and plant with contacts on a ball about the origin."""
+    gains = dataclasses.replace(GAINS, target=radius * NORMALS)
+    return dataclasses.replace(model(), normals=NORMALS, **changes), gains
+
+
+def felt(point: torch.Tensor, normal: torch.Tensor):
+    seen = observation(contact=FIRST, reading=(0.3, 0.0, 0.0))
+    nothing = torch.full((2, 3), torch.nan, dtype=torch.float64)
+    return dataclasses.replace(
+        seen, points=torch.cat([point[None], nothing]), normals=torch.cat([normal[None], nothing])
+    )
+
+
+def surface_point(shape, direction: torch.Tensor) -> torch.Tensor:
+    """Bisect the estimated surface along a ray from the origin."""
+    low, high = 0.0, 0.06
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        inside = bool(shape.predict((middle * direction)[None]).distance < 0)
+        low, high = (middle, high) if inside else (low, middle)
+    return low * direction
+
+
+def test_a_touch_where_it_was_expected_changes_nothing(shape):
+    belief, (hand, gains) = Belief(shape, EYE), at(0.03)
+    point = surface_point(shape, NORMALS[0])
+    revised = belief.revise(felt(point, NORMALS[0]), hand, gains)
+    assert revised[0] is hand and revised[1] is gains and belief.shape is shape
+
+
+def test_a_surprise_moves_the_contacts_in_the_air_onto_the_surface_as_it_is_now(shape):
+    belief, (hand, gains) = Belief(shape, EYE), at(0.03)
+    point = surface_point(shape, NORMALS[0]) + 0.01 * NORMALS[0]
+    inside = bool(shape.contains(point[None]))
+    moved, revised = belief.revise(felt(point, NORMALS[0]), hand, gains)
+    assert inside and belief.shape is not shape
+    assert float(belief.shape.predict(point[None]).distance.abs() * shape.scale) < 0.01
+    assert torch.equal(revised.target[0], gains.target[0]) and torch.equal(moved.normals[0], hand.normals[0])
+    for finger in (1, 2):
+        way = revised.target[finger] - gains.target[finger]
+        assert torch.linalg.cross(way, NORMALS[finger]).norm() < 1e-9 and way.norm() <= FARTHEST + 1e-9
+        if way.norm() > 0:
+            assert float(belief.shape.predict(revised.target[finger][None]).distance.abs() * shape.scale) < 2e-3
+            assert torch.allclose(moved.normals[finger], belief.shape.predict(revised.target[finger][None]).normal[0])
+    assert (revised.target - gains.target).norm() > 1e-4
+    again = belief.revise(felt(point, NORMALS[0]), moved, revised)
+    assert again[0] is moved and again[1] is revised  # each finger's first touch is taken once
+
+
+def test_the_answer_does_not_depend_on_the_hand_s_frame(shape):
+    turn = rigid(rotation_from_vector(real([0.3, -0.5, 0.9])), real([0.1, 0.2, -0.1]))
+    point = surface_point(shape, NORMALS[0]) + 0.01 * NORMALS[0]
+    hand, gains = at(0.03)
+    first = Belief(shape, EYE).revise(felt(point, NORMALS[0]), hand, gains)[1].target
+    back = turn[:3, :3].T
+    there = dataclasses.replace(gains, target=(gains.target - turn[:3, 3]) @ back.T)
+    aside = dataclasses.replace(hand, normals=NORMALS @ back.T)
+    seen = felt(back @ (point - turn[:3, 3]), back @ NORMALS[0])
+    second = Belief(shape, turn).revise(seen, aside, there)[1].target
+    assert torch.allclose(second @ turn[:3, :3].T + turn[:3, 3], first, atol=1e-7)
+
+
+def test_a_touch_out_of_the_ball_of_the_posterior_is_left_alone(shape):
+    belief, (hand, gains) = Belief(shape, EYE), at(0.03)
+    revised = belief.revise(felt(real([1.0, 0.0, 0.0]), NORMALS[0]), hand, gains)
+    assert revised[0] is hand and belief.shape is shape
+
+
+def test_the_closing_follows_the_belief_and_others_refuse_it(shape):
+    hand, gains = at(0.03)
+    closing = UncertaintyClosing(hand, gains, Belief(shape, EYE))
+    closing(felt(surface_point(shape, NORMALS[0]) + 0.01 * NORMALS[0], NORMALS[0]), PERIOD)
+    assert closing.gains is not gains
+    with pytest.raises(BadArgument, match="belief"):
+        GraspController(hand, gains, "position", "force", Belief(shape, EYE))

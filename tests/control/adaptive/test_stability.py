@@ -1,0 +1,127 @@
+"""The model of stable grasps: Bayes' rule and the conditional against closed forms, its file, and whose it is."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from torchgrasp.control.adaptive.stability import (
+    LEAST_FORCE,
+    NAMES,
+    StabilityModel,
+    fit_stability,
+    lengths_of,
+    load_stability,
+    read_stability,
+    state_of,
+)
+from torchgrasp.errors import BadArgument, ModelFileError
+from torchgrasp.frames import rotation_from_vector
+from torchgrasp.hand.load import load_hand
+from torchgrasp.posture_model.compatibility import describe_compatibility
+from torchgrasp.posture_model.encoding import encode_fingertips
+
+
+def states(count: int, strength: float, seed: int) -> torch.Tensor:
+    """States whose third finger presses as the others together, and the firmer the wider the grasp."""
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.randn(count, 9, generator=generator, dtype=torch.float64)
+    lengths = 0.04 * (0.2 * noise[:, :3]).exp()
+    fingers = strength * (lengths[:, :2] / 0.04) ** 1.5 * (0.1 * noise[:, 3:5]).exp()
+    forces = torch.cat([fingers, fingers.sum(1, keepdim=True) * (0.05 * noise[:, 5:6]).exp()], 1)
+    return state_of(100 * (0.5 * noise[:, 6:]).exp(), lengths, forces)
+
+
+@pytest.fixture(scope="module")
+def model() -> StabilityModel:
+    hand = load_hand("allegro")
+    meta = {**describe_compatibility(hand), "joint_names": ",".join(hand.joint_names)}
+    return fit_stability(states(400, 2.0, 0), states(200, 0.7, 1), 1, meta)
+
+
+def tips(width: float) -> torch.Tensor:
+    return torch.tensor([[width, 0.02, 0.0], [width, -0.02, 0.0], [-width, 0.0, 0.0]], dtype=torch.float64)
+
+
+def test_lengths_are_those_of_the_code_in_any_frame():
+    points = tips(0.03)
+    normals = torch.eye(3).double()
+    assert torch.allclose(lengths_of(points), encode_fingertips(points, normals)[:3])
+    turned = points @ rotation_from_vector(torch.tensor([0.3, 0.4, -0.2]).double()).T + 0.1
+    assert torch.allclose(lengths_of(turned), lengths_of(points))
+    quiet = state_of(torch.ones(3), torch.ones(3), torch.tensor([-0.1, 0.0, 1.0]))
+    assert quiet[6:].exp().tolist() == pytest.approx([LEAST_FORCE, LEAST_FORCE, 1.0])
+
+
+def test_odds_tell_held_grasps_from_others():
+    """Both densities are Gaussians of known mean: the odds are their quadratic form, and rank held-out states."""
+    held, failed = states(300, 2.0, 2), states(300, 0.7, 3)
+    fitted = fit_stability(states(400, 2.0, 0), states(200, 0.7, 1), 1)
+    right, wrong = fitted.odds(held), fitted.odds(failed)
+    assert float((right[:, None] > wrong).double().mean()) > 0.95
+    seen = [0, 1, 2, 6, 7, 8]
+    oracle = torch.zeros(300).double()
+    for mixture, sign in ((fitted.stable, 1), (fitted.others, -1)):
+        mean, block = mixture.means[0, seen], mixture.covariances[0][seen][:, seen]
+        oracle += sign * torch.distributions.MultivariateNormal(mean, block).log_prob(held[:, seen])
+    assert torch.allclose(right, oracle + torch.tensor(2.0).log(), atol=1e-6)
+
+
+def test_the_wish_is_the_regression_on_the_lengths(model: StabilityModel):
+    """Twice as wide, 2^1.5 as firm; the thumb presses as both fingers; the deviation is that of the draws."""
+    narrow, wide = model.wish(tips(0.03)), model.wish(tips(0.06))
+    ratio = (lengths_of(tips(0.06)) / lengths_of(tips(0.03)))[:2]
+    assert torch.allclose(wide.forces[:2] / narrow.forces[:2], ratio**1.5, rtol=0.15)
+    assert float(narrow.forces[2]) == pytest.approx(float(narrow.forces[:2].sum()), rel=0.1)
+    deviation = narrow.covariance.diagonal().sqrt() / narrow.forces
+    assert deviation[:2].tolist() == pytest.approx([0.13, 0.13], abs=0.05)
+    assert torch.allclose(narrow.springs, torch.full((3,), 100.0).double(), rtol=0.3)
+    firmer = 1.2 * float(narrow.forces[2])
+    asked = model.wish(tips(0.03), firmer)
+    assert float(asked.forces[2]) == pytest.approx(firmer)
+    assert float(asked.forces[:2].sum()) == pytest.approx(firmer, rel=0.15)
+    assert float(asked.forces[:2].sum()) > float(narrow.forces[:2].sum())
+    assert float(asked.covariance[2].abs().max()) == 0.0
+    moved = model.wish(tips(0.03) @ rotation_from_vector(torch.tensor([0.5, 0.1, 0.9]).double()).T + 1.0)
+    assert torch.allclose(moved.forces, narrow.forces)
+    with pytest.raises(BadArgument, match="tips"):
+        model.wish(tips(float("nan")))
+
+
+def test_the_file_is_read_back_and_refused_by_another_hand(model: StabilityModel, tmp_path):
+    path = model.save(tmp_path / "stability.safetensors")
+    assert path.stat().st_size < 100_000
+    again = read_stability(path, load_hand("allegro"))
+    assert torch.equal(again.stable.means, model.stable.means)
+    assert torch.equal(again.odds(states(5, 1.0, 4)), model.odds(states(5, 1.0, 4)))
+    with pytest.raises(BadArgument, match="joints"):
+        read_stability(path, load_hand("barrett"))
+    with pytest.raises(BadArgument, match="fingertips"):
+        read_stability(path, load_hand("allegro_biotac"))
+    (tmp_path / "broken.safetensors").write_bytes(path.read_bytes()[:200])
+    with pytest.raises(ModelFileError):
+        read_stability(tmp_path / "broken.safetensors", load_hand("allegro"))
+
+
+def test_shipped_models_are_of_their_hands():
+    assert load_stability(load_hand("allegro_biotac")) is None
+    for name in ("allegro", "barrett"):
+        hand = load_hand(name)
+        shipped = load_stability(hand)
+        assert shipped is not None
+        assert float(shipped.meta["auc"]) > 0.75
+        wish = shipped.wish(tips(0.04))
+        assert 0.5 < float(wish.forces.min()) < float(wish.forces.max()) < 10.0
+        firm, weak = (
+            shipped.odds(state_of(wish.springs, lengths_of(tips(0.04)), factor * wish.forces)) for factor in (1.0, 0.25)
+        )
+        assert float(firm) > 0 > float(weak)
+
+
+def test_bad_fits_are_refused(model: StabilityModel):
+    with pytest.raises(BadArgument, match="components"):
+        fit_stability(states(20, 2.0, 0), states(20, 1.0, 1), 4)
+    with pytest.raises(BadArgument, match="share"):
+        dataclasses.replace(model, share=1.0)
+    with pytest.raises(BadArgument, match="names"):
+        dataclasses.replace(model, stable=model.stable.marginal(NAMES[:6]))

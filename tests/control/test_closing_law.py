@@ -1,0 +1,220 @@
+"""The closing law, Eqs. (25)-(28), against NumPy and closed forms; bounded and finite for any state."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torchgrasp.control.closing_law import (
+    DAMPING,
+    MAX_SPEED,
+    MAX_STEP,
+    POSITION_FLOOR,
+    POSITION_RATE,
+    blend,
+    closing_gains,
+    damped_inverse,
+    force_gain,
+    joint_step,
+    position_gain,
+    surface_covariance,
+    tip_compliance,
+    tip_velocity,
+)
+from torchgrasp.errors import BadArgument, IndefiniteCovariance
+from torchgrasp.frames import apply, inverse, rigid, rotate, rotation_from_vector
+from torchgrasp.hand.load import load_hand
+from torchgrasp.values import Certificate, Contacts, Grasps
+
+
+def draw(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def directions(*shape, seed=0):
+    v = draw(*shape, 3, seed=seed)
+    return v / v.norm(dim=-1, keepdim=True)
+
+
+def grasp_of(hand, std=0.004):
+    """A grasp whose contacts are where the fingertips of the middle posture are."""
+    joints = (0.5 * (hand.lower + hand.upper))[None]
+    obj_from_hand = rigid(rotation_from_vector(draw(1, 3, seed=3)), draw(1, 3, seed=4))
+    points, normals = hand.fingertips(joints)
+    one = torch.ones(1, dtype=torch.float64)
+    contacts = Contacts(
+        points=apply(obj_from_hand, points),
+        normals=-rotate(obj_from_hand, normals),
+        variance=0.01 * torch.ones(1, 3, dtype=torch.float64),
+        std_m=std * torch.ones(1, 3, dtype=torch.float64),
+    )
+    return Grasps(
+        joints=joints,
+        pregrasp=joints,
+        approach=rotate(obj_from_hand, hand.approach[None].double())[:, 0],
+        obj_from_hand=obj_from_hand,
+        contacts=contacts,
+        permutation=torch.tensor([[0, 1, 2]]),
+        tip_error=torch.zeros(1, 3, dtype=torch.float64),
+        clearance=one,
+        normal_angle=torch.zeros(1, 3, dtype=torch.float64),
+        certificate=Certificate(one, one, one, torch.tensor([True]), torch.zeros(1, 6)),
+        score=one,
+        status=torch.zeros(1, dtype=torch.int64),
+    )
+
+
+def test_eq26_blend_is_the_gaussian_of_the_error():
+    normals, std = directions(50), 0.02 * draw(50, seed=1).abs()
+    covariance = surface_covariance(normals, std)
+    error = 0.01 * draw(50, 3, seed=2)
+    oracle = [math.exp(-0.5 * e @ np.linalg.inv(s) @ e) for e, s in zip(error.numpy(), covariance.numpy(), strict=True)]
+    share = blend(error, covariance)
+    assert np.allclose(share.numpy(), oracle)
+    assert ((share >= 0) & (share <= 1)).all()
+    assert torch.equal(blend(torch.zeros(3), torch.eye(3)), torch.tensor(1.0))
+
+
+def test_eq26_tolerates_errors_along_the_normal_more_than_across():
+    normal = torch.tensor([0.0, 0.0, 1.0])
+    covariance = surface_covariance(normal, torch.tensor(0.015))
+    assert blend(0.01 * normal, covariance) > 0.75
+    assert blend(torch.tensor([0.01, 0.0, 0.0]), covariance) < 0.2
+
+
+def test_eq26_refuses_an_indefinite_covariance():
+    with pytest.raises(IndefiniteCovariance):
+        blend(torch.ones(3), torch.diag(torch.tensor([1.0, 1.0, -1.0])))
+
+
+def test_eq27_gain_is_inverse_to_the_variance_and_bounded_for_axis_normals():
+    normals = torch.cat([torch.eye(3).double(), directions(20)])
+    std = torch.linspace(0, 0.03, 23, dtype=torch.float64)
+    gain = position_gain(surface_covariance(normals, std))
+    oracle = POSITION_RATE * POSITION_FLOOR**2 / (std[:, None] ** 2 * normals**2 + POSITION_FLOOR**2)
+    assert torch.allclose(gain, oracle)
+    assert torch.isfinite(gain).all()
+    assert gain.max() <= POSITION_RATE + 1e-9
+    less, more = (position_gain(surface_covariance(normals, s * torch.ones(23).double())) for s in (0.002, 0.02))
+    assert (less >= more).all()
+
+
+def test_eq28_gain_is_inverse_to_the_force_variance():
+    covariance = torch.diag_embed(draw(7, 3).abs() + 0.1)
+    assert torch.allclose(force_gain(covariance, 0.5), 0.5 / covariance.diagonal(dim1=-2, dim2=-1))
+    alpha = torch.linspace(0.1, 1, 7).double()
+    assert torch.allclose(force_gain(covariance, alpha)[3], alpha[3] / covariance[3].diagonal())
+
+
+def test_eq25_is_the_papers_law_for_square_jacobians():
+    """One finger of three joints a contact, small errors: J^-1 [(1-l) K (xd-xc) + l C (fd-fc)]."""
+    jacobian = torch.zeros(3, 3, 9, dtype=torch.float64)
+    for finger in range(3):
+        jacobian[finger, :, 3 * finger : 3 * finger + 3] = 0.05 * (torch.eye(3) + 0.2 * draw(3, 3, seed=finger))
+    error, force_error = 1e-4 * draw(3, 3, seed=7), 0.01 * draw(3, 3, seed=8)
+    share, k, c = torch.tensor([0.1, 0.5, 0.9]).double(), 3 * draw(3, 3).abs(), 0.02 * draw(3, 3, seed=9).abs()
+    velocity = tip_velocity(error, force_error, share, k, c)
+    step = joint_step(jacobian, velocity, 0.01, damping=1e-12)
+    for finger in range(3):
+        columns = slice(3 * finger, 3 * finger + 3)
+        near, square = float(share[finger]), jacobian[finger, :, columns].numpy()
+        bracket = (1 - near) * (k * error)[finger].numpy() + near * (c * force_error)[finger].numpy()
+        assert np.allclose(step[columns], np.linalg.solve(square, 0.01 * bracket), rtol=1e-6)
+
+
+@pytest.mark.parametrize("h", [4, 9, 12])
+def test_eq25_damped_inverse_is_the_regularised_least_squares(h):
+    jacobian = 0.05 * draw(6, 9, h)
+    for j, found in zip(jacobian.numpy(), damped_inverse(jacobian).numpy(), strict=True):
+        stacked = np.concatenate([j, math.sqrt(DAMPING) * np.eye(h)])
+        oracle = np.linalg.lstsq(stacked, np.concatenate([np.eye(9), np.zeros((h, 9))]), rcond=None)[0]
+        assert np.allclose(found, oracle, atol=1e-8)
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-9, 1e-3, 1.0, 1e3])
+def test_i12_eq25_is_bounded_and_finite_for_any_state(scale):
+    """10^5 states in all: fingers that nothing moves, singular ones, and gains from zero to almost infinite."""
+    n = 20_000
+    jacobian = scale * draw(n, 3, 3, 12, seed=1)
+    jacobian[: n // 4, 0] = 0
+    jacobian[n // 4 : n // 2, 1] = jacobian[n // 4 : n // 2, 0]
+    jacobian[n // 2 : 5 * n // 8, :, :, 1:] = 0
+    error, force_error = scale * draw(n, 3, 3, seed=2), 1e3 * scale * draw(n, 3, 3, seed=3)
+    share = torch.rand(n, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    gain = 10 * draw(n, 3, 3, seed=5).abs()
+    gain[::7], gain[1::7] = 0, 1e12
+    velocity = tip_velocity(error, force_error, share, gain, gain)
+    assert velocity.norm(dim=-1).max() <= MAX_SPEED + 1e-12
+    step = joint_step(jacobian, velocity, 0.01, posture_error=scale * draw(n, 12, seed=6))
+    assert torch.isfinite(step).all()
+    assert step.abs().max() <= MAX_STEP + 1e-12
+
+
+def test_eq25_posture_moves_no_fingertip():
+    hand = load_hand("allegro")
+    joints = 0.5 * (hand.lower + hand.upper)
+    jacobian = hand.jacobian(joints)
+    step = joint_step(jacobian, torch.zeros(3, 3).double(), 0.01, posture_error=draw(12), damping=1e-9)
+    assert step.norm() > 1e-3
+    assert (jacobian @ step).norm() < 1e-3 * step.norm() * jacobian.norm()
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett"])
+def test_gains_are_those_of_the_grasp_in_the_hands_frame(name):
+    hand = load_hand(name)
+    grasp = grasp_of(hand)
+    gains = closing_gains(grasp, hand, 5.0)
+    points, pads = hand.fingertips(grasp.joints)
+    assert torch.allclose(gains.target, points[0])
+    assert torch.allclose(gains.covariance, surface_covariance(pads[0], grasp.contacts.std_m[0]))
+    assert torch.allclose(gains.position_gain, position_gain(gains.covariance))
+    assert ((gains.force_gain > 0) & (gains.force_gain < 0.1)).all()
+    push = (gains.desired_force * pads[0]).sum(-1)
+    assert float(push.max()) == pytest.approx(5.0)
+    here = rotate(inverse(grasp.obj_from_hand), -grasp.contacts.normals)[0]
+    assert torch.allclose(here, pads[0])
+
+
+def test_contacts_without_balance_are_pressed_along_their_normals():
+    hand = load_hand("allegro")
+    grasp = grasp_of(hand)
+    same = grasp.contacts.normals[:, :1].expand(1, 3, 3).contiguous()
+    grasp = dataclasses.replace(grasp, contacts=dataclasses.replace(grasp.contacts, normals=same))
+    gains = closing_gains(grasp, hand, 5.0)
+    assert torch.allclose(gains.desired_force, -5.0 * rotate(inverse(grasp.obj_from_hand), same)[0])
+    assert torch.isfinite(gains.force_gain).all()
+
+
+def test_compliance_is_what_the_drives_yield():
+    """Allegro's joints are driven one by one: pushing with 1 N moves the tip by n.J K^-1 J^T n."""
+    hand = load_hand("allegro")
+    joints = 0.5 * (hand.lower + hand.upper)
+    _, pads = hand.fingertips(joints)
+    jacobian = hand.jacobian(joints)
+    for finger in range(3):
+        torque = jacobian[finger].T @ pads[finger]
+        bent = torque / torch.tensor([hand.actuators[n].kp for n in hand.joint_names])
+        moved = (jacobian[finger] @ bent) @ pads[finger]
+        assert float(tip_compliance(hand, joints, pads)[finger]) == pytest.approx(float(moved))
+
+
+def test_bad_arguments_are_named():
+    hand = load_hand("allegro")
+    grasp = grasp_of(hand)
+    with pytest.raises(BadArgument, match="grasps: found 0 rows"):
+        closing_gains(grasp[:0], hand)
+    with pytest.raises(BadArgument, match="grasps: found 12 joints"):
+        closing_gains(grasp, load_hand("barrett"))
+    spoilt = dataclasses.replace(grasp, obj_from_hand=grasp.obj_from_hand * float("nan"))
+    with pytest.raises(BadArgument, match="obj_from_hand: found nan"):
+        closing_gains(spoilt, hand)
+    spoilt = dataclasses.replace(
+        grasp, contacts=dataclasses.replace(grasp.contacts, std_m=grasp.contacts.std_m * float("inf"))
+    )
+    with pytest.raises(BadArgument, match="std_m: found inf"):
+        closing_gains(spoilt, hand)
+    for force in (0.0, -1.0, float("nan")):
+        with pytest.raises(BadArgument, match="force"):
+            closing_gains(grasp, hand, force)

@@ -1,0 +1,173 @@
+"""Evaluations: what is counted, what is refused, and the same bits however many processes share the work."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from tests.pinch import cylinder, pinch
+from torchgrasp import cli
+from torchgrasp.errors import BadArgument, Status
+from torchgrasp.evaluation.evaluate import choose_rows, evaluate
+from torchgrasp.evaluation.protocols import (
+    PROTOCOLS,
+    Execution,
+    LiftProtocol,
+    ProtocolResult,
+    find_protocol,
+    run_protocol,
+)
+from torchgrasp.evaluation.score import STAGES, ViewScore, share, summarise
+from torchgrasp.files import hold_folder
+from torchgrasp.hand.load import load_hand
+from torchgrasp.specs import TrialSpec
+from torchgrasp.values import load_grasps
+
+GOOD = ProtocolResult(0, 0, True, Status.OK, 0.01, 0.1, 4.0, 0.002, 1.0)
+SLID = dataclasses.replace(GOOD, rank=1, passed=False, status=Status.MOVED, overlap=0.004)
+STUCK = dataclasses.replace(GOOD, passed=False, status=Status.START_OVERLAP, force=math.nan, overlap=math.nan)
+HUNG = dataclasses.replace(SLID, status=Status.TIMED_OUT, force=math.nan, overlap=math.nan, seconds=math.nan)
+SCORES = [
+    ViewScore("tin", "view0", 9, 2.0, (GOOD, SLID)),
+    ViewScore("tin", "view1", 0, 4.0, (), Status.OBJECT_COLLISION),
+    ViewScore("cup", "view0", 1, 3.0, (STUCK, HUNG)),
+    ViewScore("sieve", "view0", 0, math.nan, (), Status.BAD_OBJECT, "an <open> surface"),
+]
+
+
+def test_shares_count_every_view_and_failures_their_stage():
+    found = summarise(SCORES)
+    assert found["gsr"][::3] == (1 / 4, 4) and found["top1"][::3] == (1 / 4, 4) and found["objects"][::3] == (1 / 3, 3)
+    assert found["refused"] == 2 and found["force_n"] == 4.0 and found["plan_cpu_s"] == 3.0
+    assert found["overlap_mm"] == pytest.approx(3.0) and found["overlap_mm_max"] == 4.0
+    assert found["cpu_s"] == 9.0 + 3.0 and found["executable"] == 10
+    assert found["failures"] == {
+        "planning": {"OBJECT_COLLISION": 1, "BAD_OBJECT": 1},
+        "start": {"START_OVERLAP": 1},
+        "pulling or lifting": {"MOVED": 1},
+        "simulation": {"TIMED_OUT": 1},
+    }
+    assert found["by_object"]["tin"]["gsr"][::3] == (0.5, 2) and found["by_object"]["tin"]["refused"] == 1
+    noisy = [dataclasses.replace(SCORES[0], attempts=(GOOD, dataclasses.replace(STUCK, draw=1))), SCORES[1]]
+    assert summarise(noisy)["top1"][::3] == (1 / 4, 4)  # two draws each, of the refused view too
+
+
+def test_wilson_intervals():
+    low, high = share(8, 10)[1:3]  # Wilson (1927) by hand
+    z2 = 1.959963985**2
+    middle, half = (0.8 + z2 / 20) / (1 + z2 / 10), 1.959963985 * math.sqrt(0.16 / 10 + z2 / 400) / (1 + z2 / 10)
+    assert (low, high) == (pytest.approx(middle - half), pytest.approx(middle + half))
+
+
+def test_every_status_of_an_attempt_has_one_stage():
+    stages = [status for reasons in STAGES.values() for status in reasons]
+    assert sorted(stages) == [s for s in Status if s >= Status.START_OVERLAP and s is not Status.BAD_OBJECT]
+
+
+def test_spread_rows_reach_from_the_best_to_the_worst():
+    for n in range(1, 30):
+        rows = choose_rows(n, 6, "spread")
+        assert len(set(rows)) == len(rows) == min(n, 6) and rows == sorted(rows)
+        assert rows[0] == 0 and rows[-1] == n - 1
+        assert choose_rows(n, 6, "best") == list(range(min(n, 6)))
+    assert choose_rows(9, 1, "spread") == [0] and choose_rows(0, 3, "spread") == []
+
+
+def test_protocols_and_executions_are_checked():
+    for name in ("pose-noise", "tabletop", "paper"):
+        assert find_protocol(name, Execution()).name == name
+    hand = load_hand("allegro")
+    for protocol, execution, named in (
+        ("best", Execution(), "protocol"),
+        ("tabletop", Execution(force=-1.0), "force"),
+        ("multidex", Execution(force=0.0), "force"),
+    ):
+        with pytest.raises(BadArgument, match=f"{named}: found"):
+            evaluate(Path("nowhere"), hand, protocol, execution)
+    for options, named in (({"grasps": 0}, "grasps"), ({}, "objects")):
+        with pytest.raises(BadArgument, match=f"{named}: found"):
+            evaluate(Path("nowhere"), hand, **options)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A tin seen from one side, and another whose mesh is open."""
+    path = tmp_path_factory.mktemp("objects")
+    tin = trimesh.creation.cylinder(radius=0.03, height=0.12, sections=64)
+    tin.apply_translation([0, 0, 0.06])
+    rng = np.random.default_rng(0)
+    angle, height = (rng.random(700) - 0.5) * 2.9, 0.12 * rng.random(700)
+    seen = np.stack([0.03 * np.cos(angle), 0.03 * np.sin(angle), height], -1)
+    pose = np.eye(4)
+    pose[:3, 3] = [0.45, 0.0, 0.15]
+    for name, mesh in (("tin", tin), ("torn", trimesh.Trimesh(tin.vertices, tin.faces[:-9]))):
+        (path / name).mkdir()
+        mesh.export(path / name / "mesh.ply")
+        trimesh.PointCloud(seen).export(path / name / "view0_noisy.ply")
+    entry = {"views": {"view0": {"T_object_camera": pose.tolist()}}}
+    (path / "manifest.json").write_text(json.dumps({"objects": {"tin": entry, "torn": entry}}))
+    return path
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+def test_n10_any_number_of_workers_gives_the_same_bits_and_a_bad_object_is_refused(folder, tmp_path):
+    pytest.importorskip("sapien"), pytest.importorskip("pebble")
+    hand = load_hand("allegro")
+    quick = dataclasses.replace(PROTOCOLS["pose-noise"], seconds=0.2, draws=2)
+    options = {"grasps": 2, "starts": 60, "ranks": "spread", "folder": tmp_path}
+    one, two = (evaluate(folder, hand, quick, workers=n, **options) for n in (0, 2))
+    assert without_times(one) == without_times(two)
+    tin, torn = one
+    assert [(a.rank, a.draw) for a in tin.attempts] == [(r, d) for r in (0, tin.executable - 1) for d in (0, 1)]
+    assert (torn.executable, torn.refusal, torn.attempts) == (0, Status.BAD_OBJECT, ()) and "open surface" in torn.note
+    assert len(load_grasps(tmp_path / "tin_view0.safetensors")) == tin.executable
+    again = evaluate(folder, hand, quick, planned=True, **options)
+    assert without_times(again) == without_times(one)
+    other = evaluate(folder, load_hand("barrett"), quick, planned=True, **options)[0]
+    assert other.refusal is Status.BAD_OBJECT and "another cloud or hand" in other.note
+
+
+def test_a_second_run_on_the_folder_is_refused_and_a_bad_input_leaves_none(tmp_path, capsys):
+    words = ["evaluate", "--objects", str(tmp_path / "none"), "--hand", "allegro", "--out", str(tmp_path / "out")]
+    with hold_folder(tmp_path / "out"):
+        assert cli.main(words) == 2
+        assert capsys.readouterr().err.startswith(f"torchgrasp: --out: found {tmp_path / 'out'}, in use by process")
+    assert cli.main(words) == 2
+    assert capsys.readouterr().err.startswith("torchgrasp: --objects: found")
+    assert list(tmp_path.iterdir()) == []
+
+
+def without_times(scores):
+    rows = [dataclasses.replace(x, seconds=0.0, attempts=()) for x in scores]
+    return rows, [dataclasses.replace(a, seconds=0.0) for x in scores for a in x.attempts]
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+def test_a_pinched_cylinder_is_lifted():
+    pytest.importorskip("sapien")
+    hand, grasp = pinch("allegro")
+    protocol = LiftProtocol("quick", TrialSpec(friction=0.8, hold_time=0.2))
+    found = run_protocol(grasp, hand, cylinder(), [cylinder()], protocol, Execution())
+    assert found.passed and found.status is Status.OK and found.force > 1.0 and found.moved < 0.01
+    assert 0.0 <= found.overlap < 0.003
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+def test_the_command_writes_numbers_and_a_page(folder, tmp_path, capsys):
+    pytest.importorskip("sapien"), pytest.importorskip("pebble")
+    words = ["evaluate", "--objects", str(folder), "--hand", "allegro", "--out", str(tmp_path / "out")]
+    assert cli.main([*words, "--grasps", "2", "--starts", "60"]) == 0
+    written = json.loads((tmp_path / "out" / "evaluate.json").read_text(), parse_constant=pytest.fail)
+    assert written["views"][0]["object"] == "tin" and len(written["views"][0]["attempts"]) == 2
+    assert written["summary"]["top1"][3] == 2 and written["asked"]["protocol"]["name"] == "dexgraspbench"
+    assert "best-ranked grasps that pass" in capsys.readouterr().out
+    page = (tmp_path / "out" / "evaluate.html").read_text()
+    assert "<h1>Grasps of the allegro hand under dexgraspbench</h1>" in page and "bad_object" in page
+    assert cli.main([*words, "--grasps", "1", "--planned", str(tmp_path / "out" / "grasps")]) == 0

@@ -1,0 +1,150 @@
+"""Trials on a standing cylinder: held by both hands, repeatable to the last bit, and with the right reason if not."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from tests.pinch import QUICK, close, cylinder, digest, digest_elsewhere, pinch
+from torchgrasp.errors import BadArgument, MeshError, Status
+from torchgrasp.hand.load import load_hand
+from torchgrasp.specs import TrialSpec
+
+pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett"])
+def test_a_cylinder_is_held(name):
+    result = close(name)
+    assert result.held
+    assert result.status is Status.OK
+    assert sorted(result.contact_order) == [0, 1, 2]
+    rise = result.object_pose[-1, 2, 3] - result.object_pose[0, 2, 3]
+    assert float(rise) == pytest.approx(0.1, abs=0.01)
+    assert result.object_motion[0] < 0.01
+    assert result.object_motion[1] < 0.2
+    strongest = result.forces[-50:].amax(-1)
+    assert float(strongest.mean()) == pytest.approx(4.0, rel=0.15)
+    assert len(result.time) == len(result.forces) == len(result.joints) == len(result.hand_pose)
+    assert set(result.joint_names) == set(load_hand(name).urdf_joint_names)
+
+
+def test_same_seed_same_bits_here_and_in_another_process():
+    first, second = (close("allegro", spec=QUICK, seed=3) for _ in range(2))
+    assert digest(first) == digest(second)
+    assert digest(first) != digest(close("allegro", spec=QUICK, seed=4))
+    assert digest_elsewhere("allegro", "sapien", 3) == digest(first)
+
+
+def test_controllers_differ_and_waiting_keeps_the_object_still():
+    """The object stands 8 mm off: the finger that meets it first must not push it away before the others touch."""
+    mesh = cylinder((0.0, 0.008))
+    aware = close("allegro", mesh, dataclasses.replace(QUICK, noise=False))
+    position = close("allegro", mesh, dataclasses.replace(QUICK, noise=False, closing="position"))
+    assert not torch.equal(aware.joints[:50], position.joints[:50])
+    assert aware.held
+
+
+def test_the_hand_may_stand_beside_where_it_was_planned_and_may_be_shaken():
+    aside = torch.eye(4, dtype=torch.float64)
+    aside[0, 3] = 0.004
+    result = close("allegro", spec=dataclasses.replace(QUICK, shake=0.003, hold_time=0.5), error=aside)
+    assert result.held
+    _, grasp = pinch("allegro")
+    planned = (grasp.obj_from_hand[0] @ aside)[:3, 3]
+    height = result.hand_pose[-15:, 2, 3] - planned[2] - TrialSpec().lift_height
+    assert float(height.max() - height.min()) == pytest.approx(0.006, rel=0.1)
+
+
+def test_the_hand_comes_straight_to_where_it_was_planned():
+    _, grasp = pinch("allegro")
+    result = close("allegro", spec=QUICK)
+    way = result.hand_pose[:, :3, 3] - grasp.obj_from_hand[0, :3, 3]
+    along = way @ grasp.approach[0]
+    coming = int(along.argmax())
+    aside = way - along[:, None] * grasp.approach[0]
+    assert float(along[1]) == pytest.approx(-TrialSpec().approach, abs=1e-3)
+    assert abs(float(along[coming])) < 1e-3
+    assert float(aside[1:coming].norm(dim=-1).max()) < 1e-4
+    moved = result.object_pose[coming, :3, 3] - result.object_pose[0, :3, 3]
+    assert float(moved.norm()) < 1e-3  # the opened hand touches nothing on its way
+
+
+def test_all_a_fingertip_exerts_is_felt_friction_included():
+    """At rest the tips carry the object: their full forces sum to its weight, their normal parts are the readings."""
+    pytest.importorskip("sapien")
+    from torchgrasp.control.closing_law import closing_gains
+    from torchgrasp.control.controller import GraspController
+    from torchgrasp.control.observation import model_from_hand, observe
+    from torchgrasp.sim.convex_parts import convex_parts
+    from torchgrasp.sim.hand import SimulatedHand
+    from torchgrasp.sim.open import open_scene
+    from torchgrasp.sim.scene import SceneSpec
+
+    hand, grasp = pinch("allegro")
+    start = {name: float(q) for name, q in hand.expand(grasp.pregrasp[0]).items()}
+    stands, mesh = grasp.obj_from_hand[0].numpy(), cylinder()
+    tips = tuple(hand.tip_links)
+    scene = open_scene(SceneSpec(hand.urdf_path, stands, start, hand.actuators, tips, mesh, convex_parts(mesh), 0.1))
+    model = model_from_hand(hand, grasp, 4.0, scene.joint_names)
+    robot = SimulatedHand(scene, hand, model, 100.0, None)
+    controller = GraspController(model, closing_gains(grasp, hand))
+    observation = robot.tick(controller.targets)
+    while not controller.closed:
+        observation = robot.tick(controller.step(observation, robot.period))
+    for k in range(200):
+        scene.lift(min(k, 100) * 5e-4)
+        observation = robot.tick(controller.step(observation, robot.period))
+    total = (grasp.obj_from_hand[0, :3, :3] @ observation.forces.T).sum(1)
+    assert torch.allclose(total, torch.tensor([0, 0, 0.981]).double(), atol=0.02)
+    assert torch.allclose(-(observation.forces * observation.normals).sum(-1), observation.reading, atol=0.02)
+    own = observation.joints[list(model.actuated)]
+    alone = observe(hand, own, robot._touch)
+    order = [hand.urdf_joint_names.index(name) for name in scene.joint_names]
+    assert torch.allclose(alone.tips, observation.tips, atol=1e-5)
+    assert torch.allclose(alone.jacobian[:, :, order], observation.jacobian, atol=1e-5)
+
+
+def test_a_hand_that_starts_in_the_object_is_refused():
+    forward = torch.eye(4, dtype=torch.float64)
+    forward[2, 3] = 0.2
+    result = close("barrett", error=forward)
+    assert result.status is Status.START_OVERLAP
+    assert not result.held
+    assert len(result.time) == 1
+
+
+def test_a_finger_in_the_air_is_named():
+    result = close("barrett", cylinder((0.4, 0.0)), QUICK)
+    assert result.status is Status.NO_CONTACT
+    assert result.contact_order == ()
+
+
+def test_too_little_friction_leaves_the_object_behind():
+    result = close("allegro", spec=dataclasses.replace(QUICK, friction=0.02))
+    assert not result.held
+    assert result.status in (Status.NOT_LIFTED, Status.EJECTED, Status.DROPPED)
+
+
+def test_bad_arguments_are_refused():
+    from torchgrasp.evaluation.lift import close_hand
+
+    hand, grasp = pinch("allegro")
+    with pytest.raises(BadArgument, match="grasps: found 0 rows"):
+        close_hand(grasp[:0], hand, cylinder())
+    mesh = cylinder()
+    with pytest.raises(MeshError, match="open surface"):
+        close_hand(grasp, hand, trimesh.Trimesh(mesh.vertices, mesh.faces[:-1]))
+    with pytest.raises(BadArgument, match="control_rate: found 1000 Hz"):
+        close_hand(grasp, hand, mesh, TrialSpec(control_rate=1000.0))
+    with pytest.raises(BadArgument, match="joints: found 9 for"):
+        close_hand(dataclasses.replace(grasp, pregrasp=grasp.pregrasp * 0 + 9), hand, mesh)
+    for wrong in (math.nan, 0.0, 2.0):
+        with pytest.raises(BadArgument, match="unit vector"):
+            close_hand(dataclasses.replace(grasp, approach=wrong * grasp.approach), hand, mesh)
+    with pytest.raises(MeshError, match="parts"):
+        close_hand(grasp, hand, mesh, parts=[])
+    assert np.isfinite(mesh.vertices).all()

@@ -1,0 +1,44 @@
+"""Where the hand and the object really stand: within the errors asked for, uniform, and the same for the same seed."""
+
+import math
+
+import pytest
+import torch
+
+from torchgrasp.evaluation.pose_noise import draw_object_poses, draw_pose_errors, error_from_object_pose
+from torchgrasp.frames import apply, inverse, rigid, rotation_angle, rotation_from_vector
+
+
+def test_errors_of_the_pose_stay_within_the_protocol_s():
+    errors = draw_pose_errors(0.005, math.radians(5), 3, 200, seed=1)
+    assert errors.shape == (3, 200, 4, 4)
+    assert 0.0048 < float(errors[..., :3, 3].abs().max()) <= 0.005
+    angle = rotation_angle(errors[..., :3, :3])
+    assert math.radians(5) < float(angle.max()) <= math.radians(5) * 3**0.5
+    assert torch.equal(errors, draw_pose_errors(0.005, math.radians(5), 3, 200, seed=1))
+    still = draw_pose_errors(0.0, 0.0, 2, 1, seed=0)
+    assert torch.equal(still, torch.eye(4, dtype=torch.float64).expand(2, 1, 4, 4))
+
+
+def test_an_object_is_moved_on_its_table_and_turned_about_the_vertical() -> None:
+    pivot = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
+    places = draw_object_poses(0.005, 0.1, pivot, 2000, seed=1)
+    moved = (places[:, :3, :3] @ pivot) + places[:, :3, 3] - pivot
+    assert moved[:, :2].abs().max() <= 0.005
+    assert moved[:, 2].abs().max() < 1e-15
+    angle = torch.atan2(places[:, 1, 0], places[:, 0, 0])
+    assert angle.abs().max() <= 0.1
+    assert torch.equal(places[:, 2, :3], torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(2000, 3))
+    # uniform: standard deviation a / sqrt(3), known to 2 % from 2000 draws
+    assert float(angle.std()) == pytest.approx(0.1 / math.sqrt(3), rel=0.05)
+    assert float(moved[:, 0].std()) == pytest.approx(0.005 / math.sqrt(3), rel=0.05)
+
+
+def test_a_hand_in_its_place_sees_a_moved_object_as_a_moved_hand_sees_the_object_in_its_place(generator) -> None:
+    turn = torch.randn(2, 3, generator=generator, dtype=torch.float64)
+    shift = torch.randn(2, 3, generator=generator, dtype=torch.float64)
+    obj_from_hand, place = rigid(rotation_from_vector(turn), shift)
+    points = torch.randn(5, 3, generator=generator, dtype=torch.float64)
+    seen = apply(inverse(obj_from_hand), apply(place, points))
+    stands = obj_from_hand @ error_from_object_pose(obj_from_hand, place)
+    torch.testing.assert_close(apply(inverse(stands), points), seen)

@@ -1,0 +1,119 @@
+"""Protocols on a pinched cylinder: what holds, what does not, and what statics says of how much it takes."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from tests.pinch import HEIGHT, RADIUS, cylinder, pinch
+from torchgrasp import fit_shape
+from torchgrasp.control.closing_law import joint_stiffness
+from torchgrasp.control.squeeze import squeeze_joints
+from torchgrasp.errors import BadArgument, Status
+from torchgrasp.evaluation.pull import DIRECTIONS, PROTOCOLS, check_test, pull_grasp
+from torchgrasp.frames import apply, inverse
+from torchgrasp.values import PointCloud
+
+pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
+QUICK = dataclasses.replace(PROTOCOLS["dexgraspbench"], seconds=0.2, mass=0.05)
+
+
+def pull(name, protocol, **options):
+    pytest.importorskip("sapien")
+    hand, grasp = pinch(name)
+    return pull_grasp(grasp, hand, cylinder(), protocol, **options)
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett"])
+def test_the_squeeze_presses_with_forces_that_cancel(name):
+    hand, grasp = pinch(name)
+    lead = squeeze_joints(grasp, hand, force=4.0)[0] - grasp.joints[0]
+    torque = joint_stiffness(hand) * lead
+    # Forces at the planned contacts, from the torques alone: J^T f = torque, of all f the one that cancels.
+    hand_from_obj = inverse(grasp.obj_from_hand)
+    points = apply(hand_from_obj, grasp.contacts.points)[0]
+    jacobian = hand.jacobian(grasp.joints)[0].flatten(0, 1)
+    still = torch.cat([torch.eye(3).double().repeat(1, 3), torch.cat([cross(p) for p in points], 1)])
+    system = torch.cat([jacobian.T, still])
+    wished = torch.cat([torque, torch.zeros(6, dtype=torch.float64)])
+    force = torch.linalg.lstsq(system, wished[:, None]).solution[:, 0]
+    torch.testing.assert_close(system @ force, wished, rtol=0, atol=1e-6)
+    push = -(force.reshape(3, 3) * (hand_from_obj[0, :3, :3] @ grasp.contacts.normals[0].T).T).sum(-1)
+    assert float(push.max()) == pytest.approx(4.0, rel=1e-6) and float(push.min()) > 1.0
+    twice = squeeze_joints(grasp, hand, force=4.0, kp=2 * hand.actuators[hand.joint_names[0]].kp)[0]
+    torch.testing.assert_close(twice - grasp.joints[0], lead / 2, rtol=1e-9, atol=1e-12)
+
+
+def cross(p):
+    x, y, z = p.tolist()
+    return torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+
+
+def test_a_pinched_cylinder_passes_and_the_same_numbers_come_twice():
+    first, second = (pull("allegro", QUICK, force=5.0) for _ in range(2))
+    assert first.passed and first.status is Status.OK and first.directions == 6
+    assert dataclasses.replace(first, seconds=0.0) == dataclasses.replace(second, seconds=0.0)
+    assert 2.0 < first.force < 5.0 and first.moved < 0.02
+
+
+def test_more_pull_than_friction_can_hold_moves_the_object():
+    """Three fingers of N newtons hold at most 3 mu N along the cylinder's axis."""
+    held = 3 * 0.6 * 4.0
+    strong = pull("allegro", dataclasses.replace(QUICK, pull=2 * held / QUICK.mass, seconds=1.0), force=4.0)
+    assert not strong.passed and strong.status is Status.MOVED
+    assert strong.moved >= QUICK.distance or strong.turned >= QUICK.angle
+    slippery = pull("allegro", dataclasses.replace(QUICK, friction=0.01), force=5.0)
+    assert not slippery.passed
+
+
+@pytest.mark.parametrize("closing", ["uncertainty", "position"])
+def test_a_controller_closes_and_holds(closing):
+    result = pull("allegro", dataclasses.replace(QUICK, pull=2.0), force=4.0, closing=closing)
+    assert result.passed and 1.0 < result.force < 5.0
+
+
+def test_touches_revise_a_shape_that_was_believed_thinner_in_each_direction_anew(monkeypatch):
+    angle, height = torch.rand(2, 400, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    normals = torch.cat([torch.cos(2 * math.pi * angle), torch.sin(2 * math.pi * angle), 0 * angle], 1)
+    points = (RADIUS - 0.008) * normals + HEIGHT * height * normals.new_tensor([0.0, 0.0, 1.0])
+    shape, down = fit_shape(PointCloud(points, normals), seed=0), DIRECTIONS[4]
+
+    def pull_down(times, belief):
+        monkeypatch.setattr("torchgrasp.evaluation.pull.DIRECTIONS", times * (down,))
+        return pull("allegro", QUICK, force=4.0, closing="uncertainty", belief=belief)
+
+    once, twice, unaware = pull_down(1, shape), pull_down(2, shape), pull_down(1, None)
+    assert once.passed and 1.0 < once.force < 5.0 and once.force != unaware.force
+    assert dataclasses.replace(twice, directions=1, seconds=once.seconds) == once
+    with pytest.raises(BadArgument, match="belief: found one for 'open_loop'"):
+        pull("allegro", QUICK, belief=shape)
+
+
+def test_a_hand_inside_the_object_is_refused():
+    hand, grasp = pinch("barrett")
+    result = pull_grasp(grasp, hand, cylinder((0.0, 0.05)), dataclasses.replace(QUICK, overlap=1e-3))
+    assert result.status is Status.START_OVERLAP and result.directions == 1 and math.isnan(result.force)
+
+
+def test_bad_arguments_are_named():
+    hand, grasp = pinch("allegro")
+    with pytest.raises(BadArgument, match="protocol: found 'best'"):
+        pull_grasp(grasp, hand, cylinder(), "best")
+    with pytest.raises(BadArgument, match="grasp: found 0 rows"):
+        pull_grasp(grasp[:0], hand, cylinder())
+    with pytest.raises(BadArgument, match="force: found -1"):
+        pull_grasp(grasp, hand, cylinder(), force=-1.0)
+    with pytest.raises(BadArgument, match="closing: found 'fast'"):
+        check_test("dexgraspbench", 5.0, "fast")
+    with pytest.raises(BadArgument, match="joints: found 9 for"):
+        pull_grasp(dataclasses.replace(grasp, pregrasp=grasp.pregrasp * 0 + 9), hand, cylinder())
+    with pytest.raises(BadArgument, match="grasps: found 12 joints"):
+        squeeze_joints(grasp, pinch("barrett")[0])
+
+
+def test_a_hand_that_stands_aside_misses_the_object():
+    aside = torch.eye(4, dtype=torch.float64)
+    aside[2, 3] = 0.2
+    hand, grasp = pinch("allegro")
+    assert not pull_grasp(grasp, hand, cylinder(), QUICK, error=aside).passed

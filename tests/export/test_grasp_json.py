@@ -1,0 +1,95 @@
+"""Exported grasps, read back by others: yourdfpy places the tips of the JSON, MuJoCo those of the keyframes."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from tests.pinch import pinch
+from torchgrasp import cli
+from torchgrasp.control.squeeze import squeeze
+from torchgrasp.export.grasp_json import format_grasps
+from torchgrasp.export.mujoco_keyframes import format_keyframes
+from torchgrasp.frames import apply
+from torchgrasp.hand.load import load_hand
+
+HANDS = ["allegro", "barrett"]
+
+
+def planned_tips(hand, grasp):
+    """Return the contact points of the tips in the object's frame, by the library itself."""
+    return apply(grasp.obj_from_hand, hand.fingertips(grasp.joints)[0])[0].numpy()
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_the_json_replays_to_the_planned_tips(name):
+    yourdfpy = pytest.importorskip("yourdfpy")
+    hand, grasp = pinch(name)
+    content = json.loads(format_grasps(grasp, hand, 5.0), parse_constant=pytest.fail)
+    row = content["grasps"][0]
+    robot = yourdfpy.URDF.load(str(hand.urdf_path), load_meshes=False, load_collision_meshes=False)
+    robot.update_cfg(row["joints"]["grasp"])
+    w, x, y, z = row["pose"]["quaternion_wxyz"]
+    turn, place = Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(row["pose"]["position"])
+    for i, contact in enumerate(row["contacts"]):
+        assert contact["finger"] == hand.finger_names[i]
+        tip = robot.get_transform(contact["link"], content["hand"]["root"])
+        point = turn @ (tip @ np.append(hand.contact[i].numpy(), 1.0))[:3] + place
+        np.testing.assert_allclose(point, planned_tips(hand, grasp)[i], atol=1e-9)
+    assert row["approach"] == {"direction": grasp.approach[0].tolist(), "distance": 0.1}
+    joints = row["joints"]
+    assert set(joints["squeeze"]) == set(hand.urdf_joint_names) and content["time"]["squeeze"] > 0
+    for joint in content["actuated"]:  # stiffness x lead = torque
+        lead = joints["squeeze"][joint] - joints["grasp"][joint]
+        if name == "allegro":  # no coupling
+            assert content["stiffness"][joint] * lead == pytest.approx(row["torque"][joint], abs=1e-12)
+    forces = np.array([contact["force"] for contact in row["contacts"]])
+    normals = np.array([contact["normal"] for contact in row["contacts"]])
+    np.testing.assert_allclose(forces.sum(0), 0, atol=1e-9)
+    assert (-(forces * normals).sum(1)).max() == pytest.approx(5.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_mujoco_loads_the_keyframes_and_places_the_tips(name):
+    mujoco = pytest.importorskip("mujoco")
+    hand, grasp = pinch(name)
+    model = mujoco.MjModel.from_xml_string(format_keyframes(grasp, hand, 5.0))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("grasp_0_grasp").id)
+    mujoco.mj_kinematics(model, data)
+    for i, link in enumerate(hand.tip_links):
+        point = data.body(link).xmat.reshape(3, 3) @ hand.contact[i].numpy() + data.body(link).xpos
+        np.testing.assert_allclose(point, planned_tips(hand, grasp)[i], atol=1e-9)
+    pressed = hand.expand(squeeze(grasp, hand, 5.0).joints)
+    key = model.key("grasp_0_squeeze")
+    np.testing.assert_array_equal(key.qpos, model.key("grasp_0_grasp").qpos)
+    for k in range(model.nu):  # each actuator by its name, whatever the order
+        assert key.ctrl[k] == float(pressed[model.actuator(k).name][0])
+    mujoco.mj_resetDataKeyframe(model, data, model.key("grasp_0_pregrasp").id)
+    for joint, q in hand.expand(grasp.pregrasp).items():
+        assert data.joint(joint).qpos[0] == float(q[0])
+    start, arrived = (model.key(f"grasp_0_{pose}").qpos for pose in ("approach", "pregrasp"))
+    np.testing.assert_array_equal(start[3:], arrived[3:])
+    np.testing.assert_allclose(arrived[:3] - start[:3], 0.1 * grasp.approach[0].numpy(), atol=1e-12)
+
+
+def test_the_command_writes_both_and_names_what_is_wrong(tmp_path, capsys):
+    hand, grasp = pinch("allegro")
+    grasp = dataclasses.replace(grasp, meta={"hand": "allegro", "hand_sha256": hand.sha256})
+    grasp.save(tmp_path / "grasps.safetensors")
+    words = ["export", str(tmp_path / "grasps.safetensors"), "--out", str(tmp_path / "out")]
+    assert cli.main(words) == 0 and json.loads((tmp_path / "out").read_text())["grasps"][0]["status"] == "OK"
+    assert cli.main([*words, "--format", "mujoco"]) == 0 and (tmp_path / "out").read_text().startswith("<mujoco")
+    for more, named in ((["--hand", "barrett"], "--hand"), (["--force", "-1"], "--force"), (["--most", "0"], "--most")):
+        assert cli.main([*words, *more]) == 2
+        assert named in capsys.readouterr().err
+
+
+def test_no_grasps_are_an_empty_list():
+    hand = load_hand("allegro")
+    grasp = pinch("allegro")[1][torch.zeros(0, dtype=torch.int64)]
+    assert json.loads(format_grasps(grasp, hand))["grasps"] == []
+    assert "<key " not in format_keyframes(grasp, hand)

@@ -1,0 +1,124 @@
+"""A first hand.toml for a URDF, and a third hand on its whole way: URDF, hand.toml, model, grasps."""
+
+import pytest
+import torch
+import trimesh
+
+from torchgrasp import ContactSpec, Status, certify, fit_mixture, plan_grasps
+from torchgrasp.cloud.camera import partial_view
+from torchgrasp.errors import BadArgument, HandFileError
+from torchgrasp.frames import apply, rotate
+from torchgrasp.hand.draft import draft_hand
+from torchgrasp.hand.hand_toml import read_hand_toml
+from torchgrasp.hand.load import hands_folder, load_hand
+from torchgrasp.posture_model.sample import sample_configurations
+from torchgrasp.testing import check_hand
+
+
+def drafted(urdf, *tips):
+    (urdf.parent / "hand.toml").write_text(draft_hand(urdf, tips))
+    return urdf.parent
+
+
+def test_a_draft_for_the_claw_passes_the_law(claw):
+    hand = check_hand(drafted(claw))
+    assert hand.joint_names == tuple(f"{f}_{j}" for f in ("left", "right", "thumb") for j in ("swivel", "bend"))
+    joints = torch.tensor([[0.1, 0.4, 0.2, 0.5, -0.1, 1.0]], dtype=torch.float64)
+    found = hand.expand(joints)
+    for finger in ("left", "right", "thumb"):
+        torch.testing.assert_close(found[f"{finger}_follow"], -0.7 * found[f"{finger}_bend"] + 0.1)
+    assert hand.tip_radius.tolist() == [0.011] * 3
+    assert hand.approach.tolist() == [0, 0, 1]
+    # hardly bent, each pad looks to the middle of the fingertips
+    points, normals = hand.fingertips(torch.tensor([[0.0, 0.1] * 3], dtype=torch.float64))
+    assert bool((((points.mean(1, keepdim=True) - points) * normals).sum(-1) > 0).all())
+
+
+@pytest.mark.parametrize(
+    ("name", "tips"), [("allegro", ("index_tip", "middle_tip", "thumb_tip", "ring_tip")), ("barrett", ())]
+)
+def test_a_draft_finds_what_the_shipped_hands_have(tmp_path, name, tips):
+    shipped = hands_folder() / name
+    (tmp_path / "hand.urdf").write_bytes((shipped / "hand.urdf").read_bytes())
+    (tmp_path / "hand.toml").write_text(draft_hand(tmp_path / "hand.urdf", tips))
+    ours, theirs = read_hand_toml(tmp_path / "hand.toml"), read_hand_toml(shipped / "hand.toml")
+    assert ours.coupling == theirs.coupling and ours.approach == theirs.approach
+    assert [f.joints for f in ours.fingers] == [f.joints for f in theirs.fingers]
+    pads = [torch.tensor([f.normal for f in spec.fingers], dtype=torch.float64) for spec in (ours, theirs)]
+    assert float((pads[0] * pads[1]).sum(1).min()) > 0.95
+    assert [f.radius for f in ours.fingers] == [f.radius for f in theirs.fingers]
+    assert set(map(frozenset, theirs.pairs or ())) <= set(map(frozenset, ours.pairs or ()))
+    assert check_hand(tmp_path).joint_names == load_hand(name).joint_names
+
+
+@pytest.mark.parametrize("tip", ['<box size="0.02 0.018 0.03"/>', '<cylinder radius="0.008" length="0.03"/>'])
+def test_a_tip_that_is_not_round_gets_a_pad_on_its_side(claw, tip):
+    claw.write_text(claw.read_text().replace('<sphere radius="0.011"/>', tip))
+    hand = check_hand(drafted(claw))  # the contact is not inside the tip
+    depth = 0.01 if "box" in tip else 0.008
+    torch.testing.assert_close(
+        hand.contact[0], torch.tensor([depth, 0, 0.015 - (0.009 if "box" in tip else 0.008)]).double()
+    )
+    assert hand.normal[0].tolist() == [1, 0, 0] and hand.tip_radius[0] == 0
+    # what tells whether a tip is in the object reaches its contact and no farther
+    cover, first = hand.collision_spheres, hand.collision_spheres.link_index == hand.tip_index[0]
+    reach = (cover.center[first] @ hand.normal[0] + cover.radius[first]).max()
+    assert depth - 0.002 < float(reach) <= depth + 1e-9
+
+
+def test_what_cannot_be_guessed_is_asked_for(claw, tmp_path):
+    with pytest.raises(BadArgument, match="left_tip"):
+        draft_hand(claw, ("left_tip", "right_tip"))
+    with pytest.raises(BadArgument, match="left_tip"):
+        draft_hand(claw, ("left_tip", "right_tip", "nose"))
+    with pytest.raises(BadArgument, match="base"):
+        draft_hand(claw, ("left_tip", "right_tip", "base"))
+    with pytest.raises(BadArgument, match="ring_tip"):
+        draft_hand(hands_folder() / "allegro" / "hand.urdf")  # four branches
+    with pytest.raises(HandFileError, match="no file"):
+        draft_hand(tmp_path / "none.urdf")
+
+
+def test_names_of_the_urdf_cannot_break_the_toml(claw):
+    text = claw.read_text().replace("left_", "le&quot;ft # \\_")
+    claw.write_text(text)
+    assert check_hand(drafted(claw)).joint_names[0] == 'le"ft # \\_swivel'
+
+
+def rests_on(shape: trimesh.Trimesh):
+    shape.apply_translation([0, 0, -shape.bounds[0, 2]])
+    return partial_view(shape, 20.0, 40.0, noise=False), shape
+
+
+@pytest.mark.parametrize("mode", ["joint", "contact_first"])
+def test_a_third_hand_goes_the_whole_way(claw, mode):
+    """From the URDF to grasps of a ball or a box, each checked again by what it says of itself."""
+    folder = drafted(claw)
+    hand = check_hand(folder)
+    done: list[int] = []
+    samples = sample_configurations(hand, 4000, seed=3, observer=done.append)
+    assert sum(done) == 4000
+    mixture = fit_mixture(samples, components=8, iterations=30)
+    mixture.save(folder / "mixture.safetensors")
+    assert float((mixture.joints(samples.q) - samples.joints).abs().mean()) < 0.35
+    spec = ContactSpec(table=0.0)
+    view, shape = rests_on(
+        trimesh.creation.icosphere(3, 0.035) if mode == "joint" else trimesh.creation.box((0.06, 0.05, 0.09))
+    )
+    found = plan_grasps(view, hand, spec, starts=50, seed=0, mode=mode)
+    good = found[found.status == Status.OK]
+    assert len(good) >= 3
+    hand.check_joints(good.joints)
+    centres = apply(good.obj_from_hand, hand.tip_centres(good.joints))
+    outward = good.contacts.normals
+    miss = (centres - hand.tip_radius[:, None] * outward - good.contacts.points).norm(dim=-1)
+    assert float(miss.max()) <= 1e-3
+    pads = rotate(good.obj_from_hand, hand.fingertips(good.joints)[1])
+    assert float((pads * outward).sum(-1).max()) < -0.4  # a pad faces the surface
+    assert bool((hand.self_clearance(good.joints) >= 0).all())
+    assert bool(certify(good.contacts, spec).closed.all())
+    surface_points = torch.from_numpy(trimesh.sample.sample_surface(shape, 4000, seed=0)[0])
+    cover = hand.collision_spheres
+    spheres = apply(good.obj_from_hand, hand.spheres(good.joints))[:, ~cover.touching]
+    gap = torch.cdist(spheres, surface_points.expand(len(good), -1, 3)).amin(2) - cover.radius[~cover.touching]
+    assert float(gap.min()) > -0.012  # of the true surface, whose far side the planner did not see

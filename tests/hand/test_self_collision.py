@@ -1,0 +1,150 @@
+"""Self-collision against exact distances of the URDF's shapes (coal), and against its own definition."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchgrasp.errors import BadArgument
+from torchgrasp.frames import rotation_from_vector
+from torchgrasp.hand.collision_pairs import NEAR, collision_pairs
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.hand_toml import read_hand_toml
+from torchgrasp.hand.load import load_hand
+from torchgrasp.hand.self_collision import self_collision_from_urdf
+from torchgrasp.hand.urdf import read_urdf
+from torchgrasp.testing import check_hand
+
+HANDS = [("allegro", "default"), ("allegro", "paper_literal"), ("barrett", "default")]
+
+
+@pytest.fixture(params=HANDS, ids=["-".join(h) for h in HANDS])
+def hand(request) -> Hand:
+    return load_hand(*request.param)
+
+
+def postures(hand: Hand, n: int, generator: torch.Generator) -> torch.Tensor:
+    share = torch.rand(n, hand.dof, generator=generator, dtype=torch.float64)
+    return hand.lower + (hand.upper - hand.lower) * share
+
+
+def test_self_collision_agrees_with_exact_hulls(hand, generator, monkeypatch):
+    pytest.importorskip("coal")
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "scripts"))
+    from benchmarks.hand.coal_reference import exact_clearance
+
+    joints = postures(hand, 300, generator)
+    truth, found = exact_clearance(hand, joints), hand.self_clearance(joints).numpy()
+    met, wrong = truth < 0, (truth < 0) != (found < 0)
+    assert 0.1 < met.mean() < 0.5
+    assert wrong.mean() < 0.01
+    assert (wrong & met).mean() < 0.01
+    np.testing.assert_allclose(found[met & ~wrong], truth[met & ~wrong], atol=1e-3)  # Barrett's palm is a prism
+    assert (found.clip(max=NEAR)[~met] <= truth[~met] + 1e-3).all()  # pairs farther apart than that are not tested
+    assert (found[~met & ~wrong] >= truth[~met & ~wrong] / 3**0.5 - 1e-3).all()
+
+
+def test_clearance_is_the_least_of_all_pairs(hand, generator):
+    joints = postures(hand, 500, generator)
+    every = hand.self_collision.separations(hand.frames(joints), torch.inf)
+    torch.testing.assert_close(hand.self_clearance(joints), every.amin(0), atol=1e-14, rtol=0)
+    torch.testing.assert_close(hand.self_clearance(joints, chunk=7), every.amin(0), atol=1e-14, rtol=0)
+    for below in (0.0, 0.004):
+        found = hand.self_clearance(joints, below=below)
+        torch.testing.assert_close(found.clamp_max(below), every.amin(0).clamp_max(below), atol=1e-14, rtol=0)
+    near = hand.self_collision.separations(hand.frames(joints), 0.002)
+    torch.testing.assert_close(near.clamp_max(0.002), every.clamp_max(0.002), atol=1e-14, rtol=0)
+
+
+def test_clearance_in_float32_is_that_in_float64(hand, generator):
+    joints = postures(hand, 500, generator).float()
+    found = hand.self_clearance(joints)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found.double(), hand.self_clearance(joints.double()), atol=2e-5, rtol=0)
+
+
+def test_clearance_gradient_equals_finite_differences(hand, generator):
+    joints = postures(hand, 60, generator).requires_grad_()
+    (gradient,) = torch.autograd.grad(hand.self_clearance(joints).sum(), joints)
+    step = 1e-6 * torch.randn(60, hand.dof, generator=generator, dtype=torch.float64)
+    with torch.no_grad():
+        change = (hand.self_clearance(joints + step) - hand.self_clearance(joints - step)) / 2
+    same = (change - (gradient * step).sum(1)).abs() < 1e-3 * step.norm(dim=1)
+    assert float(same.double().mean()) > 0.95  # the rest: the closest pair changes within the step
+
+
+def test_wrenches_are_the_derivative_by_a_motion_of_the_second_shape(hand, generator):
+    itself, frames = hand.self_collision, hand.frames(postures(hand, 1, generator))
+    shaken = rotation_from_vector(0.1 * torch.randn(frames.shape[2], 3, generator=generator, dtype=torch.float64))
+    frames = torch.einsum("lij,jkln->ikln", shaken, frames)  # no two axes are parallel, where it has kinks
+    pair, row = torch.arange(len(itself.pairs)), torch.zeros(len(itself.pairs), dtype=torch.long)
+    found = itself.wrenches(frames, pair, row)
+    links = itself.link[itself.pairs[:, 1]]
+    step = 1e-6 * torch.randn(6, generator=generator, dtype=torch.float64)
+    for link in links.unique().tolist():
+        moved = frames.clone(), frames.clone()
+        for sign, some in zip((1, -1), moved, strict=True):
+            some[..., link, 0] += sign * torch.linalg.cross(step[3:, None].expand(3, 4), some[..., link, 0], dim=0)
+            some[:, 3, link, 0] += sign * step[:3]
+        ahead, back = (itself.separations(some, torch.inf)[:, 0] for some in moved)
+        mine = links == link
+        torch.testing.assert_close((step @ found)[mine], ((ahead - back) / 2)[mine], atol=1e-10, rtol=1e-4)
+
+
+def test_self_collision_rates_are_those_of_the_hands(generator):
+    rates = [
+        float((h.self_clearance(postures(h, 3000, generator)) < 0).double().mean())
+        for h in (load_hand("allegro"), load_hand("barrett"))
+    ]
+    assert 0.22 < rates[0] < 0.29  # 0.25 by exact hulls with the ring finger parked
+    assert 0.17 < rates[1] < 0.25  # 0.21 by exact hulls
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett"])
+def test_pairs_of_the_shipped_hands_are_the_learned_ones(name):
+    hand = load_hand(name)
+    spec = read_hand_toml(hand.urdf_path.parent / "hand.toml")
+    assert spec.pairs is not None
+    learned = collision_pairs(read_urdf(hand.urdf_path), spec.coupling, n=3000)
+    left_out = {("palm", "f1_med"), ("palm", "f2_med")} & set(learned)
+    assert set(learned) - left_out <= set(spec.pairs)
+    assert len(left_out) == (2 if name == "barrett" else 0)
+    assert len(learned) > 0.8 * len(spec.pairs)
+    assert list(spec.pairs) == sorted(spec.pairs, key=lambda pair: [hand.link_names.index(x) for x in pair])
+
+
+def test_neighbours_and_links_that_always_or_never_meet_are_no_pairs(toy_hand):
+    urdf = read_urdf(toy_hand / "hand.urdf")
+    assert collision_pairs(urdf, {}, n=50) == [("t1", "t2"), ("t2", "t3")] or collision_pairs(urdf, {}, n=50) == []
+    with pytest.raises(BadArgument, match="coupling: found j9"):
+        collision_pairs(urdf, {"j9": ("j1", 1.0, 0.0)}, n=50)
+    with pytest.raises(BadArgument, match="n: found 0"):
+        collision_pairs(urdf, {}, n=0)
+
+
+def test_a_hand_without_pairs_is_always_clear(toy_hand):
+    text = (toy_hand / "hand.toml").read_text()
+    (toy_hand / "hand.toml").write_text(text.replace("[options", "[self_collision]\npairs = []\n[options", 1))
+    hand = check_hand(toy_hand)
+    assert hand.self_clearance(torch.zeros(3, 3)).tolist() == [torch.inf] * 3
+
+
+def test_cylinders_are_within_two_percent(tmp_path):
+    path = tmp_path / "hand.urdf"
+    shape = "<collision><geometry><{}/></geometry></collision>"
+    path.write_text(
+        '<robot name="two"><link name="base">' + shape.format('cylinder radius="0.05" length="0.1"') + "</link>"
+        '<link name="ball">' + shape.format('sphere radius="0.01"') + '</link><link name="arm"/>'
+        '<joint name="turn" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>'
+        '<limit lower="-4" upper="4"/></joint><joint name="out" type="prismatic"><parent link="arm"/>'
+        '<child link="ball"/><axis xyz="1 0 0"/><limit lower="0" upper="1"/></joint></robot>'
+    )
+    urdf = read_urdf(path)
+    from torchgrasp.hand.kinematics import kinematics_from_urdf
+
+    tree, itself = kinematics_from_urdf(urdf), self_collision_from_urdf(urdf, None)
+    around = torch.stack([torch.linspace(-4, 4, 200, dtype=torch.float64), torch.full((200,), 0.09).double()])
+    error = itself.clearance(tree.frames(around)) - 0.03
+    assert float(error.abs().max()) < 0.02 * 0.05
+    assert abs(float(error.mean())) < 0.005 * 0.05

@@ -1,0 +1,135 @@
+"""The way to a pre-grasp against distances to solids in closed form."""
+
+import math
+
+import pytest
+import torch
+
+from tests.pinch import HEIGHT, RADIUS, cylinder, pinch
+from torchgrasp.frames import apply, rigid, rotation_from_vector
+from torchgrasp.ik.approach import DISTANCE, FINE_PLACES, _directions, find_approach
+from torchgrasp.ik.clearance import CollisionWorld
+from torchgrasp.ik.configuration import Configuration, SpatialJacobian
+from torchgrasp.ik.sdf import SignedDistanceField, field_from_mesh
+from torchgrasp.linalg import unit
+
+
+def spheres_on_the_way(posture, hand, direction, places=81):
+    """Centres (p, s, 3) of the hand's spheres from where the way starts to where it ends, and their radii."""
+    cover = hand.collision_spheres
+    centres = SpatialJacobian.at(posture, hand).points(cover.link_index, cover.center)[0]
+    back = torch.linspace(DISTANCE, 0.0, places, dtype=torch.float64)
+    return centres - back[:, None, None] * direction[0], cover.radius
+
+
+def cylinder_distance(points):
+    """Signed distance to the cylinder of the tests."""
+    across = points[..., :2].norm(dim=-1) - RADIUS
+    along = (points[..., 2] - HEIGHT / 2).abs() - HEIGHT / 2
+    outside = torch.stack([across, along], -1).clamp_min(0).norm(dim=-1)
+    return outside + torch.maximum(across, along).clamp_max(0)
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett"])
+def test_the_way_is_clear_of_the_object_and_the_table_as_said(name):
+    hand, grasp = pinch(name)
+    posture = Configuration(grasp.pregrasp, grasp.obj_from_hand)
+    direction, clearance = find_approach(posture, hand, CollisionWorld(field_from_mesh(cylinder()), 0.0))
+    assert float(direction.norm()) == pytest.approx(1.0)
+    centres, radius = spheres_on_the_way(posture, hand, direction)
+    away = centres[: 81 - 5]  # the last sixteenth is the pre-grasp's own matter
+    least = min(
+        float((cylinder_distance(away) - radius).min()),
+        float((away[..., 2] - radius).min()),
+    )
+    assert least > 0
+    assert float(clearance) == pytest.approx(least, abs=5e-4)
+
+
+def field_of(distance, center, half=0.4, spacing=0.01):
+    """A field of a distance in closed form around a centre."""
+    axis = torch.arange(-half, half, spacing, dtype=torch.float64)
+    offsets = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    return SignedDistanceField(center - half, spacing, distance(offsets + center))
+
+
+def test_a_wall_is_avoided_and_a_cage_leaves_no_way():
+    hand, grasp = pinch("allegro")
+    posture, center = Configuration(grasp.pregrasp, grasp.obj_from_hand), grasp.obj_from_hand[0, :3, 3]
+    free, _ = find_approach(posture, hand, CollisionWorld(field_from_mesh(cylinder()), None))
+
+    def wall(points):
+        """Distance to all that is more than 0.1 m behind the hand on that way."""
+        return ((points - center) * free[0]).sum(-1) + 0.1
+
+    other, clearance = find_approach(posture, hand, CollisionWorld(field_of(wall, center), None))
+    before = (wall(spheres_on_the_way(posture, hand, free)[0]) - hand.collision_spheres.radius).min()
+    after = (wall(spheres_on_the_way(posture, hand, other)[0][:-5]) - hand.collision_spheres.radius).min()
+    assert float(after) > float(before) + 0.02
+    assert float(clearance) == pytest.approx(float(after), abs=1e-12)
+
+    def cage(points):
+        """Distance to all that is more than 0.15 m from the middle of the hand."""
+        return 0.15 - (points - center).norm(dim=-1)
+
+    _, none = find_approach(posture, hand, CollisionWorld(field_of(cage, center), None))
+    assert float(none) < 0
+
+
+def wall_of(normal, origin):
+    """Distance to all that lies behind a plane."""
+    return lambda points: ((points - origin) * normal).sum(-1)
+
+
+def test_the_way_turns_with_hand_and_frame():
+    """A wall behind the hand that leans by 40 degrees leaves most room on the way that is tilted towards it."""
+    hand, grasp = pinch("barrett")
+    posture = Configuration(grasp.pregrasp, grasp.obj_from_hand)
+    axis, side = torch.eye(3).double()[[2, 0]]
+    tilted = math.sqrt(0.5) * (axis + side)
+    leaning = math.cos(math.radians(40)) * axis - math.sin(math.radians(40)) * side
+    assert torch.equal(hand.approach.double(), axis)
+    motion = rigid(rotation_from_vector(torch.tensor([0.3, -0.8, 0.5]).double()), torch.tensor([0.2, 0.1, -0.3]))
+    clearances = []
+    for turn in (torch.eye(4).double(), motion.double()):
+        turned = Configuration(posture.joints, turn @ posture.obj_from_hand)
+        rotation = turned.obj_from_hand[0, :3, :3]
+        middle = apply(turned.obj_from_hand[0], 0.1 * axis[None])[0]
+        wall = wall_of(rotation @ leaning, middle - 0.25 * (rotation @ leaning))
+        field = field_of(wall, middle, half=0.35, spacing=0.005)
+        direction, clearance = find_approach(turned, hand, CollisionWorld(field, None))
+        assert torch.allclose(direction[0], rotation @ tilted, atol=1e-12)
+        centres, radius = spheres_on_the_way(turned, hand, direction)
+        # between the nodes of a plane's distance nothing is lost
+        assert float(clearance) == pytest.approx(float((wall(centres) - radius).min()), abs=1e-12)
+        clearances.append(float(clearance))
+    assert clearances[0] == pytest.approx(clearances[1], abs=1e-12)
+
+
+def test_what_is_called_free_is_free_where_the_nearest_node_errs(generator):
+    """Nodes 3 cm apart rank the ways badly; one that is free is found all the same, and its clearance is exact."""
+    hand, grasp = pinch("allegro")
+    posture = Configuration(grasp.pregrasp, grasp.obj_from_hand)
+    centres = SpatialJacobian.at(posture, hand).points(hand.collision_spheres.link_index, hand.collision_spheres.center)
+    middle, radius, erred = centres[0].mean(0), hand.collision_spheres.radius, 0
+    for _ in range(20):
+        normal = unit(torch.randn(3, generator=generator, dtype=torch.float64))
+        directions = _directions(posture, hand, None)[0]
+        ways = [spheres_on_the_way(posture, hand, d[None], FINE_PLACES + 1)[0][:-1] for d in directions]
+        room = torch.stack([(wall_of(normal, middle)(way) - radius).min() for way in ways])
+        field = field_of(wall_of(normal, middle + (room.max() - 1e-3) * normal), middle, half=0.42, spacing=0.03)
+        by_node = torch.stack([(field.nearest(way) - radius).min() for way in ways]).argmax()
+        erred += int(room[by_node] < room.max() - 1e-3)
+        found, clearance = find_approach(posture, hand, CollisionWorld(field, None))
+        which = (directions - found).norm(dim=1).argmin()
+        assert float(clearance) == pytest.approx(float(room[which] - room.max() + 1e-3), abs=1e-12)
+        assert float(clearance) >= 0
+    assert erred > 2
+
+
+def test_without_anything_around_the_hand_comes_along_its_own_axis():
+    hand, grasp = pinch("barrett")
+    direction, clearance = find_approach(
+        Configuration(grasp.pregrasp, grasp.obj_from_hand), hand, CollisionWorld(None, None)
+    )
+    assert torch.allclose(direction, grasp.approach, atol=1e-12) and torch.isinf(clearance).all()

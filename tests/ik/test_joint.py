@@ -1,0 +1,126 @@
+"""Contacts, pose and joints solved together: the Jacobian, and grasps against oracles of their own."""
+
+import pytest
+import torch
+
+from torchgrasp import ContactSpec, certify, fit_shape, load_hand, load_object, plan_contacts
+from torchgrasp.errors import Status
+from torchgrasp.frames import apply
+from torchgrasp.ik.clearance import CollisionWorld
+from torchgrasp.ik.configuration import Configuration
+from torchgrasp.ik.contact_first import assign, solve_contact_first
+from torchgrasp.ik.joint import JointState, joint_residuals, solve_joint
+from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
+from torchgrasp.ik.sdf import field_from_surface
+from torchgrasp.plan.flatness import flatness_constraint
+from torchgrasp.plan.problem import ContactProblem
+from torchgrasp.plan.solver import normalise_tensions
+from torchgrasp.shape.surface import extract_surface
+
+SPEC = ContactSpec(table=0.0)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """What the pipeline makes of one view of a jug with a handle, up to certified contacts and guesses for them."""
+    hand, shape = load_hand("allegro"), fit_shape(load_object("jug").view, seed=0, table=0.0)
+    surface = extract_surface(shape)
+    plan = plan_contacts(shape, SPEC, starts=24, seed=2)
+    certificate = certify(plan.contacts, SPEC)
+    good = (plan.status == Status.OK) & certificate.closed
+    contacts, certificate = plan.contacts[good], certificate[good]
+    world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), SPEC.table)
+    guess = nearest_postures(contacts, PostureLibrary.of(hand, 600), world)
+    return guess, hand, contacts, certificate, world, surface.vertices.mean(0), shape, SPEC
+
+
+@pytest.fixture(scope="module")
+def grasps(scene):
+    return solve_joint(*scene)
+
+
+def test_jacobian_of_joined_rows_against_finite_differences(scene, generator):
+    guess, hand, contacts, _, world, _, shape, spec = scene
+    guess = guess[::8][:24]
+    lower, upper = hand.lower + 0.01, hand.upper - 0.01  # steps must not meet the limits
+    posture = Configuration(guess.joints.clamp(lower, upper), guess.obj_from_hand)
+    points = shape.normalise(assign(contacts, guess).points)
+    points = points + 0.1 * torch.randn(points.shape, generator=generator, dtype=torch.float64)
+    tension = normalise_tensions(points, torch.rand(24, 3, generator=generator, dtype=torch.float64))
+    problem, flat = ContactProblem.of(shape, spec), flatness_constraint(shape, points, 0.2)
+
+    def rows(state: JointState):
+        residual, jacobian = joint_residuals(state, hand, shape, problem, world, flat)
+        links = slice(12, residual.shape[1] - 3 - 15 - 12)  # no matter of the contacts, and tested in test_refine
+        assert bool((jacobian[:, links, 6 + hand.dof :] == 0).all())
+        rest = [*range(12), *range(links.stop, residual.shape[1])]
+        return residual[:, rest], jacobian[:, rest]
+
+    state = JointState(posture, points, tension)
+    jacobian = rows(state)[1]
+    assert int((jacobian != 0).any(2).any(0).sum()) >= 12 + 3 + 6 + 12  # all but ball, sides and table
+    for k in range(jacobian.shape[2]):
+        step = torch.zeros(24, jacobian.shape[2], dtype=torch.float64)
+        step[:, k] = 1e-5
+        slope = (rows(state.moved(step, hand))[0] - rows(state.moved(-step, hand))[0]) / 2e-5
+        torch.testing.assert_close(jacobian[..., k], slope, rtol=1e-4, atol=0.1)  # digits of the variance
+
+
+def test_grasps_satisfy_every_constraint(scene, grasps):
+    _, hand, contacts, _, world, _, shape, spec = scene
+    good = grasps[grasps.status == Status.OK]
+    assert len(good) >= 0.85 * len(contacts)
+    seen = shape.predict(good.contacts.points)
+    assert float(seen.distance.abs().max()) <= 1e-5
+    assert float(seen.variance.max()) <= spec.max_variance + 1e-6
+    torch.testing.assert_close(good.contacts.normals, seen.normal, atol=1e-6, rtol=0)
+    assert bool(certify(good.contacts, spec).closed.all()) and bool(good.certificate.closed.all())
+    sides = torch.linalg.vector_norm(good.contacts.points - good.contacts.points.roll(1, 1), dim=-1)
+    assert float(sides.min()) >= spec.separation
+    centres = apply(good.obj_from_hand, hand.tip_centres(good.joints))
+    gap = centres - good.contacts.points - hand.tip_radius[:, None] * good.contacts.normals
+    assert float(torch.linalg.vector_norm(gap, dim=-1).max()) <= 1e-3
+    assert bool((good.joints >= hand.lower).all()) and bool((good.joints <= hand.upper).all())
+    cover = hand.collision_spheres
+    for joints, links in ((good.joints, ~cover.touching), (good.pregrasp, cover.radius > 0)):
+        spheres = apply(good.obj_from_hand, hand.spheres(joints))
+        assert float((spheres[..., 2] - cover.radius).min()) >= 0
+        assert float((world.field.query(spheres)[0] - cover.radius)[:, links].min()) >= 0
+        assert float(hand.self_clearance(joints).min()) >= 0
+
+
+def test_links_are_outside_the_estimated_surface(scene, grasps):
+    """Link centre lines against the mean itself, not the field that the solver saw."""
+    _, hand, *_, shape, _ = scene
+    good = grasps[grasps.status == Status.OK]
+    centres = apply(good.obj_from_hand, hand.spheres(good.joints))[:, ~hand.collision_spheres.touching]
+    near = torch.linalg.vector_norm(shape.normalise(centres), dim=-1) < shape.domain_radius
+    assert int(near.sum()) > 100
+    assert float(shape.predict(centres[near]).distance.min()) > 0
+
+
+def test_sliding_contacts_find_more_grasps_than_still_ones(scene, grasps):
+    still = solve_contact_first(*scene[:6])
+    better = int((grasps.status == Status.OK).sum()) - int((still.status == Status.OK).sum())
+    assert better > 0
+    begun = scene[2].points.flatten(1)
+    ended = grasps[grasps.status == Status.OK].contacts.points
+    own = ended.gather(1, grasps[grasps.status == Status.OK].permutation.argsort(1)[..., None].expand_as(ended))
+    moved = torch.cdist(own.flatten(1), begun).amin(1)
+    assert int((moved > 1e-4).sum()) >= better
+
+
+def test_a_triple_without_a_grasp_says_why(scene):
+    guess, hand, contacts, certificate, world, center, shape, spec = scene
+    flooded = CollisionWorld(world.field, 0.5)  # a table far above the object
+    found = solve_joint(guess[:48], hand, contacts, certificate, flooded, center, shape, spec)
+    assert len(found) == len(torch.unique(guess.row[:48]))
+    assert bool((found.status != Status.OK).all())
+    assert {Status(int(s)) for s in found.status} <= set(Status)
+
+
+def test_same_guesses_give_the_same_bits(scene, grasps):
+    again = solve_joint(*scene)
+    assert torch.equal(again.joints, grasps.joints) and torch.equal(again.status, grasps.status)
+    assert torch.equal(again.contacts.points, grasps.contacts.points)
+    assert len(solve_joint(scene[0][:0], *scene[1:])) == 0

@@ -1,0 +1,173 @@
+"""Query of postures for contacts: contacts that a real posture touches are found again (Eqs. 21-24)."""
+
+import dataclasses
+import functools
+
+import pytest
+import torch
+
+from torchgrasp.errors import BadArgument
+from torchgrasp.frames import apply, inverse, rigid, rotate, virtual_frame
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import load_hand
+from torchgrasp.ik.query import WRONG_SIDE, query_mixture
+from torchgrasp.posture_model.encoding import PERMUTATIONS
+from torchgrasp.posture_model.fit import fit_mixture
+from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture, load_mixture
+from torchgrasp.posture_model.sample import HandSamples, sample_configurations
+from torchgrasp.values import Contacts
+
+
+@functools.cache
+def barrett() -> tuple[Hand, HandSamples, GraspMixture]:
+    hand = load_hand("barrett")
+    samples = sample_configurations(hand, 12_000, seed=1)
+    return hand, samples, fit_mixture(samples[:9000], components=12, iterations=60)
+
+
+def contacts_of(hand: Hand, joints: torch.Tensor, obj_from_hand: torch.Tensor) -> Contacts:
+    """The contacts on an object that these postures touch: outward normals against those of the tips."""
+    points, normals = hand.fingertips(joints)
+    points, normals = apply(obj_from_hand, points), -rotate(obj_from_hand, normals)
+    zero = torch.zeros(points.shape[:2], dtype=points.dtype)
+    return Contacts(points, normals, zero, zero)
+
+
+def test_eq24_frames_of_tips_and_contacts_coincide(motion):
+    hand, samples, mixture = barrett()
+    contacts = contacts_of(hand, samples.joints[9000:9050], motion)
+    found = query_mixture(contacts, hand, mixture)
+    tips = apply(found.obj_from_hand, hand.fingertips(found.joints)[0])
+    wanted = contacts.points[found.row[:, None], found.permutation]
+    torch.testing.assert_close(virtual_frame(tips), virtual_frame(wanted), rtol=0, atol=1e-9)
+    torch.testing.assert_close(found.tip_error, (tips - wanted).norm(dim=-1))
+
+
+def test_eq24_the_true_joints_give_the_true_pose(motion):
+    hand, samples, _ = barrett()
+    tips, _ = hand.fingertips(samples.joints[:50])
+    obj_from_vf = virtual_frame(apply(motion, tips))
+    torch.testing.assert_close(obj_from_vf @ inverse(virtual_frame(tips)), motion.expand(50, 4, 4))
+
+
+def test_postures_are_found_again(motion):
+    hand, samples, mixture = barrett()
+    contacts = contacts_of(hand, samples.joints[9000:9300], motion)
+    found = query_mixture(contacts, hand, mixture)
+    own = (found.permutation == torch.arange(3)).all(-1)
+    assert len(found.row[own].unique()) >= 285  # the 99 % threshold
+    least = torch.full((300,), 9.0, dtype=torch.float64)
+    least = least.scatter_reduce(0, found.row[own], found.tip_error[own].amax(-1), "amin")
+    assert float(least.median()) < 0.02
+    assert bool(((found.joints >= hand.lower) & (found.joints <= hand.upper)).all())
+    assert bool((found.reach < DEFAULT_ENERGY).all())
+
+
+def test_rows_are_in_order_and_the_wrong_side_comes_last(motion):
+    hand, samples, mixture = barrett()
+    contacts = contacts_of(hand, samples.joints[9000:9100], motion)
+    found = query_mixture(contacts, hand, mixture, guesses=3)
+    assert bool((found.row.diff() >= 0).all())
+    normals = rotate(found.obj_from_hand, hand.fingertips(found.joints)[1])
+    side = (normals * contacts.normals[found.row[:, None], found.permutation]).sum(-1).mean(-1)
+    wrong = (side > WRONG_SIDE).long()
+    same_row = found.row.diff() == 0
+    assert bool((wrong.diff()[same_row] >= 0).all())
+    # All six assignments are asked, each with three guesses or, out of reach, none.
+    counts = torch.stack([(found.permutation == torch.tensor(p)).all(-1).sum() for p in PERMUTATIONS])
+    assert int(counts.sum()) == len(found)
+    assert bool((counts > 0).all())
+
+
+def test_guesses_do_not_depend_on_the_objects_frame(motion):
+    hand, samples, mixture = barrett()
+    first = query_mixture(contacts_of(hand, samples.joints[9000:9020], torch.eye(4).double()), hand, mixture)
+    moved = query_mixture(contacts_of(hand, samples.joints[9000:9020], motion), hand, mixture)
+    # Equal up to rounding; the order of equal errors may differ.
+    torch.testing.assert_close(moved.joints.sum(), first.joints.sum(), rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(moved.tip_error.sum(), first.tip_error.sum(), rtol=1e-6, atol=1e-6)
+
+
+def test_degenerate_and_unreachable_rows_have_no_guesses(motion):
+    hand, samples, mixture = barrett()
+    contacts = contacts_of(hand, samples.joints[9000:9004], motion)
+    points = contacts.points.clone()
+    points[1] = points[1, 0]
+    points[2] = 1 + 10 * (points[2] - points[2].mean(0))  # a triangle ten times as large
+    found = query_mixture(dataclasses.replace(contacts, points=points), hand, mixture)
+    assert not set(found.row.tolist()) & {1, 2}
+    assert {0, 3} <= set(found.row.tolist())
+
+
+def test_empty_and_float32_contacts():
+    hand, samples, mixture = barrett()
+    contacts = contacts_of(hand, samples.joints[:5], rigid(torch.eye(3).double(), torch.ones(3).double()))
+    assert len(query_mixture(contacts[:0], hand, mixture)) == 0
+    single = query_mixture(contacts.to(torch.float32), hand, mixture)
+    assert single.joints.dtype == single.obj_from_hand.dtype == torch.float32
+    torch.testing.assert_close(
+        single.reach.sum(), query_mixture(contacts, hand, mixture).reach.sum().float(), rtol=1e-3, atol=0
+    )
+
+
+def test_paper_coverage_accepts_fewer(motion):
+    hand, samples, mixture = barrett()
+    contacts = contacts_of(hand, samples.joints[9000:9100], motion)
+    few, many = (query_mixture(contacts, hand, mixture, max_energy=r) for r in (PAPER_ENERGY, DEFAULT_ENERGY))
+    assert 0 < len(few) < len(many)
+
+
+def test_bad_arguments():
+    hand, samples, mixture = barrett()
+    contacts = contacts_of(hand, samples.joints[:2], torch.eye(4).double())
+    with pytest.raises(BadArgument, match="guesses: found 0"):
+        query_mixture(contacts, hand, mixture, guesses=0)
+    with pytest.raises(BadArgument, match="max_energy: found nan"):
+        query_mixture(contacts, hand, mixture, max_energy=float("nan"))
+    with pytest.raises(BadArgument, match="mixture: found joints"):
+        query_mixture(contacts, load_hand("allegro"), mixture)
+
+
+def test_a_mixture_of_other_limits_fingers_or_fingertips_is_refused():
+    hand, samples, mixture = barrett()
+    contacts = contacts_of(hand, samples.joints[:2], torch.eye(4).double())
+    others = [
+        dataclasses.replace(hand, upper=hand.upper - 0.01),
+        dataclasses.replace(hand, contact=hand.contact + 1e-4),
+        dataclasses.replace(hand, normal=hand.normal.roll(1, 1)),
+        dataclasses.replace(hand, coupling=hand.coupling * 1.001),
+    ]
+    for other in others:
+        with pytest.raises(BadArgument, match=r"mixture: found a model of hand 'barrett'.*train it anew"):
+            query_mixture(contacts, other, mixture)
+    spoilt = dataclasses.replace(mixture, meta=mixture.meta | {"hand_codes": "one two"})
+    with pytest.raises(BadArgument, match="mixture: found hand_codes"):
+        query_mixture(contacts, hand, spoilt)
+    # What does not change the codes is no other hand, nor are single precision and samples that tell no hand.
+    for same in (dataclasses.replace(hand, sha256="0" * 64), hand.to(torch.float32)):
+        assert len(query_mixture(contacts, same, mixture))
+    assert len(query_mixture(contacts, hand, dataclasses.replace(mixture, meta={})))
+
+
+def test_many_triples_are_answered_as_each_alone(motion):
+    hand, samples, mixture = barrett()
+    contacts = contacts_of(hand, samples.joints[9000:9600], motion)  # more than one pass
+    found = query_mixture(contacts, hand, mixture, guesses=2)
+    assert bool((found.row.diff() >= 0).all())
+    for k in (0, 255, 256, 599):
+        one, rows = query_mixture(contacts[k], hand, mixture, guesses=2), found[found.row == k]
+        assert torch.equal(one.permutation, rows.permutation)
+        torch.testing.assert_close(one.joints, rows.joints, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("name", "components"), [("allegro", 41), ("barrett", 36)])
+def test_shipped_mixtures_fit_their_hands(name, components):
+    hand, mixture = load_hand(name), load_mixture(name)
+    assert mixture.joint_names == tuple(hand.joint_names)
+    assert len(mixture.weights) == components
+    assert int(mixture.meta["samples"]) >= 100_000
+    fresh = sample_configurations(hand, 3000, seed=99)
+    accepted = float((mixture.energy(fresh.q) < DEFAULT_ENERGY).double().mean())
+    assert abs(accepted - float(mixture.meta["acceptance_default_coverage"])) < 0.01
+    error = float((mixture.joints(fresh.q) - fresh.joints).abs().mean())
+    assert abs(error - float(mixture.meta["mean_absolute_error"])) < 0.02

@@ -1,0 +1,179 @@
+"""Refinement: Jacobians against finite differences, postures recovered, limits and clearances kept."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from torchgrasp.errors import Status
+from torchgrasp.frames import apply, rigid, rotate, rotation_from_vector
+from torchgrasp.hand.load import load_hand
+from torchgrasp.ik.checks import check, normal_angle, tip_error
+from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, clearance_rows
+from torchgrasp.ik.configuration import Configuration, SpatialJacobian
+from torchgrasp.ik.refine import open_hand, refine, refinement_cost, tip_rows, tip_targets
+from torchgrasp.ik.sdf import field_from_surface
+from torchgrasp.values import Contacts
+
+
+@pytest.fixture(scope="module", params=["allegro", "barrett"])
+def hand(request):
+    return load_hand(request.param)
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """A ball of radius 30 mm at the origin."""
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.03)
+    return field_from_surface(torch.tensor(mesh.vertices), torch.tensor(mesh.faces))
+
+
+def random_postures(hand, n: int, seed: int = 0) -> Configuration:
+    rng = torch.Generator().manual_seed(seed)
+
+    def rand(*shape):
+        return torch.rand(*shape, generator=rng, dtype=torch.float64)
+
+    joints = hand.lower + (hand.upper - hand.lower) * rand(n, hand.dof)
+    turn = rotation_from_vector(rand(n, 3) * 4 - 2)
+    return Configuration(joints, rigid(turn, rand(n, 3) * 0.1 - 0.05))
+
+
+def touched(hand, posture: Configuration) -> Contacts:
+    """Contacts that this very posture touches with the middle of its pads."""
+    points, normals = hand.fingertips(posture.joints)
+    centres = apply(posture.obj_from_hand, hand.tip_centres(posture.joints))
+    outward = -rotate(posture.obj_from_hand, normals)
+    b = len(points)
+    zeros = torch.zeros(b, 3, dtype=torch.float64)
+    return Contacts(centres - hand.tip_radius[:, None] * outward, outward, zeros, zeros)
+
+
+def far(ball_field) -> CollisionWorld:
+    return CollisionWorld(ball_field, None)
+
+
+def test_jacobian_against_finite_differences(hand, ball):
+    posture = random_postures(hand, 6)
+    lower, upper = hand.lower + 0.05, hand.upper - 0.05
+    posture = Configuration(posture.joints.clamp(lower, upper), posture.obj_from_hand)  # steps must not meet the limits
+    contacts = touched(hand, random_postures(hand, 6, seed=1))
+    world = CollisionWorld(ball, -0.02)
+
+    def rows(at):
+        jacobians, target = SpatialJacobian.at(at, hand), tip_targets(hand, contacts)
+        return tip_rows(jacobians, target, contacts.normals), clearance_rows(jacobians, world, tips_touch=True)
+
+    tips, links = rows(posture)
+    h = 1e-6
+    for k in range(6 + hand.dof):
+        step = torch.zeros(6, 6 + hand.dof, dtype=torch.float64)
+        step[:, k] = h
+        plus, minus = rows(posture.moved(step, hand)), rows(posture.moved(-step, hand))
+        difference = (plus[0][0] - minus[0][0]) / (2 * h)
+        torch.testing.assert_close(tips[1][..., k], difference, rtol=1e-5, atol=2e-3)
+        # hinges come sorted by depth, so that only the sum of squares compares row by row
+        slope = (2 * links[0] * links[1][..., k]).sum(1)
+        difference = ((plus[1][0] ** 2).sum(1) - (minus[1][0] ** 2).sum(1)) / (2 * h)
+        torch.testing.assert_close(slope, difference, rtol=2e-3, atol=1.0)
+
+
+def test_a_touching_posture_is_its_own_solution(hand, ball):
+    posture = random_postures(hand, 20)
+    jacobians = SpatialJacobian.at(posture, hand)
+    contacts = touched(hand, posture)
+    torch.testing.assert_close(
+        tip_error(jacobians, contacts), torch.zeros(20, 3, dtype=torch.float64), atol=1e-8, rtol=0
+    )
+    assert float(normal_angle(jacobians, contacts).max()) < 1e-3
+
+
+def test_disturbed_postures_come_back(hand, ball):
+    """From 5 mm, 10 degrees and 0.15 rad away the tips return to their contacts."""
+    rng = torch.Generator().manual_seed(5)
+    truth = random_postures(hand, 200)
+    free = hand.self_clearance(truth.joints) > 2 * MILLIMETRE
+    truth = Configuration(truth.joints[free], truth.obj_from_hand[free])
+    truth = Configuration(truth.joints, rigid(truth.obj_from_hand[:, :3, :3], truth.obj_from_hand[:, :3, 3] + 1.0))
+    contacts = touched(hand, truth)  # a metre away from the ball: reach alone is tested
+    g = len(truth.joints)
+    scale = torch.cat([torch.full((3,), 0.005), torch.full((3,), 0.17), torch.full((hand.dof,), 0.15)]).double()
+    start = truth.moved(torch.randn(g, 6 + hand.dof, generator=rng, dtype=torch.float64) * scale, hand)
+    found = refine(start, hand, contacts, far(ball))
+    error = tip_error(SpatialJacobian.at(found, hand), contacts).amax(1)
+    assert float((error < MILLIMETRE).double().mean()) > 0.95
+    assert bool((found.joints >= hand.lower).all())
+    assert bool((found.joints <= hand.upper).all())
+    assert bool(
+        (refinement_cost(found, hand, contacts, far(ball)) <= refinement_cost(start, hand, contacts, far(ball))).all()
+    )
+
+
+def test_check_names_what_is_wrong(hand, ball):
+    posture = random_postures(hand, 60)
+    free = hand.self_clearance(posture.joints) > 0
+    posture = Configuration(posture.joints[free], posture.obj_from_hand[free])
+    away = torch.tensor([0.0, 0, 1.0], dtype=torch.float64)
+    posture = Configuration(
+        posture.joints, rigid(posture.obj_from_hand[:, :3, :3], posture.obj_from_hand[:, :3, 3] + away)
+    )
+    contacts = touched(hand, posture)
+    same = check(posture, posture.joints, hand, contacts, CollisionWorld(ball, None))
+    assert (same.status == Status.OK).all()
+
+    shifted = Contacts(contacts.points + 0.003, contacts.normals, contacts.variance, contacts.std_m)
+    assert (check(posture, posture.joints, hand, shifted, far(ball)).status == Status.TIP_ERROR).all()
+
+    inside_out = Contacts(
+        contacts.points - 2 * hand.tip_radius[:, None] * -contacts.normals,
+        -contacts.normals,
+        contacts.variance,
+        contacts.std_m,
+    )
+    assert (check(posture, posture.joints, hand, inside_out, far(ball)).status == Status.NORMAL_ANGLE).all()
+
+    below = check(posture, posture.joints, hand, contacts, CollisionWorld(ball, 2.0))
+    assert (below.status == Status.TABLE_COLLISION).all()
+
+    outside = Configuration(posture.joints.clone(), posture.obj_from_hand)
+    outside.joints[:, 0] = hand.upper[0] + 0.1
+    limits = check(outside, posture.joints, hand, touched(hand, outside), far(ball))
+    assert (limits.status == Status.JOINT_LIMITS).all()
+
+    onto = Configuration(
+        posture.joints, rigid(posture.obj_from_hand[:, :3, :3], torch.zeros_like(away).expand(len(free[free]), 3))
+    )
+    hit = check(onto, posture.joints, hand, touched(hand, onto), CollisionWorld(ball, None))
+    inside = hit.clearance < 0
+    assert inside.any()
+    assert (hit.status[inside] == Status.OBJECT_COLLISION).all()
+
+    crossed = random_postures(hand, 60).joints
+    crossed = crossed[hand.self_clearance(crossed) < 0]
+    n = min(len(crossed), len(posture.joints))
+    assert n > 3
+    few, bent = Configuration(posture.joints[:n], posture.obj_from_hand[:n]), crossed[:n]
+    itself = Configuration(bent, few.obj_from_hand)
+    status = check(itself, few.joints, hand, touched(hand, itself), far(ball)).status
+    assert (status == Status.SELF_COLLISION).all()
+    assert (check(few, bent, hand, contacts[:n], far(ball)).status == Status.PREGRASP).all()
+
+    nowhere = dataclasses.replace(contacts, points=contacts.points * float("nan"))
+    assert (check(posture, posture.joints, hand, nowhere, far(ball)).status == Status.TIP_ERROR).all()
+
+
+def test_the_opened_hand_is_farther_and_clear(hand, ball):
+    """Tips around the ball open to more than they touch, at the same pose."""
+    posture = random_postures(hand, 40)
+    contacts = touched(hand, posture)
+    away = CollisionWorld(ball, None)
+    opened = open_hand(posture, hand, contacts, away)
+    before = hand.tip_centres(posture.joints)
+    after = hand.tip_centres(opened)
+    outward = -hand.fingertips(posture.joints)[1]
+    travel = ((after - before) * outward).sum(-1)
+    assert float(travel.median()) > 0.005
+    assert bool((opened >= hand.lower).all())
+    assert bool((opened <= hand.upper).all())

@@ -1,0 +1,96 @@
+"""Distance fields against analytic surfaces."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from torchgrasp.errors import BadArgument
+from torchgrasp.hand.box_distance import box_distance
+from torchgrasp.ik.sdf import (
+    closest_on_triangles,
+    field_from_mesh,
+    field_from_surface,
+)
+
+
+def test_closest_on_triangles_is_that_of_trimesh():
+    rng = np.random.default_rng(0)
+    points, triangles = rng.normal(size=(500, 3)), rng.normal(size=(500, 3, 3))
+    found, feature = closest_on_triangles(points, triangles)
+    np.testing.assert_allclose(found, trimesh.triangles.closest_point(triangles, points), atol=1e-9)
+    assert set(feature.tolist()) == set(range(7))
+    for k in range(3):
+        np.testing.assert_allclose(found[feature == 4 + k], triangles[feature == 4 + k, k])
+
+
+@pytest.mark.parametrize("given", ["faces", "normals"])
+def test_distance_field_of_a_sphere(given, generator):
+    ball = trimesh.creation.icosphere(5, 0.04)
+    vertices = torch.tensor(ball.vertices)
+    normals = vertices / torch.linalg.vector_norm(vertices, dim=1, keepdim=True)
+    field = field_from_surface(vertices, torch.tensor(ball.faces) if given == "faces" else normals, margin=0.05)
+    points = 0.08 * (2 * torch.rand(4000, 3, generator=generator, dtype=torch.float64) - 1)
+    distance, gradient = field.query(points)
+    radius = torch.linalg.vector_norm(points, dim=1)
+    assert float((distance - (radius - 0.04)).abs().max()) < 3e-3  # interpolated far from the surface
+    near = (radius - 0.04).abs() < 0.018
+    assert float((distance - (radius - 0.04)).abs()[near].max()) < 4e-4
+    cosine = (gradient[near] * points[near]).sum(1) / radius[near]
+    assert float((cosine - 1).abs().max()) < 0.15
+    assert bool(((distance < 0) == (radius < 0.04))[(radius - 0.04).abs() > 1e-3].all())
+
+
+def test_distance_field_of_a_box_has_the_right_sides(generator):
+    box = trimesh.creation.box(extents=[0.03, 0.06, 0.12])  # twelve large triangles
+    field = field_from_mesh(box, margin=0.03)
+    points = 0.06 * torch.randn(3000, 3, generator=generator, dtype=torch.float64)
+    points = points.clamp(-0.04, 0.04)
+    half = torch.tensor([0.015, 0.03, 0.06], dtype=torch.float64)
+    truth = box_distance(points, half.expand_as(points))
+    error = (field.query(points)[0] - truth).abs()
+    assert float(error.max()) < 2e-3
+    assert float(error.median()) < 2e-4
+
+
+def test_distance_field_gradient_is_the_derivative_inside_and_beyond(generator):
+    field = field_from_mesh(trimesh.creation.icosphere(3, 0.03), margin=0.02)
+    points = (0.06 * torch.randn(300, 3, generator=generator, dtype=torch.float64)).requires_grad_()
+    distance, gradient = field.query(points)
+    (derivative,) = torch.autograd.grad(distance.sum(), points)
+    torch.testing.assert_close(gradient, derivative, atol=1e-9, rtol=0)
+    far = torch.tensor([[1.0, 0, 0]], dtype=torch.float64)
+    reach = field.origin[0] + field.spacing * (field.values.shape[0] - 1)
+    at_border, _ = field.query(torch.stack([reach, far[0, 1], far[0, 2]])[None])
+    torch.testing.assert_close(field.query(far)[0], at_border + 1.0 - reach)
+
+
+def test_distance_field_follows_the_dtype_and_shape_of_the_points():
+    field = field_from_mesh(trimesh.creation.icosphere(2, 0.03), margin=0.02)
+    distance, gradient = field.query(torch.zeros(2, 3, 4, 3))
+    assert (distance.shape, gradient.shape, distance.dtype) == ((2, 3, 4), (2, 3, 4, 3), torch.float32)
+    torch.testing.assert_close(field.to(torch.float32).query(torch.zeros(2, 3, 4, 3))[0], distance)
+
+
+def test_distance_field_of_a_flat_patch_without_margin():
+    vertices = torch.tensor([[0.0, 0, 0], [0.03, 0, 0], [0, 0.03, 0]], dtype=torch.float64)
+    field = field_from_surface(vertices, torch.tensor([[0, 1, 2]]), margin=0.0)
+    distance, _ = field.query(torch.tensor([[0.008, 0.008, 0.004]], dtype=torch.float64))
+    assert float(distance) == pytest.approx(0.004, abs=1e-6)
+
+
+def test_bad_surfaces_are_named():
+    vertices = torch.eye(3, dtype=torch.float64)
+    with pytest.raises(BadArgument, match="faces"):
+        field_from_surface(vertices, torch.tensor([[0, 1, 3]]))
+    with pytest.raises(BadArgument, match="normals"):
+        field_from_surface(vertices, torch.ones(2, 3))
+    for spoilt in (0.0, float("nan")):
+        with pytest.raises(BadArgument, match="normal of length 0 or NaN"):
+            field_from_surface(vertices, vertices * torch.tensor([1.0, 1.0, spoilt], dtype=torch.float64))
+    with pytest.raises(BadArgument, match="without area"):
+        field_from_surface(vertices, torch.tensor([[0, 1, 1]]))
+    with pytest.raises(BadArgument, match="spacing"):
+        field_from_surface(vertices, torch.tensor([[0, 1, 2]]), spacing=0.0)
+    with pytest.raises(BadArgument, match="nodes"):
+        field_from_surface(vertices, torch.tensor([[0, 1, 2]]), spacing=0.001)

@@ -1,0 +1,70 @@
+"""The model of success: what it is shipped with, and which way each thing that it knows of a grasp counts."""
+
+import json
+import math
+
+import pytest
+import torch
+
+from torchgrasp.ik.success import FEATURES, MODEL, success_features, success_odds
+from torchgrasp.values import Contacts
+
+CENTER = torch.tensor([0.0, 0.03, 0.0], dtype=torch.float64)
+PADS = torch.tensor([[0.1, 0.3, 0.2]], dtype=torch.float64)
+CLOSED = torch.tensor([0.9], dtype=torch.float64)
+GOOD = torch.tensor([[4.0, 0.3, 0.3, 0.5, 0.6]])
+
+
+@pytest.mark.parametrize("name", FEATURES)
+def test_every_feature_counts_the_way_it_should(name):
+    changed = GOOD.clone()
+    changed[0, FEATURES.index(name)] += -2.0 if name == "log-odds of closure" else 0.5
+    assert float(success_odds(changed)) < float(success_odds(GOOD))
+
+
+def test_the_shipped_model_beats_the_base_rate_where_it_was_not_fitted():
+    model = json.loads(MODEL.read_text())
+    assert model["brier_on_objects_not_fitted_on"] < model["brier_of_the_base_rates"]
+    assert set(model["weights"]) == set(FEATURES) and model["fitted_on"] and model["trial"]
+
+
+def ring(lift=0.0, shift=0.0):
+    """Contacts around z with normals tilted up by `lift` [rad]; forces meet `shift` beside their centre."""
+    real = {"dtype": torch.float64}
+    around = torch.tensor([0.0, 2.0, 4.0], **real) * math.pi / 3
+    out = torch.stack([around.cos(), around.sin(), 0 * around], -1)
+    inner = 0.03 * out - torch.tensor([shift, 0.0, 0.0], **real)
+    inner = inner / inner.norm(dim=-1, keepdim=True)
+    normals = inner * math.cos(lift) + torch.tensor([0.0, 0.0, math.sin(lift)], **real)
+    spread = torch.full((1, 3), 0.004, **real)
+    return Contacts(0.03 * out[None], normals[None], spread, spread)
+
+
+def test_features_of_a_triangle_by_hand():
+    cone = math.atan(0.5)
+    found = success_features(ring(lift=0.2), CLOSED, PADS, CENTER, 0.5)[0]
+    torch.testing.assert_close(
+        found, torch.tensor([math.log(9), 1.5, 0.2 / cone, 0.2 / cone, 0.2], dtype=torch.float64), atol=1e-3, rtol=0
+    )
+    # Forces that meet where the normals do need no friction; those to the centre, half a radius aside, do.
+    _, offset, least, lean, _ = success_features(ring(shift=0.01), CLOSED, PADS, CENTER, 0.5)[0]
+    aside = math.pi / 3 - math.atan2(math.sqrt(3) / 2, 5 / 6)
+    assert float(least) < 0.02 and float(lean) * cone == pytest.approx(aside, abs=1e-6)
+    assert float(offset) == pytest.approx(1.5)
+
+
+def test_features_do_not_depend_on_the_frame_and_are_finite_where_nothing_balances():
+    contacts = ring(lift=0.1, shift=0.01)
+    turned = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64))[0]
+    turned = turned * torch.linalg.det(turned)
+    points, normals = contacts.points @ turned.T + 1.0, contacts.normals @ turned.T
+    moved = Contacts(points, normals, contacts.variance, contacts.std_m)
+    again = success_features(moved, CLOSED, PADS, CENTER @ turned.T + 1.0, 0.5)
+    torch.testing.assert_close(again, success_features(contacts, CLOSED, PADS, CENTER, 0.5), atol=1e-3, rtol=0)
+    certain = success_features(contacts, torch.ones_like(CLOSED), PADS, CENTER, 0.5)
+    assert bool(torch.isfinite(certain).all())
+    alike = Contacts(points, normals[:, :1].expand(1, 3, 3).contiguous(), contacts.variance, contacts.std_m)
+    assert float(success_features(alike, CLOSED, PADS, CENTER, 0.5)[0, 2]) == pytest.approx(
+        math.pi / 2 / math.atan(0.5)
+    )
+    assert success_features(contacts[:0], CLOSED[:0], PADS[:0], CENTER, 0.5).shape == (0, 5)

@@ -1,0 +1,126 @@
+"""Steps of a batch: onto the surface and along it, never uphill, each triple by itself; and what they reach."""
+
+import dataclasses
+
+import pytest
+import torch
+from scipy.optimize import linprog
+from torch import Tensor
+
+from torchgrasp.linalg import unit
+from torchgrasp.objects import load_object
+from torchgrasp.plan.problem import ContactProblem, forces_from_tensions
+from torchgrasp.plan.solve import plan_contacts
+from torchgrasp.plan.solver import LONGEST_STEP, Stage, State, descend, project, residual, start_state, step
+from torchgrasp.plan.wrench import rank_ratio, wrenches
+from torchgrasp.shape.fit import fit_shape
+from torchgrasp.specs import ContactSpec
+
+SPEC = ContactSpec.paper()
+STAGE = Stage(centre=1.0, cones=1.0, steps=6)
+
+
+def triples(ellipsoid, generator: torch.Generator, count: int = 40) -> Tensor:
+    return project(ellipsoid, 0.7 * unit(torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)), 8)
+
+
+def cost(problem: ContactProblem, state: State, stage: Stage = STAGE) -> Tensor:
+    rows = problem.rows(state.points, state.tension, state.jet)
+    return residual(rows, stage)[0].square().sum(1) / 2
+
+
+def test_all_forces_that_balance_at_three_contacts_are_tensions_of_their_sides(ellipsoid, generator):
+    points = triples(ellipsoid, generator, 5)
+    for corners in points:
+        push = torch.eye(9, dtype=torch.float64).view(9, 3, 3)
+        total = torch.cat([push.sum(1), torch.linalg.cross(corners.expand(9, 3, 3), push).sum(1)], 1)
+        assert int(torch.linalg.matrix_rank(total)) == 6  # so that forces that balance have three dimensions
+        forces = forces_from_tensions(corners.expand(3, 3, 3), torch.eye(3, dtype=torch.float64))[0].flatten(1)
+        assert int(torch.linalg.matrix_rank(forces)) == 3
+        assert float((forces @ total).abs().max()) < 1e-12
+
+
+def test_points_go_to_the_nearest_place_of_a_sphere_and_stay_there(ellipsoid, generator):
+    sphere = dataclasses.replace(ellipsoid, axes=(0.8, 0.8, 0.8))
+    points = unit(torch.randn(20, 3, 3, generator=generator, dtype=torch.float64))
+    points = points * (0.4 + 0.8 * torch.rand(20, 3, 1, generator=generator, dtype=torch.float64))
+    found = project(sphere, points, 8)
+    torch.testing.assert_close(found, 0.8 * unit(points))
+    torch.testing.assert_close(project(sphere, found, 3), found)
+
+
+def test_a_stage_leaves_no_triple_worse_and_all_near_the_surface(ellipsoid, generator):
+    problem, first = ContactProblem.of(ellipsoid, SPEC), start_state(ellipsoid, triples(ellipsoid, generator))
+    last = descend(ellipsoid, problem, first, STAGE)
+    before, after = cost(problem, first), cost(problem, last)
+    assert bool((after <= before).all())
+    assert float((after / before).median()) < 0.2
+    assert float(ellipsoid.value(last.points).abs().max()) < 0.05
+    size = torch.linalg.vector_norm(forces_from_tensions(last.points, last.tension)[0], dim=-1).mean(-1)
+    torch.testing.assert_close(size, torch.ones(40, dtype=torch.float64))
+
+
+def test_steps_are_bounded_and_promise_what_the_linear_rows_keep(ellipsoid, generator):
+    problem, state = ContactProblem.of(ellipsoid, SPEC), start_state(ellipsoid, triples(ellipsoid, generator))
+    rows = problem.rows(state.points, state.tension, state.jet)
+    x, reach, promised = step(rows, STAGE, state.damping)
+    moved = torch.linalg.vector_norm(x[:, :9].unflatten(1, (3, 3)), dim=-1).amax(-1)
+    torch.testing.assert_close(moved, reach)
+    assert float(reach.max()) <= LONGEST_STEP + 1e-12
+    assert bool((promised > 0).all())
+    # A hundredth of the step keeps what a linear model of the squares promises of it, to first order.
+    small = State(
+        state.points + 0.01 * x[:, :9].unflatten(1, (3, 3)), state.tension + 0.01 * x[:, 9:], state.jet, state.damping
+    )
+    small = dataclasses.replace(small, jet=start_state(ellipsoid, small.points).jet)
+    kept = cost(problem, state) - cost(problem, small)
+    value, weight = residual(rows, STAGE)
+    slope = weight[..., None] * torch.cat([rows.centre_by_x, rows.surface_by_x, rows.bounds_by_x], 1)
+    linear = -0.01 * (value[:, None] @ slope @ x[..., None])[:, 0, 0]
+    assert bool(((kept - linear).abs() < 0.1 * linear).all())
+
+
+def test_each_triple_goes_its_own_way(ellipsoid, generator):
+    problem, points = ContactProblem.of(ellipsoid, SPEC), triples(ellipsoid, generator, 12)
+    together = descend(ellipsoid, problem, start_state(ellipsoid, points), STAGE)
+    for i in (0, 5, 11):
+        alone = descend(ellipsoid, problem, start_state(ellipsoid, points[i : i + 1]), STAGE)
+        torch.testing.assert_close(alone.points[0], together.points[i])
+
+
+def test_what_has_settled_or_is_not_finite_is_left_alone(ellipsoid, generator):
+    problem, points = ContactProblem.of(ellipsoid, SPEC), triples(ellipsoid, generator, 6)
+    points[2, 1] = torch.nan
+    state = start_state(ellipsoid, points)
+    still = descend(ellipsoid, problem, state, dataclasses.replace(STAGE, settled=1.0))  # no step is that long
+    torch.testing.assert_close(still.points, points, equal_nan=True, rtol=0, atol=0)
+    moved = descend(ellipsoid, problem, state, STAGE)
+    assert bool(torch.isnan(moved.points[2, 1]).all())
+    assert bool(torch.isfinite(moved.points[[0, 1, 3, 4, 5]]).all())
+
+
+@pytest.mark.parametrize("name", ["jug", "spray"])
+def test_nearly_every_single_try_solves_the_papers_problem(name, generator):
+    shape = fit_shape(load_object(name).view, support="paper", budget=65)
+    for radius in (0.1, 1.0):
+        starts = radius * unit(torch.randn(40, 3, 3, generator=generator, dtype=torch.float64))
+        plan = plan_contacts(shape, SPEC, shape.metres(starts))
+        found = shape.predict(plan.contacts.points)
+        x = shape.normalise(plan.contacts.points)
+        good = (found.distance.abs() <= 1e-5).all(-1) & (found.variance <= SPEC.max_variance).all(-1)
+        w = wrenches(x, found.normal, SPEC.friction, SPEC.edges)
+        good &= rank_ratio(w) > 1e-3
+        closed = torch.tensor([balances(each) for each in w.flatten(1, 2)])
+        assert int((good & closed).sum()) >= 38
+        assert float(x.mean(1).square().sum(-1)[good].mean()) < 1e-3  # Eq. (14), squared
+
+
+def balances(wrench: Tensor) -> bool:
+    """Solve Eq. (13) by HiGHS: phi >= s balances, sum phi = 1, and s is as great as can be."""
+    m = len(wrench)
+    equal = torch.cat([wrench.T, torch.ones(1, m, dtype=torch.float64)])
+    equal = torch.cat([equal, equal.sum(1, keepdim=True)], 1)  # phi = s + psi with psi >= 0
+    right = torch.tensor([0.0] * 6 + [1.0], dtype=torch.float64)
+    bounds = [(0, None)] * m + [(None, None)]
+    found = linprog([0.0] * m + [-1.0], A_eq=equal.numpy(), b_eq=right.numpy(), bounds=bounds, method="highs")
+    return found.x is not None and found.x[m] > 1e-8

@@ -1,0 +1,149 @@
+"""A fit that was killed goes on at its last step, to the same bits; several processes fit what one does."""
+
+import dataclasses
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchgrasp.errors import BadArgument, ModelFileError, OutputError
+from torchgrasp.posture_model.em import Progress
+from torchgrasp.posture_model.fit import fit_mixture
+from torchgrasp.posture_model.mixture import GraspMixture, load_mixture
+from torchgrasp.posture_model.sample import HandSamples
+
+
+def ring(n: int = 3000) -> HandSamples:
+    """One joint that goes round, and a code that follows it."""
+    rng = np.random.default_rng(7)
+    angle = rng.uniform(0, 6, size=n)
+    lengths = 0.05 + 0.01 * np.stack([np.sin(angle), np.cos(angle), np.sin(2 * angle)], -1)
+    cosines = np.stack([np.cos(angle), np.sin(angle), np.cos(3 * angle)], -1)
+    q = np.concatenate([lengths, cosines], -1) + rng.normal(size=(n, 6)) * np.repeat([1e-3, 0.05], 3)
+    return HandSamples(torch.from_numpy(angle[:, None]), torch.from_numpy(q), ("turn",))
+
+
+def parameters(mixture: GraspMixture) -> torch.Tensor:
+    return torch.cat([mixture.weights, mixture.means.flatten(), mixture.covariances.flatten()])
+
+
+class Killed(Exception):
+    """What ends a fit in the middle."""
+
+
+def fit_until(step: int, path: Path, samples: HandSamples) -> None:
+    """Fit with a checkpoint and be killed after so many steps of this run."""
+    steps: list[Progress] = []
+
+    def kill(progress: Progress) -> None:
+        steps.append(progress)
+        if len(steps) == step:
+            raise Killed
+
+    with pytest.raises(Killed):
+        fit_mixture(samples, 5, iterations=20, tolerance=0.0, checkpoint=path, observer=kill)
+
+
+def test_f2_a_fit_goes_on_where_it_was_killed(tmp_path):
+    samples, path = ring(), tmp_path / "fit.safetensors"
+    whole = fit_mixture(samples, 5, iterations=20, tolerance=0.0)
+    for step in (1, 3, 8):  # killed three times
+        fit_until(step, path, samples)
+    steps: list[Progress] = []
+    again = fit_mixture(samples, 5, iterations=20, tolerance=0.0, checkpoint=path, observer=steps.append)
+    assert len(steps) == 20 - (1 + 3 + 8)
+    assert torch.equal(parameters(again), parameters(whole))
+    assert again.meta == whole.meta
+    # Asked once more, the finished fit takes no step; with more iterations it takes those.
+    assert torch.equal(
+        parameters(fit_mixture(samples, 5, iterations=20, tolerance=0.0, checkpoint=path)), parameters(whole)
+    )
+    longer = fit_mixture(samples, 5, iterations=25, tolerance=0.0, checkpoint=path)
+    assert torch.equal(parameters(longer), parameters(fit_mixture(samples, 5, iterations=25, tolerance=0.0)))
+
+
+def test_f2_kill_9(tmp_path):
+    path = tmp_path / "fit.safetensors"
+    script = f"""
+import os, signal, sys
+import torch
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from test_checkpoint import ring
+from torchgrasp.posture_model.fit import fit_mixture
+torch.set_num_threads({torch.get_num_threads()})
+def kill(progress):
+    if len(progress.log_likelihood) == 6:
+        os.kill(os.getpid(), signal.SIGKILL)
+fit_mixture(ring(), 5, iterations=12, tolerance=0.0, checkpoint={str(path)!r}, observer=kill)
+"""
+    assert subprocess.run([sys.executable, "-c", script]).returncode == -signal.SIGKILL
+    steps: list[Progress] = []
+    again = fit_mixture(ring(), 5, iterations=12, tolerance=0.0, checkpoint=path, observer=steps.append)
+    assert len(steps) == 6
+    assert torch.equal(parameters(again), parameters(fit_mixture(ring(), 5, iterations=12, tolerance=0.0)))
+
+
+def test_the_checkpoint_of_another_fit_is_refused(tmp_path):
+    samples, path = ring(), tmp_path / "fit.safetensors"
+    fit_mixture(samples, 5, iterations=2, checkpoint=path)
+    moved = dataclasses.replace(samples, joints=samples.joints * (1 + 1e-6))
+    for other, given in [
+        (samples, {"components": 4}),
+        (samples, {"components": 5, "seed": 1}),
+        (samples, {"components": 5, "starts": 2}),
+        (samples, {"components": 5, "regularisation": 1e-7}),
+        (samples[:-1], {"components": 5}),
+        (moved, {"components": 5}),
+    ]:
+        with pytest.raises(BadArgument, match="checkpoint: found"):
+            fit_mixture(other, **given, iterations=2, checkpoint=path)
+
+
+def test_a_damaged_checkpoint_and_a_folder_that_cannot_be_written_are_named(tmp_path):
+    samples, path = ring(), tmp_path / "fit.safetensors"
+    mixture = fit_mixture(samples, 5, iterations=2, checkpoint=path)
+    data = path.read_bytes()
+    for damaged in (b"", data[: len(data) // 2], mixture.save(tmp_path / "mixture.safetensors").read_bytes()):
+        path.write_bytes(damaged)
+        with pytest.raises(ModelFileError):
+            fit_mixture(samples, 5, checkpoint=path)
+    with pytest.raises(OutputError):
+        fit_mixture(samples, 5, iterations=2, checkpoint=tmp_path / "mixture.safetensors" / "below")
+
+
+def test_two_processes_fit_what_one_does(tmp_path):
+    script = tmp_path / "share.py"
+    script.write_text(f"""
+import sys
+import torch
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from test_checkpoint import ring
+from torchgrasp.posture_model.fit import fit_mixture
+torch.distributed.init_process_group("gloo")
+rank = torch.distributed.get_rank()
+share = ring()[:1100] if rank == 0 else ring()[1100:]  # unequal shares
+path = {str(tmp_path)!r}
+mixture = fit_mixture(share, 5, seed=3, iterations=25, tolerance=0.0, distributed=True, checkpoint=path + "/fit")
+mixture.save(path + f"/{{rank}}.safetensors")
+torch.distributed.destroy_process_group()
+""")
+    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
+    done = subprocess.run(launch, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    first, second = (load_mixture(tmp_path / f"{rank}.safetensors") for rank in (0, 1))
+    assert torch.equal(parameters(first), parameters(second))
+    one = fit_mixture(ring(), 5, seed=3, iterations=25, tolerance=0.0)
+    torch.testing.assert_close(parameters(first), parameters(one), rtol=1e-9, atol=1e-12)
+    assert first.meta == one.meta
+    # One process goes on where two stood.
+    longer = fit_mixture(ring(), 5, seed=3, iterations=30, tolerance=0.0, checkpoint=tmp_path / "fit")
+    assert longer.meta["iterations"] == "30"
+
+
+def test_distributed_without_a_group_is_named():
+    with pytest.raises(BadArgument, match="distributed: found True in a process without a group"):
+        fit_mixture(ring(), 5, distributed=True)

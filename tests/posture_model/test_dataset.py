@@ -1,0 +1,164 @@
+"""Samples on disk: the same bytes for any number of workers and after a kill; faults of the disk; damaged folders."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchgrasp.cli import main
+from torchgrasp.errors import BadArgument, ModelFileError, OutputError
+from torchgrasp.files import hold_folder
+from torchgrasp.hand.load import load_hand
+from torchgrasp.posture_model.dataset import load_samples, write_samples
+from torchgrasp.posture_model.sample import check_sampling, sample_configurations
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """Chunks of 500 postures: several of them in little time."""
+    monkeypatch.setattr("torchgrasp.posture_model.sample.CHUNK", 500)
+    monkeypatch.setattr("torchgrasp.posture_model.dataset.CHUNK", 500)
+    monkeypatch.setattr("torchgrasp.posture_model.sample.BLOCK", 250)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("sampling", ["uniform", "opposed"])
+def test_a_folder_holds_what_sample_configurations_returns_for_any_number_of_workers(tmp_path, small, sampling):
+    hand = load_hand("barrett")
+    made = write_samples(hand, 1700, tmp_path / "one", seed=3, sampling=sampling)
+    write_samples(hand, 1700, tmp_path / "three", seed=3, workers=3, sampling=sampling)
+    assert contents(tmp_path / "one") == contents(tmp_path / "three")
+    assert len(contents(tmp_path / "one")) == 5
+    found, truth = load_samples(tmp_path / "one"), sample_configurations(hand, 1700, seed=3, sampling=sampling)
+    assert found == made
+    assert len(found) == 1700
+    assert [len(chunk) for chunk in found] == [500, 500, 500, 200]
+    everything = found.read()
+    assert torch.equal(everything.joints, truth.joints)
+    assert torch.equal(everything.q, truth.q)
+    assert everything.meta == truth.meta
+    assert everything.joint_names == truth.joint_names
+    assert torch.equal(found.read(600).joints, truth.joints[:600])
+    with pytest.raises(BadArgument, match="n: found 1701"):
+        found.read(1701)
+
+
+def test_a_run_that_was_interrupted_and_killed_is_continued_to_the_same_bytes(tmp_path):
+    hand, n, folder = load_hand("barrett"), 120_000, tmp_path / "killed"
+    arguments = ["hand", "sample", "--hand", "barrett", "--n", str(n), "--out", str(folder), "--workers", "2"]
+    code = f"import sys; from torchgrasp.cli import main; sys.exit(main({arguments!r}))"
+    for sign, expected in ((signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)):
+        before = {path: path.stat().st_mtime_ns for path in folder.glob("chunk-*")}
+        run = subprocess.Popen([sys.executable, "-c", code])
+        while run.poll() is None and len(list(folder.glob("chunk-*"))) == len(before):
+            time.sleep(0.01)
+        os.kill(run.pid, sign)
+        assert run.wait() == expected
+        assert len(before) < len(list(folder.glob("chunk-*"))) < 12
+        assert all(path.stat().st_mtime_ns == then for path, then in before.items())  # whole chunks were kept
+    with pytest.raises(ModelFileError, match="without"):
+        load_samples(folder)
+    write_samples(hand, n, folder)
+    write_samples(hand, n, tmp_path / "whole", workers=3)
+    assert contents(folder) == contents(tmp_path / "whole")
+
+
+def test_half_a_chunk_is_never_taken_for_a_whole_one(tmp_path, small):
+    hand = load_hand("barrett")
+    write_samples(hand, 1100, tmp_path)
+    whole = contents(tmp_path)
+    chunk = tmp_path / "chunk-000001.safetensors"
+    for damaged in (whole[chunk.name][:-8], b"", whole["chunk-000000.safetensors"], whole["chunk-000002.safetensors"]):
+        chunk.write_bytes(damaged)
+        with pytest.raises(ModelFileError, match="chunk-000001"):
+            load_samples(tmp_path).read()
+        (tmp_path / ".chunk-000001.safetensors.abc.safetensors").write_bytes(damaged)  # of a run that was killed
+        write_samples(hand, 1100, tmp_path)
+        assert contents(tmp_path) == whole
+
+
+def test_a_second_run_on_the_folder_is_refused(tmp_path, small):
+    hand = load_hand("barrett")
+    with hold_folder(tmp_path), pytest.raises(OutputError, match=f"in use by process {os.getpid()} on"):
+        write_samples(hand, 100, tmp_path)
+    (tmp_path / ".lock").write_text("process 1 on nowhere")  # left by a run that was killed: nobody holds it
+    write_samples(hand, 100, tmp_path)
+    assert not (tmp_path / ".lock").exists()
+
+
+def test_a_full_disk_leaves_nothing_half_written_and_the_run_goes_on_later(tmp_path, small, monkeypatch):
+    hand = load_hand("barrett")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        with pytest.raises(OutputError, match=r"chunk-00000\d.safetensors \(File too large\)"):
+            write_samples(hand, 1100, tmp_path / "small", workers=2)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert [path.name for path in (tmp_path / "small").iterdir()] == ["samples.json"]
+    write_samples(hand, 1100, tmp_path / "small")
+    write_samples(hand, 1100, tmp_path / "whole")
+    assert contents(tmp_path / "small") == contents(tmp_path / "whole")
+    monkeypatch.setattr("shutil.disk_usage", lambda _: type("Usage", (), {"free": 1000})())
+    with pytest.raises(OutputError, match="1000 bytes free, allowed is 88000 bytes"):
+        write_samples(hand, 1100, tmp_path / "full")
+
+
+def test_a_folder_of_other_samples_or_files_is_refused(tmp_path, small):
+    hand = load_hand("barrett")
+    write_samples(hand, 600, tmp_path / "a")
+    for other in ({"n": 601}, {"seed": 1}, {"sampling": "opposed"}):
+        with pytest.raises(OutputError, match="holds other samples"):
+            write_samples(hand, **{"n": 600, "folder": tmp_path / "a", **other})
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "thesis.tex").write_text("years of work")
+    with pytest.raises(OutputError, match="holds other files"):
+        write_samples(hand, 600, tmp_path / "b")
+    assert [path.name for path in (tmp_path / "b").iterdir()] == ["thesis.tex"]
+    with pytest.raises(OutputError, match="a folder that can be written"):
+        write_samples(hand, 600, tmp_path / "b" / "thesis.tex")
+    with pytest.raises(BadArgument, match="sampling: found 'thumbs'"):
+        check_sampling(hand, 600, 0, 1, "thumbs")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"n": 0}, {"n": True}, {"n": 10**12}, {"n": "600"}, {"joint_names": []}, {"joint_names": "abcd"}, {"seed": 0},
+     {"chunk": 7}, {"version": 2}, {"torchgrasp": "grasps"}, {"joint_names": ["a"]}, {"hand": "allegro"}],
+)  # fmt: skip
+def test_a_damaged_manifest_is_refused(tmp_path, small, change):
+    write_samples(load_hand("barrett"), 600, tmp_path)
+    path = tmp_path / "samples.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(ModelFileError):
+        load_samples(tmp_path).read()
+
+
+@pytest.mark.parametrize("data", [b"", b"{", b"[]", b"\xff\xfe", b"[" * 100_000, b" " * 2_000_000])
+def test_what_is_no_manifest_is_refused(tmp_path, data):
+    (tmp_path / "samples.json").write_bytes(data)
+    with pytest.raises(ModelFileError, match=r"samples\.json"):
+        load_samples(tmp_path)
+    with pytest.raises(ModelFileError, match=r"without samples\.json"):
+        load_samples(tmp_path / "nowhere")
+
+
+def test_command(tmp_path, small, capsys):
+    arguments = ["hand", "sample", "--hand", "barrett", "--n", "700", "--sampling", "opposed"]
+    assert main([*arguments, "--out", str(tmp_path / "a")]) == 0
+    assert "700 opposed postures of barrett" in capsys.readouterr().out
+    assert len(load_samples(tmp_path / "a")) == 700
+    for wrong, named in [(["--hand", "shadow"], "--hand"), (["--n", "0"], "--n"), (["--seed", "-1"], "--seed"),
+                         (["--fingers", "toes"], "--fingers"), (["--seed", "1"], "--out")]:  # fmt: skip
+        assert main([*arguments, "--out", str(tmp_path / "a"), *wrong]) == 2
+        assert f"torchgrasp: {named}" in capsys.readouterr().err

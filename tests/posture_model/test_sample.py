@@ -1,0 +1,85 @@
+"""Sampled postures are free, within limits, and do not depend on the number of workers."""
+
+import itertools
+
+import pytest
+import torch
+
+from torchgrasp.errors import BadArgument
+from torchgrasp.hand.load import load_hand
+from torchgrasp.posture_model.encoding import encode_fingertips
+from torchgrasp.posture_model.sample import sample_configurations
+
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch):
+    """Chunks of 1000 postures: several of them in little time."""
+    monkeypatch.setattr("torchgrasp.posture_model.sample.CHUNK", 1000)
+    monkeypatch.setattr("torchgrasp.posture_model.sample.BLOCK", 500)
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett"])
+def test_samples_are_free_within_limits_and_coded(name):
+    hand = load_hand(name)
+    samples = sample_configurations(hand, 2000, seed=3)
+    assert len(samples) == 2000
+    assert samples.joint_names == tuple(hand.joint_names)
+    assert samples.joints.dtype == torch.float64
+    assert bool(((samples.joints >= hand.lower) & (samples.joints <= hand.upper)).all())
+    assert bool((hand.self_clearance(samples.joints) > 0).all())
+    torch.testing.assert_close(samples.q, encode_fingertips(*hand.fingertips(samples.joints)))
+    assert samples.rows().shape == (2000, len(hand.joint_names) + 6)
+
+
+def test_same_seed_same_samples_for_any_number_of_workers():
+    hand = load_hand("barrett")
+    n = 2500  # more than one chunk
+    one = sample_configurations(hand, n, seed=5, workers=1)
+    two = sample_configurations(hand, n, seed=5, workers=2)
+    assert torch.equal(one.joints, two.joints)
+    assert torch.equal(one.q, two.q)
+    fewer = sample_configurations(hand, 100, seed=5)
+    assert torch.equal(fewer.joints, one.joints[:100])
+    assert not torch.equal(fewer.joints, sample_configurations(hand, 100, seed=6).joints)
+
+
+def test_samples_are_uniform_among_the_free_postures():
+    # The oracle rejects draws of another generator, and takes them all at once.
+    hand = load_hand("barrett")
+    samples = sample_configurations(hand, 4000).joints
+    draws = torch.rand(6000, 4, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
+    free = hand.lower + (hand.upper - hand.lower) * draws
+    free = free[hand.self_clearance(free) > 0]
+    for power in (1, 2):
+        moments = [(x**power).mean(0) for x in (samples, free)]
+        error = sum((x**power).var(0) / len(x) for x in (samples, free)) ** 0.5
+        assert bool(((moments[0] - moments[1]).abs() < 4 * error).all())
+
+
+def test_opposed_samples_are_the_uniform_ones_in_which_two_pads_can_hold_something():
+    hand = load_hand("allegro")
+    samples = sample_configurations(hand, 900, seed=2, sampling="opposed")
+    points, normals = hand.fingertips(samples.joints)
+    held = torch.zeros(900, dtype=torch.bool)
+    for i, j in itertools.combinations(range(3), 2):
+        middle = (points[:, i] + points[:, j]) / 2  # a thin plate there is between the pads
+        towards = [((middle - points[:, k]) * normals[:, k]).sum(-1) for k in (i, j)]
+        angle = torch.rad2deg(torch.arccos((normals[:, i] * normals[:, j]).sum(-1)))
+        held |= (towards[0] > 0) & (towards[1] > 0) & (angle > 120)
+    assert bool(held.all())
+    uniform = sample_configurations(hand, 1000, seed=2)
+    rows = {tuple(row) for row in uniform.joints.tolist()}
+    shared = sum(tuple(row) in rows for row in samples.joints.tolist())
+    assert 0.2 < shared / 1000 < 0.8  # both take their postures from the same draws
+
+
+def test_a_hand_that_can_hardly_move_is_refused(monkeypatch):
+    monkeypatch.setattr("torchgrasp.posture_model.sample.OPPOSED", -2.0)
+    with pytest.raises(BadArgument, match="hand: found 0 kept of 5000 postures"):
+        sample_configurations(load_hand("barrett"), 10, sampling="opposed")
+
+
+@pytest.mark.parametrize(("name", "value"), [("n", 0), ("seed", -1), ("workers", 0)])
+def test_bad_arguments(name, value):
+    with pytest.raises(BadArgument, match=f"{name}: found {value}"):
+        sample_configurations(load_hand("barrett"), **{"n": 10, name: value})

@@ -1,0 +1,99 @@
+"""The criterion over the number of components, cross-validation, and the judgement on held-out postures."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from benchmarks.hand.model_selection import bic_curve, cross_validate
+
+from torchgrasp.errors import BadArgument
+from torchgrasp.posture_model.evaluate import evaluate_mixture
+from torchgrasp.posture_model.fit import bic, fit_mixture
+from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY
+from torchgrasp.posture_model.sample import HandSamples
+
+
+def islands(n: int = 1500, m: int = 4) -> HandSamples:
+    """Draws of m Gaussians far apart: the criterion's minimum is known."""
+    rng = np.random.default_rng(2)
+    centres = rng.normal(size=(m, 8)) * 6
+    x = centres[rng.integers(m, size=n)] + rng.normal(size=(n, 8))
+    return HandSamples(torch.from_numpy(x[:, :2]), torch.from_numpy(x[:, 2:]), ("a", "b"))
+
+
+def test_bic_finds_the_number_of_true_components():
+    seen = []
+    curve = bic_curve(islands(), (1, 2, 3, 4, 5, 6), observer=lambda m, mixture: seen.append(m))
+    assert seen == [1, 2, 3, 4, 5, 6]
+    assert int(curve.components[curve.bic.argmin()]) == 4
+    assert str(curve).endswith("least at 4")
+    assert str(bic_curve(islands(), (1, 2))).endswith("no minimum is seen")
+
+
+def test_bic_of_the_curve_is_that_of_the_fit():
+    samples = islands()
+    curve = bic_curve(samples, (2,), seed=3)
+    assert math.isclose(float(curve.bic[0]), bic(fit_mixture(samples, 2, seed=3), samples), rel_tol=1e-9, abs_tol=0.1)
+
+
+def test_f2_a_killed_sweep_goes_on(tmp_path):
+    samples, whole = islands(), bic_curve(islands(), (1, 2, 3))
+
+    def kill(m, mixture):
+        if m == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        bic_curve(samples, (1, 2, 3), checkpoints=tmp_path, observer=kill)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["em_1.safetensors", "em_2.safetensors"]
+    assert torch.equal(bic_curve(samples, (1, 2, 3), checkpoints=tmp_path).bic, whole.bic)
+
+
+def test_cross_validation_judges_each_posture_once_and_by_others():
+    samples = islands(400)
+    found = cross_validate(samples, (1, 4), folds=4, seed=1)
+    assert found.log_likelihood.shape == found.error.shape == (2, 4)
+    # One Gaussian by hand: the same division, the moments of three parts, the density on the fourth.
+    parts = torch.randperm(400, generator=torch.Generator().manual_seed(1)).tensor_split(4)
+    x = samples.rows()
+    for fold, held_out in enumerate(parts):
+        rest = torch.cat([part for part in parts if part is not held_out])
+        gaussian = torch.distributions.MultivariateNormal(x[rest].mean(0), torch.cov(x[rest].T, correction=0))
+        expected = float(gaussian.log_prob(x[held_out]).mean())
+        assert math.isclose(float(found.log_likelihood[0, fold]), expected, abs_tol=1e-3)
+    assert bool((found.log_likelihood[1] > found.log_likelihood[0]).all())
+    assert bool((found.error[1] < found.error[0]).all())
+    assert "4 folds" in str(found)
+
+
+def test_a_judgement_is_what_it_says():
+    samples = islands(600)
+    mixture = fit_mixture(samples[:400], 4)
+    held_out = samples[400:]
+    found = evaluate_mixture(mixture, held_out)
+    error = (mixture.joints(held_out.q) - held_out.joints).abs()
+    torch.testing.assert_close(found.error, error.mean(0))
+    torch.testing.assert_close(found.deviation, error.std(0))
+    assert math.isclose(found.mean_error, float(error.mean()))
+    accepted = [float((mixture.energy(held_out.q) < r).double().mean()) for r in (PAPER_ENERGY, DEFAULT_ENERGY)]
+    assert [found.paper_coverage, found.default_coverage] == accepted
+    assert found.meta()["acceptance_paper_coverage"] == f"{accepted[0]:.4f}"
+    assert "within reach" in str(found) and "a " in str(found)
+
+
+def test_bad_arguments():
+    samples = islands(100)
+    with pytest.raises(BadArgument, match="components: found none"):
+        bic_curve(samples, ())
+    with pytest.raises(BadArgument, match="components: found none"):
+        cross_validate(samples, ())
+    for folds in (1, 51):
+        with pytest.raises(BadArgument, match=f"folds: found {folds}"):
+            cross_validate(samples, (1,), folds=folds)
+    mixture = fit_mixture(samples, 1)
+    with pytest.raises(BadArgument, match="samples: found 1 postures"):
+        evaluate_mixture(mixture, samples[:1])
+    other = HandSamples(samples.joints, samples.q, ("a", "c"))
+    with pytest.raises(BadArgument, match="samples: found joints"):
+        evaluate_mixture(mixture, other)

@@ -1,0 +1,165 @@
+"""Completion of shapes whose hidden side is known in closed form."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchgrasp.frames import apply, rotate
+from torchgrasp.shape.completion.complete import LEAST_NOISE, Completion, complete_cloud
+from torchgrasp.shape.completion.silhouette import farthest_points, seen_from_one_side, silhouette
+from torchgrasp.values import PointCloud
+
+CAMERA = torch.tensor([0.45, 0.0, 0.3], dtype=torch.float64)
+
+
+def _seen_box(half: tuple[float, float, float], camera: Tensor) -> PointCloud:
+    """The seen faces of a box that stands on z = 0, with exact normals."""
+    rng = torch.Generator().manual_seed(2)
+    size, points, normals = torch.tensor(half, dtype=torch.float64), [], []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            area = float(size.prod() / size[axis])
+            p = (2 * torch.rand(int(3e5 * area), 3, dtype=torch.float64, generator=rng) - 1) * size
+            p[:, axis] = sign * size[axis]
+            n = torch.zeros_like(p)
+            n[:, axis] = sign
+            points.append(p + torch.tensor([0.0, 0.0, half[2]], dtype=torch.float64))
+            normals.append(n)
+    p, n = torch.cat(points), torch.cat(normals)
+    seen = ((camera - p) * n).sum(-1) > 0.1 * torch.linalg.vector_norm(camera - p, dim=-1)
+    return PointCloud(p[seen], n[seen], camera)
+
+
+def _angles(found: Tensor, wanted: Tensor) -> Tensor:
+    return torch.rad2deg(torch.arccos((found * wanted).sum(-1).clamp(-1, 1)))
+
+
+def test_hidden_half_of_a_cylinder_is_found(seen_cylinder: PointCloud):
+    found = complete_cloud(seen_cylinder, table=0.0)
+    side = found.points[:, 2] < 0.11
+    error = torch.linalg.vector_norm(found.points[side, :2], dim=-1) - 0.03
+    assert len(found.points) >= 30 and (found.points[:, 0] < 0).double().mean() > 0.8
+    assert error.abs().median() < 0.0015 and error.abs().max() < 0.004
+    outward = found.points[side] * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
+    outward = outward / torch.linalg.vector_norm(outward, dim=-1, keepdim=True)
+    assert _angles(found.normals[side], outward).median() < 5
+    assert found.scores[0] > 0.3
+
+
+def test_back_of_a_box_is_found():
+    camera = torch.tensor([0.4, 0.2, 0.3], dtype=torch.float64)
+    found = complete_cloud(_seen_box((0.025, 0.04, 0.06), camera), table=0.0)
+    half = torch.tensor([0.025, 0.04, 0.06], dtype=torch.float64)
+    off = ((found.points - torch.tensor([0.0, 0.0, 0.06], dtype=torch.float64)).abs() - half).amax(-1)
+    assert off.abs().median() < 0.004 and off.abs().max() < 0.006
+    assert (found.points[:, 0] < -0.02).any() and (found.points[:, 1] < -0.035).any()
+
+
+def test_hidden_half_is_found_without_a_table(seen_cylinder: PointCloud):
+    found = complete_cloud(seen_cylinder)
+    error = torch.linalg.vector_norm(found.points[:, :2], dim=-1) - 0.03
+    assert (found.points[:, 0] < -0.01).sum() > 10
+    assert error[found.points[:, 2] < 0.11].abs().median() < 0.003
+
+
+def test_completion_moves_with_the_object(seen_cylinder: PointCloud, motion: Tensor):
+    """Directions on a fixed grid do not turn with the object, but what they are refined to nearly does."""
+    assert seen_cylinder.normals is not None
+    camera = apply(motion, CAMERA[None])[0]
+    found = complete_cloud(
+        PointCloud(apply(motion, seen_cylinder.points), rotate(motion, seen_cylinder.normals), camera)
+    )
+    back = (found.points - motion[:3, 3]) @ motion[:3, :3]
+    error = torch.linalg.vector_norm(back[:, :2], dim=-1) - 0.03
+    assert (back[:, 0] < -0.01).sum() > 10
+    assert error[back[:, 2] < 0.11].abs().median() < 0.003
+
+
+def test_mirrored_points_respect_cloud_outline_seen_surface_and_table(seen_cylinder: PointCloud):
+    found = complete_cloud(seen_cylinder, table=0.0)
+    assert found.points[:, 2].min() > -0.002
+    assert torch.cdist(found.points, seen_cylinder.points).min() > 0.006
+    assert found.outline.hull_distance(found.points).max() < 0.001
+    apart = torch.cdist(found.points, found.points) + torch.eye(len(found.points))
+    assert apart.min() > 0.004
+    assert len(complete_cloud(seen_cylinder, table=0.0, budget=7).points) == 7
+
+
+def test_noise_covers_the_error_and_grows_without_symmetry(seen_cylinder: PointCloud):
+    found = complete_cloud(seen_cylinder, table=0.0)
+    side = found.points[:, 2] < 0.11
+    error = (torch.linalg.vector_norm(found.points[side, :2], dim=-1) - 0.03).abs()
+    assert (error < _deviation(found)[side]).double().mean() > 0.9
+    assert _deviation(found).median() < 0.008
+    poor = complete_cloud(_without_symmetry(seen_cylinder), table=0.0)
+    assert poor.scores[0] < found.scores[0]
+    assert _deviation(poor).median() > _deviation(found).median()
+
+
+@pytest.mark.parametrize("table", [0.0, None])
+def test_shared_errors_are_those_of_a_moved_plane(seen_cylinder: PointCloud, table: float | None):
+    """A plane's shift moves all its points along its normal, a turn those further away more: the rank stays small."""
+    found = complete_cloud(seen_cylinder, table=table)
+    free = 2 if table is not None else 3  # a shift and one or two turns
+    values = torch.linalg.svdvals(found.shared)
+    assert float((values[free * len(found.planes) :] ** 2).sum()) < 0.02 * float((values**2).sum())
+    assert torch.linalg.vector_norm(found.shared, dim=1).min() > 0
+
+
+def _deviation(found: Completion) -> Tensor:
+    """The standard deviation [m] of each point's whole error."""
+    return torch.sqrt(LEAST_NOISE**2 + (found.deviations**2).sum(1))
+
+
+def test_neighbours_share_what_is_asymmetric_and_those_far_apart_do_not(seen_cylinder: PointCloud):
+    found = complete_cloud(_without_symmetry(seen_cylinder), table=0.0)
+    parts = found.deviations[:, found.shared.shape[1] :]
+    covariance = parts @ parts.T
+    scale = torch.sqrt(covariance.diagonal()[:, None] * covariance.diagonal())
+    apart = torch.cdist(found.points, found.points)
+    torch.testing.assert_close(covariance / scale, torch.exp(-0.5 * (apart / 0.02) ** 2), atol=1e-9, rtol=0)
+    own = found.asymmetry**2 + (found.shared**2).sum(1)
+    torch.testing.assert_close(covariance.diagonal(), own, atol=1e-12, rtol=1e-9)
+
+
+def _without_symmetry(cloud: PointCloud) -> PointCloud:
+    """The cloud with waves on its side that no mirror repeats."""
+    assert cloud.normals is not None
+    angle = torch.atan2(cloud.points[:, 1], cloud.points[:, 0])
+    wave = 0.006 * torch.sin(4 * angle + 100 * cloud.points[:, 2] + 1)
+    return PointCloud(cloud.points + wave[:, None] * cloud.normals, cloud.normals, cloud.viewpoint)
+
+
+def test_silhouette_of_a_ball_is_its_circle():
+    rng = torch.Generator().manual_seed(4)
+    p = torch.randn(4000, 3, dtype=torch.float64, generator=rng)
+    p = 0.04 * p / torch.linalg.vector_norm(p, dim=-1, keepdim=True)
+    camera = torch.tensor([0.0, 0.5, 0.0], dtype=torch.float64)
+    cloud = PointCloud(p[((camera - p) * p).sum(-1) > 0])
+    outline = silhouette(cloud, camera)
+    # The tangent cone touches the ball on a circle of radius r sqrt(1 - (r/d)^2) at distance d - r^2/d.
+    ring = 0.04 * math.sqrt(1 - 0.08**2)
+    assert len(outline.rim) == 16
+    assert (torch.linalg.vector_norm(outline.rim[:, [0, 2]], dim=-1) - ring).abs().max() < 0.0025
+    assert _angles(outline.rim_normals, outline.rim / 0.04).max() < 20
+    probe = torch.tensor([[0.0, -0.2, 0.0], [0.2, 0.0, 0.0], [0.0, 0.03, 0.0], [0.0, 0.07, 0.0]], dtype=torch.float64)
+    hull = outline.hull_distance(probe)
+    assert hull[0] < 0 and hull[1].item() == pytest.approx(0.16, abs=0.004) and hull[2] < 0
+    violation = outline.violation(probe)
+    assert violation[0] == 0 and violation[2] == 0
+    assert violation[1] == hull[1] and violation[3].item() == pytest.approx(0.03 - 0.002, abs=0.002)
+
+
+def test_a_single_view_is_told_from_a_whole_surface(seen_cylinder: PointCloud):
+    assert seen_from_one_side(seen_cylinder, CAMERA)
+    assert seen_cylinder.normals is not None
+    turned = torch.cat([seen_cylinder.normals, -seen_cylinder.normals])
+    assert not seen_from_one_side(PointCloud(seen_cylinder.points.repeat(2, 1), turned), CAMERA)
+
+
+def test_farthest_points_are_all_points_when_there_are_few():
+    p = torch.rand(5, 3, generator=torch.Generator().manual_seed(0))
+    assert sorted(farthest_points(p, 9).tolist()) == [0, 1, 2, 3, 4]
+    assert len(farthest_points(p[:0], 9)) == 0

@@ -1,0 +1,71 @@
+"""Bodies of revolution: the axis is found beside a handle, and a handle is not mirrored to where the body hides it."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchgrasp.shape.completion.complete import complete_cloud
+from torchgrasp.shape.completion.revolution import find_revolution
+from torchgrasp.values import PointCloud
+
+CAMERA = torch.tensor([0.45, 0.0, 0.3], dtype=torch.float64)
+ARM = 0.05
+
+
+def _rod(azimuth: float) -> tuple[Tensor, Tensor]:
+    """Points and normals of an upright rod of 6 mm radius beside a body at the origin, seen from +x."""
+    generator = torch.Generator().manual_seed(1)
+    draws = torch.rand(250, 2, dtype=torch.float64, generator=generator)
+    angle = math.pi * (draws[:, 0] - 0.5)
+    normals = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], 1)
+    center = torch.tensor([ARM * math.cos(azimuth), ARM * math.sin(azimuth), 0.03], dtype=torch.float64)
+    return center + 0.006 * normals + torch.stack([0 * angle, 0 * angle, 0.06 * draws[:, 1]], 1), normals
+
+
+def _jug(cylinder: PointCloud, azimuth: float) -> PointCloud:
+    """A cylinder with a rod as its handle."""
+    points, normals = _rod(azimuth)
+    assert cylinder.normals is not None
+    return PointCloud(torch.cat([cylinder.points, points]), torch.cat([cylinder.normals, normals]), CAMERA)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.7])
+def test_axis_is_found_beside_a_handle_and_through_noise(seen_cylinder: PointCloud, shift: float):
+    jug = _jug(seen_cylinder, 1.5)
+    assert jug.normals is not None
+    generator = torch.Generator().manual_seed(3)
+    noise = torch.randn(2, len(jug), 3, dtype=torch.float64, generator=generator)
+    move = torch.tensor([shift, -2 * shift, 0.0], dtype=torch.float64)
+    normals = torch.nn.functional.normalize(jug.normals + 0.05 * noise[0], dim=1)
+    found = find_revolution(jug.points + 0.0005 * noise[1] + move, normals)
+    assert found is not None
+    assert torch.linalg.vector_norm(found.center - move[:2]) < 0.001
+    handle = torch.arange(len(jug)) >= len(seen_cylinder)
+    assert found.body[~handle].double().mean() > 0.95 and found.body[handle].double().mean() < 0.1
+
+
+def test_boxes_and_walls_are_no_bodies_of_revolution():
+    generator = torch.Generator().manual_seed(2)
+    face = torch.rand(400, 3, dtype=torch.float64, generator=generator) - 0.5
+    front, side = face.clone(), face.clone()
+    front[:, 0], side[:, 1] = 0.5, 0.5
+    x, y, _ = torch.eye(3, dtype=torch.float64)
+    assert find_revolution(0.08 * front, x.expand(400, 3)) is None
+    both = torch.cat([x.expand(400, 3), y.expand(400, 3)])
+    assert find_revolution(0.08 * torch.cat([front, side]), both) is None
+    assert find_revolution(0.08 * face, torch.tensor([0.0, 0.0, 1.0]).double().expand(400, 3)) is None
+
+
+@pytest.mark.parametrize("azimuth", [1.1, 1.5, -1.9])
+def test_a_handle_is_not_mirrored_to_where_the_body_hides_it(seen_cylinder: PointCloud, azimuth: float):
+    """Any plane through the axis explains the body; mirrored across most of them the handle lies hidden behind it."""
+    jug = _jug(seen_cylinder, azimuth)
+    found = complete_cloud(jug, table=0.0)
+    level = found.points[found.points[:, 2] < 0.11, :2]
+    center = ARM * torch.tensor([math.cos(azimuth), math.sin(azimuth)], dtype=torch.float64)
+    beside = torch.linalg.vector_norm(level - center, dim=1) < 0.02
+    off = (torch.linalg.vector_norm(level, dim=1) - 0.03).abs()
+    assert (off[~beside] < 0.004).all()
+    assert (level[:, 0] < 0).double().mean() > 0.5 and (~beside).sum() > 20

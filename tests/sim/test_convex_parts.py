@@ -1,0 +1,118 @@
+"""Convex parts of a mesh: volumes, cache, refusals."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from torchgrasp.errors import MeshError, SuspiciousScale
+from torchgrasp.sim.convex_parts import check_parts, convex_parts, read_mesh
+
+
+def bracket():
+    """A U of three boxes as one closed mesh of the extruded outline."""
+    from trimesh.creation import extrude_triangulation
+
+    outline = np.array([[0, 0], [6, 0], [6, 4], [4, 4], [4, 2], [2, 2], [2, 4], [0, 4]]) * 0.01
+    triangles = [[0, 1, 4], [0, 4, 5], [0, 5, 6], [0, 6, 7], [1, 2, 3], [1, 3, 4]]
+    return extrude_triangulation(outline, np.array(triangles), 0.03)
+
+
+def test_a_convex_mesh_is_its_own_part(tmp_path):
+    mesh = trimesh.creation.cylinder(radius=0.03, height=0.12)
+    parts = convex_parts(mesh, tmp_path)
+    assert len(parts) == 1
+    assert parts[0].volume == pytest.approx(mesh.volume)
+    assert not list(tmp_path.iterdir())
+
+
+def test_parts_of_a_concave_mesh_fill_it_and_leave_the_gap(tmp_path, capfd):
+    pytest.importorskip("coacd")
+    mesh = bracket()
+    parts = convex_parts(mesh, tmp_path)
+    assert len(parts) >= 2
+    assert all(p.is_convex for p in parts)
+    assert sum(p.volume for p in parts) == pytest.approx(mesh.volume, rel=0.1)
+    gap = np.array([[0.03, 0.035, 0.015]])
+    assert not any(p.contains(gap)[0] for p in parts)
+    assert capfd.readouterr().out == ""
+    files = list(tmp_path.iterdir())
+    assert len(files) == 1
+    again = convex_parts(mesh, tmp_path)
+    assert len(again) == len(parts)
+    for a, b in zip(parts, again, strict=True):
+        assert np.array_equal(a.vertices, b.vertices)  # to the last bit, or a trial would depend on the cache
+    files[0].write_bytes(b"damaged")
+    assert len(convex_parts(mesh, tmp_path)) == len(parts)
+    assert files[0].stat().st_size > 100
+
+
+def test_parts_given_are_used_as_they_are():
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    assert check_parts([box])[0] is box
+    with pytest.raises(MeshError, match="part 0, which is not convex"):
+        check_parts([bracket()])
+    with pytest.raises(MeshError):
+        check_parts([])
+
+
+def open_box():
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    return trimesh.Trimesh(box.vertices, box.faces[:-1])
+
+
+def inside_out():
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    return trimesh.Trimesh(box.vertices, box.faces[:, ::-1], process=False)
+
+
+def flat():
+    """A closed surface around nothing."""
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    return trimesh.Trimesh(box.vertices * [1, 1, 0], box.faces, process=False)
+
+
+def one_face_turned():
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    faces = np.array(box.faces)
+    faces[0] = faces[0, ::-1]
+    return trimesh.Trimesh(box.vertices, faces, process=False)
+
+
+def not_finite():
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    vertices = np.array(box.vertices)
+    vertices[0, 0] = np.nan
+    return trimesh.Trimesh(vertices, box.faces, process=False)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "reason"),
+    [
+        (open_box, "open surface"),
+        (inside_out, "volume"),
+        (not_finite, "non-finite"),
+        (flat, "volume"),
+        (one_face_turned, "volume"),
+        (lambda: trimesh.Trimesh(), "without faces"),
+    ],
+)
+def test_bad_meshes_are_refused(mesh, reason):
+    with pytest.raises(MeshError, match=reason):
+        convex_parts(mesh())
+
+
+@pytest.mark.parametrize("size", [1e-4, 10.0])
+def test_meshes_of_another_unit_are_refused(size):
+    with pytest.raises(SuspiciousScale, match="use metres"):
+        convex_parts(trimesh.creation.box((size, size, 2 * size)))
+
+
+def test_bad_files_are_refused(tmp_path):
+    with pytest.raises(MeshError, match="no file"):
+        read_mesh(tmp_path / "none.ply")
+    (tmp_path / "noise.ply").write_bytes(b"ply\nnonsense")
+    with pytest.raises(MeshError):
+        read_mesh(tmp_path / "noise.ply")
+    path = tmp_path / "box.ply"
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(path)
+    assert read_mesh(str(path)).volume == pytest.approx(1e-3)

@@ -1,0 +1,216 @@
+"""The simulated scene against statics, rigid-body formulae and the hand's own kinematics."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from torchgrasp.errors import BadArgument, HandFileError
+from torchgrasp.hand.load import load_hand
+from torchgrasp.sim.mount import APPROACH_JOINT, LIFT_JOINT, euler_from_rotation, mounted_urdf
+from torchgrasp.sim.scene import SceneSpec
+
+
+def test_euler_angles_rebuild_the_rotation():
+    rotations = Rotation.random(200, random_state=0).as_matrix()
+    level = [Rotation.from_euler("xyz", [0.3, s * math.pi / 2, 0.8]).as_matrix() for s in (1, -1)]
+    for matrix in [*rotations, *level, np.eye(3), np.diag([1.0, -1.0, -1.0])]:
+        again = Rotation.from_euler("xyz", euler_from_rotation(matrix)).as_matrix()
+        assert np.abs(again - matrix).max() < 1e-7
+
+
+def carried(urdf_path, **options):
+    ball = trimesh.creation.icosphere(radius=0.02)
+    return mounted_urdf(SceneSpec(urdf_path, np.eye(4), {}, {}, (), ball, [ball], 0.1, **options))
+
+
+def test_carried_urdf_holds_geometry_and_the_joints_of_the_carriage():
+    path = load_hand("barrett").urdf_path
+    assert APPROACH_JOINT not in carried(path)
+    text = carried(path, approach=(0.0, 0.06, -0.08))
+    assert LIFT_JOINT in text
+    assert 'xyz="0 0.6 -0.8"' in text
+    assert "<mimic" not in text
+    assert "<visual" not in text
+    assert text.count("<collision") > 5
+
+
+def test_files_that_are_no_hand_are_refused(tmp_path):
+    with pytest.raises(HandFileError):
+        carried(tmp_path / "none.urdf")
+    (tmp_path / "two.urdf").write_text('<robot name="r"><link name="a"/><link name="b"/></robot>')
+    with pytest.raises(HandFileError, match="one root link"):
+        carried(tmp_path / "two.urdf")
+
+
+SIMULATORS = ["sapien", "mujoco"]
+
+
+def build(name, mesh, simulator="sapien", **options):
+    """A scene with the hand half a metre above the object."""
+    pytest.importorskip(simulator)
+    from torchgrasp.sim.open import open_scene
+    from torchgrasp.sim.scene import SceneSpec
+
+    hand = load_hand(name)
+    joints = 0.5 * (hand.lower + hand.upper)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec([0.3, -0.8, 1.1]).as_matrix(), [0.05, -0.1, 0.6]
+    start = {k: float(v) for k, v in hand.expand(joints).items()}
+    args = (hand.urdf_path, pose, start, hand.actuators, hand.tip_links, mesh, [mesh.convex_hull], 0.36)
+    return hand, joints, torch.from_numpy(pose), open_scene(SceneSpec(*args, **options), simulator)
+
+
+def standing(radius=0.03, height=0.12):
+    mesh = trimesh.creation.cylinder(radius=radius, height=height)
+    mesh.apply_translation([0, 0, height / 2 + 0.2])
+    return mesh
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("simulator", SIMULATORS)
+@pytest.mark.parametrize("timestep", [1 / 240, 1 / 500])
+def test_resting_weight(timestep, simulator):
+    *_, scene = build("barrett", standing(), simulator, timestep=timestep)
+    forces = []
+    for _ in range(200):
+        scene.step()
+        forces.append(support(scene))
+    assert np.mean(forces[100:]) == pytest.approx(0.36 * 9.81, rel=5e-3)
+    assert np.abs(scene.object_pose() - np.eye(4)).max() < 1e-4
+
+
+def support(scene):
+    """The force [N] with which all contacts hold up the object."""
+    if hasattr(scene, "data"):
+        return scene.data.joint("torchgrasp_object").qfrc_constraint[2]
+    impulse = sum(np.asarray(p.impulse) for c in scene.system.get_contacts() for p in c.points)
+    return np.abs(impulse)[2] / scene.timestep
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("simulator", SIMULATORS)
+def test_object_has_the_mass_centre_and_inertia_of_its_mesh(simulator):
+    radius, height, mass = 0.03, 0.12, 0.36
+    mesh = standing(radius, height)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]))
+    *_, scene = build("barrett", mesh, simulator)
+    if simulator == "sapien":
+        inertia, centre = scene.body.inertia, np.asarray(scene.body.cmass_local_pose.p)
+        frame = scene.body.cmass_local_pose.to_transformation_matrix()[:3, :3]
+    else:
+        body = scene.model.body("torchgrasp_object")
+        inertia, centre, frame = body.inertia, body.ipos, Rotation.from_quat(body.iquat, scalar_first=True).as_matrix()
+    across, along = mass * (3 * radius**2 + height**2) / 12, mass * radius**2 / 2
+    assert np.sort(inertia) == pytest.approx([along, across, across], rel=0.02)
+    assert centre == pytest.approx(mesh.center_mass, abs=1e-6)
+    assert frame @ np.diag(inertia) @ frame.T == pytest.approx(
+        np.asarray(mesh.moment_inertia) * mass / mesh.volume, rel=1e-3, abs=1e-8
+    )
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("simulator", SIMULATORS)
+@pytest.mark.parametrize("name", ["allegro", "barrett"])
+def test_kinematics_are_those_of_the_hand(name, simulator):
+    hand, joints, world_from_hand, scene = build(name, standing(), simulator)
+    assert scene.penetration() == 0.0
+    assert np.abs(scene.hand_pose() - world_from_hand.numpy()).max() < 1e-5
+    tips = world_from_hand @ hand.link_poses(joints)[hand.tip_index]
+    assert np.abs(scene.tip_poses() - tips.numpy()).max() < 1e-4
+    points, _ = hand.fingertips(joints)
+    world_points = points @ world_from_hand[:3, :3].T + world_from_hand[:3, 3]
+    order = [hand.urdf_joint_names.index(n) for n in scene.joint_names]
+    found = scene.jacobian(world_points.numpy()) @ hand.coupling[order].numpy()
+    assert np.abs(found - (world_from_hand[:3, :3] @ hand.jacobian(joints)).numpy()).max() < 1e-4
+    assert scene.joints() == pytest.approx(hand.expand_joints(joints).numpy()[order], abs=1e-4)
+
+
+SLIDING = """<robot name="r"><link name="pal&lt;m">{body}</link>{fingers}</robot>"""
+SLIDER = """<link name="t{k}">{body}</link>
+  <joint name="j{k}" type="{kind}"><parent link="pal&lt;m"/><child link="t{k}"/>
+  <origin xyz="0 0 {k}"/><axis xyz="{axis}"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>"""
+BODY = """<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
+  <collision><geometry><sphere radius="0.1"/></geometry></collision>"""
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("simulator", SIMULATORS)
+def test_sliding_joints_move_their_tips_along_their_axes(tmp_path, simulator):
+    pytest.importorskip(simulator)
+    from torchgrasp.hand.hand import Actuator
+    from torchgrasp.sim.open import open_scene
+    from torchgrasp.sim.scene import SceneSpec
+
+    kinds = [("prismatic", "1 0 0"), ("prismatic", "0 0 1"), ("revolute", "0 1 0")]
+    fingers = "".join(SLIDER.format(k=k, kind=d, axis=x, body=BODY) for k, (d, x) in enumerate(kinds, start=1))
+    (tmp_path / "hand.urdf").write_text(SLIDING.format(body=BODY, fingers=fingers))
+    names, mesh = ("j1", "j2", "j3"), standing()
+    start, drives = dict.fromkeys(names, 0.0), dict.fromkeys(names, Actuator(1.0, 1.0, 1.0, 0.1))
+    pose = np.eye(4)
+    pose[0, 3] = 5.0
+    urdf = tmp_path / "hand.urdf"
+    scene = open_scene(
+        SceneSpec(urdf, pose, start, drives, ("t1", "t2", "t3"), mesh, [mesh.convex_hull], 0.36), simulator
+    )
+    scene.step()
+    assert set(scene.joint_names) == set(names)
+    points = scene.tip_poses()[:, :3, 3] + [0.0, 0.0, 0.5]
+    found = scene.jacobian(points)[:, :, [scene.joint_names.index(n) for n in names]]
+    expected = np.zeros((3, 3, 3))
+    expected[0, :, 0], expected[1, :, 1], expected[2, :, 2] = [1, 0, 0], [0, 0, 1], [0.5, 0, 0]
+    assert np.abs(found - expected).max() < 1e-3
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("simulator", SIMULATORS)
+def test_the_hand_rises_with_its_joint_and_stays_where_it_is_driven(simulator):
+    hand, joints, world_from_hand, scene = build("allegro", standing(), simulator, travel=0.1)
+    for k in range(700):
+        scene.lift(0.1 * min(1.0, k / 200))
+        scene.step()
+    rise = scene.hand_pose()[:3, 3] - world_from_hand[:3, 3].numpy()
+    assert rise == pytest.approx([0, 0, 0.1], abs=5e-4)
+    order = [hand.urdf_joint_names.index(n) for n in scene.joint_names]
+    assert np.abs(scene.joints() - hand.expand_joints(joints).numpy()[order]).max() < 2e-3
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("simulator", SIMULATORS)
+def test_a_force_pulls_at_the_mass_centre_and_the_lift_follows_a_speed(simulator):
+    mesh = standing()
+    mesh.apply_translation([0.3, 0.0, 0.0])
+    *_, scene = build("allegro", mesh, simulator, gravity=0.0, table=False)
+    scene.pull(np.array([0.0, 0.072, 0.0]))
+    for k in range(250):
+        scene.lift(0.04 * (k + 1) * scene.timestep, 0.04)
+        scene.step()
+    moved = np.eye(4)
+    moved[1, 3] = 0.5 * (0.072 / 0.36) * 0.5**2
+    assert scene.object_pose() == pytest.approx(moved, abs=3e-4)  # turned nowhere, moved by F t^2 / 2 m
+    assert scene.hand_pose()[2, 3] - 0.6 == pytest.approx(0.02, abs=3e-4)
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("simulator", SIMULATORS)
+def test_joints_without_a_drive_are_named(simulator):
+    pytest.importorskip(simulator)
+    from torchgrasp.sim.open import open_scene
+    from torchgrasp.sim.scene import SceneSpec
+
+    mesh, hand = standing(), load_hand("barrett")
+    setup = SceneSpec(hand.urdf_path, np.eye(4), {}, hand.actuators, hand.tip_links, mesh, [mesh], 0.1)
+    with pytest.raises(BadArgument, match=r"no position or drive for .*spread"):
+        open_scene(setup, simulator)
+    with pytest.raises(BadArgument, match="simulator: found 'bullet'"):
+        open_scene(setup, "bullet")

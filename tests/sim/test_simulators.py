@@ -1,0 +1,105 @@
+"""The same pinched cylinder in both simulators: held in both, with the same forces, and each repeats itself."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from tests.pinch import QUICK as QUICK_SAPIEN
+from tests.pinch import close, cylinder, digest, digest_elsewhere, pinch
+from torchgrasp.errors import Status
+from torchgrasp.evaluation.lift import close_hand
+from torchgrasp.evaluation.pull import PROTOCOLS, pull_grasp
+
+pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
+QUICK = dataclasses.replace(QUICK_SAPIEN, simulator="mujoco")
+PULL = dataclasses.replace(PROTOCOLS["dexgraspbench"], seconds=0.2, mass=0.05)
+
+
+@pytest.fixture(autouse=True)
+def both():
+    pytest.importorskip("sapien")
+    pytest.importorskip("mujoco")
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett"])
+def test_both_hold_a_cylinder_with_the_same_forces(name):
+    spec = dataclasses.replace(QUICK, noise=False)
+    there, here = (close(name, spec=dataclasses.replace(spec, simulator=s)) for s in ("sapien", "mujoco"))
+    assert there.held and here.held
+    assert np.abs(here.forces[-1] - there.forces[-1]).max() < 0.6
+    assert np.abs(here.object_pose[-1] - there.object_pose[-1]).max() < 0.05
+    assert set(here.joint_names) == set(there.joint_names)
+
+
+def test_mujoco_gives_the_same_bits_here_and_in_another_process():
+    first = digest(close("allegro", spec=QUICK, seed=3))
+    assert first == digest(close("allegro", spec=QUICK, seed=3))
+    assert first != digest(close("allegro", spec=QUICK, seed=4))
+    assert first == digest_elsewhere("allegro", "mujoco", 3)
+
+
+def test_mujoco_tells_overlap_and_absence():
+    forward = torch.eye(4, dtype=torch.float64)
+    forward[2, 3] = 0.2
+    assert close("barrett", spec=QUICK, error=forward).status is Status.START_OVERLAP
+    assert close("barrett", cylinder((0.4, 0.0)), QUICK).status is Status.NO_CONTACT
+    slippery = dataclasses.replace(QUICK, friction=0.02)
+    assert not close("allegro", spec=slippery).held
+
+
+@pytest.mark.parametrize("pull", [10.0, 300.0])
+def test_both_agree_on_a_pull(pull):
+    hand, grasp = pinch("allegro")
+    protocol = dataclasses.replace(PULL, pull=pull)
+    there, here = (pull_grasp(grasp, hand, cylinder(), protocol, simulator=s) for s in ("sapien", "mujoco"))
+    assert there.passed == here.passed == (pull < 100)
+    assert here.force == pytest.approx(there.force, rel=0.05)
+
+
+@pytest.mark.parametrize("simulator", ["sapien", "mujoco"])
+@pytest.mark.parametrize(("effort", "held"), [(0.01, False), (0.7, True)])
+def test_drives_that_cannot_hold_the_weight_are_named(simulator, effort, held):
+    hand, grasp = pinch("allegro")
+    drives = {name: drive._replace(effort=effort) for name, drive in hand.actuators.items()}
+    spec = dataclasses.replace(QUICK, simulator=simulator)
+    result = close_hand(grasp, dataclasses.replace(hand, actuators=drives), cylinder(), spec)
+    assert result.status is (Status.OK if held else Status.TOO_WEAK)
+
+
+@pytest.mark.parametrize("simulator", ["sapien", "mujoco"])
+def test_what_leaves_all_bounds_or_starts_in_the_object_never_counts_as_held(simulator, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    hand, grasp = pinch("allegro")
+    wild = {name: drive._replace(kp=1e12, kd=0.0, effort=1e30) for name, drive in hand.actuators.items()}
+    protocol = dataclasses.replace(PULL, kp=None)
+    for closing in ("open_loop", "uncertainty"):
+        spec = dataclasses.replace(QUICK, simulator=simulator, closing=closing)
+        assert not close_hand(grasp, dataclasses.replace(hand, actuators=wild), cylinder(), spec).held
+        given = (grasp, dataclasses.replace(hand, actuators=wild), cylinder(), protocol, 7.0, closing)
+        assert pull_grasp(*given, simulator=simulator).status in (Status.UNSTABLE, Status.MOVED)
+    deep = cylinder((0.04, 0.04))
+    assert pull_grasp(grasp, hand, deep, PULL, simulator=simulator).status is Status.START_OVERLAP
+    within = dataclasses.replace(PULL, overlap=1.0)  # no overlap is refused: the object is thrown out
+    thrown = pull_grasp(grasp, hand, deep, within, simulator=simulator)
+    assert thrown.status in (Status.EJECTED, Status.MOVED) and not thrown.passed
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_scene_as_mjcf_is_a_model_of_its_own():
+    """What is exported opens without this library, and weighs what hand and object weigh."""
+    import mujoco
+
+    from torchgrasp.sim.mjcf import scene_mjcf
+    from torchgrasp.sim.scene import SceneSpec
+
+    hand, grasp = pinch("allegro")
+    start = {k: float(v) for k, v in hand.expand(grasp.pregrasp[0]).items()}
+    mesh, where = cylinder(), grasp.obj_from_hand[0].numpy()
+    setup = SceneSpec(hand.urdf_path, where, start, hand.actuators, hand.tip_links, mesh, [mesh], 0.1, patch=0.0)
+    model = mujoco.MjModel.from_xml_string(scene_mjcf(setup))
+    assert model.nu == len(hand.urdf_joint_names) + 1
+    assert model.body("torchgrasp_object").mass[0] == pytest.approx(0.1)
+    assert set(model.geom_condim) == {3}
+    assert model.actuator("joint_0").forcerange == pytest.approx([-0.7, 0.7])

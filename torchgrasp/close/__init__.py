@@ -1,1 +1,0 @@
-"""Closing on it: the compliant law, the desired forces and the controllers, without a simulator."""

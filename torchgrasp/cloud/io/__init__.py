@@ -1,0 +1,1 @@
+"""Point-cloud files: PLY, PCD, NumPy and text."""

@@ -1,0 +1,119 @@
+"""The PLY format: points, normals and a viewpoint in and out; a mesh becomes points of its surface."""
+
+import io
+from typing import Any
+
+import numpy as np
+
+from torchgrasp.cloud.io.text import MAX_POINTS, read_table
+
+MAX_MESH_TEXT = 64 * 2**20
+"""Bytes of the largest mesh that is read from text: the parser makes some 20 bytes of each."""
+MESH_POINTS = 2000
+"""Points drawn from the surface of a mesh."""
+
+TYPES = {
+    **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2"},
+    **{"uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
+    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
+}
+
+
+def parse_ply(data: bytes) -> dict[str, Any]:
+    """Return points, normals and viewpoint of the bytes of a PLY file, None for what it does not have.
+
+    Raises:
+        ValueError: the bytes are no PLY file, or fewer than its header promises.
+
+    >>> parse_ply(format_ply(np.ones((5, 3)), viewpoint=np.zeros(3)))["viewpoint"].tolist()
+    [0.0, 0.0, 0.0]
+    """
+    header, body = _split_header(data)
+    encoding, viewpoint = "", None
+    elements: list[tuple[str, int, list[tuple[str, str]]]] = []
+    for line in header:
+        match line.split():
+            case ["format", kind, "1.0"]:
+                encoding = kind
+            case ["comment", "viewpoint", x, y, z]:
+                viewpoint = np.array([float(x), float(y), float(z)])
+            case ["element", name, count]:
+                elements.append((name, int(count), []))
+            case ["property", "list", _, _, name] if elements:
+                elements[-1][2].append((name, "list"))
+            case ["property", kind, name] if elements and kind in TYPES:
+                elements[-1][2].append((name, TYPES[kind]))
+            case ["property" | "element" | "format", *_]:
+                raise ValueError(f"the header line {line!r}")
+    if encoding not in ("ascii", "binary_little_endian", "binary_big_endian"):
+        raise ValueError(f"the encoding {encoding!r}")
+    # Before anything is made of the body: a mesh has twice as many faces as corners.
+    if any(not 0 <= count <= 2 * MAX_POINTS for _, count, _ in elements):
+        raise ValueError(f"elements {[(name, count) for name, count, _ in elements]}; at most {MAX_POINTS} points")
+    if any(name == "face" and count > 0 for name, count, _ in elements):
+        if encoding == "ascii" and len(body) > MAX_MESH_TEXT:
+            raise ValueError(f"a mesh of {len(body)} bytes of text, more than {MAX_MESH_TEXT}; a binary one may have")
+        points, normals = _sample_mesh(data)
+        return {"points": points, "normals": normals, "viewpoint": viewpoint}
+    if not elements or elements[0][0] != "vertex" or any(kind == "list" for _, kind in elements[0][2]):
+        raise ValueError("a first element that is not a plain vertex")
+    _, count, properties = elements[0]
+    columns = _read_columns(body, encoding, count, properties)
+    points = np.stack([columns[name] for name in "xyz"], axis=-1)
+    normals = None
+    if "nx" in columns:
+        normals = np.stack([columns[name] for name in ("nx", "ny", "nz")], axis=-1)
+    return {"points": points, "normals": normals, "viewpoint": viewpoint}
+
+
+def format_ply(points: np.ndarray, normals: np.ndarray | None = None, viewpoint: np.ndarray | None = None) -> bytes:
+    """Return the bytes of a binary PLY file; the viewpoint goes into a comment line that `parse_ply` understands."""
+    lines = ["ply", "format binary_little_endian 1.0"]
+    if viewpoint is not None:
+        lines.append("comment viewpoint " + " ".join(repr(float(x)) for x in viewpoint))
+    lines.append(f"element vertex {len(points)}")
+    names = ["x", "y", "z"] + (["nx", "ny", "nz"] if normals is not None else [])
+    lines += [f"property float {name}" for name in names]
+    table = points if normals is None else np.concatenate([points, normals], axis=1)
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii") + table.astype("<f4").tobytes()
+
+
+def _split_header(data: bytes) -> tuple[list[str], bytes]:
+    """Split a PLY file into the lines of its header and the bytes behind it."""
+    end = data.find(b"end_header", 0, 65536)
+    stop = data.find(b"\n", end) + 1
+    if not data.startswith(b"ply") or end < 0 or stop == 0:
+        raise ValueError("no PLY header")
+    return data[:end].decode("ascii").splitlines()[1:], data[stop:]
+
+
+def _read_columns(body: bytes, encoding: str, count: int, properties: list[tuple[str, str]]) -> dict[str, np.ndarray]:
+    """Return the columns of the vertex element by name."""
+    names = [name for name, _ in properties]
+    if len(set(names)) != len(names) or not 0 <= count <= MAX_POINTS:
+        raise ValueError(f"the properties {names} of {count} vertices")
+    if encoding == "ascii":
+        table = read_table(body, count, len(names))
+        return {name: table[:, i] for i, name in enumerate(names)}
+    order = "<" if encoding == "binary_little_endian" else ">"
+    dtype = np.dtype([(name, order + kind) for name, kind in properties])
+    if count * dtype.itemsize > len(body):
+        raise ValueError(f"{len(body)} bytes, fewer than {count} vertices have")
+    table = np.frombuffer(body, dtype=dtype, count=count)
+    return {name: table[name] for name in names}
+
+
+def _sample_mesh(data: bytes) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return points of a mesh's surface, and outward normals if the mesh is closed and consistently wound."""
+    import trimesh
+
+    # No resolver is given: a texture named in the header is not looked for.
+    try:
+        mesh = trimesh.load(io.BytesIO(data), file_type="ply", process=False, skip_materials=True)
+    except Exception as error:  # the parser raises whatever the bytes provoke
+        raise ValueError(f"a mesh that cannot be parsed ({error})") from error
+    if not isinstance(mesh, trimesh.Trimesh) or not mesh.area > 0 or not np.isfinite(mesh.vertices).all():
+        raise ValueError("a mesh without a surface")
+    points, faces = trimesh.sample.sample_surface(mesh, MESH_POINTS, seed=0)[:2]
+    mesh.merge_vertices()
+    return np.asarray(points), np.asarray(mesh.face_normals[faces]) if mesh.is_volume else None

@@ -1,0 +1,1 @@
+"""Closing and holding: the controller of a real or a simulated hand."""

@@ -1,0 +1,1 @@
+"""Adaptive control: impedance, learned stability, and a shape revised by touch."""

@@ -1,0 +1,202 @@
+"""Object-level impedance [6]: the grasp is a spring in the hand, and the fingers are springs to each other.
+
+The virtual frame of the three fingertips (Eqs. 15-17) stands for the object, which no sensor sees. A wrench pulls it
+back to where it was in the hand when the object was grasped; the fingers share that wrench. Internal forces press
+whatever the wrench: the desired ones, which turn with the frame, and springs along the sides of the triangle. These
+sides span the whole null space of the grasp map. Springs from the fingertips to the frame's origin, as in [6], balance
+only in the proportion of their lengths: two fingers against a thumb would press 30 to 45 degrees off their normals.
+
+[6] M. Li, H. Yin, K. Tahara and A. Billard, "Learning object-level impedance control for robust grasping and dexterous
+manipulation", ICRA 2014.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.control.adaptive.stability import lengths_of, state_of
+from torchgrasp.control.closing_law import actuated_stiffness, damped_inverse
+from torchgrasp.control.holding import RAMP, held_forces
+from torchgrasp.control.observation import ControlModel, Observation
+from torchgrasp.control.tactile import low_pass
+from torchgrasp.frames import degenerate, rigid, skew, virtual_frame
+from torchgrasp.plan.internal_forces import internal_forces
+from torchgrasp.values import ClosingGains
+
+TRANSLATION_STIFFNESS = 1200.0
+"""Of the virtual frame's origin [N/m]: 0.1 kg sags by 1 mm."""
+
+ROTATION_STIFFNESS = 4.0
+"""Of the virtual frame's axes [N m/rad]."""
+
+GRASP_STIFFNESS = 100.0
+"""Of the spring along each side of the triangle of fingertips [N/m]."""
+
+MOST_SHARE = 1.0
+"""The wrench asks of no finger for more than this share of the strongest desired force."""
+
+SURE = math.log(3)
+"""Log-odds of stability from which on a grasp is left as it is: a lost object costs more than a firmer grasp."""
+
+MOST_RAISE = 2.0
+"""How many times the desired forces a grasp that turns unstable may ask for."""
+
+HASTE = 8.0
+"""Rate [1/s] at which an unstable grasp becomes firmer and stiffer."""
+
+FEELING = 2.0
+"""Cut-off [Hz] of the mean of the tactile readings by which stability is judged: noise must not look like a slip."""
+
+SETTLING = 0.3
+"""Time [s] after the squeeze has risen before stability is judged: by then the mean has followed it."""
+
+
+def grasp_map(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 6 9"]:
+    """Return the matrix that turns three forces at `points` into force and torque about their centre.
+
+    >>> grasp_map(torch.eye(3)) @ internal_forces(torch.eye(3)).flatten(1).T
+    tensor([[0., 0., 0.],
+            [0., 0., 0.],
+            [0., 0., 0.],
+            [0., 0., 0.],
+            [0., 0., 0.],
+            [0., 0., 0.]])
+    """
+    arms = points - points.mean(-2, keepdim=True)
+    eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*arms.shape[:-2], 3, 3)
+    return torch.cat([torch.cat([eye] * 3, -1), torch.cat(skew(arms).unbind(-3), -1)], -2)
+
+
+def restoring_wrench(
+    hand_from_vf: Float[Tensor, "*b 4 4"],
+    rest: Float[Tensor, "*b 4 4"],
+    translation: float = TRANSLATION_STIFFNESS,
+    rotation: float = ROTATION_STIFFNESS,
+) -> Float[Tensor, "*b 6"]:
+    """Return the force [N] and torque [N m] about the virtual frame's origin that turn it back to `rest`.
+
+    The torque is along the axis of the turn and grows with the sine of its angle.
+
+    >>> restoring_wrench(torch.eye(4), torch.eye(4))
+    tensor([0., 0., 0., 0., 0., 0.])
+    """
+    axes, wanted = hand_from_vf[..., :3, :3].mT, rest[..., :3, :3].mT
+    turn = 0.5 * torch.linalg.cross(axes, wanted).sum(-2)
+    return torch.cat([translation * (rest[..., :3, 3] - hand_from_vf[..., :3, 3]), rotation * turn], -1)
+
+
+def shared_forces(
+    points: Float[Tensor, "*b 3 3"], wrench: Float[Tensor, "*b 6"], most: Float[Tensor, "*b"]
+) -> Float[Tensor, "*b 3 3"]:
+    """Return the smallest forces at `points` that add up to a wrench, scaled so that none exceeds `most` [N]."""
+    forces = (torch.linalg.pinv(grasp_map(points)) @ wrench[..., None])[..., 0].unflatten(-1, (3, 3))
+    largest = torch.linalg.vector_norm(forces, dim=-1).amax(-1)
+    return forces * (most / torch.maximum(largest, most))[..., None, None]
+
+
+def spring_forces(
+    points: Float[Tensor, "*b 3 3"], lengths: Float[Tensor, "*b 3"], stiffness: Float[Tensor, "*b 3"]
+) -> Float[Tensor, "*b 3 3"]:
+    """Return the forces of springs along the sides (0, 1), (1, 2) and (2, 0) of a triangle, which always balance.
+
+    Args:
+        points: fingertips [m].
+        lengths: of the sides at which the springs are free of force [m].
+        stiffness: of each spring [N/m].
+    """
+    return torch.einsum("...k,...kci->...ci", stiffness * (side_lengths(points) - lengths), internal_forces(points))
+
+
+def side_lengths(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
+    """Return the lengths of the sides (0, 1), (1, 2) and (2, 0) of a triangle [m]."""
+    return torch.linalg.vector_norm(points.roll(-1, dims=-2) - points, dim=-1)
+
+
+class Impedance:
+    """Hold what is grasped as a spring in the hand: the joints' torques are J^T f, set as targets q + J^T f / kp.
+
+    At rest in the grasp's pose the forces are the desired ones, balanced anew for the contacts that were really made.
+    One common factor keeps the sum of what the fingertips feel at what was asked for. Motions of the joints that move
+    no fingertip are held where they were.
+
+    A hand with a model of its stable grasps judges at every tick by what it feels whether this is one. While the odds
+    are less than three to one, the grasp becomes firmer, up to `MOST_RAISE` times, and its springs approach those of
+    stable grasps of the same lengths. It never loosens again: what it holds may still be heavy.
+
+    Args:
+        plant: the hand.
+        gains: of the closing before, for the desired forces.
+        sight: at the end of the closing.
+        start: its last joint targets [rad].
+        springs: stiffness [N/m] along the sides (0, 1), (1, 2) and (2, 0) of the triangle, then kept; None:
+            `GRASP_STIFFNESS`, and a grasp that looks unstable to the hand's own model adapts.
+    """
+
+    def __init__(
+        self,
+        model: ControlModel,
+        gains: ClosingGains,
+        observation: Observation,
+        start: Float[Tensor, " j"],
+        springs: Float[Tensor, "3"] | None = None,
+    ) -> None:
+        self.model = model
+        self.stable = model.stable if springs is None else None
+        self.springs = torch.full_like(model.radius, GRASP_STIFFNESS) if springs is None else springs
+        self.stiffness = actuated_stiffness(model.coupling, model.kp)
+        forces, self.strength = held_forces(model, gains, observation)
+        self.frame = rigid(torch.eye(3).to(observation.tips), observation.tips.mean(0))
+        self.rest, self.lengths = self._frame(observation.tips), side_lengths(observation.tips)
+        self.desired = forces @ self.rest[:3, :3]  # in the virtual frame
+        self.posture = self._actuated(observation.joints)
+        self.lead = self._actuated(start) - self.posture
+        self.factor, self.raised, self.time = 1.0, 1.0, 0.0
+        self.felt = observation.reading
+
+    def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
+        """Return the targets of all joints for the next tick."""
+        self.time += period
+        share = min(self.time / RAMP, 1.0)
+        self.felt = self.felt + low_pass(FEELING, period) * (observation.reading - self.felt)
+        if share == 1.0:
+            lacking = 1 - float(observation.reading.sum()) / (self.raised * self.strength)
+            self.factor = min(max(self.factor + period * lacking, 0.5), 1.5)
+            self._adapt(observation, period)
+        posture = self._actuated(observation.joints)
+        jacobian = (observation.jacobian @ self.model.coupling).flatten(0, 1)
+        lead = jacobian.T @ self.forces(observation.tips).flatten() / self.stiffness
+        drift = self.posture - posture
+        drift = drift - damped_inverse(jacobian) @ (jacobian @ drift)
+        return self.model.expand(posture + drift + self.lead + share * (lead - self.lead))
+
+    def _adapt(self, observation: Observation, period: float) -> None:
+        """Become firmer and as stiff as stable grasps of these lengths are, as long as this one may be unstable."""
+        if self.stable is None or self.time < RAMP + SETTLING:
+            return
+        state = state_of(self.springs, lengths_of(observation.tips), self.felt)
+        if float(self.stable.odds(state)) > SURE:
+            return
+        wish, haste = self.stable.wish(observation.tips), min(HASTE * period, 1.0)
+        self.raised += haste * (MOST_RAISE - self.raised)
+        self.springs = self.springs * (wish.springs / self.springs) ** haste
+
+    def forces(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+        """Return the forces of the fingers on the object [N], in the hand's frame, for where the fingertips are."""
+        frame = self._frame(tips)
+        desired = self.raised * self.factor * self.desired @ frame[:3, :3].T
+        most = MOST_SHARE * torch.linalg.vector_norm(desired, dim=-1).amax()
+        springs = spring_forces(tips, self.lengths, self.springs)
+        return desired + springs + shared_forces(tips, restoring_wrench(frame, self.rest), most)
+
+    def _frame(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "4 4"]:
+        """Return the virtual frame; tips on a line, as when the object is gone, keep the last one."""
+        if not bool(degenerate(tips)):
+            self.frame = virtual_frame(tips)
+        return self.frame
+
+    def _actuated(self, joints: Float[Tensor, " j"]) -> Float[Tensor, " h"]:
+        """Return the actuated joints that come nearest to all joints, each weighted with its stiffness."""
+        weighted = self.model.coupling * self.model.kp[:, None]
+        return weighted.T @ (joints - self.model.offset) / self.stiffness

@@ -1,0 +1,1 @@
+"""Simulated trials: lifts, pulls, protocols and scores."""

@@ -1,0 +1,1 @@
+"""Grasps and surfaces for other programs."""

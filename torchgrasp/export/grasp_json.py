@@ -1,0 +1,110 @@
+"""Grasps as others can replay them: three poses of named joints with forces, torques, frames and units, as plain JSON.
+
+DexGraspBench's own .npy is not written: it is a pickled dictionary, which can run code when it is read.
+"""
+
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from torchgrasp.control.closing import POSE_TIME
+from torchgrasp.control.squeeze import squeeze
+from torchgrasp.errors import Status
+from torchgrasp.files import format_json
+from torchgrasp.frames import rotate
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.urdf import read_urdf
+from torchgrasp.ik.approach import DISTANCE
+from torchgrasp.values import Grasps
+
+VERSION = 2
+"""Of the layout."""
+
+CONVENTIONS = {
+    "units": {"length": "m", "angle": "rad", "force": "N", "torque": "N m", "stiffness": "N m/rad", "time": "s"},
+    "frames": {
+        "object": "the frame of the cloud that the grasp was planned on",
+        "hand": "the root link of the hand's URDF",
+    },
+    "pose": "position p and unit quaternion (w, x, y, z) of the hand in the object's frame: x_object = R x_hand + p",
+    "approach": "unit direction in the object's frame in which the hand comes to its pose, opened, by the distance",
+    "joints": "by the names of the hand's URDF, all that move: actuated, coupled and parked",
+    "squeeze": "targets of position-controlled joints: stiffness (squeeze - grasp) = torque = J^T force",
+    "force": "of the fingertip on the object at its contact, in the object's frame",
+}
+"""What the numbers mean; it is a part of the file."""
+
+
+def format_grasps(grasps: Grasps, hand: Hand, force: float = 4.0) -> str:
+    """Return grasps as JSON: for each the pose, three postures by joint name, contacts, forces, torques and checks.
+
+    The hand comes to "pose" along "approach" with its joints at "pregrasp", closes to "grasp" in the time given, and
+    presses towards "squeeze" in as much again, all joints moving evenly.
+
+    Args:
+        grasps: g rows.
+        hand: the hand that they were planned for.
+        force: normal force of the strongest finger [N].
+
+    Raises:
+        BadArgument: joints of another hand, or a force that is not positive.
+    """
+    pressed = squeeze(grasps, hand, force)
+    forces = rotate(grasps.obj_from_hand.double(), pressed.forces)
+    postures = {"pregrasp": grasps.pregrasp.double(), "grasp": grasps.joints.double(), "squeeze": pressed.joints}
+    named = {name: hand.expand(joints) for name, joints in postures.items()}
+    rows = [
+        {
+            "rank": row,
+            "status": Status(int(grasps.status[row])).name,
+            "success": float(grasps.success[row]),
+            "pose": _pose(grasps.obj_from_hand[row]),
+            "approach": {"direction": grasps.approach[row].tolist(), "distance": DISTANCE},
+            "joints": {name: {joint: float(q[row]) for joint, q in all_.items()} for name, all_ in named.items()},
+            "torque": dict(zip(hand.joint_names, pressed.torques[row].tolist(), strict=True)),
+            "contacts": [
+                {
+                    "finger": finger,
+                    "link": link,
+                    "point": grasps.contacts.points[row, i].tolist(),
+                    "normal": grasps.contacts.normals[row, i].tolist(),
+                    "force": forces[row, i].tolist(),
+                    "std_m": float(grasps.contacts.std_m[row, i]),
+                    "tip_error": float(grasps.tip_error[row, i]),
+                }
+                for i, (finger, link) in enumerate(zip(hand.finger_names, hand.tip_links, strict=True))
+            ],
+            "clearance": float(grasps.clearance[row]),
+            "closure_margin": float(grasps.certificate.margin[row]),
+        }
+        for row in range(len(grasps))
+    ]
+    content = {
+        "format": "torchgrasp grasps",
+        "version": VERSION,
+        **CONVENTIONS,
+        "hand": {
+            "name": hand.name,
+            "urdf": hand.urdf_path.name,
+            "root": read_urdf(hand.urdf_path).root,
+            "sha256": hand.sha256,
+        },
+        "actuated": list(hand.joint_names),
+        "stiffness": {name: drive.kp for name, drive in hand.actuators.items()},
+        "strongest_normal_force": force,
+        "time": {"pregrasp": 0.0, "grasp": POSE_TIME, "squeeze": 2 * POSE_TIME},
+        "provenance": grasps.meta,
+        "grasps": rows,
+    }
+    return format_json(content)
+
+
+def _pose(obj_from_hand: Tensor) -> dict[str, list[float]]:
+    """Return a pose as position and quaternion (w, x, y, z)."""
+    return {"position": obj_from_hand[:3, 3].tolist(), "quaternion_wxyz": quaternion(obj_from_hand)}
+
+
+def quaternion(a_from_b: Float[Tensor, "4 4"]) -> list[float]:
+    """Return the rotation of a pose as a unit quaternion (w, x, y, z)."""
+    x, y, z, w = Rotation.from_matrix(a_from_b[:3, :3].double().cpu().numpy()).as_quat()
+    return [float(q) for q in (w, x, y, z)]

@@ -1,0 +1,74 @@
+"""Which pairs of links can meet: learned from random postures, once for a hand, and stored in its hand.toml."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.errors import BadArgument
+from torchgrasp.hand.kinematics import kinematics_from_urdf
+from torchgrasp.hand.self_collision import self_collision_from_urdf
+from torchgrasp.hand.urdf import Urdf
+
+NEAR = 0.002
+"""Links that come nearer than this [m] in some posture are a pair to test."""
+ALWAYS = 0.98
+"""Links that overlap in a larger share of the postures do so by construction, and are no pair to test."""
+CHUNK = 1000
+
+
+def collision_pairs(
+    urdf: Urdf, coupling: Mapping[str, tuple[str, float, float]], n: int = 20_000, seed: int = 0
+) -> list[tuple[str, str]]:
+    """Return the pairs of links that meet in some postures of a hand, but not in nearly all, and share no joint.
+
+    The postures are uniform within the limits of every joint, so that the list serves all finger options. The test is
+    exact for boxes and balls (`torchgrasp.hand.self_collision`).
+
+    Args:
+        urdf: the hand's tree, with collision shapes.
+        coupling: which joint follows which, as joint: (source, ratio, offset); the other joints move freely.
+        n: how many postures.
+        seed: of the draws.
+
+    Raises:
+        BadArgument: n outside [1, 10^7], or a coupling with joints that the URDF does not have.
+
+    >>> from torchgrasp.hand.load import find_hand
+    >>> from torchgrasp.hand.urdf import read_urdf
+    >>> collision_pairs(read_urdf(find_hand("allegro") / "hand.urdf"), {}, n=100)[0]
+    ('palm', 'thumb_medial')
+    """
+    if not 1 <= n <= 10**7:
+        raise BadArgument("n", n, "a whole number in [1, 10^7]")
+    tree, every = kinematics_from_urdf(urdf), self_collision_from_urdf(urdf, None)
+    if not len(every.pairs):
+        return []
+    links, owner = torch.unique(every.link[every.pairs].sort(1).values, dim=0, return_inverse=True)
+    met, near = torch.zeros(2, len(links))
+    for values in draw_postures(urdf, coupling, n, seed).split(CHUNK, 1):
+        apart = every.separations(tree.frames(values), NEAR)
+        apart = apart.new_full((len(links), apart.shape[1]), torch.inf).scatter_reduce(
+            0, owner[:, None].expand_as(apart), apart, "amin"
+        )
+        met += (apart < 0).sum(1)
+        near += (apart < NEAR).sum(1)
+    kept = links[(near > 0) & (met <= ALWAYS * n)]
+    return [(tree.link_names[i], tree.link_names[j]) for i, j in kept.tolist()]
+
+
+def draw_postures(
+    urdf: Urdf, coupling: Mapping[str, tuple[str, float, float]], n: int, seed: int
+) -> Float[Tensor, "j n"]:
+    """Draw every movable joint uniformly, but those that follow another."""
+    movable = {j.name: j for j in urdf.joints if j.kind != "fixed"}
+    unknown = sorted(({*coupling} | {source for source, _, _ in coupling.values()}) - set(movable))
+    if unknown:
+        raise BadArgument("coupling", unknown[0], f"joints of the URDF: {sorted(movable)}")
+    share = np.random.default_rng(seed).random((len(movable), n))
+    drawn = {name: j.lower + (j.upper - j.lower) * share[k] for k, (name, j) in enumerate(movable.items())}
+    for joint, (source, ratio, offset) in coupling.items():
+        drawn[joint] = ratio * drawn[source] + offset
+    return torch.from_numpy(np.stack([drawn[name] for name in movable]))

@@ -1,0 +1,1 @@
+"""Inverse kinematics: hand configurations that reach planned contacts."""

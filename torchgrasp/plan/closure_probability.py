@@ -1,0 +1,97 @@
+"""How probable it is that planned contacts are closed on the real surface, of which only a posterior is known.
+
+The fingers come along the planned normals and touch where they meet a surface drawn from the posterior (`plan/lines`).
+The draw is closed if the three points they touch, with the normals there, are for round cones.
+"""
+
+import dataclasses
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.base import Batch
+from torchgrasp.errors import BadArgument
+from torchgrasp.plan.bound import closure_bound
+from torchgrasp.plan.surface_samples import SurfaceSamples, first_contact, sample_surfaces
+from torchgrasp.plan.wrench import closed_exact
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.specs import ContactSpec
+from torchgrasp.values import Contacts
+
+CHUNK = 8192
+"""Drawn triples that are judged at a time."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ClosureProbability(Batch):
+    """The `probability` that each triple is closed, with its `standard_error`, and a proven `lower_bound` of it."""
+
+    probability: Float[Tensor, "b"]
+    standard_error: Float[Tensor, "b"]
+    lower_bound: Float[Tensor, "b"]
+
+
+def closure_probability(
+    shape: ShapeGP, contacts: Contacts, spec: ContactSpec | None = None, n: int = 2500, seed: int = 0
+) -> ClosureProbability:
+    """Return how probable closure is on the uncertain surface, by Monte Carlo and by a bound from below.
+
+    `spec.max_variance` says which contacts are allowed, the probability which of them to prefer:
+    `plan[probability.probability.argsort(descending=True)]` ranks a plan. All rows share the same draws, so that
+    their order does not hang on chance alone, and no row depends on those beside it.
+
+    Args:
+        shape: the posterior.
+        contacts: triples [m] of any planner with outward unit normals, within the domain of the shape. A finger that
+            meets no surface within 12 standard deviations of its contact does not close.
+        spec: its `friction`, that of execution, is the one that counts, not the smaller `planned_friction`.
+        n: draws; the standard error is at most 1 / (2 sqrt(n)), 0.01 with 2500. It is that of (k + 1) / (n + 2)
+            after k closed draws, and never 0.
+        seed: of the draws.
+
+    Raises:
+        BadArgument: a wrong argument, or a contact that is not finite or outside the shape's domain.
+
+    >>> from torchgrasp.linalg import unit
+    >>> from torchgrasp import PointCloud, fit_shape
+    >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
+    >>> corners = torch.tensor([[[1.0, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0]]])
+    >>> contacts = Contacts(0.04 * corners, corners, torch.zeros(1, 3), torch.zeros(1, 3))
+    >>> closure_probability(fit_shape(PointCloud(0.04 * ball, ball)), contacts).probability > 0.9
+    tensor([True])
+    """
+    spec = ContactSpec() if spec is None else spec
+    if not isinstance(shape, ShapeGP):
+        raise BadArgument("shape", type(shape).__name__, "a ShapeGP")
+    if not isinstance(spec, ContactSpec):
+        raise BadArgument("spec", type(spec).__name__, "a ContactSpec")
+    for name, value, least in (("n", n, 1), ("seed", seed, 0)):
+        if not isinstance(value, int) or not least <= value < 2**63:
+            raise BadArgument(name, value, f"an integer from {least}")
+    lines = sample_surfaces(shape, contacts)
+    closed = closure_share(lines, spec.friction, n, seed)
+    middle = (n * closed + 1) / (n + 2)
+    error = torch.sqrt(middle * (1 - middle) / n)
+    return ClosureProbability(closed, error, closure_bound(lines, spec.friction))
+
+
+def closure_share(lines: SurfaceSamples, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:
+    """Draw the surface along the fingers' lines and return the share of draws that are closed.
+
+    Args:
+        lines: of the triples.
+        friction: of the round cones.
+        n: draws, the same for all triples.
+        seed: of the draws.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    count = lines.points.new_zeros(len(lines))
+    at_once = min(n, CHUNK)
+    for start in range(0, n, at_once):
+        standard = torch.randn(min(at_once, n - start), lines.root.shape[-1], dtype=torch.float64, generator=generator)
+        for rows in torch.arange(len(lines), device=count.device).split(max(CHUNK // len(standard), 1)):
+            points, normals = first_contact(lines[rows], standard.to(count) @ lines.root[rows])
+            closed = closed_exact(points.flatten(0, 1), normals.flatten(0, 1), friction)
+            count[rows] += closed.unflatten(0, points.shape[:2]).sum(1)
+    return count / n

@@ -1,0 +1,121 @@
+"""Internal forces of three contacts: in equilibrium, and with the least tangential part.
+
+The grasp map of three points has a null space of three dimensions: a push along each side of the triangle. Every
+balanced set of forces is such a combination, so the search is over directions in three dimensions whatever the grasp,
+and balance holds by construction.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.linalg import unit
+
+DIRECTIONS = 1024
+"""Directions in the null space that are tried before the search closes in on the best."""
+
+REFINEMENTS = 24
+"""Rounds of the search, each within 0.75 times the distance of the one before: 0.06 rad down to 1e-4 rad."""
+
+EVENNESS = 0.01
+"""Worth of equal normal forces against the friction angle (its tangent): it decides only between equally good sets."""
+
+LEANING = 0.2
+"""Worth of the wished proportions of the normal forces against the friction angle (its tangent)."""
+
+
+def internal_forces(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3 3"]:
+    """Return the null space of the grasp map: `[..., k, i, :]` is the force at contact i when pair k is pressed.
+
+    Pairs are (0, 1), (1, 2) and (2, 0); each presses along its side of the triangle, so forces and torques cancel.
+
+    >>> internal_forces(torch.eye(3)).sum(1).abs().max()
+    tensor(0.)
+    """
+    sides = unit(points.roll(-1, dims=-2) - points)
+    basis = torch.zeros(*points.shape[:-2], 3, 3, 3, dtype=points.dtype, device=points.device)
+    for pair in range(3):
+        basis[..., pair, pair, :] = sides[..., pair, :]
+        basis[..., pair, (pair + 1) % 3, :] = -sides[..., pair, :]
+    return basis
+
+
+def tangential_ratio(forces: Float[Tensor, "*b 3 3"], normals: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
+    """Return tangential over normal force at each contact: the friction it needs; infinite where it pulls."""
+    push = -(forces * normals).sum(-1)
+    tangential = torch.linalg.vector_norm(forces + push[..., None] * normals, dim=-1)
+    return torch.where(push > 0, tangential / push.clamp_min(1e-12), torch.inf)
+
+
+def least_friction_forces(
+    points: Float[Tensor, "*b 3 3"],
+    normals: Float[Tensor, "*b 3 3"],
+    strongest: float = 4.0,
+    wish: Float[Tensor, "*#b 3"] | None = None,
+) -> Float[Tensor, "*b 3 3"]:
+    """Return forces of the fingers on the object [N] in equilibrium that need the least friction.
+
+    They lie inside a friction cone whenever any balanced set does, because the largest ratio of tangential to normal
+    force is what is minimised (a quasi-convex problem in the two-dimensional sphere of the null space). For two
+    fingers against a thumb the thumb's force is the sum of the others'.
+
+    Args:
+        points: contacts [m].
+        normals: outward unit normals of the object.
+        strongest: normal force of the strongest finger [N].
+        wish: normal forces, whose proportions decide between sets that need nearly the same friction; None: equal ones.
+
+    Returns:
+        Forces; NaN rows where no balanced set pushes at all three contacts.
+
+    >>> points = torch.tensor([[[0.0, 1, 0], [0, 0, 0], [1, 0.5, 0]]])
+    >>> normals = torch.tensor([[[-1.0, 0, 0], [-1, 0, 0], [1, 0, 0]]])
+    >>> least_friction_forces(points, normals, 2.0)[0, :, 0].round(decimals=2)
+    tensor([ 1.,  1., -2.])
+    """
+    basis = internal_forces(points)
+    spots = fibonacci_sphere(DIRECTIONS, points)
+    shape = points.shape[:-2]
+    wish = None if wish is None else (wish / wish.amax(-1, keepdim=True))[..., None, :]
+    weights, cost = _best(spots.expand(*shape, -1, 3), basis, normals, wish)
+    near, reach = fibonacci_sphere(64, points), 4 / math.sqrt(DIRECTIONS)
+    for _ in range(REFINEMENTS):
+        around = unit(weights[..., None, :] + reach * near)
+        around = torch.cat([weights[..., None, :], around], dim=-2)
+        weights, cost = _best(around, basis, normals, wish)
+        reach *= 0.75
+    forces = torch.einsum("...k,...kci->...ci", weights, basis)
+    push = -(forces * normals).sum(-1)
+    scaled = forces * (strongest / push.amax(-1))[..., None, None]
+    return torch.where(torch.isfinite(cost)[..., None, None], scaled, torch.nan)
+
+
+def fibonacci_sphere(count: int, like: Tensor) -> Float[Tensor, "k 3"]:
+    """Return `count` points spread evenly over the unit sphere, in the dtype and on the device of `like`."""
+    k = torch.arange(count, dtype=like.dtype, device=like.device)
+    z = 1 - (2 * k + 1) / count
+    angle = k * (math.pi * (3 - math.sqrt(5)))
+    radius = torch.sqrt(1 - z * z)
+    return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle), z], dim=-1)
+
+
+def _best(
+    weights: Float[Tensor, "*b k 3"],
+    basis: Float[Tensor, "*b 3 3 3"],
+    normals: Float[Tensor, "*b 3 3"],
+    wish: Float[Tensor, "*#b 1 3"] | None,
+) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b"]]:
+    """Return the combination that needs the least friction among k, and its cost (infinite: some contact pulls)."""
+    forces = torch.einsum("...jk,...kci->...jci", weights, basis)
+    normals = normals[..., None, :, :]
+    push = -(forces * normals).sum(-1)
+    if wish is None:
+        preference = EVENNESS * push.amax(-1) / push.amin(-1).clamp_min(1e-12)
+    else:
+        preference = LEANING * torch.linalg.vector_norm(push / push.amax(-1, keepdim=True) - wish, dim=-1)
+    cost = tangential_ratio(forces, normals.expand_as(forces)).amax(-1) + preference
+    least = cost.argmin(-1)
+    index = least[..., None, None].expand(*least.shape, 1, 3)
+    return weights.gather(-2, index)[..., 0, :], cost.gather(-1, least[..., None])[..., 0]

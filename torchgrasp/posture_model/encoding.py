@@ -1,0 +1,78 @@
+"""The frame-invariant code of three contacts, by which the learned model of a hand is asked (Eq. 18)."""
+
+import itertools
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.base import check_tensor
+from torchgrasp.errors import BadArgument, Status
+from torchgrasp.frames import degenerate, virtual_frame
+from torchgrasp.values import ContactCode, Contacts
+
+PERMUTATIONS: tuple[tuple[int, int, int], ...] = tuple(itertools.permutations(range(3)))  # pyright: ignore[reportAssignmentType]
+"""The six ways to give three contacts to three fingers: finger i touches contact `PERMUTATIONS[k][i]`."""
+
+CODE_NAMES = ("L1", "L2", "L3", "N1", "N2", "N3")
+"""The six numbers of a code q = (L, N): three lengths [m], three cosines."""
+
+
+def encode_fingertips(points: Float[Tensor, "*b 3 3"], normals: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 6"]:
+    """Return the code q = (L, N) of three points with unit normals, Eq. (18).
+
+    L_i is the distance [m] of point i from the centre of the three; N holds the cosines n1.n2, n1.n3 and n2.n3. The
+    code does not change when points and normals move rigidly, nor when all three normals are negated: so fingertips,
+    whose outward normals oppose those of the object, have the code of the contacts they touch. Nor does it change
+    when the points or the normals alone are mirrored or turned together: every match has to be checked afterwards.
+
+    Args:
+        points: fingertips or contacts [m] in the order of the fingers, any frame.
+        normals: their unit normals, same frame.
+
+    >>> encode_fingertips(torch.eye(3), torch.eye(3))[3:]
+    tensor([0., 0., 0.])
+    """
+    lengths = torch.linalg.vector_norm(points - points.mean(-2, keepdim=True), dim=-1)
+    n1, n2, n3 = normals.unbind(-2)
+    cosines = torch.stack([(n1 * n2).sum(-1), (n1 * n3).sum(-1), (n2 * n3).sum(-1)], dim=-1)
+    return torch.cat([lengths, cosines], dim=-1)
+
+
+def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
+    """Encode contact triples for all six assignments of contacts to fingers, Eqs. (15)-(18).
+
+    Args:
+        contacts: `Contacts`, or a pair (points (b, 3, 3) [m], unit normals (b, 3, 3)).
+
+    Returns:
+        The code of each assignment, and the virtual frame of the contacts in the order of the fingers. A triple that
+        spans no frame holds NaN and `Status.DEGENERATE`.
+
+    Raises:
+        BadArgument: wrong shapes, non-finite numbers, or normals that are not of length 1 within 1e-3.
+
+    >>> encode((torch.eye(3)[None], torch.eye(3)[None])).q.shape
+    torch.Size([1, 6, 6])
+    """
+    points, normals = (contacts.points, contacts.normals) if isinstance(contacts, Contacts) else contacts
+    check_tensor("points", points, (None, 3, 3))
+    check_tensor("normals", normals, (len(points), 3, 3))
+    lengths = torch.linalg.vector_norm(normals, dim=-1)
+    if bool(((lengths - 1).abs() > 1e-3).any()):
+        worst = lengths.flatten()[(lengths - 1).abs().argmax()].item()
+        raise BadArgument("normals", f"a normal of length {worst:.6g}", "unit vectors")
+    order = torch.tensor(PERMUTATIONS, device=points.device)
+    ordered_points, ordered_normals = points[:, order], normals[:, order]  # (b, 6, 3, 3)
+    flat = degenerate(ordered_points).any(1)  # of any order: at the threshold rounding may tell them apart
+    bad = flat[:, None, None]
+    # A row without a frame borrows a harmless triangle, so that the others can be framed in one call.
+    harmless = torch.eye(3, dtype=points.dtype, device=points.device)
+    frames = virtual_frame(torch.where(bad[..., None], harmless, ordered_points))
+    nan = torch.full((), float("nan"), dtype=points.dtype, device=points.device)
+    return ContactCode(
+        q=torch.where(bad, nan, encode_fingertips(ordered_points, ordered_normals)),
+        obj_from_vf=torch.where(bad[..., None], nan, frames),
+        status=torch.where(flat, int(Status.DEGENERATE), int(Status.OK)),
+        permutation=order,
+    )

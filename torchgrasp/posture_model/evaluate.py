@@ -1,0 +1,103 @@
+"""What a learned model is worth on postures that its fit has not seen (Sec. 6.3)."""
+
+import dataclasses
+
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.base import Value
+from torchgrasp.errors import BadArgument
+from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture
+from torchgrasp.posture_model.sample import HandSamples
+
+MODES = 4
+"""Modes of the conditional mixture of which the nearest is judged beside the conditional mean."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MixtureScore(Value):
+    """The errors of a model on held-out postures.
+
+    Args:
+        joint_names: of the errors.
+        error: mean absolute error of the conditional mean, Eq. (23), of each joint [rad].
+        deviation: standard deviation of the absolute error over the postures [rad].
+        nearest_mode: mean absolute error over all joints of the nearest of the first `MODES` modes [rad].
+        paper_coverage: share of codes within `PAPER_ENERGY`.
+        default_coverage: share of codes within `DEFAULT_ENERGY`.
+        log_likelihood: mean over the postures [nats].
+        postures: how many.
+    """
+
+    joint_names: tuple[str, ...]
+    error: Float[Tensor, "h"]
+    deviation: Float[Tensor, "h"]
+    nearest_mode: float
+    paper_coverage: float
+    default_coverage: float
+    log_likelihood: float
+    postures: int
+
+    @property
+    def mean_error(self) -> float:
+        """The mean absolute error over all joints [rad]."""
+        return float(self.error.mean())
+
+    def __str__(self) -> str:
+        """Return the table that the paper calls Table 5 and Fig. 8, and the acceptance of Eq. (21)."""
+        rows = zip(self.joint_names, self.error.tolist(), self.deviation.tolist(), strict=True)
+        lines = [f"  {name:20s} {error:.3f} +- {deviation:.3f}" for name, error, deviation in rows]
+        return "\n".join(
+            [
+                f"mean absolute error on {self.postures} held-out postures [rad]: Eq. (23) +- deviation over postures",
+                *lines,
+                f"  {'all joints':20s} {self.mean_error:.3f}; the nearest of {MODES} modes {self.nearest_mode:.3f}",
+                f"within reach: {self.paper_coverage:.4f} at the paper's {PAPER_ENERGY:g}, "
+                f"{self.default_coverage:.4f} at the default {DEFAULT_ENERGY:.3f}",
+                f"log-likelihood a held-out posture: {self.log_likelihood:.6f}",
+            ]
+        )
+
+    def meta(self) -> dict[str, str]:
+        """Return what a mixture's file tells of it."""
+        return {
+            "held_out": str(self.postures),
+            "held_out_log_likelihood": f"{self.log_likelihood:.6f}",
+            "acceptance_paper_coverage": f"{self.paper_coverage:.4f}",
+            "acceptance_default_coverage": f"{self.default_coverage:.4f}",
+            "mean_absolute_error": f"{self.mean_error:.4f}",
+            "mean_absolute_errors": " ".join(f"{error:.4f}" for error in self.error.tolist()),
+        }
+
+
+def evaluate_mixture(mixture: GraspMixture, samples: HandSamples) -> MixtureScore:
+    """Measure a model on postures that its fit has not seen.
+
+    Raises:
+        BadArgument: samples of other joints, or fewer than two.
+
+    >>> from torchgrasp.hand.load import load_hand
+    >>> from torchgrasp.posture_model.mixture import load_mixture
+    >>> from torchgrasp.posture_model.sample import sample_configurations
+    >>> samples = sample_configurations(load_hand("barrett"), 500, seed=9)
+    >>> evaluate_mixture(load_mixture("barrett"), samples).mean_error < 0.2
+    True
+    """
+    if samples.joint_names != mixture.joint_names:
+        raise BadArgument("samples", f"joints {samples.joint_names}", f"the mixture's {mixture.joint_names}")
+    if len(samples) < 2:
+        raise BadArgument("samples", f"{len(samples)} postures", "at least 2")
+    joints, q = samples.joints.double(), samples.q.double()
+    error = (mixture.joints(q) - joints).abs()
+    modes = mixture.modes(q, min(MODES, len(mixture.weights)))[0]
+    reach = mixture.energy(q)
+    return MixtureScore(
+        joint_names=samples.joint_names,
+        error=error.mean(0),
+        deviation=error.std(0),
+        nearest_mode=float((modes - joints[:, None]).abs().mean(-1).amin(-1).mean()),
+        paper_coverage=float((reach < PAPER_ENERGY).double().mean()),
+        default_coverage=float((reach < DEFAULT_ENERGY).double().mean()),
+        log_likelihood=float(mixture.log_prob(samples.rows().double()).mean()),
+        postures=len(samples),
+    )

@@ -1,0 +1,1 @@
+"""What is known of the side that the camera did not see."""

@@ -1,0 +1,87 @@
+"""The joint posterior of distances and normals at several points, and samples of it."""
+
+import dataclasses
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.base import Value
+from torchgrasp.errors import IndefiniteCovariance
+from torchgrasp.shape.gradient_kernel import gram
+from torchgrasp.shape.posterior import Posterior
+
+ROUNDING = 1e-8
+"""Eigenvalues of a posterior covariance above minus this times the prior variance are zeros, rounded."""
+
+
+@dataclasses.dataclass(frozen=True)
+class JointEstimate(Value):
+    """The joint posterior of (d, w) at k points, normalised: `mean` and `covariance`, point by point.
+
+    `w` is the gradient of the distance, not of unit length. `covariance.reshape(k, 4, k, 4)` has the block of points
+    i and j at [i, :, j].
+    """
+
+    mean: Float[Tensor, "k 4"]
+    covariance: Float[Tensor, "rows rows"]
+
+
+def joint_estimate(posterior: Posterior, x: Float[Tensor, "k 3"]) -> JointEstimate:
+    """Return the mean and the 4k x 4k covariance of (d, w) at normalised points, Eqs. (7)-(8) for all at once."""
+    k = len(x)
+    cross = posterior.cross(x)
+    mean = (cross @ posterior.weights).T
+    by_point = posterior.ordered(cross.transpose(0, 1).flatten(0, 1).T)
+    whitened = torch.linalg.solve_triangular(posterior.factor, by_point, upper=False)
+    prior = gram(posterior.kernel, x, k)
+    prior = prior.reshape(4, k, 4, k).permute(1, 0, 3, 2).reshape(4 * k, 4 * k)
+    return JointEstimate(mean, prior - whitened.T @ whitened)
+
+
+def distance_covariance(posterior: Posterior, x: Float[Tensor, "b k 3"]) -> Float[Tensor, "b k k"]:
+    """Return the covariances of the distances alone at each of many sets of normalised points, Eq. (8)."""
+    b, k = x.shape[:2]
+    cross = posterior.cross(x.flatten(0, 1))[0]
+    whitened = torch.linalg.solve_triangular(posterior.factor, posterior.ordered(cross.T), upper=False)
+    whitened = whitened.T.reshape(b, k, len(posterior.factor))
+    prior = posterior.kernel.profile(torch.linalg.vector_norm(x[:, :, None] - x[:, None], dim=-1))
+    return prior - whitened @ whitened.mT
+
+
+def symmetric_root(covariance: Float[Tensor, "*b k k"], prior: float, remedy: str) -> Float[Tensor, "*b k k"]:
+    """Return the symmetric root of covariances, which no choice of basis among equal eigenvalues changes.
+
+    Points that coincide, or that are known exactly, leave eigenvalues of zero, which rounding makes negative: those
+    within `ROUNDING` of zero are zero.
+
+    Args:
+        covariance: positive semidefinite to rounding.
+        prior: the prior variance of a distance, the scale of rounding.
+        remedy: what to do about one that is not.
+
+    Raises:
+        IndefiniteCovariance: an eigenvalue is negative by more than rounding.
+    """
+    values, vectors = torch.linalg.eigh(covariance)
+    if values.numel() and not float(values.min()) >= -ROUNDING * prior:
+        raise IndefiniteCovariance("the joint covariance", float(values.min()), remedy)
+    return (vectors * torch.where(values > 0, values, 0.0).sqrt()[..., None, :]) @ vectors.mT
+
+
+def draw_samples(joint: JointEstimate, prior: float, n: int, seed: int) -> Float[Tensor, "n k 4"]:
+    """Draw from a joint posterior with the symmetric root of its covariance.
+
+    Args:
+        joint: what to draw from.
+        prior: the prior variance of a distance, the scale of rounding.
+        n: number of samples.
+        seed: of the draws.
+
+    Raises:
+        IndefiniteCovariance: an eigenvalue is negative by more than rounding.
+    """
+    root = symmetric_root(joint.covariance, prior, "query points within the domain")
+    generator = torch.Generator().manual_seed(seed)
+    draws = torch.randn(n, len(root), dtype=torch.float64, generator=generator).to(root)
+    return joint.mean + (draws @ root).reshape(n, *joint.mean.shape)

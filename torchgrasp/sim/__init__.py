@@ -1,0 +1,1 @@
+"""The simulated world that a controller acts in: SAPIEN or MuJoCo."""

@@ -1,0 +1,22 @@
+"""The simulators of a scene, by name; each is loaded when it is asked for."""
+
+from torchgrasp.sim.scene import Scene, SceneSpec
+from torchgrasp.specs import check_simulator
+
+
+def open_scene(setup: SceneSpec, simulator: str = "sapien") -> Scene:
+    """Return a fresh scene at its start.
+
+    Raises:
+        BadArgument: an unknown simulator, or a joint of the hand without a position or drive.
+        HandFileError: the hand's URDF is no sound one.
+        MissingExtra: the simulator is not installed.
+    """
+    check_simulator(simulator)
+    if simulator == "mujoco":
+        from torchgrasp.sim.mujoco_scene import MujocoScene
+
+        return MujocoScene(setup)
+    from torchgrasp.sim.sapien_scene import SapienScene
+
+    return SapienScene(setup)

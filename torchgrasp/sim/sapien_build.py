@@ -1,0 +1,132 @@
+"""Build a scene in SAPIEN.
+
+Settings that differ from SAPIEN's defaults each have a measured reason: joints get an armature of 1e-3 kg m^2 (without
+it the implicit drives lose a third of their torque in a contact), friction 0.8 or as told on every shape, the hand's
+links feel neither gravity nor each other, sleeping is off (a sleeping body keeps stale contacts), the object's inertia
+is set with its mass, and penetrations are resolved at 1 m/s at most. PhysX keeps 255 faces of a convex part at most: a
+ball of 30 mm loses up to 0.5 mm, and a finely divided cylinder becomes an 18-gon.
+"""
+
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from torchgrasp.errors import MissingExtra
+from torchgrasp.sim.mount import MOUNT_DRIVE, mount_slides, mounted_urdf
+from torchgrasp.sim.scene import ARMATURE, TABLE, SceneSpec, check_drives
+
+
+class Built(NamedTuple):
+    """SAPIEN's own objects: the system that computes, the scene that steps, the object's body and the hand."""
+
+    system: Any
+    scene: Any
+    body: Any
+    hand: Any
+
+
+def build(setup: SceneSpec) -> Built:
+    """Return a scene with table, object and hand at their start.
+
+    Raises:
+        BadArgument: a joint of the hand without a position or drive.
+        MissingExtra: SAPIEN is not installed.
+    """
+    sapien, physx = _import_sapien()
+    physx.set_scene_config(gravity=np.array([0, 0, -setup.gravity], np.float32), enable_tgs=True, enable_pcm=True)
+    physx.set_shape_config(contact_offset=0.002, rest_offset=0.0)
+    physx.set_body_config(solver_position_iterations=10, solver_velocity_iterations=1, sleep_threshold=0.0)
+    system = physx.PhysxCpuSystem()
+    scene = sapien.Scene([system])
+    scene.timestep = setup.timestep
+    material = physx.PhysxMaterial(setup.friction, setup.friction, 0.0)
+    if setup.table:
+        _place(sapien, scene, "table", _table(physx, material), float(setup.mesh.bounds[0, 2]) - TABLE[2] / 2)
+    body = _object(sapien, physx, material, setup)
+    _place(sapien, scene, "object", body, 0.0)
+    return Built(system, scene, body, _hand(scene, material, setup))
+
+
+def _place(sapien: Any, scene: Any, name: str, body: Any, height: float) -> None:
+    """Add an entity of one body to the scene, at a height [m] above the origin."""
+    entity = sapien.Entity()
+    entity.name = name
+    entity.add_component(body)
+    entity.set_pose(sapien.Pose([0.0, 0.0, height]))
+    scene.add_entity(entity)
+
+
+def _table(physx: Any, material: Any) -> Any:
+    """Return a box to put under the object."""
+    body = physx.PhysxRigidStaticComponent()
+    body.attach(physx.PhysxCollisionShapeBox(np.array(TABLE, np.float32) / 2, material))
+    return body
+
+
+def _object(sapien: Any, physx: Any, material: Any, setup: SceneSpec) -> Any:
+    """Return the object where its mesh is; mass centre and inertia are those of the mesh, filled evenly."""
+    body = physx.PhysxRigidDynamicComponent()
+    for part in setup.parts:
+        vertices = np.asarray(part.vertices, np.float32)
+        shape = physx.PhysxCollisionShapeConvexMesh(vertices, np.ones(3, np.float32), material)
+        shape.min_patch_radius = setup.patch
+        body.attach(shape)
+    moments, axes = np.linalg.eigh(np.asarray(setup.mesh.moment_inertia) * (setup.mass / setup.mesh.volume))
+    axes = axes * np.array([1.0, 1.0, np.sign(np.linalg.det(axes))])
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = axes, setup.mesh.center_mass
+    body.mass = setup.mass
+    body.cmass_local_pose = sapien.Pose(frame)
+    body.inertia = moments.astype(np.float32)
+    body.max_depenetration_velocity = 1.0
+    body.linear_damping = body.angular_damping = 0.0
+    return body
+
+
+def _hand(scene: Any, material: Any, setup: SceneSpec) -> Any:
+    """Load the hand, strip what the simulator gets wrong, and set it to its start."""
+    loader = scene.create_urdf_loader()
+    loader.fix_root_link = True
+    loader.set_material(material.static_friction, material.dynamic_friction, 0.0)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "hand.urdf"
+        file.write_text(mounted_urdf(setup), encoding="utf-8")
+        hand = loader.load(str(file))
+    slides = {slide.name: slide for slide in mount_slides(setup)}
+    check_drives(setup, [j.name for j in hand.active_joints if j.name not in slides])
+    start = []
+    for joint in hand.active_joints:
+        joint.set_friction(0.0)
+        if joint.name in slides:
+            drive, position = MOUNT_DRIVE, slides[joint.name].start
+        else:
+            drive, position = setup.drives[joint.name], float(setup.joints[joint.name])
+            joint.set_armature(np.array([ARMATURE], np.float32))
+        joint.set_drive_properties(drive.kp, drive.kd, force_limit=drive.effort)
+        joint.set_drive_target(position)
+        start.append(position)
+    hand.set_qpos(np.array(start, np.float32))
+    for link in hand.links:
+        link.disable_gravity = True
+        for shape in link.collision_shapes:
+            groups = shape.get_collision_groups()
+            groups[2] |= 1  # shapes that share such a bit do not collide: the hand with itself
+            shape.set_collision_groups(groups)
+            if link.name in setup.tip_links:
+                shape.min_patch_radius = setup.patch
+    return hand
+
+
+def _import_sapien() -> tuple[Any, Any]:
+    """Import SAPIEN; its warning about a missing system Vulkan does not concern physics."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            import sapien
+            import sapien.physx as physx
+    except ImportError as error:
+        raise MissingExtra("sapien", "sim") from error
+    return sapien, physx
