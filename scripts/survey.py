@@ -10,6 +10,7 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
 
@@ -50,12 +51,12 @@ def words(sentence: str) -> list[str]:
 
 
 def doc_sentences(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """Yield line and text of every sentence in docstrings, those of module-level numbers included, examples left out."""
+    """Yield line and text of every sentence in docstrings; those of numbers count, examples do not."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
             yield from ((getattr(node, "lineno", 1), s) for s in split_sentences(ast.get_docstring(node) or ""))
     body = getattr(tree, "body", [])
-    for before, node in zip(body, body[1:], strict=False):
+    for before, node in pairwise(body):
         if isinstance(before, ast.Assign | ast.AnnAssign) and is_text(node):
             yield from ((node.lineno, s) for s in split_sentences(node.value.value))
 

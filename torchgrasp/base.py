@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument, FailedRows, Status
@@ -74,6 +74,26 @@ def join(parts: Sequence[SomeBatch]) -> SomeBatch:
 
     fields = dataclasses.fields(parts[0])  # pyright: ignore[reportArgumentType]
     return type(parts[0])(**{f.name: together([getattr(part, f.name) for part in parts]) for f in fields})
+
+
+def pick(choose: Bool[Tensor, "b"], new: SomeValue, old: SomeValue) -> SomeValue:
+    """Return the new rows of a value where `choose`, the old ones elsewhere."""
+
+    def merge(a: Any, b: Any) -> Any:
+        return pick(choose, a, b) if isinstance(a, Value) else torch.where(choose.view(-1, *[1] * (a.ndim - 1)), a, b)
+
+    fields = dataclasses.fields(new)  # pyright: ignore[reportArgumentType]
+    return type(new)(**{f.name: merge(getattr(new, f.name), getattr(old, f.name)) for f in fields})
+
+
+def put(whole: SomeValue, at: Int[Tensor, "a"], part: SomeValue) -> SomeValue:
+    """Return a value with `part` in the rows `at`."""
+
+    def place(w: Any, p: Any) -> Any:
+        return put(w, at, p) if isinstance(w, Value) else w.index_copy(0, at, p)
+
+    fields = dataclasses.fields(whole)  # pyright: ignore[reportArgumentType]
+    return type(whole)(**{f.name: place(getattr(whole, f.name), getattr(part, f.name)) for f in fields})
 
 
 def count_status(status: Int[Tensor, "*b"]) -> dict[Status, int]:

@@ -7,8 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch
-from torchgrasp.plan.solver import pick, put
+from torchgrasp.base import Batch, pick, put
 
 State = TypeVar("State", bound=Batch)
 Residuals = tuple[Float[Tensor, "g m"], Float[Tensor, "g m d"]]

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from paper import closing_trials as tables
 from paper.closing_trials import THRESHOLDS, Cell, difference, threshold_cells, trend, trend_over_grasps
 
 from torchgrasp.errors import Status
-from paper import closing_trials as tables
 
 
 def cells(row: str, held: dict[str, int], of: int = 10) -> list[Cell]:

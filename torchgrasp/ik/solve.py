@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch, check_tensor, join
+from torchgrasp.base import Batch, check_tensor, join, pick
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import degenerate
 from torchgrasp.hand.hand import Hand
@@ -25,7 +25,6 @@ from torchgrasp.ik.contact_first import assign, rank_in_group
 from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
 from torchgrasp.ik.query import query_mixture
 from torchgrasp.ik.refine import refine, settle_tips
-from torchgrasp.plan.solver import pick
 from torchgrasp.posture_model.mixture import GraspMixture
 from torchgrasp.values import Contacts, IKSeeds
 

@@ -9,13 +9,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import pick, put
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.linalg import unit
 from torchgrasp.plan.closure_probability import closure_share
 from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.objectives import Cost, epsilon_cost, evaluate_cost, min_weight_cost, slope_of
 from torchgrasp.plan.problem import ContactProblem, Shape
-from torchgrasp.plan.solver import FINISH, Stage, descend, pick, project, put, start_state
+from torchgrasp.plan.solver import FINISH, Stage, descend, project, start_state
 from torchgrasp.plan.surface_samples import sample_surfaces, well_inside
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec

@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import join
+from torchgrasp.base import join, pick, put
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.improve import Improve, Objective, improver
 from torchgrasp.plan.problem import ContactProblem, Shape
-from torchgrasp.plan.solver import FINISH, Stage, descend, pick, project, put, start_state
+from torchgrasp.plan.solver import FINISH, Stage, descend, project, start_state
 from torchgrasp.plan.starts import StartFrom, check_starts, drawn_starts, given_starts
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan

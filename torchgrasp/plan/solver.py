@@ -5,13 +5,12 @@ brought back to the surface by the mean alone, which costs a fraction of a full 
 """
 
 import dataclasses
-from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Batch, SomeValue, Value
+from torchgrasp.base import Batch, pick, put
 from torchgrasp.plan.objectives import Cost, differentiate_cost
 from torchgrasp.plan.problem import Constraints, ContactProblem, Shape, TripleJet, forces_from_tensions, triple_jet
 
@@ -140,16 +139,6 @@ def step(
     return x, reach / shrink, promised if downhill is None else promised + (downhill * x).sum(1)
 
 
-def pick(choose: Bool[Tensor, "b"], new: SomeValue, old: SomeValue) -> SomeValue:
-    """Return the new rows of a value where `choose`, the old ones elsewhere."""
-
-    def merge(a: Any, b: Any) -> Any:
-        return pick(choose, a, b) if isinstance(a, Value) else torch.where(choose.view(-1, *[1] * (a.ndim - 1)), a, b)
-
-    fields = dataclasses.fields(new)  # pyright: ignore[reportArgumentType]
-    return type(new)(**{f.name: merge(getattr(new, f.name), getattr(old, f.name)) for f in fields})
-
-
 def average_slopes(rows: Constraints, refused: Constraints) -> Constraints:
     """Return rows with the mean of their slopes and those where a step was refused.
 
@@ -158,16 +147,6 @@ def average_slopes(rows: Constraints, refused: Constraints) -> Constraints:
     """
     names = ("surface_by_x", "bounds_by_x")
     return dataclasses.replace(rows, **{n: (getattr(rows, n) + getattr(refused, n)) / 2 for n in names})
-
-
-def put(whole: SomeValue, at: Int[Tensor, "a"], part: SomeValue) -> SomeValue:
-    """Return a value with `part` in the rows `at`."""
-
-    def place(w: Any, p: Any) -> Any:
-        return put(w, at, p) if isinstance(w, Value) else w.index_copy(0, at, p)
-
-    fields = dataclasses.fields(whole)  # pyright: ignore[reportArgumentType]
-    return type(whole)(**{f.name: place(getattr(whole, f.name), getattr(part, f.name)) for f in fields})
 
 
 def descend(shape: Shape, problem: ContactProblem, state: State, stage: Stage, objective: Cost | None = None) -> State:
