@@ -1,0 +1,131 @@
+"""What the set-up decides about torch, run against a stand-in for Python and pip: nothing is downloaded."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+INDEX = "https://download.example.org/whl/cpu"
+
+STAND_IN = """#!{python}
+# Plays python3 and .venv/bin/python: makes the environment, answers pip from answers.json, runs any other code.
+import json, os, pathlib, shutil, sys
+arguments, here = sys.argv[1:], pathlib.Path({folder!r})
+if arguments[:2] == ["-m", "venv"]:
+    pathlib.Path(".venv/bin").mkdir(parents=True)
+    shutil.copy(here / "python", ".venv/bin/python")
+elif arguments[:2] == ["-m", "pip"]:
+    with open(here / "calls.txt", "a") as calls:
+        print(*arguments[2:], file=calls)
+    answers = json.loads((here / "answers.json").read_text())
+    if arguments[2] == "show":
+        sys.exit(0 if answers["installed"] else 1)
+    if "--report" in arguments:
+        report = answers["index" if "--index-url" in arguments else "configured"]
+        if report is None:
+            sys.exit(1)
+        print(json.dumps(report))
+elif "import sapien" not in arguments[-1]:
+    os.execv({python!r}, [{python!r}, *arguments])
+"""
+
+
+def report(wheel: Path, *needs: str) -> dict:
+    """What pip would say of a torch with these requirements."""
+    metadata = {"name": "torch", "requires_dist": ["filelock", 'numpy; extra == "np"', *needs]}
+    metadata["project_url"] = ["Repository, https://example.org/code", "Homepage, https://example.org"]
+    return {"install": [{"download_info": {"url": wheel.as_uri()}, "metadata": metadata}]}
+
+
+@pytest.fixture
+def set_up(tmp_path):
+    """Return a function that runs scripts/_setup in a copy of the project; it returns the run and pip's calls."""
+    project, fake = tmp_path / "project", tmp_path / "fake"
+    (project / "scripts").mkdir(parents=True)
+    fake.mkdir()
+    for name in ("pyproject.toml", "constraints.txt", "scripts/_setup"):
+        shutil.copy(ROOT / name, project / name)
+    (fake / "python").write_text(STAND_IN.format(python=sys.executable, folder=str(fake)))
+    (fake / "python").chmod(0o755)
+
+    def run(installed=False, configured=None, index=None, **environment):
+        answers = {"installed": installed, "configured": configured, "index": index}
+        (fake / "answers.json").write_text(json.dumps(answers))
+        (fake / "calls.txt").unlink(missing_ok=True)
+        clean = {k: v for k, v in os.environ.items() if not k.startswith(("TORCHGRASP_", "PIP_"))}
+        done = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", "source scripts/_setup"],
+            cwd=project,
+            env={**clean, "PYTHON": str(fake / "python"), **environment},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        calls = (fake / "calls.txt").read_text().splitlines() if (fake / "calls.txt").exists() else []
+        return done, [c for c in calls if c.startswith("install") and "--report" not in c]
+
+    return run
+
+
+@pytest.fixture
+def wheel(tmp_path):
+    path = tmp_path / "torch.whl"
+    path.write_bytes(bytes(150_000_000 // 1000))
+    return path
+
+
+def test_a_cpu_build_is_taken_from_where_pip_looks(set_up, wheel):
+    done, installs = set_up(configured=report(wheel))
+    assert done.returncode == 0, done.stderr
+    assert "torch==" in installs[0] and "--index-url" not in installs[0]
+    assert len(installs) == 2 and "-e .[sim,mujoco,dev]" in installs[1]
+
+
+def test_a_cpu_build_is_looked_for_in_the_projects_own_index(set_up, wheel):
+    done, installs = set_up(configured=report(wheel, "nvidia-cublas-cu12"), index=report(wheel))
+    assert done.returncode == 0, done.stderr
+    assert f"--index-url {INDEX}" in installs[0]
+    assert "CPU build" in done.stdout and "--index-url" not in installs[1]
+
+
+@pytest.mark.parametrize("elsewhere", ["nothing", "cuda"])
+def test_a_cuda_build_is_taken_with_its_size_where_there_is_no_other(set_up, wheel, elsewhere):
+    cuda = report(wheel, "nvidia-cublas-cu12; platform_system == 'Linux'", "triton")
+    wheel.write_bytes(b"")
+    os.truncate(wheel, 2_300_000_000)  # a sparse file: it takes no space
+    done, installs = set_up(configured=cuda, index=cuda if elsewhere == "cuda" else None)
+    assert done.returncode == 0, done.stderr
+    assert "2.3 GB" in done.stdout
+    assert "torch==" in installs[0] and "--index-url" not in installs[0]
+
+
+def test_a_size_that_cannot_be_known_does_not_stop_the_set_up(set_up, wheel):
+    cuda = report(wheel, "nvidia-cublas-cu12")
+    wheel.unlink()
+    done, installs = set_up(configured=cuda)
+    assert done.returncode == 0, done.stderr
+    assert "several GB" in done.stdout and "torch==" in installs[0]
+
+
+@pytest.mark.parametrize("given", [{"installed": True}, {"TORCHGRASP_CUDA": "1"}], ids=["installed", "asked for"])
+def test_a_torch_that_is_installed_or_asked_for_is_not_questioned(set_up, wheel, given):
+    done, installs = set_up(configured=report(wheel, "nvidia-cublas-cu12"), index=report(wheel), **given)
+    assert done.returncode == 0, done.stderr
+    assert "--index-url" not in installs[0] and "CUDA" not in done.stdout
+
+
+def test_no_torch_at_all_is_named(set_up):
+    done, installs = set_up()
+    assert done.returncode == 1 and installs == []
+    assert "pip finds no torch==" in done.stderr
+
+
+def test_a_second_run_does_nothing(set_up, wheel):
+    assert len(set_up(configured=report(wheel))[1]) == 2
+    done, installs = set_up(configured=report(wheel))
+    assert done.returncode == 0 and installs == [] and done.stdout == ""
