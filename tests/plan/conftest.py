@@ -6,8 +6,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchgrasp.values import PointCloud
-
 
 @dataclasses.dataclass(frozen=True)
 class AnalyticJet:
@@ -29,7 +27,6 @@ class Ellipsoid:
     domain_radius: float = 1.35
     std_factor: float = 0.65
     center: tuple[float, float, float] = (0.3, -0.2, 0.5)
-    cloud: PointCloud | None = None
 
     def value(self, x: Tensor) -> Tensor:
         return (((x / x.new_tensor(self.axes)) ** 2).sum(-1) - 1) / 2

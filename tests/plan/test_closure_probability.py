@@ -1,4 +1,4 @@
-"""The probability of closure against surfaces drawn anew, and its bound against the probability."""
+"""The probability of closure against surfaces drawn anew."""
 
 import itertools
 from pathlib import Path
@@ -10,7 +10,6 @@ from torch import Tensor
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
-from torchgrasp.plan.bound import sphere
 from torchgrasp.plan.closure_probability import closure_probability
 from torchgrasp.plan.surface_samples import FOOTPRINT, NODES, finer_grid, first_contact, sample_surfaces
 from torchgrasp.plan.wrench import closed_exact
@@ -59,28 +58,26 @@ def doubtful() -> ShapeGP:
     return ball(-0.2, std_factor=0.4)
 
 
-def test_a_sure_shape_is_sure_to_be_closed_and_the_bound_knows():
+def test_a_sure_shape_is_sure_to_be_closed():
     shape = ball(-2.0, std_factor=0.1)
     angle = torch.tensor([0.1, 2.2, 4.3], dtype=torch.float64)
     corners = torch.stack([angle.cos(), angle.sin(), torch.zeros(3, dtype=torch.float64)], -1)[None]
     none = torch.zeros(1, 3)
     contacts = Contacts(RADIUS * corners, corners, none, none)
     found = closure_probability(shape, contacts)
-    assert float(found.probability) > 0.999 and float(found.lower_bound) > 0.999
+    assert float(found.probability) > 0.999
     assert 0.0 < float(found.standard_error) < 1e-3
     for friction in (0.0, 1e-3):
         none = closure_probability(shape, contacts, ContactSpec(friction=friction))
-        assert float(none.probability) < 0.02 and float(none.lower_bound) == 0.0
+        assert float(none.probability) < 0.02
 
 
-def test_the_bound_is_below_the_probability_and_says_something(doubtful, generator):
+def test_the_probability_is_a_share_with_a_bounded_error(doubtful, generator):
     contacts = contacts_on(doubtful, generator, 100)
     for friction in (0.5, 1.0):
         found = closure_probability(doubtful, contacts, ContactSpec(friction=friction), n=1000)
-        assert bool((found.lower_bound <= found.probability + 3 * found.standard_error).all())
         assert float(found.standard_error.max()) <= 0.5 / 1000**0.5
-        assert bool(((found.lower_bound >= 0) & (found.probability <= 1)).all())
-    assert 0.1 < float((found.lower_bound > 0.3).double().mean()) < 1.0
+        assert bool(((found.probability >= 0) & (found.probability <= 1)).all())
     assert 0.5 < float(found.probability.mean()) < 0.99
 
 
@@ -98,11 +95,10 @@ def test_surfaces_drawn_anew_are_closed_as_often(doubtful, generator, monkeypatc
 def test_rows_do_not_depend_on_each_other_and_a_seed_fixes_every_bit(doubtful, generator):
     contacts = contacts_on(doubtful, generator, 20)
     every, again, other = (closure_probability(doubtful, contacts, n=300, seed=seed) for seed in (3, 3, 4))
-    assert torch.equal(every.probability, again.probability) and torch.equal(every.lower_bound, again.lower_bound)
+    assert torch.equal(every.probability, again.probability)
     assert not torch.equal(every.probability, other.probability)
     some = closure_probability(doubtful, contacts[[4, 11]], n=300, seed=3)
     torch.testing.assert_close(some.probability, every.probability[[4, 11]], rtol=0, atol=1 / 300)
-    torch.testing.assert_close(some.lower_bound, every.lower_bound[[4, 11]], rtol=0, atol=1e-6)
     assert len(closure_probability(doubtful, contacts[:0])) == 0
 
 
@@ -177,16 +173,6 @@ def test_a_triple_is_closed_if_and_only_if_internal_forces_lie_inside_its_cones(
     assert bool((closed | ~exists).all())
     assert int((closed & ~exists).sum()) < 0.05 * int(closed.sum())  # the grid is coarse
     assert 50 < int(closed.sum()) < 180
-
-
-@pytest.mark.parametrize("level", [0, 1, 3])
-def test_the_triangulated_sphere_is_whole(generator, level):
-    corners, faces, share, distance = sphere(level)
-    assert len(faces) == 8 * 4**level and len(corners) == 2 + len(faces) // 2
-    assert float(share.sum()) == pytest.approx(1.0, abs=1e-12)
-    within = torch.rand(50, 3, generator=generator, dtype=torch.float64)
-    inside = (within / within.sum(1, keepdim=True)) @ corners[faces]  # points of the flat triangles
-    assert bool((torch.linalg.vector_norm(inside, dim=-1) >= distance[:, None] - 1e-12).all())
 
 
 def test_bad_arguments_name_what_was_found(doubtful, generator):

@@ -13,10 +13,9 @@ from torchgrasp.plan.feasibility import check_feasibility, first_violation
 from torchgrasp.plan.normal_variation import normal_variation
 from torchgrasp.plan.solve import plan_chunk, plan_contacts
 from torchgrasp.plan.solver import project
-from torchgrasp.plan.starts import draw_in, drawn_starts
+from torchgrasp.plan.starts import draw_in
 from torchgrasp.plan.wrench import wrenches
 from torchgrasp.specs import ContactSpec
-from torchgrasp.values import PointCloud
 
 SPECS = {"paper": ContactSpec.paper(), "table": ContactSpec(table=0.472, contact_height=0.005, flatness=0.6)}
 
@@ -95,28 +94,6 @@ def test_a_start_without_a_gradient_is_named_and_harms_no_other(ellipsoid, gener
     torch.testing.assert_close(plan.contacts.points[[0, 2, 3]], alone.contacts.points)
 
 
-def test_a_warm_start_comes_first_and_keeps_what_was_found(ellipsoid):
-    spec = SPECS["table"]
-    plan = plan_contacts(ellipsoid, spec, starts=30, seed=2)
-    warm = int((plan.status == Status.OK).sum())
-    again = plan_contacts(ellipsoid, spec, starts=5, seed=9, warm_start=plan)
-    assert len(again) == warm + 5
-    assert bool((again.status[:warm] == Status.OK).all())
-    fresh = plan_contacts(ellipsoid, spec, starts=5, seed=9)
-    torch.testing.assert_close(again.contacts.points[warm:], fresh.contacts.points)
-
-
-def test_a_plan_follows_the_surface_to_a_later_estimate(ellipsoid):
-    plan = plan_contacts(ellipsoid, SPECS["table"], starts=30, seed=2)
-    good = plan.contacts.points[plan.status == Status.OK]
-    later = dataclasses.replace(ellipsoid, axes=(1.02, 0.63, 0.48))
-    warm = plan_contacts(later, SPECS["table"], starts=1, warm_start=plan)[: len(good)]
-    held = warm.status == Status.OK
-    assert float(held.double().mean()) >= 0.9
-    moved = torch.linalg.vector_norm(warm.contacts.points - good, dim=-1)[held]
-    assert float(moved.median()) < 0.005  # [m]: the estimate has moved by 2 mm
-
-
 def test_a_time_budget_bounds_how_many_starts_are_planned_and_changes_no_row(ellipsoid, monkeypatch):
     now = [0.0]
     monkeypatch.setattr("torchgrasp.plan.solve.time.monotonic", lambda: now[0])
@@ -140,19 +117,6 @@ def test_more_starts_only_add_rows(ellipsoid, monkeypatch):
     for spec in SPECS.values():
         few, many = (plan_contacts(ellipsoid, spec, starts=count) for count in (10, 15))
         torch.testing.assert_close(few.contacts.points, many.contacts.points[:10])
-
-
-def test_starts_are_drawn_from_the_cloud(ellipsoid, generator):
-    around = unit(torch.randn(400, 3, generator=generator, dtype=torch.float64)) * torch.tensor(ellipsoid.axes)
-    seen = dataclasses.replace(ellipsoid, cloud=PointCloud(ellipsoid.metres(around[around[:, 1] > 0])))
-    for spec in SPECS.values():
-        first = torch.cat(list(drawn_starts(seen, spec, 8, 0, "cloud")))
-        assert first.shape == (8, 3, 3)
-        assert float(seen.value(first).abs().max()) < 1e-9
-        assert float(first[..., 1].min()) > -1e-6
-    assert len(plan_contacts(seen, ContactSpec.paper(), starts=8, start_from="cloud")) == 8
-    with pytest.raises(BadArgument, match="holds no cloud"):
-        plan_contacts(ellipsoid, starts=8, start_from="cloud")
 
 
 def test_far_starts_are_drawn_in_and_those_on_the_surface_stay(ellipsoid, generator):

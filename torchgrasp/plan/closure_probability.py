@@ -12,7 +12,6 @@ from torch import Tensor
 
 from torchgrasp.base import Batch
 from torchgrasp.errors import BadArgument
-from torchgrasp.plan.bound import closure_bound
 from torchgrasp.plan.surface_samples import SurfaceSamples, first_contact, sample_surfaces
 from torchgrasp.plan.wrench import closed_exact
 from torchgrasp.shape.gp import ShapeGP
@@ -25,17 +24,16 @@ CHUNK = 8192
 
 @dataclasses.dataclass(frozen=True)
 class ClosureProbability(Batch):
-    """The `probability` that each triple is closed, with its `standard_error`, and a proven `lower_bound` of it."""
+    """The `probability` that each triple is closed, with its `standard_error`."""
 
     probability: Float[Tensor, "b"]
     standard_error: Float[Tensor, "b"]
-    lower_bound: Float[Tensor, "b"]
 
 
 def closure_probability(
     shape: ShapeGP, contacts: Contacts, spec: ContactSpec | None = None, n: int = 2500, seed: int = 0
 ) -> ClosureProbability:
-    """Return how probable closure is on the uncertain surface, by Monte Carlo and by a bound from below.
+    """Return how probable closure is on the uncertain surface, by Monte Carlo.
 
     `spec.max_variance` says which contacts are allowed, the probability which of them to prefer:
     `plan[probability.probability.argsort(descending=True)]` ranks a plan. All rows share the same draws, so that
@@ -73,7 +71,7 @@ def closure_probability(
     closed = closure_share(lines, spec.friction, n, seed)
     middle = (n * closed + 1) / (n + 2)
     error = torch.sqrt(middle * (1 - middle) / n)
-    return ClosureProbability(closed, error, closure_bound(lines, spec.friction))
+    return ClosureProbability(closed, error)
 
 
 def closure_share(lines: SurfaceSamples, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:

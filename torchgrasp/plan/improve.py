@@ -90,8 +90,8 @@ def raise_probability(
 ) -> ContactPlan:
     """Return the plan with contacts moved along the surface while closure gets more probable; `quality` is minus that.
 
-    The count of closed draws has no gradient, and its proven bound is 0 for most triples: moves are drawn, the same
-    for all rows, judged on the same draws, and kept where more of these are closed.
+    The count of closed draws has no gradient: moves are drawn, the same for all rows,
+    judged on the same draws, and kept where more of these are closed.
     """
     generator = torch.Generator().manual_seed(seed)
     plan = dataclasses.replace(plan, quality=torch.zeros_like(plan.quality))

@@ -13,7 +13,7 @@ from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.improve import Improve, Objective, improver
 from torchgrasp.plan.problem import ContactProblem, Shape
 from torchgrasp.plan.solver import FINISH, Stage, descend, project, start_state
-from torchgrasp.plan.starts import StartFrom, check_starts, drawn_starts, given_starts
+from torchgrasp.plan.starts import check_starts, drawn_starts, given_starts
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan
 
@@ -42,8 +42,6 @@ def plan_contacts(
     seed: int = 0,
     *,
     objective: Objective = "center",
-    start_from: StartFrom = "sphere",
-    warm_start: ContactPlan | None = None,
     time_budget: float | None = None,
 ) -> ContactPlan:
     """Plan three contacts from each of many starts, Eqs. (10)-(14): one row a start, in the order of the starts.
@@ -56,7 +54,7 @@ def plan_contacts(
     Args:
         shape: a `ShapeGP`, or another implicit surface with the same methods.
         spec: what the contacts must satisfy; `ContactSpec()` by default.
-        starts: the number of starts, drawn by `start_from`, or the starting points themselves [m].
+        starts: the number of starts, drawn on the sphere of `spec.start_radius` (Sec. 6.2), or starting points [m].
         seed: seed of the draw.
         objective: what is minimised: "center", Eq. (14); "epsilon", minus the radius of the largest ball in the hull of
             the wrenches (Ferrari and Canny 1992; 0.1 s a start); "min_weight", minus the greatest margin of the
@@ -65,9 +63,6 @@ def plan_contacts(
             and outward unit normals (b, 3, 3) that returns costs (b,), each of its own row alone, differentiable by
             autograd, in any unit. `quality` holds the values. All but "center" begin where that ends, and a row
             only changes for a lower value.
-        start_from: "sphere": that of `spec.start_radius` about the shape's centre (Sec. 6.2); "cloud": what was seen.
-        warm_start: an earlier plan, also for another estimate of the same object: its OK rows are the first starts,
-            before all others.
         time_budget: seconds of wall time for the call: of all starts as many are planned as will fit, at the pace of
             those before, and never less than 25. None: all.
 
@@ -83,11 +78,11 @@ def plan_contacts(
     torch.Size([8, 3, 3])
     """
     spec = ContactSpec() if spec is None else spec
-    check_starts(shape, spec, starts, seed, start_from)
+    check_starts(shape, spec, starts, seed)
     if time_budget is not None and not time_budget > 0:  # also refuses NaN
         raise BadArgument("time_budget", time_budget, "a positive number of seconds, or None")
     improve = improver(objective, shape, spec, seed)
-    chunks = _chunks(shape, spec, starts, seed, start_from, warm_start)
+    chunks = _chunks(shape, spec, starts, seed)
     if time_budget is not None:
         chunks = _within(time_budget, chunks)
     return join([plan_chunk(shape, spec, first, stages, improve) for first, stages in chunks])
@@ -112,20 +107,13 @@ def _chunks(
     spec: ContactSpec,
     starts: int | Float[Tensor, "b 3 3"],
     seed: int,
-    start_from: StartFrom,
-    warm_start: ContactPlan | None,
 ) -> Iterator[Chunk]:
     """Yield normalised starts on the surface and the stages from there, chunk by chunk."""
-    if warm_start is not None:
-        warm = warm_start.contacts.points[warm_start.status == Status.OK]
-        check_starts(shape, spec, warm, seed, start_from)
-        for first in given_starts(shape, warm):
-            yield first, IMPROVE
     if isinstance(starts, Tensor):
         for first in given_starts(shape, starts):
             yield first, SEARCH
     else:
-        for first in drawn_starts(shape, spec, starts, seed, start_from):
+        for first in drawn_starts(shape, spec, starts, seed):
             yield first, SEARCH if spec.flatness is None else IMPROVE
 
 

@@ -1,7 +1,6 @@
 """Where planning starts: points on a sphere as in the paper, or triples surveyed on the surface, or given points."""
 
 from collections.abc import Iterator
-from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -15,7 +14,6 @@ from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet
 from torchgrasp.plan.solver import project
 from torchgrasp.plan.wrench import closed_exact
 from torchgrasp.specs import ContactSpec
-from torchgrasp.values import PointCloud
 
 SURVEY = 700
 """Triples of surface points that are surveyed for certain and flat places: 2100 points cover a hand-sized object in
@@ -35,10 +33,8 @@ surface 2 to 10 % are closed."""
 CHUNK = 500
 """Starts that are planned at once: memory is bounded, and results come early."""
 
-StartFrom = Literal["sphere", "cloud"]
 
-
-def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor, seed: int, start_from: str) -> None:
+def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor, seed: int) -> None:
     """Refuse starts that are no positive number, of a wrong shape, or outside the shape's domain, by `BadArgument`.
 
     What is no shape, specification or seed is refused, too.
@@ -49,10 +45,6 @@ def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor, seed: in
         raise BadArgument("seed", seed, "an integer from 0")
     if not isinstance(spec, ContactSpec):
         raise BadArgument("spec", type(spec).__name__, "a ContactSpec")
-    if start_from not in get_args(StartFrom):
-        raise BadArgument("start_from", repr(start_from), "'sphere' or 'cloud'")
-    if start_from == "cloud" and not isinstance(getattr(shape, "cloud", None), PointCloud):
-        raise BadArgument("start_from", "'cloud'", "'sphere' for a shape that holds no cloud")
     if isinstance(starts, Tensor):
         points = shape.normalise(check_tensor("starts", starts, (None, 3, 3)))
         farthest = float(torch.linalg.vector_norm(points, dim=-1).max()) if len(points) else 0.0
@@ -75,13 +67,11 @@ def given_starts(shape: Shape, starts: Float[Tensor, "b 3 3"]) -> Iterator[Float
         yield project(shape, draw_in(shape, shape.normalise(points)), steps=6)
 
 
-def drawn_starts(
-    shape: Shape, spec: ContactSpec, starts: int, seed: int, start_from: StartFrom = "sphere"
-) -> Iterator[Float[Tensor, "_ 3 3"]]:
+def drawn_starts(shape: Shape, spec: ContactSpec, starts: int, seed: int) -> Iterator[Float[Tensor, "_ 3 3"]]:
     """Yield as many normalised starts on the surface as `starts` says, chunk by chunk.
 
     Without `spec.flatness` each is three points of the sphere of `spec.start_radius`, moved onto the surface
-    (Sec. 6.2), or three of the observed cloud. With it such points are surveyed first: starts are triples of those
+    (Sec. 6.2). With it such points are surveyed first: starts are triples of those
     that are certain, flat, inside and above the table, and closed ones come first in each chunk. The centre of a flat
     grasp may lie 30 mm from the object's, and a descent from the paper's starts rarely finds its way there.
     """
@@ -89,12 +79,8 @@ def drawn_starts(
     generator = torch.Generator().manual_seed(seed)
 
     def draw(count: int) -> Float[Tensor, "_ 3 3"]:
-        if start_from == "sphere":
-            drawn = spec.start_radius * unit(torch.randn(count, 3, 3, generator=generator, dtype=torch.float64))
-            return drawn.to(device)
-        seen: PointCloud = shape.cloud  # pyright: ignore[reportAttributeAccessIssue] - `check_starts` has asked
-        rows = torch.randint(len(seen), (count, 3), generator=generator)
-        return shape.normalise(seen.points.to(device, torch.float64)[rows.to(device)])
+        drawn = spec.start_radius * unit(torch.randn(count, 3, 3, generator=generator, dtype=torch.float64))
+        return drawn.to(device)
 
     places = None
     if spec.flatness is not None:
