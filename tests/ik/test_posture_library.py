@@ -36,21 +36,21 @@ def touched(postures: PostureLibrary, poses: torch.Tensor) -> Contacts:
 
 
 def test_eq24_members_of_the_set_are_found_and_placed(postures, poses):
-    found = nearest_postures(touched(postures, poses), postures, CollisionWorld(NOTHING, None), guesses=3)
+    found = nearest_postures(touched(postures, poses), postures, CollisionWorld(NOTHING, None), n_seeds=3)
     assert found.row.tolist() == [i for i in range(12) for _ in range(3)]
     best = found[torch.arange(0, 36, 3)]
     torch.testing.assert_close(best.joints, postures.joints[:12])
     torch.testing.assert_close(best.obj_from_hand, poses)
     assert best.permutation.tolist() == [[0, 1, 2]] * 12
     assert float(best.tip_error.max()) < 1e-9
-    assert float(best.reach.max()) < 1e-3  # rounding of single precision
-    assert bool((best.reach <= found.reach.view(12, 3).T).all())
+    assert float(best.energy.max()) < 1e-3  # rounding of single precision
+    assert bool((best.energy <= found.energy.view(12, 3).T).all())
 
 
 def test_the_order_of_the_contacts_does_not_matter(postures, poses):
     contacts, order = touched(postures, poses), [2, 0, 1]
     turned = Contacts(contacts.points[:, order], contacts.normals[:, order], contacts.variance, contacts.std_m)
-    found = nearest_postures(turned, postures, CollisionWorld(NOTHING, None), guesses=1)
+    found = nearest_postures(turned, postures, CollisionWorld(NOTHING, None), n_seeds=1)
     torch.testing.assert_close(found.joints, postures.joints[:12])
     assert found.permutation.tolist() == [[1, 2, 0]] * 12  # finger i takes the contact that was its own
 
@@ -61,7 +61,7 @@ def test_a_table_moves_clear_postures_to_the_front(postures, poses):
     hand, cover = postures.hand, postures.hand.collision_spheres
 
     def overlap(world: CollisionWorld) -> torch.Tensor:
-        best = nearest_postures(contacts, postures, world, guesses=1)
+        best = nearest_postures(contacts, postures, world, n_seeds=1)
         spheres = apply(best.obj_from_hand, hand.spheres(best.joints))
         return collision_cost(spheres, cover, CollisionWorld(NOTHING, table))
 
@@ -93,12 +93,12 @@ def test_degenerate_triples_have_no_guess_and_same_seed_same_bits(postures, pose
     points, normals = contacts.points.clone(), contacts.normals.clone()
     points[4], normals[4] = line, up
     mixed = Contacts(points, normals, contacts.variance, contacts.std_m)
-    found = nearest_postures(mixed, postures, CollisionWorld(NOTHING, None), guesses=2)
+    found = nearest_postures(mixed, postures, CollisionWorld(NOTHING, None), n_seeds=2)
     assert 4 not in found.row.tolist() and len(found) == 22
     again = nearest_postures(
-        mixed, PostureLibrary.of(postures.hand, 400, seed=3), CollisionWorld(NOTHING, None), guesses=2
+        mixed, PostureLibrary.of(postures.hand, 400, seed=3), CollisionWorld(NOTHING, None), n_seeds=2
     )
     assert torch.equal(found.joints, again.joints) and torch.equal(found.obj_from_hand, again.obj_from_hand)
     assert len(nearest_postures(mixed[:0], postures, CollisionWorld(NOTHING, None))) == 0
-    with pytest.raises(BadArgument, match="guesses"):
-        nearest_postures(mixed, postures, CollisionWorld(NOTHING, None), guesses=0)
+    with pytest.raises(BadArgument, match="n_seeds"):
+        nearest_postures(mixed, postures, CollisionWorld(NOTHING, None), n_seeds=0)

@@ -60,13 +60,13 @@ def test_postures_are_found_again(motion):
     least = least.scatter_reduce(0, found.row[own], found.tip_error[own].amax(-1), "amin")
     assert float(least.median()) < 0.02
     assert bool(((found.joints >= hand.lower) & (found.joints <= hand.upper)).all())
-    assert bool((found.reach < DEFAULT_ENERGY).all())
+    assert bool((found.energy < DEFAULT_ENERGY).all())
 
 
 def test_rows_are_in_order_and_the_wrong_side_comes_last(motion):
     hand, samples, mixture = barrett()
     contacts = contacts_of(hand, samples.joints[9000:9100], motion)
-    found = query_mixture(contacts, hand, mixture, guesses=3)
+    found = query_mixture(contacts, hand, mixture, n_seeds=3)
     assert bool((found.row.diff() >= 0).all())
     normals = rotate(found.obj_from_hand, hand.fingertips(found.joints)[1])
     side = (normals * contacts.normals[found.row[:, None], found.permutation]).sum(-1).mean(-1)
@@ -106,7 +106,7 @@ def test_empty_and_float32_contacts():
     single = query_mixture(contacts.to(torch.float32), hand, mixture)
     assert single.joints.dtype == single.obj_from_hand.dtype == torch.float32
     torch.testing.assert_close(
-        single.reach.sum(), query_mixture(contacts, hand, mixture).reach.sum().float(), rtol=1e-3, atol=0
+        single.energy.sum(), query_mixture(contacts, hand, mixture).energy.sum().float(), rtol=1e-3, atol=0
     )
 
 
@@ -120,8 +120,8 @@ def test_paper_coverage_accepts_fewer(motion):
 def test_bad_arguments():
     hand, samples, mixture = barrett()
     contacts = contacts_of(hand, samples.joints[:2], torch.eye(4).double())
-    with pytest.raises(BadArgument, match="guesses: found 0"):
-        query_mixture(contacts, hand, mixture, guesses=0)
+    with pytest.raises(BadArgument, match="n_seeds: found 0"):
+        query_mixture(contacts, hand, mixture, n_seeds=0)
     with pytest.raises(BadArgument, match="max_energy: found nan"):
         query_mixture(contacts, hand, mixture, max_energy=float("nan"))
     with pytest.raises(BadArgument, match="mixture: found joints"):
@@ -152,10 +152,10 @@ def test_a_mixture_of_other_limits_fingers_or_fingertips_is_refused():
 def test_many_triples_are_answered_as_each_alone(motion):
     hand, samples, mixture = barrett()
     contacts = contacts_of(hand, samples.joints[9000:9600], motion)  # more than one pass
-    found = query_mixture(contacts, hand, mixture, guesses=2)
+    found = query_mixture(contacts, hand, mixture, n_seeds=2)
     assert bool((found.row.diff() >= 0).all())
     for k in (0, 255, 256, 599):
-        one, rows = query_mixture(contacts[k], hand, mixture, guesses=2), found[found.row == k]
+        one, rows = query_mixture(contacts[k], hand, mixture, n_seeds=2), found[found.row == k]
         assert torch.equal(one.permutation, rows.permutation)
         torch.testing.assert_close(one.joints, rows.joints, rtol=0, atol=1e-9)
 
@@ -168,6 +168,6 @@ def test_shipped_mixtures_fit_their_hands(name, components):
     assert int(mixture.meta["samples"]) >= 100_000
     fresh = sample_configurations(hand, 3000, seed=99)
     accepted = float((mixture.energy(fresh.q) < DEFAULT_ENERGY).double().mean())
-    assert abs(accepted - float(mixture.meta["acceptance_default_coverage"])) < 0.01
+    assert abs(accepted - float(mixture.meta["acceptance_default_reach"])) < 0.01
     error = float((mixture.joints(fresh.q) - fresh.joints).abs().mean())
     assert abs(error - float(mixture.meta["mean_absolute_error"])) < 0.02

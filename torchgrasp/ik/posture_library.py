@@ -74,7 +74,7 @@ def nearest_postures(contacts: Contacts, postures: PostureLibrary, world: Collis
         BadArgument: `n_seeds` is not in [1, 64].
     """
     if not 1 <= n_seeds <= CANDIDATES:
-        raise BadArgument("guesses", n_seeds, f"1 to {CANDIDATES}")
+        raise BadArgument("n_seeds", n_seeds, f"1 to {CANDIDATES}")
     radius, order = postures.hand.tip_radius.double(), torch.tensor(PERMUTATIONS, device=contacts.points.device)
     inward = -contacts.normals.double()[:, order]
     centres = contacts.points.double()[:, order] - radius[:, None] * inward  # (n, 6, 3, 3)

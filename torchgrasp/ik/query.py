@@ -62,7 +62,7 @@ def query_mixture(
     """
     check_compatible(mixture.meta, mixture.joint_names, hand)
     if not 1 <= n_seeds <= len(mixture.weights) + 1:
-        raise BadArgument("guesses", n_seeds, f"1 to {len(mixture.weights) + 1}")
+        raise BadArgument("n_seeds", n_seeds, f"1 to {len(mixture.weights) + 1}")
     if not max_energy > 0:
         raise BadArgument("max_energy", max_energy, "a positive number")
     loose = mixture.with_observation_noise(LENGTH_SLACK, COSINE_SLACK)

@@ -101,7 +101,7 @@ def _solved_row(hand: str, what: str, found: IKSolution, seconds: float, bar: fl
 
 def _cobyla_row(hand: Hand, mixture: GraspMixture, contacts: Contacts, ours: IKSolution, seconds: float) -> Row:
     """Return the row of COBYLA from the first guess alone, one try a code."""
-    guess, asked = timed(lambda: query_mixture(contacts, hand, mixture, guesses=MODES))
+    guess, asked = timed(lambda: query_mixture(contacts, hand, mixture, n_seeds=MODES))
     guess = guess[rank_in_group(torch.zeros_like(guess.energy), guess.row) == 0]
     taken, start = assign(contacts, guess), Configuration(guess.joints, guess.obj_from_hand)
     spent, place = [0.0], cobyla.place
