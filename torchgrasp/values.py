@@ -1,8 +1,7 @@
-"""All value types of the data flow, in its order: the map of the library. What a user asks for is in `specs`.
+"""The value types of the data flow, in its order: the map of the library. Options stand in `specs`.
 
-Values are frozen dataclasses of tensors. They are complete when they exist, they never change, and `.to()`
-returns a new one. Lengths are metres and positions are in the cloud's frame ("obj") unless said otherwise;
-`a_from_b` maps coordinates of frame b into frame a.
+A value is a frozen dataclass of tensors: it never changes, and `.to()` returns a new one. Lengths are metres.
+Positions are in the frame of the cloud ("obj") unless said otherwise. `a_from_b` maps coordinates of frame b into a.
 
 Letters in shapes: n points, b batch rows, g grasps, e friction-cone edges, h actuated joints, t time steps.
 """
@@ -27,10 +26,9 @@ class PointCloud(Value):
     """A point cloud of one object, as a camera saw it.
 
     Args:
-        points: surface points [m], at least 4 of them.
-        normals: outward normals, or None. Non-unit normals are normalised by the functions that use them.
-        viewpoint: the camera's position [m] in the cloud's frame, of shape (3,), or of shape (n, 3) that of the camera
-            which saw each point, for several views in one cloud; None when it is not known.
+        points: surface points [m], at least 4.
+        normals: outward normals, or None. Functions that use them normalise them.
+        viewpoint: position of the camera [m]; (n, 3) gives one camera for each point; None: unknown.
 
     Raises:
         BadArgument: wrong shape, dtype or non-finite numbers.
@@ -61,7 +59,7 @@ class PointCloud(Value):
         return len(self.points)
 
     def select(self, rows: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> "PointCloud":
-        """Return some of the points, with what is known of them.
+        """Return some of the points, with their normals and viewpoints.
 
         Args:
             rows: a mask, or indices in the order wanted.
@@ -74,7 +72,7 @@ class PointCloud(Value):
         )
 
     def split_views(self) -> "list[PointCloud]":
-        """Return the part that each camera saw, with its viewpoint (3,), in the order of their first points."""
+        """Return one cloud for each camera, in the order of their first points."""
         if self.viewpoint is None or self.viewpoint.ndim == 1:
             return [self]
         _, view = self.viewpoint.unique(dim=0, return_inverse=True)
@@ -86,9 +84,9 @@ class PointCloud(Value):
 class ShapeEstimate(Value):
     """The posterior of the shape at query points (Eqs. 7-8).
 
-    `distance`, `variance` and `covariance` are in the paper's normalised units (the cloud centred and divided by
-    `shape.scale` metres), so that `max_variance=0.03` means what the paper means. `normal` is the unit gradient of
-    the mean. `std_m` is the calibrated standard deviation of the surface position [m].
+    `distance`, `variance` and `covariance` are in the normalised units of the paper: one unit is `shape.scale` metres.
+    So `max_variance=0.03` means what it means in the paper. `normal` is the unit gradient of the mean. `std_m` is the
+    calibrated standard deviation of the surface position [m].
     """
 
     distance: Float[Tensor, "*b"]
@@ -113,10 +111,10 @@ class Contacts(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class ContactPlan(Batch):
-    """The planner's rows, one for each start, in the order of the starts.
+    """The planned contacts, one row for each start, in the order of the starts.
 
-    `coefficients` are the planner's own phi of Eq. (13); `quality` is Eq. (14) [m]: the distance of the contacts'
-    centre from the centre of the cloud, or the cost that was asked for; less is better.
+    `coefficients` is phi of Eq. (13). `quality` is Eq. (14), the distance [m] of the contacts' centre from the centre
+    of the cloud, or the value of the chosen objective. Less is better.
     """
 
     contacts: Contacts
@@ -127,13 +125,13 @@ class ContactPlan(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class Certificate(Batch):
-    """Frictional form closure (Eq. 13) or its absence, with what proves either; see `certify`.
+    """The proof that contacts have frictional form closure (Eq. 13), or that they lack it; see `certify`.
 
-    `margin` is the largest s with W phi = 0, sum phi = 1, phi >= s; `rank_ratio` the smallest over the largest
-    singular value of W with torques divided by the contacts' radius; `residual` the largest |W phi|. `closed` needs
-    margin > 0 and full rank: Eq. (13) alone holds for coincident and for collinear contacts. `witness` is a unit
-    wrench (force, torque about the contacts' centre over their radius) whose product with every edge wrench is at
-    least -margin: a row that is not closed has none against it, and cannot resist it.
+    `margin` is the largest s with W phi = 0, sum phi = 1, phi >= s. `rank_ratio` is the smallest over the largest
+    singular value of W, torques divided by the radius of the contacts. `residual` is the largest |W phi|. `closed`
+    needs margin > 0 and full rank, because coincident or collinear contacts satisfy Eq. (13), too. `witness` is a unit
+    wrench w with w . v >= -margin for every edge wrench v. If the contacts are not closed, w separates: no contact
+    force opposes it.
     """
 
     margin: Float[Tensor, "b"]
@@ -148,9 +146,9 @@ class Certificate(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class ContactCode(Value):
-    """The frame-invariant code q = (L, N) of Eq. (18) for each of the six assignments of contacts to fingers.
+    """The frame-invariant code q = (L, N) of Eq. (18) for the six assignments of contacts to fingers.
 
-    Finger i touches contact `permutation[k, i]` in assignment k. Degenerate rows hold NaN and say so in `status`.
+    In assignment k finger i touches contact `permutation[k, i]`. Degenerate rows hold NaN, and `status` says so.
     """
 
     q: Float[Tensor, "b 6 6"]
@@ -161,11 +159,11 @@ class ContactCode(Value):
 
 @dataclasses.dataclass(frozen=True)
 class IKSeeds(Batch):
-    """Postures of the learned model or of the hand's own, aligned with the contacts by their virtual frames (Eq. 24).
+    """Starts of the inverse kinematics: postures placed on contacts by their virtual frames (Eq. 24).
 
-    `row` names the row of the contact plan and `permutation` the contact of each finger; `energy` is the least f_i of
-    Eq. (21), of a posture of the hand's own half its squared distance; `tip_error` [m] is the distance of each
-    fingertip from its contact before refinement.
+    `row` is the row of the contacts, `permutation` the contact of each finger. `energy` is the least f_i of Eq. (21),
+    or half the squared distance of a library posture. `tip_error` [m] is the distance of each fingertip from its
+    contact.
     """
 
     joints: Float[Tensor, "g h"]
@@ -178,13 +176,13 @@ class IKSeeds(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class Grasps(Batch):
-    """Hand configurations that realise planned contacts, best first.
+    """Hand configurations on planned contacts, best first.
 
-    Contact i is touched by finger i of the hand. `clearance` [m] is the least distance of the hand's links from the
-    estimated surface (fingertips apart), from each other and from the table; `normal_angle` [rad] the angle between
-    the contact direction and the pad's axis; `pregrasp` the joints of the opened hand at the same pose, and `approach`
-    the unit direction in which it comes there, straight. `score` ranks; after `plan_grasps` it is the log-odds of
-    `success` of those with `Status.OK`. `meta` holds names, units, hashes and the seed, as they are written to files.
+    Finger i touches contact i. `pregrasp` is the joints of the opened hand at the same pose; `approach` is the unit
+    direction of its straight path there. `clearance` [m] is the least distance of the links from the estimated
+    surface, from each other and from the table; fingertips may touch the surface. `normal_angle` [rad] is the angle
+    between pad axis and contact direction. `score` ranks the grasps; `plan_grasps` makes it the log-odds of `success`.
+    `meta` holds names, units, hashes and the seed as text.
     """
 
     joints: Float[Tensor, "g h"]
@@ -203,14 +201,14 @@ class Grasps(Batch):
 
     @property
     def success(self) -> Float[Tensor, "g"]:
-        """The predicted probability (`hand.success`) that each planned grasp holds; 0 where it cannot be executed."""
+        """The predicted probability that each planned grasp holds; 0 if the grasp cannot be executed."""
         return torch.where(self.status == Status.OK, torch.sigmoid(self.score), 0.0)
 
     def save(self, path: Path | str) -> None:
-        """Write the grasps with their metadata as safetensors, atomically; `load_grasps` reads them back.
+        """Write the grasps as a safetensors file, atomically; `load_grasps` reads it.
 
         Raises:
-            OutputError: the file cannot be written; nothing half-written stays.
+            OutputError: the file cannot be written.
         """
         save_tensors(path, "grasps", _flatten(self), self.meta)
 
@@ -235,7 +233,7 @@ def load_grasps(path: Path | str) -> Grasps:
 
 
 def _flatten(value: Any, prefix: str = "") -> dict[str, Tensor]:
-    """Name every tensor inside a value by its path of field names."""
+    """Return every tensor inside a value by its dotted field name."""
     tensors: dict[str, Tensor] = {}
     for field in dataclasses.fields(value):
         inner = getattr(value, field.name)
@@ -251,9 +249,9 @@ def _flatten(value: Any, prefix: str = "") -> dict[str, Tensor]:
 
 @dataclasses.dataclass(frozen=True)
 class ClosingGains(Value):
-    """Gains of the closing controller for each finger, in the hand's frame (Eqs. 26-28).
+    """Gains of the closing controller for each finger, in the frame of the hand (Eqs. 26-28).
 
-    `force_source` tells where the desired forces come from: "analytic", or "learned" from stable grasps.
+    `force_source` is "analytic", or "learned" if the stability model gave the desired forces.
     """
 
     target: Float[Tensor, "3 3"]
@@ -268,12 +266,11 @@ class ClosingGains(Value):
 class ClosureResult(Value):
     """What happened when the hand closed on the true object.
 
-    `time` [s] is the control ticks; `forces` [N] the normal force of each fingertip; `object_pose` and `hand_pose`
-    the object's and the hand's frames in the world at each tick; `joints` every joint of the URDF in the order of
-    `joint_names`. `contact_order` lists the fingers in the order of their first touch, those that never touched left
-    out. `object_motion` is how far the object moved [m] and turned [rad] against the hand from when the hand has come
-    to its pre-grasp to the end; `start_overlap` [m] how deep the opened hand was in object or table before it came.
-    `held` is true when the object is still up with the hand at the end; `seconds` is the wall time.
+    `time` [s] counts control ticks. `forces` [N] is the normal force of each fingertip. `object_pose` and `hand_pose`
+    are the frames of object and hand in the world. `joints` has every joint of the URDF, in the order of `joint_names`.
+    `contact_order` lists the fingers by their first touch. `object_motion` is the motion of the object in the hand
+    from the pre-grasp to the end. `start_overlap` [m] is the depth of the opened hand in object or table at the start.
+    `held` tells whether the object is up with the hand at the end; `seconds` is wall time.
     """
 
     held: bool
