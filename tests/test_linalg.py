@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchgrasp.errors import IndefiniteCovariance
-from torchgrasp.linalg import cholesky, safe_distance, squared_mahalanobis, unit
+from torchgrasp.linalg import cholesky, squared_mahalanobis, unit
 
 
 def test_cholesky_raises_with_the_smallest_eigenvalue():
@@ -24,24 +24,6 @@ def test_cholesky_adds_nothing(generator):
     matrix = a @ a.T + torch.eye(5, dtype=torch.float64)
     factor = cholesky(matrix, "K", "-")
     torch.testing.assert_close(factor @ factor.T, matrix, rtol=1e-14, atol=1e-14)
-
-
-@pytest.mark.parametrize("mode", ["reverse", "forward"])
-def test_safe_distance_has_second_derivatives_at_zero(mode):
-    psi = 2.0
-
-    def k(x):  # thin plate; its second derivative at r = 0 is -6 psi
-        r = safe_distance(x)
-        return 2 * r**3 - 3 * psi * (x * x).sum(-1)
-
-    jac = torch.func.jacrev if mode == "reverse" else torch.func.jacfwd
-    hessian = jac(torch.func.grad(k))(torch.zeros(3, dtype=torch.float64))
-    torch.testing.assert_close(hessian, -6 * psi * torch.eye(3, dtype=torch.float64))
-
-
-def test_safe_distance_is_the_norm(generator):
-    x = torch.randn(20, 3, generator=generator)
-    torch.testing.assert_close(safe_distance(x), x.norm(dim=-1))
 
 
 def test_mahalanobis_against_the_inverse(generator):

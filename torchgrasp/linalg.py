@@ -1,4 +1,4 @@
-"""Linear algebra that never repairs silently: a checked Cholesky factor, safe norms, Mahalanobis distances."""
+"""Linear algebra that never repairs silently: a checked Cholesky factor, Mahalanobis distances."""
 
 import torch
 from jaxtyping import Float
@@ -10,17 +10,6 @@ from torchgrasp.errors import IndefiniteCovariance
 def unit(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
     """Return vectors of length 1 in the direction of `v`; a zero vector gives NaN, which the callers check."""
     return v / torch.linalg.vector_norm(v, dim=-1, keepdim=True)
-
-
-def safe_distance(difference: Float[Tensor, "*b d"]) -> Float[Tensor, "*b"]:
-    """Return |difference| with all derivatives defined at 0.
-
-    The norm itself has none there: autograd of it gives NaN, and by forward mode silently 0 in second derivatives.
-    The root is taken of 1 where the argument is 0, and that branch is then masked by 0.
-    """
-    squared = (difference * difference).sum(-1)
-    zero = squared == 0
-    return torch.where(zero, 0.0, torch.sqrt(torch.where(zero, 1.0, squared)))
 
 
 def cholesky(matrix: Float[Tensor, "*b n n"], what: str, remedy: str) -> Float[Tensor, "*b n n"]:

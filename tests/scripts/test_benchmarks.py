@@ -12,8 +12,8 @@ from torchgrasp.linalg import unit
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure_lp import solve_closure_lp
 from torchgrasp.plan.wrench import wrenches
-from torchgrasp.shape.kernel import covariance, thin_plate
-from torchgrasp.shape.kernels import kernel_by_name
+from torchgrasp.shape.gradient_kernel import covariance
+from torchgrasp.shape.kernel import kernel_by_name, thin_plate
 from torchgrasp.shape.select import select_points
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts

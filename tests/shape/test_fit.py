@@ -10,7 +10,7 @@ from torchgrasp.errors import BadArgument, IndefiniteCovariance, SuspiciousScale
 from torchgrasp.linalg import unit
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.kernels import Kernel, KernelName, matern52_kernel
+from torchgrasp.shape.kernel import Kernel, KernelName, matern52_kernel
 from torchgrasp.shape.select import Criterion
 from torchgrasp.values import PointCloud
 

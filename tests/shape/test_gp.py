@@ -10,7 +10,8 @@ from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.linalg import unit
 from torchgrasp.shape.condition import condition, longest_distance
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.kernel import covariance, thin_plate
+from torchgrasp.shape.gradient_kernel import covariance
+from torchgrasp.shape.kernel import thin_plate
 from torchgrasp.shape.observations import Observations
 from torchgrasp.values import PointCloud
 

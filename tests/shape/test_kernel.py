@@ -8,7 +8,8 @@ import torch
 from sklearn.gaussian_process.kernels import RBF
 from torch import Tensor
 
-from torchgrasp.shape.kernel import Profile, covariance, radial_derivatives, thin_plate
+from torchgrasp.shape.gradient_kernel import covariance
+from torchgrasp.shape.kernel import Profile, differentiate, thin_plate
 
 PSI = 3.6
 PLATE = partial(thin_plate, psi=PSI)
@@ -101,13 +102,22 @@ def test_any_radial_profile_can_be_plugged_in(gap: float):
 def test_eq6_thin_plate_is_the_polynomial_and_vanishes_with_its_slope_at_psi():
     r = torch.linspace(0, PSI, 50, dtype=torch.float64)
     torch.testing.assert_close(thin_plate(r, PSI), 2 * r**3 - 3 * PSI * r**2 + PSI**3)
-    k, slope, bend = radial_derivatives(partial(thin_plate, psi=PSI), r)
-    assert k[-1].abs() < 1e-12 and slope[-1].abs() < 1e-12
-    torch.testing.assert_close(slope, 6 * (r - PSI))
-    torch.testing.assert_close(bend, 12 * r - 6 * PSI)
+    k, first = differentiate(partial(thin_plate, psi=PSI), r, 2)
+    assert k[-1].abs() < 1e-12 and first[-1].abs() < 1e-12
+    torch.testing.assert_close(first, 6 * (r - PSI))
 
 
-def test_a_linear_profile_has_no_curvature():
-    _, slope, bend = radial_derivatives(lambda r: 1 - r, torch.tensor([0.5, 1.0]))
-    torch.testing.assert_close(slope, torch.tensor([-2.0, -1.0]))
-    assert not bend.any()
+def test_derivatives_in_half_the_squared_distance_are_those_of_a_polynomial_in_it():
+    """k = u^3 + 2 u^2 - u with u = r^2 / 2, at distances from 0 on."""
+    r = torch.tensor([0.0, 1e-7, 1e-3, 0.3, 1.0, 2.0], dtype=torch.float64)
+    u = r * r / 2
+    found = differentiate(lambda r: (r * r / 2) ** 3 + 2 * (r * r / 2) ** 2 - r * r / 2, r, 4)
+    wanted = (u**3 + 2 * u**2 - u, 3 * u**2 + 4 * u - 1, 6 * u + 4, torch.full_like(u, 6.0))
+    for a, b, factor in zip(found, wanted, (1.0, 1.0, r**2, r**3), strict=True):  # with which covariances take them
+        torch.testing.assert_close(a * factor, b * factor, rtol=0, atol=1e-8)
+
+
+def test_profiles_without_curvature_have_derivatives():
+    r = torch.tensor([0.5, 1.0])
+    torch.testing.assert_close(differentiate(lambda r: 1 - r, r, 2)[1], torch.tensor([-2.0, -1.0]))
+    assert not any(d.any() for d in differentiate(torch.ones_like, r, 4)[1:])

@@ -12,10 +12,9 @@ from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.linalg import unit
 from torchgrasp.shape.condition import condition, posterior_given
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.gradient_kernel import cross_covariance
+from torchgrasp.shape.gradient_kernel import covariance, cross_covariance
 from torchgrasp.shape.joint_posterior import JointEstimate, draw_samples
-from torchgrasp.shape.kernel import covariance, radial_derivatives, thin_plate
-from torchgrasp.shape.kernels import Kernel, kernel_by_name, matern52_kernel, rbf_kernel
+from torchgrasp.shape.kernel import Kernel, differentiate, kernel_by_name, matern52_kernel, rbf_kernel, thin_plate
 from torchgrasp.shape.observations import Observations
 from torchgrasp.shape.update import append_observations
 from torchgrasp.values import PointCloud
@@ -134,8 +133,8 @@ def test_mean_and_gradient_without_variances_equal_the_jet():
 def test_closed_forms_of_a_kernel_equal_autograd_of_its_profile(name: str):
     kernel = kernel_by_name(name, 3.6)
     r = torch.tensor([0.0, 1e-7, 0.01, 0.3, 1.0, 2.4], dtype=torch.float64)
-    derived = Kernel.from_profile(kernel.profile).slopes(r, 4)
-    for i, (a, b) in enumerate(zip(kernel.slopes(r, 4), derived, strict=True)):
+    derived = differentiate(kernel.profile, r, 4)
+    for i, (a, b) in enumerate(zip(kernel.derivatives(r, 4), derived, strict=True)):
         start = 0 if i < 2 else 2  # the higher ones are multiplied by 0 at r = 0
         torch.testing.assert_close(a[start:], b[start:], rtol=1e-6, atol=1e-6)
     x = torch.randn(6, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
@@ -147,9 +146,9 @@ def test_closed_forms_of_a_kernel_equal_autograd_of_its_profile(name: str):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_kernels_have_the_thin_plates_prior_variances(name: str):
-    k, slope, _ = radial_derivatives(kernel_by_name(name, 3.6).profile, torch.zeros(1, dtype=torch.float64))
+    k, curvature = kernel_by_name(name, 3.6).derivatives(torch.zeros(1, dtype=torch.float64), 2)
     torch.testing.assert_close(k, torch.full_like(k, 3.6**3))
-    torch.testing.assert_close(slope, torch.full_like(k, -6 * 3.6))
+    torch.testing.assert_close(curvature, torch.full_like(k, -6 * 3.6))
 
 
 def test_matern_and_rbf_are_those_of_scikit_learn():
@@ -164,7 +163,7 @@ def test_matern_and_rbf_are_those_of_scikit_learn():
 def test_any_profile_gives_the_posterior_of_the_same_kernel_by_name():
     known = _known(12)
     shape = _fit(known)
-    own = _fit(known, Kernel.from_profile(partial(thin_plate, psi=shape.psi), shape.kernel.diameter))
+    own = _fit(known, Kernel(partial(thin_plate, psi=shape.psi), shape.kernel.diameter))
     points = _queries(shape, 20)
     a, b = shape.predict(points), own.predict(points)
     torch.testing.assert_close(a.distance, b.distance, rtol=0, atol=1e-8)

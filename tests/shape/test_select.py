@@ -10,8 +10,8 @@ from torch import Tensor
 from torchgrasp.errors import IndefiniteCovariance
 from torchgrasp.linalg import unit
 from torchgrasp.shape.condition import posterior_given
-from torchgrasp.shape.kernel import covariance, thin_plate
-from torchgrasp.shape.kernels import kernel_by_name
+from torchgrasp.shape.gradient_kernel import covariance
+from torchgrasp.shape.kernel import kernel_by_name, thin_plate
 from torchgrasp.shape.observations import Observations, join, on_surface
 from torchgrasp.shape.select import Criterion, Selection, select_points
 

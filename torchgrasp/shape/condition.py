@@ -7,7 +7,7 @@ from torch import Tensor
 from torchgrasp.linalg import cholesky
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.gradient_kernel import gram
-from torchgrasp.shape.kernels import Kernel, kernel_by_name
+from torchgrasp.shape.kernel import Kernel, kernel_by_name
 from torchgrasp.shape.observations import Observations
 from torchgrasp.shape.posterior import Posterior
 from torchgrasp.values import PointCloud
@@ -99,7 +99,7 @@ def check_kernel(posterior: Posterior, least_noise: float) -> None:
     """
     kernel = posterior.kernel
     if longest_distance(posterior.x) > kernel.diameter:
-        matrix = gram(kernel, posterior.x, posterior.oriented)
+        matrix = gram(kernel, posterior.x, posterior.n_oriented)
         matrix.diagonal().add_(least_noise**2)
         cholesky(matrix, "the covariance K", kernel.remedy)
 

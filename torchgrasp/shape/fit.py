@@ -17,7 +17,7 @@ from torchgrasp.shape.completion.free_space import free_space, free_space_violat
 from torchgrasp.shape.completion.silhouette import seen_from_one_side
 from torchgrasp.shape.condition import as_shape, check_kernel, longest_distance
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.kernels import Kernel, KernelName, kernel_by_name
+from torchgrasp.shape.kernel import Kernel, KernelName, kernel_by_name
 from torchgrasp.shape.observations import Observations, join, off_surface, on_surface
 from torchgrasp.shape.select import Criterion, select_points
 from torchgrasp.shape.update import append_observations

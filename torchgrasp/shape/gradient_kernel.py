@@ -1,32 +1,60 @@
-"""Covariances of signed distances and normals in closed form, from a kernel's slopes: what all fast paths use.
-
-`kernel.covariance` defines them by autograd of the profile, and the tests hold the two against each other.
-"""
+"""Covariances of signed distances and normals, derived from any radial kernel k(r), Eqs. (2)-(5)."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.shape.kernels import Kernel
+from torchgrasp.shape.kernel import Kernel, Profile
+
+
+def covariance(
+    x: Float[Tensor, "n 3"],
+    other: Float[Tensor, "m 3"],
+    has_normal: Bool[Tensor, "n"],
+    other_has_normal: Bool[Tensor, "m"],
+    profile: Profile,
+) -> Float[Tensor, "rows columns"]:
+    """Return the covariance between the observations at two sets of points by autograd of the profile, Eqs. (2)-(5).
+
+    A point with a normal has four rows (d, w1, w2, w3), another point only d. Rows are ordered by component: all d,
+    then w1, w2 and w3 of the points with normals. This is the definition; the posterior uses `cross_covariance`.
+
+    Args:
+        x, other: points, normalised.
+        has_normal, other_has_normal: which points are observed with their normal.
+        profile: the radial kernel, e.g. `functools.partial(thin_plate, psi=3.6)`.
+
+    Returns:
+        The blocks, without a gradient to the points.
+
+    >>> x, mask = torch.rand(5, 3), torch.tensor([True, True, False, False, False])
+    >>> covariance(x, x, mask, mask, lambda r: torch.exp(-(r**2))).shape
+    torch.Size([11, 11])
+    """
+    # Detached as the derivatives of the profile are: a gradient through one factor alone would be wrong.
+    blocks = cross_covariance(Kernel(profile), x.detach(), other.detach(), len(other)).flatten(0, 1)
+    rows, columns = (torch.cat([torch.ones_like(mask), mask.repeat(3)]) for mask in (has_normal, other_has_normal))
+    return blocks[rows][:, columns]
 
 
 def cross_covariance(
     kernel: Kernel,
     x: Float[Tensor, "q 3"],
     y: Float[Tensor, "n 3"],
-    near: int,
+    n_oriented: int,
     out: Float[Tensor, "4 q rows"] | None = None,
 ) -> Float[Tensor, "4 q rows"]:
-    """Return the covariance of (d, w) at points x with what is observed at points y, Eqs. (2)-(5).
+    """Return the covariance of (d, w) at points x with the observations at points y, Eqs. (2)-(5).
 
     With d = x - y and k', k'' the derivatives of the kernel in r^2 / 2, the blocks are k, k' d, -k' d^T and
-    -k' I - k'' d d^T.
+    -k' I - k'' d d^T. In Eq. (5) one derivative is of each argument; both of the same argument would flip the sign of
+    the block and make the matrix indefinite.
 
     Args:
         kernel: the radial kernel.
         x: points, normalised.
-        y: points, of which the first `near` are observed with normals.
-        near: see `y`.
+        y: points, of which the first `n_oriented` are observed with normals.
+        n_oriented: see `y`.
         out: where to write the result; new memory costs more than the arithmetic.
 
     Returns:
@@ -34,22 +62,22 @@ def cross_covariance(
     """
     n = len(y)
     d, r = separations(x, y)
-    k, slope, bend = kernel.slopes(r, 3)
+    k, first, second = kernel.derivatives(r, 3)
     if out is None:
-        out = x.new_empty(4, len(x), n + 3 * near)
+        out = x.new_empty(4, len(x), n + 3 * n_oriented)
     out[0, :, :n] = k
     for m in range(3):
-        torch.mul(slope, d[m], out=out[m + 1, :, :n])
-    if not near:
+        torch.mul(first, d[m], out=out[m + 1, :, :n])
+    if not n_oriented:
         return out
-    d, slope, bend = [part[:, :near] for part in d], -slope[:, :near], -bend[:, :near]
+    d, first, second = [part[:, :n_oriented] for part in d], -first[:, :n_oriented], -second[:, :n_oriented]
     for m in range(3):
-        columns = slice(n + m * near, n + (m + 1) * near)
-        torch.mul(slope, d[m], out=out[0, :, columns])
-        tilted = bend * d[m]
-        torch.addcmul(slope, tilted, d[m], out=out[m + 1, :, columns])
+        columns = slice(n + m * n_oriented, n + (m + 1) * n_oriented)
+        torch.mul(first, d[m], out=out[0, :, columns])
+        tilted = second * d[m]
+        torch.addcmul(first, tilted, d[m], out=out[m + 1, :, columns])
         for p in range(m):
-            block = out[m + 1, :, n + p * near : n + (p + 1) * near]
+            block = out[m + 1, :, n + p * n_oriented : n + (p + 1) * n_oriented]
             torch.mul(tilted, d[p], out=block)
             out[p + 1, :, columns] = block
     return out
@@ -62,21 +90,21 @@ def separations(x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"]) -> tuple[list[
 
 
 def covariance_rows(
-    kernel: Kernel, x: Float[Tensor, "n 3"], near: int, y: Float[Tensor, "m 3"], other_near: int
+    kernel: Kernel, x: Float[Tensor, "n 3"], n_oriented: int, y: Float[Tensor, "m 3"], other_oriented: int
 ) -> Float[Tensor, "rows columns"]:
-    """Return what `covariance` does for two sets of points of which the first `near` and `other_near` have normals.
+    """Return `covariance` for points of which the first `n_oriented` and `other_oriented` have normals.
 
-    >>> from torchgrasp.shape.kernels import rbf_kernel
+    >>> from torchgrasp.shape.kernel import rbf_kernel
     >>> x = torch.rand(5, 3, dtype=torch.float64)
     >>> covariance_rows(rbf_kernel(1.0), x, 2, x, 0).shape
     torch.Size([11, 5])
     """
-    block = cross_covariance(kernel, x, y, other_near)
-    if near == len(x):
+    block = cross_covariance(kernel, x, y, other_oriented)
+    if n_oriented == len(x):
         return block.flatten(0, 1)
-    return torch.cat([block[0], block[1:, :near].flatten(0, 1)])
+    return torch.cat([block[0], block[1:, :n_oriented].flatten(0, 1)])
 
 
-def gram(kernel: Kernel, x: Float[Tensor, "n 3"], near: int) -> Float[Tensor, "rows rows"]:
-    """Return the covariance of what is observed at points, of which the first `near` have normals; symmetric."""
-    return covariance_rows(kernel, x, near, x, near)
+def gram(kernel: Kernel, x: Float[Tensor, "n 3"], n_oriented: int) -> Float[Tensor, "rows rows"]:
+    """Return the covariance of what is observed at points, of which the first `n_oriented` have normals; symmetric."""
+    return covariance_rows(kernel, x, n_oriented, x, n_oriented)

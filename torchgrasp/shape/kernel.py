@@ -1,25 +1,83 @@
-"""Covariances of signed distances and normals, derived from any radial kernel k(r), Eqs. (2)-(6)."""
+"""Radial kernels k(r) of the shape: the thin plate of the paper, Matern 5/2, the squared exponential, or your own.
 
+A kernel is its scalar profile; autograd gives the derivatives. A closed form of them may be registered as a speed-up.
+"""
+
+import dataclasses
+import math
 from collections.abc import Callable
+from functools import partial
+from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.linalg import safe_distance
+from torchgrasp.errors import BadArgument
 
 Profile = Callable[[Tensor], Tensor]
-"""A radial kernel k(r), elementwise and twice differentiable, with k'(0) = 0."""
+"""A radial kernel k(r), elementwise and three times differentiable where r > 0, with k'(0) = 0."""
+KernelName = Literal["thin_plate", "matern52", "rbf"]
 
 NEAR = 1e-5
-"""Distance below which k'(r)/r is taken as k''(r/2), its midpoint rule: exact for the thin plate, and no 0/0."""
+"""Below this distance k'(r)/r is k''(r/2), its midpoint rule: exact for the thin plate, and no 0/0."""
+LEAST_PSI = 4.0 / 3.0
+"""psi over the diameter of a ball in which the thin plate kernel is positive definite (dense limit: 1.313)."""
+PLATE_REMEDY = "use a psi_scale of at least 1.34: the thin plate kernel is a covariance only within 3/4 psi"
+NOISE_REMEDY = "use more noise, or a shorter length of the kernel"
+
+
+@dataclasses.dataclass(frozen=True)
+class Kernel:
+    """A radial kernel k(r) of normalised distances.
+
+    Args:
+        profile: k(r); the covariances of distances and normals follow from it by autograd.
+        diameter: of the ball, normalised, within which k is a covariance; infinite if it is one everywhere.
+        remedy: what to do when the covariance is not positive definite.
+        closed_form: a faster `differentiate` of this profile, called with `r` and `count`; None: autograd.
+
+    >>> kernel = Kernel(lambda r: (1 + r) * torch.exp(-r))
+    >>> [round(float(s), 4) for s in kernel.derivatives(torch.ones(1, dtype=torch.float64), 4)]
+    [0.7358, -0.3679, 0.3679, -0.7358]
+    """
+
+    profile: Profile
+    diameter: float = math.inf
+    remedy: str = NOISE_REMEDY
+    closed_form: Callable[[Tensor, int], tuple[Tensor, ...]] | None = None
+
+    def derivatives(self, r: Float[Tensor, "*s"], count: int) -> tuple[Float[Tensor, "*s"], ...]:
+        """Return the first `count` of k and its derivatives in r^2 / 2; see `differentiate`."""
+        return differentiate(self.profile, r, count) if self.closed_form is None else self.closed_form(r, count)
+
+
+def differentiate(profile: Profile, r: Float[Tensor, "*s"], count: int) -> tuple[Float[Tensor, "*s"], ...]:
+    """Return the first `count` (at most 4) of k, dk/du, d2k/du2 and d3k/du3 with u = r^2 / 2, by autograd.
+
+    All derivatives of the covariance are polynomials in them and in the difference of two points. The first is
+    k'(r)/r, which tends to k''(0). The others may be infinite at r = 0 and are 0 there: their factors vanish faster.
+
+    >>> differentiate(lambda r: torch.exp(-(r**2)), torch.zeros(1), 2)
+    (tensor([1.]), tensor([-2.]))
+    """
+    k, *by_r = _differentiate_by_distance(profile, r, max(count - 1, 1))
+    *_, midpoint = _differentiate_by_distance(profile, r / 2, 2)
+    positive = torch.where(r > 0, r, 1.0)
+    values = [k, torch.where(r < NEAR, midpoint, by_r[0] / positive)]
+    if count > 2:
+        values.append(torch.where(r > 0, (by_r[1] - values[1]) / positive**2, 0.0))
+    if count > 3:
+        third = (by_r[2] / positive - 3.0 * values[2]) / positive**2
+        values.append(torch.where(r < NEAR, 0.0, third))
+    return tuple(values[:count])
 
 
 def thin_plate(r: Float[Tensor, "*s"], psi: float) -> Float[Tensor, "*s"]:
-    """Return the thin plate kernel 2 r^3 - 3 psi r^2 + psi^3 of a distance, Eq. (6).
+    """Return the thin plate kernel 2 r^3 - 3 psi r^2 + psi^3, Eq. (6).
 
-    It is a covariance only on a ball of diameter 3/4 psi or less: with psi equal to the longest distance of the
-    data, as the paper has it, three points and two normals suffice for a negative eigenvalue.
+    It is a covariance only within a ball of diameter 3/4 psi. The paper takes the longest distance of the data as
+    psi: three points and two normals then suffice for a negative eigenvalue.
 
     Args:
         r: distances, normalised.
@@ -32,72 +90,81 @@ def thin_plate(r: Float[Tensor, "*s"], psi: float) -> Float[Tensor, "*s"]:
     return r * r * (2.0 * r - 3.0 * psi) + psi**3
 
 
-def radial_derivatives(
-    profile: Profile, r: Float[Tensor, "*s"]
-) -> tuple[Float[Tensor, "*s"], Float[Tensor, "*s"], Float[Tensor, "*s"]]:
-    """Return k(r), k'(r)/r and k''(r) by autograd of the profile, with the limit k''(0) of k'(r)/r at r = 0.
+def thin_plate_kernel(psi: float) -> Kernel:
+    """Return the thin plate kernel with the closed form of its derivatives."""
+    return Kernel(partial(thin_plate, psi=psi), psi / LEAST_PSI, PLATE_REMEDY, partial(_differentiate_thin_plate, psi))
 
-    >>> k, slope, bend = radial_derivatives(lambda r: torch.exp(-(r**2)), torch.zeros(1))
-    >>> slope, bend
-    (tensor([-2.]), tensor([-2.]))
+
+def matern52_kernel(length: float, variance: float = 1.0) -> Kernel:
+    """Return the Matern kernel v (1 + s + s^2 / 3) exp(-s) with s = sqrt(5) r / length and v = `variance`.
+
+    >>> float(matern52_kernel(1.0).profile(torch.zeros(())))
+    1.0
     """
-    k, first, second = _differentiate(profile, r)
-    near = r < NEAR
-    _, _, midpoint = _differentiate(profile, r / 2)
-    return k, torch.where(near, midpoint, first / torch.where(near, 1.0, r)), second
+    _check_positive(length, variance)
+
+    def profile(r: Tensor) -> Tensor:
+        s = (math.sqrt(5.0) / length) * r
+        return variance * (1.0 + s + s * s / 3.0) * torch.exp(-s)
+
+    return Kernel(profile)
 
 
-def covariance(
-    x: Float[Tensor, "n 3"],
-    other: Float[Tensor, "m 3"],
-    has_normal: Bool[Tensor, "n"],
-    other_has_normal: Bool[Tensor, "m"],
-    profile: Profile,
-) -> Float[Tensor, "rows columns"]:
-    """Return the covariance between the observations at two sets of points, Eqs. (2)-(5).
+def rbf_kernel(length: float, variance: float = 1.0) -> Kernel:
+    """Return the squared exponential kernel v exp(-r^2 / (2 length^2)) with v = `variance`.
 
-    A point with a normal has four rows (d, w1, w2, w3), another only d. Rows are ordered by component: all d, then
-    w1, w2, w3 of the points with normals. In Eq. (5) one derivative is of each argument; both of the same argument
-    would flip the sign of the block and make the matrix indefinite.
+    >>> float(rbf_kernel(1.0).profile(torch.zeros(())))
+    1.0
+    """
+    _check_positive(length, variance)
+    return Kernel(lambda r: variance * torch.exp(r * r * (-0.5 / length**2)))
+
+
+def kernel_by_name(name: str, psi: float) -> Kernel:
+    """Return a kernel with the prior variances of the thin plate: k(0) = psi^3 and k''(0) = -6 psi.
+
+    The squared exponential then has the length psi / sqrt(6), and Matern 5/2 has sqrt(5/18) psi.
 
     Args:
-        x, other: points, normalised.
-        has_normal, other_has_normal: which of them are observed with their normal.
-        profile: the radial kernel, e.g. `functools.partial(thin_plate, psi=3.6)`.
+        name: "thin_plate", "matern52" or "rbf".
+        psi: normalised.
 
-    Returns:
-        The blocks, without a gradient to the points.
-
-    >>> x, mask = torch.rand(5, 3), torch.tensor([True, True, False, False, False])
-    >>> covariance(x, x, mask, mask, lambda r: torch.exp(-(r**2))).shape
-    torch.Size([11, 11])
+    Raises:
+        BadArgument: another name.
     """
-    # Detached as the derivatives of the profile are: a gradient through one factor alone would be wrong.
-    difference = (x[:, None] - other[None]).detach()
-    r = safe_distance(difference)
-    k, slope, bend = radial_derivatives(profile, r)
-    # d2k/dx_m dx'_n = -(k'/r) delta_mn - (k'' - k'/r) u_m u_n with u = d/r; at r = 0 the second term has no
-    # direction, and k'' - k'/r vanishes there.
-    direction = difference / torch.where(r == 0, 1.0, r)[..., None]
-    tilt = bend - slope
-    rows = [torch.cat([k] + [-(slope * difference[..., n])[:, other_has_normal] for n in range(3)], 1)]
-    for m in range(3):
-        block = [slope * difference[..., m]]
-        for n in range(3):
-            mixed = -tilt * direction[..., m] * direction[..., n]
-            block.append((mixed - slope if m == n else mixed)[:, other_has_normal])
-        rows.append(torch.cat(block, 1)[has_normal])
-    return torch.cat(rows, 0)
+    if name == "thin_plate":
+        return thin_plate_kernel(psi)
+    if name == "matern52":
+        return matern52_kernel(psi * math.sqrt(5.0 / 18.0), psi**3)
+    if name == "rbf":
+        return rbf_kernel(psi / math.sqrt(6.0), psi**3)
+    raise BadArgument("kernel", repr(name), "'thin_plate', 'matern52', 'rbf' or a Kernel")
 
 
-def _differentiate(profile: Profile, r: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the profile and its first two derivatives, elementwise."""
+def _differentiate_by_distance(profile: Profile, r: Tensor, order: int) -> list[Tensor]:
+    """Return the profile and its derivatives in r up to an order, elementwise."""
     with torch.enable_grad():
         r = r.detach().requires_grad_()
-        k = profile(r)
-        (first,) = torch.autograd.grad(k.sum(), r, create_graph=True, materialize_grads=True)
-        if first.requires_grad:
-            (second,) = torch.autograd.grad(first.sum(), r, materialize_grads=True)
-        else:  # a linear profile
-            second = torch.zeros_like(first)
-    return k.detach(), first.detach(), second.detach()
+        values = [profile(r)]
+        for _ in range(order):
+            value = values[-1] + 0.0 * r  # a constant would have no graph
+            values += torch.autograd.grad(value.sum(), r, create_graph=True)
+    return [value.detach() for value in values]
+
+
+def _differentiate_thin_plate(psi: float, r: Tensor, count: int) -> tuple[Tensor, ...]:
+    """Return what `differentiate` does for the thin plate, in closed form."""
+    values = [(2.0 * r).sub_(3.0 * psi).mul_(r).mul_(r).add_(psi**3), (6.0 * r).sub_(6.0 * psi)]
+    if count > 2:
+        inverse = torch.reciprocal(r).masked_fill_(r == 0, 0.0)
+        values.append(6.0 * inverse)
+        if count > 3:
+            values.append((inverse * inverse).mul_(inverse).mul_(-6.0))
+    return tuple(values)
+
+
+def _check_positive(length: float, variance: float) -> None:
+    """Refuse a length or a variance that is no positive number."""
+    for name, value in (("length", length), ("variance", variance)):
+        if not 0.0 < value < math.inf:
+            raise BadArgument(name, value, "a positive number, normalised")

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.shape.gradient_kernel import cross_covariance, separations
-from torchgrasp.shape.kernels import Kernel
+from torchgrasp.shape.kernel import Kernel
 
 BLOCK = 2**27
 """Bytes of the largest temporary of a query on an accelerator; memory stays bounded for any number of points."""
@@ -77,7 +77,7 @@ class Posterior(Value):
         return [inverse[i : i + width, : i + width].T.contiguous() for i in range(0, rows, width)]
 
     @cached_property
-    def oriented(self) -> int:
+    def n_oriented(self) -> int:
         """Number of observed points with normals."""
         return int(self.has_normal.sum())
 
@@ -89,9 +89,9 @@ class Posterior(Value):
         """Return the mean signed distance alone, normalised, at normalised points: for grids of many points."""
 
         def evaluate(x: Tensor) -> tuple[Tensor]:
-            n, near = len(self.x), self.oriented
+            n, near = len(self.x), self.n_oriented
             b = self.weights[n:].reshape(3, near).T
-            k, slope = self.kernel.slopes(_distances(x, self.x), 2)
+            k, slope = self.kernel.derivatives(_distances(x, self.x), 2)
             along = x @ b.T - (self.x[:near] * b).sum(-1)
             return (k @ self.weights[:n] - (slope[:, :near] * along).sum(1),)
 
@@ -104,9 +104,9 @@ class Posterior(Value):
         """
 
         def evaluate(x: Tensor) -> tuple[Tensor, Tensor]:
-            n, near = len(self.x), self.oriented
+            n, near = len(self.x), self.n_oriented
             a, b = self.weights[:n], self.weights[n:].reshape(3, near).T
-            k, slope, bend = self.kernel.slopes(_distances(x, self.x), 3)
+            k, slope, bend = self.kernel.derivatives(_distances(x, self.x), 3)
             along = x @ b.T - (self.x[:near] * b).sum(-1)
             distance = k @ a - (slope[:, :near] * along).sum(1)
             c = slope * a
@@ -124,7 +124,7 @@ class Posterior(Value):
 
         def evaluate(x: Tensor) -> tuple[Tensor, Tensor]:
             source, target = (space[: 4 * len(x) * rows].view(4, len(x), rows) for space in spaces)
-            cross_covariance(self.kernel, x, self.x, self.oriented, source)
+            cross_covariance(self.kernel, x, self.x, self.n_oriented, source)
             mean = (source @ self.weights).T
             if self.order is not None:
                 source, target = torch.index_select(source, 2, self.order, out=target), source
@@ -164,7 +164,7 @@ class Posterior(Value):
 
     def cross(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "4 q rows"]:
         """Return the covariance of (d, w) at points with the observations, in the order of `covariance`'s columns."""
-        return cross_covariance(self.kernel, x, self.x, self.oriented)
+        return cross_covariance(self.kernel, x, self.x, self.n_oriented)
 
     def _chunk(self, x: Tensor) -> int:
         """Return how many points to query at once."""
@@ -174,10 +174,10 @@ class Posterior(Value):
 
     def _jet(self, x: Float[Tensor, "q 3"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Return the fields of `SurfaceJet` for one chunk."""
-        n, near = len(self.x), self.oriented  # the points with normals come first
+        n, near = len(self.x), self.n_oriented  # the points with normals come first
         a, b = self.weights[:n], self.weights[n:].reshape(3, near).T
         d, r = separations(x, self.x)
-        k, slope, bend, third = self.kernel.slopes(r, 4)
+        k, slope, bend, third = self.kernel.derivatives(r, 4)
         near_d, near_slope, near_bend = [part[:, :near] for part in d], slope[:, :near], bend[:, :near]
         row = x.new_empty(len(x), n + 3 * near)
         row[:, :n] = k

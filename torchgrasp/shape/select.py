@@ -12,7 +12,7 @@ from torchgrasp.base import Value
 from torchgrasp.linalg import cholesky
 from torchgrasp.shape.condition import posterior_given
 from torchgrasp.shape.gradient_kernel import cross_covariance
-from torchgrasp.shape.kernels import Kernel
+from torchgrasp.shape.kernel import Kernel
 from torchgrasp.shape.observations import Observations, on_surface
 from torchgrasp.shape.posterior import Posterior
 from torchgrasp.shape.update import extend_posterior

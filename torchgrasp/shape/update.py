@@ -33,7 +33,7 @@ def append_observations(
     new = new.with_normals_first()
     y, noise = new.rows()
     fresh = int(new.has_normal.sum())
-    cross = covariance_rows(kernel, posterior.x, posterior.oriented, new.x, fresh)
+    cross = covariance_rows(kernel, posterior.x, posterior.n_oriented, new.x, fresh)
     own = gram(kernel, new.x, fresh) + torch.diag_embed(noise)
     if shared is not None:
         own[: len(new.x), : len(new.x)] += shared @ shared.T

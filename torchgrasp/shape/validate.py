@@ -5,7 +5,7 @@ from typing import get_args
 
 from torchgrasp.errors import BadArgument, TooFewPoints
 from torchgrasp.shape.completion.silhouette import share_behind
-from torchgrasp.shape.kernels import Kernel, KernelName, kernel_by_name
+from torchgrasp.shape.kernel import Kernel, KernelName, kernel_by_name
 from torchgrasp.shape.select import Criterion
 from torchgrasp.values import PointCloud
 

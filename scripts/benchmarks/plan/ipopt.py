@@ -79,7 +79,7 @@ def _posterior(ca: Any, shape: ShapeGP) -> Any:
 
     With d = x - x_j and r = |d|: k = (psi - r)^2 (psi + 2 r), cov(value, normal) = 6 (psi - r) d.
     """
-    x, near, n, psi = ca.MX.sym("x", 3), shape.oriented, len(shape.x), shape.psi
+    x, near, n, psi = ca.MX.sym("x", 3), shape.n_oriented, len(shape.x), shape.psi
     observed = ca.DM(shape.x.T.numpy())
     a, b = ca.DM(shape.weights[:n].numpy()), ca.DM(shape.weights[n:].reshape(3, near).numpy())
     d = ca.repmat(x, 1, n) - observed

@@ -17,7 +17,7 @@ from torchgrasp.shape.condition import condition, longest_distance
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.gradient_kernel import gram
-from torchgrasp.shape.kernels import kernel_by_name
+from torchgrasp.shape.kernel import kernel_by_name
 from torchgrasp.shape.observations import Observations, join, off_surface, on_surface
 from torchgrasp.shape.select import select_points
 from torchgrasp.values import PointCloud
