@@ -2,29 +2,17 @@
 
 import dataclasses
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
+from tests.rings import ring, run_python
 from torchgrasp.errors import BadArgument, ModelFileError, OutputError
 from torchgrasp.posture_model.em import Progress
 from torchgrasp.posture_model.fit import fit_mixture
 from torchgrasp.posture_model.mixture import GraspMixture, load_mixture
 from torchgrasp.posture_model.sample import HandSamples
-
-
-def ring(n: int = 3000) -> HandSamples:
-    """One joint that goes round, and a code that follows it."""
-    rng = np.random.default_rng(7)
-    angle = rng.uniform(0, 6, size=n)
-    lengths = 0.05 + 0.01 * np.stack([np.sin(angle), np.cos(angle), np.sin(2 * angle)], -1)
-    cosines = np.stack([np.cos(angle), np.sin(angle), np.cos(3 * angle)], -1)
-    q = np.concatenate([lengths, cosines], -1) + rng.normal(size=(n, 6)) * np.repeat([1e-3, 0.05], 3)
-    return HandSamples(torch.from_numpy(angle[:, None]), torch.from_numpy(q), ("turn",))
 
 
 def parameters(mixture: GraspMixture) -> torch.Tensor:
@@ -48,7 +36,7 @@ def fit_until(step: int, path: Path, samples: HandSamples) -> None:
         fit_mixture(samples, 5, iterations=20, tolerance=0.0, checkpoint=path, observer=kill)
 
 
-def test_f2_a_fit_goes_on_where_it_was_killed(tmp_path):
+def test_a_fit_goes_on_where_it_was_killed(tmp_path):
     samples, path = ring(), tmp_path / "fit.safetensors"
     whole = fit_mixture(samples, 5, iterations=20, tolerance=0.0)
     for step in (1, 3, 8):  # killed three times
@@ -66,13 +54,12 @@ def test_f2_a_fit_goes_on_where_it_was_killed(tmp_path):
     assert torch.equal(parameters(longer), parameters(fit_mixture(samples, 5, iterations=25, tolerance=0.0)))
 
 
-def test_f2_kill_9(tmp_path):
+def test_a_fit_outlives_kill_9(tmp_path):
     path = tmp_path / "fit.safetensors"
     script = f"""
-import os, signal, sys
+import os, signal
 import torch
-sys.path.insert(0, {str(Path(__file__).parent)!r})
-from test_checkpoint import ring
+from tests.rings import ring
 from torchgrasp.posture_model.fit import fit_mixture
 torch.set_num_threads({torch.get_num_threads()})
 def kill(progress):
@@ -80,7 +67,7 @@ def kill(progress):
         os.kill(os.getpid(), signal.SIGKILL)
 fit_mixture(ring(), 5, iterations=12, tolerance=0.0, checkpoint={str(path)!r}, observer=kill)
 """
-    assert subprocess.run([sys.executable, "-c", script]).returncode == -signal.SIGKILL
+    assert run_python("-c", script).returncode == -signal.SIGKILL
     steps: list[Progress] = []
     again = fit_mixture(ring(), 5, iterations=12, tolerance=0.0, checkpoint=path, observer=steps.append)
     assert len(steps) == 6
@@ -118,10 +105,8 @@ def test_a_damaged_checkpoint_and_a_folder_that_cannot_be_written_are_named(tmp_
 def test_two_processes_fit_what_one_does(tmp_path):
     script = tmp_path / "share.py"
     script.write_text(f"""
-import sys
 import torch
-sys.path.insert(0, {str(Path(__file__).parent)!r})
-from test_checkpoint import ring
+from tests.rings import ring
 from torchgrasp.posture_model.fit import fit_mixture
 torch.distributed.init_process_group("gloo")
 rank = torch.distributed.get_rank()
@@ -131,8 +116,7 @@ mixture = fit_mixture(share, 5, seed=3, iterations=25, tolerance=0.0, distribute
 mixture.save(path + f"/{{rank}}.safetensors")
 torch.distributed.destroy_process_group()
 """)
-    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
-    done = subprocess.run(launch, capture_output=True, text=True, timeout=300)
+    done = run_python("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script))
     assert done.returncode == 0, done.stderr
     first, second = (load_mixture(tmp_path / f"{rank}.safetensors") for rank in (0, 1))
     assert torch.equal(parameters(first), parameters(second))

@@ -20,6 +20,7 @@ from torchgrasp.posture_model.em import (
     maximisation,
 )
 from torchgrasp.posture_model.kmeans import start_components
+from torchgrasp.posture_model.shard import Shard
 
 
 def clustered(n: int = 6000, d: int = 5, m: int = 4) -> torch.Tensor:
@@ -55,8 +56,8 @@ def test_eq20_one_component_is_the_sample_mean_and_covariance():
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 def test_eq20_em_equals_scikit_learn_from_the_same_start():
     x, m, steps = clustered(), 6, 15
-    start = start_components(x, m, seed=0, regularisation=1e-6)
-    ours = expectation_maximisation(x, start, steps, tolerance=0.0, regularisation=1e-6)
+    start = start_components(Shard(x), m, seed=0, regularisation=1e-6)
+    ours = expectation_maximisation(Shard(x), start, steps, tolerance=0.0, regularisation=1e-6)
     first = start.components
     theirs = GaussianMixture(
         m,
@@ -76,24 +77,26 @@ def test_eq20_em_equals_scikit_learn_from_the_same_start():
 @pytest.mark.parametrize("m", [1, 3, 9])
 def test_log_likelihood_never_decreases(m):
     x = clustered()
-    fit = expectation_maximisation(x, start_components(x, m, 1, 1e-6), 60, tolerance=0.0, regularisation=1e-6)
+    fit = expectation_maximisation(
+        Shard(x), start_components(Shard(x), m, 1, 1e-6), 60, tolerance=0.0, regularisation=1e-6
+    )
     assert float(fit.log_likelihood.diff().min()) >= -1e-9
     # The last entry belongs to the components that are returned.
-    _, log_likelihood = expectation(x, fit.components)
+    _, log_likelihood = expectation(Shard(x), fit.components)
     torch.testing.assert_close(log_likelihood / len(x), fit.log_likelihood[-1])
 
 
 def test_start_is_the_same_for_the_same_seed():
     x = clustered()
-    first, second = (start_components(x, 5, 7, 1e-6) for _ in range(2))
+    first, second = (start_components(Shard(x), 5, 7, 1e-6) for _ in range(2))
     assert torch.equal(first.components.means, second.components.means)
-    assert not torch.equal(first.components.means, start_components(x, 5, 8, 1e-6).components.means)
+    assert not torch.equal(first.components.means, start_components(Shard(x), 5, 8, 1e-6).components.means)
 
 
 def test_start_finds_separate_clusters(generator):
     centres = torch.tensor([[-2.0, 0], [2, 0], [0, 3]], dtype=torch.float64)
     x = (centres[:, None] + 0.05 * torch.randn(3, 200, 2, generator=generator, dtype=torch.float64)).flatten(0, 1)
-    start = start_components(x, 3, 0, 0.0).components
+    start = start_components(Shard(x), 3, 0, 0.0).components
     torch.testing.assert_close(start.weights, torch.full((3,), 1 / 3, dtype=torch.float64))
     assert float(torch.cdist(centres, start.means).amin(1).max()) < 0.02
 
@@ -101,39 +104,39 @@ def test_start_finds_separate_clusters(generator):
 def test_fewer_different_rows_than_components_are_named():
     rows = torch.tensor([[0.0, 1.0], [1.0, 0.0]], dtype=torch.float64).repeat(50, 1)
     with pytest.raises(BadArgument, match="components: found 3, allowed is at most 2"):
-        start_components(rows, 3, 0, 1e-6)
+        start_components(Shard(rows), 3, 0, 1e-6)
 
 
 def test_an_indefinite_start_is_an_error_not_a_repair():
     x = clustered()
-    start = start_components(x, 3, 0, 1e-6)
+    start = start_components(Shard(x), 3, 0, 1e-6)
     flat = start.components.covariances * torch.tensor([1.0, 1, 0])[:, None, None]
     components = Components(start.components.weights, start.components.means, flat)
     with pytest.raises(IndefiniteCovariance, match="fewer components"):
-        expectation_maximisation(x, Progress(components, start.reseeded, start.log_likelihood), 5, 0.0, 0.0)
+        expectation_maximisation(Shard(x), Progress(components, start.reseeded, start.log_likelihood), 5, 0.0, 0.0)
 
 
-def test_i11_a_collapsed_component_is_placed_anew_and_the_fit_recovers():
+def test_a_collapsed_component_is_placed_anew_and_the_fit_recovers():
     x = clustered()
-    start = start_components(x, 3, 0, 1e-6)
+    start = start_components(Shard(x), 3, 0, 1e-6)
     # A component so far away that no row belongs to it: it takes half of the heaviest one.
     means = start.components.means.index_fill(0, torch.tensor([1]), 50.0)
     lost = Progress(dataclasses.replace(start.components, means=means), start.reseeded, start.log_likelihood)
     steps: list[Progress] = []
-    fit = expectation_maximisation(x, lost, 200, 1e-6, 1e-6, observe=steps.append)
+    fit = expectation_maximisation(Shard(x), lost, 200, 1e-6, 1e-6, observer=steps.append)
     assert fit.reseeded.tolist() == [0, 1, 0]
     assert [step.jumped for step in steps[:2]] == [True, False]
     assert fit.converged
     assert float(fit.components.weights.min()) > 0.05
     assert float(fit.log_likelihood[1:].diff().min()) >= -1e-9
-    usual = expectation_maximisation(x, start, 200, 1e-6, 1e-6)
+    usual = expectation_maximisation(Shard(x), start, 200, 1e-6, 1e-6)
     assert abs(float(fit.log_likelihood[-1] - usual.log_likelihood[-1])) < 0.05
 
 
-def test_i11_a_component_is_placed_anew_three_times_and_no_more():
+def test_a_component_is_placed_anew_three_times_and_no_more():
     x = clustered()
-    components = start_components(x, 3, 0, 1e-6).components
-    sums, _ = expectation(x, components)
+    components = start_components(Shard(x), 3, 0, 1e-6).components
+    sums, _ = expectation(Shard(x), components)
     sums[2] = 0.0
     for before in range(RESEEDS):
         found, reseeded = maximisation(sums, len(x), 0.0, torch.tensor([0, 0, before]))
@@ -147,8 +150,8 @@ def test_i11_a_component_is_placed_anew_three_times_and_no_more():
         maximisation(sums, len(x), 0.0, torch.tensor([0, 0, RESEEDS]))
 
 
-def test_i11_data_that_span_no_covariance_are_an_error_at_once():
+def test_data_that_span_no_covariance_are_an_error_at_once():
     x = clustered()
     x = torch.cat([x, x[:, :1]], 1)  # a column twice
     with pytest.raises(IndefiniteCovariance, match="collapsed 1 times"):
-        start_components(x, 3, 0, 0.0)
+        start_components(Shard(x), 3, 0, 0.0)

@@ -37,7 +37,7 @@ def test_bic_of_the_curve_is_that_of_the_fit():
     assert math.isclose(float(curve.bic[0]), bic(fit_mixture(samples, 2, seed=3), samples), rel_tol=1e-9, abs_tol=0.1)
 
 
-def test_f2_a_killed_sweep_goes_on(tmp_path):
+def test_a_killed_sweep_goes_on(tmp_path):
     samples, whole = islands(), bic_curve(islands(), (1, 2, 3))
 
     def kill(m, mixture):

@@ -1,4 +1,4 @@
-"""Where a fit stands, kept in a file after every step: a fit that was killed goes on at its last step."""
+"""The state of a fit in a file, written after every step: a fit that was killed continues from its last step."""
 
 import dataclasses
 from pathlib import Path
@@ -10,58 +10,60 @@ from torch import Tensor
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.posture_model.em import Components, Progress
+from torchgrasp.posture_model.shard import Shard
 
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """The file of one fit, and what tells that fit from others: data, components, seeds and added variance.
-
-    The data are known by their number, mean and standard deviation in every dimension, which are equal to the last
-    bit when they are the same.
+    """The file of one fit, with what distinguishes this fit from others.
 
     Args:
-        path: of the file; it need not exist.
-        rows: how many the data are.
-        centre: their mean.
-        scale: their standard deviation.
-        components: m.
-        seed: of the first start.
-        starts: how many there were.
-        regularisation: relative added variance.
+        path: of the file; None keeps nothing.
+        shard: the data; process 0 writes the file and all processes read it.
+        centre: mean of the data. Centre and scale identify the data.
+        scale: standard deviation of the data.
+        settings: numbers of rows, components and starts, seed, regularisation.
     """
 
-    path: Path
-    rows: int
+    path: Path | None
+    shard: Shard
     centre: Float[Tensor, "d"]
     scale: Float[Tensor, "d"]
-    components: int
-    seed: int
-    starts: int
-    regularisation: float
+    settings: dict[str, str]
 
     def save(self, progress: Progress) -> None:
-        """Write atomically where the fit stands.
+        """Write the state atomically.
 
         Raises:
             OutputError: the file cannot be written.
         """
-        fields = dataclasses.fields(Components)
-        tensors = {field.name: getattr(progress.components, field.name) for field in fields}
+        if self.path is None or self.shard.rank > 0:
+            return
+        tensors = {field.name: getattr(progress.components, field.name) for field in dataclasses.fields(Components)}
         tensors |= {"reseeded": progress.reseeded, "log_likelihood": progress.log_likelihood}
         tensors |= {"centre": self.centre, "scale": self.scale}
-        meta = {**self._settings(), "jumped": str(progress.jumped)}
-        save_tensors(self.path, "em", tensors, meta)
+        save_tensors(self.path, "em", tensors, {**self.settings, "jumped": str(progress.jumped)})
 
     def load(self) -> Progress | None:
-        """Return where the fit stood, or None when there is no file yet.
+        """Return the saved state, or None when there is no file yet.
 
         Raises:
-            ModelFileError: the file is damaged, or no checkpoint.
-            BadArgument: it is the checkpoint of another fit.
+            ModelFileError: the file is damaged, or is no checkpoint.
+            BadArgument: the checkpoint of another fit, or not all processes read the same state.
         """
-        if not self.path.exists():
-            return None
-        m, d = self.components, len(self.centre)
+        progress = self._read(self.path) if self.path and self.path.exists() else None
+        steps = len(progress.log_likelihood) if progress else 0
+        # Processes at different steps would wait for each other for ever. Equal steps have no variance.
+        total, squares = self.shard.sum(torch.tensor([steps, steps**2], device=self.centre.device)).tolist()
+        if squares * self.shard.processes != total**2:
+            raise BadArgument(
+                "checkpoint", "a file that some processes see and others do not", "a file for all of them"
+            )
+        return progress
+
+    def _read(self, path: Path) -> Progress:
+        """Read the file and check that it belongs to this fit."""
+        m, d = int(self.settings["components"]), len(self.centre)
         shapes = {
             "weights": (m,),
             "means": (m, d),
@@ -71,33 +73,24 @@ class Checkpoint:
             "centre": (d,),
             "scale": (d,),
         }
-        tensors, meta = load_tensors(self.path, "em", set(shapes))
-        other = {k: meta.get(k) for k, v in self._settings().items() if meta.get(k) != v}
-        for name, mine in (("centre", self.centre), ("scale", self.scale)):
-            if not _same(tensors[name], mine):
+        tensors, meta = load_tensors(path, "em", set(shapes))
+        other = {k: meta.get(k) for k, v in self.settings.items() if meta.get(k) != v}
+        for name, ours in (("centre", self.centre), ("scale", self.scale)):
+            if not _agree(tensors[name], ours):
                 other[name] = "of other data"
         if other:
-            allowed = f"a new file, or the checkpoint of this fit: {self._settings()} and the same data"
-            raise BadArgument("checkpoint", f"{self.path}: {other}", allowed)
+            allowed = f"a new file, or the checkpoint of this fit: {self.settings} and the same data"
+            raise BadArgument("checkpoint", f"{path}: {other}", allowed)
         for name, shape in shapes.items():
             t = tensors[name]
             if (shape and t.shape != shape) or t.dtype != (torch.int64 if name == "reseeded" else torch.float64):
-                raise ModelFileError("checkpoint", f"{self.path}: {name} {tuple(t.shape)} {t.dtype}", str(shape))
+                raise ModelFileError("checkpoint", f"{path}: {name} {tuple(t.shape)} {t.dtype}", str(shape))
         device = self.centre.device
         components = Components(*(tensors[k].to(device) for k in ("weights", "means", "covariances")))
         history = tensors["log_likelihood"].to(device)
         return Progress(components, tensors["reseeded"].to(device), history, meta.get("jumped") == "True")
 
-    def _settings(self) -> dict[str, str]:
-        return {
-            "rows": str(self.rows),
-            "components": str(self.components),
-            "seed": str(self.seed),
-            "starts": str(self.starts),
-            "regularisation": repr(self.regularisation),
-        }
 
-
-def _same(found: Tensor, mine: Float[Tensor, "d"]) -> bool:
-    """Tell whether two statistics agree up to the order in which the data were summed."""
-    return found.shape == mine.shape and torch.allclose(found.to(mine), mine, rtol=1e-9, atol=1e-12)
+def _agree(saved: Tensor, ours: Float[Tensor, "d"]) -> bool:
+    """Tell whether two statistics agree up to the order of summation."""
+    return saved.shape == ours.shape and torch.allclose(saved.to(ours), ours, rtol=1e-9, atol=1e-12)

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.errors import IndefiniteCovariance
 from torchgrasp.linalg import cholesky
-from torchgrasp.posture_model.allreduce import AllReduce, local_sum
+from torchgrasp.posture_model.shard import Shard
 
 ROWS = 2048
 """Rows of one pass: features and responsibilities of so many rows stay in the cache."""
@@ -63,32 +63,30 @@ class Fit(Progress):
 
 
 def expectation_maximisation(
-    x: Float[Tensor, "n d"],
+    shard: Shard,
     start: Progress,
     iterations: int,
     tolerance: float,
     regularisation: float,
-    allreduce: AllReduce = local_sum,
-    observe: Callable[[Progress], None] = lambda progress: None,
+    observer: Callable[[Progress], None] = lambda progress: None,
 ) -> Fit:
     """Iterate until the mean log-likelihood gains less than `tolerance` in a step.
 
     Args:
-        x: standardised data, or this process's share of them.
+        shard: standardised data.
         start: where to begin, or to go on.
         iterations: most steps, those already taken included.
         tolerance: of the mean log-likelihood [nats].
         regularisation: added to every diagonal of a covariance, relative to the data's variance of 1.
-        total: how sums over the data are summed over processes.
-        observe: called after every step.
+        observer: called after every step.
 
     Raises:
         IndefiniteCovariance: a component collapsed more than `RESEEDS` times, or the start is indefinite.
     """
-    n = int(allreduce(x.new_tensor(len(x))))
+    n = shard.count()
     state = start
     while True:
-        sums, log_likelihood = expectation(x, state.components, allreduce)
+        sums, log_likelihood = expectation(shard, state.components)
         history = torch.cat([state.log_likelihood, (log_likelihood / n)[None]])
         converged = len(history) > 1 and not state.jumped and float(history[-1] - history[-2]) < tolerance
         if converged or len(history) > iterations:
@@ -96,14 +94,12 @@ def expectation_maximisation(
         components, reseeded = maximisation(sums, n, regularisation, state.reseeded)
         jumped = not torch.equal(reseeded, state.reseeded)
         state = Progress(components, reseeded, history, jumped)
-        observe(state)
+        observer(state)
 
 
-def expectation(
-    x: Float[Tensor, "n d"], components: Components, allreduce: AllReduce = local_sum
-) -> tuple[Float[Tensor, "m f"], Float[Tensor, ""]]:
+def expectation(shard: Shard, components: Components) -> tuple[Float[Tensor, "m f"], Float[Tensor, ""]]:
     """Return the responsibility-weighted sums of the features, and the total log-likelihood of Eq. (19)."""
-    coefficients = coefficients_from_components(components)
+    x, coefficients = shard.rows, coefficients_from_components(components)
     sums, log_likelihood = torch.zeros_like(coefficients), x.new_zeros(())
     features = x.new_empty(coefficients.shape[1], min(ROWS, len(x)))  # written anew in every pass, and kept in cache
     joint = x.new_empty(len(coefficients), min(ROWS, len(x)))
@@ -116,7 +112,7 @@ def expectation(
         density = responsibility.sub_(largest).clamp_(min=least).exp_().sum(0)
         sums.addmm_(responsibility.div_(density), phi.T)
         log_likelihood += (density.log() + largest).sum()
-    both = allreduce(torch.cat([sums.flatten(), log_likelihood[None]]))
+    both = shard.sum(torch.cat([sums.flatten(), log_likelihood[None]]))
     return both[:-1].reshape(sums.shape), both[-1]
 
 

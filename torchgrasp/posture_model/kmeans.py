@@ -7,8 +7,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.posture_model.allreduce import AllReduce, device_of, local_sum
 from torchgrasp.posture_model.em import ROWS, Progress, features_from_data, maximisation
+from torchgrasp.posture_model.shard import Shard
 
 SUBSAMPLE = 20_000
 """Rows among which k-means++ picks its centres."""
@@ -17,45 +17,43 @@ ROUNDS = 10
 """Rounds of Lloyd's algorithm."""
 
 
-def start_components(
-    x: Float[Tensor, "n d"], m: int, seed: int, regularisation: float, allreduce: AllReduce = local_sum
-) -> Progress:
+def start_components(shard: Shard, m: int, seed: int, regularisation: float) -> Progress:
     """Return a start from k-means: centres by k-means++ on a subsample, then some rounds of Lloyd on all the data.
 
     Args:
-        x: standardised data, or this process's share of them.
+        shard: standardised data.
         m: number of components.
         seed: of the subsample and of the centres; the number of processes does not matter.
         regularisation: added to every diagonal of a covariance.
-        total: how sums over the data are summed over processes.
 
     Raises:
         BadArgument: fewer different rows than components.
         IndefiniteCovariance: hardly any cluster has enough rows for a covariance.
     """
     generator = torch.Generator().manual_seed(seed)
-    centres = _plus_plus(_subsample(x, generator, allreduce), m, generator)
+    centres = _plus_plus(_subsample(shard, generator), m, generator)
     for _ in range(ROUNDS):
-        sums = _sums_of_clusters(x, centres, _ones_and_data, allreduce)
+        sums = _sums_of_clusters(shard, centres, _ones_and_data)
         moved = sums[:, 1:] / sums[:, :1]
         centres = torch.where(sums[:, :1] > 0, moved, centres)  # a centre without data stays where it is
-    sums = _sums_of_clusters(x, centres, features_from_data, allreduce)
+    sums = _sums_of_clusters(shard, centres, features_from_data)
     n = round(float(sums[:, 0].sum()))
-    components, reseeded = maximisation(sums, n, regularisation, torch.zeros(m, dtype=torch.long, device=x.device))
-    return Progress(components, reseeded, x.new_empty(0))
+    components, reseeded = maximisation(sums, n, regularisation, torch.zeros(m, dtype=torch.long, device=sums.device))
+    return Progress(components, reseeded, sums.new_empty(0))
 
 
-def _subsample(x: Float[Tensor, "n d"], generator: torch.Generator, allreduce: AllReduce) -> Float[Tensor, "s d"]:
+def _subsample(shard: Shard, generator: torch.Generator) -> Float[Tensor, "s d"]:
     """Return the same random rows in every process, whichever of them holds a row."""
-    rank, size = device_of(allreduce)
-    lengths = x.new_zeros(size)
-    lengths[rank] = len(x)
-    lengths = allreduce(lengths).long()
-    pick = torch.randperm(int(lengths.sum()), generator=generator)[:SUBSAMPLE].to(x.device) - lengths[:rank].sum()
+    x = shard.rows
+    lengths = x.new_zeros(shard.processes, dtype=torch.int64)
+    lengths[shard.rank] = len(x)
+    lengths = shard.sum(lengths)
+    before = lengths[: shard.rank].sum()
+    pick = torch.randperm(int(lengths.sum()), generator=generator)[:SUBSAMPLE].to(x.device) - before
     here = (pick >= 0) & (pick < len(x))
     pool = x.new_zeros(len(pick), x.shape[1])
     pool[here] = x[pick[here]]
-    return allreduce(pool)
+    return shard.sum(pool)
 
 
 def _plus_plus(pool: Float[Tensor, "s d"], m: int, generator: torch.Generator) -> Float[Tensor, "m d"]:
@@ -72,17 +70,14 @@ def _plus_plus(pool: Float[Tensor, "s d"], m: int, generator: torch.Generator) -
 
 
 def _sums_of_clusters(
-    x: Float[Tensor, "n d"],
-    centres: Float[Tensor, "m d"],
-    features: Callable[[Float[Tensor, "r d"]], Float[Tensor, "f r"]],
-    allreduce: AllReduce,
+    shard: Shard, centres: Float[Tensor, "m d"], features: Callable[[Float[Tensor, "r d"]], Float[Tensor, "f r"]]
 ) -> Float[Tensor, "m f"]:
     """Return the sums of the features over the rows nearest to each centre."""
-    sums = x.new_zeros(len(centres), len(features(x[:1])))
-    for rows in x.split(ROWS):
-        member = nearest(rows, centres)[:, None] == torch.arange(len(centres), device=x.device)
-        sums.addmm_(member.T.to(x), features(rows).T)
-    return allreduce(sums)
+    sums = centres.new_zeros(len(centres), len(features(centres[:1])))
+    for rows in shard.rows.split(ROWS):
+        member = assign_clusters(rows, centres)[:, None] == torch.arange(len(centres), device=rows.device)
+        sums.addmm_(member.T.to(rows), features(rows).T)
+    return shard.sum(sums)
 
 
 def _ones_and_data(x: Float[Tensor, "r d"]) -> Float[Tensor, "f r"]:
@@ -90,6 +85,6 @@ def _ones_and_data(x: Float[Tensor, "r d"]) -> Float[Tensor, "f r"]:
     return torch.cat([torch.ones_like(x[:, :1]), x], dim=1).T
 
 
-def nearest(x: Float[Tensor, "n d"], centres: Float[Tensor, "m d"]) -> Int[Tensor, "n"]:
+def assign_clusters(x: Float[Tensor, "n d"], centres: Float[Tensor, "m d"]) -> Int[Tensor, "n"]:
     """Return the index of the nearest centre of every row."""
     return (0.5 * (centres**2).sum(1) - x @ centres.T).argmin(1)

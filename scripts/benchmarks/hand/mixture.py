@@ -25,6 +25,7 @@ from torchgrasp.posture_model.fit import fit_mixture
 from torchgrasp.posture_model.kmeans import start_components
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY
 from torchgrasp.posture_model.sample import HandSamples, Sampling, sample_configurations
+from torchgrasp.posture_model.shard import Shard
 
 COMPONENTS = {"allegro": 41, "barrett": 36}
 """The paper's numbers of Gaussians."""
@@ -53,13 +54,13 @@ def bench_em(n: int) -> list[Row]:
 def _bench_steps(name: str, n: int) -> list[Row]:
     """Return the rows of time and log-likelihood of one hand."""
     x, m = _standardised(draw(name, n)), COMPONENTS[name]
-    start = start_components(x, m, 0, 1e-6)
+    start = start_components(Shard(x), m, 0, 1e-6)
     rows = []
     for dtype in (torch.float64, torch.float32):
         data, first = x.to(dtype), start.to(dtype)
         ours = least_seconds(functools.partial(_step, data, first), 3)
         theirs, reached = _scikit_learn(data, first)
-        fit = expectation_maximisation(data, first, STEPS - 1, 0.0, 1e-6)
+        fit = expectation_maximisation(Shard(data), first, STEPS - 1, 0.0, 1e-6)
         apart = abs(float(fit.log_likelihood[-1]) - reached)
         precise = dtype == torch.float64
         rows.append(
@@ -80,7 +81,7 @@ def _standardised(samples: HandSamples) -> Float[Tensor, "n d"]:
 
 
 def _step(x: Float[Tensor, "n d"], start: Progress) -> None:
-    sums, _ = expectation(x, start.components)
+    sums, _ = expectation(Shard(x), start.components)
     maximisation(sums, len(x), 1e-6, start.reseeded)
 
 

@@ -25,6 +25,7 @@ from torchgrasp.posture_model.compatibility import check_compatible
 from torchgrasp.posture_model.em import expectation_maximisation
 from torchgrasp.posture_model.gaussian import GaussianMixture
 from torchgrasp.posture_model.kmeans import start_components
+from torchgrasp.posture_model.shard import Shard
 
 STIFFNESS, LENGTHS, FORCES = ("logK1", "logK2", "logK3"), ("logL1", "logL2", "logL3"), ("logF1", "logF2", "logF3")
 NAMES = (*STIFFNESS, *LENGTHS, *FORCES)
@@ -185,9 +186,9 @@ def _fit(states: Float[Tensor, "n 9"], components: int, seed: int) -> GaussianMi
     if not 1 <= components <= n // (d + 2):
         raise BadArgument("components", f"{components} for {n} states", f"1 to {n // (d + 2)}")
     centre, scale = states.mean(0), states.std(0, correction=0)
-    x = (states - centre) / scale
-    start = start_components(x, components, seed, REGULARISATION)
-    found = expectation_maximisation(x, start, 300, 1e-4, REGULARISATION).components
+    shard = Shard((states - centre) / scale)
+    start = start_components(shard, components, seed, REGULARISATION)
+    found = expectation_maximisation(shard, start, 300, 1e-4, REGULARISATION).components
     covariances = found.covariances * scale[:, None] * scale
     return GaussianMixture(found.weights, found.means * scale + centre, covariances, NAMES)
 
