@@ -24,7 +24,6 @@ def ring(n: int = 3000) -> HandSamples:
 def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Run Python in a process of its own that can import the library and the helpers of the tests."""
     root = str(Path(__file__).parents[1])
-    path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-    return subprocess.run(
-        [sys.executable, *arguments], capture_output=True, text=True, env=os.environ | {"PYTHONPATH": path}
-    )
+    path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=600, env=os.environ | {"PYTHONPATH": path})

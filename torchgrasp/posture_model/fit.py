@@ -154,10 +154,11 @@ def _likeliest(shard: Shard, starts: list[Progress], regularisation: float) -> P
 
 def _outcome(fit: Fit, n: int, log_likelihood: float) -> dict[str, str]:
     """Return what a fit reports; the mean log-likelihood is in the samples' units."""
+    m, d = fit.components.means.shape
     return {
         "iterations": str(len(fit.log_likelihood) - 1),
         "converged": str(fit.converged).lower(),
         "reseeded": str(int(fit.reseeded.sum())),
         "log_likelihood": f"{log_likelihood:.6f}",
-        "bic": f"{_criterion(n * log_likelihood, *fit.components.means.shape, n):.1f}",
+        "bic": f"{_criterion(n * log_likelihood, m, d, n):.1f}",
     }
