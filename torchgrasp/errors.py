@@ -1,7 +1,7 @@
-"""Every error that torchgrasp raises, and the status that a batch row carries instead.
+"""The errors of torchgrasp, and the status of a batch row.
 
-A bad *argument* raises a subclass of `GraspError` at the public function, before any work. A row of a batch
-that fails does not raise: it carries a `Status`, whose member holds the sentence for the user.
+A bad argument raises a subclass of `GraspError` at the public function, before any work. A failed row of a batch
+does not raise: it carries a `Status`, which explains the failure in a sentence.
 """
 
 import copyreg
@@ -10,15 +10,15 @@ from typing import Any
 
 
 class GraspError(Exception):
-    """Base of all errors raised by torchgrasp."""
+    """Base of all errors of torchgrasp."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Travel between processes as what it is, whatever its class is made from."""
+        """Pickle the error with its class and fields, so that worker processes can raise it."""
         return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class BadArgument(GraspError, ValueError):
-    """An argument is of the wrong shape, type or range; the message names it, what was found and what is allowed."""
+    """An argument has a wrong shape, type or range; the message says what was found and what is allowed."""
 
     def __init__(self, argument: str, found: object, allowed: str):
         super().__init__(f"{argument}: found {found}, allowed is {allowed}")
@@ -30,11 +30,11 @@ class TooFewPoints(BadArgument):
 
 
 class SuspiciousScale(BadArgument):
-    """A cloud's or a mesh's extent is no object that a hand could grasp: most often millimetres given as metres."""
+    """A cloud or a mesh is too small or too large to grasp; its unit may be millimetres."""
 
 
 class CloudFileError(BadArgument):
-    """A point-cloud file is missing, empty, or not what its suffix says."""
+    """A point-cloud file is missing, empty, or of another format than its suffix."""
 
 
 class MeshError(BadArgument):
@@ -46,7 +46,7 @@ class HandFileError(BadArgument):
 
 
 class ModelFileError(BadArgument):
-    """A safetensors file is missing, truncated, or does not hold what its kind requires."""
+    """A safetensors file is missing or truncated, or holds other tensors than its kind requires."""
 
 
 class OutputError(BadArgument):
@@ -54,7 +54,7 @@ class OutputError(BadArgument):
 
 
 class MissingExtra(GraspError, ImportError):
-    """A stage needs a package of an extra that is not installed; the message names the extra."""
+    """A package of an optional extra is not installed; the message names the extra."""
 
     def __init__(self, package: str, extra: str):
         super().__init__(f"{package} is not installed: pip install 'torchgrasp[{extra}]'")
@@ -62,7 +62,7 @@ class MissingExtra(GraspError, ImportError):
 
 
 class IndefiniteCovariance(GraspError, ValueError):
-    """A covariance matrix is not positive definite; nothing is added to its diagonal to hide it."""
+    """A covariance matrix is not positive definite. The library never adds jitter."""
 
     def __init__(self, what: str, smallest_eigenvalue: float, remedy: str):
         super().__init__(f"{what} is not positive definite (smallest eigenvalue {smallest_eigenvalue:.3g}): {remedy}")
@@ -70,15 +70,15 @@ class IndefiniteCovariance(GraspError, ValueError):
 
 
 class DegenerateContacts(GraspError, ValueError):
-    """Three contacts lie on a line or in a point: no virtual frame exists."""
+    """Three contacts lie on a line or in a point, so they have no virtual frame."""
 
 
 class FailedRows(GraspError):
-    """Raised by `raise_for_status` when rows of a batch did not succeed."""
+    """Some rows of a batch failed; raised by `raise_for_status`."""
 
 
 class Status(enum.IntEnum):
-    """What became of one row of a batch. The member's `sentence` is written for the user.
+    """The outcome of one row of a batch; `sentence` explains it to the user.
 
     >>> Status.NOT_CLOSED.sentence
     'the contacts do not resist every wrench at the planned friction (no frictional form closure)'
@@ -87,7 +87,7 @@ class Status(enum.IntEnum):
     sentence: str
 
     def __new__(cls, code: int, sentence: str) -> "Status":
-        """Attach the sentence to the integer code."""
+        """Make a member from its integer code and its sentence."""
         member = int.__new__(cls, code)
         member._value_ = code
         member.sentence = sentence

@@ -1,6 +1,6 @@
-"""Files that torchgrasp writes and reads back: safetensors with JSON metadata, written atomically; folders held.
+"""Files: safetensors with JSON metadata, atomic writes, locked folders.
 
-There is no pickle anywhere: a file from a stranger can be malformed, but it cannot run code.
+Nothing here is pickled: a file from a stranger can be malformed, but it cannot run code.
 """
 
 import contextlib
@@ -22,20 +22,20 @@ from torch import Tensor
 from torchgrasp.errors import ModelFileError, OutputError, Status
 
 VERSION = "1"
-"""Version of the layout of every file written here; readers refuse any other."""
+"""Version of the file layout; readers refuse any other."""
 
 LOCK = ".lock"
-"""The file in a folder by which a run holds it; it names the run."""
+"""Name of the lock file in a folder; the file names the run that holds the lock."""
 
 
 @contextlib.contextmanager
 def hold_folder(folder: Path) -> Iterator[None]:
-    """Make a folder and hold it against other runs; the system lets go of it when the process ends, however it ends.
+    """Make a folder and lock it against other runs; the system frees the lock when the process ends.
 
-    A folder that was made for this and is empty at the end is taken away again.
+    A new folder that is still empty at the end is removed.
 
     Raises:
-        OutputError: another run holds it, or it cannot be made or written.
+        OutputError: another run holds the lock, or the folder cannot be written.
     """
     import fcntl
 
@@ -66,10 +66,10 @@ def hold_folder(folder: Path) -> Iterator[None]:
 
 
 def write_atomically(path: Path | str, write: Callable[[Path], object]) -> Path:
-    """Call `write` on a temporary file beside `path`, then move it into place; nothing half-written stays.
+    """Call `write` on a temporary file beside `path`, then move the file into place.
 
     Raises:
-        OutputError: the folder cannot be made or written, or the disk is full.
+        OutputError: the folder cannot be written, or the disk is full. Nothing half-written stays.
     """
     path = Path(path)
     temporary: Path | None = None
@@ -90,13 +90,13 @@ def write_atomically(path: Path | str, write: Callable[[Path], object]) -> Path:
 
 
 def write_file(path: Path | str, content: str | bytes) -> Path:
-    """Write a whole file at once, text as UTF-8; see `write_atomically`."""
+    """Write a file atomically, text as UTF-8."""
     data = content.encode() if isinstance(content, str) else content
     return write_atomically(path, lambda temporary: temporary.write_bytes(data))
 
 
 def format_json(value: Any) -> str:
-    """Return a value as JSON: a status by its name, and null for a number that is not finite, which JSON lacks.
+    """Return a value as JSON; a status becomes its name, NaN and infinity become null.
 
     >>> format_json({"force": float("nan"), "status": Status.OK}).split()
     ['{', '"force":', 'null,', '"status":', '"OK"', '}']
@@ -105,7 +105,7 @@ def format_json(value: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value without what JSON lacks."""
+    """Replace statuses, NaN and infinity, which JSON lacks."""
     if isinstance(value, dict):
         return {key: _plain(x) for key, x in value.items()}
     if isinstance(value, list | tuple):
@@ -116,7 +116,7 @@ def _plain(value: Any) -> Any:
 
 
 def save_tensors(path: Path | str, kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) -> Path:
-    """Write named tensors and metadata as one safetensors file of a `kind` ("grasps", "mixture", ...).
+    """Write tensors and metadata as one safetensors file of a `kind`, such as "grasps".
 
     Raises:
         OutputError: the file cannot be written.
@@ -129,10 +129,11 @@ def save_tensors(path: Path | str, kind: str, tensors: dict[str, Tensor], meta: 
 
 
 def load_tensors(path: Path | str, kind: str, names: set[str]) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read a safetensors file, checking its kind, its version and that it holds exactly `names`, all finite.
+    """Read a safetensors file of a `kind` that holds exactly the tensors `names`.
 
     Raises:
-        ModelFileError: the file is missing, malformed, of another kind or version, or holds other tensors.
+        ModelFileError: the file is missing or malformed, has another kind, version or tensors, or a number is not
+            finite.
     """
     path = Path(path)
     if not path.is_file():
@@ -158,5 +159,5 @@ def load_tensors(path: Path | str, kind: str, names: set[str]) -> tuple[dict[str
 
 
 def sha256(path: Path | str) -> str:
-    """Return the SHA-256 of a file's bytes as hexadecimal digits."""
+    """Return the SHA-256 of a file in hexadecimal digits."""
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()

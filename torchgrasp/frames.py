@@ -1,6 +1,6 @@
 """Rigid transforms and the virtual frame of three contacts (Eqs. 15-17).
 
-Every transform is named `a_from_b` and maps coordinates of frame b into frame a, so that chains read by adjacency:
+A transform `a_from_b` maps coordinates of frame b into frame a. So chains read by adjacency:
 `obj_from_hand = obj_from_vf @ vf_from_hand` (Eq. 24).
 """
 
@@ -14,12 +14,12 @@ from torchgrasp.errors import DegenerateContacts
 from torchgrasp.linalg import unit
 
 MIN_HEIGHT_RATIO = 1e-3
-"""Least height of a contact triangle over its longest side; a flatter one fixes no frame (the frame turns by
-0.01 rad for 1e-6 m of noise at a height of 1e-4 m)."""
+"""Least height of a contact triangle over its longest side. At a height of 1e-4 m, noise of 1e-6 m turns the virtual
+frame by 0.01 rad."""
 
 
 def rigid(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
-    """Assemble the homogeneous transform of a rotation and a translation [m].
+    """Return the homogeneous transform of a rotation and a translation [m].
 
     >>> rigid(torch.eye(3), torch.ones(3))[:3, 3]
     tensor([1., 1., 1.])
@@ -30,7 +30,7 @@ def rigid(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"])
 
 
 def inverse(a_from_b: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
-    """Return `b_from_a` of a rigid transform, exactly and without a solve."""
+    """Return `b_from_a` of a rigid transform."""
     rotation = a_from_b[..., :3, :3].transpose(-1, -2)
     return rigid(rotation, -(rotation @ a_from_b[..., :3, 3:])[..., 0])
 
@@ -92,7 +92,7 @@ def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
 
 
 def degenerate(points: Float[Tensor, "*b 3 3"]) -> Bool[Tensor, "*b"]:
-    """Tell which triangles are too flat to fix a virtual frame (height over longest side below 1e-3)."""
+    """Tell which triangles are too flat for a virtual frame; see `MIN_HEIGHT_RATIO`."""
     sides = points - points.roll(1, dims=-2)
     longest = torch.linalg.vector_norm(sides, dim=-1).amax(-1)
     doubled_area = torch.linalg.vector_norm(torch.linalg.cross(sides[..., 0, :], sides[..., 1, :]), dim=-1)
@@ -102,8 +102,8 @@ def degenerate(points: Float[Tensor, "*b 3 3"]) -> Bool[Tensor, "*b"]:
 def virtual_frame(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4 4"]:
     """Return the virtual frame of three contacts, Eqs. (15)-(17): `a_from_vf` for points given in frame a.
 
-    The origin is the centre of the contacts (Eq. 16); the x axis points from the first to the third; the z axis is
-    the normal of their plane.
+    The origin is the centre of the contacts (Eq. 16). The x axis points from the first contact to the third. The z axis
+    is the normal of their plane.
 
     Args:
         points: contacts or fingertips [m] in the order of the fingers.

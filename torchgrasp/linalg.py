@@ -1,4 +1,4 @@
-"""Linear algebra that never repairs silently: a checked Cholesky factor, Mahalanobis distances."""
+"""Linear algebra without silent repair: checked Cholesky factors, Mahalanobis distances."""
 
 import torch
 from jaxtyping import Float
@@ -8,12 +8,12 @@ from torchgrasp.errors import IndefiniteCovariance
 
 
 def unit(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
-    """Return vectors of length 1 in the direction of `v`; a zero vector gives NaN, which the callers check."""
+    """Return vectors of length 1 in the direction of `v`; a zero vector gives NaN."""
     return v / torch.linalg.vector_norm(v, dim=-1, keepdim=True)
 
 
 def cholesky(matrix: Float[Tensor, "*b n n"], what: str, remedy: str) -> Float[Tensor, "*b n n"]:
-    """Return the lower Cholesky factor; nothing is added to the diagonal.
+    """Return the lower Cholesky factor, without jitter.
 
     Raises:
         IndefiniteCovariance: with the smallest eigenvalue and the `remedy`.

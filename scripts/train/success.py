@@ -1,24 +1,19 @@
-#!/usr/bin/env python
-"""Fit the model that predicts whether a grasp holds, and show how well it is calibrated.
+"""Fit the model of predicted success, and show its calibration.
 
-python scripts/make_success.py --objects DIR    trials on own, simple and given objects; the fit; the reliability
-
-Grasps of all ranks are planned on noisy views and pulled at: closed open loop and under uncertainty, at two frictions,
-where they were planned and beside it. The model is fitted on all trials and judged on each object by a fit without it.
-Trials that are in the folder already are not run again.
+Grasps of all ranks are planned on noisy views and pulled: closed in open loop and under uncertainty, at two frictions,
+with and without an error of the pose. The model is fitted to all trials. Each object is judged by a fit without it.
 """
 
 from pathlib import Path
 
 import torch
-import tyro
 from benchmarks.close.success import TESTS, brier, draw_reliability, fit, judge, leave_one_out, read_trials
 
 from torchgrasp.files import format_json, write_file
 from torchgrasp.ik.success import FEATURES, MODEL
 
 
-def main(
+def success(
     objects: tuple[Path, ...] = (),
     hands: tuple[str, ...] = ("allegro",),
     grasps: int = 12,
@@ -26,14 +21,14 @@ def main(
     folder: Path = Path("out/success"),
     model: Path = MODEL,
 ) -> None:
-    """Run the trials that are missing, fit, judge, and write the model.
+    """Run the missing trials, fit the model of predicted success, judge it and write it.
 
     Args:
-        objects: folders of objects beside the library's own and simple bodies.
+        objects: folders of objects, beside the library's own and simple bodies.
         hands: names of hands.
-        grasps: of each view, spread over all ranks.
+        grasps: grasps of each view, spread over all ranks.
         workers: processes.
-        folder: of grasps and trials, and of the picture.
+        folder: where grasps, trials and the reliability diagram go; trials found there are not run again.
         model: file of the model.
     """
     torch.set_num_threads(1)
@@ -52,7 +47,3 @@ def main(
         "brier_of_the_base_rates": round(brier(base, trials.passed), 4),
     }
     print(write_file(model, format_json(content) + "\n"))
-
-
-if __name__ == "__main__":
-    tyro.cli(main)

@@ -1,0 +1,19 @@
+#!/usr/bin/env python
+"""Make the files that torchgrasp ships: learned models, and the library's own objects.
+
+python scripts/train.py posture-model hands/allegro               the mixture of a hand that has a hand.toml
+python scripts/train.py posture-model mine/hand.urdf --tips a b c  the same from a URDF alone
+python scripts/train.py stability allegro --workers 2             which pulled grasps hold, for the impedance control
+python scripts/train.py success --objects DIR                     the predicted success that ranks grasps
+python scripts/train.py objects                                   meshes, convex parts and views of the own objects
+"""
+
+import tyro
+from train.author_objects import objects
+from train.posture_model import posture_model
+from train.stability import stability
+from train.success import success
+
+if __name__ == "__main__":
+    commands = {"posture-model": posture_model, "stability": stability, "success": success, "objects": objects}
+    tyro.extras.subcommand_cli_from_dict(commands, prog="train.py", description="Files that torchgrasp ships.")
