@@ -121,7 +121,7 @@ def test_tips_limits_and_clearances_hold(run):
     centres = centres @ good.obj_from_hand[:, :3, :3].transpose(1, 2) + good.obj_from_hand[:, None, :3, 3]
     touching = centres - hand.tip_radius[:, None] * good.contacts.normals
     assert float((touching - good.contacts.points).norm(dim=-1).max()) <= 0.002 + 1e-9
-    spheres = hand.spheres(good.joints)
+    spheres = hand.sphere_centres(good.joints)
     spheres = spheres @ good.obj_from_hand[:, :3, :3].transpose(1, 2) + good.obj_from_hand[:, None, :3, 3]
     assert float((spheres[..., 2] - hand.collision_spheres.radius).min()) >= SPEC.table
 
@@ -131,7 +131,7 @@ def test_links_stay_out_of_the_true_cylinder(run):
     hand, grasps, _ = run
     best = grasps[:5]
     cover = hand.collision_spheres
-    spheres = hand.spheres(best.joints)
+    spheres = hand.sphere_centres(best.joints)
     spheres = spheres @ best.obj_from_hand[:, :3, :3].transpose(1, 2) + best.obj_from_hand[:, None, :3, 3]
     radial = spheres[..., :2].norm(dim=-1) - 0.033  # the shipped cylinder: 66 mm wide, 110 mm high
     above = spheres[..., 2] - 0.11
@@ -159,7 +159,7 @@ def test_the_file_names_everything(run, tmp_path):
     meta = load_grasps(tmp_path / "grasps.safetensors").meta
     assert meta["hand"] == hand.name
     assert meta["joint_names"].split(",") == list(hand.joint_names)
-    assert meta["hand_sha256"] == hand.sha256
+    assert meta["hand_sha256"] == hand.source.sha256
     model = {"joint": 4, "contact_first": 64}[meta["mode"]]  # "none", since none is asked, or its hash
     assert len(meta["mixture_sha256"]) == model
     assert meta["cloud_sha256"] == digest(load_object("cylinder").view)

@@ -188,7 +188,7 @@ def plan_grasps(
         grasps,
         meta={
             "hand": hand.name,
-            "hand_sha256": hand.sha256,
+            "hand_sha256": hand.source.sha256,
             "mode": mode,
             "mixture_sha256": "none" if model is None else model[1],
             "cloud_sha256": digest(cloud),

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -9,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.errors import HandFileError
-from torchgrasp.hand.collision_spheres import rotation_from_rpy
+from torchgrasp.frames import rotation_from_rpy
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import HandSpec, read_hand_toml
 from torchgrasp.hand.load import find_hand, load_hand
@@ -134,7 +135,7 @@ def _inside(point: np.ndarray, shape: Shape) -> bool:
 def largest_fk_error(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[float, str]:
     """Return the largest difference of a link's pose [m, and entries of rotations] from others', and the link.
 
-    They are yourdfpy, and the chain of pytorch-kinematics that `Kinematics` is a fused evaluation of.
+    The others are yourdfpy and pytorch-kinematics.
 
     Args:
         hand: the hand.
@@ -144,14 +145,26 @@ def largest_fk_error(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[float, s
 
     robot = yourdfpy.URDF.load(str(hand.urdf_path), load_meshes=False, load_collision_meshes=False)
     poses = hand.link_poses(joints).double().numpy()
-    chain = hand.kinematics.reference_poses(hand.expand_joints(joints)).double().numpy()
+    chain = reference_poses(read_urdf(hand.urdf_path), hand.expand_joints(joints)).double().numpy()
     worst, where = 0.0, ""
     for row in range(len(joints)):
         values = {n: float(v) for n, v in hand.expand(joints[row]).items()}
         robot.update_cfg([values[n] for n in robot.actuated_joint_names])
-        for index, link in enumerate(hand.link_names):
+        for index, link in enumerate(hand.tree.link_names):
             both = np.stack([robot.get_transform(link), chain[row, index]])
             error = float(np.abs(both - poses[row, index]).max())
             if error > worst:
                 worst, where = error, link
     return worst, where
+
+
+def reference_poses(urdf: Urdf, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
+    """Return `root_from_link` of every link by pytorch-kinematics, which is good to 1e-8 m."""
+    import pytorch_kinematics
+
+    chain: Any = pytorch_kinematics.build_chain_from_urdf(urdf.kinematic_xml())
+    chain = chain.to(dtype=values.dtype, device=values.device)
+    names = [j.name for j in urdf.joints if j.kind != "fixed"]
+    order = [names.index(name) for name in chain.get_joint_parameter_names()]
+    poses = chain.forward_kinematics_tensor(values[:, order], analytical_grad=False)
+    return poses[[chain.frame_to_idx[link.name] for link in urdf.links]].transpose(0, 1)

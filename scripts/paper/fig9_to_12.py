@@ -156,7 +156,7 @@ def draw(taken: Taken, index: int, eye: Direction) -> Image.Image:
     vertices = surface.vertices.numpy()
     canvas.add_mesh(vertices, surface.faces.numpy(), OBJECT, surface.normals.numpy(), transparent=True)
     joints = hand.expand_joints(grasp.joints[0])
-    solids = solids_from_hand(hand, joints, hand.urdf_joint_names, grasp.obj_from_hand[0])
+    solids = solids_from_hand(hand, joints, hand.tree.joint_names, grasp.obj_from_hand[0])
     for solid in solids:
         canvas.add_mesh(solid.vertices, solid.faces, HAND if solid.finger == PARKED else FINGERS[solid.finger])
     _add_frame(canvas, contacts)

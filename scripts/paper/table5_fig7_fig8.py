@@ -144,7 +144,7 @@ def draw_both(hand: Hand, true: Float[Tensor, "h"], found: Float[Tensor, "h"]) -
     """Draw a hand at its true joints, and sheer over it at those that were found."""
     canvas, corners = Canvas(), []
     for joints, transparent in ((true, False), (found, True)):
-        for solid in solids_from_hand(hand, hand.expand_joints(joints), hand.urdf_joint_names, torch.eye(4).double()):
+        for solid in solids_from_hand(hand, hand.expand_joints(joints), hand.tree.joint_names, torch.eye(4).double()):
             color = HAND if solid.finger == PARKED else FINGERS[solid.finger]
             canvas.add_mesh(solid.vertices, solid.faces, color, transparent=transparent)
             corners.append(solid.vertices)

@@ -29,7 +29,7 @@ def test_a_cylinder_is_held(name):
     strongest = result.forces[-50:].amax(-1)
     assert float(strongest.mean()) == pytest.approx(4.0, rel=0.15)
     assert len(result.time) == len(result.forces) == len(result.joints) == len(result.hand_pose)
-    assert set(result.joint_names) == set(load_hand(name).urdf_joint_names)
+    assert set(result.joint_names) == set(load_hand(name).tree.joint_names)
 
 
 def test_same_seed_same_bits_here_and_in_another_process():
@@ -103,7 +103,7 @@ def test_all_a_fingertip_exerts_is_felt_friction_included():
     assert torch.allclose(-(observation.forces * observation.normals).sum(-1), observation.reading, atol=0.02)
     own = observation.joints[list(model.actuated)]
     alone = observe(hand, own, robot._touch)
-    order = [hand.urdf_joint_names.index(name) for name in scene.joint_names]
+    order = [hand.tree.joint_names.index(name) for name in scene.joint_names]
     assert torch.allclose(alone.tips, observation.tips, atol=1e-5)
     assert torch.allclose(alone.jacobian[:, :, order], observation.jacobian, atol=1e-5)
 

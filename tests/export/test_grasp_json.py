@@ -37,11 +37,11 @@ def test_the_json_replays_to_the_planned_tips(name):
     for i, contact in enumerate(row["contacts"]):
         assert contact["finger"] == hand.finger_names[i]
         tip = robot.get_transform(contact["link"], content["hand"]["root"])
-        point = turn @ (tip @ np.append(hand.contact[i].numpy(), 1.0))[:3] + place
+        point = turn @ (tip @ np.append(hand.tips.contact[i].numpy(), 1.0))[:3] + place
         np.testing.assert_allclose(point, planned_tips(hand, grasp)[i], atol=1e-9)
     assert row["approach"] == {"direction": grasp.approach[0].tolist(), "distance": 0.1}
     joints = row["joints"]
-    assert set(joints["squeeze"]) == set(hand.urdf_joint_names) and content["time"]["squeeze"] > 0
+    assert set(joints["squeeze"]) == set(hand.tree.joint_names) and content["time"]["squeeze"] > 0
     for joint in content["actuated"]:  # stiffness x lead = torque
         lead = joints["squeeze"][joint] - joints["grasp"][joint]
         if name == "allegro":  # no coupling
@@ -61,7 +61,7 @@ def test_mujoco_loads_the_keyframes_and_places_the_tips(name):
     mujoco.mj_resetDataKeyframe(model, data, model.key("grasp_0_grasp").id)
     mujoco.mj_kinematics(model, data)
     for i, link in enumerate(hand.tip_links):
-        point = data.body(link).xmat.reshape(3, 3) @ hand.contact[i].numpy() + data.body(link).xpos
+        point = data.body(link).xmat.reshape(3, 3) @ hand.tips.contact[i].numpy() + data.body(link).xpos
         np.testing.assert_allclose(point, planned_tips(hand, grasp)[i], atol=1e-9)
     pressed = hand.expand(squeeze(grasp, hand, 5.0).joints)
     key = model.key("grasp_0_squeeze")
@@ -78,7 +78,7 @@ def test_mujoco_loads_the_keyframes_and_places_the_tips(name):
 
 def test_the_command_writes_both_and_names_what_is_wrong(tmp_path, capsys):
     hand, grasp = pinch("allegro")
-    grasp = dataclasses.replace(grasp, meta={"hand": "allegro", "hand_sha256": hand.sha256})
+    grasp = dataclasses.replace(grasp, meta={"hand": "allegro", "hand_sha256": hand.source.sha256})
     grasp.save(tmp_path / "grasps.safetensors")
     words = ["export", str(tmp_path / "grasps.safetensors"), "--out", str(tmp_path / "out")]
     assert cli.main(words) == 0 and json.loads((tmp_path / "out").read_text())["grasps"][0]["status"] == "OK"

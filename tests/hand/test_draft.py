@@ -57,12 +57,12 @@ def test_a_tip_that_is_not_round_gets_a_pad_on_its_side(claw, tip):
     hand = check_hand(drafted(claw))  # the contact is not inside the tip
     depth = 0.01 if "box" in tip else 0.008
     torch.testing.assert_close(
-        hand.contact[0], torch.tensor([depth, 0, 0.015 - (0.009 if "box" in tip else 0.008)]).double()
+        hand.tips.contact[0], torch.tensor([depth, 0, 0.015 - (0.009 if "box" in tip else 0.008)]).double()
     )
-    assert hand.normal[0].tolist() == [1, 0, 0] and hand.tip_radius[0] == 0
+    assert hand.tips.normal[0].tolist() == [1, 0, 0] and hand.tip_radius[0] == 0
     # what tells whether a tip is in the object reaches its contact and no farther
-    cover, first = hand.collision_spheres, hand.collision_spheres.link_index == hand.tip_index[0]
-    reach = (cover.center[first] @ hand.normal[0] + cover.radius[first]).max()
+    cover, first = hand.collision_spheres, hand.collision_spheres.link_index == hand.tips.index[0]
+    reach = (cover.center[first] @ hand.tips.normal[0] + cover.radius[first]).max()
     assert depth - 0.002 < float(reach) <= depth + 1e-9
 
 
@@ -119,6 +119,6 @@ def test_a_third_hand_goes_the_whole_way(claw, mode):
     assert bool(certify(good.contacts, spec).closed.all())
     surface_points = torch.from_numpy(trimesh.sample.sample_surface(shape, 4000, seed=0)[0])
     cover = hand.collision_spheres
-    spheres = apply(good.obj_from_hand, hand.spheres(good.joints))[:, ~cover.touching]
+    spheres = apply(good.obj_from_hand, hand.sphere_centres(good.joints))[:, ~cover.touching]
     gap = torch.cdist(spheres, surface_points.expand(len(good), -1, 3)).amin(2) - cover.radius[~cover.touching]
     assert float(gap.min()) > -0.012  # of the true surface, whose far side the planner did not see

@@ -47,14 +47,6 @@ def test_jacobian_equals_finite_differences(hand, generator):
         torch.testing.assert_close(jacobian[..., j], difference, atol=1e-7, rtol=1e-6)
 
 
-def test_point_jacobian_equals_autograd(hand, generator):
-    joints = postures(hand, 1, generator)[0]
-    poses, cover = hand.link_poses(joints), hand.collision_spheres
-    found = hand.point_jacobian(poses, cover.link_index, hand.spheres(joints))
-    truth = torch.autograd.functional.jacobian(hand.spheres, joints)
-    torch.testing.assert_close(found, truth, atol=2e-8, rtol=1e-6)
-
-
 def test_batch_equals_singles_and_keeps_its_shape(hand, generator):
     joints = postures(hand, 6, generator).reshape(2, 3, hand.dof)
     points, normals = hand.fingertips(joints)
@@ -80,7 +72,7 @@ def test_expand_names_every_joint_and_couples_exactly():
     hand = load_hand("barrett")
     joints = torch.tensor([1.0, 0.3, 0.6, 0.9], dtype=torch.float64)
     q = hand.expand(joints)
-    assert set(q) == set(hand.urdf_joint_names)
+    assert set(q) == set(hand.tree.joint_names)
     assert len(q) == 8
     assert q["spread_mimic"] == q["spread"] == 1.0
     for k, value in enumerate((0.1, 0.2, 0.3), start=1):
@@ -91,7 +83,7 @@ def test_expand_names_every_joint_and_couples_exactly():
 
 def test_barrett_is_the_published_hand():
     hand = load_hand("barrett")
-    poses = dict(zip(hand.link_names, hand.link_poses(torch.zeros(4, dtype=torch.float64)), strict=True))
+    poses = dict(zip(hand.tree.link_names, hand.link_poses(torch.zeros(4, dtype=torch.float64)), strict=True))
     expected = {"f1_dist": (-25.0, -119.94, 78.4), "f2_dist": (25.0, -119.94, 78.4), "f3_dist": (0.0, 119.94, 78.4)}
     for link, mm in expected.items():
         torch.testing.assert_close(poses[link][:3, 3] * 1e3, torch.tensor(mm).double(), atol=1e-3, rtol=0)
@@ -128,7 +120,7 @@ def test_allegro_thumb_opposes_the_fingers(generator):
 
 
 def test_spheres_cover_the_collision_shapes(hand):
-    from torchgrasp.hand.collision_spheres import rotation_from_rpy
+    from torchgrasp.frames import rotation_from_rpy
     from torchgrasp.hand.urdf import read_urdf
 
     cover, generator = hand.collision_spheres, torch.Generator().manual_seed(0)
@@ -148,7 +140,7 @@ def test_spheres_cover_the_collision_shapes(hand):
 
 def test_touching_spheres_are_the_three_tips(hand):
     cover = hand.collision_spheres
-    assert cover.link_index[cover.touching].tolist() == sorted(hand.tip_index.tolist())
+    assert cover.link_index[cover.touching].tolist() == sorted(hand.tips.index.tolist())
     assert set(cover.finger.tolist()) == ({-2, -1, 0, 1, 2} if hand.name == "allegro" else {-1, 0, 1, 2})
 
 
@@ -175,7 +167,7 @@ def test_to_moves_every_tensor_and_leaves_the_hand_as_it_was():
     moved = hand.to(torch.float32)
     assert moved.lower.dtype == moved.collision_spheres.radius.dtype == torch.float32
     assert hand.lower.dtype == torch.float64
-    assert moved.child.dtype == torch.int64
+    assert moved.tree.child.dtype == torch.int64
     assert moved.fingertips(torch.zeros(1, 12))[0].shape == (1, 3, 3)
 
 
@@ -185,13 +177,13 @@ def test_tactile_fingertips_reach_23_mm_farther_and_change_nothing_else():
     reach = []
     for hand in (stock, tactile):
         poses = hand.link_poses(torch.zeros(hand.dof, dtype=torch.float64))
-        tips = torch.linalg.inv(poses[[hand.link_names.index(f"{f}_distal") for f in hand.finger_names]])
-        centres = (tips @ poses[hand.tip_index])[:, :3, 3]
+        tips = torch.linalg.inv(poses[[hand.tree.link_names.index(f"{f}_distal") for f in hand.finger_names]])
+        centres = (tips @ poses[hand.tips.index])[:, :3, 3]
         reach.append(centres[:, 2] + hand.tip_radius)
     torch.testing.assert_close(reach[0], torch.tensor([0.0387, 0.0387, 0.0543]).double(), rtol=0, atol=1e-6)
     torch.testing.assert_close(reach[1], torch.tensor([0.0618, 0.0618, 0.0774]).double(), rtol=0, atol=2e-4)
-    same = [name for name in stock.link_names if not name.endswith("tip")]
+    same = [name for name in stock.tree.link_names if not name.endswith("tip")]
     joints = 0.5 * (stock.lower + stock.upper)
     for name in same:
-        found = [hand.link_poses(joints)[hand.link_names.index(name)] for hand in (stock, tactile)]
+        found = [hand.link_poses(joints)[hand.tree.link_names.index(name)] for hand in (stock, tactile)]
         torch.testing.assert_close(*found, rtol=0, atol=1e-12)

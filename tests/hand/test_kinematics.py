@@ -5,9 +5,10 @@ import pytest
 import torch
 
 from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.kinematics import kinematics_from_urdf
+from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.urdf import read_urdf
+from torchgrasp.testing import reference_poses
 
 BRANCHED = """<robot name="branched">
   <link name="tip"/><link name="base"/><link name="slider"/><link name="arm"/><link name="side"/><link name="bolt"/>
@@ -45,7 +46,7 @@ def assert_same_poses(found: torch.Tensor, truth: torch.Tensor) -> None:
 
 def test_fk_equals_pytorch_kinematics(hand, generator):
     joints = postures(hand, 1000, generator)
-    assert_same_poses(hand.link_poses(joints), hand.kinematics.reference_poses(hand.expand_joints(joints)))
+    assert_same_poses(hand.link_poses(joints), reference_poses(read_urdf(hand.urdf_path), hand.expand_joints(joints)))
 
 
 def test_fk_and_jacobian_equal_pinocchios_by_joint_name(hand, generator):
@@ -54,10 +55,10 @@ def test_fk_and_jacobian_equal_pinocchios_by_joint_name(hand, generator):
     data, joints = model.createData(), postures(hand, 1000, generator)
     every = {name: values.tolist() for name, values in hand.expand(joints).items()}
     order = [every[name] for name in list(model.names)[1:]]
-    frames = [model.getFrameId(name) for name in hand.link_names]
+    frames = [model.getFrameId(name) for name in hand.tree.link_names]
     truth = torch.zeros(1000, len(frames), 4, 4, dtype=torch.float64)
-    column = [hand.urdf_joint_names.index(name) for name in list(model.names)[1:]]
-    found, at = hand.jacobian(joints), [frames[k] for k in hand.tip_index.tolist()]
+    column = [hand.tree.joint_names.index(name) for name in list(model.names)[1:]]
+    found, at = hand.jacobian(joints), [frames[k] for k in hand.tips.index.tolist()]
     for row in range(1000):
         q = np.array([values[row] for values in order])
         pin.framesForwardKinematics(model, data, q)
@@ -67,9 +68,9 @@ def test_fk_and_jacobian_equal_pinocchios_by_joint_name(hand, generator):
             continue
         for finger, frame in enumerate(at):
             twist = torch.from_numpy(pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED))
-            arm = torch.from_numpy(data.oMf[frame].rotation) @ hand.contact[finger]
+            arm = torch.from_numpy(data.oMf[frame].rotation) @ hand.tips.contact[finger]
             moved = twist[:3] + torch.linalg.cross(twist[3:], arm[:, None].expand(3, len(q)), dim=0)
-            torch.testing.assert_close(found[row, finger], moved @ hand.coupling[column], atol=1e-12, rtol=0)
+            torch.testing.assert_close(found[row, finger], moved @ hand.actuated.coupling[column], atol=1e-12, rtol=0)
     assert_same_poses(hand.link_poses(joints), truth)
     assert float((hand.link_poses(joints) - truth).abs().max()) < 1e-12
 
@@ -89,16 +90,17 @@ def test_derivative_of_the_jacobian_is_symmetric(hand, generator):
 def test_a_tree_of_every_kind_of_joint_is_that_of_pytorch_kinematics(tmp_path, generator):
     path = tmp_path / "hand.urdf"
     path.write_text(BRANCHED)
-    tree = kinematics_from_urdf(read_urdf(path))
+    urdf = read_urdf(path)
+    tree = tree_from_urdf(urdf)
     assert tree.joint_names == ("end", "turn", "slide", "away")
     values = torch.randn(50, 4, generator=generator, dtype=torch.float64)
-    assert_same_poses(tree.poses(values), tree.reference_poses(values))
+    assert_same_poses(tree.poses(values), reference_poses(urdf, values))
     assert torch.autograd.gradgradcheck(tree.poses, values[:1].requires_grad_())
 
 
 def test_kinematics_keeps_dtype_and_follows_the_hand(hand, generator):
     joints = postures(hand, 3, generator)
     moved = hand.to(torch.float32)
-    assert moved.kinematics.constant.dtype == torch.float32
+    assert moved.tree.tables.dtype == torch.float32
     torch.testing.assert_close(moved.link_poses(joints.float()), hand.link_poses(joints.float()), atol=1e-7, rtol=0)
-    assert hand.link_poses(joints[0]).shape == (len(hand.link_names), 4, 4)
+    assert hand.link_poses(joints[0]).shape == (len(hand.tree.link_names), 4, 4)

@@ -11,7 +11,7 @@ def test_a_hand_is_found_by_name_folder_and_file():
     folder = hands_folder() / "barrett"
     for given in ("barrett", folder, str(folder), folder / "hand.toml"):
         assert find_hand(given) == folder
-    assert load_hand(folder).sha256 == load_hand("barrett").sha256
+    assert load_hand(folder).source.sha256 == load_hand("barrett").source.sha256
 
 
 def test_unknown_hand_and_option_are_named(tmp_path):

@@ -24,6 +24,10 @@ def hand(request) -> Hand:
     return load_hand(*request.param)
 
 
+def frames_of(hand: Hand, joints: torch.Tensor) -> torch.Tensor:
+    return hand.tree.frames(hand.expand_joints(joints).T.contiguous())
+
+
 def postures(hand: Hand, n: int, generator: torch.Generator) -> torch.Tensor:
     share = torch.rand(n, hand.dof, generator=generator, dtype=torch.float64)
     return hand.lower + (hand.upper - hand.lower) * share
@@ -47,13 +51,13 @@ def test_self_collision_agrees_with_exact_hulls(hand, generator, monkeypatch):
 
 def test_clearance_is_the_least_of_all_pairs(hand, generator):
     joints = postures(hand, 500, generator)
-    every = hand.self_collision.separations(hand.frames(joints), torch.inf)
+    every = hand.self_collision.separations(frames_of(hand, joints), torch.inf)
     torch.testing.assert_close(hand.self_clearance(joints), every.amin(0), atol=1e-14, rtol=0)
     torch.testing.assert_close(hand.self_clearance(joints, chunk=7), every.amin(0), atol=1e-14, rtol=0)
     for below in (0.0, 0.004):
         found = hand.self_clearance(joints, below=below)
         torch.testing.assert_close(found.clamp_max(below), every.amin(0).clamp_max(below), atol=1e-14, rtol=0)
-    near = hand.self_collision.separations(hand.frames(joints), 0.002)
+    near = hand.self_collision.separations(frames_of(hand, joints), 0.002)
     torch.testing.assert_close(near.clamp_max(0.002), every.clamp_max(0.002), atol=1e-14, rtol=0)
 
 
@@ -75,7 +79,7 @@ def test_clearance_gradient_equals_finite_differences(hand, generator):
 
 
 def test_wrenches_are_the_derivative_by_a_motion_of_the_second_shape(hand, generator):
-    itself, frames = hand.self_collision, hand.frames(postures(hand, 1, generator))
+    itself, frames = hand.self_collision, frames_of(hand, postures(hand, 1, generator))
     shaken = rotation_from_vector(0.1 * torch.randn(frames.shape[2], 3, generator=generator, dtype=torch.float64))
     frames = torch.einsum("lij,jkln->ikln", shaken, frames)  # no two axes are parallel, where it has kinks
     pair, row = torch.arange(len(itself.pairs)), torch.zeros(len(itself.pairs), dtype=torch.long)
@@ -111,7 +115,7 @@ def test_pairs_of_the_shipped_hands_are_the_learned_ones(name):
     assert set(learned) - left_out <= set(spec.pairs)
     assert len(left_out) == (2 if name == "barrett" else 0)
     assert len(learned) > 0.8 * len(spec.pairs)
-    assert list(spec.pairs) == sorted(spec.pairs, key=lambda pair: [hand.link_names.index(x) for x in pair])
+    assert list(spec.pairs) == sorted(spec.pairs, key=lambda pair: [hand.tree.link_names.index(x) for x in pair])
 
 
 def test_neighbours_and_links_that_always_or_never_meet_are_no_pairs(toy_hand):
@@ -141,9 +145,9 @@ def test_cylinders_are_within_two_percent(tmp_path):
         '<child link="ball"/><axis xyz="1 0 0"/><limit lower="0" upper="1"/></joint></robot>'
     )
     urdf = read_urdf(path)
-    from torchgrasp.hand.kinematics import kinematics_from_urdf
+    from torchgrasp.hand.kinematics import tree_from_urdf
 
-    tree, itself = kinematics_from_urdf(urdf), self_collision_from_urdf(urdf, None)
+    tree, itself = tree_from_urdf(urdf), self_collision_from_urdf(urdf, None)
     around = torch.stack([torch.linspace(-4, 4, 200, dtype=torch.float64), torch.full((200,), 0.09).double()])
     error = itself.clearance(tree.frames(around)) - 0.03
     assert float(error.abs().max()) < 0.02 * 0.05

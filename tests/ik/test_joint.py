@@ -83,7 +83,7 @@ def test_grasps_satisfy_every_constraint(scene, grasps):
     assert bool((good.joints >= hand.lower).all()) and bool((good.joints <= hand.upper).all())
     cover = hand.collision_spheres
     for joints, links in ((good.joints, ~cover.touching), (good.pregrasp, cover.radius > 0)):
-        spheres = apply(good.obj_from_hand, hand.spheres(joints))
+        spheres = apply(good.obj_from_hand, hand.sphere_centres(joints))
         assert float((spheres[..., 2] - cover.radius).min()) >= 0
         assert float((world.field.query(spheres)[0] - cover.radius)[:, links].min()) >= 0
         assert float(hand.self_clearance(joints).min()) >= 0
@@ -93,7 +93,7 @@ def test_links_are_outside_the_estimated_surface(scene, grasps):
     """Link centre lines against the mean itself, not the field that the solver saw."""
     _, hand, *_, shape, _ = scene
     good = grasps[grasps.status == Status.OK]
-    centres = apply(good.obj_from_hand, hand.spheres(good.joints))[:, ~hand.collision_spheres.touching]
+    centres = apply(good.obj_from_hand, hand.sphere_centres(good.joints))[:, ~hand.collision_spheres.touching]
     near = torch.linalg.vector_norm(shape.normalise(centres), dim=-1) < shape.domain_radius
     assert int(near.sum()) > 100
     assert float(shape.predict(centres[near]).distance.min()) > 0

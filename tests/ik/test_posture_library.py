@@ -62,7 +62,7 @@ def test_a_table_moves_clear_postures_to_the_front(postures, poses):
 
     def overlap(world: CollisionWorld) -> torch.Tensor:
         best = nearest_postures(contacts, postures, world, n_seeds=1)
-        spheres = apply(best.obj_from_hand, hand.spheres(best.joints))
+        spheres = apply(best.obj_from_hand, hand.sphere_centres(best.joints))
         return collision_cost(spheres, cover, CollisionWorld(NOTHING, table))
 
     without, aware = overlap(CollisionWorld(NOTHING, None)), overlap(CollisionWorld(NOTHING, table))
@@ -71,7 +71,7 @@ def test_a_table_moves_clear_postures_to_the_front(postures, poses):
 
 def test_crowding_is_the_sum_of_squared_lacks(postures, poses):
     hand, cover = postures.hand, postures.hand.collision_spheres
-    spheres = apply(poses, hand.spheres(postures.joints[:12]))
+    spheres = apply(poses, hand.sphere_centres(postures.joints[:12]))
     nothing = torch.zeros(12, dtype=torch.float64)
     torch.testing.assert_close(collision_cost(spheres, cover, CollisionWorld(NOTHING, -10.0)), nothing)
     wanted = []

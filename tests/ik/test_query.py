@@ -132,10 +132,10 @@ def test_a_mixture_of_other_limits_fingers_or_fingertips_is_refused():
     hand, samples, mixture = barrett()
     contacts = contacts_of(hand, samples.joints[:2], torch.eye(4).double())
     others = [
-        dataclasses.replace(hand, upper=hand.upper - 0.01),
-        dataclasses.replace(hand, contact=hand.contact + 1e-4),
-        dataclasses.replace(hand, normal=hand.normal.roll(1, 1)),
-        dataclasses.replace(hand, coupling=hand.coupling * 1.001),
+        dataclasses.replace(hand, actuated=dataclasses.replace(hand.actuated, upper=hand.upper - 0.01)),
+        dataclasses.replace(hand, tips=dataclasses.replace(hand.tips, contact=hand.tips.contact + 1e-4)),
+        dataclasses.replace(hand, tips=dataclasses.replace(hand.tips, normal=hand.tips.normal.roll(1, 1))),
+        dataclasses.replace(hand, actuated=dataclasses.replace(hand.actuated, coupling=hand.actuated.coupling * 1.001)),
     ]
     for other in others:
         with pytest.raises(BadArgument, match=r"mixture: found a model of hand 'barrett'.*train it anew"):
@@ -144,7 +144,7 @@ def test_a_mixture_of_other_limits_fingers_or_fingertips_is_refused():
     with pytest.raises(BadArgument, match="mixture: found hand_codes"):
         query_mixture(contacts, hand, spoilt)
     # What does not change the codes is no other hand, nor are single precision and samples that tell no hand.
-    for same in (dataclasses.replace(hand, sha256="0" * 64), hand.to(torch.float32)):
+    for same in (dataclasses.replace(hand, source=hand.source._replace(sha256="0" * 64)), hand.to(torch.float32)):
         assert len(query_mixture(contacts, same, mixture))
     assert len(query_mixture(contacts, hand, dataclasses.replace(mixture, meta={})))
 

@@ -81,7 +81,7 @@ def test_a_table_is_kept_clear_of(scene):
     found = solve_ik(contacts[:10], hand, mixture, CollisionWorld(table=height), postures=postures)
     good = found.status == Status.OK
     cover = hand.collision_spheres
-    lowest = (apply(found.obj_from_hand, hand.spheres(found.joints))[..., 2] - cover.radius).amin(1)
+    lowest = (apply(found.obj_from_hand, hand.sphere_centres(found.joints))[..., 2] - cover.radius).amin(1)
     assert bool(good.any()) and bool((lowest[good] >= height).all())
     assert bool((found.status[~good] >= Status.OUT_OF_REACH).all())
 

@@ -10,7 +10,7 @@ def test_every_fingertip_belongs_to_its_finger_and_the_palm_to_none():
         hand = load_hand(name)
         fingers = finger_of_links(hand)
         assert [fingers[tip] for tip in hand.tip_links] == [0, 1, 2]
-        assert fingers[hand.link_names[0]] == PARKED
+        assert fingers[hand.tree.link_names[0]] == PARKED
 
 
 def test_solids_follow_the_pose_of_the_hand_rigidly():
@@ -20,8 +20,8 @@ def test_solids_follow_the_pose_of_the_hand_rigidly():
     there = here.clone()
     there[:3, 3] = torch.tensor([0.1, -0.2, 0.3])
     pairs = zip(
-        solids_from_hand(hand, joints, hand.urdf_joint_names, here),
-        solids_from_hand(hand, joints, hand.urdf_joint_names, there),
+        solids_from_hand(hand, joints, hand.tree.joint_names, here),
+        solids_from_hand(hand, joints, hand.tree.joint_names, there),
         strict=True,
     )
     for a, b in pairs:
@@ -31,7 +31,7 @@ def test_solids_follow_the_pose_of_the_hand_rigidly():
 def test_the_order_of_the_joints_does_not_matter():
     hand = load_hand("barrett")
     joints = hand.expand_joints(hand.upper.double() * 0.5)
-    names = hand.urdf_joint_names
+    names = hand.tree.joint_names
     place = torch.eye(4, dtype=torch.float64)
     turned = solids_from_hand(hand, joints.flip(0), names[::-1], place)
     for a, b in zip(solids_from_hand(hand, joints, names, place), turned, strict=True):
@@ -42,6 +42,6 @@ def test_a_fingertip_solid_lies_at_the_tip():
     hand = load_hand("allegro")
     joints = ((hand.lower + hand.upper) / 2).double()
     centre = hand.tip_centres(joints)[0].numpy()
-    solids = solids_from_hand(hand, hand.expand_joints(joints), hand.urdf_joint_names, torch.eye(4).double())
+    solids = solids_from_hand(hand, hand.expand_joints(joints), hand.tree.joint_names, torch.eye(4).double())
     middles = [(s.vertices.min(0) + s.vertices.max(0)) / 2 for s in solids if s.finger == 0]
     assert min(np.linalg.norm(m - centre) for m in middles) < 1e-6

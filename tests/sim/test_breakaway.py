@@ -13,7 +13,7 @@ from torchgrasp.sim.breakaway import Breakaway
 def barrett():
     hand, grasp = pinch("barrett")
     model = model_from_hand(hand, grasp)
-    index = {name: k for k, name in enumerate(hand.urdf_joint_names)}
+    index = {name: k for k, name in enumerate(hand.tree.joint_names)}
     return model, index
 
 
@@ -36,7 +36,7 @@ def test_the_outer_link_takes_the_whole_turn_of_the_motor():
 
 def test_a_hand_without_geared_fingers_has_no_clutch():
     hand, grasp = pinch("allegro")
-    targets = torch.rand(len(hand.urdf_joint_names), dtype=torch.float64)
+    targets = torch.rand(len(hand.tree.joint_names), dtype=torch.float64)
     assert torch.equal(Breakaway(model_from_hand(hand, grasp), 1e-6)(targets, 0 * targets), targets)
 
 

@@ -122,12 +122,12 @@ def test_kinematics_are_those_of_the_hand(name, simulator):
     hand, joints, world_from_hand, scene = build(name, standing(), simulator)
     assert scene.penetration() == 0.0
     assert np.abs(scene.hand_pose() - world_from_hand.numpy()).max() < 1e-5
-    tips = world_from_hand @ hand.link_poses(joints)[hand.tip_index]
+    tips = world_from_hand @ hand.link_poses(joints)[hand.tips.index]
     assert np.abs(scene.tip_poses() - tips.numpy()).max() < 1e-4
     points, _ = hand.fingertips(joints)
     world_points = points @ world_from_hand[:3, :3].T + world_from_hand[:3, 3]
-    order = [hand.urdf_joint_names.index(n) for n in scene.joint_names]
-    found = scene.jacobian(world_points.numpy()) @ hand.coupling[order].numpy()
+    order = [hand.tree.joint_names.index(n) for n in scene.joint_names]
+    found = scene.jacobian(world_points.numpy()) @ hand.actuated.coupling[order].numpy()
     assert np.abs(found - (world_from_hand[:3, :3] @ hand.jacobian(joints)).numpy()).max() < 1e-4
     assert scene.joints() == pytest.approx(hand.expand_joints(joints).numpy()[order], abs=1e-4)
 
@@ -179,7 +179,7 @@ def test_the_hand_rises_with_its_joint_and_stays_where_it_is_driven(simulator):
         scene.step()
     rise = scene.hand_pose()[:3, 3] - world_from_hand[:3, 3].numpy()
     assert rise == pytest.approx([0, 0, 0.1], abs=5e-4)
-    order = [hand.urdf_joint_names.index(n) for n in scene.joint_names]
+    order = [hand.tree.joint_names.index(n) for n in scene.joint_names]
     assert np.abs(scene.joints() - hand.expand_joints(joints).numpy()[order]).max() < 2e-3
 
 

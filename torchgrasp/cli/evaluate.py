@@ -84,7 +84,8 @@ def evaluate(
         used = dict(zip(("force", "closing"), execution.on(PROTOCOLS[protocol]), strict=True)) | {"holding": holding}
         used |= {"simulator": simulator}
         asked = {"protocol": dataclasses.asdict(PROTOCOLS[protocol]), "hand": hand, **used, "grasps": grasps}
-        asked |= {"ranks": ranks, "starts": starts, "complete": complete, "seed": seed, "hand_sha256": the_hand.sha256}
+        asked |= {"ranks": ranks, "starts": starts, "complete": complete, "seed": seed}
+        asked |= {"hand_sha256": the_hand.source.sha256}
         content = {"asked": asked, "summary": summary, "views": [dataclasses.asdict(score) for score in scores]}
         write_file(out / "evaluate.json", format_json(content))
         write_evaluation(out / "evaluate.html", f"Grasps of the {hand} hand under {protocol}", asked, scores)

@@ -37,7 +37,7 @@ def export(
         found = load_grasps(grasps)
     with naming("--hand", "hand", "name"):
         robot = load_hand(found.meta.get("hand", "") if hand is None else hand)
-    if found.meta.get("hand_sha256") != robot.sha256:
+    if found.meta.get("hand_sha256") != robot.source.sha256:
         raise BadArgument("--hand", f"{robot.name}, whose files are not those that were planned with", "the same hand")
     if most < 1:
         raise BadArgument("--most", most, "at least 1")

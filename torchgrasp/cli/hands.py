@@ -88,19 +88,20 @@ def describe(hand: Hand, joints: torch.Tensor) -> str:
         hand: the hand.
         joints: postures (n, h) [rad], uniform within the limits.
     """
-    lines = [f"{hand.name}, option {hand.option}: {hand.dof} actuated of {len(hand.urdf_joint_names)} joints"]
+    lines = [f"{hand.name}, option {hand.source.option}: {hand.dof} actuated of {len(hand.tree.joint_names)} joints"]
     ends = torch.rad2deg(torch.stack([hand.lower, hand.upper], 1)).tolist()
     lines += [
         f"  {n:24} {low:7.1f} to {high:6.1f} degrees" for n, (low, high) in zip(hand.joint_names, ends, strict=True)
     ]
-    for k, finger in enumerate(hand.finger_names):
-        radius = float(hand.tip_radius[k])
+    tips = hand.tips
+    for k, finger in enumerate(tips.names):
+        radius = float(tips.radius[k])
         tip = f"a sphere of {1e3 * radius:.1f} mm" if radius else "a point"
-        contact, normal = (", ".join(f"{x:.4g}" for x in v[k].tolist()) for v in (hand.contact, hand.normal))
-        lines.append(f"finger {finger}: {tip} on {hand.tip_links[k]}")
+        contact, normal = (", ".join(f"{x:.4g}" for x in v[k].tolist()) for v in (tips.contact, tips.normal))
+        lines.append(f"finger {finger}: {tip} on {tips.links[k]}")
         lines.append(f"  contact [{contact}] m, normal [{normal}]")
-    for j, name in enumerate(hand.urdf_joint_names):
-        row, offset = hand.coupling[j], float(hand.offset[j])
+    for j, name in enumerate(hand.tree.joint_names):
+        row, offset = hand.actuated.coupling[j], float(hand.actuated.offset[j])
         sources = torch.nonzero(row)[:, 0].tolist()
         if not sources:
             lines.append(f"joint {name} is parked at {offset:.4g}")

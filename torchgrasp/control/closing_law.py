@@ -150,7 +150,7 @@ def joint_step(
 
 def drive_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "j"]:
     """Return the stiffness [N m/rad] of the drive of every joint of the URDF: the hand's own, or `kp` of all."""
-    every = [hand.actuators[name].kp if kp is None else kp for name in hand.urdf_joint_names]
+    every = [hand.actuators[name].kp if kp is None else kp for name in hand.tree.joint_names]
     return torch.tensor(every, dtype=torch.float64)
 
 
@@ -170,7 +170,7 @@ def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
         hand: the hand.
         kp: of every drive [N m/rad]; None: the hand's own.
     """
-    return actuated_stiffness(hand.coupling, drive_stiffness(hand, kp).to(hand.coupling))
+    return actuated_stiffness(hand.actuated.coupling, drive_stiffness(hand, kp).to(hand.actuated.coupling))
 
 
 def tip_compliance(

@@ -78,11 +78,11 @@ def model_from_hand(
         names: the order of all joints of the URDF; None: the hand's own.
         kp: stiffness of every joint's drive [N m/rad]; None: the hand's own.
     """
-    names = hand.urdf_joint_names if names is None else names
-    order = [hand.urdf_joint_names.index(name) for name in names]
+    names = hand.tree.joint_names if names is None else names
+    order = [hand.tree.joint_names.index(name) for name in names]
     return ControlModel(
-        coupling=hand.coupling[order].double(),
-        offset=hand.offset[order].double(),
+        coupling=hand.actuated.coupling[order].double(),
+        offset=hand.actuated.offset[order].double(),
         actuated=tuple(names.index(name) for name in hand.joint_names),
         kp=drive_stiffness(hand, kp)[order],
         lower=hand.lower.double(),
@@ -99,13 +99,14 @@ def model_from_hand(
 def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> Observation:
     """Return what a robot knows from the encoders of its actuated joints [rad] and its fingertips, hand's frame.
 
-    All joints of the URDF are in the order of `hand.urdf_joint_names`, as in `model_from_hand` by default.
+    All joints of the URDF are in the order of `hand.tree.joint_names`, as in `model_from_hand` by default.
     """
     poses = hand.link_poses(joints.double())
     tips = hand.tip_centres(joints.double())
-    axes, origins = hand.jacobians(poses)
+    axes, origins = hand.tree.joint_axes(poses)
     turned = torch.linalg.cross(axes.expand(3, -1, 3), tips[:, None] - origins)
-    columns = torch.where(hand.prismatic[:, None] > 0, axes, turned) * hand.moves[hand.tip_index][:, :, None]
+    columns = torch.where(hand.tree.prismatic[:, None] > 0, axes, turned)
+    columns = columns * hand.tree.moves[hand.tips.index][:, :, None]
     return Observation(
         joints=hand.expand_joints(joints.double()),
         tips=tips,

@@ -151,7 +151,7 @@ def _plan(view: _View, robot: str, friction: float, starts: int, seed: int, shel
         cloud = read_view(view.objects, view.object, view.view)
         if planned:
             grasps = load_grasps(view.file(shelf))
-            if (grasps.meta.get("cloud_sha256"), grasps.meta.get("hand_sha256")) != (digest(cloud), hand.sha256):
+            if (grasps.meta.get("cloud_sha256"), grasps.meta.get("hand_sha256")) != (digest(cloud), hand.source.sha256):
                 raise BadArgument("folder", f"{view.file(shelf)} of another cloud or hand", "grasps of this view")
             return dataclasses.replace(found, executable=len(grasps))
         began = time.process_time()

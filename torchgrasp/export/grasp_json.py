@@ -87,7 +87,7 @@ def format_grasps(grasps: Grasps, hand: Hand, force: float = 4.0) -> str:
             "name": hand.name,
             "urdf": hand.urdf_path.name,
             "root": read_urdf(hand.urdf_path).root,
-            "sha256": hand.sha256,
+            "sha256": hand.source.sha256,
         },
         "actuated": list(hand.joint_names),
         "stiffness": {name: drive.kp for name, drive in hand.actuators.items()},

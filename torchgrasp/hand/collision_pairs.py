@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.hand.kinematics import kinematics_from_urdf
+from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.self_collision import self_collision_from_urdf
 from torchgrasp.hand.urdf import Urdf
 
@@ -43,7 +43,7 @@ def collision_pairs(
     """
     if not 1 <= n <= 10**7:
         raise BadArgument("n", n, "a whole number in [1, 10^7]")
-    tree, every = kinematics_from_urdf(urdf), self_collision_from_urdf(urdf, None)
+    tree, every = tree_from_urdf(urdf), self_collision_from_urdf(urdf, None)
     if not len(every.pairs):
         return []
     links, owner = torch.unique(every.link[every.pairs].sort(1).values, dim=0, return_inverse=True)

@@ -18,7 +18,7 @@ from torch import Tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import rotation_from_rpy
 from torchgrasp.hand.collision_pairs import collision_pairs, draw_postures
-from torchgrasp.hand.kinematics import kinematics_from_urdf, placed
+from torchgrasp.hand.kinematics import map_points, tree_from_urdf
 from torchgrasp.hand.urdf import Joint, Link, Shape, Triple, Urdf, read_urdf
 
 POSTURES = 20_000
@@ -78,7 +78,7 @@ def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = No
     grasping = {joint for tip in chosen[:3] for joint in chains[tip]}
     moved = grasping | {coupling[j][0] for j in grasping if j in coupling}
     parked = {j: min(max(0.0, k.lower), k.upper) for j, k in kinds.items() if j not in moved and j not in coupling}
-    frames = kinematics_from_urdf(urdf).frames(draw_postures(urdf, coupling, POSTURES, seed))
+    frames = tree_from_urdf(urdf).frames(draw_postures(urdf, coupling, POSTURES, seed))
     pads, approach = guess_pads(urdf, frames, chosen)
     efforts = [k.effort for j, k in kinds.items() if j not in coupling and k.effort > 0]
     kp = STIFFNESS * min(efforts, default=1.0)
@@ -156,7 +156,7 @@ def guess_pads(urdf: Urdf, frames: Float[Tensor, "3 4 l n"], tips: Sequence[str]
     shapes = [_end_shape(urdf.links[i]) for i in index.tolist()]
     cores = [_core(shape) for shape in shapes]
     at = frames.index_select(2, index)
-    centres = placed(at, torch.tensor(np.stack(cores)))  # 3 f n
+    centres = map_points(at, torch.tensor(np.stack(cores)))  # 3 f n
     middle = centres[:, :3].mean(1, keepdim=True)
     spread = torch.linalg.vector_norm(centres[:, :3] - middle, dim=0).sum(0)
     near = spread.topk(max(1, int(NEAR * len(spread))), largest=False).indices

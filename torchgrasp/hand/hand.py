@@ -1,19 +1,19 @@
-"""The hand as a value: joints, fingers, pads, coupling; where its links and fingertips are and how they move."""
+"""A robot hand as a value: its joints, its kinematic tree, its fingertips, and how they move."""
 
 import dataclasses
-import functools
 import math
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.errors import BadArgument
 from torchgrasp.hand.collision_spheres import CollisionSpheres
-from torchgrasp.hand.kinematics import Kinematics, placed, turned
+from torchgrasp.hand.fingertips import Fingertips
+from torchgrasp.hand.joints import ActuatedJoints
+from torchgrasp.hand.kinematics import KinematicTree, map_directions, map_points
 from torchgrasp.hand.self_collision import SelfCollision
 
 
@@ -26,57 +26,72 @@ class Actuator(NamedTuple):
     kd: float
 
 
-@dataclasses.dataclass(frozen=True)
-class Hand(Value):
-    """A robot hand with three grasping fingers; positions are in the frame of the palm (the URDF's root) in metres.
+class HandSource(NamedTuple):
+    """What a hand was loaded from: finger option, URDF, and the SHA-256 of hand.toml and URDF together."""
 
-    `joints` (.., h) below are always the actuated joints of the grasping fingers, in the order of `joint_names`, with
-    `lower` and `upper` as limits [rad]. Coupled joints follow them, and the other joints are parked:
-    `all joints = coupling @ joints + offset`, in the order of `urdf_joint_names`. Fingers are in grasp order. Every
-    method refuses joints of another count or dtype, or that are not finite, with `BadArgument`.
-
-    `contact`, `normal` and `center` [m] are the pads in the frames of `tip_links`, `approach` points out of the palm,
-    `axis`, `prismatic` and `child` (an index into `link_names`) describe the joints of the URDF, `moves` tells which
-    of them move a link, and `sha256` is that of both files. `fingers` is that part of the tree which leads to the
-    last links that joints move, `tip_place` where those that carry the tips stand in it, and `tip_pose` each tip's
-    frame in its carrier's.
-    """
-
-    name: str
     option: str
     urdf_path: Path
     sha256: str
-    joint_names: tuple[str, ...]
-    lower: Float[Tensor, " h"]
-    upper: Float[Tensor, " h"]
-    finger_names: tuple[str, str, str]
-    tip_links: tuple[str, str, str]
-    urdf_joint_names: tuple[str, ...]
-    link_names: tuple[str, ...]
-    coupling: Float[Tensor, "j h"]
-    offset: Float[Tensor, " j"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Hand(Value):
+    """A robot hand with three grasping fingers. Positions are in the palm's frame (the URDF's root), in metres.
+
+    `joints` (.., h) are everywhere the actuated joints of the grasping fingers, in the order of `joint_names`. Every
+    method refuses joints of another count or dtype, or that are not finite, with `BadArgument`. Fingers are in grasp
+    order. `approach` points out of the palm. `actuators` are named after all joints of the URDF.
+    """
+
+    name: str
+    source: HandSource
+    actuated: ActuatedJoints
+    tree: KinematicTree = dataclasses.field(repr=False)
+    tips: Fingertips = dataclasses.field(repr=False)
     approach: Float[Tensor, "3"]
-    tip_index: Int[Tensor, "3"]
-    contact: Float[Tensor, "3 3"]
-    normal: Float[Tensor, "3 3"]
-    center: Float[Tensor, "3 3"]
-    tip_radius: Float[Tensor, "3"]
-    axis: Float[Tensor, "j 3"]
-    prismatic: Float[Tensor, " j"]
-    child: Int[Tensor, " j"]
-    moves: Float[Tensor, "l j"]
     actuators: dict[str, Actuator]
-    collision_spheres: CollisionSpheres
-    self_collision: SelfCollision
-    tip_place: Int[Tensor, "3"]
-    tip_pose: Float[Tensor, "3 4 3 1"]
-    kinematics: Kinematics = dataclasses.field(repr=False)
-    fingers: Kinematics = dataclasses.field(repr=False)
+    collision_spheres: CollisionSpheres = dataclasses.field(repr=False)
+    self_collision: SelfCollision = dataclasses.field(repr=False)
+
+    @property
+    def urdf_path(self) -> Path:
+        """The URDF."""
+        return self.source.urdf_path
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the actuated joints."""
+        return self.actuated.names
 
     @property
     def dof(self) -> int:
-        """Count the actuated joints, h."""
-        return len(self.joint_names)
+        """Number of actuated joints, h."""
+        return len(self.actuated.names)
+
+    @property
+    def lower(self) -> Float[Tensor, " h"]:
+        """Lower limits of the actuated joints [rad]."""
+        return self.actuated.lower
+
+    @property
+    def upper(self) -> Float[Tensor, " h"]:
+        """Upper limits of the actuated joints [rad]."""
+        return self.actuated.upper
+
+    @property
+    def finger_names(self) -> tuple[str, str, str]:
+        """Names of the grasping fingers."""
+        return self.tips.names
+
+    @property
+    def tip_links(self) -> tuple[str, str, str]:
+        """Links of the fingertips."""
+        return self.tips.links
+
+    @property
+    def tip_radius(self) -> Float[Tensor, "3"]:
+        """Radii of the tips' spheres [m]; 0 for a tip that touches in one point alone."""
+        return self.tips.radius
 
     def check_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b h"]:
         """Return `joints` if they are finite and within the limits.
@@ -84,160 +99,93 @@ class Hand(Value):
         Raises:
             BadArgument: with the first joint's name, value and limits.
         """
-        self._check(joints)
-        low, high = self.lower.to(joints), self.upper.to(joints)
-        # the limits are rounded to the dtype of the joints, and so may the joints be
-        wrong = ~((joints >= low - 1e-6) & (joints <= high + 1e-6))
-        if bool(wrong.any()):
-            *_, j = first = torch.nonzero(wrong)[0].tolist()
-            found = f"{joints[tuple(first)].item():.6g} for {self.joint_names[j]}"
-            raise BadArgument("joints", found, f"[{self.lower[j].item():.6g}, {self.upper[j].item():.6g}]")
+        self.actuated.check_limits(joints)
         return joints
 
     def expand(self, joints: Float[Tensor, "*b h"]) -> dict[str, Float[Tensor, "*b"]]:
         """Return every movable joint of the URDF by name: actuated, coupled and parked."""
-        return dict(zip(self.urdf_joint_names, self.expand_joints(joints).unbind(-1), strict=True))
+        return dict(zip(self.tree.joint_names, self.expand_joints(joints).unbind(-1), strict=True))
 
     def expand_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
-        """Return every movable joint of the URDF in the order of `urdf_joint_names`."""
-        self._check(joints)
-        return joints @ self.coupling.to(joints).T + self.offset.to(joints)
-
-    def frames(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "3 4 l n"]:
-        """Return `link_poses` without their last row, all postures in one last axis: the fast layout."""
-        return self.kinematics.frames(self._columns(joints))
+        """Return every movable joint of the URDF in the order of `tree.joint_names`."""
+        return self.actuated.expand(joints)
 
     def link_poses(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b l 4 4"]:
-        """Return `hand_from_link` of every link, in the order of `link_names`."""
+        """Return `hand_from_link` of every link, in the order of `tree.link_names`."""
         values = self.expand_joints(joints)
-        poses = self.kinematics.poses(values.reshape(-1, values.shape[-1]))
+        poses = self.tree.poses(values.reshape(-1, values.shape[-1]))
         return poses.reshape(*joints.shape[:-1], *poses.shape[1:])
 
     def fingertips(self, joints: Float[Tensor, "*b h"]) -> tuple[Float[Tensor, "*b 3 3"], Float[Tensor, "*b 3 3"]]:
-        """Return the contact points [m] on the three pads and their outward unit normals (the pads' axes).
+        """Return the contact points [m] of the three pads and their outward unit normals.
 
         >>> from torchgrasp.hand.load import load_hand
         >>> points, normals = load_hand("allegro").fingertips(torch.zeros(5, 12))
         >>> points.shape, normals.shape
         (torch.Size([5, 3, 3]), torch.Size([5, 3, 3]))
         """
-        tips = self._tips(self._columns(joints))[1]
-        contact, normal, _ = self._pads
-        return _rows(placed(tips, contact), joints), _rows(turned(tips, normal), joints)
+        _, carriers = self.tips.frames(self._columns(joints))
+        contact, normal, _ = self.tips.in_carriers
+        return _rows(map_points(carriers, contact), joints), _rows(map_directions(carriers, normal), joints)
 
     def tip_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b 3 3"]:
         """Return the centres [m] of the tips' spheres of `tip_radius`; the contact points where the radius is 0."""
-        return _rows(placed(self._tips(self._columns(joints))[1], self._pads[2]), joints)
+        _, carriers = self.tips.frames(self._columns(joints))
+        return _rows(map_points(carriers, self.tips.in_carriers[2]), joints)
 
     def jacobian(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b 3 3 h"]:
         """Return the derivative of the contact points by the actuated joints, coupling included [m/rad].
 
         The axes are: finger, coordinate, joint.
         """
-        frames, tips = self._tips(self._columns(joints))
-        return _rows(self._derivative(self.fingers, frames, self.tip_index, placed(tips, self._pads[0])), joints)
-
-    def point_jacobian(
-        self, poses: Float[Tensor, "*b l 4 4"], link_index: Int[Tensor, " p"], points: Float[Tensor, "*b p 3"]
-    ) -> Float[Tensor, "*b p 3 h"]:
-        """Return the derivative of points fixed to links by the actuated joints [m/rad].
-
-        Args:
-            poses: `link_poses` of the posture.
-            link_index: the link each point is fixed to, an index into `link_names`.
-            points: where the points are now, in the palm's frame [m].
-        """
-        columns = points.reshape(-1, *points.shape[-2:]).permute(2, 1, 0)
-        found = self._derivative(self.kinematics, _frames(poses), link_index, columns)
-        return _rows(found, points[..., 0, :])
-
-    def _columns(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "j n"]:
-        """Return every movable joint of the URDF, all postures in the last axis."""
-        values = self.expand_joints(joints)
-        return values.reshape(-1, values.shape[-1]).T.contiguous()
-
-    @functools.cached_property
-    def _pads(self) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3 3"], Float[Tensor, "3 3"]]:
-        """The pads' contact points and normals and the tips' centres in the frames of the links that carry the tips."""
-        pose = self.tip_pose
-        contact, center = (placed(pose, x)[..., 0].T for x in (self.contact, self.center))
-        return contact, turned(pose, self.normal)[..., 0].T, center
-
-    def _tips(self, values: Float[Tensor, "j n"]) -> tuple[Float[Tensor, "3 4 l n"], Float[Tensor, "3 4 3 n"]]:
-        """Return the frames of the links that lead to the tips, and those of the links that carry the tips."""
-        frames = self.fingers.frames(values)
-        return frames, frames.index_select(2, self.tip_place)
-
-    def _derivative(
-        self,
-        tree: Kinematics,
-        frames: Float[Tensor, "3 4 l n"],
-        link_index: Int[Tensor, " p"],
-        points: Float[Tensor, "3 p n"],
-    ) -> Float[Tensor, "h 3 p n"]:
-        """Return the derivative of points: of each by the joints between its link and the palm alone."""
-        acts = self.moves[link_index][:, :, None] * self.coupling  # on a point, through a joint, by an actuated joint
-        point, joint, actuated = torch.nonzero(acts, as_tuple=True)
-        link, ratio = tree.child[joint], self.coupling.to(points)[joint, actuated][:, None]
-        axes = turned(frames, tree.axis).index_select(1, link) * ratio
-        arm = points.index_select(1, point) - frames[:, 3].index_select(1, link)
-        (ax, ay, az), (x, y, z) = axes, arm
+        chains = self.tips.chains
+        frames, carriers = self.tips.frames(self._columns(joints))
+        contact = map_points(carriers, self.tips.in_carriers[0])
+        # a finger's contact moves with the joints above it, and they with the actuated joints
+        moves = self.tree.moves[self.tips.index][:, :, None] * self.actuated.coupling
+        finger, joint, actuated = torch.nonzero(moves, as_tuple=True)
+        ratio = self.actuated.coupling.to(contact)[joint, actuated][:, None]
+        child = frames.index_select(2, chains.child[joint])
+        axes = map_directions(child, chains.axis[joint]) * ratio
+        (ax, ay, az), (x, y, z) = axes, contact.index_select(1, finger) - child[:, 3]
         column = torch.stack([ay * z - az * y, az * x - ax * z, ax * y - ay * x])
-        if tree.slides:
-            column = torch.where(self.prismatic[joint][:, None] > 0, axes, column)
-        size = (3, points.shape[1] * self.dof, points.shape[2])
-        summed = points.new_zeros(size).index_add(1, point * self.dof + actuated, column)
-        return summed.unflatten(1, (-1, self.dof)).movedim(2, 0)
+        if chains.slides:
+            column = torch.where(self.tree.prismatic[joint][:, None] > 0, axes, column)
+        summed = contact.new_zeros(3, 3 * self.dof, contact.shape[2]).index_add(1, finger * self.dof + actuated, column)
+        return _rows(summed.unflatten(1, (3, self.dof)).movedim(2, 0), joints)
 
-    def spheres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b s 3"]:
-        """Return the centres [m] of `collision_spheres` in the palm's frame."""
-        cover = self.collision_spheres
-        return _rows(placed(self.frames(joints).index_select(2, cover.link_index), cover.center), joints)
+    def sphere_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b s 3"]:
+        """Return the centres [m] of `collision_spheres`."""
+        spheres, frames = self.collision_spheres, self.tree.frames(self._columns(joints))
+        return _rows(map_points(frames.index_select(2, spheres.link_index), spheres.center), joints)
 
     def self_clearance(
         self, joints: Float[Tensor, "*b h"], below: float = math.inf, chunk: int = 1000
     ) -> Float[Tensor, "*b"]:
         """Return the signed least separation [m] between links that can meet; negative: they overlap.
 
-        The links are the collision shapes of the URDF, parked fingers and the palm included, and the pairs those of
-        hand.toml. Where links overlap it is how far two must move to part, and where they face one another it is their
-        distance; corner to corner it is less.
+        The links are the collision shapes of the URDF, the palm and parked fingers included. hand.toml lists the pairs.
+        An overlap is the least translation that parts two links. Apart, the value is a lower bound of the distance,
+        and exact where a face is nearest.
 
         Args:
             joints: postures [rad].
-            below: only values below this [m] are wanted, others may be any larger number: 0 for a verdict alone takes
-                half the time.
+            below: values above this [m] are lower bounds only; with 0, for a verdict alone, the call is twice as fast.
             chunk: rows taken at a time, which bounds the memory and keeps the work in the cache.
         """
-        self._check(joints)
+        self.actuated.check(joints)
         rows = joints.reshape(-1, joints.shape[-1])
-        parts = [self.self_collision.clearance(self.frames(part), below) for part in rows.split(chunk)]
+        parts = [
+            self.self_collision.clearance(self.tree.frames(self._columns(part)), below) for part in rows.split(chunk)
+        ]
         return torch.cat(parts).reshape(joints.shape[:-1]) if parts else rows.new_zeros(joints.shape[:-1])
 
-    def jacobians(self, poses: Float[Tensor, "*b l 4 4"]) -> tuple[Float[Tensor, "*b j 3"], Float[Tensor, "*b j 3"]]:
-        """Return the axes and origins of all movable joints in the palm's frame."""
-        chains = _frames(poses).index_select(2, self.child)
-        like = poses[..., 0, 0, :]
-        return _rows(turned(chains, self.axis), like), _rows(chains[:, 3], like)
-
-    def _check(self, joints: Tensor) -> None:
-        """Refuse joints of another count or dtype, and numbers that are none, before any work."""
-        if joints.ndim < 1 or joints.shape[-1] != self.dof:
-            raise BadArgument("joints", f"shape {tuple(joints.shape)}", f"{self.dof} joints last: {self.joint_names}")
-        if joints.dtype not in (torch.float32, torch.float64):
-            raise BadArgument("joints", str(joints.dtype), "torch.float32 or torch.float64")
-        finite = torch.isfinite(joints)
-        if not bool(finite.all()):
-            first = torch.nonzero(~finite)[0].tolist()
-            found = f"{joints[tuple(first)].item()} for {self.joint_names[first[-1]]}"
-            raise BadArgument("joints", found, "finite numbers")
+    def _columns(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "j n"]:
+        """Return every movable joint of the URDF, with the postures last."""
+        values = self.expand_joints(joints)
+        return values.reshape(-1, values.shape[-1]).T.contiguous()
 
 
-def _frames(poses: Float[Tensor, "*b l 4 4"]) -> Float[Tensor, "3 4 l n"]:
-    """Return the first three rows of poses with all postures in one last axis."""
-    return poses.reshape(-1, *poses.shape[-3:])[..., :3, :].permute(2, 3, 1, 0)
-
-
-def _rows(columns: Tensor, like: Float[Tensor, "*b h"]) -> Tensor:
-    """Return what was computed for all postures in one last axis with its axes reversed, as the rows of `like`."""
-    return columns.permute(*range(columns.ndim - 1, -1, -1)).reshape(*like.shape[:-1], *columns.shape[-2::-1])
+def _rows(columns: Tensor, joints: Float[Tensor, "*b h"]) -> Tensor:
+    """Return what has the postures last with its axes reversed, in the batch shape of `joints`."""
+    return columns.permute(*range(columns.ndim - 1, -1, -1)).reshape(*joints.shape[:-1], *columns.shape[-2::-1])

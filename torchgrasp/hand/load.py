@@ -4,14 +4,14 @@ import hashlib
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from torchgrasp.errors import HandFileError
 from torchgrasp.hand.collision_spheres import spheres_from_urdf
-from torchgrasp.hand.hand import Actuator, Hand
+from torchgrasp.hand.fingertips import tips_from_files
+from torchgrasp.hand.hand import Actuator, Hand, HandSource
 from torchgrasp.hand.hand_toml import HandSpec, read_hand_toml
-from torchgrasp.hand.kinematics import ancestor_mask, fixed_to, kinematics_from_urdf
+from torchgrasp.hand.joints import joints_from_files
+from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.self_collision import self_collision_from_urdf
 from torchgrasp.hand.urdf import Urdf, read_urdf
 
@@ -65,77 +65,26 @@ def hand_from_files(spec: HandSpec, urdf: Urdf) -> Hand:
         HandFileError: hand.toml names what the URDF does not have, a joint neither grasps nor is parked, a margin
             leaves no range, or links without a collision shape.
     """
-    movable = {j.name: j for j in urdf.joints if j.kind != "fixed"}
-    links = {x.name: i for i, x in enumerate(urdf.links)}
-    _check_names(spec, urdf, set(movable), set(links))
+    _check_names(spec, urdf)
     _check_coupling(spec, urdf)
     _check_shapes(spec, urdf)
-    names = tuple(dict.fromkeys(j for f in spec.fingers for j in f.joints if j not in spec.coupling))
-    coupling, offset = _coupling(spec, tuple(movable), names)
-    limits = torch.tensor([[movable[n].lower, movable[n].upper] for n in names], dtype=torch.float64)
-    limits = limits + torch.tensor([spec.limit_margin, -spec.limit_margin], dtype=torch.float64)
-    for name, (low, high) in zip(names, limits.tolist(), strict=True):
-        if not low < high:
-            found = f"{spec.path}: limit_margin {spec.limit_margin:g} leaves joint {name} [{low:g}, {high:g}]"
-            raise HandFileError("hand.toml", found, "lower < upper")
-    kinematics = kinematics_from_urdf(urdf)
-    carriers, poses = zip(*(fixed_to(urdf, f.tip_link) for f in spec.fingers), strict=True)
-    leading = kinematics_from_urdf(urdf, carriers)
-    fingers = spec.fingers
+    movable = [j for j in urdf.joints if j.kind != "fixed"]
     return Hand(
         name=spec.name,
-        option=spec.option,
-        urdf_path=urdf.path,
-        sha256=hashlib.sha256(spec.data + b"\0" + urdf.data).hexdigest(),
-        joint_names=names,
-        lower=limits[:, 0].clone(),
-        upper=limits[:, 1].clone(),
-        finger_names=(fingers[0].name, fingers[1].name, fingers[2].name),
-        tip_links=(fingers[0].tip_link, fingers[1].tip_link, fingers[2].tip_link),
-        urdf_joint_names=kinematics.joint_names,
-        link_names=kinematics.link_names,
-        coupling=coupling,
-        offset=offset,
+        source=HandSource(spec.option, urdf.path, hashlib.sha256(spec.data + b"\0" + urdf.data).hexdigest()),
+        actuated=joints_from_files(spec, urdf),
+        tree=tree_from_urdf(urdf),
+        tips=tips_from_files(spec, urdf),
         approach=torch.tensor(spec.approach, dtype=torch.float64),
-        tip_index=torch.tensor([links[f.tip_link] for f in fingers]),
-        contact=torch.tensor([f.contact for f in fingers], dtype=torch.float64),
-        normal=torch.tensor([f.normal for f in fingers], dtype=torch.float64),
-        center=torch.tensor([f.center for f in fingers], dtype=torch.float64),
-        tip_radius=torch.tensor([f.radius for f in fingers], dtype=torch.float64),
-        axis=torch.tensor([j.axis for j in movable.values()], dtype=torch.float64),
-        prismatic=torch.tensor([float(j.kind == "prismatic") for j in movable.values()], dtype=torch.float64),
-        child=kinematics.child,
-        moves=torch.tensor(ancestor_mask(urdf), dtype=torch.float64),
-        actuators={n: Actuator(j.effort, j.velocity, spec.kp, spec.kd) for n, j in movable.items()},
+        actuators={j.name: Actuator(j.effort, j.velocity, spec.kp, spec.kd) for j in movable},
         collision_spheres=spheres_from_urdf(urdf, spec),
         self_collision=self_collision_from_urdf(urdf, spec.pairs),
-        tip_place=torch.tensor([leading.link_names.index(name) for name in carriers]),
-        tip_pose=torch.stack(poses, -1)[..., None],
-        kinematics=kinematics,
-        fingers=leading,
     )
 
 
-def _coupling(
-    spec: HandSpec, movable: tuple[str, ...], names: tuple[str, ...]
-) -> tuple[Float[Tensor, "j h"], Float[Tensor, " j"]]:
-    """Return the matrix and offset that give every joint from the actuated ones."""
-    matrix = torch.zeros(len(movable), len(names), dtype=torch.float64)
-    offset = torch.zeros(len(movable), dtype=torch.float64)
-    for row, joint in enumerate(movable):
-        source, ratio, shift = spec.coupling.get(joint, (joint, 1.0, 0.0))
-        if source in names:
-            matrix[row, names.index(source)] = ratio
-            offset[row] = shift
-        elif source in spec.parked:
-            offset[row] = ratio * spec.parked[source] + shift
-        else:
-            raise HandFileError("hand.toml", f"{spec.path}: joint {joint} neither grasps nor is parked", "either")
-    return matrix, offset
-
-
-def _check_names(spec: HandSpec, urdf: Urdf, movable: set[str], links: set[str]) -> None:
+def _check_names(spec: HandSpec, urdf: Urdf) -> None:
     """Refuse names in hand.toml that the URDF does not have."""
+    movable, links = {j.name for j in urdf.joints if j.kind != "fixed"}, {x.name for x in urdf.links}
     if spec.base_link != urdf.root:
         raise HandFileError("hand.toml", f"{spec.path}: base_link {spec.base_link!r}", f"the URDF's root {urdf.root!r}")
     joints = [j for f in spec.all_fingers for j in f.joints] + list(spec.parked) + list(spec.coupling)

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.frames import rotation_from_rpy
 from torchgrasp.hand.box_distance import box_distance, box_separation
-from torchgrasp.hand.kinematics import placed
+from torchgrasp.hand.kinematics import map_points
 from torchgrasp.hand.urdf import Shape, Triple, Urdf
 
 PRISM = 6
@@ -83,7 +83,7 @@ class SelfCollision(Value):
         """Return the shapes' axes and centres in the palm's frame."""
         links, turn = frames.index_select(2, self.link), self.turn.to(frames)[..., None]
         axes = links[:, 0, None] * turn[0] + links[:, 1, None] * turn[1] + links[:, 2, None] * turn[2]
-        return axes, placed(links, self.center)
+        return axes, map_points(links, self.center)
 
     def _distances(self, center: Float[Tensor, "3 s n"]) -> Float[Tensor, "p n"]:
         """Return how far the centres of each pair are apart."""

@@ -40,13 +40,14 @@ class GraspErrors(Batch):
 def tip_error(jacobians: SpatialJacobian, contacts: Contacts) -> Float[Tensor, "g 3"]:
     """Return the distance [m] of each fingertip's touching point from its contact."""
     hand = jacobians.hand
-    return torch.linalg.vector_norm(jacobians.points(hand.tip_index, hand.center) - tip_targets(hand, contacts), dim=-1)
+    centres = jacobians.points(hand.tips.index, hand.tips.center)
+    return torch.linalg.vector_norm(centres - tip_targets(hand, contacts), dim=-1)
 
 
 def normal_angle(jacobians: SpatialJacobian, contacts: Contacts) -> Float[Tensor, "g 3"]:
     """Return the angle [rad] between each pad's axis and the direction into the surface."""
     hand = jacobians.hand
-    pads = jacobians.directions(hand.tip_index, hand.normal)
+    pads = jacobians.directions(hand.tips.index, hand.tips.normal)
     return torch.acos((-(pads * contacts.normals).sum(-1)).clamp(-1.0, 1.0))
 
 

@@ -47,9 +47,9 @@ class SpatialJacobian(Value):
     def at(cls, posture: Configuration, hand: Hand) -> "SpatialJacobian":
         """Evaluate the forward kinematics once."""
         links, pose = hand.link_poses(posture.joints), posture.obj_from_hand
-        axes, origins = hand.jacobians(links)
+        axes, origins = hand.tree.joint_axes(links)
         axes, origins = rotate(pose, axes), apply(pose, origins)
-        slide = hand.prismatic.to(axes)[:, None]
+        slide = hand.tree.prismatic.to(axes)[:, None]
         twists = torch.cat([torch.linalg.cross(origins, axes) * (1 - slide) + axes * slide, axes * (1 - slide)], -1)
         return cls(hand, pose[:, None] @ links, twists.mT, pose)
 
@@ -77,7 +77,8 @@ class SpatialJacobian(Value):
         force, torque = wrench.split(3, -1)
         turn, origin = self.pose[:, :3, :3], self.pose[:, :3, 3]
         about = torque - torch.linalg.cross(origin[:, None].expand_as(force), force)
-        joints = ((wrench @ self.twists) * self.hand.moves[links].to(wrench)) @ self.hand.coupling.to(wrench)
+        moves, coupling = self.hand.tree.moves[links].to(wrench), self.hand.actuated.coupling.to(wrench)
+        joints = ((wrench @ self.twists) * moves) @ coupling
         return torch.cat([force @ turn, about @ turn, joints], -1)
 
 

@@ -85,7 +85,7 @@ def joint_residuals(
     scale, normals = float(shape.scale), jet.normals
     identity, turn = torch.eye(3).to(normals), jet.turn
     wanted = scale * identity + hand.tip_radius.to(normals)[:, None, None] * turn
-    pads = jacobians.directions(hand.tip_index, hand.normal)
+    pads = jacobians.directions(hand.tips.index, hand.tips.normal)
     tilt = (pads[..., None, :] @ turn)[..., 0, :] * (tips[:, 9:] > 0)[..., None]
     apart = torch.einsum("gixy,ij->gixjy", wanted, identity).flatten(3).flatten(1, 2)
     tilted = torch.einsum("giy,ij->gijy", tilt, identity).flatten(2)

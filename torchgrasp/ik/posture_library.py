@@ -49,7 +49,7 @@ class PostureLibrary(Value):
         centres, (_, pads) = hand.tip_centres(joints), hand.fingertips(joints)
         vf_from_hand = inverse(virtual_frame(centres))
         centres, pads = apply(vf_from_hand, centres), rotate(vf_from_hand, pads)
-        return cls(hand, joints, vf_from_hand, centres, feature(centres, pads), hand.spheres(joints).float())
+        return cls(hand, joints, vf_from_hand, centres, feature(centres, pads), hand.sphere_centres(joints).float())
 
 
 def feature(centres: Float[Tensor, "*b 3 3"], pads: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 18"]:

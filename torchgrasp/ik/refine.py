@@ -44,15 +44,15 @@ def tip_rows(jacobians: SpatialJacobian, target: Float[Tensor, "g 3 3"], normals
     """Return residuals [mm] of the tips' centres from their targets and of the pads' axes from the normals' cones."""
     hand = jacobians.hand
     radius = hand.tip_radius.to(normals)
-    tips = jacobians.points(hand.tip_index, hand.center)
+    tips = jacobians.points(hand.tips.index, hand.tips.center)
     three = torch.arange(3, device=tips.device).repeat_interleave(3)
     axes = torch.eye(3).to(tips).repeat(3, 1).expand(len(tips), 9, 3)
-    pads = jacobians.directions(hand.tip_index, hand.normal)
+    pads = jacobians.directions(hand.tips.index, hand.tips.normal)
     cone = torch.where(radius > 0, math.cos(ROUND_PAD), math.cos(FLAT_PAD))
     outside = cone + (pads * normals).sum(-1)  # the contact direction is the inward normal
     turning = torch.cat([torch.zeros_like(pads), torch.linalg.cross(pads, normals)], -1)
     wrenches = torch.cat([wrench_of(tips[:, three], axes), turning], 1)
-    jacobian = jacobians.jacobian(wrenches, hand.tip_index[torch.cat([three, torch.arange(3).to(three)])])
+    jacobian = jacobians.jacobian(wrenches, hand.tips.index[torch.cat([three, torch.arange(3).to(three)])])
     active = (outside > 0).to(tips)
     return (
         torch.cat([TIP_WEIGHT * (tips - target).flatten(1) / MILLIMETRE, PAD_WEIGHT * outside * active], 1),

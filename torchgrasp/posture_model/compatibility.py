@@ -15,7 +15,7 @@ TOLERANCE = 1e-5
 def describe_compatibility(hand: Hand) -> dict[str, str]:
     """Return what samples and models tell about their hand: name, fingers, hash of its files and some of its codes."""
     codes = " ".join(f"{x:.7f}" for x in _probe(hand).flatten().tolist())
-    return {"hand": hand.name, "fingers": hand.option, "hand_sha256": hand.sha256, "hand_codes": codes}
+    return {"hand": hand.name, "fingers": hand.source.option, "hand_sha256": hand.source.sha256, "hand_codes": codes}
 
 
 def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: Hand) -> None:
@@ -38,7 +38,8 @@ def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: H
         raise BadArgument("mixture", f"hand_codes {meta['hand_codes']!r}", "numbers") from error
     if theirs.shape != ours.shape or not torch.allclose(theirs.to(ours), ours, rtol=0, atol=TOLERANCE):
         whose = f"hand {meta.get('hand')!r}, fingers {meta.get('fingers')!r}, of other limits or fingertips"
-        raise BadArgument("mixture", f"a model of {whose}", f"one of {hand.name!r}, {hand.option!r}: train it anew")
+        allowed = f"one of {hand.name!r}, {hand.source.option!r}: train it anew"
+        raise BadArgument("mixture", f"a model of {whose}", allowed)
 
 
 def _probe(hand: Hand) -> Float[Tensor, "3 6"]:

@@ -70,7 +70,7 @@ def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
 
 def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> bytes:
     """Draw the hand in the frame of its palm, with its pads and that frame, as a PNG."""
-    solids = solids_from_hand(hand, hand.expand_joints(joints), hand.urdf_joint_names, torch.eye(4).to(joints))
+    solids = solids_from_hand(hand, hand.expand_joints(joints), hand.tree.joint_names, torch.eye(4).to(joints))
     points, normals = (x.cpu().numpy() for x in hand.fingertips(joints[None].double()))
     canvas = Canvas()
     for solid in solids:
@@ -116,7 +116,8 @@ def _fingers_of_joints(hand: Hand) -> Sequence[int]:
     found = []
     for k in range(hand.dof):
         moved = {
-            fingers[hand.link_names[int(hand.child[j])]] for j in torch.nonzero(hand.coupling[:, k])[:, 0].tolist()
+            fingers[hand.tree.link_names[int(hand.tree.child[j])]]
+            for j in torch.nonzero(hand.actuated.coupling[:, k])[:, 0].tolist()
         }
         found.append(moved.pop() if len(moved) == 1 else PARKED)
     return found

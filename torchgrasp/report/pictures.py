@@ -58,7 +58,7 @@ def draw_contacts(surface: Surface, contacts: Contacts, direction: Direction, ta
 def draw_grasp(surface: Surface, hand: Hand, grasp: Grasps, direction: Direction, table: float | None = None) -> bytes:
     """Draw the hand of the first row on the estimated surface, one colour a finger."""
     joints = hand.expand_joints(grasp.joints[0].double())
-    solids = solids_from_hand(hand, joints, hand.urdf_joint_names, grasp.obj_from_hand[0])
+    solids = solids_from_hand(hand, joints, hand.tree.joint_names, grasp.obj_from_hand[0])
     vertices = _array(surface.vertices)
     canvas = Canvas()
     canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, _array(surface.normals))

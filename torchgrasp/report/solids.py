@@ -38,12 +38,12 @@ def solids_from_hand(
         names: the names of `joints`.
         obj_from_hand: the pose of the hand's base in the frame of the picture.
     """
-    values = torch.stack([joints[names.index(n)] for n in hand.urdf_joint_names]).double()
-    poses = (obj_from_hand.double() @ hand.kinematics.poses(values[None])[0]).cpu().numpy()
+    values = torch.stack([joints[names.index(n)] for n in hand.tree.joint_names]).double()
+    poses = (obj_from_hand.double() @ hand.tree.poses(values[None])[0]).cpu().numpy()
     shapes = {link.name: link.shapes for link in read_urdf(hand.urdf_path).links}
     fingers = finger_of_links(hand)
     solids = []
-    for pose, name in zip(poses, hand.link_names, strict=True):
+    for pose, name in zip(poses, hand.tree.link_names, strict=True):
         for shape in shapes[name]:
             mesh = _mesh(shape)
             vertices = np.asarray(mesh.vertices) @ pose[:3, :3].T + pose[:3, 3]
@@ -53,11 +53,11 @@ def solids_from_hand(
 
 def finger_of_links(hand: Hand) -> dict[str, int]:
     """Return the finger of every link: the one whose fingertip is moved by all joints that move the link."""
-    moves = hand.moves.bool().cpu()
+    moves = hand.tree.moves.bool().cpu()
     found = {}
-    for link, name in enumerate(hand.link_names):
+    for link, name in enumerate(hand.tree.link_names):
         mine = moves[link]
-        owners = [f for f in range(3) if bool(mine.any()) and bool(moves[hand.tip_index[f]][mine].all())]
+        owners = [f for f in range(3) if bool(mine.any()) and bool(moves[hand.tips.index[f]][mine].all())]
         found[name] = owners[0] if len(owners) == 1 else PARKED
     return found
 

@@ -42,7 +42,7 @@ class SimulatedHand:
         self.period = self.substeps * scene.timestep
         self.steps, self.first_touch = 0, [float("inf")] * 3
         self.force, self.finger = np.zeros(3), np.zeros(3, dtype=bool)
-        self._centres = torch.cat([hand.center.double(), torch.ones(3, 1, dtype=torch.float64)], dim=-1).numpy()
+        self._centres = torch.cat([hand.tips.center.double(), torch.ones(3, 1, dtype=torch.float64)], dim=-1).numpy()
         self._touch = no_contact()
         self._clutch = None if breakaway is None else Breakaway(model, breakaway)
 

@@ -29,7 +29,7 @@ def exact_clearance(hand: Hand, joints: torch.Tensor) -> np.ndarray:
         for link, part in enumerate(urdf.links)
         for s in part.shapes
     ]
-    owner = [hand.link_names[link] for link, *_ in shapes]
+    owner = [hand.tree.link_names[link] for link, *_ in shapes]
     pairs = [
         (i, j)
         for i, j in itertools.combinations(range(len(shapes)), 2)

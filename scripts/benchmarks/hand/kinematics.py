@@ -24,7 +24,9 @@ from benchmarks.common import Row
 from benchmarks.hand.coal_reference import exact_clearance
 from torchgrasp import load_hand
 from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.posture_model.dataset import load_samples
+from torchgrasp.testing import reference_poses
 
 HANDS = ("allegro", "barrett")
 CONFIGURATIONS = 1000
@@ -60,12 +62,15 @@ def _exactness(name: str, hand: Hand) -> Row:
     found = hand.link_poses(joints)
     model = pinocchio.buildModelFromUrdf(str(hand.urdf_path))
     data, every = model.createData(), {k: v.tolist() for k, v in hand.expand(joints).items()}
-    frames = [model.getFrameId(link) for link in hand.link_names]
+    frames = [model.getFrameId(link) for link in hand.tree.link_names]
     exact = torch.zeros_like(found)
     for row in range(len(joints)):
         pinocchio.framesForwardKinematics(model, data, np.array([every[n][row] for n in list(model.names)[1:]]))
         exact[row] = torch.from_numpy(np.stack([data.oMf[frame].homogeneous for frame in frames]))
-    peers = {"pytorch-kinematics": hand.kinematics.reference_poses(hand.expand_joints(joints)), "pinocchio": exact}
+    peers = {
+        "pytorch-kinematics": reference_poses(read_urdf(hand.urdf_path), hand.expand_joints(joints)),
+        "pinocchio": exact,
+    }
     worst = {peer: _worst(found, poses) for peer, poses in peers.items()}
     told = "; ".join(f"{peer} {move:.1e} m, {turn:.1e} rad" for peer, (move, turn) in worst.items())
     met = max(max(errors) for errors in worst.values()) <= 1e-6
@@ -93,12 +98,13 @@ def _speed(name: str, hand: Hand, n: int, threads: int, dtype: torch.dtype) -> l
     Its Jacobian has the three rows of rotation as well, which it cannot leave out and nothing here asks for.
     """
     joints, some = _postures(hand, n, 3, dtype), n // 10  # the peer's time is as long for each row
-    chain: Any = pytorch_kinematics.build_chain_from_urdf(hand.kinematics.xml).to(dtype=dtype)
+    xml = read_urdf(hand.urdf_path).kinematic_xml()
+    chain: Any = pytorch_kinematics.build_chain_from_urdf(xml).to(dtype=dtype)
     make: Any = pytorch_kinematics.build_serial_chain_from_urdf
-    fingers = [make(hand.kinematics.xml, link).to(dtype=dtype) for link in hand.tip_links]
-    order = [hand.urdf_joint_names.index(x) for x in chain.get_joint_parameter_names()]
-    orders = [[hand.urdf_joint_names.index(x) for x in f.get_joint_parameter_names()] for f in fingers]
-    coupling, contact = hand.coupling.to(dtype), hand.contact.to(dtype)
+    fingers = [make(xml, link).to(dtype=dtype) for link in hand.tip_links]
+    order = [hand.tree.joint_names.index(x) for x in chain.get_joint_parameter_names()]
+    orders = [[hand.tree.joint_names.index(x) for x in f.get_joint_parameter_names()] for f in fingers]
+    coupling, contact = hand.actuated.coupling.to(dtype), hand.tips.contact.to(dtype)
 
     def peers_tips(rows: Tensor) -> None:
         poses = chain.forward_kinematics_tensor(hand.expand_joints(rows)[:, order])

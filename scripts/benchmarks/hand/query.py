@@ -117,7 +117,7 @@ def _cobyla_row(hand: Hand, mixture: GraspMixture, contacts: Contacts, ours: IKS
     finally:
         cobyla.place = place
     jacobians = SpatialJacobian.at(found, hand)
-    points = jacobians.points(hand.tip_index, hand.contact)
+    points = jacobians.points(hand.tips.index, hand.tips.contact)
     error = 1e3 * torch.linalg.vector_norm(points - taken.points, dim=-1).amax(1)
     free = hand.self_clearance(found.joints) >= 0
     share = float(((error <= 1e3 * TIP_TOLERANCE) & free).double().mean())

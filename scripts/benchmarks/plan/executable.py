@@ -76,7 +76,7 @@ def bench_executable(views: list[Any], starts: int, seed: int) -> list[Row]:
 def count_blockers(grasps: Grasps, hand: Hand, world: CollisionWorld) -> dict[str, float]:
     """Return the share of triples that each of `BLOCKERS` kept from a grasp, by the best failure of each triple."""
     posture = Configuration(grasps.joints, grasps.obj_from_hand)
-    cover, centres = hand.collision_spheres, apply(posture.obj_from_hand, hand.spheres(posture.joints))
+    cover, centres = hand.collision_spheres, apply(posture.obj_from_hand, hand.sphere_centres(posture.joints))
     assert world.field is not None and world.table is not None
     free = world.field.query(centres)[0] - cover.radius
     height = (centres[..., 2] - cover.radius - world.table).amin(1)

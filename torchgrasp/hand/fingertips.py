@@ -1,0 +1,68 @@
+"""The three fingertips of a hand: where their pads are, and the chains of links that move them."""
+
+import dataclasses
+import functools
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchgrasp.base import Value
+from torchgrasp.hand.hand_toml import HandSpec
+from torchgrasp.hand.kinematics import KinematicTree, map_directions, map_points, pose_in_carrier, tree_from_urdf
+from torchgrasp.hand.urdf import Urdf
+
+
+@dataclasses.dataclass(frozen=True)
+class Fingertips(Value):
+    """The fingertips in grasp order: names of the fingers, their tip links, and the pads in the frames of these links.
+
+    `index` is that of the tip links in the whole tree. `contact` and `center` are in metres, `normal` points outward.
+    `radius` [m] is that of the tip's sphere about `center`; 0: the tip touches in `contact` alone.
+
+    `chains` leads to the carriers: the last links that joints move, to which the tips are fixed. `carrier` indexes
+    them in `chains`; `carrier_from_tip` holds the tips' frames in theirs.
+    """
+
+    names: tuple[str, str, str]
+    links: tuple[str, str, str]
+    index: Int[Tensor, "3"]
+    contact: Float[Tensor, "3 3"]
+    normal: Float[Tensor, "3 3"]
+    center: Float[Tensor, "3 3"]
+    radius: Float[Tensor, "3"]
+    chains: KinematicTree
+    carrier: Int[Tensor, "3"]
+    carrier_from_tip: Float[Tensor, "3 4 3 1"]
+
+    @functools.cached_property
+    def in_carriers(self) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3 3"], Float[Tensor, "3 3"]]:
+        """`contact`, `normal` and `center` in the frames of the carriers."""
+        pose = self.carrier_from_tip
+        contact, center = (map_points(pose, x)[..., 0].T for x in (self.contact, self.center))
+        return contact, map_directions(pose, self.normal)[..., 0].T, center
+
+    def frames(self, values: Float[Tensor, "j n"]) -> tuple[Float[Tensor, "3 4 l n"], Float[Tensor, "3 4 3 n"]]:
+        """Return the frames of the links of `chains`, and those of the carriers, for all joints of the URDF."""
+        frames = self.chains.frames(values)
+        return frames, frames.index_select(2, self.carrier)
+
+
+def tips_from_files(spec: HandSpec, urdf: Urdf) -> Fingertips:
+    """Return the fingertips of the chosen fingers."""
+    links = [x.name for x in urdf.links]
+    one, two, three = spec.fingers
+    carriers, poses = zip(*(pose_in_carrier(urdf, f.tip_link) for f in spec.fingers), strict=True)
+    chains = tree_from_urdf(urdf, carriers)
+    return Fingertips(
+        names=(one.name, two.name, three.name),
+        links=(one.tip_link, two.tip_link, three.tip_link),
+        index=torch.tensor([links.index(f.tip_link) for f in spec.fingers]),
+        contact=torch.tensor([f.contact for f in spec.fingers], dtype=torch.float64),
+        normal=torch.tensor([f.normal for f in spec.fingers], dtype=torch.float64),
+        center=torch.tensor([f.center for f in spec.fingers], dtype=torch.float64),
+        radius=torch.tensor([f.radius for f in spec.fingers], dtype=torch.float64),
+        chains=chains,
+        carrier=torch.tensor([chains.link_names.index(name) for name in carriers]),
+        carrier_from_tip=torch.stack(poses, -1)[..., None],
+    )

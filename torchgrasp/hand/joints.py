@@ -1,0 +1,91 @@
+"""The actuated joints of a hand: names, limits, and how every other joint of the URDF follows them."""
+
+import dataclasses
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.base import Value
+from torchgrasp.errors import BadArgument, HandFileError
+from torchgrasp.hand.hand_toml import HandSpec
+from torchgrasp.hand.urdf import Urdf
+
+ROUNDING = 1e-6
+"""Joints may pass their limits by this [rad]: limits and joints are both rounded to float32."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ActuatedJoints(Value):
+    """Joints that move the grasping fingers, with their limits [rad or m].
+
+    All joints of the URDF are `coupling @ joints + offset`. Coupled joints follow actuated ones; parked joints are
+    constant.
+    """
+
+    names: tuple[str, ...]
+    lower: Float[Tensor, " h"]
+    upper: Float[Tensor, " h"]
+    coupling: Float[Tensor, "j h"]
+    offset: Float[Tensor, " j"]
+
+    def expand(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
+        """Return every movable joint of the URDF."""
+        self.check(joints)
+        return joints @ self.coupling.to(joints).T + self.offset.to(joints)
+
+    def check(self, joints: Tensor) -> None:
+        """Refuse joints of a wrong count or dtype, and joints that are not finite."""
+        if joints.ndim < 1 or joints.shape[-1] != len(self.names):
+            wanted = f"{len(self.names)} joints last: {self.names}"
+            raise BadArgument("joints", f"shape {tuple(joints.shape)}", wanted)
+        if joints.dtype not in (torch.float32, torch.float64):
+            raise BadArgument("joints", str(joints.dtype), "torch.float32 or torch.float64")
+        finite = torch.isfinite(joints)
+        if not bool(finite.all()):
+            value, k = _first(joints, ~finite)
+            raise BadArgument("joints", f"{value} for {self.names[k]}", "finite numbers")
+
+    def check_limits(self, joints: Tensor) -> None:
+        """Refuse what `check` refuses, and joints beyond their limits."""
+        self.check(joints)
+        low, high = self.lower.to(joints), self.upper.to(joints)
+        wrong = ~((joints >= low - ROUNDING) & (joints <= high + ROUNDING))
+        if bool(wrong.any()):
+            value, k = _first(joints, wrong)
+            allowed = f"[{self.lower[k].item():.6g}, {self.upper[k].item():.6g}]"
+            raise BadArgument("joints", f"{value:.6g} for {self.names[k]}", allowed)
+
+
+def _first(joints: Tensor, wrong: Tensor) -> tuple[float, int]:
+    """Return the first wrong value and the index of its joint."""
+    first = torch.nonzero(wrong)[0].tolist()
+    return joints[tuple(first)].item(), first[-1]
+
+
+def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
+    """Return the joints of the grasping fingers with their coupling.
+
+    Raises:
+        HandFileError: a joint neither grasps nor is parked, or `limit_margin` leaves a joint no range.
+    """
+    movable = {j.name: j for j in urdf.joints if j.kind != "fixed"}
+    names = tuple(dict.fromkeys(j for f in spec.fingers for j in f.joints if j not in spec.coupling))
+    limits = torch.tensor([[movable[n].lower, movable[n].upper] for n in names], dtype=torch.float64)
+    limits = limits + torch.tensor([spec.limit_margin, -spec.limit_margin], dtype=torch.float64)
+    for name, (low, high) in zip(names, limits.tolist(), strict=True):
+        if not low < high:
+            found = f"{spec.path}: limit_margin {spec.limit_margin:g} leaves joint {name} [{low:g}, {high:g}]"
+            raise HandFileError("hand.toml", found, "lower < upper")
+    coupling = torch.zeros(len(movable), len(names), dtype=torch.float64)
+    offset = torch.zeros(len(movable), dtype=torch.float64)
+    for row, joint in enumerate(movable):
+        source, ratio, shift = spec.coupling.get(joint, (joint, 1.0, 0.0))
+        if source in names:
+            coupling[row, names.index(source)] = ratio
+            offset[row] = shift
+        elif source in spec.parked:
+            offset[row] = ratio * spec.parked[source] + shift
+        else:
+            raise HandFileError("hand.toml", f"{spec.path}: joint {joint} neither grasps nor is parked", "either")
+    return ActuatedJoints(names, limits[:, 0].clone(), limits[:, 1].clone(), coupling, offset)
