@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from torchgrasp.base import Value
+from torchgrasp.datasets import list_views, read_object_mesh, read_view
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.evaluation.pool import run_tasks
@@ -25,9 +26,8 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.objects import list_objects, load_object
 from torchgrasp.pipeline import plan_grasps
-from torchgrasp.shape.accuracy import list_views, object_scale, read_view
 from torchgrasp.shape.fit import fit_shape
-from torchgrasp.sim.convex_parts import convex_parts, read_mesh
+from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ClosingMode, ContactSpec, HoldingMode
 from torchgrasp.values import Grasps, PointCloud
 
@@ -274,6 +274,6 @@ def _read(
         own = load_object(name)
         return [own.view], own.mesh, own.parts, own.mass
     objects = Path(folder)
-    mesh = read_mesh(objects / name / "mesh.ply").apply_scale(object_scale(objects, name))
+    mesh = read_object_mesh(objects, name)
     clouds = [read_view(objects, name, view) for _, view in list_views(objects, only=[name])]
     return clouds, mesh, convex_parts(mesh), MASS

@@ -1,27 +1,12 @@
 """Distance fields against analytic surfaces."""
 
-import numpy as np
 import pytest
 import torch
 import trimesh
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.box_distance import box_distance
-from torchgrasp.ik.sdf import (
-    closest_on_triangles,
-    field_from_mesh,
-    field_from_surface,
-)
-
-
-def test_closest_on_triangles_is_that_of_trimesh():
-    rng = np.random.default_rng(0)
-    points, triangles = rng.normal(size=(500, 3)), rng.normal(size=(500, 3, 3))
-    found, feature = closest_on_triangles(points, triangles)
-    np.testing.assert_allclose(found, trimesh.triangles.closest_point(triangles, points), atol=1e-9)
-    assert set(feature.tolist()) == set(range(7))
-    for k in range(3):
-        np.testing.assert_allclose(found[feature == 4 + k], triangles[feature == 4 + k, k])
+from torchgrasp.ik.sdf import field_from_mesh, field_from_surface
 
 
 @pytest.mark.parametrize("given", ["faces", "normals"])

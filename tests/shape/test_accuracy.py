@@ -10,14 +10,11 @@ import pytest
 import torch
 import trimesh
 
-from torchgrasp.errors import BadArgument
 from torchgrasp.shape.accuracy import (
     format_table,
     mean_row,
     measure_accuracy,
     measure_shape,
-    nearest_on_mesh,
-    sample_mesh,
 )
 from torchgrasp.shape.condition import condition
 from torchgrasp.shape.gp import ShapeGP
@@ -85,26 +82,6 @@ def _sphere_part() -> torch.Tensor:
     return RADIUS * n[n[:, 0] > 0]
 
 
-def test_the_nearest_point_of_a_mesh_is_exact():
-    mesh = _ball()
-    points = 0.05 * torch.randn(200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    found, normals = nearest_on_mesh(mesh, points)
-    _, distance, faces = trimesh.proximity.closest_point_naive(mesh, points.numpy())
-    error = torch.linalg.vector_norm(found - points, dim=-1).numpy() - distance
-    assert np.abs(error).max() < 1e-5 and np.median(np.abs(error)) < 1e-12
-    assert (normals.numpy() * mesh.face_normals[faces]).sum(-1).min() > 0.99
-    assert nearest_on_mesh(mesh, points[:0])[0].shape == (0, 3)
-
-
-def test_samples_of_a_mesh_lie_on_it_evenly():
-    box = trimesh.creation.box([0.1, 0.2, 0.3])
-    points, normals = sample_mesh(box, 20000, np.random.default_rng(0))
-    half = torch.tensor([0.05, 0.1, 0.15], dtype=torch.float64)
-    assert ((points.abs() - half).amax(-1)).abs().max() < 1e-12
-    torch.testing.assert_close((points * normals).sum(-1), (half * normals.abs()).sum(-1))
-    assert (normals[:, 0].abs() > 0.5).double().mean().item() == pytest.approx(0.06 * 2 / 0.22, abs=0.02)
-
-
 def test_a_folder_of_objects_becomes_rows_and_a_table(tmp_path: Path):
     (tmp_path / "tin").mkdir()
     tin = trimesh.creation.cylinder(radius=0.06, height=0.24, sections=64)
@@ -127,11 +104,3 @@ def test_a_folder_of_objects_becomes_rows_and_a_table(tmp_path: Path):
 
 def test_a_mean_leaves_out_what_was_not_measured():
     assert mean_row([{"a": 1.0, "b": math.nan, "view": "x"}, {"a": 3.0, "b": 5.0, "view": "y"}]) == {"a": 2.0, "b": 5.0}
-
-
-def test_a_folder_without_a_manifest_or_the_object_is_refused(tmp_path: Path):
-    with pytest.raises(BadArgument, match="objects"):
-        measure_accuracy(tmp_path)
-    (tmp_path / "manifest.json").write_text('{"objects": {}}')
-    with pytest.raises(BadArgument, match="objects"):
-        measure_accuracy(tmp_path)

@@ -10,7 +10,7 @@ from torchgrasp.cloud.camera import partial_view
 from torchgrasp.cloud.diagnose import diagnose_cloud, format_report
 from torchgrasp.cloud.io.read import read_cloud, save_cloud
 from torchgrasp.errors import BadArgument
-from torchgrasp.sim.convex_parts import read_mesh
+from torchgrasp.mesh import read_mesh
 
 
 def check(

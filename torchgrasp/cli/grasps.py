@@ -19,12 +19,12 @@ from torchgrasp.errors import BadArgument, MissingExtra
 from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.files import sha256
 from torchgrasp.hand.load import load_hand
+from torchgrasp.mesh import read_mesh
 from torchgrasp.objects import DATA, MASSES, list_objects, load_object
 from torchgrasp.pipeline import Mode, plan_grasps
 from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows, write_report
 from torchgrasp.report.run import Run, Stage, verdict
 from torchgrasp.shape.surface import extract_surface
-from torchgrasp.sim.convex_parts import read_mesh
 from torchgrasp.specs import ContactSpec, Simulator, TrialSpec
 from torchgrasp.values import Grasps
 

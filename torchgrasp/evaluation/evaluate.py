@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import torch
 
 from torchgrasp.base import count_status
+from torchgrasp.datasets import list_views, read_object_mesh, read_view
 from torchgrasp.errors import BadArgument, GraspError, MissingExtra, Status
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.evaluation.protocols import Execution, Protocol, ProtocolResult, draw_error, find_protocol, run_protocol
@@ -24,8 +25,7 @@ from torchgrasp.evaluation.score import ViewScore
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.pipeline import digest, plan_grasps
-from torchgrasp.shape.accuracy import list_views, object_scale, read_view
-from torchgrasp.sim.convex_parts import convex_parts, read_mesh
+from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan, Grasps, load_grasps
 
@@ -194,7 +194,7 @@ def _try(
 @functools.lru_cache(maxsize=2)
 def _solid(objects: Path, name: str) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh]]":
     """Return an object's mesh and its convex parts: trials of one object follow each other."""
-    mesh = read_mesh(objects / name / "mesh.ply").apply_scale(object_scale(objects, name))
+    mesh = read_object_mesh(objects, name)
     return mesh, convex_parts(mesh)
 
 

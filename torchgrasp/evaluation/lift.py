@@ -18,8 +18,9 @@ from torchgrasp.control.observation import Observation, model_from_hand
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import apply, inverse, rotation_angle
 from torchgrasp.hand.hand import Hand
+from torchgrasp.mesh import read_mesh
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.sim.convex_parts import check_parts, convex_parts, read_mesh
+from torchgrasp.sim.convex_parts import check_parts, convex_parts
 from torchgrasp.sim.hand import SimulatedHand
 from torchgrasp.sim.open import open_scene
 from torchgrasp.sim.scene import SceneSpec

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchgrasp.base import Value, check_tensor
 from torchgrasp.errors import BadArgument
+from torchgrasp.mesh import closest_on_triangles
 
 BAND = 0.022
 """Nodes whose interpolated distance [m] is below this are made exact; farther out it stays interpolated."""
@@ -197,28 +198,3 @@ def _pseudonormals(corners: np.ndarray) -> np.ndarray:
     at_side = np.zeros((side.max() + 1, 3))
     np.add.at(at_side, side.reshape(-1), np.repeat(face, 3, 0))
     return np.concatenate([face[:, None], at_side[side], at_corner[ids]], 1)
-
-
-def closest_on_triangles(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the closest point (n, 3) of each triangle (n, 3 corners, 3) to each point, and the feature it lies on.
-
-    Feature 0 is the face, 1 to 3 the sides ab, bc, ca, 4 to 6 the corners a, b, c.
-    """
-    a, u, v = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    w = points - a
-    uu, vv, uv = (np.einsum("ij,ij->i", x, y) for x, y in ((u, u), (v, v), (u, v)))
-    uw, vw = np.einsum("ij,ij->i", u, w), np.einsum("ij,ij->i", v, w)
-    span = np.maximum(uu * vv - uv * uv, 1e-40)
-    s, t = (vv * uw - uv * vw) / span, (uu * vw - uv * uw) / span
-    best, feature = a + s[:, None] * u + t[:, None] * v, np.zeros(len(points), dtype=int)
-    out = np.nonzero((s < 0) | (t < 0) | (s + t > 1))[0]  # then the closest point lies on a side
-    corner = triangles[out]
-    side = np.roll(corner, -1, 1) - corner
-    along = np.einsum("ikj,ikj->ik", points[out, None] - corner, side) / np.einsum("ikj,ikj->ik", side, side)
-    along = np.clip(along, 0, 1)
-    feet = corner + along[..., None] * side
-    gap = points[out, None] - feet
-    k, rows = np.einsum("ikj,ikj->ik", gap, gap).argmin(1), np.arange(len(out))
-    best[out], along = feet[rows, k], along[rows, k]
-    feature[out] = np.where(along <= 0, 4 + k, np.where(along >= 1, 4 + (k + 1) % 3, 1 + k))
-    return best, feature

@@ -1,6 +1,7 @@
 """The zero level of the shape as a triangle mesh, Eq. (9): for pictures and for collision fields."""
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,6 +12,9 @@ from torchgrasp.base import Value
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
 from torchgrasp.shape.gp import ShapeGP
+
+if TYPE_CHECKING:
+    import trimesh
 
 NEWTON_STEPS = 3
 """Steps that move the vertices of marching cubes onto the zero level."""
@@ -31,6 +35,12 @@ class Surface(Value):
     faces: Int[Tensor, "f 3"]
     normals: Float[Tensor, "v 3"]
     std_m: Float[Tensor, "v"]
+
+    def mesh(self) -> "trimesh.Trimesh":
+        """Return vertices and faces as a mesh."""
+        import trimesh
+
+        return trimesh.Trimesh(self.vertices.cpu().numpy(), self.faces.cpu().numpy(), process=False)
 
 
 def extract_surface(shape: ShapeGP, resolution: int = 48) -> Surface:

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from torchgrasp.cloud.check import MAX_EXTENT, MIN_EXTENT
-from torchgrasp.errors import MeshError, MissingExtra, ModelFileError, OutputError, SuspiciousScale
+from torchgrasp.errors import MeshError, MissingExtra, ModelFileError, OutputError
 from torchgrasp.files import load_tensors, save_tensors
+from torchgrasp.mesh import LEAST_VOLUME, check_solid, read_mesh
 
 if TYPE_CHECKING:
     import trimesh
@@ -25,61 +25,11 @@ if TYPE_CHECKING:
 THRESHOLD = 0.05
 """Concavity at which CoACD stops cutting (0.01-1; its own default)."""
 
-LEAST_VOLUME = 1e-12
-"""Volume [m^3] from which on a body is one: a cube of 0.1 mm."""
-
 _SEARCH: dict[str, Any] = {"mcts_iterations": 60, "mcts_max_depth": 2, "mcts_nodes": 10}
 """A narrower search for the cuts than CoACD's own. Scans of 800 to 16000 faces then took 1 to 22 s of CPU time, and
 the volumes of the parts summed to 1.02 to 1.03 of the mesh's."""
 
 _log = logging.getLogger(__name__)
-
-
-def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
-    """Return a closed mesh [m] from a file or a trimesh, checked and never repaired.
-
-    Raises:
-        MeshError: no mesh in the file, non-finite vertices, an open surface, faces that are not all turned outward, or
-            no volume.
-        SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; most often the unit is mm.
-
-    >>> import trimesh
-    >>> len(read_mesh(trimesh.creation.box((0.1, 0.1, 0.1))).faces)
-    12
-    """
-    import trimesh
-
-    name = "a mesh"
-    if not isinstance(mesh, trimesh.Trimesh):
-        path, name = Path(mesh), str(mesh)
-        if not path.is_file():
-            raise MeshError("mesh", f"{path}, which is no file", "a mesh file (ply, obj, stl, ...)")
-        try:
-            loaded = trimesh.load_mesh(path)
-        except Exception as error:  # the readers of trimesh raise whatever their format runs into
-            raise MeshError("mesh", f"{path}: {error}", "a mesh file (ply, obj, stl, ...)") from error
-        if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
-            raise MeshError("mesh", f"{path}, which holds no faces", "a closed triangle mesh")
-        mesh = loaded
-    _check_solid(mesh, name)
-    extent = float(mesh.extents.max())
-    if not MIN_EXTENT <= extent <= MAX_EXTENT:
-        raise SuspiciousScale("mesh", f"{name} of {extent:.4g} m", f"{MIN_EXTENT:g} m to {MAX_EXTENT:g} m: use metres")
-    return mesh
-
-
-def _check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
-    """Raise `MeshError` unless a mesh bounds a volume."""
-    if len(mesh.faces) == 0:
-        raise MeshError("mesh", f"{name} without faces", "a closed triangle mesh")
-    if not np.isfinite(mesh.vertices).all():
-        raise MeshError("mesh", f"{name} with a non-finite vertex", "finite vertices [m]")
-    if not mesh.is_watertight:
-        raise MeshError("mesh", f"{name} with an open surface", "a closed (watertight) mesh")
-    with np.errstate(invalid="ignore", divide="ignore"):  # trimesh divides by the volume
-        volume = mesh.volume
-    if not (mesh.is_winding_consistent and volume > LEAST_VOLUME):
-        raise MeshError("mesh", f"{name} of volume {volume:.3g} m^3", "a positive volume, faces turned outward")
 
 
 def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None = None) -> "list[trimesh.Trimesh]":
@@ -123,7 +73,7 @@ def _filled(parts: "list[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
 def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
     """Return parts given by the caller as they are, or raise `MeshError` when one is no convex body."""
     for index, part in enumerate(parts):
-        _check_solid(part, f"part {index}")
+        check_solid(part, f"part {index}")
         if not part.is_convex:
             raise MeshError("parts", f"part {index}, which is not convex", "convex meshes")
     if not parts:

@@ -4,15 +4,13 @@ import functools
 import time
 from pathlib import Path
 
-import trimesh
-
 from benchmarks.common import Row
 from torchgrasp import Status, TrialSpec, close_hand, fit_shape, load_hand, plan_grasps
+from torchgrasp.datasets import list_views, read_object_mesh, read_view
 from torchgrasp.evaluation.evaluate import choose_rows
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.evaluation.protocols import PAPER, draw_error
 from torchgrasp.evaluation.score import share
-from torchgrasp.shape.accuracy import list_views, object_scale, read_view
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ContactSpec
 
@@ -68,7 +66,7 @@ def _close_view(
     shape = fit_shape(cloud, seed=seed, table=0.0)
     found = plan_grasps(cloud, hand, ContactSpec(friction=PAPER.friction, table=0.0), starts, seed, shape=shape)
     found = found[found.status == Status.OK]
-    mesh = trimesh.load(objects / name / "mesh.ply", force="mesh").apply_scale(object_scale(objects, name))
+    mesh = read_object_mesh(objects, name)
     close = functools.partial(close_hand, hand=hand, mesh=mesh, parts=convex_parts(mesh))
     cases = []
     for row in choose_rows(len(found), tries, "spread"):

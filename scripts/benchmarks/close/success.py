@@ -19,6 +19,7 @@ from tqdm import tqdm
 from benchmarks.common import Row
 from torchgrasp.cloud.camera import partial_view
 from torchgrasp.cloud.io.read import save_cloud
+from torchgrasp.datasets import list_views, read_view
 from torchgrasp.evaluation.evaluate import evaluate
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.evaluation.protocols import Execution
@@ -29,7 +30,6 @@ from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.success import success_features
 from torchgrasp.objects import list_objects, load_object
 from torchgrasp.pipeline import closure_of
-from torchgrasp.shape.accuracy import list_views, read_view
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface

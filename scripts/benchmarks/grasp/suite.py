@@ -1,6 +1,5 @@
 """From one noisy view to a held object, for every object of a folder and both hands."""
 
-import dataclasses
 import json
 import time
 from pathlib import Path
@@ -9,42 +8,30 @@ from typing import Any
 import torch
 import trimesh
 
-from torchgrasp import ContactSpec, PointCloud, Status, TrialSpec, close_hand, load_hand, plan_grasps, read_cloud
+from torchgrasp import ContactSpec, PointCloud, Status, TrialSpec, close_hand, load_hand, plan_grasps
 from torchgrasp.base import count_status
+from torchgrasp.datasets import list_views, read_object_mesh, read_view
 from torchgrasp.files import write_file
 
 
-@dataclasses.dataclass(frozen=True)
-class Scene:
-    """One object of the bench: what the planner sees, and the mesh that the simulator alone uses."""
-
-    name: str
-    cloud: PointCloud
-    mesh: trimesh.Trimesh
-
-
-def read_scene(folder: Path, entry: dict[str, Any], view: str, camera_is_known: bool) -> Scene:
-    """Read a noisy view without normals and the true mesh, both at the object's suggested scale."""
-    scale = float(entry["suggested_scale"])
-    cloud = read_cloud(folder / f"{view}_noisy.ply")
-    camera = torch.tensor(entry["views"][view]["T_object_camera"], dtype=torch.float64)[:3, 3]
-    mesh = trimesh.load(folder / "mesh.ply", force="mesh")
-    mesh.apply_scale(scale)
-    return Scene(folder.name, PointCloud(cloud.points * scale, None, camera * scale if camera_is_known else None), mesh)
-
-
-def bench_one(scene: Scene, hand_name: str, starts: int, seed: int, close: int, spec: ContactSpec) -> dict[str, Any]:
-    """Plan for one object and hand, then close on the first `close` grasps."""
+def bench_one(
+    cloud: PointCloud, mesh: trimesh.Trimesh, hand_name: str, starts: int, seed: int, close: int
+) -> dict[str, Any]:
+    """Plan for one cloud and hand, then close on the true mesh with the first `close` grasps."""
     hand = load_hand(hand_name)
     messages: list[str] = []
     began = time.perf_counter()
     grasps = plan_grasps(
-        scene.cloud, hand, spec, starts, seed, observer=lambda stage, text, value: messages.append(f"{stage}: {text}")
+        cloud,
+        hand,
+        ContactSpec(table=0.0),
+        starts,
+        seed,
+        observer=lambda stage, text, value: messages.append(f"{stage}: {text}"),
     )
     seconds = time.perf_counter() - began
     good = grasps[grasps.status == Status.OK]
     row: dict[str, Any] = {
-        "object": scene.name,
         "hand": hand_name,
         "seconds": round(seconds, 1),
         "grasps": len(good),
@@ -56,7 +43,7 @@ def bench_one(scene: Scene, hand_name: str, starts: int, seed: int, close: int, 
         row["tip_mm"] = round(1e3 * float(good.tip_error[0].max()), 2)
         row["clearance_mm"] = round(1e3 * float(good.clearance[0]), 1)
     for i in range(min(close, len(good))):
-        result = close_hand(good[i], hand, scene.mesh, TrialSpec(), seed=seed)
+        result = close_hand(good[i], hand, mesh, TrialSpec(), seed=seed)
         row["trials"].append(
             {
                 "held": result.held,
@@ -123,14 +110,11 @@ def grasp(
     """
     torch.set_num_threads(1)  # the batches are small: a second thread brings nothing here
     print(HEADER)
-    entries = json.loads((objects / "manifest.json").read_text())["objects"]
     rows = []
-    for name in sorted(entries):
-        if only and name not in only:
-            continue
-        scene = read_scene(objects / name, entries[name], view, camera)
+    for name in dict.fromkeys(name for name, _ in list_views(objects, only=only)):
+        cloud, mesh = read_view(objects, name, view, camera), read_object_mesh(objects, name)
         for hand in hands:
-            rows.append(bench_one(scene, hand, starts, seed, close, ContactSpec(table=0.0)))
+            rows.append({"object": name} | bench_one(cloud, mesh, hand, starts, seed, close))
             print(table_line(rows[-1]), flush=True)
     print_counts(rows)
     threads = torch.get_num_threads()

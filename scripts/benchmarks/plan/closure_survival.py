@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.linalg import unit
+from torchgrasp.mesh import nearest_on_mesh, sample_mesh
 from torchgrasp.plan.wrench import closed_exact
-from torchgrasp.shape.accuracy import RESOLUTION, SURE_VARIANCE, mesh_from_surface, nearest_on_mesh, sample_mesh
+from torchgrasp.shape.accuracy import RESOLUTION, SURE_VARIANCE
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
 
@@ -46,7 +47,7 @@ def closure_survival(shape: ShapeGP, mesh: "trimesh.Trimesh", seed: int = 0) -> 
         seed: of the samples.
     """
     generator = np.random.default_rng(seed)
-    points, _ = sample_mesh(mesh_from_surface(extract_surface(shape, RESOLUTION)), SAMPLES, generator)
+    points, _ = sample_mesh(extract_surface(shape, RESOLUTION).mesh(), SAMPLES, generator)
     points = points[shape.contains(points)]
     jet = shape.jet(shape.normalise(points))
     normals = unit(jet.gradient)

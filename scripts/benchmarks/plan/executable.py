@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from benchmarks.common import Row
 from torchgrasp import ContactSpec, Grasps, Hand, Status, certify, fit_shape, load_hand, load_mixture, plan_contacts
+from torchgrasp.datasets import read_views
 from torchgrasp.frames import apply
 from torchgrasp.ik.checks import TIP_PENETRATION
 from torchgrasp.ik.clearance import CLEARANCE, SELF_CLEARANCE, CollisionWorld
@@ -24,7 +25,6 @@ from torchgrasp.ik.joint import solve_joint
 from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
 from torchgrasp.ik.query import query_mixture
 from torchgrasp.ik.sdf import field_from_surface
-from torchgrasp.shape.accuracy import read_views
 from torchgrasp.shape.surface import extract_surface
 
 SPEC = ContactSpec(table=0.0)

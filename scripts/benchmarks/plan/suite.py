@@ -12,7 +12,7 @@ from benchmarks.plan.ipopt_comparison import POINTS, bench_peers
 from benchmarks.plan.scaling import bench_anytime, bench_growth, bench_memory
 from benchmarks.plan.true_surface import bench_fields, bench_objectives, bench_truth
 from torchgrasp import ContactSpec, Status, certify, fit_shape, plan_contacts
-from torchgrasp.shape.accuracy import read_views
+from torchgrasp.datasets import read_views
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.values import PointCloud
 

@@ -10,8 +10,8 @@ from tqdm import tqdm
 
 from benchmarks.common import Row
 from torchgrasp import ContactSpec, Status, fit_shape, plan_contacts
+from torchgrasp.mesh import nearest_on_mesh
 from torchgrasp.plan.wrench import closed_exact
-from torchgrasp.shape.accuracy import nearest_on_mesh
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.values import Contacts
 

@@ -8,8 +8,9 @@ from tqdm import tqdm
 
 from benchmarks.common import Row
 from torchgrasp.cloud.merge import merge_clouds
+from torchgrasp.datasets import read_views
 from torchgrasp.shape.accuracy import Row as View
-from torchgrasp.shape.accuracy import mean_row, measure_accuracy, measure_shape, read_views
+from torchgrasp.shape.accuracy import mean_row, measure_accuracy, measure_shape
 from torchgrasp.shape.fit import fit_shape
 
 WEAKER = {

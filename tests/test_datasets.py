@@ -1,0 +1,66 @@
+"""Folders of objects: what the manifest says is what is read."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from torchgrasp import PointCloud
+from torchgrasp.cloud.io.read import save_cloud
+from torchgrasp.datasets import list_views, read_object_mesh, read_view, read_views
+from torchgrasp.errors import BadArgument, MeshError
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A box of 0.2 m, to be halved, with two views and a whole cloud, and a torn mesh without views."""
+    box = trimesh.creation.box((0.2, 0.2, 0.2))
+    for name in ("box", "torn"):
+        (tmp_path / name).mkdir()
+    box.export(tmp_path / "box" / "mesh.ply")
+    trimesh.Trimesh(box.vertices, box.faces[:-1]).export(tmp_path / "torn" / "mesh.ply")
+    corners = torch.from_numpy(np.array(box.vertices))
+    for view in ("view0", "view1"):
+        save_cloud(PointCloud(corners), tmp_path / "box" / f"{view}_noisy.ply")
+    save_cloud(PointCloud(corners, corners / 0.1), tmp_path / "box" / "full_normals.ply")
+    pose = np.eye(4)
+    pose[:3, 3] = [0.0, 0.0, 2.0]
+    views = {view: {"T_object_camera": pose.tolist()} for view in ("view1", "view0")}
+    entries = {"torn": {"views": {}}, "box": {"suggested_scale": 0.5, "views": views}}
+    (tmp_path / "manifest.json").write_text(json.dumps({"objects": entries}))
+    return tmp_path
+
+
+def test_views_are_listed_in_order(folder: Path):
+    assert list_views(folder) == [("box", "view0"), ("box", "view1")]
+    assert list_views(folder, whole=True) == [("box", "whole"), ("torn", "whole")]
+    assert list_views(folder, only=["torn"]) == []
+
+
+def test_views_and_meshes_come_at_the_suggested_scale(folder: Path):
+    ((name, view, cloud, mesh), _) = list(read_views(folder, only=["box"]))
+    assert (name, view) == ("box", "view0") and cloud.normals is None
+    assert cloud.points.abs().max().item() == pytest.approx(0.05) and mesh.volume == pytest.approx(1e-3)
+    assert cloud.viewpoint is not None and cloud.viewpoint.tolist() == pytest.approx([0.0, 0.0, 1.0])
+    assert read_view(folder, "box", "view0", camera=False).viewpoint is None
+
+
+def test_a_whole_cloud_has_normals_and_no_camera(folder: Path):
+    cloud = read_view(folder, "box", "whole")
+    assert cloud.normals is not None and cloud.viewpoint is None
+    assert cloud.points.abs().max().item() == pytest.approx(0.05)
+
+
+def test_a_torn_mesh_is_refused(folder: Path):
+    with pytest.raises(MeshError, match="open surface"):
+        read_object_mesh(folder, "torn")
+
+
+def test_a_folder_without_a_manifest_or_the_object_is_refused(folder: Path, tmp_path: Path):
+    with pytest.raises(BadArgument, match="manifest"):
+        list_views(tmp_path / "empty")
+    with pytest.raises(BadArgument, match="asked for"):
+        list_views(folder, only=["jug"])

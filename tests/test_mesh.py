@@ -1,0 +1,102 @@
+"""True meshes: refusals, samples and nearest points, against trimesh."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from torchgrasp.errors import MeshError, SuspiciousScale
+from torchgrasp.mesh import closest_on_triangles, nearest_on_mesh, read_mesh, sample_mesh
+
+
+def open_box():
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    return trimesh.Trimesh(box.vertices, box.faces[:-1])
+
+
+def inside_out():
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    return trimesh.Trimesh(box.vertices, box.faces[:, ::-1], process=False)
+
+
+def flat():
+    """A closed surface around nothing."""
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    return trimesh.Trimesh(box.vertices * [1, 1, 0], box.faces, process=False)
+
+
+def one_face_turned():
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    faces = np.array(box.faces)
+    faces[0] = faces[0, ::-1]
+    return trimesh.Trimesh(box.vertices, faces, process=False)
+
+
+def not_finite():
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    vertices = np.array(box.vertices)
+    vertices[0, 0] = np.nan
+    return trimesh.Trimesh(vertices, box.faces, process=False)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "reason"),
+    [
+        (open_box, "open surface"),
+        (inside_out, "volume"),
+        (not_finite, "non-finite"),
+        (flat, "volume"),
+        (one_face_turned, "volume"),
+        (lambda: trimesh.Trimesh(), "without faces"),
+    ],
+)
+def test_bad_meshes_are_refused(mesh, reason):
+    with pytest.raises(MeshError, match=reason):
+        read_mesh(mesh())
+
+
+@pytest.mark.parametrize("size", [1e-4, 10.0])
+def test_meshes_of_another_unit_are_refused(size):
+    with pytest.raises(SuspiciousScale, match="use metres"):
+        read_mesh(trimesh.creation.box((size, size, 2 * size)))
+
+
+def test_bad_files_are_refused(tmp_path):
+    with pytest.raises(MeshError, match="no file"):
+        read_mesh(tmp_path / "none.ply")
+    (tmp_path / "noise.ply").write_bytes(b"ply\nnonsense")
+    with pytest.raises(MeshError):
+        read_mesh(tmp_path / "noise.ply")
+    path = tmp_path / "box.ply"
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(path)
+    assert read_mesh(str(path)).volume == pytest.approx(1e-3)
+
+
+def test_closest_points_of_triangles_are_those_of_trimesh():
+    rng = np.random.default_rng(0)
+    points, triangles = rng.normal(size=(500, 3)), rng.normal(size=(500, 3, 3))
+    found, feature = closest_on_triangles(points, triangles)
+    np.testing.assert_allclose(found, trimesh.triangles.closest_point(triangles, points), atol=1e-9)
+    assert set(feature.tolist()) == set(range(7))
+    for k in range(3):
+        np.testing.assert_allclose(found[feature == 4 + k], triangles[feature == 4 + k, k])
+
+
+def test_the_nearest_point_of_a_mesh_is_exact():
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.04)
+    points = 0.05 * torch.randn(200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    found, normals = nearest_on_mesh(mesh, points)
+    _, distance, faces = trimesh.proximity.closest_point_naive(mesh, points.numpy())
+    error = torch.linalg.vector_norm(found - points, dim=-1).numpy() - distance
+    assert np.abs(error).max() < 1e-5 and np.median(np.abs(error)) < 1e-12
+    assert (normals.numpy() * mesh.face_normals[faces]).sum(-1).min() > 0.99
+    assert nearest_on_mesh(mesh, points[:0])[0].shape == (0, 3)
+
+
+def test_samples_of_a_mesh_lie_on_it_evenly():
+    box = trimesh.creation.box([0.1, 0.2, 0.3])
+    points, normals = sample_mesh(box, 20000, np.random.default_rng(0))
+    half = torch.tensor([0.05, 0.1, 0.15], dtype=torch.float64)
+    assert ((points.abs() - half).amax(-1)).abs().max() < 1e-12
+    torch.testing.assert_close((points * normals).sum(-1), (half * normals.abs()).sum(-1))
+    assert (normals[:, 0].abs() > 0.5).double().mean().item() == pytest.approx(0.06 * 2 / 0.22, abs=0.02)

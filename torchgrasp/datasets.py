@@ -1,0 +1,80 @@
+"""Folders of objects: true meshes with simulated or real views, described by a manifest.
+
+`manifest.json` has "objects" by name, each with "views" by name, each with "T_object_camera" (4x4), and optionally
+"suggested_scale". Each object has a folder with `mesh.ply` and `<view>_noisy.ply` [m], resting at z = 0. Meshes and
+clouds are returned times the suggested scale, at which a hand can grasp the object.
+"""
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from torchgrasp.cloud.io.read import read_cloud
+from torchgrasp.errors import BadArgument
+from torchgrasp.mesh import read_mesh
+from torchgrasp.values import PointCloud
+
+if TYPE_CHECKING:
+    import trimesh
+
+WHOLE = "whole"
+"""Name of the view that shows an object from all sides, with normals: `full_normals.ply`."""
+
+
+def list_views(objects: Path, whole: bool = False, only: Sequence[str] = ()) -> list[tuple[str, str]]:
+    """Return pairs of an object and a view, sorted; with `whole` the one view `WHOLE` of each object.
+
+    Args:
+        objects: the folder.
+        whole: see above.
+        only: names of objects to keep; all of them if empty.
+
+    Raises:
+        BadArgument: no manifest, or none of the objects in it.
+    """
+    entries = _read_manifest(objects, only)
+    return [(name, view) for name in entries for view in ([WHOLE] if whole else sorted(entries[name]["views"]))]
+
+
+def read_view(objects: Path, name: str, view: str, camera: bool = True) -> PointCloud:
+    """Return the noisy cloud of a view, without normals; without its viewpoint if not `camera`."""
+    entry, folder = _read_manifest(objects, [name])[name], Path(objects) / name
+    if view == WHOLE:
+        cloud = read_cloud(folder / "full_normals.ply")
+        return PointCloud(cloud.points * _scale(entry), cloud.normals)
+    cloud = read_cloud(folder / f"{view}_noisy.ply")
+    viewpoint = torch.tensor(entry["views"][view]["T_object_camera"], dtype=torch.float64)[:3, 3]
+    return PointCloud(cloud.points * _scale(entry), None, viewpoint * _scale(entry) if camera else None)
+
+
+def read_object_mesh(objects: Path, name: str) -> "trimesh.Trimesh":
+    """Return the true mesh of an object; raises as `read_mesh`."""
+    return read_mesh(Path(objects) / name / "mesh.ply").apply_scale(_scale(_read_manifest(objects, [name])[name]))
+
+
+def read_views(
+    objects: Path, camera: bool = True, only: Sequence[str] = ()
+) -> Iterator[tuple[str, str, PointCloud, "trimesh.Trimesh"]]:
+    """Yield object, view, noisy cloud and true mesh of every view."""
+    for name, view in list_views(objects, only=only):
+        yield name, view, read_view(objects, name, view, camera), read_object_mesh(objects, name)
+
+
+def _scale(entry: dict[str, Any]) -> float:
+    """Return the factor of an object's mesh and clouds."""
+    return float(entry.get("suggested_scale", 1.0))
+
+
+def _read_manifest(objects: Path, only: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Return the entries of the objects asked for, sorted by name; all of them if none is asked for."""
+    manifest = Path(objects) / "manifest.json"
+    if not manifest.is_file():
+        raise BadArgument("objects", str(objects), "a folder with a manifest.json")
+    entries = json.loads(manifest.read_text()).get("objects", {})
+    chosen = {name: entries[name] for name in sorted(entries) if not only or name in only}
+    if not chosen:
+        raise BadArgument("objects", f"{manifest} with {sorted(entries)}", "a manifest with the objects asked for")
+    return chosen

@@ -1,0 +1,142 @@
+"""True meshes: read and checked, sampled, and the nearest point of one."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.cloud.check import MAX_EXTENT, MIN_EXTENT
+from torchgrasp.errors import MeshError, SuspiciousScale
+
+if TYPE_CHECKING:
+    import trimesh
+
+LEAST_VOLUME = 1e-12
+"""Volume [m^3] from which on a mesh is a body: a cube of 0.1 mm."""
+SEARCH_SAMPLES, SEARCH_TRIANGLES = 20_000, 8
+"""Samples of a surface, and how many of them give the triangles among which its nearest point is sought."""
+
+
+def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
+    """Return a closed mesh [m] from a file or a trimesh, checked and never repaired.
+
+    Raises:
+        MeshError: no mesh in the file, non-finite vertices, an open surface, faces that are not all turned outward, or
+            no volume.
+        SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; most often the unit is mm.
+
+    >>> import trimesh
+    >>> len(read_mesh(trimesh.creation.box((0.1, 0.1, 0.1))).faces)
+    12
+    """
+    import trimesh
+
+    name = "a mesh"
+    if not isinstance(mesh, trimesh.Trimesh):
+        path, name = Path(mesh), str(mesh)
+        if not path.is_file():
+            raise MeshError("mesh", f"{path}, which is no file", "a mesh file (ply, obj, stl, ...)")
+        try:
+            loaded = trimesh.load_mesh(path)
+        except Exception as error:  # the readers of trimesh raise whatever their format runs into
+            raise MeshError("mesh", f"{path}: {error}", "a mesh file (ply, obj, stl, ...)") from error
+        if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
+            raise MeshError("mesh", f"{path}, which holds no faces", "a closed triangle mesh")
+        mesh = loaded
+    check_solid(mesh, name)
+    extent = float(mesh.extents.max())
+    if not MIN_EXTENT <= extent <= MAX_EXTENT:
+        raise SuspiciousScale("mesh", f"{name} of {extent:.4g} m", f"{MIN_EXTENT:g} m to {MAX_EXTENT:g} m: use metres")
+    return mesh
+
+
+def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
+    """Raise `MeshError` unless a mesh bounds a volume."""
+    if len(mesh.faces) == 0:
+        raise MeshError("mesh", f"{name} without faces", "a closed triangle mesh")
+    if not np.isfinite(mesh.vertices).all():
+        raise MeshError("mesh", f"{name} with a non-finite vertex", "finite vertices [m]")
+    if not mesh.is_watertight:
+        raise MeshError("mesh", f"{name} with an open surface", "a closed (watertight) mesh")
+    with np.errstate(invalid="ignore", divide="ignore"):  # trimesh divides by the volume
+        volume = mesh.volume
+    if not (mesh.is_winding_consistent and volume > LEAST_VOLUME):
+        raise MeshError("mesh", f"{name} of volume {volume:.3g} m^3", "a positive volume, faces turned outward")
+
+
+def sample_mesh(
+    mesh: "trimesh.Trimesh", n: int, generator: np.random.Generator
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Return n random points of a mesh, evenly by area, and their face normals."""
+    points, _, normals = _sample(mesh, n, generator)
+    return torch.from_numpy(points), torch.from_numpy(normals)
+
+
+def nearest_on_mesh(
+    mesh: "trimesh.Trimesh", points: Float[Tensor, "n 3"]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Return the nearest point of a mesh to each point, and its face normal.
+
+    Only the triangles of the nearest samples are tried: much faster than a search over all triangles.
+    """
+    from scipy.spatial import KDTree
+
+    if not len(points):
+        return points, points
+    samples, faces, _ = _sample(mesh, SEARCH_SAMPLES, np.random.default_rng(0))
+    queries = points.numpy()
+    _, index = KDTree(samples).query(queries, k=SEARCH_TRIANGLES)
+    candidates = faces[index]  # (n, SEARCH_TRIANGLES)
+    corners = np.asarray(mesh.triangles)[candidates.reshape(-1)]
+    feet = closest_on_triangles(np.repeat(queries, SEARCH_TRIANGLES, 0), corners)[0].reshape(*candidates.shape, 3)
+    best = np.linalg.norm(feet - queries[:, None], axis=-1).argmin(1)
+    rows = np.arange(len(queries))
+    return torch.from_numpy(feet[rows, best]), torch.from_numpy(_face_normals(mesh, candidates[rows, best]))
+
+
+def closest_on_triangles(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the closest point (n, 3) of each triangle (n, 3 corners, 3) to each point, and the feature it lies on.
+
+    Feature 0 is the face, 1 to 3 the sides ab, bc, ca, 4 to 6 the corners a, b, c.
+    """
+    a, u, v = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    w = points - a
+    uu, vv, uv = (np.einsum("ij,ij->i", x, y) for x, y in ((u, u), (v, v), (u, v)))
+    uw, vw = np.einsum("ij,ij->i", u, w), np.einsum("ij,ij->i", v, w)
+    span = np.maximum(uu * vv - uv * uv, 1e-40)
+    s, t = (vv * uw - uv * vw) / span, (uu * vw - uv * uw) / span
+    best, feature = a + s[:, None] * u + t[:, None] * v, np.zeros(len(points), dtype=int)
+    out = np.nonzero((s < 0) | (t < 0) | (s + t > 1))[0]  # then the closest point lies on a side
+    corner = triangles[out]
+    side = np.roll(corner, -1, 1) - corner
+    along = np.einsum("ikj,ikj->ik", points[out, None] - corner, side) / np.einsum("ikj,ikj->ik", side, side)
+    along = np.clip(along, 0, 1)
+    feet = corner + along[..., None] * side
+    gap = points[out, None] - feet
+    k, rows = np.einsum("ikj,ikj->ik", gap, gap).argmin(1), np.arange(len(out))
+    best[out], along = feet[rows, k], along[rows, k]
+    feature[out] = np.where(along <= 0, 4 + k, np.where(along >= 1, 4 + (k + 1) % 3, 1 + k))
+    return best, feature
+
+
+def _sample(
+    mesh: "trimesh.Trimesh", n: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return n random points evenly by area, their faces and the faces' normals."""
+    corners = np.asarray(mesh.triangles)
+    area = np.cumsum(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1))
+    face = np.minimum(np.searchsorted(area, generator.random(n) * area[-1]), len(area) - 1)
+    u, v = generator.random((2, n))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    a, b, c = corners[face].transpose(1, 0, 2)
+    return a + u[:, None] * (b - a) + v[:, None] * (c - a), face, _face_normals(mesh, face)
+
+
+def _face_normals(mesh: "trimesh.Trimesh", faces: np.ndarray) -> np.ndarray:
+    """Return unit normals of faces by their winding; trimesh has none for very thin ones."""
+    a, b, c = np.asarray(mesh.triangles)[faces].transpose(1, 0, 2)
+    across = np.cross(b - a, c - a)
+    return across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-300)
