@@ -121,3 +121,9 @@ def check_tensor(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor
         first = torch.nonzero(~finite)[0].tolist()
         raise BadArgument(name, f"{value[tuple(first)].item()} at index {first}", "finite numbers")
     return value
+
+
+def check_whole(name: str, value: int, low: int, high: int) -> None:
+    """Refuse a number that is not whole or is out of range; raise `BadArgument`."""
+    if not low <= value <= high or value != int(value):
+        raise BadArgument(name, value, f"a whole number in [{low}, {high}]")

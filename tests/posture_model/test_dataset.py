@@ -17,15 +17,15 @@ from torchgrasp.errors import BadArgument, ModelFileError, OutputError
 from torchgrasp.files import hold_folder
 from torchgrasp.hand.load import load_hand
 from torchgrasp.posture_model.dataset import load_samples, write_samples
-from torchgrasp.posture_model.sample import check_sampling, sample_configurations
+from torchgrasp.posture_model.sample import SampleSpec, sample_configurations
 
 
 @pytest.fixture
 def small(monkeypatch):
     """Chunks of 500 postures: several of them in little time."""
-    monkeypatch.setattr("torchgrasp.posture_model.sample.CHUNK", 500)
-    monkeypatch.setattr("torchgrasp.posture_model.dataset.CHUNK", 500)
-    monkeypatch.setattr("torchgrasp.posture_model.sample.BLOCK", 250)
+    monkeypatch.setattr("torchgrasp.posture_model.sample.CHUNK_POSTURES", 500)
+    monkeypatch.setattr("torchgrasp.posture_model.dataset.CHUNK_POSTURES", 500)
+    monkeypatch.setattr("torchgrasp.posture_model.sample.BLOCK_POSTURES", 250)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -35,12 +35,13 @@ def contents(folder: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize("sampling", ["uniform", "opposed"])
 def test_a_folder_holds_what_sample_configurations_returns_for_any_number_of_workers(tmp_path, small, sampling):
     hand = load_hand("barrett")
-    made = write_samples(hand, 1700, tmp_path / "one", seed=3, sampling=sampling)
-    write_samples(hand, 1700, tmp_path / "three", seed=3, workers=3, sampling=sampling)
+    spec = SampleSpec(1700, 3, sampling)
+    written = write_samples(hand, spec, tmp_path / "one")
+    write_samples(hand, spec, tmp_path / "three", workers=3)
     assert contents(tmp_path / "one") == contents(tmp_path / "three")
     assert len(contents(tmp_path / "one")) == 5
     found, truth = load_samples(tmp_path / "one"), sample_configurations(hand, 1700, seed=3, sampling=sampling)
-    assert found == made
+    assert found == written
     assert len(found) == 1700
     assert [len(chunk) for chunk in found] == [500, 500, 500, 200]
     everything = found.read()
@@ -53,29 +54,50 @@ def test_a_folder_holds_what_sample_configurations_returns_for_any_number_of_wor
         found.read(1701)
 
 
+HELD_RUN = """
+import signal, sys, threading
+from torchgrasp.cli import main
+from torchgrasp.posture_model import dataset
+
+interrupted = threading.Event()
+
+def interrupt(*_):
+    interrupted.set()
+    raise KeyboardInterrupt
+
+def draw_the_first(hand, spec, i, draw=dataset.draw_chunk):
+    if i >= {held}:  # the run cannot end before it is interrupted, whatever the machine does meanwhile
+        interrupted.wait()
+    return draw(hand, spec, i)
+
+signal.signal(signal.SIGINT, interrupt)
+dataset.draw_chunk = draw_the_first
+sys.exit(main({arguments!r}))
+"""
+
+
 def test_a_run_that_was_interrupted_and_killed_is_continued_to_the_same_bytes(tmp_path):
-    hand, n, folder = load_hand("barrett"), 120_000, tmp_path / "killed"
+    hand, n, folder = load_hand("barrett"), 70_000, tmp_path / "killed"
     arguments = ["hand", "sample", "--hand", "barrett", "--n", str(n), "--out", str(folder), "--workers", "2"]
-    code = f"import sys; from torchgrasp.cli import main; sys.exit(main({arguments!r}))"
-    for sign, expected in ((signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)):
+    for sign, expected, held in ((signal.SIGINT, 130, 2), (signal.SIGKILL, -signal.SIGKILL, 5)):
         before = {path: path.stat().st_mtime_ns for path in folder.glob("chunk-*")}
-        run = subprocess.Popen([sys.executable, "-c", code])
-        while run.poll() is None and len(list(folder.glob("chunk-*"))) == len(before):
+        run = subprocess.Popen([sys.executable, "-c", HELD_RUN.format(held=held, arguments=arguments)])
+        while run.poll() is None and len(list(folder.glob("chunk-*"))) < held:
             time.sleep(0.01)
         os.kill(run.pid, sign)
         assert run.wait() == expected
-        assert len(before) < len(list(folder.glob("chunk-*"))) < 12
+        assert len(before) < held <= len(list(folder.glob("chunk-*"))) < 7
         assert all(path.stat().st_mtime_ns == then for path, then in before.items())  # whole chunks were kept
     with pytest.raises(ModelFileError, match="without"):
         load_samples(folder)
-    write_samples(hand, n, folder)
-    write_samples(hand, n, tmp_path / "whole", workers=3)
+    write_samples(hand, SampleSpec(n), folder)
+    write_samples(hand, SampleSpec(n), tmp_path / "whole", workers=3)
     assert contents(folder) == contents(tmp_path / "whole")
 
 
 def test_half_a_chunk_is_never_taken_for_a_whole_one(tmp_path, small):
     hand = load_hand("barrett")
-    write_samples(hand, 1100, tmp_path)
+    write_samples(hand, SampleSpec(1100), tmp_path)
     whole = contents(tmp_path)
     chunk = tmp_path / "chunk-000001.safetensors"
     for damaged in (whole[chunk.name][:-8], b"", whole["chunk-000000.safetensors"], whole["chunk-000002.safetensors"]):
@@ -83,16 +105,16 @@ def test_half_a_chunk_is_never_taken_for_a_whole_one(tmp_path, small):
         with pytest.raises(ModelFileError, match="chunk-000001"):
             load_samples(tmp_path).read()
         (tmp_path / ".chunk-000001.safetensors.abc.safetensors").write_bytes(damaged)  # of a run that was killed
-        write_samples(hand, 1100, tmp_path)
+        write_samples(hand, SampleSpec(1100), tmp_path)
         assert contents(tmp_path) == whole
 
 
 def test_a_second_run_on_the_folder_is_refused(tmp_path, small):
     hand = load_hand("barrett")
     with hold_folder(tmp_path), pytest.raises(OutputError, match=f"in use by process {os.getpid()} on"):
-        write_samples(hand, 100, tmp_path)
+        write_samples(hand, SampleSpec(100), tmp_path)
     (tmp_path / ".lock").write_text("process 1 on nowhere")  # left by a run that was killed: nobody holds it
-    write_samples(hand, 100, tmp_path)
+    write_samples(hand, SampleSpec(100), tmp_path)
     assert not (tmp_path / ".lock").exists()
 
 
@@ -102,33 +124,35 @@ def test_a_full_disk_leaves_nothing_half_written_and_the_run_goes_on_later(tmp_p
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
     try:
         with pytest.raises(OutputError, match=r"chunk-00000\d.safetensors \(File too large\)"):
-            write_samples(hand, 1100, tmp_path / "small", workers=2)
+            write_samples(hand, SampleSpec(1100), tmp_path / "small", workers=2)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert [path.name for path in (tmp_path / "small").iterdir()] == ["samples.json"]
-    write_samples(hand, 1100, tmp_path / "small")
-    write_samples(hand, 1100, tmp_path / "whole")
+    write_samples(hand, SampleSpec(1100), tmp_path / "small")
+    write_samples(hand, SampleSpec(1100), tmp_path / "whole")
     assert contents(tmp_path / "small") == contents(tmp_path / "whole")
     monkeypatch.setattr("shutil.disk_usage", lambda _: type("Usage", (), {"free": 1000})())
     with pytest.raises(OutputError, match="1000 bytes free, allowed is 88000 bytes"):
-        write_samples(hand, 1100, tmp_path / "full")
+        write_samples(hand, SampleSpec(1100), tmp_path / "full")
 
 
 def test_a_folder_of_other_samples_or_files_is_refused(tmp_path, small):
     hand = load_hand("barrett")
-    write_samples(hand, 600, tmp_path / "a")
-    for other in ({"n": 601}, {"seed": 1}, {"sampling": "opposed"}):
+    write_samples(hand, SampleSpec(600), tmp_path / "a")
+    for other in (SampleSpec(601), SampleSpec(600, 1), SampleSpec(600, 0, "opposed")):
         with pytest.raises(OutputError, match="holds other samples"):
-            write_samples(hand, **{"n": 600, "folder": tmp_path / "a", **other})
+            write_samples(hand, other, tmp_path / "a")
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "thesis.tex").write_text("years of work")
     with pytest.raises(OutputError, match="holds other files"):
-        write_samples(hand, 600, tmp_path / "b")
+        write_samples(hand, SampleSpec(600), tmp_path / "b")
     assert [path.name for path in (tmp_path / "b").iterdir()] == ["thesis.tex"]
     with pytest.raises(OutputError, match="a folder that can be written"):
-        write_samples(hand, 600, tmp_path / "b" / "thesis.tex")
-    with pytest.raises(BadArgument, match="sampling: found 'thumbs'"):
-        check_sampling(hand, 600, 0, 1, "thumbs")
+        write_samples(hand, SampleSpec(600), tmp_path / "b" / "thesis.tex")
+    with pytest.raises((BadArgument, TypeError), match="sampling"):
+        SampleSpec(600, 0, "thumbs")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(BadArgument, match="workers: found 0"):
+        write_samples(hand, SampleSpec(600), tmp_path / "a", workers=0)
 
 
 @pytest.mark.parametrize(
@@ -137,7 +161,7 @@ def test_a_folder_of_other_samples_or_files_is_refused(tmp_path, small):
      {"chunk": 7}, {"version": 2}, {"torchgrasp": "grasps"}, {"joint_names": ["a"]}, {"hand": "allegro"}],
 )  # fmt: skip
 def test_a_damaged_manifest_is_refused(tmp_path, small, change):
-    write_samples(load_hand("barrett"), 600, tmp_path)
+    write_samples(load_hand("barrett"), SampleSpec(600), tmp_path)
     path = tmp_path / "samples.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     with pytest.raises(ModelFileError):

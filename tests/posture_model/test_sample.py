@@ -14,8 +14,8 @@ from torchgrasp.posture_model.sample import sample_configurations
 @pytest.fixture(autouse=True)
 def small_chunks(monkeypatch):
     """Chunks of 1000 postures: several of them in little time."""
-    monkeypatch.setattr("torchgrasp.posture_model.sample.CHUNK", 1000)
-    monkeypatch.setattr("torchgrasp.posture_model.sample.BLOCK", 500)
+    monkeypatch.setattr("torchgrasp.posture_model.sample.CHUNK_POSTURES", 1000)
+    monkeypatch.setattr("torchgrasp.posture_model.sample.BLOCK_POSTURES", 500)
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
@@ -74,7 +74,7 @@ def test_opposed_samples_are_the_uniform_ones_in_which_two_pads_can_hold_somethi
 
 
 def test_a_hand_that_can_hardly_move_is_refused(monkeypatch):
-    monkeypatch.setattr("torchgrasp.posture_model.sample.OPPOSED", -2.0)
+    monkeypatch.setattr("torchgrasp.posture_model.sample.OPPOSED_COSINE", -2.0)
     with pytest.raises(BadArgument, match="hand: found 0 kept of 5000 postures"):
         sample_configurations(load_hand("barrett"), 10, sampling="opposed")
 

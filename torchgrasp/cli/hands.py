@@ -6,6 +6,7 @@ from typing import Annotated
 
 import torch
 import tyro
+from tqdm import tqdm
 
 from torchgrasp.cli.common import check_folder, check_seed, naming
 from torchgrasp.errors import BadArgument, GraspError, OutputError
@@ -14,7 +15,7 @@ from torchgrasp.hand.draft import draft_hand
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import find_hand, load_hand
 from torchgrasp.posture_model.dataset import write_samples
-from torchgrasp.posture_model.sample import Sampling
+from torchgrasp.posture_model.sample import SampleSpec, Sampling
 from torchgrasp.report.hands import draw_hand, opposed_posture
 from torchgrasp.testing import check_hand, find_faults, random_joints
 
@@ -144,8 +145,10 @@ def sample(
         robot = load_hand(hand, fingers)
     begin = time.perf_counter()
     with naming("--out", "folder", "path"), naming("--n", "n"), naming("--workers", "workers"):
-        made = write_samples(robot, n, out, seed, workers, sampling, progress=True)
-    print(f"{len(made)} {sampling} postures of {robot.name} in {out}, {time.perf_counter() - begin:.0f} s")
+        spec = SampleSpec(n, seed, sampling)
+        with tqdm(total=n, unit="posture", unit_scale=True, disable=None, leave=False) as bar:
+            write_samples(robot, spec, out, workers, bar.update)
+    print(f"{n} {sampling} postures of {robot.name} in {out}, {time.perf_counter() - begin:.0f} s")
     return 0
 
 

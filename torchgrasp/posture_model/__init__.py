@@ -1,1 +1,31 @@
-"""The learned posture model: a Gaussian mixture over contacts and joints (Sec. 4)."""
+"""The learned posture model: a Gaussian mixture over the joints of a hand and the codes of its fingertips (Sec. 4)."""
+
+from torchgrasp.posture_model.encoding import encode, encode_fingertips
+from torchgrasp.posture_model.sample import HandSamples, SampleSpec, sample_configurations
+from torchgrasp.posture_model.dataset import SampleFolder, load_samples, write_samples
+from torchgrasp.posture_model.em import Progress
+from torchgrasp.posture_model.fit import bic, fit_mixture
+from torchgrasp.posture_model.gaussian import GaussianMixture
+from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture, load_mixture
+from torchgrasp.posture_model.evaluate import MixtureScore, evaluate_mixture
+
+__all__ = [
+    "encode",
+    "encode_fingertips",
+    "HandSamples",
+    "SampleSpec",
+    "sample_configurations",
+    "SampleFolder",
+    "write_samples",
+    "load_samples",
+    "Progress",
+    "fit_mixture",
+    "bic",
+    "GaussianMixture",
+    "GraspMixture",
+    "PAPER_ENERGY",
+    "DEFAULT_ENERGY",
+    "load_mixture",
+    "MixtureScore",
+    "evaluate_mixture",
+]

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value, check_tensor
+from torchgrasp.base import Value, check_tensor, check_whole
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import cholesky
 
@@ -83,9 +83,8 @@ class GaussianMixture(Value):
         Raises:
             BadArgument: n or seed outside its range.
         """
-        for name, value in (("n", n), ("seed", seed)):
-            if not 0 <= value < 2**63 or value != int(value):
-                raise BadArgument(name, value, "a whole number in [0, 2^63)")
+        check_whole("n", n, 0, 2**63 - 1)
+        check_whole("seed", seed, 0, 2**63 - 1)
         generator = torch.Generator().manual_seed(seed)
         weights, means = self.weights.double().cpu(), self.means.double().cpu()
         # the sum of the weights is 1 to rounding only; the last one takes what is drawn above it
