@@ -58,7 +58,7 @@ def pinch(name):
         pregrasp=opened,
         approach=rotate(pose, hand.approach[None].double())[:, 0],
         obj_from_hand=pose,
-        contacts=Contacts(points[None], normals[None], 0.01 * three, 0.004 * three),
+        contacts=Contacts(points[None], normals[None], std_m=0.004 * three),
         permutation=torch.tensor([[0, 1, 2]]),
         tip_error=0 * three,
         clearance=0.01 * one,

@@ -1,5 +1,6 @@
 """Safetensors files: round trip, refusals, atomic writes."""
 
+import dataclasses
 import os
 
 import pytest
@@ -40,6 +41,23 @@ def test_grasps_survive_the_round_trip(tmp_path):
     torch.testing.assert_close(after.joints, before.joints, rtol=0, atol=0)
     torch.testing.assert_close(after.contacts.std_m, before.contacts.std_m, rtol=0, atol=0)
     assert torch.equal(after.certificate.closed, before.certificate.closed)
+
+
+def test_grasps_on_contacts_of_unknown_variance_survive_the_round_trip(tmp_path):
+    before = some_grasps()
+    contacts = Contacts(before.contacts.points, before.contacts.normals)
+    dataclasses.replace(before, contacts=contacts).save(tmp_path / "grasps")
+    after = load_grasps(tmp_path / "grasps")
+    assert after.contacts.variance is None and after.contacts.std_m is None
+    torch.testing.assert_close(after.contacts.normals, contacts.normals, rtol=0, atol=0)
+
+
+def test_optional_tensors_may_be_absent_and_others_may_not(tmp_path):
+    save_tensors(tmp_path / "some", "toy", {"a": torch.zeros(1), "b": torch.ones(1)}, {})
+    assert set(load_tensors(tmp_path / "some", "toy", {"a"}, {"b", "c"})[0]) == {"a", "b"}
+    for names, optional in (({"a"}, {"c"}), ({"a", "c"}, {"b"})):
+        with pytest.raises(ModelFileError, match="tensors"):
+            load_tensors(tmp_path / "some", "toy", names, optional)
 
 
 def test_the_same_grasps_give_the_same_bytes(tmp_path):

@@ -202,10 +202,7 @@ def test_spread_rows_are_far_apart():
     points[25:] = points[24]  # half of the plan is one triple
     status = torch.zeros(50, dtype=torch.int64)
     status[3] = Status.NOT_CLOSED
-    zeros = torch.zeros(50, 3, dtype=torch.float64)
-    plan = ContactPlan(
-        Contacts(points, points, zeros, zeros), torch.zeros(50, 3, 8), torch.arange(50, dtype=torch.float64), status
-    )
+    plan = ContactPlan(Contacts(points, points), torch.zeros(50, 3, 8), torch.arange(50, dtype=torch.float64), status)
     rows = spread_rows(plan, 20)
     assert len(rows) == 20
     assert 3 not in rows.tolist()

@@ -2,10 +2,11 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
 
-from torchgrasp.base import count_status
+from torchgrasp.base import count_status, join, pick, put
 from torchgrasp.errors import BadArgument, FailedRows, GraspError, Status, TooFewPoints
 from torchgrasp.specs import ContactSpec, TrialSpec
 from torchgrasp.values import Certificate, ContactPlan, Contacts, PointCloud
@@ -32,18 +33,68 @@ def test_count_status_puts_the_most_frequent_first():
     assert list(count_status(torch.tensor([0, 13, 13]))) == [Status.NOT_CLOSED, Status.OK]
 
 
-@pytest.mark.parametrize("rows", [1, slice(1, 2), torch.tensor([False, True, False]), torch.tensor([1])])
-def test_indexing_selects_rows_of_nested_values(rows):
+ONE_ROW = [
+    1,
+    -2,
+    np.int64(1),
+    np.array(1),
+    torch.tensor(1),
+    slice(1, 2),
+    torch.tensor([False, True, False]),
+    torch.tensor([1]),
+    [1],
+]
+
+
+@pytest.mark.parametrize("rows", ONE_ROW, ids=repr)
+def test_indexing_selects_rows_of_nested_values_and_keeps_the_batch_axis(rows):
     picked = plan([0, 1 + 12, 0])[rows]
     assert len(picked) == len(picked.contacts) == 1
     assert picked.quality.tolist() == [1.0]
     assert picked.status.tolist() == [Status.NOT_CLOSED]
 
 
-def test_iteration_ends_and_indices_are_checked():
-    assert [float(row.quality) for row in plan([0, 0, 0])] == [0.0, 1.0, 2.0]
+@pytest.mark.parametrize("row", [True, np.bool_(True), torch.tensor(True)], ids=repr)
+def test_a_single_boolean_is_no_index(row):
+    with pytest.raises(BadArgument, match="rows"):
+        plan([0, 0])[row]
+
+
+@pytest.mark.parametrize("row", [2, -3, np.int64(2), torch.tensor(2)], ids=repr)
+def test_indices_beyond_the_rows_are_refused(row):
     with pytest.raises(IndexError):
-        plan([0])[1]
+        plan([0, 0])[row]
+
+
+def test_contacts_of_unknown_variance_are_batches_like_others():
+    contacts = Contacts(torch.rand(3, 3, 3), torch.rand(3, 3, 3))
+    moved = contacts.to(torch.float64)
+    assert moved.points.dtype == torch.float64 and moved.variance is None and moved.std_m is None
+    assert torch.equal(contacts[1].points, contacts.points[1:2]) and contacts[1].std_m is None
+    both = join([contacts, contacts[:1]])
+    assert len(both) == 4 and both.variance is None
+    mixed = pick(torch.tensor([True, False, True]), contacts, contacts[[1, 1, 1]])
+    assert torch.equal(mixed.points, contacts.points[[0, 1, 2]]) and mixed.std_m is None
+    assert torch.equal(put(contacts, torch.tensor([2]), contacts[0]).points, contacts.points[[0, 1, 0]])
+    with pytest.raises(BadArgument, match="std_m: found None"):
+        contacts.require_std()
+
+
+def test_known_and_unknown_variances_do_not_mix():
+    contacts = Contacts(torch.rand(2, 3, 3), torch.rand(2, 3, 3))
+    known = dataclasses.replace(contacts, std_m=torch.rand(2, 3))
+    for action in (
+        lambda: join([contacts, known]),
+        lambda: join([known, contacts]),
+        lambda: pick(torch.tensor([True, False]), known, contacts),
+        lambda: put(contacts, torch.tensor([0]), known[1]),
+    ):
+        with pytest.raises(BadArgument, match="std_m: found None beside a tensor"):
+            action()
+
+
+def test_iteration_yields_batches_of_one_and_ends():
+    assert [float(row.quality) for row in plan([0, 0, 0])] == [0.0, 1.0, 2.0]
 
 
 def test_to_returns_a_new_value_and_keeps_integers():

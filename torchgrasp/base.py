@@ -1,7 +1,7 @@
 """What every value is made of: frozen dataclasses of tensors, batches with rows, checks and counts."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import torch
@@ -14,22 +14,38 @@ SomeValue = TypeVar("SomeValue", bound="Value")
 SomeBatch = TypeVar("SomeBatch", bound="Batch")
 
 
+def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValue:
+    """Return a value whose tensors are `function` of the tensors in the same field of every value.
+
+    Nested values are mapped in the same way. Fields without tensors are those of the first value.
+
+    Raises:
+        BadArgument: a field holds a tensor in one value and None in another.
+    """
+
+    def merge(name: str, *found: Any) -> Any:
+        if isinstance(found[0], Value):
+            return map_tensors(function, *found)
+        tensors = [isinstance(x, Tensor) for x in found]
+        if any(tensors) and not all(tensors):
+            raise BadArgument(name, "None beside a tensor", "a tensor in every value, or in none")
+        return function(*found) if all(tensors) else found[0]
+
+    fields = [f.name for f in dataclasses.fields(values[0])]  # pyright: ignore[reportArgumentType]
+    return type(values[0])(**{name: merge(name, *(getattr(value, name) for value in values)) for name in fields})
+
+
 class Value:
     """Base of all values: `.to()` maps every tensor inside, nested values included, into a new value."""
 
     def to(self: SomeValue, *args: Any, **kwargs: Any) -> SomeValue:
         """Return the value on another device or in another floating dtype; integers keep theirs."""
 
-        def move(x: Any) -> Any:
-            if isinstance(x, Value):
-                return x.to(*args, **kwargs)
-            if isinstance(x, Tensor):
-                moved = x.to(*args, **kwargs)
-                return moved if x.is_floating_point() else moved.to(x.dtype)
-            return x
+        def move(x: Tensor) -> Tensor:
+            moved = x.to(*args, **kwargs)
+            return moved if x.is_floating_point() else moved.to(x.dtype)
 
-        fields = dataclasses.fields(self)  # pyright: ignore[reportArgumentType]
-        return type(self)(**{f.name: move(getattr(self, f.name)) for f in fields})
+        return map_tensors(move, self)
 
 
 class Batch(Value):
@@ -40,16 +56,18 @@ class Batch(Value):
         return len(getattr(self, dataclasses.fields(self)[0].name))  # pyright: ignore[reportArgumentType]
 
     def __getitem__(self: SomeBatch, rows: Any) -> SomeBatch:
-        """Select rows by a slice, a mask or an index tensor; an integer keeps the batch axis."""
-        if isinstance(rows, int):
-            rows = range(len(self))[rows]  # raises IndexError as a list would
-            rows = slice(rows, rows + 1)
+        """Select rows by a slice, a mask or indices. A single index of any kind keeps the batch axis.
 
-        def pick(x: Any) -> Any:
-            return x[rows] if isinstance(x, (Tensor, Batch)) else x
-
-        fields = dataclasses.fields(self)  # pyright: ignore[reportArgumentType]
-        return type(self)(**{f.name: pick(getattr(self, f.name)) for f in fields})
+        Raises:
+            BadArgument: a single boolean.
+            IndexError: a single index beyond the rows.
+        """
+        if isinstance(rows, int) or getattr(rows, "ndim", None) == 0:  # also a NumPy scalar or a 0-d tensor
+            if torch.as_tensor(rows).dtype == torch.bool:
+                raise BadArgument("rows", repr(rows), "an index, a slice, a mask of all rows or a tensor of indices")
+            row = range(len(self))[rows]
+            rows = slice(row, row + 1)
+        return map_tensors(lambda x: x[rows], self)
 
     def __iter__(self: SomeBatch) -> Iterator[SomeBatch]:
         """Iterate over the rows, each a batch of one."""
@@ -65,35 +83,18 @@ class Batch(Value):
 
 
 def join(parts: Sequence[SomeBatch]) -> SomeBatch:
-    """Put the rows of batches of one kind one below the other; what has no rows is the first one's."""
-
-    def together(values: list[Any]) -> Any:
-        if isinstance(values[0], Tensor):
-            return torch.cat(values)
-        return join(values) if isinstance(values[0], Value) else values[0]
-
-    fields = dataclasses.fields(parts[0])  # pyright: ignore[reportArgumentType]
-    return type(parts[0])(**{f.name: together([getattr(part, f.name) for part in parts]) for f in fields})
+    """Put the rows of batches of one kind one below the other; fields without rows are those of the first."""
+    return map_tensors(lambda *tensors: torch.cat(tensors), *parts)
 
 
-def pick(choose: Bool[Tensor, "b"], new: SomeValue, old: SomeValue) -> SomeValue:
-    """Return the new rows of a value where `choose`, the old ones elsewhere."""
-
-    def merge(a: Any, b: Any) -> Any:
-        return pick(choose, a, b) if isinstance(a, Value) else torch.where(choose.view(-1, *[1] * (a.ndim - 1)), a, b)
-
-    fields = dataclasses.fields(new)  # pyright: ignore[reportArgumentType]
-    return type(new)(**{f.name: merge(getattr(new, f.name), getattr(old, f.name)) for f in fields})
+def pick(choose: Bool[Tensor, "b"], new: SomeBatch, old: SomeBatch) -> SomeBatch:
+    """Return the new rows where `choose`, the old ones elsewhere."""
+    return map_tensors(lambda a, b: torch.where(choose.view(-1, *[1] * (a.ndim - 1)), a, b), new, old)
 
 
-def put(whole: SomeValue, at: Int[Tensor, "a"], part: SomeValue) -> SomeValue:
-    """Return a value with `part` in the rows `at`."""
-
-    def place(w: Any, p: Any) -> Any:
-        return put(w, at, p) if isinstance(w, Value) else w.index_copy(0, at, p)
-
-    fields = dataclasses.fields(whole)  # pyright: ignore[reportArgumentType]
-    return type(whole)(**{f.name: place(getattr(whole, f.name), getattr(part, f.name)) for f in fields})
+def put(whole: SomeBatch, at: Int[Tensor, "a"], part: SomeBatch) -> SomeBatch:
+    """Return a batch with `part` in the rows `at`."""
+    return map_tensors(lambda rows, new: rows.index_copy(0, at, new), whole, part)
 
 
 def count_status(status: Int[Tensor, "*b"]) -> dict[Status, int]:

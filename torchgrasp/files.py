@@ -10,7 +10,7 @@ import math
 import os
 import socket
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -128,21 +128,23 @@ def save_tensors(path: Path | str, kind: str, tensors: dict[str, Tensor], meta: 
     return write_file(path, save(contiguous, header))
 
 
-def load_tensors(path: Path | str, kind: str, names: set[str]) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read a safetensors file of a `kind` that holds exactly the tensors `names`.
+def load_tensors(
+    path: Path | str, kind: str, names: set[str], optional: Collection[str] = ()
+) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Read a safetensors file of a `kind` that holds the tensors `names`, and of others at most the `optional`.
 
     Raises:
         ModelFileError: the file is missing or malformed, has another kind, version or tensors, or a number is not
             finite.
     """
-    path = Path(path)
+    path, allowed = Path(path), names.union(optional)
     if not path.is_file():
         raise ModelFileError("path", f"{path}, which is no file", f"a safetensors file of kind {kind!r}")
     try:
         with safe_open(path, framework="pt") as file:
             meta = json.loads((file.metadata() or {}).get("torchgrasp", "{}"))
             found = set(file.keys())
-            tensors = {name: file.get_tensor(name) for name in found & names}  # nothing else is worth its memory
+            tensors = {name: file.get_tensor(name) for name in found & allowed}  # nothing else is worth its memory
     except (SafetensorError, OSError, ValueError, KeyError) as error:
         raise ModelFileError("path", f"{path}: {error}", f"a safetensors file of kind {kind!r}") from error
     if not isinstance(meta, dict):
@@ -150,7 +152,7 @@ def load_tensors(path: Path | str, kind: str, names: set[str]) -> tuple[dict[str
     if meta.get("kind") != kind or meta.get("version") != VERSION:
         other = f"kind {meta.get('kind')!r}, version {meta.get('version')!r}"
         raise ModelFileError("path", f"{path}: {other}", f"kind {kind!r}, version {VERSION!r}")
-    if found != names:
+    if not names <= found <= allowed:
         raise ModelFileError("path", f"{path}: tensors {sorted(found)}", f"tensors {sorted(names)}")
     for name, t in tensors.items():
         if t.is_floating_point() and not bool(torch.isfinite(t).all()):

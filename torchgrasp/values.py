@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value, check_tensor
-from torchgrasp.errors import ModelFileError, Status, TooFewPoints
+from torchgrasp.errors import BadArgument, ModelFileError, Status, TooFewPoints
 from torchgrasp.files import load_tensors, save_tensors
 
 # ---------------------------------------------------------------------------------------------- what was seen
@@ -101,12 +101,26 @@ class ShapeEstimate(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Contacts(Batch):
-    """Three contacts a row: `points` [m], outward unit `normals`, `variance` (Eq. 12) and `std_m` [m] of the shape."""
+    """Three contacts a row: `points` [m] and outward unit `normals`.
+
+    `variance` (Eq. 12, normalised units) and `std_m` [m] say how uncertain the surface is there. They are None where
+    nobody knows, as for contacts of another planner.
+    """
 
     points: Float[Tensor, "b 3 3"]
     normals: Float[Tensor, "b 3 3"]
-    variance: Float[Tensor, "b 3"]
-    std_m: Float[Tensor, "b 3"]
+    variance: Float[Tensor, "b 3"] | None = None
+    std_m: Float[Tensor, "b 3"] | None = None
+
+    def require_std(self) -> Float[Tensor, "b 3"]:
+        """Return `std_m`.
+
+        Raises:
+            BadArgument: these contacts have none.
+        """
+        if self.std_m is None:
+            raise BadArgument("contacts.std_m", "None", "the standard deviation [m] of the surface at each contact")
+        return self.std_m
 
 
 @dataclasses.dataclass(frozen=True)
@@ -221,14 +235,15 @@ def load_grasps(path: Path | str) -> Grasps:
     """
     nested = {"contacts": Contacts, "certificate": Certificate}
     plain = [f.name for f in dataclasses.fields(Grasps) if f.name not in (*nested, "meta")]
-    names = set(plain) | {f"{k}.{f.name}" for k, t in nested.items() for f in dataclasses.fields(t)}
-    tensors, meta = load_tensors(path, "grasps", names)
+    inner = {f"{name}.{f.name}": f for name, kind in nested.items() for f in dataclasses.fields(kind)}
+    optional = {name for name, f in inner.items() if f.default is None}
+    tensors, meta = load_tensors(path, "grasps", {*plain, *inner} - optional, optional)
     rows = {name: len(t) for name, t in tensors.items()}
     if len(set(rows.values())) != 1:
         raise ModelFileError("path", f"{path}: rows {rows}", "as many rows in every tensor")
     values: dict[str, Any] = {name: tensors[name] for name in plain}
     for name, kind in nested.items():
-        values[name] = kind(**{f.name: tensors[f"{name}.{f.name}"] for f in dataclasses.fields(kind)})
+        values[name] = kind(**{f.name: tensors.get(f"{name}.{f.name}") for f in dataclasses.fields(kind)})
     return Grasps(**values, meta={k: v for k, v in meta.items() if k not in ("kind", "version")})
 
 

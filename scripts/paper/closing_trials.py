@@ -133,7 +133,7 @@ def controller_cells(
 def riskiest(grasps: Grasps, most: int = GRASPS) -> Grasps:
     """Return the executable grasps whose contacts' variances have the greatest sum (Sec. 6.5)."""
     grasps = grasps[grasps.status == Status.OK]
-    return grasps[torch.argsort(grasps.contacts.std_m.square().sum(1), descending=True, stable=True)[:most]]
+    return grasps[torch.argsort(grasps.contacts.require_std().square().sum(1), descending=True, stable=True)[:most]]
 
 
 def difference(first: Sequence[Cell], second: Sequence[Cell], seed: int = 0) -> tuple[float, float, float]:
@@ -253,7 +253,7 @@ def _fill(
             grasp = grasps[k // draws]
             error = error_from_object_pose(grasp.obj_from_hand[0].double(), place)
             results.append(close_hand(grasp, hand, mesh, spec, seed + k, parts=parts, error=error))
-        stds = [float(grasp.contacts.std_m.amax()) for grasp in grasps]
+        stds = [float(grasp.contacts.require_std().amax()) for grasp in grasps]
         std_m = sum(stds) / len(stds) if stds else math.nan
         cells.append(Cell(label, hand_name, row, tuple(r.status for r in results), draws, std_m))
     return tuple(cells)

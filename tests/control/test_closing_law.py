@@ -47,7 +47,6 @@ def grasp_of(hand, std=0.004):
     contacts = Contacts(
         points=apply(obj_from_hand, points),
         normals=-rotate(obj_from_hand, normals),
-        variance=0.01 * torch.ones(1, 3, dtype=torch.float64),
         std_m=std * torch.ones(1, 3, dtype=torch.float64),
     )
     return Grasps(
@@ -215,6 +214,9 @@ def test_bad_arguments_are_named():
     )
     with pytest.raises(BadArgument, match="std_m: found inf"):
         closing_gains(spoilt, hand)
+    unknown = dataclasses.replace(grasp, contacts=dataclasses.replace(grasp.contacts, std_m=None))
+    with pytest.raises(BadArgument, match="std_m: found None"):
+        closing_gains(unknown, hand)
     for force in (0.0, -1.0, float("nan")):
         with pytest.raises(BadArgument, match="force"):
             closing_gains(grasp, hand, force)

@@ -1,11 +1,13 @@
 """Choosing, assigning and ranking of guesses."""
 
+import dataclasses
 import math
 
+import pytest
 import torch
 import trimesh
 
-from torchgrasp.errors import Status
+from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import apply
 from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.checks import GraspErrors
@@ -41,7 +43,7 @@ def test_assign_gives_finger_i_its_contact(generator):
         torch.zeros(2),
         torch.zeros(2, 3),
     )
-    taken = assign(Contacts(points, -points, flat, flat), guess)
+    taken = assign(Contacts(points, -points, std_m=flat), guess)
     torch.testing.assert_close(taken.points[0, 0], points[3, 2])
     torch.testing.assert_close(taken.normals[0, 2], -points[3, 1])
     torch.testing.assert_close(taken.std_m[1], flat[1])
@@ -56,7 +58,7 @@ def test_realised_grasps_are_checked_and_ranked():
     flat = torch.full((6, 3), 0.001, dtype=torch.float64)
     angle = turn[:, None] + torch.tensor([0.0, 2.1, 4.2], dtype=torch.float64)
     normals = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
-    contacts = Contacts(0.035 * normals, normals, flat, flat)
+    contacts = Contacts(0.035 * normals, normals, std_m=flat)
     ones = torch.ones(6, dtype=torch.float64)
     certificate = Certificate(torch.arange(6, dtype=torch.float64), ones, ones, ones > 0, ones[:, None].expand(6, 6))
     world, center = CollisionWorld(field, None), torch.zeros(3, dtype=torch.float64)
@@ -73,6 +75,9 @@ def test_realised_grasps_are_checked_and_ranked():
     gap = torch.linalg.vector_norm(tips, dim=-1) - 0.035 - hand.tip_radius
     assert float(gap.abs().max()) < 2.1e-3
     assert len(solve_contact_first(guess[:0], hand, contacts, certificate, world, center)) == 0
+    unknown = dataclasses.replace(contacts, std_m=None)
+    with pytest.raises(BadArgument, match="std_m"):
+        solve_contact_first(guess, hand, unknown, certificate, world, center)
 
 
 def triple(height: float = 0.0, tilt: float = 0.0) -> Contacts:
@@ -81,8 +86,7 @@ def triple(height: float = 0.0, tilt: float = 0.0) -> Contacts:
     radial = torch.stack([angle.cos(), angle.sin(), torch.zeros(3, dtype=torch.float64)], -1)
     up = torch.tensor([0.0, 0, 1], dtype=torch.float64)
     normals = torch.cos(torch.tensor(tilt)) * radial + torch.sin(torch.tensor(tilt)) * up
-    spread = torch.full((1, 3), 0.001, dtype=torch.float64)
-    return Contacts((0.03 * radial + height * up)[None], normals[None], spread, spread)
+    return Contacts((0.03 * radial + height * up)[None], normals[None])
 
 
 def test_centred_friction_is_the_tangent_of_the_tilt():

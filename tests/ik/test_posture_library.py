@@ -31,8 +31,7 @@ def touched(postures: PostureLibrary, poses: torch.Tensor) -> Contacts:
     hand, joints = postures.hand, postures.joints[: len(poses)]
     outward = -rotate(poses, hand.fingertips(joints)[1])
     points = apply(poses, hand.tip_centres(joints)) - hand.tip_radius[:, None] * outward
-    zeros = torch.zeros(len(poses), 3, dtype=torch.float64)
-    return Contacts(points, outward, zeros, zeros)
+    return Contacts(points, outward)
 
 
 def test_eq24_members_of_the_set_are_found_and_placed(postures, poses):
@@ -49,7 +48,7 @@ def test_eq24_members_of_the_set_are_found_and_placed(postures, poses):
 
 def test_the_order_of_the_contacts_does_not_matter(postures, poses):
     contacts, order = touched(postures, poses), [2, 0, 1]
-    turned = Contacts(contacts.points[:, order], contacts.normals[:, order], contacts.variance, contacts.std_m)
+    turned = Contacts(contacts.points[:, order], contacts.normals[:, order])
     found = nearest_postures(turned, postures, CollisionWorld(NOTHING, None), n_seeds=1)
     torch.testing.assert_close(found.joints, postures.joints[:12])
     assert found.permutation.tolist() == [[1, 2, 0]] * 12  # finger i takes the contact that was its own
@@ -92,7 +91,7 @@ def test_degenerate_triples_have_no_guess_and_same_seed_same_bits(postures, pose
     up = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand(3, 3)
     points, normals = contacts.points.clone(), contacts.normals.clone()
     points[4], normals[4] = line, up
-    mixed = Contacts(points, normals, contacts.variance, contacts.std_m)
+    mixed = Contacts(points, normals)
     found = nearest_postures(mixed, postures, CollisionWorld(NOTHING, None), n_seeds=2)
     assert 4 not in found.row.tolist() and len(found) == 22
     again = nearest_postures(

@@ -29,8 +29,7 @@ def contacts_of(hand: Hand, joints: torch.Tensor, obj_from_hand: torch.Tensor) -
     """The contacts on an object that these postures touch: outward normals against those of the tips."""
     points, normals = hand.fingertips(joints)
     points, normals = apply(obj_from_hand, points), -rotate(obj_from_hand, normals)
-    zero = torch.zeros(points.shape[:2], dtype=points.dtype)
-    return Contacts(points, normals, zero, zero)
+    return Contacts(points, normals)
 
 
 def test_eq24_frames_of_tips_and_contacts_coincide(motion):

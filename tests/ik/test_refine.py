@@ -46,9 +46,7 @@ def touched(hand, posture: Configuration) -> Contacts:
     points, normals = hand.fingertips(posture.joints)
     centres = apply(posture.obj_from_hand, hand.tip_centres(posture.joints))
     outward = -rotate(posture.obj_from_hand, normals)
-    b = len(points)
-    zeros = torch.zeros(b, 3, dtype=torch.float64)
-    return Contacts(centres - hand.tip_radius[:, None] * outward, outward, zeros, zeros)
+    return Contacts(centres - hand.tip_radius[:, None] * outward, outward)
 
 
 def far(ball_field) -> CollisionWorld:
@@ -123,14 +121,12 @@ def test_check_names_what_is_wrong(hand, ball):
     same = check(posture, posture.joints, hand, contacts, CollisionWorld(ball, None))
     assert (same.status == Status.OK).all()
 
-    shifted = Contacts(contacts.points + 0.003, contacts.normals, contacts.variance, contacts.std_m)
+    shifted = Contacts(contacts.points + 0.003, contacts.normals)
     assert (check(posture, posture.joints, hand, shifted, far(ball)).status == Status.TIP_ERROR).all()
 
     inside_out = Contacts(
         contacts.points - 2 * hand.tip_radius[:, None] * -contacts.normals,
         -contacts.normals,
-        contacts.variance,
-        contacts.std_m,
     )
     assert (check(posture, posture.joints, hand, inside_out, far(ball)).status == Status.NORMAL_ANGLE).all()
 
@@ -167,7 +163,7 @@ def test_check_names_what_is_wrong(hand, ball):
 def test_the_opened_hand_is_farther_and_clear(hand, ball):
     """Tips around the ball open to more than they touch, at the same pose."""
     posture = random_postures(hand, 40)
-    contacts = touched(hand, posture)
+    contacts = dataclasses.replace(touched(hand, posture), std_m=torch.zeros_like(posture.joints[:, :3]))
     away = CollisionWorld(ball, None)
     opened = open_hand(posture, hand, contacts, away)
     before = hand.tip_centres(posture.joints)

@@ -21,8 +21,7 @@ def scene(request):
     """A hand, its model, its own postures, and contacts that 40 postures of another seed touch."""
     hand = load_hand(request.param)
     points, normals = hand.fingertips(sample_configurations(hand, 40, seed=5).joints)
-    zeros = torch.zeros_like(points[..., 0])
-    return hand, load_mixture(request.param), PostureLibrary.of(hand), Contacts(points, -normals, zeros, zeros)
+    return hand, load_mixture(request.param), PostureLibrary.of(hand), Contacts(points, -normals)
 
 
 def miss(hand, found, contacts):
@@ -53,7 +52,7 @@ def test_the_frame_of_the_contacts_does_not_matter(scene):
     turn = rotation_from_vector(torch.tensor([0.4, -1.0, 2.0], dtype=torch.float64))
     move = rigid(turn, torch.tensor([0.5, -0.2, 0.1], dtype=torch.float64))
     some = contacts[:10]
-    moved = Contacts(apply(move, some.points), rotate(move, some.normals), some.variance, some.std_m)
+    moved = Contacts(apply(move, some.points), rotate(move, some.normals))
     here, there = (solve_ik(x, hand, mixture, postures=postures) for x in (some, moved))
     torch.testing.assert_close(here.joints, there.joints, atol=1e-6, rtol=0)
     torch.testing.assert_close(move @ here.obj_from_hand, there.obj_from_hand, atol=1e-6, rtol=0)
@@ -63,8 +62,7 @@ def test_cobyla_lowers_the_tip_distances_with_the_pose_of_eq24():
     hand = load_hand("barrett")
     true = torch.tensor([[0.3, 0.9, 1.0, 0.8], [0.1, 1.2, 0.6, 1.0]], dtype=torch.float64)
     points, normals = hand.fingertips(true)
-    zeros = torch.zeros(2, 3, dtype=torch.float64)
-    contacts, start = Contacts(points, -normals, zeros, zeros), true + 0.05
+    contacts, start = Contacts(points, -normals), true + 0.05
     nowhere = torch.eye(4, dtype=torch.float64).expand(2, 4, 4)
     found = refine_by_cobyla(Configuration(start, nowhere), hand, contacts, CollisionWorld())
     tips = hand.fingertips(found.joints)[0]
@@ -91,8 +89,7 @@ def test_rows_without_a_posture_say_so(scene):
     flat = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]]).double()
     far = 100 * contacts.points[0]
     points = torch.stack([flat, far, contacts.points[1]])
-    zeros = torch.zeros(3, 3, dtype=torch.float64)
-    given = Contacts(points, contacts.normals[:3], zeros, zeros)
+    given = Contacts(points, contacts.normals[:3])
     found = solve_ik(given, hand, mixture, postures=postures)
     assert found.status.tolist() == [Status.DEGENERATE, Status.TIP_ERROR, Status.OK]
     assert bool(found.joints[0].isnan().all()) and not bool(found.joints[1:].isnan().any())
@@ -101,7 +98,7 @@ def test_rows_without_a_posture_say_so(scene):
 
 def test_bad_arguments_are_named(scene):
     hand, mixture, postures, contacts = scene
-    nan = Contacts(contacts.points * torch.nan, contacts.normals, contacts.variance, contacts.std_m)
+    nan = Contacts(contacts.points * torch.nan, contacts.normals)
     with pytest.raises(BadArgument, match=r"contacts\.points"):
         solve_ik(nan, hand, mixture, postures=postures)
     with pytest.raises((BadArgument, TypeError), match="method"):

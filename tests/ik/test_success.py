@@ -36,8 +36,7 @@ def ring(lift=0.0, shift=0.0):
     inner = 0.03 * out - torch.tensor([shift, 0.0, 0.0], **real)
     inner = inner / inner.norm(dim=-1, keepdim=True)
     normals = inner * math.cos(lift) + torch.tensor([0.0, 0.0, math.sin(lift)], **real)
-    spread = torch.full((1, 3), 0.004, **real)
-    return Contacts(0.03 * out[None], normals[None], spread, spread)
+    return Contacts(0.03 * out[None], normals[None])
 
 
 def test_features_of_a_triangle_by_hand():
@@ -58,12 +57,12 @@ def test_features_do_not_depend_on_the_frame_and_are_finite_where_nothing_balanc
     turned = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64))[0]
     turned = turned * torch.linalg.det(turned)
     points, normals = contacts.points @ turned.T + 1.0, contacts.normals @ turned.T
-    moved = Contacts(points, normals, contacts.variance, contacts.std_m)
+    moved = Contacts(points, normals)
     again = success_features(moved, CLOSED, PADS, CENTER @ turned.T + 1.0, 0.5)
     torch.testing.assert_close(again, success_features(contacts, CLOSED, PADS, CENTER, 0.5), atol=1e-3, rtol=0)
     certain = success_features(contacts, torch.ones_like(CLOSED), PADS, CENTER, 0.5)
     assert bool(torch.isfinite(certain).all())
-    alike = Contacts(points, normals[:, :1].expand(1, 3, 3).contiguous(), contacts.variance, contacts.std_m)
+    alike = Contacts(points, normals[:, :1].expand(1, 3, 3).contiguous())
     assert float(success_features(alike, CLOSED, PADS, CENTER, 0.5)[0, 2]) == pytest.approx(
         math.pi / 2 / math.atan(0.5)
     )

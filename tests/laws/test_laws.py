@@ -26,13 +26,12 @@ def triples(n: int, generator: torch.Generator) -> Contacts:
     """Random contacts on a ball of 40 mm, normals outward: many are closed, many are not."""
     points = torch.randn(n, 3, 3, generator=generator, dtype=torch.float64)
     normals = points / points.norm(dim=-1, keepdim=True)
-    zeros = torch.zeros(n, 3, dtype=torch.float64)
-    return Contacts(0.04 * normals, normals, zeros, zeros)
+    return Contacts(0.04 * normals, normals)
 
 
 def transformed(contacts: Contacts, motion: torch.Tensor, scale: float = 1.0) -> Contacts:
     points = scale * apply(motion, contacts.points)
-    return Contacts(points, rotate(motion, contacts.normals), contacts.variance, contacts.std_m)
+    return Contacts(points, rotate(motion, contacts.normals))
 
 
 def test_the_posterior_moves_with_its_observations(seen_cylinder, motion, generator):
@@ -86,7 +85,7 @@ def test_certificates_and_codes_ignore_frames_and_units(generator, motion):
 
 def test_the_code_of_a_permuted_triple_is_the_permuted_set(generator):
     contacts = triples(10, generator)
-    swapped = Contacts(contacts.points.flip(1), contacts.normals.flip(1), contacts.variance, contacts.std_m)
+    swapped = Contacts(contacts.points.flip(1), contacts.normals.flip(1))
     a, b = encode(contacts).q, encode(swapped).q
     permutations = encode(contacts).permutation.tolist()
     index = [permutations.index([2 - i, 2 - j, 2 - k]) for i, j, k in permutations]

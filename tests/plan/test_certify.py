@@ -21,11 +21,6 @@ from torchgrasp.values import Contacts
 SPEC = ContactSpec(friction=0.6, friction_margin=1.0)
 
 
-def contacts(points: Tensor, normals: Tensor) -> Contacts:
-    zero = torch.zeros(points.shape[:2], dtype=points.dtype)
-    return Contacts(points, normals, zero, zero)
-
-
 def triangle() -> Tensor:
     angle = torch.tensor([0.1, 2.2, 4.3], dtype=torch.float64)
     return torch.stack([angle.cos(), angle.sin(), torch.zeros(3, dtype=torch.float64)], -1)[None]
@@ -58,7 +53,7 @@ def test_eq13_margins_agree_with_a_programme_written_from_the_equation_alone(gen
     points = torch.randn(60, 3, 3, generator=generator, dtype=torch.float64)
     lean = torch.randn(60, 3, 3, generator=generator, dtype=torch.float64)
     normals = unit(unit(points - points.mean(1, keepdim=True)) + 0.4 * lean)
-    found = certify(contacts(points, normals), ContactSpec(friction=0.6, friction_margin=1.0, edges=64))
+    found = certify(Contacts(points, normals), ContactSpec(friction=0.6, friction_margin=1.0, edges=64))
     oracle = [margin_of_eq13(p.numpy(), n.numpy(), 0.6, 64) for p, n in zip(points, normals, strict=True)]
     # With 64 edges the margin hardly depends on the tangent from which they are counted.
     torch.testing.assert_close(found.margin, torch.tensor(oracle, dtype=torch.float64), atol=2e-4, rtol=0.05)
@@ -83,7 +78,7 @@ def exact_products(wrench: Tensor, witness: Tensor) -> list[Fraction]:
 
 def test_open_rows_carry_a_wrench_that_no_contact_opposes(generator):
     points, normals = leaning(generator, 200)
-    found = certify(contacts(points, normals), SPEC)
+    found = certify(Contacts(points, normals), SPEC)
     edges = wrenches(points, normals, 0.6, 8).flatten(1, 2)
     torch.testing.assert_close(torch.linalg.vector_norm(found.witness, dim=-1), torch.ones(200, dtype=torch.float64))
     open_rows = torch.nonzero(~found.closed)[:, 0].tolist()
@@ -99,7 +94,7 @@ def test_open_rows_carry_a_wrench_that_no_contact_opposes(generator):
 
 def test_margin_and_witness_bound_each_other_so_that_neither_can_be_improved(generator):
     points, normals = leaning(generator, 500)
-    found = certify(contacts(points, normals), SPEC)
+    found = certify(Contacts(points, normals), SPEC)
     edges = wrenches(points, normals, 0.6, 8).flatten(1, 2)
     torch.testing.assert_close(bound_margin(edges, found.witness), found.margin, rtol=0, atol=1e-12)
     other = torch.randn(500, 6, generator=generator, dtype=torch.float64)
@@ -110,9 +105,9 @@ def test_margin_and_witness_bound_each_other_so_that_neither_can_be_improved(gen
 def test_highs_gives_the_same_certificates_where_the_batch_gives_none(generator, monkeypatch, edges):
     points, normals = leaning(generator, 40)
     spec = ContactSpec(friction=0.6, friction_margin=1.0, edges=edges)
-    batch = certify(contacts(points, normals), spec)
+    batch = certify(Contacts(points, normals), spec)
     monkeypatch.setattr(closure_lp, "PIVOTS", 0)
-    alone = certify(contacts(points, normals), spec)
+    alone = certify(Contacts(points, normals), spec)
     assert torch.equal(batch.closed, alone.closed)
     torch.testing.assert_close(batch.margin, alone.margin, rtol=0, atol=1e-9)
     w = wrenches(points, normals, 0.6, edges).flatten(1, 2)
@@ -121,8 +116,8 @@ def test_highs_gives_the_same_certificates_where_the_batch_gives_none(generator,
 
 def test_a_certificate_does_not_depend_on_the_rows_beside_it(generator):
     points, normals = leaning(generator, 30)
-    every = certify(contacts(points, normals), SPEC)
-    some = certify(contacts(points[7:9], normals[7:9]), SPEC)
+    every = certify(Contacts(points, normals), SPEC)
+    some = certify(Contacts(points[7:9], normals[7:9]), SPEC)
     for name in ("margin", "rank_ratio", "witness"):
         torch.testing.assert_close(getattr(some, name), getattr(every, name)[7:9], rtol=0, atol=1e-12)
 
@@ -130,8 +125,8 @@ def test_a_certificate_does_not_depend_on_the_rows_beside_it(generator):
 def test_parallel_normals_and_no_friction_leave_no_balance_at_all(generator):
     up = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand(1, 3, 3)
     for found in (
-        certify(contacts(triangle(), up), SPEC),
-        certify(contacts(triangle(), up), ContactSpec(friction=0.0)),
+        certify(Contacts(triangle(), up), SPEC),
+        certify(Contacts(triangle(), up), ContactSpec(friction=0.0)),
     ):
         assert float(found.margin) == -math.inf and not bool(found.closed)
         # Every force has the same part along -z: it pushes down, whatever is asked of it.
@@ -140,13 +135,13 @@ def test_parallel_normals_and_no_friction_leave_no_balance_at_all(generator):
 
 def test_margin_is_at_most_uniform_and_free_of_units_and_frames(motion):
     points = triangle()
-    found = certify(contacts(points, points), SPEC)
+    found = certify(Contacts(points, points), SPEC)
     assert bool(found.closed)
     assert 0 < float(found.margin) <= 1 / 24
-    moved = certify(contacts(apply(motion, 0.001 * points), rotate(motion, points)), SPEC)
+    moved = certify(Contacts(apply(motion, 0.001 * points), rotate(motion, points)), SPEC)
     torch.testing.assert_close(moved.margin, found.margin)
     torch.testing.assert_close(moved.rank_ratio, found.rank_ratio)
-    single = certify(contacts(points.float(), points.float()), SPEC)
+    single = certify(Contacts(points.float(), points.float()), SPEC)
     torch.testing.assert_close(single.margin, found.margin, atol=1e-6, rtol=1e-4)
 
 
@@ -154,13 +149,13 @@ def test_planned_friction_decides():
     tilt = math.radians(35)  # needs more than tan 35 = 0.70
     up = torch.tensor([0.0, 0, 1], dtype=torch.float64)
     normals = math.cos(tilt) * triangle() + math.sin(tilt) * up
-    assert not bool(certify(contacts(triangle(), normals), ContactSpec(friction=1.0, friction_margin=0.6)).closed)
-    assert bool(certify(contacts(triangle(), normals), ContactSpec(friction=1.0, friction_margin=0.9)).closed)
+    assert not bool(certify(Contacts(triangle(), normals), ContactSpec(friction=1.0, friction_margin=0.6)).closed)
+    assert bool(certify(Contacts(triangle(), normals), ContactSpec(friction=1.0, friction_margin=0.9)).closed)
 
 
 def test_coincident_contacts_are_refused_though_eq13_holds_for_them():
     points = torch.ones(1, 3, 3, dtype=torch.float64)
-    found = certify(contacts(points, triangle()), SPEC)
+    found = certify(Contacts(points, triangle()), SPEC)
     assert float(found.margin) > 0
     assert float(found.rank_ratio) < 1e-9
     assert not bool(found.closed)
@@ -170,7 +165,7 @@ def test_coincident_contacts_are_refused_though_eq13_holds_for_them():
 def test_collinear_contacts_are_refused_though_eq13_holds_for_them():
     points = torch.tensor([[[-1.0, 0, 0], [1, 0, 0], [0.4, 0, 0]]], dtype=torch.float64)
     normals = torch.tensor([[[-1.0, 0, 0], [1, 0, 0], [1, 0, 0]]], dtype=torch.float64)
-    found = certify(contacts(points, normals), SPEC)
+    found = certify(Contacts(points, normals), SPEC)
     assert float(found.margin) > 0
     assert not bool(found.closed)
     # No contact on the x axis can turn the object about it.
@@ -183,16 +178,16 @@ def test_rows_that_are_not_finite_are_not_closed_and_harm_no_other():
     normals = triangle().repeat(3, 1, 1)
     normals[2, 1, 2] = torch.inf
     normals[2, 1] = torch.nan
-    found = certify(contacts(points, normals), SPEC)
+    found = certify(Contacts(points, normals), SPEC)
     assert found.closed.tolist() == [True, False, False]
     assert found.witness.isnan().all(-1).tolist() == [False, True, True]
 
 
 def test_no_rows_give_no_certificates():
     empty = torch.zeros(0, 3, 3, dtype=torch.float64)
-    assert len(certify(contacts(empty, empty), SPEC)) == 0
+    assert len(certify(Contacts(empty, empty), SPEC)) == 0
 
 
 def test_bad_arguments_name_what_was_found():
     with pytest.raises(BadArgument, match="unit vectors"):
-        certify(contacts(triangle(), 1.01 * triangle()), SPEC)
+        certify(Contacts(triangle(), 1.01 * triangle()), SPEC)

@@ -49,8 +49,7 @@ def contacts_on(shape: ShapeGP, generator: torch.Generator, count: int) -> Conta
     normals = unit(shape.slope(x.flatten(0, 1))[1]).unflatten(0, (len(x), 3))
     good = closed_exact(x, normals, 0.8) & (torch.linalg.vector_norm(x - x.roll(1, 1), dim=-1).amin(-1) > 0.3)
     x, normals = x[good][:count], normals[good][:count]
-    none = torch.zeros(count, 3, dtype=torch.float64)
-    return Contacts(shape.metres(x), normals, none, none)
+    return Contacts(shape.metres(x), normals)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +62,7 @@ def test_a_sure_shape_is_sure_to_be_closed():
     angle = torch.tensor([0.1, 2.2, 4.3], dtype=torch.float64)
     corners = torch.stack([angle.cos(), angle.sin(), torch.zeros(3, dtype=torch.float64)], -1)[None]
     none = torch.zeros(1, 3)
-    contacts = Contacts(RADIUS * corners, corners, none, none)
+    contacts = Contacts(RADIUS * corners, corners)
     found = closure_probability(shape, contacts)
     assert float(found.probability) > 0.999
     assert 0.0 < float(found.standard_error) < 1e-3
@@ -177,8 +176,8 @@ def test_a_triple_is_closed_if_and_only_if_internal_forces_lie_inside_its_cones(
 
 def test_bad_arguments_name_what_was_found(doubtful, generator):
     contacts = contacts_on(doubtful, generator, 2)
-    far = Contacts(contacts.points * 100, contacts.normals, contacts.variance, contacts.std_m)
-    long = Contacts(contacts.points, 1.1 * contacts.normals, contacts.variance, contacts.std_m)
+    far = Contacts(contacts.points * 100, contacts.normals)
+    long = Contacts(contacts.points, 1.1 * contacts.normals)
     for action, match in (
         (lambda: closure_probability(doubtful, contacts, n=0), "integer from 1"),
         (lambda: closure_probability(doubtful, contacts, seed=-1), "integer from 0"),

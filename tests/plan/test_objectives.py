@@ -23,22 +23,17 @@ from torchgrasp.values import Contacts
 SPEC = ContactSpec.paper()
 
 
-def contacts_of(points: Tensor, normals: Tensor) -> Contacts:
-    zero = torch.zeros_like(points[..., 0])
-    return Contacts(points, normals, zero, zero)
-
-
 def closed_triples(generator: torch.Generator, count: int = 12) -> tuple[Tensor, Tensor]:
     points = torch.randn(400, 3, 3, generator=generator, dtype=torch.float64)
     noise = torch.randn(400, 3, 3, generator=generator, dtype=torch.float64)
     normals = unit(unit(points - points.mean(1, keepdim=True)) + 0.3 * noise)
-    closed = certify(contacts_of(points, normals), SPEC).closed
+    closed = certify(Contacts(points, normals), SPEC).closed
     return points[closed][:count], normals[closed][:count]
 
 
 def test_min_weight_is_the_margin_of_the_certificate(generator):
     points, normals = closed_triples(generator)
-    margin = certify(contacts_of(points, normals), SPEC).margin
+    margin = certify(Contacts(points, normals), SPEC).margin
     torch.testing.assert_close(-min_weight_cost(SPEC, points, normals), margin, atol=1e-9, rtol=0)
 
 
@@ -59,7 +54,7 @@ def test_epsilon_is_the_distance_of_the_nearest_plane_that_bounds_the_hull(gener
     points, normals = closed_triples(generator, 6)
     spec = dataclasses.replace(SPEC, edges=4)
     w = wrenches(points, normals, spec.planned_friction, spec.edges).flatten(1, 2)
-    inside = certify(contacts_of(points, normals), spec).closed
+    inside = certify(Contacts(points, normals), spec).closed
     assert int(inside.sum()) >= 3
     epsilon = -epsilon_cost(spec, points, normals)
     assert torch.equal(epsilon > 0, inside)

@@ -28,11 +28,6 @@ def triples(generator: torch.Generator, count: int) -> tuple[Tensor, Tensor]:
     return points, unit(unit(points - points.mean(1, keepdim=True)) + 0.45 * noise)
 
 
-def contacts(points: Tensor, normals: Tensor) -> Contacts:
-    zero = torch.zeros(points.shape[:2], dtype=points.dtype)
-    return Contacts(points, normals, zero, zero)
-
-
 @pytest.mark.parametrize("edges", [3, 8])
 def test_eq13_edges_lie_on_the_friction_cone_about_the_inward_normal(generator, edges):
     points, normals = triples(generator, 50)
@@ -79,7 +74,7 @@ def test_exact_closure_agrees_with_a_programme_of_64_edges(generator):
         exact = closed_exact(points, normals, friction)
         spec = ContactSpec(friction=friction, edges=64, friction_margin=1.0)
         # 64 edges lie inside the round cone and hold the round cone of friction cos(pi/64).
-        outer = certify(contacts(points, normals), spec).closed
+        outer = certify(Contacts(points, normals), spec).closed
         inner = closed_exact(points, normals, friction * math.cos(math.pi / 64))
         assert 10 < int(exact.sum()) < 240
         assert bool((exact | ~outer).all())

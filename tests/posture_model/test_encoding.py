@@ -61,7 +61,7 @@ def test_eq15_eq16_eq17_frames_follow_the_permutation(generator):
 
 def test_contacts_and_pairs_are_the_same(generator):
     points, normals = triples(5, generator)
-    contacts = Contacts(points, normals, torch.zeros(5, 3).double(), torch.zeros(5, 3).double())
+    contacts = Contacts(points, normals)
     assert torch.equal(encode(contacts).q, encode((points, normals)).q)
     assert encode(contacts[2]).q.shape == (1, 6, 6)
 

@@ -28,7 +28,7 @@ def run() -> Run:
     angles = torch.tensor([0.0, 2.0, 4.0], dtype=F64)
     out = torch.stack([angles.cos(), angles.sin(), torch.zeros(3, dtype=F64)], -1).expand(2, 3, 3).clone()
     small = torch.full((2, 3), 1e-3, dtype=F64)
-    contacts = Contacts(0.03 * out, out, small, small)
+    contacts = Contacts(0.03 * out, out, std_m=small)
     one = torch.ones(2, dtype=F64)
     joints = ((hand.lower + hand.upper) / 2).to(F64).expand(2, -1).clone()
     pose = torch.eye(4, dtype=F64).repeat(2, 1, 1)

@@ -66,8 +66,7 @@ def test_rational_arithmetic_confirms_margins_and_both_verdicts(scripts, generat
     points = torch.randn(20, 3, 3, generator=generator, dtype=torch.float64)
     lean = torch.randn(20, 3, 3, generator=generator, dtype=torch.float64)
     normals = unit(unit(points - points.mean(1, keepdim=True)) + 0.4 * lean)
-    none = torch.zeros(20, 3, dtype=torch.float64)
-    found = certify(Contacts(points, normals, none, none), ContactSpec(friction=0.6, friction_margin=1.0))
+    found = certify(Contacts(points, normals), ContactSpec(friction=0.6, friction_margin=1.0))
     phi, _ = solve_closure_lp(wrenches(points, normals, 0.6, 8).flatten(1, 2))
     assert 3 < int(found.closed.sum()) < 17
     for i in range(20):

@@ -215,11 +215,11 @@ def closing_gains(grasps: Grasps, hand: Hand, force: float = 4.0, forces: ForceS
     check_tensor("grasps.obj_from_hand", grasps.obj_from_hand, (1, 4, 4))
     check_tensor("grasps.contacts.points", grasps.contacts.points, (1, 3, 3))
     check_tensor("grasps.contacts.normals", grasps.contacts.normals, (1, 3, 3))
-    check_tensor("grasps.contacts.std_m", grasps.contacts.std_m, (1, 3))
+    std = check_tensor("grasps.contacts.std_m", grasps.contacts.std_m, (1, 3))
     joints, contacts = grasps.joints.double(), grasps.contacts.to(torch.float64)
     hand_from_obj = inverse(grasps.obj_from_hand.double())
     target, normals = move(hand_from_obj, contacts.points), rotate(hand_from_obj, contacts.normals)
-    covariance = surface_covariance(normals, contacts.std_m)
+    covariance = surface_covariance(normals, std.double())
     wish, deviation = None, None
     if forces == "learned":
         model = load_stability(hand)

@@ -53,6 +53,7 @@ def format_grasps(grasps: Grasps, hand: Hand, force: float = 4.0) -> str:
     forces = rotate(grasps.obj_from_hand.double(), pressed.forces)
     postures = {"pregrasp": grasps.pregrasp.double(), "grasp": grasps.joints.double(), "squeeze": pressed.joints}
     named = {name: hand.expand(joints) for name, joints in postures.items()}
+    std = grasps.contacts.std_m
     rows = [
         {
             "rank": row,
@@ -69,7 +70,7 @@ def format_grasps(grasps: Grasps, hand: Hand, force: float = 4.0) -> str:
                     "point": grasps.contacts.points[row, i].tolist(),
                     "normal": grasps.contacts.normals[row, i].tolist(),
                     "force": forces[row, i].tolist(),
-                    "std_m": float(grasps.contacts.std_m[row, i]),
+                    "std_m": None if std is None else float(std[row, i]),
                     "tip_error": float(grasps.tip_error[row, i]),
                 }
                 for i, (finger, link) in enumerate(zip(hand.finger_names, hand.tip_links, strict=True))

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import join
+from torchgrasp.base import join, map_tensors
 from torchgrasp.errors import Status
 from torchgrasp.frames import rotate
 from torchgrasp.hand.hand import Hand
@@ -45,12 +45,7 @@ def rank_in_group(refinement_cost: Float[Tensor, "g"], group: Int[Tensor, "g"]) 
 def assign(contacts: Contacts, seeds: IKSeeds) -> Contacts:
     """Return the contacts of each guess in the order of the fingers."""
     at = seeds.row[:, None]
-    return Contacts(
-        contacts.points[at, seeds.permutation],
-        contacts.normals[at, seeds.permutation],
-        contacts.variance[at, seeds.permutation],
-        contacts.std_m[at, seeds.permutation],
-    )
+    return map_tensors(lambda x: x[at, seeds.permutation], contacts)
 
 
 def rank_seeds(seeds: IKSeeds, hand: Hand, contacts: Contacts, world: CollisionWorld) -> Int[Tensor, "g"]:
@@ -158,7 +153,12 @@ def refinement_on_contacts(
     world: CollisionWorld,
     center: Float[Tensor, "3"],
 ) -> Refinement:
-    """Return the attempt that moves the hand onto the contacts as they are."""
+    """Return the attempt that moves the hand onto the contacts as they are.
+
+    Raises:
+        BadArgument: contacts without `std_m`, by which the pre-grasp opens.
+    """
+    contacts.require_std()  # before any work
 
     def attempt(seeds: IKSeeds) -> Grasps:
         taken = assign(contacts, seeds)

@@ -57,8 +57,8 @@ def query_mixture(
 
     >>> from torchgrasp.hand.load import load_hand
     >>> from torchgrasp.posture_model.mixture import load_mixture
-    >>> points, zero = 0.05 * torch.eye(3)[None], torch.zeros(1, 3)
-    >>> seeds = query_mixture(Contacts(points, 20 * points, zero, zero), load_hand("allegro"), load_mixture("allegro"))
+    >>> points = 0.05 * torch.eye(3)[None]
+    >>> seeds = query_mixture(Contacts(points, 20 * points), load_hand("allegro"), load_mixture("allegro"))
     """
     check_compatible(mixture.meta, mixture.joint_names, hand)
     if not 1 <= n_seeds <= len(mixture.weights) + 1:

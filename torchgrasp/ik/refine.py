@@ -123,7 +123,7 @@ def open_hand(posture: Configuration, hand: Hand, contacts: Contacts, world: Col
     the object even where that is larger than it was thought to be, but not into the table. Opening along the normals
     alone drives links into the object; here clearance is part of the problem.
     """
-    normals, gap = contacts.normals, OPENING + OPENING_SIGMAS * contacts.std_m
+    normals, gap = contacts.normals, OPENING + OPENING_SIGMAS * contacts.require_std()
     target = tip_targets(hand, contacts) + gap[..., None] * normals
     if world.table is not None:
         lowest = world.table + CLEARANCE + hand.tip_radius.to(target)

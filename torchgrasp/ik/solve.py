@@ -87,8 +87,8 @@ def solve_ik(
         BadArgument: contacts that are no finite triples, a mixture of another hand, an unknown method.
 
     >>> from torchgrasp.hand.load import load_hand
-    >>> points, zero = 0.05 * torch.eye(3)[None].double(), torch.zeros(1, 3).double()
-    >>> found = solve_ik(Contacts(points, 20 * points, zero, zero), load_hand("allegro"))
+    >>> points = 0.05 * torch.eye(3)[None].double()
+    >>> found = solve_ik(Contacts(points, 20 * points), load_hand("allegro"))
     >>> bool(found.tip_error.max() < 1e-3)
     True
     """

@@ -50,7 +50,7 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
         BadArgument: `contacts` of a wrong shape, or with normals that are not of length 1 (to 1e-3); no `ContactSpec`.
 
     >>> corners = torch.tensor([[[1.0, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0]]])
-    >>> certify(Contacts(corners, corners, torch.zeros(1, 3), torch.zeros(1, 3))).closed
+    >>> certify(Contacts(corners, corners)).closed
     tensor([True])
     """
     spec = ContactSpec() if spec is None else spec

@@ -55,7 +55,7 @@ def closure_probability(
     >>> from torchgrasp import PointCloud, fit_shape
     >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
     >>> corners = torch.tensor([[[1.0, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0]]])
-    >>> contacts = Contacts(0.04 * corners, corners, torch.zeros(1, 3), torch.zeros(1, 3))
+    >>> contacts = Contacts(0.04 * corners, corners)
     >>> closure_probability(fit_shape(PointCloud(0.04 * ball, ball)), contacts).probability > 0.9
     tensor([True])
     """

@@ -104,7 +104,7 @@ def grasp_rows(grasps: Grasps, most: int = ROWS) -> list[tuple[str, ...]]:
                 f"{1e3 * float(grasp.clearance[0]):.1f}",
                 f"{math.degrees(float(grasp.normal_angle[0].max())):.0f}",
                 f"{float(grasp.certificate.margin[0]):.4f}",
-                f"{1e3 * float(grasp.contacts.std_m[0].max()):.1f}",
+                "" if grasp.contacts.std_m is None else f"{1e3 * float(grasp.contacts.std_m[0].max()):.1f}",
             )
         )
     return rows

@@ -67,8 +67,7 @@ def _bench_hand(name: str, codes: int, peers: int) -> list[Row]:
 def touched(hand: Hand, joints: Float[Tensor, "n h"]) -> Contacts:
     """Return the contacts that postures touch with the middle of their pads, in the hand's frame."""
     points, normals = hand.fingertips(joints)
-    nothing = torch.zeros_like(points[..., 0])
-    return Contacts(points, -normals, nothing, nothing)
+    return Contacts(points, -normals)
 
 
 def timed(action: Callable[[], Result]) -> tuple[Result, float]:

@@ -133,13 +133,7 @@ def bench_certificates(grasps: int, seed: int) -> list[Row]:
 def random_contacts(count: int, generator: torch.Generator, lean: float = 0.45) -> Contacts:
     """Return random triples with normals that lean away from their centre; the smaller `lean`, the more are closed."""
     points, noise = (torch.randn(count, 3, 3, generator=generator, dtype=torch.float64) for _ in range(2))
-    return contacts_of(points, unit(unit(points - points.mean(1, keepdim=True)) + lean * noise))
-
-
-def contacts_of(points: Tensor, normals: Tensor) -> Contacts:
-    """Return contacts of which no uncertainty is known."""
-    none = torch.zeros(points.shape[:2], dtype=points.dtype)
-    return Contacts(points, normals, none, none)
+    return Contacts(points, unit(unit(points - points.mean(1, keepdim=True)) + lean * noise))
 
 
 def border_triples(count: int, spec: ContactSpec, generator: torch.Generator) -> Contacts:
@@ -151,12 +145,12 @@ def border_triples(count: int, spec: ContactSpec, generator: torch.Generator) ->
     low, high = torch.zeros(half, 1, 1, dtype=torch.float64), torch.full((half, 1, 1), 2.0, dtype=torch.float64)
     for _ in range(45):
         middle = (low + high) / 2
-        closed = certify(contacts_of(points, unit(near + middle * (far - near))), spec).closed[:, None, None]
+        closed = certify(Contacts(points, unit(near + middle * (far - near))), spec).closed[:, None, None]
         low, high = torch.where(closed, middle, low), torch.where(closed, high, middle)
     step = 10 ** (-3 - 7 * torch.rand(half, 1, 1, generator=generator, dtype=torch.float64))
     sign = torch.sign(torch.randn(half, 1, 1, generator=generator, dtype=torch.float64))
     turned = unit(near + (low + sign * step) * (far - near))
-    return contacts_of(contacts.points, torch.cat([turned, contacts.normals[half:]]))
+    return Contacts(contacts.points, torch.cat([turned, contacts.normals[half:]]))
 
 
 def has_low_rank(points: np.ndarray, normals: np.ndarray, friction: float, edges: int) -> bool:
@@ -253,7 +247,7 @@ def bench_objects(objects: Path, starts: int, seed: int) -> list[Row]:
             asked[name].append(
                 {
                     "probability": found.probability,
-                    "sum of variances": -contacts.variance.sum(1),
+                    "sum of variances": -contacts.require_std().square().sum(1),
                     "margin": margin,
                     "true": true,
                 }
