@@ -43,7 +43,7 @@ def random_postures(hand, n: int, seed: int = 0) -> Configuration:
 
 def touched(hand, posture: Configuration) -> Contacts:
     """Contacts that this very posture touches with the middle of its pads."""
-    points, normals = hand.fingertips(posture.joints)
+    _, normals = hand.fingertips(posture.joints)
     centres = apply(posture.obj_from_hand, hand.tip_centres(posture.joints))
     outward = -rotate(posture.obj_from_hand, normals)
     return Contacts(centres - hand.tip_radius[:, None] * outward, outward)
