@@ -7,7 +7,7 @@ from torchgrasp.cloud.diagnose import diagnose_cloud, format_report
 from torchgrasp.cloud.filter import remove_outliers, voxel_downsample
 from torchgrasp.cloud.io.read import read_cloud, save_cloud
 from torchgrasp.cloud.merge import merge_clouds
-from torchgrasp.cloud.normals import clean_cloud
+from torchgrasp.cloud.prepare import clean_cloud
 from torchgrasp.errors import BadArgument, TooFewPoints
 from torchgrasp.frames import apply, inverse
 from torchgrasp.linalg import unit

@@ -1,4 +1,4 @@
-"""What is promised about bad and odd clouds, I1 to I8, for every public function that takes a cloud."""
+"""What is promised about bad and odd clouds, for every public function that takes a cloud."""
 
 import inspect
 import math
@@ -6,29 +6,27 @@ import math
 import pytest
 import torch
 
-from torchgrasp.cloud import diagnose, filter, merge, normals, orientation
-from torchgrasp.cloud.check import check_cloud, remove_duplicates
+from torchgrasp.cloud import check, diagnose, filter, merge, orientation, prepare, viewpoint
 from torchgrasp.errors import BadArgument, GraspError, SuspiciousScale, TooFewPoints
 from torchgrasp.linalg import unit
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.values import PointCloud
 
 FUNCTIONS = {
-    "check_cloud": check_cloud,
-    "keep_distinct": remove_duplicates,
-    "thin_cloud": lambda cloud: filter.voxel_downsample(cloud, 0.004),
+    "check_cloud": check.check_cloud,
+    "remove_duplicates": check.remove_duplicates,
+    "voxel_downsample": lambda cloud: filter.voxel_downsample(cloud, 0.004),
     "remove_outliers": filter.remove_outliers,
-    "estimate_normals": normals.estimate_normals,
-    "clean_cloud": normals.clean_cloud,
-    "estimate_viewpoint": normals.estimate_viewpoint,
+    "estimate_normals": prepare.estimate_normals,
+    "clean_cloud": prepare.clean_cloud,
+    "prepare_cloud": lambda cloud: prepare.prepare_cloud(cloud, torch.Generator()),
+    "estimate_viewpoint": viewpoint.estimate_viewpoint,
     "check_normals": lambda cloud: orientation.check_normals(cloud),
-    "drop_unoriented": orientation.drop_unoriented,
     "merge_clouds": lambda cloud: merge.merge_clouds([cloud, cloud], [torch.eye(4).double()] * 2),
     "diagnose_cloud": diagnose.diagnose_cloud,
     "fit_shape": fit_shape,
     "fit_shape paper": lambda cloud: fit_shape(cloud, support="paper"),
 }
-CHECKED = {name: function for name, function in FUNCTIONS.items() if name != "keep_distinct"}
 WORK = (
     "scipy.spatial.KDTree.query",
     "torch.linalg.eigh",
@@ -61,20 +59,19 @@ def refused(function, value, kind, match):
 @pytest.mark.parametrize("name", FUNCTIONS)
 @pytest.mark.parametrize("field", ["points", "normals", "viewpoint"])
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_i1_no_number_is_refused_where_the_value_is_made_and_where_it_is_used(name, field, bad):
+def test_no_number_is_refused_where_the_value_is_made_and_where_it_is_used(name, field, bad):
     cloud = ball()
     tensor = getattr(cloud, field)
     spoilt = tensor.clone()
     spoilt.view(-1)[1] = bad
     refused(lambda t: PointCloud(**{"points": cloud.points, field: t}), spoilt, BadArgument, field)
-    if name != "keep_distinct":  # it counts points and nothing else
-        tensor.view(-1)[1] = bad  # after the value was made
-        refused(FUNCTIONS[name], cloud, BadArgument, field)
+    tensor.view(-1)[1] = bad  # after the value was made
+    refused(FUNCTIONS[name], cloud, BadArgument, field)
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 @pytest.mark.parametrize("n", [0, 1, 2, 3])
-def test_i2_fewer_than_four_points_are_refused(name, n):
+def test_fewer_than_four_points_are_refused(name, n):
     cloud = ball()
     refused(lambda c: PointCloud(c.points[:n]), cloud, TooFewPoints, f"{n} points")
     copies = PointCloud(*(x.repeat(20, 1) for x in (cloud.points[: max(n, 1)], cloud.normals[: max(n, 1)])))
@@ -82,13 +79,13 @@ def test_i2_fewer_than_four_points_are_refused(name, n):
 
 
 @pytest.mark.parametrize("distance", [0.0, 1e-12, 5e-10])
-def test_i3_copies_change_nothing(distance):
+def test_copies_change_nothing(distance):
     cloud = ball(91)
     jitter = 0.08 * distance * unit(torch.randn(5 * 91, 3, generator=torch.Generator().manual_seed(1)).double())
     copies = PointCloud(
         torch.cat([cloud.points, cloud.points.repeat(5, 1) + jitter]), cloud.normals.repeat(6, 1), cloud.viewpoint
     )
-    assert len(remove_duplicates(copies)) == 91
+    assert len(check.remove_duplicates(copies)) == 91
     assert diagnose.diagnose_cloud(copies).copies == 5 * 91
     for support in ("camera", "paper"):
         once, six = (fit_shape(c, support=support).predict(1.1 * cloud.points[:9]) for c in (cloud, copies))
@@ -96,15 +93,15 @@ def test_i3_copies_change_nothing(distance):
         torch.testing.assert_close(six.variance, once.variance, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("name", CHECKED)
-def test_i4_a_point_and_a_line_are_refused(name):
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_point_and_a_line_are_refused(name):
     along = torch.linspace(0, 0.1, 50, dtype=torch.float64)[:, None] * torch.tensor([1.0, 2.0, -1.0]).double()
-    refused(CHECKED[name], PointCloud(0 * along, along + 1), BadArgument, "coincide")
-    refused(CHECKED[name], PointCloud(along, along + 1), BadArgument, "line")
+    refused(FUNCTIONS[name], PointCloud(0 * along, along + 1), BadArgument, "coincide")
+    refused(FUNCTIONS[name], PointCloud(along, along + 1), BadArgument, "line")
 
 
 @pytest.mark.parametrize("thickness", [0.0, 1e-12, 1e-6, 1e-3])
-def test_i4_a_flat_cloud_is_accepted_and_finite(thickness):
+def test_a_flat_cloud_is_accepted_and_finite(thickness):
     points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     points = points * torch.tensor([0.1, 0.1, 0.1 * thickness]).double()
     report = diagnose.diagnose_cloud(PointCloud(points, None, EYE))
@@ -114,32 +111,32 @@ def test_i4_a_flat_cloud_is_accepted_and_finite(thickness):
         assert bool(torch.isfinite(getattr(estimate, field)).all())
 
 
-@pytest.mark.parametrize("name", CHECKED)
+@pytest.mark.parametrize("name", FUNCTIONS)
 @pytest.mark.parametrize("factor", [1e-6, 1e-3, 1e3, 1e6])
-def test_i5_a_wrong_unit_is_refused_by_name(name, factor):
+def test_a_wrong_unit_is_refused_by_name(name, factor):
     cloud = ball()
     scaled = PointCloud(factor * cloud.points, cloud.normals, factor * EYE)
-    refused(CHECKED[name], scaled, SuspiciousScale, "mm" if factor > 1 else "metres")
+    refused(FUNCTIONS[name], scaled, SuspiciousScale, "mm" if factor > 1 else "metres")
 
 
 @pytest.mark.parametrize("factor", [0.25, 8.0])
-def test_i5_results_scale_with_the_cloud(factor):
+def test_results_scale_with_the_cloud(factor):
     cloud = ball()
     large = PointCloud(factor * cloud.points, cloud.normals, factor * EYE)
     one, other = diagnose.diagnose_cloud(cloud), diagnose.diagnose_cloud(large)
     for name in ("spacing", "noise"):
         assert getattr(other, name) == pytest.approx(factor * getattr(one, name), rel=1e-9)
     assert other.density == pytest.approx(one.density / factor**2, rel=1e-9) and other.outliers == one.outliers
-    a, b = normals.clean_cloud(cloud), normals.clean_cloud(large)
+    a, b = prepare.clean_cloud(cloud), prepare.clean_cloud(large)
     torch.testing.assert_close(b.points, factor * a.points, rtol=1e-9, atol=1e-12)
     small, big = filter.voxel_downsample(cloud, 0.01), filter.voxel_downsample(large, 0.01 * factor)
     torch.testing.assert_close(big.points, factor * small.points, rtol=1e-9, atol=1e-12)
 
 
-def test_i6_far_from_the_origin_nothing_changes():
+def test_far_from_the_origin_nothing_changes():
     cloud, shift = ball(), torch.tensor([1e4, -1e4, 1e4], dtype=torch.float64)
     far = PointCloud(cloud.points + shift, cloud.normals, EYE + shift)
-    a, b = normals.clean_cloud(cloud), normals.clean_cloud(far)
+    a, b = prepare.clean_cloud(cloud), prepare.clean_cloud(far)
     torch.testing.assert_close(b.points - shift, a.points, atol=1e-7, rtol=0)
     torch.testing.assert_close(b.normals, a.normals, atol=1e-7, rtol=0)
     at = 1.05 * cloud.points[:20]
@@ -149,15 +146,15 @@ def test_i6_far_from_the_origin_nothing_changes():
 
 
 @pytest.mark.parametrize("dtype", [torch.int64, torch.float16, torch.complex64])
-def test_i7_other_dtypes_and_shapes_are_refused(dtype):
+def test_other_dtypes_and_shapes_are_refused(dtype):
     refused(lambda p: PointCloud(p), torch.ones(9, 3).to(dtype), (BadArgument, TypeError), "points")
     for shape in ((9,), (9, 2), (1, 9, 3), (3, 9)):
         refused(lambda p: PointCloud(p), torch.rand(shape), (BadArgument, TypeError), "points")
 
 
-@pytest.mark.parametrize("name", CHECKED)
-def test_i7_gradients_are_refused_and_strides_do_not_matter(name):
-    cloud, function = ball(), CHECKED[name]
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_gradients_are_refused_and_strides_do_not_matter(name):
+    cloud, function = ball(), FUNCTIONS[name]
     refused(function, PointCloud(cloud.points.clone().requires_grad_(), cloud.normals), BadArgument, "detach")
     strided = PointCloud(
         cloud.points.T.contiguous().T,
@@ -171,12 +168,12 @@ def test_i7_gradients_are_refused_and_strides_do_not_matter(name):
         torch.testing.assert_close(one, other)
 
 
-def test_i8_strays_go_lengths_do_not_matter_and_zero_is_refused():
+def test_strays_go_lengths_do_not_matter_and_zero_is_refused():
     cloud = ball(400)
     generator = torch.Generator().manual_seed(5)
     far = 0.15 * unit(torch.randn(40, 3, generator=generator, dtype=torch.float64))
     dirty = PointCloud(torch.cat([cloud.points, far]), torch.cat([cloud.normals, far]), None)
-    clean = normals.clean_cloud(dirty)
+    clean = prepare.clean_cloud(dirty)
     assert float(torch.linalg.vector_norm(clean.points, dim=-1).max()) < 0.06
     long = PointCloud(cloud.points, 7 * cloud.normals)
     assert orientation.check_normals(long).scaled == 400
@@ -184,16 +181,16 @@ def test_i8_strays_go_lengths_do_not_matter_and_zero_is_refused():
     torch.testing.assert_close(one.predict(cloud.points).distance, other.predict(cloud.points).distance)
     zero = cloud.normals.clone()
     zero[3] = 0
-    refused(check_cloud, PointCloud(cloud.points, zero), BadArgument, "length zero")
+    refused(check.check_cloud, PointCloud(cloud.points, zero), BadArgument, "length zero")
 
 
 def test_every_function_on_clouds_is_in_the_table():
     public = {
         name
-        for module in (filter, merge, normals, orientation, diagnose)
+        for module in (check, filter, merge, prepare, viewpoint, orientation, diagnose)
         for name, function in inspect.getmembers(module, inspect.isfunction)
         if function.__module__ == module.__name__ and not name.startswith("_")
         if "cloud" in str(inspect.signature(function))
     }
-    assert public - {"select_rows", "format_report"} <= set(FUNCTIONS)
+    assert public - {"format_report", "compare_normals"} <= set(FUNCTIONS)
     assert issubclass(BadArgument, GraspError)

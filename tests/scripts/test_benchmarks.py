@@ -14,6 +14,7 @@ from torchgrasp.plan.closure_lp import solve_closure_lp
 from torchgrasp.plan.wrench import wrenches
 from torchgrasp.shape.gradient_kernel import covariance
 from torchgrasp.shape.kernel import kernel_by_name, thin_plate
+from torchgrasp.shape.observations import on_surface
 from torchgrasp.shape.select import select_points
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts
@@ -45,7 +46,8 @@ def test_the_selection_picks_what_a_refit_for_each_pick_does(scripts, generator)
 
     x, normals = random_view(120, generator)
     known = observe_support(x)
-    found = select_points(x, normals, known, kernel_by_name("thin_plate", 3.6), 40, 0.01, 0.05)
+    candidates = on_surface(x, normals, torch.full_like(x[:, 0], 0.01), 0.05)
+    found = select_points(candidates, known, kernel_by_name("thin_plate", 3.6), 40)
     assert torch.equal(found.picks, select_by_refitting(x, known, 40, 3.6, 0.01, 0.05))
 
 

@@ -33,10 +33,14 @@ def _normals(x: Tensor) -> Tensor:
     return unit(x / torch.tensor([1.0, 0.25, 0.64], dtype=torch.float64))
 
 
+def _on_surface(x: Tensor) -> Observations:
+    return on_surface(x, _normals(x), torch.full_like(x[:, 0], 0.01), 0.05)
+
+
 def _select(
     x: Tensor, known: Observations, budget: int, criterion: Criterion = "variance", stop: float = -math.inf
 ) -> Selection:
-    return select_points(x, _normals(x), known, PLATE, budget, 0.01, 0.05, criterion=criterion, stop=stop)
+    return select_points(_on_surface(x), known, PLATE, budget, criterion, stop)
 
 
 def _refit(x: Tensor, known: Observations, budget: int) -> list[int]:
@@ -85,7 +89,7 @@ def test_informative_points_leave_less_variance_than_random_ones():
 def test_a_psi_too_small_is_named():
     x, known = _scene(50)
     with pytest.raises(IndefiniteCovariance, match="psi_scale"):
-        select_points(x, _normals(x), known, kernel_by_name("thin_plate", 1.5), 20, 0.01, 0.05)
+        select_points(_on_surface(x), known, kernel_by_name("thin_plate", 1.5), 20)
 
 
 @pytest.mark.parametrize("kernel", ["thin_plate", "matern52"])
@@ -113,7 +117,7 @@ def test_picks_by_error_are_those_of_refitting_every_time(criterion: Criterion, 
             score = score + 2.0 * (PSI**3 - (star * torch.linalg.solve(k, star.T).T).sum(1)).sqrt()
         score[wanted] = -torch.inf
         wanted.append(int(score.argmax()))
-    found = select_points(x, normals, known, chosen, 20, 0.01, 0.05, criterion=criterion)
+    found = select_points(_on_surface(x), known, chosen, 20, criterion)
     assert found.picks.tolist() == wanted
 
 
@@ -137,8 +141,7 @@ def test_picking_stops_when_every_point_is_as_certain_as_asked():
 def test_the_factor_of_the_selection_is_that_of_the_posterior(criterion: Criterion):
     x, known = _scene(120)
     found = _select(x, known, 20, criterion)
-    sigma = torch.full((20,), 0.01, dtype=torch.float64)
-    every = join(known, on_surface(x[found.picks], _normals(x)[found.picks], sigma, 0.05))
+    every = join(known, _on_surface(x).select(found.picks))
     grown, fresh = found.posterior, posterior_given(every, PLATE)
     assert torch.equal(grown.x, fresh.x) and torch.equal(grown.has_normal, fresh.has_normal)
     torch.testing.assert_close(grown.weights, fresh.weights, rtol=0, atol=1e-7)

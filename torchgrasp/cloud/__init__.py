@@ -1,1 +1,36 @@
-"""What the camera saw: reading, checking, normals, depth images, a virtual camera."""
+"""What the camera saw: read, checked, merged, cleaned, and prepared for a shape."""
+
+from torchgrasp.cloud.camera import look_at, partial_view, render_depth
+from torchgrasp.cloud.check import check_cloud, remove_duplicates
+from torchgrasp.cloud.depth import cloud_from_depth
+from torchgrasp.cloud.diagnose import CloudReport, diagnose_cloud, format_report
+from torchgrasp.cloud.filter import remove_outliers, voxel_downsample
+from torchgrasp.cloud.io.read import read_cloud, save_cloud
+from torchgrasp.cloud.merge import merge_clouds
+from torchgrasp.cloud.orientation import NormalCheck, check_normals
+from torchgrasp.cloud.prepare import PreparedCloud, clean_cloud, estimate_normals, prepare_cloud
+from torchgrasp.cloud.viewpoint import estimate_viewpoint
+
+__all__ = [
+    "CloudReport",
+    "NormalCheck",
+    "PreparedCloud",
+    "check_cloud",
+    "check_normals",
+    "clean_cloud",
+    "cloud_from_depth",
+    "diagnose_cloud",
+    "estimate_normals",
+    "estimate_viewpoint",
+    "format_report",
+    "look_at",
+    "merge_clouds",
+    "partial_view",
+    "prepare_cloud",
+    "read_cloud",
+    "remove_duplicates",
+    "remove_outliers",
+    "render_depth",
+    "save_cloud",
+    "voxel_downsample",
+]

@@ -9,10 +9,9 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.cloud.check import check_cloud, remove_duplicates
-from torchgrasp.cloud.filter import nearest, remove_outliers
-from torchgrasp.cloud.local_fit import fit_planes
-from torchgrasp.cloud.normals import clean_cloud
+from torchgrasp.cloud.neighbours import find_inliers, fit_planes, nearest
 from torchgrasp.cloud.orientation import NormalCheck, check_normals
+from torchgrasp.cloud.prepare import clean_cloud
 from torchgrasp.values import PointCloud
 
 NEIGHBOURS = 8
@@ -94,9 +93,9 @@ def diagnose_cloud(cloud: PointCloud) -> CloudReport:
         size=(side[0], side[1], side[2]),
         spacing=float(distance[:, 1].median()),
         density=float(((distance.shape[1] - 1) / area).median()),
-        noise=float(fit_planes(points)[2].median()),
+        noise=float(fit_planes(points)[1].median()),
         copies=len(cloud) - len(distinct),
-        outliers=len(distinct) - len(remove_outliers(distinct)),
+        outliers=int((~find_inliers(points)).sum()),
         normals=given,
         viewpoint=clean.viewpoint,
         viewpoint_given=cloud.viewpoint is not None,

@@ -1,27 +1,23 @@
-"""Fewer points: one a voxel, or none that stray."""
+"""Fewer points: one a voxel, or without the outliers."""
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool
 from torch import Tensor
 
-from torchgrasp.cloud.check import check_cloud, remove_duplicates
+from torchgrasp.cloud.check import MIN_POINTS, check_cloud, remove_duplicates
+from torchgrasp.cloud.neighbours import find_inliers
 from torchgrasp.errors import BadArgument, TooFewPoints
 from torchgrasp.values import PointCloud
 
-OUTLIER_NEIGHBOURS = 8
-"""Neighbours whose mean distance tells a stray point."""
-OUTLIER_RATIO = 2.5
-"""A point is stray when that distance is more than so many times the median one."""
 MIN_VOXEL, MAX_VOXEL = 1e-5, 1.0
-"""Sides [m] that a voxel may have."""
+"""Sides [m] of a voxel: below a sensor's resolution nothing is merged, above 1 m no object is left."""
 
 
 def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
-    """Return the cloud with one point a voxel: the one nearest to the voxel's centre, as it was measured.
+    """Return one measured point a voxel, the nearest to the voxel's centre; the order is kept.
 
-    The grid starts at the lowest corner of the cloud, so that the choice moves with it. Points are chosen, not
-    averaged: a mean of the two sides of a thin wall lies on neither. The order of the points is kept.
+    The grid starts at the cloud's lowest corner, so that the choice moves with the cloud. Points are not averaged:
+    the mean of the two sides of a thin wall lies on neither.
 
     Args:
         cloud: points [m], with or without normals and viewpoint.
@@ -47,13 +43,14 @@ def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
     first[1:] = group[order][1:] != group[order][:-1]
     keep = torch.zeros_like(first)
     keep[order[first]] = True
-    return select_rows(cloud, keep, f"voxels of {voxel:g} m")
+    check_enough(keep, f"voxels of {voxel:g} m")
+    return cloud.select(keep)
 
 
 def remove_outliers(cloud: PointCloud) -> PointCloud:
-    """Return the distinct points of a cloud without those that stray, such as flying pixels behind a rim.
+    """Return the distinct points of a cloud without outliers, such as flying pixels behind a rim.
 
-    Stray is a point whose mean distance to its 8 nearest neighbours is more than 2.5 times the median one.
+    The mean distance of an outlier to its 8 nearest neighbours is more than 2.5 times the median one.
 
     Args:
         cloud: points [m], with or without normals and viewpoint.
@@ -66,23 +63,12 @@ def remove_outliers(cloud: PointCloud) -> PointCloud:
     >>> bool(remove_outliers(PointCloud(points)).points.max() < 0.2)
     True
     """
-    cloud = remove_duplicates(check_cloud(cloud))
-    neighbour, _ = nearest(cloud.points.double(), OUTLIER_NEIGHBOURS + 1)
-    spacing = neighbour[:, 1:].mean(-1)
-    return select_rows(cloud, spacing <= OUTLIER_RATIO * spacing.median(), "points that are not stray")
+    cloud = remove_duplicates(cloud)
+    return cloud.select(check_enough(find_inliers(cloud.points.double()), "inliers"))
 
 
-def select_rows(cloud: PointCloud, keep: Bool[Tensor, "n"], what: str) -> PointCloud:
-    """Return the points of a mask; refuse to leave fewer than a surface needs, calling them `what`."""
-    if int(keep.sum()) < 4:
-        raise TooFewPoints("points", f"{int(keep.sum())} {what}", "at least 4")
-    return cloud.select(keep)
-
-
-def nearest(points: Float[Tensor, "n 3"], k: int) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
-    """Return distances and indices of the k nearest points of each point, itself first; fewer in a small cloud."""
-    from scipy.spatial import KDTree
-
-    array = points.detach().cpu().numpy()
-    distance, index = KDTree(array).query(array, k=min(k, len(array)))
-    return torch.from_numpy(distance).to(points), torch.from_numpy(np.asarray(index, dtype=np.int64)).to(points.device)
+def check_enough(keep: Bool[Tensor, "n"], what: str) -> Bool[Tensor, "n"]:
+    """Return a mask of points; refuse one that leaves fewer than 4, calling them `what`."""
+    if int(keep.sum()) < MIN_POINTS:
+        raise TooFewPoints("points", f"{int(keep.sum())} {what}", f"at least {MIN_POINTS}")
+    return keep

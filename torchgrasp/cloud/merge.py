@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchgrasp.cloud.check import check_cloud
 from torchgrasp.cloud.depth import check_rigid
-from torchgrasp.cloud.normals import estimate_normals
+from torchgrasp.cloud.prepare import estimate_normals
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, rotate
 from torchgrasp.linalg import unit

@@ -3,35 +3,39 @@
 import dataclasses
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.cloud.check import check_cloud
-from torchgrasp.cloud.filter import nearest
+from torchgrasp.cloud.neighbours import nearest
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
 from torchgrasp.values import PointCloud
 
-NEIGHBOURS = 8
-"""Neighbours whose normals a normal is compared with."""
-PARALLEL = 0.7
-"""Least cosine, of either sign, at which two normals are compared; across an edge there is nothing to compare."""
-OUT_OF_PLANE = 0.3
-"""A neighbour that lies higher over the tangent plane, over its distance, may be the other side of a thin wall."""
-UNORIENTED = 0.35
-"""Share of opposite pairs from which on the signs say nothing: random ones make .5 of them, 10 % of flips .18."""
-LEAST_PAIRS = 20
-"""Pairs below which nothing is said."""
+N_NEIGHBOURS = 8
+"""Neighbours that a normal is compared with: enough for a majority, near enough to share a side."""
+MIN_COSINE = 0.7
+"""Least cosine, of either sign, of normals that are compared: 45 degrees; across an edge signs say nothing."""
+MAX_HEIGHT = 0.3
+"""Greatest height over the tangent plane, per distance; a higher neighbour may be the other side of a thin wall."""
+MAX_OPPOSED = 0.35
+"""Share of opposite pairs from which on signs say nothing: random ones make .5 of them, 10 % of flips .18."""
+MIN_PAIRS = 20
+"""Fewest pairs that can tell random signs: of fewer a share of .35 may be chance."""
+UNIT_TOLERANCE = 1e-3
+"""Deviation of a unit normal's length: a text file rounds to three digits."""
 
 
 @dataclasses.dataclass(frozen=True)
 class NormalCheck(Value):
-    """What the normals of a cloud are worth.
+    """What given normals are worth.
 
-    `flipped` marks normals against most of their neighbours', `opposed` is the share of opposite ones among pairs of
-    neighbours, and `oriented` tells whether the signs can be believed. `scaled` counts normals that are not of unit
-    length (to 1e-3); they are normalised wherever they are used.
+    Args:
+        flipped: which normals oppose most of their neighbours'.
+        opposed: share of opposite normals among pairs of neighbours.
+        oriented: whether the signs can be trusted.
+        scaled: number of normals that are not of unit length; functions that use normals normalise them.
     """
 
     flipped: Bool[Tensor, "n"]
@@ -41,7 +45,7 @@ class NormalCheck(Value):
 
 
 def check_normals(cloud: PointCloud) -> NormalCheck:
-    """Compare the given normals of neighbouring points, and report what does not fit; nothing is changed.
+    """Compare the given normals of neighbouring points; nothing is changed.
 
     Raises:
         BadArgument: a cloud without normals; see also `check_cloud`.
@@ -54,36 +58,22 @@ def check_normals(cloud: PointCloud) -> NormalCheck:
     cloud = check_cloud(cloud)
     if cloud.normals is None:
         raise BadArgument("cloud", "no normals", "a cloud with normals")
-    points, normals = cloud.points.double(), unit(cloud.normals.double())
-    distance, index = nearest(points, NEIGHBOURS + 1)
-    cosine = (normals[:, None] * normals[index[:, 1:]]).sum(-1)
-    height = ((points[index[:, 1:]] - points[:, None]) * normals[:, None]).sum(-1).abs()
-    compared = (cosine.abs() > PARALLEL) & (height <= OUT_OF_PLANE * distance[:, 1:])
+    return compare_normals(cloud.points.double(), cloud.normals.double())
+
+
+def compare_normals(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> NormalCheck:
+    """Compare the normals of neighbouring points, of any length but zero."""
+    distance, index = nearest(points, N_NEIGHBOURS + 1)
+    directions = unit(normals)
+    cosine = (directions[:, None] * directions[index[:, 1:]]).sum(-1)
+    height = ((points[index[:, 1:]] - points[:, None]) * directions[:, None]).sum(-1).abs()
+    compared = (cosine.abs() > MIN_COSINE) & (height <= MAX_HEIGHT * distance[:, 1:])
     against = compared & (cosine < 0)
     pairs = int(compared.sum())
-    opposed = int(against.sum()) / pairs if pairs >= LEAST_PAIRS else 0.0
-    length = torch.linalg.vector_norm(cloud.normals.double(), dim=-1)
+    opposed = int(against.sum()) / pairs if pairs >= MIN_PAIRS else 0.0
     return NormalCheck(
         flipped=2 * against.sum(-1) > compared.sum(-1),
         opposed=opposed,
-        oriented=opposed < UNORIENTED,
-        scaled=int(((length - 1).abs() > 1e-3).sum()),
+        oriented=opposed < MAX_OPPOSED,
+        scaled=int(((torch.linalg.vector_norm(normals, dim=-1) - 1).abs() > UNIT_TOLERANCE).sum()),
     )
-
-
-def drop_unoriented(cloud: PointCloud) -> PointCloud:
-    """Return the cloud, without its normals if their signs are random, as those of many programs are.
-
-    A single view whose normals point anywhere would be taken for a whole surface.
-
-    Raises:
-        BadArgument, TooFewPoints, SuspiciousScale: see `check_cloud`.
-
-    >>> ball = unit(torch.randn(500, 3))
-    >>> drop_unoriented(PointCloud(0.05 * ball, torch.randn(500, 1).sign() * ball)).normals is None
-    True
-    """
-    cloud = check_cloud(cloud)
-    if cloud.normals is None or check_normals(cloud).oriented:
-        return cloud
-    return PointCloud(cloud.points, None, cloud.viewpoint)

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.linalg import unit
+from torchgrasp.linalg import GOLDEN_ANGLE, fibonacci_sphere, unit
 
 DIRECTIONS = 1024
 """Directions in the null space that are tried before the search closes in on the best."""
@@ -76,11 +76,11 @@ def least_friction_forces(
     tensor([ 1.,  1., -2.])
     """
     basis = internal_forces(points)
-    spots = fibonacci_sphere(DIRECTIONS, points)
+    spots = fibonacci_sphere(DIRECTIONS, points, GOLDEN_ANGLE, 0.0)
     shape = points.shape[:-2]
     wish = None if wish is None else (wish / wish.amax(-1, keepdim=True))[..., None, :]
     weights, cost = _best(spots.expand(*shape, -1, 3), basis, normals, wish)
-    near, reach = fibonacci_sphere(64, points), 4 / math.sqrt(DIRECTIONS)
+    near, reach = fibonacci_sphere(64, points, GOLDEN_ANGLE, 0.0), 4 / math.sqrt(DIRECTIONS)
     for _ in range(REFINEMENTS):
         around = unit(weights[..., None, :] + reach * near)
         around = torch.cat([weights[..., None, :], around], dim=-2)
@@ -90,15 +90,6 @@ def least_friction_forces(
     push = -(forces * normals).sum(-1)
     scaled = forces * (strongest / push.amax(-1))[..., None, None]
     return torch.where(torch.isfinite(cost)[..., None, None], scaled, torch.nan)
-
-
-def fibonacci_sphere(count: int, like: Tensor) -> Float[Tensor, "k 3"]:
-    """Return `count` points spread evenly over the unit sphere, in the dtype and on the device of `like`."""
-    k = torch.arange(count, dtype=like.dtype, device=like.device)
-    z = 1 - (2 * k + 1) / count
-    angle = k * (math.pi * (3 - math.sqrt(5)))
-    radius = torch.sqrt(1 - z * z)
-    return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle), z], dim=-1)
 
 
 def _best(

@@ -2,35 +2,27 @@
 
 import dataclasses
 import math
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.cloud.check import remove_duplicates
-from torchgrasp.cloud.normals import clean_cloud, estimate_normals, estimate_viewpoint, spread_directions
-from torchgrasp.cloud.orientation import drop_unoriented
-from torchgrasp.linalg import unit
+from torchgrasp.cloud.prepare import PreparedCloud, prepare_cloud
+from torchgrasp.errors import BadArgument
+from torchgrasp.linalg import fibonacci_sphere, unit
 from torchgrasp.shape.completion.complete import LEAST_NOISE, PART, Completion, complete_cloud
 from torchgrasp.shape.completion.free_space import free_space, free_space_violations
-from torchgrasp.shape.completion.silhouette import seen_from_one_side
 from torchgrasp.shape.condition import as_shape, check_kernel, longest_distance
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.kernel import Kernel, KernelName, kernel_by_name
 from torchgrasp.shape.observations import Observations, join, off_surface, on_surface
 from torchgrasp.shape.select import Criterion, select_points
 from torchgrasp.shape.update import append_observations
-from torchgrasp.shape.validate import (
-    MOST_BUDGET,
-    OUTER_POINTS,
-    check_arguments,
-    check_model,
-    check_viewpoint,
-    check_views,
-)
 from torchgrasp.values import PointCloud
 
+OUTER_POINTS = 20
+"""Points outside (Sec. 3.1)."""
 OUTER_RADIUS = 1.2
 """Radius, normalised, of the sphere of the points outside."""
 NORMAL_NOISE = 0.05
@@ -49,13 +41,13 @@ FREE_NOISE = 0.003
 """Standard deviation [m] of the least distance observed where the shape reached into free space."""
 FREE_ROUNDS = 3
 """Times that a shape is pushed out of free space."""
-Part = tuple[Observations, Tensor | None]
-"""Later observations, and the errors that their distances share; see `append_observations`."""
-CANDIDATES = 2000
-"""Points of a cloud among which the informative ones are sought, at most."""
 BUDGETS = {"camera": 85, "paper": 70}
 """Points observed by default, rim and mirrored points apart. From 70 to 85 to 100 the error of the seen surface falls
 from .68 to .61 to .56 mm and from 9.9 to 9.2 to 8.6 degrees; planning takes 1.5, 1.6 and 1.8 s."""
+
+
+MAX_BUDGET = 1000
+"""Greatest budget, and the limit of "sure": its factor has 4000 rows."""
 
 
 def fit_shape(
@@ -108,144 +100,134 @@ def fit_shape(
     >>> fit_shape(PointCloud(0.04 * ball, ball)).predict(torch.tensor([0.0, 0.0, 0.04])).distance.abs() < 0.02
     tensor(True)
     """
-    check_arguments(noise, budget, psi_scale, support, seed, table)
-    check_model(kernel, criterion)
-    model = _Model(noise, BUDGETS[support] if budget is None else budget, psi_scale, kernel, criterion)
-    cloud = drop_unoriented(cloud)
-    check_views(cloud)
+    _check_numbers(noise, budget, psi_scale, seed, table)
+    _check_names(support, kernel, criterion)
     generator = torch.Generator().manual_seed(seed)
-    if support == "paper":
-        return _fit_paper(cloud, model, generator)
-    return _fit_camera(cloud, model, generator, table)
+    seen = prepare_cloud(cloud, generator, clean=support == "camera")
+    beside = _paper_support(seen, noise, generator) if support == "paper" else _camera_support(seen, noise, table)
+    x = beside.normalise(seen.points)
+    candidates = on_surface(x, seen.normals, torch.full_like(x[:, 0], noise), beside.normal_noise)
 
-
-@dataclasses.dataclass(frozen=True)
-class _Model:
-    """The arguments of `fit_shape` that say how the posterior follows from what is observed."""
-
-    noise: float
-    budget: int | Literal["sure"]
-    psi_scale: float
-    kernel: KernelName | Kernel
-    criterion: Criterion
-
-
-def _fit_paper(cloud: PointCloud, model: _Model, generator: torch.Generator) -> ShapeGP:
-    """Return the shape from the paper's own observations (Sec. 3.1)."""
-    cloud = estimate_normals(cloud) if cloud.normals is None else remove_duplicates(cloud)
-    points, normals = _known(_candidates(cloud, generator))
-    center = points.mean(0)
-    scale = float(torch.linalg.vector_norm(points - center, dim=-1).max())
-    sphere = unit(torch.randn(OUTER_POINTS, 3, dtype=torch.float64, generator=generator)).to(points)
-    support = off_surface(
-        torch.cat([torch.zeros_like(center)[None], OUTER_RADIUS * sphere]),
-        torch.cat([-torch.ones_like(center[:1]), torch.ones_like(sphere[:, 0])]),
-        model.noise,
-    )
-    return _condition(points, normals, support, [], model, model.noise, center, scale, cloud)
-
-
-def _fit_camera(cloud: PointCloud, model: _Model, generator: torch.Generator, table: float | None) -> ShapeGP:
-    """Return the shape from metric distances, the outline and the mirrored cloud."""
-    if cloud.normals is not None and cloud.viewpoint is not None and not seen_from_one_side(cloud, cloud.viewpoint):
-        # A whole surface: turned towards a viewpoint its far side would be inside out.
-        cloud = PointCloud(cloud.points, cloud.normals)
-    cloud = clean_cloud(cloud)
-    seen = _candidates(cloud, generator)
-    points, normals = _known(seen)
-    low, high = points.amin(0), points.amax(0)
-    center = (low + high) / 2
-    scale = float(torch.linalg.vector_norm(points - center, dim=-1).max())
-    if seen.viewpoint is None:
-        seen = PointCloud(points, normals, estimate_viewpoint(cloud).to(points))
-    assert seen.viewpoint is not None
-    parts: list[Part] = []
-    free: list[tuple[Tensor, Tensor]] = []
-    inside, surface = True, points
-    if seen_from_one_side(seen, seen.viewpoint):  # else it is a whole surface, and nothing is hidden
-        for view in seen.split_views():
-            check_viewpoint(view)
-        found = complete_cloud(seen, table)
-        parts = _observe_completion(found, center, scale)
-        surface = torch.cat([points, found.points.to(points)])
-        free = [free_space(found.outline, center, scale, table)]
-        inside = float(found.outline.violation(center.cpu())) == 0.0  # not so for an arch or a bowl
-
-    sphere = OUTER_RADIUS * spread_directions(OUTER_POINTS, points)
-    anchors = torch.cat([torch.zeros_like(center)[None], sphere]) if inside else sphere
-    away = torch.cdist(anchors, (surface - center) / scale).amin(1)
-    away = torch.cat([-away[:1], away[1:]]) if inside else away
-    support = off_surface(anchors, away, model.noise)
-    shape = _condition(points, normals, support, parts, model, NORMAL_NOISE, center, scale, cloud, CAMERA_STD_FACTOR)
-    for x, least in FREE_ROUNDS * free:
-        rows = free_space_violations(shape, x, least)
+    # The kernel's length is that of all candidates from the start, so that one factor grows from first to last.
+    every = join(beside.anchors, candidates, *(part for part, _ in beside.parts))
+    psi = psi_scale * longest_distance(every.x)
+    kernel = kernel_by_name(kernel, psi) if isinstance(kernel, str) else kernel
+    most, stop = (MAX_BUDGET, noise) if budget == "sure" else (budget or BUDGETS[support], -math.inf)
+    most = max(most - len(beside.anchors.x), 1)
+    posterior = select_points(candidates, beside.anchors, kernel, most, criterion=criterion, stop=stop).posterior
+    for part, shared in beside.parts:
+        posterior = append_observations(posterior, part, shared)
+    check_kernel(posterior, every.least_noise)
+    shape = as_shape(posterior, beside.center, beside.scale, seen.cloud, psi, beside.std_factor)
+    if beside.free is None:
+        return shape
+    free, least = beside.free
+    for _ in range(FREE_ROUNDS):
+        rows = free_space_violations(shape, free, least)
         if not len(rows):
             break
-        longer = append_observations(shape, off_surface(x[rows], least[rows], FREE_NOISE / scale))
-        shape = as_shape(longer, center, scale, cloud, shape.psi, CAMERA_STD_FACTOR)
+        longer = append_observations(shape, off_surface(free[rows], least[rows], FREE_NOISE / beside.scale))
+        shape = as_shape(longer, beside.center, beside.scale, seen.cloud, psi, beside.std_factor)
     return shape
 
 
-def _observe_completion(found: Completion, center: Float[Tensor, "3"], scale: float) -> list[Part]:
+@dataclasses.dataclass(frozen=True)
+class _Support:
+    """What is observed beside the points of the cloud, and the normalised frame.
+
+    Args:
+        center, scale: origin [m] and unit [m] of the normalised frame.
+        anchors: points inside and outside.
+        normal_noise: standard deviation of the cloud's normals.
+        std_factor: see `ShapeGP`.
+        parts: rim and mirrored points, with the errors that their distances share; see `append_observations`.
+        free: points of free space and the least signed distance there; None: none is known.
+    """
+
+    center: Float[Tensor, "3"]
+    scale: float
+    anchors: Observations
+    normal_noise: float
+    std_factor: float = 1.0
+    parts: tuple[tuple[Observations, Tensor | None], ...] = ()
+    free: tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]] | None = None
+
+    def normalise(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Map points [m] to the normalised frame."""
+        return (points - self.center) / self.scale
+
+
+def _paper_support(seen: PreparedCloud, noise: float, generator: torch.Generator) -> _Support:
+    """Return the paper's own: the cloud's centre inside and 20 random points outside (Sec. 3.1)."""
+    center = seen.points.mean(0)
+    scale = float(torch.linalg.vector_norm(seen.points - center, dim=-1).max())
+    sphere = unit(torch.randn(OUTER_POINTS, 3, dtype=torch.float64, generator=generator)).to(center)
+    anchors = off_surface(
+        torch.cat([torch.zeros_like(center)[None], OUTER_RADIUS * sphere]),
+        torch.cat([-torch.ones_like(center[:1]), torch.ones_like(sphere[:, 0])]),
+        noise,
+    )
+    return _Support(center, scale, anchors, noise)
+
+
+def _camera_support(seen: PreparedCloud, noise: float, table: float | None) -> _Support:
+    """Return metric distances inside and outside; of a view also the outline, mirrored points and free space."""
+    center = (seen.points.amin(0) + seen.points.amax(0)) / 2
+    scale = float(torch.linalg.vector_norm(seen.points - center, dim=-1).max())
+    surface, inside, parts, free = seen.points, True, (), None
+    if seen.one_sided:
+        completion = complete_cloud(PointCloud(seen.points, seen.normals, seen.viewpoint), table)
+        parts = _observe_completion(completion, center, scale)
+        surface = torch.cat([surface, completion.points.to(surface)])
+        free = free_space(completion.outline, center, scale, table)
+        inside = float(completion.outline.violation(center.cpu())) == 0.0  # not so for an arch or a bowl
+    sphere = OUTER_RADIUS * fibonacci_sphere(OUTER_POINTS, center)
+    x = torch.cat([torch.zeros_like(center)[None], sphere]) if inside else sphere
+    distance = torch.cdist(x, (surface - center) / scale).amin(1)
+    distance = torch.cat([-distance[:1], distance[1:]]) if inside else distance
+    anchors = off_surface(x, distance, noise)
+    return _Support(center, scale, anchors, NORMAL_NOISE, CAMERA_STD_FACTOR, parts, free)
+
+
+def _observe_completion(
+    completion: Completion, center: Float[Tensor, "3"], scale: float
+) -> tuple[tuple[Observations, Tensor | None], ...]:
     """Return rim and mirrored points as observations of the surface."""
 
     def observe(points: Tensor, normals: Tensor, noise: float, normal_noise: float) -> Observations:
         x = (points.to(center) - center) / scale
         return on_surface(x, normals.to(center), torch.full_like(x[:, 0], noise / scale), normal_noise)
 
-    mirrored = observe(found.points, found.normals, LEAST_NOISE, MIRROR_NORMAL_NOISE)
-    slope = (found.asymmetry / PART).to(center)  # of a field of that deviation, alike over that length
-    mirrored = dataclasses.replace(mirrored, normal_noise=torch.hypot(mirrored.normal_noise, slope))
-
-    rim, rim_normals = found.outline.rim, found.outline.rim_normals
-    return [
-        (observe(rim, rim_normals, RIM_NOISE, RIM_NORMAL_NOISE), None),
-        (mirrored, found.deviations.to(center) / scale),
-    ]
+    outline = completion.outline
+    mirrored = observe(completion.points, completion.normals, LEAST_NOISE, MIRROR_NORMAL_NOISE)
+    tilt = (completion.asymmetry / PART).to(center)  # of a field of that deviation, alike over that length
+    mirrored = dataclasses.replace(mirrored, normal_noise=torch.hypot(mirrored.normal_noise, tilt))
+    rim = observe(outline.rim, outline.rim_normals, RIM_NOISE, RIM_NORMAL_NOISE)
+    return (rim, None), (mirrored, completion.deviations.to(center) / scale)
 
 
-def _condition(
-    points: Float[Tensor, "n 3"],
-    normals: Float[Tensor, "n 3"],
-    support: Observations,
-    parts: list[Part],
-    model: _Model,
-    normal_noise: float,
-    center: Float[Tensor, "3"],
-    scale: float,
-    cloud: PointCloud,
-    std_factor: float = 1.0,
-) -> ShapeGP:
-    """Return the shape given `support`, the most informative points of the cloud and then other `parts`.
-
-    The kernel's length is that of all candidates from the start, so that one factor grows from the first to the last.
-    """
-    x = (points - center) / scale
-    every = join(support, on_surface(x, normals, torch.full_like(x[:, 0], model.noise), normal_noise))
-    every = join(every, *(part for part, _ in parts))
-    psi = model.psi_scale * longest_distance(every.x)
-    kernel = kernel_by_name(model.kernel, psi) if isinstance(model.kernel, str) else model.kernel
-    budget, stop = (MOST_BUDGET, model.noise) if model.budget == "sure" else (model.budget, -math.inf)
-    budget = max(budget - len(support.x), 1)
-    found = select_points(
-        x, normals, support, kernel, budget, model.noise, normal_noise, criterion=model.criterion, stop=stop
-    ).posterior
-    for part, shared in parts:
-        found = append_observations(found, part, shared)
-    check_kernel(found, every.least_noise)
-    return as_shape(found, center, scale, cloud, psi, std_factor)
+def _check_numbers(
+    noise: float, budget: int | Literal["sure"] | None, psi_scale: float, seed: int, table: float | None
+) -> None:
+    """Refuse numbers out of range."""
+    if not 0.0 < noise <= 1.0:  # also refuses NaN
+        raise BadArgument("noise", noise, "a number in (0, 1], normalised")
+    least = OUTER_POINTS + 1 + 4
+    if budget not in (None, "sure") and not (isinstance(budget, int) and least <= budget <= MAX_BUDGET):
+        raise BadArgument("budget", budget, f"{least} to {MAX_BUDGET} points, 'sure' or None")
+    if not 1.0 <= psi_scale <= 100.0:
+        raise BadArgument("psi_scale", psi_scale, "a number in [1, 100]; 1.34 and more are safe")
+    if not isinstance(seed, int) or not 0 <= seed < 2**63:
+        raise BadArgument("seed", seed, "an integer from 0")
+    if table is not None and not math.isfinite(table):
+        raise BadArgument("table", table, "a height in metres, or None")
 
 
-def _candidates(cloud: PointCloud, generator: torch.Generator) -> PointCloud:
-    """Return the cloud in float64, with unit normals; a random part of it if it is very dense."""
-    cloud = cloud.to(torch.float64)
-    if len(cloud) > CANDIDATES:
-        cloud = cloud.select(torch.randperm(len(cloud), generator=generator)[:CANDIDATES].to(cloud.points.device))
-    assert cloud.normals is not None
-    return PointCloud(cloud.points, unit(cloud.normals), cloud.viewpoint)
-
-
-def _known(cloud: PointCloud) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Return points and normals of a cloud that has both."""
-    assert cloud.normals is not None
-    return cloud.points, cloud.normals
+def _check_names(support: str, kernel: KernelName | Kernel, criterion: str) -> None:
+    """Refuse an unknown support, kernel or criterion."""
+    if support not in BUDGETS:
+        raise BadArgument("support", repr(support), "'camera' or 'paper'")
+    if not isinstance(kernel, Kernel):
+        kernel_by_name(kernel, 1.0)
+    if criterion not in get_args(Criterion):
+        raise BadArgument("criterion", repr(criterion), "'variance', 'error' or 'both'")

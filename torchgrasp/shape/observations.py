@@ -3,7 +3,7 @@
 import dataclasses
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
@@ -34,10 +34,13 @@ class Observations(Value):
         """Return the least standard deviation of anything observed."""
         return float(torch.cat([self.distance_noise, self.normal_noise[self.has_normal]]).min())
 
+    def select(self, rows: Int[Tensor, "m"]) -> "Observations":
+        """Return some of the observations, in the order of `rows`."""
+        return Observations(**{f.name: getattr(self, f.name)[rows] for f in dataclasses.fields(self)})
+
     def with_normals_first(self) -> "Observations":
         """Return the observations with the points that have normals before the others, else in their order."""
-        order = torch.argsort(~self.has_normal, stable=True)
-        return Observations(**{f.name: getattr(self, f.name)[order] for f in dataclasses.fields(self)})
+        return self.select(torch.argsort(~self.has_normal, stable=True))
 
 
 def on_surface(

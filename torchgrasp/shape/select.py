@@ -1,4 +1,4 @@
-"""The most informative points of a cloud, by a pivoted Cholesky factorisation in blocks of four rows."""
+"""The most informative points of a cloud, Sec. 3.2: a pivoted Cholesky factorisation in blocks of four rows."""
 
 import dataclasses
 import math
@@ -13,7 +13,7 @@ from torchgrasp.linalg import cholesky
 from torchgrasp.shape.condition import posterior_given
 from torchgrasp.shape.gradient_kernel import cross_covariance
 from torchgrasp.shape.kernel import Kernel
-from torchgrasp.shape.observations import Observations, on_surface
+from torchgrasp.shape.observations import Observations
 from torchgrasp.shape.posterior import Posterior
 from torchgrasp.shape.update import extend_posterior
 
@@ -22,46 +22,43 @@ Criterion = Literal["variance", "error", "both"]
 
 @dataclasses.dataclass(frozen=True)
 class Selection(Value):
-    """Which points of a cloud are to be observed, the most informative one first, and the posterior given them."""
+    """Rows of the selected candidates, the most informative first, and the posterior given them."""
 
     picks: Int[Tensor, "picks"]
     posterior: Posterior
 
 
 def select_points(
-    x: Float[Tensor, "n 3"],
-    normals: Float[Tensor, "n 3"],
+    candidates: Observations,
     known: Observations,
     kernel: Kernel,
     budget: int,
-    distance_noise: float,
-    normal_noise: float,
-    *,
     criterion: Criterion = "variance",
     stop: float = -math.inf,
 ) -> Selection:
-    """Return the points of the surface to observe with normals, each the most informative one given the former.
+    """Return the candidates to observe, each the most informative one given those before it (Sec. 3.2).
 
-    The most informative point has the greatest posterior variance; or the greatest error, its mean signed distance
-    instead of 0; or the greatest |error| + 2 sqrt(variance). The covariance of the candidates is never refitted: the
-    rows of their distances, whitened by the growing factor, are kept, so that a pick costs O(rows n). The factor that
-    has grown is that of the posterior.
+    The most informative point has the greatest posterior variance, the greatest |mean signed distance|, or the
+    greatest |mean| + 2 sqrt(variance). One Cholesky factor grows by four rows a pick and becomes the posterior's own;
+    nothing is refitted. A pick costs O(rows n).
 
     Args:
-        x: candidates, normalised.
-        normals: of the candidates, unit.
-        known: what is observed already, e.g. points inside and outside.
+        candidates: points of the surface, normalised, all with normals.
+        known: what is observed already, such as points inside and outside.
         kernel: of the posterior.
-        budget: greatest number of picks; all candidates in order of their variance if there are fewer.
-        distance_noise, normal_noise: standard deviations with which a pick will be observed.
+        budget: greatest number of picks.
         criterion: "variance", "error" or "both".
-        stop: picking ends as soon as no candidate has a greater variance. For "variance" and `stop=distance_noise`
-            that is after 22 to 40 of 1000 points of the project's four objects.
+        stop: the selection ends when no candidate has a greater variance.
 
     Raises:
         IndefiniteCovariance: the points are too far apart for the kernel.
     """
-    start, n, budget = posterior_given(known, kernel), len(x), min(budget, len(x))
+    x, start, n, budget = (
+        candidates.x,
+        posterior_given(known, kernel),
+        len(candidates.x),
+        min(budget, len(candidates.x)),
+    )
     old, rows = len(start.factor), len(start.factor) + 4 * budget
     factor = x.new_zeros(rows, rows).T  # by columns, as the solver wants it: it copies any other matrix
     factor[:old, :old] = start.factor
@@ -71,11 +68,12 @@ def select_points(
     whitened[:old, n] = start.factor.T @ start.weights
     variance = kernel.profile(x.new_zeros(())) - (whitened[:old, :n] ** 2).sum(0)
     error = whitened[:old, n] @ whitened[:old, :n]
-    own = start.prior_block() + torch.diag(x.new_tensor([distance_noise] + 3 * [normal_noise]) ** 2)
-    values = torch.cat([torch.zeros_like(normals[:, :1]), normals], 1)
+    prior = start.prior_block()
+    noise = torch.stack([candidates.distance_noise] + 3 * [candidates.normal_noise], 1) ** 2
+    values = torch.cat([candidates.distance[:, None], candidates.normal], 1)
 
     picks = torch.empty(budget, dtype=torch.long, device=x.device)
-    free = torch.zeros_like(error)  # minus infinity for what is picked
+    free = torch.zeros_like(error)  # minus infinity for the picks
     count = 0
     while count < budget:
         if stop > -math.inf and float((free + variance).max()) <= stop:
@@ -87,6 +85,7 @@ def select_points(
         with_picks = with_all[:, :, picks[:count]].permute(2, 1, 0).reshape(4 * count, 4)
         cross = torch.cat([with_known[:, p].squeeze(1).T, with_picks])
         before = torch.linalg.solve_triangular(factor[:end, :end], cross, upper=False)
+        own = prior + torch.diag(noise[p[0]])
         corner = cholesky(own - before.T @ before, "the covariance of a picked point", kernel.remedy)
         left = torch.cat([with_all[:, 0], values[p].T], 1).addmm_(before.T, whitened[:end], alpha=-1.0)
         factor[new, :end], factor[new, new] = before.T, corner
@@ -96,10 +95,9 @@ def select_points(
         picks[count], free[p] = p[0], -math.inf
         count += 1
     picks, rows = picks[:count], old + 4 * count
-    sigma = x.new_full((count,), distance_noise)
-    seen = on_surface(x[picks], normals[picks], sigma, normal_noise)
     by_pick = torch.arange(4 * count, device=x.device).reshape(4, count).T.flatten()
-    return Selection(picks, extend_posterior(start, seen, factor[:rows, :rows], whitened[:rows, n], by_pick))
+    observed = candidates.select(picks)
+    return Selection(picks, extend_posterior(start, observed, factor[:rows, :rows], whitened[:rows, n], by_pick))
 
 
 def _score(criterion: Criterion, variance: Float[Tensor, "n"], error: Float[Tensor, "n"]) -> Float[Tensor, "n"]:

@@ -9,10 +9,9 @@ from tqdm import tqdm
 
 from benchmarks.common import Row, least_seconds, random_view
 from benchmarks.shape.gpytorch_peer import select_by_refitting
-from torchgrasp.cloud.normals import spread_directions
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.frames import rotation_from_vector
-from torchgrasp.linalg import cholesky
+from torchgrasp.linalg import cholesky, fibonacci_sphere
 from torchgrasp.shape.condition import condition, longest_distance
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
@@ -35,7 +34,7 @@ def observe(x: Tensor, normals: Tensor, noise: float = NOISE) -> Observations:
 
 def observe_support(x: Tensor) -> Observations:
     """Return the origin and 20 points on a sphere of 1.2 with their signed distances to a view, without normals."""
-    anchors = torch.cat([torch.zeros(1, 3, dtype=torch.float64), 1.2 * spread_directions(20, x)])
+    anchors = torch.cat([torch.zeros(1, 3, dtype=torch.float64), 1.2 * fibonacci_sphere(20, x)])
     away = torch.cdist(anchors, x).amin(1)
     away[0] = -away[0]
     return off_surface(anchors, away, NOISE)
@@ -94,7 +93,8 @@ def bench_selection(seeds: int = 5) -> list[Row]:
         x, normals = random_view(1000, torch.Generator().manual_seed(seed))
         known = observe_support(x)
         psi = PSI_SCALE * longest_distance(torch.cat([known.x, x]))
-        select = partial(select_points, x, normals, known, kernel_by_name("thin_plate", psi), 65, NOISE, NOISE)
+        candidates = on_surface(x, normals, torch.full_like(x[:, 0], NOISE), NOISE)
+        select = partial(select_points, candidates, known, kernel_by_name("thin_plate", psi), 65)
         refit = partial(select_by_refitting, x, known, 65, psi, NOISE, NOISE)
         same.append(torch.equal(select().picks, refit()))
         fast, slow = least_seconds(select), least_seconds(refit, repeats=2)

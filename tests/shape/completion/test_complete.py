@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchgrasp.frames import apply, rotate
 from torchgrasp.shape.completion.complete import LEAST_NOISE, Completion, complete_cloud
-from torchgrasp.shape.completion.silhouette import farthest_points, seen_from_one_side, silhouette
+from torchgrasp.shape.completion.silhouette import farthest_points, silhouette
 from torchgrasp.values import PointCloud
 
 CAMERA = torch.tensor([0.45, 0.0, 0.3], dtype=torch.float64)
@@ -150,13 +150,6 @@ def test_silhouette_of_a_ball_is_its_circle():
     violation = outline.violation(probe)
     assert violation[0] == 0 and violation[2] == 0
     assert violation[1] == hull[1] and violation[3].item() == pytest.approx(0.03 - 0.002, abs=0.002)
-
-
-def test_a_single_view_is_told_from_a_whole_surface(seen_cylinder: PointCloud):
-    assert seen_from_one_side(seen_cylinder, CAMERA)
-    assert seen_cylinder.normals is not None
-    turned = torch.cat([seen_cylinder.normals, -seen_cylinder.normals])
-    assert not seen_from_one_side(PointCloud(seen_cylinder.points.repeat(2, 1), turned), CAMERA)
 
 
 def test_farthest_points_are_all_points_when_there_are_few():

@@ -8,8 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.cloud.normals import spread_directions
-from torchgrasp.linalg import unit
+from torchgrasp.linalg import fibonacci_sphere, unit
 from torchgrasp.shape.completion.silhouette import Outlines, farthest_points, silhouettes
 from torchgrasp.values import PointCloud
 
@@ -101,7 +100,7 @@ def find_planes(scene: SymmetryScene) -> tuple[Float[Tensor, "p 4"], Float[Tenso
     size = scene.size
     view = torch.stack([unit(scene.center - seen.viewpoint) for seen in scene.outline.views]).mean(0)
     if scene.table is None:
-        directions = spread_directions(2 * DIRECTIONS, scene.points)[:DIRECTIONS]  # a half sphere: n and -n are one
+        directions = fibonacci_sphere(2 * DIRECTIONS, scene.points)[:DIRECTIONS]  # a half sphere: n and -n are one
         rim_prior = 0.15
     else:
         angle = torch.arange(ANGLES, dtype=torch.float64) * math.pi / ANGLES

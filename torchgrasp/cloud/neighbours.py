@@ -1,0 +1,89 @@
+"""What a point's neighbours tell: whether it is an outlier, the plane about it, and the quadric below it."""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchgrasp.linalg import unit
+
+OUTLIER_NEIGHBOURS = 8
+"""Neighbours whose mean distance marks an outlier: more than the few pixels that fly off a rim together."""
+OUTLIER_RATIO = 2.5
+"""Ratio of that distance to the median one: real views, whose spacing varies with depth and slope, stay below."""
+PLANE_NEIGHBOURS = 25
+"""Neighbours, the point itself included, that fix a local plane: about eight for each of its three unknowns."""
+QUADRIC_NEIGHBOURS = 30
+"""Neighbours that fix a local quadric: five for each of its six unknowns."""
+FLATNESS = 1e-3
+"""Weight of a flat quadric against the points, whose spread counts as 1: it decides only where points are few."""
+
+
+def nearest(points: Float[Tensor, "n 3"], k: int) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
+    """Return distances and indices of the k nearest points of each point, itself first; fewer in a small cloud."""
+    from scipy.spatial import KDTree
+
+    array = points.detach().cpu().numpy()
+    distance, index = KDTree(array).query(array, k=min(k, len(array)))
+    return torch.from_numpy(distance).to(points), torch.from_numpy(np.asarray(index, dtype=np.int64)).to(points.device)
+
+
+def find_inliers(points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+    """Tell which points lie near others: mean distance to 8 neighbours at most 2.5 times the median one."""
+    distance, _ = nearest(points, OUTLIER_NEIGHBOURS + 1)
+    spacing = distance[:, 1:].mean(-1)
+    return spacing <= OUTLIER_RATIO * spacing.median()
+
+
+def fit_planes(
+    points: Float[Tensor, "n 3"],
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+    """Return unit normals of unknown sign of the planes through the 25 nearest points, and weighted rms [m].
+
+    Weights are exp(-(d / 0.7 d_25)^2).
+    """
+    near, weight = _neighbourhood(points, PLANE_NEIGHBOURS)
+    mean_squares, axes = _principal_axes(near, weight)
+    return axes[..., 0], mean_squares[:, 0].clamp_min(0).sqrt()
+
+
+def fit_quadrics(
+    points: Float[Tensor, "n 3"],
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+    """Return each point's foot on its local quadric, the unit normal there, and the quadric's weighted rms [m].
+
+    The height over the plane of the 30 nearest points is a polynomial of degree 2, fitted by weighted least squares.
+    A plane would flatten curved surfaces: points of a ball of radius r move inward by s^2 / 2r for neighbours
+    that spread over s.
+    """
+    near, weight = _neighbourhood(points, QUADRIC_NEIGHBOURS)
+    _, axes = _principal_axes(near, weight)
+    height, u, v = ((near - points[:, None]) @ axes).unbind(-1)
+    size = torch.stack([u, v], -1).norm(dim=-1).amax(-1, keepdim=True)
+    u, v = u / size, v / size
+    terms = torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v], -1)
+    weighted = weight[..., None] * terms
+    flat = FLATNESS * torch.tensor([0.0, 1.0, 1.0, 1.0, 1.0, 1.0]).to(points)
+    moments = weighted.transpose(-1, -2) @ terms + torch.diag_embed(flat)
+    quadric = torch.linalg.solve(moments, (weighted * height[..., None]).sum(-2))
+    residual = height - (terms * quadric[:, None]).sum(-1)
+    gradient = torch.stack([torch.ones_like(size[:, 0]), -quadric[:, 1] / size[:, 0], -quadric[:, 2] / size[:, 0]], -1)
+    feet = points + quadric[:, :1] * axes[..., 0]
+    return feet, unit((axes @ gradient[..., None])[..., 0]), (weight * residual**2).sum(-1).sqrt()
+
+
+def _neighbourhood(points: Float[Tensor, "n 3"], k: int) -> tuple[Float[Tensor, "n k 3"], Float[Tensor, "n k"]]:
+    """Return the k nearest points of each and their weights, whose sum is 1."""
+    distance, index = nearest(points, k)
+    weight = torch.exp(-((distance / (0.7 * distance[:, -1:])) ** 2))
+    return points[index], weight / weight.sum(-1, keepdim=True)
+
+
+def _principal_axes(
+    near: Float[Tensor, "n k 3"], weight: Float[Tensor, "n k"]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
+    """Return weighted mean squares along the principal axes, least first, and the axes as columns."""
+    difference = near - (weight[..., None] * near).sum(1)[:, None]
+    scatter = (weight[..., None] * difference).transpose(-1, -2) @ difference
+    mean_squares, axes = torch.linalg.eigh(scatter)
+    return mean_squares, axes

@@ -1,0 +1,147 @@
+"""From what the camera saw to what a shape is fitted to: distinct points without outliers, with outward normals."""
+
+import dataclasses
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.base import Value
+from torchgrasp.cloud.check import remove_duplicates
+from torchgrasp.cloud.filter import check_enough
+from torchgrasp.cloud.neighbours import find_inliers, fit_planes, fit_quadrics
+from torchgrasp.cloud.orientation import compare_normals
+from torchgrasp.cloud.viewpoint import guess_viewpoint, orient_normals, share_facing
+from torchgrasp.errors import BadArgument, TooFewPoints
+from torchgrasp.linalg import unit
+from torchgrasp.values import PointCloud
+
+OFFSET_RATIO = 4.5
+"""Distance of an outlier from its quadric over the median rms of the quadrics: beyond the tails of a camera's noise."""
+FACING = 0.9
+"""Share of normals that face the camera of a view; the others are noise at the rim."""
+MAX_POINTS = 2000
+"""Points that a shape is fitted to, at most: its selection is linear in them and gains nothing from more."""
+MAX_VIEWS, MIN_VIEW_POINTS = 16, 10
+"""Cameras of a merged cloud, at most, and fewest points of each: an object has few sides, an outline many points."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PreparedCloud(Value):
+    """A cloud that was checked and prepared once, by `prepare_cloud`; later stages check nothing.
+
+    Args:
+        cloud: distinct points [m] with outward unit normals, in the dtype that was given.
+        points, normals: at most 2000 of them in float64.
+        viewpoint: camera [m] of all `points`, or of each; None: not needed.
+    """
+
+    cloud: PointCloud
+    points: Float[Tensor, "n 3"]
+    normals: Float[Tensor, "n 3"]
+    viewpoint: Float[Tensor, "*views 3"] | None
+
+    @property
+    def one_sided(self) -> bool:
+        """Whether the cloud is a view, whose normals face the camera, and has a hidden side."""
+        return self.viewpoint is not None and share_facing(self.points, self.normals, self.viewpoint) >= FACING
+
+
+def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = True) -> PreparedCloud:
+    """Check a cloud and return what a shape is fitted to.
+
+    Given normals of random signs are ignored: a view with them would pass for a whole surface. A viewpoint that
+    the given normals do not face is ignored: the cloud is a whole surface.
+
+    Args:
+        cloud: points [m] of one object, of one view or several.
+        generator: draws 2000 of the points if there are more.
+        clean: whether to remove outliers, fit all normals anew and estimate a missing viewpoint; else normals are
+            fitted only where none are given.
+
+    Raises:
+        BadArgument, SuspiciousScale: see `check_cloud`; more than 16 cameras.
+        TooFewPoints: see `check_cloud`; fewer than 10 points of one of several cameras.
+    """
+    cloud = remove_duplicates(cloud)
+    points, normals, viewpoint = cloud.points, cloud.normals, cloud.viewpoint
+    if viewpoint is not None and viewpoint.ndim == 2:
+        _, count = viewpoint.unique(dim=0, return_counts=True)
+        if len(count) > MAX_VIEWS:
+            raise BadArgument("viewpoint", f"{len(count)} different cameras", f"at most {MAX_VIEWS}")
+        if int(count.min()) < MIN_VIEW_POINTS:
+            raise TooFewPoints(
+                "points", f"{int(count.min())} points of one view", f"at least {MIN_VIEW_POINTS} of each"
+            )
+    if normals is not None and not compare_normals(points.double(), normals.double()).oriented:
+        normals = None
+    if clean and normals is not None and viewpoint is not None and share_facing(points, normals, viewpoint) < FACING:
+        viewpoint = None
+    cloud = PointCloud(points, normals, viewpoint)
+    if clean or normals is None:
+        cloud = _fit_normals(cloud, clean)
+    wide = cloud.to(torch.float64)
+    if clean and wide.viewpoint is None:
+        guess = guess_viewpoint(wide.points, fit_planes(wide.points)[0]).to(points.dtype)
+        wide = PointCloud(wide.points, wide.normals, guess.double())
+    if len(wide) > MAX_POINTS:
+        wide = wide.select(torch.randperm(len(wide), generator=generator)[:MAX_POINTS].to(points.device))
+    assert wide.normals is not None
+    return PreparedCloud(cloud, wide.points, unit(wide.normals), wide.viewpoint)
+
+
+def estimate_normals(cloud: PointCloud) -> PointCloud:
+    """Return the distinct points of a cloud with outward unit normals of local quadrics.
+
+    Normals point towards the viewpoint, or else to the side of the normals that the cloud has, or else towards
+    the viewpoint that `estimate_viewpoint` finds, which the result then carries.
+
+    Args:
+        cloud: points [m] of one object; of one view unless it has normals.
+
+    Raises:
+        BadArgument, TooFewPoints, SuspiciousScale: see `check_cloud`.
+
+    >>> estimate_normals(PointCloud(torch.rand(90, 3), viewpoint=torch.tensor([0.5, 0.5, 9.0]))).normals.shape
+    torch.Size([90, 3])
+    """
+    return _fit_normals(remove_duplicates(cloud), clean=False)
+
+
+def clean_cloud(cloud: PointCloud) -> PointCloud:
+    """Return the cloud without outliers, each point moved onto its local quadric, with outward normals.
+
+    Outliers are far from their neighbours (`remove_outliers`), or further from their quadric than 4.5 times the median
+    rms. The move takes the noise of a simulated depth camera from 0.94 to 0.65 mm rms, and shrinks no curved surface.
+
+    Args:
+        cloud: points [m] of one object; of one view unless it has normals.
+
+    Raises:
+        BadArgument, SuspiciousScale: see `check_cloud`.
+        TooFewPoints: fewer than 4 points, before or after cleaning.
+
+    >>> len(clean_cloud(PointCloud(torch.rand(500, 3), viewpoint=torch.tensor([0.5, 0.5, 9.0])))) <= 500
+    True
+    """
+    return _fit_normals(remove_duplicates(cloud), clean=True)
+
+
+def _fit_normals(cloud: PointCloud, clean: bool) -> PointCloud:
+    """Return distinct points with oriented normals of local quadrics; `clean` ones without outliers and on those."""
+    if clean:
+        cloud = cloud.select(check_enough(find_inliers(cloud.points.double()), "inliers"))
+    points = cloud.points
+    feet, normals, rms = fit_quadrics(points.double())
+    if clean:
+        offset = torch.linalg.vector_norm(points.double() - feet, dim=-1)
+        keep = check_enough(offset <= OFFSET_RATIO * rms.median() + 1e-12, "inliers")
+        cloud, points, normals = cloud.select(keep), feet.to(points.dtype)[keep], normals[keep]
+    viewpoint = cloud.viewpoint
+    if viewpoint is None and cloud.normals is not None:
+        outward = cloud.normals.double()
+    else:
+        if viewpoint is None:
+            viewpoint = guess_viewpoint(points.double(), normals).to(points.dtype)
+        outward = viewpoint.double() - points.double()
+    return PointCloud(points, orient_normals(normals, outward).to(points.dtype), viewpoint)
