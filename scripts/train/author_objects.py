@@ -1,6 +1,6 @@
 """Write the files of torchgrasp's own objects into torchgrasp/objects/data, the same bytes every time.
 
-Run it after a change of torchgrasp/objects/author.py or of the virtual camera; it needs the extra `dev`.
+Run it after a change of `train/object_shapes.py` or of the virtual camera; it needs the extra `dev`.
 """
 
 import numpy as np
@@ -10,13 +10,21 @@ from torchgrasp.cloud.camera import partial_view
 from torchgrasp.cloud.io.read import save_cloud
 from torchgrasp.files import write_atomically, write_file
 from torchgrasp.objects import DATA, list_objects
-from train.object_shapes import author
 
 VIEWS = {"cylinder": (20.0, 30.0), "jug": (60.0, 35.0), "rabbit": (55.0, 30.0), "spray": (50.0, 25.0)}
-"""Azimuth and elevation [deg] of the camera that saw each object, by name."""
+"""Azimuth and elevation [deg] of the camera for each object."""
+
+
+def objects() -> None:
+    """Write mesh, convex parts and noisy view of every object of the library."""
+    for name in list_objects():
+        write_object(name)
 
 
 def write_object(name: str) -> None:
+    """Write the files of one object."""
+    from train.object_shapes import author  # needs manifold3d, which the other trainings do not
+
     solid, parts = author(name)
     arrays = solid.to_mesh64()
     corners = np.asarray(arrays.vert_properties)[:, :3].astype(np.float32)
@@ -33,8 +41,3 @@ def write_object(name: str) -> None:
     azimuth, elevation = VIEWS[name]
     save_cloud(partial_view(mesh, azimuth, elevation), DATA / name / "view.ply")
     print(f"{name}: {len(mesh.faces)} faces, {mesh.volume * 1e6:.0f} cm3, {len(parts)} parts")
-
-
-if __name__ == "__main__":
-    for name in list_objects():
-        write_object(name)

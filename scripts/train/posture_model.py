@@ -1,11 +1,6 @@
-"""From a hand's URDF to its learned model: hand.toml if there is none, checks, postures, fit, errors, file.
-
-python scripts/make_hand.py hands/allegro                  a hand with its hand.toml
-python scripts/make_hand.py mine/hand.urdf --tips a b c    a URDF alone: a hand.toml is written beside it first
-"""
+"""From a hand's URDF to its learned model: a hand.toml if there is none, checks, postures, fit, errors, file."""
 
 import dataclasses
-import sys
 import time
 from pathlib import Path
 from typing import Annotated
@@ -14,21 +9,18 @@ import torch
 import tyro
 from tqdm import tqdm
 
-from torchgrasp.errors import BadArgument, GraspError
+from torchgrasp.errors import BadArgument
 from torchgrasp.files import write_file
 from torchgrasp.hand.draft import draft_hand
-from torchgrasp.posture_model.em import Progress
-from torchgrasp.posture_model.evaluate import evaluate_mixture
-from torchgrasp.posture_model.fit import fit_mixture
+from torchgrasp.posture_model import Progress, evaluate_mixture, fit_mixture, sample_configurations
 from torchgrasp.posture_model.mixture import mixture_path
-from torchgrasp.posture_model.sample import sample_configurations
 from torchgrasp.testing import check_hand
 
 PAPER_COMPONENTS = {"allegro": 41, "barrett": 36}
-"""The paper's numbers of Gaussians (Sec. 6.3); 40 for any other hand."""
+"""The paper's numbers of Gaussians (Sec. 6.3)."""
 
 
-def main(
+def posture_model(
     hand: Annotated[str, tyro.conf.Positional],
     tips: tuple[str, ...] = (),
     n: int = 400_000,
@@ -41,32 +33,29 @@ def main(
     checkpoint: Path | None = None,
     out: Path | None = None,
 ) -> None:
-    """Check, sample, fit, judge and write.
+    """Learn the mixture of a hand: check the hand, sample, fit, evaluate and write.
 
     Args:
         hand: name of a shipped hand, the folder of another, or a URDF.
-        tips: links of the fingertips as for `torchgrasp hand new`, where the URDF has no hand.toml beside it.
-        n: free postures to learn from; the paper's number.
+        tips: links of the fingertips as for `torchgrasp hand new`, for a URDF without a hand.toml beside it.
+        n: free postures to learn from; the default is the paper's number.
         components: Gaussians; default: the paper's number for its hands, 40 for others.
-        seed: of postures and start.
-        starts: of the fit, of which the likeliest goes on.
+        seed: of postures and first start.
+        starts: k-means starts of the fit, of which the likeliest continues.
         tolerance: of the mean log-likelihood [nats] at which the fit stops.
-        held_out: further postures to judge by.
+        held_out: further postures for the evaluation.
         workers: threads that sample.
-        checkpoint: file in which the fit is kept after every step, and from which it goes on if it was killed.
+        checkpoint: file that holds the fit after every step; a killed fit continues from it.
         out: file to write; default: mixture.safetensors in the hand's folder.
     """
     if held_out < 2:
         raise BadArgument("held_out", held_out, "at least 2 postures")
-    hand = folder_of(hand, tips)
-    robot = check_hand(hand)
+    torch.set_num_threads(1)  # the products are small: more threads only spin
+    folder = prepare_folder(hand, tips)
+    robot = check_hand(folder)
     begin = time.perf_counter()
     with tqdm(desc="postures", total=n + held_out, unit_scale=True, disable=None) as bar:
-
-        def count(more: int) -> None:
-            bar.update(more)
-
-        samples = sample_configurations(robot, n + held_out, seed, workers, observer=count)
+        samples = sample_configurations(robot, n + held_out, seed, workers, observer=bar.update)
     print(f"{robot.name}: {len(samples)} free postures in {time.perf_counter() - begin:.0f} s")
     begin = time.perf_counter()
     m = PAPER_COMPONENTS.get(robot.name, 40) if components is None else components
@@ -86,27 +75,18 @@ def main(
         f" added relative variance {mixture.regularisation:g}"
     )
     print(f"log-likelihood a posture: {meta['log_likelihood']} fitted; BIC {meta['bic']}")
-    judged = evaluate_mixture(mixture, samples[n:])
-    print(judged)
-    mixture = dataclasses.replace(mixture, meta=meta | judged.meta())
-    print(f"written: {mixture.save(out or mixture_path(hand))}")
+    score = evaluate_mixture(mixture, samples[n:])
+    print(score)
+    mixture = dataclasses.replace(mixture, meta=meta | score.meta())
+    print(f"written: {mixture.save(out or mixture_path(folder))}")
 
 
-def folder_of(hand: str, tips: tuple[str, ...]) -> str:
-    """Return the folder of a URDF after writing a hand.toml there if there is none; any other name as it is."""
+def prepare_folder(hand: str, tips: tuple[str, ...]) -> str:
+    """Return the folder of a URDF, with a drafted hand.toml if there was none; any other name as it is."""
     if Path(hand).suffix != ".urdf":
         return hand
     target = Path(hand).parent / "hand.toml"
     if not target.exists():
-        text = draft_hand(hand, tips)
-        write_file(target, text)
+        write_file(target, draft_hand(hand, tips))
         print(f"written: {target}; look over the lines marked CHECK")
     return str(target.parent)
-
-
-if __name__ == "__main__":
-    torch.set_num_threads(1)  # small products: further threads only spin
-    try:
-        tyro.cli(main)
-    except GraspError as error:
-        sys.exit(f"make_hand: {error}")

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from tests.pinch import pinch
 from torchgrasp import cli
 from torchgrasp.control.squeeze import squeeze
-from torchgrasp.export.grasp_json import format_grasps
-from torchgrasp.export.mujoco_keyframes import format_keyframes
+from torchgrasp.export import format_grasps, format_keyframes
 from torchgrasp.frames import apply
 from torchgrasp.hand.load import load_hand
 
@@ -28,7 +27,7 @@ def planned_tips(hand, grasp):
 def test_the_json_replays_to_the_planned_tips(name):
     yourdfpy = pytest.importorskip("yourdfpy")
     hand, grasp = pinch(name)
-    content = json.loads(format_grasps(grasp, hand, 5.0), parse_constant=pytest.fail)
+    content = json.loads(format_grasps(hand, grasp, 5.0), parse_constant=pytest.fail)
     row = content["grasps"][0]
     robot = yourdfpy.URDF.load(str(hand.urdf_path), load_meshes=False, load_collision_meshes=False)
     robot.update_cfg(row["joints"]["grasp"])
@@ -56,7 +55,7 @@ def test_the_json_replays_to_the_planned_tips(name):
 def test_mujoco_loads_the_keyframes_and_places_the_tips(name):
     mujoco = pytest.importorskip("mujoco")
     hand, grasp = pinch(name)
-    model = mujoco.MjModel.from_xml_string(format_keyframes(grasp, hand, 5.0))
+    model = mujoco.MjModel.from_xml_string(format_keyframes(hand, grasp, 5.0))
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("grasp_0_grasp").id)
     mujoco.mj_kinematics(model, data)
@@ -91,5 +90,5 @@ def test_the_command_writes_both_and_names_what_is_wrong(tmp_path, capsys):
 def test_no_grasps_are_an_empty_list():
     hand = load_hand("allegro")
     grasp = pinch("allegro")[1][torch.zeros(0, dtype=torch.int64)]
-    assert json.loads(format_grasps(grasp, hand))["grasps"] == []
-    assert "<key " not in format_keyframes(grasp, hand)
+    assert json.loads(format_grasps(hand, grasp))["grasps"] == []
+    assert "<key " not in format_keyframes(hand, grasp)

@@ -7,8 +7,7 @@ import tyro
 
 from torchgrasp.cli.common import naming
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.export.grasp_json import format_grasps
-from torchgrasp.export.mujoco_keyframes import format_keyframes
+from torchgrasp.export import format_grasps, format_keyframes
 from torchgrasp.files import write_file
 from torchgrasp.hand.load import load_hand
 from torchgrasp.values import load_grasps
@@ -43,7 +42,7 @@ def export(
         raise BadArgument("--most", most, "at least 1")
     best = found[found.status == Status.OK][:most]
     with naming("--force", "force"):
-        text = (format_grasps if format == "json" else format_keyframes)(best, robot, force)
+        text = (format_grasps if format == "json" else format_keyframes)(robot, best, force)
     with naming("--out", "path"):
         write_file(out, text)
     print(f"{len(best)} grasps of the {robot.name} hand: {out}")

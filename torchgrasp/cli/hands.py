@@ -76,7 +76,9 @@ def check(
     joints = random_joints(sound, POSTURES)
     print(describe(sound, joints))
     modelled = find_hand(hand) / "mixture.safetensors"
-    print(f"learned model: {modelled if modelled.exists() else f'none; python scripts/make_hand.py {hand} learns it'}")
+    print(
+        f"learned model: {modelled if modelled.exists() else f'none; python scripts/train.py posture-model {hand} learns it'}"
+    )
     write_file(out, draw_hand(sound, opposed_posture(sound, joints)))
     print(f"picture: {out}")
     return 0

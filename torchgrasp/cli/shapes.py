@@ -7,7 +7,7 @@ import tyro
 
 from torchgrasp.cli.common import check_seed, check_table, naming, table_height
 from torchgrasp.cloud.io.read import read_cloud
-from torchgrasp.export.surface_mesh import check_surface_path, largest_std, save_surface
+from torchgrasp.export import check_surface_path, largest_std, save_surface
 from torchgrasp.shape.accuracy import format_table
 from torchgrasp.shape.accuracy import measure_accuracy as calibrate_shapes
 from torchgrasp.shape.fit import fit_shape

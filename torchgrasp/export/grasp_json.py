@@ -1,4 +1,4 @@
-"""Grasps as others can replay them: three poses of named joints with forces, torques, frames and units, as plain JSON.
+"""Grasps as plain JSON for other programs: three postures of named joints, with forces, torques, frames and units.
 
 DexGraspBench's own .npy is not written: it is a pickled dictionary, which can run code when it is read.
 """
@@ -17,8 +17,8 @@ from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.ik.approach import DISTANCE
 from torchgrasp.values import Grasps
 
-VERSION = 2
-"""Of the layout."""
+LAYOUT_VERSION = 2
+"""Readers compare it; version 1 had no approach."""
 
 CONVENTIONS = {
     "units": {"length": "m", "angle": "rad", "force": "N", "torque": "N m", "stiffness": "N m/rad", "time": "s"},
@@ -32,26 +32,26 @@ CONVENTIONS = {
     "squeeze": "targets of position-controlled joints: stiffness (squeeze - grasp) = torque = J^T force",
     "force": "of the fingertip on the object at its contact, in the object's frame",
 }
-"""What the numbers mean; it is a part of the file."""
+"""Meaning of the numbers; the file contains it."""
 
 
-def format_grasps(grasps: Grasps, hand: Hand, force: float = 4.0) -> str:
+def format_grasps(hand: Hand, grasps: Grasps, force: float = 4.0) -> str:
     """Return grasps as JSON: for each the pose, three postures by joint name, contacts, forces, torques and checks.
 
-    The hand comes to "pose" along "approach" with its joints at "pregrasp", closes to "grasp" in the time given, and
-    presses towards "squeeze" in as much again, all joints moving evenly.
+    The hand comes to "pose" along "approach" in its "pregrasp" posture. It closes to "grasp" in the time given, and
+    presses towards "squeeze" in as much again. All joints move evenly.
 
     Args:
+        hand: the hand of the grasps.
         grasps: g rows.
-        hand: the hand that they were planned for.
         force: normal force of the strongest finger [N].
 
     Raises:
         BadArgument: joints of another hand, or a force that is not positive.
     """
-    pressed = squeeze(grasps, hand, force)
-    forces = rotate(grasps.obj_from_hand.double(), pressed.forces)
-    postures = {"pregrasp": grasps.pregrasp.double(), "grasp": grasps.joints.double(), "squeeze": pressed.joints}
+    squeezed, path = squeeze(grasps, hand, force), hand.urdf_path
+    forces = rotate(grasps.obj_from_hand.double(), squeezed.forces)
+    postures = {"pregrasp": grasps.pregrasp.double(), "grasp": grasps.joints.double(), "squeeze": squeezed.joints}
     named = {name: hand.expand(joints) for name, joints in postures.items()}
     std = grasps.contacts.std_m
     rows = [
@@ -59,10 +59,10 @@ def format_grasps(grasps: Grasps, hand: Hand, force: float = 4.0) -> str:
             "rank": row,
             "status": Status(int(grasps.status[row])).name,
             "success": float(grasps.success[row]),
-            "pose": _pose(grasps.obj_from_hand[row]),
+            "pose": {"position": pose[:3, 3].tolist(), "quaternion_wxyz": quaternion(pose)},
             "approach": {"direction": grasps.approach[row].tolist(), "distance": DISTANCE},
             "joints": {name: {joint: float(q[row]) for joint, q in all_.items()} for name, all_ in named.items()},
-            "torque": dict(zip(hand.joint_names, pressed.torques[row].tolist(), strict=True)),
+            "torque": dict(zip(hand.joint_names, squeezed.torques[row].tolist(), strict=True)),
             "contacts": [
                 {
                     "finger": finger,
@@ -78,18 +78,13 @@ def format_grasps(grasps: Grasps, hand: Hand, force: float = 4.0) -> str:
             "clearance": float(grasps.clearance[row]),
             "closure_margin": float(grasps.certificate.margin[row]),
         }
-        for row in range(len(grasps))
+        for row, pose in enumerate(grasps.obj_from_hand)
     ]
     content = {
         "format": "torchgrasp grasps",
-        "version": VERSION,
+        "version": LAYOUT_VERSION,
         **CONVENTIONS,
-        "hand": {
-            "name": hand.name,
-            "urdf": hand.urdf_path.name,
-            "root": read_urdf(hand.urdf_path).root,
-            "sha256": hand.source.sha256,
-        },
+        "hand": {"name": hand.name, "urdf": path.name, "root": read_urdf(path).root, "sha256": hand.source.sha256},
         "actuated": list(hand.joint_names),
         "stiffness": {name: drive.kp for name, drive in hand.actuators.items()},
         "strongest_normal_force": force,
@@ -98,11 +93,6 @@ def format_grasps(grasps: Grasps, hand: Hand, force: float = 4.0) -> str:
         "grasps": rows,
     }
     return format_json(content)
-
-
-def _pose(obj_from_hand: Tensor) -> dict[str, list[float]]:
-    """Return a pose as position and quaternion (w, x, y, z)."""
-    return {"position": obj_from_hand[:3, 3].tolist(), "quaternion_wxyz": quaternion(obj_from_hand)}
 
 
 def quaternion(a_from_b: Float[Tensor, "4 4"]) -> list[float]:

@@ -1,4 +1,4 @@
-"""The estimated surface as a mesh file for other programs, coloured by how far it may be off."""
+"""The estimated surface as a mesh file for other programs, coloured by its standard deviation."""
 
 from pathlib import Path
 
@@ -10,14 +10,12 @@ from torchgrasp.shape.surface import Surface
 
 SUFFIXES = (".ply", ".glb")
 """The formats, by suffix."""
-COLORS = "viridis"
-"""Colour map of the standard deviation, that of the report."""
 
 
 def save_surface(surface: Surface, path: Path | str) -> Path:
     """Write a surface as `.ply` or `.glb`, its vertices coloured by `std_m` from 0 (violet) to `largest_std` (yellow).
 
-    The `.ply` file also has the number itself, as the property `std_m` [m] of each vertex.
+    The `.ply` file also holds the number itself, the property `std_m` [m] of each vertex.
 
     Raises:
         BadArgument: another suffix.
@@ -28,7 +26,8 @@ def save_surface(surface: Surface, path: Path | str) -> Path:
 
     path = check_surface_path(path)
     std = surface.std_m.detach().cpu().double().numpy()
-    colors = (255 * matplotlib.colormaps[COLORS](np.clip(std / largest_std(surface), 0.0, 1.0)) + 0.5).astype(np.uint8)
+    shares = np.clip(std / largest_std(surface), 0.0, 1.0)
+    colors = (255 * matplotlib.colormaps["viridis"](shares) + 0.5).astype(np.uint8)  # as in the report
     mesh = trimesh.Trimesh(
         vertices=surface.vertices.detach().cpu().double().numpy(),
         faces=surface.faces.cpu().numpy(),
@@ -44,12 +43,12 @@ def save_surface(surface: Surface, path: Path | str) -> Path:
 
 
 def largest_std(surface: Surface) -> float:
-    """Return the standard deviation [m] that is drawn as the largest: that of 99 % of the vertices, at least 1 um."""
+    """Return the upper end [m] of the colour scale: the 99 % quantile over the vertices, at least 1 um."""
     return max(float(surface.std_m.double().quantile(0.99)), 1e-6)
 
 
 def check_surface_path(path: Path | str) -> Path:
-    """Return the path of a mesh file that `save_surface` can write; raise `BadArgument` for another suffix.
+    """Return the path if `save_surface` can write its format; raise `BadArgument` for another suffix.
 
     >>> check_surface_path("a.glb").suffix
     '.glb'

@@ -47,7 +47,7 @@ def scene_mjcf(setup: SceneSpec) -> str:
     option = ET.SubElement(root, "option", OPTION, timestep=repr(setup.timestep), gravity=f"0 0 {-setup.gravity!r}")
     ET.SubElement(option, "flag", multiccd="enable", autoreset="disable")
     default = ET.SubElement(root, "default")
-    friction = _text((setup.friction, setup.friction * setup.patch, 0.0))
+    friction = format_numbers((setup.friction, setup.friction * setup.patch, 0.0))
     condim = "4" if setup.patch > 0 else "3"
     ET.SubElement(default, "geom", friction=friction, condim=condim, solref=SOLREF, solimp=SOLIMP)
     ET.SubElement(default, "joint", solreflimit=SOLREF)
@@ -55,7 +55,7 @@ def scene_mjcf(setup: SceneSpec) -> str:
     asset, world, actuator = (ET.SubElement(root, tag) for tag in ("asset", "worldbody", "actuator"))
     if setup.table:
         bits = _bits(TABLE_BIT, HAND_BIT)
-        height = _text((0.0, 0.0, float(setup.mesh.bounds[0, 2])))
+        height = format_numbers((0.0, 0.0, float(setup.mesh.bounds[0, 2])))
         ET.SubElement(world, "geom", bits, name=TABLE, type="plane", size="1 1 0.1", pos=height)
     _add_object(asset, world, setup)
     _add_hand(world, setup, urdf)
@@ -73,7 +73,7 @@ def _add_object(asset: ET.Element, world: ET.Element, setup: SceneSpec) -> None:
     inertia = np.asarray(setup.mesh.moment_inertia) * (setup.mass / setup.mesh.volume)
     _weigh(body, setup.mass, setup.mesh.center_mass, inertia[np.triu_indices(3)])
     for k, part in enumerate(setup.parts):
-        ET.SubElement(asset, "mesh", name=f"part_{k}", vertex=_text(np.asarray(part.vertices, float).ravel()))
+        ET.SubElement(asset, "mesh", name=f"part_{k}", vertex=format_numbers(np.asarray(part.vertices, float).ravel()))
         ET.SubElement(body, "geom", _bits(OBJECT_BIT, HAND_BIT | TABLE_BIT), type="mesh", mesh=f"part_{k}")
 
 
@@ -83,7 +83,7 @@ def _add_hand(world: ET.Element, setup: SceneSpec, urdf: Urdf) -> None:
     for slide in mount_slides(setup):
         arm = ET.SubElement(arm, "body", name=slide.name, gravcomp="1")
         _weigh(arm, 1.0, np.zeros(3), (0.01, 0.0, 0.0, 0.01, 0.0, 0.01))
-        limits = {"axis": _text(slide.axis), "range": _text((slide.lower, slide.upper))}
+        limits = {"axis": format_numbers(slide.axis), "range": format_numbers((slide.lower, slide.upper))}
         ET.SubElement(arm, "joint", limits, name=slide.name, type="slide")
     add_links(arm, urdf, setup.world_from_hand)
 
@@ -100,7 +100,7 @@ def add_links(parent: ET.Element, urdf: Urdf, parent_from_root: np.ndarray) -> E
                 bodies[joint.child] = body
                 if joint.kind != "fixed":
                     kind = "slide" if joint.kind == "prismatic" else "hinge"
-                    limits = {"axis": _text(joint.axis), "range": _text((joint.lower, joint.upper))}
+                    limits = {"axis": format_numbers(joint.axis), "range": format_numbers((joint.lower, joint.upper))}
                     ET.SubElement(body, "joint", limits, name=joint.name, type=kind, armature=repr(ARMATURE))
     return root
 
@@ -112,7 +112,7 @@ def _add_link(parent: ET.Element, link: Link, place: Iterable[float], turn: np.n
         _weigh(body, link.mass, link.com, link.inertia)
     for shape in link.shapes:
         halves = {"box": (0.5, 0.5, 0.5), "sphere": (1.0,), "cylinder": (1.0, 0.5)}[shape.kind]
-        size = _text(np.multiply(shape.size, halves))
+        size = format_numbers(np.multiply(shape.size, halves))
         frame = _frame(shape.xyz, _rotation(shape.rpy))
         ET.SubElement(body, "geom", _bits(HAND_BIT, 0) | frame, type=shape.kind, size=size)
     return body
@@ -120,15 +120,15 @@ def _add_link(parent: ET.Element, link: Link, place: Iterable[float], turn: np.n
 
 def add_drive(actuator: ET.Element, joint: str, drive: Actuator) -> None:
     """Let a motor hold a joint at its target: kp (target - q) - kd dq/dt, the effort at most."""
-    gains = {"kp": repr(drive.kp), "kv": repr(drive.kd), "forcerange": _text((-drive.effort, drive.effort))}
+    gains = {"kp": repr(drive.kp), "kv": repr(drive.kd), "forcerange": format_numbers((-drive.effort, drive.effort))}
     ET.SubElement(actuator, "position", gains, name=joint, joint=joint)
 
 
 def _weigh(body: ET.Element, mass: float, centre: Iterable[float], inertia: Iterable[float]) -> None:
     """Give a body its mass [kg], centre [m] and inertia (xx, xy, xz, yy, yz, zz) [kg m^2] in its own axes."""
     xx, xy, xz, yy, yz, zz = inertia
-    tensor = _text((xx, yy, zz, xy, xz, yz))
-    ET.SubElement(body, "inertial", mass=repr(float(mass)), pos=_text(centre), fullinertia=tensor)
+    tensor = format_numbers((xx, yy, zz, xy, xz, yz))
+    ET.SubElement(body, "inertial", mass=repr(float(mass)), pos=format_numbers(centre), fullinertia=tensor)
 
 
 def _bits(kind: int, others: int) -> dict[str, str]:
@@ -138,7 +138,7 @@ def _bits(kind: int, others: int) -> dict[str, str]:
 
 def _frame(place: Iterable[float], turn: np.ndarray) -> dict[str, str]:
     """Return a pose as attributes: where it is, and where its first two axes point."""
-    return {"pos": _text(place), "xyaxes": _text(turn[:, :2].T.ravel())}
+    return {"pos": format_numbers(place), "xyaxes": format_numbers(turn[:, :2].T.ravel())}
 
 
 def _rotation(rpy: tuple[float, float, float]) -> np.ndarray:
@@ -146,6 +146,6 @@ def _rotation(rpy: tuple[float, float, float]) -> np.ndarray:
     return rotation_from_rpy(rpy).numpy()
 
 
-def _text(numbers: Iterable[float]) -> str:
+def format_numbers(numbers: Iterable[float]) -> str:
     """Return numbers as an attribute holds them, without loss."""
     return " ".join(repr(float(x)) for x in numbers)
