@@ -44,9 +44,9 @@ def test_a_draft_finds_what_the_shipped_hands_have(tmp_path, name, tips):
     ours, theirs = read_hand_toml(tmp_path / "hand.toml"), read_hand_toml(shipped / "hand.toml")
     assert ours.coupling == theirs.coupling and ours.approach == theirs.approach
     assert [f.joints for f in ours.fingers] == [f.joints for f in theirs.fingers]
-    pads = [torch.tensor([f.normal for f in spec.fingers], dtype=torch.float64) for spec in (ours, theirs)]
+    pads = [torch.tensor([f.pad.normal for f in spec.fingers], dtype=torch.float64) for spec in (ours, theirs)]
     assert float((pads[0] * pads[1]).sum(1).min()) > 0.95
-    assert [f.radius for f in ours.fingers] == [f.radius for f in theirs.fingers]
+    assert [f.pad.radius for f in ours.fingers] == [f.pad.radius for f in theirs.fingers]
     assert set(map(frozenset, theirs.pairs or ())) <= set(map(frozenset, ours.pairs or ()))
     assert check_hand(tmp_path).joint_names == load_hand(name).joint_names
 

@@ -13,7 +13,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.self_collision import self_collision_from_urdf
-from torchgrasp.hand.urdf import read_urdf
+from torchgrasp.hand.urdf import Mimic, read_urdf
 from torchgrasp.testing import check_hand
 
 HANDS = [("allegro", "default"), ("allegro", "paper_literal"), ("barrett", "default")]
@@ -122,7 +122,7 @@ def test_neighbours_and_links_that_always_or_never_meet_are_no_pairs(toy_hand):
     urdf = read_urdf(toy_hand / "hand.urdf")
     assert collision_pairs(urdf, {}, n=50) == [("t1", "t2"), ("t2", "t3")] or collision_pairs(urdf, {}, n=50) == []
     with pytest.raises(BadArgument, match="coupling: found j9"):
-        collision_pairs(urdf, {"j9": ("j1", 1.0, 0.0)}, n=50)
+        collision_pairs(urdf, {"j9": Mimic("j1", 1.0, 0.0)}, n=50)
     with pytest.raises(BadArgument, match="n: found 0"):
         collision_pairs(urdf, {}, n=0)
 

@@ -5,7 +5,7 @@ import torch
 import trimesh
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.hand.box_distance import box_distance
+from torchgrasp.hand.self_collision import box_distance
 from torchgrasp.ik.sdf import field_from_mesh, field_from_surface
 
 

@@ -10,27 +10,25 @@ from torch import Tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.self_collision import self_collision_from_urdf
-from torchgrasp.hand.urdf import Urdf
+from torchgrasp.hand.urdf import Mimic, Urdf
 
 NEAR = 0.002
 """Links that come nearer than this [m] in some posture are a pair to test."""
 ALWAYS = 0.98
-"""Links that overlap in a larger share of the postures do so by construction, and are no pair to test."""
-CHUNK = 1000
+"""Links that overlap in a larger share of the postures overlap by construction, and are no pair to test."""
+ROWS_PER_CHUNK = 1000
+"""Postures tested at a time, which bounds the memory."""
 
 
-def collision_pairs(
-    urdf: Urdf, coupling: Mapping[str, tuple[str, float, float]], n: int = 20_000, seed: int = 0
-) -> list[tuple[str, str]]:
-    """Return the pairs of links that meet in some postures of a hand, but not in nearly all, and share no joint.
+def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, seed: int = 0) -> list[tuple[str, str]]:
+    """Return the pairs of links without a common joint that meet in some postures, but not in nearly all.
 
-    The postures are uniform within the limits of every joint, so that the list serves all finger options. The test is
-    exact for boxes and balls (`torchgrasp.hand.self_collision`).
+    The postures are uniform within the limits of every joint, so that the pairs serve all finger options.
 
     Args:
         urdf: the hand's tree, with collision shapes.
-        coupling: which joint follows which, as joint: (source, ratio, offset); the other joints move freely.
-        n: how many postures.
+        coupling: which joint follows which; the other joints move freely.
+        n: number of postures.
         seed: of the draws.
 
     Raises:
@@ -43,32 +41,29 @@ def collision_pairs(
     """
     if not 1 <= n <= 10**7:
         raise BadArgument("n", n, "a whole number in [1, 10^7]")
-    tree, every = tree_from_urdf(urdf), self_collision_from_urdf(urdf, None)
-    if not len(every.pairs):
+    tree, shapes = tree_from_urdf(urdf), self_collision_from_urdf(urdf, None)
+    if not len(shapes.pairs):
         return []
-    links, owner = torch.unique(every.link[every.pairs].sort(1).values, dim=0, return_inverse=True)
+    links, owner = torch.unique(shapes.link[shapes.pairs].sort(1).values, dim=0, return_inverse=True)
     met, near = torch.zeros(2, len(links))
-    for values in draw_postures(urdf, coupling, n, seed).split(CHUNK, 1):
-        apart = every.separations(tree.frames(values), NEAR)
-        apart = apart.new_full((len(links), apart.shape[1]), torch.inf).scatter_reduce(
-            0, owner[:, None].expand_as(apart), apart, "amin"
-        )
-        met += (apart < 0).sum(1)
-        near += (apart < NEAR).sum(1)
-    kept = links[(near > 0) & (met <= ALWAYS * n)]
-    return [(tree.link_names[i], tree.link_names[j]) for i, j in kept.tolist()]
+    for values in draw_postures(urdf, coupling, n, seed).split(ROWS_PER_CHUNK, 1):
+        apart = shapes.separations(tree.frames(values), NEAR)
+        least = apart.new_full((len(links), apart.shape[1]), torch.inf)
+        least = least.scatter_reduce(0, owner[:, None].expand_as(apart), apart, "amin")
+        met += (least < 0).sum(1)
+        near += (least < NEAR).sum(1)
+    meeting = links[(near > 0) & (met <= ALWAYS * n)]
+    return [(tree.link_names[i], tree.link_names[j]) for i, j in meeting.tolist()]
 
 
-def draw_postures(
-    urdf: Urdf, coupling: Mapping[str, tuple[str, float, float]], n: int, seed: int
-) -> Float[Tensor, "j n"]:
-    """Draw every movable joint uniformly, but those that follow another."""
-    movable = {j.name: j for j in urdf.joints if j.kind != "fixed"}
-    unknown = sorted(({*coupling} | {source for source, _, _ in coupling.values()}) - set(movable))
+def draw_postures(urdf: Urdf, coupling: Mapping[str, Mimic], n: int, seed: int) -> Float[Tensor, "j n"]:
+    """Draw every movable joint uniformly within its limits; coupled joints follow."""
+    movable = {j.name: j for j in urdf.movable}
+    unknown = sorted(({*coupling} | {mimic.source for mimic in coupling.values()}) - set(movable))
     if unknown:
         raise BadArgument("coupling", unknown[0], f"joints of the URDF: {sorted(movable)}")
     share = np.random.default_rng(seed).random((len(movable), n))
     drawn = {name: j.lower + (j.upper - j.lower) * share[k] for k, (name, j) in enumerate(movable.items())}
-    for joint, (source, ratio, offset) in coupling.items():
-        drawn[joint] = ratio * drawn[source] + offset
+    for joint, mimic in coupling.items():
+        drawn[joint] = mimic.ratio * drawn[mimic.source] + mimic.offset
     return torch.from_numpy(np.stack([drawn[name] for name in movable]))

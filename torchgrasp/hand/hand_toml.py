@@ -1,16 +1,18 @@
 """Reading of hand.toml: what a URDF does not say about a grasping hand.
 
-Which fingers grasp and in which order, where their pads are, which joints follow others, where the unused ones are
-parked, and which links can meet.
+It names the grasping fingers in their order and their pads, the joints that follow others, the posture of the unused
+ones, and the links that can meet.
 """
 
 import dataclasses
 import math
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from torchgrasp.errors import BadArgument, HandFileError
+from torchgrasp.hand.safe_xml import read_bounded
+from torchgrasp.hand.urdf import Mimic, Triple
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -18,24 +20,28 @@ else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 MAX_BYTES = 1024 * 1024
+"""Largest hand.toml; those of the shipped hands have about 5 kB."""
 
-Triple = tuple[float, float, float]
 
+class Pad(NamedTuple):
+    """Where a fingertip touches, in the tip link's frame [m].
 
-@dataclasses.dataclass(frozen=True)
-class Finger:
-    """A finger: its joints from the palm out, its tip link, and the pad in the tip link's frame [m].
-
-    `radius` is that of the tip's sphere around `center`; 0 for a tip that touches in its contact point alone.
+    `radius` is that of the tip's sphere about `center`; 0: the tip touches in `contact` alone.
     """
 
-    name: str
-    joints: tuple[str, ...]
-    tip_link: str
     contact: Triple
     normal: Triple
     center: Triple
     radius: float
+
+
+class Finger(NamedTuple):
+    """A finger: its joints from the palm outward, its tip link and its pad."""
+
+    name: str
+    joints: tuple[str, ...]
+    tip_link: str
+    pad: Pad
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,13 +60,13 @@ class HandSpec:
     fingers: tuple[Finger, Finger, Finger]
     all_fingers: tuple[Finger, ...]
     parked: dict[str, float]
-    coupling: dict[str, tuple[str, float, float]]
+    coupling: dict[str, Mimic]
     pairs: tuple[tuple[str, str], ...] | None
     data: bytes
 
 
 def _finite(value: Any) -> float | None:
-    """Return a number as a float, or None for what is no finite number."""
+    """Return a number as a float; None for anything that is not a finite number."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return None
     try:
@@ -79,52 +85,51 @@ class _Table:
 
     def wrong(self, key: str, allowed: str) -> HandFileError:
         """Make the error for a key."""
-        found = repr(self.table[key])[:80] if key in self.table else "nothing"
-        return HandFileError("hand.toml", f"{self.path}: {self.name}{key} = {found}", allowed)
+        value = repr(self.table[key])[:80] if key in self.table else "nothing"
+        return HandFileError("hand.toml", f"{self.path}: {self.name}{key} = {value}", allowed)
+
+    def value(self, key: str, default: Any = None) -> Any:
+        """Read a value of any type."""
+        self.read.add(key)
+        return self.table.get(key, default)
 
     def text(self, key: str) -> str:
         """Read a word."""
-        self.read.add(key)
-        value = self.table.get(key)
+        value = self.value(key)
         if not isinstance(value, str) or not 0 < len(value) <= 200 or not value.isprintable():
             raise self.wrong(key, "a text of 1 to 200 letters")
         return value
 
     def texts(self, key: str) -> tuple[str, ...]:
         """Read a list of words."""
-        self.read.add(key)
-        value = self.table.get(key)
+        value = self.value(key)
         if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
             raise self.wrong(key, "a list of texts")
         return tuple(value)
 
     def number(self, key: str, low: float = -math.inf, high: float = math.inf) -> float:
         """Read a finite number in a range."""
-        self.read.add(key)
-        value = _finite(self.table.get(key))
+        value = _finite(self.value(key))
         if value is None or not low <= value <= high:
             raise self.wrong(key, f"a finite number in [{low:g}, {high:g}]")
         return value
 
     def triple(self, key: str) -> Triple:
         """Read three finite numbers."""
-        self.read.add(key)
-        value = self.table.get(key)
-        found = [_finite(x) for x in value] if isinstance(value, list) and len(value) == 3 else [None]
-        if None in found:
+        value = self.value(key)
+        numbers = [_finite(x) for x in value] if isinstance(value, list) and len(value) == 3 else [None]
+        if None in numbers:
             raise self.wrong(key, "three finite numbers")
-        x, y, z = (v for v in found if v is not None)
+        x, y, z = (v for v in numbers if v is not None)
         return x, y, z
 
     def inner(self, key: str, optional: bool = False) -> "_Table":
         """Read a table inside."""
-        self.read.add(key)
-        return _Table(self.path, f"{self.name}{key}.", self.table.get(key, {} if optional else None))
+        return _Table(self.path, f"{self.name}{key}.", self.value(key, {} if optional else None))
 
     def tables(self, key: str) -> list["_Table"]:
         """Read a list of tables inside."""
-        self.read.add(key)
-        value = self.table.get(key, [])
+        value = self.value(key, [])
         if not isinstance(value, list) or len(value) > 1000:
             raise self.wrong(key, "a list of at most 1000 tables")
         return [_Table(self.path, f"{self.name}{key}[{i}].", v) for i, v in enumerate(value)]
@@ -144,11 +149,7 @@ def read_hand_toml(path: Path | str, fingers: str = "default") -> HandSpec:
         BadArgument: `fingers` names no option of this hand.
     """
     path = Path(path)
-    if not path.is_file():
-        raise HandFileError("hand.toml", f"{path}, which is no file", "a hand.toml")
-    if path.stat().st_size > MAX_BYTES:
-        raise HandFileError("hand.toml", f"{path}: {path.stat().st_size} bytes", f"at most {MAX_BYTES} bytes")
-    data = path.read_bytes()
+    data = read_bounded("hand.toml", path, "a hand.toml", MAX_BYTES)
     try:
         top = _Table(path, "", tomllib.loads(data.decode("utf-8")))
     except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
@@ -157,16 +158,14 @@ def read_hand_toml(path: Path | str, fingers: str = "default") -> HandSpec:
     urdf = (path.parent / top.text("urdf")).resolve()
     if urdf.parent != path.parent.resolve():
         raise top.wrong("urdf", "a file beside hand.toml")
-    margin = top.number("limit_margin", 0.0, 1.0)
-    actuators = top.inner("actuators")
+    margin, actuators = top.number("limit_margin", 0.0, 1.0), top.inner("actuators")
     kp, kd = actuators.number("kp", 1e-6, 1e6), actuators.number("kd", 0.0, 1e6)
     actuators.done()
     known = tuple(_finger(t) for t in top.tables("finger"))
     if len({f.name for f in known}) < len(known):
         raise HandFileError("hand.toml", f"{path}: fingers {[f.name for f in known]}", "every name once")
     chosen, parked = _option(top, known, fingers)
-    coupling = _coupling(top)
-    pairs = _pairs(top)
+    coupling, pairs = _coupling(top), _pairs(top)
     top.done()
     return HandSpec(
         path, name, urdf, base_link, approach, margin, kp, kd, fingers, chosen, known, parked, coupling, pairs, data
@@ -186,7 +185,8 @@ def _finger(table: _Table) -> Finger:
         center, radius = table.triple("center"), table.number("radius", 1e-4, 0.1)
         if math.dist(contact, tuple(c + radius * n for c, n in zip(center, normal, strict=True))) > 1e-6:
             raise table.wrong("contact", "center + radius * normal")
-    finger = Finger(table.text("name"), table.texts("joints"), table.text("tip_link"), contact, normal, center, radius)
+    pad = Pad(contact, normal, center, radius)
+    finger = Finger(table.text("name"), table.texts("joints"), table.text("tip_link"), pad)
     table.done()
     return finger
 
@@ -208,25 +208,24 @@ def _option(
     return (by_name[names[0]], by_name[names[1]], by_name[names[2]]), parked
 
 
-def _coupling(top: _Table) -> dict[str, tuple[str, float, float]]:
-    """Read which joint follows which, as joint = ratio * source + offset."""
-    table, coupling = top.inner("coupling", optional=True), {}
+def _coupling(top: _Table) -> dict[str, Mimic]:
+    """Read which joint follows which."""
+    table, coupling = top.inner("coupling", optional=True), dict[str, Mimic]()
     for joint in table.table:
         row = table.inner(joint)
-        coupling[joint] = (row.text("source"), row.number("ratio"), row.number("offset"))
+        coupling[joint] = Mimic(row.text("source"), row.number("ratio"), row.number("offset"))
         row.done()
-    for joint, (source, _, _) in coupling.items():
-        if source in coupling:
+    for joint, mimic in coupling.items():
+        if mimic.source in coupling:
             raise table.wrong(joint, "a source that follows no other joint")
     return coupling
 
 
 def _pairs(top: _Table) -> tuple[tuple[str, str], ...] | None:
-    """Read the pairs of links that the self-collision test takes (none given: all but neighbours)."""
+    """Read the pairs of links that the self-collision test takes; None: the file lists none."""
     table, pairs = top.inner("self_collision", optional=True), None
     if "pairs" in table.table:
-        table.read.add("pairs")
-        rows = table.table["pairs"]
+        rows = table.value("pairs")
         if not isinstance(rows, list) or not all(
             isinstance(r, list) and len(r) == 2 and all(isinstance(x, str) for x in r) and r[0] != r[1] for r in rows
         ):

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.hand_toml import HandSpec
-from torchgrasp.hand.urdf import Urdf
+from torchgrasp.hand.urdf import Mimic, Urdf
 
 ROUNDING = 1e-6
 """Joints may pass their limits by this [rad]: limits and joints are both rounded to float32."""
@@ -69,7 +69,7 @@ def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
     Raises:
         HandFileError: a joint neither grasps nor is parked, or `limit_margin` leaves a joint no range.
     """
-    movable = {j.name: j for j in urdf.joints if j.kind != "fixed"}
+    movable = {j.name: j for j in urdf.movable}
     names = tuple(dict.fromkeys(j for f in spec.fingers for j in f.joints if j not in spec.coupling))
     limits = torch.tensor([[movable[n].lower, movable[n].upper] for n in names], dtype=torch.float64)
     limits = limits + torch.tensor([spec.limit_margin, -spec.limit_margin], dtype=torch.float64)
@@ -80,7 +80,7 @@ def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
     coupling = torch.zeros(len(movable), len(names), dtype=torch.float64)
     offset = torch.zeros(len(movable), dtype=torch.float64)
     for row, joint in enumerate(movable):
-        source, ratio, shift = spec.coupling.get(joint, (joint, 1.0, 0.0))
+        source, ratio, shift = spec.coupling.get(joint, Mimic(joint, 1.0, 0.0))
         if source in names:
             coupling[row, names.index(source)] = ratio
             offset[row] = shift

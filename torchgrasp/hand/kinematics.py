@@ -97,8 +97,7 @@ def tree_from_urdf(urdf: Urdf, ends: Collection[str] | None = None) -> Kinematic
         levels.append(below)
     names = [name for level in levels for name in level]
     links = [x.name for x in urdf.links if x.name in part]
-    joints = [j for j in urdf.joints if j.kind != "fixed"]
-    index = {j.child: k for k, j in enumerate(joints)}
+    joints, index = urdf.movable, {j.child: k for k, j in enumerate(urdf.movable)}
     parents = [[levels[k - 1].index(above[n].parent) if k else 0 for n in level] for k, level in enumerate(levels)]
     movers = {name: set(urdf.joints_above(name)) for name in links}
     return KinematicTree(

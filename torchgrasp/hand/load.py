@@ -68,7 +68,6 @@ def hand_from_files(spec: HandSpec, urdf: Urdf) -> Hand:
     _check_names(spec, urdf)
     _check_coupling(spec, urdf)
     _check_shapes(spec, urdf)
-    movable = [j for j in urdf.joints if j.kind != "fixed"]
     return Hand(
         name=spec.name,
         source=HandSource(spec.option, urdf.path, hashlib.sha256(spec.data + b"\0" + urdf.data).hexdigest()),
@@ -76,7 +75,7 @@ def hand_from_files(spec: HandSpec, urdf: Urdf) -> Hand:
         tree=tree_from_urdf(urdf),
         tips=tips_from_files(spec, urdf),
         approach=torch.tensor(spec.approach, dtype=torch.float64),
-        actuators={j.name: Actuator(j.effort, j.velocity, spec.kp, spec.kd) for j in movable},
+        actuators={j.name: Actuator(j.effort, j.velocity, spec.kp, spec.kd) for j in urdf.movable},
         collision_spheres=spheres_from_urdf(urdf, spec),
         self_collision=self_collision_from_urdf(urdf, spec.pairs),
     )
@@ -84,18 +83,18 @@ def hand_from_files(spec: HandSpec, urdf: Urdf) -> Hand:
 
 def _check_names(spec: HandSpec, urdf: Urdf) -> None:
     """Refuse names in hand.toml that the URDF does not have."""
-    movable, links = {j.name for j in urdf.joints if j.kind != "fixed"}, {x.name for x in urdf.links}
+    movable, links = {j.name for j in urdf.movable}, {x.name for x in urdf.links}
     if spec.base_link != urdf.root:
         raise HandFileError("hand.toml", f"{spec.path}: base_link {spec.base_link!r}", f"the URDF's root {urdf.root!r}")
     joints = [j for f in spec.all_fingers for j in f.joints] + list(spec.parked) + list(spec.coupling)
-    joints += [source for source, _, _ in spec.coupling.values()]
+    joints += [mimic.source for mimic in spec.coupling.values()]
     named = [f.tip_link for f in spec.all_fingers] + [x for pair in spec.pairs or () for x in pair]
     for kind, found, known in (("joint", joints, movable), ("link", named, links)):
         unknown = sorted(set(found) - known)
         if unknown:
             raise HandFileError("hand.toml", f"{spec.path}: {kind} {unknown[0]!r}", f"one of {sorted(known)}")
     grasping = {j for f in spec.fingers for j in f.joints}
-    moved = grasping | {source for joint, (source, _, _) in spec.coupling.items() if joint in grasping}
+    moved = grasping | {mimic.source for joint, mimic in spec.coupling.items() if joint in grasping}
     both = sorted(set(spec.parked) & (moved | set(spec.coupling)))
     if both:
         allowed = "joints that neither grasp nor follow another"

@@ -8,10 +8,26 @@ from typing import Any
 from torchgrasp.errors import HandFileError
 
 MAX_DEPTH = 64
+"""Deepest nesting of elements; a URDF needs six."""
 MAX_ELEMENTS = 50_000
+"""Most elements: about 100 for each of 512 links."""
 MAX_MESH = 50 * 1024 * 1024
+"""Largest mesh that a URDF may name [bytes]."""
 IGNORED = {"material", "transmission", "gazebo"}
-"""Elements of a robot, beside links and joints, that a hand does without."""
+"""Elements of a robot, besides links and joints, that a hand can do without."""
+
+
+def read_bounded(source: str, path: Path, wanted: str, most: int) -> bytes:
+    """Read a file of at most `most` bytes.
+
+    Raises:
+        HandFileError: about `source`: there is no file, which `wanted` describes, or it is larger.
+    """
+    if not path.is_file():
+        raise HandFileError(source, f"{path}, which is no file", wanted)
+    if path.stat().st_size > most:
+        raise HandFileError(source, f"{path}: {path.stat().st_size} bytes", f"at most {most} bytes")
+    return path.read_bytes()
 
 
 class _BoundedBuilder(ET.TreeBuilder):
@@ -35,7 +51,7 @@ class _BoundedBuilder(ET.TreeBuilder):
 
 
 def parse_urdf(path: Path, data: bytes) -> ET.Element:
-    """Parse a URDF's bytes that hold no declaration through which XML could reach other files or explode.
+    """Parse the bytes of a URDF; refuse every declaration by which XML could reach other files or explode.
 
     Args:
         path: of the file, for the messages; meshes must lie in its folder, and are not opened.
@@ -72,17 +88,16 @@ def parse_urdf(path: Path, data: bytes) -> ET.Element:
 
 
 def _check_mesh_name(path: Path, name: str) -> None:
-    """Refuse a mesh outside the hand's folder, and what is no file there; the mesh itself is not opened."""
-    allowed = "a relative .stl or .obj inside the hand's folder"
+    """Refuse a mesh outside the hand's folder, and one that is no regular file; the mesh itself is not opened."""
+    refusal = HandFileError(
+        "urdf", f"{path}: mesh {name[:80]!r}", "a relative .stl or .obj of at most 50 MiB inside the hand's folder"
+    )
     if not 0 < len(name) <= 255 or ":" in name or "\\" in name or Path(name).suffix.lower() not in (".stl", ".obj"):
-        raise HandFileError("urdf", f"{path}: mesh {name[:80]!r}", allowed)
-    folder = path.parent.resolve()
+        raise refusal
+    mesh = path.parent.resolve() / name
     try:
-        inside = (folder / name).resolve().is_relative_to(folder)
+        inside = mesh.resolve().is_relative_to(path.parent.resolve())
     except (OSError, RuntimeError):  # a loop of symbolic links, a name that the file system does not take
         inside = False
-    if not inside:
-        raise HandFileError("urdf", f"{path}: mesh {name[:80]!r}", allowed)
-    mesh = folder / name
-    if mesh.exists() and not (mesh.is_file() and mesh.stat().st_size <= MAX_MESH):
-        raise HandFileError("urdf", f"{path}: mesh {name[:80]!r}", f"a regular file of at most {MAX_MESH} bytes")
+    if not inside or (mesh.exists() and not (mesh.is_file() and mesh.stat().st_size <= MAX_MESH)):
+        raise refusal

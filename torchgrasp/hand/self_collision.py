@@ -1,7 +1,7 @@
-"""Self-collision of a hand by the collision shapes of its URDF, which are what a simulator sees.
+"""Signed separations of a hand's links, by the collision shapes of its URDF.
 
-The sign is exact for boxes and balls: two boxes overlap unless one of 15 axes parts them. A cylinder is taken as a
-prism of twelve sides, which is off by 2 % of its radius.
+The sign is exact for boxes and spheres: two boxes overlap unless one of 15 axes separates them. A cylinder becomes a
+prism of twelve sides, which is off by 2 % of the radius.
 """
 
 import dataclasses
@@ -15,24 +15,28 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.frames import rotation_from_rpy
-from torchgrasp.hand.box_distance import box_distance, box_separation
 from torchgrasp.hand.kinematics import map_points
 from torchgrasp.hand.urdf import Shape, Triple, Urdf
 
-PRISM = 6
-"""Boxes that a cylinder is the union of: each reaches from one side of the prism to the opposite one."""
+PRISM_BOXES = 6
+"""Boxes whose union is the prism of a cylinder: each reaches from one side to the opposite one."""
+PARALLEL = 1e-10
+"""Squared sine below which two edges count as parallel; the faces' normals then cover their product."""
+
+Placed = tuple[Float[Tensor, "3 3 s n"], Float[Tensor, "3 s n"]]
+"""Axes and centres of shapes in the palm's frame."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SelfCollision(Value):
-    """Boxes and balls fixed to links, in link frames [m], and the pairs of them to test.
+    """Boxes and spheres fixed to links, in link frames [m], and the pairs of them to test.
 
-    A ball has a `radius` and `half` sizes of 0; a box has `half` sizes and a radius of 0. In `pairs` those of two boxes
-    come first, then those of a ball and a box, in this order, then those of two balls: `kinds` counts each.
+    A sphere has a `radius` and half sizes of 0; a box has half sizes and a radius of 0. `pairs` lists pairs of boxes
+    first, then (sphere, box), then pairs of spheres; `kinds` counts each.
     """
 
     link: Int[Tensor, " s"]
-    turn: Float[Tensor, "3 3 s"]
+    rotation: Float[Tensor, "3 3 s"]
     center: Float[Tensor, "s 3"]
     half: Float[Tensor, "s 3"]
     radius: Float[Tensor, " s"]
@@ -42,8 +46,8 @@ class SelfCollision(Value):
     def clearance(self, frames: Float[Tensor, "3 4 l n"], below: float = torch.inf) -> Float[Tensor, " n"]:
         """Return the signed least separation [m] of the pairs; infinite for a hand without pairs.
 
-        A pair is evaluated where it can be the least: where the balls around its shapes are not farther apart than
-        the balls inside the shapes of some pair, nor than `below`. What is not below that is some larger number.
+        A pair is skipped if its bounding spheres are farther apart than the inscribed spheres of the closest pair, or
+        than `below`. Values above `below` are some larger number.
         """
         least = frames.new_full(frames.shape[3:], torch.inf)
         if not len(self.pairs):
@@ -51,47 +55,46 @@ class SelfCollision(Value):
         shapes = self._place(frames)
         with torch.no_grad():
             distance = self._distances(shapes[1])
-            inner = self.half.amin(1) + self.radius
-            limit = (distance - self._sums(inner, distance)).amin(0).clamp_max(below)
-            pair, row = torch.nonzero(distance - self._sums(self._outer(), distance) <= limit, as_tuple=True)
+            inscribed = self.half.amin(1) + self.radius
+            limit = (distance - self._sums(inscribed, distance)).amin(0).clamp_max(below)
+            pair, row = torch.nonzero(distance - self._sums(self._bounding(), distance) <= limit, as_tuple=True)
         return least.scatter_reduce(0, row, self._separations(shapes, pair, row), "amin")
 
     def separations(self, frames: Float[Tensor, "3 4 l n"], below: float) -> Float[Tensor, "p n"]:
-        """Return the separation [m] of each pair where it can be less than `below`, else that of balls around it."""
+        """Return the separation [m] of each pair; that of the bounding spheres where it is not less than `below`."""
         shapes = self._place(frames)
         distance = self._distances(shapes[1])
-        apart = distance - self._sums(self._outer(), distance)
+        apart = distance - self._sums(self._bounding(), distance)
         pair, row = torch.nonzero(apart < below, as_tuple=True)
         return apart.index_put((pair, row), self._separations(shapes, pair, row))
 
     def wrenches(
         self, frames: Float[Tensor, "3 4 l n"], pair: Int[Tensor, " k"], row: Int[Tensor, " k"]
     ) -> Float[Tensor, "6 k"]:
-        """Return the derivative of separations by a motion of the pair's second shape (translation, rotation).
+        """Return the derivative of separations by a twist (translation, rotation) of the pair's second shape.
 
-        As a wrench (force, torque about the frames' origin) it is what parts the two, and its negative acts on the
-        first shape.
+        It is a wrench about the frames' origin (force, torque). The first shape takes its negative.
         """
         if not len(pair):
             return frames.new_zeros(6, 0)
-        turn, center = (x.detach() for x in self._place(frames))
+        axes, center = (x.detach() for x in self._place(frames))
         with torch.enable_grad():
-            twist = turn.new_zeros(6, len(pair), requires_grad=True)
-            return torch.autograd.grad(self._separations((turn, center), pair, row, twist).sum(), twist)[0]
+            twist = axes.new_zeros(6, len(pair), requires_grad=True)
+            return torch.autograd.grad(self._separations((axes, center), pair, row, twist).sum(), twist)[0]
 
-    def _place(self, frames: Float[Tensor, "3 4 l n"]) -> tuple[Float[Tensor, "3 3 s n"], Float[Tensor, "3 s n"]]:
+    def _place(self, frames: Float[Tensor, "3 4 l n"]) -> Placed:
         """Return the shapes' axes and centres in the palm's frame."""
-        links, turn = frames.index_select(2, self.link), self.turn.to(frames)[..., None]
-        axes = links[:, 0, None] * turn[0] + links[:, 1, None] * turn[1] + links[:, 2, None] * turn[2]
+        links, rotation = frames.index_select(2, self.link), self.rotation.to(frames)[..., None]
+        axes = links[:, 0, None] * rotation[0] + links[:, 1, None] * rotation[1] + links[:, 2, None] * rotation[2]
         return axes, map_points(links, self.center)
 
     def _distances(self, center: Float[Tensor, "3 s n"]) -> Float[Tensor, "p n"]:
-        """Return how far the centres of each pair are apart."""
+        """Return the distance between the centres of each pair."""
         first, second = self.pairs.unbind(1)
         return _length(center.index_select(1, second) - center.index_select(1, first))
 
-    def _outer(self) -> Float[Tensor, " s"]:
-        """Return the radii of the balls around the shapes."""
+    def _bounding(self) -> Float[Tensor, " s"]:
+        """Return the radii of the bounding spheres."""
         return torch.linalg.vector_norm(self.half, dim=1) + self.radius
 
     def _sums(self, radius: Float[Tensor, " s"], like: Tensor) -> Float[Tensor, "p 1"]:
@@ -99,96 +102,135 @@ class SelfCollision(Value):
         return radius[self.pairs].sum(1, keepdim=True).to(like)
 
     def _separations(
-        self,
-        shapes: tuple[Float[Tensor, "3 3 s n"], Float[Tensor, "3 s n"]],
-        pair: Int[Tensor, " k"],
-        row: Int[Tensor, " k"],
-        twist: Float[Tensor, "6 k"] | None = None,
+        self, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"], twist: Tensor | None = None
     ) -> Float[Tensor, " k"]:
-        """Return the separation of chosen pairs in chosen rows, after a small twist of the second shapes."""
-        found = shapes[1].new_zeros(len(pair))
-        low = 0
+        """Return the separation of chosen pairs in chosen rows, after a small twist (6, k) of the second shapes."""
+        separation, low = shapes[1].new_zeros(len(pair)), 0
         for kind, count in enumerate(self.kinds):
             at = torch.nonzero((pair >= low) & (pair < low + count))[:, 0]
             if len(at):
-                some = self._of_kind(kind, shapes, pair[at], row[at], None if twist is None else twist[:, at])
-                found = found.index_put((at,), some)
+                part = self._of_kind(kind, shapes, pair[at], row[at], None if twist is None else twist[:, at])
+                separation = separation.index_put((at,), part)
             low += count
-        return found
+        return separation
 
     def _of_kind(
-        self,
-        kind: int,
-        shapes: tuple[Float[Tensor, "3 3 s n"], Float[Tensor, "3 s n"]],
-        pair: Int[Tensor, " k"],
-        row: Int[Tensor, " k"],
-        twist: Float[Tensor, "6 k"] | None,
+        self, kind: int, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"], twist: Tensor | None
     ) -> Float[Tensor, " k"]:
         """Return the separation of pairs of one kind."""
-        turn, center, n = shapes[0].flatten(2), shapes[1].flatten(1), shapes[1].shape[2]
-        half, radius, outer = (x.to(center) for x in (self.half.T, self.radius, self._outer()))
+        rotation, center, n = shapes[0].flatten(2), shapes[1].flatten(1), shapes[1].shape[2]
+        half, radius, bounding = (x.to(center) for x in (self.half.T, self.radius, self._bounding()))
         first, second = self.pairs[pair].unbind(1)
         one, two = first * n + row, second * n + row
-        place, axes = center.index_select(1, two), turn.index_select(2, two)
+        place, axes = center.index_select(1, two), rotation.index_select(2, two)
         if twist is not None:
             place = place + twist[:3] + torch.linalg.cross(twist[3:], place, dim=0)
             axes = axes + torch.linalg.cross(twist[3:, None].expand_as(axes), axes, dim=0)
         gap = place - center.index_select(1, one)
         if kind == 1:
-            inside = axes[0] * gap[0] + axes[1] * gap[1] + axes[2] * gap[2]
-            return box_distance(inside.T, half[:, second].T) - radius[first]
-        apart = _length(gap) - outer[first] - outer[second]
+            local = axes[0] * gap[0] + axes[1] * gap[1] + axes[2] * gap[2]
+            return box_distance(local.T, half[:, second].T) - radius[first]
+        apart = _length(gap) - bounding[first] - bounding[second]
         if kind == 2:
             return apart
-        return torch.maximum(
-            apart, box_separation(turn.index_select(2, one), axes, gap, half[:, first], half[:, second])
-        )
+        boxes = box_separation(rotation.index_select(2, one), axes, gap, half[:, first], half[:, second])
+        return torch.maximum(apart, boxes)
 
 
 def _length(v: Float[Tensor, "3 *b"]) -> Float[Tensor, "*b"]:
-    """Return the length of vectors; its derivative is 0 where it is."""
+    """Return the length of vectors; its derivative at 0 is 0."""
     squared = torch.addcmul(torch.addcmul(v[0] * v[0], v[1], v[1]), v[2], v[2])
     return torch.sqrt(squared.clamp_min(1e-24))
 
 
-def self_collision_from_urdf(urdf: Urdf, linked: Iterable[tuple[str, str]] | None) -> SelfCollision:
-    """List the pairs of shapes to test.
+def box_separation(
+    a: Float[Tensor, "3 3 k"],
+    b: Float[Tensor, "3 3 k"],
+    gap: Float[Tensor, "3 k"],
+    half_a: Float[Tensor, "3 k"],
+    half_b: Float[Tensor, "3 k"],
+) -> Float[Tensor, " k"]:
+    """Return the largest separation [m] of two boxes along 15 axes (Gottschalk et al., 1996).
+
+    Of boxes that overlap it is minus the least translation that parts them. Apart, it is a lower bound of the distance,
+    and exact where a face or two crossing edges are nearest.
 
     Args:
-        urdf: the hand's tree with its collision shapes.
-        linked: pairs of links to test; by default all but those that share a joint.
+        a: rotation of the first box; column i, `a[:, i]`, is its axis i.
+        b: rotation of the second.
+        gap: from the centre of the first to that of the second [m].
+        half_a: half sizes of the first [m].
+        half_b: half sizes of the second [m].
+
+    >>> still, x = torch.eye(3)[..., None], torch.tensor([[3.0], [0.0], [0.0]])
+    >>> box_separation(still, still, x, torch.ones(3, 1), torch.ones(3, 1))
+    tensor([1.])
     """
-    if linked is None:
-        joined = {frozenset((j.parent, j.child)) for j in urdf.joints}
-        every = itertools.combinations([x.name for x in urdf.links], 2)
-        linked = [pair for pair in every if frozenset(pair) not in joined]
-    tested = {frozenset(pair) for pair in linked}
-    shapes = [(i, x.name, *part) for i, x in enumerate(urdf.links) for shape in x.shapes for part in _parts(shape)]
+    rotation = a[0, :, None] * b[0] + a[1, :, None] * b[1] + a[2, :, None] * b[2]  # b's axes in the frame of a
+    t, u = (x[0] * gap[0] + x[1] * gap[1] + x[2] * gap[2] for x in (a, b))
+    size, square = rotation.abs(), rotation * rotation
+    by_a = t.abs() - half_a - (size[:, 0] * half_b[0] + size[:, 1] * half_b[1] + size[:, 2] * half_b[2])
+    by_b = u.abs() - half_b - (size[0] * half_a[0, None] + size[1] * half_a[1, None] + size[2] * half_a[2, None])
+    # axis i of a cross axis j of b; the other two axes of a box follow by rolling
+    next_t, last_t, next_a, last_a = (x.roll(k, 0)[:, None] for x in (t, half_a) for k in (-1, 1))
+    along = last_t * rotation.roll(-1, 0) - next_t * rotation.roll(1, 0)
+    reach = next_a * size.roll(1, 0) + last_a * size.roll(-1, 0)
+    reach = reach + half_b.roll(-1, 0) * size.roll(1, 1) + half_b.roll(1, 0) * size.roll(-1, 1)
+    sine = square.roll(-1, 1) + square.roll(1, 1)
+    crossing = sine > PARALLEL
+    by_edges = (along.abs() - reach) * torch.rsqrt(torch.where(crossing, sine, 1.0))
+    by_edges = torch.where(crossing, by_edges, -torch.inf)
+    return torch.maximum(torch.maximum(by_a, by_b).amax(0), by_edges.amax((0, 1)))
+
+
+def box_distance(points: Float[Tensor, "*b 3"], half: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+    """Return the signed distance [m] of points from boxes about the origin with half sizes `half`; negative inside.
+
+    >>> box_distance(torch.tensor([[2.0, 0, 0], [0.0, 0, 0.5]]), torch.ones(2, 3))
+    tensor([ 1.0000, -0.5000])
+    """
+    ox, oy, oz = (points.abs() - half).unbind(-1)
+    px, py, pz = ox.clamp_min(0), oy.clamp_min(0), oz.clamp_min(0)
+    squared = px * px + py * py + pz * pz
+    # the root's derivative is infinite at 0; there the largest coordinate is the distance
+    outside = squared > 0
+    inside = torch.maximum(torch.maximum(ox, oy), oz)
+    return torch.where(outside, torch.sqrt(torch.where(outside, squared, 1.0)), inside)
+
+
+def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None) -> SelfCollision:
+    """Return the shapes of a URDF with the pairs to test, for pairs of links; None: all links that share no joint."""
+    names = [x.name for x in urdf.links]
+    tested = {frozenset(pair) for pair in (itertools.combinations(names, 2) if pairs is None else pairs)}
+    if pairs is None:
+        tested -= {frozenset((j.parent, j.child)) for j in urdf.joints}
+    shapes = [(i, *part) for i, link in enumerate(urdf.links) for shape in link.shapes for part in _parts(shape)]
+    link, rotation, center, half, radius = zip(*shapes, strict=True) if shapes else ((), (), (), (), ())
     kinds: tuple[list[tuple[int, int]], ...] = ([], [], [])
     for one, two in itertools.combinations(range(len(shapes)), 2):
-        if frozenset((shapes[one][1], shapes[two][1])) in tested:
-            balls = [shapes[k][5] > 0 for k in (one, two)]
-            kinds[sum(balls)].append((two, one) if balls == [False, True] else (one, two))
+        if frozenset((names[link[one]], names[link[two]])) in tested:
+            spheres = radius[one] > 0, radius[two] > 0
+            kinds[sum(spheres)].append((two, one) if spheres == (False, True) else (one, two))
     return SelfCollision(
-        link=torch.tensor([s[0] for s in shapes], dtype=torch.long),
-        turn=torch.stack([s[2] for s in shapes], -1) if shapes else torch.zeros(3, 3, 0, dtype=torch.float64),
-        center=torch.tensor([s[3] for s in shapes], dtype=torch.float64).reshape(-1, 3),
-        half=torch.tensor([s[4] for s in shapes], dtype=torch.float64).reshape(-1, 3),
-        radius=torch.tensor([s[5] for s in shapes], dtype=torch.float64),
+        link=torch.tensor(link, dtype=torch.long),
+        rotation=torch.stack(rotation, -1) if shapes else torch.zeros(3, 3, 0, dtype=torch.float64),
+        center=torch.tensor(center, dtype=torch.float64).reshape(-1, 3),
+        half=torch.tensor(half, dtype=torch.float64).reshape(-1, 3),
+        radius=torch.tensor(radius, dtype=torch.float64),
         pairs=torch.tensor([pair for kind in kinds for pair in kind], dtype=torch.long).reshape(-1, 2),
         kinds=(len(kinds[0]), len(kinds[1]), len(kinds[2])),
     )
 
 
 def _parts(shape: Shape) -> list[tuple[Float[Tensor, "3 3"], Triple, Triple, float]]:
-    """Return the boxes and balls that a shape is the union of: rotation, centre, half sizes, radius."""
-    turn = rotation_from_rpy(shape.rpy)
+    """Return the boxes and spheres whose union a shape is: rotation, centre, half sizes, radius."""
+    rotation = rotation_from_rpy(shape.rpy)
     if shape.kind == "sphere":
-        return [(turn, shape.xyz, (0.0, 0.0, 0.0), shape.size[0])]
+        return [(rotation, shape.xyz, (0.0, 0.0, 0.0), shape.size[0])]
     if shape.kind == "box":
         x, y, z = shape.size
-        return [(turn, shape.xyz, (x / 2, y / 2, z / 2), 0.0)]
-    step = math.pi / PRISM
+        return [(rotation, shape.xyz, (x / 2, y / 2, z / 2), 0.0)]
+    step = math.pi / PRISM_BOXES
     corner = 2 * shape.size[0] / (1 + math.cos(step / 2))  # as far outside the circle as the sides are inside
     half = (corner * math.cos(step / 2), corner * math.sin(step / 2), shape.size[1] / 2)
-    return [(turn @ rotation_from_rpy((0.0, 0.0, k * step)), shape.xyz, half, 0.0) for k in range(PRISM)]
+    return [(rotation @ rotation_from_rpy((0.0, 0.0, k * step)), shape.xyz, half, 0.0) for k in range(PRISM_BOXES)]

@@ -7,7 +7,7 @@ import trimesh
 from scipy.optimize import linprog
 
 from torchgrasp.frames import rotation_from_vector
-from torchgrasp.hand.box_distance import box_distance, box_separation
+from torchgrasp.hand.self_collision import box_distance, box_separation
 
 
 def boxes(n: int, generator: torch.Generator) -> tuple[torch.Tensor, ...]:
