@@ -144,20 +144,20 @@ def plan_grasps(
     4
     """
     spec = ContactSpec() if spec is None else spec
-    if not isinstance(cloud, PointCloud):
-        raise BadArgument("cloud", type(cloud).__name__, "a PointCloud")
     if not isinstance(hand, Hand):
         raise BadArgument("hand", type(hand).__name__, "a Hand from load_hand")
     if mode not in get_args(Mode):
         raise BadArgument("mode", repr(mode), "'joint' or 'contact_first'")
-    check_cloud(cloud)
-    hand = hand.to(cloud.points.device)
     model = None
     if mode == "contact_first":
         mixture_file = mixture_path(hand.urdf_path.parent)  # beside the hand, also when it is a user's own
-        model = load_mixture(mixture_file).to(cloud.points.device), sha256(mixture_file)
+        model = load_mixture(mixture_file), sha256(mixture_file)
 
-    shape = fit_shape(cloud, seed=seed, table=spec.table) if shape is None else shape
+    if shape is None:
+        shape = fit_shape(cloud, seed=seed, table=spec.table)
+    else:
+        check_cloud(cloud)
+    hand = hand.to(shape.device)
     surface = extract_surface(shape)
     certain = float((surface.std_m < 0.004).double().mean())
     observer("shape", f"{len(shape.x)} points, {certain:.0%} of the surface certain to 4 mm", shape)
@@ -176,7 +176,7 @@ def plan_grasps(
     if model is None:
         guess = nearest_postures(contacts, PostureLibrary.of(hand, seed=seed), world)
     else:
-        guess = query_mixture(contacts, hand, model[0])
+        guess = query_mixture(contacts, hand, model[0].to(shape.device))
     reached = len(torch.unique(guess.row))
     observer("query", f"{len(guess)} postures for {reached} of {len(contacts)} triples", guess)
 
