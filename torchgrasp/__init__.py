@@ -33,7 +33,7 @@ from torchgrasp.posture_model.mixture import GraspMixture, load_mixture
 from torchgrasp.ik.solve import solve_ik
 from torchgrasp.pipeline import plan_grasps
 from torchgrasp.values import load_grasps
-from torchgrasp.control.closing_law import closing_gains
+from torchgrasp.control import closing_gains
 from torchgrasp.evaluation.lift import close_hand
 
 __version__ = "0.1.0"

@@ -103,8 +103,6 @@ class TrialSpec(Value):
         noise: whether the tactile sensor has noise (0.1 N normal, 0.3 N tangential, 1.5 mm of a contact's place).
         timestep: of the simulator [s].
         control_rate: of the controller [Hz].
-        breakaway: torque [N m] above which a stopped inner link lets its outer link close on alone, as Barrett's clutch
-            does; None: fingers stay coupled.
         simulator: "sapien" or "mujoco".
 
     Raises:
@@ -124,7 +122,6 @@ class TrialSpec(Value):
     noise: bool = True
     timestep: float = 1 / 500
     control_rate: float = 100.0
-    breakaway: float | None = None
     simulator: Simulator = "sapien"
 
     def __post_init__(self) -> None:
@@ -148,8 +145,6 @@ class TrialSpec(Value):
         for name, (low, high) in ranges.items():
             if not low <= getattr(self, name) <= high:
                 raise BadArgument(name, getattr(self, name), f"a number in [{low:g}, {high:g}]")
-        if self.breakaway is not None and not self.breakaway > 0:
-            raise BadArgument("breakaway", self.breakaway, "a positive torque [N m], or None")
 
 
 def check_simulator(simulator: str) -> None:

@@ -11,13 +11,12 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.control.closing import UncertaintyClosing
-from torchgrasp.control.observation import ControlModel, Observation, model_from_hand
+from torchgrasp.control.observation import Observation
+from torchgrasp.control.reference import ClosingReference
 from torchgrasp.frames import rotation_angle
-from torchgrasp.hand.hand import Hand
 from torchgrasp.sim.hand import SimulatedHand
 from torchgrasp.sim.open import open_scene
 from torchgrasp.sim.scene import SceneSpec
-from torchgrasp.values import ClosingGains, Grasps
 
 if TYPE_CHECKING:
     import trimesh
@@ -80,12 +79,10 @@ class Disturbed(Value):
 
 
 def disturb_grasp(
-    grasp: Grasps,
-    hand: Hand,
+    reference: ClosingReference,
     mesh: "trimesh.Trimesh",
     parts: "list[trimesh.Trimesh]",
-    gains: ClosingGains,
-    holding: Callable[[ControlModel, ClosingGains, Observation, Float[Tensor, " j"]], Holding],
+    holding: Callable[[ClosingReference, Observation, Float[Tensor, " j"]], Holding],
     pull: Pull,
     friction: float = 0.8,
     error: Float[Tensor, "4 4"] | None = None,
@@ -94,19 +91,18 @@ def disturb_grasp(
     """Close a hand on a floating object, hold it, and pull at it, in a fresh simulation without gravity.
 
     Args:
-        grasp: one row.
-        hand: the hand that it was planned for.
+        reference: of the hand and its grasp.
         mesh: the true object [m].
         parts: its convex parts.
-        gains: of the closing (`closing_gains`).
         holding: makes what holds the object once it is grasped: `Squeeze`, `Impedance`.
         pull: the disturbance.
         friction: of every contact.
         error: where the hand really stands in its planned frame.
         seed: of the noise of the fingertips.
     """
-    stands = grasp.obj_from_hand[0] if error is None else grasp.obj_from_hand[0] @ error
-    start = {name: float(q) for name, q in hand.expand(grasp.pregrasp[0]).items()}
+    hand, planned = reference.hand, reference.obj_from_hand
+    stands = planned if error is None else planned @ error
+    start = {name: float(q) for name, q in hand.expand(reference.pregrasp).items()}
     scene = open_scene(
         SceneSpec(
             hand.urdf_path, stands.numpy(), start, hand.actuators, tuple(hand.tip_links), mesh, parts, MASS, friction,
@@ -116,16 +112,16 @@ def disturb_grasp(
     rows: list[_Row] = []
     if not scene.penetration() <= 1e-3:
         return _record(rows, overlap=True)
-    model = model_from_hand(hand, grasp, names=scene.joint_names)
-    robot = SimulatedHand(scene, hand, model, 100.0, torch.Generator().manual_seed(seed))
-    targets = model.expand(model.pregrasp)
-    observation, closing = robot.tick(targets), UncertaintyClosing(model, gains)
+    robot = SimulatedHand(scene, reference, 100.0, torch.Generator().manual_seed(seed))
+    reference = robot.reference
+    targets = reference.model.expand(reference.pregrasp)
+    observation, closing = robot.tick(targets), UncertaintyClosing(reference)
     for _ in range(robot.ticks(CLOSING_TIME)):
         targets = closing(observation, robot.period)
         observation = robot.tick(targets)
         if closing.done:
             break
-    hold = holding(model, gains, observation, targets)
+    hold = holding(reference, observation, targets)
     readings, every, before = torch.zeros(3, dtype=torch.float64), robot.ticks(SAMPLING), scene.object_pose()
     pressing = robot.ticks(PRESSING_TIME)
     for k in range(pressing + robot.ticks(pull.seconds)):

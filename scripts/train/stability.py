@@ -30,9 +30,9 @@ from torchgrasp import (
     plan_grasps,
 )
 from torchgrasp.base import Batch
+from torchgrasp.control import ClosingReference
 from torchgrasp.control.adaptive.impedance import Impedance
 from torchgrasp.control.adaptive.stability import StabilityModel, fit_stability, lengths_of, stability_path, state_of
-from torchgrasp.control.closing_law import closing_gains
 from torchgrasp.errors import GraspError
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.files import load_tensors, save_tensors
@@ -123,11 +123,9 @@ def rehearse_once(
     direction = unit(torch.randn(3, generator=generator, dtype=torch.float64))
     off = 2 * torch.rand(6, generator=generator, dtype=torch.float64) - 1
     error = rigid(rotation_from_vector(TURN * off[:3]), SHIFT * off[3:])
-    gains = closing_gains(grasp, hand, strength)
+    reference = ClosingReference.from_grasp(hand, grasp, strength)
     holding = functools.partial(Impedance, springs=springs)
-    return disturb_grasp(
-        grasp, hand, mesh, parts, gains, holding, Pull(direction, most / 0.3, most, 0.8), friction, error, seed
-    )
+    return disturb_grasp(reference, mesh, parts, holding, Pull(direction, most / 0.3, most, 0.8), friction, error, seed)
 
 
 def summary(trial: Disturbed) -> dict[str, Any]:
@@ -181,7 +179,7 @@ def judge(trials: Rehearsals, components: int, seed: int) -> dict[str, float]:
         model, other = (trials[~out].fit(m, seed) for m in (components, 1))
         late = trials.late[out]
         odds[out], density[out], single[out] = (
-            model.odds(late),
+            model.log_odds(late),
             model.stable.log_prob(late),
             other.stable.log_prob(late),
         )

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 
+from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
 from torchgrasp.control.closing import (
     AIM_DEPTH,
     LEAD,
@@ -16,71 +17,15 @@ from torchgrasp.control.closing import (
     PositionClosing,
     UncertaintyClosing,
 )
-from torchgrasp.control.closing_law import MAX_SPEED, POSITION_FLOOR, POSITION_RATE, surface_covariance
+from torchgrasp.control.closing_law import MAX_SPEED, POSITION_FLOOR, POSITION_RATE
 from torchgrasp.control.controller import CLOSING_TIME, PRESSING_TIME, GraspController
 from torchgrasp.control.holding import RAMP, ForceHold, held_forces
-from torchgrasp.control.observation import ControlModel, Observation
+from torchgrasp.control.observation import Observation
 from torchgrasp.errors import BadArgument
-from torchgrasp.values import ClosingGains
-
-PERIOD = 0.01
-FREE, TOUCHING = torch.zeros(3, dtype=torch.bool), torch.ones(3, dtype=torch.bool)
-
-
-def real(values) -> torch.Tensor:
-    return torch.tensor(values, dtype=torch.float64)
-
-
-NORMALS = real([[1, 0, 0], [1, 0, 0], [-1, 0, 0]])
-TARGET = real([[0.03, 0, 0.02], [0.03, 0, -0.02], [-0.03, 0, 0]])
-
-
-def model(coupling: torch.Tensor | None = None) -> ControlModel:
-    """Point fingers that slide along x, y and z: joint 3 i + k moves finger i along axis k."""
-    coupling = torch.eye(9).double() if coupling is None else coupling
-    h = coupling.shape[1]
-    ones, zero = torch.ones(h).double(), torch.zeros(h).double()
-    return ControlModel(
-        coupling=coupling,
-        offset=torch.zeros(9).double(),
-        actuated=tuple(range(h)),
-        kp=torch.full((9,), 2.0).double(),
-        lower=-ones,
-        upper=ones,
-        radius=real([0.01, 0.01, 0.01]),
-        normals=NORMALS,
-        joints=zero,
-        pregrasp=zero,
-        squeeze=zero + 0.02,
-    )
-
-
-GAINS = ClosingGains(
-    target=TARGET,
-    covariance=surface_covariance(NORMALS, torch.full((3,), 0.004).double()),
-    position_gain=torch.full((3, 3), 4.0).double(),
-    force_gain=torch.full((3, 3), 0.01).double(),
-    desired_force=-NORMALS * real([[2.0], [2.0], [4.0]]),
-)
-
-
-def observation(off: float = 0.02, reading=(0.0, 0.0, 0.0), contact=FREE, joints=None) -> Observation:
-    """Tips `off` metres away from their contacts along the normals; sensed contacts are the planned ones."""
-    touched = contact[:, None]
-    return Observation(
-        joints=torch.zeros(9).double() if joints is None else joints,
-        tips=TARGET + (0.01 + off) * NORMALS,
-        jacobian=torch.eye(9).double().reshape(3, 3, 9),
-        reading=real(reading),
-        forces=-real(reading)[:, None] * NORMALS,
-        contact=contact,
-        points=torch.where(touched, TARGET, torch.nan),
-        normals=torch.where(touched, NORMALS, torch.nan),
-    )
 
 
 def test_eq25_free_fingers_approach_their_contacts():
-    step = UncertaintyClosing(model(), GAINS)(observation(), PERIOD).reshape(3, 3)
+    step = UncertaintyClosing(reference())(observation(), PERIOD).reshape(3, 3)
     assert ((step * NORMALS).sum(-1) < 0).all()
     assert step.norm(dim=-1).max() <= MAX_SPEED * PERIOD + 1e-12
     assert step[:, 1:].abs().max() < 1e-9
@@ -89,38 +34,38 @@ def test_eq25_free_fingers_approach_their_contacts():
 def test_a_touching_finger_keeps_the_waiting_force_whatever_its_position_error():
     one = torch.tensor([True, False, False])
     for reading, sign in ((0.0, -1), (1.0, 1)):
-        step = UncertaintyClosing(model(), GAINS)(observation(0.02, (reading, 0, 0), one), PERIOD).reshape(3, 3)
+        step = UncertaintyClosing(reference())(observation(0.02, (reading, 0, 0), one), PERIOD).reshape(3, 3)
         assert float((step[0] * NORMALS[0]).sum()) * sign > 0
 
 
 def test_closing_ends_when_all_touch_or_patience_is_over():
-    controller = UncertaintyClosing(model(), GAINS)
+    controller = UncertaintyClosing(reference())
     for contact, wait in ((TOUCHING, SETTLED), (torch.tensor([True, False, False]), PATIENCE)):
-        controller = UncertaintyClosing(model(), GAINS)
+        controller = UncertaintyClosing(reference())
         ticks = 0
         while not controller.done:
             controller(observation(contact=contact), PERIOD)
             ticks += 1
         assert ticks * PERIOD == pytest.approx(wait, abs=1.5 * PERIOD)
-    controller = UncertaintyClosing(model(), GAINS)
+    controller = UncertaintyClosing(reference())
     for _ in range(300):
         controller(observation(), PERIOD)
     assert not controller.done
 
 
 def test_targets_stay_within_limits_and_near_the_joints():
-    controller = UncertaintyClosing(model(), GAINS)
+    controller = UncertaintyClosing(reference())
     for _ in range(500):
         targets = controller(observation(0.5), PERIOD)
     assert targets.abs().max() == pytest.approx(LEAD)
-    stopping = PositionClosing(model(), GAINS)
+    stopping = PositionClosing(reference())
     for _ in range(5000):
         targets = stopping(observation(0.5), PERIOD)
     assert targets.abs().max() == pytest.approx(1.0)
 
 
 def test_the_baseline_stops_each_finger_by_itself_and_for_good():
-    controller = PositionClosing(model(), GAINS)
+    controller = PositionClosing(reference())
     first = controller(observation(0.02, (STOP_FORCE, 0.0, 0.0)), PERIOD).reshape(3, 3)
     assert first[0].abs().max() == 0
     assert (first[1:].abs().amax(-1) > 0).all()
@@ -134,12 +79,12 @@ def test_the_baseline_stops_each_finger_by_itself_and_for_good():
 
 
 def test_held_forces_are_balanced_at_the_sensed_contacts():
-    forces, total = held_forces(model(), GAINS, observation(contact=TOUCHING))
+    forces, total = held_forces(reference(), observation(contact=TOUCHING))
     assert forces.sum(0).abs().max() < 1e-9
     assert torch.linalg.cross(TARGET, forces).sum(0).abs().max() < 1e-9
     assert total == pytest.approx(8.0, rel=0.02)
     assert float((-(forces * NORMALS).sum(-1)).max()) == pytest.approx(4.0)
-    planned, total = held_forces(model(), GAINS, observation(contact=torch.tensor([True, True, False])))
+    planned, total = held_forces(reference(), observation(contact=torch.tensor([True, True, False])))
     assert torch.equal(planned, GAINS.desired_force)
     assert total == pytest.approx(8.0)
 
@@ -147,12 +92,12 @@ def test_held_forces_are_balanced_at_the_sensed_contacts():
 def test_the_squeeze_rises_to_what_the_drives_turn_into_the_forces():
     start = 0.01 * torch.ones(9).double()
     seen = observation(0.0, contact=TOUCHING, reading=(2.0, 2.0, 4.0))
-    hold = ForceHold(model(), GAINS, seen, start)
+    hold = ForceHold(reference(), seen, start)
     first = hold(seen, PERIOD)
     assert (first - start).abs().max() < 0.1
     for _ in range(round(RAMP / PERIOD)):
         last = hold(seen, PERIOD)
-    forces, _ = held_forces(model(), GAINS, seen)
+    forces, _ = held_forces(reference(), seen)
     assert torch.allclose(2.0 * last.reshape(3, 3), forces, atol=0.02)  # kp times the lead of sliding joints is force
     weak = observation(0.0, contact=TOUCHING, reading=(1.0, 1.0, 2.0))
     for _ in range(50):
@@ -168,8 +113,8 @@ def run(controller: GraspController, seen: Observation, seconds: float) -> list[
 
 
 def test_the_open_loop_goes_through_its_three_poses_whatever_is_felt():
-    opened = dataclasses.replace(model(), pregrasp=model().joints - 0.01)
-    controller = GraspController(opened, GAINS, "open_loop")
+    opened = dataclasses.replace(reference(), pregrasp=reference().joints - 0.01)
+    controller = GraspController(opened, "open_loop")
     assert not controller.closed
     path = torch.stack(run(controller, observation(contact=TOUCHING), 2 * POSE_TIME + 0.2))
     assert torch.allclose(path[39], real(0.0), atol=1e-12) and torch.allclose(path[19], real(-0.005))
@@ -179,7 +124,7 @@ def test_the_open_loop_goes_through_its_three_poses_whatever_is_felt():
 
 @pytest.mark.parametrize("closing", ["position", "fixed", "uncertainty"])
 def test_closing_ends_in_time_and_a_holding_takes_over(closing):
-    controller = GraspController(model(), GAINS, closing)
+    controller = GraspController(reference(), closing)
     run(controller, observation(0.05), CLOSING_TIME - PERIOD)
     assert controller.hold is None
     run(controller, observation(0.05), 3 * PERIOD)
@@ -189,16 +134,16 @@ def test_closing_ends_in_time_and_a_holding_takes_over(closing):
 
 
 def test_the_first_targets_are_the_opened_hand_and_unknown_names_are_refused():
-    assert torch.equal(GraspController(model(), GAINS).targets, model().pregrasp)
+    assert torch.equal(GraspController(reference()).targets, reference().pregrasp)
     with pytest.raises((BadArgument, TypeError), match="slow"):
-        GraspController(model(), GAINS, "slow")  # pyright: ignore[reportArgumentType]
+        GraspController(reference(), "slow")  # pyright: ignore[reportArgumentType]
     with pytest.raises((BadArgument, TypeError), match="glue"):
-        GraspController(model(), GAINS, "fixed", "glue")  # pyright: ignore[reportArgumentType]
+        GraspController(reference(), "fixed", "glue")  # pyright: ignore[reportArgumentType]
 
 
 def test_fixed_gains_know_nothing_of_the_surface():
     """Eq. 27 without uncertainty: each contact and each direction has the rate of the floor alone."""
-    gains = FixedGainClosing(model(), GAINS).gains
+    gains = FixedGainClosing(reference()).reference.gains
     assert torch.allclose(gains.position_gain, real(POSITION_RATE))
     assert torch.allclose(gains.covariance, POSITION_FLOOR**2 * torch.eye(3).double())
     assert (gains.force_gain == gains.force_gain[:, :1]).all()
@@ -208,7 +153,7 @@ def test_fixed_gains_know_nothing_of_the_surface():
 def test_fingers_in_the_air_arrive_together():
     seen = observation(0.2)
     near = dataclasses.replace(seen, tips=TARGET + 0.01 * NORMALS + real([[0.2], [0.1], [0.2]]) * NORMALS)
-    step = UncertaintyClosing(model(), GAINS)(near, PERIOD).reshape(3, 3)
+    step = UncertaintyClosing(reference())(near, PERIOD).reshape(3, 3)
     speed = -(step * NORMALS).sum(-1)
     assert float(speed[1] / speed[0]) == pytest.approx((0.1 + POSITION_FLOOR) / (0.2 + POSITION_FLOOR), rel=1e-3)
     assert float(speed[2]) == pytest.approx(float(speed[0]))
@@ -217,7 +162,7 @@ def test_fingers_in_the_air_arrive_together():
 def test_a_late_finger_searches_on_beyond_its_planned_contact_and_presses_harder():
     two = torch.tensor([True, True, False])
     seen = observation(-0.03, (0.3, 0.3, 0.0), two)
-    controller = UncertaintyClosing(model(), GAINS)
+    controller = UncertaintyClosing(reference())
     first = controller(seen, PERIOD).reshape(3, 3)
     assert float(first[2] @ NORMALS[2]) < -0.5 * MAX_SPEED * PERIOD
     for _ in range(250):

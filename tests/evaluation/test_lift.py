@@ -76,9 +76,7 @@ def test_the_hand_comes_straight_to_where_it_was_planned():
 def test_all_a_fingertip_exerts_is_felt_friction_included():
     """At rest the tips carry the object: their full forces sum to its weight, their normal parts are the readings."""
     pytest.importorskip("sapien")
-    from torchgrasp.control.closing_law import closing_gains
-    from torchgrasp.control.controller import GraspController
-    from torchgrasp.control.observation import model_from_hand, observe
+    from torchgrasp.control import ClosingReference, GraspController, observe
     from torchgrasp.sim.convex_parts import convex_parts
     from torchgrasp.sim.hand import SimulatedHand
     from torchgrasp.sim.open import open_scene
@@ -89,9 +87,8 @@ def test_all_a_fingertip_exerts_is_felt_friction_included():
     stands, mesh = grasp.obj_from_hand[0].numpy(), cylinder()
     tips = tuple(hand.tip_links)
     scene = open_scene(SceneSpec(hand.urdf_path, stands, start, hand.actuators, tips, mesh, convex_parts(mesh), 0.1))
-    model = model_from_hand(hand, grasp, 4.0, scene.joint_names)
-    robot = SimulatedHand(scene, hand, model, 100.0, None)
-    controller = GraspController(model, closing_gains(grasp, hand))
+    robot = SimulatedHand(scene, ClosingReference.from_grasp(hand, grasp), 100.0, None)
+    controller = GraspController(robot.reference)
     observation = robot.tick(controller.targets)
     while not controller.closed:
         observation = robot.tick(controller.step(observation, robot.period))
@@ -101,8 +98,8 @@ def test_all_a_fingertip_exerts_is_felt_friction_included():
     total = (grasp.obj_from_hand[0, :3, :3] @ observation.forces.T).sum(1)
     assert torch.allclose(total, torch.tensor([0, 0, 0.981]).double(), atol=0.02)
     assert torch.allclose(-(observation.forces * observation.normals).sum(-1), observation.reading, atol=0.02)
-    own = observation.joints[list(model.actuated)]
-    alone = observe(hand, own, robot._touch)
+    own = observation.joints[list(robot.reference.model.actuated)]
+    alone = observe(hand, own, robot.tactile)
     order = [hand.tree.joint_names.index(name) for name in scene.joint_names]
     assert torch.allclose(alone.tips, observation.tips, atol=1e-5)
     assert torch.allclose(alone.jacobian[:, :, order], observation.jacobian, atol=1e-5)
@@ -133,7 +130,7 @@ def test_bad_arguments_are_refused():
     from torchgrasp.evaluation.lift import close_hand
 
     hand, grasp = pinch("allegro")
-    with pytest.raises(BadArgument, match="grasps: found 0 rows"):
+    with pytest.raises(BadArgument, match="grasp: found 0 rows"):
         close_hand(grasp[:0], hand, cylinder())
     mesh = cylinder()
     with pytest.raises(MeshError, match="open surface"):

@@ -8,8 +8,8 @@ import torch
 
 from tests.pinch import HEIGHT, RADIUS, cylinder, pinch
 from torchgrasp import fit_shape
-from torchgrasp.control.closing_law import joint_stiffness
-from torchgrasp.control.squeeze import squeeze_joints
+from torchgrasp.control import squeeze
+from torchgrasp.control.stiffness import joint_stiffness
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.pull import DIRECTIONS, PROTOCOLS, check_test, pull_grasp
 from torchgrasp.frames import apply, inverse
@@ -28,7 +28,7 @@ def pull(name, protocol, **options):
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
 def test_the_squeeze_presses_with_forces_that_cancel(name):
     hand, grasp = pinch(name)
-    lead = squeeze_joints(grasp, hand, force=4.0)[0] - grasp.joints[0]
+    lead = squeeze(hand, grasp, force=4.0).joints[0] - grasp.joints[0]
     torque = joint_stiffness(hand) * lead
     # Forces at the planned contacts, from the torques alone: J^T f = torque, of all f the one that cancels.
     hand_from_obj = inverse(grasp.obj_from_hand)
@@ -41,7 +41,7 @@ def test_the_squeeze_presses_with_forces_that_cancel(name):
     torch.testing.assert_close(system @ force, wished, rtol=0, atol=1e-6)
     push = -(force.reshape(3, 3) * (hand_from_obj[0, :3, :3] @ grasp.contacts.normals[0].T).T).sum(-1)
     assert float(push.max()) == pytest.approx(4.0, rel=1e-6) and float(push.min()) > 1.0
-    twice = squeeze_joints(grasp, hand, force=4.0, kp=2 * hand.actuators[hand.joint_names[0]].kp)[0]
+    twice = squeeze(hand, grasp, force=4.0, kp=2 * hand.actuators[hand.joint_names[0]].kp).joints[0]
     torch.testing.assert_close(twice - grasp.joints[0], lead / 2, rtol=1e-9, atol=1e-12)
 
 
@@ -109,7 +109,7 @@ def test_bad_arguments_are_named():
     with pytest.raises(BadArgument, match="joints: found 9 for"):
         pull_grasp(dataclasses.replace(grasp, pregrasp=grasp.pregrasp * 0 + 9), hand, cylinder())
     with pytest.raises(BadArgument, match="grasps: found 12 joints"):
-        squeeze_joints(grasp, pinch("barrett")[0])
+        squeeze(pinch("barrett")[0], grasp)
 
 
 def test_a_hand_that_stands_aside_misses_the_object():

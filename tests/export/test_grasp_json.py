@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.pinch import pinch
 from torchgrasp import cli
-from torchgrasp.control.squeeze import squeeze
+from torchgrasp.control.forces import squeeze
 from torchgrasp.export import format_grasps, format_keyframes
 from torchgrasp.frames import apply
 from torchgrasp.hand.load import load_hand
@@ -62,7 +62,7 @@ def test_mujoco_loads_the_keyframes_and_places_the_tips(name):
     for i, link in enumerate(hand.tip_links):
         point = data.body(link).xmat.reshape(3, 3) @ hand.tips.contact[i].numpy() + data.body(link).xpos
         np.testing.assert_allclose(point, planned_tips(hand, grasp)[i], atol=1e-9)
-    pressed = hand.expand(squeeze(grasp, hand, 5.0).joints)
+    pressed = hand.expand(squeeze(hand, grasp, 5.0).joints)
     key = model.key("grasp_0_squeeze")
     np.testing.assert_array_equal(key.qpos, model.key("grasp_0_grasp").qpos)
     for k in range(model.nu):  # each actuator by its name, whatever the order

@@ -7,26 +7,26 @@ import torch
 from train.pull_trials import Disturbed, Pull, disturb_grasp
 
 from tests.pinch import cylinder, pinch
-from torchgrasp.control.adaptive.impedance import GRASP_STIFFNESS, Impedance
+from torchgrasp.control import ClosingReference, closing_gains
+from torchgrasp.control.adaptive.impedance import Impedance
 from torchgrasp.control.adaptive.stability import lengths_of, load_stability, state_of
-from torchgrasp.control.closing_law import closing_gains
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 
-KEPT = functools.partial(Impedance, springs=torch.full((3,), GRASP_STIFFNESS).double())
 UP = torch.tensor([0.0, 0.0, 1.0]).double()
 
 
-def pulled(force: float, most: float, holding=Impedance) -> Disturbed:
+def pulled(force: float, most: float, adapts: bool = False) -> Disturbed:
     pytest.importorskip("sapien")
     hand, grasp = pinch("allegro")
     mesh = cylinder()
-    gains = closing_gains(grasp, hand, force)
-    return disturb_grasp(grasp, hand, mesh, [mesh], gains, holding, Pull(UP, 4.0, most, 1.5), 0.6)
+    holding = functools.partial(Impedance, stability=load_stability(hand) if adapts else None)
+    reference = ClosingReference.from_grasp(hand, grasp, force)
+    return disturb_grasp(reference, mesh, [mesh], holding, Pull(UP, 4.0, most, 1.5), 0.6)
 
 
 def test_adaptation_keeps_what_a_weak_grasp_loses():
-    weak, adapted = pulled(1.0, 1.8, KEPT), pulled(1.0, 1.8)
+    weak, adapted = pulled(1.0, 1.8), pulled(1.0, 1.8, adapts=True)
     assert weak.lost
     assert not adapted.lost
     assert adapted.forces[-1].sum() > 1.3 * weak.forces[3].sum()
@@ -41,16 +41,16 @@ def test_the_odds_before_the_pull_tell_the_firm_grasp_from_the_weak():
     assert model is not None
     odds = []
     for force in (0.8, 4.0):
-        trial = pulled(force, 1.8, KEPT)
-        odds.append(float(model.odds(state_of(trial.springs[4], lengths_of(trial.tips[4]), trial.forces[4]))))
+        trial = pulled(force, 1.8)
+        odds.append(float(model.log_odds(state_of(trial.springs[4], lengths_of(trial.tips[4]), trial.forces[4]))))
         assert trial.lost is (force < 1.0)
     assert odds[0] < 0 < odds[1]
 
 
 def test_learned_forces_are_balanced_and_named():
     hand, grasp = pinch("allegro")
-    gains = closing_gains(grasp, hand, 4.0, "learned")
-    assert gains.force_source == "learned"
+    gains = closing_gains(grasp, hand, 4.0, load_stability(hand))
+    assert gains.force_source == "stability"
     assert closing_gains(grasp, hand, 4.0).force_source == "analytic"
     assert gains.desired_force.sum(0).abs().max() < 1e-9
     assert torch.linalg.cross(gains.target, gains.desired_force).sum(0).abs().max() < 1e-9

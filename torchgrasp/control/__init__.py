@@ -1,1 +1,24 @@
-"""Closing and holding: the controller of a real or a simulated hand."""
+"""Closing and holding: the controller of a real or a simulated hand, from grasp and sensors to joint targets."""
+
+from torchgrasp.control.controller import GraspController
+from torchgrasp.control.forces import Squeeze, squeeze
+from torchgrasp.control.observation import Observation, observe
+from torchgrasp.control.reference import ClosingReference, ControlModel, closing_gains
+from torchgrasp.control.tactile import TactileState, TipContact, measure, no_contact
+from torchgrasp.values import ClosingGains
+
+__all__ = [
+    "ClosingGains",
+    "ClosingReference",
+    "ControlModel",
+    "GraspController",
+    "Observation",
+    "Squeeze",
+    "TactileState",
+    "TipContact",
+    "closing_gains",
+    "measure",
+    "no_contact",
+    "observe",
+    "squeeze",
+]

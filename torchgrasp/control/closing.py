@@ -1,18 +1,21 @@
 """How the fingers come to the object: in open loop, under the law (Eq. 25), or as the paper's position baseline.
 
-Each turns what a robot knows at a tick (`Observation`) into joint targets and says when it is `done`.
+Each closing turns an `Observation` into joint targets and says when it is `done`.
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.control.adaptive.belief import Belief
 from torchgrasp.control.closing_law import POSITION_FLOOR, POSITION_RATE, blend, joint_step, tip_velocity
-from torchgrasp.control.observation import ControlModel, Observation
-from torchgrasp.values import ClosingGains
+from torchgrasp.control.observation import Observation
+from torchgrasp.control.reference import ClosingReference
+
+Revision = Callable[[Observation, ClosingReference], ClosingReference]
+"""Revises the reference by what the fingers feel (`Belief.revise`)."""
 
 POSE_TIME = 0.4
 """Time [s] from pre-grasp to grasp in open loop, and as much from grasp to squeeze."""
@@ -30,28 +33,28 @@ STOP_FORCE = 0.5
 """Force [N] at which a finger of the position baseline stops (Sec. 6.5)."""
 
 AIM_DEPTH = 0.02
-"""How far [m] behind its planned contact a finger of the position baseline aims, to touch what is not where it was
-believed to be."""
+"""How far [m] the position baseline aims behind the planned contacts, to reach a displaced object (docs/closing.md)."""
 
 STOP_DISTANCE = 1e-3
 """Distance [m] from its target at which a finger of the position baseline stops."""
 
 INTEGRAL_RATE = 2.0
-"""Integral gain [1/s^2] of the position baseline."""
+"""Integral gain [1/s^2] of the position baseline (docs/closing.md)."""
 
 IMPATIENCE = 0.25
 """Time [s] of waiting for a late finger in which its drives may press harder by as much as they may at first."""
 
 LEAD = 0.04
-"""Largest lead [rad] of a joint's target over the joint while closing: a link that meets the object unfelt, elsewhere
-than at the fingertip, presses with no more than kp times this."""
+"""Largest lead [rad] of a joint's target over the joint while closing. It bounds the force of a link that is stopped
+elsewhere than at its fingertip, which no sensor feels."""
 
 
 class OpenLoopClosing:
-    """Pre-grasp, grasp and squeeze one after the other, whatever is felt: what others replay."""
+    """Replay pre-grasp, grasp and squeeze, whatever is felt."""
 
-    def __init__(self, model: ControlModel, gains: ClosingGains) -> None:
-        self.poses = torch.stack([model.expand(pose) for pose in (model.pregrasp, model.joints, model.squeeze)])
+    def __init__(self, reference: ClosingReference) -> None:
+        poses = (reference.pregrasp, reference.joints, reference.squeeze)
+        self.poses = torch.stack([reference.model.expand(pose) for pose in poses])
         self.time, self.done = 0.0, False
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
@@ -66,47 +69,44 @@ class OpenLoopClosing:
 class UncertaintyClosing:
     """The uncertainty-aware controller (Eqs. 25-28), with fingers that wait for each other.
 
-    A finger in the air searches for its desired force, beyond the planned contact, too: along the normal Eq. (26)
-    tolerates a position error, and here it tolerates any as soon as the contact is passed. Before the first touch the
-    fingers keep pace, so that they arrive together. One that feels contact is force-controlled whatever its
-    position error (its blend is 1): a calibrated shape is still wrong now and then, and Eq. (26) would press on
-    towards the planned point. It waits with `WAITING_FORCE`, so that the object stays where it is, until all touch or
-    `PATIENCE` is over. The full forces are left to the holding: raised by three separate loops they would not balance
-    on the way, and a cylinder of 0.1 kg moves by 8 mm instead of 4 mm. With a `belief` a touch that surprises moves the
-    contacts of the others.
+    A finger in the air searches along its contact's normal, beyond the planned contact if need be. Before the first
+    touch the fingers keep pace, so that they arrive together. A finger that touches is force-controlled whatever its
+    position error: where a calibrated shape is wrong, Eq. (26) would press on towards the planned point. It waits with
+    `WAITING_FORCE`, so that the object stays where it is, until all touch or `PATIENCE` is over. The holding raises the
+    full forces: three separate loops would not keep their balance and would push the object (docs/closing.md).
     """
 
-    def __init__(self, model: ControlModel, gains: ClosingGains, belief: Belief | None = None) -> None:
-        self.model, self.gains, self.belief = model, gains, belief
-        self.target = model.pregrasp
+    def __init__(self, reference: ClosingReference, revise: Revision | None = None) -> None:
+        self.reference, self.revise = reference, revise
+        self.target = reference.pregrasp
         self.waiting = self.settled = 0.0
         self.done = False
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets of all joints for the next tick."""
-        if self.belief is not None:
-            self.model, self.gains = self.belief.revise(observation, self.model, self.gains)
-        model, gains = self.model, self.gains
-        self.waiting = self.waiting + period if bool(observation.contact.any()) else 0.0
-        self.settled = self.settled + period if bool(observation.contact.all()) else 0.0
+        if self.revise is not None:
+            self.reference = self.revise(observation, self.reference)
+        reference, model, gains = self.reference, self.reference.model, self.reference.gains
+        normals, contact = reference.normals, observation.contact
+        self.waiting = self.waiting + period if bool(contact.any()) else 0.0
+        self.settled = self.settled + period if bool(contact.all()) else 0.0
         self.done = self.settled >= SETTLED or self.waiting >= PATIENCE
-        wished = torch.where(observation.contact, WAITING_FORCE, -(gains.desired_force * model.normals).sum(-1))
-        error = gains.target - (observation.tips - model.radius[:, None] * model.normals)
-        ahead = -(error * model.normals).sum(-1)  # how far the planned contact still lies ahead of each fingertip
-        error = error + ahead.clamp_max(0.0)[:, None] * model.normals
-        share = torch.where(observation.contact, 1.0, blend(error, gains.covariance))
-        force_error = -(wished - observation.reading)[:, None] * model.normals
+        desired = torch.where(contact, WAITING_FORCE, -(gains.desired_force * normals).sum(-1))
+        error = gains.target - reference.contact_points(observation.tips)
+        ahead = -(error * normals).sum(-1)  # how far the planned contact still lies ahead of each fingertip
+        error = error + ahead.clamp_max(0.0)[:, None] * normals
+        share = torch.where(contact, 1.0, blend(error, gains.covariance))
+        force_error = -(desired - observation.reading)[:, None] * normals
         velocity = tip_velocity(error, force_error, share, gains.position_gain, gains.force_gain)
-        velocity = velocity * self._pace(ahead, observation.contact)[:, None]
-        step = joint_step(observation.jacobian @ model.coupling, velocity, period, model.joints - self.target)
+        velocity = velocity * self._pace(ahead, contact)[:, None]
+        step = joint_step(observation.jacobian @ model.coupling, velocity, period, reference.joints - self.target)
         actuated = observation.joints[list(model.actuated)]
         lead = LEAD * (1 + self.waiting / IMPATIENCE)
-        target = torch.minimum(torch.maximum(self.target + step, actuated - lead), actuated + lead)
-        self.target = torch.minimum(torch.maximum(target, model.lower), model.upper)
+        self.target = model.clamp(torch.minimum(torch.maximum(self.target + step, actuated - lead), actuated + lead))
         return model.expand(self.target)
 
     def _pace(self, ahead: Float[Tensor, "3"], contact: Bool[Tensor, "3"]) -> Float[Tensor, "3"]:
-        """Return the share of its speed that each finger may go, so that those in the air arrive together."""
+        """Return the share of its speed that each finger may go, so that fingers in the air arrive together."""
         if bool(contact.any()):
             return torch.ones_like(ahead)
         left = ahead.clamp_min(0.0) + POSITION_FLOOR
@@ -114,47 +114,45 @@ class UncertaintyClosing:
 
 
 class FixedGainClosing(UncertaintyClosing):
-    """`UncertaintyClosing` with the same gains for every contact and direction: what the uncertainty's weights are measured by."""
+    """`UncertaintyClosing` with equal gains for every contact and direction, to measure what the uncertainty is worth."""
 
-    def __init__(self, model: ControlModel, gains: ClosingGains, belief: Belief | None = None) -> None:
-        same = torch.eye(3, dtype=gains.covariance.dtype).expand(3, 3, 3)
+    def __init__(self, reference: ClosingReference, revise: Revision | None = None) -> None:
+        gains = reference.gains
         isotropic = dataclasses.replace(
             gains,
-            covariance=POSITION_FLOOR**2 * same,
+            covariance=POSITION_FLOOR**2 * torch.eye(3, dtype=gains.covariance.dtype).expand(3, 3, 3),
             position_gain=torch.full_like(gains.position_gain, POSITION_RATE),
             force_gain=gains.force_gain.amax(-1, keepdim=True).expand(3, 3),
         )
-        super().__init__(model, isotropic, belief)
+        super().__init__(dataclasses.replace(reference, gains=isotropic), revise)
 
 
 class PositionClosing:
     """The paper's baseline: an isotropic PI position controller per fingertip that stops at `STOP_FORCE` (Table 7).
 
-    It is tuned: of 48 lifts of uncertain grasps of four scanned objects none held when the fingers aimed at the planned
-    contacts, where 28 ended before some finger touched, 14 when they aimed 5 mm behind them, 16 at 10 mm and 18 at
-    `AIM_DEPTH`. When the squeeze follows, 44 to 45 hold with any. The integral helps (9 against 6 of 56 grasps).
+    It aims `AIM_DEPTH` behind the planned contacts: aimed at the contacts, most closings end before all fingers touch
+    (docs/closing.md).
     """
 
-    def __init__(self, model: ControlModel, gains: ClosingGains) -> None:
-        self.model = model
-        self.aim = gains.target - AIM_DEPTH * model.normals
-        self.target = model.pregrasp
-        self.integral = torch.zeros_like(gains.target)
+    def __init__(self, reference: ClosingReference) -> None:
+        self.reference = reference
+        self.aim = reference.gains.target - AIM_DEPTH * reference.normals
+        self.target = reference.pregrasp
+        self.integral = torch.zeros_like(self.aim)
         self.stopped = torch.zeros(3, dtype=torch.bool)
         self.done = False
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets of all joints for the next tick."""
-        model = self.model
-        error = self.aim - (observation.tips - model.radius[:, None] * model.normals)
+        model = self.reference.model
+        error = self.aim - self.reference.contact_points(observation.tips)
         arrived = torch.linalg.vector_norm(error, dim=-1) < STOP_DISTANCE
         self.stopped = self.stopped | arrived | (observation.reading >= STOP_FORCE)
         self.done = bool(self.stopped.all())
         self.integral = self.integral + period * error
         demand = POSITION_RATE * error + INTEGRAL_RATE * self.integral
-        gain, free = torch.ones_like(demand), torch.zeros(3, dtype=demand.dtype)
-        velocity = tip_velocity(demand, torch.zeros_like(demand), free, gain, gain)
+        gain, position_only = torch.ones_like(demand), torch.zeros_like(demand[:, 0])
+        velocity = tip_velocity(demand, torch.zeros_like(demand), position_only, gain, gain)
         velocity = torch.where(self.stopped[:, None], 0.0, velocity)
-        step = joint_step(observation.jacobian @ model.coupling, velocity, period)
-        self.target = torch.minimum(torch.maximum(self.target + step, model.lower), model.upper)
+        self.target = model.clamp(self.target + joint_step(observation.jacobian @ model.coupling, velocity, period))
         return model.expand(self.target)

@@ -4,21 +4,11 @@ Everything here is pure and batched over leading axes. Gains are rates (position
 newton) and `joint_step` takes the control period, so that the same gains mean the same motion at 100 and at 250 Hz.
 """
 
-from typing import Literal, get_args
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import check_tensor
-from torchgrasp.control.adaptive.stability import load_stability
-from torchgrasp.control.forces import desired_forces, force_covariance
-from torchgrasp.errors import BadArgument
-from torchgrasp.frames import apply as move
-from torchgrasp.frames import inverse, rotate
-from torchgrasp.hand.hand import Hand
 from torchgrasp.linalg import cholesky, squared_mahalanobis
-from torchgrasp.values import ClosingGains, Grasps
 
 POSITION_FLOOR = 0.005
 """Isotropic standard deviation [m] that is added to the one along the normal. Eq. (27) needs it: for a normal along
@@ -146,95 +136,3 @@ def joint_step(
         step = step + wish - (inverse_jacobian @ (stacked @ wish[..., None]))[..., 0]
     largest = step.abs().amax(-1, keepdim=True)
     return step * (max_step / largest.clamp_min(max_step))
-
-
-def drive_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "j"]:
-    """Return the stiffness [N m/rad] of the drive of every joint of the URDF: the hand's own, or `kp` of all."""
-    every = [hand.actuators[name].kp if kp is None else kp for name in hand.tree.joint_names]
-    return torch.tensor(every, dtype=torch.float64)
-
-
-def actuated_stiffness(coupling: Float[Tensor, "j h"], kp: Float[Tensor, " j"]) -> Float[Tensor, "h"]:
-    """Return the stiffness [N m/rad] of each actuated joint: that of its drive and of the joints that follow it.
-
-    >>> actuated_stiffness(torch.tensor([[1.0], [0.5]]), torch.tensor([4.0, 4.0]))
-    tensor([5.])
-    """
-    return (coupling**2 * kp[:, None]).sum(0)
-
-
-def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
-    """Return the stiffness [N m/rad] of each actuated joint of a hand (`actuated_stiffness`).
-
-    Args:
-        hand: the hand.
-        kp: of every drive [N m/rad]; None: the hand's own.
-    """
-    return actuated_stiffness(hand.actuated.coupling, drive_stiffness(hand, kp).to(hand.actuated.coupling))
-
-
-def tip_compliance(
-    hand: Hand, joints: Float[Tensor, "*b h"], normals: Float[Tensor, "*b 3 3"]
-) -> Float[Tensor, "*b 3"]:
-    """Return how far each fingertip yields [m/N] along its normal when its joints are driven with the hand's kp."""
-    along = torch.einsum("...cih,...ci->...ch", hand.jacobian(joints), normals)
-    return (along**2 / joint_stiffness(hand).to(joints)).sum(-1)
-
-
-ForceSource = Literal["analytic", "learned"]
-"""Where desired forces come from: the balanced set of least friction, with a deviation in proportion; or the hand's
-model of stable grasps (`stable.load_stability`), whose proportions decide between sets that need nearly as little."""
-
-
-def closing_gains(grasps: Grasps, hand: Hand, force: float = 4.0, forces: ForceSource = "analytic") -> ClosingGains:
-    """Return target, gains and desired force of each finger for one grasp, in the hand's frame (Eqs. 26-28).
-
-    Desired forces are balanced. Contacts at which no balanced set presses (a certified grasp has none) are pressed
-    along their normals, each with `force`.
-
-    Args:
-        grasps: one row.
-        hand: the hand that the grasp was planned for.
-        force: normal force of the strongest finger [N].
-        forces: where the desired forces and their covariance come from; the gains tell it.
-
-    Raises:
-        BadArgument: not exactly one row, joints of another hand, a force that is not positive, numbers in the
-            grasp that are not finite, an unknown source of forces, or a hand without a model of stable grasps.
-    """
-    if forces not in get_args(ForceSource):
-        raise BadArgument("forces", repr(forces), f"one of {', '.join(get_args(ForceSource))}")
-    if len(grasps) != 1:
-        raise BadArgument("grasps", f"{len(grasps)} rows", "exactly one: index the grasps, as in grasps[0]")
-    if grasps.joints.shape[-1] != len(hand.joint_names):
-        raise BadArgument("grasps", f"{grasps.joints.shape[-1]} joints", f"the {len(hand.joint_names)} of {hand.name}")
-    if not 0.0 < force < 1e3:
-        raise BadArgument("force", force, "a number in (0, 1000) [N]")
-    h = len(hand.joint_names)
-    check_tensor("grasps.joints", grasps.joints, (1, h))
-    check_tensor("grasps.obj_from_hand", grasps.obj_from_hand, (1, 4, 4))
-    check_tensor("grasps.contacts.points", grasps.contacts.points, (1, 3, 3))
-    check_tensor("grasps.contacts.normals", grasps.contacts.normals, (1, 3, 3))
-    std = check_tensor("grasps.contacts.std_m", grasps.contacts.std_m, (1, 3))
-    joints, contacts = grasps.joints.double(), grasps.contacts.to(torch.float64)
-    hand_from_obj = inverse(grasps.obj_from_hand.double())
-    target, normals = move(hand_from_obj, contacts.points), rotate(hand_from_obj, contacts.normals)
-    covariance = surface_covariance(normals, std.double())
-    wish, deviation = None, None
-    if forces == "learned":
-        model = load_stability(hand)
-        if model is None:
-            raise BadArgument("forces", f"'learned' for {hand.name}, which has no stability.safetensors", "'analytic'")
-        wish = model.wish(target[0] + hand.tip_radius.to(normals)[:, None] * normals[0], force)
-        deviation = wish.covariance.diagonal()[None].sqrt()
-    desired = desired_forces(target, normals, force, None if wish is None else wish.forces[None])
-    spread = force_covariance(desired, normals, FORCE_FLOOR, deviation)
-    alpha_f = FORCE_BANDWIDTH * FORCE_FLOOR**2 * tip_compliance(hand, joints, normals)
-    return ClosingGains(
-        target=target[0],
-        covariance=covariance[0],
-        position_gain=position_gain(covariance)[0],
-        force_gain=force_gain(spread, alpha_f)[0],
-        desired_force=desired[0],
-        force_source=forces,
-    )

@@ -1,23 +1,30 @@
-"""Desired fingertip forces and their covariance: what Eq. (28) weights force errors by."""
+"""What the fingers press with: balanced forces, their covariance (Eq. 28), and the squeeze that drives apply them by."""
+
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.control.stiffness import joint_stiffness
+from torchgrasp.errors import BadArgument
+from torchgrasp.frames import apply, inverse, rotate
+from torchgrasp.hand.hand import Hand
 from torchgrasp.plan.internal_forces import least_friction_forces
+from torchgrasp.values import Grasps
 
 FORCE_SPREAD = 0.1
-"""Relative standard deviation of the desired normal force, where no model of stable grasps gives that of Eq. (28)."""
+"""Relative standard deviation of the desired normal force, where no stability model gives that of Eq. (28)."""
 
 
 def desired_forces(
     points: Float[Tensor, "*b 3 3"],
     normals: Float[Tensor, "*b 3 3"],
     strongest: float = 4.0,
-    wish: Float[Tensor, "*#b 3"] | None = None,
+    preferred: Float[Tensor, "*#b 3"] | None = None,
 ) -> Float[Tensor, "*b 3 3"]:
     """Return `least_friction_forces`, or `strongest` along the normals where no balanced set presses at all contacts."""
-    balanced = least_friction_forces(points, normals, strongest, wish)
+    balanced = least_friction_forces(points, normals, strongest, preferred)
     return torch.where(torch.isfinite(balanced), balanced, -strongest * normals)
 
 
@@ -27,15 +34,74 @@ def force_covariance(
     floor: float,
     deviation: Float[Tensor, "*b"] | None = None,
 ) -> Float[Tensor, "*b 3 3"]:
-    """Return Sigma_fd of Eq. (28) [N^2]: the normal force's deviation along the normal over an isotropic floor.
+    """Return Sigma_fd of Eq. (28) [N^2]: the normal force's variance along the normal, plus an isotropic floor.
 
     Args:
         forces: desired [N].
         normals: outward unit normals.
         floor: standard deviation in every direction [N].
-        deviation: of the normal forces [N], from the model of stable grasps; None: the analytic stand-in, by which a
-            stronger force is less certain in proportion (`FORCE_SPREAD`).
+        deviation: standard deviation of the normal forces [N]; None: proportional to the force (`FORCE_SPREAD`).
     """
     deviation = FORCE_SPREAD * (forces * normals).sum(-1) if deviation is None else deviation
     along = normals[..., :, None] * normals[..., None, :] * deviation[..., None, None] ** 2
     return along + floor**2 * torch.eye(3, dtype=forces.dtype, device=forces.device)
+
+
+def contacts_in_hand(grasps: Grasps) -> tuple[Float[Tensor, "g 3 3"], Float[Tensor, "g 3 3"]]:
+    """Return the planned contact points [m] and outward normals in the hand's frame, in float64."""
+    hand_from_obj = inverse(grasps.obj_from_hand.double())
+    return apply(hand_from_obj, grasps.contacts.points.double()), rotate(
+        hand_from_obj, grasps.contacts.normals.double()
+    )
+
+
+class Squeeze(NamedTuple):
+    """The third pose of a grasp: joint targets [rad], forces on the object in the hand's frame [N], torques [N m]."""
+
+    joints: Float[Tensor, "g h"]
+    forces: Float[Tensor, "g 3 3"]
+    torques: Float[Tensor, "g h"]
+
+
+def squeeze(hand: Hand, grasps: Grasps, force: float = 4.0, kp: float | None = None) -> Squeeze:
+    """Return joint targets with which position-controlled fingers press at their planned contacts.
+
+    The targets solve J^T f = kp (target - q) for the `desired_forces` f; they may exceed a joint's limits. A hand that
+    replays pre-grasp, grasp and squeeze closes in open loop.
+
+    Args:
+        hand: the hand.
+        grasps: g rows, planned for it.
+        force: normal force of the strongest finger [N].
+        kp: stiffness of every joint's drive [N m/rad]; None: the hand's own.
+
+    Raises:
+        BadArgument: joints of another hand, or a force or stiffness that is not positive.
+
+    >>> from torchgrasp import ContactSpec, load_hand, load_object, plan_grasps
+    >>> hand = load_hand("allegro")
+    >>> grasps = plan_grasps(load_object("cylinder").view, hand, ContactSpec(table=0.0), starts=20)
+    >>> lead = squeeze(hand, grasps, force=5.0).joints - grasps.joints
+    >>> lead.shape[1], bool((lead.abs().amax(1) > 0.01).all())
+    (12, True)
+    """
+    if grasps.joints.shape[-1] != hand.dof:
+        raise BadArgument("grasps", f"{grasps.joints.shape[-1]} joints", f"the {hand.dof} of {hand.name}")
+    for name, value in (("force", force), ("kp", 1.0 if kp is None else kp)):
+        if not 0.0 < value < 1e6:
+            raise BadArgument(name, value, "a number in (0, 10^6)")
+    hand, joints = hand.to(torch.float64), grasps.joints.double()
+    return press(
+        joints, hand.jacobian(joints), desired_forces(*contacts_in_hand(grasps), force), joint_stiffness(hand, kp)
+    )
+
+
+def press(
+    joints: Float[Tensor, "g h"],
+    jacobian: Float[Tensor, "g 3 3 h"],
+    forces: Float[Tensor, "g 3 3"],
+    stiffness: Float[Tensor, " h"],
+) -> Squeeze:
+    """Return the `Squeeze` by which joints of a stiffness [N m/rad] exert forces [N] at the contacts."""
+    torques = torch.einsum("gcih,gci->gh", jacobian, forces)
+    return Squeeze(joints + torques / stiffness, forces, torques)

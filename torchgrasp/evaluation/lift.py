@@ -11,10 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.control.adaptive.belief import Belief
-from torchgrasp.control.closing_law import closing_gains
 from torchgrasp.control.controller import GraspController, check_modes
-from torchgrasp.control.observation import Observation, model_from_hand
+from torchgrasp.control.observation import Observation
+from torchgrasp.control.reference import ClosingReference
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import apply, inverse, rotation_angle
 from torchgrasp.hand.hand import Hand
@@ -25,7 +24,7 @@ from torchgrasp.sim.hand import SimulatedHand
 from torchgrasp.sim.open import open_scene
 from torchgrasp.sim.scene import SceneSpec
 from torchgrasp.specs import TrialSpec
-from torchgrasp.values import ClosingGains, ClosureResult, Grasps
+from torchgrasp.values import ClosureResult, Grasps
 
 if TYPE_CHECKING:
     import trimesh
@@ -97,15 +96,15 @@ def close_hand(
         found = f"{spec.control_rate:g} Hz with a timestep of {spec.timestep:g} s"
         raise BadArgument("control_rate", found, "a period of at least one timestep")
     grasp, hand = grasp.to("cpu", torch.float64), hand.to("cpu", torch.float64)
-    gains = closing_gains(grasp, hand, spec.force)
+    reference = ClosingReference.from_grasp(hand, grasp, spec.force)
     hand.check_joints(grasp.pregrasp)
     if spec.approach and not abs(float(torch.linalg.vector_norm(grasp.approach)) - 1) < 1e-4:
         raise BadArgument("grasp", f"an approach along {grasp.approach[0].tolist()}", "a unit vector")
     mesh = read_mesh(mesh)
     bodies = convex_parts(mesh) if parts is None else check_parts(parts)
     stands = grasp.obj_from_hand[0] if error is None else grasp.obj_from_hand[0] @ error.double().cpu()
-    trial = _Trial(grasp, hand, mesh, bodies, spec, stands, seed)
-    status = trial.run(gains, None if belief is None else Belief(belief, grasp.obj_from_hand[0]))
+    trial = _Trial(grasp, reference, mesh, bodies, spec, stands, seed)
+    status = trial.run(belief)
     return trial.result(status, time.perf_counter() - started)
 
 
@@ -128,14 +127,14 @@ class _Trial:
     def __init__(
         self,
         grasp: Grasps,
-        hand: Hand,
+        reference: ClosingReference,
         mesh: "trimesh.Trimesh",
         parts: "list[trimesh.Trimesh]",
         spec: TrialSpec,
         stands: Float[Tensor, "4 4"],
         seed: int,
     ) -> None:
-        self.spec = spec
+        self.spec, hand = spec, reference.hand
         start = {name: float(q) for name, q in hand.expand(grasp.pregrasp[0]).items()}
         way = stands[:3, :3] @ grasp.obj_from_hand[0, :3, :3].T @ grasp.approach[0] * spec.approach
         setup = SceneSpec(
@@ -154,9 +153,8 @@ class _Trial:
             tuple(way.tolist()),
         )
         self.scene = open_scene(setup, spec.simulator)
-        self.model = model_from_hand(hand, grasp, spec.force, self.scene.joint_names)
         generator = torch.Generator().manual_seed(seed) if spec.noise else None
-        self.robot = SimulatedHand(self.scene, hand, self.model, spec.control_rate, generator, spec.breakaway)
+        self.robot = SimulatedHand(self.scene, reference, spec.control_rate, generator)
         self.time: list[float] = []
         self.forces: list[np.ndarray] = []
         self.touching: list[int] = []
@@ -168,13 +166,13 @@ class _Trial:
 
     # ------------------------------------------------------------------------------------------------- the phases
 
-    def run(self, gains: ClosingGains, belief: Belief | None) -> Status:
+    def run(self, belief: ShapeGP | None) -> Status:
         """Approach, close, press, lift and hold; return what became of it."""
         self.overlap = self.scene.penetration()
         self._record(np.zeros(3))
         if not self.overlap <= START_TOLERANCE:
             return Status.START_OVERLAP
-        controller = GraspController(self.model, gains, self.spec.closing, self.spec.holding, belief)
+        controller = GraspController(self.robot.reference, self.spec.closing, self.spec.holding, belief)
         period = self.robot.period
         try:
             arriving = self.robot.ticks(self.spec.approach / APPROACH_SPEED) if self.spec.approach else 0
@@ -187,7 +185,8 @@ class _Trial:
             while not controller.closed:
                 observation = self._tick(controller.step(observation, period))
             self.pushed = float(np.linalg.norm(self._centre(-1) - self._centre(0)))
-            self.strained = bool((self.model.kp * (controller.targets - observation.joints).abs() >= self.effort).any())
+            kp = self.robot.reference.model.kp
+            self.strained = bool((kp * (controller.targets - observation.joints).abs() >= self.effort).any())
             rising = self.robot.ticks(LIFT_TIME)
             for k in range(rising + self.robot.ticks(self.spec.hold_time)):
                 self.scene.lift(*self._height((k + 1) * period, rising * period))

@@ -20,10 +20,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.control.adaptive.belief import Belief
-from torchgrasp.control.closing_law import closing_gains
 from torchgrasp.control.controller import GraspController, check_modes
-from torchgrasp.control.observation import model_from_hand
+from torchgrasp.control.reference import ClosingReference
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import rotation_angle
 from torchgrasp.hand.hand import Hand
@@ -34,7 +32,7 @@ from torchgrasp.sim.hand import SimulatedHand
 from torchgrasp.sim.open import open_scene
 from torchgrasp.sim.scene import Scene, SceneSpec
 from torchgrasp.specs import ClosingMode, HoldingMode, Simulator, check_simulator
-from torchgrasp.values import ClosingGains, Grasps
+from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
     import trimesh
@@ -168,11 +166,11 @@ def pull_grasp(
         raise BadArgument("grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]")
     grasp, hand = grasp.to("cpu", torch.float64), hand.to("cpu", torch.float64)
     hand.check_joints(grasp.pregrasp)
-    gains = closing_gains(grasp, hand, force)
+    reference = ClosingReference.from_grasp(hand, grasp, force, protocol.kp)
     mesh = read_mesh(mesh)
     bodies = convex_parts(mesh) if parts is None else check_parts(parts)
     stands = grasp.obj_from_hand[0] if error is None else grasp.obj_from_hand[0] @ error.double()
-    trial = _Pull(grasp, hand, mesh, bodies, protocol, stands, closing, holding, gains, belief, force, seed, simulator)
+    trial = _Pull(grasp, mesh, bodies, protocol, stands, closing, holding, reference, belief, seed, simulator)
     status, moved, turned, pressed, tried = Status.OK, 0.0, 0.0, math.nan, 0
     for direction in DIRECTIONS:
         found, forces = trial.run(direction)
@@ -205,25 +203,24 @@ class _Pull:
     def __init__(
         self,
         grasp: Grasps,
-        hand: Hand,
         mesh: "trimesh.Trimesh",
         parts: "list[trimesh.Trimesh]",
         protocol: PullProtocol,
         stands: Float[Tensor, "4 4"],
         closing: ClosingMode,
         holding: HoldingMode,
-        gains: ClosingGains,
+        reference: ClosingReference,
         belief: ShapeGP | None,
-        force: float,
         seed: int,
         simulator: Simulator,
     ) -> None:
         self.simulator: Simulator = simulator
-        self.grasp, self.hand, self.mesh, self.parts, self.protocol = grasp, hand, mesh, parts, protocol
+        hand = reference.hand
+        self.hand, self.mesh, self.parts, self.protocol = hand, mesh, parts, protocol
         self.closing: ClosingMode = closing
         self.holding: HoldingMode = holding
         self.stands = stands.numpy()
-        self.gains, self.belief, self.force, self.seed = gains, belief, force, seed
+        self.reference, self.belief, self.seed = reference, belief, seed
         self.mass = protocol.density * float(mesh.volume) if protocol.mass is None else protocol.mass
         self.start = {name: float(q) for name, q in hand.expand(grasp.pregrasp[0]).items()}
         self.drives = hand.actuators
@@ -241,8 +238,7 @@ class _Pull:
         if not scene.penetration() <= rule.overlap:
             return (Status.START_OVERLAP, 0.0, 0.0), math.nan
         generator = torch.Generator().manual_seed(self.seed)
-        model = model_from_hand(self.hand, self.grasp, self.force, scene.joint_names, rule.kp)
-        robot = SimulatedHand(scene, self.hand, model, CONTROL_RATE, generator)
+        robot = SimulatedHand(scene, self.reference, CONTROL_RATE, generator)
         before, far = scene.object_pose(), (0.0, 0.0)
         hold = self._close(robot)
         force = float(robot.force.mean())
@@ -261,8 +257,7 @@ class _Pull:
 
     def _close(self, robot: SimulatedHand) -> Callable[[], None]:
         """Close the hand and return what holds it closed for one tick more."""
-        belief = None if self.belief is None else Belief(self.belief, self.grasp.obj_from_hand[0])
-        controller = GraspController(robot.model, self.gains, self.closing, self.holding, belief)
+        controller = GraspController(robot.reference, self.closing, self.holding, self.belief)
         observation = robot.tick(controller.targets)
 
         def go_on() -> None:

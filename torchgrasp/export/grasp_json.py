@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from torchgrasp.control.closing import POSE_TIME
-from torchgrasp.control.squeeze import squeeze
+from torchgrasp.control.forces import squeeze
 from torchgrasp.errors import Status
 from torchgrasp.files import format_json
 from torchgrasp.frames import rotate
@@ -49,7 +49,7 @@ def format_grasps(hand: Hand, grasps: Grasps, force: float = 4.0) -> str:
     Raises:
         BadArgument: joints of another hand, or a force that is not positive.
     """
-    squeezed, path = squeeze(grasps, hand, force), hand.urdf_path
+    squeezed, path = squeeze(hand, grasps, force), hand.urdf_path
     forces = rotate(grasps.obj_from_hand.double(), squeezed.forces)
     postures = {"pregrasp": grasps.pregrasp.double(), "grasp": grasps.joints.double(), "squeeze": squeezed.joints}
     named = {name: hand.expand(joints) for name, joints in postures.items()}

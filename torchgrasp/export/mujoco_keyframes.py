@@ -4,7 +4,7 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 
-from torchgrasp.control.squeeze import squeeze
+from torchgrasp.control.forces import squeeze
 from torchgrasp.export.grasp_json import quaternion
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
@@ -34,7 +34,7 @@ def format_keyframes(hand: Hand, grasps: Grasps, force: float = 4.0) -> str:
     Raises:
         BadArgument: joints of another hand, or a force that is not positive.
     """
-    squeezed, urdf = squeeze(grasps, hand, force), read_urdf(hand.urdf_path)
+    squeezed, urdf = squeeze(hand, grasps, force), read_urdf(hand.urdf_path)
     root = ET.Element("mujoco", model=hand.name)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     tags = "custom", "worldbody", "actuator", "keyframe"

@@ -5,10 +5,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.control.observation import ControlModel, Observation
+from torchgrasp.control.observation import Observation
+from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import TipContact, measure, no_contact
-from torchgrasp.hand.hand import Hand
-from torchgrasp.sim.breakaway import Breakaway
 from torchgrasp.sim.scene import Scene
 
 
@@ -21,35 +20,30 @@ class SimulatedHand:
 
     Args:
         scene: at its start.
-        hand: its hand.
-        plant: what the controllers know of it.
+        reference: what it follows.
         control_rate: ticks a second [Hz].
         generator: draws the noise of the fingertips; None: no noise.
-        breakaway: torque [N m] at which its clutches let go (`Breakaway`); None: it has none.
     """
 
     def __init__(
         self,
         scene: Scene,
-        hand: Hand,
-        model: ControlModel,
+        reference: ClosingReference,
         control_rate: float,
         generator: torch.Generator | None,
-        breakaway: float | None = None,
     ) -> None:
-        self.scene, self.model, self.generator = scene, model, generator
+        self.scene, self.reference, self.generator = scene, reference.reorder(scene.joint_names), generator
         self.substeps = max(1, round(1 / (control_rate * scene.timestep)))
         self.period = self.substeps * scene.timestep
         self.steps, self.first_touch = 0, [float("inf")] * 3
         self.force, self.finger = np.zeros(3), np.zeros(3, dtype=bool)
-        self._centres = torch.cat([hand.tips.center.double(), torch.ones(3, 1, dtype=torch.float64)], dim=-1).numpy()
-        self._touch = no_contact()
-        self._clutch = None if breakaway is None else Breakaway(model, breakaway)
+        self._centres = torch.cat(
+            [reference.hand.tips.center.double(), torch.ones(3, 1, dtype=torch.float64)], dim=-1
+        ).numpy()
+        self.tactile = no_contact()
 
     def tick(self, targets: Float[Tensor, " j"]) -> Observation:
         """Drive the joints for one control period and return what the robot then knows."""
-        if self._clutch is not None:
-            targets = self._clutch(targets, torch.from_numpy(self.scene.joints()))
         self.scene.drive(targets.numpy())
         impulse, moment, weight, force = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))
         for _ in range(self.substeps):
@@ -80,16 +74,10 @@ class SimulatedHand:
         directions = torch.from_numpy(np.concatenate([force, normals]) @ turn)
         places = torch.from_numpy((np.concatenate([points, centres]) - origin) @ turn)
         press = TipContact(torch.from_numpy(self.force), directions[:3], places[:3], directions[3:])
-        self._touch = touch = measure(
-            self._touch, press, self.model.normals, self.model.radius, self.period, self.generator
+        normals, radius = self.reference.normals, self.reference.model.radius
+        self.tactile = measure(self.tactile, press, normals, radius, self.period, self.generator)
+        joints, jacobian = (
+            torch.from_numpy(self.scene.joints()),
+            torch.from_numpy(turn.T @ self.scene.jacobian(centres)),
         )
-        return Observation(
-            joints=torch.from_numpy(self.scene.joints()),
-            tips=places[3:],
-            jacobian=torch.from_numpy(turn.T @ self.scene.jacobian(centres)),
-            reading=touch.reading,
-            forces=touch.forces,
-            contact=touch.contact,
-            points=touch.points,
-            normals=touch.normals,
-        )
+        return Observation.join(joints, places[3:], jacobian, self.tactile)

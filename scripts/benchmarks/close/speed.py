@@ -7,10 +7,7 @@ from pathlib import Path
 
 from benchmarks.common import Row, least_seconds
 from torchgrasp import ContactSpec, TrialSpec, close_hand, load_grasps, load_hand, load_object, plan_grasps
-from torchgrasp.control.closing_law import closing_gains
-from torchgrasp.control.controller import GraspController
-from torchgrasp.control.observation import model_from_hand, observe
-from torchgrasp.control.tactile import no_contact
+from torchgrasp.control import ClosingReference, GraspController, no_contact, observe
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.objects import GraspObject
 
@@ -63,7 +60,7 @@ def _trial_row(name: str, path: Path) -> Row:
 def _tick_row(name: str, path: Path) -> Row:
     """Return the time of one tick of the controller, without simulator and sensor."""
     hand, grasp = load_hand(name), load_grasps(path)
-    controller = GraspController(model_from_hand(hand, grasp), closing_gains(grasp, hand))
+    controller = GraspController(ClosingReference.from_grasp(hand, grasp))
     seen = observe(hand, grasp.pregrasp[0], no_contact())
 
     def close() -> None:

@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -14,15 +13,11 @@ from benchmarks.common import Row
 from torchgrasp import ContactSpec, Grasps, Hand, Status, load_hand, plan_grasps
 from torchgrasp.control.adaptive.impedance import GRASP_STIFFNESS, Impedance
 from torchgrasp.control.adaptive.stability import StabilityModel, lengths_of, load_stability, state_of
-from torchgrasp.control.closing_law import closing_gains
 from torchgrasp.control.holding import ForceHold
 from torchgrasp.datasets import read_views
 from torchgrasp.evaluation.evaluate import choose_rows
 from torchgrasp.linalg import unit
 from torchgrasp.sim.convex_parts import convex_parts
-
-if TYPE_CHECKING:
-    pass
 
 FRICTION, STRENGTH = 0.6, (1.0, 8.0)
 """Of every contact; and the strongest finger's desired force [N], drawn evenly in its logarithm for each grasp."""
@@ -33,14 +28,8 @@ RATE, MOST, SECONDS = 4.0, 16.0, 4.0
 AGAINST = 3.0
 """The stability before the pull is to tell which grasps keep their object at this pull [N]."""
 
-KEPT = torch.full((3,), GRASP_STIFFNESS, dtype=torch.float64)
-HOLDINGS = {
-    "squeeze": (ForceHold, "analytic"),
-    "impedance": (functools.partial(Impedance, springs=KEPT), "analytic"),
-    "impedance that adapts": (Impedance, "analytic"),
-    "impedance that adapts, learned forces": (Impedance, "learned"),
-}
-"""What holds, and where its desired forces come from."""
+HOLDINGS = ("force", "impedance", "impedance that adapts", "impedance that adapts, learned forces")
+"""What holds; the last takes its desired forces, too, from the stability model."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,15 +69,15 @@ def pull_at(grasp: Grasps, hand: Hand, model: StabilityModel, mesh, parts, seed:
     strength = math.exp(math.log(STRENGTH[0]) + share * math.log(STRENGTH[1] / STRENGTH[0]))
     pull = Pull(unit(torch.randn(3, generator=generator, dtype=torch.float64)), RATE, MOST, SECONDS)
     held: dict[str, Held] = {}
-    grasp = grasp.to(dtype=torch.float64)
-    for name, (holding, source) in HOLDINGS.items():
-        gains = closing_gains(grasp, hand, strength, source)
-        trial = disturb_grasp(
-            grasp.to(dtype=torch.float64), hand, mesh, parts, gains, holding, pull, FRICTION, seed=seed
-        )
+    for name in HOLDINGS:
+        learned, adapts = name.endswith("learned forces"), "adapts" in name
+        reference = ClosingReference.from_grasp(hand, grasp, strength, stability=model if learned else None)
+        impedance = functools.partial(Impedance, stability=model if adapts else None)
+        holding = ForceHold if name == "force" else impedance
+        trial = disturb_grasp(reference, mesh, parts, holding, pull, FRICTION, seed=seed)
         if trial.overlap:
             return {}
-        held[name] = judged(trial, model, gains.desired_force.norm(dim=-1))
+        held[name] = judged(trial, model, reference.gains.desired_force.norm(dim=-1))
     return held
 
 
@@ -96,9 +85,9 @@ def judged(trial: Disturbed, model: StabilityModel, desired: torch.Tensor) -> He
     """Return what a trial tells."""
     rest = max(int((trial.pulled == 0).sum()) - 1, 0)  # the forces have risen by then
     felt = trial.forces[rest]
-    state = state_of(KEPT, lengths_of(trial.tips[rest]), felt)
+    state = state_of(torch.full((3,), GRASP_STIFFNESS, dtype=torch.float64), lengths_of(trial.tips[rest]), felt)
     error = float(((felt - desired) / desired).abs().mean())
-    return Held(float(trial.pulled[-1]) if trial.lost else MOST, float(model.odds(state)), error)
+    return Held(float(trial.pulled[-1]) if trial.lost else MOST, float(model.log_odds(state)), error)
 
 
 def likelihood_row(hand: Hand, model: StabilityModel) -> Row:
@@ -128,9 +117,9 @@ def error_row(hand: Hand, found: dict[str, list[Held]]) -> Row:
 
 
 def lost_row(hand: Hand, found: dict[str, list[Held]]) -> Row:
-    """Return the mean pull at which the object is lost, and the paired gain over the squeeze."""
+    """Return the mean pull at which the object is lost, and the paired gain over the holding by forces."""
     pulls = {name: np.array([h.lost_at for h in held]) for name, held in found.items()}
-    base, parts, numbers = pulls["squeeze"], [], {}
+    base, parts, numbers = pulls["force"], [], {}
     for name, at in pulls.items():
         gain = at - base
         width = 1.96 * float(gain.std()) / math.sqrt(max(len(gain), 1))
@@ -138,4 +127,4 @@ def lost_row(hand: Hand, found: dict[str, list[Held]]) -> Row:
         parts.append(f"{name} {at.mean():.2f} N ({gain.mean():+.2f} +- {width:.2f})")
     best = numbers["impedance that adapts"]
     title = f"{hand.name}: mean pull at which {len(base)} held objects are lost"
-    return Row(title, "adapting above the squeeze", "; ".join(parts), best["gain"] > best["width"], numbers)
+    return Row(title, "adapting above force", "; ".join(parts), best["gain"] > best["width"], numbers)

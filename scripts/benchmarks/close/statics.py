@@ -20,13 +20,12 @@ from torchgrasp import (
     Status,
     TrialSpec,
     close_hand,
-    closing_gains,
     load_hand,
     load_object,
     plan_grasps,
 )
-from torchgrasp.control.controller import GraspController
-from torchgrasp.control.observation import model_from_hand
+from torchgrasp.control import ClosingReference, GraspController
+from torchgrasp.control.holding import ForceHold
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.sim.convex_parts import convex_parts
@@ -159,9 +158,9 @@ def hold(
     pose, tips = grasp.obj_from_hand[0].numpy(), tuple(hand.tip_links)
     setup = SceneSpec(hand.urdf_path, pose, start, hand.actuators, tips, mesh, convex_parts(mesh), mass, patch=0.0)
     scene = open_scene(setup, simulator)
-    gains, model = closing_gains(grasp, hand, force), model_from_hand(hand, grasp, force, scene.joint_names)
-    robot = SimulatedHand(scene, hand, model, 100.0, None if seed is None else torch.Generator().manual_seed(seed))
-    controller = GraspController(model, gains)
+    generator = None if seed is None else torch.Generator().manual_seed(seed)
+    robot = SimulatedHand(scene, ClosingReference.from_grasp(hand, grasp, force), 100.0, generator)
+    controller, model = GraspController(robot.reference), robot.reference.model
     observation = robot.tick(controller.targets)
     while not controller.closed:
         observation = robot.tick(controller.step(observation, robot.period))
@@ -184,11 +183,11 @@ def hold(
         torques.append(np.where(np.abs(scene.joints() - middle) < reach, driven - felt, 0.0))
         pressed.append(robot.force.sum())
     weight = np.array([0.0, 0.0, mass * setup.gravity])
-    asked = controller.hold.strength
+    assert isinstance(controller.hold, ForceHold)
     return Held(
         float(np.linalg.norm(np.mean(sums, 0) - weight) / weight[2]),
         float(np.abs(np.mean(torques, 0)).max()),
-        float(np.mean(pressed)) / asked,
+        float(np.mean(pressed)) / controller.hold.strength,
     )
 
 

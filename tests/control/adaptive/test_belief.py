@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from tests.control.test_controller import GAINS, PERIOD, model, observation, real
+from tests.point_fingers import GAINS, PERIOD, observation, real, reference
 from torchgrasp import fit_shape
 from torchgrasp.control.adaptive.belief import FARTHEST, Belief
 from torchgrasp.control.closing import UncertaintyClosing
@@ -28,10 +28,9 @@ def shape():
     return fit_shape(PointCloud(seen, unit(seen), real([0.5, 0.0, 0.0])), seed=0)
 
 
-def at(radius: float, **changes):
-    """Gains and plant with contacts on a ball about the origin."""
-    gains = dataclasses.replace(GAINS, target=radius * NORMALS)
-    return dataclasses.replace(model(), normals=NORMALS, **changes), gains
+def at(radius: float):
+    """A reference with contacts on a ball about the origin."""
+    return dataclasses.replace(reference(), normals=NORMALS, gains=dataclasses.replace(GAINS, target=radius * NORMALS))
 
 
 def felt(point: torch.Tensor, normal: torch.Tensor):
@@ -53,54 +52,53 @@ def surface_point(shape, direction: torch.Tensor) -> torch.Tensor:
 
 
 def test_a_touch_where_it_was_expected_changes_nothing(shape):
-    belief, (hand, gains) = Belief(shape, EYE), at(0.03)
+    belief, planned = Belief(shape, EYE), at(0.03)
     point = surface_point(shape, NORMALS[0])
-    revised = belief.revise(felt(point, NORMALS[0]), hand, gains)
-    assert revised[0] is hand and revised[1] is gains and belief.shape is shape
+    assert belief.revise(felt(point, NORMALS[0]), planned) is planned and belief.shape is shape
 
 
 def test_a_surprise_moves_the_contacts_in_the_air_onto_the_surface_as_it_is_now(shape):
-    belief, (hand, gains) = Belief(shape, EYE), at(0.03)
+    belief, planned = Belief(shape, EYE), at(0.03)
     point = surface_point(shape, NORMALS[0]) + 0.01 * NORMALS[0]
     inside = bool(shape.contains(point[None]))
-    moved, revised = belief.revise(felt(point, NORMALS[0]), hand, gains)
+    revised = belief.revise(felt(point, NORMALS[0]), planned)
+    target, before = revised.gains.target, planned.gains.target
     assert inside and belief.shape is not shape
     assert float(belief.shape.predict(point[None]).distance.abs() * shape.scale) < 0.01
-    assert torch.equal(revised.target[0], gains.target[0]) and torch.equal(moved.normals[0], hand.normals[0])
+    assert torch.equal(target[0], before[0]) and torch.equal(revised.normals[0], planned.normals[0])
     for finger in (1, 2):
-        way = revised.target[finger] - gains.target[finger]
-        assert torch.linalg.cross(way, NORMALS[finger]).norm() < 1e-9 and way.norm() <= FARTHEST + 1e-9
-        if way.norm() > 0:
-            assert float(belief.shape.predict(revised.target[finger][None]).distance.abs() * shape.scale) < 2e-3
-            assert torch.allclose(moved.normals[finger], belief.shape.predict(revised.target[finger][None]).normal[0])
-    assert (revised.target - gains.target).norm() > 1e-4
-    again = belief.revise(felt(point, NORMALS[0]), moved, revised)
-    assert again[0] is moved and again[1] is revised  # each finger's first touch is taken once
+        step = target[finger] - before[finger]
+        assert torch.linalg.cross(step, NORMALS[finger]).norm() < 1e-9 and step.norm() <= FARTHEST + 1e-9
+        if step.norm() > 0:
+            estimate = belief.shape.predict(target[finger][None])
+            assert float(estimate.distance.abs() * shape.scale) < 2e-3
+            assert torch.allclose(revised.normals[finger], estimate.normal[0])
+    assert (target - before).norm() > 1e-4
+    assert belief.revise(felt(point, NORMALS[0]), revised) is revised  # each finger's first touch is taken once
 
 
 def test_the_answer_does_not_depend_on_the_hand_s_frame(shape):
     turn = rigid(rotation_from_vector(real([0.3, -0.5, 0.9])), real([0.1, 0.2, -0.1]))
     point = surface_point(shape, NORMALS[0]) + 0.01 * NORMALS[0]
-    hand, gains = at(0.03)
-    first = Belief(shape, EYE).revise(felt(point, NORMALS[0]), hand, gains)[1].target
+    planned = at(0.03)
+    first = Belief(shape, EYE).revise(felt(point, NORMALS[0]), planned).gains.target
     back = turn[:3, :3].T
-    there = dataclasses.replace(gains, target=(gains.target - turn[:3, 3]) @ back.T)
-    aside = dataclasses.replace(hand, normals=NORMALS @ back.T)
+    there = dataclasses.replace(planned.gains, target=(planned.gains.target - turn[:3, 3]) @ back.T)
+    aside = dataclasses.replace(planned, normals=NORMALS @ back.T, gains=there)
     seen = felt(back @ (point - turn[:3, 3]), back @ NORMALS[0])
-    second = Belief(shape, turn).revise(seen, aside, there)[1].target
+    second = Belief(shape, turn).revise(seen, aside).gains.target
     assert torch.allclose(second @ turn[:3, :3].T + turn[:3, 3], first, atol=1e-7)
 
 
 def test_a_touch_out_of_the_ball_of_the_posterior_is_left_alone(shape):
-    belief, (hand, gains) = Belief(shape, EYE), at(0.03)
-    revised = belief.revise(felt(real([1.0, 0.0, 0.0]), NORMALS[0]), hand, gains)
-    assert revised[0] is hand and belief.shape is shape
+    belief, planned = Belief(shape, EYE), at(0.03)
+    assert belief.revise(felt(real([1.0, 0.0, 0.0]), NORMALS[0]), planned) is planned and belief.shape is shape
 
 
 def test_the_closing_follows_the_belief_and_others_refuse_it(shape):
-    hand, gains = at(0.03)
-    closing = UncertaintyClosing(hand, gains, Belief(shape, EYE))
-    closing(felt(surface_point(shape, NORMALS[0]) + 0.01 * NORMALS[0], NORMALS[0]), PERIOD)
-    assert closing.gains is not gains
+    planned = at(0.03)
+    controller = GraspController(planned, belief=shape)
+    controller.step(felt(surface_point(shape, NORMALS[0]) + 0.01 * NORMALS[0], NORMALS[0]), PERIOD)
+    assert isinstance(controller.closing, UncertaintyClosing) and controller.closing.reference is not planned
     with pytest.raises(BadArgument, match="belief"):
-        GraspController(hand, gains, "position", "force", Belief(shape, EYE))
+        GraspController(planned, "position", belief=shape)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.control.test_controller import GAINS, PERIOD, TOUCHING, model, observation, real
+from tests.point_fingers import PERIOD, TOUCHING, observation, real, reference
 from torchgrasp.control.adaptive.impedance import (
     MOST_RAISE,
     MOST_SHARE,
@@ -17,7 +17,7 @@ from torchgrasp.control.adaptive.impedance import (
     side_lengths,
     spring_forces,
 )
-from torchgrasp.control.adaptive.stability import PreferredForces
+from torchgrasp.control.adaptive.stability import PreferredForces, StabilityModel
 from torchgrasp.control.holding import RAMP, held_forces
 from torchgrasp.frames import rigid, rotation_from_vector, virtual_frame
 
@@ -83,17 +83,17 @@ def test_the_wrench_is_the_gradient_of_an_energy():
 
 def test_at_rest_the_drives_press_with_the_desired_forces():
     seen = observation(0.0, contact=TOUCHING, reading=(2.0, 2.0, 4.0))
-    hold = Impedance(model(), GAINS, seen, torch.zeros(9).double())
+    hold = Impedance(reference(), seen, torch.zeros(9).double())
     first = hold(seen, PERIOD)
     assert first.abs().max() < 0.1
     last = [hold(seen, PERIOD) for _ in range(round(RAMP / PERIOD))][-1]
-    forces, _ = held_forces(model(), GAINS, seen)
+    forces, _ = held_forces(reference(), seen)
     assert torch.allclose(2.0 * last.reshape(3, 3), forces, atol=1e-9)
 
 
 def test_a_shifted_or_turned_grasp_is_pulled_back_and_stays_pressed():
     seen = observation(0.0, contact=TOUCHING, reading=(2.0, 2.0, 4.0))
-    hold = Impedance(model(), GAINS, seen, torch.zeros(9).double())
+    hold = Impedance(reference(), seen, torch.zeros(9).double())
     tips, rest = seen.tips, hold.forces(seen.tips)
     shift = real([0.0, 0.001, 0.0])
     assert torch.allclose((hold.forces(tips + shift) - rest).sum(0), -TRANSLATION_STIFFNESS * shift, atol=1e-9)
@@ -108,10 +108,10 @@ def test_a_shifted_or_turned_grasp_is_pulled_back_and_stays_pressed():
 
 def test_forces_turn_with_the_hand_frame():
     seen = observation(0.0, contact=TOUCHING)
-    hold = Impedance(model(), GAINS, seen, torch.zeros(9).double())
+    hold = Impedance(reference(), seen, torch.zeros(9).double())
     moved = seen.tips + 0.002 * triangles(1, 3)[0] / 0.05
     there = rigid(rotation_from_vector(real([0.5, 0.2, -0.8])), real([0.1, 0.0, 0.2]))
-    turned = Impedance(model(), GAINS, seen, torch.zeros(9).double())
+    turned = Impedance(reference(), seen, torch.zeros(9).double())
     turned.rest = there @ hold.rest
     forces = turned.forces(moved @ there[:3, :3].T + there[:3, 3])
     assert torch.allclose(forces, hold.forces(moved) @ there[:3, :3].T, atol=1e-9)
@@ -119,48 +119,49 @@ def test_forces_turn_with_the_hand_frame():
 
 def test_tips_on_a_line_keep_the_last_frame():
     seen = observation(0.0, contact=TOUCHING)
-    hold = Impedance(model(), GAINS, seen, torch.zeros(9).double())
+    hold = Impedance(reference(), seen, torch.zeros(9).double())
     line = seen.tips.mean(0) + torch.arange(3)[:, None] * real([0.01, 0.0, 0.0])
     assert torch.isfinite(hold.forces(line)).all()
     assert torch.equal(hold.frame, hold.rest)
 
 
 def test_a_grasp_that_feels_unstable_becomes_firmer_and_another_does_not():
-    class Model:
+    class Model(StabilityModel):
         """Stable is what presses with more than 5 N in all."""
 
-        def odds(self, state: torch.Tensor) -> torch.Tensor:
+        def __init__(self) -> None:
+            pass
+
+        def log_odds(self, state: torch.Tensor) -> torch.Tensor:
             return state[6:].exp().sum() - 5.0
 
-        def wish(self, tips: torch.Tensor) -> PreferredForces:
+        def preferred_forces(self, tips: torch.Tensor, force: float | None = None) -> PreferredForces:
             return PreferredForces(torch.ones(3).double(), torch.eye(3).double(), torch.full((3,), 300.0).double())
 
-    def held(reading: tuple[float, float, float], springs: torch.Tensor | None = None) -> Impedance:
+    def held(reading: tuple[float, float, float], **options) -> Impedance:
         seen = observation(0.0, contact=TOUCHING, reading=reading)
-        body = model()
-        object.__setattr__(body, "stable", Model())
-        hold = Impedance(body, GAINS, seen, torch.zeros(9).double(), springs)
+        hold = Impedance(reference(), seen, torch.zeros(9).double(), **options)
         for _ in range(round((RAMP + SETTLING + 1.0) / PERIOD)):
             hold(seen, PERIOD)
         return hold
 
-    firm, weak = held((2.0, 2.0, 4.0)), held((1.0, 1.0, 2.0))
+    firm, weak = held((2.0, 2.0, 4.0), stability=Model()), held((1.0, 1.0, 2.0), stability=Model())
     assert firm.raised == 1.0
     assert weak.raised == pytest.approx(MOST_RAISE, rel=0.01)
     assert weak.springs.tolist() == pytest.approx([300.0] * 3, rel=0.01)
     assert weak.forces(observation(0.0).tips).norm() > 1.9 * firm.forces(observation(0.0).tips).norm()
-    kept = held((1.0, 1.0, 2.0), torch.full((3,), 50.0).double())
+    kept = held((1.0, 1.0, 2.0), springs=torch.full((3,), 50.0).double())
     assert (kept.raised, kept.springs.tolist()) == (1.0, [50.0] * 3)
 
 
 def test_coupled_joints_get_the_torque_of_their_actuator():
     """Three actuators move three joints each: the generalised torque is C^T J^T f whatever their stiffness."""
     coupling = torch.kron(torch.eye(3), torch.tensor([[1.0], [0.5], [0.25]])).double()
-    body = model(coupling)
+    body = reference(coupling)
     joints = 0.01 * torch.randn(9, generator=torch.Generator().manual_seed(2)).double()
     seen = observation(0.0, contact=TOUCHING, joints=joints)
-    hold = Impedance(body, GAINS, seen, seen.joints)
+    hold = Impedance(body, seen, seen.joints)
     targets = [hold(seen, PERIOD) for _ in range(round(RAMP / PERIOD) + 1)][-1]
-    torque = coupling.T @ (body.kp * (targets - seen.joints))
+    torque = coupling.T @ (body.model.kp * (targets - seen.joints))
     wanted = coupling.T @ (seen.jacobian.flatten(0, 1).T @ hold.forces(seen.tips).flatten())
     assert torch.allclose(torque, wanted, atol=1e-9)

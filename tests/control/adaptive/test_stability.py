@@ -57,7 +57,7 @@ def test_odds_tell_held_grasps_from_others():
     """Both densities are Gaussians of known mean: the odds are their quadratic form, and rank held-out states."""
     held, failed = states(300, 2.0, 2), states(300, 0.7, 3)
     fitted = fit_stability(states(400, 2.0, 0), states(200, 0.7, 1), 1)
-    right, wrong = fitted.odds(held), fitted.odds(failed)
+    right, wrong = fitted.log_odds(held), fitted.log_odds(failed)
     assert float((right[:, None] > wrong).double().mean()) > 0.95
     seen = [0, 1, 2, 6, 7, 8]
     oracle = torch.zeros(300).double()
@@ -67,9 +67,9 @@ def test_odds_tell_held_grasps_from_others():
     assert torch.allclose(right, oracle + torch.tensor(2.0).log(), atol=1e-6)
 
 
-def test_the_wish_is_the_regression_on_the_lengths(model: StabilityModel):
+def test_preferred_forces_are_the_regression_on_the_lengths(model: StabilityModel):
     """Twice as wide, 2^1.5 as firm; the thumb presses as both fingers; the deviation is that of the draws."""
-    narrow, wide = model.wish(tips(0.03)), model.wish(tips(0.06))
+    narrow, wide = model.preferred_forces(tips(0.03)), model.preferred_forces(tips(0.06))
     ratio = (lengths_of(tips(0.06)) / lengths_of(tips(0.03)))[:2]
     assert torch.allclose(wide.forces[:2] / narrow.forces[:2], ratio**1.5, rtol=0.15)
     assert float(narrow.forces[2]) == pytest.approx(float(narrow.forces[:2].sum()), rel=0.1)
@@ -77,15 +77,15 @@ def test_the_wish_is_the_regression_on_the_lengths(model: StabilityModel):
     assert deviation[:2].tolist() == pytest.approx([0.13, 0.13], abs=0.05)
     assert torch.allclose(narrow.springs, torch.full((3,), 100.0).double(), rtol=0.3)
     firmer = 1.2 * float(narrow.forces[2])
-    asked = model.wish(tips(0.03), firmer)
+    asked = model.preferred_forces(tips(0.03), firmer)
     assert float(asked.forces[2]) == pytest.approx(firmer)
     assert float(asked.forces[:2].sum()) == pytest.approx(firmer, rel=0.15)
     assert float(asked.forces[:2].sum()) > float(narrow.forces[:2].sum())
     assert float(asked.covariance[2].abs().max()) == 0.0
-    moved = model.wish(tips(0.03) @ rotation_from_vector(torch.tensor([0.5, 0.1, 0.9]).double()).T + 1.0)
+    moved = model.preferred_forces(tips(0.03) @ rotation_from_vector(torch.tensor([0.5, 0.1, 0.9]).double()).T + 1.0)
     assert torch.allclose(moved.forces, narrow.forces)
     with pytest.raises(BadArgument, match="tips"):
-        model.wish(tips(float("nan")))
+        model.preferred_forces(tips(float("nan")))
 
 
 def test_the_file_is_read_back_and_refused_by_another_hand(model: StabilityModel, tmp_path):
@@ -93,7 +93,7 @@ def test_the_file_is_read_back_and_refused_by_another_hand(model: StabilityModel
     assert path.stat().st_size < 100_000
     again = read_stability(path, load_hand("allegro"))
     assert torch.equal(again.stable.means, model.stable.means)
-    assert torch.equal(again.odds(states(5, 1.0, 4)), model.odds(states(5, 1.0, 4)))
+    assert torch.equal(again.log_odds(states(5, 1.0, 4)), model.log_odds(states(5, 1.0, 4)))
     with pytest.raises(BadArgument, match="joints"):
         read_stability(path, load_hand("barrett"))
     with pytest.raises(BadArgument, match="fingertips"):
@@ -110,10 +110,11 @@ def test_shipped_models_are_of_their_hands():
         shipped = load_stability(hand)
         assert shipped is not None
         assert float(shipped.meta["auc"]) > 0.75
-        wish = shipped.wish(tips(0.04))
-        assert 0.5 < float(wish.forces.min()) < float(wish.forces.max()) < 10.0
+        preferred = shipped.preferred_forces(tips(0.04))
+        assert 0.5 < float(preferred.forces.min()) < float(preferred.forces.max()) < 10.0
         firm, weak = (
-            shipped.odds(state_of(wish.springs, lengths_of(tips(0.04)), factor * wish.forces)) for factor in (1.0, 0.25)
+            shipped.log_odds(state_of(preferred.springs, lengths_of(tips(0.04)), factor * preferred.forces))
+            for factor in (1.0, 0.25)
         )
         assert float(firm) > 0 > float(weak)
 

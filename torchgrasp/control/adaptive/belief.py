@@ -15,11 +15,12 @@ from torch import Tensor
 
 from torchgrasp.control.closing_law import position_gain, surface_covariance
 from torchgrasp.control.forces import desired_forces
-from torchgrasp.control.observation import ControlModel, Observation
+from torchgrasp.control.observation import Observation
+from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import FLAT_RADIUS, PLACE_NOISE
 from torchgrasp.frames import apply, inverse, rotate
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.values import ClosingGains, ShapeEstimate
+from torchgrasp.values import ShapeEstimate
 
 SURPRISE = 2.0
 """A contact surprises from this many standard deviations off the expected surface on."""
@@ -47,44 +48,41 @@ class Belief:
         self.hand_from_obj = inverse(self.obj_from_hand)
         self.felt = torch.zeros(3, dtype=torch.bool)
 
-    def revise(
-        self, observation: Observation, model: ControlModel, gains: ClosingGains
-    ) -> tuple[ControlModel, ClosingGains]:
-        """Return plant and gains as they are, or replanned for the fingers in the air after a touch that surprised."""
+    def revise(self, observation: Observation, reference: ClosingReference) -> ClosingReference:
+        """Return the reference itself, or, after a touch that surprised, one replanned for the fingers in the air."""
         fresh = observation.contact & ~self.felt & torch.isfinite(observation.points + observation.normals).all(-1)
         if not bool(fresh.any()):
-            return model, gains
+            return reference
         self.felt = self.felt | fresh
         points = apply(self.obj_from_hand, observation.points[fresh])
         inside = self.shape.contains(points)
         points, normals = points[inside], rotate(self.obj_from_hand, observation.normals[fresh])[inside]
         if not len(points):
-            return model, gains
-        along, found = self._meet(points, normals)
-        known = torch.hypot(found.std_m, found.std_m.new_tensor(PLACE_NOISE))
-        surprising = along.abs() > (SURPRISE * known).clamp_max(0.99 * FARTHEST)
+            return reference
+        along, expected = self._meet(points, normals)
+        deviation = torch.hypot(expected.std_m, expected.std_m.new_tensor(PLACE_NOISE))
+        surprising = along.abs() > (SURPRISE * deviation).clamp_max(0.99 * FARTHEST)
         if not bool(surprising.any()):
-            return model, gains
+            return reference
         self.shape = self.shape.update(
             points[surprising],
             normals[surprising],
             noise=PLACE_NOISE,
             normal_noise=PLACE_NOISE / FLAT_RADIUS,
         )
-        return self._replan(~observation.contact, model, gains)
+        return self._replan(~observation.contact, reference)
 
-    def _replan(
-        self, air: Bool[Tensor, "3"], model: ControlModel, gains: ClosingGains
-    ) -> tuple[ControlModel, ClosingGains]:
-        """Return plant and gains with the contacts of the fingers in the air on the surface as it is believed now."""
-        start, line = apply(self.obj_from_hand, gains.target), rotate(self.obj_from_hand, model.normals)
-        along, found = self._meet(start, line)
-        missed = self._distance(start + along[:, None] * line)[0].abs() > PLACE_NOISE
-        moved = (air & ~missed)[:, None]
-        target = torch.where(moved, apply(self.hand_from_obj, start + along[:, None] * line), gains.target)
-        normals = torch.where(moved, rotate(self.hand_from_obj, found.normal), model.normals)
-        covariance = torch.where(moved[..., None], surface_covariance(normals, found.std_m), gains.covariance)
-        strongest = float((-(gains.desired_force * model.normals).sum(-1)).max())
+    def _replan(self, air: Bool[Tensor, "3"], reference: ClosingReference) -> ClosingReference:
+        """Return the reference with the contacts of the fingers in the air on the revised surface."""
+        gains = reference.gains
+        start, lines = apply(self.obj_from_hand, gains.target), rotate(self.obj_from_hand, reference.normals)
+        along, surface = self._meet(start, lines)
+        points = start + along[:, None] * lines
+        moved = (air & (self._distance(points)[0].abs() <= PLACE_NOISE))[:, None]
+        target = torch.where(moved, apply(self.hand_from_obj, points), gains.target)
+        normals = torch.where(moved, rotate(self.hand_from_obj, surface.normal), reference.normals)
+        covariance = torch.where(moved[..., None], surface_covariance(normals, surface.std_m), gains.covariance)
+        strongest = float((-(gains.desired_force * reference.normals).sum(-1)).max())
         revised = dataclasses.replace(
             gains,
             target=target,
@@ -92,7 +90,7 @@ class Belief:
             position_gain=position_gain(covariance),
             desired_force=desired_forces(target, normals, strongest),
         )
-        return dataclasses.replace(model, normals=normals), revised
+        return dataclasses.replace(reference, normals=normals, gains=revised)
 
     def _meet(
         self, points: Float[Tensor, "n 3"], lines: Float[Tensor, "n 3"]

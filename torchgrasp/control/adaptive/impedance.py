@@ -16,14 +16,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.control.adaptive.stability import lengths_of, state_of
-from torchgrasp.control.closing_law import actuated_stiffness, damped_inverse
-from torchgrasp.control.holding import RAMP, held_forces
-from torchgrasp.control.observation import ControlModel, Observation
+from torchgrasp.control.adaptive.stability import StabilityModel, lengths_of, state_of
+from torchgrasp.control.closing_law import damped_inverse
+from torchgrasp.control.holding import RAMP, held_forces, regulate
+from torchgrasp.control.observation import Observation
+from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.stiffness import actuated_stiffness
 from torchgrasp.control.tactile import low_pass
 from torchgrasp.frames import degenerate, rigid, skew, virtual_frame
 from torchgrasp.plan.internal_forces import internal_forces
-from torchgrasp.values import ClosingGains
 
 TRANSLATION_STIFFNESS = 1200.0
 """Of the virtual frame's origin [N/m]: 0.1 kg sags by 1 mm."""
@@ -43,11 +44,11 @@ SURE = math.log(3)
 MOST_RAISE = 2.0
 """How many times the desired forces a grasp that turns unstable may ask for."""
 
-HASTE = 8.0
+ADAPTATION_RATE = 8.0
 """Rate [1/s] at which an unstable grasp becomes firmer and stiffer."""
 
-FEELING = 2.0
-"""Cut-off [Hz] of the mean of the tactile readings by which stability is judged: noise must not look like a slip."""
+READING_CUTOFF = 2.0
+"""Cut-off [Hz] of the mean reading by which stability is judged: noise must not look like a slip."""
 
 SETTLING = 0.3
 """Time [s] after the squeeze has risen before stability is judged: by then the mean has followed it."""
@@ -121,48 +122,45 @@ class Impedance:
     One common factor keeps the sum of what the fingertips feel at what was asked for. Motions of the joints that move
     no fingertip are held where they were.
 
-    A hand with a model of its stable grasps judges at every tick by what it feels whether this is one. While the odds
-    are less than three to one, the grasp becomes firmer, up to `MOST_RAISE` times, and its springs approach those of
-    stable grasps of the same lengths. It never loosens again: what it holds may still be heavy.
+    With a `stability` model it judges at every tick whether the grasp is stable. Below `SURE` the grasp becomes firmer,
+    up to `MOST_RAISE` times, and its springs approach those of stable grasps of the same lengths. It never loosens
+    again: the object may still be heavy.
 
     Args:
-        plant: the hand.
-        gains: of the closing before, for the desired forces.
-        sight: at the end of the closing.
-        start: its last joint targets [rad].
-        springs: stiffness [N/m] along the sides (0, 1), (1, 2) and (2, 0) of the triangle, then kept; None:
-            `GRASP_STIFFNESS`, and a grasp that looks unstable to the hand's own model adapts.
+        reference: of the closing.
+        observation: at the end of the closing.
+        start: the last targets of all joints [rad].
+        springs: stiffness [N/m] along the sides (0, 1), (1, 2), (2, 0) of the triangle; None: `GRASP_STIFFNESS`.
+        stability: of the hand's grasps; None: the grasp does not adapt.
     """
 
     def __init__(
         self,
-        model: ControlModel,
-        gains: ClosingGains,
+        reference: ClosingReference,
         observation: Observation,
         start: Float[Tensor, " j"],
         springs: Float[Tensor, "3"] | None = None,
+        stability: StabilityModel | None = None,
     ) -> None:
-        self.model = model
-        self.stable = model.stable if springs is None else None
-        self.springs = torch.full_like(model.radius, GRASP_STIFFNESS) if springs is None else springs
-        self.stiffness = actuated_stiffness(model.coupling, model.kp)
-        forces, self.strength = held_forces(model, gains, observation)
+        self.model, self.stability = reference.model, stability
+        self.springs = torch.full_like(self.model.radius, GRASP_STIFFNESS) if springs is None else springs
+        self.stiffness = actuated_stiffness(self.model.coupling, self.model.kp)
+        forces, self.strength = held_forces(reference, observation)
         self.frame = rigid(torch.eye(3).to(observation.tips), observation.tips.mean(0))
         self.rest, self.lengths = self._frame(observation.tips), side_lengths(observation.tips)
         self.desired = forces @ self.rest[:3, :3]  # in the virtual frame
         self.posture = self._actuated(observation.joints)
         self.lead = self._actuated(start) - self.posture
         self.factor, self.raised, self.time = 1.0, 1.0, 0.0
-        self.felt = observation.reading
+        self.reading = observation.reading
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets of all joints for the next tick."""
         self.time += period
         share = min(self.time / RAMP, 1.0)
-        self.felt = self.felt + low_pass(FEELING, period) * (observation.reading - self.felt)
+        self.reading = self.reading + low_pass(READING_CUTOFF, period) * (observation.reading - self.reading)
         if share == 1.0:
-            lacking = 1 - float(observation.reading.sum()) / (self.raised * self.strength)
-            self.factor = min(max(self.factor + period * lacking, 0.5), 1.5)
+            self.factor = regulate(self.factor, observation, self.raised * self.strength, period)
             self._adapt(observation, period)
         posture = self._actuated(observation.joints)
         jacobian = (observation.jacobian @ self.model.coupling).flatten(0, 1)
@@ -172,15 +170,15 @@ class Impedance:
         return self.model.expand(posture + drift + self.lead + share * (lead - self.lead))
 
     def _adapt(self, observation: Observation, period: float) -> None:
-        """Become firmer and as stiff as stable grasps of these lengths are, as long as this one may be unstable."""
-        if self.stable is None or self.time < RAMP + SETTLING:
+        """Become firmer, and as stiff as stable grasps of these lengths, as long as the grasp may be unstable."""
+        if self.stability is None or self.time < RAMP + SETTLING:
             return
-        state = state_of(self.springs, lengths_of(observation.tips), self.felt)
-        if float(self.stable.odds(state)) > SURE:
+        state = state_of(self.springs, lengths_of(observation.tips), self.reading)
+        if float(self.stability.log_odds(state)) > SURE:
             return
-        wish, haste = self.stable.wish(observation.tips), min(HASTE * period, 1.0)
-        self.raised += haste * (MOST_RAISE - self.raised)
-        self.springs = self.springs * (wish.springs / self.springs) ** haste
+        preferred, share = self.stability.preferred_forces(observation.tips), min(ADAPTATION_RATE * period, 1.0)
+        self.raised += share * (MOST_RAISE - self.raised)
+        self.springs = self.springs * (preferred.springs / self.springs) ** share
 
     def forces(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
         """Return the forces of the fingers on the object [N], in the hand's frame, for where the fingertips are."""

@@ -1,6 +1,6 @@
 """Which grasps are stable [6]: Gaussian mixtures over stiffness, virtual-frame lengths and tactile forces of a hand.
 
-Learned from simulated grasps that were pulled at (`scripts/make_force.py`). Conditioned on the lengths of a grasp, the
+Learned from simulated grasps that were pulled at (`scripts/train/stability.py`). Conditioned on the lengths of a grasp, the
 mixture of those that held tells how firmly and how stiffly such grasps press, Sigma_fd of Eq. (28) included. Whether a
 grasp in progress is stable is told by Bayes' rule, with a second mixture of those that did not hold: the density of the
 stable ones alone, as in [6], falls as much with objects and stiffness that were rare among the trials as with forces
@@ -97,7 +97,7 @@ class StabilityModel(Value):
         if not 0.0 < self.share < 1.0:
             raise BadArgument("share", self.share, "a number in (0, 1)")
 
-    def wish(self, tips: Float[Tensor, "3 3"], force: float | None = None) -> PreferredForces:
+    def preferred_forces(self, tips: Float[Tensor, "3 3"], force: float | None = None) -> PreferredForces:
         """Return how stable grasps with fingertips so far apart press: the conditional given their lengths, as in [6].
 
         Forces are those of the conditional's mean (of the logarithms); their covariance is carried over by the
@@ -127,7 +127,7 @@ class StabilityModel(Value):
         forces = mean.exp()
         return PreferredForces(forces, forces[:, None] * covariance * forces, rest.marginal(STIFFNESS).mean().exp())
 
-    def odds(self, state: Float[Tensor, "*b 9"]) -> Float[Tensor, "*b"]:
+    def log_odds(self, state: Float[Tensor, "*b 9"]) -> Float[Tensor, "*b"]:
         """Return the logarithm of the odds that a grasp holds what pulled in the trials, by Bayes' rule; 0: even.
 
         Stiffness and forces are judged. The lengths tell more of the body than of the grasp: with them the estimate is
@@ -153,7 +153,7 @@ class StabilityModel(Value):
             for kind, mixture in (("stable", self.stable), ("others", self.others))
             for name in ("weights", "means", "covariances")
         }
-        return save_tensors(path, "stable", tensors, {**self.meta, "share": repr(self.share)})
+        return save_tensors(path, "stability", tensors, {**self.meta, "share": repr(self.share)})
 
 
 def fit_stability(
@@ -221,7 +221,7 @@ def read_stability(path: Path | str, hand: Hand) -> StabilityModel:
         BadArgument: it is the model of another hand.
     """
     parts = [f"{kind}.{name}" for kind in ("stable", "others") for name in ("weights", "means", "covariances")]
-    tensors, meta = load_tensors(path, "stable", set(parts))
+    tensors, meta = load_tensors(path, "stability", set(parts))
     try:
         joints, share = tuple(meta["joint_names"].split(",")), float(meta.pop("share"))
         stable, others = (
@@ -230,6 +230,6 @@ def read_stability(path: Path | str, hand: Hand) -> StabilityModel:
         )
         model = StabilityModel(stable, others, share, {k: v for k, v in meta.items() if k not in ("kind", "version")})
     except (KeyError, AttributeError, ValueError) as error:
-        raise ModelFileError("path", f"{path}: {error}", "a model that StableGrasps.save wrote") from error
+        raise ModelFileError("path", f"{path}: {error}", "a model that StabilityModel.save wrote") from error
     check_compatible(meta, joints, hand)
     return model
