@@ -104,9 +104,15 @@ class TrialSpec(Value):
         timestep: of the simulator [s].
         control_rate: of the controller [Hz].
         simulator: "sapien" or "mujoco".
+        density: of the object [kg/m^3], which gives its mass; None: `mass` does.
+        patch: radius [m] of a fingertip's contact patch, whose torsional friction is friction x force x patch.
+        kp: stiffness of all joint drives [N m/rad]; None: the hand's own.
+        overlap: largest overlap [m] of the opened hand with object or table at the start: convex parts bulge a little.
+        table: whether the object stands on a table.
 
     Raises:
-        BadArgument: a number outside its range, or an unknown controller, holding or simulator.
+        BadArgument: a number outside its range, an unknown closing, holding or simulator, or a control period below
+            one timestep.
     """
 
     closing: ClosingMode = "uncertainty"
@@ -123,6 +129,11 @@ class TrialSpec(Value):
     timestep: float = 1 / 500
     control_rate: float = 100.0
     simulator: Simulator = "sapien"
+    density: float | None = None
+    patch: float = 0.005
+    kp: float | None = None
+    overlap: float = 1e-3
+    table: bool = True
 
     def __post_init__(self) -> None:
         """Check every range once, where the value is made."""
@@ -141,10 +152,18 @@ class TrialSpec(Value):
             "force": (0.01, 100.0),
             "timestep": (1e-4, 1 / 60),
             "control_rate": (10.0, 1000.0),
+            "density": (1.0, 1e5),
+            "patch": (0.0, 1.0),
+            "kp": (1e-3, 1e6),
+            "overlap": (0.0, 1.0),
         }
         for name, (low, high) in ranges.items():
-            if not low <= getattr(self, name) <= high:
-                raise BadArgument(name, getattr(self, name), f"a number in [{low:g}, {high:g}]")
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:  # also refuses NaN
+                raise BadArgument(name, value, f"a number in [{low:g}, {high:g}]")
+        if not self.control_rate * self.timestep < 1 + 1e-9:
+            found = f"{self.control_rate:g} Hz with a timestep of {self.timestep:g} s"
+            raise BadArgument("control_rate", found, "a period of at least one timestep")
 
 
 def check_simulator(simulator: str) -> None:

@@ -8,7 +8,7 @@ Letters in shapes: n points, b batch rows, g grasps, e friction-cone edges, h ac
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -277,6 +277,13 @@ class ClosingGains(Value):
     force_source: str = "analytic"
 
 
+class ObjectMotion(NamedTuple):
+    """Motion of an object in the hand: `distance` [m] of its centre, and the `angle` [rad] of its rotation."""
+
+    distance: float
+    angle: float
+
+
 @dataclasses.dataclass(frozen=True)
 class ClosureResult(Value):
     """What happened when the hand closed on the true object.
@@ -297,6 +304,6 @@ class ClosureResult(Value):
     joints: Float[Tensor, "t j"]
     joint_names: tuple[str, ...]
     contact_order: tuple[int, ...]
-    object_motion: tuple[float, float]
+    object_motion: ObjectMotion
     start_overlap: float
     seconds: float

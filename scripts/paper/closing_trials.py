@@ -247,7 +247,7 @@ def _fill(
         grasps = [grasp for found in planned[support, threshold] for grasp in found]
         spec = dataclasses.replace(PAPER.trial, closing=closing, holding=holding, mass=mass)
         draws = math.ceil(trials / max(len(grasps), 1))
-        places = draw_object_poses(PAPER.shift, PAPER.turn, pivot, draws * len(grasps), seed)
+        places = draw_object_poses(PAPER.noise, pivot, draws * len(grasps), seed)
         results = []
         for k, place in enumerate(places):
             grasp = grasps[k // draws]

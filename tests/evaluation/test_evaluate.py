@@ -10,34 +10,18 @@ import pytest
 import trimesh
 
 from tests.pinch import cylinder, pinch
+from tests.scores import GOOD, SCORES, STUCK
 from torchgrasp import cli
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.evaluation.evaluate import choose_rows, evaluate
-from torchgrasp.evaluation.protocols import (
-    PROTOCOLS,
-    Execution,
-    LiftProtocol,
-    ProtocolResult,
-    find_protocol,
-    run_protocol,
-)
-from torchgrasp.evaluation.score import STAGES, ViewScore, share, summarise
+from torchgrasp.evaluation.attempt import run_protocol
+from torchgrasp.evaluation.closing import GraspTrial
+from torchgrasp.evaluation.evaluate import EvaluationSpec, choose_rows, evaluate
+from torchgrasp.evaluation.protocols import PROTOCOLS, Protocol
+from torchgrasp.evaluation.score import STAGES, share, summarise
 from torchgrasp.files import hold_folder
 from torchgrasp.hand.load import load_hand
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import load_grasps
-
-GOOD = ProtocolResult(0, 0, True, Status.OK, 0.01, 0.1, 4.0, 0.002, 1.0)
-SLID = dataclasses.replace(GOOD, rank=1, passed=False, status=Status.MOVED, overlap=0.004)
-STUCK = dataclasses.replace(GOOD, passed=False, status=Status.START_OVERLAP, force=math.nan, overlap=math.nan)
-HUNG = dataclasses.replace(SLID, status=Status.TIMED_OUT, force=math.nan, overlap=math.nan, seconds=math.nan)
-SCORES = [
-    ViewScore("tin", "view0", 9, 2.0, (GOOD, SLID)),
-    ViewScore("tin", "view1", 0, 4.0, (), Status.OBJECT_COLLISION),
-    ViewScore("cup", "view0", 1, 3.0, (STUCK, HUNG)),
-    ViewScore("sieve", "view0", 0, math.nan, (), Status.BAD_OBJECT, "an <open> surface"),
-]
-
 
 def test_shares_count_every_view_and_failures_their_stage():
     found = summarise(SCORES)
@@ -77,20 +61,20 @@ def test_spread_rows_reach_from_the_best_to_the_worst():
     assert choose_rows(9, 1, "spread") == [0] and choose_rows(0, 3, "spread") == []
 
 
-def test_protocols_and_executions_are_checked():
-    for name in ("pose-noise", "tabletop", "paper"):
-        assert find_protocol(name, Execution()).name == name
+def test_bad_protocols_and_specs_are_named_before_any_work():
     hand = load_hand("allegro")
-    for protocol, execution, named in (
-        ("best", Execution(), "protocol"),
-        ("tabletop", Execution(force=-1.0), "force"),
-        ("multidex", Execution(force=0.0), "force"),
-    ):
+    for name, protocol in PROTOCOLS.items():
+        assert protocol.name == name
+    for changes, named in (({"force": -1.0}, "force"), ({"density": 0.0}, "density"), ({"simulator": "x"}, "simulator")):
         with pytest.raises(BadArgument, match=f"{named}: found"):
-            evaluate(Path("nowhere"), hand, protocol, execution)
-    for options, named in (({"grasps": 0}, "grasps"), ({}, "objects")):
+            PROTOCOLS["multidex"].with_trial(**changes)
+    with pytest.raises(BadArgument, match="protocol: found"):
+        evaluate(Path("nowhere"), hand, "best")
+    with pytest.raises(BadArgument, match="objects: found"):
+        evaluate(Path("nowhere"), hand)
+    for options, named in (({"grasps": 0}, "grasps"), ({"ranks": "worst"}, "ranks")):
         with pytest.raises(BadArgument, match=f"{named}: found"):
-            evaluate(Path("nowhere"), hand, **options)
+            EvaluationSpec(**options)
 
 
 @pytest.fixture(scope="module")
@@ -115,20 +99,22 @@ def folder(tmp_path_factory):
 
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
-def test_n10_any_number_of_workers_gives_the_same_bits_and_a_bad_object_is_refused(folder, tmp_path):
+def test_any_number_of_workers_gives_the_same_bits_and_a_bad_object_is_refused(folder, tmp_path):
     pytest.importorskip("sapien"), pytest.importorskip("pebble")
     hand = load_hand("allegro")
-    quick = dataclasses.replace(PROTOCOLS["pose-noise"], seconds=0.2, draws=2)
-    options = {"grasps": 2, "starts": 60, "ranks": "spread", "folder": tmp_path}
-    one, two = (evaluate(folder, hand, quick, workers=n, **options) for n in (0, 2))
+    noisy = PROTOCOLS["pose-noise"]
+    pull, noise = dataclasses.replace(noisy.pull, seconds=0.2), dataclasses.replace(noisy.noise, draws=2)
+    quick, spec = dataclasses.replace(noisy, pull=pull, noise=noise), EvaluationSpec(2, "spread", starts=60)
+    one, two = (list(evaluate(folder, hand, quick, spec, workers=n, folder=tmp_path)) for n in (0, 2))
     assert without_times(one) == without_times(two)
     tin, torn = one
     assert [(a.rank, a.draw) for a in tin.attempts] == [(r, d) for r in (0, tin.executable - 1) for d in (0, 1)]
     assert (torn.executable, torn.refusal, torn.attempts) == (0, Status.BAD_OBJECT, ()) and "open surface" in torn.note
     assert len(load_grasps(tmp_path / "tin_view0.safetensors")) == tin.executable
-    again = evaluate(folder, hand, quick, planned=True, **options)
+    planned = dataclasses.replace(spec, planned=True)
+    again = list(evaluate(folder, hand, quick, planned, folder=tmp_path))
     assert without_times(again) == without_times(one)
-    other = evaluate(folder, load_hand("barrett"), quick, planned=True, **options)[0]
+    other = next(evaluate(folder, load_hand("barrett"), quick, planned, folder=tmp_path))
     assert other.refusal is Status.BAD_OBJECT and "another cloud or hand" in other.note
 
 
@@ -152,8 +138,8 @@ def without_times(scores):
 def test_a_pinched_cylinder_is_lifted():
     pytest.importorskip("sapien")
     hand, grasp = pinch("allegro")
-    protocol = LiftProtocol("quick", TrialSpec(friction=0.8, hold_time=0.2))
-    found = run_protocol(grasp, hand, cylinder(), [cylinder()], protocol, Execution())
+    trial = GraspTrial(hand, grasp, cylinder(), parts=[cylinder()])
+    found = run_protocol(trial, Protocol("quick", TrialSpec(friction=0.8, hold_time=0.2)))
     assert found.passed and found.status is Status.OK and found.force > 1.0 and found.moved < 0.01
     assert 0.0 <= found.overlap < 0.003
 

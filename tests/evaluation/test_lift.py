@@ -24,8 +24,8 @@ def test_a_cylinder_is_held(name):
     assert sorted(result.contact_order) == [0, 1, 2]
     rise = result.object_pose[-1, 2, 3] - result.object_pose[0, 2, 3]
     assert float(rise) == pytest.approx(0.1, abs=0.01)
-    assert result.object_motion[0] < 0.01
-    assert result.object_motion[1] < 0.2
+    assert result.object_motion.distance < 0.01
+    assert result.object_motion.angle < 0.2
     strongest = result.forces[-50:].amax(-1)
     assert float(strongest.mean()) == pytest.approx(4.0, rel=0.15)
     assert len(result.time) == len(result.forces) == len(result.joints) == len(result.hand_pose)

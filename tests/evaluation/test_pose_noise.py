@@ -5,24 +5,25 @@ import math
 import pytest
 import torch
 
-from torchgrasp.evaluation.pose_noise import draw_object_poses, draw_pose_errors, error_from_object_pose
+from torchgrasp.evaluation.pose_noise import PoseNoise, apply_error, draw_hand_errors, draw_object_poses, error_from_object_pose
 from torchgrasp.frames import apply, inverse, rigid, rotation_angle, rotation_from_vector
 
 
 def test_errors_of_the_pose_stay_within_the_protocol_s():
-    errors = draw_pose_errors(0.005, math.radians(5), 3, 200, seed=1)
+    noise = PoseNoise(0.005, math.radians(5), 200)
+    errors = draw_hand_errors(noise, 3, seed=1)
     assert errors.shape == (3, 200, 4, 4)
     assert 0.0048 < float(errors[..., :3, 3].abs().max()) <= 0.005
     angle = rotation_angle(errors[..., :3, :3])
     assert math.radians(5) < float(angle.max()) <= math.radians(5) * 3**0.5
-    assert torch.equal(errors, draw_pose_errors(0.005, math.radians(5), 3, 200, seed=1))
-    still = draw_pose_errors(0.0, 0.0, 2, 1, seed=0)
+    assert torch.equal(errors, draw_hand_errors(noise, 3, seed=1))
+    still = draw_hand_errors(PoseNoise(), 2, seed=0)
     assert torch.equal(still, torch.eye(4, dtype=torch.float64).expand(2, 1, 4, 4))
 
 
 def test_an_object_is_moved_on_its_table_and_turned_about_the_vertical() -> None:
     pivot = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
-    places = draw_object_poses(0.005, 0.1, pivot, 2000, seed=1)
+    places = draw_object_poses(PoseNoise(0.005, 0.1), pivot, 2000, seed=1)
     moved = (places[:, :3, :3] @ pivot) + places[:, :3, 3] - pivot
     assert moved[:, :2].abs().max() <= 0.005
     assert moved[:, 2].abs().max() < 1e-15
@@ -40,5 +41,5 @@ def test_a_hand_in_its_place_sees_a_moved_object_as_a_moved_hand_sees_the_object
     obj_from_hand, place = rigid(rotation_from_vector(turn), shift)
     points = torch.randn(5, 3, generator=generator, dtype=torch.float64)
     seen = apply(inverse(obj_from_hand), apply(place, points))
-    stands = obj_from_hand @ error_from_object_pose(obj_from_hand, place)
-    torch.testing.assert_close(apply(inverse(stands), points), seen)
+    true_pose = apply_error(obj_from_hand, error_from_object_pose(obj_from_hand, place))
+    torch.testing.assert_close(apply(inverse(true_pose), points), seen)

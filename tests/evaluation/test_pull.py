@@ -11,18 +11,24 @@ from torchgrasp import fit_shape
 from torchgrasp.control import squeeze
 from torchgrasp.control.stiffness import joint_stiffness
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.evaluation.pull import DIRECTIONS, PROTOCOLS, check_test, pull_grasp
+from torchgrasp.evaluation.closing import GraspTrial
+from torchgrasp.evaluation.protocols import PROTOCOLS, PullSpec
+from torchgrasp.evaluation.pull import DIRECTIONS, pull_grasp
 from torchgrasp.frames import apply, inverse
 from torchgrasp.values import PointCloud
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
-QUICK = dataclasses.replace(PROTOCOLS["dexgraspbench"], seconds=0.2, mass=0.05)
+MASS = 0.05
+PULL = PullSpec(10.0, 0.2, 0.05, math.radians(15))
+QUICK = dataclasses.replace(PROTOCOLS["dexgraspbench"].with_trial(mass=MASS, force=5.0), pull=PULL)
 
 
-def pull(name, protocol, **options):
+def pull(name, pull=PULL, belief=None, **changes):
+    """The quick test with some of its numbers changed, on the pinched cylinder."""
     pytest.importorskip("sapien")
     hand, grasp = pinch(name)
-    return pull_grasp(grasp, hand, cylinder(), protocol, **options)
+    protocol = dataclasses.replace(QUICK, pull=pull).with_trial(**changes)
+    return pull_grasp(GraspTrial(hand, grasp, cylinder(), belief=belief), protocol)
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
@@ -51,7 +57,7 @@ def cross(p):
 
 
 def test_a_pinched_cylinder_passes_and_the_same_numbers_come_twice():
-    first, second = (pull("allegro", QUICK, force=5.0) for _ in range(2))
+    first, second = (pull("allegro") for _ in range(2))
     assert first.passed and first.status is Status.OK and first.directions == 6
     assert dataclasses.replace(first, seconds=0.0) == dataclasses.replace(second, seconds=0.0)
     assert 2.0 < first.force < 5.0 and first.moved < 0.02
@@ -60,16 +66,16 @@ def test_a_pinched_cylinder_passes_and_the_same_numbers_come_twice():
 def test_more_pull_than_friction_can_hold_moves_the_object():
     """Three fingers of N newtons hold at most 3 mu N along the cylinder's axis."""
     held = 3 * 0.6 * 4.0
-    strong = pull("allegro", dataclasses.replace(QUICK, pull=2 * held / QUICK.mass, seconds=1.0), force=4.0)
+    strong = pull("allegro", dataclasses.replace(PULL, acceleration=2 * held / MASS, seconds=1.0), force=4.0)
     assert not strong.passed and strong.status is Status.MOVED
-    assert strong.moved >= QUICK.distance or strong.turned >= QUICK.angle
-    slippery = pull("allegro", dataclasses.replace(QUICK, friction=0.01), force=5.0)
+    assert strong.moved >= PULL.distance or strong.turned >= PULL.angle
+    slippery = pull("allegro", friction=0.01)
     assert not slippery.passed
 
 
 @pytest.mark.parametrize("closing", ["uncertainty", "position"])
 def test_a_controller_closes_and_holds(closing):
-    result = pull("allegro", dataclasses.replace(QUICK, pull=2.0), force=4.0, closing=closing)
+    result = pull("allegro", dataclasses.replace(PULL, acceleration=2.0), force=4.0, closing=closing)
     assert result.passed and 1.0 < result.force < 5.0
 
 
@@ -81,33 +87,36 @@ def test_touches_revise_a_shape_that_was_believed_thinner_in_each_direction_anew
 
     def pull_down(times, belief):
         monkeypatch.setattr("torchgrasp.evaluation.pull.DIRECTIONS", times * (down,))
-        return pull("allegro", QUICK, force=4.0, closing="uncertainty", belief=belief)
+        return pull("allegro", belief=belief, force=4.0, closing="uncertainty")
 
     once, twice, unaware = pull_down(1, shape), pull_down(2, shape), pull_down(1, None)
     assert once.passed and 1.0 < once.force < 5.0 and once.force != unaware.force
     assert dataclasses.replace(twice, directions=1, seconds=once.seconds) == once
     with pytest.raises(BadArgument, match="belief: found one for 'open_loop'"):
-        pull("allegro", QUICK, belief=shape)
+        pull("allegro", belief=shape)
 
 
 def test_a_hand_inside_the_object_is_refused():
     hand, grasp = pinch("barrett")
-    result = pull_grasp(grasp, hand, cylinder((0.0, 0.05)), dataclasses.replace(QUICK, overlap=1e-3))
+    result = pull_grasp(GraspTrial(hand, grasp, cylinder((0.0, 0.05))), QUICK.with_trial(overlap=1e-3))
     assert result.status is Status.START_OVERLAP and result.directions == 1 and math.isnan(result.force)
 
 
 def test_bad_arguments_are_named():
     hand, grasp = pinch("allegro")
-    with pytest.raises(BadArgument, match="protocol: found 'best'"):
-        pull_grasp(grasp, hand, cylinder(), "best")
+    trial = GraspTrial(hand, grasp, cylinder())
+    for protocol, message in (("best", "protocol: found 'best'"), ("paper", "protocol: found 'paper', which lifts")):
+        with pytest.raises(BadArgument, match=message):
+            pull_grasp(trial, protocol)
     with pytest.raises(BadArgument, match="grasp: found 0 rows"):
-        pull_grasp(grasp[:0], hand, cylinder())
-    with pytest.raises(BadArgument, match="force: found -1"):
-        pull_grasp(grasp, hand, cylinder(), force=-1.0)
-    with pytest.raises(BadArgument, match="closing: found 'fast'"):
-        check_test("dexgraspbench", 5.0, "fast")
+        pull_grasp(dataclasses.replace(trial, grasp=grasp[:0]))
+    for changes, message in (({"force": -1.0}, "force: found -1"), ({"closing": "fast"}, "closing: found 'fast'")):
+        with pytest.raises(BadArgument, match=message):
+            QUICK.with_trial(**changes)
     with pytest.raises(BadArgument, match="joints: found 9 for"):
-        pull_grasp(dataclasses.replace(grasp, pregrasp=grasp.pregrasp * 0 + 9), hand, cylinder())
+        pull_grasp(dataclasses.replace(trial, grasp=dataclasses.replace(grasp, pregrasp=grasp.pregrasp * 0 + 9)))
+    with pytest.raises(BadArgument, match="error: found shape"):
+        pull_grasp(dataclasses.replace(trial, error=torch.eye(3)))
     with pytest.raises(BadArgument, match="grasps: found 12 joints"):
         squeeze(pinch("barrett")[0], grasp)
 
@@ -116,4 +125,4 @@ def test_a_hand_that_stands_aside_misses_the_object():
     aside = torch.eye(4, dtype=torch.float64)
     aside[2, 3] = 0.2
     hand, grasp = pinch("allegro")
-    assert not pull_grasp(grasp, hand, cylinder(), QUICK, error=aside).passed
+    assert not pull_grasp(GraspTrial(hand, grasp, cylinder(), error=aside), QUICK).passed

@@ -12,7 +12,7 @@ from torchgrasp.hand.load import load_hand
 from torchgrasp.report.run import Run, Stage
 from torchgrasp.shape.surface import Surface
 from torchgrasp.specs import ContactSpec
-from torchgrasp.values import Certificate, ClosureResult, ContactPlan, Contacts, Grasps, PointCloud
+from torchgrasp.values import Certificate, ClosureResult, ContactPlan, Contacts, Grasps, ObjectMotion, PointCloud
 
 F64 = torch.float64
 
@@ -65,7 +65,7 @@ def run() -> Run:
         joints=hand.expand_joints(joints[:1]).expand(steps, -1).clone(),
         joint_names=hand.tree.joint_names,
         contact_order=(0, 1, 2),
-        object_motion=(0.003, math.radians(2)),
+        object_motion=ObjectMotion(0.003, math.radians(2)),
         start_overlap=0.0,
         seconds=1.0,
     )

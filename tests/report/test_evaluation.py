@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from tests.evaluation.test_evaluate import SCORES
+from tests.scores import SCORES
 from torchgrasp.evaluation.score import share
 from torchgrasp.report.evaluation import WIDTH, bar, format_evaluation, write_evaluation
 

@@ -9,12 +9,15 @@ import torch
 from tests.pinch import QUICK as QUICK_SAPIEN
 from tests.pinch import close, cylinder, digest, digest_elsewhere, pinch
 from torchgrasp.errors import Status
+from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.lift import close_hand
-from torchgrasp.evaluation.pull import PROTOCOLS, pull_grasp
+from torchgrasp.evaluation.protocols import PROTOCOLS
+from torchgrasp.evaluation.pull import pull_grasp
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 QUICK = dataclasses.replace(QUICK_SAPIEN, simulator="mujoco")
-PULL = dataclasses.replace(PROTOCOLS["dexgraspbench"], seconds=0.2, mass=0.05)
+PULL = PROTOCOLS["dexgraspbench"].with_trial(mass=0.05)
+PULL = dataclasses.replace(PULL, pull=dataclasses.replace(PULL.pull, seconds=0.2))
 
 
 @pytest.fixture(autouse=True)
@@ -52,8 +55,9 @@ def test_mujoco_tells_overlap_and_absence():
 @pytest.mark.parametrize("pull", [10.0, 300.0])
 def test_both_agree_on_a_pull(pull):
     hand, grasp = pinch("allegro")
-    protocol = dataclasses.replace(PULL, pull=pull)
-    there, here = (pull_grasp(grasp, hand, cylinder(), protocol, simulator=s) for s in ("sapien", "mujoco"))
+    trial = GraspTrial(hand, grasp, cylinder())
+    protocol = dataclasses.replace(PULL, pull=dataclasses.replace(PULL.pull, acceleration=pull))
+    there, here = (pull_grasp(trial, protocol.with_trial(simulator=s)) for s in ("sapien", "mujoco"))
     assert there.passed == here.passed == (pull < 100)
     assert here.force == pytest.approx(there.force, rel=0.05)
 
@@ -72,17 +76,16 @@ def test_drives_that_cannot_hold_the_weight_are_named(simulator, effort, held):
 def test_what_leaves_all_bounds_or_starts_in_the_object_never_counts_as_held(simulator, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     hand, grasp = pinch("allegro")
-    wild = {name: drive._replace(kp=1e12, kd=0.0, effort=1e30) for name, drive in hand.actuators.items()}
-    protocol = dataclasses.replace(PULL, kp=None)
+    drives = {name: drive._replace(kp=1e12, kd=0.0, effort=1e30) for name, drive in hand.actuators.items()}
+    wild, protocol = dataclasses.replace(hand, actuators=drives), PULL.with_trial(simulator=simulator)
     for closing in ("open_loop", "uncertainty"):
         spec = dataclasses.replace(QUICK, simulator=simulator, closing=closing)
-        assert not close_hand(grasp, dataclasses.replace(hand, actuators=wild), cylinder(), spec).held
-        given = (grasp, dataclasses.replace(hand, actuators=wild), cylinder(), protocol, 7.0, closing)
-        assert pull_grasp(*given, simulator=simulator).status in (Status.UNSTABLE, Status.MOVED)
-    deep = cylinder((0.04, 0.04))
-    assert pull_grasp(grasp, hand, deep, PULL, simulator=simulator).status is Status.START_OVERLAP
-    within = dataclasses.replace(PULL, overlap=1.0)  # no overlap is refused: the object is thrown out
-    thrown = pull_grasp(grasp, hand, deep, within, simulator=simulator)
+        assert not close_hand(grasp, wild, cylinder(), spec).held
+        result = pull_grasp(GraspTrial(wild, grasp, cylinder()), protocol.with_trial(closing=closing, kp=None))
+        assert result.status in (Status.UNSTABLE, Status.MOVED)
+    deep = GraspTrial(hand, grasp, cylinder((0.04, 0.04)))
+    assert pull_grasp(deep, protocol).status is Status.START_OVERLAP
+    thrown = pull_grasp(deep, protocol.with_trial(overlap=1.0))  # no overlap is refused: the object is thrown out
     assert thrown.status in (Status.EJECTED, Status.MOVED) and not thrown.passed
     assert not list(tmp_path.iterdir())
 

@@ -6,10 +6,11 @@ from typing import Any, Literal
 
 from torchgrasp.cli.common import check_seed, naming
 from torchgrasp.cli.grasps import check_simulator
+from torchgrasp.columns import format_columns, format_line
 from torchgrasp.errors import Status
-from torchgrasp.evaluation.evaluate import Ranks
+from torchgrasp.evaluation.evaluate import EvaluationSpec, Ranks
 from torchgrasp.evaluation.evaluate import evaluate as evaluate_views
-from torchgrasp.evaluation.protocols import PROTOCOLS, Execution
+from torchgrasp.evaluation.protocols import find_protocol
 from torchgrasp.evaluation.score import ViewScore, summarise
 from torchgrasp.files import format_json, hold_folder, write_file
 from torchgrasp.hand.load import load_hand
@@ -39,16 +40,16 @@ def evaluate(
 ) -> int:
     """Plan on each noisy view of a folder's objects and put the best grasps through a protocol in simulation.
 
-    Prints a line for each view, then the shares with 95 % Wilson intervals, and writes evaluate.json, evaluate.html,
-    and the grasps of each view into the folder grasps.
+    Prints a line for each view, then the shares with 95 % Wilson intervals. Writes evaluate.json, evaluate.html, and
+    the grasps of each view into the folder grasps.
 
     Args:
         objects: folder with manifest.json, and for each object mesh.ply and noisy views.
         hand: allegro, allegro_biotac, barrett, or the folder of another hand.
         out: folder of the results; it is made where it does not exist, and no other run may use it meanwhile.
-        protocol: which test: see torchgrasp.evaluation.pull and torchgrasp.evaluation.protocols.
-        closing: open loop through pre-grasp, grasp and squeeze, or by a controller that feels with the fingertips; by
-            default open loop where the object is pulled at, and under uncertainty where it is lifted.
+        protocol: which test; see torchgrasp.evaluation.protocols.
+        closing: how the hand closes; by default open loop where the object is pulled at, under uncertainty where it is
+            lifted.
         holding: how the hand presses from then on.
         simulator: sapien or mujoco.
         force: normal force of the strongest finger [N]; by default 7 where the object is pulled at, 4 where it is
@@ -66,26 +67,22 @@ def evaluate(
     check_simulator(simulator)
     with naming("--hand", "hand", "name"):
         the_hand = load_hand(hand)
-    execution = Execution(force, closing, holding, simulator)
+    changes = {"closing": closing, "force": force, "holding": holding, "simulator": simulator}
+    with naming("--force", "force"):
+        test = find_protocol(protocol).with_trial(**{name: x for name, x in changes.items() if x is not None})
+    with naming("--grasps", "grasps"):
+        spec = EvaluationSpec(grasps, ranks, starts, complete, only, planned is not None, seed)
+    scores = []
     with naming("--out", "folder", "path"), hold_folder(out):
-        with (
-            naming("--objects", "objects", "path"),
-            naming("--grasps", "grasps"),
-            naming("--force", "force"),
-            naming("--closing", "closing"),
-            naming("--workers", "workers"),
-        ):
-            scores = evaluate_views(
-                objects, the_hand, protocol, execution, grasps, starts, seed, ranks=ranks, complete=complete, only=only,
-                workers=workers, folder=planned or out / "grasps", planned=planned is not None, observer=print_score,
-            )  # fmt: skip
+        with naming("--objects", "objects", "path"), naming("--workers", "workers"):
+            folder = planned or out / "grasps"
+            for score in evaluate_views(objects, the_hand, test, spec, folder=folder, workers=workers):
+                print_score(score)
+                scores.append(score)
         summary = summarise(scores)
         print_summary(protocol, summary)
-        used = dict(zip(("force", "closing"), execution.on(PROTOCOLS[protocol]), strict=True)) | {"holding": holding}
-        used |= {"simulator": simulator}
-        asked = {"protocol": dataclasses.asdict(PROTOCOLS[protocol]), "hand": hand, **used, "grasps": grasps}
-        asked |= {"ranks": ranks, "starts": starts, "complete": complete, "seed": seed}
-        asked |= {"hand_sha256": the_hand.source.sha256}
+        asked = {"hand": hand, "hand_sha256": the_hand.source.sha256, **dataclasses.asdict(spec)}
+        asked |= {"protocol": dataclasses.asdict(test)}
         content = {"asked": asked, "summary": summary, "views": [dataclasses.asdict(score) for score in scores]}
         write_file(out / "evaluate.json", format_json(content))
         write_evaluation(out / "evaluate.html", f"Grasps of the {hand} hand under {protocol}", asked, scores)
@@ -98,17 +95,19 @@ def print_score(score: ViewScore) -> None:
     reasons = ", ".join(f"{failed.count(status)} {status.name.lower()}" for status in dict.fromkeys(failed))
     reasons = reasons if score.attempts else score.note or score.refusal.sentence
     passed = f"{sum(attempt.passed for attempt in score.attempts)}/{len(score.attempts)}"
-    print(f"{score.object:14}{score.view:8}{score.executable:7}{passed:>9}  {reasons}", flush=True)
+    print(format_line((score.object, score.view, score.executable, passed, reasons), (-12, -6, 5, 7, -1)), flush=True)
 
 
 def print_summary(protocol: str, summary: dict[str, Any]) -> None:
-    """Print the shares, what failed at which stage, and what it cost."""
+    """Print the shares, the failures by stage, and the cost."""
     print(f"\n{protocol}")
+    rows = []
     for key, text in SHARE_NAMES.items():
         value, low, high, total = summary[key]
-        print(f"{text:34}{value:6.1%}  [{low:.1%}, {high:.1%}] of {total}")
+        rows.append((text, f"{value:.1%} [{low:.1%}, {high:.1%}] of {total}"))
     for stage, reasons in summary["failures"].items():
-        print(f"failed in {stage:24}{', '.join(f'{n} {name.lower()}' for name, n in reasons.items())}")
+        rows.append((f"failed in {stage}", ", ".join(f"{n} {name.lower()}" for name, n in reasons.items())))
+    print(format_columns(rows, left={0, 1}))
     force, overlap, most = (_number(summary[key]) for key in ("force_n", "overlap_mm", "overlap_mm_max"))
     print(f"mean normal force of a finger {force} N, overlap at the grasp {overlap} mm (most {most} mm)")
     plan, trial = _number(summary["plan_cpu_s"]), _number(summary["trial_cpu_s"])

@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from torchgrasp.cli.common import check_folder, check_seed, check_table, naming, table_height
 from torchgrasp.cloud.io.read import read_cloud
+from torchgrasp.columns import format_columns
 from torchgrasp.errors import BadArgument, MissingExtra
 from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.files import sha256
@@ -26,7 +27,6 @@ from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows, write_report
 from torchgrasp.report.run import Run, Stage, verdict
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ContactSpec, Simulator, TrialSpec
-from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
     import trimesh
@@ -117,7 +117,8 @@ def grasp(
             grasps.save(out / "grasps.safetensors")
             write_report(out / "report.html", run)
         progress.end("report", f"{out / 'grasps.safetensors'}, {out / 'report.html'}")
-    print_table(run.executable)
+    if len(run.executable):
+        print(f"\n{format_columns([GRASP_COLUMNS, *grasp_rows(run.executable, 5)])}\n")
     print(verdict(run))
     done = bool(len(run.executable)) if not close else run.closure is not None and run.closure.held
     return 0 if done else 1
@@ -162,18 +163,6 @@ def object_name(path: Path) -> str:
     """
     generic = path.stem.rstrip("0123456789") in ("mesh", "view", "cloud", "model", "points")
     return path.resolve().parent.name or "object" if generic else path.stem
-
-
-def print_table(grasps: Grasps, most: int = 5) -> None:
-    """Print the best grasps, one a line."""
-    if not len(grasps):
-        return
-    rows = [GRASP_COLUMNS, *grasp_rows(grasps, most)]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(GRASP_COLUMNS))]
-    print()
-    for row in rows:
-        print("  ".join(value.rjust(width) for value, width in zip(row, widths, strict=True)))
-    print()
 
 
 class _Progress:

@@ -1,54 +1,41 @@
-"""One simulated trial: the opened hand comes to the true object, closes under the law, lifts it and holds it."""
+"""A simulated lift: the hand closes on the true object, lifts it off the table and holds it."""
 
 import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.control.controller import GraspController, check_modes
-from torchgrasp.control.observation import Observation
-from torchgrasp.control.reference import ClosingReference
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.errors import Status
+from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun, smooth_step
 from torchgrasp.frames import apply, inverse, rotation_angle
 from torchgrasp.hand.hand import Hand
-from torchgrasp.mesh import read_mesh
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.sim.convex_parts import check_parts, convex_parts
-from torchgrasp.sim.hand import SimulatedHand
-from torchgrasp.sim.open import open_scene
-from torchgrasp.sim.scene import SceneSpec
 from torchgrasp.specs import TrialSpec
-from torchgrasp.values import ClosureResult, Grasps
+from torchgrasp.values import ClosureResult, Grasps, ObjectMotion
 
 if TYPE_CHECKING:
     import trimesh
 
-START_TOLERANCE = 1e-3
-"""Overlap [m] of the hand with object or table up to which a trial starts: convex parts bulge a little."""
-
-APPROACH_SPEED = 0.2
-"""Of the hand on its way to the pre-grasp [m/s], on average."""
-
 LIFT_TIME = 1.0
-"""Time [s] in which the hand rises, by a smooth step."""
+"""Time [s] in which the hand rises: over 0.1 m it accelerates by no more than 0.6 m/s^2."""
 
 SHAKE_RATE = 5.0
-"""Of the shaking [Hz]: 3 mm are then 3 m/s^2."""
+"""Frequency of the shaking [Hz]: at 3 mm the hand accelerates by 3 m/s^2."""
 
 JUDGED_TIME = 0.2
-"""Time [s] at the end of the hold in which at least two fingers must touch, most of the time."""
+"""Time [s] at the end of the hold in which the fingers' contacts are judged: one tick may miss a contact."""
 
-PUSHED = 0.05
-"""Motion [m] of the object's centre while the hand closes from which on it counts as pushed out."""
+PUSHED_DISTANCE = 0.05
+"""Motion [m] of the object's centre while the hand closes that counts as pushed out: about its own size."""
 
-LOST = 0.5
-"""Distance [m] from its start at which the object is gone and the trial over."""
+LOST_DISTANCE = 0.5
+"""Distance [m] from its start, beyond the lift, at which the object is gone and the trial over."""
 
 
 def close_hand(
@@ -64,12 +51,11 @@ def close_hand(
 ) -> ClosureResult:
     """Close a hand on the true object, lift it and hold it, in a fresh simulation.
 
-    The object stands on a table where its mesh is lowest, in the frame of the grasp. The opened hand comes the last
-    `spec.approach` of its way straight to its pre-grasp, pushing aside what it meets, closes and presses
-    (`GraspController`), rises by `spec.lift_height` and holds, shaken if `spec.shake` says so. The object is **held**
-    when at the end its centre has risen by at least half the lift and in most of the last `JUDGED_TIME` at least two
-    fingers touch it. `object_motion` is against the hand, so that stricter rules can be counted from it. The same
-    arguments give the same result to the last bit.
+    The object stands on a table at the mesh's lowest point, in the frame of the grasp. The opened hand moves the last
+    `spec.approach` straight to its pre-grasp, then closes and presses (`GraspController`). It rises by
+    `spec.lift_height` and holds, shaken by `spec.shake`. The object is **held** if at the end its centre has risen by
+    at least half the lift, and at least two fingers touched it in most of the last `JUDGED_TIME`. The same arguments
+    give the same result to the last bit.
 
     Args:
         grasp: one row.
@@ -77,173 +63,124 @@ def close_hand(
         mesh: the true object [m], closed: a trimesh or a file.
         spec: of the trial; None: `TrialSpec()`.
         seed: of the tactile sensor's noise.
-        error: where the hand really stands in its planned frame, of which it knows nothing; None: where it was planned.
-        belief: the shape that the grasp was planned on: touches that surprise revise it while the hand closes, and the
-            contacts of the fingers still in the air; None: they do not.
-        parts: convex bodies to use for the mesh instead of its own decomposition (`convex_parts`).
+        error: true pose of the hand in its planned frame, unknown to the hand; None: the planned pose.
+        belief: the shape that the grasp was planned on, which touches revise while the hand closes; None: they do not.
+        parts: convex bodies that stand for the mesh; None: its own decomposition (`convex_parts`).
 
     Raises:
         BadArgument: not exactly one row, a grasp of another hand or with numbers that are not finite, a pre-grasp
-            outside the joint limits, an approach that is no unit vector, a controller faster than the simulator, or a
-            belief for a closing that does not follow the law (Eq. 25).
+            outside the joint limits, an approach that is no unit vector, an error that is no pose, or a belief for a
+            closing that does not follow the law (Eq. 25).
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
     """
+    return lift_grasp(GraspTrial(hand, grasp, mesh, seed, error, belief, parts), spec)
+
+
+def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResult:
+    """Run a trial as `close_hand` does."""
     started = time.perf_counter()
-    spec = TrialSpec() if spec is None else spec
-    check_modes(spec.closing, spec.holding, belief)
-    if not spec.control_rate * spec.timestep < 1 + 1e-9:
-        found = f"{spec.control_rate:g} Hz with a timestep of {spec.timestep:g} s"
-        raise BadArgument("control_rate", found, "a period of at least one timestep")
-    grasp, hand = grasp.to("cpu", torch.float64), hand.to("cpu", torch.float64)
-    reference = ClosingReference.from_grasp(hand, grasp, spec.force)
-    hand.check_joints(grasp.pregrasp)
-    if spec.approach and not abs(float(torch.linalg.vector_norm(grasp.approach)) - 1) < 1e-4:
-        raise BadArgument("grasp", f"an approach along {grasp.approach[0].tolist()}", "a unit vector")
-    mesh = read_mesh(mesh)
-    bodies = convex_parts(mesh) if parts is None else check_parts(parts)
-    stands = grasp.obj_from_hand[0] if error is None else grasp.obj_from_hand[0] @ error.double().cpu()
-    trial = _Trial(grasp, reference, mesh, bodies, spec, stands, seed)
-    status = trial.run(belief)
-    return trial.result(status, time.perf_counter() - started)
+    lift = _Lift(TrialDriver(trial, TrialSpec() if spec is None else spec).open())
+    return lift.result(lift.perform(), time.perf_counter() - started)
 
 
-def smooth_step(time: float) -> tuple[float, float]:
-    """Return how far a motion from 0 to 1 that starts and ends at rest has come by a time in [0, 1], and its speed.
-
-    >>> smooth_step(0.5)
-    (0.5, 1.5)
-    """
-    return time * time * (3 - 2 * time), 6 * time * (1 - time)
+class _ObjectLost(Exception):
+    """The object is gone: the trial is over before its time."""
 
 
-class _Lost(Exception):
-    """The object is gone, or the numbers are: the trial is over before its time."""
+class _Tick(NamedTuple):
+    """The truth at one control tick; `touching` counts the fingers that touch the object."""
+
+    time: float
+    forces: np.ndarray
+    touching: int
+    object_pose: np.ndarray
+    hand_pose: np.ndarray
+    joints: np.ndarray
 
 
-class _Trial:
-    """The state of one trial: the scene, the sensor, and the record of every tick."""
+class _Lift:
+    """A lift under way, and the record of its ticks."""
 
-    def __init__(
-        self,
-        grasp: Grasps,
-        reference: ClosingReference,
-        mesh: "trimesh.Trimesh",
-        parts: "list[trimesh.Trimesh]",
-        spec: TrialSpec,
-        stands: Float[Tensor, "4 4"],
-        seed: int,
-    ) -> None:
-        self.spec, hand = spec, reference.hand
-        start = {name: float(q) for name, q in hand.expand(grasp.pregrasp[0]).items()}
-        way = stands[:3, :3] @ grasp.obj_from_hand[0, :3, :3].T @ grasp.approach[0] * spec.approach
-        setup = SceneSpec(
-            hand.urdf_path,
-            stands.numpy(),
-            start,
-            hand.actuators,
-            tuple(hand.tip_links),
-            mesh,
-            parts,
-            spec.mass,
-            spec.friction,
-            spec.gravity,
-            spec.timestep,
-            spec.lift_height,
-            tuple(way.tolist()),
-        )
-        self.scene = open_scene(setup, spec.simulator)
-        generator = torch.Generator().manual_seed(seed) if spec.noise else None
-        self.robot = SimulatedHand(self.scene, reference, spec.control_rate, generator)
-        self.time: list[float] = []
-        self.forces: list[np.ndarray] = []
-        self.touching: list[int] = []
-        self.object_pose: list[np.ndarray] = []
-        self.hand_pose: list[np.ndarray] = []
-        self.joints: list[np.ndarray] = []
-        self.overlap, self.pushed, self.strained, self.arrived = 0.0, 0.0, False, 0
-        self.effort = torch.tensor([hand.actuators[name].effort for name in self.scene.joint_names])
+    def __init__(self, run: TrialRun) -> None:
+        self.run, self.spec = run, run.spec
+        self.ticks: list[_Tick] = []
+        self.arrived, self.pushed, self.strained = 0, 0.0, False
 
-    # ------------------------------------------------------------------------------------------------- the phases
-
-    def run(self, belief: ShapeGP | None) -> Status:
-        """Approach, close, press, lift and hold; return what became of it."""
-        self.overlap = self.scene.penetration()
-        self._record(np.zeros(3))
-        if not self.overlap <= START_TOLERANCE:
+    def perform(self) -> Status:
+        """Approach, close, press, lift and hold; return the status of the trial."""
+        run = self.run
+        self._record()
+        if not run.starts:
             return Status.START_OVERLAP
-        controller = GraspController(self.robot.reference, self.spec.closing, self.spec.holding, belief)
-        period = self.robot.period
         try:
-            arriving = self.robot.ticks(self.spec.approach / APPROACH_SPEED) if self.spec.approach else 0
-            for k in range(arriving):
-                share, rate = smooth_step((k + 1) / arriving)
-                self.scene.approach(self.spec.approach * (1 - share), self.spec.approach * rate / (arriving * period))
-                self._tick(controller.targets)
-            self.arrived = len(self.time) - 1
-            observation = self._tick(controller.targets)
-            while not controller.closed:
-                observation = self._tick(controller.step(observation, period))
-            self.pushed = float(np.linalg.norm(self._centre(-1) - self._centre(0)))
-            kp = self.robot.reference.model.kp
-            self.strained = bool((kp * (controller.targets - observation.joints).abs() >= self.effort).any())
-            rising = self.robot.ticks(LIFT_TIME)
-            for k in range(rising + self.robot.ticks(self.spec.hold_time)):
-                self.scene.lift(*self._height((k + 1) * period, rising * period))
-                observation = self._tick(controller.step(observation, period))
-        except _Lost as lost:
-            if lost.args:
-                return Status.UNSTABLE
+            for _ in run.approach():
+                self._record()
+            self.arrived = len(self.ticks) - 1
+            for _ in run.close():
+                self._record()
+            self.pushed, self.strained = self._moved(), run.strained()
+            rising = run.robot.ticks(LIFT_TIME)
+            for k in range(rising + run.robot.ticks(self.spec.hold_time)):
+                run.scene.lift(*self._height((k + 1) * run.robot.period, rising * run.robot.period))
+                run.step()
+                self._record()
+        except FloatingPointError:
+            return Status.UNSTABLE
+        except _ObjectLost:
+            pass
         return self._verdict()
 
     def _height(self, time: float, rising: float) -> tuple[float, float]:
-        """Return how high [m] the hand is to be some time [s] after it began to rise, and how fast [m/s]."""
+        """Return height [m] and speed [m/s] of the hand at a time [s] since it began to rise for `rising` seconds."""
         share, rate = smooth_step(min(time / rising, 1.0))
         height = self.spec.lift_height * share
         if time < rising or self.spec.shake == 0.0:
             return height, self.spec.lift_height * rate / rising
-        turning = 2 * math.pi * SHAKE_RATE
-        phase = turning * (time - rising)
-        return height + self.spec.shake * math.sin(phase), self.spec.shake * turning * math.cos(phase)
+        frequency = 2 * math.pi * SHAKE_RATE
+        phase = frequency * (time - rising)
+        return height + self.spec.shake * math.sin(phase), self.spec.shake * frequency * math.cos(phase)
 
-    def _tick(self, targets: Float[Tensor, " j"]) -> Observation:
-        """Drive the joints for one control period, record it, and return what the robot then knows."""
-        observation = self.robot.tick(targets)
-        self._record(self.robot.force)
-        moved = float(np.linalg.norm(self._centre(-1) - self._centre(0)))
-        if not np.isfinite(self.joints[-1]).all() or not np.isfinite(moved):
-            raise _Lost(Status.UNSTABLE)
-        if moved > LOST + self.spec.lift_height:
+    def _record(self) -> None:
+        """Append one tick.
+
+        Raises:
+            FloatingPointError: the simulation has diverged.
+            _ObjectLost: the object is too far from its start.
+        """
+        robot, scene = self.run.robot, self.run.scene
+        now = robot.steps * self.spec.timestep
+        touching = int(robot.finger.sum())
+        self.ticks.append(
+            _Tick(now, robot.force, touching, scene.object_pose(), scene.hand_pose(), scene.joints())
+        )
+        moved = self._moved()
+        if not np.isfinite(self.ticks[-1].joints).all() or not np.isfinite(moved):
+            raise FloatingPointError
+        if moved > LOST_DISTANCE + self.spec.lift_height:
             self.pushed = self.pushed or moved
-            raise _Lost
-        return observation
+            raise _ObjectLost
 
-    # ------------------------------------------------------------------------------------------------ the record
-
-    def _record(self, force: np.ndarray) -> None:
-        """Append one tick."""
-        self.time.append(self.robot.steps * self.spec.timestep)
-        self.forces.append(force)
-        self.touching.append(int(self.robot.finger.sum()))
-        self.object_pose.append(self.scene.object_pose())
-        self.hand_pose.append(self.scene.hand_pose())
-        self.joints.append(self.scene.joints())
+    def _moved(self) -> float:
+        """Return the distance [m] of the object's centre from its start."""
+        return float(np.linalg.norm(self._centre(-1) - self._centre(0)))
 
     def _centre(self, tick: int) -> np.ndarray:
         """Return the object's mass centre [m] in the world at a tick."""
-        pose = self.object_pose[tick]
-        return pose[:3, :3] @ self.scene.centre + pose[:3, 3]
+        pose = self.ticks[tick].object_pose
+        return pose[:3, :3] @ self.run.scene.centre + pose[:3, 3]
 
     def _verdict(self) -> Status:
         """Return the status of a finished trial: held, or the earliest thing that went wrong."""
-        rise = np.array([self._centre(k)[2] - self._centre(0)[2] for k in range(len(self.time))])
+        rise = np.array([self._centre(k)[2] - self._centre(0)[2] for k in range(len(self.ticks))])
         half = 0.5 * self.spec.lift_height
-        gripped = np.array(self.touching[-self.robot.ticks(JUDGED_TIME) :]) >= 2
+        judged = self.ticks[-self.run.robot.ticks(JUDGED_TIME) :]
+        gripped = np.array([tick.touching >= 2 for tick in judged])
         if rise[-1] >= half and gripped.mean() > 0.5:
             return Status.OK
-        if not np.isfinite(self.robot.first_touch).all():
+        if not np.isfinite(self.run.robot.first_touch).all():
             return Status.NO_CONTACT
-        if self.pushed > PUSHED:
+        if self.pushed > PUSHED_DISTANCE:
             return Status.EJECTED
         if self.strained:
             return Status.TOO_WEAK
@@ -251,26 +188,30 @@ class _Trial:
 
     def result(self, status: Status, seconds: float) -> ClosureResult:
         """Return the record as a value."""
-        object_pose, hand_pose = (
-            torch.from_numpy(np.stack(self.object_pose)),
-            torch.from_numpy(np.stack(self.hand_pose)),
+        time, forces, _, object_pose, hand_pose, joints = (
+            torch.from_numpy(np.stack(column)) for column in zip(*self.ticks, strict=True)
         )
-        hand_from_object = inverse(hand_pose) @ object_pose
-        centre = torch.from_numpy(self.scene.centre)[None]
-        ends = apply(hand_from_object[[self.arrived, -1]], centre.expand(2, 1, 3))[:, 0]
-        turned = hand_from_object[self.arrived, :3, :3].T @ hand_from_object[-1, :3, :3]
-        touched = [i for i in range(3) if np.isfinite(self.robot.first_touch[i])]
+        first_touch = self.run.robot.first_touch
+        touched = [finger for finger in range(3) if np.isfinite(first_touch[finger])]
         return ClosureResult(
             held=status is Status.OK,
             status=status,
-            time=torch.tensor(self.time, dtype=torch.float64),
-            forces=torch.from_numpy(np.stack(self.forces)),
+            time=time,
+            forces=forces,
             object_pose=object_pose,
             hand_pose=hand_pose,
-            joints=torch.from_numpy(np.stack(self.joints)),
-            joint_names=self.scene.joint_names,
-            contact_order=tuple(sorted(touched, key=lambda i: self.robot.first_touch[i])),
-            object_motion=(float(torch.linalg.vector_norm(ends[1] - ends[0])), float(rotation_angle(turned))),
-            start_overlap=self.overlap,
+            joints=joints,
+            joint_names=self.run.scene.joint_names,
+            contact_order=tuple(sorted(touched, key=lambda finger: first_touch[finger])),
+            object_motion=self._motion(inverse(hand_pose) @ object_pose),
+            start_overlap=self.run.overlap,
             seconds=seconds,
         )
+
+    def _motion(self, hand_from_object: Float[Tensor, "t 4 4"]) -> ObjectMotion:
+        """Return the object's motion in the hand from the pre-grasp to the end."""
+        start, end = hand_from_object[self.arrived], hand_from_object[-1]
+        centre = torch.from_numpy(self.run.scene.centre)[None]
+        ends = apply(torch.stack([start, end]), centre.expand(2, 1, 3))[:, 0]
+        distance = float(torch.linalg.vector_norm(ends[1] - ends[0]))
+        return ObjectMotion(distance, float(rotation_angle(start[:3, :3].T @ end[:3, :3])))

@@ -1,47 +1,74 @@
-"""Where things really stand: the hand beside where it was planned to be, or the object beside where it was seen.
+"""Errors of pose that neither the planner nor the controller knows: of the hand, or of the object on its table.
 
-Neither is known to the planner or the controller. Both come to a trial as the hand's place in its planned frame.
+Both reach a trial as the error of the hand in its planned frame.
 """
+
+import dataclasses
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import Value, check_tensor
 from torchgrasp.frames import inverse, rigid, rotation_from_vector
 
 
-def draw_pose_errors(shift: float, turn: float, grasps: int, draws: int, seed: int) -> Float[Tensor, "g n 4 4"]:
-    """Return drawn places of the hand in its planned frame, uniform within the largest errors [m, rad] of each axis."""
-    generator = torch.Generator().manual_seed(seed)
-    most = torch.tensor([turn] * 3 + [shift] * 3, dtype=torch.float64)
-    drawn = 2 * torch.rand(grasps, draws, 6, generator=generator, dtype=torch.float64) - 1
-    angles, shifts = (most * drawn).split(3, -1)
-    return rigid(rotation_from_vector(angles), shifts)
-
-
-def draw_object_poses(
-    shift: float, turn: float, pivot: Float[Tensor, "3"], count: int, seed: int
-) -> Float[Tensor, "n 4 4"]:
-    """Return drawn places of an object on its table, as poses in the frame in which it was seen.
+@dataclasses.dataclass(frozen=True)
+class PoseNoise(Value):
+    """Errors of pose, uniform along and about each axis.
 
     Args:
-        shift: largest error along each of the table's axes [m].
-        turn: largest turn about the vertical through the pivot [rad].
-        pivot: of the turn [m]: a point of the object.
-        count: how many.
-        seed: of the draws, which are uniform.
+        translation: largest error along each axis [m].
+        rotation: largest error about each axis [rad].
+        draws: errors that are drawn for each grasp.
+    """
+
+    translation: float = 0.0
+    rotation: float = 0.0
+    draws: int = 1
+
+
+def apply_error(obj_from_hand: Float[Tensor, "4 4"], error: Float[Tensor, "4 4"] | None) -> Float[Tensor, "4 4"]:
+    """Return the true pose of a hand on the CPU in float64, whatever device and dtype pose and error have.
+
+    Args:
+        obj_from_hand: the planned pose.
+        error: the true pose in the planned frame; None: the hand is where it was planned.
+
+    Raises:
+        BadArgument: an error that is no finite floating (4, 4).
+    """
+    planned = obj_from_hand.to("cpu", torch.float64)
+    return planned if error is None else planned @ check_tensor("error", error, (4, 4)).to("cpu", torch.float64)
+
+
+def draw_hand_errors(noise: PoseNoise, grasps: int, seed: int) -> Float[Tensor, "g n 4 4"]:
+    """Draw errors of the hand in its planned frame."""
+    generator = torch.Generator().manual_seed(seed)
+    largest = torch.tensor([noise.rotation] * 3 + [noise.translation] * 3, dtype=torch.float64)
+    drawn = 2 * torch.rand(grasps, noise.draws, 6, generator=generator, dtype=torch.float64) - 1
+    rotations, translations = (largest * drawn).split(3, -1)
+    return rigid(rotation_from_vector(rotations), translations)
+
+
+def draw_object_poses(noise: PoseNoise, pivot: Float[Tensor, "3"], count: int, seed: int) -> Float[Tensor, "n 4 4"]:
+    """Draw poses of an object on its table, in the frame in which it was seen.
+
+    The errors are along the table's two axes and about the vertical through `pivot` [m], a point of the object.
     """
     generator = torch.Generator().manual_seed(seed)
     drawn = 2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    rotation = rotation_from_vector(turn * drawn[:, :1] * up)
-    return rigid(rotation, shift * drawn[:, [1, 2, 2]] * (1 - up) + pivot - rotation @ pivot)
+    rotation = rotation_from_vector(noise.rotation * drawn[:, :1] * up)
+    return rigid(rotation, noise.translation * drawn[:, [1, 2, 2]] * (1 - up) + pivot - rotation @ pivot)
 
 
-def error_from_object_pose(obj_from_hand: Float[Tensor, "4 4"], place: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    """Return where the hand stands in its planned frame when the object is at a place and the hand as planned.
+def error_from_object_pose(
+    obj_from_hand: Float[Tensor, "4 4"], object_pose: Float[Tensor, "4 4"]
+) -> Float[Tensor, "4 4"]:
+    """Return the error of a hand at its planned pose when the object is elsewhere.
 
     >>> error_from_object_pose(torch.eye(4), torch.eye(4)).equal(torch.eye(4))
     True
     """
-    return inverse(obj_from_hand) @ inverse(place) @ obj_from_hand
+    return inverse(obj_from_hand) @ inverse(object_pose) @ obj_from_hand

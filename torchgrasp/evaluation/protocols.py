@@ -1,24 +1,21 @@
-"""One grasp put to one protocol, whether that pulls at the object or lifts it: what was asked, what became of it."""
+"""The tests that a grasp can be put to, by name: published pulls at the object, and lifts off a table.
+
+A pull test has neither table nor gravity. The hand is fixed and closes, by default in open loop. Then a constant force
+pulls at the object's mass centre along one axis of the world.
+"""
 
 import dataclasses
 import math
-import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.errors import BadArgument, Status
-from torchgrasp.evaluation.lift import close_hand
-from torchgrasp.evaluation.pose_noise import draw_object_poses, draw_pose_errors, error_from_object_pose
-from torchgrasp.evaluation.pull import PROTOCOLS as PULLS
-from torchgrasp.evaluation.pull import TIMESTEP, PullProtocol, check_test, pull_grasp
-from torchgrasp.hand.hand import Hand
-from torchgrasp.sim.open import open_scene
-from torchgrasp.sim.scene import SceneSpec
-from torchgrasp.specs import ClosingMode, HoldingMode, Simulator, TrialSpec, check_simulator
+from torchgrasp.errors import BadArgument
+from torchgrasp.evaluation.pose_noise import PoseNoise, draw_hand_errors, draw_object_poses, error_from_object_pose
+from torchgrasp.specs import TrialSpec
 from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
@@ -26,169 +23,110 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True)
-class LiftProtocol(Value):
-    """A test that lifts a grasped object off a table and holds it; the object must be up at the end.
+class PullSpec(Value):
+    """A pull at a grasped object along each of six directions, and how far the object may then move.
+
+    Args:
+        acceleration: force over mass [m/s^2].
+        seconds: duration of each pull.
+        distance: by which the object's centre may move from its start [m].
+        angle: by which the object may rotate [rad].
+    """
+
+    acceleration: float
+    seconds: float
+    distance: float
+    angle: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Protocol(Value):
+    """A test of a grasp: a trial that ends in a lift, or in pulls at the object.
 
     Args:
         name: of the protocol.
-        trial: friction, mass, gravity, lift, hold and shaking; how the hand closes is no part of it (`Execution`).
-        shift: largest error of where the object stands along each of the table's axes [m].
-        turn: largest error of its orientation about the vertical [rad].
-        draws: how many such errors are drawn for each grasp.
+        trial: how the hand closes, the object's mass, friction, gravity and table.
+        pull: how the object is pulled at; None: it is lifted.
+        noise: errors of the hand's pose where the object is pulled at, of the object's where it is lifted.
     """
 
     name: str
     trial: TrialSpec
-    shift: float = 0.0
-    turn: float = 0.0
-    draws: int = 1
+    pull: PullSpec | None = None
+    noise: PoseNoise = PoseNoise()
 
-    @property
-    def friction(self) -> float:
-        """Of every contact."""
-        return self.trial.friction
+    def with_trial(self, **changes: Any) -> "Protocol":
+        """Return the protocol with fields of its trial changed, such as `closing` or `force`.
+
+        Raises:
+            BadArgument: a number outside its range, or an unknown mode.
+
+        >>> find_protocol("tabletop").with_trial(closing="fixed").trial.closing
+        'fixed'
+        """
+        return dataclasses.replace(self, trial=dataclasses.replace(self.trial, **changes))
 
 
-Protocol = PullProtocol | LiftProtocol
+# PhysX resists torsion by friction x force x patch: the patch is the torsional coefficient [m] over the sliding one.
+_FLOATING = TrialSpec(
+    closing="open_loop", force=7.0, mass=0.1, friction=0.6, patch=0.02 / 0.6, kp=5.0, overlap=0.01,
+    gravity=0.0, table=False, approach=0.0, lift_height=0.0,
+)  # fmt: skip
+_DEXGRASPBENCH = Protocol("dexgraspbench", _FLOATING, PullSpec(10.0, 2.0, 0.05, math.radians(15)))
+_MULTIDEX = _DEXGRASPBENCH.with_trial(density=500.0, friction=3.0, patch=0.0, kp=None)
+_HARD = _DEXGRASPBENCH.with_trial(friction=0.3, patch=0.002 / 0.3)
 
-PAPER = LiftProtocol("paper", TrialSpec(), shift=0.005, turn=math.radians(5))
-"""The paper's lift (Sec. 6.5), with an error of where the object stands instead of the real robot's chance."""
+PAPER = Protocol("paper", TrialSpec(), noise=PoseNoise(0.005, math.radians(5)))
+"""The paper's lift (Sec. 6.5). An error of the object's pose takes the place of the real robot's chance."""
 
-PROTOCOLS: dict[str, Protocol] = {
-    **PULLS,
-    "paper": PAPER,
-    "tabletop": LiftProtocol("tabletop", TrialSpec(friction=0.6, shake=0.003)),
+PROTOCOLS = {
+    protocol.name: protocol
+    for protocol in (
+        dataclasses.replace(_MULTIDEX, name="multidex", pull=PullSpec(0.5, 1.0, 0.02, math.inf)),
+        _DEXGRASPBENCH,
+        dataclasses.replace(_HARD, name="dexgraspbench-hard"),
+        dataclasses.replace(_DEXGRASPBENCH, name="pose-noise", noise=PoseNoise(0.005, math.radians(5), draws=20)),
+        PAPER,
+        Protocol("tabletop", TrialSpec(friction=0.6, shake=0.003)),
+    )
 }
-"""By name: those that pull (`torchgrasp.evaluation.pull`); the paper's lift at friction 0.8; and a lift by 0.1 m at
-friction 0.6 that is held for 2 s while the hand shakes."""
+"""By name.
+
+* multidex: MultiDex as D(R,O) runs it (arXiv 2410.01702).
+* dexgraspbench: force closure for floating objects (as of BODex, arXiv 2412.16490).
+* dexgraspbench-hard: the same with halved friction, as in Dexonomy (arXiv 2504.18829).
+* pose-noise: the same with an error of the hand's pose, as large as in Get a Grip (CoRL 2024).
+* paper: the paper's lift at friction 0.8.
+* tabletop: a lift by 0.1 m at friction 0.6, held for 2 s while the hand shakes.
+"""
 
 
-@dataclasses.dataclass(frozen=True)
-class Execution(Value):
-    """How a grasp is executed, whatever it is put to.
-
-    Args:
-        force: normal force of the strongest finger [N]; None: 7 where the object is pulled at, 4 where it is lifted.
-        closing: how the hand closes; None: open loop where the object is pulled at, as the authors of those tests do,
-            and under uncertainty where it is lifted.
-        holding: how the hand presses from then on; the open loop keeps its squeeze.
-        simulator: "sapien" or "mujoco".
-    """
-
-    force: float | None = None
-    closing: ClosingMode | None = None
-    holding: HoldingMode = "force"
-    simulator: Simulator = "sapien"
-
-    def on(self, protocol: Protocol) -> tuple[float, ClosingMode]:
-        """Return force and closing for a protocol."""
-        pulls = isinstance(protocol, PullProtocol)
-        force = (7.0 if pulls else protocol.trial.force) if self.force is None else self.force
-        return force, self.closing or ("open_loop" if pulls else "uncertainty")
-
-
-@dataclasses.dataclass(frozen=True)
-class ProtocolResult(Value):
-    """What became of one grasp.
-
-    `rank` is its row among the executable grasps of its view and `draw` the number of its drawn error of the hand's
-    pose; `moved` [m] and `turned` [rad] tell how far the object moved, against the world where it was pulled at and
-    against the hand where it was lifted; `force` [N] is the fingers' mean normal force and `overlap` [m] how deep the
-    hand in its grasp pose is in the object before any of them moves; `seconds` is CPU time. What was never measured is
-    NaN.
-    """
-
-    rank: int
-    draw: int
-    passed: bool
-    status: Status
-    moved: float
-    turned: float
-    force: float
-    overlap: float
-    seconds: float
-
-
-def find_protocol(protocol: Protocol | str, execution: Execution) -> Protocol:
-    """Return a protocol, by its name or as it is, after checking that it can be executed so.
+def find_protocol(protocol: Protocol | str) -> Protocol:
+    """Return a protocol by its name, or as it is.
 
     Raises:
-        BadArgument: an unknown protocol, closing or simulator, or a force outside its range.
+        BadArgument: an unknown name.
 
-    >>> find_protocol("tabletop", Execution()).friction
+    >>> find_protocol("tabletop").trial.friction
     0.6
     """
-    if isinstance(protocol, str):
-        if protocol not in PROTOCOLS:
-            raise BadArgument("protocol", repr(protocol), f"one of {', '.join(PROTOCOLS)}")
-        protocol = PROTOCOLS[protocol]
-    force, closing = execution.on(protocol)
-    check_simulator(execution.simulator)
-    if isinstance(protocol, PullProtocol):
-        return check_test(protocol, force, closing, execution.holding)
-    dataclasses.replace(protocol.trial, force=force, closing=closing, holding=execution.holding)  # checks itself
-    return protocol
-
-
-def run_protocol(
-    grasp: Grasps,
-    hand: Hand,
-    mesh: "trimesh.Trimesh",
-    parts: "list[trimesh.Trimesh]",
-    protocol: Protocol,
-    execution: Execution,
-    seed: int = 0,
-    *,
-    error: Float[Tensor, "4 4"] | None = None,
-) -> ProtocolResult:
-    """Put one grasp to a protocol; see `pull_grasp` and `close_hand`."""
-    began = time.process_time()
-    force, closing = execution.on(protocol)
-    grasp, hand = grasp.to("cpu", torch.float64), hand.to("cpu", torch.float64)
-    overlap = grasp_overlap(grasp, hand, mesh, parts, error, execution.simulator)
-    if isinstance(protocol, PullProtocol):
-        pulled = pull_grasp(
-            grasp, hand, mesh, protocol, force, closing, seed,
-            holding=execution.holding, error=error, parts=parts, simulator=execution.simulator,
-        )  # fmt: skip
-        status, moved, turned, pressed = pulled.status, pulled.moved, pulled.turned, pulled.force
-    else:
-        given = {"holding": execution.holding, "simulator": execution.simulator}
-        spec = dataclasses.replace(protocol.trial, force=force, closing=closing, **given)
-        lifted = close_hand(grasp, hand, mesh, spec, seed, error=error, parts=parts)
-        status, (moved, turned), pressed = lifted.status, lifted.object_motion, float(lifted.forces[-1].mean())
-        pressed = math.nan if status is Status.START_OVERLAP else pressed
-    spent = time.process_time() - began
-    return ProtocolResult(0, 0, status is Status.OK, status, moved, turned, pressed, overlap, spent)
+    if isinstance(protocol, Protocol):
+        return protocol
+    if protocol not in PROTOCOLS:
+        raise BadArgument("protocol", repr(protocol), f"one of {', '.join(PROTOCOLS)}")
+    return PROTOCOLS[protocol]
 
 
 def draw_error(
     protocol: Protocol, grasp: Grasps, mesh: "trimesh.Trimesh", row: int, draw: int, seed: int
 ) -> Float[Tensor, "4 4"]:
-    """Return where the hand really stands in its planned frame, in one draw for one row among a view's grasps.
+    """Draw the error of the hand in its planned frame, for one row among a view's grasps and one draw.
 
-    Pull tests put the hand down beside its plan, in the air; in a lift the object stands elsewhere on its table.
+    In a pull the hand is off; in a lift the object is off on its table.
     """
-    if isinstance(protocol, PullProtocol):
-        return draw_pose_errors(protocol.shift, protocol.turn, row + 1, protocol.draws, seed)[row, draw]
+    noise = protocol.noise
+    if protocol.pull is not None:
+        return draw_hand_errors(noise, row + 1, seed)[row, draw]
     pivot = torch.tensor(mesh.center_mass.tolist(), dtype=torch.float64)
-    places = draw_object_poses(protocol.shift, protocol.turn, pivot, (row + 1) * protocol.draws, seed)
-    return error_from_object_pose(grasp.obj_from_hand[0].double(), places[row * protocol.draws + draw])
-
-
-def grasp_overlap(
-    grasp: Grasps,
-    hand: Hand,
-    mesh: "trimesh.Trimesh",
-    parts: "list[trimesh.Trimesh]",
-    error: Float[Tensor, "4 4"] | None = None,
-    simulator: Simulator = "sapien",
-) -> float:
-    """Return how deep [m] the simulated hand in its grasp pose is in the true object, fingertips included."""
-    stands = grasp.obj_from_hand[0] if error is None else grasp.obj_from_hand[0] @ error
-    joints = {name: float(q) for name, q in hand.expand(grasp.joints[0]).items()}
-    setup = SceneSpec(
-        hand.urdf_path, stands.numpy(), joints, hand.actuators, tuple(hand.tip_links), mesh, parts,
-        mass=0.1, timestep=TIMESTEP, table=False,
-    )  # fmt: skip
-    return open_scene(setup, simulator).penetration()
+    poses = draw_object_poses(noise, pivot, (row + 1) * noise.draws, seed)
+    return error_from_object_pose(grasp.obj_from_hand[0].double(), poses[row * noise.draws + draw])

@@ -8,7 +8,7 @@ from typing import Any
 
 from torchgrasp.base import Value
 from torchgrasp.errors import Status
-from torchgrasp.evaluation.protocols import ProtocolResult
+from torchgrasp.evaluation.attempt import ProtocolResult
 
 STAGES: dict[str, tuple[Status, ...]] = {
     "start": (Status.START_OVERLAP,),

@@ -48,7 +48,7 @@ def format_document(title: str, body: Sequence[str]) -> str:
     )
 
 
-def format_table(
+def format_html_table(
     heads: Sequence[str], rows: Iterable[Sequence[str]], numbers: Collection[int] = (), code: Collection[int] = ()
 ) -> str:
     """Return a table; columns in `numbers` are set flush right, those in `code` in a fixed width."""

@@ -7,7 +7,7 @@ from typing import Any
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.score import Share, ViewScore, summarise
 from torchgrasp.files import write_file
-from torchgrasp.report.document import Markup, escape, format_document, format_table
+from torchgrasp.report.document import Markup, escape, format_document, format_html_table
 
 WIDTH, HEIGHT = 180, 16
 """Size of a bar [pixels]."""
@@ -37,16 +37,16 @@ def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[
         f"<h1>{escape(title)}</h1>",
         f'<p class="verdict{"" if value else " bad"}">{escape(verdict)}</p>',
         "<h2>Shares</h2>",
-        format_table(SHARES, [_share_row(name, found[key]) for key, name in SHARE_NAMES.items()], numbers={1, 3, 4}),
+        format_html_table(SHARES, [_share_row(name, found[key]) for key, name in SHARE_NAMES.items()], numbers={1, 3, 4}),
         "<h2>By object and view</h2>",
         _objects(scores, found["by_object"]),
         "<h2>What went wrong, by stage</h2>",
         _failures(found["failures"]),
         *_notes(scores),
         "<h2>Forces, overlap and time</h2>",
-        format_table(("what", "value"), _figures(found), numbers={1}),
+        format_html_table(("what", "value"), _figures(found), numbers={1}),
         "<h2>What was asked</h2>",
-        format_table(("what", "value"), [(k.replace("_", " "), str(v)) for k, v in asked.items()], code={1}),
+        format_html_table(("what", "value"), [(k.replace("_", " "), str(v)) for k, v in asked.items()], code={1}),
     ]
     return format_document(title, body)
 
@@ -94,7 +94,7 @@ def _objects(scores: Sequence[ViewScore], by_object: Mapping[str, Any]) -> str:
         shares = f"{value:.0%}", bar(row["gsr"]), f"{low:.0%} to {high:.0%}", str(total), f"{row['top1'][0]:.0%}"
         rows.append((name, *shares, *cells))
     heads = ("object", "pass", "with its 95 % interval", "interval", "of", "best-ranked", *views)
-    return format_table(heads, rows, numbers={1, 3, 4, 5, *range(6, 6 + len(views))})
+    return format_html_table(heads, rows, numbers={1, 3, 4, 5, *range(6, 6 + len(views))})
 
 
 def _cell(score: ViewScore) -> str:
@@ -111,7 +111,7 @@ def _failures(found: Mapping[str, Mapping[str, int]]) -> str:
         for stage, reasons in found.items()
         for name, n in reasons.items()
     ]
-    return format_table(("stage", "reason", "count", "", "meaning"), rows, numbers={2})
+    return format_html_table(("stage", "reason", "count", "", "meaning"), rows, numbers={2})
 
 
 def _length(part: float) -> Markup:
@@ -122,7 +122,7 @@ def _length(part: float) -> Markup:
 def _notes(scores: Sequence[ViewScore]) -> list[str]:
     """Return what more is known of views that were refused."""
     rows = [(score.object, score.view, score.note) for score in scores if score.note]
-    return ["<h3>Refused</h3>", format_table(("object", "view", "why"), rows)] if rows else []
+    return ["<h3>Refused</h3>", format_html_table(("object", "view", "why"), rows)] if rows else []
 
 
 def _figures(found: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgrasp.base import count_status
 from torchgrasp.files import write_file
-from torchgrasp.report.document import escape, format_document, format_table
+from torchgrasp.report.document import escape, format_document, format_html_table
 from torchgrasp.report.palette import FINGERS
 from torchgrasp.report.pictures import (
     draw_cloud,
@@ -79,7 +79,7 @@ def format_page(run: Run, pictures: dict[str, list[tuple[str, bytes]]]) -> str:
         f'<p class="verdict{"" if good else " bad"}">{escape(verdict(run))}</p>',
         *(_section(name, shots, run) for name, shots in pictures.items()),
         "<h2>Stages</h2>",
-        format_table(("stage", "result", "seconds"), stages, numbers={2}),
+        format_html_table(("stage", "result", "seconds"), stages, numbers={2}),
     ]
     if len(run.executable):
         body += [f"<h2>Best grasps ({min(ROWS, len(run.executable))} of {len(run.executable)})</h2>", _grasps(run)]
@@ -88,7 +88,7 @@ def format_page(run: Run, pictures: dict[str, list[tuple[str, bytes]]]) -> str:
     if len(run.grasps):
         body += ["<h2>What became of every posture</h2>", _statuses(run.grasps.status)]
     facts = [(name.replace("_", " "), value) for name, value in sorted(run.grasps.meta.items())]
-    body += ["<h2>Provenance</h2>", format_table(("what", "value"), facts, code={1})]
+    body += ["<h2>Provenance</h2>", format_html_table(("what", "value"), facts, code={1})]
     return format_document(title, body)
 
 
@@ -117,12 +117,12 @@ GRASP_COLUMNS = ("rank", "success", "tip error mm", "clearance mm", "pad angle d
 def _statuses(status: Int[Tensor, "b"]) -> str:
     """Return the table of statuses and how often each came."""
     rows = [(str(n), s.name.lower(), s.sentence) for s, n in count_status(status).items()]
-    return format_table(("count", "status", "meaning"), rows, numbers={0})
+    return format_html_table(("count", "status", "meaning"), rows, numbers={0})
 
 
 def _grasps(run: Run) -> str:
     """Return the table of the best grasps."""
-    return format_table(GRASP_COLUMNS, grasp_rows(run.executable), numbers=set(range(len(GRASP_COLUMNS))))
+    return format_html_table(GRASP_COLUMNS, grasp_rows(run.executable), numbers=set(range(len(GRASP_COLUMNS))))
 
 
 def _section(name: str, shots: Sequence[tuple[str, bytes]], run: Run) -> str:

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.columns import format_columns
 from torchgrasp.datasets import read_views
 from torchgrasp.linalg import unit
 from torchgrasp.mesh import nearest_on_mesh, sample_mesh
@@ -117,21 +118,11 @@ def measure_shape(shape: ShapeGP, mesh: "trimesh.Trimesh", cloud: PointCloud, se
 
 def format_table(rows: Sequence[Row]) -> str:
     """Return rows of `measure_accuracy` as a table, one line a view, then the mean of each object and of all views."""
-    titles = (
-        "object",
-        "view",
-        "seen mm",
-        "hidden mm  deg",
-        "hidden 1 2 3 sd",
-        "seen 1 2 3 sd",
-        "paper's 1 2 3 sd",
-        "sure mm  deg",
-    )
-    widths = (12, 7, 12, 20, 18, 18, 18, 12)
-    lines = ["".join(t.ljust(w) for t, w in zip(titles, widths, strict=True)).rstrip()]
+    within = ("hidden 1 2 3 sd", "seen 1 2 3 sd", "paper's 1 2 3 sd")
+    table = [("object", "view", "seen mm", "hidden mm  deg", *within, "sure mm  deg")]
 
-    def line(name: str, view: str, r: Row) -> str:
-        cells = (
+    def line(name: str, view: str, r: Row) -> tuple[str, ...]:
+        return (
             name,
             view,
             f"{r['seen_median_mm']:.1f}/{r['seen_p90_mm']:.1f}",
@@ -140,18 +131,15 @@ def format_table(rows: Sequence[Row]) -> str:
             " ".join(f"{r[f'hidden_raw_{k}']:.2f}" for k in (1, 2, 3)),
             f"{r['sure_median_mm']:.1f}  {r['sure_normal_deg']:.0f}",
         )
-        return "".join(c.ljust(w) for c, w in zip(cells, widths, strict=True)).rstrip()
 
     names = sorted({r["object"] for r in rows})
     for name in names:
         mine = [r for r in rows if r["object"] == name]
-        lines += [line(name, r["view"], r) for r in mine]
-        lines.append(line(name, "mean", mean_row(mine)))
-    lines.append(line("all", "mean", mean_row(rows)))
-    lines.append(
-        f"least share of a view's hidden surface within 2 std_m: {min(r['hidden_within_2'] for r in rows):.2f}"
-    )
-    return "\n".join(lines)
+        table += [line(name, r["view"], r) for r in mine] + [line(name, "mean", mean_row(mine))]
+    table.append(line("all", "mean", mean_row(rows)))
+    least = min(r["hidden_within_2"] for r in rows)
+    text = format_columns(table, left=range(len(table[0])))
+    return f"{text}\nleast share of a view's hidden surface within 2 std_m: {least:.2f}"
 
 
 def mean_row(rows: Sequence[Row]) -> Row:

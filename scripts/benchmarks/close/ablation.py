@@ -64,7 +64,7 @@ def _close_view(
     """Return part, status, motion in the hand [m] and CPU time [s] of every trial of one view and hand."""
     hand, cloud = load_hand(hand_name), read_view(objects, name, view)
     shape = fit_shape(cloud, seed=seed, table=0.0)
-    found = plan_grasps(cloud, hand, ContactSpec(friction=PAPER.friction, table=0.0), starts, seed, shape=shape)
+    found = plan_grasps(cloud, hand, ContactSpec(friction=PAPER.trial.friction, table=0.0), starts, seed, shape=shape)
     found = found[found.status == Status.OK]
     mesh = read_object_mesh(objects, name)
     close = functools.partial(close_hand, hand=hand, mesh=mesh, parts=convex_parts(mesh))
@@ -75,5 +75,5 @@ def _close_view(
             belief = shape if revises else None
             began = time.process_time()
             result = close(found[row], spec=spec, seed=seed, error=error, belief=belief)
-            cases.append((part, result.status.name, result.object_motion[0], time.process_time() - began))
+            cases.append((part, result.status.name, result.object_motion.distance, time.process_time() - began))
     return cases

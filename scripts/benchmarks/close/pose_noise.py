@@ -1,4 +1,4 @@
-"""What an error of the hand's pose costs, with the controller and with the naive closing."""
+"""What an error of the hand's pose costs, closed under the law and in open loop."""
 
 import dataclasses
 import tempfile
@@ -6,45 +6,48 @@ from pathlib import Path
 
 from benchmarks.common import Row
 from torchgrasp import load_hand
-from torchgrasp.evaluation.evaluate import evaluate
-from torchgrasp.evaluation.protocols import PROTOCOLS, Execution
-from torchgrasp.evaluation.pull import PullProtocol
+from torchgrasp.evaluation.evaluate import EvaluationSpec, evaluate
+from torchgrasp.evaluation.protocols import PROTOCOLS
 from torchgrasp.evaluation.score import share
 
 MOST_LOST = 0.10
-"""Of the share that passes without errors."""
+"""Largest loss of the share that passes without errors: the project's own bar."""
 
 
 def bench_noise(
-    objects: Path, hands: tuple[str, ...], tries: int, draws: int, starts: int, seed: int, workers: int
+    objects: Path, hands: tuple[str, ...], draws: int, spec: EvaluationSpec, workers: int
 ) -> list[Row]:
-    """Put the same grasps to the test with and without errors of the pose, by the controller and open loop."""
+    """Put the same grasps to the test with and without errors of the pose, under the law and in open loop."""
     noisy = PROTOCOLS["pose-noise"]
-    assert isinstance(noisy, PullProtocol)
-    tests = {"still": PROTOCOLS["dexgraspbench"], "noisy": dataclasses.replace(noisy, draws=draws)}
+    noisy = dataclasses.replace(noisy, noise=dataclasses.replace(noisy.noise, draws=draws))
+    tests = {"still": PROTOCOLS["dexgraspbench"], "noisy": noisy}
     rows = []
     for name in hands:
-        with tempfile.TemporaryDirectory() as shelf:
+        with tempfile.TemporaryDirectory() as folder:
             planned = False
             for closing, bar in (("uncertainty", MOST_LOST), ("open_loop", None)):
-                found = {}
+                shares = {}
                 for key, test in tests.items():
                     scores = evaluate(
-                        objects, load_hand(name), test, Execution(closing=closing), tries, starts, seed,
-                        workers=workers, folder=Path(shelf), planned=planned,
-                    )  # fmt: skip
-                    every = [attempt for score in scores for attempt in score.attempts]
-                    found[key] = share(sum(attempt.passed for attempt in every), len(every))
+                        objects,
+                        load_hand(name),
+                        test.with_trial(closing=closing),
+                        dataclasses.replace(spec, planned=planned),
+                        folder=Path(folder),
+                        workers=workers,
+                    )
+                    attempts = [attempt for score in scores for attempt in score.attempts]
+                    shares[key] = share(sum(attempt.passed for attempt in attempts), len(attempts))
                     planned = True
-                lost = found["still"][0] - found["noisy"][0]
-                words = [f"{key} {x[0]:.1%} [{x[1]:.1%}, {x[2]:.1%}] of {x[3]}" for key, x in found.items()]
+                lost = shares["still"][0] - shares["noisy"][0]
+                words = [f"{key} {x[0]:.1%} [{x[1]:.1%}, {x[2]:.1%}] of {x[3]}" for key, x in shares.items()]
                 rows.append(
                     Row(
                         f"{name}, {closing}: loss by 5 mm and 5 degrees",
                         "none" if bar is None else f"at most {bar:.0%}",
                         f"{lost:+.1%}: {', '.join(words)}",
                         None if bar is None else lost <= bar,
-                        found,
+                        shares,
                     )
                 )
     return rows

@@ -10,8 +10,9 @@ from sklearn.metrics import cohen_kappa_score, confusion_matrix
 
 from benchmarks.common import Row
 from torchgrasp import load_hand
-from torchgrasp.evaluation.evaluate import evaluate
-from torchgrasp.evaluation.protocols import PROTOCOLS, Execution, ProtocolResult
+from torchgrasp.evaluation.attempt import ProtocolResult
+from torchgrasp.evaluation.evaluate import EvaluationSpec, evaluate
+from torchgrasp.evaluation.protocols import PROTOCOLS
 from torchgrasp.evaluation.score import ViewScore, share
 
 TESTS = ("dexgraspbench", "dexgraspbench-hard", "pose-noise", "paper")
@@ -34,22 +35,20 @@ class Case:
     mujoco: ProtocolResult
 
 
-def bench_agreement(objects: Path, tries: int, starts: int, seed: int, workers: int) -> list[Row]:
-    """Put `tries` grasps of all ranks of every view of every object to each test, with both hands."""
+def bench_agreement(objects: Path, spec: EvaluationSpec, workers: int) -> list[Row]:
+    """Put grasps of all ranks of every view of every object to each test, with both hands."""
+    spec = dataclasses.replace(spec, ranks="spread")
     cases = []
     for hand in (load_hand("allegro"), load_hand("barrett")):
-        with tempfile.TemporaryDirectory() as shelf:
+        with tempfile.TemporaryDirectory() as folder:
             planned = False
             for test in TESTS:
-                protocol = dataclasses.replace(PROTOCOLS[test], draws=1)
+                protocol = PROTOCOLS[test]
+                protocol = dataclasses.replace(protocol, noise=dataclasses.replace(protocol.noise, draws=1))
                 scores = []
                 for simulator in SIMULATORS:
-                    scores.append(
-                        evaluate(
-                            objects, hand, protocol, Execution(simulator=simulator), tries, starts, seed,
-                            ranks="spread", workers=workers, folder=Path(shelf), planned=planned,
-                        )
-                    )  # fmt: skip
+                    run, asked = protocol.with_trial(simulator=simulator), dataclasses.replace(spec, planned=planned)
+                    scores.append(list(evaluate(objects, hand, run, asked, folder=Path(folder), workers=workers)))
                     planned = True
                 for there, here in zip(*scores, strict=True):
                     pairs = zip(there.attempts, here.attempts, strict=True)

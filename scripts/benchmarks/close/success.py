@@ -20,10 +20,9 @@ from benchmarks.common import Row
 from torchgrasp.cloud.camera import partial_view
 from torchgrasp.cloud.io.read import save_cloud
 from torchgrasp.datasets import list_views, read_view
-from torchgrasp.evaluation.evaluate import evaluate
+from torchgrasp.evaluation.evaluate import EvaluationSpec, evaluate
 from torchgrasp.evaluation.pool import run_tasks
-from torchgrasp.evaluation.protocols import Execution
-from torchgrasp.evaluation.pull import PROTOCOLS
+from torchgrasp.evaluation.protocols import PROTOCOLS
 from torchgrasp.evaluation.score import share
 from torchgrasp.files import format_json, write_atomically, write_file
 from torchgrasp.hand.load import load_hand
@@ -146,15 +145,13 @@ def try_object(source: Path, name: str, hand: str, grasps: int, folder: Path) ->
     """Keep a row for each trial of an object: which it was, its features, and whether it passed."""
     rows, shelf = [], folder / "grasps" / hand / source.name
     for k, (protocol, closing) in enumerate(TESTS):
-        test = PROTOCOLS[protocol]
-        scores = evaluate(
-            source, load_hand(hand), dataclasses.replace(test, draws=1), Execution(closing=closing), grasps,
-            ranks="spread", only=[name], workers=0, folder=shelf, planned=k > 0,
-        )  # fmt: skip
-        for score in scores:
+        test = PROTOCOLS[protocol].with_trial(closing=closing)
+        test = dataclasses.replace(test, noise=dataclasses.replace(test.noise, draws=1))
+        spec = EvaluationSpec(grasps, "spread", only=(name,), planned=k > 0)
+        for score in evaluate(source, load_hand(hand), test, spec, folder=shelf):
             told = {"object": name, "view": score.view, "hand": hand, "protocol": protocol, "closing": closing}
             ranks = tuple(attempt.rank for attempt in score.attempts)
-            known = known_of(source, name, score.view, shelf, test.friction, ranks)
+            known = known_of(source, name, score.view, shelf, test.trial.friction, ranks)
             rows += [
                 {**told, "rank": attempt.rank, "features": features, "passed": attempt.passed}
                 for attempt, features in zip(score.attempts, known, strict=True)

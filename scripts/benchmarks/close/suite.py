@@ -13,6 +13,7 @@ from benchmarks.close.stability import bench_force
 from benchmarks.close.statics import bench_checks
 from benchmarks.close.success import bench_success
 from benchmarks.common import Row, measure
+from torchgrasp.evaluation.evaluate import EvaluationSpec
 
 SUBJECTS = ("checks", "speed", "ablation", "agreement", "force", "noise", "success")
 
@@ -44,13 +45,14 @@ def close(
         out: where the numbers are written as JSON.
     """
     torch.set_num_threads(threads)
+    spec = EvaluationSpec(tries, starts=starts, seed=seed)
     subjects: dict[str, Callable[[], list[Row]]] = {
         "checks": bench_checks,
         "speed": bench_closing_speed,
         "ablation": lambda: bench_ablation(objects, tries, starts, seed, workers) if objects else [],
-        "agreement": lambda: bench_agreement(objects, tries, starts, seed, workers) if objects else [],
+        "agreement": lambda: bench_agreement(objects, spec, workers) if objects else [],
         "force": lambda: bench_force(objects, tries, starts, seed) if objects else [],
-        "noise": lambda: bench_noise(objects, hands, tries, draws, starts, seed, workers) if objects else [],
+        "noise": lambda: bench_noise(objects, hands, draws, spec, workers) if objects else [],
         "success": lambda: bench_success(objects, hands, tries, workers, out.parent / "success") if objects else [],
     }
     settings = {"tries": tries, "starts": starts, "threads": threads, "seed": seed, "torch": torch.__version__}

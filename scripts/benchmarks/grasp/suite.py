@@ -1,6 +1,7 @@
 """From one noisy view to a held object, for every object of a folder and both hands."""
 
 import json
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import trimesh
 
 from torchgrasp import ContactSpec, PointCloud, Status, TrialSpec, close_hand, load_hand, plan_grasps
 from torchgrasp.base import count_status
+from torchgrasp.columns import format_line
 from torchgrasp.datasets import list_views, read_object_mesh, read_view
 from torchgrasp.files import write_file
 
@@ -48,8 +50,8 @@ def bench_one(
             {
                 "held": result.held,
                 "status": result.status.name,
-                "moved_mm": round(1e3 * result.object_motion[0], 1),
-                "turned_deg": round(57.29578 * result.object_motion[1], 1),
+                "moved_mm": round(1e3 * result.object_motion.distance, 1),
+                "turned_deg": round(math.degrees(result.object_motion.angle), 1),
                 "force_n": [round(float(f), 2) for f in result.forces[-50:].mean(0)],
                 "seconds": round(result.seconds, 1),
             }
@@ -57,20 +59,19 @@ def bench_one(
     return row
 
 
-HEADER = f"{'object':12}{'hand':9}{'s':>6}{'grasps':>8}{'tip mm':>8}{'clear mm':>9}  {'top grasp':20}{'held':>7}"
+COLUMNS = {"object": -12, "hand": -8, "s": 5, "grasps": 6, "tip mm": 6, "clear mm": 8, "best grasp": -20, "held": 5}
+"""Heads and widths of the table: seconds to plan, executable grasps, the best grasp, and how many trials held."""
 
 
 def table_line(r: dict[str, Any]) -> str:
-    """Return one line of the table: seconds to plan, executable grasps, the best one, and how many trials held."""
-    top = "-"
+    """Return one line of the table."""
+    best = "-"
     if r["trials"]:
         first = r["trials"][0]
-        top = f"{first['status'].lower()} {first['moved_mm']:.0f} mm {first['turned_deg']:.0f} deg"
+        best = f"{first['status'].lower()} {first['moved_mm']:.0f} mm {first['turned_deg']:.0f} deg"
     held = f"{sum(t['held'] for t in r['trials'])}/{len(r['trials'])}"
-    return (
-        f"{r['object']:12}{r['hand']:9}{r['seconds']:6.1f}{r['grasps']:8}{r.get('tip_mm', '-')!s:>8}"
-        f"{r.get('clearance_mm', '-')!s:>9}  {top:20}{held:>7}"
-    )
+    numbers = (r["seconds"], r["grasps"], r.get("tip_mm", "-"), r.get("clearance_mm", "-"))
+    return format_line((r["object"], r["hand"], *numbers, best, held), list(COLUMNS.values()))
 
 
 def print_counts(rows: list[dict[str, Any]]) -> None:
@@ -109,7 +110,7 @@ def grasp(
         out: where the numbers are written as JSON.
     """
     torch.set_num_threads(1)  # the batches are small: a second thread brings nothing here
-    print(HEADER)
+    print(format_line(list(COLUMNS), list(COLUMNS.values())))
     rows = []
     for name in dict.fromkeys(name for name, _ in list_views(objects, only=only)):
         cloud, mesh = read_view(objects, name, view, camera), read_object_mesh(objects, name)

@@ -1,0 +1,54 @@
+"""One grasp put to one protocol, whether that pulls at the object or lifts it."""
+
+import dataclasses
+import math
+import time
+
+from torchgrasp.base import Value
+from torchgrasp.errors import Status
+from torchgrasp.evaluation.closing import GraspTrial, TrialDriver
+from torchgrasp.evaluation.lift import lift_grasp
+from torchgrasp.evaluation.protocols import Protocol
+from torchgrasp.evaluation.pull import pull_grasp
+
+
+@dataclasses.dataclass(frozen=True)
+class ProtocolResult(Value):
+    """The outcome of one grasp; what was never measured is NaN.
+
+    Args:
+        rank: row of the grasp among the executable grasps of its view.
+        draw: number of the drawn error of pose.
+        passed: whether the grasp passed.
+        status: the reason if it did not.
+        moved: motion of the object's centre [m], in the world where it is pulled at, in the hand where it is lifted.
+        turned: rotation of the object [rad], likewise.
+        force: mean normal force of the fingers [N].
+        overlap: depth [m] of the hand in its grasp pose in the object, before a finger moves.
+        seconds: CPU time.
+    """
+
+    rank: int
+    draw: int
+    passed: bool
+    status: Status
+    moved: float
+    turned: float
+    force: float
+    overlap: float
+    seconds: float
+
+
+def run_protocol(trial: GraspTrial, protocol: Protocol, rank: int = 0, draw: int = 0) -> ProtocolResult:
+    """Put one grasp to a protocol; see `pull_grasp` and `lift_grasp`."""
+    started = time.process_time()
+    overlap = TrialDriver(trial, protocol.trial).grasp_overlap()
+    if protocol.pull is not None:
+        pull = pull_grasp(trial, protocol)
+        status, moved, turned, force = pull.status, pull.moved, pull.turned, pull.force
+    else:
+        lift = lift_grasp(trial, protocol.trial)
+        status, (moved, turned) = lift.status, lift.object_motion
+        force = math.nan if status is Status.START_OVERLAP else float(lift.forces[-1].mean())
+    spent = time.process_time() - started
+    return ProtocolResult(rank, draw, status is Status.OK, status, moved, turned, force, overlap, spent)
