@@ -75,7 +75,9 @@ def gather(cells: Iterator[tuple[Cell, ...]]) -> list[list[Cell]]:
     rows: list[list[Cell]] = []
     for found in cells:
         if not rows:
-            place = f"{1e3 * PAPER.noise.translation:.0f} mm and {57.3 * PAPER.noise.rotation:.0f} deg of where it was seen"
+            place = (
+                f"{1e3 * PAPER.noise.translation:.0f} mm and {57.3 * PAPER.noise.rotation:.0f} deg of where it was seen"
+            )
             print(f"the object stands within {place}; held of")
             print(f"{'object':16}{'hand':9}" + "".join(f"{cell.row:>24}" for cell in found))
             rows = [[] for _ in found]

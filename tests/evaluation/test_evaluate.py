@@ -23,6 +23,7 @@ from torchgrasp.hand.load import load_hand
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import load_grasps
 
+
 def test_shares_count_every_view_and_failures_their_stage():
     found = summarise(SCORES)
     assert found["gsr"][::3] == (1 / 4, 4) and found["top1"][::3] == (1 / 4, 4) and found["objects"][::3] == (1 / 3, 3)
@@ -65,7 +66,11 @@ def test_bad_protocols_and_specs_are_named_before_any_work():
     hand = load_hand("allegro")
     for name, protocol in PROTOCOLS.items():
         assert protocol.name == name
-    for changes, named in (({"force": -1.0}, "force"), ({"density": 0.0}, "density"), ({"simulator": "x"}, "simulator")):
+    for changes, named in (
+        ({"force": -1.0}, "force"),
+        ({"density": 0.0}, "density"),
+        ({"simulator": "x"}, "simulator"),
+    ):
         with pytest.raises(BadArgument, match=f"{named}: found"):
             PROTOCOLS["multidex"].with_trial(**changes)
     with pytest.raises(BadArgument, match="protocol: found"):

@@ -5,7 +5,13 @@ import math
 import pytest
 import torch
 
-from torchgrasp.evaluation.pose_noise import PoseNoise, apply_error, draw_hand_errors, draw_object_poses, error_from_object_pose
+from torchgrasp.evaluation.pose_noise import (
+    PoseNoise,
+    apply_error,
+    draw_hand_errors,
+    draw_object_poses,
+    error_from_object_pose,
+)
 from torchgrasp.frames import apply, inverse, rigid, rotation_angle, rotation_from_vector
 
 

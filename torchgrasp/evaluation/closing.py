@@ -14,8 +14,8 @@ from torchgrasp.control.reference import ClosingReference
 from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.pose_noise import apply_error
 from torchgrasp.hand.hand import Hand
-from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.mesh import read_mesh
+from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.sim.convex_parts import check_parts, convex_parts
 from torchgrasp.sim.hand import SimulatedHand
 from torchgrasp.sim.open import open_scene
@@ -70,7 +70,7 @@ class TrialDriver:
     def __init__(self, trial: GraspTrial, spec: TrialSpec) -> None:
         check_modes(spec.closing, spec.holding, trial.belief)
         self.trial, self.spec = trial, spec
-        self.hand, self.grasp = hand, grasp = (x.to("cpu", torch.float64) for x in (trial.hand, trial.grasp))
+        hand, grasp = trial.hand.to("cpu", torch.float64), trial.grasp.to("cpu", torch.float64)
         self.reference = ClosingReference.from_grasp(hand, grasp, spec.force, spec.kp)
         hand.check_joints(grasp.pregrasp)
         if spec.approach and not abs(float(torch.linalg.vector_norm(grasp.approach)) - 1) < 1e-4:
@@ -84,7 +84,7 @@ class TrialDriver:
         self.scene_spec = SceneSpec(
             urdf_path=hand.urdf_path,
             world_from_hand=true_pose.numpy(),
-            joints=_by_name(hand, grasp.pregrasp),
+            joints=_by_name(hand, grasp.pregrasp[0]),
             drives=drives,
             tip_links=tuple(hand.tip_links),
             mesh=mesh,
@@ -110,7 +110,10 @@ class TrialDriver:
     def grasp_overlap(self) -> float:
         """Return how deep [m] the simulated hand in its grasp pose is in the object, fingertips included."""
         spec = dataclasses.replace(
-            self.scene_spec, joints=_by_name(self.hand, self.grasp.joints), approach=(0.0, 0.0, 0.0), table=False
+            self.scene_spec,
+            joints=_by_name(self.reference.hand, self.reference.joints),
+            approach=(0.0, 0.0, 0.0),
+            table=False,
         )
         return open_scene(spec, self.spec.simulator).penetration()
 
@@ -173,6 +176,6 @@ def smooth_step(time: float) -> tuple[float, float]:
     return time * time * (3 - 2 * time), 6 * time * (1 - time)
 
 
-def _by_name(hand: Hand, joints: Float[Tensor, "1 h"]) -> dict[str, float]:
+def _by_name(hand: Hand, joints: Float[Tensor, " h"]) -> dict[str, float]:
     """Return the position [rad] of every joint of the URDF by its name."""
-    return {name: float(q) for name, q in hand.expand(joints[0]).items()}
+    return {name: float(q) for name, q in hand.expand(joints).items()}

@@ -118,10 +118,16 @@ def _evaluate(
         planning = [(view, protocol.trial.friction, spec) for view in views]
         plans = [_ended_plan(plan) for plan in run_tasks(_plan, planning, workers, PLAN_LIMIT)]
         places = [
-            [(row, draw) for row in choose_rows(plan.executable, spec.grasps, spec.ranks) for draw in range(protocol.noise.draws)]
+            [
+                (row, draw)
+                for row in choose_rows(plan.executable, spec.grasps, spec.ranks)
+                for draw in range(protocol.noise.draws)
+            ]
             for plan in plans
         ]
-        trying = [(view, protocol, spec.seed, *place) for view, mine in zip(views, places, strict=True) for place in mine]
+        trying = [
+            (view, protocol, spec.seed, *place) for view, mine in zip(views, places, strict=True) for place in mine
+        ]
         with contextlib.closing(run_tasks(_try, trying, workers, TRIAL_LIMIT)) as results:
             for view, plan, mine in zip(views, plans, places, strict=True):
                 attempts = tuple(_ended_attempt(next(results), *place) for place in mine)
@@ -180,7 +186,12 @@ def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
         contacts = ContactSpec(friction=min(friction, MOST_FRICTION), table=0.0)
         stages: dict[str, Any] = {}
         grasps = plan_grasps(
-            cloud, hand, contacts, spec.starts, spec.seed, observer=lambda stage, _, value: stages.update({stage: value})
+            cloud,
+            hand,
+            contacts,
+            spec.starts,
+            spec.seed,
+            observer=lambda stage, _, value: stages.update({stage: value}),
         )
         executable = grasps[grasps.status == Status.OK]
         executable.save(view.file)

@@ -151,9 +151,7 @@ class _Lift:
         robot, scene = self.run.robot, self.run.scene
         now = robot.steps * self.spec.timestep
         touching = int(robot.finger.sum())
-        self.ticks.append(
-            _Tick(now, robot.force, touching, scene.object_pose(), scene.hand_pose(), scene.joints())
-        )
+        self.ticks.append(_Tick(now, robot.force, touching, scene.object_pose(), scene.hand_pose(), scene.joints()))
         moved = self._moved()
         if not np.isfinite(self.ticks[-1].joints).all() or not np.isfinite(moved):
             raise FloatingPointError

@@ -28,6 +28,10 @@ class PoseNoise(Value):
     draws: int = 1
 
 
+NO_NOISE = PoseNoise()
+"""One draw of no error."""
+
+
 def apply_error(obj_from_hand: Float[Tensor, "4 4"], error: Float[Tensor, "4 4"] | None) -> Float[Tensor, "4 4"]:
     """Return the true pose of a hand on the CPU in float64, whatever device and dtype pose and error have.
 

@@ -14,7 +14,13 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.errors import BadArgument
-from torchgrasp.evaluation.pose_noise import PoseNoise, draw_hand_errors, draw_object_poses, error_from_object_pose
+from torchgrasp.evaluation.pose_noise import (
+    NO_NOISE,
+    PoseNoise,
+    draw_hand_errors,
+    draw_object_poses,
+    error_from_object_pose,
+)
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import Grasps
 
@@ -53,7 +59,7 @@ class Protocol(Value):
     name: str
     trial: TrialSpec
     pull: PullSpec | None = None
-    noise: PoseNoise = PoseNoise()
+    noise: PoseNoise = NO_NOISE
 
     def with_trial(self, **changes: Any) -> "Protocol":
         """Return the protocol with fields of its trial changed, such as `closing` or `force`.

@@ -37,7 +37,9 @@ def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[
         f"<h1>{escape(title)}</h1>",
         f'<p class="verdict{"" if value else " bad"}">{escape(verdict)}</p>',
         "<h2>Shares</h2>",
-        format_html_table(SHARES, [_share_row(name, found[key]) for key, name in SHARE_NAMES.items()], numbers={1, 3, 4}),
+        format_html_table(
+            SHARES, [_share_row(name, found[key]) for key, name in SHARE_NAMES.items()], numbers={1, 3, 4}
+        ),
         "<h2>By object and view</h2>",
         _objects(scores, found["by_object"]),
         "<h2>What went wrong, by stage</h2>",

@@ -119,7 +119,7 @@ def measure_shape(shape: ShapeGP, mesh: "trimesh.Trimesh", cloud: PointCloud, se
 def format_table(rows: Sequence[Row]) -> str:
     """Return rows of `measure_accuracy` as a table, one line a view, then the mean of each object and of all views."""
     within = ("hidden 1 2 3 sd", "seen 1 2 3 sd", "paper's 1 2 3 sd")
-    table = [("object", "view", "seen mm", "hidden mm  deg", *within, "sure mm  deg")]
+    table: list[tuple[str, ...]] = [("object", "view", "seen mm", "hidden mm  deg", *within, "sure mm  deg")]
 
     def line(name: str, view: str, r: Row) -> tuple[str, ...]:
         return (

@@ -14,9 +14,7 @@ MOST_LOST = 0.10
 """Largest loss of the share that passes without errors: the project's own bar."""
 
 
-def bench_noise(
-    objects: Path, hands: tuple[str, ...], draws: int, spec: EvaluationSpec, workers: int
-) -> list[Row]:
+def bench_noise(objects: Path, hands: tuple[str, ...], draws: int, spec: EvaluationSpec, workers: int) -> list[Row]:
     """Put the same grasps to the test with and without errors of the pose, under the law and in open loop."""
     noisy = PROTOCOLS["pose-noise"]
     noisy = dataclasses.replace(noisy, noise=dataclasses.replace(noisy.noise, draws=draws))
