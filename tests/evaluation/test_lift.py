@@ -51,7 +51,7 @@ def test_controllers_differ_and_waiting_keeps_the_object_still():
 def test_the_hand_may_stand_beside_where_it_was_planned_and_may_be_shaken():
     aside = torch.eye(4, dtype=torch.float64)
     aside[0, 3] = 0.004
-    result = close("allegro", spec=dataclasses.replace(QUICK, shake=0.003, hold_time=0.5), error=aside)
+    result = close("allegro", spec=dataclasses.replace(QUICK, shake=0.003, hold_time=0.5), error=aside.float())
     assert result.held
     _, grasp = pinch("allegro")
     planned = (grasp.obj_from_hand[0] @ aside)[:3, 3]

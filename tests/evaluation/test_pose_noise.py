@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.pose_noise import (
     PoseNoise,
     apply_error,
@@ -49,3 +50,18 @@ def test_a_hand_in_its_place_sees_a_moved_object_as_a_moved_hand_sees_the_object
     seen = apply(inverse(obj_from_hand), apply(place, points))
     true_pose = apply_error(obj_from_hand, error_from_object_pose(obj_from_hand, place))
     torch.testing.assert_close(apply(inverse(true_pose), points), seen)
+
+
+def test_an_error_of_any_dtype_and_device_moves_the_hand_in_its_planned_frame(generator) -> None:
+    turn, shift = torch.randn(2, 3, generator=generator, dtype=torch.float64)
+    planned, error = rigid(rotation_from_vector(turn), shift), torch.eye(4, dtype=torch.float64)
+    error[0, 3] = 0.25
+    devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+    for device in devices:
+        for dtype in (torch.float32, torch.float64):
+            pose = apply_error(planned.to(device), error.to(device, dtype))
+            assert pose.dtype is torch.float64 and pose.device.type == "cpu"
+            torch.testing.assert_close(pose, planned @ error, rtol=0, atol=1e-15)
+    assert torch.equal(apply_error(planned.float(), None), planned.float().double())
+    with pytest.raises(BadArgument, match="error: found"):
+        apply_error(planned, torch.full((4, 4), math.nan))

@@ -110,13 +110,12 @@ def test_bad_arguments_are_named():
             pull_grasp(trial, protocol)
     with pytest.raises(BadArgument, match="grasp: found 0 rows"):
         pull_grasp(dataclasses.replace(trial, grasp=grasp[:0]))
-    for changes, message in (({"force": -1.0}, "force: found -1"), ({"closing": "fast"}, "closing: found 'fast'")):
-        with pytest.raises(BadArgument, match=message):
-            QUICK.with_trial(**changes)
+    with pytest.raises(BadArgument, match="force: found -1"):
+        QUICK.with_trial(force=-1.0)
     with pytest.raises(BadArgument, match="joints: found 9 for"):
         pull_grasp(dataclasses.replace(trial, grasp=dataclasses.replace(grasp, pregrasp=grasp.pregrasp * 0 + 9)))
-    with pytest.raises(BadArgument, match="error: found shape"):
-        pull_grasp(dataclasses.replace(trial, error=torch.eye(3)))
+    with pytest.raises(BadArgument, match="error: found"):
+        pull_grasp(dataclasses.replace(trial, error=torch.full((4, 4), math.nan)))
     with pytest.raises(BadArgument, match="grasps: found 12 joints"):
         squeeze(pinch("barrett")[0], grasp)
 
