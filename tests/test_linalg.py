@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchgrasp.errors import IndefiniteCovariance
-from torchgrasp.linalg import cholesky, squared_mahalanobis, unit
+from torchgrasp.linalg import cholesky, farthest_points, limit_norm, squared_mahalanobis, unit
 
 
 def test_cholesky_raises_with_the_smallest_eigenvalue():
@@ -38,3 +38,32 @@ def test_unit(generator):
     v = torch.randn(9, 3, generator=generator)
     torch.testing.assert_close(unit(v).norm(dim=-1), torch.ones(9))
     assert bool(torch.isnan(unit(torch.zeros(3))).all())
+
+
+def test_farthest_points_are_all_points_when_there_are_few(generator):
+    p = torch.rand(5, 3, generator=generator)
+    assert sorted(farthest_points(p, 9).tolist()) == [0, 1, 2, 3, 4]
+    assert len(farthest_points(p[:0], 9)) == 0
+
+
+def test_each_farthest_point_is_the_farthest_from_those_before_it(generator):
+    p = torch.rand(60, 3, generator=generator, dtype=torch.float64)
+    picks = farthest_points(p, 12, first=7).tolist()
+    assert picks[0] == 7
+    for k in range(1, 12):
+        nearest = torch.cdist(p, p[picks[:k]]).amin(1)
+        assert nearest[picks[k]] == nearest.max()
+
+
+def test_of_points_that_tie_the_first_is_the_farthest():
+    p = torch.tensor([[0.0], [1.0], [1.0 + 1e-12]], dtype=torch.float64)
+    assert farthest_points(p, 2).tolist() == [0, 2] and farthest_points(p, 2, tie=1e-9).tolist() == [0, 1]
+
+
+def test_a_limited_norm_keeps_the_direction(generator):
+    v = torch.cat([torch.randn(20, 3, generator=generator, dtype=torch.float64), torch.zeros(1, 3)])
+    short = limit_norm(v, 1.0)
+    assert (short.norm(dim=-1) <= 1.0 + 1e-12).all()
+    within = v.norm(dim=-1) <= 1.0
+    assert torch.equal(short[within], v[within])
+    torch.testing.assert_close(unit(short[:20]), unit(v[:20]))

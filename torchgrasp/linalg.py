@@ -1,9 +1,10 @@
-"""Linear algebra without silent repair: checked Cholesky factors, Mahalanobis distances."""
+"""Linear algebra without silent repair: checked Cholesky factors, Mahalanobis distances, farthest points."""
 
 import math
+from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.errors import IndefiniteCovariance
@@ -38,6 +39,15 @@ def fibonacci_sphere(
     return torch.stack([ring * torch.cos(rotation), ring * torch.sin(rotation), z], -1)
 
 
+def limit_norm(v: Float[Tensor, "*b d"], longest: float) -> Float[Tensor, "*b d"]:
+    """Return vectors shortened to the length `longest` where they are longer.
+
+    >>> limit_norm(torch.tensor([3.0, 4.0]), 1.0)
+    tensor([0.6000, 0.8000])
+    """
+    return v * (longest / torch.linalg.vector_norm(v, dim=-1, keepdim=True).clamp_min(longest))
+
+
 def cholesky(matrix: Float[Tensor, "*b n n"], what: str, remedy: str) -> Float[Tensor, "*b n n"]:
     """Return the lower Cholesky factor, without jitter.
 
@@ -60,3 +70,35 @@ def squared_mahalanobis(difference: Float[Tensor, "*b d"], factor: Float[Tensor,
     """Return x^T Sigma^-1 x for the lower Cholesky factor of Sigma."""
     whitened = torch.linalg.solve_triangular(factor, difference[..., None], upper=False)[..., 0]
     return (whitened * whitened).sum(-1)
+
+
+def squared_distance(points: Float[Tensor, "n d"], one: Float[Tensor, "d"]) -> Float[Tensor, "n"]:
+    """Return the squared Euclidean distance of each point from one."""
+    return (points - one).square().sum(-1)
+
+
+def farthest_points(
+    points: Float[Tensor, "n *d"],
+    count: int,
+    first: int = 0,
+    tie: float = 0.0,
+    distance: Callable[[Tensor, Tensor], Tensor] = squared_distance,
+) -> Int[Tensor, "picks"]:
+    """Return the indices of at most `count` points, each the farthest from all points before it.
+
+    Args:
+        points: any values that `distance` compares.
+        count: the number of points.
+        first: index of the point to begin with.
+        tie: relative difference of distances that counts as none; of equally far points the first is taken.
+        distance: the distance of each point from one of them.
+
+    >>> farthest_points(torch.tensor([[0.0], [1.0], [9.0]]), 2)
+    tensor([0, 2])
+    """
+    picks = [first] if len(points) else []
+    nearest = torch.full((len(points),), torch.inf, dtype=points.dtype, device=points.device)
+    while len(picks) < min(count, len(points)):
+        nearest = torch.minimum(nearest, distance(points, points[picks[-1]]))
+        picks.append(int(torch.nonzero(nearest >= (1.0 - tie) * nearest.max())[0]))
+    return torch.tensor(picks, dtype=torch.long, device=points.device)

@@ -22,6 +22,7 @@ from torchgrasp.ik.query import query_mixture
 from torchgrasp.ik.ranking import rank_by_success
 from torchgrasp.ik.sdf import field_from_surface
 from torchgrasp.ik.success import success_features, success_odds
+from torchgrasp.linalg import farthest_points
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure_probability import closure_share
 from torchgrasp.plan.solve import plan_contacts
@@ -65,12 +66,7 @@ def spread_rows(plan: ContactPlan, most: int) -> Int[Tensor, "k"]:
     points = plan.contacts.points[rows]
     order = torch.argsort(points[..., 2], dim=1, stable=True)
     place = points.gather(1, order[..., None].expand(-1, -1, 3)).flatten(1)
-    chosen = torch.zeros(most, dtype=torch.int64, device=rows.device)
-    chosen[0] = plan.quality[rows].argmin()
-    distance = torch.full_like(place[:, 0], torch.inf)
-    for k in range(1, most):
-        distance = torch.minimum(distance, (place - place[chosen[k - 1]]).square().sum(1))
-        chosen[k] = distance.argmax()
+    chosen = farthest_points(place, most, first=int(plan.quality[rows].argmin()))
     return rows[chosen.sort().values]
 
 

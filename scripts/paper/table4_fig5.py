@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
 
 from torchgrasp import (
     Contacts,
@@ -22,6 +23,7 @@ from torchgrasp import (
     plan_contacts,
 )
 from torchgrasp.files import write_atomically, write_file
+from torchgrasp.linalg import farthest_points
 from torchgrasp.plan.closure_probability import closure_probability
 from torchgrasp.report.canvas import Canvas, draw_bar
 from torchgrasp.report.palette import INK, PAPER
@@ -144,14 +146,12 @@ def fig5(out: Path, starts: int = 300, seed: int = 0) -> None:
 
 def unlike(contacts: Contacts, count: int) -> Contacts:
     """Return grasps whose contacts are far from each other's, whichever finger takes them."""
-    places = contacts.points
-    apart = torch.cdist(places.flatten(0, 1), places.flatten(0, 1)).unflatten(0, (-1, 3)).unflatten(2, (-1, 3))
-    distance = apart.amin(1).amax(-1)  # from the contact of one grasp that is farthest from all of another's
-    distance = torch.maximum(distance, distance.T)
-    picks = [0]
-    while len(picks) < min(count, len(contacts)):
-        picks.append(int(distance[picks].amin(0).argmax()))
-    return contacts[torch.tensor(picks)]
+
+    def hausdorff(places: Tensor, one: Tensor) -> Tensor:
+        apart = torch.cdist(places, one.expand_as(places))
+        return torch.maximum(apart.amin(1).amax(-1), apart.amin(2).amax(-1))
+
+    return contacts[farthest_points(contacts.points, count, distance=hausdorff)]
 
 
 def draw(surface: Surface, contacts: Contacts, most: float) -> Image.Image:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.linalg import cholesky, squared_mahalanobis
+from torchgrasp.linalg import cholesky, limit_norm, squared_mahalanobis
 
 POSITION_FLOOR = 0.005
 """Isotropic standard deviation [m] that is added to the one along the normal. Eq. (27) needs it: for a normal along
@@ -100,8 +100,7 @@ def tip_velocity(
     """Return the bracket of Eq. (25) [m/s] for each fingertip, no faster than `max_speed`; the direction is kept."""
     share = blend[..., None]
     velocity = (1 - share) * position_gain * position_error + share * force_gain * force_error
-    speed = torch.linalg.vector_norm(velocity, dim=-1, keepdim=True)
-    return velocity * (max_speed / speed.clamp_min(max_speed))
+    return limit_norm(velocity, max_speed)
 
 
 def joint_step(

@@ -11,8 +11,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Batch, pick, put
+from torchgrasp.linalg import limit_norm
 from torchgrasp.plan.objectives import Cost, differentiate_cost
 from torchgrasp.plan.problem import Constraints, ContactProblem, Shape, TripleJet, forces_from_tensions, triple_jet
+from torchgrasp.shape.surface import newton_step
 
 LONGEST_STEP = 0.3
 """A point moves at most this far in a step, in normalised units: about the range in which the surface is smooth."""
@@ -82,9 +84,7 @@ def project(shape: Shape, points: Float[Tensor, "b k 3"], steps: int) -> Float[T
     x = points.flatten(0, 1)
     for _ in range(steps):
         distance, gradient = shape.slope(x)
-        move = -(distance / (gradient * gradient).sum(-1))[:, None] * gradient
-        length = torch.linalg.vector_norm(move, dim=-1, keepdim=True)
-        x = x + move * (LONGEST_STEP / length).clamp(max=1.0)
+        x = x + limit_norm(newton_step(distance, gradient, gradient)[:, None] * gradient, LONGEST_STEP)
     return x.view_as(points)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.errors import BadArgument
-from torchgrasp.linalg import unit
+from torchgrasp.linalg import limit_norm, unit
 from torchgrasp.shape.gp import ShapeGP
 
 if TYPE_CHECKING:
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 NEWTON_STEPS = 3
 """Steps that move the vertices of marching cubes onto the zero level."""
-MAX_STEP = 1.0
-"""Longest Newton step, in cells."""
+LEAST_SLOPE = 1e-12
+"""Least squared gradient with which a Newton step is computed: a stationary vertex stays."""
 LEAST_SHARE = 0.02
 """A sheet of the zero level is kept when at least this share of the cloud lies nearest to it (an ear, a handle)."""
 
@@ -80,10 +80,8 @@ def extract_surface(shape: ShapeGP, resolution: int = 48) -> Surface:
     faces = torch.from_numpy(faces.reshape(-1, 3).astype(np.int64)).to(device)
     for _ in range(NEWTON_STEPS):
         jet = shape.jet(x)
-        move = -jet.distance / (jet.gradient**2).sum(-1).clamp_min(1e-12)
-        move = move[:, None] * jet.gradient
-        length = torch.linalg.vector_norm(move, dim=-1, keepdim=True)
-        x = x + move * (MAX_STEP * step / length.clamp_min(MAX_STEP * step))
+        move = newton_step(jet.distance, jet.gradient, jet.gradient, LEAST_SLOPE)[:, None] * jet.gradient
+        x = x + limit_norm(move, step)
     jet = shape.jet(x)
     a, b, c = x[faces].unbind(1)
     across = torch.linalg.cross(b - a, c - a)
@@ -94,6 +92,22 @@ def extract_surface(shape: ShapeGP, resolution: int = 48) -> Surface:
         normals=unit(jet.gradient),
         std_m=shape.std_factor * shape.scale * torch.sqrt(jet.variance),
     )
+
+
+def newton_step(
+    value: Float[Tensor, "n"],
+    gradient: Float[Tensor, "n 3"],
+    direction: Float[Tensor, "n 3"],
+    least_slope: float = 0.0,
+) -> Float[Tensor, "n"]:
+    """Return the multiple of `direction` that leads onto the zero level, Eq. (9), to first order.
+
+    Args:
+        value, gradient: of the mean.
+        direction: where to go, often the gradient itself.
+        least_slope: a smaller derivative along the direction counts as this one.
+    """
+    return -value / (gradient * direction).sum(-1).clamp_min(least_slope)
 
 
 def _carries_cloud(corners: np.ndarray, faces: np.ndarray, shape: ShapeGP) -> np.ndarray:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchgrasp.frames import apply, rotate
 from torchgrasp.shape.completion.complete import LEAST_NOISE, Completion, complete_cloud
-from torchgrasp.shape.completion.silhouette import farthest_points, silhouette
+from torchgrasp.shape.completion.silhouette import silhouette
 from torchgrasp.values import PointCloud
 
 CAMERA = torch.tensor([0.45, 0.0, 0.3], dtype=torch.float64)
@@ -150,9 +150,3 @@ def test_silhouette_of_a_ball_is_its_circle():
     violation = outline.violation(probe)
     assert violation[0] == 0 and violation[2] == 0
     assert violation[1] == hull[1] and violation[3].item() == pytest.approx(0.03 - 0.002, abs=0.002)
-
-
-def test_farthest_points_are_all_points_when_there_are_few():
-    p = torch.rand(5, 3, generator=torch.Generator().manual_seed(0))
-    assert sorted(farthest_points(p, 9).tolist()) == [0, 1, 2, 3, 4]
-    assert len(farthest_points(p[:0], 9)) == 0

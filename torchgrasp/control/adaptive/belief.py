@@ -20,6 +20,7 @@ from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import FLAT_RADIUS, PLACE_NOISE
 from torchgrasp.frames import apply, inverse, rotate
 from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.surface import newton_step
 from torchgrasp.values import ShapeEstimate
 
 SURPRISE = 2.0
@@ -99,8 +100,7 @@ class Belief:
         along = torch.zeros_like(points[:, 0])
         for _ in range(NEWTON_STEPS):
             off, normal = self._distance(points + along[:, None] * lines)
-            slope = (normal * lines).sum(-1).clamp_min(LEAST_SLOPE)
-            along = (along - off / slope).clamp(-FARTHEST, FARTHEST)
+            along = (along + newton_step(off, normal, lines, LEAST_SLOPE)).clamp(-FARTHEST, FARTHEST)
         return along, self.shape.predict(self.shape.metres(self._within(points + along[:, None] * lines)))
 
     def _distance(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:

@@ -8,8 +8,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.linalg import farthest_points
 from torchgrasp.shape.completion.revolution import find_revolution
-from torchgrasp.shape.completion.silhouette import Outlines, farthest_points
+from torchgrasp.shape.completion.silhouette import TIE, Outlines
 from torchgrasp.shape.completion.symmetry import (
     SymmetryScene,
     find_planes,
@@ -106,7 +107,7 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
     images = _mirror_parts(parts)
     images.sort(key=lambda image: -image.score)
     kept = _keep(scene, _Image.of(scene, torch.arange(0), len(planes)), images)
-    kept = kept.select(farthest_points(kept.points, budget))
+    kept = kept.select(farthest_points(kept.points, budget, tie=TIE))
     return Completion(
         points=kept.points,
         normals=kept.normals,

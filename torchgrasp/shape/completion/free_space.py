@@ -4,7 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.shape.completion.silhouette import Outlines, Silhouette, farthest_points
+from torchgrasp.linalg import farthest_points
+from torchgrasp.shape.completion.silhouette import TIE, Outlines, Silhouette
 from torchgrasp.shape.gp import ShapeGP
 
 OUTLINE_ERROR = 0.005
@@ -70,7 +71,7 @@ def free_space_violations(shape: ShapeGP, x: Float[Tensor, "n 3"], least: Float[
     short = shape.mean(x) - least
     rows = torch.nonzero(short < -TOLERANCE / shape.scale)[:, 0]
     rows = rows[torch.argsort(short[rows], stable=True)]
-    return rows[farthest_points(x[rows], MOST)]
+    return rows[farthest_points(x[rows], MOST, tie=TIE)]
 
 
 def _points_beside(outline: Silhouette, origin: Float[Tensor, "3"], scale: float) -> Float[Tensor, "n 3"]:
@@ -88,4 +89,4 @@ def _rays_beside(outline: Silhouette, offset: float) -> Float[Tensor, "k 3"]:
     row, column = torch.nonzero(near, as_tuple=True)
     place = outline.corner + outline.cell * torch.stack([column, row], -1).double()
     rays = torch.cat([place, torch.ones_like(place[:, :1])], -1)
-    return rays[farthest_points(rays, RAYS)]
+    return rays[farthest_points(rays, RAYS, tie=TIE)]

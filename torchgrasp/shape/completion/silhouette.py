@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.errors import BadArgument
-from torchgrasp.linalg import unit
+from torchgrasp.linalg import farthest_points, unit
 from torchgrasp.values import PointCloud
 
 CELLS = 4.0
@@ -25,8 +25,9 @@ BEHIND, PIXELS = 0.3, 6
 degrees would explain."""
 MOST_BEHIND = 0.2
 """Share of points behind others from which a cloud is no single view."""
-TIE = 1e-9
-"""Relative difference of two distances that rounding can make."""
+TIE = 2e-9
+"""Relative difference of squared distances that rounding can make: on a raster many points are equally far, and the
+frame must not decide between them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +105,7 @@ def silhouettes(cloud: PointCloud) -> Outlines:
     Raises:
         BadArgument: a camera that has not the whole of its view in front of it, or no single view.
 
-    >>> cap = torch.rand(99, 3).double() - 0.5
+    >>> cap = torch.rand(99, 3).double() * torch.tensor([0.1, 0.1, 0.01])
     >>> len(silhouettes(PointCloud(cap, viewpoint=torch.tensor([0.0, 0.0, 9.0]).double())).views)
     1
     """
@@ -158,21 +159,6 @@ def silhouette(cloud: PointCloud, viewpoint: Float[Tensor, "3"], n_rim: int = 16
         rim=torch.from_numpy(rim) @ axes + viewpoint,
         rim_normals=torch.from_numpy(rim_normals) @ axes,
     )
-
-
-def farthest_points(points: Float[Tensor, "n 3"], n: int) -> Tensor:
-    """Return the indices of at most n points, each the farthest from those before it, beginning at the first.
-
-    >>> farthest_points(torch.tensor([[0.0, 0, 0], [1, 0, 0], [9, 0, 0]]), 2)
-    tensor([0, 2])
-    """
-    picks = [0] if len(points) else []
-    distance = torch.full((len(points),), torch.inf, dtype=points.dtype, device=points.device)
-    while len(picks) < min(n, len(points)):
-        distance = torch.minimum(distance, torch.linalg.vector_norm(points - points[picks[-1]], dim=-1))
-        # Of points equally far, as on a raster, the first: not the one that rounding favours in this frame.
-        picks.append(int(torch.nonzero(distance >= (1.0 - TIE) * distance.max())[0]))
-    return torch.tensor(picks, dtype=torch.long, device=points.device)
 
 
 def _check_view(view: PointCloud) -> None:
@@ -251,7 +237,7 @@ def _rim(
     if len(place) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3))
     flat = torch.from_numpy(np.concatenate([place, np.zeros((len(place), 1))], -1))
-    picks = farthest_points(flat, n).numpy()
+    picks = farthest_points(flat, n, tie=TIE).numpy()
     place, slope = place[picks], slope[picks]
     _, index = KDTree(pixels).query(place, k=min(4, len(pixels)))
     depth = np.median(depths[index].reshape(len(place), -1), axis=-1)

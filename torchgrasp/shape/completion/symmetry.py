@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.linalg import fibonacci_sphere, unit
-from torchgrasp.shape.completion.silhouette import Outlines, farthest_points, silhouettes
+from torchgrasp.linalg import farthest_points, fibonacci_sphere, unit
+from torchgrasp.shape.completion.silhouette import TIE, Outlines, silhouettes
 from torchgrasp.values import PointCloud
 
 TAU = 0.003
@@ -61,7 +61,7 @@ class SymmetryScene:
 
     def scored_by(self, rows: Int[Tensor, "k"]) -> "SymmetryScene":
         """Return the same scene, scored by some points of the cloud."""
-        rows = rows[farthest_points(self.points[rows], PROBES)]
+        rows = rows[farthest_points(self.points[rows], PROBES, tie=TIE)]
         return dataclasses.replace(self, probes=self.points[rows], probe_normals=self.normals[rows])
 
     @property
