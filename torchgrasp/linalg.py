@@ -18,21 +18,18 @@ def unit(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
     return v / torch.linalg.vector_norm(v, dim=-1, keepdim=True)
 
 
-def fibonacci_sphere(
-    n: int, like: Tensor, angle: float = math.pi * (1 + math.sqrt(5)), start: float = 0.5
-) -> Float[Tensor, "n 3"]:
-    """Return n unit vectors spread evenly over the sphere from +z to -z, in the dtype and on the device of `like`.
+def fibonacci_sphere(n: int, angle: float = math.pi * (1 + math.sqrt(5)), start: float = 0.5) -> Float[Tensor, "n 3"]:
+    """Return n unit vectors spread evenly over the sphere, from +z to -z, in float64.
 
     Args:
         n: number of vectors.
-        like: any tensor.
-        angle: rotation about z from one vector to the next [rad], `GOLDEN_ANGLE` in either sense.
+        angle: rotation about z from one vector to the next [rad]: `GOLDEN_ANGLE`, in either sense.
         start: rotation of the first vector, in units of `angle`.
 
-    >>> fibonacci_sphere(4, torch.zeros(0))[:, 2]
-    tensor([ 0.7500,  0.2500, -0.2500, -0.7500])
+    >>> fibonacci_sphere(4)[:, 2]
+    tensor([ 0.7500,  0.2500, -0.2500, -0.7500], dtype=torch.float64)
     """
-    k = torch.arange(n, dtype=like.dtype, device=like.device)
+    k = torch.arange(n, dtype=torch.float64)
     z = 1 - (2 * k + 1) / n
     rotation = angle * (k + start)
     ring = torch.sqrt(1 - z * z)

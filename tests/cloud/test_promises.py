@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from torchgrasp.cloud import check, diagnose, filter, merge, orientation, prepare, viewpoint
+from torchgrasp.cloud import check, diagnose, filter, merge, orientation, prepare
 from torchgrasp.errors import BadArgument, GraspError, SuspiciousScale, TooFewPoints
 from torchgrasp.linalg import unit
 from torchgrasp.shape.fit import fit_shape
@@ -20,7 +20,7 @@ FUNCTIONS = {
     "estimate_normals": prepare.estimate_normals,
     "clean_cloud": prepare.clean_cloud,
     "prepare_cloud": lambda cloud: prepare.prepare_cloud(cloud, torch.Generator()),
-    "estimate_viewpoint": viewpoint.estimate_viewpoint,
+    "estimate_viewpoint": orientation.estimate_viewpoint,
     "check_normals": lambda cloud: orientation.check_normals(cloud),
     "merge_clouds": lambda cloud: merge.merge_clouds([cloud, cloud], [torch.eye(4).double()] * 2),
     "diagnose_cloud": diagnose.diagnose_cloud,
@@ -187,7 +187,7 @@ def test_strays_go_lengths_do_not_matter_and_zero_is_refused():
 def test_every_function_on_clouds_is_in_the_table():
     public = {
         name
-        for module in (check, filter, merge, prepare, viewpoint, orientation, diagnose)
+        for module in (check, filter, merge, prepare, orientation, diagnose)
         for name, function in inspect.getmembers(module, inspect.isfunction)
         if function.__module__ == module.__name__ and not name.startswith("_")
         if "cloud" in str(inspect.signature(function))

@@ -4,8 +4,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from torchgrasp.cloud.camera import look_at, partial_view
+from torchgrasp.cloud.orientation import estimate_viewpoint, share_facing
 from torchgrasp.cloud.prepare import estimate_normals
-from torchgrasp.cloud.viewpoint import estimate_viewpoint, share_facing
 from torchgrasp.frames import apply, inverse
 from torchgrasp.objects import list_objects, load_object
 from torchgrasp.values import PointCloud

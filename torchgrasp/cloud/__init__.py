@@ -7,9 +7,8 @@ from torchgrasp.cloud.diagnose import CloudReport, diagnose_cloud, format_report
 from torchgrasp.cloud.filter import remove_outliers, voxel_downsample
 from torchgrasp.cloud.io.read import read_cloud, save_cloud
 from torchgrasp.cloud.merge import merge_clouds
-from torchgrasp.cloud.orientation import NormalCheck, check_normals
+from torchgrasp.cloud.orientation import NormalCheck, check_normals, estimate_viewpoint
 from torchgrasp.cloud.prepare import PreparedCloud, clean_cloud, estimate_normals, prepare_cloud
-from torchgrasp.cloud.viewpoint import estimate_viewpoint
 
 __all__ = [
     "CloudReport",

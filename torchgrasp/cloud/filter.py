@@ -1,8 +1,6 @@
 """Fewer points: one a voxel, or without the outliers."""
 
 import torch
-from jaxtyping import Bool
-from torch import Tensor
 
 from torchgrasp.cloud.check import MIN_POINTS, check_cloud, remove_duplicates
 from torchgrasp.cloud.neighbours import find_inliers
@@ -43,7 +41,8 @@ def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
     first[1:] = group[order][1:] != group[order][:-1]
     keep = torch.zeros_like(first)
     keep[order[first]] = True
-    check_enough(keep, f"voxels of {voxel:g} m")
+    if int(keep.sum()) < MIN_POINTS:
+        raise TooFewPoints("points", f"{int(keep.sum())} voxels of {voxel:g} m", f"at least {MIN_POINTS}")
     return cloud.select(keep)
 
 
@@ -64,11 +63,4 @@ def remove_outliers(cloud: PointCloud) -> PointCloud:
     True
     """
     cloud = remove_duplicates(cloud)
-    return cloud.select(check_enough(find_inliers(cloud.points.double()), "inliers"))
-
-
-def check_enough(keep: Bool[Tensor, "n"], what: str) -> Bool[Tensor, "n"]:
-    """Return a mask of points; refuse one that leaves fewer than 4, calling them `what`."""
-    if int(keep.sum()) < MIN_POINTS:
-        raise TooFewPoints("points", f"{int(keep.sum())} {what}", f"at least {MIN_POINTS}")
-    return keep
+    return cloud.select(find_inliers(cloud.points.double()))

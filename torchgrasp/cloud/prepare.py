@@ -8,10 +8,8 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.cloud.check import remove_duplicates
-from torchgrasp.cloud.filter import check_enough
 from torchgrasp.cloud.neighbours import find_inliers, fit_planes, fit_quadrics
-from torchgrasp.cloud.orientation import compare_normals
-from torchgrasp.cloud.viewpoint import guess_viewpoint, orient_normals, share_facing
+from torchgrasp.cloud.orientation import compare_normals, guess_viewpoint, orient_normals, share_facing
 from torchgrasp.errors import BadArgument, TooFewPoints
 from torchgrasp.linalg import unit
 from torchgrasp.values import PointCloud
@@ -80,14 +78,14 @@ def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = T
     cloud = PointCloud(points, normals, viewpoint)
     if clean or normals is None:
         cloud = _fit_normals(cloud, clean)
-    wide = cloud.to(torch.float64)
-    if clean and wide.viewpoint is None:
-        guess = guess_viewpoint(wide.points, fit_planes(wide.points)[0]).to(points.dtype)
-        wide = PointCloud(wide.points, wide.normals, guess.double())
-    if len(wide) > MAX_POINTS:
-        wide = wide.select(torch.randperm(len(wide), generator=generator)[:MAX_POINTS].to(points.device))
-    assert wide.normals is not None
-    return PreparedCloud(cloud, wide.points, unit(wide.normals), wide.viewpoint)
+    double = cloud.to(torch.float64)
+    if clean and double.viewpoint is None:
+        guess = guess_viewpoint(double.points, fit_planes(double.points)[0]).to(points.dtype)
+        double = PointCloud(double.points, double.normals, guess.double())
+    if len(double) > MAX_POINTS:
+        double = double.select(torch.randperm(len(double), generator=generator)[:MAX_POINTS].to(points.device))
+    assert double.normals is not None
+    return PreparedCloud(cloud, double.points, unit(double.normals), double.viewpoint)
 
 
 def estimate_normals(cloud: PointCloud) -> PointCloud:
@@ -130,12 +128,12 @@ def clean_cloud(cloud: PointCloud) -> PointCloud:
 def _fit_normals(cloud: PointCloud, clean: bool) -> PointCloud:
     """Return distinct points with oriented normals of local quadrics; `clean` ones without outliers and on those."""
     if clean:
-        cloud = cloud.select(check_enough(find_inliers(cloud.points.double()), "inliers"))
+        cloud = cloud.select(find_inliers(cloud.points.double()))
     points = cloud.points
     feet, normals, rms = fit_quadrics(points.double())
     if clean:
         offset = torch.linalg.vector_norm(points.double() - feet, dim=-1)
-        keep = check_enough(offset <= OFFSET_RATIO * rms.median() + 1e-12, "inliers")
+        keep = offset <= OFFSET_RATIO * rms.median() + 1e-12
         cloud, points, normals = cloud.select(keep), feet.to(points.dtype)[keep], normals[keep]
     viewpoint = cloud.viewpoint
     if viewpoint is None and cloud.normals is not None:

@@ -76,11 +76,11 @@ def least_friction_forces(
     tensor([ 1.,  1., -2.])
     """
     basis = internal_forces(points)
-    spots = fibonacci_sphere(DIRECTIONS, points, GOLDEN_ANGLE, 0.0)
+    spots = fibonacci_sphere(DIRECTIONS, GOLDEN_ANGLE, 0.0).to(points)
     shape = points.shape[:-2]
     wish = None if wish is None else (wish / wish.amax(-1, keepdim=True))[..., None, :]
     weights, cost = _best(spots.expand(*shape, -1, 3), basis, normals, wish)
-    near, reach = fibonacci_sphere(64, points, GOLDEN_ANGLE, 0.0), 4 / math.sqrt(DIRECTIONS)
+    near, reach = fibonacci_sphere(64, GOLDEN_ANGLE, 0.0).to(points), 4 / math.sqrt(DIRECTIONS)
     for _ in range(REFINEMENTS):
         around = unit(weights[..., None, :] + reach * near)
         around = torch.cat([weights[..., None, :], around], dim=-2)

@@ -181,7 +181,7 @@ def _camera_support(seen: PreparedCloud, noise: float, table: float | None) -> _
         surface = torch.cat([surface, completion.points.to(surface)])
         free = free_space(completion.outline, center, scale, table)
         inside = float(completion.outline.violation(center.cpu())) == 0.0  # not so for an arch or a bowl
-    sphere = OUTER_RADIUS * fibonacci_sphere(OUTER_POINTS, center)
+    sphere = OUTER_RADIUS * fibonacci_sphere(OUTER_POINTS).to(center)
     x = torch.cat([torch.zeros_like(center)[None], sphere]) if inside else sphere
     distance = torch.cdist(x, (surface - center) / scale).amin(1)
     distance = torch.cat([-distance[:1], distance[1:]]) if inside else distance

@@ -34,7 +34,7 @@ def observe(x: Tensor, normals: Tensor, noise: float = NOISE) -> Observations:
 
 def observe_support(x: Tensor) -> Observations:
     """Return the origin and 20 points on a sphere of 1.2 with their signed distances to a view, without normals."""
-    anchors = torch.cat([torch.zeros(1, 3, dtype=torch.float64), 1.2 * fibonacci_sphere(20, x)])
+    anchors = torch.cat([torch.zeros(1, 3, dtype=torch.float64), 1.2 * fibonacci_sphere(20).to(x)])
     away = torch.cdist(anchors, x).amin(1)
     away[0] = -away[0]
     return off_surface(anchors, away, NOISE)

@@ -100,7 +100,7 @@ def find_planes(scene: SymmetryScene) -> tuple[Float[Tensor, "p 4"], Float[Tenso
     size = scene.size
     view = torch.stack([unit(scene.center - seen.viewpoint) for seen in scene.outline.views]).mean(0)
     if scene.table is None:
-        directions = fibonacci_sphere(2 * DIRECTIONS, scene.points)[:DIRECTIONS]  # a half sphere: n and -n are one
+        directions = fibonacci_sphere(2 * DIRECTIONS)[:DIRECTIONS]  # a half sphere: n and -n are one
         rim_prior = 0.15
     else:
         angle = torch.arange(ANGLES, dtype=torch.float64) * math.pi / ANGLES
