@@ -1,4 +1,4 @@
-"""The public law for hands: what a hand of your own must satisfy before torchgrasp can plan with it."""
+"""The public law for hands: what torchgrasp needs of a hand of your own."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,10 +23,10 @@ FK_TOLERANCE = 1e-6
 
 
 def check_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
-    """Check a hand's files and return the hand: the public law for hands.
+    """Check a hand's files and return the hand.
 
-    The law covers coupling, limits, drives, masses, inertias, pads, the parked posture and self-collision. It compares
-    the forward kinematics with pytorch-kinematics and with yourdfpy, which applies `<mimic>` by itself.
+    The law covers coupling, limits, drives, masses, pads, parked joints and self-collision. The forward kinematics
+    must equal those of pytorch-kinematics and of yourdfpy, which applies `<mimic>` by itself.
 
     Args:
         name_or_path: a shipped hand, or the folder of another one.
@@ -76,44 +76,44 @@ def random_joints(hand: Hand, n: int, seed: int = 0) -> Float[Tensor, "n h"]:
 def _wrong_bodies(urdf: Urdf) -> Iterator[HandFileError]:
     """Find masses and inertias that no body can have."""
     for link in urdf.links:
-        where = f"{urdf.path}: link {link.name}"
         if not link.mass > 0:
-            yield HandFileError("urdf", f"{where} of mass {link.mass} kg", "a positive mass")
+            yield urdf.wrong(f"link {link.name} of mass {link.mass} kg", "a positive mass")
         xx, xy, xz, yy, yz, zz = link.inertia
         principal = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         if principal[0] <= 0 or principal[0] + principal[1] < principal[2] * (1 - 1e-6):
-            yield HandFileError("urdf", f"{where} of principal inertias {principal}", "positive, any two >= the third")
+            found = f"link {link.name} of principal inertias {principal}"
+            yield urdf.wrong(found, "positive, any two >= the third")
 
 
 def _wrong_joints(urdf: Urdf, spec: HandSpec, hand: Hand) -> Iterator[HandFileError]:
-    """Find drives that cannot move, and parked and coupled joints beyond their limits."""
+    """Find drives without effort, and parked or coupled joints beyond their limits."""
     for joint in urdf.movable:
         if not (joint.effort > 0 and joint.velocity > 0):
-            found = f"{urdf.path}: joint {joint.name} of effort {joint.effort}, velocity {joint.velocity}"
-            yield HandFileError("urdf", found, "positive effort and velocity")
+            found = f"joint {joint.name} of effort {joint.effort}, velocity {joint.velocity}"
+            yield urdf.wrong(found, "positive effort and velocity")
     ends = hand.expand_joints(torch.stack([hand.lower, hand.upper])).T.tolist()
     for joint, values in zip(urdf.movable, ends, strict=True):
         for value in [q for q in values if not joint.lower - 1e-6 <= q <= joint.upper + 1e-6][:1]:
-            found = f"{spec.path}: joint {joint.name} at {value:.6g}"
-            yield HandFileError("hand.toml", found, f"within its limits [{joint.lower:.6g}, {joint.upper:.6g}]")
+            allowed = f"within its limits [{joint.lower:.6g}, {joint.upper:.6g}]"
+            yield spec.wrong(f"joint {joint.name} at {value:.6g}", allowed)
 
 
 def _wrong_pads(urdf: Urdf, spec: HandSpec) -> Iterator[HandFileError]:
-    """Find fingertips that their own joints do not move, and contacts inside the tip's own shapes."""
+    """Find fingers with wrong joints, and contacts inside the tip's own shapes."""
     shapes = {x.name: x.shapes for x in urdf.links}
     for finger in spec.all_fingers:
         movers = [j.name for j in reversed(urdf.movers(finger.tip_link))]
         if list(finger.joints) != movers:
-            found = f"{spec.path}: finger {finger.name} of joints {list(finger.joints)}"
-            yield HandFileError("hand.toml", found, f"the joints above {finger.tip_link} in order, {movers}")
+            found = f"finger {finger.name} of joints {list(finger.joints)}"
+            yield spec.wrong(found, f"the joints above {finger.tip_link} in order, {movers}")
         outside = np.array(finger.pad.contact) + 1e-4 * np.array(finger.pad.normal)
         if any(_inside(outside, shape) for shape in shapes[finger.tip_link]):
-            found = f"{spec.path}: the contact of finger {finger.name} lies inside its tip's shape"
-            yield HandFileError("hand.toml", found, "a contact on the surface, its normal outward")
+            found = f"the contact of finger {finger.name} lies inside its tip's shape"
+            yield spec.wrong(found, "a contact on the surface, its normal outward")
 
 
 def _inside(point: np.ndarray, shape: Shape) -> bool:
-    """Tell whether a point of a link lies in one of its shapes."""
+    """Tell whether a point of a link lies in a shape."""
     x, y, z = rotation_from_rpy(shape.rpy).numpy().T @ (point - shape.xyz)
     if shape.kind == "box":
         return bool((2 * np.abs([x, y, z]) < shape.size).all())
@@ -123,10 +123,7 @@ def _inside(point: np.ndarray, shape: Shape) -> bool:
 
 
 def largest_fk_error(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[float, str]:
-    """Return the largest difference [m, and entries of rotations] of a link's pose from others', and the link.
-
-    The others are yourdfpy and pytorch-kinematics.
-    """
+    """Return the largest difference of a pose from yourdfpy's and pytorch-kinematics', and its link."""
     import yourdfpy
 
     robot = yourdfpy.URDF.load(str(hand.urdf_path), load_meshes=False, load_collision_meshes=False)
@@ -141,7 +138,7 @@ def largest_fk_error(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[float, s
 
 
 def reference_poses(urdf: Urdf, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
-    """Return `root_from_link` of every link by pytorch-kinematics, which is good to 1e-8 m."""
+    """Return `root_from_link` of every link by pytorch-kinematics, accurate to 1e-8 m."""
     import pytorch_kinematics
 
     chain: Any = pytorch_kinematics.build_chain_from_urdf(urdf.kinematic_xml())

@@ -1,4 +1,4 @@
-"""Which pairs of links can meet: learned from random postures, once for a hand, and stored in its hand.toml."""
+"""The pairs of links that can meet, learned from random postures. hand.toml stores them."""
 
 from collections.abc import Mapping
 
@@ -21,9 +21,9 @@ ROWS_PER_CHUNK = 1000
 
 
 def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, seed: int = 0) -> list[tuple[str, str]]:
-    """Return the pairs of links without a common joint that meet in some postures, but not in nearly all.
+    """Return the pairs of links that meet in some postures, but not in nearly all. Neighbours are left out.
 
-    The postures are uniform within the limits of every joint, so that the pairs serve all finger options.
+    Every joint is uniform within its limits, so that the pairs serve all finger options.
 
     Args:
         urdf: the hand's tree, with collision shapes.

@@ -1,8 +1,8 @@
-"""Spheres that cover the hand's links, for the clearance from the object and the table.
+"""Spheres that cover the hand's links, for clearance from object and table.
 
-Each collision shape of the URDF is cut into cells, and each cell gets a sphere. Spheres stand out of flat faces by up
-to 4 mm: no surface with a radius of curvature of 25 mm or more reaches a face between them. Edges of fingers stick out
-of the spheres by up to 4 mm, corners of the palm by 9 mm.
+Each collision shape is cut into cells, one sphere each. The spheres stand out of flat faces by up to 4 mm. No surface
+with a radius of curvature above 25 mm reaches a face between them. Edges of fingers stick out of the spheres by up to
+4 mm, corners of the palm by 9 mm.
 """
 
 import dataclasses
@@ -34,8 +34,7 @@ INSET = 0.001
 class CollisionSpheres(Value):
     """Spheres fixed to links: `center` [m] in the link's frame, `radius` [m].
 
-    `finger` is the finger's index in grasp order, -1 for the palm, -2 for parked fingers. `touching` marks the
-    fingertips, which are meant to touch the object.
+    `finger` is the index in grasp order, -1 for the palm, -2 for parked fingers. `touching` marks the fingertips.
     """
 
     link_index: Int[Tensor, " s"]
@@ -69,10 +68,11 @@ def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
 
 
 def _cover(shape: Shape, cell: float, bulge: float) -> tuple[list[Triple], float]:
-    """Return the centres and the radius of the spheres that cover a shape; a cylinder is cut as its bounding box."""
+    """Return the centres and the radius of the spheres that cover a shape."""
     if shape.kind == "sphere":
         return [shape.xyz], shape.size[0]
     cylinder = shape.kind == "cylinder"
+    # a cylinder is cut as its bounding box
     size = (2 * shape.size[0], 2 * shape.size[0], shape.size[1]) if cylinder else shape.size
     counts = [1 if x == min(size) and x < SINGLE_LAYER else max(1, round(x / cell)) for x in size]
     half = [x / n / 2 for x, n in zip(size, counts, strict=True)]

@@ -1,12 +1,12 @@
-"""A first hand.toml for a URDF: fingers, pads, coupling and pairs of links, as far as tree and shapes tell.
+"""A first hand.toml for a URDF: fingers, pads, coupling, pairs of links.
 
-A URDF does not say where a finger's pad is. Here the pad faces the way in which the finger's last joint bends: to the
-side where that joint has most of its range. If both sides have as much, it bends to the middle of the fingertips.
+A URDF does not say where a finger's pad is. Here the pad faces the way in which the finger's last joint bends. A joint
+bends to the side with most of its range. If both sides have as much, it bends towards the other fingertips.
 """
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from torchgrasp.frames import rotation_from_rpy
 from torchgrasp.hand.collision_pairs import collision_pairs, draw_postures
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import map_points, tree_from_urdf
-from torchgrasp.hand.urdf import Joint, Mimic, Shape, Triple, Urdf, read_urdf
+from torchgrasp.hand.urdf import Joint, Shape, Triple, Urdf, read_urdf
 
 POSTURES = 20_000
 """Random postures from which pads and approach are guessed."""
@@ -39,7 +39,7 @@ Vector = Float[np.ndarray, "3"]
 
 
 def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = None, seed: int = 0) -> str:
-    """Write the text of a hand.toml for a URDF, to be looked over, saved beside it and checked by `check_hand`.
+    """Write the text of a hand.toml for a URDF, to be looked over and checked by `check_hand`.
 
     Args:
         path: of the URDF.
@@ -77,51 +77,38 @@ def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = No
     names = {tip: tip.removesuffix("_tip") for tip in chosen}
     lines = [
         "# A draft. Lengths [m], angles [rad], in the link frames of the URDF. Look over what is marked CHECK.",
-        f"name = {_text(name or urdf.name or 'hand')}",
-        f"urdf = {_text(urdf.path.name)}",
-        f"base_link = {_text(urdf.root)}",
-        f"approach = {_list(approach)}  # CHECK: out of the palm",
+        f"name = {_toml(name or urdf.name or 'hand')}",
+        f"urdf = {_toml(urdf.path.name)}",
+        f"base_link = {_toml(urdf.root)}",
+        f"approach = {_toml(approach)}  # CHECK: out of the palm",
         "limit_margin = 0.0  # taken off both ends of every joint's range",
         "",
         "[actuators]  # joint position control; effort [N m] and velocity [rad/s] are those of the URDF",
         f"kp = {kp:.3g}  # CHECK: [N m/rad]",
         f"kd = {DAMPING * kp:.3g}  # [N m s/rad]",
-        *_coupling_lines(coupling),
-        "",
-        "# Which fingers grasp, in grasp order; every other joint is parked.",
-        "[options.default]",
-        f"fingers = [{', '.join(_text(names[tip]) for tip in chosen[:3])}]",
     ]
+    if coupling:
+        lines += ["", "# joint = ratio * source + offset", "[coupling]"]
+    for joint, (source, ratio, offset) in coupling.items():
+        lines.append(f"{_toml(joint)} = {{ source = {_toml(source)}, ratio = {ratio!r}, offset = {offset!r} }}")
+    lines += ["", "# Which fingers grasp, in grasp order; every other joint is parked.", "[options.default]"]
+    lines.append(f"fingers = {_toml([names[tip] for tip in chosen[:3]])}")
     if parked:
-        row = ", ".join(f"{_text(joint)} = {value!r}" for joint, value in parked.items())
+        row = ", ".join(f"{_toml(joint)} = {value!r}" for joint, value in parked.items())
         lines.append(f"parked = {{ {row} }}  # CHECK: out of the way of the others")
     for tip, pad in zip(chosen, pads, strict=True):
-        lines += ["", "[[finger]]", f"name = {_text(names[tip])}"]
-        lines += [f"joints = [{', '.join(map(_text, chains[tip]))}]", f"tip_link = {_text(tip)}", *_pad_lines(pad)]
+        lines += ["", "[[finger]]", f"name = {_toml(names[tip])}"]
+        lines += [f"joints = {_toml(chains[tip])}", f"tip_link = {_toml(tip)}"]
+        lines += [f"contact = {_toml(pad.contact)}  # CHECK: the middle of the pad", f"normal = {_toml(pad.normal)}"]
+        sphere = ['tip = "sphere"', f"center = {_toml(pad.center)}", f"radius = {pad.radius!r}"]
+        lines += sphere if pad.radius else ['tip = "point"']
     lines += ["", "[self_collision]", "# The pairs of links that meet in some random postures, but not in nearly all."]
-    pairs = collision_pairs(urdf, coupling, seed=seed)
-    lines += ["pairs = [", *(f"  [{_text(a)}, {_text(b)}]," for a, b in pairs), "]", ""]
+    lines += ["pairs = [", *(f"  {_toml(pair)}," for pair in collision_pairs(urdf, coupling, seed=seed)), "]", ""]
     return "\n".join(lines)
 
 
-def _coupling_lines(coupling: Mapping[str, Mimic]) -> list[str]:
-    """Write which joint follows which."""
-    lines = ["", "# joint = ratio * source + offset", "[coupling]"] if coupling else []
-    for joint, (source, ratio, offset) in coupling.items():
-        lines.append(f"{_text(joint)} = {{ source = {_text(source)}, ratio = {ratio!r}, offset = {offset!r} }}")
-    return lines
-
-
-def _pad_lines(pad: Pad) -> list[str]:
-    """Write where a fingertip touches."""
-    lines = [f"contact = {_list(pad.contact)}  # CHECK: the middle of the pad", f"normal = {_list(pad.normal)}"]
-    if pad.radius:
-        return [*lines, 'tip = "sphere"', f"center = {_list(pad.center)}", f"radius = {pad.radius!r}"]
-    return [*lines, 'tip = "point"']
-
-
 def fingertip_links(urdf: Urdf) -> tuple[str, ...]:
-    """Return the last link with a collision shape of every branch that a joint moves, in the order of the file."""
+    """Return the last link with a collision shape of every movable branch."""
     parents, shaped = {j.parent for j in urdf.joints}, {x.name for x in urdf.links if x.shapes}
     ends = []
     for link in (x.name for x in urdf.links if x.name not in parents):
@@ -130,7 +117,7 @@ def fingertip_links(urdf: Urdf) -> tuple[str, ...]:
 
 
 def _chain(urdf: Urdf, tip: str, ends: Sequence[str]) -> tuple[str, ...]:
-    """Return the movable joints above a fingertip, those at the palm first; refuse what is no fingertip."""
+    """Return the movable joints above a fingertip from the palm outward; refuse other links."""
     shaped = {x.name for x in urdf.links if x.shapes}
     joints = tuple(j.name for j in urdf.movers(tip)[::-1])
     if tip not in shaped or not joints:
@@ -139,13 +126,7 @@ def _chain(urdf: Urdf, tip: str, ends: Sequence[str]) -> tuple[str, ...]:
 
 
 def guess_pads(urdf: Urdf, frames: Float[Tensor, "3 4 l n"], tips: Sequence[str]) -> tuple[tuple[Pad, ...], Triple]:
-    """Return the pads of fingertips and the direction out of the palm, from random postures.
-
-    Args:
-        urdf: the hand's tree.
-        frames: of its links in n postures.
-        tips: links of the fingertips, the three that grasp first.
-    """
+    """Guess the pads of the tips and the direction out of the palm, from the links' frames in random postures."""
     links = {x.name: i for i, x in enumerate(urdf.links)}
     index = torch.tensor([links[tip] for tip in tips])
     # a tip's shape is the one that reaches farthest from its joint
@@ -172,7 +153,7 @@ def guess_pads(urdf: Urdf, frames: Float[Tensor, "3 4 l n"], tips: Sequence[str]
 
 
 def _motion(urdf: Urdf, tip: str, core: Vector) -> tuple[Joint, Vector, Vector]:
-    """Return the last joint that moves a tip, and in the tip's frame its direction of motion and its arm's direction."""
+    """Return the last joint that moves a tip, the tip's direction of motion and that of its arm, in its frame."""
     tip_from_above = np.eye(4)
     for joint in urdf.joints_above(tip):
         if joint.kind != "fixed":
@@ -197,7 +178,7 @@ def _half(shape: Shape) -> Vector:
 
 
 def _core(shape: Shape) -> Vector:
-    """Return the middle of the end of a tip: one half thickness before its far end, in the link's frame."""
+    """Return the point one half thickness before the far end of a tip, in the link's frame."""
     center, half = np.array(shape.xyz), _half(shape)
     rotation, long = rotation_from_rpy(shape.rpy).numpy(), int(half.argmax())
     inset = half[long] - np.delete(half, long).min()
@@ -205,7 +186,7 @@ def _core(shape: Shape) -> Vector:
 
 
 def _pad(shape: Shape, core: Vector, motion: Vector, outward: Vector) -> Pad:
-    """Return the pad of a tip that closes along `motion`: on a sphere tilted outward, else in the middle of a side."""
+    """Return the pad of a tip that moves along `motion`; on a sphere it is tilted outward."""
     if shape.kind == "sphere":
         normal, radius = math.cos(TILT) * motion + math.sin(TILT) * outward, shape.size[0]
         center, normal = np.array(shape.xyz), normal / np.linalg.norm(normal)
@@ -228,11 +209,6 @@ def _triple(x: Vector) -> Triple:
     return a, b, c
 
 
-def _list(x: Triple) -> str:
-    """Write three numbers."""
-    return "[" + ", ".join(f"{v:.12g}" for v in x) + "]"
-
-
-def _text(x: str) -> str:
-    """Write a word in quotes that TOML reads back."""
+def _toml(x: object) -> str:
+    """Write texts and numbers, or lists of them, as TOML reads them back."""
     return json.dumps(x, ensure_ascii=False)

@@ -1,4 +1,4 @@
-"""The three fingertips of a hand: where their pads are, and the chains of links that move them."""
+"""The three fingertips of a hand: their pads, and the chains of links that move them."""
 
 import dataclasses
 import functools
@@ -15,13 +15,13 @@ from torchgrasp.hand.urdf import Urdf
 
 @dataclasses.dataclass(frozen=True)
 class Fingertips(Value):
-    """The fingertips in grasp order: names of the fingers, their tip links, and the pads in the frames of these links.
+    """The fingertips in grasp order, with the pads in the frames of the tip links.
 
-    `index` is that of the tip links in the whole tree. `contact` and `center` are in metres, `normal` points outward.
+    `index` locates the tip links in the whole tree. `contact` and `center` are in metres, `normal` points outward.
     `radius` [m] is that of the tip's sphere about `center`; 0: the tip touches in `contact` alone.
 
-    `chains` leads to the carriers: the last links that joints move, to which the tips are fixed. `carrier` indexes
-    them in `chains`; `carrier_from_tip` holds the tips' frames in theirs.
+    Each tip is fixed to a carrier, the last link that a joint moves. `chains` is the tree that leads to the carriers,
+    and `carrier` their index in it.
     """
 
     names: tuple[str, str, str]
@@ -43,7 +43,7 @@ class Fingertips(Value):
         return contact, map_directions(pose, self.normal)[..., 0].T, center
 
     def frames(self, values: Float[Tensor, "j n"]) -> tuple[Float[Tensor, "3 4 l n"], Float[Tensor, "3 4 3 n"]]:
-        """Return the frames of the links of `chains`, and those of the carriers, for all joints of the URDF."""
+        """Return the frames of all links of `chains`, and those of the carriers."""
         frames = self.chains.frames(values)
         return frames, frames.index_select(2, self.carrier)
 

@@ -1,4 +1,4 @@
-"""A robot hand as a value: its joints, its kinematic tree, its fingertips, and how they move."""
+"""A robot hand as a value: joints, kinematic tree, fingertips, and how they move."""
 
 import dataclasses
 import math
@@ -18,7 +18,7 @@ from torchgrasp.hand.self_collision import SelfCollision
 
 
 class Actuator(NamedTuple):
-    """Drive of one joint: largest torque [N m], largest speed [rad/s], stiffness [N m/rad], damping [N m s/rad]."""
+    """Drive of one joint: effort [N m], velocity [rad/s], stiffness [N m/rad], damping [N m s/rad]."""
 
     effort: float
     velocity: float
@@ -27,7 +27,7 @@ class Actuator(NamedTuple):
 
 
 class HandSource(NamedTuple):
-    """What a hand was loaded from: finger option, URDF, and the SHA-256 of hand.toml and URDF together."""
+    """Origin of a hand: finger option, URDF, and SHA-256 of hand.toml and URDF together."""
 
     option: str
     urdf_path: Path
@@ -38,9 +38,9 @@ class HandSource(NamedTuple):
 class Hand(Value):
     """A robot hand with three grasping fingers. Positions are in the palm's frame (the URDF's root), in metres.
 
-    `joints` (.., h) are everywhere the actuated joints of the grasping fingers, in the order of `joint_names`. Every
-    method refuses joints of another count or dtype, or that are not finite, with `BadArgument`. Fingers are in grasp
-    order. `approach` points out of the palm. `actuators` are named after all joints of the URDF.
+    `joints` (.., h) are the actuated joints of the grasping fingers, in the order of `joint_names`. Every method raises
+    `BadArgument` for joints of a wrong count or dtype, and for NaN or infinity. Fingers are in grasp order. `approach`
+    points out of the palm. `actuators` has all joints of the URDF.
     """
 
     name: str
@@ -90,7 +90,7 @@ class Hand(Value):
 
     @property
     def tip_radius(self) -> Float[Tensor, "3"]:
-        """Radii of the tips' spheres [m]; 0 for a tip that touches in one point alone."""
+        """Radii of the tips' spheres [m]; 0: the tip touches in one point alone."""
         return self.tips.radius
 
     def check_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b h"]:
@@ -103,21 +103,21 @@ class Hand(Value):
         return joints
 
     def expand(self, joints: Float[Tensor, "*b h"]) -> dict[str, Float[Tensor, "*b"]]:
-        """Return every movable joint of the URDF by name: actuated, coupled and parked."""
+        """Return every movable joint of the URDF by name."""
         return dict(zip(self.tree.joint_names, self.expand_joints(joints).unbind(-1), strict=True))
 
     def expand_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
-        """Return every movable joint of the URDF in the order of `tree.joint_names`."""
+        """Return every movable joint of the URDF, ordered as `tree.joint_names`."""
         return self.actuated.expand(joints)
 
     def link_poses(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b l 4 4"]:
-        """Return `hand_from_link` of every link, in the order of `tree.link_names`."""
+        """Return `hand_from_link` of every link, ordered as `tree.link_names`."""
         values = self.expand_joints(joints)
         poses = self.tree.poses(values.reshape(-1, values.shape[-1]))
         return poses.reshape(*joints.shape[:-1], *poses.shape[1:])
 
     def fingertips(self, joints: Float[Tensor, "*b h"]) -> tuple[Float[Tensor, "*b 3 3"], Float[Tensor, "*b 3 3"]]:
-        """Return the contact points [m] of the three pads and their outward unit normals.
+        """Return the pads' contact points [m] and outward unit normals.
 
         >>> from torchgrasp.hand.load import load_hand
         >>> points, normals = load_hand("allegro").fingertips(torch.zeros(5, 12))
@@ -129,15 +129,12 @@ class Hand(Value):
         return _rows(map_points(carriers, contact), joints), _rows(map_directions(carriers, normal), joints)
 
     def tip_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b 3 3"]:
-        """Return the centres [m] of the tips' spheres of `tip_radius`; the contact points where the radius is 0."""
+        """Return the centres [m] of the tips' spheres; the contact points where the radius is 0."""
         _, carriers = self.tips.frames(self._columns(joints))
         return _rows(map_points(carriers, self.tips.in_carriers[2]), joints)
 
     def jacobian(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b 3 3 h"]:
-        """Return the derivative of the contact points by the actuated joints, coupling included [m/rad].
-
-        The axes are: finger, coordinate, joint.
-        """
+        """Return the derivative [m/rad] of the contact points (finger, coordinate) by the actuated joints."""
         chains = self.tips.chains
         frames, carriers = self.tips.frames(self._columns(joints))
         contact = map_points(carriers, self.tips.in_carriers[0])
@@ -162,15 +159,14 @@ class Hand(Value):
     def self_clearance(
         self, joints: Float[Tensor, "*b h"], below: float = math.inf, chunk: int = 1000
     ) -> Float[Tensor, "*b"]:
-        """Return the signed least separation [m] between links that can meet; negative: they overlap.
+        """Return the signed least separation [m] of links that can meet; negative: they overlap.
 
-        The links are the collision shapes of the URDF, the palm and parked fingers included. hand.toml lists the pairs.
-        An overlap is the least translation that parts two links. Apart, the value is a lower bound of the distance,
-        and exact where a face is nearest.
+        hand.toml lists the pairs, palm and parked fingers included. An overlap is the least translation that parts two
+        links. Apart, the value is a lower bound of the distance, exact where a face is nearest.
 
         Args:
             joints: postures [rad].
-            below: values above this [m] are lower bounds only; with 0, for a verdict alone, the call is twice as fast.
+            below: values above this [m] are lower bounds only; 0, for a verdict alone, is twice as fast.
             chunk: rows taken at a time, which bounds the memory and keeps the work in the cache.
         """
         self.actuated.check(joints)
@@ -187,5 +183,5 @@ class Hand(Value):
 
 
 def _rows(columns: Tensor, joints: Float[Tensor, "*b h"]) -> Tensor:
-    """Return what has the postures last with its axes reversed, in the batch shape of `joints`."""
+    """Reverse the axes of a tensor with the postures last; restore the batch shape of `joints`."""
     return columns.permute(*range(columns.ndim - 1, -1, -1)).reshape(*joints.shape[:-1], *columns.shape[-2::-1])

@@ -1,12 +1,12 @@
-"""Reading of hand.toml: what a URDF does not say about a grasping hand.
+"""Reading of hand.toml, which completes the URDF of a grasping hand.
 
-It names the grasping fingers in their order and their pads, the joints that follow others, the posture of the unused
-ones, and the links that can meet.
+It lists fingers, pads, coupled joints, parked joints and pairs of links that can meet.
 """
 
 import dataclasses
 import math
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,7 +36,7 @@ class Pad(NamedTuple):
 
 
 class Finger(NamedTuple):
-    """A finger: its joints from the palm outward, its tip link and its pad."""
+    """A finger with its joints from the palm outward."""
 
     name: str
     joints: tuple[str, ...]
@@ -64,19 +64,31 @@ class HandSpec:
     pairs: tuple[tuple[str, str], ...] | None
     data: bytes
 
+    def wrong(self, found: str, allowed: str) -> HandFileError:
+        """Make the error for a rule that the file breaks."""
+        return HandFileError("hand.toml", f"{self.path}: {found}", allowed)
 
-def _finite(value: Any) -> float | None:
-    """Return a number as a float; None for anything that is not a finite number."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return None
+
+def _is_number(value: Any) -> bool:
+    """Tell whether a value is a finite number; an integer of more than 308 digits is none."""
     try:
-        return float(value) if math.isfinite(value) else None
-    except OverflowError:  # an integer of more than 308 digits
-        return None
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:
+        return False
+
+
+def _is_word(value: Any) -> bool:
+    """Tell whether a value is a printable text of 1 to 200 letters."""
+    return isinstance(value, str) and 0 < len(value) <= 200 and value.isprintable()
+
+
+def _is_texts(value: Any) -> bool:
+    """Tell whether a value is a list of texts."""
+    return isinstance(value, list) and all(isinstance(x, str) for x in value)
 
 
 class _Table:
-    """A toml table that names itself in every complaint and knows which of its keys were read."""
+    """A toml table that names itself in complaints and records which keys were read."""
 
     def __init__(self, path: Path, name: str, table: Any):
         if not isinstance(table, dict):
@@ -88,48 +100,43 @@ class _Table:
         value = repr(self.table[key])[:80] if key in self.table else "nothing"
         return HandFileError("hand.toml", f"{self.path}: {self.name}{key} = {value}", allowed)
 
-    def value(self, key: str, default: Any = None) -> Any:
-        """Read a value of any type."""
+    def value(self, key: str, right: Callable[[Any], bool], allowed: str) -> Any:
+        """Read a value that must be right."""
         self.read.add(key)
-        return self.table.get(key, default)
+        if not right(self.table.get(key)):
+            raise self.wrong(key, allowed)
+        return self.table[key]
 
     def text(self, key: str) -> str:
         """Read a word."""
-        value = self.value(key)
-        if not isinstance(value, str) or not 0 < len(value) <= 200 or not value.isprintable():
-            raise self.wrong(key, "a text of 1 to 200 letters")
-        return value
+        return self.value(key, _is_word, "a text of 1 to 200 letters")
 
     def texts(self, key: str) -> tuple[str, ...]:
         """Read a list of words."""
-        value = self.value(key)
-        if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-            raise self.wrong(key, "a list of texts")
-        return tuple(value)
+        return tuple(self.value(key, _is_texts, "a list of texts"))
 
     def number(self, key: str, low: float = -math.inf, high: float = math.inf) -> float:
         """Read a finite number in a range."""
-        value = _finite(self.value(key))
-        if value is None or not low <= value <= high:
-            raise self.wrong(key, f"a finite number in [{low:g}, {high:g}]")
-        return value
+        return float(
+            self.value(key, lambda x: _is_number(x) and low <= x <= high, f"a finite number in [{low:g}, {high:g}]")
+        )
 
     def triple(self, key: str) -> Triple:
         """Read three finite numbers."""
-        value = self.value(key)
-        numbers = [_finite(x) for x in value] if isinstance(value, list) and len(value) == 3 else [None]
-        if None in numbers:
-            raise self.wrong(key, "three finite numbers")
-        x, y, z = (v for v in numbers if v is not None)
-        return x, y, z
+        x, y, z = self.value(
+            key, lambda v: isinstance(v, list) and len(v) == 3 and all(map(_is_number, v)), "three finite numbers"
+        )
+        return float(x), float(y), float(z)
 
     def inner(self, key: str, optional: bool = False) -> "_Table":
         """Read a table inside."""
-        return _Table(self.path, f"{self.name}{key}.", self.value(key, {} if optional else None))
+        self.read.add(key)
+        return _Table(self.path, f"{self.name}{key}.", self.table.get(key, {} if optional else None))
 
     def tables(self, key: str) -> list["_Table"]:
         """Read a list of tables inside."""
-        value = self.value(key, [])
+        self.read.add(key)
+        value = self.table.get(key, [])
         if not isinstance(value, list) or len(value) > 1000:
             raise self.wrong(key, "a list of at most 1000 tables")
         return [_Table(self.path, f"{self.name}{key}[{i}].", v) for i, v in enumerate(value)]
@@ -142,7 +149,7 @@ class _Table:
 
 
 def read_hand_toml(path: Path | str, fingers: str = "default") -> HandSpec:
-    """Read and check a hand.toml, choosing one of its options for the three grasping fingers.
+    """Read and check a hand.toml, with one of its finger options.
 
     Raises:
         HandFileError: with the file, the key, what was found and what is allowed.
@@ -173,7 +180,7 @@ def read_hand_toml(path: Path | str, fingers: str = "default") -> HandSpec:
 
 
 def _finger(table: _Table) -> Finger:
-    """Read a finger; its normal must be a unit vector, and its contact lie on its sphere."""
+    """Read a finger with a unit normal and a contact on its sphere."""
     kind = table.text("tip")
     if kind not in ("sphere", "point"):
         raise table.wrong("tip", "'sphere' or 'point'")
@@ -194,7 +201,7 @@ def _finger(table: _Table) -> Finger:
 def _option(
     top: _Table, known: tuple[Finger, ...], name: str
 ) -> tuple[tuple[Finger, Finger, Finger], dict[str, float]]:
-    """Choose the three grasping fingers, in grasp order, and the posture of the joints that do not grasp."""
+    """Return the three grasping fingers in grasp order, and the parked joints with their values."""
     options = top.inner("options")
     if name not in options.table:
         raise BadArgument("fingers", repr(name), f"one of {sorted(options.table)}")
@@ -222,14 +229,13 @@ def _coupling(top: _Table) -> dict[str, Mimic]:
 
 
 def _pairs(top: _Table) -> tuple[tuple[str, str], ...] | None:
-    """Read the pairs of links that the self-collision test takes; None: the file lists none."""
+    """Read the pairs of links to test for self-collision; None: not listed."""
     table, pairs = top.inner("self_collision", optional=True), None
     if "pairs" in table.table:
-        rows = table.value("pairs")
-        if not isinstance(rows, list) or not all(
-            isinstance(r, list) and len(r) == 2 and all(isinstance(x, str) for x in r) and r[0] != r[1] for r in rows
-        ):
-            raise table.wrong("pairs", "a list of pairs of different links")
-        pairs = tuple((r[0], r[1]) for r in rows)
+
+        def right(rows: Any) -> bool:
+            return isinstance(rows, list) and all(_is_texts(r) and len(r) == 2 and r[0] != r[1] for r in rows)
+
+        pairs = tuple((a, b) for a, b in table.value("pairs", right, "a list of pairs of different links"))
     table.done()
     return pairs

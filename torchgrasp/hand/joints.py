@@ -1,4 +1,4 @@
-"""The actuated joints of a hand: names, limits, and how every other joint of the URDF follows them."""
+"""The actuated joints of a hand, their limits, and the joints that follow them."""
 
 import dataclasses
 
@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.errors import BadArgument, HandFileError
+from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand_toml import HandSpec
 from torchgrasp.hand.urdf import Mimic, Urdf
 
@@ -35,7 +35,7 @@ class ActuatedJoints(Value):
         return joints @ self.coupling.to(joints).T + self.offset.to(joints)
 
     def check(self, joints: Tensor) -> None:
-        """Refuse joints of a wrong count or dtype, and joints that are not finite."""
+        """Refuse joints of a wrong count or dtype, NaN and infinity."""
         if joints.ndim < 1 or joints.shape[-1] != len(self.names):
             wanted = f"{len(self.names)} joints last: {self.names}"
             raise BadArgument("joints", f"shape {tuple(joints.shape)}", wanted)
@@ -47,7 +47,7 @@ class ActuatedJoints(Value):
             raise BadArgument("joints", f"{value} for {self.names[k]}", "finite numbers")
 
     def check_limits(self, joints: Tensor) -> None:
-        """Refuse what `check` refuses, and joints beyond their limits."""
+        """Refuse joints beyond their limits, too."""
         self.check(joints)
         low, high = self.lower.to(joints), self.upper.to(joints)
         wrong = ~((joints >= low - ROUNDING) & (joints <= high + ROUNDING))
@@ -64,19 +64,15 @@ def _first(joints: Tensor, wrong: Tensor) -> tuple[float, int]:
 
 
 def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
-    """Return the joints of the grasping fingers with their coupling.
-
-    Raises:
-        HandFileError: a joint neither grasps nor is parked, or `limit_margin` leaves a joint no range.
-    """
+    """Return the joints of the grasping fingers; refuse joints without a range, and joints without a role."""
     movable = {j.name: j for j in urdf.movable}
     names = tuple(dict.fromkeys(j for f in spec.fingers for j in f.joints if j not in spec.coupling))
     limits = torch.tensor([[movable[n].lower, movable[n].upper] for n in names], dtype=torch.float64)
     limits = limits + torch.tensor([spec.limit_margin, -spec.limit_margin], dtype=torch.float64)
     for name, (low, high) in zip(names, limits.tolist(), strict=True):
         if not low < high:
-            found = f"{spec.path}: limit_margin {spec.limit_margin:g} leaves joint {name} [{low:g}, {high:g}]"
-            raise HandFileError("hand.toml", found, "lower < upper")
+            found = f"limit_margin {spec.limit_margin:g} leaves joint {name} [{low:g}, {high:g}]"
+            raise spec.wrong(found, "lower < upper")
     coupling = torch.zeros(len(movable), len(names), dtype=torch.float64)
     offset = torch.zeros(len(movable), dtype=torch.float64)
     for row, joint in enumerate(movable):
@@ -87,5 +83,5 @@ def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
         elif source in spec.parked:
             offset[row] = ratio * spec.parked[source] + shift
         else:
-            raise HandFileError("hand.toml", f"{spec.path}: joint {joint} neither grasps nor is parked", "either")
+            raise spec.wrong(f"joint {joint} neither grasps nor is parked", "either")
     return ActuatedJoints(names, limits[:, 0].clone(), limits[:, 1].clone(), coupling, offset)

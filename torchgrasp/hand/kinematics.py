@@ -1,7 +1,7 @@
-"""Forward kinematics of a URDF's tree, one level of the tree at a time, for all postures at once.
+"""Forward kinematics of a URDF's tree, level by level, for all postures at once.
 
-The frame of a joint's child in its parent is `constant + sine sin q + cosine cos q + slide q`, entry by entry. The four
-tables are made once. `torchgrasp.testing.check_hand` compares the result with pytorch-kinematics and with yourdfpy.
+The child's frame in its parent is `constant + sine sin q + cosine cos q + slide q`, entry by entry. The four tables are
+made once. `torchgrasp.testing.check_hand` compares the result with pytorch-kinematics and with yourdfpy.
 """
 
 import dataclasses
@@ -18,14 +18,14 @@ from torchgrasp.hand.urdf import Joint, Urdf
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class KinematicTree(Value):
-    """The links and movable joints of a URDF in the order of the file, or the part of them that leads to some links.
+    """The links and movable joints of a URDF in the order of the file, or a part of the tree.
 
-    `child` is the link that each joint moves (0: none of this part), `axis` the joint's axis in that link's frame.
-    `prismatic` is 1 for a joint that slides. `moves[l, j]` is 1 if joint j moves link l.
+    `child[j]` is the link that joint j moves, or 0 outside this part. `axis` is in that link's frame. `prismatic` is 1
+    for a joint that slides. `moves[l, j]` is 1 if joint j moves link l.
 
-    The tables hold one frame for each link, sorted by level; `level_sizes` counts the links of each level. `joint` is
-    the joint of each frame (0 for a fixed one). `parent` indexes the level above; `straight[k]` says that the parents
-    of level k are all of level k - 1, in order. `places` holds level and index of each of `link_names`.
+    `tables` sorts the links by level; `level_sizes` counts them. `joint` is the joint of each link, 0 for a fixed one.
+    `parent` indexes the level above. `straight[k]`: level k's parents are exactly level k-1, in order. `places` gives
+    level and index of each of `link_names`. `slides`: some joint is prismatic.
     """
 
     link_names: tuple[str, ...]
@@ -43,7 +43,7 @@ class KinematicTree(Value):
     slides: bool
 
     def frames(self, values: Float[Tensor, "j n"]) -> Float[Tensor, "3 4 l n"]:
-        """Return the first three rows of `root_from_link` of every link, with the postures last: the fast layout."""
+        """Return three rows of `root_from_link` of every link, postures last: the fast layout."""
         constant, sine, cosine, slide = self.tables.to(values).unbind()
         local = torch.addcmul(constant, sine, values.sin().index_select(0, self.joint))
         local = torch.addcmul(local, cosine, values.cos().index_select(0, self.joint))
@@ -63,13 +63,13 @@ class KinematicTree(Value):
         return torch.stack([frames[level][:, :, index] for level, index in self.places], 2)
 
     def poses(self, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
-        """Return `root_from_link` of every link for the values of every joint [rad or m]."""
+        """Return `root_from_link` of every link, for joints in rad or m."""
         frames = self.frames(values.T.contiguous())
         last = frames.new_tensor([0.0, 0.0, 0.0, 1.0])[:, None, None].expand(1, 4, *frames.shape[2:])
         return torch.cat([frames, last]).permute(3, 2, 0, 1)
 
     def joint_axes(self, poses: Float[Tensor, "*b l 4 4"]) -> tuple[Float[Tensor, "*b j 3"], Float[Tensor, "*b j 3"]]:
-        """Return the axis and the origin of every joint in the root's frame, for poses of the links."""
+        """Return axis and origin of every joint in the root's frame, from the links' poses."""
         child = poses.reshape(-1, *poses.shape[-3:])[..., :3, :].permute(2, 3, 1, 0).index_select(2, self.child)
         axes, origins = (x.permute(2, 1, 0) for x in (map_directions(child, self.axis), child[:, 3]))
         size = (*poses.shape[:-3], len(self.child), 3)
@@ -88,7 +88,7 @@ def map_directions(frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]
 
 
 def tree_from_urdf(urdf: Urdf, ends: Collection[str] | None = None) -> KinematicTree:
-    """Tabulate the tree of a URDF; with `ends`, the part of it that leads to those links."""
+    """Tabulate the tree of a URDF, or the part that leads to the links `ends`."""
     above = {j.child: j for j in urdf.joints}
     part = {x.name for x in urdf.links} if ends is None else {urdf.root, *ends}
     part |= {j.parent for end in ends or () for j in urdf.joints_above(end)}
@@ -118,7 +118,7 @@ def tree_from_urdf(urdf: Urdf, ends: Collection[str] | None = None) -> Kinematic
 
 
 def pose_in_carrier(urdf: Urdf, link: str) -> tuple[str, Float[Tensor, "3 4"]]:
-    """Return the nearest link above (or the link itself) that a joint moves, and the link's frame in it."""
+    """Return the carrier of a link, which a joint moves, and the link's frame in it."""
     above = {j.child: j for j in urdf.joints}
     pose = _tables(None)[0]
     while link in above and above[link].kind == "fixed":
@@ -129,7 +129,7 @@ def pose_in_carrier(urdf: Urdf, link: str) -> tuple[str, Float[Tensor, "3 4"]]:
 
 
 def _tables(joint: Joint | None) -> Float[Tensor, "4 3 4"]:
-    """Return the four tables of the child's frame in its parent; the root (None) is the identity."""
+    """Return the four tables of a joint; None: the identity of the root."""
     tables = torch.zeros(4, 3, 4, dtype=torch.float64)
     constant, sine, cosine, slide = tables
     if joint is None:

@@ -1,4 +1,4 @@
-"""From a hand's folder to the hand: find it, read its two files, and refuse them where they do not fit each other."""
+"""Loading of a hand from its folder; refuses two files that do not fit each other."""
 
 import hashlib
 from pathlib import Path
@@ -17,14 +17,14 @@ from torchgrasp.hand.urdf import Urdf, read_urdf
 
 
 def hands_folder() -> Path:
-    """Return the folder of the shipped hands: inside the installed package, else beside it in a checkout."""
+    """Return the folder of the shipped hands: in the package, or beside it in a checkout."""
     package = Path(__file__).resolve().parents[1]
     installed = package / "assets" / "hands"
     return installed if installed.is_dir() else package.parent / "hands"
 
 
 def find_hand(name_or_path: str | Path) -> Path:
-    """Return the folder of a shipped hand by its name, or of a hand's folder or hand.toml by its path.
+    """Return the folder of a hand, given a shipped name, a folder or a hand.toml.
 
     Raises:
         HandFileError: there is no such hand; the message lists the shipped ones.
@@ -41,30 +41,21 @@ def find_hand(name_or_path: str | Path) -> Path:
 
 
 def load_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
-    """Load a hand from its hand.toml and URDF, with one of the finger options that its hand.toml offers.
+    """Load a hand from its hand.toml and URDF, with one of its finger options.
 
     Args:
         name_or_path: a shipped hand ("allegro", "allegro_biotac", "barrett"), or the folder of another one.
         fingers: "default", or for the Allegro "paper_literal" (index, middle and ring finger).
 
     Raises:
-        HandFileError: a file is missing, malformed, or the two do not fit each other.
+        HandFileError: a file is missing or malformed, or the two do not fit each other.
         BadArgument: the hand has no such option.
 
     >>> load_hand("barrett").joint_names
     ('spread', 'f1_flex', 'f2_flex', 'f3_flex')
     """
     spec = read_hand_toml(find_hand(name_or_path) / "hand.toml", fingers)
-    return hand_from_files(spec, read_urdf(spec.urdf))
-
-
-def hand_from_files(spec: HandSpec, urdf: Urdf) -> Hand:
-    """Assemble a hand from its two files, checking that they fit each other.
-
-    Raises:
-        HandFileError: hand.toml names what the URDF does not have, a joint neither grasps nor is parked, a margin
-            leaves no range, or links without a collision shape.
-    """
+    urdf = read_urdf(spec.urdf)
     _check_names(spec, urdf)
     _check_coupling(spec, urdf)
     _check_shapes(spec, urdf)
@@ -82,38 +73,35 @@ def hand_from_files(spec: HandSpec, urdf: Urdf) -> Hand:
 
 
 def _check_names(spec: HandSpec, urdf: Urdf) -> None:
-    """Refuse names in hand.toml that the URDF does not have."""
+    """Refuse names in hand.toml that the URDF does not have, and parked joints that grasp or follow."""
     movable, links = {j.name for j in urdf.movable}, {x.name for x in urdf.links}
     if spec.base_link != urdf.root:
-        raise HandFileError("hand.toml", f"{spec.path}: base_link {spec.base_link!r}", f"the URDF's root {urdf.root!r}")
-    joints = [j for f in spec.all_fingers for j in f.joints] + list(spec.parked) + list(spec.coupling)
-    joints += [mimic.source for mimic in spec.coupling.values()]
-    named = [f.tip_link for f in spec.all_fingers] + [x for pair in spec.pairs or () for x in pair]
-    for kind, found, known in (("joint", joints, movable), ("link", named, links)):
-        unknown = sorted(set(found) - known)
+        raise spec.wrong(f"base_link {spec.base_link!r}", f"the URDF's root {urdf.root!r}")
+    sources = {joint: mimic.source for joint, mimic in spec.coupling.items()}
+    joints = {j for f in spec.all_fingers for j in f.joints} | {*spec.parked, *sources, *sources.values()}
+    named = {f.tip_link for f in spec.all_fingers} | {x for pair in spec.pairs or () for x in pair}
+    for kind, unknown, known in (("joint", joints - movable, movable), ("link", named - links, links)):
         if unknown:
-            raise HandFileError("hand.toml", f"{spec.path}: {kind} {unknown[0]!r}", f"one of {sorted(known)}")
+            raise spec.wrong(f"{kind} {min(unknown)!r}", f"one of {sorted(known)}")
     grasping = {j for f in spec.fingers for j in f.joints}
-    moved = grasping | {mimic.source for joint, mimic in spec.coupling.items() if joint in grasping}
-    both = sorted(set(spec.parked) & (moved | set(spec.coupling)))
+    moved = grasping | {sources[joint] for joint in grasping if joint in sources}
+    both = set(spec.parked) & (moved | set(sources))
     if both:
-        allowed = "joints that neither grasp nor follow another"
-        raise HandFileError("hand.toml", f"{spec.path}: parked joint {both[0]!r}", allowed)
+        raise spec.wrong(f"parked joint {min(both)!r}", "joints that neither grasp nor follow another")
 
 
 def _check_coupling(spec: HandSpec, urdf: Urdf) -> None:
-    """Refuse a joint that follows another in the URDF and is free, or follows otherwise, in hand.toml."""
+    """Refuse a hand.toml that contradicts a mimic joint of the URDF."""
     for joint in urdf.joints:
         if joint.mimic is not None and spec.coupling.get(joint.name) != joint.mimic:
-            found = f"{spec.path}: joint {joint.name} follows {spec.coupling.get(joint.name, 'nothing')}"
-            raise HandFileError("hand.toml", found, f"the coupling of the URDF: {joint.mimic}")
+            found = f"joint {joint.name} follows {spec.coupling.get(joint.name, 'nothing')}"
+            raise spec.wrong(found, f"the coupling of the URDF: {joint.mimic}")
 
 
 def _check_shapes(spec: HandSpec, urdf: Urdf) -> None:
-    """Refuse a hand whose fingertips or whose other links no collision check and no simulator could see."""
-    tips = {f.tip_link for f in spec.fingers}
-    bare = sorted(x.name for x in urdf.links if x.name in tips and not x.shapes)
-    if bare:
-        raise HandFileError("urdf", f"{urdf.path}: link {bare[0]} without collision", "a shape for every fingertip")
-    if not any(x.shapes for x in urdf.links if x.name not in tips):
-        raise HandFileError("urdf", f"{urdf.path}: collision of fingertips alone", "shapes for palm and fingers too")
+    """Refuse fingertips without a collision shape, and a hand whose other links have none."""
+    tips, bare = {f.tip_link for f in spec.fingers}, {x.name for x in urdf.links if not x.shapes}
+    if tips & bare:
+        raise urdf.wrong(f"link {min(tips & bare)} without collision", "a shape for every fingertip")
+    if len(tips | bare) == len(urdf.links):
+        raise urdf.wrong("collision of fingertips alone", "shapes for palm and fingers too")

@@ -1,4 +1,4 @@
-"""Safe parsing of a URDF's XML: bounds before and while parsing, no declarations, no mesh outside the folder."""
+"""Safe parsing of a URDF's XML: bounded, without declarations, without meshes outside the folder."""
 
 import re
 import xml.etree.ElementTree as ET
@@ -18,11 +18,7 @@ IGNORED = {"material", "transmission", "gazebo"}
 
 
 def read_bounded(source: str, path: Path, wanted: str, most: int) -> bytes:
-    """Read a file of at most `most` bytes.
-
-    Raises:
-        HandFileError: about `source`: there is no file, which `wanted` describes, or it is larger.
-    """
+    """Read a file of at most `most` bytes; `source` and `wanted` describe it in the error."""
     if not path.is_file():
         raise HandFileError(source, f"{path}, which is no file", wanted)
     if path.stat().st_size > most:
@@ -51,15 +47,10 @@ class _BoundedBuilder(ET.TreeBuilder):
 
 
 def parse_urdf(path: Path, data: bytes) -> ET.Element:
-    """Parse the bytes of a URDF; refuse every declaration by which XML could reach other files or explode.
-
-    Args:
-        path: of the file, for the messages; meshes must lie in its folder, and are not opened.
-        data: its bytes, UTF-8.
+    """Parse the bytes of a URDF; refuse declarations by which XML could reach other files or explode.
 
     Raises:
-        HandFileError: a declaration, another encoding, malformed or too deep XML, an unknown element, or a mesh
-            outside the folder.
+        HandFileError: another encoding, malformed or too deep XML, an unknown element, or a mesh outside the folder.
     """
     # anywhere, comments included: what looks like a comment may be hidden in a processing instruction
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
@@ -88,7 +79,7 @@ def parse_urdf(path: Path, data: bytes) -> ET.Element:
 
 
 def _check_mesh_name(path: Path, name: str) -> None:
-    """Refuse a mesh outside the hand's folder, and one that is no regular file; the mesh itself is not opened."""
+    """Refuse a mesh outside the hand's folder or not a regular file, without opening it."""
     refusal = HandFileError(
         "urdf", f"{path}: mesh {name[:80]!r}", "a relative .stl or .obj of at most 50 MiB inside the hand's folder"
     )

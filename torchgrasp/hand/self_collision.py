@@ -1,7 +1,6 @@
-"""Signed separations of a hand's links, by the collision shapes of its URDF.
+"""Signed separations of a hand's links, by their collision shapes.
 
-The sign is exact for boxes and spheres: two boxes overlap unless one of 15 axes separates them. A cylinder becomes a
-prism of twelve sides, which is off by 2 % of the radius.
+The sign is exact for boxes and spheres. A cylinder becomes a prism of twelve sides, off by 2 % of the radius.
 """
 
 import dataclasses
@@ -29,10 +28,10 @@ Placed = tuple[Float[Tensor, "3 3 s n"], Float[Tensor, "3 s n"]]
 
 @dataclasses.dataclass(frozen=True)
 class SelfCollision(Value):
-    """Boxes and spheres fixed to links, in link frames [m], and the pairs of them to test.
+    """Boxes and spheres fixed to links, in link frames [m], and the pairs to test.
 
-    A sphere has a `radius` and half sizes of 0; a box has half sizes and a radius of 0. `pairs` lists pairs of boxes
-    first, then (sphere, box), then pairs of spheres; `kinds` counts each.
+    A sphere has `half` sizes of 0, a box a `radius` of 0. `pairs` lists box and box first, then sphere and box, then
+    sphere and sphere. `kinds` counts each.
     """
 
     link: Int[Tensor, " s"]
@@ -44,10 +43,10 @@ class SelfCollision(Value):
     kinds: tuple[int, int, int]
 
     def clearance(self, frames: Float[Tensor, "3 4 l n"], below: float = torch.inf) -> Float[Tensor, " n"]:
-        """Return the signed least separation [m] of the pairs; infinite for a hand without pairs.
+        """Return the signed least separation [m] of the pairs; infinite without pairs.
 
-        A pair is skipped if its bounding spheres are farther apart than the inscribed spheres of the closest pair, or
-        than `below`. Values above `below` are some larger number.
+        Pairs are skipped by their bounding spheres. The upper bound is `below`, or the least distance of two inscribed
+        spheres. Values above `below` are some larger number.
         """
         least = frames.new_full(frames.shape[3:], torch.inf)
         if not len(self.pairs):
@@ -61,7 +60,7 @@ class SelfCollision(Value):
         return least.scatter_reduce(0, row, self._separations(shapes, pair, row), "amin")
 
     def separations(self, frames: Float[Tensor, "3 4 l n"], below: float) -> Float[Tensor, "p n"]:
-        """Return the separation [m] of each pair; that of the bounding spheres where it is not less than `below`."""
+        """Return the separation [m] of each pair; above `below`, that of the bounding spheres."""
         shapes = self._place(frames)
         distance = self._distances(shapes[1])
         apart = distance - self._sums(self._bounding(), distance)
@@ -71,9 +70,9 @@ class SelfCollision(Value):
     def wrenches(
         self, frames: Float[Tensor, "3 4 l n"], pair: Int[Tensor, " k"], row: Int[Tensor, " k"]
     ) -> Float[Tensor, "6 k"]:
-        """Return the derivative of separations by a twist (translation, rotation) of the pair's second shape.
+        """Return the derivative of separations by a twist (translation, rotation) of the second shape.
 
-        It is a wrench about the frames' origin (force, torque). The first shape takes its negative.
+        It is a wrench (force, torque) about the frames' origin. The first shape takes its negative.
         """
         if not len(pair):
             return frames.new_zeros(6, 0)
@@ -104,7 +103,7 @@ class SelfCollision(Value):
     def _separations(
         self, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"], twist: Tensor | None = None
     ) -> Float[Tensor, " k"]:
-        """Return the separation of chosen pairs in chosen rows, after a small twist (6, k) of the second shapes."""
+        """Return the separation of chosen pairs in chosen rows, with a small twist of the second shapes."""
         separation, low = shapes[1].new_zeros(len(pair)), 0
         for kind, count in enumerate(self.kinds):
             at = torch.nonzero((pair >= low) & (pair < low + count))[:, 0]
@@ -152,15 +151,13 @@ def box_separation(
 ) -> Float[Tensor, " k"]:
     """Return the largest separation [m] of two boxes along 15 axes (Gottschalk et al., 1996).
 
-    Of boxes that overlap it is minus the least translation that parts them. Apart, it is a lower bound of the distance,
-    and exact where a face or two crossing edges are nearest.
+    Boxes overlap where it is negative; its size is then the least translation that parts them. Apart, it is a lower
+    bound of the distance, exact where a face or two crossing edges are nearest.
 
     Args:
-        a: rotation of the first box; column i, `a[:, i]`, is its axis i.
-        b: rotation of the second.
+        a, b: rotations of the boxes; column i, `a[:, i]`, is axis i.
         gap: from the centre of the first to that of the second [m].
-        half_a: half sizes of the first [m].
-        half_b: half sizes of the second [m].
+        half_a, half_b: half sizes [m].
 
     >>> still, x = torch.eye(3)[..., None], torch.tensor([[3.0], [0.0], [0.0]])
     >>> box_separation(still, still, x, torch.ones(3, 1), torch.ones(3, 1))
@@ -184,7 +181,7 @@ def box_separation(
 
 
 def box_distance(points: Float[Tensor, "*b 3"], half: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-    """Return the signed distance [m] of points from boxes about the origin with half sizes `half`; negative inside.
+    """Return the signed distance of points from boxes about the origin; negative inside.
 
     >>> box_distance(torch.tensor([[2.0, 0, 0], [0.0, 0, 0.5]]), torch.ones(2, 3))
     tensor([ 1.0000, -0.5000])
@@ -199,7 +196,7 @@ def box_distance(points: Float[Tensor, "*b 3"], half: Float[Tensor, "*b 3"]) -> 
 
 
 def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None) -> SelfCollision:
-    """Return the shapes of a URDF with the pairs to test, for pairs of links; None: all links that share no joint."""
+    """Return the shapes of a URDF with the pairs of links to test; None: all but neighbours."""
     names = [x.name for x in urdf.links]
     tested = {frozenset(pair) for pair in (itertools.combinations(names, 2) if pairs is None else pairs)}
     if pairs is None:
@@ -223,7 +220,7 @@ def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None
 
 
 def _parts(shape: Shape) -> list[tuple[Float[Tensor, "3 3"], Triple, Triple, float]]:
-    """Return the boxes and spheres whose union a shape is: rotation, centre, half sizes, radius."""
+    """Return the boxes or the sphere of a shape: rotation, centre, half sizes, radius."""
     rotation = rotation_from_rpy(shape.rpy)
     if shape.kind == "sphere":
         return [(rotation, shape.xyz, (0.0, 0.0, 0.0), shape.size[0])]

@@ -1,4 +1,4 @@
-"""A URDF as values: the links, joints and collision shapes of a checked tree. Only the URDF itself is opened."""
+"""A URDF as values: links, joints and collision shapes of a checked tree. No other file is opened."""
 
 import dataclasses
 import functools
@@ -42,7 +42,7 @@ class Shape:
 
 @dataclasses.dataclass(frozen=True)
 class Link:
-    """A rigid body: mass [kg], centre [m], inertia about the centre (xx, xy, xz, yy, yz, zz) [kg m2] and shapes."""
+    """A rigid body: mass [kg], centre [m], inertia (xx, xy, xz, yy, yz, zz) [kg m2] about it, shapes."""
 
     name: str
     mass: float
@@ -71,7 +71,7 @@ class Joint:
 
 @dataclasses.dataclass(frozen=True)
 class Urdf:
-    """A checked URDF: one root, every other link the child of exactly one joint, finite numbers throughout."""
+    """A checked URDF: one tree of links, finite numbers throughout."""
 
     path: Path
     name: str
@@ -80,13 +80,17 @@ class Urdf:
     joints: tuple[Joint, ...]
     data: bytes
 
+    def wrong(self, found: str, allowed: str) -> HandFileError:
+        """Make the error for a rule that the file breaks."""
+        return HandFileError("urdf", f"{self.path}: {found}", allowed)
+
     @functools.cached_property
     def movable(self) -> tuple[Joint, ...]:
         """The joints that are not fixed."""
         return tuple(j for j in self.joints if j.kind != "fixed")
 
     def joints_above(self, link: str) -> tuple[Joint, ...]:
-        """Return the joints between a link and the root, the nearest first, fixed ones included."""
+        """Return the joints between a link and the root, the nearest first."""
         above, chain = {j.child: j for j in self.joints}, []
         while link in above:
             chain.append(above[link])
@@ -94,7 +98,7 @@ class Urdf:
         return tuple(chain)
 
     def movers(self, link: str) -> tuple[Joint, ...]:
-        """Return the movable joints between a link and the root, the nearest first."""
+        """Return the movable ones of `joints_above`."""
         return tuple(j for j in self.joints_above(link) if j.kind != "fixed")
 
     def kinematic_xml(self) -> bytes:
@@ -115,7 +119,7 @@ class Urdf:
 
 
 def read_urdf(path: Path | str) -> Urdf:
-    """Read and check a URDF file of at most 4 MiB; meshes are neither opened nor allowed outside the file's folder.
+    """Read and check a URDF file of at most 4 MiB. Meshes outside its folder are refused; none is opened.
 
     Raises:
         HandFileError: with the file, what was found and what is allowed.
@@ -141,7 +145,7 @@ class _Reader:
     def numbers(
         self, where: str, element: ET.Element | None, key: str, n: int, default: float | None = None
     ) -> tuple[float, ...]:
-        """Read n finite numbers from an attribute of an element that may be missing."""
+        """Read n finite numbers from an attribute; the element may be missing."""
         text = None if element is None else element.get(key)
         if text is None and default is not None:
             return (default,) * n
@@ -188,7 +192,7 @@ class _Reader:
         return Link(name, mass, com, inertia, tuple(self.shape(name, c) for c in element.findall("collision")))
 
     def shape(self, link: str, collision: ET.Element) -> Shape:
-        """Read one collision shape; a mesh is refused, because neither planner nor simulator would see it."""
+        """Read one collision shape; planner and simulator could not see a mesh."""
         where = f"link {link} collision"
         xyz, rpy = self.origin(where, collision)
         geometry = collision.find("geometry")
@@ -208,7 +212,7 @@ class _Reader:
         return Shape(g.tag, size, xyz, rpy)
 
     def joint(self, element: ET.Element) -> Joint:
-        """Read a joint; a movable one needs a unit axis and finite limits in order."""
+        """Read a joint; a movable one needs a unit axis and ordered limits."""
         name = self.name(element, "name", "a joint")
         where, kind = f"joint {name}", element.get("type", "")
         if kind not in ("revolute", "prismatic", "fixed"):
