@@ -10,8 +10,7 @@ from scipy.optimize import linprog
 
 from torchgrasp import ContactSpec, PointCloud, Status, load_grasps, load_hand, load_object, plan_grasps
 from torchgrasp.errors import BadArgument, SuspiciousScale
-from torchgrasp.ik.ranking import rank_by_success
-from torchgrasp.ik.success import FEATURES, MODEL
+from torchgrasp.ik.ranking import FEATURES, MODEL, rank_by_success
 from torchgrasp.linalg import unit
 from torchgrasp.pipeline import describe, digest, spread_rows
 from torchgrasp.plan.closure_probability import closure_probability

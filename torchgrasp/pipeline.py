@@ -14,20 +14,20 @@ from torchgrasp.cloud.check import check_cloud
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.files import sha256
 from torchgrasp.hand.hand import Hand
+from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.contact_first import solve_contact_first
 from torchgrasp.ik.joint import solve_joint
 from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
 from torchgrasp.ik.query import query_mixture
-from torchgrasp.ik.ranking import rank_by_success
+from torchgrasp.ik.ranking import rank_by_success, success_features, success_log_odds
 from torchgrasp.ik.sdf import field_from_surface
-from torchgrasp.ik.success import success_features, success_odds
 from torchgrasp.linalg import farthest_points
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure_probability import closure_share
 from torchgrasp.plan.solve import plan_contacts
 from torchgrasp.plan.surface_samples import sample_surfaces, well_inside
-from torchgrasp.posture_model.mixture import load_mixture, mixture_path
+from torchgrasp.posture_model.mixture import GraspMixture, load_mixture, mixture_path
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
@@ -40,15 +40,15 @@ Observer = Callable[[str, str, Any], None]
 Mode = Literal["joint", "contact_first"]
 """How planned contacts become grasps.
 
-* "joint": from the hand's own postures near each triple; where a hand that reaches it touches something, contacts,
-  pose and joints are solved together.
-* "contact_first": as in the paper, from the learned model's postures onto the contacts as they are.
+* "joint": random postures of the hand near each triple are the seeds. Where no seed succeeds on the contacts as they
+  are, contacts, pose and joints are solved together.
+* "contact_first": as in the paper, the learned model's seeds move onto fixed contacts.
 """
 
 TRIPLES = 250
-"""How many of the planned contact triples are certified and offered to the hand."""
-DRAWS = 600
-"""Surfaces drawn for the probability of closure, which then is known to 0.02."""
+"""How many planned contact triples are certified and offered to the hand."""
+SURFACE_DRAWS = 600
+"""Surfaces drawn for the probability of closure: its standard error is then 0.02."""
 
 
 def _ignore(stage: str, message: str, value: Any) -> None:
@@ -58,15 +58,15 @@ def _ignore(stage: str, message: str, value: Any) -> None:
 def spread_rows(plan: ContactPlan, most: int) -> Int[Tensor, "k"]:
     """Return at most `most` rows that succeeded, far apart from each other (greedy farthest point), in plan order.
 
-    A triple in another order of its contacts is the same triple, so each is sorted by height first.
+    Contacts in another order are the same triple, so each triple is sorted by height first.
     """
     rows = torch.nonzero(plan.status == Status.OK)[:, 0]
     if len(rows) <= most:
         return rows
     points = plan.contacts.points[rows]
     order = torch.argsort(points[..., 2], dim=1, stable=True)
-    place = points.gather(1, order[..., None].expand(-1, -1, 3)).flatten(1)
-    chosen = farthest_points(place, most, first=int(plan.quality[rows].argmin()))
+    points = points.gather(1, order[..., None].expand(-1, -1, 3)).flatten(1)
+    chosen = farthest_points(points, most, first=int(plan.quality[rows].argmin()))
     return rows[chosen.sort().values]
 
 
@@ -81,26 +81,16 @@ def describe(counts: dict[Status, int]) -> str:
 
 
 def digest(cloud: PointCloud) -> str:
-    """Return the SHA-256 of the points that were given, so that a result names its input."""
+    """Return the SHA-256 of the points, so that a result names its input."""
     return hashlib.sha256(cloud.points.detach().cpu().double().contiguous().numpy().tobytes()).hexdigest()
 
 
-def closure_of(contacts: Contacts, shape: ShapeGP, friction: float, seed: int) -> Float[Tensor, "k"]:
-    """Return the probability of closure of each triple, 0 of one at the edge of the shape's domain."""
+def closure_of(shape: ShapeGP, contacts: Contacts, friction: float, seed: int) -> Float[Tensor, "k"]:
+    """Return the probability of closure of each triple, 0 at the edge of the shape's domain."""
     closure, inside = torch.zeros_like(contacts.points[:, 0, 0]), well_inside(shape, contacts)
-    closure[inside] = closure_share(sample_surfaces(shape, contacts[inside]), friction, DRAWS, seed).to(closure)
+    draws = sample_surfaces(shape, contacts[inside])
+    closure[inside] = closure_share(draws, friction, SURFACE_DRAWS, seed).to(closure)
     return closure
-
-
-def odds_of(
-    grasps: Grasps, shape: ShapeGP, center: Float[Tensor, "3"], spec: ContactSpec, seed: int
-) -> Float[Tensor, "k"]:
-    """Return the log-odds of success of the k executable grasps."""
-    good = grasps[grasps.status == Status.OK]
-    if not len(good):
-        return good.score
-    closure = closure_of(good.contacts, shape, spec.friction, seed)
-    return success_odds(success_features(good.contacts, closure, good.normal_angle, center, spec.friction))
 
 
 def plan_grasps(
@@ -117,18 +107,18 @@ def plan_grasps(
     """Plan grasps of a hand on the object of a partial point cloud: every stage of the library in one call.
 
     Args:
-        cloud: what the camera saw [m]; normals and viewpoint are estimated where they are missing.
+        cloud: what the camera saw [m]; missing normals and viewpoint are estimated.
         hand: from `load_hand`.
-        spec: what the contacts must satisfy; `ContactSpec()` by default.
+        spec: what the contacts must satisfy; None: `ContactSpec()`.
         starts: random starts of the contact planner.
         seed: of every random draw; the same seed gives bitwise the same grasps.
         mode: how planned contacts become grasps, see `Mode`. Only "contact_first" needs the hand's learned model.
-        shape: the object's shape as it is believed to be, where it is known better than from the cloud, as after a
-            touch (`ShapeGP.update`); None: it is fitted to the cloud.
+        shape: the object's shape where more is known than the cloud shows, as after a touch (`ShapeGP.update`); None:
+            it is fitted to the cloud.
         observer: called after each stage with its name, a line of counts, and its value.
 
     Returns:
-        Grasps, those with `Status.OK` first and best first; the others say what they lack. There may be none.
+        Grasps, those with `Status.OK` first, best first. The others say what they lack. There may be none.
 
     Raises:
         BadArgument: an argument of the wrong type or range, or a cloud that no object of graspable size gives.
@@ -144,10 +134,7 @@ def plan_grasps(
         raise BadArgument("hand", type(hand).__name__, "a Hand from load_hand")
     if mode not in get_args(Mode):
         raise BadArgument("mode", repr(mode), "'joint' or 'contact_first'")
-    model = None
-    if mode == "contact_first":
-        mixture_file = mixture_path(hand.urdf_path.parent)  # beside the hand, also when it is a user's own
-        model = load_mixture(mixture_file), sha256(mixture_file)
+    mixture, mixture_sha256 = _read_mixture(hand) if mode == "contact_first" else (None, "none")
 
     if shape is None:
         shape = fit_shape(cloud, seed=seed, table=spec.table)
@@ -161,43 +148,64 @@ def plan_grasps(
     plan = plan_contacts(shape, spec, starts, seed)
     observer("plan", f"{starts} starts: {describe(count_status(plan.status))}", plan)
 
-    rows = spread_rows(plan, TRIPLES)
-    certificate = certify(plan.contacts[rows], spec)
-    contacts, certificate = plan.contacts[rows][certificate.closed], certificate[certificate.closed]
-    observer(
-        "certify", f"{len(contacts)} of {len(rows)} triples closed at friction {spec.planned_friction:g}", certificate
-    )
+    contacts = plan.contacts[spread_rows(plan, TRIPLES)]
+    certificate = certify(contacts, spec)
+    closed, offered = certificate.closed, len(contacts)
+    contacts, certificate = contacts[closed], certificate[closed]
+    message = f"{len(contacts)} of {offered} triples closed at friction {spec.planned_friction:g}"
+    observer("certify", message, certificate)
 
     world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), spec.table)
-    if model is None:
-        guess = nearest_postures(contacts, PostureLibrary.of(hand, seed=seed), world)
+    problem = GraspProblem(hand, contacts, certificate, world, surface.vertices.mean(0))
+    if mixture is None:
+        seeds = nearest_postures(PostureLibrary.of(hand, seed=seed), contacts, world)
     else:
-        guess = query_mixture(contacts, hand, model[0].to(shape.device))
-    reached = len(torch.unique(guess.row))
-    observer("query", f"{len(guess)} postures for {reached} of {len(contacts)} triples", guess)
+        seeds = query_mixture(hand, contacts, mixture.to(shape.device))
+    reached = len(torch.unique(seeds.row))
+    observer("query", f"{len(seeds)} seeds for {reached} of {len(contacts)} triples", seeds)
 
-    center = surface.vertices.mean(0)
-    given = guess, hand, contacts, certificate, world, center
-    grasps = solve_joint(*given, shape, spec) if model is None else solve_contact_first(*given)
-    grasps = rank_by_success(grasps, odds_of(grasps, shape, center, spec, seed))
-    grasps = dataclasses.replace(
-        grasps,
-        meta={
-            "hand": hand.name,
-            "hand_sha256": hand.source.sha256,
-            "mode": mode,
-            "mixture_sha256": "none" if model is None else model[1],
-            "cloud_sha256": digest(cloud),
-            "joint_names": ",".join(hand.joint_names),
-            "finger_names": ",".join(hand.finger_names),
-            "frames": "obj: the frame of the cloud; hand: the base link of the hand's URDF; a_from_b maps b into a",
-            "units": "metre, radian",
-            "friction": f"{spec.friction:g}",
-            "planned_friction": f"{spec.planned_friction:g}",
-            "table": "none" if spec.table is None else f"{spec.table:g}",
-            "starts": str(starts),
-            "seed": str(seed),
-        },
-    )
+    grasps = solve_joint(problem, seeds, shape, spec) if mixture is None else solve_contact_first(problem, seeds)
+    grasps = rank_by_success(grasps, _log_odds(grasps, shape, problem.center, spec, seed))
+    meta = {"mode": mode, "mixture_sha256": mixture_sha256, "starts": str(starts), "seed": str(seed)}
+    grasps = dataclasses.replace(grasps, meta=_describe_hand(hand) | _describe_task(cloud, spec) | meta)
     observer("refine", f"{len(grasps)} refined: {describe(count_status(grasps.status))}", grasps)
     return grasps
+
+
+def _read_mixture(hand: Hand) -> tuple[GraspMixture, str]:
+    """Return the learned model beside the hand's URDF, and its hash."""
+    path = mixture_path(hand.urdf_path.parent)
+    return load_mixture(path), sha256(path)
+
+
+def _log_odds(
+    grasps: Grasps, shape: ShapeGP, center: Float[Tensor, "3"], spec: ContactSpec, seed: int
+) -> Float[Tensor, "k"]:
+    """Return the log-odds of success of the executable grasps."""
+    grasps = grasps[grasps.status == Status.OK]
+    if not len(grasps):
+        return grasps.score
+    closure = closure_of(shape, grasps.contacts, spec.friction, seed)
+    return success_log_odds(success_features(grasps.contacts, closure, grasps.normal_angle, center, spec.friction))
+
+
+def _describe_hand(hand: Hand) -> dict[str, str]:
+    """Return what a file of grasps says of the hand and of the numbers' meaning."""
+    return {
+        "hand": hand.name,
+        "hand_sha256": hand.source.sha256,
+        "joint_names": ",".join(hand.joint_names),
+        "finger_names": ",".join(hand.finger_names),
+        "frames": "obj: the frame of the cloud; hand: the base link of the hand's URDF; a_from_b maps b into a",
+        "units": "metre, radian",
+    }
+
+
+def _describe_task(cloud: PointCloud, spec: ContactSpec) -> dict[str, str]:
+    """Return what a file of grasps says of the cloud and the specification."""
+    return {
+        "cloud_sha256": digest(cloud),
+        "friction": f"{spec.friction:g}",
+        "planned_friction": f"{spec.planned_friction:g}",
+        "table": "none" if spec.table is None else f"{spec.table:g}",
+    }

@@ -26,8 +26,9 @@ from torchgrasp import (
 )
 from torchgrasp.files import write_atomically
 from torchgrasp.frames import virtual_frame
+from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.clearance import CollisionWorld
-from torchgrasp.ik.contact_first import rank_seeds, refinement_on_contacts
+from torchgrasp.ik.contact_first import rank_seeds, refine_on_contacts
 from torchgrasp.ik.query import query_mixture
 from torchgrasp.ik.sdf import field_from_surface
 from torchgrasp.pipeline import spread_rows
@@ -94,11 +95,12 @@ def take(name: str, starts: int, seed: int) -> tuple[Taken, Taken]:
     contacts, certificate = contacts[certificate.closed], certificate[certificate.closed]
     found = []
     for hand in (load_hand("allegro"), load_hand("barrett")):
-        guess = query_mixture(contacts, hand, load_mixture(hand.name), GUESSES)
-        guess = guess[rank_seeds(guess, hand, contacts, world) < TRIED]
-        tried = refinement_on_contacts(hand, contacts, certificate, world, surface.vertices.mean(0))(guess)
-        good = tried.status == Status.OK
-        found.append(Taken(hand, surface, tried[good], guess.row[good]))
+        problem = GraspProblem(hand, contacts, certificate, world, surface.vertices.mean(0))
+        seeds = query_mixture(hand, contacts, load_mixture(hand.name), GUESSES)
+        seeds = seeds[rank_seeds(problem, seeds) < TRIED]
+        refined = refine_on_contacts(problem, seeds)
+        good = refined.status == Status.OK
+        found.append(Taken(hand, surface, refined[good], seeds.row[good]))
     return found[0], found[1]
 
 

@@ -10,7 +10,7 @@ import torch
 from benchmarks.close.success import TESTS, brier, draw_reliability, fit, judge, leave_one_out, read_trials
 
 from torchgrasp.files import format_json, write_file
-from torchgrasp.ik.success import FEATURES, MODEL
+from torchgrasp.ik.ranking import FEATURES, MODEL
 
 
 def success(

@@ -1,4 +1,4 @@
-"""The way to a pre-grasp against distances to solids in closed form."""
+"""The path to a pre-grasp against distances to solids in closed form."""
 
 import math
 
@@ -6,19 +6,20 @@ import pytest
 import torch
 
 from tests.pinch import HEIGHT, RADIUS, cylinder, pinch
+from tests.reach import field_of_mesh
 from torchgrasp.frames import apply, rigid, rotation_from_vector
-from torchgrasp.ik.approach import DISTANCE, FINE_PLACES, _directions, find_approach
+from torchgrasp.ik.approach import APPROACH_DISTANCE, FINE_STEPS, approach_directions, find_approach
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
-from torchgrasp.ik.sdf import SignedDistanceField, field_from_mesh
+from torchgrasp.ik.sdf import SignedDistanceField
 from torchgrasp.linalg import unit
 
 
-def spheres_on_the_way(posture, hand, direction, places=81):
-    """Centres (p, s, 3) of the hand's spheres from where the way starts to where it ends, and their radii."""
+def spheres_on_path(posture, hand, direction, places=81):
+    """Centres (p, s, 3) of the hand's spheres along the path, and their radii."""
     cover = hand.collision_spheres
-    centres = SpatialJacobian.at(posture, hand).points(cover.link_index, cover.center)[0]
-    back = torch.linspace(DISTANCE, 0.0, places, dtype=torch.float64)
+    centres = SpatialJacobian.at(hand, posture).points(cover.link_index, cover.center)[0]
+    back = torch.linspace(APPROACH_DISTANCE, 0.0, places, dtype=torch.float64)
     return centres - back[:, None, None] * direction[0], cover.radius
 
 
@@ -31,12 +32,12 @@ def cylinder_distance(points):
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
-def test_the_way_is_clear_of_the_object_and_the_table_as_said(name):
+def test_the_path_is_as_clear_of_the_object_and_the_table_as_said(name):
     hand, grasp = pinch(name)
     posture = Configuration(grasp.pregrasp, grasp.obj_from_hand)
-    direction, clearance = find_approach(posture, hand, CollisionWorld(field_from_mesh(cylinder()), 0.0))
+    direction, clearance = find_approach(hand, posture, CollisionWorld(field_of_mesh(cylinder()), 0.0))
     assert float(direction.norm()) == pytest.approx(1.0)
-    centres, radius = spheres_on_the_way(posture, hand, direction)
+    centres, radius = spheres_on_path(posture, hand, direction)
     away = centres[: 81 - 5]  # the last sixteenth is the pre-grasp's own matter
     least = min(
         float((cylinder_distance(away) - radius).min()),
@@ -53,18 +54,18 @@ def field_of(distance, center, half=0.4, spacing=0.01):
     return SignedDistanceField(center - half, spacing, distance(offsets + center))
 
 
-def test_a_wall_is_avoided_and_a_cage_leaves_no_way():
+def test_a_wall_is_avoided_and_a_cage_leaves_no_path():
     hand, grasp = pinch("allegro")
     posture, center = Configuration(grasp.pregrasp, grasp.obj_from_hand), grasp.obj_from_hand[0, :3, 3]
-    free, _ = find_approach(posture, hand, CollisionWorld(field_from_mesh(cylinder()), None))
+    free, _ = find_approach(hand, posture, CollisionWorld(field_of_mesh(cylinder()), None))
 
     def wall(points):
-        """Distance to all that is more than 0.1 m behind the hand on that way."""
+        """Distance to all that is more than 0.1 m behind the hand on that path."""
         return ((points - center) * free[0]).sum(-1) + 0.1
 
-    other, clearance = find_approach(posture, hand, CollisionWorld(field_of(wall, center), None))
-    before = (wall(spheres_on_the_way(posture, hand, free)[0]) - hand.collision_spheres.radius).min()
-    after = (wall(spheres_on_the_way(posture, hand, other)[0][:-5]) - hand.collision_spheres.radius).min()
+    other, clearance = find_approach(hand, posture, CollisionWorld(field_of(wall, center), None))
+    before = (wall(spheres_on_path(posture, hand, free)[0]) - hand.collision_spheres.radius).min()
+    after = (wall(spheres_on_path(posture, hand, other)[0][:-5]) - hand.collision_spheres.radius).min()
     assert float(after) > float(before) + 0.02
     assert float(clearance) == pytest.approx(float(after), abs=1e-12)
 
@@ -72,7 +73,7 @@ def test_a_wall_is_avoided_and_a_cage_leaves_no_way():
         """Distance to all that is more than 0.15 m from the middle of the hand."""
         return 0.15 - (points - center).norm(dim=-1)
 
-    _, none = find_approach(posture, hand, CollisionWorld(field_of(cage, center), None))
+    _, none = find_approach(hand, posture, CollisionWorld(field_of(cage, center), None))
     assert float(none) < 0
 
 
@@ -81,8 +82,8 @@ def wall_of(normal, origin):
     return lambda points: ((points - origin) * normal).sum(-1)
 
 
-def test_the_way_turns_with_hand_and_frame():
-    """A wall behind the hand that leans by 40 degrees leaves most room on the way that is tilted towards it."""
+def test_the_path_turns_with_hand_and_frame():
+    """A wall behind the hand that leans by 40 degrees leaves most room on the path that is tilted towards it."""
     hand, grasp = pinch("barrett")
     posture = Configuration(grasp.pregrasp, grasp.obj_from_hand)
     axis, side = torch.eye(3).double()[[2, 0]]
@@ -97,9 +98,9 @@ def test_the_way_turns_with_hand_and_frame():
         middle = apply(turned.obj_from_hand[0], 0.1 * axis[None])[0]
         wall = wall_of(rotation @ leaning, middle - 0.25 * (rotation @ leaning))
         field = field_of(wall, middle, half=0.35, spacing=0.005)
-        direction, clearance = find_approach(turned, hand, CollisionWorld(field, None))
+        direction, clearance = find_approach(hand, turned, CollisionWorld(field, None))
         assert torch.allclose(direction[0], rotation @ tilted, atol=1e-12)
-        centres, radius = spheres_on_the_way(turned, hand, direction)
+        centres, radius = spheres_on_path(turned, hand, direction)
         # between the nodes of a plane's distance nothing is lost
         assert float(clearance) == pytest.approx(float((wall(centres) - radius).min()), abs=1e-12)
         clearances.append(float(clearance))
@@ -107,20 +108,20 @@ def test_the_way_turns_with_hand_and_frame():
 
 
 def test_what_is_called_free_is_free_where_the_nearest_node_errs(generator):
-    """Nodes 3 cm apart rank the ways badly; one that is free is found all the same, and its clearance is exact."""
+    """Nodes 3 cm apart rank the paths badly; one that is free is found all the same, and its clearance is exact."""
     hand, grasp = pinch("allegro")
     posture = Configuration(grasp.pregrasp, grasp.obj_from_hand)
-    centres = SpatialJacobian.at(posture, hand).points(hand.collision_spheres.link_index, hand.collision_spheres.center)
+    centres = SpatialJacobian.at(hand, posture).points(hand.collision_spheres.link_index, hand.collision_spheres.center)
     middle, radius, erred = centres[0].mean(0), hand.collision_spheres.radius, 0
     for _ in range(20):
         normal = unit(torch.randn(3, generator=generator, dtype=torch.float64))
-        directions = _directions(posture, hand, None)[0]
-        ways = [spheres_on_the_way(posture, hand, d[None], FINE_PLACES + 1)[0][:-1] for d in directions]
-        room = torch.stack([(wall_of(normal, middle)(way) - radius).min() for way in ways])
+        directions = approach_directions(hand, posture, None)[0]
+        paths = [spheres_on_path(posture, hand, d[None], FINE_STEPS + 1)[0][:-1] for d in directions]
+        room = torch.stack([(wall_of(normal, middle)(path) - radius).min() for path in paths])
         field = field_of(wall_of(normal, middle + (room.max() - 1e-3) * normal), middle, half=0.42, spacing=0.03)
-        by_node = torch.stack([(field.nearest(way) - radius).min() for way in ways]).argmax()
+        by_node = torch.stack([(field.nearest_node(path) - radius).min() for path in paths]).argmax()
         erred += int(room[by_node] < room.max() - 1e-3)
-        found, clearance = find_approach(posture, hand, CollisionWorld(field, None))
+        found, clearance = find_approach(hand, posture, CollisionWorld(field, None))
         which = (directions - found).norm(dim=1).argmin()
         assert float(clearance) == pytest.approx(float(room[which] - room.max() + 1e-3), abs=1e-12)
         assert float(clearance) >= 0
@@ -129,7 +130,6 @@ def test_what_is_called_free_is_free_where_the_nearest_node_errs(generator):
 
 def test_without_anything_around_the_hand_comes_along_its_own_axis():
     hand, grasp = pinch("barrett")
-    direction, clearance = find_approach(
-        Configuration(grasp.pregrasp, grasp.obj_from_hand), hand, CollisionWorld(None, None)
-    )
+    opened = Configuration(grasp.pregrasp, grasp.obj_from_hand)
+    direction, clearance = find_approach(hand, opened, CollisionWorld())
     assert torch.allclose(direction, grasp.approach, atol=1e-12) and torch.isinf(clearance).all()

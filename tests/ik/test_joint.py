@@ -1,16 +1,20 @@
 """Contacts, pose and joints solved together: the Jacobian, and grasps against oracles of their own."""
 
+import dataclasses
+
 import pytest
 import torch
 
 from torchgrasp import ContactSpec, certify, fit_shape, load_hand, load_object, plan_contacts
 from torchgrasp.errors import Status
 from torchgrasp.frames import apply
+from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration
-from torchgrasp.ik.contact_first import assign, solve_contact_first
-from torchgrasp.ik.joint import JointState, joint_residuals, solve_joint
+from torchgrasp.ik.contact_first import solve_contact_first
+from torchgrasp.ik.joint import JointProblem, JointState, solve_joint
 from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
+from torchgrasp.ik.rounds import assign
 from torchgrasp.ik.sdf import field_from_surface
 from torchgrasp.plan.flatness import flatness_constraint
 from torchgrasp.plan.problem import ContactProblem
@@ -22,7 +26,7 @@ SPEC = ContactSpec(table=0.0)
 
 @pytest.fixture(scope="module")
 def scene():
-    """What the pipeline makes of one view of a jug with a handle, up to certified contacts and guesses for them."""
+    """What the pipeline makes of one view of a jug with a handle, up to certified contacts and seeds for them."""
     hand, shape = load_hand("allegro"), fit_shape(load_object("jug").view, seed=0, table=0.0)
     surface = extract_surface(shape)
     plan = plan_contacts(shape, SPEC, starts=24, seed=2)
@@ -30,8 +34,8 @@ def scene():
     good = (plan.status == Status.OK) & certificate.closed
     contacts, certificate = plan.contacts[good], certificate[good]
     world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), SPEC.table)
-    guess = nearest_postures(contacts, PostureLibrary.of(hand, 600), world)
-    return guess, hand, contacts, certificate, world, surface.vertices.mean(0), shape, SPEC
+    seeds = nearest_postures(PostureLibrary.of(hand, 600), contacts, world)
+    return GraspProblem(hand, contacts, certificate, world, surface.vertices.mean(0)), seeds, shape, SPEC
 
 
 @pytest.fixture(scope="module")
@@ -39,18 +43,19 @@ def grasps(scene):
     return solve_joint(*scene)
 
 
-def test_jacobian_of_joined_rows_against_finite_differences(scene, generator):
-    guess, hand, contacts, _, world, _, shape, spec = scene
-    guess = guess[::8][:24]
+def test_jacobian_of_the_joint_problem_against_finite_differences(scene, generator):
+    given, seeds, shape, spec = scene
+    hand, seeds = given.hand, seeds[::8][:24]
     lower, upper = hand.lower + 0.01, hand.upper - 0.01  # steps must not meet the limits
-    posture = Configuration(guess.joints.clamp(lower, upper), guess.obj_from_hand)
-    points = shape.normalise(assign(contacts, guess).points)
+    posture = Configuration(seeds.joints.clamp(lower, upper), seeds.obj_from_hand)
+    points = shape.normalise(assign(given.contacts, seeds).points)
     points = points + 0.1 * torch.randn(points.shape, generator=generator, dtype=torch.float64)
     tension = normalise_tensions(points, torch.rand(24, 3, generator=generator, dtype=torch.float64))
-    problem, flat = ContactProblem.of(shape, spec), flatness_constraint(shape, points, 0.2)
+    problem = JointProblem(hand, shape, ContactProblem.of(shape, spec), given.world, 0.2)
+    flat = flatness_constraint(shape, points, 0.2)
 
     def rows(state: JointState):
-        residual, jacobian = joint_residuals(state, hand, shape, problem, world, flat)
+        residual, jacobian = problem.residuals(state, flat)
         links = slice(12, residual.shape[1] - 3 - 15 - 12)  # no matter of the contacts, and tested in test_refine
         assert bool((jacobian[:, links, 6 + hand.dof :] == 0).all())
         rest = [*range(12), *range(links.stop, residual.shape[1])]
@@ -62,14 +67,15 @@ def test_jacobian_of_joined_rows_against_finite_differences(scene, generator):
     for k in range(jacobian.shape[2]):
         step = torch.zeros(24, jacobian.shape[2], dtype=torch.float64)
         step[:, k] = 1e-5
-        slope = (rows(state.moved(step, hand))[0] - rows(state.moved(-step, hand))[0]) / 2e-5
+        slope = (rows(state.integrate(hand, step))[0] - rows(state.integrate(hand, -step))[0]) / 2e-5
         torch.testing.assert_close(jacobian[..., k], slope, rtol=1e-4, atol=0.1)  # digits of the variance
 
 
 def test_grasps_satisfy_every_constraint(scene, grasps):
-    _, hand, contacts, _, world, _, shape, spec = scene
+    given, _, shape, spec = scene
+    hand, world = given.hand, given.world
     good = grasps[grasps.status == Status.OK]
-    assert len(good) >= 0.85 * len(contacts)
+    assert len(good) >= 0.85 * len(given.contacts)
     seen = shape.predict(good.contacts.points)
     assert float(seen.distance.abs().max()) <= 1e-5
     assert float(seen.variance.max()) <= spec.max_variance + 1e-6
@@ -91,7 +97,7 @@ def test_grasps_satisfy_every_constraint(scene, grasps):
 
 def test_links_are_outside_the_estimated_surface(scene, grasps):
     """Link centre lines against the mean itself, not the field that the solver saw."""
-    _, hand, *_, shape, _ = scene
+    hand, shape = scene[0].hand, scene[2]
     good = grasps[grasps.status == Status.OK]
     centres = apply(good.obj_from_hand, hand.sphere_centres(good.joints))[:, ~hand.collision_spheres.touching]
     near = torch.linalg.vector_norm(shape.normalise(centres), dim=-1) < shape.domain_radius
@@ -100,10 +106,10 @@ def test_links_are_outside_the_estimated_surface(scene, grasps):
 
 
 def test_sliding_contacts_find_more_grasps_than_still_ones(scene, grasps):
-    still = solve_contact_first(*scene[:6])
+    still = solve_contact_first(*scene[:2])
     better = int((grasps.status == Status.OK).sum()) - int((still.status == Status.OK).sum())
     assert better > 0
-    begun = scene[2].points.flatten(1)
+    begun = scene[0].contacts.points.flatten(1)
     ended = grasps[grasps.status == Status.OK].contacts.points
     own = ended.gather(1, grasps[grasps.status == Status.OK].permutation.argsort(1)[..., None].expand_as(ended))
     moved = torch.cdist(own.flatten(1), begun).amin(1)
@@ -111,16 +117,16 @@ def test_sliding_contacts_find_more_grasps_than_still_ones(scene, grasps):
 
 
 def test_a_triple_without_a_grasp_says_why(scene):
-    guess, hand, contacts, certificate, world, center, shape, spec = scene
-    flooded = CollisionWorld(world.field, 0.5)  # a table far above the object
-    found = solve_joint(guess[:48], hand, contacts, certificate, flooded, center, shape, spec)
-    assert len(found) == len(torch.unique(guess.row[:48]))
-    assert bool((found.status != Status.OK).all())
-    assert {Status(int(s)) for s in found.status} <= set(Status)
+    problem, seeds, shape, spec = scene
+    flooded = dataclasses.replace(problem, world=CollisionWorld(problem.world.field, 0.5))  # far above the object
+    grasps = solve_joint(flooded, seeds[:48], shape, spec)
+    assert len(grasps) == len(torch.unique(seeds.row[:48]))
+    assert bool((grasps.status != Status.OK).all())
+    assert {Status(int(s)) for s in grasps.status} <= set(Status)
 
 
-def test_same_guesses_give_the_same_bits(scene, grasps):
+def test_same_seeds_give_the_same_bits(scene, grasps):
     again = solve_joint(*scene)
     assert torch.equal(again.joints, grasps.joints) and torch.equal(again.status, grasps.status)
     assert torch.equal(again.contacts.points, grasps.contacts.points)
-    assert len(solve_joint(scene[0][:0], *scene[1:])) == 0
+    assert len(solve_joint(scene[0], scene[1][:0], *scene[2:])) == 0

@@ -1,10 +1,12 @@
-"""Nearest postures: a set finds its own members again, in any order and place, and prefers those that are clear."""
+"""Posture library: it finds its own postures again, in any order and place, and prefers clear ones."""
 
+import numpy as np
 import pytest
 import torch
 
+from tests.reach import touched_contacts
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import apply, rigid, rotate, rotation_from_vector
+from torchgrasp.frames import apply, rigid, rotation_from_vector
 from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, collision_cost
 from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
@@ -16,7 +18,7 @@ NOTHING = SignedDistanceField(torch.zeros(3, dtype=torch.float64), 1.0, torch.on
 
 
 @pytest.fixture(scope="module", params=["allegro", "barrett"])
-def postures(request):
+def library(request):
     return PostureLibrary.of(load_hand(request.param), 400, seed=3)
 
 
@@ -26,19 +28,16 @@ def poses(generator):
     return rigid(turn, torch.randn(12, 3, generator=generator, dtype=torch.float64))
 
 
-def touched(postures: PostureLibrary, poses: torch.Tensor) -> Contacts:
-    """Contacts that the first postures touch with the middle of their pads at these poses."""
-    hand, joints = postures.hand, postures.joints[: len(poses)]
-    outward = -rotate(poses, hand.fingertips(joints)[1])
-    points = apply(poses, hand.tip_centres(joints)) - hand.tip_radius[:, None] * outward
-    return Contacts(points, outward)
+def touched(library: PostureLibrary, poses: torch.Tensor) -> Contacts:
+    """Contacts that the library's first postures touch at these poses."""
+    return touched_contacts(library.hand, library.joints[: len(poses)], poses)
 
 
-def test_eq24_members_of_the_set_are_found_and_placed(postures, poses):
-    found = nearest_postures(touched(postures, poses), postures, CollisionWorld(NOTHING, None), n_seeds=3)
+def test_eq24_postures_of_the_library_are_found_and_placed(library, poses):
+    found = nearest_postures(library, touched(library, poses), CollisionWorld(NOTHING), n_seeds=3)
     assert found.row.tolist() == [i for i in range(12) for _ in range(3)]
     best = found[torch.arange(0, 36, 3)]
-    torch.testing.assert_close(best.joints, postures.joints[:12])
+    torch.testing.assert_close(best.joints, library.joints[:12])
     torch.testing.assert_close(best.obj_from_hand, poses)
     assert best.permutation.tolist() == [[0, 1, 2]] * 12
     assert float(best.tip_error.max()) < 1e-9
@@ -46,58 +45,51 @@ def test_eq24_members_of_the_set_are_found_and_placed(postures, poses):
     assert bool((best.energy <= found.energy.view(12, 3).T).all())
 
 
-def test_the_order_of_the_contacts_does_not_matter(postures, poses):
-    contacts, order = touched(postures, poses), [2, 0, 1]
+def test_the_order_of_the_contacts_does_not_matter(library, poses):
+    contacts, order = touched(library, poses), [2, 0, 1]
     turned = Contacts(contacts.points[:, order], contacts.normals[:, order])
-    found = nearest_postures(turned, postures, CollisionWorld(NOTHING, None), n_seeds=1)
-    torch.testing.assert_close(found.joints, postures.joints[:12])
+    found = nearest_postures(library, turned, CollisionWorld(NOTHING), n_seeds=1)
+    torch.testing.assert_close(found.joints, library.joints[:12])
     assert found.permutation.tolist() == [[1, 2, 0]] * 12  # finger i takes the contact that was its own
 
 
-def test_a_table_moves_clear_postures_to_the_front(postures, poses):
-    contacts = touched(postures, poses)
-    table = float(contacts.points[..., 2].min()) - 0.02
-    hand, cover = postures.hand, postures.hand.collision_spheres
+def test_a_table_moves_clear_postures_to_the_front(library, poses):
+    contacts = touched(library, poses)
+    table, hand = float(contacts.points[..., 2].min()) - 0.02, library.hand
 
     def overlap(world: CollisionWorld) -> torch.Tensor:
-        best = nearest_postures(contacts, postures, world, n_seeds=1)
-        spheres = apply(best.obj_from_hand, hand.sphere_centres(best.joints))
-        return collision_cost(spheres, cover, CollisionWorld(NOTHING, table))
+        best = nearest_postures(library, contacts, world, n_seeds=1)
+        centres = apply(best.obj_from_hand, hand.sphere_centres(best.joints))
+        return collision_cost(centres, hand.collision_spheres, CollisionWorld(NOTHING, table))
 
-    without, aware = overlap(CollisionWorld(NOTHING, None)), overlap(CollisionWorld(NOTHING, table))
+    without, aware = overlap(CollisionWorld(NOTHING)), overlap(CollisionWorld(NOTHING, table))
     assert float(aware.sum()) <= float(without.sum())
 
 
-def test_crowding_is_the_sum_of_squared_lacks(postures, poses):
-    hand, cover = postures.hand, postures.hand.collision_spheres
-    spheres = apply(poses, hand.sphere_centres(postures.joints[:12]))
+def test_collision_cost_is_the_sum_of_squared_deficits(library, poses):
+    spheres = library.hand.collision_spheres
+    centres = apply(poses, library.hand.sphere_centres(library.joints[:12]))
     nothing = torch.zeros(12, dtype=torch.float64)
-    torch.testing.assert_close(collision_cost(spheres, cover, CollisionWorld(NOTHING, -10.0)), nothing)
-    wanted = []
-    for centres in spheres.tolist():
-        total = 0.0
-        for (_, _, z), radius, touches in zip(centres, cover.radius.tolist(), cover.touching.tolist(), strict=True):
-            lack = 0.1 + (0 if touches else CLEARANCE) - (z - radius)
-            total += max(0.0, lack / MILLIMETRE) ** 2
-        wanted.append(total)
-    torch.testing.assert_close(
-        collision_cost(spheres, cover, CollisionWorld(NOTHING, 0.1)), torch.tensor(wanted, dtype=torch.float64)
-    )
+    torch.testing.assert_close(collision_cost(centres, spheres, CollisionWorld(NOTHING, -10.0)), nothing)
+    height, radius = centres[..., 2].numpy(), spheres.radius.numpy()
+    deficit = 0.1 + np.where(spheres.touching.numpy(), 0.0, CLEARANCE) - (height - radius)
+    expected = (np.maximum(deficit / MILLIMETRE, 0) ** 2).sum(1)
+    cost = collision_cost(centres, spheres, CollisionWorld(NOTHING, 0.1))
+    torch.testing.assert_close(cost, torch.tensor(expected, dtype=torch.float64))
 
 
-def test_degenerate_triples_have_no_guess_and_same_seed_same_bits(postures, poses):
-    contacts = touched(postures, poses)
+def test_degenerate_triples_have_no_seeds_and_same_seed_same_bits(library, poses):
+    contacts = touched(library, poses)
     line = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]], dtype=torch.float64)
     up = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand(3, 3)
     points, normals = contacts.points.clone(), contacts.normals.clone()
     points[4], normals[4] = line, up
     mixed = Contacts(points, normals)
-    found = nearest_postures(mixed, postures, CollisionWorld(NOTHING, None), n_seeds=2)
+    found = nearest_postures(library, mixed, CollisionWorld(NOTHING), n_seeds=2)
     assert 4 not in found.row.tolist() and len(found) == 22
-    again = nearest_postures(
-        mixed, PostureLibrary.of(postures.hand, 400, seed=3), CollisionWorld(NOTHING, None), n_seeds=2
-    )
+    same = PostureLibrary.of(library.hand, 400, seed=3)
+    again = nearest_postures(same, mixed, CollisionWorld(NOTHING), n_seeds=2)
     assert torch.equal(found.joints, again.joints) and torch.equal(found.obj_from_hand, again.obj_from_hand)
-    assert len(nearest_postures(mixed[:0], postures, CollisionWorld(NOTHING, None))) == 0
+    assert len(nearest_postures(library, mixed[:0], CollisionWorld(NOTHING))) == 0
     with pytest.raises(BadArgument, match="n_seeds"):
-        nearest_postures(mixed, postures, CollisionWorld(NOTHING, None), n_seeds=0)
+        nearest_postures(library, mixed, CollisionWorld(NOTHING), n_seeds=0)

@@ -1,4 +1,4 @@
-"""Query of postures for contacts: contacts that a real posture touches are found again (Eqs. 21-24)."""
+"""Query of the learned model: contacts that a real posture touches give the posture again (Eqs. 21-24)."""
 
 import dataclasses
 import functools
@@ -6,6 +6,7 @@ import functools
 import pytest
 import torch
 
+from tests.reach import touched_contacts
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, inverse, rigid, rotate, virtual_frame
 from torchgrasp.hand.hand import Hand
@@ -15,7 +16,6 @@ from torchgrasp.posture_model.encoding import PERMUTATIONS
 from torchgrasp.posture_model.fit import fit_mixture
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture, load_mixture
 from torchgrasp.posture_model.sample import HandSamples, sample_configurations
-from torchgrasp.values import Contacts
 
 
 @functools.cache
@@ -25,21 +25,14 @@ def barrett() -> tuple[Hand, HandSamples, GraspMixture]:
     return hand, samples, fit_mixture(samples[:9000], components=12, iterations=60)
 
 
-def contacts_of(hand: Hand, joints: torch.Tensor, obj_from_hand: torch.Tensor) -> Contacts:
-    """The contacts on an object that these postures touch: outward normals against those of the tips."""
-    points, normals = hand.fingertips(joints)
-    points, normals = apply(obj_from_hand, points), -rotate(obj_from_hand, normals)
-    return Contacts(points, normals)
-
-
 def test_eq24_frames_of_tips_and_contacts_coincide(motion):
     hand, samples, mixture = barrett()
-    contacts = contacts_of(hand, samples.joints[9000:9050], motion)
-    found = query_mixture(contacts, hand, mixture)
-    tips = apply(found.obj_from_hand, hand.fingertips(found.joints)[0])
-    wanted = contacts.points[found.row[:, None], found.permutation]
+    contacts = touched_contacts(hand, samples.joints[9000:9050], motion)
+    seeds = query_mixture(hand, contacts, mixture)
+    tips = apply(seeds.obj_from_hand, hand.fingertips(seeds.joints)[0])
+    wanted = contacts.points[seeds.row[:, None], seeds.permutation]
     torch.testing.assert_close(virtual_frame(tips), virtual_frame(wanted), rtol=0, atol=1e-9)
-    torch.testing.assert_close(found.tip_error, (tips - wanted).norm(dim=-1))
+    torch.testing.assert_close(seeds.tip_error, (tips - wanted).norm(dim=-1))
 
 
 def test_eq24_the_true_joints_give_the_true_pose(motion):
@@ -51,85 +44,85 @@ def test_eq24_the_true_joints_give_the_true_pose(motion):
 
 def test_postures_are_found_again(motion):
     hand, samples, mixture = barrett()
-    contacts = contacts_of(hand, samples.joints[9000:9300], motion)
-    found = query_mixture(contacts, hand, mixture)
-    own = (found.permutation == torch.arange(3)).all(-1)
-    assert len(found.row[own].unique()) >= 285  # the 99 % threshold
+    contacts = touched_contacts(hand, samples.joints[9000:9300], motion)
+    seeds = query_mixture(hand, contacts, mixture)
+    own = (seeds.permutation == torch.arange(3)).all(-1)
+    assert len(seeds.row[own].unique()) >= 285  # the 99 % threshold
     least = torch.full((300,), 9.0, dtype=torch.float64)
-    least = least.scatter_reduce(0, found.row[own], found.tip_error[own].amax(-1), "amin")
+    least = least.scatter_reduce(0, seeds.row[own], seeds.tip_error[own].amax(-1), "amin")
     assert float(least.median()) < 0.02
-    assert bool(((found.joints >= hand.lower) & (found.joints <= hand.upper)).all())
-    assert bool((found.energy < DEFAULT_ENERGY).all())
+    assert bool(((seeds.joints >= hand.lower) & (seeds.joints <= hand.upper)).all())
+    assert bool((seeds.energy < DEFAULT_ENERGY).all())
 
 
 def test_rows_are_in_order_and_the_wrong_side_comes_last(motion):
     hand, samples, mixture = barrett()
-    contacts = contacts_of(hand, samples.joints[9000:9100], motion)
-    found = query_mixture(contacts, hand, mixture, n_seeds=3)
-    assert bool((found.row.diff() >= 0).all())
-    normals = rotate(found.obj_from_hand, hand.fingertips(found.joints)[1])
-    side = (normals * contacts.normals[found.row[:, None], found.permutation]).sum(-1).mean(-1)
+    contacts = touched_contacts(hand, samples.joints[9000:9100], motion)
+    seeds = query_mixture(hand, contacts, mixture, n_seeds=3)
+    assert bool((seeds.row.diff() >= 0).all())
+    normals = rotate(seeds.obj_from_hand, hand.fingertips(seeds.joints)[1])
+    side = (normals * contacts.normals[seeds.row[:, None], seeds.permutation]).sum(-1).mean(-1)
     wrong = (side > WRONG_SIDE).long()
-    same_row = found.row.diff() == 0
+    same_row = seeds.row.diff() == 0
     assert bool((wrong.diff()[same_row] >= 0).all())
-    # All six assignments are asked, each with three guesses or, out of reach, none.
-    counts = torch.stack([(found.permutation == torch.tensor(p)).all(-1).sum() for p in PERMUTATIONS])
-    assert int(counts.sum()) == len(found)
+    # All six assignments are asked, each with three seeds or, out of reach, none.
+    counts = torch.stack([(seeds.permutation == torch.tensor(p)).all(-1).sum() for p in PERMUTATIONS])
+    assert int(counts.sum()) == len(seeds)
     assert bool((counts > 0).all())
 
 
-def test_guesses_do_not_depend_on_the_objects_frame(motion):
+def test_seeds_do_not_depend_on_the_objects_frame(motion):
     hand, samples, mixture = barrett()
-    first = query_mixture(contacts_of(hand, samples.joints[9000:9020], torch.eye(4).double()), hand, mixture)
-    moved = query_mixture(contacts_of(hand, samples.joints[9000:9020], motion), hand, mixture)
+    first = query_mixture(hand, touched_contacts(hand, samples.joints[9000:9020], torch.eye(4).double()), mixture)
+    moved = query_mixture(hand, touched_contacts(hand, samples.joints[9000:9020], motion), mixture)
     # Equal up to rounding; the order of equal errors may differ.
     torch.testing.assert_close(moved.joints.sum(), first.joints.sum(), rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(moved.tip_error.sum(), first.tip_error.sum(), rtol=1e-6, atol=1e-6)
 
 
-def test_degenerate_and_unreachable_rows_have_no_guesses(motion):
+def test_degenerate_and_unreachable_rows_have_no_seeds(motion):
     hand, samples, mixture = barrett()
-    contacts = contacts_of(hand, samples.joints[9000:9004], motion)
+    contacts = touched_contacts(hand, samples.joints[9000:9004], motion)
     points = contacts.points.clone()
     points[1] = points[1, 0]
     points[2] = 1 + 10 * (points[2] - points[2].mean(0))  # a triangle ten times as large
-    found = query_mixture(dataclasses.replace(contacts, points=points), hand, mixture)
-    assert not set(found.row.tolist()) & {1, 2}
-    assert {0, 3} <= set(found.row.tolist())
+    seeds = query_mixture(hand, dataclasses.replace(contacts, points=points), mixture)
+    assert not set(seeds.row.tolist()) & {1, 2}
+    assert {0, 3} <= set(seeds.row.tolist())
 
 
 def test_empty_and_float32_contacts():
     hand, samples, mixture = barrett()
-    contacts = contacts_of(hand, samples.joints[:5], rigid(torch.eye(3).double(), torch.ones(3).double()))
-    assert len(query_mixture(contacts[:0], hand, mixture)) == 0
-    single = query_mixture(contacts.to(torch.float32), hand, mixture)
+    contacts = touched_contacts(hand, samples.joints[:5], rigid(torch.eye(3).double(), torch.ones(3).double()))
+    assert len(query_mixture(hand, contacts[:0], mixture)) == 0
+    single = query_mixture(hand, contacts.to(torch.float32), mixture)
     assert single.joints.dtype == single.obj_from_hand.dtype == torch.float32
     torch.testing.assert_close(
-        single.energy.sum(), query_mixture(contacts, hand, mixture).energy.sum().float(), rtol=1e-3, atol=0
+        single.energy.sum(), query_mixture(hand, contacts, mixture).energy.sum().float(), rtol=1e-3, atol=0
     )
 
 
 def test_paper_coverage_accepts_fewer(motion):
     hand, samples, mixture = barrett()
-    contacts = contacts_of(hand, samples.joints[9000:9100], motion)
-    few, many = (query_mixture(contacts, hand, mixture, max_energy=r) for r in (PAPER_ENERGY, DEFAULT_ENERGY))
+    contacts = touched_contacts(hand, samples.joints[9000:9100], motion)
+    few, many = (query_mixture(hand, contacts, mixture, max_energy=r) for r in (PAPER_ENERGY, DEFAULT_ENERGY))
     assert 0 < len(few) < len(many)
 
 
 def test_bad_arguments():
     hand, samples, mixture = barrett()
-    contacts = contacts_of(hand, samples.joints[:2], torch.eye(4).double())
+    contacts = touched_contacts(hand, samples.joints[:2], torch.eye(4).double())
     with pytest.raises(BadArgument, match="n_seeds: found 0"):
-        query_mixture(contacts, hand, mixture, n_seeds=0)
+        query_mixture(hand, contacts, mixture, n_seeds=0)
     with pytest.raises(BadArgument, match="max_energy: found nan"):
-        query_mixture(contacts, hand, mixture, max_energy=float("nan"))
+        query_mixture(hand, contacts, mixture, max_energy=float("nan"))
     with pytest.raises(BadArgument, match="mixture: found joints"):
-        query_mixture(contacts, load_hand("allegro"), mixture)
+        query_mixture(load_hand("allegro"), contacts, mixture)
 
 
 def test_a_mixture_of_other_limits_fingers_or_fingertips_is_refused():
     hand, samples, mixture = barrett()
-    contacts = contacts_of(hand, samples.joints[:2], torch.eye(4).double())
+    contacts = touched_contacts(hand, samples.joints[:2], torch.eye(4).double())
     others = [
         dataclasses.replace(hand, actuated=dataclasses.replace(hand.actuated, upper=hand.upper - 0.01)),
         dataclasses.replace(hand, tips=dataclasses.replace(hand.tips, contact=hand.tips.contact + 1e-4)),
@@ -138,23 +131,23 @@ def test_a_mixture_of_other_limits_fingers_or_fingertips_is_refused():
     ]
     for other in others:
         with pytest.raises(BadArgument, match=r"mixture: found a model of hand 'barrett'.*train it anew"):
-            query_mixture(contacts, other, mixture)
+            query_mixture(other, contacts, mixture)
     spoilt = dataclasses.replace(mixture, meta=mixture.meta | {"hand_codes": "one two"})
     with pytest.raises(BadArgument, match="mixture: found hand_codes"):
-        query_mixture(contacts, hand, spoilt)
+        query_mixture(hand, contacts, spoilt)
     # What does not change the codes is no other hand, nor are single precision and samples that tell no hand.
     for same in (dataclasses.replace(hand, source=hand.source._replace(sha256="0" * 64)), hand.to(torch.float32)):
-        assert len(query_mixture(contacts, same, mixture))
-    assert len(query_mixture(contacts, hand, dataclasses.replace(mixture, meta={})))
+        assert len(query_mixture(same, contacts, mixture))
+    assert len(query_mixture(hand, contacts, dataclasses.replace(mixture, meta={})))
 
 
 def test_many_triples_are_answered_as_each_alone(motion):
     hand, samples, mixture = barrett()
-    contacts = contacts_of(hand, samples.joints[9000:9600], motion)  # more than one pass
-    found = query_mixture(contacts, hand, mixture, n_seeds=2)
-    assert bool((found.row.diff() >= 0).all())
+    contacts = touched_contacts(hand, samples.joints[9000:9600], motion)  # more than one pass
+    seeds = query_mixture(hand, contacts, mixture, n_seeds=2)
+    assert bool((seeds.row.diff() >= 0).all())
     for k in (0, 255, 256, 599):
-        one, rows = query_mixture(contacts[k], hand, mixture, n_seeds=2), found[found.row == k]
+        one, rows = query_mixture(hand, contacts[k], mixture, n_seeds=2), seeds[seeds.row == k]
         assert torch.equal(one.permutation, rows.permutation)
         torch.testing.assert_close(one.joints, rows.joints, rtol=0, atol=1e-9)
 

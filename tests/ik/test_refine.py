@@ -5,13 +5,14 @@ import dataclasses
 import pytest
 import torch
 
+from tests.reach import touched_contacts
 from torchgrasp.errors import Status
-from torchgrasp.frames import apply, rigid, rotate, rotation_from_vector
+from torchgrasp.frames import rigid, rotation_from_vector
 from torchgrasp.hand.load import load_hand
-from torchgrasp.ik.checks import check, normal_angle, tip_error
-from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, clearance_rows
+from torchgrasp.ik.checks import is_clear, measure_errors, normal_angle, tip_error
+from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, clearance_hinges
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
-from torchgrasp.ik.refine import open_hand, refine, refinement_cost, tip_rows, tip_targets
+from torchgrasp.ik.refine import open_hand, refine, refinement_cost, tip_residuals, tip_targets
 from torchgrasp.ik.sdf import field_from_surface
 from torchgrasp.values import Contacts
 
@@ -42,11 +43,8 @@ def random_postures(hand, n: int, seed: int = 0) -> Configuration:
 
 
 def touched(hand, posture: Configuration) -> Contacts:
-    """Contacts that this very posture touches with the middle of its pads."""
-    _, normals = hand.fingertips(posture.joints)
-    centres = apply(posture.obj_from_hand, hand.tip_centres(posture.joints))
-    outward = -rotate(posture.obj_from_hand, normals)
-    return Contacts(centres - hand.tip_radius[:, None] * outward, outward)
+    """Contacts that this very configuration touches."""
+    return touched_contacts(hand, posture.joints, posture.obj_from_hand)
 
 
 def far(ball_field) -> CollisionWorld:
@@ -61,15 +59,15 @@ def test_jacobian_against_finite_differences(hand, ball):
     world = CollisionWorld(ball, -0.02)
 
     def rows(at):
-        jacobians, target = SpatialJacobian.at(at, hand), tip_targets(hand, contacts)
-        return tip_rows(jacobians, target, contacts.normals), clearance_rows(jacobians, world, tips_touch=True)
+        spatial, target = SpatialJacobian.at(hand, at), tip_targets(hand, contacts)
+        return tip_residuals(spatial, target, contacts.normals), clearance_hinges(spatial, world, tips_touch=True)
 
     tips, links = rows(posture)
     h = 1e-6
     for k in range(6 + hand.dof):
         step = torch.zeros(6, 6 + hand.dof, dtype=torch.float64)
         step[:, k] = h
-        plus, minus = rows(posture.moved(step, hand)), rows(posture.moved(-step, hand))
+        plus, minus = rows(posture.integrate(hand, step)), rows(posture.integrate(hand, -step))
         difference = (plus[0][0] - minus[0][0]) / (2 * h)
         torch.testing.assert_close(tips[1][..., k], difference, rtol=1e-5, atol=2e-3)
         # hinges come sorted by depth, so that only the sum of squares compares row by row
@@ -80,12 +78,10 @@ def test_jacobian_against_finite_differences(hand, ball):
 
 def test_a_touching_posture_is_its_own_solution(hand, ball):
     posture = random_postures(hand, 20)
-    jacobians = SpatialJacobian.at(posture, hand)
+    spatial = SpatialJacobian.at(hand, posture)
     contacts = touched(hand, posture)
-    torch.testing.assert_close(
-        tip_error(jacobians, contacts), torch.zeros(20, 3, dtype=torch.float64), atol=1e-8, rtol=0
-    )
-    assert float(normal_angle(jacobians, contacts).max()) < 1e-3
+    torch.testing.assert_close(tip_error(spatial, contacts), torch.zeros(20, 3, dtype=torch.float64), atol=1e-8, rtol=0)
+    assert float(normal_angle(spatial, contacts).max()) < 1e-3
 
 
 def test_disturbed_postures_come_back(hand, ball):
@@ -98,18 +94,18 @@ def test_disturbed_postures_come_back(hand, ball):
     contacts = touched(hand, truth)  # a metre away from the ball: reach alone is tested
     g = len(truth.joints)
     scale = torch.cat([torch.full((3,), 0.005), torch.full((3,), 0.17), torch.full((hand.dof,), 0.15)]).double()
-    start = truth.moved(torch.randn(g, 6 + hand.dof, generator=rng, dtype=torch.float64) * scale, hand)
-    found = refine(start, hand, contacts, far(ball))
-    error = tip_error(SpatialJacobian.at(found, hand), contacts).amax(1)
+    start = truth.integrate(hand, torch.randn(g, 6 + hand.dof, generator=rng, dtype=torch.float64) * scale)
+    found = refine(hand, start, contacts, far(ball))
+    error = tip_error(SpatialJacobian.at(hand, found), contacts).amax(1)
     assert float((error < MILLIMETRE).double().mean()) > 0.95
     assert bool((found.joints >= hand.lower).all())
     assert bool((found.joints <= hand.upper).all())
     assert bool(
-        (refinement_cost(found, hand, contacts, far(ball)) <= refinement_cost(start, hand, contacts, far(ball))).all()
+        (refinement_cost(hand, found, contacts, far(ball)) <= refinement_cost(hand, start, contacts, far(ball))).all()
     )
 
 
-def test_check_names_what_is_wrong(hand, ball):
+def test_errors_name_what_is_wrong(hand, ball):
     posture = random_postures(hand, 60)
     free = hand.self_clearance(posture.joints) > 0
     posture = Configuration(posture.joints[free], posture.obj_from_hand[free])
@@ -118,30 +114,30 @@ def test_check_names_what_is_wrong(hand, ball):
         posture.joints, rigid(posture.obj_from_hand[:, :3, :3], posture.obj_from_hand[:, :3, 3] + away)
     )
     contacts = touched(hand, posture)
-    same = check(posture, posture.joints, hand, contacts, CollisionWorld(ball, None))
+    same = measure_errors(hand, posture, contacts, CollisionWorld(ball, None))
     assert (same.status == Status.OK).all()
 
     shifted = Contacts(contacts.points + 0.003, contacts.normals)
-    assert (check(posture, posture.joints, hand, shifted, far(ball)).status == Status.TIP_ERROR).all()
+    assert (measure_errors(hand, posture, shifted, far(ball)).status == Status.TIP_ERROR).all()
 
     inside_out = Contacts(
         contacts.points - 2 * hand.tip_radius[:, None] * -contacts.normals,
         -contacts.normals,
     )
-    assert (check(posture, posture.joints, hand, inside_out, far(ball)).status == Status.NORMAL_ANGLE).all()
+    assert (measure_errors(hand, posture, inside_out, far(ball)).status == Status.NORMAL_ANGLE).all()
 
-    below = check(posture, posture.joints, hand, contacts, CollisionWorld(ball, 2.0))
+    below = measure_errors(hand, posture, contacts, CollisionWorld(ball, 2.0))
     assert (below.status == Status.TABLE_COLLISION).all()
 
     outside = Configuration(posture.joints.clone(), posture.obj_from_hand)
     outside.joints[:, 0] = hand.upper[0] + 0.1
-    limits = check(outside, posture.joints, hand, touched(hand, outside), far(ball))
+    limits = measure_errors(hand, outside, touched(hand, outside), far(ball))
     assert (limits.status == Status.JOINT_LIMITS).all()
 
     onto = Configuration(
         posture.joints, rigid(posture.obj_from_hand[:, :3, :3], torch.zeros_like(away).expand(len(free[free]), 3))
     )
-    hit = check(onto, posture.joints, hand, touched(hand, onto), CollisionWorld(ball, None))
+    hit = measure_errors(hand, onto, touched(hand, onto), CollisionWorld(ball, None))
     inside = hit.clearance < 0
     assert inside.any()
     assert (hit.status[inside] == Status.OBJECT_COLLISION).all()
@@ -152,12 +148,15 @@ def test_check_names_what_is_wrong(hand, ball):
     assert n > 3
     few, bent = Configuration(posture.joints[:n], posture.obj_from_hand[:n]), crossed[:n]
     itself = Configuration(bent, few.obj_from_hand)
-    status = check(itself, few.joints, hand, touched(hand, itself), far(ball)).status
+    status = measure_errors(hand, itself, touched(hand, itself), far(ball)).status
     assert (status == Status.SELF_COLLISION).all()
-    assert (check(few, bent, hand, contacts[:n], far(ball)).status == Status.PREGRASP).all()
+    assert is_clear(hand, few, far(ball)).all() and not is_clear(hand, itself, far(ball)).any()
+    assert (
+        not is_clear(hand, few, CollisionWorld(ball, 2.0)).any() and not is_clear(hand, onto[inside], far(ball)).any()
+    )
 
     nowhere = dataclasses.replace(contacts, points=contacts.points * float("nan"))
-    assert (check(posture, posture.joints, hand, nowhere, far(ball)).status == Status.TIP_ERROR).all()
+    assert (measure_errors(hand, posture, nowhere, far(ball)).status == Status.TIP_ERROR).all()
 
 
 def test_the_opened_hand_is_farther_and_clear(hand, ball):
@@ -165,7 +164,7 @@ def test_the_opened_hand_is_farther_and_clear(hand, ball):
     posture = random_postures(hand, 40)
     contacts = dataclasses.replace(touched(hand, posture), std_m=torch.zeros_like(posture.joints[:, :3]))
     away = CollisionWorld(ball, None)
-    opened = open_hand(posture, hand, contacts, away)
+    opened = open_hand(hand, posture, contacts, away)
     before = hand.tip_centres(posture.joints)
     after = hand.tip_centres(opened)
     outward = -hand.fingertips(posture.joints)[1]

@@ -4,9 +4,10 @@ import pytest
 import torch
 import trimesh
 
+from tests.reach import field_of_mesh
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.self_collision import box_distance
-from torchgrasp.ik.sdf import field_from_mesh, field_from_surface
+from torchgrasp.ik.sdf import field_from_surface
 
 
 @pytest.mark.parametrize("given", ["faces", "normals"])
@@ -28,7 +29,7 @@ def test_distance_field_of_a_sphere(given, generator):
 
 def test_distance_field_of_a_box_has_the_right_sides(generator):
     box = trimesh.creation.box(extents=[0.03, 0.06, 0.12])  # twelve large triangles
-    field = field_from_mesh(box, margin=0.03)
+    field = field_of_mesh(box, margin=0.03)
     points = 0.06 * torch.randn(3000, 3, generator=generator, dtype=torch.float64)
     points = points.clamp(-0.04, 0.04)
     half = torch.tensor([0.015, 0.03, 0.06], dtype=torch.float64)
@@ -39,7 +40,7 @@ def test_distance_field_of_a_box_has_the_right_sides(generator):
 
 
 def test_distance_field_gradient_is_the_derivative_inside_and_beyond(generator):
-    field = field_from_mesh(trimesh.creation.icosphere(3, 0.03), margin=0.02)
+    field = field_of_mesh(trimesh.creation.icosphere(3, 0.03), margin=0.02)
     points = (0.06 * torch.randn(300, 3, generator=generator, dtype=torch.float64)).requires_grad_()
     distance, gradient = field.query(points)
     (derivative,) = torch.autograd.grad(distance.sum(), points)
@@ -51,7 +52,7 @@ def test_distance_field_gradient_is_the_derivative_inside_and_beyond(generator):
 
 
 def test_distance_field_follows_the_dtype_and_shape_of_the_points():
-    field = field_from_mesh(trimesh.creation.icosphere(2, 0.03), margin=0.02)
+    field = field_of_mesh(trimesh.creation.icosphere(2, 0.03), margin=0.02)
     distance, gradient = field.query(torch.zeros(2, 3, 4, 3))
     assert (distance.shape, gradient.shape, distance.dtype) == ((2, 3, 4), (2, 3, 4, 3), torch.float32)
     torch.testing.assert_close(field.to(torch.float32).query(torch.zeros(2, 3, 4, 3))[0], distance)

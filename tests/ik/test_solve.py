@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from tests.reach import touched_contacts
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import apply, rigid, rotate, rotation_from_vector, virtual_frame
 from torchgrasp.hand.load import load_hand
@@ -20,40 +21,40 @@ from torchgrasp.values import Contacts
 def scene(request):
     """A hand, its model, its own postures, and contacts that 40 postures of another seed touch."""
     hand = load_hand(request.param)
-    points, normals = hand.fingertips(sample_configurations(hand, 40, seed=5).joints)
-    return hand, load_mixture(request.param), PostureLibrary.of(hand), Contacts(points, -normals)
+    contacts = touched_contacts(hand, sample_configurations(hand, 40, seed=5).joints)
+    return hand, load_mixture(request.param), PostureLibrary.of(hand), contacts
 
 
-def miss(hand, found, contacts):
+def miss(hand, solution, contacts):
     """The distance of each round tip's surface point from its contact [m], by the hand's public functions alone."""
     at = torch.arange(len(contacts))[:, None]
-    points, normals = contacts.points[at, found.permutation], contacts.normals[at, found.permutation]
-    centres = apply(found.obj_from_hand, hand.tip_centres(found.joints))
+    points, normals = contacts.points[at, solution.permutation], contacts.normals[at, solution.permutation]
+    centres = apply(solution.obj_from_hand, hand.tip_centres(solution.joints))
     return (centres - hand.tip_radius[:, None] * normals - points).norm(dim=-1)
 
 
 @pytest.mark.parametrize("learned", [True, False])
 def test_codes_of_real_postures_are_solved(scene, learned):
-    hand, mixture, postures, contacts = scene
-    found = solve_ik(contacts, hand, mixture if learned else None, postures=postures)
-    assert (found.status == Status.OK).all()
-    torch.testing.assert_close(found.tip_error, miss(hand, found, contacts), atol=1e-9, rtol=0)
-    assert float(found.tip_error.max()) < 1e-3
-    assert float(found.tip_error.amax(1).median()) < 5e-5
-    assert bool((hand.self_clearance(found.joints) >= 0).all())
-    hand.check_joints(found.joints)
-    assert bool((found.attempts >= 1).all())
-    again = solve_ik(contacts, hand, mixture if learned else None, postures=postures)
-    assert torch.equal(found.joints, again.joints)
+    hand, mixture, library, contacts = scene
+    solution = solve_ik(hand, contacts, mixture if learned else None, library=library)
+    assert (solution.status == Status.OK).all()
+    torch.testing.assert_close(solution.tip_error, miss(hand, solution, contacts), atol=1e-9, rtol=0)
+    assert float(solution.tip_error.max()) < 1e-3
+    assert float(solution.tip_error.amax(1).median()) < 5e-5
+    assert bool((hand.self_clearance(solution.joints) >= 0).all())
+    hand.check_joints(solution.joints)
+    assert bool((solution.attempts >= 1).all())
+    again = solve_ik(hand, contacts, mixture if learned else None, library=library)
+    assert torch.equal(solution.joints, again.joints)
 
 
 def test_the_frame_of_the_contacts_does_not_matter(scene):
-    hand, mixture, postures, contacts = scene
+    hand, mixture, library, contacts = scene
     turn = rotation_from_vector(torch.tensor([0.4, -1.0, 2.0], dtype=torch.float64))
     move = rigid(turn, torch.tensor([0.5, -0.2, 0.1], dtype=torch.float64))
     some = contacts[:10]
     moved = Contacts(apply(move, some.points), rotate(move, some.normals))
-    here, there = (solve_ik(x, hand, mixture, postures=postures) for x in (some, moved))
+    here, there = (solve_ik(hand, x, mixture, library=library) for x in (some, moved))
     torch.testing.assert_close(here.joints, there.joints, atol=1e-6, rtol=0)
     torch.testing.assert_close(move @ here.obj_from_hand, there.obj_from_hand, atol=1e-6, rtol=0)
 
@@ -64,45 +65,45 @@ def test_cobyla_lowers_the_tip_distances_with_the_pose_of_eq24():
     points, normals = hand.fingertips(true)
     contacts, start = Contacts(points, -normals), true + 0.05
     nowhere = torch.eye(4, dtype=torch.float64).expand(2, 4, 4)
-    found = refine_by_cobyla(Configuration(start, nowhere), hand, contacts, CollisionWorld())
-    tips = hand.fingertips(found.joints)[0]
-    assert float((apply(found.obj_from_hand, tips) - points).norm(dim=-1).max()) < 1e-4
-    torch.testing.assert_close(found.obj_from_hand @ virtual_frame(tips), virtual_frame(points), atol=1e-9, rtol=0)
-    hand.check_joints(found.joints)
-    by_name = solve_ik(contacts[:1], hand, load_mixture("barrett"), method="cobyla")
+    solution = refine_by_cobyla(hand, Configuration(start, nowhere), contacts, CollisionWorld())
+    tips = hand.fingertips(solution.joints)[0]
+    assert float((apply(solution.obj_from_hand, tips) - points).norm(dim=-1).max()) < 1e-4
+    torch.testing.assert_close(solution.obj_from_hand @ virtual_frame(tips), virtual_frame(points), atol=1e-9, rtol=0)
+    hand.check_joints(solution.joints)
+    by_name = solve_ik(hand, contacts[:1], load_mixture("barrett"), method="cobyla")
     assert by_name.status[0] == Status.OK
 
 
 def test_a_table_is_kept_clear_of(scene):
-    hand, mixture, postures, contacts = scene
+    hand, mixture, library, contacts = scene
     height = float(contacts.points[..., 2].min()) - 0.005
-    found = solve_ik(contacts[:10], hand, mixture, CollisionWorld(table=height), postures=postures)
-    good = found.status == Status.OK
+    solution = solve_ik(hand, contacts[:10], mixture, CollisionWorld(table=height), library=library)
+    good = solution.status == Status.OK
     cover = hand.collision_spheres
-    lowest = (apply(found.obj_from_hand, hand.sphere_centres(found.joints))[..., 2] - cover.radius).amin(1)
+    lowest = (apply(solution.obj_from_hand, hand.sphere_centres(solution.joints))[..., 2] - cover.radius).amin(1)
     assert bool(good.any()) and bool((lowest[good] >= height).all())
-    assert bool((found.status[~good] >= Status.OUT_OF_REACH).all())
+    assert bool((solution.status[~good] >= Status.OUT_OF_REACH).all())
 
 
 def test_rows_without_a_posture_say_so(scene):
-    hand, mixture, postures, contacts = scene
+    hand, mixture, library, contacts = scene
     flat = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]]).double()
     far = 100 * contacts.points[0]
     points = torch.stack([flat, far, contacts.points[1]])
     given = Contacts(points, contacts.normals[:3])
-    found = solve_ik(given, hand, mixture, postures=postures)
-    assert found.status.tolist() == [Status.DEGENERATE, Status.TIP_ERROR, Status.OK]
-    assert bool(found.joints[0].isnan().all()) and not bool(found.joints[1:].isnan().any())
-    assert len(solve_ik(given[:0], hand, mixture, postures=postures)) == 0
+    solution = solve_ik(hand, given, mixture, library=library)
+    assert solution.status.tolist() == [Status.DEGENERATE, Status.TIP_ERROR, Status.OK]
+    assert bool(solution.joints[0].isnan().all()) and not bool(solution.joints[1:].isnan().any())
+    assert len(solve_ik(hand, given[:0], mixture, library=library)) == 0
 
 
 def test_bad_arguments_are_named(scene):
-    hand, mixture, postures, contacts = scene
+    hand, mixture, library, contacts = scene
     nan = Contacts(contacts.points * torch.nan, contacts.normals)
     with pytest.raises(BadArgument, match=r"contacts\.points"):
-        solve_ik(nan, hand, mixture, postures=postures)
+        solve_ik(hand, nan, mixture, library=library)
     with pytest.raises((BadArgument, TypeError), match="method"):
-        solve_ik(contacts, hand, mixture, method="newton", postures=postures)  # pyright: ignore
+        solve_ik(hand, contacts, mixture, method="newton", library=library)  # pyright: ignore
     other = load_mixture("barrett" if hand.name == "allegro" else "allegro")
     with pytest.raises(BadArgument, match="mixture"):
-        solve_ik(contacts, hand, other, postures=postures)
+        solve_ik(hand, contacts, other, library=library)

@@ -14,7 +14,7 @@ from torchgrasp.files import format_json
 from torchgrasp.frames import rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.ik.approach import DISTANCE
+from torchgrasp.ik.approach import APPROACH_DISTANCE
 from torchgrasp.values import Grasps
 
 LAYOUT_VERSION = 2
@@ -60,7 +60,7 @@ def format_grasps(hand: Hand, grasps: Grasps, force: float = 4.0) -> str:
             "status": Status(int(grasps.status[row])).name,
             "success": float(grasps.success[row]),
             "pose": {"position": pose[:3, 3].tolist(), "quaternion_wxyz": quaternion(pose)},
-            "approach": {"direction": grasps.approach[row].tolist(), "distance": DISTANCE},
+            "approach": {"direction": grasps.approach[row].tolist(), "distance": APPROACH_DISTANCE},
             "joints": {name: {joint: float(q[row]) for joint, q in all_.items()} for name, all_ in named.items()},
             "torque": dict(zip(hand.joint_names, squeezed.torques[row].tolist(), strict=True)),
             "contacts": [

@@ -8,7 +8,7 @@ from torchgrasp.control.forces import squeeze
 from torchgrasp.export.grasp_json import quaternion
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.ik.approach import DISTANCE
+from torchgrasp.ik.approach import APPROACH_DISTANCE
 from torchgrasp.sim.mjcf import add_drive, add_links, format_numbers
 from torchgrasp.values import Grasps
 
@@ -48,7 +48,7 @@ def format_keyframes(hand: Hand, grasps: Grasps, force: float = 4.0) -> str:
     ET.SubElement(custom, "text", name="ctrl", data=" ".join(order))
     opened, closed = hand.expand(grasps.pregrasp.double()), hand.expand(grasps.joints.double())
     keys = (
-        ("approach", DISTANCE, opened, opened),
+        ("approach", APPROACH_DISTANCE, opened, opened),
         ("pregrasp", 0.0, opened, opened),
         ("grasp", 0.0, closed, closed),
         ("squeeze", 0.0, closed, hand.expand(squeezed.joints)),

@@ -1,4 +1,4 @@
-"""What the links of a hand must stay clear of: the object, the table, and each other."""
+"""Clearances of a hand's links from the object, from the table, and from each other."""
 
 import dataclasses
 import math
@@ -14,17 +14,18 @@ from torchgrasp.ik.sdf import SignedDistanceField
 from torchgrasp.optim import Residuals
 
 MILLIMETRE = 1e-3
+"""Unit of all residuals [m]: it makes lengths as large as angles times their weights."""
 CLEARANCE = 4 * MILLIMETRE
-"""Clearance [m] that the links are asked to keep of the object and the table; `check` accepts any above zero."""
+"""Clearance [m] that refinement asks of links and object or table; the checks accept any above zero."""
 SELF_CLEARANCE = 1 * MILLIMETRE
-"""Clearance [m] that the links are asked to keep of each other."""
-WORST = 8
+"""Clearance [m] that refinement asks between links, whose shapes are exact."""
+HINGES = 8
 """How many of the least clearances of each kind enter one step; the others are larger."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CollisionWorld(Value):
-    """What the links must not touch: the object's `field` and the height [m] of the `table`, None without one."""
+    """The signed distance field of the object and the height of the table [m]; None where there is none."""
 
     field: SignedDistanceField | None = None
     table: float | None = None
@@ -36,99 +37,94 @@ def hinge(clearance: Float[Tensor, "g k"], jacobian: Float[Tensor, "g k d"], mar
     return active * (margin - clearance) / MILLIMETRE, -active[..., None] * jacobian / MILLIMETRE
 
 
-def least(clearance: Float[Tensor, "g s"]) -> Int[Tensor, "g k"]:
-    """Return where the `WORST` least clearances of each row are."""
-    return clearance.topk(min(WORST, clearance.shape[1]), dim=1, largest=False, sorted=False).indices
+def least(clearance: Float[Tensor, "g s"]) -> tuple[Int[Tensor, "g 1"], Int[Tensor, "g k"]]:
+    """Return the rows and columns of the least clearances of each row."""
+    index = clearance.topk(min(HINGES, clearance.shape[1]), dim=1, largest=False, sorted=False).indices
+    return torch.arange(len(index), device=index.device)[:, None], index
 
 
 def collision_cost(
-    centres: Float[Tensor, "*b s 3"], cover: CollisionSpheres, world: CollisionWorld
+    centres: Float[Tensor, "*b s 3"], spheres: CollisionSpheres, world: CollisionWorld
 ) -> Float[Tensor, "*b"]:
-    """Return the sum of squares [mm2] of what a touching hand's spheres lack of clearance, by the nearest node."""
-    radius = cover.radius.to(centres)
-    lack = centres.new_zeros(centres.shape[:-2])
+    """Return the sum of squared deficits of clearance [mm2] of a touching hand, by the field's nearest nodes."""
+    radius = spheres.radius.to(centres)
+    cost = centres.new_zeros(centres.shape[:-2])
     if world.field is not None:
-        object_lack = (CLEARANCE + radius - world.field.nearest(centres)) * ~cover.touching
-        lack = lack + object_lack.clamp_min(0).square().sum(-1)
+        deficit = (CLEARANCE + radius - world.field.nearest_node(centres)) * ~spheres.touching
+        cost = cost + deficit.clamp_min(0).square().sum(-1)
     if world.table is not None:
-        table_lack = world.table + CLEARANCE * ~cover.touching + radius - centres[..., 2]
-        lack = lack + table_lack.clamp_min(0).square().sum(-1)
-    return lack / MILLIMETRE**2
+        deficit = world.table + CLEARANCE * ~spheres.touching + radius - centres[..., 2]
+        cost = cost + deficit.clamp_min(0).square().sum(-1)
+    return cost / MILLIMETRE**2
 
 
-def clearance_rows(jacobians: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> Residuals:
-    """Return hinges on the least clearances from the object, from the table and between the links."""
-    found = [self_rows(jacobians)]
+def clearance_hinges(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> Residuals:
+    """Return hinges on the least clearances between links, from the object and from the table."""
+    hinges = [self_hinges(spatial)]
     if world.field is not None:
-        found.append(object_rows(jacobians, world.field, tips_touch))
+        hinges.append(object_hinges(spatial, world.field, tips_touch))
     if world.table is not None:
-        found.append(table_rows(jacobians, world.table, tips_touch))
-    residuals, by_hand = zip(*found, strict=True)
-    return torch.cat(residuals, 1), torch.cat(by_hand, 1)
+        hinges.append(table_hinges(spatial, world.table, tips_touch))
+    residuals, jacobians = zip(*hinges, strict=True)
+    return torch.cat(residuals, 1), torch.cat(jacobians, 1)
 
 
-def object_rows(jacobians: SpatialJacobian, field: SignedDistanceField, tips_touch: bool) -> Residuals:
+def object_hinges(spatial: SpatialJacobian, field: SignedDistanceField, tips_touch: bool) -> Residuals:
     """Return hinges on the least clearances of the links' spheres from the object."""
-    cover = jacobians.hand.collision_spheres
-    centres = jacobians.points(cover.link_index, cover.center)
-    radius = cover.radius.to(centres)
-    rough = field.nearest(centres) - radius
+    spheres = spatial.hand.collision_spheres
+    centres = spatial.points(spheres.link_index, spheres.center)
+    radius = spheres.radius.to(centres)
+    coarse = field.nearest_node(centres) - radius
     if tips_touch:
-        rough = torch.where(cover.touching, math.inf, rough)
-    index = least(rough)
-    at = torch.arange(len(centres), device=centres.device)[:, None]
-    near = centres[at, index]
-    distance, gradient = field.query(near)
-    clearance = distance - radius[index] + torch.where(torch.isinf(rough[at, index]), 1.0, 0.0)
-    return hinge(clearance, jacobians.jacobian(wrench_of(near, gradient), cover.link_index[index]), CLEARANCE)
+        coarse = torch.where(spheres.touching, math.inf, coarse)
+    row, index = least(coarse)
+    nearest = centres[row, index]
+    distance, gradient = field.query(nearest)
+    clearance = distance - radius[index] + torch.where(torch.isinf(coarse[row, index]), 1.0, 0.0)
+    return hinge(clearance, spatial.jacobian(wrench_of(nearest, gradient), spheres.link_index[index]), CLEARANCE)
 
 
-def table_rows(jacobians: SpatialJacobian, table: float, tips_touch: bool) -> Residuals:
+def table_hinges(spatial: SpatialJacobian, table: float, tips_touch: bool) -> Residuals:
     """Return hinges on the least clearances of the links' spheres from the table."""
-    cover = jacobians.hand.collision_spheres
-    centres = jacobians.points(cover.link_index, cover.center)
-    above = centres[..., 2] - cover.radius.to(centres) - table
-    if tips_touch:  # such a tip is where its contact is
-        above = above + CLEARANCE * cover.touching
-    index = least(above)
-    at = torch.arange(len(centres), device=centres.device)[:, None]
+    spheres = spatial.hand.collision_spheres
+    centres = spatial.points(spheres.link_index, spheres.center)
+    height = centres[..., 2] - spheres.radius.to(centres) - table
+    if tips_touch:  # their contacts decide how low these are
+        height = height + CLEARANCE * spheres.touching
+    row, index = least(height)
     up = torch.tensor([0.0, 0.0, 1.0]).to(centres).expand(*index.shape, 3)
-    jacobian = jacobians.jacobian(wrench_of(centres[at, index], up), cover.link_index[index])
-    return hinge(above[at, index], jacobian, CLEARANCE)
+    jacobian = spatial.jacobian(wrench_of(centres[row, index], up), spheres.link_index[index])
+    return hinge(height[row, index], jacobian, CLEARANCE)
 
 
-def self_rows(jacobians: SpatialJacobian) -> Residuals:
+def self_hinges(spatial: SpatialJacobian) -> Residuals:
     """Return hinges on the least clearances of the links from each other."""
-    itself, frames = jacobians.hand.self_collision, jacobians.obj_from_link[:, :, :3].permute(2, 3, 1, 0).contiguous()
-    between = itself.separations(frames, SELF_CLEARANCE).T
-    index = least(between)
-    at = torch.arange(len(index), device=index.device)[:, None].expand_as(index)
-    between = between[at, index]
-    close = between < SELF_CLEARANCE  # the others' hinges are flat
-    apart = between.new_zeros(*index.shape, 6)
-    apart[close] = itself.wrenches(frames, index[close], at[close]).T
-    first, second = itself.link[itself.pairs[index]].unbind(-1)
-    return hinge(between, jacobians.jacobian(apart, second) - jacobians.jacobian(apart, first), SELF_CLEARANCE)
+    pairs, frames = spatial.hand.self_collision, spatial.obj_from_link[:, :, :3].permute(2, 3, 1, 0).contiguous()
+    separation = pairs.separations(frames, SELF_CLEARANCE).T
+    row, index = least(separation)
+    separation = separation[row, index]
+    close = separation < SELF_CLEARANCE  # the hinges of the others are flat
+    wrench = separation.new_zeros(*index.shape, 6)
+    wrench[close] = pairs.wrenches(frames, index[close], row.expand_as(index)[close]).T
+    first, second = pairs.link[pairs.pairs[index]].unbind(-1)
+    return hinge(separation, spatial.jacobian(wrench, second) - spatial.jacobian(wrench, first), SELF_CLEARANCE)
 
 
 def link_clearance(
-    jacobians: SpatialJacobian, world: CollisionWorld, tips_touch: bool
+    spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool
 ) -> tuple[Float[Tensor, "g"], Float[Tensor, "g"], Float[Tensor, "g"]]:
-    """Return the least clearance [m] of the links from the object, of the tips from it, and of both from the table.
+    """Return the least clearances [m] of links and object, tips and object, and all and table; infinite without.
 
-    Where the tips are meant to touch, they count in the second figure alone. What is not there is infinitely far.
+    Tips that are meant to touch do not count as links.
     """
-    cover = jacobians.hand.collision_spheres
-    centres = jacobians.points(cover.link_index, cover.center)
-    radius = cover.radius.to(centres)
-    free = torch.full_like(centres[..., 0], math.inf)
+    spheres = spatial.hand.collision_spheres
+    centres = spatial.points(spheres.link_index, spheres.center)
+    radius = spheres.radius.to(centres)
+    clearance = torch.full_like(centres[..., 0], math.inf)
     if world.field is not None:
-        free = world.field.query(centres)[0] - radius
-    touches = cover.touching
-    tips = free[:, touches].amin(1)
-    links = free[:, ~touches].amin(1) if tips_touch else free.amin(1)
+        clearance = world.field.query(centres)[0] - radius
+    tips = clearance[:, spheres.touching].amin(1)
+    links = clearance[:, ~spheres.touching].amin(1) if tips_touch else clearance.amin(1)
     if world.table is None:
-        table = torch.full_like(tips, math.inf)
-    else:
-        table = (centres[..., 2] - radius).amin(1) - world.table
-    return links, tips, table
+        return links, tips, torch.full_like(tips, math.inf)
+    return links, tips, (centres[..., 2] - radius).amin(1) - world.table

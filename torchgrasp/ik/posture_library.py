@@ -1,8 +1,8 @@
-"""Postures of the hand's own that fit contacts: the nearest of many random ones, placed, and clear of all around.
+"""Random postures of a hand, and the nearest of them to contacts, clear of everything around.
 
-The learned model (`query_mixture`) answers with the few postures that are likely for a code, wherever the object and the
-table are. Here a few thousand random postures are compared with every triple in all six assignments, which one matrix
-product does, and the nearest are ranked by their clearances, too: a hand from above comes before one from below.
+The learned model (`query_mixture`) answers with the few postures likely for a code, wherever object and table are. Here
+thousands of random postures are compared with every triple in all six assignments, by one matrix product. Clearances
+rank the nearest ones too, so a hand from above comes before one from below.
 """
 
 import dataclasses
@@ -22,17 +22,15 @@ from torchgrasp.posture_model.encoding import PERMUTATIONS
 from torchgrasp.posture_model.sample import sample_configurations
 from torchgrasp.values import Contacts, IKSeeds
 
-POSTURES = 5000
-"""Random postures that are compared; with 2000 or 20000 of them the share of triples with a grasp is 0.02 apart."""
+LIBRARY_SIZE = 5000
+"""Random postures of a library; with 2000 or 20000 the share of triples with a grasp differs by 0.02."""
 CANDIDATES = 64
-"""Nearest postures of a triple, in all assignments together, whose clearances are measured."""
-CHUNK = 64
-"""Triples that are compared at a time: memory is bounded, and the work stays in the cache."""
+"""Nearest postures of a triple, over all assignments, whose clearances are measured; also the most seeds of it."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PostureLibrary(Value):
-    """Postures with their tips' `centres` in their virtual frame [m], the `feature`, and the hand's spheres [m]."""
+    """Postures of a hand, with tip `centres` in their virtual frame [m], `feature`s and collision `spheres` [m]."""
 
     hand: Hand
     joints: Float[Tensor, "s h"]
@@ -42,8 +40,8 @@ class PostureLibrary(Value):
     spheres: Float[Tensor, "s k 3"]
 
     @classmethod
-    def of(cls, hand: Hand, count: int = POSTURES, seed: int = 0) -> "PostureLibrary":
-        """Draw postures within the limits and free of self-collision."""
+    def of(cls, hand: Hand, count: int = LIBRARY_SIZE, seed: int = 0) -> "PostureLibrary":
+        """Draw postures within the joint limits and free of self-collision."""
         joints = sample_configurations(hand, count, seed).joints.to(hand.lower.device, torch.float64)
         joints = joints[~degenerate(hand.tip_centres(joints))]
         centres, (_, pads) = hand.tip_centres(joints), hand.fingertips(joints)
@@ -53,67 +51,68 @@ class PostureLibrary(Value):
 
 
 def feature(centres: Float[Tensor, "*b 3 3"], pads: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 18"]:
-    """Return tips' centres and pads' axes in the units of the slacks that rolling makes up for."""
+    """Return tip centres and pad axes in units of the slack of a rolling tip."""
     return torch.cat([centres / LENGTH_SLACK, pads / COSINE_SLACK], -1).flatten(-2).float()
 
 
-def nearest_postures(contacts: Contacts, postures: PostureLibrary, world: CollisionWorld, n_seeds: int = 8) -> IKSeeds:
-    """Return the postures that fit contacts best, placed by Eq. (24) with the centres of round tips for fingertips.
+def nearest_postures(library: PostureLibrary, contacts: Contacts, world: CollisionWorld, n_seeds: int = 8) -> IKSeeds:
+    """Return the postures that fit contacts best, placed by Eq. (24) with round tips' centres for fingertips.
 
     Args:
-        contacts: contact triples on the object.
-        postures: of the hand.
-        surroundings: what the links must stay clear of.
-        guesses: postures for each triple.
+        library: postures of the hand.
+        contacts: triples on the object.
+        world: the object and the table.
+        n_seeds: postures for each triple.
 
     Returns:
-        The guesses in the order of the contacts' rows, best first within a row. `energy` is half the squared distance
-        of the features. A degenerate row has no guesses.
+        Seeds in the order of the contacts' rows, best first within a row, none of a degenerate row. `energy` is half
+        the squared distance of the features.
 
     Raises:
         BadArgument: `n_seeds` is not in [1, 64].
     """
     if not 1 <= n_seeds <= CANDIDATES:
         raise BadArgument("n_seeds", n_seeds, f"1 to {CANDIDATES}")
-    radius, order = postures.hand.tip_radius.double(), torch.tensor(PERMUTATIONS, device=contacts.points.device)
+    radius, order = library.hand.tip_radius.double(), torch.tensor(PERMUTATIONS, device=contacts.points.device)
     inward = -contacts.normals.double()[:, order]
     centres = contacts.points.double()[:, order] - radius[:, None] * inward  # (n, 6, 3, 3)
     rows = torch.nonzero(~degenerate(centres).any(1))[:, 0]
-    found = join([_nearest(centres[at], inward[at], at, postures, world, n_seeds) for at in rows.split(CHUNK)])
-    return found.to(contacts.points.dtype)
+    # 64 triples at a time bound the memory, and the work stays in the cache.
+    parts = [_nearest(library, centres[row], inward[row], row, world, n_seeds) for row in rows.split(64)]
+    return join(parts).to(contacts.points.dtype)
 
 
 def _nearest(
+    library: PostureLibrary,
     centres: Float[Tensor, "b 6 3 3"],
     inward: Float[Tensor, "b 6 3 3"],
     row: Int[Tensor, "b"],
-    postures: PostureLibrary,
     world: CollisionWorld,
     n_seeds: int,
 ) -> IKSeeds:
-    """Return the guesses of a chunk of triples, each in the six orders of their contacts."""
+    """Return the seeds of some triples, each in the six orders of its contacts."""
     obj_from_vf = virtual_frame(centres)
     vf_from_obj = inverse(obj_from_vf)
-    wanted, have = feature(apply(vf_from_obj, centres), rotate(vf_from_obj, inward)), postures.feature
-    half = wanted.square().sum(-1)[..., None] / 2 + have.square().sum(-1) / 2 - wanted @ have.T
-    reach, index = half.flatten(1).topk(CANDIDATES, 1, largest=False)
-    order, sample = index // len(have), index % len(have)
+    wanted, given = feature(apply(vf_from_obj, centres), rotate(vf_from_obj, inward)), library.feature
+    energy = wanted.square().sum(-1)[..., None] / 2 + given.square().sum(-1) / 2 - wanted @ given.T
+    energy, index = energy.flatten(1).topk(CANDIDATES, 1, largest=False)
+    order, sample = index // len(given), index % len(given)
     b = torch.arange(len(row), device=row.device)[:, None]
-    obj_from_hand = obj_from_vf[b, order] @ postures.vf_from_hand[sample]
-    spheres = apply(obj_from_hand.float(), postures.spheres[sample])
-    tips = 2 * reach * (TIP_WEIGHT * LENGTH_SLACK / MILLIMETRE) ** 2  # squared millimetres, as `refine` weighs them
-    crowd = collision_cost(spheres, postures.hand.collision_spheres, world)
-    best = (tips + crowd).topk(n_seeds, 1, largest=False).indices.flatten()
+    obj_from_hand = obj_from_vf[b, order] @ library.vf_from_hand[sample]
+    spheres = apply(obj_from_hand.float(), library.spheres[sample])
+    tips = 2 * energy * (TIP_WEIGHT * LENGTH_SLACK / MILLIMETRE) ** 2  # squared millimetres, weighed as in `refine`
+    cost = tips + collision_cost(spheres, library.hand.collision_spheres, world)
+    best = cost.topk(n_seeds, 1, largest=False).indices.flatten()
 
-    # From here on one row a guess.
+    # From here on one row a seed.
     b = b.repeat_interleave(n_seeds)
     order, sample = order[b, best], sample[b, best]
-    gap = apply(obj_from_vf[b, order], postures.centres[sample]) - centres[b, order]
+    gap = apply(obj_from_vf[b, order], library.centres[sample]) - centres[b, order]
     return IKSeeds(
-        joints=postures.joints[sample],
+        joints=library.joints[sample],
         obj_from_hand=obj_from_hand[b, best],
         row=row[b],
         permutation=torch.tensor(PERMUTATIONS, device=row.device)[order],
-        energy=reach[b, best].double(),
+        energy=energy[b, best].double(),
         tip_error=torch.linalg.vector_norm(gap, dim=-1),
     )

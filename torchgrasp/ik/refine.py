@@ -1,16 +1,15 @@
-"""Move hand postures onto their contacts without touching anything else: batched Levenberg-Marquardt.
+"""Move hands onto their contacts without touching anything else, by batched Levenberg-Marquardt.
 
-The learned posture (Eqs. 23-24) leaves millimetres to centimetres between fingertips and contacts. Here the hand's
-pose and joints are solved together, every guess a row of one batch, with analytic Jacobians. The residuals are
+Seeds of the learned model (Eqs. 23-24) leave millimetres to centimetres between fingertips and contacts. Pose and
+joints are solved together, every seed a row of one batch. The residuals are
 
 * a round fingertip's centre one radius off the contact along its normal, so that the tip may roll; a tip that is not
   round brings its contact point itself to the contact,
 * the contact direction inside a cone about the pad's axis,
-* hinges on the clearance of the links' spheres from the object's field and from the table, and of the links' shapes
-  from each other. Boxes (the palm's) are left to `check`.
+* hinges on the clearances of the links from object, table and each other.
 
-Joint limits hold at every step by projection. The paper's COBYLA minimises the tip distances alone, one grasp at a
-time; here collision is part of the problem, because that is where planned contacts are lost.
+Every step ends within the joint limits. The paper's COBYLA minimises the tip distances alone, one grasp at a time. Here
+collision is part of the problem, because there most planned contacts are lost.
 """
 
 import math
@@ -20,39 +19,43 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, clearance_rows
+from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, clearance_hinges
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian, wrench_of
 from torchgrasp.optim import SOLVED, Residuals, levenberg_marquardt
 from torchgrasp.values import Contacts
 
 ROUND_PAD, FLAT_PAD = math.radians(60), math.radians(40)
-"""Half angles [rad] of the cone about the pad's axis in which a round and a flat fingertip may touch."""
+"""Half angles [rad] of the cone about the pad's axis in which a round and a flat fingertip may touch: choices."""
 TIP_WEIGHT, PAD_WEIGHT = 2.0, 80.0
-"""Residual of a tip's millimetre and of a contact direction's unit of cosine outside the pad's cone, against 1 for a
-millimetre of clearance: what must be met outweighs a margin that may be used up."""
+"""Weights of a tip's millimetre and of a contact direction's cosine outside the cone; a millimetre of clearance has 1.
+So contact outweighs a margin of clearance."""
 ITERATIONS = 40
+"""Most steps of one refinement; a row that stalls stops earlier."""
 OPENING, OPENING_SIGMAS = 0.012, 3.0
-"""How far the pre-grasp's tips are from their contacts: metres, and standard deviations of the surface there."""
+"""Distance of the pre-grasp's tips from their contacts: metres, plus standard deviations of the surface there."""
 
 
 def tip_targets(hand: Hand, contacts: Contacts) -> Float[Tensor, "g 3 3"]:
-    """Return where the centres of tips (`Hand.tip_centres`) that touch their contacts are [m]."""
+    """Return the centres (`Hand.tip_centres`) of tips that touch their contacts [m]."""
     return contacts.points + hand.tip_radius.to(contacts.normals)[:, None] * contacts.normals
 
 
-def tip_rows(jacobians: SpatialJacobian, target: Float[Tensor, "g 3 3"], normals: Float[Tensor, "g 3 3"]) -> Residuals:
-    """Return residuals [mm] of the tips' centres from their targets and of the pads' axes from the normals' cones."""
-    hand = jacobians.hand
+def tip_residuals(
+    spatial: SpatialJacobian, target: Float[Tensor, "g 3 3"], normals: Float[Tensor, "g 3 3"]
+) -> Residuals:
+    """Return the tips' distances from their targets [mm] and the contact directions' excess over the pads' cones."""
+    hand = spatial.hand
     radius = hand.tip_radius.to(normals)
-    tips = jacobians.points(hand.tips.index, hand.tips.center)
-    three = torch.arange(3, device=tips.device).repeat_interleave(3)
+    tips = spatial.points(hand.tips.index, hand.tips.center)
+    finger = torch.arange(3, device=tips.device)
+    coordinate = finger.repeat_interleave(3)
     axes = torch.eye(3).to(tips).repeat(3, 1).expand(len(tips), 9, 3)
-    pads = jacobians.directions(hand.tips.index, hand.tips.normal)
+    pads = spatial.directions(hand.tips.index, hand.tips.normal)
     cone = torch.where(radius > 0, math.cos(ROUND_PAD), math.cos(FLAT_PAD))
     outside = cone + (pads * normals).sum(-1)  # the contact direction is the inward normal
-    turning = torch.cat([torch.zeros_like(pads), torch.linalg.cross(pads, normals)], -1)
-    wrenches = torch.cat([wrench_of(tips[:, three], axes), turning], 1)
-    jacobian = jacobians.jacobian(wrenches, hand.tips.index[torch.cat([three, torch.arange(3).to(three)])])
+    torques = torch.cat([torch.zeros_like(pads), torch.linalg.cross(pads, normals)], -1)
+    wrenches = torch.cat([wrench_of(tips[:, coordinate], axes), torques], 1)
+    jacobian = spatial.jacobian(wrenches, hand.tips.index[torch.cat([coordinate, finger])])
     active = (outside > 0).to(tips)
     return (
         torch.cat([TIP_WEIGHT * (tips - target).flatten(1) / MILLIMETRE, PAD_WEIGHT * outside * active], 1),
@@ -60,68 +63,69 @@ def tip_rows(jacobians: SpatialJacobian, target: Float[Tensor, "g 3 3"], normals
     )
 
 
-def grasp_rows(
-    posture: Configuration,
+def grasp_residuals(
     hand: Hand,
+    configuration: Configuration,
     target: Float[Tensor, "g 3 3"],
     normals: Float[Tensor, "g 3 3"],
     world: CollisionWorld,
     tips_touch: bool,
 ) -> Residuals:
-    """Return the residuals of a hand: its tips from their targets, its pads, its clearances."""
-    jacobians = SpatialJacobian.at(posture, hand)
-    tips = tip_rows(jacobians, target, normals)
-    links = clearance_rows(jacobians, world, tips_touch)
+    """Return the residuals of tips, pads and clearances."""
+    spatial = SpatialJacobian.at(hand, configuration)
+    tips, links = tip_residuals(spatial, target, normals), clearance_hinges(spatial, world, tips_touch)
     return torch.cat([tips[0], links[0]], 1), torch.cat([tips[1], links[1]], 1)
 
 
 def refinement_cost(
-    posture: Configuration, hand: Hand, contacts: Contacts, world: CollisionWorld
+    hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld
 ) -> Float[Tensor, "g"]:
-    """Return the sum of squared residuals of each row: what `refine` lowers."""
-    rows = grasp_rows(posture, hand, tip_targets(hand, contacts), contacts.normals, world, tips_touch=True)
-    return rows[0].square().sum(1)
+    """Return the sum of squared residuals of each row, which `refine` lowers."""
+    target = tip_targets(hand, contacts)
+    return grasp_residuals(hand, configuration, target, contacts.normals, world, tips_touch=True)[0].square().sum(1)
 
 
 def refine(
-    posture: Configuration, hand: Hand, contacts: Contacts, world: CollisionWorld, solved: float = SOLVED
+    hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld, solved: float = SOLVED
 ) -> Configuration:
-    """Return postures whose fingertips are on their contacts and whose links are clear, as far as each row allows.
+    """Return configurations with the fingertips on their contacts and the links clear, as far as each row allows.
 
     Args:
-        posture: starting pose and joints, g rows.
-        hand: whose fingers, in grasp order, take the contacts in theirs.
-        contacts: g rows; finger i takes contact i.
-        surroundings: the estimated object and the table.
-        solved: sum of squared residuals [mm2] at which a row is left alone.
+        hand: finger i takes contact i.
+        configuration: starting pose and joints, g rows.
+        contacts: g rows.
+        world: the object and the table.
+        solved: sum of squared residuals [mm2] at which a row is done.
 
     Returns:
-        As many rows; whether each succeeded is for `check` to say.
+        As many rows; `measure_errors` tells which succeeded.
     """
     target, normals = tip_targets(hand, contacts), contacts.normals
 
-    def evaluate(state: Configuration, at: Int[Tensor, "a"]) -> Residuals:
-        return grasp_rows(state, hand, target[at], normals[at], world, tips_touch=True)
+    def evaluate(state: Configuration, rows: Int[Tensor, "a"]) -> Residuals:
+        return grasp_residuals(hand, state, target[rows], normals[rows], world, tips_touch=True)
 
-    return levenberg_marquardt(posture, evaluate, lambda state, step: state.moved(step, hand), ITERATIONS, solved)
+    return levenberg_marquardt(configuration, evaluate, lambda x, step: x.integrate(hand, step), ITERATIONS, solved)
 
 
-def settle_tips(posture: Configuration, hand: Hand, contacts: Contacts, solved: float) -> Configuration:
-    """Return refined postures with their tips on their contacts, whatever clearance that costs: it is a last touch."""
+def settle_tips(hand: Hand, configuration: Configuration, contacts: Contacts, solved: float) -> Configuration:
+    """Return refined configurations with their tips on their contacts, whatever clearance that costs."""
     target, normals = tip_targets(hand, contacts), contacts.normals
 
-    def evaluate(state: Configuration, at: Int[Tensor, "a"]) -> Residuals:
-        return tip_rows(SpatialJacobian.at(state, hand), target[at], normals[at])
+    def evaluate(state: Configuration, rows: Int[Tensor, "a"]) -> Residuals:
+        return tip_residuals(SpatialJacobian.at(hand, state), target[rows], normals[rows])
 
-    return levenberg_marquardt(posture, evaluate, lambda state, step: state.moved(step, hand), ITERATIONS, solved)
+    return levenberg_marquardt(configuration, evaluate, lambda x, step: x.integrate(hand, step), ITERATIONS, solved)
 
 
-def open_hand(posture: Configuration, hand: Hand, contacts: Contacts, world: CollisionWorld) -> Float[Tensor, "g h"]:
-    """Return the joints of the pre-grasp: at the same pose, the tips off their contacts and everything clear.
+def open_hand(
+    hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld
+) -> Float[Tensor, "g h"]:
+    """Return the joints of the pre-grasp: the same pose, the tips off their contacts, everything clear.
 
-    Each tip opens by `OPENING` and three standard deviations of the surface at its contact, so that it starts outside
-    the object even where that is larger than it was thought to be, but not into the table. Opening along the normals
-    alone drives links into the object; here clearance is part of the problem.
+    Each tip opens along its normal by `OPENING` plus three standard deviations of the surface, but not into the table.
+    So it starts outside the object even where the object is larger than estimated. Clearances are part of the problem,
+    because opening alone drives links into the object.
     """
     normals, gap = contacts.normals, OPENING + OPENING_SIGMAS * contacts.require_std()
     target = tip_targets(hand, contacts) + gap[..., None] * normals
@@ -129,11 +133,11 @@ def open_hand(posture: Configuration, hand: Hand, contacts: Contacts, world: Col
         lowest = world.table + CLEARANCE + hand.tip_radius.to(target)
         target = torch.stack([*target.unbind(-1)[:2], torch.maximum(target[..., 2], lowest)], -1)
 
-    def evaluate(state: Configuration, at: Int[Tensor, "a"]) -> Residuals:
-        residual, jacobian = grasp_rows(state, hand, target[at], normals[at], world, tips_touch=False)
+    def evaluate(state: Configuration, rows: Int[Tensor, "a"]) -> Residuals:
+        residual, jacobian = grasp_residuals(hand, state, target[rows], normals[rows], world, tips_touch=False)
         return residual, jacobian[..., 6:]
 
-    def move(state: Configuration, step: Float[Tensor, "a d"]) -> Configuration:
-        return state.moved(torch.cat([step.new_zeros(len(step), 6), step], 1), hand)
+    def integrate(state: Configuration, step: Float[Tensor, "a d"]) -> Configuration:
+        return state.integrate(hand, torch.cat([step.new_zeros(len(step), 6), step], 1))
 
-    return levenberg_marquardt(posture, evaluate, move, ITERATIONS).joints
+    return levenberg_marquardt(configuration, evaluate, integrate, ITERATIONS).joints

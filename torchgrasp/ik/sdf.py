@@ -1,7 +1,6 @@
 """A signed distance field of an object's surface, for collision."""
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,25 +12,27 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.mesh import closest_on_triangles
 
 BAND = 0.022
-"""Nodes whose interpolated distance [m] is below this are made exact; farther out it stays interpolated."""
+"""Nodes whose interpolated distance [m] is below this are computed exactly; a finger is about as thick."""
 COARSE = 3
-"""Nodes of the coarse grid are this many spacings apart."""
-NEAREST = 4
-"""Samples of the surface that are asked for the distance and the side of one node."""
+"""Spacings between the nodes of the coarse grid, from which the fine one is interpolated."""
+NEAREST_SAMPLES = 4
+"""Samples of the surface whose triangles are asked for the distance of one node."""
+MOST_NODES = 2e7
+"""Largest grid: 160 MB."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SignedDistanceField(Value):
-    """A signed distance [m] on a grid in the object's frame, negative inside; node i is at origin + i * spacing."""
+    """Signed distance [m] on a grid in the object's frame, negative inside; node i is at origin + i * spacing."""
 
     origin: Float[Tensor, "3"]
     spacing: float
     values: Float[Tensor, "x y z"]
 
-    def nearest(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+    def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return the value [m] at the node nearest to each point: at most 0.87 spacings off inside the grid.
 
-        Outside it is the value at the border, which is too small.
+        Outside the grid the value at its border is returned, which is too small.
         """
         flat = 0
         for x, low, count in zip(points.unbind(-1), self.origin.tolist(), self.values.shape, strict=True):
@@ -40,26 +41,25 @@ class SignedDistanceField(Value):
         return self.values.reshape(-1)[flat].to(points)
 
     def query(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
-        """Return the signed distance [m] and its gradient at points [m], trilinearly; the gradient is its derivative.
+        """Return the trilinear signed distance [m] at points [m] and its derivative by them.
 
-        Beyond the grid the value at its border is continued by the distance from the grid.
+        Outside the grid the distance from the grid is added to the value at its border.
         """
         shape = torch.tensor(self.values.shape, device=points.device)
-        place = (points - self.origin.to(points)) / self.spacing
-        held = torch.minimum(place.clamp_min(0), (shape - 1).to(points))
-        cell = torch.minimum(held.detach().long(), shape - 2)
-        f = held - cell
+        position = (points - self.origin.to(points)) / self.spacing
+        inside = torch.minimum(position.clamp_min(0), (shape - 1).to(points))
+        cell = torch.minimum(inside.detach().long(), shape - 2)
+        fx, fy, fz = (inside - cell).unbind(-1)
         flat = (cell[..., 0] * shape[1] + cell[..., 1]) * shape[2] + cell[..., 2]
         table, dx, dy = self.values.reshape(-1), int(shape[1] * shape[2]), int(shape[2])
         corner = [table[flat + i * dx + j * dy + k].to(points) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-        fx, fy, fz = f.unbind(-1)
         z = [torch.lerp(corner[2 * i], corner[2 * i + 1], fz) for i in range(4)]
         y = [torch.lerp(z[0], z[1], fy), torch.lerp(z[2], z[3], fy)]
         slope_z = [corner[2 * i + 1] - corner[2 * i] for i in range(4)]
         slope_z = torch.lerp(torch.lerp(slope_z[0], slope_z[1], fy), torch.lerp(slope_z[2], slope_z[3], fy), fx)
         slope_y = torch.lerp(z[1] - z[0], z[3] - z[2], fx)
         slope = torch.stack([y[1] - y[0], slope_y, slope_z], -1) / self.spacing
-        beyond = (place - held) * self.spacing
+        beyond = (position - inside) * self.spacing
         away = torch.linalg.vector_norm(beyond, dim=-1)
         outward = beyond / away.clamp_min(1e-12)[..., None]
         gradient = torch.where(beyond != 0, 0.0, slope) + outward
@@ -72,17 +72,17 @@ def field_from_surface(
     spacing: float = 0.003,
     margin: float = 0.08,
 ) -> SignedDistanceField:
-    """Build the signed distance field of a surface, negative on the side its normals point away from.
+    """Return the signed distance field of a surface, negative on the side opposite to its normals.
 
-    With faces the distance is that of the nearest triangles; with normals that of the tangent planes of the nearest
-    vertices, which must be dense. The side is taken from the normals near the closest point, so that a surface may be
-    open; a triangle mesh must be wound consistently, outward.
+    With faces the distance is to the nearest triangles, wound consistently outward. With normals it is to the tangent
+    planes of the nearest vertices, which must be dense. The surface may be open: the side follows from the normals near
+    the closest point.
 
     Args:
-        vertices: [m].
-        faces_or_normals: integer faces (f, 3) into the vertices, or an outward unit normal for each vertex.
-        spacing: distance of the nodes [m].
-        margin: how far the grid reaches beyond the surface [m].
+        vertices: of the surface [m].
+        faces_or_normals: integer faces (f, 3) into the vertices, or an outward normal for each vertex.
+        spacing: of the nodes [m].
+        margin: of the grid around the surface [m].
 
     Raises:
         BadArgument: wrong shapes, faces that name no vertex, or a grid of more than 2e7 nodes.
@@ -94,28 +94,22 @@ def field_from_surface(
     low, high = vertices.amin(0).double() - margin, vertices.amax(0).double() + margin
     # the coarse nodes are every third of the fine ones
     counts = [COARSE * max(1, int(c)) + 1 for c in torch.ceil((high - low) / (COARSE * spacing)).tolist()]
-    if np.prod(np.array(counts, dtype=float)) > 2e7:
+    if np.prod(np.array(counts, dtype=float)) > MOST_NODES:
         raise BadArgument("spacing", spacing, f"a coarser grid than {counts} nodes")
     origin = low.cpu().numpy()
     lines = [origin[k] + spacing * np.arange(counts[k]) for k in range(3)]
-    rough = np.stack(np.meshgrid(*(line[::COARSE] for line in lines), indexing="ij"), -1)
-    values = surface.distance(rough.reshape(-1, 3)).reshape(rough.shape[:3])
+    nodes = np.stack(np.meshgrid(*(line[::COARSE] for line in lines), indexing="ij"), -1)
+    values = surface.distance(nodes.reshape(-1, 3)).reshape(nodes.shape[:3])
     for axis in range(3):
-        values = _refined(values, axis)
+        values = _upsample(values, axis)
     near = np.nonzero(np.abs(values) < BAND)
     values[near] = surface.distance(np.stack([lines[k][near[k]] for k in range(3)], -1))
     to = {"device": vertices.device, "dtype": torch.float64}
     return SignedDistanceField(low.to(**to), float(spacing), torch.tensor(values, **to))
 
 
-def field_from_mesh(mesh: Any, spacing: float = 0.003, margin: float = 0.08) -> SignedDistanceField:
-    """Build the signed distance field of a `trimesh.Trimesh` [m]; see `field_from_surface`."""
-    vertices, faces = torch.tensor(np.asarray(mesh.vertices)), torch.tensor(np.asarray(mesh.faces))
-    return field_from_surface(vertices.double(), faces.long(), spacing, margin)
-
-
-def _refined(values: np.ndarray, axis: int) -> np.ndarray:
-    """Put COARSE - 1 linearly interpolated nodes between the nodes of one axis."""
+def _upsample(values: np.ndarray, axis: int) -> np.ndarray:
+    """Interpolate COARSE - 1 nodes between the nodes of one axis, linearly."""
     nodes = np.moveaxis(values, axis, 0)
     steps = [nodes[:-1] + k / COARSE * (nodes[1:] - nodes[:-1]) for k in range(COARSE)]
     fine = np.stack(steps, 1).reshape(-1, *nodes.shape[1:])
@@ -123,7 +117,7 @@ def _refined(values: np.ndarray, axis: int) -> np.ndarray:
 
 
 class _Surface:
-    """Dense samples of a surface in a tree, for the distances of many points."""
+    """Dense samples of a surface in a tree, for the distances of many points to it."""
 
     def __init__(self, vertices: Tensor, faces_or_normals: Tensor):
         from scipy.spatial import KDTree
@@ -161,7 +155,7 @@ class _Surface:
         self.tree, self.pitch = KDTree(self.samples), 0.0
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the signed distances [m] of points (n, 3), in chunks that stay in the cache."""
+        """Return the signed distances [m] of points (n, 3), chunk by chunk to stay in the cache."""
         return np.concatenate([self._distance(points[k : k + 8192]) for k in range(0, max(1, len(points)), 8192)])
 
     def _distance(self, points: np.ndarray) -> np.ndarray:
@@ -169,7 +163,7 @@ class _Surface:
             length, index = self.tree.query(points)
             along = ((points - self.samples[index]) * self.normals[index]).sum(1)
             return np.copysign(np.maximum(np.abs(along), length - self.pitch), along)
-        _, index = self.tree.query(points, k=min(NEAREST, len(self.samples)))
+        _, index = self.tree.query(points, k=min(NEAREST_SAMPLES, len(self.samples)))
         owner = self.owner[index.reshape(len(points), -1)]
         feet, feature = closest_on_triangles(np.repeat(points, owner.shape[1], 0), self.triangles[owner.reshape(-1)])
         gap = points[:, None] - feet.reshape(*owner.shape, 3)
@@ -180,10 +174,10 @@ class _Surface:
 
 
 def _pseudonormals(corners: np.ndarray) -> np.ndarray:
-    """Return the normal (f, 7, 3) of each triangle's face, its three sides and its three corners.
+    """Return pseudonormals (f, 7, 3) of each triangle's face, three sides and three corners.
 
-    The side on which a point lies follows from the normal of the feature that holds its closest point: of a side the
-    sum of the two faces', of a corner the faces' weighted by their angles (Baerentzen and Aanaes, 2005).
+    The pseudonormal at a point's closest point tells its side of the surface (Baerentzen and Aanaes, 2005). It is the
+    sum of the two face normals at a side, and their sum weighted by angle at a corner.
     """
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     face /= np.linalg.norm(face, axis=1, keepdims=True)

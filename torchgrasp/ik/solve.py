@@ -1,12 +1,10 @@
-"""Inverse kinematics of three contacts: the joints and the pose with which a hand touches them, and nothing of itself.
+"""Inverse kinematics of contacts: joints and pose with which a hand touches them, and nothing of itself.
 
-Starts come from the learned model first (Eqs. 21-24) and, for what those leave, from the hand's own postures nearest to
-the contacts. Each is refined, by Levenberg-Marquardt with the links' clearances among the residuals or by the paper's
-COBYLA, and measured again; a row that no start solves returns the best try with its Status.
+Seeds of the learned model come first (Eqs. 21-24). Rows that these leave unsolved get the hand's random postures
+nearest to their contacts. Each seed is refined by Levenberg-Marquardt, or by the paper's COBYLA, and measured again.
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import Literal, get_args
 
 import torch
@@ -17,38 +15,38 @@ from torchgrasp.base import Batch, check_tensor, join, pick
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import degenerate
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.checks import measure
+from torchgrasp.ik.checks import measure_errors
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.cobyla import refine_by_cobyla
 from torchgrasp.ik.configuration import Configuration
-from torchgrasp.ik.contact_first import assign, rank_in_group
 from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
 from torchgrasp.ik.query import query_mixture
+from torchgrasp.ik.ranking import rank_in_group
 from torchgrasp.ik.refine import refine, settle_tips
+from torchgrasp.ik.rounds import Attempts, assign
 from torchgrasp.posture_model.mixture import GraspMixture
 from torchgrasp.values import Contacts, IKSeeds
 
 Method = Literal["levenberg_marquardt", "cobyla"]
 
-MODES = 2
-"""Guesses of the learned model for each assignment: the conditional mean (Eq. 23) and the likeliest component's."""
-LEARNED, OWN = 4, 8
-"""How many starts of the learned model, and of the hand's own postures, are tried of a row before it is given up."""
+SEEDS_PER_ASSIGNMENT = 2
+"""Seeds of the learned model for each assignment: the conditional mean (Eq. 23) and the likeliest component's."""
+LEARNED_ATTEMPTS, LIBRARY_ATTEMPTS = 4, 8
+"""Seeds of the learned model and of the posture library that are refined before a row is given up."""
 EXACT = 1e-6
 """Sum of squared residuals [mm2] at which a row is done: 0.5 um at a fingertip."""
-NEAR = 5e-5
-"""Error of the fingertips [m] above which a solved row is tried on: another posture may have none."""
-CHUNK = 512
-"""Rows refined at a time: their temporaries stay in the cache."""
+EXACT_TIPS = 5e-5
+"""Tip error [m] above which a solved row is tried further: another configuration may have none."""
+SEEDS_PER_PASS = 512
+"""Seeds refined at a time: their temporaries stay in the cache."""
 
 
 @dataclasses.dataclass(frozen=True)
 class IKSolution(Batch):
-    """A posture for each row of contacts; finger i touches contact `permutation[:, i]`.
+    """A configuration for each row of contacts; finger i touches contact `permutation[:, i]`.
 
-    `tip_error` [m] and `normal_angle` [rad] are those of each fingertip, `clearance` [m] is the least of the links from
-    each other and from the surroundings; `attempts` counts the starts that were refined, those of the learned model first.
-    A row without a start holds NaN, and its `status` tells why.
+    `tip_error` [m] and `normal_angle` [rad] are each fingertip's. `clearance` [m] is the links' least from each other
+    and from the world. `attempts` counts the refined seeds. A row without seeds holds NaN, and `status` tells why.
     """
 
     joints: Float[Tensor, "b h"]
@@ -62,134 +60,95 @@ class IKSolution(Batch):
 
 
 def solve_ik(
-    contacts: Contacts,
     hand: Hand,
+    contacts: Contacts,
     mixture: GraspMixture | None = None,
     world: CollisionWorld | None = None,
     method: Method = "levenberg_marquardt",
-    postures: PostureLibrary | None = None,
+    library: PostureLibrary | None = None,
 ) -> IKSolution:
-    """Return postures whose three fingertips touch the contacts, in whichever assignment, free of self-collision.
+    """Return configurations whose fingertips touch the contacts in any assignment, free of self-collision.
 
     Args:
-        contacts: b triples; `std_m` and `variance` are not used.
         hand: the hand.
-        mixture: its learned model; None: only the hand's own postures are starts.
-        surroundings: what the links must not touch; by default nothing but each other.
-        method: "cobyla" is the paper's (Sec. 6.3), which moves the joints alone and sees the tips alone.
-        postures: the hand's own; by default they are drawn when they are needed, which takes about a second.
+        contacts: b triples; `std_m` and `variance` are not used.
+        mixture: the hand's learned model; None: only the library gives seeds.
+        world: what the links must not touch; None: only each other.
+        method: "cobyla" is the paper's (Sec. 6.3), which sees the tips alone.
+        library: the hand's random postures; None: drawn when they are needed, in about a second.
 
     Returns:
-        One row for each of the contacts, `Status.OK` where every tip is within 1 mm of its contact and inside its
-        pad's cone, and every link is clear.
+        One row for each of the contacts. Under `Status.OK` every tip is within 1 mm of its contact and inside its
+        pad's cone, and every link is clear. An unsolved row is the best attempt, with its Status.
 
     Raises:
         BadArgument: contacts that are no finite triples, a mixture of another hand, an unknown method.
 
     >>> from torchgrasp.hand.load import load_hand
     >>> points = 0.05 * torch.eye(3)[None].double()
-    >>> found = solve_ik(Contacts(points, 20 * points), load_hand("allegro"))
-    >>> bool(found.tip_error.max() < 1e-3)
+    >>> solution = solve_ik(load_hand("allegro"), Contacts(points, 20 * points))
+    >>> bool(solution.tip_error.max() < 1e-3)
     True
     """
     check_tensor("contacts.points", contacts.points, (None, 3, 3))
     check_tensor("contacts.normals", contacts.normals, (len(contacts), 3, 3))
     if method not in get_args(Method):
         raise BadArgument("method", repr(method), f"one of {get_args(Method)}")
-    around = CollisionWorld() if world is None else world
-    move = refine_by_cobyla if method == "cobyla" else _refine
+    world = CollisionWorld() if world is None else world
+    move = refine_by_cobyla if method == "cobyla" else refine_exactly
 
-    def learned(some: Contacts) -> IKSeeds:
+    def refine_seeds(seeds: IKSeeds) -> IKSolution:
+        """Refine seeds and measure what came of them."""
+        taken, start = assign(contacts, seeds), Configuration(seeds.joints, seeds.obj_from_hand)
+        configuration = move(hand, start, taken, world)
+        errors = measure_errors(hand, configuration, taken, world)
+        return IKSolution(
+            configuration.joints, configuration.obj_from_hand, seeds.permutation, errors.tip_error,
+            errors.normal_angle, errors.clearance, torch.ones_like(errors.status), errors.status,
+        )  # fmt: skip
+
+    def refine_in_passes(seeds: IKSeeds) -> IKSolution:
+        """Refine seeds pass by pass."""
+        passes = range(0, max(len(seeds), 1), SEEDS_PER_PASS)
+        return join([refine_seeds(seeds[k : k + SEEDS_PER_PASS]) for k in passes])
+
+    def learned_seeds(some: Contacts) -> IKSeeds:
         assert mixture is not None
-        return query_mixture(some, hand, mixture, n_seeds=MODES)
+        return query_mixture(hand, some, mixture, n_seeds=SEEDS_PER_ASSIGNMENT)
 
-    def own(some: Contacts) -> IKSeeds:
-        return nearest_postures(some, PostureLibrary.of(hand) if postures is None else postures, around, OWN)
+    def library_seeds(some: Contacts) -> IKSeeds:
+        return nearest_postures(PostureLibrary.of(hand) if library is None else library, some, world, LIBRARY_ATTEMPTS)
 
-    found = _nowhere(contacts, hand)
-    sources = [(own, OWN)] if mixture is None else [(learned, LEARNED), (own, OWN)]
-    for source, attempts in sources:
-        waiting = torch.nonzero(~_done(found) & (found.status != Status.DEGENERATE))[:, 0]
-        if not len(waiting):
-            break
-        found = _improve(found, waiting, source(contacts[waiting]), contacts, hand, around, move, attempts)
-    return found
-
-
-def _refine(posture: Configuration, hand: Hand, contacts: Contacts, world: CollisionWorld) -> Configuration:
-    """Refine until the tips are exact; where a margin of clearance has kept them off, it is given up if all is well."""
-    refined = refine(posture, hand, contacts, world, EXACT)
-    settled = settle_tips(refined, hand, contacts, EXACT)
-    good = measure(settled, hand, contacts, world).status == Status.OK
-    return pick(good, settled, refined)
+    attempts = Attempts(~degenerate(contacts.points), _is_exact)
+    attempts.add(_no_solution(hand, contacts), torch.arange(len(contacts), device=contacts.points.device))
+    sources = [(learned_seeds, LEARNED_ATTEMPTS)] if mixture is not None else []
+    for source, count in [*sources, (library_seeds, LIBRARY_ATTEMPTS)]:
+        rows = torch.nonzero(attempts.unsolved)[:, 0]
+        if len(rows):
+            seeds = source(contacts[rows])
+            seeds = dataclasses.replace(seeds, row=rows[seeds.row])
+            attempts.refine(seeds, rank_in_group(seeds.row), [1] * count, refine_in_passes)
+    solution, row = attempts.best(lambda tried: ((tried.status != Status.OK).int(), tried.tip_error.amax(1)))
+    counts = torch.bincount(torch.cat(attempts.rows), minlength=len(contacts)) - 1
+    return dataclasses.replace(solution[row.argsort()], attempts=counts)
 
 
-def _improve(
-    found: IKSolution,
-    rows: Int[Tensor, "w"],
-    seeds: IKSeeds,
-    contacts: Contacts,
-    hand: Hand,
-    world: CollisionWorld,
-    move: Callable[[Configuration, Hand, Contacts, CollisionWorld], Configuration],
-    attempts: int,
-) -> IKSolution:
-    """Try the guesses of rows one after the other until one solves the row exactly, keeping the best.
-
-    `seeds.row` points into `rows`.
-    """
-    seeds = dataclasses.replace(seeds, row=rows[seeds.row])
-    rank = rank_in_group(torch.zeros_like(seeds.energy), seeds.row)
-    for k in range(attempts):
-        chosen = seeds[(rank == k) & ~_done(found)[seeds.row]]
-        if not len(chosen):
-            break
-        tried = join([_try(part, contacts, hand, world, move) for part in _chunks(chosen)])
-        found.attempts[chosen.row] += 1
-        before = found[chosen.row]
-        tried = dataclasses.replace(tried, attempts=before.attempts)
-        gain = (tried.status == Status.OK).long() - (before.status == Status.OK).long()
-        nearer = ~(before.tip_error.amax(1) <= tried.tip_error.amax(1))
-        better = (gain > 0) | ((gain == 0) & nearer)
-        found = _put(found, chosen.row[better], tried[better])
-    return found
+def refine_exactly(
+    hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld
+) -> Configuration:
+    """Refine until the tips are exact, giving up margins of clearance where the checks allow it."""
+    refined = refine(hand, configuration, contacts, world, EXACT)
+    settled = settle_tips(hand, refined, contacts, EXACT)
+    return pick(measure_errors(hand, settled, contacts, world).status == Status.OK, settled, refined)
 
 
-def _done(found: IKSolution) -> Bool[Tensor, "b"]:
+def _is_exact(solution: IKSolution) -> Bool[Tensor, "b"]:
     """Tell which rows are solved, and exactly."""
-    return (found.status == Status.OK) & (found.tip_error.amax(1) <= NEAR)
+    return (solution.status == Status.OK) & (solution.tip_error.amax(1) <= EXACT_TIPS)
 
 
-def _try(
-    seeds: IKSeeds,
-    contacts: Contacts,
-    hand: Hand,
-    world: CollisionWorld,
-    move: Callable[[Configuration, Hand, Contacts, CollisionWorld], Configuration],
-) -> IKSolution:
-    """Refine guesses and measure what came of it."""
-    taken = assign(contacts, seeds)
-    posture = move(Configuration(seeds.joints, seeds.obj_from_hand), hand, taken, world)
-    seen = measure(posture, hand, taken, world)
-    return IKSolution(
-        posture.joints, posture.obj_from_hand, seeds.permutation, seen.tip_error, seen.normal_angle, seen.clearance,
-        torch.ones_like(seen.status), seen.status,
-    )  # fmt: skip
-
-
-def _chunks(seeds: IKSeeds) -> list[IKSeeds]:
-    """Cut a batch into parts that stay in the cache."""
-    return [seeds[k : k + CHUNK] for k in range(0, len(seeds), CHUNK)]
-
-
-def _put(found: IKSolution, rows: Int[Tensor, "r"], better: IKSolution) -> IKSolution:
-    """Return the batch with some of its rows replaced."""
-    fields = (f.name for f in dataclasses.fields(found))
-    return IKSolution(**{name: getattr(found, name).index_copy(0, rows, getattr(better, name)) for name in fields})
-
-
-def _nowhere(contacts: Contacts, hand: Hand) -> IKSolution:
-    """Return rows without a posture: out of reach, or degenerate."""
+def _no_solution(hand: Hand, contacts: Contacts) -> IKSolution:
+    """Return rows without a configuration: out of reach, or degenerate."""
     b, nan = len(contacts), torch.full((), torch.nan).to(contacts.points)
     order = torch.arange(3, device=nan.device).expand(b, 3)
     status = torch.where(degenerate(contacts.points), int(Status.DEGENERATE), int(Status.OUT_OF_REACH))

@@ -26,7 +26,7 @@ from torchgrasp.evaluation.protocols import PROTOCOLS
 from torchgrasp.evaluation.score import share
 from torchgrasp.files import format_json, write_atomically, write_file
 from torchgrasp.hand.load import load_hand
-from torchgrasp.ik.success import success_features
+from torchgrasp.ik.ranking import success_features
 from torchgrasp.objects import list_objects, load_object
 from torchgrasp.pipeline import closure_of
 from torchgrasp.shape.fit import fit_shape
@@ -168,7 +168,7 @@ def known_of(
         return []
     grasps = load_grasps(shelf / f"{name}_{view}.safetensors")[torch.tensor(ranks)]
     shape, center = shape_of(source, name, view)
-    closure = closure_of(grasps.contacts, shape, friction, 0)
+    closure = closure_of(shape, grasps.contacts, friction, 0)
     return success_features(grasps.contacts, closure, grasps.normal_angle, center, friction).tolist()
 
 

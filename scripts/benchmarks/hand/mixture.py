@@ -215,10 +215,10 @@ def bench_queries(codes: int) -> list[Row]:
         hand, mixture = load_hand(name), load_mixture(name)
         held_out = sample_configurations(hand, codes, SEED)
         contacts = touched(hand, held_out.joints)
-        seconds = least_seconds(lambda: query_mixture(contacts, hand, mixture, n_seeds=1), 2)  # noqa: B023
+        seconds = least_seconds(lambda: query_mixture(hand, contacts, mixture, n_seeds=1), 2)  # noqa: B023
         reach = mixture.energy(held_out.q)
         shares = {r: float((reach < r).double().mean()) for r in (PAPER_ENERGY, DEFAULT_ENERGY)}
-        accepted = {r: query_mixture(contacts, hand, mixture, n_seeds=1, max_energy=r) for r in shares}
+        accepted = {r: query_mixture(hand, contacts, mixture, n_seeds=1, max_energy=r) for r in shares}
         found = {r: len(guess.row.unique()) / codes for r, guess in accepted.items()}
         rows.append(
             Row(

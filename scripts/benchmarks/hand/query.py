@@ -16,15 +16,16 @@ from torch import Tensor
 from benchmarks.common import Row
 from torchgrasp import Contacts, load_hand, load_mixture
 from torchgrasp.errors import Status
-from torchgrasp.hand import cobyla
 from torchgrasp.hand.hand import Hand
+from torchgrasp.ik import cobyla
 from torchgrasp.ik.checks import TIP_TOLERANCE
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
-from torchgrasp.ik.contact_first import assign, rank_in_group
 from torchgrasp.ik.posture_library import PostureLibrary
 from torchgrasp.ik.query import query_mixture
-from torchgrasp.ik.solve import LEARNED, MODES, IKSolution, solve_ik
+from torchgrasp.ik.ranking import rank_in_group
+from torchgrasp.ik.rounds import assign
+from torchgrasp.ik.solve import LEARNED_ATTEMPTS, SEEDS_PER_ASSIGNMENT, IKSolution, solve_ik
 from torchgrasp.posture_model.mixture import GraspMixture
 from torchgrasp.posture_model.sample import sample_configurations
 
@@ -52,15 +53,15 @@ def _bench_hand(name: str, codes: int, peers: int) -> list[Row]:
     """Return the rows of one hand."""
     hand, mixture = load_hand(name), load_mixture(name)
     contacts = touched(hand, sample_configurations(hand, codes, SEED).joints)
-    postures, drawn = timed(lambda: PostureLibrary.of(hand))
-    solve_ik(contacts[:100], hand, mixture, postures=postures)  # the first call sets up
-    found, learned = timed(lambda: solve_ik(contacts, hand, mixture, postures=postures))
-    own, alone = timed(lambda: solve_ik(contacts, hand, postures=postures))
-    without = f"without the model, from 5000 own postures (drawn once in {drawn:.1f} s)"
+    library, drawn = timed(lambda: PostureLibrary.of(hand))
+    solve_ik(hand, contacts[:100], mixture, library=library)  # the first call sets up
+    solution, seconds = timed(lambda: solve_ik(hand, contacts, mixture, library=library))
+    by_library, library_seconds = timed(lambda: solve_ik(hand, contacts, library=library))
+    without = f"without the model, from {len(library.joints)} random postures (drawn once in {drawn:.1f} s)"
     return [
-        _solved_row(name, "query + refine", found, learned / codes, BARS[name]),
-        _solved_row(name, without, own, alone / codes, None),
-        _cobyla_row(hand, mixture, contacts[:peers], found[:peers], learned / codes),
+        _solved_row(name, "query + refine", solution, seconds / codes, BARS[name]),
+        _solved_row(name, without, by_library, library_seconds / codes, None),
+        _cobyla_row(hand, mixture, contacts[:peers], solution[:peers], seconds / codes),
     ]
 
 
@@ -76,23 +77,27 @@ def timed(action: Callable[[], Result]) -> tuple[Result, float]:
     return action(), time.process_time() - began
 
 
-def _solved_row(hand: str, what: str, found: IKSolution, seconds: float, bar: float | None) -> Row:
+def _solved_row(hand: str, what: str, solution: IKSolution, seconds: float, bar: float | None) -> Row:
     """Return the row of the share of solved codes and of their errors."""
-    near, free = found.tip_error.amax(1) <= TIP_TOLERANCE, found.clearance >= 0
-    solved, first = near & free, (found.status == Status.OK) & (found.attempts <= LEARNED)
-    error = 1e3 * found.tip_error.amax(1).nan_to_num(torch.inf)
+    touching, clear = solution.tip_error.amax(1) <= TIP_TOLERANCE, solution.clearance >= 0
+    solved, ok = touching & clear, solution.status == Status.OK
+    error = 1e3 * solution.tip_error.amax(1).nan_to_num(torch.inf)
     share, median = float(solved.double().mean()), float(error.median())
-    right = float((found.status == Status.OK).double().mean())
-    by_model = f", {float(first.double().mean()):.2%} by the learned model's starts alone" if bar else ""
+    right = float(ok.double().mean())
+    by_model = (
+        f", {float((ok & (solution.attempts <= LEARNED_ATTEMPTS)).double().mean()):.2%} by the learned model's starts alone"
+        if bar
+        else ""
+    )
     wanted = "none"
     if bar is not None:
         wanted = f">= {bar:.0%} with all tips within 1 mm and free of self-collision, median <= {MEDIAN} mm"
-    numbers = {"share": share, "median_mm": median, "ms": 1e3 * seconds, "right": right, "codes": len(found)}
+    numbers = {"share": share, "median_mm": median, "ms": 1e3 * seconds, "right": right, "codes": len(solution)}
     return Row(
-        f"{len(found)} held-out codes, {hand}, {what}",
+        f"{len(solution)} held-out codes, {hand}, {what}",
         wanted,
         f"{share:.2%}, median {median:.1e} mm, 99 % {float(error.quantile(0.99)):.1e} mm; inside the pads' cones too "
-        f"{right:.2%}{by_model}; {1e3 * seconds:.2f} ms a code, {float(found.attempts.double().mean()):.2f} starts",
+        f"{right:.2%}{by_model}; {1e3 * seconds:.2f} ms a code, {float(solution.attempts.double().mean()):.2f} starts",
         None if bar is None else share >= bar and median <= MEDIAN,
         numbers,
     )
@@ -100,26 +105,25 @@ def _solved_row(hand: str, what: str, found: IKSolution, seconds: float, bar: fl
 
 def _cobyla_row(hand: Hand, mixture: GraspMixture, contacts: Contacts, ours: IKSolution, seconds: float) -> Row:
     """Return the row of COBYLA from the first guess alone, one try a code."""
-    guess, asked = timed(lambda: query_mixture(contacts, hand, mixture, n_seeds=MODES))
-    guess = guess[rank_in_group(torch.zeros_like(guess.energy), guess.row) == 0]
-    taken, start = assign(contacts, guess), Configuration(guess.joints, guess.obj_from_hand)
+    seeds, asked = timed(lambda: query_mixture(hand, contacts, mixture, n_seeds=SEEDS_PER_ASSIGNMENT))
+    seeds = seeds[rank_in_group(seeds.row) == 0]
+    taken, start = assign(contacts, seeds), Configuration(seeds.joints, seeds.obj_from_hand)
     spent, place = [0.0], cobyla.place
 
     def counted(*arguments: Any) -> tuple[Tensor, Tensor]:
-        found, used = timed(lambda: place(*arguments))
+        placed, used = timed(lambda: place(*arguments))
         spent[0] += used
-        return found
+        return placed
 
     cobyla.place = counted
     try:
-        found, used = timed(lambda: cobyla.refine_by_cobyla(start, hand, taken, CollisionWorld()))
+        refined, used = timed(lambda: cobyla.refine_by_cobyla(hand, start, taken, CollisionWorld()))
     finally:
         cobyla.place = place
-    jacobians = SpatialJacobian.at(found, hand)
-    points = jacobians.points(hand.tips.index, hand.tips.contact)
+    points = SpatialJacobian.at(hand, refined).points(hand.tips.index, hand.tips.contact)
     error = 1e3 * torch.linalg.vector_norm(points - taken.points, dim=-1).amax(1)
-    free = hand.self_clearance(found.joints) >= 0
-    share = float(((error <= 1e3 * TIP_TOLERANCE) & free).double().mean())
+    clear = hand.self_clearance(refined.joints) >= 0
+    share = float(((error <= 1e3 * TIP_TOLERANCE) & clear).double().mean())
     mine = 1e3 * ours.tip_error.amax(1).nan_to_num(torch.inf)
     each, scipy = (asked + used) / len(contacts), (used - spent[0]) / len(contacts)
     medians = [float(x.median()) for x in (mine, error)]

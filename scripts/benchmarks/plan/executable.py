@@ -1,7 +1,7 @@
-"""How many starts become grasps that a hand can take, and what one costs: contacts first, and solved together.
+"""How many starts become grasps that a hand can take, and what one costs, in both modes.
 
 A start is certified when its planned contacts are (default specification with a table, LP margin and rank). A grasp is
-executable when `check` finds every fingertip within 1 mm of its contact and inside its pad's cone, joints within their
+executable when every fingertip is within 1 mm of its contact and inside its pad's cone, joints within their
 limits, and links and pre-grasp clear of the estimated surface, the table and each other. The cost of a grasp is the
 processor's time of planning, certificates, guesses and solving; the shape and its distance field are given.
 """
@@ -17,9 +17,9 @@ from benchmarks.common import Row
 from torchgrasp import ContactSpec, Grasps, Hand, Status, certify, fit_shape, load_hand, load_mixture, plan_contacts
 from torchgrasp.datasets import read_views
 from torchgrasp.frames import apply
+from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.checks import TIP_PENETRATION
 from torchgrasp.ik.clearance import CLEARANCE, SELF_CLEARANCE, CollisionWorld
-from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.contact_first import solve_contact_first
 from torchgrasp.ik.joint import solve_joint
 from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
@@ -54,39 +54,39 @@ def bench_executable(views: list[Any], starts: int, seed: int) -> list[Row]:
         contacts, certificate = plan.contacts[closed], certificate[closed]
         planned = time.process_time() - began
         for hand_name, hand in hands.items():
-            given = hand, contacts, certificate, world, surface.vertices.mean(0)
+            problem = GraspProblem(hand, contacts, certificate, world, surface.vertices.mean(0))
             for mode in ("contact_first", "joint"):
                 began = time.process_time()
                 if mode == "joint":
-                    guess = nearest_postures(contacts, PostureLibrary.of(hand, seed=seed), world)
-                    grasps = solve_joint(guess, *given, shape, SPEC)
+                    seeds = nearest_postures(PostureLibrary.of(hand, seed=seed), contacts, world)
+                    grasps = solve_joint(problem, seeds, shape, SPEC)
                 else:
-                    grasps = solve_contact_first(query_mixture(contacts, hand, load_mixture(hand_name)), *given)
+                    seeds = query_mixture(hand, contacts, load_mixture(hand_name))
+                    grasps = solve_contact_first(problem, seeds)
                 good = int((grasps.status == Status.OK).sum())
                 found.setdefault((hand_name, mode), {})[name] = {
                     "certified": len(contacts),
                     "executable": good,
                     "share": good / max(len(contacts), 1),
                     "ms": 1e3 * (planned + time.process_time() - began) / max(good, 1),
-                    "blocked": count_blockers(grasps, hand, world),
+                    "blocked": count_blockers(hand, grasps, world),
                 }
     return [_row(*key, objects, starts) for key, objects in found.items()]
 
 
-def count_blockers(grasps: Grasps, hand: Hand, world: CollisionWorld) -> dict[str, float]:
+def count_blockers(hand: Hand, grasps: Grasps, world: CollisionWorld) -> dict[str, float]:
     """Return the share of triples that each of `BLOCKERS` kept from a grasp, by the best failure of each triple."""
-    posture = Configuration(grasps.joints, grasps.obj_from_hand)
-    cover, centres = hand.collision_spheres, apply(posture.obj_from_hand, hand.sphere_centres(posture.joints))
+    spheres, centres = hand.collision_spheres, apply(grasps.obj_from_hand, hand.sphere_centres(grasps.joints))
     assert world.field is not None and world.table is not None
-    free = world.field.query(centres)[0] - cover.radius
-    height = (centres[..., 2] - cover.radius - world.table).amin(1)
-    parts = (cover.finger == -1, (cover.finger != -1) & ~cover.touching, cover.touching)
-    palm, links, tips = (torch.where(part, free, torch.inf).amin(1) for part in parts)
+    clearance = world.field.query(centres)[0] - spheres.radius
+    height = (centres[..., 2] - spheres.radius - world.table).amin(1)
+    parts = (spheres.finger == -1, (spheres.finger != -1) & ~spheres.touching, spheres.touching)
+    palm, links, tips = (torch.where(part, clearance, torch.inf).amin(1) for part in parts)
     lack = torch.stack(
         [
             CLEARANCE - palm,
             CLEARANCE - links,
-            SELF_CLEARANCE - hand.self_clearance(posture.joints),
+            SELF_CLEARANCE - hand.self_clearance(grasps.joints),
             -height,
             -TIP_PENETRATION - tips,
         ],

@@ -1,4 +1,4 @@
-"""The model of success: what it is shipped with, and which way each thing that it knows of a grasp counts."""
+"""Ranking: order within groups, the geometric score, and which way each feature of the model of success counts."""
 
 import json
 import math
@@ -6,7 +6,15 @@ import math
 import pytest
 import torch
 
-from torchgrasp.ik.success import FEATURES, MODEL, success_features, success_odds
+from torchgrasp.ik.ranking import (
+    FEATURES,
+    MODEL,
+    centred_friction,
+    rank_in_group,
+    score,
+    success_features,
+    success_log_odds,
+)
 from torchgrasp.values import Contacts
 
 CENTER = torch.tensor([0.0, 0.03, 0.0], dtype=torch.float64)
@@ -15,11 +23,48 @@ CLOSED = torch.tensor([0.9], dtype=torch.float64)
 GOOD = torch.tensor([[4.0, 0.3, 0.3, 0.5, 0.6]])
 
 
+def test_rank_in_group_against_brute_force(generator):
+    cost = torch.randint(0, 40, (200,), generator=generator).double()  # with ties
+    group = torch.randint(0, 30, (200,), generator=generator)
+    place, counts = torch.zeros(200, dtype=torch.int64), {}
+    for i in sorted(range(200), key=lambda i: (float(cost[i]), i)):
+        place[i] = counts.get(int(group[i]), 0)
+        counts[int(group[i])] = int(place[i]) + 1
+    assert torch.equal(rank_in_group(group, cost), place)
+    assert len(rank_in_group(group[:0], cost[:0])) == 0
+
+
+def triple(height: float = 0.0, tilt: float = 0.0) -> Contacts:
+    """Three contacts on a vertical cylinder at 120 degrees, normals tilted upward."""
+    angle = torch.arange(3, dtype=torch.float64) * 2 * math.pi / 3
+    radial = torch.stack([angle.cos(), angle.sin(), torch.zeros(3, dtype=torch.float64)], -1)
+    up = torch.tensor([0.0, 0, 1], dtype=torch.float64)
+    normals = torch.cos(torch.tensor(tilt)) * radial + torch.sin(torch.tensor(tilt)) * up
+    spread = torch.full((1, 3), 0.001, dtype=torch.float64)
+    return Contacts((0.03 * radial + height * up)[None], normals[None], spread, spread)
+
+
+def test_centred_friction_is_the_tangent_of_the_tilt():
+    torch.testing.assert_close(
+        centred_friction(triple(tilt=0.0)), torch.zeros(1, dtype=torch.float64), atol=1e-6, rtol=0
+    )
+    torch.testing.assert_close(
+        centred_friction(triple(tilt=0.3)), torch.tensor([0.3], dtype=torch.float64).tan(), atol=1e-6, rtol=0
+    )
+
+
+def test_central_untilted_grasps_rank_first():
+    pads, center = torch.zeros(1, 3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    best = score(triple(), pads, center)
+    for worse in (triple(height=0.03), triple(tilt=0.5)):
+        assert float(score(worse, pads, center)) < float(best)
+
+
 @pytest.mark.parametrize("name", FEATURES)
 def test_every_feature_counts_the_way_it_should(name):
     changed = GOOD.clone()
     changed[0, FEATURES.index(name)] += -2.0 if name == "log-odds of closure" else 0.5
-    assert float(success_odds(changed)) < float(success_odds(GOOD))
+    assert float(success_log_odds(changed)) < float(success_log_odds(GOOD))
 
 
 def test_the_shipped_model_beats_the_base_rate_where_it_was_not_fitted():

@@ -1,0 +1,88 @@
+"""Rounds of refinement: who is refined when, and what is best of it."""
+
+import dataclasses
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchgrasp.base import Batch
+from torchgrasp.errors import Status
+from torchgrasp.ik.ranking import rank_in_group
+from torchgrasp.ik.rounds import Attempts, assign
+from torchgrasp.values import Contacts, IKSeeds
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome(Batch):
+    """A status and an error for each seed."""
+
+    error: Float[Tensor, "k"]
+    status: Int[Tensor, "k"]
+
+
+def seeds_of(row: list[int], energy: list[float]) -> IKSeeds:
+    """Seeds that `energy` tells apart."""
+    g = len(row)
+    order, poses = torch.arange(3).expand(g, 3), torch.eye(4).expand(g, 4, 4)
+    return IKSeeds(torch.zeros(g, 4), poses, torch.tensor(row), order, torch.tensor(energy), torch.zeros(g, 3))
+
+
+def by_sign(refined: list[list[float]]):
+    """A refinement that solves the seeds of negative energy, and keeps a record."""
+
+    def refine(seeds: IKSeeds) -> Outcome:
+        refined.append(seeds.energy.tolist())
+        failed = (seeds.energy >= 0).long() * int(Status.TIP_ERROR)
+        return Outcome(seeds.energy.abs(), failed)
+
+    return refine
+
+
+def solves(outcome: Outcome) -> Tensor:
+    return outcome.status == Status.OK
+
+
+def test_later_rounds_refine_only_seeds_of_unsolved_triples():
+    refined = []
+    seeds = seeds_of([0, 0, 0, 1, 1, 1, 2], [5.0, -1.0, -2.0, 4.0, 3.0, -6.0, -7.0])
+    attempts = Attempts(torch.tensor([True, True, False, True]), solves)
+    attempts.refine(seeds, rank_in_group(seeds.row), [1, 1], by_sign(refined))
+    assert refined == [[5.0, 4.0], [-1.0, 3.0]]  # triple 2 was not to be solved
+    assert attempts.unsolved.tolist() == [False, True, False, True]
+    attempts.refine(seeds, rank_in_group(seeds.row), [3], by_sign(refined))  # another refinement starts anew
+    assert refined[2:] == [[4.0, 3.0, -6.0]]
+    assert attempts.unsolved.tolist() == [False, False, False, True]
+
+
+def test_the_best_of_each_triple_is_a_success_else_the_least_error():
+    attempts = Attempts(torch.ones(3, dtype=torch.bool), solves)
+    seeds = seeds_of([0, 0, 0, 1, 1], [2.0, -9.0, -8.0, 4.0, 3.0])
+    attempts.refine(seeds, rank_in_group(seeds.row), [5], by_sign([]))
+    best, row = attempts.best(lambda outcome: ((outcome.status != Status.OK).int(), outcome.error))
+    assert dict(zip(row.tolist(), best.error.tolist(), strict=True)) == {0: 8.0, 1: 3.0}
+
+
+def test_no_seeds_give_no_results():
+    attempts, seeds = Attempts(torch.ones(2, dtype=torch.bool), solves), seeds_of([0], [1.0])[:0]
+    attempts.refine(seeds, seeds.row, [1, 2], by_sign([]))
+    best, row = attempts.best(lambda outcome: (outcome.error,))
+    assert len(best) == len(row) == 0
+
+
+def test_assign_gives_finger_i_its_contact(generator):
+    points = torch.rand(4, 3, 3, generator=generator, dtype=torch.float64)
+    flat = torch.rand(4, 3, generator=generator, dtype=torch.float64)
+    permutation = torch.tensor([[2, 0, 1], [0, 1, 2]])
+    seeds = IKSeeds(
+        torch.zeros(2, 4),
+        torch.eye(4).expand(2, 4, 4),
+        torch.tensor([3, 1]),
+        permutation,
+        torch.zeros(2),
+        torch.zeros(2, 3),
+    )
+    taken = assign(Contacts(points, -points, std_m=flat), seeds)
+    torch.testing.assert_close(taken.points[0, 0], points[3, 2])
+    torch.testing.assert_close(taken.normals[0, 2], -points[3, 1])
+    torch.testing.assert_close(taken.std_m[1], flat[1])

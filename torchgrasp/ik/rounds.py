@@ -1,0 +1,83 @@
+"""Rounds of refinement: the first seeds of every contact triple, then more seeds of the triples still unsolved.
+
+Most seeds fail and nothing tells which beforehand. But one of a triple's best seeds often succeeds.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Generic, TypeVar
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from torchgrasp.base import Batch, join, map_tensors
+from torchgrasp.errors import Status
+from torchgrasp.ik.ranking import lexical_order, rank_in_group
+from torchgrasp.values import Contacts, Grasps, IKSeeds
+
+Result = TypeVar("Result", bound=Batch)
+
+
+def assign(contacts: Contacts, seeds: IKSeeds) -> Contacts:
+    """Return the contacts of each seed in the order of the fingers."""
+    return map_tensors(lambda x: x[seeds.row[:, None], seeds.permutation], contacts)
+
+
+class Attempts(Generic[Result]):
+    """The results of all seeds refined so far, and which contact triples are still unsolved.
+
+    Args:
+        unsolved: the triples to be solved.
+        solves: tells which results solve their triple.
+    """
+
+    def __init__(self, unsolved: Bool[Tensor, "b"], solves: Callable[[Result], Bool[Tensor, "k"]]):
+        self.unsolved, self.solves = unsolved, solves
+        self.results: list[Result] = []
+        self.rows: list[Int[Tensor, k]] = []
+
+    def add(self, results: Result, row: Int[Tensor, "k"]) -> None:
+        """Add results of the triples `row`."""
+        self.results.append(results)
+        self.rows.append(row)
+        self.unsolved = self.unsolved.index_fill(0, row[self.solves(results)], False)
+
+    def refine(
+        self, seeds: IKSeeds, rank: Int[Tensor, "g"], counts: Sequence[int], refine: Callable[[IKSeeds], Result]
+    ) -> None:
+        """Refine the seeds of unsolved triples, so many more of each triple in every round.
+
+        Args:
+            seeds: `seeds.row` is the triple.
+            rank: of each seed within its triple; the lowest are refined first.
+            counts: seeds of a triple in each round.
+            refine: makes a result of each seed.
+        """
+        first = 0
+        for count in counts:
+            chosen = seeds[(rank >= first) & (rank < first + count) & self.unsolved[seeds.row]]
+            first += count
+            if len(chosen) or not self.results:
+                self.add(refine(chosen), chosen.row)
+
+    def best(self, keys: Callable[[Result], tuple[Tensor, ...]]) -> tuple[Result, Int[Tensor, "t"]]:
+        """Return the first result of each triple by `lexical_order` of the keys, and the triples."""
+        results, row = join(self.results), torch.cat(self.rows)
+        first = rank_in_group(row, *keys(results)) == 0
+        return results[first], row[first]
+
+
+def executable(grasps: Grasps) -> Bool[Tensor, "g"]:
+    """Tell which grasps passed every check."""
+    return grasps.status == Status.OK
+
+
+def best_grasps(attempts: Attempts[Grasps]) -> Grasps:
+    """Return one grasp of each triple, best first: a success, else a failure of certified contacts, else any."""
+
+    def keys(grasps: Grasps) -> tuple[Tensor, Tensor]:
+        failed = ~executable(grasps)
+        return failed.int() + (failed & (grasps.status < Status.OUT_OF_REACH)).int(), -grasps.score
+
+    grasps, _ = attempts.best(keys)
+    return grasps[lexical_order((~executable(grasps)).int(), -grasps.score)]
