@@ -34,7 +34,7 @@ class Attempts(Generic[Result]):
     def __init__(self, unsolved: Bool[Tensor, "b"], solves: Callable[[Result], Bool[Tensor, "k"]]):
         self.unsolved, self.solves = unsolved, solves
         self.results: list[Result] = []
-        self.rows: list[Int[Tensor, k]] = []
+        self.rows: list[Tensor] = []
 
     def add(self, results: Result, row: Int[Tensor, "k"]) -> None:
         """Add results of the triples `row`."""
