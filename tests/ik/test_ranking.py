@@ -40,8 +40,7 @@ def triple(height: float = 0.0, tilt: float = 0.0) -> Contacts:
     radial = torch.stack([angle.cos(), angle.sin(), torch.zeros(3, dtype=torch.float64)], -1)
     up = torch.tensor([0.0, 0, 1], dtype=torch.float64)
     normals = torch.cos(torch.tensor(tilt)) * radial + torch.sin(torch.tensor(tilt)) * up
-    spread = torch.full((1, 3), 0.001, dtype=torch.float64)
-    return Contacts((0.03 * radial + height * up)[None], normals[None], spread, spread)
+    return Contacts((0.03 * radial + height * up)[None], normals[None])
 
 
 def test_centred_friction_is_the_tangent_of_the_tilt():
