@@ -9,7 +9,7 @@ from sklearn.mixture import GaussianMixture
 
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.posture_model.em import (
-    RESEEDS,
+    MAX_RESEEDS,
     Components,
     Progress,
     coefficients_from_components,
@@ -138,7 +138,7 @@ def test_a_component_is_placed_anew_three_times_and_no_more():
     components = start_components(Shard(x), 3, 0, 1e-6).components
     sums, _ = expectation(Shard(x), components)
     sums[2] = 0.0
-    for before in range(RESEEDS):
+    for before in range(MAX_RESEEDS):
         found, reseeded = maximisation(sums, len(x), 0.0, torch.tensor([0, 0, before]))
         assert reseeded.tolist() == [0, 0, before + 1]
         heaviest = int(components_from_sums(sums, len(x), 0.0).weights.argmax())
@@ -147,7 +147,7 @@ def test_a_component_is_placed_anew_three_times_and_no_more():
         middle = (found.means[2] + found.means[heaviest]) / 2
         torch.testing.assert_close(middle, sums[heaviest, 1:6] / sums[heaviest, 0])
     with pytest.raises(IndefiniteCovariance, match=r"component 2, of 0\.0 rows, collapsed 4 times"):
-        maximisation(sums, len(x), 0.0, torch.tensor([0, 0, RESEEDS]))
+        maximisation(sums, len(x), 0.0, torch.tensor([0, 0, MAX_RESEEDS]))
 
 
 def test_data_that_span_no_covariance_are_an_error_at_once():

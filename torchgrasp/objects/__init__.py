@@ -1,4 +1,4 @@
-"""Objects of torchgrasp's own: a mesh, its convex parts, and one noisy view of each."""
+"""The library's own objects: meshes, convex parts and noisy views."""
 
 import dataclasses
 from pathlib import Path
@@ -13,19 +13,25 @@ from torchgrasp.values import PointCloud
 if TYPE_CHECKING:
     import trimesh
 
+__all__ = ["GraspObject", "list_objects", "load_object"]
+
 DATA = Path(__file__).parent / "data"
 """Folder of the objects: `<name>/mesh.ply`, `<name>/parts.npz` and `<name>/view.ply`."""
 
 MASSES = {"cylinder": 0.15, "jug": 0.20, "rabbit": 0.10, "spray": 0.15}
-"""Masses [kg], by name: a tin, a plastic jug, a plush rabbit, a bottle a third full."""
+"""Masses [kg]: a tin, a plastic jug, a plush rabbit, a bottle a third full."""
 
 
 @dataclasses.dataclass(frozen=True)
 class GraspObject:
-    """An object to be grasped, in metres, z up, resting at z = 0.
+    """An object in metres, z up, resting at z = 0.
 
-    `mesh` is the true surface, closed; `parts` are the convex solids whose union stands for it in a simulation;
-    `view` is what a noisy depth camera saw of it from one side, with its viewpoint; `mass` is in kg.
+    Args:
+        name: of the object.
+        mesh: the true, closed surface.
+        parts: convex solids for simulation; their union is the object.
+        view: noisy view from one side, with its viewpoint.
+        mass: [kg].
     """
 
     name: str
@@ -48,7 +54,7 @@ def load_object(name: str) -> GraspObject:
     """Return one of the library's objects.
 
     Raises:
-        BadArgument: no object of this name.
+        BadArgument: no such object.
 
     >>> jug = load_object("jug")
     >>> jug.mesh.is_watertight, len(jug.view)

@@ -1,4 +1,4 @@
-"""Which hand a model was learned from, told by what the model depends on: joints, limits and fingertips."""
+"""Whether a model fits a hand, tested by what the model depends on: joints, limits and fingertips."""
 
 import torch
 from jaxtyping import Float
@@ -8,43 +8,43 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.encoding import encode_fingertips
 
-TOLERANCE = 1e-5
-"""Difference of a code [m or cosine] that rounding leaves."""
+CODE_TOLERANCE = 1e-5
+"""Largest difference of two codes [m or cosine] by rounding: `describe_compatibility` writes seven digits."""
 
 
 def describe_compatibility(hand: Hand) -> dict[str, str]:
-    """Return what samples and models tell about their hand: name, fingers, hash of its files and some of its codes."""
-    codes = " ".join(f"{x:.7f}" for x in _probe(hand).flatten().tolist())
+    """Return the metadata of samples and models about their hand: name, fingers, hash of its files, some codes."""
+    codes = " ".join(f"{x:.7f}" for x in _probe_codes(hand).flatten().tolist())
     return {"hand": hand.name, "fingers": hand.source.option, "hand_sha256": hand.source.sha256, "hand_codes": codes}
 
 
 def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: Hand) -> None:
-    """Refuse a model of another hand, of other fingers of it, of other limits or of other fingertips.
+    """Refuse a model of another hand, or of other fingers, limits or fingertips.
 
-    What else the hand's files say (masses, motors, collision shapes) may have changed. A model without `hand_codes`,
-    as one of measured postures, is taken by the names of its joints.
+    Masses, motors and collision shapes may have changed. A model without `hand_codes`, such as one of measured
+    postures, is recognised by its joint names.
 
     Raises:
-        BadArgument: it is the model of another hand.
+        BadArgument: the model of another hand.
     """
     if joint_names != hand.joint_names:
         raise BadArgument("mixture", f"joints {joint_names}", f"the joints {hand.joint_names} of the hand")
     if "hand_codes" not in meta:
         return
-    ours = _probe(hand).flatten()
+    ours = _probe_codes(hand).flatten()
     try:
         theirs = torch.tensor([float(x) for x in meta["hand_codes"].split()], dtype=torch.float64)
     except ValueError as error:
         raise BadArgument("mixture", f"hand_codes {meta['hand_codes']!r}", "numbers") from error
-    if theirs.shape != ours.shape or not torch.allclose(theirs.to(ours), ours, rtol=0, atol=TOLERANCE):
+    if theirs.shape != ours.shape or not torch.allclose(theirs.to(ours), ours, rtol=0, atol=CODE_TOLERANCE):
         whose = f"hand {meta.get('hand')!r}, fingers {meta.get('fingers')!r}, of other limits or fingertips"
         allowed = f"one of {hand.name!r}, {hand.source.option!r}: train it anew"
         raise BadArgument("mixture", f"a model of {whose}", allowed)
 
 
-def _probe(hand: Hand) -> Float[Tensor, "3 6"]:
-    """Return the codes of three postures between the limits, which limits, links and fingertips all decide."""
+def _probe_codes(hand: Hand) -> Float[Tensor, "3 6"]:
+    """Return the codes of three postures between the limits; they depend on limits, links and fingertips."""
     lower, upper = hand.lower.double(), hand.upper.double()
     share = torch.tensor([0.2, 0.5, 0.7], dtype=torch.float64, device=lower.device)
-    turn = (torch.arange(hand.dof)[None] + torch.arange(3)[:, None]) % 3
-    return encode_fingertips(*hand.fingertips(lower + share[turn] * (upper - lower)))
+    index = (torch.arange(hand.dof)[None] + torch.arange(3)[:, None]) % 3
+    return encode_fingertips(*hand.fingertips(lower + share[index] * (upper - lower)))

@@ -1,9 +1,8 @@
-"""Maximum-likelihood fitting of Gaussian mixtures by expectation-maximisation (Eqs. 19-20), for standardised data.
+"""Expectation-maximisation of Gaussian mixtures (Eqs. 19-20).
 
-Both steps are one matrix product each over the features [1, x, x_i x_j]: the log-density of a Gaussian is linear in
-them, and their responsibility-weighted sums are all that the maximisation needs. That halves the work of whitening
-and keeps the statistics of a step small enough to be summed over processes. The features cancel unless every column
-of the data has mean 0 and variance 1, which the caller sees to.
+The data are standardised: every column has mean 0 and variance 1, or the features below would cancel. Each step is
+one matrix product over the features [1, x_i, x_i x_j]. The log-density of a Gaussian is linear in them, and their
+responsibility-weighted sums suffice for the maximisation. These sums are small enough to be added over processes.
 """
 
 import dataclasses
@@ -16,17 +15,17 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.errors import IndefiniteCovariance
-from torchgrasp.linalg import cholesky
+from torchgrasp.posture_model.gaussian import whitening_matrices
 from torchgrasp.posture_model.shard import Shard
 
-ROWS = 2048
-"""Rows of one pass: features and responsibilities of so many rows stay in the cache."""
+CACHED_ROWS = 2048
+"""Rows of one pass: their features and responsibilities stay in the cache."""
 
-SINGULAR = 1e-12
-"""A variance, given the dimensions before it, that is rounding beside the data's variance of 1."""
+SINGULAR_VARIANCE = 1e-12
+"""A conditional variance of this size is rounding, beside the data's variance of 1."""
 
-RESEEDS = 3
-"""How often a component that collapses is placed anew before that is an error."""
+MAX_RESEEDS = 3
+"""A component that collapses more often shows that the data support fewer components."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,13 +39,13 @@ class Components(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Progress(Value):
-    """Where a fit stands: all that its next step depends on but for the data.
+    """State of a fit: with the data it determines the next step.
 
     Args:
         components: after the steps so far.
-        reseeded: how often each component was placed anew.
-        log_likelihood: the mean over the data before each of those steps [nats].
-        jumped: whether the last step placed a component anew, after which the likelihood may have fallen.
+        reseeded: number of times that each component was placed anew.
+        log_likelihood: mean over the data before each step [nats].
+        jumped: whether the last step placed a component anew; the likelihood may then have fallen.
     """
 
     components: Components
@@ -57,7 +56,7 @@ class Progress(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Fit(Progress):
-    """A fitted mixture; the last log-likelihood is that of the components themselves."""
+    """A fitted mixture; the last log-likelihood belongs to its components."""
 
     converged: bool = False
 
@@ -70,21 +69,20 @@ def expectation_maximisation(
     regularisation: float,
     observer: Callable[[Progress], None] = lambda progress: None,
 ) -> Fit:
-    """Iterate until the mean log-likelihood gains less than `tolerance` in a step.
+    """Iterate until a step raises the mean log-likelihood by less than `tolerance`.
 
     Args:
         shard: standardised data.
-        start: where to begin, or to go on.
-        iterations: most steps, those already taken included.
+        start: first or resumed state.
+        iterations: largest number of steps, steps before `start` included.
         tolerance: of the mean log-likelihood [nats].
-        regularisation: added to every diagonal of a covariance, relative to the data's variance of 1.
+        regularisation: added to the diagonal of every covariance.
         observer: called after every step.
 
     Raises:
-        IndefiniteCovariance: a component collapsed more than `RESEEDS` times, or the start is indefinite.
+        IndefiniteCovariance: a component collapsed more than `MAX_RESEEDS` times, or the start is indefinite.
     """
-    n = shard.count()
-    state = start
+    n, state = shard.count(), start
     while True:
         sums, log_likelihood = expectation(shard, state.components)
         history = torch.cat([state.log_likelihood, (log_likelihood / n)[None]])
@@ -98,26 +96,28 @@ def expectation_maximisation(
 
 
 def expectation(shard: Shard, components: Components) -> tuple[Float[Tensor, "m f"], Float[Tensor, ""]]:
-    """Return the responsibility-weighted sums of the features, and the total log-likelihood of Eq. (19)."""
+    """Return the responsibility-weighted sums of the features, and the log-likelihood of all data, Eq. (19)."""
     x, coefficients = shard.rows, coefficients_from_components(components)
     sums, log_likelihood = torch.zeros_like(coefficients), x.new_zeros(())
-    features = x.new_empty(coefficients.shape[1], min(ROWS, len(x)))  # written anew in every pass, and kept in cache
-    joint = x.new_empty(len(coefficients), min(ROWS, len(x)))
-    least = math.log(torch.finfo(x.dtype).tiny) / 2  # far below rounding; underflow and what is near it are slow
-    for rows in x.split(ROWS):
+    features = x.new_empty(coefficients.shape[1], min(CACHED_ROWS, len(x)))  # reused by every pass
+    joint = x.new_empty(len(coefficients), min(CACHED_ROWS, len(x)))
+    floor = math.log(torch.finfo(x.dtype).tiny) / 2  # far below rounding; denormal numbers are slow
+    for rows in x.split(CACHED_ROWS):
         phi = features_from_data(rows, features[:, : len(rows)])
-        responsibility = torch.mm(coefficients, phi, out=joint[:, : len(rows)])  # log joint density (m, rows), so far
-        # log-sum-exp by hand: its exponentials are the responsibilities but for a division
+        responsibility = torch.mm(
+            coefficients, phi, out=joint[:, : len(rows)]
+        )  # log joint density (m, rows) until here
+        # log-sum-exp written out, because its exponentials are the responsibilities before normalisation
         largest = responsibility.amax(0)
-        density = responsibility.sub_(largest).clamp_(min=least).exp_().sum(0)
+        density = responsibility.sub_(largest).clamp_(min=floor).exp_().sum(0)
         sums.addmm_(responsibility.div_(density), phi.T)
         log_likelihood += (density.log() + largest).sum()
-    both = shard.sum(torch.cat([sums.flatten(), log_likelihood[None]]))
-    return both[:-1].reshape(sums.shape), both[-1]
+    statistics = shard.sum(torch.cat([sums.flatten(), log_likelihood[None]]))
+    return statistics[:-1].reshape(sums.shape), statistics[-1]
 
 
 def features_from_data(x: Float[Tensor, "n d"], out: Float[Tensor, "f n"] | None = None) -> Float[Tensor, "f n"]:
-    """Return [1, x_i, x_i x_j (i <= j)] of every row, one column a row, in `out` where it is given."""
+    """Return the features [1, x_i, x_i x_j (i <= j)] of every row as a column, written into `out` if it is given."""
     n, d = x.shape
     out = x.new_empty(1 + d + d * (d + 1) // 2, n) if out is None else out
     out[0] = 1
@@ -129,15 +129,13 @@ def features_from_data(x: Float[Tensor, "n d"], out: Float[Tensor, "f n"] | None
 
 
 def coefficients_from_components(components: Components) -> Float[Tensor, "m f"]:
-    """Return the coefficients that turn features into log(weight) + log N(x | mean, covariance), Eq. (19).
+    """Return the coefficients of the features in log(weight) + log N(x | mean, covariance), Eq. (19).
 
     Raises:
         IndefiniteCovariance: a covariance is not positive definite.
     """
     means, d = components.means, components.means.shape[1]
-    factor = cholesky(components.covariances, "a component's covariance", "use fewer components or more samples")
-    eye = torch.eye(d, dtype=means.dtype, device=means.device)
-    whitening = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)
+    whitening = whitening_matrices(components.covariances)
     precision = whitening.transpose(-1, -2) @ whitening
     linear = (precision @ means[..., None])[..., 0]
     constant = (
@@ -147,29 +145,29 @@ def coefficients_from_components(components: Components) -> Float[Tensor, "m f"]
         - 0.5 * (linear * means).sum(-1)
     )
     i, j = torch.triu_indices(d, d, device=means.device)
-    quadratic = precision[:, i, j] * torch.where(i == j, -0.5, -1.0)  # each mixed product stands for two
+    quadratic = precision[:, i, j] * torch.where(i == j, -0.5, -1.0)  # a mixed product occurs twice in the square
     return torch.cat([constant[:, None], linear, quadratic], dim=1)
 
 
 def maximisation(
     sums: Float[Tensor, "m f"], n: int, regularisation: float, reseeded: Int[Tensor, "m"]
 ) -> tuple[Components, Int[Tensor, "m"]]:
-    """Return the components of greatest likelihood for the weighted sums, the collapsed ones placed anew.
+    """Return the most likely components for the weighted sums; collapsed components are placed anew.
 
-    A component has collapsed when the responsibilities for it add up to less than the d + 1 rows that span a
-    covariance, or when its covariance is singular. It then takes half of the heaviest component, which is split
-    across its longest axis. No data are needed for that, so that every process does the same.
+    A component has collapsed if its responsibilities sum to less than the d + 1 rows that span a covariance, or if its
+    covariance is singular. The heaviest component is then split across its longest axis, and one half replaces it. This
+    needs no data, so every process does the same.
 
     Raises:
-        IndefiniteCovariance: every component collapsed, or one of them more than `RESEEDS` times.
+        IndefiniteCovariance: every component collapsed, or one of them more than `MAX_RESEEDS` times.
     """
     components = components_from_sums(sums, n, regularisation)
     weights, means, covariances = components.weights.clone(), components.means.clone(), components.covariances.clone()
     factor, info = torch.linalg.cholesky_ex(covariances)
-    regular = (info == 0) & (factor.diagonal(dim1=-2, dim2=-1) ** 2 > SINGULAR).all(-1)
+    regular = (info == 0) & (factor.diagonal(dim1=-2, dim2=-1) ** 2 > SINGULAR_VARIANCE).all(-1)
     collapsed = (sums[:, 0] < means.shape[1] + 1) | ~regular
     reseeded = reseeded + collapsed
-    if bool(collapsed.all()) or int(reseeded.max()) > RESEEDS:
+    if bool(collapsed.all()) or int(reseeded.max()) > MAX_RESEEDS:
         k = int(reseeded.argmax())
         smallest = float(torch.linalg.eigvalsh(covariances[k]).min()) if bool(covariances[k].isfinite().all()) else 0.0
         what = f"the covariance of component {k}, of {float(sums[k, 0]):.1f} rows, collapsed {int(reseeded[k])} times,"
@@ -187,8 +185,7 @@ def maximisation(
 
 def components_from_sums(sums: Float[Tensor, "m f"], n: int, regularisation: float) -> Components:
     """Return weights, means and covariances from the weighted sums of the features; a component without data is NaN."""
-    # The features determine d: 1 + d + d (d + 1) / 2 of them.
-    d = round((math.sqrt(8 * sums.shape[1] + 1) - 3) / 2)
+    d = round((math.sqrt(8 * sums.shape[1] + 1) - 3) / 2)  # from the number of features, 1 + d + d (d + 1) / 2
     count = sums[:, :1]
     means = sums[:, 1 : d + 1] / count
     i, j = torch.triu_indices(d, d, device=sums.device)

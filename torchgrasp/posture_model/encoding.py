@@ -1,4 +1,4 @@
-"""The frame-invariant code of three contacts, by which the learned model of a hand is asked (Eq. 18)."""
+"""The frame-invariant code of three contacts, the input of a hand's learned model (Eq. 18)."""
 
 import itertools
 
@@ -12,19 +12,18 @@ from torchgrasp.frames import degenerate, virtual_frame
 from torchgrasp.values import ContactCode, Contacts
 
 PERMUTATIONS: tuple[tuple[int, int, int], ...] = tuple(itertools.permutations(range(3)))  # pyright: ignore[reportAssignmentType]
-"""The six ways to give three contacts to three fingers: finger i touches contact `PERMUTATIONS[k][i]`."""
+"""The six assignments of three contacts to three fingers: finger i touches contact `PERMUTATIONS[k][i]`."""
 
 CODE_NAMES = ("L1", "L2", "L3", "N1", "N2", "N3")
-"""The six numbers of a code q = (L, N): three lengths [m], three cosines."""
+"""The numbers of a code q = (L, N): three lengths [m], three cosines."""
 
 
 def encode_fingertips(points: Float[Tensor, "*b 3 3"], normals: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 6"]:
     """Return the code q = (L, N) of three points with unit normals, Eq. (18).
 
-    L_i is the distance [m] of point i from the centre of the three; N holds the cosines n1.n2, n1.n3 and n2.n3. The
-    code does not change when points and normals move rigidly, nor when all three normals are negated: so fingertips,
-    whose outward normals oppose those of the object, have the code of the contacts they touch. Nor does it change
-    when the points or the normals alone are mirrored or turned together: every match has to be checked afterwards.
+    L_i is the distance [m] of point i from the centre of the points; N is n1.n2, n1.n3 and n2.n3. Rigid motion does
+    not change the code. Negated normals do not change it either, so fingertips have the code of the contacts that they
+    touch. Nor do a mirror image or a rotation of the normals alone: every match has to be checked afterwards.
 
     Args:
         points: fingertips or contacts [m] in the order of the fingers, any frame.
@@ -46,11 +45,11 @@ def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
         contacts: `Contacts`, or a pair (points (b, 3, 3) [m], unit normals (b, 3, 3)).
 
     Returns:
-        The code of each assignment, and the virtual frame of the contacts in the order of the fingers. A triple that
-        spans no frame holds NaN and `Status.DEGENERATE`.
+        The code and the virtual frame of each assignment. A triple that spans no frame holds NaN and
+        `Status.DEGENERATE`.
 
     Raises:
-        BadArgument: wrong shapes, non-finite numbers, or normals that are not of length 1 within 1e-3.
+        BadArgument: wrong shapes, non-finite numbers, or normals whose length is not 1 within 1e-3.
 
     >>> encode((torch.eye(3)[None], torch.eye(3)[None])).q.shape
     torch.Size([1, 6, 6])
@@ -64,11 +63,11 @@ def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
         raise BadArgument("normals", f"a normal of length {worst:.6g}", "unit vectors")
     order = torch.tensor(PERMUTATIONS, device=points.device)
     ordered_points, ordered_normals = points[:, order], normals[:, order]  # (b, 6, 3, 3)
-    flat = degenerate(ordered_points).any(1)  # of any order: at the threshold rounding may tell them apart
+    flat = degenerate(ordered_points).any(1)  # in any order: at the threshold rounding may distinguish them
     bad = flat[:, None, None]
-    # A row without a frame borrows a harmless triangle, so that the others can be framed in one call.
-    harmless = torch.eye(3, dtype=points.dtype, device=points.device)
-    frames = virtual_frame(torch.where(bad[..., None], harmless, ordered_points))
+    # A degenerate row gets another triangle, so that one call frames all rows.
+    triangle = torch.eye(3, dtype=points.dtype, device=points.device)
+    frames = virtual_frame(torch.where(bad[..., None], triangle, ordered_points))
     nan = torch.full((), float("nan"), dtype=points.dtype, device=points.device)
     return ContactCode(
         q=torch.where(bad, nan, encode_fingertips(ordered_points, ordered_normals)),

@@ -1,4 +1,4 @@
-"""What a learned model is worth on postures that its fit has not seen (Sec. 6.3)."""
+"""Errors of a learned model on held-out postures (Sec. 6.3)."""
 
 import dataclasses
 
@@ -10,23 +10,23 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture
 from torchgrasp.posture_model.sample import HandSamples
 
-MODES = 4
-"""Modes of the conditional mixture of which the nearest is judged beside the conditional mean."""
+COMPARED_MODES = 4
+"""Modes of which the nearest is compared with the conditional mean: a code has a few postures at most."""
 
 
 @dataclasses.dataclass(frozen=True)
 class MixtureScore(Value):
-    """The errors of a model on held-out postures.
+    """Errors of a model on held-out postures.
 
     Args:
         joint_names: of the errors.
         error: mean absolute error of the conditional mean, Eq. (23), of each joint [rad].
         deviation: standard deviation of the absolute error over the postures [rad].
-        nearest_mode: mean absolute error over all joints of the nearest of the first `MODES` modes [rad].
-        paper_coverage: share of codes within `PAPER_ENERGY`.
-        default_coverage: share of codes within `DEFAULT_ENERGY`.
+        nearest_mode: mean absolute error of the nearest of the first `COMPARED_MODES` modes [rad].
+        paper_coverage: share of codes below `PAPER_ENERGY`.
+        default_coverage: share of codes below `DEFAULT_ENERGY`.
         log_likelihood: mean over the postures [nats].
-        postures: how many.
+        postures: number of postures.
     """
 
     joint_names: tuple[str, ...]
@@ -40,18 +40,18 @@ class MixtureScore(Value):
 
     @property
     def mean_error(self) -> float:
-        """The mean absolute error over all joints [rad]."""
+        """Mean absolute error over all joints [rad]."""
         return float(self.error.mean())
 
     def __str__(self) -> str:
-        """Return the table that the paper calls Table 5 and Fig. 8, and the acceptance of Eq. (21)."""
+        """Return the errors of Table 5 and Fig. 8, and the acceptance of Eq. (21)."""
         rows = zip(self.joint_names, self.error.tolist(), self.deviation.tolist(), strict=True)
         lines = [f"  {name:20s} {error:.3f} +- {deviation:.3f}" for name, error, deviation in rows]
         return "\n".join(
             [
                 f"mean absolute error on {self.postures} held-out postures [rad]: Eq. (23) +- deviation over postures",
                 *lines,
-                f"  {'all joints':20s} {self.mean_error:.3f}; the nearest of {MODES} modes {self.nearest_mode:.3f}",
+                f"  {'all joints':20s} {self.mean_error:.3f}; the nearest of {COMPARED_MODES} modes {self.nearest_mode:.3f}",
                 f"within reach: {self.paper_coverage:.4f} at the paper's {PAPER_ENERGY:g}, "
                 f"{self.default_coverage:.4f} at the default {DEFAULT_ENERGY:.3f}",
                 f"log-likelihood a held-out posture: {self.log_likelihood:.6f}",
@@ -59,7 +59,7 @@ class MixtureScore(Value):
         )
 
     def meta(self) -> dict[str, str]:
-        """Return what a mixture's file tells of it."""
+        """Return the metadata for the file of the mixture."""
         return {
             "held_out": str(self.postures),
             "held_out_log_likelihood": f"{self.log_likelihood:.6f}",
@@ -71,10 +71,10 @@ class MixtureScore(Value):
 
 
 def evaluate_mixture(mixture: GraspMixture, samples: HandSamples) -> MixtureScore:
-    """Measure a model on postures that its fit has not seen.
+    """Evaluate a model on held-out postures.
 
     Raises:
-        BadArgument: samples of other joints, or fewer than two.
+        BadArgument: samples of other joints, or fewer than two samples.
 
     >>> from torchgrasp.hand.load import load_hand
     >>> from torchgrasp.posture_model.mixture import load_mixture
@@ -89,15 +89,15 @@ def evaluate_mixture(mixture: GraspMixture, samples: HandSamples) -> MixtureScor
         raise BadArgument("samples", f"{len(samples)} postures", "at least 2")
     joints, q = samples.joints.double(), samples.q.double()
     error = (mixture.joints(q) - joints).abs()
-    modes = mixture.modes(q, min(MODES, len(mixture.weights)))[0]
-    reach = mixture.energy(q)
+    modes = mixture.modes(q, min(COMPARED_MODES, len(mixture.weights)))[0]
+    energy = mixture.energy(q)
     return MixtureScore(
         joint_names=samples.joint_names,
         error=error.mean(0),
         deviation=error.std(0),
         nearest_mode=float((modes - joints[:, None]).abs().mean(-1).amin(-1).mean()),
-        paper_coverage=float((reach < PAPER_ENERGY).double().mean()),
-        default_coverage=float((reach < DEFAULT_ENERGY).double().mean()),
+        paper_coverage=float((energy < PAPER_ENERGY).double().mean()),
+        default_coverage=float((energy < DEFAULT_ENERGY).double().mean()),
         log_likelihood=float(mixture.log_prob(samples.rows().double()).mean()),
         postures=len(samples),
     )

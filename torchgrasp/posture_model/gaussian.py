@@ -1,4 +1,4 @@
-"""A Gaussian mixture over named dimensions: its density, samples, marginals and conditionals (Eqs. 19-20)."""
+"""A Gaussian mixture over named dimensions: density, samples, marginals and conditionals (Eqs. 19-20)."""
 
 import dataclasses
 import functools
@@ -13,23 +13,23 @@ from torchgrasp.base import Value, check_tensor, check_whole
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import cholesky
 
-ROWS = 8192
-"""Rows evaluated in one pass, to bound memory at rows x components x dimensions."""
+ROWS_PER_CHUNK = 8192
+"""Rows evaluated together: this bounds the memory for rows x components x dimensions."""
 
 
 @dataclasses.dataclass(frozen=True)
 class GaussianMixture(Value):
-    """A mixture of m Gaussians over d named dimensions (Eqs. 19-20). All evaluation is in float64.
+    """A mixture of m Gaussians over d named dimensions (Eqs. 19-20), evaluated in float64.
 
     Args:
-        weights: pi_i, none negative, of sum 1.
+        weights: pi_i, non-negative, with sum 1.
         means: mu_i.
         covariances: Sigma_i, symmetric and positive definite.
         names: of the dimensions.
 
     Raises:
-        BadArgument: shapes that do not agree, weights that are negative or do not sum to 1, an indefinite or
-            asymmetric covariance, a name twice.
+        BadArgument: inconsistent shapes, weights that are negative or do not sum to 1, an indefinite or asymmetric
+            covariance, a name twice.
 
     >>> mixture = GaussianMixture(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None], ("a", "b"))
     >>> mixture.condition({"b": 3.0}).means
@@ -48,7 +48,7 @@ class GaussianMixture(Value):
         check_tensor("means", self.means, (m, d))
         check_tensor("covariances", self.covariances, (m, d, d))
         if m < 1 or not bool((self.weights >= 0).all()) or abs(float(self.weights.double().sum()) - 1) > 1e-6:
-            found = f"{m} weights of least {self.weights.min() if m else None} and sum {float(self.weights.sum())}"
+            found = f"{m} weights, the least {self.weights.min() if m else None} and sum {float(self.weights.sum())}"
             raise BadArgument("weights", found, "at least one, none negative, of sum 1 within 1e-6")
         if d < 1 or len(set(self.names)) < d:
             raise BadArgument("names", self.names, "at least one, each once")
@@ -65,43 +65,43 @@ class GaussianMixture(Value):
         """Return the log-density of rows, Eq. (19).
 
         Raises:
-            BadArgument: rows of another length than the mixture has dimensions.
+            BadArgument: rows of another length than d.
         """
         if x.ndim < 1 or x.shape[-1] != len(self.names):
             raise BadArgument("x", f"shape {tuple(x.shape)}", f"rows of {len(self.names)} numbers")
         rows = x.reshape(-1, x.shape[-1]).double()
-        parts = [torch.logsumexp(self.log_joint(part), -1) for part in rows.split(ROWS)]
+        parts = [torch.logsumexp(self.log_joint(part), -1) for part in rows.split(ROWS_PER_CHUNK)]
         return torch.cat(parts).reshape(x.shape[:-1]).to(x.dtype)
 
     def log_joint(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
-        """Return log(pi_i) + log N(x | mu_i, Sigma_i) of every row and component."""
+        """Return log(pi_i) + log N(x | mu_i, Sigma_i) for every row and component."""
         return self.weights.double().log() + self.whitening.log_densities(x)
 
     def sample(self, n: int, seed: int = 0) -> Float[Tensor, "n d"]:
-        """Draw n rows; the same seed gives the same rows.
+        """Draw n rows.
 
         Raises:
-            BadArgument: n or seed outside its range.
+            BadArgument: n or seed is out of range.
         """
         check_whole("n", n, 0, 2**63 - 1)
         check_whole("seed", seed, 0, 2**63 - 1)
         generator = torch.Generator().manual_seed(seed)
         weights, means = self.weights.double().cpu(), self.means.double().cpu()
-        # the sum of the weights is 1 to rounding only; the last one takes what is drawn above it
         draw = torch.rand(n, generator=generator, dtype=torch.float64)
-        which = torch.searchsorted(weights.cumsum(0), draw, right=True).clamp(max=len(weights) - 1)
+        # By rounding the sum of the weights may lie below a draw, which then belongs to the last component.
+        component = torch.searchsorted(weights.cumsum(0), draw, right=True).clamp(max=len(weights) - 1)
         noise = torch.randn(n, len(self.names), generator=generator, dtype=torch.float64)
         factor = torch.linalg.cholesky(self.covariances.double().cpu())
-        found = means[which]
+        rows = means[component]
         for k in range(len(weights)):
-            found[which == k] += noise[which == k] @ factor[k].T
-        return found.to(self.means.device)
+            rows[component == k] += noise[component == k] @ factor[k].T
+        return rows.to(self.means.device)
 
     def marginal(self, names: Sequence[str]) -> "GaussianMixture":
-        """Return the density of some dimensions alone, in the order of `names`, Eq. (22).
+        """Return the marginal density of some dimensions, in the order of `names`, Eq. (22).
 
         Raises:
-            BadArgument: a name that the mixture does not have, or twice.
+            BadArgument: an unknown name, or a name twice.
         """
         index = self._index(names)
         means, covariances = self.means.double(), self.covariances.double()
@@ -109,53 +109,53 @@ class GaussianMixture(Value):
         return GaussianMixture(self.weights.double(), means[:, index], block, tuple(names))
 
     def condition(self, given: dict[str, float]) -> "GaussianMixture":
-        """Return the density of the other dimensions where some are given, the bracket of Eq. (23) and its h_i.
+        """Return the conditional density of the other dimensions: means and weights are the bracket and h_i of Eq. (23).
 
         Args:
-            given: number of each observed dimension, by name.
+            given: value of each observed dimension, by name.
 
         Returns:
-            A mixture over the other dimensions, in their order; components that the observation rules out to the
-            last digit are left out.
+            A mixture over the other dimensions, in their order, without components of weight 0.
 
         Raises:
-            BadArgument: a name that the mixture does not have, a number that is not finite, or nothing left over.
+            BadArgument: an unknown name, a value that is not finite, or all dimensions given.
         """
-        seen = self._index(tuple(given))
-        rest = [i for i in range(len(self.names)) if i not in seen]
+        observed = self._index(tuple(given))
+        rest = [i for i in range(len(self.names)) if i not in observed]
         if not rest:
             raise BadArgument("given", "every dimension", "some of them")
-        values = check_tensor("given", self.means.new_tensor(list(given.values()), dtype=torch.float64), (len(seen),))
-        if not seen:
+        values = check_tensor("given", self.means.new_tensor(list(given.values()), dtype=torch.float64), (len(given),))
+        if not given:
             return self.marginal(self.names)
         part = self.marginal(tuple(given))
         weights = torch.softmax(part.log_joint(values[None])[0], 0)
         means, covariances = self.means.double(), self.covariances.double()
-        cross = covariances[:, rest][:, :, seen] @ part.whitening.matrix.transpose(-1, -2)  # (m, rest, seen), whitened
+        cross = covariances[:, rest][:, :, observed] @ part.whitening.matrix.transpose(-1, -2)  # whitened
         offset = part.whitening.matrix @ (values - part.means)[..., None]
-        moved = means[:, rest] + (cross @ offset)[..., 0]
-        left = covariances[:, rest][:, :, rest] - cross @ cross.transpose(-1, -2)
-        kept = weights > 0
+        means = means[:, rest] + (cross @ offset)[..., 0]
+        covariances = covariances[:, rest][:, :, rest] - cross @ cross.transpose(-1, -2)
+        covariances = (covariances + covariances.transpose(-1, -2)) / 2
+        possible = weights > 0
         names = tuple(self.names[i] for i in rest)
-        return GaussianMixture(weights[kept], moved[kept], (left + left.transpose(-1, -2))[kept] / 2, names)
+        return GaussianMixture(weights[possible], means[possible], covariances[possible], names)
 
     def mean(self) -> Float[Tensor, "d"]:
         """Return the expected value of every dimension."""
         return self.weights.double() @ self.means.double()
 
     def covariance(self) -> Float[Tensor, "d d"]:
-        """Return the covariance of all dimensions: that within the components, and that of their means."""
-        apart = self.means.double() - self.mean()
+        """Return the covariance of all dimensions, within components and between their means."""
+        offset = self.means.double() - self.mean()
         within = torch.einsum("m,mij->ij", self.weights.double(), self.covariances.double())
-        return within + torch.einsum("m,mi,mj->ij", self.weights.double(), apart, apart)
+        return within + torch.einsum("m,mi,mj->ij", self.weights.double(), offset, offset)
 
     @functools.cached_property
     def whitening(self) -> "Whitening":
-        """The factors by which densities are evaluated."""
+        """The components in whitened form, which densities are evaluated with."""
         return Whitening.of(self.means, self.covariances)
 
     def _index(self, names: Sequence[str]) -> list[int]:
-        """Return where dimensions are."""
+        """Return the indices of dimensions."""
         unknown = [name for name in names if name not in self.names]
         if unknown or len(set(names)) < len(names):
             raise BadArgument("names", unknown or tuple(names), f"some of {', '.join(self.names)}, each once")
@@ -164,7 +164,7 @@ class GaussianMixture(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Whitening:
-    """Gaussians of m components, ready to be evaluated: `matrix` W with W^T W = Sigma^-1, and W mu."""
+    """m Gaussians in whitened form: `matrix` W with W^T W = Sigma^-1, `means` W mu."""
 
     matrix: Float[Tensor, "m d d"]
     means: Float[Tensor, "m d"]
@@ -172,23 +172,28 @@ class Whitening:
 
     @staticmethod
     def of(means: Float[Tensor, "m d"], covariances: Float[Tensor, "m d d"]) -> "Whitening":
-        """Factor every covariance.
-
-        Raises:
-            IndefiniteCovariance: one is not positive definite.
-        """
-        factor = cholesky(covariances.double(), "a component's covariance", "fit with fewer components")
-        eye = torch.eye(means.shape[1], dtype=torch.float64, device=means.device)
-        matrix = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)
+        """Whiten Gaussians; raises `IndefiniteCovariance`."""
+        matrix = whitening_matrices(covariances.double())
         log_scale = matrix.diagonal(dim1=-2, dim2=-1).log().sum(-1) - 0.5 * means.shape[1] * math.log(2 * math.pi)
         return Whitening(matrix, (matrix @ means.double()[..., None])[..., 0], log_scale)
 
     def squared(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
-        """Return the squared Mahalanobis distance of every row from every component."""
+        """Return the squared Mahalanobis distance between every row and component."""
         m, d = self.means.shape
         whitened = (x @ self.matrix.reshape(m * d, d).T).reshape(-1, m, d) - self.means
         return (whitened * whitened).sum(-1)
 
     def log_densities(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
-        """Return log N(x | mu_i, Sigma_i) of every row and component."""
+        """Return log N(x | mu_i, Sigma_i) for every row and component."""
         return self.log_scale - 0.5 * self.squared(x)
+
+
+def whitening_matrices(covariances: Float[Tensor, "m d d"]) -> Float[Tensor, "m d d"]:
+    """Return the lower-triangular W with W^T W = Sigma^-1 of every covariance.
+
+    Raises:
+        IndefiniteCovariance: a covariance is not positive definite.
+    """
+    factor = cholesky(covariances, "a component's covariance", "use fewer components or more samples")
+    eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
+    return torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)

@@ -1,4 +1,4 @@
-"""Where expectation-maximisation begins: k-means++ on a part of the data, then Lloyd's rounds on all of them."""
+"""The start of expectation-maximisation: k-means++ on a part of the data, then Lloyd's algorithm on all of them."""
 
 from collections.abc import Callable
 
@@ -7,24 +7,24 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.posture_model.em import ROWS, Progress, features_from_data, maximisation
+from torchgrasp.posture_model.em import CACHED_ROWS, Progress, features_from_data, maximisation
 from torchgrasp.posture_model.shard import Shard
 
 SUBSAMPLE = 20_000
-"""Rows among which k-means++ picks its centres."""
+"""Rows among which k-means++ chooses its centres: some hundred for each component."""
 
-ROUNDS = 10
-"""Rounds of Lloyd's algorithm."""
+LLOYD_ROUNDS = 10
+"""Rounds of Lloyd's algorithm: EM follows, so the clusters need not converge."""
 
 
 def start_components(shard: Shard, m: int, seed: int, regularisation: float) -> Progress:
-    """Return a start from k-means: centres by k-means++ on a subsample, then some rounds of Lloyd on all the data.
+    """Return a start from k-means.
 
     Args:
         shard: standardised data.
         m: number of components.
-        seed: of the subsample and of the centres; the number of processes does not matter.
-        regularisation: added to every diagonal of a covariance.
+        seed: of the subsample and of the centres; their draw does not depend on the number of processes.
+        regularisation: added to the diagonal of every covariance.
 
     Raises:
         BadArgument: fewer different rows than components.
@@ -32,10 +32,10 @@ def start_components(shard: Shard, m: int, seed: int, regularisation: float) -> 
     """
     generator = torch.Generator().manual_seed(seed)
     centres = _plus_plus(_subsample(shard, generator), m, generator)
-    for _ in range(ROUNDS):
+    for _ in range(LLOYD_ROUNDS):
         sums = _sums_of_clusters(shard, centres, _ones_and_data)
         moved = sums[:, 1:] / sums[:, :1]
-        centres = torch.where(sums[:, :1] > 0, moved, centres)  # a centre without data stays where it is
+        centres = torch.where(sums[:, :1] > 0, moved, centres)  # a centre without data stays
     sums = _sums_of_clusters(shard, centres, features_from_data)
     n = round(float(sums[:, 0].sum()))
     components, reseeded = maximisation(sums, n, regularisation, torch.zeros(m, dtype=torch.long, device=sums.device))
@@ -43,7 +43,7 @@ def start_components(shard: Shard, m: int, seed: int, regularisation: float) -> 
 
 
 def _subsample(shard: Shard, generator: torch.Generator) -> Float[Tensor, "s d"]:
-    """Return the same random rows in every process, whichever of them holds a row."""
+    """Return random rows of all data, the same in every process."""
     x = shard.rows
     lengths = x.new_zeros(shard.processes, dtype=torch.int64)
     lengths[shard.rank] = len(x)
@@ -57,7 +57,7 @@ def _subsample(shard: Shard, generator: torch.Generator) -> Float[Tensor, "s d"]
 
 
 def _plus_plus(pool: Float[Tensor, "s d"], m: int, generator: torch.Generator) -> Float[Tensor, "m d"]:
-    """Return centres, each drawn with a probability in proportion to its squared distance from those before it."""
+    """Return centres drawn with probabilities proportional to the squared distance from the centres before."""
     centres = pool[:1]
     squared = ((pool - centres) ** 2).sum(1)
     for k in range(1, m):
@@ -72,19 +72,19 @@ def _plus_plus(pool: Float[Tensor, "s d"], m: int, generator: torch.Generator) -
 def _sums_of_clusters(
     shard: Shard, centres: Float[Tensor, "m d"], features: Callable[[Float[Tensor, "r d"]], Float[Tensor, "f r"]]
 ) -> Float[Tensor, "m f"]:
-    """Return the sums of the features over the rows nearest to each centre."""
+    """Return the sums of the features over each cluster."""
     sums = centres.new_zeros(len(centres), len(features(centres[:1])))
-    for rows in shard.rows.split(ROWS):
+    for rows in shard.rows.split(CACHED_ROWS):
         member = assign_clusters(rows, centres)[:, None] == torch.arange(len(centres), device=rows.device)
         sums.addmm_(member.T.to(rows), features(rows).T)
     return shard.sum(sums)
 
 
 def _ones_and_data(x: Float[Tensor, "r d"]) -> Float[Tensor, "f r"]:
-    """Return [1, x], the first of the features."""
+    """Return the features [1, x_i], one column a row."""
     return torch.cat([torch.ones_like(x[:, :1]), x], dim=1).T
 
 
 def assign_clusters(x: Float[Tensor, "n d"], centres: Float[Tensor, "m d"]) -> Int[Tensor, "n"]:
-    """Return the index of the nearest centre of every row."""
+    """Return the index of the nearest centre for every row."""
     return (0.5 * (centres**2).sum(1) - x @ centres.T).argmin(1)

@@ -1,4 +1,4 @@
-"""What a hand can reach, and with which joints: a Gaussian mixture over joints and codes (Eqs. 19-23)."""
+"""The learned model of a hand: a Gaussian mixture over joints and codes (Eqs. 19-23)."""
 
 import dataclasses
 import functools
@@ -12,53 +12,51 @@ from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.hand.load import find_hand
 from torchgrasp.posture_model.encoding import CODE_NAMES
-from torchgrasp.posture_model.gaussian import ROWS, GaussianMixture
+from torchgrasp.posture_model.gaussian import ROWS_PER_CHUNK, GaussianMixture
 from torchgrasp.values import ContactCode
 
 PAPER_ENERGY = 2.0
-"""The paper's threshold on f_i of Eq. (21). f is half a squared Mahalanobis distance, so that "two standard
-deviations" in six dimensions accept only 32 % of what a single component itself generates (chi-square_6 < 4)."""
+"""The paper's threshold on f_i of Eq. (21). It accepts 32 % of the codes of a single component (chi-square_6 < 4)."""
 
 DEFAULT_ENERGY = 8.405946915
-"""Half the 99 % quantile of chi-square with six degrees of freedom: a component accepts 99 % of its own codes."""
+"""Half the 99 % quantile of chi-square_6: it accepts 99 % of the codes of a single component."""
 
 
 @dataclasses.dataclass(frozen=True)
 class GraspMixture(GaussianMixture):
-    """The joint density of joints and codes of one hand, a Gaussian mixture (Eqs. 19-20).
+    """The joint density of joints and codes of one hand (Eqs. 19-20).
 
-    A dimension is a joint [rad], in the order of the hand, or one of L1 L2 L3 [m] N1 N2 N3, which come last.
+    The dimensions are the joints [rad], in the order of the hand, then the code: L1 L2 L3 [m] N1 N2 N3.
 
     Args:
-        weights: pi_i, none negative, of sum 1.
+        weights: pi_i, non-negative, with sum 1.
         means: mu_i.
         covariances: Sigma_i, symmetric and positive definite.
         names: of the dimensions.
-        regularisation: the variance that the fit added to every dimension of every component, relative to the
-            variance of that dimension over all samples.
-        meta: what it was fitted on: hand, its hash, samples, seed, and what the fit reported.
+        regularisation: variance that the fit added to every dimension, relative to its variance over all samples.
+        meta: the hand, its hash, the samples, and the report of the fit.
 
     Raises:
-        BadArgument: what `GaussianMixture` refuses, or names that do not end with those of a code.
+        BadArgument: as `GaussianMixture`, or names that do not end with `CODE_NAMES`.
     """
 
     regularisation: float = 0.0
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
 
     def __post_init__(self) -> None:
-        """Check everything once, where the value is made."""
+        """Check the names, too."""
         super().__post_init__()
         if self.names[-6:] != CODE_NAMES or len(self.names) < 7:
             raise BadArgument("names", self.names, f"the joints' names, then {', '.join(CODE_NAMES)}")
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """The names of the joints, in the order of the hand."""
+        """Names of the joints, in the order of the hand."""
         return self.names[:-6]
 
     @functools.cached_property
     def _code(self) -> GaussianMixture:
-        """The density of the code alone, Eq. (22)."""
+        """The marginal density of the code, Eq. (22)."""
         return self.marginal(CODE_NAMES)
 
     @functools.cached_property
@@ -68,34 +66,32 @@ class GraspMixture(GaussianMixture):
         return self.covariances[:, :-6, -6:].double() @ whitening.transpose(-1, -2) @ whitening
 
     @functools.cached_property
-    def _lines(self) -> Float[Tensor, "k h"]:
-        """The conditional mean of every component as a linear function of (q, 1), one below the other."""
+    def _stacked_regression(self) -> Float[Tensor, "k h"]:
+        """The conditional mean of every component as a matrix that multiplies (q, 1); the matrices are stacked."""
         at_zero = self.means[:, :-6].double() - (self._regression @ self.means[:, -6:, None].double())[..., 0]
         return torch.cat([self._regression.transpose(1, 2), at_zero[:, None]], 1).flatten(0, 1)
 
     def energy(self, code: ContactCode | Float[Tensor, "*b 6"]) -> Float[Tensor, "*b"]:
-        """Return the least f_i of Eq. (21), by which a code is within the hand's reach or not.
+        """Return min_i f_i of Eq. (21): half the squared Mahalanobis distance to the nearest component.
+
+        The hand reaches codes below a threshold, `DEFAULT_ENERGY` or `PAPER_ENERGY`.
 
         Args:
-            code: a `ContactCode` (rows b, 6 permutations) or bare codes q. A code of NaN has a reach of NaN.
-
-        Returns:
-            Half the squared Mahalanobis distance from the nearest component; compare with `DEFAULT_ENERGY` or
-            `PAPER_ENERGY`.
+            code: a `ContactCode` (rows b, 6 permutations) or bare codes q. NaN gives NaN.
 
         Raises:
             BadArgument: codes of another length than 6.
         """
         q = _checked(code)
         rows = q.reshape(-1, 6).double()
-        parts = [0.5 * self._code.whitening.squared(part).amin(-1) for part in rows.split(ROWS)]
+        parts = [0.5 * self._code.whitening.squared(part).amin(-1) for part in rows.split(ROWS_PER_CHUNK)]
         return torch.cat(parts).reshape(q.shape[:-1]).to(q.dtype)
 
     def joints(self, code: ContactCode | Float[Tensor, "*b 6"]) -> Float[Tensor, "*b h"]:
         """Return the expected joints [rad] given a code, Eq. (23); they may lie outside the hand's limits.
 
         Args:
-            code: a `ContactCode` or bare codes q. A code of NaN has joints of NaN.
+            code: a `ContactCode` or bare codes q. NaN gives NaN.
 
         Raises:
             BadArgument: codes of another length than 6.
@@ -103,21 +99,21 @@ class GraspMixture(GaussianMixture):
         q = _checked(code)
         rows = q.reshape(-1, 6).double()
         parts = []
-        for part in rows.split(ROWS):
+        for part in rows.split(ROWS_PER_CHUNK):
             responsibility = self._log_responsibility(part).exp()
-            # the sum over components of h_i times a linear function of q, as one product
+            # sum_i h_i A_i (q, 1) as one matrix product
             weighted = responsibility[:, :, None] * torch.cat([part, torch.ones_like(part[:, :1])], 1)[:, None]
-            parts.append(weighted.flatten(1) @ self._lines)
+            parts.append(weighted.flatten(1) @ self._stacked_regression)
         return torch.cat(parts).reshape(*q.shape[:-1], len(self.joint_names)).to(q.dtype)
 
     def modes(self, q: Float[Tensor, "*b 6"], k: int) -> tuple[Float[Tensor, "*b k h"], Float[Tensor, "*b k"]]:
         """Return the conditional means of the k components most responsible for a code, and their h_i of Eq. (23).
 
-        Where several postures have the code, their mean (Eq. 23) may be none of them; these are.
+        If several postures have the code, their mean (Eq. 23) may be none of them.
 
         Args:
             q: codes.
-            k: how many, at most the number of components.
+            k: number of modes, at most m.
 
         Raises:
             BadArgument: k outside [1, m], or codes of another length than 6.
@@ -126,21 +122,21 @@ class GraspMixture(GaussianMixture):
         if not 1 <= k <= len(self.weights):
             raise BadArgument("k", k, f"1 to {len(self.weights)} (the mixture's components)")
         joints, weights = [], []
-        for part in q.reshape(-1, 6).double().split(ROWS):
+        for part in q.reshape(-1, 6).double().split(ROWS_PER_CHUNK):
             top = self._log_responsibility(part).topk(k, dim=-1)
-            picked = top.indices[..., None].expand(-1, -1, self.means.shape[1] - 6)
-            joints.append(self._conditional_means(part).gather(-2, picked))
+            index = top.indices[..., None].expand(-1, -1, self.means.shape[1] - 6)
+            joints.append(self._conditional_means(part).gather(-2, index))
             weights.append(top.values.exp())
         shape = (*q.shape[:-1], k)
-        found = torch.cat(joints).reshape(*shape, len(self.joint_names))
-        return found.to(q.dtype), torch.cat(weights).reshape(shape).to(q.dtype)
+        modes = torch.cat(joints).reshape(*shape, len(self.joint_names))
+        return modes.to(q.dtype), torch.cat(weights).reshape(shape).to(q.dtype)
 
     def with_observation_noise(self, lengths: float, cosines: float) -> "GraspMixture":
-        """Return the mixture of codes observed with independent Gaussian noise: its variances are added to Sigma_q.
+        """Return the mixture of codes observed with independent Gaussian noise, whose variances are added to Sigma_q.
 
-        A round fingertip rolls: the code of what it can touch differs from that of its pad's middle by some
-        millimetres and by the pad's cone. Where codes fill a thin manifold (the Barrett hand's four joints), Eq. (21)
-        refuses almost every contact triple that the hand can take, unless this slack is granted.
+        A round fingertip rolls, so its contact differs from the middle of its pad by some millimetres. The codes of
+        the Barrett hand fill a thin manifold of four dimensions. Without noise, Eq. (21) would then refuse almost every
+        contact triple within reach.
 
         Args:
             lengths: standard deviation [m] of L1 L2 L3.
@@ -156,11 +152,11 @@ class GraspMixture(GaussianMixture):
         return dataclasses.replace(self, covariances=self.covariances + torch.diag(noise))
 
     def _log_responsibility(self, q: Float[Tensor, "n 6"]) -> Float[Tensor, "n m"]:
-        """Return log h_i of Eq. (23); in logarithms a code far from every component still has its nearest."""
+        """Return log h_i of Eq. (23); the logarithm does not underflow far from every component."""
         return torch.log_softmax(self._code.log_joint(q), dim=-1)
 
     def _conditional_means(self, q: Float[Tensor, "n 6"]) -> Float[Tensor, "n m h"]:
-        """Return each component's mean of the joints given the code, the bracket of Eq. (23)."""
+        """Return the joints' mean given the code in each component, the bracket of Eq. (23)."""
         difference = q[:, None] - self.means[:, -6:].double()
         return self.means[:, :-6].double() + torch.einsum("mhc,nmc->nmh", self._regression, difference)
 
@@ -176,7 +172,7 @@ class GraspMixture(GaussianMixture):
 
 
 def _checked(code: ContactCode | Tensor) -> Float[Tensor, "*b 6"]:
-    """Return the codes q of an argument, refusing rows that are not six numbers."""
+    """Return the codes q of an argument; refuse rows of other than six numbers."""
     q = code.q if isinstance(code, ContactCode) else code
     if q.ndim < 1 or q.shape[-1] != 6:
         raise BadArgument("code", f"shape {tuple(q.shape)}", "rows of 6 numbers, L and N")
@@ -184,11 +180,11 @@ def _checked(code: ContactCode | Tensor) -> Float[Tensor, "*b 6"]:
 
 
 def load_mixture(name_or_path: Path | str) -> GraspMixture:
-    """Read the mixture of a hand by the hand's name or folder, or any mixture by the path of its .safetensors file.
+    """Read a mixture by the name or folder of its hand, or by the path of its .safetensors file.
 
     Raises:
-        HandFileError: there is no such hand.
-        ModelFileError: the file is missing or malformed, its weights do not sum to 1, a covariance is indefinite.
+        HandFileError: no such hand.
+        ModelFileError: the file is missing, malformed, or holds no mixture.
 
     >>> load_mixture("allegro").means.shape
     torch.Size([41, 18])
@@ -209,11 +205,7 @@ def load_mixture(name_or_path: Path | str) -> GraspMixture:
 
 
 def mixture_path(name_or_path: Path | str) -> Path:
-    """Return the file of a hand's mixture: a .safetensors path as it is, else mixture.safetensors in a hand's folder.
-
-    Raises:
-        HandFileError: neither such a path nor a hand.
-    """
+    """Return a .safetensors path as it is, else mixture.safetensors in the folder of a hand; raises `HandFileError`."""
     if Path(name_or_path).suffix == ".safetensors":
         return Path(name_or_path)
     return find_hand(name_or_path) / "mixture.safetensors"
