@@ -15,14 +15,10 @@ from torchgrasp.posture_model.shard import Shard
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """The file of one fit, with what distinguishes this fit from others.
+    """The file of one fit; without a path nothing is kept. Process 0 writes it, all processes read it.
 
-    Args:
-        path: of the file; None keeps nothing.
-        shard: the data; process 0 writes the file and all processes read it.
-        centre: mean of the data. Centre and scale identify the data.
-        scale: standard deviation of the data.
-        settings: numbers of rows, components and starts, seed, regularisation.
+    Mean and standard deviation identify the data. The settings are the numbers of rows, components and starts, the
+    seed and the regularisation.
     """
 
     path: Path | None
@@ -32,11 +28,7 @@ class Checkpoint:
     settings: dict[str, str]
 
     def save(self, progress: Progress) -> None:
-        """Write the state atomically.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Write the state atomically; raises `OutputError`."""
         if self.path is None or self.shard.rank > 0:
             return
         tensors = {field.name: getattr(progress.components, field.name) for field in dataclasses.fields(Components)}
@@ -64,33 +56,24 @@ class Checkpoint:
     def _read(self, path: Path) -> Progress:
         """Read the file and check that it belongs to this fit."""
         m, d = int(self.settings["components"]), len(self.centre)
-        shapes = {
-            "weights": (m,),
-            "means": (m, d),
-            "covariances": (m, d, d),
-            "reseeded": (m,),
-            "log_likelihood": None,
-            "centre": (d,),
-            "scale": (d,),
-        }
+        shapes = {"weights": (m,), "means": (m, d), "covariances": (m, d, d), "reseeded": (m,)}
+        shapes |= {"log_likelihood": (-1,), "centre": (d,), "scale": (d,)}
         tensors, meta = load_tensors(path, "em", set(shapes))
         other = {k: meta.get(k) for k, v in self.settings.items() if meta.get(k) != v}
         for name, ours in (("centre", self.centre), ("scale", self.scale)):
-            if not _agree(tensors[name], ours):
+            saved = tensors[name].to(ours)
+            if saved.shape != ours.shape or not torch.allclose(saved, ours, rtol=1e-9, atol=1e-12):  # order of the sum
                 other[name] = "of other data"
         if other:
             allowed = f"a new file, or the checkpoint of this fit: {self.settings} and the same data"
             raise BadArgument("checkpoint", f"{path}: {other}", allowed)
         for name, shape in shapes.items():
             t = tensors[name]
-            if (shape and t.shape != shape) or t.dtype != (torch.int64 if name == "reseeded" else torch.float64):
+            if (shape != (-1,) and t.shape != shape) or t.dtype != (
+                torch.int64 if name == "reseeded" else torch.float64
+            ):
                 raise ModelFileError("checkpoint", f"{path}: {name} {tuple(t.shape)} {t.dtype}", str(shape))
         device = self.centre.device
         components = Components(*(tensors[k].to(device) for k in ("weights", "means", "covariances")))
         history = tensors["log_likelihood"].to(device)
         return Progress(components, tensors["reseeded"].to(device), history, meta.get("jumped") == "True")
-
-
-def _agree(saved: Tensor, ours: Float[Tensor, "d"]) -> bool:
-    """Tell whether two statistics agree up to the order of summation."""
-    return saved.shape == ours.shape and torch.allclose(saved.to(ours), ours, rtol=1e-9, atol=1e-12)

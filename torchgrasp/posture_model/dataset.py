@@ -29,7 +29,7 @@ MANIFEST = "samples.json"
 """The file that describes a folder."""
 
 MAX_MANIFEST = 1024 * 1024
-"""Most bytes that are read of a manifest: a stranger's file must not fill the memory."""
+"""Most bytes of a manifest: the file of a stranger must not fill the memory."""
 
 META_KEYS = ("hand", "fingers", "hand_sha256", "hand_codes", "seed", "sampling")
 """The keys of `SampleSpec.meta`."""
@@ -53,11 +53,7 @@ class SampleFolder:
         return (self.chunk(i) for i in range(len(chunk_counts(self.n))))
 
     def chunk(self, i: int) -> HandSamples:
-        """Read chunk i.
-
-        Raises:
-            ModelFileError: the chunk is missing, damaged, or belongs to other samples.
-        """
+        """Read chunk i; raises `ModelFileError` if it is missing, damaged, or belongs to other samples."""
         path, count = self.path(i), chunk_counts(self.n)[i]
         tensors, meta = load_tensors(path, "samples", {"joints", "q"})
         shapes = tuple(tuple(tensors[name].shape) for name in ("joints", "q"))
@@ -69,12 +65,7 @@ class SampleFolder:
         return HandSamples(tensors["joints"], tensors["q"], self.joint_names, dict(self.meta))
 
     def read(self, n: int | None = None) -> HandSamples:
-        """Read the first `n` postures into memory; by default all.
-
-        Raises:
-            BadArgument: n outside [1, len].
-            ModelFileError: a chunk is missing or damaged.
-        """
+        """Read the first `n` postures into memory; by default all. Raises `BadArgument` for n outside [1, len]."""
         n = self.n if n is None else n
         check_whole("n", n, 1, self.n)
         return join([self.chunk(i) for i in range(len(chunk_counts(n)))])[:n]
@@ -101,14 +92,8 @@ def write_samples(
 ) -> SampleFolder:
     """Write the samples of `sample_configurations` chunk by chunk, and return the folder.
 
-    The same call continues a run that was interrupted or killed. Chunks under way are lost, or drawn to their end.
-
-    Args:
-        hand: the hand.
-        spec: which samples.
-        folder: new, empty, or with a part of the same samples.
-        workers: threads that draw at the same time.
-        observer: called with the number of postures of every chunk that is on disk.
+    The same call continues a run that was interrupted or killed. `workers` threads draw at the same time. The observer
+    is called with the number of postures on disk at first, then with that of every new chunk.
 
     Raises:
         BadArgument: workers outside [1, 1024], or a hand whose postures are hardly ever kept.
@@ -117,8 +102,15 @@ def write_samples(
     check_whole("workers", workers, 1, 1024)
     counts, meta = chunk_counts(spec.n), spec.meta(hand)
     samples = SampleFolder(Path(folder), spec.n, hand.joint_names, meta)
-    content = {"torchgrasp": "samples", "version": 1, "n": spec.n, "chunk": CHUNK_POSTURES}
-    content |= {"joint_names": hand.joint_names, **meta}
+    names = hand.joint_names
+    content = {
+        "torchgrasp": "samples",
+        "version": 1,
+        "n": spec.n,
+        "chunk": CHUNK_POSTURES,
+        "joint_names": names,
+        **meta,
+    }
 
     def write(i: int) -> int:
         joints, q, drawn = draw_chunk(hand, spec, i)
@@ -130,9 +122,9 @@ def write_samples(
         _begin(samples.folder, json.dumps(content, indent=1) + "\n")
         missing = [i for i in range(len(counts)) if not samples.holds(i)]  # a damaged chunk is drawn again
         needed = 8 * sum(counts[i] for i in missing) * (hand.dof + 6)
-        if shutil.disk_usage(samples.folder).free < needed:
-            found = f"{folder}, {shutil.disk_usage(samples.folder).free} bytes free"
-            raise OutputError("folder", found, f"{needed} bytes")
+        free = shutil.disk_usage(samples.folder).free
+        if free < needed:
+            raise OutputError("folder", f"{folder}, {free} bytes free", f"{needed} bytes")
         observer(sum(counts) - sum(counts[i] for i in missing))
         pool = ThreadPoolExecutor(workers)
         try:

@@ -39,13 +39,10 @@ class Components(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Progress(Value):
-    """State of a fit: with the data it determines the next step.
+    """State of a fit. With the data it determines the next step.
 
-    Args:
-        components: after the steps so far.
-        reseeded: number of times that each component was placed anew.
-        log_likelihood: mean over the data before each step [nats].
-        jumped: whether the last step placed a component anew; the likelihood may then have fallen.
+    `reseeded` counts how often each component was placed anew, and `log_likelihood` [nats] is the mean over the data
+    before each step. After a jump, which places a component anew, the likelihood may fall.
     """
 
     components: Components
@@ -69,15 +66,10 @@ def expectation_maximisation(
     regularisation: float,
     observer: Callable[[Progress], None] = lambda progress: None,
 ) -> Fit:
-    """Iterate until a step raises the mean log-likelihood by less than `tolerance`.
+    """Iterate until a step raises the mean log-likelihood by less than `tolerance` [nats].
 
-    Args:
-        shard: standardised data.
-        start: first or resumed state.
-        iterations: largest number of steps, steps before `start` included.
-        tolerance: of the mean log-likelihood [nats].
-        regularisation: added to the diagonal of every covariance.
-        observer: called after every step.
+    `iterations` bounds the number of steps, steps before `start` included. `regularisation` is added to the diagonal of
+    every covariance.
 
     Raises:
         IndefiniteCovariance: a component collapsed more than `MAX_RESEEDS` times, or the start is indefinite.
@@ -154,9 +146,9 @@ def maximisation(
 ) -> tuple[Components, Int[Tensor, "m"]]:
     """Return the most likely components for the weighted sums; collapsed components are placed anew.
 
-    A component has collapsed if its responsibilities sum to less than the d + 1 rows that span a covariance, or if its
-    covariance is singular. The heaviest component is then split across its longest axis, and one half replaces it. This
-    needs no data, so every process does the same.
+    A component collapses if its covariance is singular, or if its responsibilities sum to less than the d + 1 rows that
+    span one. The heaviest component is then split across its longest axis, and one half replaces it. This needs no
+    data, so every process does the same.
 
     Raises:
         IndefiniteCovariance: every component collapsed, or one of them more than `MAX_RESEEDS` times.

@@ -23,8 +23,7 @@ class MixtureScore(Value):
         error: mean absolute error of the conditional mean, Eq. (23), of each joint [rad].
         deviation: standard deviation of the absolute error over the postures [rad].
         nearest_mode: mean absolute error of the nearest of the first `COMPARED_MODES` modes [rad].
-        paper_coverage: share of codes below `PAPER_ENERGY`.
-        default_coverage: share of codes below `DEFAULT_ENERGY`.
+        paper_coverage, default_coverage: shares of codes below `PAPER_ENERGY` and `DEFAULT_ENERGY`.
         log_likelihood: mean over the postures [nats].
         postures: number of postures.
     """
@@ -45,13 +44,14 @@ class MixtureScore(Value):
 
     def __str__(self) -> str:
         """Return the errors of Table 5 and Fig. 8, and the acceptance of Eq. (21)."""
-        rows = zip(self.joint_names, self.error.tolist(), self.deviation.tolist(), strict=True)
-        lines = [f"  {name:20s} {error:.3f} +- {deviation:.3f}" for name, error, deviation in rows]
+        rows = zip((*self.joint_names, "all joints"), (*self.error.tolist(), self.mean_error), strict=True)
+        spread = [f" +- {deviation:.3f}" for deviation in self.deviation.tolist()]
+        modes = f"; the nearest of {COMPARED_MODES} modes {self.nearest_mode:.3f}"
+        lines = [f"  {name:20s} {error:.3f}{more}" for (name, error), more in zip(rows, (*spread, modes), strict=True)]
         return "\n".join(
             [
                 f"mean absolute error on {self.postures} held-out postures [rad]: Eq. (23) +- deviation over postures",
                 *lines,
-                f"  {'all joints':20s} {self.mean_error:.3f}; the nearest of {COMPARED_MODES} modes {self.nearest_mode:.3f}",
                 f"within reach: {self.paper_coverage:.4f} at the paper's {PAPER_ENERGY:g}, "
                 f"{self.default_coverage:.4f} at the default {DEFAULT_ENERGY:.3f}",
                 f"log-likelihood a held-out posture: {self.log_likelihood:.6f}",

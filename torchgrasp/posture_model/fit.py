@@ -39,17 +39,14 @@ def fit_mixture(
 ) -> GraspMixture:
     """Fit the mixture of Eqs. (19)-(20) to sampled postures by expectation-maximisation from a k-means start.
 
-    A collapsed component is placed anew, at most three times.
-
     Args:
-        samples: postures and their codes, more than a covariance has dimensions.
+        samples: postures and their codes.
         components: m, the number of Gaussians.
         seed: of the start.
         iterations: largest number of steps.
         tolerance: stop when a step raises the mean log-likelihood by less [nats].
         regularisation: variance added to every dimension of a component, relative to its variance over all samples.
-        starts: number of k-means starts, with consecutive seeds. Each takes `TRIAL_STEPS` steps; the likeliest
-            continues.
+        starts: k-means starts of consecutive seeds. Each takes `TRIAL_STEPS` steps; the likeliest continues.
         checkpoint: file that holds the fit after every further step. If it exists, the fit continues from it to the
             same bits on the same machine; iterations and tolerance may differ.
         distributed: whether `samples` are the shard of one process under torchrun. All processes get the same
@@ -61,8 +58,7 @@ def fit_mixture(
 
     Raises:
         BadArgument: too few samples, a joint that does not vary, a number out of range, the checkpoint of another fit.
-        ModelFileError: a damaged checkpoint.
-        OutputError: the checkpoint cannot be written.
+        ModelFileError, OutputError: a damaged checkpoint, or one that cannot be written.
         IndefiniteCovariance: a component collapsed more than three times.
 
     >>> import torch

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Float
@@ -62,27 +62,17 @@ class GaussianMixture(Value):
             raise BadArgument("covariances", found, "symmetric positive definite matrices")
 
     def log_prob(self, x: Float[Tensor, "*b d"]) -> Float[Tensor, "*b"]:
-        """Return the log-density of rows, Eq. (19).
-
-        Raises:
-            BadArgument: rows of another length than d.
-        """
+        """Return the log-density of rows, Eq. (19); raises `BadArgument` for rows of another length than d."""
         if x.ndim < 1 or x.shape[-1] != len(self.names):
             raise BadArgument("x", f"shape {tuple(x.shape)}", f"rows of {len(self.names)} numbers")
-        rows = x.reshape(-1, x.shape[-1]).double()
-        parts = [torch.logsumexp(self.log_joint(part), -1) for part in rows.split(ROWS_PER_CHUNK)]
-        return torch.cat(parts).reshape(x.shape[:-1]).to(x.dtype)
+        return map_rows(lambda rows: torch.logsumexp(self.log_joint(rows), -1), x)
 
     def log_joint(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
         """Return log(pi_i) + log N(x | mu_i, Sigma_i) for every row and component."""
         return self.weights.double().log() + self.whitening.log_densities(x)
 
     def sample(self, n: int, seed: int = 0) -> Float[Tensor, "n d"]:
-        """Draw n rows.
-
-        Raises:
-            BadArgument: n or seed is out of range.
-        """
+        """Draw n rows; raises `BadArgument` if n or seed is out of range."""
         check_whole("n", n, 0, 2**63 - 1)
         check_whole("seed", seed, 0, 2**63 - 1)
         generator = torch.Generator().manual_seed(seed)
@@ -98,24 +88,16 @@ class GaussianMixture(Value):
         return rows.to(self.means.device)
 
     def marginal(self, names: Sequence[str]) -> "GaussianMixture":
-        """Return the marginal density of some dimensions, in the order of `names`, Eq. (22).
-
-        Raises:
-            BadArgument: an unknown name, or a name twice.
-        """
+        """Return the marginal density of some dimensions, Eq. (22); `BadArgument` for an unknown name or a name twice."""
         index = self._index(names)
         means, covariances = self.means.double(), self.covariances.double()
         block = covariances[:, index][:, :, index]
         return GaussianMixture(self.weights.double(), means[:, index], block, tuple(names))
 
     def condition(self, given: dict[str, float]) -> "GaussianMixture":
-        """Return the conditional density of the other dimensions: means and weights are the bracket and h_i of Eq. (23).
+        """Return the density of the other dimensions given the values of some: bracket and h_i of Eq. (23).
 
-        Args:
-            given: value of each observed dimension, by name.
-
-        Returns:
-            A mixture over the other dimensions, in their order, without components of weight 0.
+        Components of weight 0 are left out.
 
         Raises:
             BadArgument: an unknown name, a value that is not finite, or all dimensions given.
@@ -186,6 +168,12 @@ class Whitening:
     def log_densities(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
         """Return log N(x | mu_i, Sigma_i) for every row and component."""
         return self.log_scale - 0.5 * self.squared(x)
+
+
+def map_rows(function: Callable[[Float[Tensor, "n d"]], Tensor], x: Float[Tensor, "*b d"]) -> Tensor:
+    """Apply a function to rows in float64, a chunk at a time; restore batch axes and dtype."""
+    y = torch.cat([function(rows) for rows in x.reshape(-1, x.shape[-1]).double().split(ROWS_PER_CHUNK)])
+    return y.reshape(*x.shape[:-1], *y.shape[1:]).to(x.dtype)
 
 
 def whitening_matrices(covariances: Float[Tensor, "m d d"]) -> Float[Tensor, "m d d"]:

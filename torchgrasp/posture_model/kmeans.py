@@ -18,13 +18,7 @@ LLOYD_ROUNDS = 10
 
 
 def start_components(shard: Shard, m: int, seed: int, regularisation: float) -> Progress:
-    """Return a start from k-means.
-
-    Args:
-        shard: standardised data.
-        m: number of components.
-        seed: of the subsample and of the centres; their draw does not depend on the number of processes.
-        regularisation: added to the diagonal of every covariance.
+    """Return the clusters of k-means as m components; the draws do not depend on the number of processes.
 
     Raises:
         BadArgument: fewer different rows than components.

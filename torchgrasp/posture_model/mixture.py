@@ -12,7 +12,7 @@ from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.hand.load import find_hand
 from torchgrasp.posture_model.encoding import CODE_NAMES
-from torchgrasp.posture_model.gaussian import ROWS_PER_CHUNK, GaussianMixture
+from torchgrasp.posture_model.gaussian import GaussianMixture, map_rows
 from torchgrasp.values import ContactCode
 
 PAPER_ENERGY = 2.0
@@ -26,15 +26,8 @@ DEFAULT_ENERGY = 8.405946915
 class GraspMixture(GaussianMixture):
     """The joint density of joints and codes of one hand (Eqs. 19-20).
 
-    The dimensions are the joints [rad], in the order of the hand, then the code: L1 L2 L3 [m] N1 N2 N3.
-
-    Args:
-        weights: pi_i, non-negative, with sum 1.
-        means: mu_i.
-        covariances: Sigma_i, symmetric and positive definite.
-        names: of the dimensions.
-        regularisation: variance that the fit added to every dimension, relative to its variance over all samples.
-        meta: the hand, its hash, the samples, and the report of the fit.
+    The dimensions are the joints [rad], in the order of the hand, then the code: L1 L2 L3 [m] N1 N2 N3. The fit added
+    `regularisation` to every variance, relative to the samples' variance. `meta` describes hand, samples and fit.
 
     Raises:
         BadArgument: as `GaussianMixture`, or names that do not end with `CODE_NAMES`.
@@ -74,62 +67,44 @@ class GraspMixture(GaussianMixture):
     def energy(self, code: ContactCode | Float[Tensor, "*b 6"]) -> Float[Tensor, "*b"]:
         """Return min_i f_i of Eq. (21): half the squared Mahalanobis distance to the nearest component.
 
-        The hand reaches codes below a threshold, `DEFAULT_ENERGY` or `PAPER_ENERGY`.
-
-        Args:
-            code: a `ContactCode` (rows b, 6 permutations) or bare codes q. NaN gives NaN.
-
-        Raises:
-            BadArgument: codes of another length than 6.
+        The hand reaches codes below a threshold, `DEFAULT_ENERGY` or `PAPER_ENERGY`. NaN gives NaN. Codes of another
+        length than 6 raise `BadArgument`.
         """
-        q = _checked(code)
-        rows = q.reshape(-1, 6).double()
-        parts = [0.5 * self._code.whitening.squared(part).amin(-1) for part in rows.split(ROWS_PER_CHUNK)]
-        return torch.cat(parts).reshape(q.shape[:-1]).to(q.dtype)
+        return map_rows(lambda q: 0.5 * self._code.whitening.squared(q).amin(-1), _codes(code))
 
     def joints(self, code: ContactCode | Float[Tensor, "*b 6"]) -> Float[Tensor, "*b h"]:
         """Return the expected joints [rad] given a code, Eq. (23); they may lie outside the hand's limits.
 
-        Args:
-            code: a `ContactCode` or bare codes q. NaN gives NaN.
-
-        Raises:
-            BadArgument: codes of another length than 6.
+        NaN gives NaN. Codes of another length than 6 raise `BadArgument`.
         """
-        q = _checked(code)
-        rows = q.reshape(-1, 6).double()
-        parts = []
-        for part in rows.split(ROWS_PER_CHUNK):
-            responsibility = self._log_responsibility(part).exp()
+
+        def expect(q: Float[Tensor, "n 6"]) -> Float[Tensor, "n h"]:
             # sum_i h_i A_i (q, 1) as one matrix product
-            weighted = responsibility[:, :, None] * torch.cat([part, torch.ones_like(part[:, :1])], 1)[:, None]
-            parts.append(weighted.flatten(1) @ self._stacked_regression)
-        return torch.cat(parts).reshape(*q.shape[:-1], len(self.joint_names)).to(q.dtype)
+            weighted = (
+                self._log_responsibility(q).exp()[:, :, None] * torch.cat([q, torch.ones_like(q[:, :1])], 1)[:, None]
+            )
+            return weighted.flatten(1) @ self._stacked_regression
+
+        return map_rows(expect, _codes(code))
 
     def modes(self, q: Float[Tensor, "*b 6"], k: int) -> tuple[Float[Tensor, "*b k h"], Float[Tensor, "*b k"]]:
         """Return the conditional means of the k components most responsible for a code, and their h_i of Eq. (23).
 
         If several postures have the code, their mean (Eq. 23) may be none of them.
 
-        Args:
-            q: codes.
-            k: number of modes, at most m.
-
         Raises:
             BadArgument: k outside [1, m], or codes of another length than 6.
         """
-        q = _checked(q)
         if not 1 <= k <= len(self.weights):
             raise BadArgument("k", k, f"1 to {len(self.weights)} (the mixture's components)")
-        joints, weights = [], []
-        for part in q.reshape(-1, 6).double().split(ROWS_PER_CHUNK):
-            top = self._log_responsibility(part).topk(k, dim=-1)
-            index = top.indices[..., None].expand(-1, -1, self.means.shape[1] - 6)
-            joints.append(self._conditional_means(part).gather(-2, index))
-            weights.append(top.values.exp())
-        shape = (*q.shape[:-1], k)
-        modes = torch.cat(joints).reshape(*shape, len(self.joint_names))
-        return modes.to(q.dtype), torch.cat(weights).reshape(shape).to(q.dtype)
+
+        def take(q: Float[Tensor, "n 6"]) -> Float[Tensor, "n k d"]:
+            top = self._log_responsibility(q).topk(k, dim=-1)
+            index = top.indices[..., None].expand(-1, -1, len(self.joint_names))
+            return torch.cat([self._conditional_means(q).gather(-2, index), top.values.exp()[..., None]], -1)
+
+        modes = map_rows(take, _codes(q))
+        return modes[..., :-1], modes[..., -1]
 
     def with_observation_noise(self, lengths: float, cosines: float) -> "GraspMixture":
         """Return the mixture of codes observed with independent Gaussian noise, whose variances are added to Sigma_q.
@@ -171,7 +146,7 @@ class GraspMixture(GaussianMixture):
         return save_tensors(path, "mixture", tensors, meta)
 
 
-def _checked(code: ContactCode | Tensor) -> Float[Tensor, "*b 6"]:
+def _codes(code: ContactCode | Tensor) -> Float[Tensor, "*b 6"]:
     """Return the codes q of an argument; refuse rows of other than six numbers."""
     q = code.q if isinstance(code, ContactCode) else code
     if q.ndim < 1 or q.shape[-1] != 6:

@@ -71,7 +71,7 @@ class SampleSpec(Value):
             raise BadArgument("sampling", repr(self.sampling), f"one of {get_args(Sampling)}")
 
     def meta(self, hand: Hand) -> dict[str, str]:
-        """Return what distinguishes these samples of a hand from others, but for their number."""
+        """Return the metadata of samples: all that distinguishes them but their number."""
         return {**describe_compatibility(hand), "seed": str(self.seed), "sampling": self.sampling}
 
 
@@ -85,13 +85,8 @@ def sample_configurations(
 ) -> HandSamples:
     """Draw postures uniformly within the joint limits and keep those free of self-collision (Sec. 6.3).
 
-    Args:
-        hand: the hand.
-        n: number of free postures, see `SampleSpec`.
-        seed: of the draws.
-        workers: threads that draw at the same time; the result does not depend on them.
-        sampling: "uniform" or "opposed", see `SampleSpec`.
-        observer: called after every chunk with its number of postures.
+    `SampleSpec` explains n, seed and sampling. `workers` threads draw at the same time, with the same result. The
+    observer is called after every chunk with its number of postures.
 
     Raises:
         BadArgument: an argument out of range, or a hand whose postures are hardly ever kept.

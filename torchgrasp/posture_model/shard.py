@@ -11,13 +11,7 @@ from torchgrasp.errors import BadArgument
 
 @dataclasses.dataclass(frozen=True)
 class Shard:
-    """One process's rows of the data, and the sums over the rows of all processes.
-
-    Args:
-        rows: of this process; processes may hold different numbers of rows.
-        rank: number of this process.
-        processes: how many there are; more than one share torch.distributed's default group.
-    """
+    """The rows of one process. Several processes form the default group of torch.distributed."""
 
     rows: Float[Tensor, "n d"]
     rank: int = 0
@@ -25,11 +19,7 @@ class Shard:
 
     @staticmethod
     def of(rows: Float[Tensor, "n d"], distributed: bool) -> "Shard":
-        """Return the shard of this process; without `distributed` it holds all the data.
-
-        Raises:
-            BadArgument: `distributed` in a process that is in no group.
-        """
+        """Return the shard of this process; raises `BadArgument` for a distributed one without a group."""
         if not distributed:
             return Shard(rows)
         if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
