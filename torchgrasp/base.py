@@ -128,3 +128,9 @@ def check_whole(name: str, value: int, low: int, high: int) -> None:
     """Refuse a number that is not whole or is out of range; raise `BadArgument`."""
     if not low <= value <= high or value != int(value):
         raise BadArgument(name, value, f"a whole number in [{low}, {high}]")
+
+
+def check_number(name: str, value: int | float, low: int | float, high: int | float) -> None:
+    """Refuse a number that is out of range or NaN; raise `BadArgument`."""
+    if not low <= value <= high:
+        raise BadArgument(name, value, f"a number in [{low:g}, {high:g}]")

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Literal, get_args
 
-from torchgrasp.base import Value
+from torchgrasp.base import Value, check_number
 from torchgrasp.errors import BadArgument
 
 Simulator = Literal["sapien", "mujoco"]
@@ -62,8 +62,7 @@ class ContactSpec(Value):
             ("start_radius", self.start_radius, 1e-6, 1.2),
         ]
         for name, value, low, high in ranges:
-            if not low <= value <= high:  # also refuses NaN
-                raise BadArgument(name, value, f"a number in [{low:g}, {high:g}]")
+            check_number(name, value, low, high)
 
     @property
     def planned_friction(self) -> float:
@@ -158,9 +157,8 @@ class TrialSpec(Value):
             "overlap": (0.0, 1.0),
         }
         for name, (low, high) in ranges.items():
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:  # also refuses NaN
-                raise BadArgument(name, value, f"a number in [{low:g}, {high:g}]")
+            if getattr(self, name) is not None:
+                check_number(name, getattr(self, name), low, high)
         if not self.control_rate * self.timestep < 1 + 1e-9:
             found = f"{self.control_rate:g} Hz with a timestep of {self.timestep:g} s"
             raise BadArgument("control_rate", found, "a period of at least one timestep")

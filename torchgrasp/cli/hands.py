@@ -15,12 +15,10 @@ from torchgrasp.hand.draft import draft_hand
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import find_hand, load_hand
 from torchgrasp.posture_model.dataset import write_samples
-from torchgrasp.posture_model.sample import SampleSpec, Sampling
+from torchgrasp.posture_model.sample import OPPOSED_COSINE, SampleSpec, Sampling
 from torchgrasp.report.hands import draw_hand, opposed_posture
 from torchgrasp.testing import check_hand, find_faults, random_joints
 
-OPPOSED = -0.5
-"""Two pads whose normals have a cosine below this can hold something between them."""
 POSTURES = 5000
 """Random postures that tell what a hand is like."""
 
@@ -76,9 +74,8 @@ def check(
     joints = random_joints(sound, POSTURES)
     print(describe(sound, joints))
     modelled = find_hand(hand) / "mixture.safetensors"
-    print(
-        f"learned model: {modelled if modelled.exists() else f'none; python scripts/train.py posture-model {hand} learns it'}"
-    )
+    none = f"none; python scripts/train.py posture-model {hand} learns it"
+    print(f"learned model: {modelled if modelled.exists() else none}")
     write_file(out, draw_hand(sound, opposed_posture(sound, joints)))
     print(f"picture: {out}")
     return 0
@@ -114,7 +111,7 @@ def describe(hand: Hand, joints: torch.Tensor) -> str:
     free = hand.self_clearance(joints) > 0
     sides = torch.linalg.vector_norm(points - points.roll(1, 1), dim=-1)[free]
     pairs = (normals * normals.roll(1, 1)).sum(-1)[free]
-    share, opposed = 1 - float(free.double().mean()), float((pairs < OPPOSED).any(1).double().mean())
+    share, opposed = 1 - float(free.double().mean()), float((pairs < OPPOSED_COSINE).any(1).double().mean())
     lines.append(f"{share:.1%} of {len(joints)} random postures collide with themselves")
     lines.append(f"{opposed:.1%} of the free ones have two pads face to face (an angle above 120 degrees)")
     least, most = (1e3 * float(sides.quantile(q)) for q in (0.01, 0.99))

@@ -1,6 +1,6 @@
 """The learned posture model: a Gaussian mixture over the joints of a hand and the codes of its fingertips (Sec. 4)."""
 
-from torchgrasp.posture_model.encoding import encode, encode_fingertips
+from torchgrasp.posture_model.encoding import encode
 from torchgrasp.posture_model.sample import HandSamples, SampleSpec, sample_configurations
 from torchgrasp.posture_model.dataset import SampleFolder, load_samples, write_samples
 from torchgrasp.posture_model.em import Progress
@@ -11,7 +11,6 @@ from torchgrasp.posture_model.evaluate import MixtureScore, evaluate_mixture
 
 __all__ = [
     "encode",
-    "encode_fingertips",
     "HandSamples",
     "SampleSpec",
     "sample_configurations",

@@ -31,9 +31,8 @@ class Checkpoint:
         """Write the state atomically; raises `OutputError`."""
         if self.path is None or self.shard.rank > 0:
             return
-        tensors = {field.name: getattr(progress.components, field.name) for field in dataclasses.fields(Components)}
+        tensors = {**vars(progress.components), "centre": self.centre, "scale": self.scale}
         tensors |= {"reseeded": progress.reseeded, "log_likelihood": progress.log_likelihood}
-        tensors |= {"centre": self.centre, "scale": self.scale}
         save_tensors(self.path, "em", tensors, {**self.settings, "jumped": str(progress.jumped)})
 
     def load(self) -> Progress | None:
@@ -48,9 +47,8 @@ class Checkpoint:
         # Processes at different steps would wait for each other for ever. Equal steps have no variance.
         total, squares = self.shard.sum(torch.tensor([steps, steps**2], device=self.centre.device)).tolist()
         if squares * self.shard.processes != total**2:
-            raise BadArgument(
-                "checkpoint", "a file that some processes see and others do not", "a file for all of them"
-            )
+            found = "a file that some processes see and others do not"
+            raise BadArgument("checkpoint", found, "a file for all of them")
         return progress
 
     def _read(self, path: Path) -> Progress:
@@ -68,10 +66,8 @@ class Checkpoint:
             allowed = f"a new file, or the checkpoint of this fit: {self.settings} and the same data"
             raise BadArgument("checkpoint", f"{path}: {other}", allowed)
         for name, shape in shapes.items():
-            t = tensors[name]
-            if (shape != (-1,) and t.shape != shape) or t.dtype != (
-                torch.int64 if name == "reseeded" else torch.float64
-            ):
+            t, dtype = tensors[name], torch.int64 if name == "reseeded" else torch.float64
+            if (shape != (-1,) and t.shape != shape) or t.dtype != dtype:
                 raise ModelFileError("checkpoint", f"{path}: {name} {tuple(t.shape)} {t.dtype}", str(shape))
         device = self.centre.device
         components = Components(*(tensors[k].to(device) for k in ("weights", "means", "covariances")))

@@ -102,15 +102,8 @@ def write_samples(
     check_whole("workers", workers, 1, 1024)
     counts, meta = chunk_counts(spec.n), spec.meta(hand)
     samples = SampleFolder(Path(folder), spec.n, hand.joint_names, meta)
-    names = hand.joint_names
-    content = {
-        "torchgrasp": "samples",
-        "version": 1,
-        "n": spec.n,
-        "chunk": CHUNK_POSTURES,
-        "joint_names": names,
-        **meta,
-    }
+    content = {"torchgrasp": "samples", "version": 1, "n": spec.n, "chunk": CHUNK_POSTURES}
+    content |= {"joint_names": hand.joint_names, **meta}
 
     def write(i: int) -> int:
         joints, q, drawn = draw_chunk(hand, spec, i)
@@ -149,15 +142,16 @@ def load_samples(folder: Path | str) -> SampleFolder:
     torch.Size([50, 4])
     """
     folder = Path(folder)
-    manifest = _read_manifest(folder)
-    names: Any = manifest.get("joint_names")
-    n: Any = manifest.get("n")
-    meta: dict[str, Any] = {key: manifest.get(key) for key in META_KEYS}
-    sound = isinstance(names, list) and 0 < len(names) <= 1000 and all(isinstance(x, str) for x in names)
-    sound = sound and isinstance(n, int) and not isinstance(n, bool) and 1 <= n <= MAX_SAMPLES
-    if not (sound and manifest.get("chunk") == CHUNK_POSTURES and all(isinstance(x, str) for x in meta.values())):
-        raise ModelFileError("folder", f"{folder / MANIFEST}, which is damaged", "a manifest written by write_samples")
-    samples, chunks = SampleFolder(folder, n, tuple(names), meta), len(chunk_counts(n))
+    path, allowed = folder / MANIFEST, "a folder written by write_samples"
+    if not path.is_file():
+        raise ModelFileError("folder", f"{folder} without {MANIFEST}", allowed)
+    try:
+        if path.stat().st_size > MAX_MANIFEST:
+            raise ValueError("larger than 1 MiB")
+        samples = _parse_manifest(folder, json.loads(path.read_text("utf-8")))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ModelFileError("folder", f"{path}: {error}", allowed) from error
+    chunks = len(chunk_counts(samples.n))
     missing = sum(not samples.path(i).is_file() for i in range(chunks))
     if missing:
         allowed = "a finished folder: run the command that began it again"
@@ -165,21 +159,19 @@ def load_samples(folder: Path | str) -> SampleFolder:
     return samples
 
 
-def _read_manifest(folder: Path) -> dict[str, Any]:
-    """Read the manifest of a folder."""
-    path = folder / MANIFEST
-    allowed = "a folder written by write_samples"
-    if not path.is_file():
-        raise ModelFileError("folder", f"{folder} without {MANIFEST}", allowed)
-    try:
-        if path.stat().st_size > MAX_MANIFEST:
-            raise ValueError("larger than 1 MiB")
-        manifest = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise ModelFileError("folder", f"{path}: {error}", allowed) from error
-    if not isinstance(manifest, dict) or manifest.get("torchgrasp") != "samples" or manifest.get("version") != 1:
-        raise ModelFileError("folder", f"{path}: another kind of file, or of another version", allowed)
-    return manifest
+def _parse_manifest(folder: Path, manifest: Any) -> SampleFolder:
+    """Return the samples that a manifest describes; raise `ValueError` for anything but a manifest."""
+    fixed = {"torchgrasp": "samples", "version": 1, "chunk": CHUNK_POSTURES}
+    if not isinstance(manifest, dict) or any(manifest.get(key) != value for key, value in fixed.items()):
+        raise ValueError("another kind of file, or of another version")
+    n: Any = manifest.get("n")
+    names: Any = manifest.get("joint_names")
+    meta: dict[str, Any] = {key: manifest.get(key) for key in META_KEYS}
+    sound = isinstance(n, int) and not isinstance(n, bool) and 1 <= n <= MAX_SAMPLES
+    sound = sound and isinstance(names, list) and 0 < len(names) <= 1000
+    if not (sound and all(isinstance(x, str) for x in (*names, *meta.values()))):
+        raise ValueError("damaged")
+    return SampleFolder(folder, n, tuple(names), meta)
 
 
 def _begin(folder: Path, manifest: str) -> None:

@@ -121,11 +121,7 @@ def features_from_data(x: Float[Tensor, "n d"], out: Float[Tensor, "f n"] | None
 
 
 def coefficients_from_components(components: Components) -> Float[Tensor, "m f"]:
-    """Return the coefficients of the features in log(weight) + log N(x | mean, covariance), Eq. (19).
-
-    Raises:
-        IndefiniteCovariance: a covariance is not positive definite.
-    """
+    """Return the coefficients of the features in log(weight) + log N(x | mean, covariance), Eq. (19)."""
     means, d = components.means, components.means.shape[1]
     whitening = whitening_matrices(components.covariances)
     precision = whitening.transpose(-1, -2) @ whitening

@@ -44,18 +44,15 @@ class MixtureScore(Value):
 
     def __str__(self) -> str:
         """Return the errors of Table 5 and Fig. 8, and the acceptance of Eq. (21)."""
-        rows = zip((*self.joint_names, "all joints"), (*self.error.tolist(), self.mean_error), strict=True)
-        spread = [f" +- {deviation:.3f}" for deviation in self.deviation.tolist()]
-        modes = f"; the nearest of {COMPARED_MODES} modes {self.nearest_mode:.3f}"
-        lines = [f"  {name:20s} {error:.3f}{more}" for (name, error), more in zip(rows, (*spread, modes), strict=True)]
-        return "\n".join(
-            [
-                f"mean absolute error on {self.postures} held-out postures [rad]: Eq. (23) +- deviation over postures",
-                *lines,
-                f"within reach: {self.paper_coverage:.4f} at the paper's {PAPER_ENERGY:g}, "
-                f"{self.default_coverage:.4f} at the default {DEFAULT_ENERGY:.3f}",
-                f"log-likelihood a held-out posture: {self.log_likelihood:.6f}",
-            ]
+        rows = zip(self.joint_names, self.error.tolist(), self.deviation.tolist(), strict=True)
+        joints = "\n".join(f"  {name:20s} {error:.3f} +- {deviation:.3f}" for name, error, deviation in rows)
+        return (
+            f"mean absolute error on {self.postures} held-out postures [rad]: Eq. (23) +- deviation over postures\n"
+            f"{joints}\n  {'all joints':20s} {self.mean_error:.3f}; "
+            f"the nearest of {COMPARED_MODES} modes {self.nearest_mode:.3f}\n"
+            f"within reach: {self.paper_coverage:.4f} at the paper's {PAPER_ENERGY:g}, "
+            f"{self.default_coverage:.4f} at the default {DEFAULT_ENERGY:.3f}\n"
+            f"log-likelihood a held-out posture: {self.log_likelihood:.6f}"
         )
 
     def meta(self) -> dict[str, str]:
@@ -71,10 +68,7 @@ class MixtureScore(Value):
 
 
 def evaluate_mixture(mixture: GraspMixture, samples: HandSamples) -> MixtureScore:
-    """Evaluate a model on held-out postures.
-
-    Raises:
-        BadArgument: samples of other joints, or fewer than two samples.
+    """Evaluate a model on at least two held-out postures of its joints.
 
     >>> from torchgrasp.hand.load import load_hand
     >>> from torchgrasp.posture_model.mixture import load_mixture

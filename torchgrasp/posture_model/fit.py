@@ -7,7 +7,7 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import check_tensor
+from torchgrasp.base import check_number, check_tensor, check_whole
 from torchgrasp.errors import BadArgument
 from torchgrasp.posture_model.checkpoint import Checkpoint
 from torchgrasp.posture_model.em import Fit, Progress, expectation_maximisation
@@ -39,6 +39,8 @@ def fit_mixture(
 ) -> GraspMixture:
     """Fit the mixture of Eqs. (19)-(20) to sampled postures by expectation-maximisation from a k-means start.
 
+    The mixture's `meta` reports iterations, convergence, components placed anew, mean log-likelihood and BIC.
+
     Args:
         samples: postures and their codes.
         components: m, the number of Gaussians.
@@ -52,9 +54,6 @@ def fit_mixture(
         distributed: whether `samples` are the shard of one process under torchrun. All processes get the same
             mixture, and must see the same checkpoint.
         observer: called after every step.
-
-    Returns:
-        The mixture. Its `meta` holds iterations, convergence, components placed anew, mean log-likelihood and BIC.
 
     Raises:
         BadArgument: too few samples, a joint that does not vary, a number out of range, the checkpoint of another fit.
@@ -72,15 +71,11 @@ def fit_mixture(
     n, least = shard.count(), rows.shape[1] + 2  # fewer samples leave the covariance of d dimensions singular
     if n < least:
         raise BadArgument("samples", f"{n} samples", f"at least {least}")
-    for name, value, low, high in [
-        ("components", components, 1, n // least),
-        ("iterations", iterations, 1, 100_000),
-        ("starts", starts, 1, 1000),
-        ("tolerance", tolerance, 0.0, 1.0),
-        ("regularisation", regularisation, 0.0, MAX_REGULARISATION),
-    ]:
-        if not low <= value <= high:
-            raise BadArgument(name, value, f"a number in [{low:g}, {high:g}]")
+    check_whole("components", components, 1, n // least)
+    check_whole("iterations", iterations, 1, 100_000)
+    check_whole("starts", starts, 1, 1000)
+    check_number("tolerance", tolerance, 0.0, 1.0)
+    check_number("regularisation", regularisation, 0.0, MAX_REGULARISATION)
     names = (*samples.joint_names, *CODE_NAMES)
     centre, scale = _standardise(shard, names)
 
@@ -115,12 +110,12 @@ def bic(mixture: GraspMixture, samples: HandSamples) -> float:
     Codes are exact functions of the joints, so the criterion keeps falling as components are added. Read its elbow
     beside the error on held-out postures, not its minimum.
     """
-    m, d = mixture.means.shape
-    return _criterion(float(mixture.log_prob(samples.rows().double()).sum()), m, d, len(samples))
+    return _criterion(float(mixture.log_prob(samples.rows().double()).sum()), len(samples), mixture.means)
 
 
-def _criterion(log_likelihood: float, m: int, d: int, n: int) -> float:
-    """Return -2 log-likelihood + free parameters x log(n) for m full covariances in d dimensions."""
+def _criterion(log_likelihood: float, n: int, means: Float[Tensor, "m d"]) -> float:
+    """Return -2 log-likelihood + free parameters x log(n), with full covariances."""
+    m, d = means.shape
     free = (m - 1) + m * d + m * d * (d + 1) // 2
     return -2 * log_likelihood + free * math.log(n)
 
@@ -150,11 +145,10 @@ def _likeliest(shard: Shard, starts: list[Progress], regularisation: float) -> P
 
 def _outcome(fit: Fit, n: int, log_likelihood: float) -> dict[str, str]:
     """Return what a fit reports; the mean log-likelihood is in the samples' units."""
-    m, d = fit.components.means.shape
     return {
         "iterations": str(len(fit.log_likelihood) - 1),
         "converged": str(fit.converged).lower(),
         "reseeded": str(int(fit.reseeded.sum())),
         "log_likelihood": f"{log_likelihood:.6f}",
-        "bic": f"{_criterion(n * log_likelihood, m, d, n):.1f}",
+        "bic": f"{_criterion(n * log_likelihood, n, fit.components.means):.1f}",
     }

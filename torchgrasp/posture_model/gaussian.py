@@ -69,7 +69,7 @@ class GaussianMixture(Value):
 
     def log_joint(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
         """Return log(pi_i) + log N(x | mu_i, Sigma_i) for every row and component."""
-        return self.weights.double().log() + self.whitening.log_densities(x)
+        return self.weights.double().log() + (self.whitening.log_scale - 0.5 * self.whitening.squared(x))
 
     def sample(self, n: int, seed: int = 0) -> Float[Tensor, "n d"]:
         """Draw n rows; raises `BadArgument` if n or seed is out of range."""
@@ -88,7 +88,7 @@ class GaussianMixture(Value):
         return rows.to(self.means.device)
 
     def marginal(self, names: Sequence[str]) -> "GaussianMixture":
-        """Return the marginal density of some dimensions, Eq. (22); `BadArgument` for an unknown name or a name twice."""
+        """Return the marginal density of some dimensions, Eq. (22); raises `BadArgument` for an unknown name."""
         index = self._index(names)
         means, covariances = self.means.double(), self.covariances.double()
         block = covariances[:, index][:, :, index]
@@ -133,8 +133,10 @@ class GaussianMixture(Value):
 
     @functools.cached_property
     def whitening(self) -> "Whitening":
-        """The components in whitened form, which densities are evaluated with."""
-        return Whitening.of(self.means, self.covariances)
+        """The components in whitened form, for the evaluation of densities."""
+        means, d, matrix = self.means.double(), len(self.names), whitening_matrices(self.covariances.double())
+        log_scale = matrix.diagonal(dim1=-2, dim2=-1).log().sum(-1) - 0.5 * d * math.log(2 * math.pi)
+        return Whitening(matrix, (matrix @ means[..., None])[..., 0], log_scale)
 
     def _index(self, names: Sequence[str]) -> list[int]:
         """Return the indices of dimensions."""
@@ -146,18 +148,11 @@ class GaussianMixture(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Whitening:
-    """m Gaussians in whitened form: `matrix` W with W^T W = Sigma^-1, `means` W mu."""
+    """m Gaussians in whitened form: `matrix` W with W^T W = Sigma^-1, `means` W mu, and log-normalisers."""
 
     matrix: Float[Tensor, "m d d"]
     means: Float[Tensor, "m d"]
     log_scale: Float[Tensor, "m"]
-
-    @staticmethod
-    def of(means: Float[Tensor, "m d"], covariances: Float[Tensor, "m d d"]) -> "Whitening":
-        """Whiten Gaussians; raises `IndefiniteCovariance`."""
-        matrix = whitening_matrices(covariances.double())
-        log_scale = matrix.diagonal(dim1=-2, dim2=-1).log().sum(-1) - 0.5 * means.shape[1] * math.log(2 * math.pi)
-        return Whitening(matrix, (matrix @ means.double()[..., None])[..., 0], log_scale)
 
     def squared(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
         """Return the squared Mahalanobis distance between every row and component."""
@@ -165,23 +160,15 @@ class Whitening:
         whitened = (x @ self.matrix.reshape(m * d, d).T).reshape(-1, m, d) - self.means
         return (whitened * whitened).sum(-1)
 
-    def log_densities(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
-        """Return log N(x | mu_i, Sigma_i) for every row and component."""
-        return self.log_scale - 0.5 * self.squared(x)
-
 
 def map_rows(function: Callable[[Float[Tensor, "n d"]], Tensor], x: Float[Tensor, "*b d"]) -> Tensor:
     """Apply a function to rows in float64, a chunk at a time; restore batch axes and dtype."""
     y = torch.cat([function(rows) for rows in x.reshape(-1, x.shape[-1]).double().split(ROWS_PER_CHUNK)])
-    return y.reshape(*x.shape[:-1], *y.shape[1:]).to(x.dtype)
+    return y.reshape(x.shape[:-1] + y.shape[1:]).to(x.dtype)
 
 
 def whitening_matrices(covariances: Float[Tensor, "m d d"]) -> Float[Tensor, "m d d"]:
-    """Return the lower-triangular W with W^T W = Sigma^-1 of every covariance.
-
-    Raises:
-        IndefiniteCovariance: a covariance is not positive definite.
-    """
+    """Return the lower-triangular W with W^T W = Sigma^-1 of every covariance; raises `IndefiniteCovariance`."""
     factor = cholesky(covariances, "a component's covariance", "use fewer components or more samples")
     eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
     return torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)

@@ -20,9 +20,7 @@ LLOYD_ROUNDS = 10
 def start_components(shard: Shard, m: int, seed: int, regularisation: float) -> Progress:
     """Return the clusters of k-means as m components; the draws do not depend on the number of processes.
 
-    Raises:
-        BadArgument: fewer different rows than components.
-        IndefiniteCovariance: hardly any cluster has enough rows for a covariance.
+    Fewer different rows than components raise `BadArgument`.
     """
     generator = torch.Generator().manual_seed(seed)
     centres = _plus_plus(_subsample(shard, generator), m, generator)

@@ -100,8 +100,11 @@ class GraspMixture(GaussianMixture):
 
         def take(q: Float[Tensor, "n 6"]) -> Float[Tensor, "n k d"]:
             top = self._log_responsibility(q).topk(k, dim=-1)
+            # the bracket of Eq. (23), the mean of the joints given the code in each component
+            difference = q[:, None] - self.means[:, -6:].double()
+            means = self.means[:, :-6].double() + torch.einsum("mhc,nmc->nmh", self._regression, difference)
             index = top.indices[..., None].expand(-1, -1, len(self.joint_names))
-            return torch.cat([self._conditional_means(q).gather(-2, index), top.values.exp()[..., None]], -1)
+            return torch.cat([means.gather(-2, index), top.values.exp()[..., None]], -1)
 
         modes = map_rows(take, _codes(q))
         return modes[..., :-1], modes[..., -1]
@@ -114,11 +117,8 @@ class GraspMixture(GaussianMixture):
         contact triple within reach.
 
         Args:
-            lengths: standard deviation [m] of L1 L2 L3.
-            cosines: standard deviation of N1 N2 N3.
-
-        Raises:
-            BadArgument: a negative number.
+            lengths: standard deviation [m] of L1 L2 L3, at least 0.
+            cosines: standard deviation of N1 N2 N3, at least 0.
         """
         if not (lengths >= 0 and cosines >= 0):
             raise BadArgument("lengths, cosines", (lengths, cosines), "two numbers of at least 0")
@@ -130,17 +130,8 @@ class GraspMixture(GaussianMixture):
         """Return log h_i of Eq. (23); the logarithm does not underflow far from every component."""
         return torch.log_softmax(self._code.log_joint(q), dim=-1)
 
-    def _conditional_means(self, q: Float[Tensor, "n 6"]) -> Float[Tensor, "n m h"]:
-        """Return the joints' mean given the code in each component, the bracket of Eq. (23)."""
-        difference = q[:, None] - self.means[:, -6:].double()
-        return self.means[:, :-6].double() + torch.einsum("mhc,nmc->nmh", self._regression, difference)
-
     def save(self, path: Path | str) -> Path:
-        """Write the mixture as safetensors, atomically; `load_mixture` reads it back.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Write the mixture atomically as safetensors for `load_mixture`; raises `OutputError`."""
         tensors = {"weights": self.weights, "means": self.means, "covariances": self.covariances}
         meta = {**self.meta, "names": " ".join(self.names), "regularisation": repr(self.regularisation)}
         return save_tensors(path, "mixture", tensors, meta)
@@ -166,11 +157,11 @@ def load_mixture(name_or_path: Path | str) -> GraspMixture:
     """
     path = mixture_path(name_or_path)
     tensors, meta = load_tensors(path, "mixture", {"weights", "means", "covariances"})
-    if any(t.dtype != torch.float64 for t in tensors.values()):
-        raise ModelFileError("path", f"{path}: {[str(t.dtype) for t in tensors.values()]}", "float64 tensors")
-    shapes = [tuple(tensors[name].shape) for name in ("weights", "means", "covariances")]
-    if len(shapes[1]) != 2 or shapes[0] != shapes[1][:1] or shapes[2] != (*shapes[1], shapes[1][1]):
-        raise ModelFileError("path", f"{path}: shapes {shapes}", "(m), (m, d) and (m, d, d)")
+    weights, means, covariances = (tensors[name].shape for name in ("weights", "means", "covariances"))
+    sound = len(means) == 2 and weights == means[:1] and covariances == (*means, means[1])
+    if not sound or any(t.dtype != torch.float64 for t in tensors.values()):
+        found = {name: (str(t.dtype), *t.shape) for name, t in tensors.items()}
+        raise ModelFileError("path", f"{path}: {found}", "float64 tensors of shapes (m), (m, d) and (m, d, d)")
     try:
         names, regularisation = tuple(meta.pop("names").split()), float(meta.pop("regularisation"))
         rest = {k: v for k, v in meta.items() if k not in ("kind", "version")}

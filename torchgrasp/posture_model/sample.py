@@ -52,8 +52,7 @@ class SampleSpec(Value):
     Args:
         n: number of free postures, at most `MAX_SAMPLES`.
         seed: of the draws. Chunk i comes from (seed, i) alone, so fewer samples are a prefix of more.
-        sampling: "uniform" as in the paper. "opposed" keeps only postures with two pads face to face, which can hold
-            something.
+        sampling: "uniform" as in the paper, or "opposed": only postures with two pads face to face.
 
     Raises:
         BadArgument: a number out of range, or another sampling.
