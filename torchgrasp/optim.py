@@ -1,71 +1,151 @@
-"""Levenberg-Marquardt for a batch of small problems, each with its own damping, that leaves alone what is done."""
+"""Levenberg-Marquardt for a batch of small problems, each row with its own damping.
 
+`levenberg_marquardt` is the loop; a `Problem` says what a step is and when it is good. Nocedal and Wright, Numerical
+Optimization, ch. 10.
+"""
+
+import abc
+import dataclasses
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch, pick, put
 
-State = TypeVar("State", bound=Batch)
-Residuals = tuple[Float[Tensor, "g m"], Float[Tensor, "g m d"]]
-"""Residuals and their derivatives."""
-
 LARGEST_STEP = 0.3
-"""Largest step of any variable in one iteration."""
+"""Largest step of any variable of `LeastSquares` in one iteration [m or rad]: about where its linear model ends."""
 SOLVED = 0.1
-"""A row whose sum of squared residuals is below this is done, unless it is to be more exact: 0.3 mm in the root."""
+"""Sum of squared residuals at which `LeastSquares` is solved: 0.3 mm in the root."""
 STALLED = 0.02
-"""A row whose sum falls by less than this share in a step is left alone, and so is one of more damping than `LOST`."""
+"""A row of `LeastSquares` rests after a step that lowers its sum by less than this share."""
 LOST = 30.0
+"""A row of `LeastSquares` rests when a step is refused in spite of this damping."""
 
 
-def levenberg_marquardt(
-    state: State,
-    evaluate: Callable[[State, Int[Tensor, "a"]], Residuals],
-    move: Callable[[State, Float[Tensor, "a d"]], State],
-    iterations: int,
-    solved: float = SOLVED,
-) -> State:
-    """Lower the sum of squared residuals of every row; a step that does not lower it is undone.
+@dataclasses.dataclass(frozen=True)
+class Linearisation(Batch):
+    """The `cost` of rows at a state; a problem adds what its next step needs."""
+
+    cost: Float[Tensor, "a"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Step(Batch):
+    """A step `x` of each row, and whether the row takes it; a row that does not is left alone from then on."""
+
+    x: Float[Tensor, "a d"]
+    taken: Bool[Tensor, "a"]
+
+
+State = TypeVar("State", bound=Batch)
+Model = TypeVar("Model", bound=Linearisation)
+
+
+class Problem(abc.ABC, Generic[State, Model]):
+    """Costs to be lowered, one a row, and the rules by which their steps are made and judged."""
+
+    first_damping: float = 1e-2
+
+    @abc.abstractmethod
+    def linearise(self, state: State, rows: Int[Tensor, "a"]) -> Model:
+        """Return the cost and its linear model at the states of some rows."""
+
+    @abc.abstractmethod
+    def step(self, model: Model, damping: Float[Tensor, "a"]) -> Step:
+        """Solve the damped normal equations."""
+
+    @abc.abstractmethod
+    def move(self, state: State, x: Float[Tensor, "a d"]) -> State:
+        """Return the states after a step."""
+
+    @abc.abstractmethod
+    def judge(
+        self, model: Model, trial: Model, step: Step, damping: Float[Tensor, "a"]
+    ) -> tuple[Bool[Tensor, "a"], Float[Tensor, "a"]]:
+        """Tell which steps are accepted, and return the damping of the next ones."""
+
+    def refuse(self, model: Model, trial: Model) -> Model:
+        """Return the model of rows whose step is refused: by default the one before."""
+        return model
+
+
+def levenberg_marquardt(problem: Problem[State, Model], state: State, steps: int) -> State:
+    """Lower the cost of every row by at most so many damped Gauss-Newton steps, of one evaluation each."""
+    whole, rows = state, torch.arange(len(state))
+    model = problem.linearise(state, rows)
+    rows, damping = rows.to(model.cost.device), torch.full_like(model.cost, problem.first_damping)
+    for _ in range(steps):
+        step = problem.step(model, damping)
+        if not bool(step.taken.all()):
+            whole = put(whole, rows, state)
+            if not bool(step.taken.any()):
+                return whole
+            rows, damping = rows[step.taken], damping[step.taken]
+            state, model, step = state[step.taken], model[step.taken], step[step.taken]
+        trial_state = problem.move(state, step.x)
+        trial = problem.linearise(trial_state, rows)
+        accepted, damping = problem.judge(model, trial, step, damping)
+        state = pick(accepted, trial_state, state)
+        model = pick(accepted, trial, problem.refuse(model, trial))
+    return put(whole, rows, state)
+
+
+Residuals = tuple[Float[Tensor, "g m"], Float[Tensor, "g m d"]]
+"""Residuals and their Jacobian."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LinearResiduals(Linearisation):
+    """Residuals and their Jacobian at a state."""
+
+    residual: Float[Tensor, "a m"]
+    jacobian: Float[Tensor, "a m d"]
+
+
+@dataclasses.dataclass(frozen=True)
+class LeastSquares(Problem[State, LinearResiduals]):
+    """The sum of squared residuals of each row.
+
+    A row of infinite damping rests: its last step gained too little, or none is to be found.
 
     Args:
-        state: where to start, g rows.
-        evaluate: residuals and Jacobian of some of the rows at their states; the rows' numbers are given, too.
-        move: the state after a step.
-        iterations: at most.
-        solved: a row is done when the sum is below this.
+        residuals: residuals and Jacobian at the states of some rows; the rows' numbers are given, too.
+        moved: the states after a step.
+        solved: a row whose sum is below this is done.
     """
-    whole, at = state, torch.arange(len(state))
-    residual, jacobian = evaluate(state, at)
-    cost, at = residual.square().sum(1), at.to(residual.device)
-    damping = torch.full_like(cost, 1e-2)
-    done = cost < solved
-    for _ in range(iterations):
-        if bool(done.any()):
-            whole, going = put(whole, at, state), ~done
-            if bool(done.all()):
-                return whole
-            at, state, damping, cost = at[going], state[going], damping[going], cost[going]
-            residual, jacobian = residual[going], jacobian[going]
-        normal = jacobian.mT @ jacobian
+
+    residuals: Callable[[State, Int[Tensor, "a"]], Residuals]
+    moved: Callable[[State, Float[Tensor, "a d"]], State]
+    solved: float = SOLVED
+
+    def linearise(self, state: State, rows: Int[Tensor, "a"]) -> LinearResiduals:
+        """Evaluate residuals, Jacobian and the sum of squares."""
+        residual, jacobian = self.residuals(state, rows)
+        return LinearResiduals(residual.square().sum(1), residual, jacobian)
+
+    def step(self, model: LinearResiduals, damping: Float[Tensor, "a"]) -> Step:
+        """Return the damped step, shortened to `LARGEST_STEP`; zero without a factor, until damping makes one."""
+        normal = model.jacobian.mT @ model.jacobian
         diagonal = normal.diagonal(dim1=1, dim2=2)
         # Relative damping alone would leave a joint that moves nothing undamped.
-        damped = normal + torch.diag_embed(damping[:, None] * diagonal + 1e-3)
-        factor, info = torch.linalg.cholesky_ex(damped)
-        step = -torch.cholesky_solve(jacobian.mT @ residual[..., None], factor)[..., 0]
-        step = torch.where((info == 0)[:, None], step, 0.0)  # one row without a factor waits for more damping
-        step = step * (LARGEST_STEP / step.abs().amax(1, keepdim=True).clamp_min(LARGEST_STEP))
-        trial = move(state, step)
-        trial_residual, trial_jacobian = evaluate(trial, at)
-        trial_cost = trial_residual.square().sum(1)
-        better = trial_cost < cost
-        done = (better & ((trial_cost < solved) | (trial_cost > (1 - STALLED) * cost))) | (~better & (damping > LOST))
-        state = pick(better, trial, state)
-        residual = torch.where(better[:, None], trial_residual, residual)
-        jacobian = torch.where(better[:, None, None], trial_jacobian, jacobian)
-        cost = torch.where(better, trial_cost, cost)
-        damping = torch.where(better, damping / 3, damping * 4).clamp(1e-6, 1e6)
-    return put(whole, at, state)
+        factor, info = torch.linalg.cholesky_ex(normal + torch.diag_embed(damping[:, None] * diagonal + 1e-3))
+        x = -torch.cholesky_solve(model.jacobian.mT @ model.residual[..., None], factor)[..., 0]
+        x = torch.where((info == 0)[:, None], x, 0.0)
+        x = x * (LARGEST_STEP / x.abs().amax(1, keepdim=True).clamp_min(LARGEST_STEP))
+        return Step(x, ~(model.cost < self.solved) & torch.isfinite(damping))
+
+    def move(self, state: State, x: Float[Tensor, "a d"]) -> State:
+        """Return the states after a step."""
+        return self.moved(state, x)
+
+    def judge(
+        self, model: LinearResiduals, trial: LinearResiduals, step: Step, damping: Float[Tensor, "a"]
+    ) -> tuple[Bool[Tensor, "a"], Float[Tensor, "a"]]:
+        """Accept what lowers the sum."""
+        better = trial.cost < model.cost
+        rests = torch.where(better, trial.cost > (1 - STALLED) * model.cost, damping > LOST)
+        after = torch.where(better, damping / 3, damping * 4).clamp(1e-6, 1e6)
+        return better, torch.where(rests, torch.inf, after)

@@ -30,7 +30,7 @@ def problem_and_state(ellipsoid, generator: torch.Generator, spec: ContactSpec =
 
 def test_eq10_surface_rows_are_the_distance_at_the_points(ellipsoid, generator):
     problem, points, tension, jet = problem_and_state(ellipsoid, generator)
-    torch.testing.assert_close(problem.rows(points, tension, jet).surface, ellipsoid.value(points))
+    torch.testing.assert_close(problem.constraints(points, tension, jet).surface, ellipsoid.value(points))
 
 
 def test_eq11_normals_are_the_unit_outward_gradient(ellipsoid, generator):
@@ -42,7 +42,7 @@ def test_eq11_normals_are_the_unit_outward_gradient(ellipsoid, generator):
 
 def test_eq12_variance_row_is_positive_exactly_where_the_variance_exceeds_the_threshold(ellipsoid, generator):
     problem, points, tension, jet = problem_and_state(ellipsoid, generator)
-    rows = problem.rows(points, tension, jet)
+    rows = problem.constraints(points, tension, jet)
     assert torch.equal(rows.bounds[:, 3:6] > 0, ellipsoid.doubt_at(points) > INSIDE * SPEC.max_variance)
 
 
@@ -56,7 +56,7 @@ def test_eq13_forces_balance_whatever_the_tensions(ellipsoid, generator):
 
 def test_eq13_cone_rows_are_the_cosines_of_the_forces_and_imply_closure(ellipsoid, generator):
     problem, points, tension, jet = problem_and_state(ellipsoid, generator, ContactSpec.paper(), count=4000)
-    rows = problem.rows(points, tension, jet).bounds[:, :3]
+    rows = problem.constraints(points, tension, jet).bounds[:, :3]
     force, _ = forces_from_tensions(points, tension)
     cosine = -(unit(force) * jet.normals).sum(-1)
     cone = math.cos(math.atan(0.8 * math.cos(math.pi / 8)))
@@ -68,12 +68,12 @@ def test_eq13_cone_rows_are_the_cosines_of_the_forces_and_imply_closure(ellipsoi
 
 def test_eq14_centre_rows_are_the_mean_of_the_contacts(ellipsoid, generator):
     problem, points, tension, jet = problem_and_state(ellipsoid, generator)
-    torch.testing.assert_close(problem.rows(points, tension, jet).centre, points.mean(1))
+    torch.testing.assert_close(problem.constraints(points, tension, jet).centre, points.mean(1))
 
 
 def test_bounds_name_ball_separation_and_table(ellipsoid, generator):
     problem, points, tension, jet = problem_and_state(ellipsoid, generator)
-    bounds = problem.rows(points, tension, jet).bounds
+    bounds = problem.constraints(points, tension, jet).bounds
     assert bounds.shape == (6, 15)
     assert torch.equal(bounds[:, 6:9] > 0, torch.linalg.vector_norm(points, dim=-1) > INSIDE * 1.35)
     apart = torch.linalg.vector_norm(points - points.roll(-1, 1), dim=-1) * ellipsoid.scale
@@ -92,11 +92,11 @@ def test_bounds_name_ball_separation_and_table(ellipsoid, generator):
 
 def test_jacobian_of_every_row_against_automatic_differentiation(ellipsoid, generator):
     problem, points, tension, jet = problem_and_state(ellipsoid, generator)
-    rows = problem.rows(points, tension, jet)
+    rows = problem.constraints(points, tension, jet)
 
     def values(x: Tensor) -> tuple[Tensor, ...]:
         points = x[:, :9].unflatten(1, (3, 3))
-        r: Constraints = problem.rows(points, x[:, 9:], triple_jet(ellipsoid, points))
+        r: Constraints = problem.constraints(points, x[:, 9:], triple_jet(ellipsoid, points))
         return r.surface.sum(0), r.centre.sum(0), r.bounds.sum(0)
 
     wanted = torch.autograd.functional.jacobian(values, torch.cat([points.flatten(1), tension], 1))

@@ -22,7 +22,7 @@ from torchgrasp.ik.contact_first import refine_on_contacts
 from torchgrasp.ik.ranking import rank_in_group
 from torchgrasp.ik.refine import PAD_WEIGHT, TIP_WEIGHT, tip_residuals, tip_targets
 from torchgrasp.ik.rounds import Attempts, assign, best_grasps, executable
-from torchgrasp.optim import Residuals, levenberg_marquardt
+from torchgrasp.optim import LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.flatness import FlatnessConstraint, flatness_constraint
@@ -97,7 +97,7 @@ class JointProblem:
 
         A contact that slides carries its tip's target along and rotates the normal under the pad.
         """
-        hand, normals, normal_jacobian = self.hand, jet.normals, jet.turn
+        hand, normals, normal_jacobian = self.hand, jet.normals, jet.normal_jacobian
         identity = torch.eye(3).to(normals)
         target = float(self.shape.scale) * identity + hand.tip_radius.to(normals)[:, None, None] * normal_jacobian
         pads = spatial.directions(hand.tips.index, hand.tips.normal)
@@ -108,7 +108,7 @@ class JointProblem:
 
     def _contact_residuals(self, state: JointState, jet: TripleJet, flat: FlatnessConstraint | None) -> Residuals:
         """Return the residuals [mm] of the contact problem, zero where a bound holds, by points and tensions."""
-        rows = self.contact_problem.rows(state.points, state.tension, jet)
+        rows = self.contact_problem.constraints(state.points, state.tension, jet)
         violated = (rows.bounds > 0).to(rows.bounds)
         residuals = [rows.surface, violated * rows.bounds]
         jacobians = [rows.surface_by_x, violated[..., None] * rows.bounds_by_x]
@@ -131,7 +131,8 @@ class JointProblem:
             ) -> Residuals:
                 return self.residuals(state, None if flat is None else flat[rows])
 
-            state = levenberg_marquardt(state, evaluate, lambda x, step: x.integrate(self.hand, step), STEPS)
+            sliding = LeastSquares(evaluate, lambda x, step: x.integrate(self.hand, step))
+            state = levenberg_marquardt(sliding, state, STEPS)
         return state
 
 

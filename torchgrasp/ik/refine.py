@@ -21,7 +21,7 @@ from torch import Tensor
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, clearance_hinges
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian, wrench_of
-from torchgrasp.optim import SOLVED, Residuals, levenberg_marquardt
+from torchgrasp.optim import SOLVED, LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.values import Contacts
 
 ROUND_PAD, FLAT_PAD = math.radians(60), math.radians(40)
@@ -105,7 +105,8 @@ def refine(
     def evaluate(state: Configuration, rows: Int[Tensor, "a"]) -> Residuals:
         return grasp_residuals(hand, state, target[rows], normals[rows], world, tips_touch=True)
 
-    return levenberg_marquardt(configuration, evaluate, lambda x, step: x.integrate(hand, step), ITERATIONS, solved)
+    problem = LeastSquares(evaluate, lambda x, step: x.integrate(hand, step), solved)
+    return levenberg_marquardt(problem, configuration, ITERATIONS)
 
 
 def settle_tips(hand: Hand, configuration: Configuration, contacts: Contacts, solved: float) -> Configuration:
@@ -115,7 +116,8 @@ def settle_tips(hand: Hand, configuration: Configuration, contacts: Contacts, so
     def evaluate(state: Configuration, rows: Int[Tensor, "a"]) -> Residuals:
         return tip_residuals(SpatialJacobian.at(hand, state), target[rows], normals[rows])
 
-    return levenberg_marquardt(configuration, evaluate, lambda x, step: x.integrate(hand, step), ITERATIONS, solved)
+    problem = LeastSquares(evaluate, lambda x, step: x.integrate(hand, step), solved)
+    return levenberg_marquardt(problem, configuration, ITERATIONS)
 
 
 def open_hand(
@@ -140,4 +142,4 @@ def open_hand(
     def integrate(state: Configuration, step: Float[Tensor, "a d"]) -> Configuration:
         return state.integrate(hand, torch.cat([step.new_zeros(len(step), 6), step], 1))
 
-    return levenberg_marquardt(configuration, evaluate, integrate, ITERATIONS).joints
+    return levenberg_marquardt(LeastSquares(evaluate, integrate), configuration, ITERATIONS).joints

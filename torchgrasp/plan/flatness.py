@@ -48,14 +48,14 @@ def flatness_constraint(shape: Shape, points: Float[Tensor, "b 3 3"], flatness: 
     identity = torch.eye(3, dtype=points.dtype, device=points.device)
     # A cone of friction 1 without its axis is a ring of unit tangents, which turn with the normal.
     around = cone_edges(jet.normals, tangents(points, jet.normals), 1.0, GUIDE_POINTS) + jet.normals[:, :, None]
-    around, normal, turn = around.transpose(1, 2), jet.normals[:, None], jet.turn[:, None]
+    around, normal, turn = around.transpose(1, 2), jet.normals[:, None], jet.normal_jacobian[:, None]
     place = points[:, None] + radius * around  # (b, k, 3, 3)
     place_by_point = identity - radius * normal[..., :, None] * (around[..., None, :] @ turn)
     there = triple_jet(shape, place.flatten(0, 1))
     difference = there.normals.view_as(place) - normal
     chord = torch.linalg.vector_norm(difference, dim=-1)
     direction = difference / torch.where(chord == 0, 1.0, chord)[..., None]
-    change = there.turn.view(*place.shape, 3) @ place_by_point - turn
+    change = there.normal_jacobian.view(*place.shape, 3) @ place_by_point - turn
     slope = (direction[..., None, :] @ change)[..., 0, :]
     by_points = torch.einsum("bkij,il->bkilj", radius * slope, identity).flatten(3).flatten(1, 2)
     value = radius * (chord - 2 * math.sin(INSIDE * flatness / 2)).flatten(1)

@@ -77,7 +77,7 @@ class TripleJet(Batch):
         return unit(self.gradient)
 
     @property
-    def turn(self) -> Float[Tensor, "b 3 3 3"]:
+    def normal_jacobian(self) -> Float[Tensor, "b 3 3 3"]:
         """The derivative of each normal by its point: (1 - n n^T) H / |g|."""
         n, steep = self.normals, torch.linalg.vector_norm(self.gradient, dim=-1)[..., None, None]
         return (self.hessian - n[..., :, None] * (n[..., None, :] @ self.hessian)) / steep
@@ -103,6 +103,16 @@ class Constraints(Batch):
     centre_by_x: Float[Tensor, "b 3 12"]
     surface_by_x: Float[Tensor, "b 3 12"]
     bounds_by_x: Float[Tensor, "b k 12"]
+
+    @property
+    def values(self) -> Float[Tensor, "b r"]:
+        """Centre, surface and bounds, one after the other."""
+        return torch.cat([self.centre, self.surface, self.bounds], 1)
+
+    @property
+    def jacobian(self) -> Float[Tensor, "b r 12"]:
+        """The derivatives of `values`."""
+        return torch.cat([self.centre_by_x, self.surface_by_x, self.bounds_by_x], 1)
 
 
 def forces_from_tensions(
@@ -153,7 +163,7 @@ class ContactProblem:
         """Return the least z coordinate of contacts with these normals, at which a round fingertip is on the table."""
         return self.table + (self.tip_radius * (1 - normals[..., 2])).clamp_min(self.contact_height)
 
-    def rows(self, points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"], jet: TripleJet) -> Constraints:
+    def constraints(self, points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"], jet: TripleJet) -> Constraints:
         """Evaluate all rows and their Jacobians.
 
         Args:
@@ -182,7 +192,7 @@ class ContactProblem:
             lowest = self.least_height(jet.normals)
             values.append(lowest - points[..., 2] + (1 - INSIDE) * 0.1)
             by_tip = self.tip_radius * (lowest > self.table + self.contact_height)[..., None]
-            slopes.append(_own(-identity[2] - by_tip * jet.turn[..., 2, :]))
+            slopes.append(_own(-identity[2] - by_tip * jet.normal_jacobian[..., 2, :]))
         return Constraints(
             centre=points.mean(1),
             surface=jet.distance,
