@@ -18,6 +18,7 @@ from torchgrasp import (
 )
 from torchgrasp.frames import apply, rotate
 from torchgrasp.shape.condition import condition
+from torchgrasp.shape.gp import Normalisation
 from torchgrasp.shape.observations import Observations
 from torchgrasp.values import Contacts
 
@@ -50,8 +51,8 @@ def test_the_posterior_moves_with_its_observations(seen_cylinder, motion, genera
         x @ turn.T, observations.distance, observations.normal @ turn.T, *list(vars(observations).values())[3:]
     )
     origin = torch.zeros(3, dtype=torch.float64)
-    here = condition(observations, origin, 0.1, seen_cylinder)
-    there = condition(turned, motion[:3, 3], 0.1, seen_cylinder)
+    here = condition(observations, Normalisation(origin, 0.1), seen_cylinder)
+    there = condition(turned, Normalisation(motion[:3, 3], 0.1), seen_cylinder)
     queries = 0.01 * torch.randn(40, 3, generator=generator, dtype=torch.float64)
     a, b = here.predict(queries), there.predict(apply(motion, queries))
     torch.testing.assert_close(a.distance, b.distance, rtol=0, atol=1e-8)

@@ -46,7 +46,7 @@ class Ellipsoid:
             -2 * self.doubt * behind[:, None] * view,
         )
 
-    def slope(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def mean_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
         return self.value(x), x / x.new_tensor(self.axes) ** 2
 
     def normalise(self, points: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from torchgrasp.plan.closure_probability import closure_probability
 from torchgrasp.plan.surface_samples import FOOTPRINT, NODES, finer_grid, first_contact, sample_surfaces
 from torchgrasp.plan.wrench import closed_exact
 from torchgrasp.shape.condition import condition
-from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.gp import Normalisation, ShapeGP
 from torchgrasp.shape.joint_posterior import distance_covariance
 from torchgrasp.shape.observations import Observations
 from torchgrasp.specs import ContactSpec
@@ -36,7 +36,10 @@ def ball(seen_from: float, std_factor: float, noise: float = 0.02) -> ShapeGP:
     sigma = torch.full_like(distance, noise)
     observations = Observations(x, distance, torch.cat([n, torch.zeros_like(x[len(n) :])]), oriented, sigma, sigma)
     return condition(
-        observations, torch.zeros(3, dtype=torch.float64), RADIUS, PointCloud(RADIUS * n, n), std_factor=std_factor
+        observations,
+        Normalisation(torch.zeros(3, dtype=torch.float64), RADIUS),
+        PointCloud(RADIUS * n, n),
+        std_factor=std_factor,
     )
 
 
@@ -44,9 +47,9 @@ def contacts_on(shape: ShapeGP, generator: torch.Generator, count: int) -> Conta
     """Random triples on the mean surface whose normals are the mean's, closed there at friction 0.8."""
     x = unit(torch.randn(20 * count, 3, 3, generator=generator, dtype=torch.float64))
     for _ in range(8):
-        distance, slope = (t.unflatten(0, (len(x), 3)) for t in shape.slope(x.flatten(0, 1)))
+        distance, slope = (t.unflatten(0, (len(x), 3)) for t in shape.mean_and_gradient(x.flatten(0, 1)))
         x = x - (distance / (slope * slope).sum(-1))[..., None] * slope
-    normals = unit(shape.slope(x.flatten(0, 1))[1]).unflatten(0, (len(x), 3))
+    normals = unit(shape.mean_and_gradient(x.flatten(0, 1))[1]).unflatten(0, (len(x), 3))
     good = closed_exact(x, normals, 0.8) & (torch.linalg.vector_norm(x - x.roll(1, 1), dim=-1).amin(-1) > 0.3)
     x, normals = x[good][:count], normals[good][:count]
     return Contacts(shape.metres(x), normals)

@@ -8,7 +8,7 @@ import trimesh
 from benchmarks.plan.closure_survival import closure_survival
 
 from torchgrasp.shape.condition import condition
-from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.gp import Normalisation, ShapeGP
 from torchgrasp.shape.observations import Observations
 from torchgrasp.values import PointCloud
 
@@ -26,7 +26,7 @@ def shape() -> ShapeGP:
     oriented = torch.arange(len(x)) < 150
     noise = torch.full_like(distance, 0.01)
     observations = Observations(x, distance, torch.cat([n, torch.zeros_like(x[150:])]), oriented, noise, noise)
-    return condition(observations, center, RADIUS, PointCloud(RADIUS * n + center, n))
+    return condition(observations, Normalisation(center, RADIUS), PointCloud(RADIUS * n + center, n))
 
 
 def _ball(stretch: float = 1.0) -> trimesh.Trimesh:

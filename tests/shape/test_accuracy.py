@@ -17,7 +17,7 @@ from torchgrasp.shape.accuracy import (
     measure_shape,
 )
 from torchgrasp.shape.condition import condition
-from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.gp import Normalisation, ShapeGP
 from torchgrasp.shape.observations import Observations
 from torchgrasp.values import PointCloud
 
@@ -45,7 +45,7 @@ def shape(cloud: PointCloud) -> ShapeGP:
     oriented = torch.arange(len(x)) < 120
     noise = torch.full_like(distance, 0.01)
     observations = Observations(x, distance, torch.cat([n, torch.zeros_like(x[120:])]), oriented, noise, noise)
-    return condition(observations, torch.zeros(3, dtype=torch.float64), RADIUS, cloud)
+    return condition(observations, Normalisation(torch.zeros(3, dtype=torch.float64), RADIUS), cloud)
 
 
 def test_a_whole_ball_is_all_seen_and_nearly_exact(shape: ShapeGP, cloud: PointCloud):

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.linalg import unit
 from torchgrasp.shape.condition import condition, longest_distance
-from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.gp import Normalisation, ShapeGP
 from torchgrasp.shape.gradient_kernel import covariance
 from torchgrasp.shape.kernel import thin_plate
 from torchgrasp.shape.observations import Observations
@@ -43,7 +43,9 @@ def half_ball() -> ShapeGP:
     """The unit sphere as a ball of 50 mm at an offset, seen from the right."""
     known = _ball_observations()
     center = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
-    return condition(known, center, 0.05, PointCloud(0.05 * known.x[known.has_normal] + center), std_factor=0.65)
+    return condition(
+        known, Normalisation(center, 0.05), PointCloud(0.05 * known.x[known.has_normal] + center), std_factor=0.65
+    )
 
 
 def _queries(shape: ShapeGP, n: int) -> Tensor:
@@ -124,7 +126,7 @@ def test_jet_is_finite_at_the_observations_and_for_no_points(half_ball: ShapeGP)
 def test_a_rigid_motion_and_a_scale_move_the_estimate_with_the_object(half_ball: ShapeGP, motion: Tensor):
     known, turn = _ball_observations(), motion[:3, :3]
     moved = _observe(known.x @ turn.T, known.distance, known.normal @ turn.T, known.has_normal)
-    other = condition(moved, motion[:3, 3], 0.08, PointCloud(known.x))
+    other = condition(moved, Normalisation(motion[:3, 3], 0.08), PointCloud(known.x))
     x = _queries(half_ball, 50)
     a, b = half_ball.predict(half_ball.metres(x)), other.predict(other.metres(x @ turn.T))
     torch.testing.assert_close(a.distance, b.distance, rtol=0, atol=1e-9)
@@ -173,8 +175,8 @@ def test_three_points_make_the_papers_psi_indefinite_and_the_default_not():
     known = _observe(x, torch.zeros(3, dtype=torch.float64), unit(x), has)
     cloud, origin = PointCloud(torch.rand(5, 3)), torch.zeros(3, dtype=torch.float64)
     with pytest.raises(IndefiniteCovariance, match=r"eigenvalue -0\.2.*psi_scale of at least 1\.34"):
-        condition(known, origin, 1.0, cloud, psi_scale=1.0)
-    assert condition(known, origin, 1.0, cloud).domain_radius <= 1.5 * 3 / 8
+        condition(known, Normalisation(origin, 1.0), cloud, psi_scale=1.0)
+    assert condition(known, Normalisation(origin, 1.0), cloud).domain_radius <= 1.5 * 3 / 8
 
 
 def test_generous_noise_does_not_hide_an_indefinite_kernel():
@@ -183,4 +185,6 @@ def test_generous_noise_does_not_hide_an_indefinite_kernel():
     small, large = torch.full((3,), 0.01, dtype=torch.float64), torch.full((3,), 2.0, dtype=torch.float64)
     known = Observations(x, torch.zeros(3, dtype=torch.float64), unit(x), has, small, large)
     with pytest.raises(IndefiniteCovariance):
-        condition(known, torch.zeros(3, dtype=torch.float64), 1.0, PointCloud(torch.rand(5, 3)), psi_scale=1.0)
+        condition(
+            known, Normalisation(torch.zeros(3, dtype=torch.float64), 1.0), PointCloud(torch.rand(5, 3)), psi_scale=1.0
+        )

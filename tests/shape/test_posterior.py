@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.linalg import unit
 from torchgrasp.shape.condition import condition, posterior_given
-from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.gp import Normalisation, ShapeGP
 from torchgrasp.shape.gradient_kernel import covariance, cross_covariance
 from torchgrasp.shape.joint_posterior import JointEstimate, draw_samples
 from torchgrasp.shape.kernel import Kernel, differentiate, kernel_by_name, matern52_kernel, rbf_kernel, thin_plate
@@ -42,7 +42,7 @@ def _part(known: Observations, rows: Tensor | slice) -> Observations:
 
 
 def _fit(known: Observations, kernel: str | Kernel = "thin_plate") -> ShapeGP:
-    return condition(known, CENTER, SCALE, PointCloud(SCALE * known.x + CENTER), kernel=kernel)
+    return condition(known, Normalisation(CENTER, SCALE), PointCloud(SCALE * known.x + CENTER), kernel=kernel)
 
 
 def _queries(shape: ShapeGP, n: int) -> Tensor:
@@ -122,11 +122,11 @@ def test_derivatives_equal_finite_differences_of_predictions(name: str):
 def test_mean_and_gradient_without_variances_equal_the_jet():
     shape = _fit(_known())
     x = shape.normalise(_queries(shape, 700))
-    distance, gradient = shape.slope(x)
+    distance, gradient = shape.mean_and_gradient(x)
     jet = shape.jet(x)
     torch.testing.assert_close(distance, jet.distance, rtol=0, atol=1e-9)
     torch.testing.assert_close(gradient, jet.gradient, rtol=0, atol=1e-9)
-    assert torch.isfinite(shape.slope(shape.x)[1]).all()
+    assert torch.isfinite(shape.mean_and_gradient(shape.x)[1]).all()
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -186,7 +186,7 @@ def test_updates_equal_a_refit(name: str, with_normals: bool):
         known = Observations(**{**vars(known), "has_normal": known.has_normal & has})
     first, rest = _part(known, slice(0, -6)), _part(known, slice(-6, None))
     shape = _fit(first, name)
-    refit = condition(known, CENTER, SCALE, shape.cloud, kernel=shape.kernel)
+    refit = condition(known, Normalisation(CENTER, SCALE), shape.cloud, kernel=shape.kernel)
     updated = shape
     for rows in (slice(0, 1), slice(1, 3), slice(3, 6)):  # one after the other, and several at once
         new = _part(rest, rows)

@@ -23,7 +23,7 @@ def normal_variation(
     # A cone of friction 1 without its axis is a ring of unit tangents.
     around = cone_edges(normals, tangents(points, normals), 1.0, RING_POINTS) + normals[:, :, None]
     place = points[:, :, None] + RING_RADIUS / float(shape.scale) * around
-    _, gradient = shape.slope(project(shape, place.flatten(1, 2), steps=1).flatten(0, 1))
+    _, gradient = shape.mean_and_gradient(project(shape, place.flatten(1, 2), steps=1).flatten(0, 1))
     there = unit(gradient).unflatten(0, place.shape[:3])
     here = normals[:, :, None].expand_as(there)
     sine = torch.linalg.vector_norm(torch.linalg.cross(here, there), dim=-1)

@@ -56,7 +56,7 @@ class Shape(Protocol):
     @property
     def std_factor(self) -> float: ...  # noqa: D102
     def jet(self, x: Float[Tensor, "q 3"]) -> Jet: ...  # noqa: D102
-    def slope(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]: ...  # noqa: D102
+    def mean_and_gradient(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]: ...  # noqa: D102
     def normalise(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]: ...  # noqa: D102
     def metres(self, x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]: ...  # noqa: D102
 

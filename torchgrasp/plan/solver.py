@@ -168,7 +168,7 @@ def project(shape: Shape, points: Float[Tensor, "b k 3"], steps: int) -> Float[T
     """Move normalised points along the gradient onto f_d = 0 by Newton steps of the mean alone."""
     x = points.flatten(0, 1)
     for _ in range(steps):
-        distance, gradient = shape.slope(x)
+        distance, gradient = shape.mean_and_gradient(x)
         x = x + limit_norm(newton_step(distance, gradient, gradient)[:, None] * gradient, LONGEST_STEP)
     return x.view_as(points)
 

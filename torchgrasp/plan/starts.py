@@ -100,7 +100,7 @@ def draw_in(shape: Shape, points: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 
     that is nearest to it, uncertain or not; from near the centre the three spread over what faces them, and their
     own centre, Eq. (14), begins where it should end. Starts on the surface are guesses of contacts and stay.
     """
-    distance, _ = shape.slope(points.flatten(0, 1))
+    distance, _ = shape.mean_and_gradient(points.flatten(0, 1))
     far = distance.view(points.shape[:2]).abs().amax(-1) > FAR
     shifted = points - points.mean(1, keepdim=True)
     longest = torch.linalg.vector_norm(shifted, dim=-1).amax(-1)

@@ -120,7 +120,7 @@ def sample_surfaces(shape: ShapeGP, contacts: Contacts) -> SurfaceSamples:
     spread = points.new_empty(len(points), 12 * len(NODES), 12 * len(NODES))
     for rows in torch.arange(len(points), device=points.device).split(SETS):
         spread[rows] = deviations(shape, points[rows], normals[rows], nodes[rows])
-    slope = shape.slope((points[:, :, None] + nodes[..., None] * normals[:, :, None]).reshape(-1, 3))[1]
+    slope = shape.mean_and_gradient((points[:, :, None] + nodes[..., None] * normals[:, :, None]).reshape(-1, 3))[1]
     steps = deviation[..., None] * finer_grid().to(deviation)
     distance = shape.mean((points[:, :, None] + steps[..., None] * normals[:, :, None]).reshape(-1, 3))
     prior = float(shape.prior_block()[0, 0])

@@ -5,21 +5,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.linalg import cholesky
-from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.gp import Normalisation, ShapeGP
 from torchgrasp.shape.gradient_kernel import gram
 from torchgrasp.shape.kernel import Kernel, kernel_by_name
 from torchgrasp.shape.observations import Observations
 from torchgrasp.shape.posterior import Posterior
 from torchgrasp.values import PointCloud
 
-REACH = 1.25
-"""The domain's radius over that of the observations, at most: the posterior says nothing further out."""
-
 
 def condition(
     observations: Observations,
-    center: Float[Tensor, "3"],
-    scale: float,
+    normalisation: Normalisation,
     cloud: PointCloud,
     psi_scale: float = 1.5,
     std_factor: float = 1.0,
@@ -29,23 +25,22 @@ def condition(
 
     Args:
         observations: of the surface, normalised.
-        center: origin of the normalised frame [m].
-        scale: length [m] of the normalised unit.
-        cloud: what was seen.
-        psi_scale: 1 is the paper's psi, for which the covariance is indefinite.
+        normalisation: the frame of the observations.
+        cloud: what the camera saw.
+        psi_scale: 1 is the paper's psi, whose covariance is indefinite.
         std_factor: see `ShapeGP`.
-        kernel: "thin_plate", "matern52", "rbf" (see `kernel_by_name`), or any `Kernel` of normalised distances.
+        kernel: a name (see `kernel_by_name`), or any `Kernel` of normalised distances.
 
     Raises:
         BadArgument: an unknown kernel.
         IndefiniteCovariance: psi is too small for these observations.
     """
-    observations = observations.to(center)
+    observations = observations.to(normalisation.center)
     psi = psi_scale * longest_distance(observations.x)
     kernel = kernel_by_name(kernel, psi) if isinstance(kernel, str) else kernel
     posterior = posterior_given(observations, kernel)
     check_kernel(posterior, observations.least_noise)
-    return as_shape(posterior, center, scale, cloud, psi, std_factor)
+    return ShapeGP.of(posterior, normalisation, cloud, psi, std_factor)
 
 
 def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
@@ -63,39 +58,14 @@ def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
     return Posterior(observations.x, observations.has_normal, weights, factor, None, kernel)
 
 
-def as_shape(
-    posterior: Posterior,
-    center: Float[Tensor, "3"],
-    scale: float,
-    cloud: PointCloud,
-    psi: float,
-    std_factor: float = 1.0,
-) -> ShapeGP:
-    """Return the shape that a normalised posterior describes, valid as far as its observations and kernel reach."""
-    radius = REACH * float(torch.linalg.vector_norm(posterior.x, dim=-1).max())
-    return ShapeGP(
-        x=posterior.x,
-        has_normal=posterior.has_normal,
-        weights=posterior.weights,
-        factor=posterior.factor,
-        order=posterior.order,
-        kernel=posterior.kernel,
-        center=center,
-        psi=psi,
-        scale=scale,
-        domain_radius=min(posterior.kernel.diameter / 2.0, radius),
-        std_factor=std_factor,
-        cloud=cloud,
-    )
-
-
 def check_kernel(posterior: Posterior, least_noise: float) -> None:
-    """Refuse a kernel that is no covariance at observations further apart than its diameter.
+    """Refuse observations further apart than the kernel's diameter, unless K is positive definite there.
 
-    Generous noise on some rows can hide that from the factorisation; `least_noise`, a standard deviation, must suffice.
+    Generous noise on some rows can hide an indefinite K from the factorisation. So K is factored again with the
+    least standard deviation of all rows.
 
     Raises:
-        IndefiniteCovariance: it does not.
+        IndefiniteCovariance: K is not positive definite.
     """
     kernel = posterior.kernel
     if longest_distance(posterior.x) > kernel.diameter:

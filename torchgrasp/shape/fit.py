@@ -13,8 +13,8 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import fibonacci_sphere, unit
 from torchgrasp.shape.completion.complete import LEAST_NOISE, PART, Completion, complete_cloud
 from torchgrasp.shape.completion.free_space import free_space, free_space_violations
-from torchgrasp.shape.condition import as_shape, check_kernel, longest_distance
-from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.condition import check_kernel, longest_distance
+from torchgrasp.shape.gp import Normalisation, ShapeGP
 from torchgrasp.shape.kernel import Kernel, KernelName, kernel_by_name
 from torchgrasp.shape.observations import Observations, join, off_surface, on_surface
 from torchgrasp.shape.select import Criterion, select_points
@@ -105,7 +105,7 @@ def fit_shape(
     generator = torch.Generator().manual_seed(seed)
     seen = prepare_cloud(cloud, generator, clean=support == "camera")
     beside = _paper_support(seen, noise, generator) if support == "paper" else _camera_support(seen, noise, table)
-    x = beside.normalise(seen.points)
+    x = beside.frame.normalise(seen.points)
     candidates = on_surface(x, seen.normals, torch.full_like(x[:, 0], noise), beside.normal_noise)
 
     # The kernel's length is that of all candidates from the start, so that one factor grows from first to last.
@@ -118,7 +118,7 @@ def fit_shape(
     for part, shared in beside.parts:
         posterior = append_observations(posterior, part, shared)
     check_kernel(posterior, every.least_noise)
-    shape = as_shape(posterior, beside.center, beside.scale, seen.cloud, psi, beside.std_factor)
+    shape = ShapeGP.of(posterior, beside.frame, seen.cloud, psi, beside.std_factor)
     if beside.free is None:
         return shape
     free, least = beside.free
@@ -126,8 +126,7 @@ def fit_shape(
         rows = free_space_violations(shape, free, least)
         if not len(rows):
             break
-        longer = append_observations(shape, off_surface(free[rows], least[rows], FREE_NOISE / beside.scale))
-        shape = as_shape(longer, beside.center, beside.scale, seen.cloud, psi, beside.std_factor)
+        shape = shape.append(off_surface(free[rows], least[rows], FREE_NOISE / shape.scale))
     return shape
 
 
@@ -136,7 +135,7 @@ class _Support:
     """What is observed beside the points of the cloud, and the normalised frame.
 
     Args:
-        center, scale: origin [m] and unit [m] of the normalised frame.
+        frame: the normalised one.
         anchors: points inside and outside.
         normal_noise: standard deviation of the cloud's normals.
         std_factor: see `ShapeGP`.
@@ -144,17 +143,12 @@ class _Support:
         free: points of free space and the least signed distance there; None: none is known.
     """
 
-    center: Float[Tensor, "3"]
-    scale: float
+    frame: Normalisation
     anchors: Observations
     normal_noise: float
     std_factor: float = 1.0
     parts: tuple[tuple[Observations, Tensor | None], ...] = ()
     free: tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]] | None = None
-
-    def normalise(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Map points [m] to the normalised frame."""
-        return (points - self.center) / self.scale
 
 
 def _paper_support(seen: PreparedCloud, noise: float, generator: torch.Generator) -> _Support:
@@ -167,43 +161,41 @@ def _paper_support(seen: PreparedCloud, noise: float, generator: torch.Generator
         torch.cat([-torch.ones_like(center[:1]), torch.ones_like(sphere[:, 0])]),
         noise,
     )
-    return _Support(center, scale, anchors, noise)
+    return _Support(Normalisation(center, scale), anchors, noise)
 
 
 def _camera_support(seen: PreparedCloud, noise: float, table: float | None) -> _Support:
     """Return metric distances inside and outside; of a view also the outline, mirrored points and free space."""
     center = (seen.points.amin(0) + seen.points.amax(0)) / 2
-    scale = float(torch.linalg.vector_norm(seen.points - center, dim=-1).max())
+    frame = Normalisation(center, float(torch.linalg.vector_norm(seen.points - center, dim=-1).max()))
     surface, inside, parts, free = seen.points, True, (), None
     if seen.one_sided:
         completion = complete_cloud(PointCloud(seen.points, seen.normals, seen.viewpoint), table)
-        parts = _observe_completion(completion, center, scale)
+        parts = _observe_completion(completion, frame)
         surface = torch.cat([surface, completion.points.to(surface)])
-        free = free_space(completion.outline, center, scale, table)
+        free = free_space(completion.outline, frame, table)
         inside = float(completion.outline.violation(center.cpu())) == 0.0  # not so for an arch or a bowl
     sphere = OUTER_RADIUS * fibonacci_sphere(OUTER_POINTS).to(center)
     x = torch.cat([torch.zeros_like(center)[None], sphere]) if inside else sphere
-    distance = torch.cdist(x, (surface - center) / scale).amin(1)
+    distance = torch.cdist(x, frame.normalise(surface)).amin(1)
     distance = torch.cat([-distance[:1], distance[1:]]) if inside else distance
     anchors = off_surface(x, distance, noise)
-    return _Support(center, scale, anchors, NORMAL_NOISE, CAMERA_STD_FACTOR, parts, free)
+    return _Support(frame, anchors, NORMAL_NOISE, CAMERA_STD_FACTOR, parts, free)
 
 
-def _observe_completion(
-    completion: Completion, center: Float[Tensor, "3"], scale: float
-) -> tuple[tuple[Observations, Tensor | None], ...]:
+def _observe_completion(completion: Completion, frame: Normalisation) -> tuple[tuple[Observations, Tensor | None], ...]:
     """Return rim and mirrored points as observations of the surface."""
 
     def observe(points: Tensor, normals: Tensor, noise: float, normal_noise: float) -> Observations:
-        x = (points.to(center) - center) / scale
-        return on_surface(x, normals.to(center), torch.full_like(x[:, 0], noise / scale), normal_noise)
+        x = frame.normalise(points.to(frame.center))
+        return on_surface(x, normals.to(x), torch.full_like(x[:, 0], noise / frame.scale), normal_noise)
 
     outline = completion.outline
     mirrored = observe(completion.points, completion.normals, LEAST_NOISE, MIRROR_NORMAL_NOISE)
-    tilt = (completion.asymmetry / PART).to(center)  # of a field of that deviation, alike over that length
+    tilt = (completion.asymmetry / PART).to(frame.center)  # of a field of that deviation, alike over that length
     mirrored = dataclasses.replace(mirrored, normal_noise=torch.hypot(mirrored.normal_noise, tilt))
     rim = observe(outline.rim, outline.rim_normals, RIM_NOISE, RIM_NORMAL_NOISE)
-    return (rim, None), (mirrored, completion.deviations.to(center) / scale)
+    return (rim, None), (mirrored, completion.deviations.to(frame.center) / frame.scale)
 
 
 def _check_numbers(

@@ -16,16 +16,36 @@ from torchgrasp.shape.posterior import Posterior
 from torchgrasp.shape.update import append_observations
 from torchgrasp.values import PointCloud, ShapeEstimate
 
-MOST_JOINT = 1000
-"""Greatest number of points of one joint posterior, whose memory grows with their square."""
+MAX_JOINT = 1000
+"""Points of one joint posterior, at most: its memory grows with their square."""
+REACH = 1.25
+"""Radius of the domain over that of the observations, at most: further out the posterior says nothing."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Normalisation(Value):
+    """A frame without units: points [m] minus `center` [m], divided by `scale` [m]."""
+
+    center: Float[Tensor, "3"]
+    scale: float
+
+    def normalise(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+        """Map points [m] to the normalised frame."""
+        return (points - self.center.to(points)) / self.scale
+
+    def metres(self, x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+        """Map normalised points to the cloud's frame [m]."""
+        return x * self.scale + self.center.to(x)
 
 
 @dataclasses.dataclass(frozen=True)
 class ShapeDerivatives(Value):
-    """How an estimate changes with the query point, per metre.
+    """Derivatives of an estimate by the query point, per metre.
 
-    `distance` is the gradient of `ShapeEstimate.distance`, `normal[i, j]` the derivative of the i-th component of its
-    unit normal by the j-th coordinate, `variance` the gradient of its variance.
+    Args:
+        distance: gradient of `ShapeEstimate.distance`.
+        normal: derivative [i, j] of component i of the unit normal by coordinate j.
+        variance: gradient of the variance.
     """
 
     distance: Float[Tensor, "*b 3"]
@@ -34,25 +54,41 @@ class ShapeDerivatives(Value):
 
 
 @dataclasses.dataclass(frozen=True)
-class ShapeGP(Posterior):
+class ShapeGP(Posterior, Normalisation):
     """The posterior of an object's shape: g of Eq. (1), conditioned on observations. `fit_shape` makes it.
 
     Args:
         x, has_normal, weights, factor, order, kernel: see `Posterior`.
-        center: origin of the normalised frame [m] in the cloud's frame.
+        center, scale: see `Normalisation`.
         psi: length of the kernel, normalised: the thin plate's parameter.
-        scale: length [m] of the normalised unit.
         domain_radius: radius, normalised, of the ball in which the posterior is valid.
-        std_factor: ratio of the surface's real deviations to sqrt(variance), from held-out hidden sides.
+        std_factor: ratio of the surface's real deviations to sqrt(variance), from hidden sides of known objects.
         cloud: what the camera saw, after cleaning.
     """
 
-    center: Float[Tensor, "3"]
     psi: float
-    scale: float
     domain_radius: float
     std_factor: float
     cloud: PointCloud
+
+    @classmethod
+    def of(
+        cls, posterior: Posterior, normalisation: Normalisation, cloud: PointCloud, psi: float, std_factor: float = 1.0
+    ) -> "ShapeGP":
+        """Return the shape of a posterior, valid as far as the observations and the kernel reach."""
+        reach = REACH * float(torch.linalg.vector_norm(posterior.x, dim=-1).max())
+        return cls(
+            **_fields(posterior, Posterior),
+            **_fields(normalisation, Normalisation),
+            psi=psi,
+            domain_radius=min(posterior.kernel.diameter / 2.0, reach),
+            std_factor=std_factor,
+            cloud=cloud,
+        )
+
+    def append(self, new: Observations) -> "ShapeGP":
+        """Return the shape given further observations, normalised, with the same kernel and domain."""
+        return dataclasses.replace(self, **_fields(append_observations(self, new), Posterior))
 
     def to(self, *args: Any, **kwargs: Any) -> "ShapeGP":
         """Return the shape on another device; it stays in float64, which its condition number of 1e7 needs."""
@@ -63,14 +99,6 @@ class ShapeGP(Posterior):
     def device(self) -> torch.device:
         """Where the shape lives; planners put their points there."""
         return self.x.device
-
-    def normalise(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        """Map points [m] of the cloud's frame to the normalised frame."""
-        return (points - self.center.to(points)) / self.scale
-
-    def metres(self, x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        """Map normalised points to the cloud's frame [m]."""
-        return x * self.scale + self.center.to(x)
 
     def contains(self, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
         """Tell which points [m] lie in the ball in which the posterior is valid."""
@@ -136,8 +164,8 @@ class ShapeGP(Posterior):
             BadArgument: as `predict`, or too many points.
         """
         x = self._queries("points", check_tensor("points", points, (None, 3)))
-        if len(x) > MOST_JOINT:
-            raise BadArgument("points", f"{len(x)} points", f"at most {MOST_JOINT} points at once")
+        if len(x) > MAX_JOINT:
+            raise BadArgument("points", f"{len(x)} points", f"at most {MAX_JOINT} points at once")
         found = joint_estimate(self, x)
         return JointEstimate(found.mean.to(points.dtype), found.covariance.to(points.dtype))
 
@@ -202,8 +230,7 @@ class ShapeGP(Posterior):
             torch.full_like(x[:, 0], noise / self.scale),
             torch.full_like(x[:, 0], normal_noise),
         )
-        longer = append_observations(self, new)
-        return dataclasses.replace(self, **{f.name: getattr(longer, f.name) for f in dataclasses.fields(Posterior)})
+        return self.append(new)
 
     def _queries(self, name: str, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "q 3"]:
         """Return query points [m] as a list in the normalised frame; refuse what lies outside the domain."""
@@ -231,7 +258,12 @@ def _check_queries(points: Any) -> Float[Tensor, "*b 3"]:
     return points
 
 
-def _shaped(found: Any, points: Float[Tensor, "*b 3"]) -> Any:
+def _shaped(rows: Any, points: Float[Tensor, "*b 3"]) -> Any:
     """Return a value of rows in the dtype, on the device and with the batch shape of the query points."""
-    fields = {f.name: getattr(found, f.name).to(points) for f in dataclasses.fields(found)}
-    return type(found)(**{name: t.reshape(points.shape[:-1] + t.shape[1:]) for name, t in fields.items()})
+    fields = _fields(rows.to(points), type(rows))
+    return type(rows)(**{name: t.reshape(points.shape[:-1] + t.shape[1:]) for name, t in fields.items()})
+
+
+def _fields(value: Value, kind: type) -> dict[str, Any]:
+    """Return the fields of a value that a kind of value has."""
+    return {f.name: getattr(value, f.name) for f in dataclasses.fields(kind)}

@@ -44,7 +44,7 @@ def _closed_share(shape: ShapeGP, contacts: Contacts, friction: float, n: int, s
     root = (vectors * eigenvalues.clamp(min=0.0).sqrt()) @ vectors.T
     generator = torch.Generator().manual_seed(seed)
     drawn = (torch.randn(n, len(root), dtype=torch.float64, generator=generator) @ root).reshape(n, 3, RUNGS, 7)
-    mean, slope = shape.slope(ladder.reshape(-1, 3))
+    mean, slope = shape.mean_and_gradient(ladder.reshape(-1, 3))
     distance = mean.reshape(3, RUNGS) + drawn[..., 0]
     deviations = (drawn[..., 1:4] - drawn[..., 4:]) / (2 * width)
     gradient = slope.reshape(3, RUNGS, 3) + deviations @ axes

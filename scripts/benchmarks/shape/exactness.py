@@ -14,7 +14,7 @@ from torchgrasp.frames import rotation_from_vector
 from torchgrasp.linalg import cholesky, fibonacci_sphere
 from torchgrasp.shape.condition import condition, longest_distance
 from torchgrasp.shape.fit import fit_shape
-from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.gp import Normalisation, ShapeGP
 from torchgrasp.shape.gradient_kernel import gram
 from torchgrasp.shape.kernel import kernel_by_name
 from torchgrasp.shape.observations import Observations, join, off_surface, on_surface
@@ -44,7 +44,7 @@ def posterior(n: int, seed: int = 0) -> ShapeGP:
     """Return the shape from n points with normals of a random view, in normalised units."""
     x, normals = random_view(n, torch.Generator().manual_seed(seed))
     origin = torch.zeros(3, dtype=torch.float64)
-    return condition(observe(x, normals), origin, 1.0, PointCloud(x, normals), PSI_SCALE)
+    return condition(observe(x, normals), Normalisation(origin, 1.0), PointCloud(x, normals), PSI_SCALE)
 
 
 def queries_in(shape: ShapeGP, count: int, seed: int = 1) -> Tensor:
@@ -102,7 +102,9 @@ def bench_selection(seeds: int = 5) -> list[Row]:
         ratios.append(slow / fast)
     x, normals = random_view(70, torch.Generator().manual_seed(0))
     seen, origin = observe(x, normals), torch.zeros(3, dtype=torch.float64)
-    fit = least_seconds(lambda: condition(seen, origin, 1.0, PointCloud(x, normals), PSI_SCALE), repeats=21)
+    fit = least_seconds(
+        lambda: condition(seen, Normalisation(origin, 1.0), PointCloud(x, normals), PSI_SCALE), repeats=21
+    )
     y, noise = seen.rows()
     psi = PSI_SCALE * longest_distance(x)
     matrix = gram(kernel_by_name("thin_plate", psi), x, len(x)) + torch.diag_embed(noise)
@@ -132,13 +134,13 @@ def bench_laws(seeds: int = 10) -> Row:
     for seed in range(seeds):
         generator = torch.Generator().manual_seed(seed)
         x, normals = random_view(150, generator)
-        here = condition(observe(x, normals), x.new_zeros(3), 0.1, PointCloud(x, normals), PSI_SCALE)
+        here = condition(observe(x, normals), Normalisation(x.new_zeros(3), 0.1), PointCloud(x, normals), PSI_SCALE)
         points = queries_in(here, 300)
         known = here.predict(points)
 
         turn = rotation_from_vector(torch.randn(3, generator=generator, dtype=torch.float64))
         shift = torch.randn(3, generator=generator, dtype=torch.float64)
-        moved = condition(observe(x @ turn.T, normals @ turn.T), shift, 0.1, here.cloud, PSI_SCALE)
+        moved = condition(observe(x @ turn.T, normals @ turn.T), Normalisation(shift, 0.1), here.cloud, PSI_SCALE)
         found = moved.predict(points @ turn.T + shift)
         change = [
             (found.distance - known.distance),
@@ -147,12 +149,16 @@ def bench_laws(seeds: int = 10) -> Row:
         ]
         worst["motion"] = max(worst["motion"], *(float(c.abs().max()) for c in change))
 
-        scaled = condition(observe(x, normals), x.new_zeros(3), 102.4, here.cloud, PSI_SCALE).predict(1024 * points)
+        scaled = condition(observe(x, normals), Normalisation(x.new_zeros(3), 102.4), here.cloud, PSI_SCALE).predict(
+            1024 * points
+        )
         change = [scaled.distance - known.distance, scaled.normal - known.normal, scaled.std_m / 1024 - known.std_m]
         worst["units"] = max(worst["units"], *(float(c.abs().max()) for c in change))
 
         order = torch.randperm(len(x), generator=generator)
-        again = condition(observe(x[order], normals[order]), x.new_zeros(3), 0.1, here.cloud, PSI_SCALE).predict(points)
+        again = condition(
+            observe(x[order], normals[order]), Normalisation(x.new_zeros(3), 0.1), here.cloud, PSI_SCALE
+        ).predict(points)
         change = [again.distance - known.distance, again.normal - known.normal, again.variance - known.variance]
         worst["order"] = max(worst["order"], *(float(c.abs().max()) for c in change))
     return Row(
@@ -173,7 +179,7 @@ def bench_update(n: int = 70, seeds: int = 10) -> Row:
         origin = torch.zeros(3, dtype=torch.float64)
         seen = observe(x[:n], normals[:n])
         seen = join(seen, observe_support(x[:n]))
-        before = condition(seen, origin, 1.0, cloud, PSI_SCALE)
+        before = condition(seen, Normalisation(origin, 1.0), cloud, PSI_SCALE)
         touch = partial(before.update, x[n:], normals[n:], noise=NOISE, normal_noise=NOISE)
         every = join(seen, observe(x[n:], normals[n:]))
         refit = partial(condition, every, origin, 1.0, cloud, PSI_SCALE, kernel=before.kernel)

@@ -13,6 +13,7 @@ from benchmarks.common import Row, least_seconds, peak_mib, random_view
 from benchmarks.shape.exactness import NOISE, PSI_SCALE, observe, posterior, queries_in
 from benchmarks.shape.gpytorch_peer import gpytorch_posterior, product_floor
 from torchgrasp.shape.condition import condition
+from torchgrasp.shape.gp import Normalisation
 from torchgrasp.values import PointCloud
 
 CHUNKS = (30, 100, 300)
@@ -93,10 +94,10 @@ def bench_raw(queries: int) -> Row:
     """Fit to 1000 raw points with normals, then ask for means and normals."""
     x, normals = random_view(1000, torch.Generator().manual_seed(0))
     seen, cloud = observe(x, normals), PointCloud(x, normals)
-    fit = least_seconds(lambda: condition(seen, x.new_zeros(3), 1.0, cloud, PSI_SCALE), repeats=2)
-    shape = condition(seen, x.new_zeros(3), 1.0, cloud, PSI_SCALE)
+    fit = least_seconds(lambda: condition(seen, Normalisation(x.new_zeros(3), 1.0), cloud, PSI_SCALE), repeats=2)
+    shape = condition(seen, Normalisation(x.new_zeros(3), 1.0), cloud, PSI_SCALE)
     points = queries_in(shape, queries)
-    means = least_seconds(lambda: shape.slope(shape.normalise(points)), repeats=2)
+    means = least_seconds(lambda: shape.mean_and_gradient(shape.normalise(points)), repeats=2)
     return Row(
         f"1000 raw points, no selection (4000 rows): fit and {queries} means and normals",
         "<= 3 s on two cores",

@@ -7,6 +7,7 @@ import torch
 from torchgrasp.shape.completion.free_space import free_space, free_space_violations
 from torchgrasp.shape.completion.silhouette import silhouettes
 from torchgrasp.shape.fit import fit_shape
+from torchgrasp.shape.gp import Normalisation
 from torchgrasp.values import PointCloud
 
 CENTER = torch.tensor([0.0, 0.0, 0.06], dtype=torch.float64)
@@ -15,7 +16,7 @@ CENTER = torch.tensor([0.0, 0.0, 0.06], dtype=torch.float64)
 def test_free_space_is_free_and_its_least_distance_is_a_lower_bound(seen_cylinder: PointCloud):
     assert seen_cylinder.viewpoint is not None
     outline = silhouettes(seen_cylinder)
-    x, least = free_space(outline, CENTER, 0.07, table=0.0)
+    x, least = free_space(outline, Normalisation(CENTER, 0.07), table=0.0)
     points, least = 0.07 * x + CENTER, 0.07 * least
     assert len(x) > 100 and torch.linalg.vector_norm(x, dim=-1).max() < 1.15
     beside = torch.linalg.vector_norm(points[:, :2], dim=-1) - 0.03
@@ -23,7 +24,7 @@ def test_free_space_is_free_and_its_least_distance_is_a_lower_bound(seen_cylinde
     # The outline is known to about a spacing of the cloud's points.
     assert (apart - least).min() > -0.003
     assert (points[:, 2] < 0).any() and (points[:, 2] > 0).any()
-    above, _ = free_space(outline, CENTER, 0.07)
+    above, _ = free_space(outline, Normalisation(CENTER, 0.07))
     assert len(above) < len(x)
 
 

@@ -105,7 +105,7 @@ class Belief:
 
     def _distance(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
         """Return how far points are outside the surface [m], to first order, and its outward normal there."""
-        value, gradient = self.shape.slope(self._within(points))
+        value, gradient = self.shape.mean_and_gradient(self._within(points))
         length = torch.linalg.vector_norm(gradient, dim=-1)
         return self.shape.scale * value / length, gradient / length[:, None]
 

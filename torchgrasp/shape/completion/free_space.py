@@ -6,7 +6,7 @@ from torch import Tensor
 
 from torchgrasp.linalg import farthest_points
 from torchgrasp.shape.completion.silhouette import TIE, Outlines, Silhouette
-from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.gp import Normalisation, ShapeGP
 
 OUTLINE_ERROR = 0.005
 """How far [m] the object may stand out of the outline: a camera loses rims. Of 24 true surfaces 99 % stay within
@@ -30,7 +30,7 @@ MOST = 16
 
 
 def free_space(
-    outline: Outlines, center: Float[Tensor, "3"], scale: float, table: float | None = None
+    outline: Outlines, frame: Normalisation, table: float | None = None
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
     """Return points beside the outline and under the table, normalised, and the least signed distance there.
 
@@ -40,11 +40,10 @@ def free_space(
 
     Args:
         outline: of the views.
-        center: origin of the normalised frame [m].
-        scale: length [m] of the normalised unit.
+        frame: the normalised one.
         table: height [m] of the table, whose normal is z; None: not known.
     """
-    origin = center.double().cpu()
+    origin, scale = frame.center.double().cpu(), frame.scale
     points = torch.cat([_points_beside(view, origin, scale) for view in outline.views])
     least = outline.hull_distance(points) - OUTLINE_ERROR
     if table is not None:
@@ -56,7 +55,7 @@ def free_space(
             least = torch.cat([least, torch.full_like(ground[:, 0], below)])
     x = (points - origin) / scale
     keep = (torch.linalg.vector_norm(x, dim=-1) < REACH) & (least > LEAST)
-    return x[keep].to(center), least[keep].to(center) / scale
+    return x[keep].to(frame.center), least[keep].to(frame.center) / scale
 
 
 def free_space_violations(shape: ShapeGP, x: Float[Tensor, "n 3"], least: Float[Tensor, "n"]) -> Tensor:
