@@ -1,4 +1,4 @@
-"""`torchgrasp hand`: a first hand.toml for a URDF, what is wrong with a hand or what it is like, and its postures."""
+"""`torchgrasp hand`: draft a hand.toml, check a hand, sample its postures."""
 
 import time
 from pathlib import Path
@@ -19,8 +19,8 @@ from torchgrasp.posture_model.sample import OPPOSED_COSINE, SampleSpec, Sampling
 from torchgrasp.report.hands import draw_hand, opposed_posture
 from torchgrasp.testing import check_hand, find_faults, random_joints
 
-POSTURES = 5000
-"""Random postures that tell what a hand is like."""
+DESCRIBED_POSTURES = 5000
+"""Random postures from which a hand is described: shares vary by 1 %."""
 
 
 def new(
@@ -30,14 +30,14 @@ def new(
     name: str | None = None,
     seed: int = 0,
 ) -> int:
-    """Write a first hand.toml beside a URDF: fingers, pads, coupling and pairs of links that can meet.
+    """Write a first hand.toml beside a URDF: fingers, pads, coupling, pairs of links.
 
     Args:
         urdf: the hand: boxes, cylinders and spheres as collision shapes, masses, limits, drives.
-        tips: links of the three grasping fingertips in grasp order, then those of fingers to park; by default the
-            ends of the tree's branches, where they are three.
+        tips: links of the three grasping fingertips in grasp order, then of fingers to park; by default the ends of the
+            tree's three branches.
         name: of the hand; by default the robot's.
-        seed: of the random postures by which pads and pairs are guessed.
+        seed: of the random postures from which pads and pairs are guessed.
     """
     check_seed(seed)
     target = urdf.parent / "hand.toml"
@@ -56,7 +56,7 @@ def check(
     fingers: str = "default",
     out: Path = Path("hand.png"),
 ) -> int:
-    """Say by name what is wrong with a hand; a sound one is described and drawn.
+    """Name every fault of a hand; describe and draw a sound one.
 
     Args:
         hand: name of a shipped hand, or the folder of another.
@@ -71,51 +71,40 @@ def check(
         sound = check_hand(hand, fingers)
     with naming("--out", "path"):
         check_folder(out.parent)
-    joints = random_joints(sound, POSTURES)
+    joints = random_joints(sound, DESCRIBED_POSTURES)
     print(describe(sound, joints))
-    modelled = find_hand(hand) / "mixture.safetensors"
-    none = f"none; python scripts/train.py posture-model {hand} learns it"
-    print(f"learned model: {modelled if modelled.exists() else none}")
+    model = find_hand(hand) / "mixture.safetensors"
+    print(f"learned model: {model if model.exists() else f'none; learn it by scripts/train.py posture-model {hand}'}")
     write_file(out, draw_hand(sound, opposed_posture(sound, joints)))
     print(f"picture: {out}")
     return 0
 
 
 def describe(hand: Hand, joints: torch.Tensor) -> str:
-    """Return what a hand is like: its fingers, and what it does in random postures.
-
-    Args:
-        hand: the hand.
-        joints: postures (n, h) [rad], uniform within the limits.
-    """
+    """Describe a hand: its joints, its fingers, and its random postures `joints` (n, h) [rad]."""
+    actuated, tips = hand.actuated, hand.tips
     lines = [f"{hand.name}, option {hand.source.option}: {hand.dof} actuated of {len(hand.tree.joint_names)} joints"]
-    ends = torch.rad2deg(torch.stack([hand.lower, hand.upper], 1)).tolist()
-    lines += [
-        f"  {n:24} {low:7.1f} to {high:6.1f} degrees" for n, (low, high) in zip(hand.joint_names, ends, strict=True)
-    ]
-    tips = hand.tips
+    for name, low, high in zip(hand.joint_names, hand.lower.rad2deg(), hand.upper.rad2deg(), strict=True):
+        lines.append(f"  {name:24} {low:7.1f} to {high:6.1f} degrees")
     for k, finger in enumerate(tips.names):
         radius = float(tips.radius[k])
         tip = f"a sphere of {1e3 * radius:.1f} mm" if radius else "a point"
         contact, normal = (", ".join(f"{x:.4g}" for x in v[k].tolist()) for v in (tips.contact, tips.normal))
         lines.append(f"finger {finger}: {tip} on {tips.links[k]}")
         lines.append(f"  contact [{contact}] m, normal [{normal}]")
-    for j, name in enumerate(hand.tree.joint_names):
-        row, offset = hand.actuated.coupling[j], float(hand.actuated.offset[j])
-        sources = torch.nonzero(row)[:, 0].tolist()
-        if not sources:
+    for name, row, offset in zip(hand.tree.joint_names, actuated.coupling, actuated.offset, strict=True):
+        source = int(row.abs().argmax())
+        if not row[source]:
             lines.append(f"joint {name} is parked at {offset:.4g}")
-        elif hand.joint_names[sources[0]] != name:
-            lines.append(f"joint {name} = {float(row[sources[0]]):.4g} {hand.joint_names[sources[0]]} + {offset:.4g}")
+        elif hand.joint_names[source] != name:
+            lines.append(f"joint {name} = {row[source]:.4g} {hand.joint_names[source]} + {offset:.4g}")
     points, normals = hand.fingertips(joints)
     free = hand.self_clearance(joints) > 0
-    sides = torch.linalg.vector_norm(points - points.roll(1, 1), dim=-1)[free]
-    pairs = (normals * normals.roll(1, 1)).sum(-1)[free]
-    share, opposed = 1 - float(free.double().mean()), float((pairs < OPPOSED_COSINE).any(1).double().mean())
-    lines.append(f"{share:.1%} of {len(joints)} random postures collide with themselves")
+    sides = 1e3 * torch.linalg.vector_norm(points - points.roll(1, 1), dim=-1)[free]
+    opposed = ((normals * normals.roll(1, 1)).sum(-1)[free] < OPPOSED_COSINE).any(1).double().mean()
+    lines.append(f"{1 - free.double().mean():.1%} of {len(joints)} random postures collide with themselves")
     lines.append(f"{opposed:.1%} of the free ones have two pads face to face (an angle above 120 degrees)")
-    least, most = (1e3 * float(sides.quantile(q)) for q in (0.01, 0.99))
-    lines.append(f"fingertips are {least:.0f} to {most:.0f} mm apart")
+    lines.append(f"fingertips are {sides.quantile(0.01):.0f} to {sides.quantile(0.99):.0f} mm apart")
     return "\n".join(lines)
 
 
@@ -128,7 +117,7 @@ def sample(
     workers: int = 1,
     seed: int = 0,
 ) -> int:
-    """Write random postures of a hand that touch nothing of itself, with their codes; continues what was begun.
+    """Write random postures without self-collision, with their codes; continue an unfinished folder.
 
     Args:
         hand: name of a shipped hand, or the folder of another.
@@ -152,7 +141,7 @@ def sample(
 
 
 def _print_faults(hand: str | Path, fingers: str) -> int:
-    """Print what is wrong with a hand's files, one line each; return 0 for nothing, else the exit code 2."""
+    """Print every fault of a hand's files; return the exit code, 0 or 2."""
     try:
         faults: list[GraspError] = list(find_faults(hand, fingers))
     except BadArgument as error:

@@ -1,7 +1,8 @@
-"""One picture of a hand: pads, the frame of the palm, and the limits of its joints."""
+"""One picture of a hand: pads, the palm's frame, joint limits."""
 
 import io
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -15,35 +16,34 @@ from torchgrasp.report.palette import AXES, FINGERS, GRID, HAND, INK, PAPER
 from torchgrasp.report.pictures import Direction, turned
 from torchgrasp.report.solids import PARKED, finger_of_links, solids_from_hand
 
+if TYPE_CHECKING:
+    from PIL.ImageDraw import ImageDraw
+    from PIL.ImageFont import FreeTypeFont, ImageFont
+
 TILE = (SIZE[0] * 3 // 4, SIZE[1] * 3 // 4)
 """Width and height of one of the four views [pixels]."""
 BAR = 30
-"""Height of the line of one joint [pixels]."""
+"""Height of the line of one joint [pixels]: room for its name."""
 NORMAL = 0.03
-"""Length of the pads' normals [m]."""
+"""Length of the arrows along the pads' normals [m], about a fingertip's."""
 FRAME = 0.6
-"""Length of the palm's axes over the diagonal of the palm: they reach out of it."""
+"""Length of the palm's axes over the palm's diagonal: they reach out of it."""
 EYE = (1.0, -0.9, 0.5)
-"""From where the hand is seen."""
+"""Direction from which the hand is seen: front, right, above."""
 
 
 def opposed_posture(hand: Hand, joints: Float[Tensor, "n h"]) -> Float[Tensor, "h"]:
-    """Return the posture, of those free of self-collision, whose pads face the middle of the fingertips most.
-
-    Args:
-        hand: the hand.
-        joints: postures; where none is free, all of them compete.
-    """
+    """Return the posture, free of self-collision if any is, whose pads best face their middle."""
     points, normals = hand.fingertips(joints)
-    toward = points.mean(1, keepdim=True) - points
-    facing = (normals * unit(toward)).sum(-1).amin(1) - 10.0 * torch.linalg.vector_norm(toward, dim=-1).amax(1)
+    inward = points.mean(1, keepdim=True) - points
+    facing = (normals * unit(inward)).sum(-1).amin(1) - 10.0 * torch.linalg.vector_norm(inward, dim=-1).amax(1)
     return joints[(facing + (hand.self_clearance(joints) > 0).to(facing) * 10.0).argmax()]
 
 
 def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
-    """Draw a hand at a posture from two sides and at both ends of its limits, and under it the limits; return a PNG.
+    """Draw a hand at a posture from two sides, at both ends of its limits, and the limits; return a PNG.
 
-    An arrow on each fingertip is its contact with the pad's normal; red, green and blue are x, y and z of the palm.
+    An arrow on each fingertip is its normal. The palm's x, y and z are red, green and blue.
     """
     from PIL import Image, ImageDraw, ImageFont
 
@@ -59,17 +59,17 @@ def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
     pen = ImageDraw.Draw(sheet)
     for k, (title, posture, eye) in enumerate(views):
         picture = Image.open(io.BytesIO(draw_posture(hand, posture, eye)))
-        corner = (k % 2 * width, k // 2 * height)
-        sheet.paste(picture.resize(TILE, Image.Resampling.LANCZOS), corner)
-        pen.text((corner[0] + 16, corner[1] + 12), title, INK, font)
-    _draw_limits(pen, hand, joints, 2 * height + BAR // 2, font)
+        x, y = k % 2 * width, k // 2 * height
+        sheet.paste(picture.resize(TILE, Image.Resampling.LANCZOS), (x, y))
+        pen.text((x + 16, y + 12), title, INK, font)
+    _draw_limits(pen, font, hand, joints, 2 * height + BAR // 2)
     buffer = io.BytesIO()
     sheet.save(buffer, format="PNG")
     return buffer.getvalue()
 
 
 def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> bytes:
-    """Draw the hand in the frame of its palm, with its pads and that frame, as a PNG."""
+    """Draw the hand with its pads in the palm's frame, as a PNG."""
     solids = solids_from_hand(hand, hand.expand_joints(joints), hand.tree.joint_names, torch.eye(4).to(joints))
     points, normals = (x.cpu().numpy() for x in hand.fingertips(joints[None].double()))
     canvas = Canvas()
@@ -84,40 +84,26 @@ def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> byte
     return canvas.render_png(np.concatenate(corners), eye)
 
 
-def _draw_limits(pen: object, hand: Hand, joints: Float[Tensor, "h"], top: int, font: object) -> None:
-    """Draw the range of each joint in degrees on one scale, with the posture as a mark."""
-    from PIL import ImageDraw, ImageFont
-
-    assert isinstance(pen, ImageDraw.ImageDraw)
-    assert isinstance(font, ImageFont.ImageFont | ImageFont.FreeTypeFont)
+def _draw_limits(
+    pen: "ImageDraw", font: "ImageFont | FreeTypeFont", hand: Hand, joints: Float[Tensor, "h"], top: int
+) -> None:
+    """Draw the range of each joint in degrees, with the posture as a mark."""
     low, high = float(hand.lower.min()), float(hand.upper.max())
     left, right = 380, 2 * TILE[0] - 260
-
-    def across(value: float) -> float:
-        return left + (right - left) * (value - low) / (high - low)
-
-    owner = _fingers_of_joints(hand)
     pen.text((16, top), "joint [degrees], the posture as a mark", INK, font)
-    for k, name in enumerate(hand.joint_names):
-        y = top + BAR * (k + 1)
-        color = FINGERS[owner[k]] if owner[k] != PARKED else HAND
-        ends = [float(hand.lower[k]), float(hand.upper[k])]
+    for k, (name, finger) in enumerate(zip(hand.joint_names, _fingers_of_joints(hand), strict=True)):
+        y, ends = top + BAR * (k + 1), [float(hand.lower[k]), float(hand.upper[k])]
+        first, last, at = (left + (right - left) * (q - low) / (high - low) for q in (*ends, float(joints[k])))
         pen.text((16, y), name[:34], INK, font)
         pen.line([(left, y + 12), (right, y + 12)], GRID, 1)
-        pen.rounded_rectangle([across(ends[0]), y + 6, across(ends[1]), y + 18], 5, color)
-        at = across(float(joints[k]))
+        pen.rounded_rectangle([first, y + 6, last, y + 18], 5, HAND if finger == PARKED else FINGERS[finger])
         pen.line([(at, y), (at, y + 24)], INK, 3)
         pen.text((right + 20, y), " to ".join(f"{np.rad2deg(e):.0f}" for e in ends), INK, font)
 
 
 def _fingers_of_joints(hand: Hand) -> Sequence[int]:
-    """Return the finger of each actuated joint, `PARKED` for one that moves several."""
+    """Return the finger of each actuated joint; `PARKED` for one that moves several."""
     fingers = finger_of_links(hand)
-    found = []
-    for k in range(hand.dof):
-        moved = {
-            fingers[hand.tree.link_names[int(hand.tree.child[j])]]
-            for j in torch.nonzero(hand.actuated.coupling[:, k])[:, 0].tolist()
-        }
-        found.append(moved.pop() if len(moved) == 1 else PARKED)
-    return found
+    child = [fingers[hand.tree.link_names[k]] for k in hand.tree.child.tolist()]
+    moved = [{child[j] for j in torch.nonzero(column)[:, 0].tolist()} for column in hand.actuated.coupling.T]
+    return [owners.pop() if len(owners) == 1 else PARKED for owners in moved]
