@@ -219,7 +219,7 @@ def test_groups_of_commands_have_help(words, capsys):
 def test_cloud_check_reports_a_view(capsys):
     assert cli.main(["cloud", "check", VIEW]) == 0
     said = capsys.readouterr().out
-    for word in ("points      1000", "mm", "spacing", "noise", "strays", "normals", "viewpoint   given"):
+    for word in ("points      1000", "mm", "spacing", "noise", "outliers", "normals", "viewpoint   given"):
         assert word in said
 
 
@@ -229,8 +229,8 @@ def test_cloud_check_names_what_to_mend(tmp_path, capsys):
     np.save(tmp_path / "ball.npy", np.concatenate([points, points[:5]]))
     assert cli.main(["cloud", "check", str(tmp_path / "ball.npy"), "--viewpoint", "0", "0", "1"]) == 0
     said = capsys.readouterr().out
-    assert "6005 (5 of them copies)" in said and "thin_cloud" in said
-    assert next(line for line in said.splitlines() if line.startswith("strays")).split()[1] == "3"
+    assert "6005 (5 of them copies)" in said and "voxel_downsample" in said
+    assert next(line for line in said.splitlines() if line.startswith("outliers")).split()[1] == "3"
 
 
 @pytest.mark.parametrize("name", ["missing cloud", "empty ply", "other suffix", "two points", "millimetres", "nan"])

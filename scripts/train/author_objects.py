@@ -6,7 +6,7 @@ Run it after a change of `train/object_shapes.py` or of the virtual camera; it n
 import numpy as np
 import trimesh
 
-from torchgrasp.cloud.camera import partial_view
+from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.io.read import save_cloud
 from torchgrasp.files import write_atomically, write_file
 from torchgrasp.objects import DATA, list_objects
@@ -39,5 +39,5 @@ def write_object(name: str) -> None:
     }
     write_atomically(DATA / name / "parts.npz", lambda path: np.savez_compressed(path, **columns))
     azimuth, elevation = VIEWS[name]
-    save_cloud(partial_view(mesh, azimuth, elevation), DATA / name / "view.ply")
+    save_cloud(partial_view(mesh, look_at(azimuth, elevation, target=mesh)), DATA / name / "view.ply")
     print(f"{name}: {len(mesh.faces)} faces, {mesh.volume * 1e6:.0f} cm3, {len(parts)} parts")

@@ -44,7 +44,7 @@ def test_depth_of_a_sphere_agrees_with_the_closed_form():
 
 
 def test_an_exact_view_lies_on_the_mesh_and_faces_the_camera(box):
-    cloud = partial_view(box, 35.0, 25.0, noise=False)
+    cloud = partial_view(box, look_at(35.0, 25.0, target=box), noise=False)
     assert len(cloud) == 1000
     assert cloud.normals is None
     _, distance, face = trimesh.proximity.closest_point(box, cloud.points.numpy())
@@ -55,7 +55,7 @@ def test_an_exact_view_lies_on_the_mesh_and_faces_the_camera(box):
 
 
 def test_noise_has_the_documented_size_and_is_repeatable(box):
-    cloud, again, other = (partial_view(box, 35.0, 25.0, seed=s) for s in (0, 0, 1))
+    cloud, again, other = (partial_view(box, look_at(35.0, 25.0), seed=s) for s in (0, 0, 1))
     assert torch.equal(cloud.points, again.points)
     assert not torch.equal(cloud.points, other.points)
     distance = 1e3 * trimesh.proximity.closest_point(box, cloud.points.numpy())[1]
@@ -73,8 +73,9 @@ def test_grazing_surfaces_fade_out():
     plate = trimesh.creation.box([0.2, 0.2, 0.01])
     shares = []
     for elevation in (60.0, 10.0, 2.0):
-        exact = partial_view(plate, 0.0, elevation, n=10**6, noise=False)
-        noisy = partial_view(plate, 0.0, elevation, n=10**6)
+        pose = look_at(0.0, elevation, target=plate)
+        exact = partial_view(plate, pose, n=10**6, noise=False)
+        noisy = partial_view(plate, pose, n=10**6)
         shares.append(len(noisy) / len(exact))
         if elevation == 2.0:  # only the rim of the plate, seen head on, is left
             assert (noisy.points[:, 0] > 0.05).float().mean() > 0.9
@@ -83,21 +84,25 @@ def test_grazing_surfaces_fade_out():
 
 
 def test_fewer_pixels_than_points_give_all_pixels(box):
-    far = partial_view(box, 0.0, 0.0, distance=8.0, noise=False)
+    far = partial_view(box, look_at(0.0, 0.0, 8.0), noise=False)
     depth = render_depth(box, look_at(0.0, 0.0, 8.0))
     assert len(far) == int((depth > 0).sum()) == len(cloud_from_depth(depth, default_intrinsics())) < 1000
 
 
 def test_refusals(box):
     with pytest.raises(BadArgument, match="elevation"):
-        partial_view(box, 0.0, 90.0)
+        look_at(0.0, 90.0)
     with pytest.raises(BadArgument, match="azimuth"):
         look_at(float("nan"), 0.0, 0.5)
     with pytest.raises(BadArgument, match="distance"):
-        partial_view(box, 0.0, 0.0, distance=-1.0)
+        look_at(0.0, 0.0, distance=-1.0)
     with pytest.raises(BadArgument, match="n: found 3"):
-        partial_view(box, 0.0, 0.0, n=3)
+        partial_view(box, look_at(0.0, 0.0), n=3)
+    with pytest.raises(BadArgument, match="camera_pose"):
+        partial_view(box, 2 * look_at(0.0, 0.0))
     with pytest.raises(BadArgument, match="size"):
         render_depth(box, look_at(0.0, 0.0, 0.5), size=(0, 640))
     with pytest.raises(MeshError):
         render_depth(trimesh.Trimesh(), look_at(0.0, 0.0, 0.5))
+    with pytest.raises(MeshError):
+        look_at(0.0, 0.0, target=trimesh.Trimesh())

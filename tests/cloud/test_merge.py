@@ -2,7 +2,7 @@ import pytest
 import torch
 import trimesh
 
-from torchgrasp.cloud.camera import partial_view
+from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.diagnose import diagnose_cloud, format_report
 from torchgrasp.cloud.filter import remove_outliers, voxel_downsample
 from torchgrasp.cloud.io.read import read_cloud, save_cloud
@@ -21,7 +21,7 @@ EYE = torch.eye(4, dtype=torch.float64)
 @pytest.fixture(scope="module")
 def two_views():
     mesh = load_object("jug").mesh
-    return [partial_view(mesh, azimuth, 35.0, n=600) for azimuth in (60.0, 240.0)]
+    return [partial_view(mesh, look_at(azimuth, 35.0, target=mesh), n=600) for azimuth in (60.0, 240.0)]
 
 
 def in_own_frames(views, motion):
@@ -49,7 +49,7 @@ def test_views_come_together_with_outward_normals_wherever_their_frames_were(two
 
 def test_a_second_view_uncovers_the_hidden_side():
     mesh = load_object("spray").mesh
-    views = [partial_view(mesh, azimuth, 35.0, n=600) for azimuth in (60.0, 240.0)]
+    views = [partial_view(mesh, look_at(azimuth, 35.0, target=mesh), n=600) for azimuth in (60.0, 240.0)]
     points, face = trimesh.sample.sample_surface(mesh, 400, seed=0)
     side = torch.from_numpy(points[mesh.face_normals[face][:, 2] > -0.5].copy())
 
@@ -63,7 +63,9 @@ def test_a_second_view_uncovers_the_hidden_side():
 def test_the_hidden_side_of_two_views_is_completed_too():
     """Each camera has an outline of its own; a cloud that does not say who saw what has none."""
     mesh = load_object("cylinder").mesh
-    merged = merge_clouds([partial_view(mesh, azimuth, 35.0, n=600) for azimuth in (60.0, 180.0)], [EYE, EYE])
+    merged = merge_clouds(
+        [partial_view(mesh, look_at(azimuth, 35.0, target=mesh), n=600) for azimuth in (60.0, 180.0)], [EYE, EYE]
+    )
     points, face = trimesh.sample.sample_surface(mesh, 3000, seed=0)
     side = torch.from_numpy(points[mesh.face_normals[face][:, 2] > -0.5].copy())
     hidden = side[torch.cdist(side, merged.points).amin(1) > 0.006]

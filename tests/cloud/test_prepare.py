@@ -3,7 +3,7 @@ import pytest
 import torch
 import trimesh
 
-from torchgrasp.cloud.camera import partial_view
+from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.prepare import MAX_POINTS, clean_cloud, estimate_normals, prepare_cloud
 from torchgrasp.errors import TooFewPoints
 from torchgrasp.linalg import unit
@@ -18,7 +18,8 @@ def truth(mesh, points):
 
 @pytest.fixture(scope="module")
 def ball_view():
-    return partial_view(trimesh.creation.icosphere(subdivisions=5, radius=0.04), 20.0, 30.0, noise=False)
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.04)
+    return partial_view(ball, look_at(20.0, 30.0, target=ball), noise=False)
 
 
 def test_normals_of_a_sphere_agree_with_the_closed_form(ball_view):

@@ -13,7 +13,8 @@ from torchgrasp.values import PointCloud
 
 @pytest.fixture(scope="module")
 def ball_view():
-    return partial_view(trimesh.creation.icosphere(subdivisions=5, radius=0.04), 20.0, 30.0, noise=False)
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.04)
+    return partial_view(ball, look_at(20.0, 30.0, target=ball), noise=False)
 
 
 def test_the_guess_follows_a_rigid_motion_and_finds_the_camera(ball_view):
@@ -28,7 +29,7 @@ def test_the_guess_follows_a_rigid_motion_and_finds_the_camera(ball_view):
 
 def test_a_cloud_in_the_frame_of_its_camera_was_seen_from_the_origin():
     thing = load_object("jug")
-    pose = look_at(60.0, 35.0, 0.5, torch.from_numpy(thing.mesh.bounds.mean(0)))
+    pose = look_at(60.0, 35.0, target=thing.mesh)
     torch.testing.assert_close(pose[:3, 3], thing.view.viewpoint, atol=1e-6, rtol=0)
     assert estimate_viewpoint(PointCloud(apply(inverse(pose), thing.view.points))).tolist() == [0, 0, 0]
 

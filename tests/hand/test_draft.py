@@ -5,7 +5,7 @@ import torch
 import trimesh
 
 from torchgrasp import ContactSpec, Status, certify, fit_mixture, plan_grasps
-from torchgrasp.cloud.camera import partial_view
+from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.frames import apply, rotate
 from torchgrasp.hand.draft import draft_hand
@@ -87,7 +87,7 @@ def test_names_of_the_urdf_cannot_break_the_toml(claw):
 
 def rests_on(shape: trimesh.Trimesh):
     shape.apply_translation([0, 0, -shape.bounds[0, 2]])
-    return partial_view(shape, 20.0, 40.0, noise=False), shape
+    return partial_view(shape, look_at(20.0, 40.0, target=shape), noise=False), shape
 
 
 @pytest.mark.parametrize("mode", ["joint", "contact_first"])

@@ -1,14 +1,13 @@
-"""`torchgrasp cloud`: look at a cloud before it is grasped, or make one of a mesh."""
+"""`torchgrasp cloud`: check a cloud, or render one from a mesh."""
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from torchgrasp.cli.common import check_seed, naming
-from torchgrasp.cloud.camera import partial_view
-from torchgrasp.cloud.diagnose import diagnose_cloud, format_report
-from torchgrasp.cloud.io.read import read_cloud, save_cloud
+from torchgrasp.cloud import diagnose_cloud, format_report, look_at, partial_view, read_cloud, save_cloud
 from torchgrasp.errors import BadArgument
 from torchgrasp.mesh import read_mesh
 
@@ -18,7 +17,7 @@ def check(
     /,
     viewpoint: tuple[float, float, float] | None = None,
 ) -> int:
-    """Say what a point cloud is like: unit, size, density, noise, strays, normals, viewpoint, and what to mend.
+    """Report size, density, noise, outliers, normals and viewpoint of a point cloud, and what would make it better.
 
     Args:
         cloud: point cloud of one object in metres, z up (.ply, .pcd, .npy, .npz, .xyz).
@@ -30,25 +29,36 @@ def check(
     return 0
 
 
+@dataclasses.dataclass(frozen=True)
+class CameraPosition:
+    """Where the camera is, seen from the centre of the mesh.
+
+    Args:
+        azimuth: direction of the camera, from x towards y, in degrees.
+        elevation: of the camera above the horizontal, in degrees.
+        distance: from the centre of the mesh to the camera, in metres.
+    """
+
+    azimuth: float = 30.0
+    elevation: float = 30.0
+    distance: float = 0.5
+
+
 def render(
     mesh: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MESH")],
     /,
     out: Path,
-    azimuth: float = 30.0,
-    elevation: float = 30.0,
-    distance: float = 0.5,
+    camera: Annotated[CameraPosition, tyro.conf.arg(name="")] = CameraPosition(),
     points: int = 1000,
     no_noise: bool = False,
     seed: int = 0,
 ) -> int:
-    """Write what a depth camera sees of a mesh from one side, with the errors of an active stereo camera.
+    """Write the point cloud that a depth camera sees of a mesh, with the noise of an active stereo camera.
 
     Args:
         mesh: closed mesh of an object in metres, z up (.ply, .obj, .stl, ...).
         out: point cloud to write (.npz or .ply), with the viewpoint.
-        azimuth: direction of the camera, from x towards y, in degrees.
-        elevation: of the camera above the horizontal, in degrees.
-        distance: from the centre of the mesh to the camera, in metres.
+        camera: where the camera is.
         points: number of points; fewer if fewer pixels see the object.
         no_noise: an exact camera.
         seed: of the noise and of the choice of points.
@@ -60,7 +70,8 @@ def render(
         solid = read_mesh(mesh)
     options = [naming(f"--{name}", name) for name in ("azimuth", "elevation", "distance")]
     with options[0], options[1], options[2], naming("--points", "n"), naming("MESH", "points", "depth"):
-        cloud = partial_view(solid, azimuth, elevation, distance, points, not no_noise, seed)
+        pose = look_at(camera.azimuth, camera.elevation, camera.distance, solid)
+        cloud = partial_view(solid, pose, points, not no_noise, seed)
     with naming("--out", "path"):
         save_cloud(cloud, out)
     print(f"{len(cloud)} points, {out}")

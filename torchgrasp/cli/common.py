@@ -1,4 +1,4 @@
-"""What the commands share: the checks of options, and errors that name the option."""
+"""Checks that the commands share, and errors that name the option."""
 
 import contextlib
 import tempfile
@@ -11,7 +11,7 @@ from torchgrasp.values import PointCloud
 
 @contextlib.contextmanager
 def naming(option: str, *names: str) -> Iterator[None]:
-    """Give an error that names one of `names` the name of the option that the value came from."""
+    """Rename the argument of an error from one of `names` to the option that set it."""
     try:
         yield
     except BadArgument as error:
@@ -21,7 +21,7 @@ def naming(option: str, *names: str) -> Iterator[None]:
 
 
 def check_folder(path: Path) -> None:
-    """Refuse a folder that cannot be made or written, by trying; whatever was made for the trial is removed.
+    """Refuse a folder that cannot be made or written, by trying; nothing of the trial remains.
 
     Raises:
         OutputError: the folder cannot be made or written.
@@ -47,12 +47,12 @@ def check_seed(seed: int) -> None:
         raise BadArgument("--seed", seed, "an integer in [0, 2^63)")
 
 
-def table_height(seen: PointCloud, table: float | None, no_table: bool) -> float | None:
-    """Return the height [m] of the table: the given one, none, or the lowest point of the cloud."""
-    return None if no_table else float(seen.points[:, 2].min()) if table is None else table
+def table_height(cloud: PointCloud, table: float | None, no_table: bool) -> float | None:
+    """Return the height [m] of the table: the given one, none, or the cloud's lowest point."""
+    return None if no_table else float(cloud.points[:, 2].min()) if table is None else table
 
 
 def check_table(table: float | None, no_table: bool) -> None:
-    """Refuse a table that is there and is not."""
+    """Refuse a table's height together with `--no-table`."""
     if table is not None and no_table:
         raise BadArgument("--table", f"{table:g} and --no-table", "one of the two")

@@ -1,4 +1,4 @@
-"""A virtual depth camera: exact depth images of a mesh, and partial views with the errors of a real sensor."""
+"""A virtual depth camera: exact depth images of a mesh, and views with the errors of a real sensor."""
 
 import math
 from typing import TYPE_CHECKING
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     import trimesh
 
 WIDTH, HEIGHT = 640, 480
-"""Pixels of the default camera."""
+"""Pixels of the default camera, as of common stereo cameras."""
 FOCAL = 616.0
-"""Focal length [px] of the default camera, that of a stereo camera with a horizontal view of 55 degrees."""
+"""Focal length [px] of the default camera: a horizontal view of 55 degrees."""
 BASELINE = 0.055
-"""Distance [m] between the eyes of the stereo camera of the noise model."""
+"""Distance [m] between the eyes of the modelled stereo camera, as of common ones."""
 
 
 def default_intrinsics() -> Float[Tensor, "3 3"]:
@@ -35,18 +35,22 @@ def default_intrinsics() -> Float[Tensor, "3 3"]:
 
 
 def look_at(
-    azimuth: float, elevation: float, distance: float, target: Float[Tensor, "3"] | None = None
+    azimuth: float,
+    elevation: float,
+    distance: float = 0.5,
+    target: "Float[Tensor, '3'] | trimesh.Trimesh | None" = None,
 ) -> Float[Tensor, "4 4"]:
-    """Return obj_from_camera of a camera that looks at a target, its image upright (z of the object frame is up).
+    """Return obj_from_camera of a camera that looks at a target; its image is upright, with z of the object up.
 
     Args:
         azimuth: direction from the target to the camera, from x towards y [deg].
         elevation: above the horizontal [deg], in [-89.9, 89.9].
         distance: from the target to the camera [m], in [0.01, 10].
-        target: point (3,) [m] in the middle of the image; None: the origin.
+        target: point (3,) [m] in the middle of the image, or a mesh, for the centre of its box; None: the origin.
 
     Raises:
         BadArgument: an angle or a distance outside its range.
+        MeshError: the mesh has no faces.
 
     >>> look_at(0.0, 0.0, 0.5)[:3, 3]
     tensor([0.5000, 0.0000, 0.0000], dtype=torch.float64)
@@ -61,7 +65,12 @@ def look_at(
     away = torch.tensor([math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)], dtype=torch.float64)
     right = torch.tensor([-math.sin(a), math.cos(a), 0.0], dtype=torch.float64)
     down = torch.linalg.cross(-away, right)
-    centre = torch.zeros(3, dtype=torch.float64) if target is None else target.double()
+    if target is None:
+        centre = torch.zeros(3, dtype=torch.float64)
+    elif isinstance(target, Tensor):
+        centre = target.double()
+    else:
+        centre = torch.from_numpy(np.asarray(_with_faces(target).bounds).mean(0))
     return rigid(torch.stack([right, down, -away], -1), centre + distance * away)
 
 
@@ -80,7 +89,7 @@ def render_depth(
         size: height and width of the image [px].
 
     Raises:
-        BadArgument: intrinsics of no pinhole camera, a pose that is not rigid, a size below 1 or above 4096 pixels.
+        BadArgument: intrinsics of no pinhole camera; a pose that is not rigid; a size outside [1, 4096] pixels.
         MeshError: the mesh has no faces.
 
     >>> import trimesh
@@ -94,43 +103,41 @@ def render_depth(
 
 def partial_view(
     mesh: "trimesh.Trimesh",
-    azimuth: float,
-    elevation: float,
-    distance: float = 0.5,
+    camera_pose: Float[Tensor, "4 4"],
     n: int = 1000,
     noise: bool = True,
     seed: int = 0,
 ) -> PointCloud:
-    """Return what the default depth camera sees of a mesh from one side: n points [m], the viewpoint, no normals.
+    """Return n points [m] that the default depth camera sees of a mesh, with the viewpoint and without normals.
 
-    The camera looks at the centre of the mesh's bounding box. With `noise` the image has the errors of an active
-    stereo camera: white disparity noise of 0.12 px and steps of 1/32 px (0.9 mm at 0.5 m, growing with the square of
-    the depth), a smooth bias of 0.8 mm rms over 12 px, a quarter of the pixels on a rim flying off backwards by
-    8 mm on average and a third of them missing, 1 % of all pixels missing, and surfaces seen at more than 72.5
-    degrees from their normal fading out, none left at 87 degrees.
+    The noise is that of an active stereo camera:
+
+    * disparity: white noise of 0.12 px, in steps of 1/32 px (0.9 mm at 0.5 m, growing with the squared depth);
+    * a smooth bias of 0.8 mm rms over 12 px;
+    * rims: a quarter of the pixels fly off backwards by 8 mm on average, and a third is missing;
+    * 1 % of all pixels is missing;
+    * grazing surfaces fade out between 72.5 and 87 degrees from their normal.
 
     Args:
-        mesh: in the object frame [m], z up.
-        azimuth: direction of the camera, from x towards y [deg].
-        elevation: of the camera above the horizontal [deg].
-        distance: from the centre of the mesh to the camera [m].
+        mesh: in the object frame [m].
+        camera_pose: obj_from_camera, see `look_at`.
         n: points drawn from the pixels; all pixels if there are fewer.
         noise: whether the camera errs.
         seed: of the noise and of the draw.
 
     Raises:
-        BadArgument: a number outside its range.
+        BadArgument: fewer than 4 points; a pose that is not rigid.
         MeshError: the mesh has no faces.
         TooFewPoints: the camera sees nothing of the mesh.
 
     >>> import trimesh
-    >>> len(partial_view(trimesh.creation.box([0.06, 0.06, 0.1]), azimuth=30.0, elevation=30.0, n=500))
+    >>> box = trimesh.creation.box([0.06, 0.06, 0.1])
+    >>> len(partial_view(box, look_at(azimuth=30.0, elevation=30.0, target=box), n=500))
     500
     """
     if n < 4:
         raise BadArgument("n", n, "at least 4 points")
-    centre = torch.from_numpy(np.asarray(mesh.bounds).mean(0)) if len(mesh.faces) else None
-    pose, intrinsics = look_at(azimuth, elevation, distance, centre), default_intrinsics()
+    pose, intrinsics = check_rigid("camera_pose", camera_pose).double(), default_intrinsics()
     depth, cosine = _cast(mesh, pose, intrinsics, (HEIGHT, WIDTH))
     generator = torch.Generator().manual_seed(seed)
     if noise:
@@ -140,27 +147,33 @@ def partial_view(
     return PointCloud(cloud.points[rows], None, cloud.viewpoint)
 
 
+def _with_faces(mesh: "trimesh.Trimesh") -> "trimesh.Trimesh":
+    """Return the mesh, or refuse one without faces."""
+    if not len(mesh.faces):
+        raise MeshError("mesh", "no faces", "a mesh with a surface")
+    return mesh
+
+
 def _cast(
     mesh: "trimesh.Trimesh",
     obj_from_camera: Float[Tensor, "4 4"],
     intrinsics: Float[Tensor, "3 3"],
     size: tuple[int, int],
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """Return depth [m] and the cosine of the angle between ray and face normal, both 0 where nothing is seen."""
+    """Return depth [m] and the cosine between ray and face normal, both 0 where nothing is seen."""
     height, width = size
     if not (1 <= height <= 4096 and 1 <= width <= 4096):
         raise BadArgument("size", size, "height and width in [1, 4096] pixels")
-    if not len(mesh.faces):
-        raise MeshError("mesh", "no faces", "a mesh with a surface")
+    _with_faces(mesh)
     row, column = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
     x, y = (column - intrinsics[0, 2]) / intrinsics[0, 0], (row - intrinsics[1, 2]) / intrinsics[1, 1]
     rays = torch.stack([x, y, torch.ones_like(x)], -1)
-    inside = _within_silhouette_box(mesh, obj_from_camera, intrinsics, row, column)
+    inside = _within_image_box(mesh, obj_from_camera, intrinsics, row, column)
     direction = rotate(obj_from_camera, rays[inside]).numpy()
     origin = obj_from_camera[:3, 3].numpy()
     face = np.asarray(mesh.ray.intersects_first(np.broadcast_to(origin, direction.shape), direction))
     hit = face >= 0
-    # Embree works in float32: only the face is taken from it, the distance is that of the face's plane in float64.
+    # Embree works in float32: it gives the face, whose plane gives the distance in float64.
     normal, corner = mesh.face_normals[face[hit]], mesh.vertices[mesh.faces[face[hit], 0]]
     against = (normal * direction[hit]).sum(-1)
     z = ((corner - origin) * normal).sum(-1) / against
@@ -171,14 +184,14 @@ def _cast(
     return images[0], images[1]
 
 
-def _within_silhouette_box(
+def _within_image_box(
     mesh: "trimesh.Trimesh",
     obj_from_camera: Float[Tensor, "4 4"],
     intrinsics: Float[Tensor, "3 3"],
     row: Float[Tensor, "h w"],
     column: Float[Tensor, "h w"],
 ) -> Tensor:
-    """Tell which pixels lie in the box around the mesh's image; all of them when it reaches behind the camera."""
+    """Tell which pixels lie in the box of the mesh's image; all of them if the mesh reaches behind the camera."""
     camera_from_obj = inverse(obj_from_camera)
     vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
     x, y, z = (vertices @ camera_from_obj[:3, :3].T + camera_from_obj[:3, 3]).unbind(-1)
@@ -191,7 +204,7 @@ def _within_silhouette_box(
 def _add_noise(
     depth: Float[Tensor, "h w"], cosine: Float[Tensor, "h w"], generator: torch.Generator
 ) -> Float[Tensor, "h w"]:
-    """Return the depth image of an erring stereo camera; the errors are listed in `partial_view`."""
+    """Return the depth image [m] with the noise that `partial_view` describes."""
     from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
     def normal() -> Tensor:
@@ -200,17 +213,17 @@ def _add_noise(
     def uniform() -> Tensor:
         return torch.rand(depth.shape, generator=generator, dtype=torch.float64)
 
-    seen = depth > 0
-    disparity = FOCAL * BASELINE / torch.where(seen, depth, 1.0) + 0.12 * normal()
+    measured = depth > 0
+    disparity = FOCAL * BASELINE / torch.where(measured, depth, 1.0) + 0.12 * normal()
     noisy = FOCAL * BASELINE / (torch.round(32 * disparity) / 32).clamp_min(1 / 32)
     smooth = torch.from_numpy(gaussian_filter(normal().numpy(), 12.0))
     noisy = noisy + 0.0008 * smooth / smooth.std()
     # A rim pixel has, within two pixels, background or a surface more than 10 mm away.
-    far = torch.from_numpy(maximum_filter(torch.where(seen, depth, 100.0).numpy(), 5))
-    near = torch.from_numpy(minimum_filter(torch.where(seen, depth, 100.0).numpy(), 5))
+    far = torch.from_numpy(maximum_filter(torch.where(measured, depth, 100.0).numpy(), 5))
+    near = torch.from_numpy(minimum_filter(torch.where(measured, depth, 100.0).numpy(), 5))
     rim = (far - depth > 0.010) | (depth - near > 0.010)
     flying = rim & (uniform() < 0.25)
     noisy = noisy + torch.where(flying, -0.008 * torch.log1p(-uniform()), 0.0)
     angle = torch.rad2deg(torch.arccos(cosine.clamp(0.0, 1.0)))
     lost = (rim & (uniform() < 0.35)) | (uniform() < 0.01) | (uniform() < (angle - 72.5) / (87.0 - 72.5))
-    return torch.where(seen & ~lost, noisy, 0.0)
+    return torch.where(measured & ~lost, noisy, 0.0)

@@ -1,4 +1,4 @@
-"""A depth image becomes a point cloud with a viewpoint."""
+"""From a depth image to a point cloud with a viewpoint."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -19,19 +19,19 @@ def cloud_from_depth(
 ) -> PointCloud:
     """Return the points of a pinhole camera's depth image, with the camera as viewpoint.
 
-    Pixel (row v, column u) with depth z is the point z ((u - cx) / fx, (v - cy) / fy, 1) of the camera's frame
-    (x right, y down, z forward). Pixels with depth 0, NaN or infinity were not measured and are left out.
+    A pixel (row v, column u) of depth z is the point z ((u - cx) / fx, (v - cy) / fy, 1) in the camera's frame:
+    x right, y down, z forward. Depths of 0, NaN or infinity are not measured.
 
     Args:
         depth: distance along the optical axis [m]; integer images in mm need `depth.double() / 1000`.
         intrinsics: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [pixels].
-        mask: pixels of the object; without it every measured pixel is taken for the object.
-        camera_pose: obj_from_camera, the camera's rigid pose in the frame of the result; None: the camera's frame.
+        mask: pixels of the object; None: all measured pixels.
+        camera_pose: obj_from_camera, rigid; None: the result is in the camera's frame.
 
     Raises:
-        BadArgument: a wrong shape or type, negative depth, intrinsics of no pinhole camera, a pose that is not rigid.
+        BadArgument: a wrong shape or type; negative depth; intrinsics of no pinhole camera; a pose that is not rigid.
         TooFewPoints: fewer than 4 measured pixels.
-        SuspiciousScale: an extent outside [5 mm, 2 m]: depth in mm, or a whole scene without a mask.
+        SuspiciousScale: an extent outside [5 mm, 2 m]: depth in mm, or a scene without a mask.
 
     >>> K = torch.tensor([[600.0, 0, 32], [0, 600.0, 24], [0, 0, 1]])
     >>> cloud_from_depth(torch.full((48, 64), 0.5), K).viewpoint
@@ -44,17 +44,17 @@ def cloud_from_depth(
     if bool((depth < 0).any()):
         raise BadArgument("depth", f"{float(depth[depth < 0].min()):.4g} m", "depths >= 0")
     check_intrinsics(intrinsics)
-    seen = torch.isfinite(depth) & (depth > 0)
+    measured = torch.isfinite(depth) & (depth > 0)
     if mask is not None:
         if not isinstance(mask, Tensor):
             raise BadArgument("mask", type(mask).__name__, f"a torch tensor of bool of {tuple(depth.shape)}")
         if mask.shape != depth.shape or mask.dtype != torch.bool:
             raise BadArgument("mask", f"shape {tuple(mask.shape)} of {mask.dtype}", f"bool of {tuple(depth.shape)}")
-        seen = seen & mask
-    if int(seen.sum()) < 4:
-        raise TooFewPoints("depth", f"{int(seen.sum())} measured pixels", "at least 4 measured pixels in the mask")
-    row, column = torch.nonzero(seen, as_tuple=True)
-    z = depth[seen]
+        measured = measured & mask
+    if int(measured.sum()) < 4:
+        raise TooFewPoints("depth", f"{int(measured.sum())} measured pixels", "at least 4 measured pixels in the mask")
+    row, column = torch.nonzero(measured, as_tuple=True)
+    z = depth[measured]
     k = intrinsics.to(depth)
     points = torch.stack([z * (column - k[0, 2]) / k[0, 0], z * (row - k[1, 2]) / k[1, 1], z], -1)
     viewpoint = torch.zeros(3, dtype=points.dtype, device=points.device)

@@ -1,4 +1,4 @@
-"""Several views of one object become one cloud."""
+"""From several views of one object to one cloud."""
 
 from collections.abc import Sequence
 
@@ -18,21 +18,20 @@ from torchgrasp.values import PointCloud
 def merge_clouds(
     clouds: Sequence[PointCloud], poses: Sequence[Float[Tensor, "4 4"]] | Float[Tensor, "k 4 4"]
 ) -> PointCloud:
-    """Return the points of several views in one frame, with normals, each turned towards the camera of its view.
+    """Return the points of several views in one frame, with outward normals and the camera of each point.
 
-    A view without normals gets them by `estimate_normals`, on its own. The result has a viewpoint for each point: every
-    camera saw free space and an outline of its own, which `fit_shape` uses. Points seen twice stay twice; `voxel_downsample`
-    evens the density. A view that has normals but no viewpoint, such as a part of a scan from all sides, leaves the
-    result without any.
+    `estimate_normals` gives normals to a view without them. `fit_shape` uses each camera's outline and free space. If
+    some view has normals but no viewpoint, as part of a scan from all sides, the result has no viewpoint.
+    Regions seen twice stay twice as dense; `voxel_downsample` evens the density.
 
     Args:
-        clouds: points [m] of the views, each in a frame of its own.
-        poses: obj_from_cloud for each view, rigid; the identity where a cloud is in the frame of the result.
+        clouds: points [m] of the views, each in its own frame.
+        poses: obj_from_cloud of each view, rigid.
 
     Raises:
-        BadArgument: no cloud, another number of poses, a pose that is not rigid, clouds of different dtype or on
+        BadArgument: no cloud; another number of poses; a pose that is not rigid; clouds of different dtype or on
             different devices; see also `check_cloud`.
-        TooFewPoints, SuspiciousScale: see `check_cloud`; for the views and for the result.
+        TooFewPoints, SuspiciousScale: see `check_cloud`, for the views and for the result.
 
     >>> view = PointCloud(0.1 * torch.rand(90, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))
     >>> len(merge_clouds([view, view], [torch.eye(4), torch.eye(4)]))
@@ -46,25 +45,25 @@ def merge_clouds(
         check_cloud(cloud)
     for i, pose in enumerate(poses):
         check_rigid(f"poses[{i}]", pose)
-    kinds = {(str(c.points.dtype), str(c.points.device)) for c in clouds}
-    if len(kinds) > 1:
-        raise BadArgument("clouds", f"points of {sorted(kinds)}", "one dtype on one device")
+    types = {(str(c.points.dtype), str(c.points.device)) for c in clouds}
+    if len(types) > 1:
+        raise BadArgument("clouds", f"points of {sorted(types)}", "one dtype on one device")
     views = [_view_in_frame(cloud, pose) for cloud, pose in zip(clouds, poses, strict=True)]
     if len(views) == 1:
         return views[0]
     normals = [v.normals for v in views if v.normals is not None]
-    eyes = [v.viewpoint.expand(len(v), 3) for v in views if v.viewpoint is not None]
-    viewpoint = torch.cat(eyes) if len(eyes) == len(views) else None
+    viewpoints = [v.viewpoint.expand(len(v), 3) for v in views if v.viewpoint is not None]
+    viewpoint = torch.cat(viewpoints) if len(viewpoints) == len(views) else None
     return check_cloud(PointCloud(torch.cat([v.points for v in views]), torch.cat(normals), viewpoint))
 
 
 def _view_in_frame(cloud: PointCloud, obj_from_cloud: Float[Tensor, "4 4"]) -> PointCloud:
-    """Return a view with unit normals in the frame of the result; the motion is done in float64."""
+    """Return a view with unit normals in the frame of the result, moved in float64."""
     cloud = estimate_normals(cloud) if cloud.normals is None else cloud
     assert cloud.normals is not None
-    pose, kind = obj_from_cloud.to(cloud.points).double(), cloud.points.dtype
+    pose, dtype = obj_from_cloud.to(cloud.points).double(), cloud.points.dtype
     points, normals = apply(pose, cloud.points.double()), rotate(pose, unit(cloud.normals.double()))
-    viewpoint = None if cloud.viewpoint is None else apply(pose, cloud.viewpoint.double().reshape(-1, 3)).to(kind)
+    viewpoint = None if cloud.viewpoint is None else apply(pose, cloud.viewpoint.double().reshape(-1, 3)).to(dtype)
     if viewpoint is not None and len(viewpoint) == 1:
         viewpoint = viewpoint[0]
-    return PointCloud(points.to(kind), normals.to(kind), viewpoint)
+    return PointCloud(points.to(dtype), normals.to(dtype), viewpoint)

@@ -17,7 +17,7 @@ from sklearn.preprocessing import StandardScaler
 from tqdm import tqdm
 
 from benchmarks.common import Row
-from torchgrasp.cloud.camera import partial_view
+from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.io.read import save_cloud
 from torchgrasp.datasets import list_views, read_view
 from torchgrasp.evaluation.evaluate import EvaluationSpec, evaluate
@@ -131,7 +131,7 @@ def author_views(folder: Path) -> None:
     entries = {}
     for k, (name, mesh) in enumerate(solids.items()):
         mesh.apply_translation([0.0, 0.0, -mesh.bounds[0, 2]])
-        cloud = partial_view(mesh, azimuth=47.0 * k, elevation=30.0, seed=k)
+        cloud = partial_view(mesh, look_at(azimuth=47.0 * k, elevation=30.0, target=mesh), seed=k)
         pose = np.eye(4)
         pose[:3, 3] = cloud.viewpoint.numpy()  # pyright: ignore[reportOptionalMemberAccess]
         (folder / name).mkdir(parents=True, exist_ok=True)
