@@ -34,12 +34,13 @@ from torchgrasp.control import ClosingReference
 from torchgrasp.control.adaptive.impedance import Impedance
 from torchgrasp.control.adaptive.stability import StabilityModel, fit_stability, lengths_of, stability_path, state_of
 from torchgrasp.errors import GraspError
+from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.frames import rigid, rotation_from_vector
 from torchgrasp.linalg import unit
 from torchgrasp.posture_model.compatibility import describe_compatibility
-from train.pull_trials import Disturbed, Pull, disturb_grasp
+from train.pull_trials import PullRecord, RisingPull, pull_until_lost
 
 SIZES = {
     "box": [(0.04, 0.06, 0.13), (0.05, 0.05, 0.05), (0.03, 0.09, 0.16), (0.07, 0.07, 0.10), (0.06, 0.10, 0.04)],
@@ -110,7 +111,7 @@ def rehearse_once(
     parts: list[trimesh.Trimesh],
     generator: torch.Generator,
     seed: int,
-) -> Disturbed:
+) -> PullRecord:
     """Disturb one of the grasps; everything is drawn by the trial's own generator."""
 
     def draw(low: float, high: float) -> float:
@@ -125,10 +126,11 @@ def rehearse_once(
     error = rigid(rotation_from_vector(TURN * off[:3]), SHIFT * off[3:])
     reference = ClosingReference.from_grasp(hand, grasp, strength)
     holding = functools.partial(Impedance, springs=springs)
-    return disturb_grasp(reference, mesh, parts, holding, Pull(direction, most / 0.3, most, 0.8), friction, error, seed)
+    trial, pull = GraspTrial(hand, grasp, mesh, seed, error, parts=parts), RisingPull(direction, most / 0.3, most, 0.8)
+    return pull_until_lost(trial, reference, holding, pull, friction)
 
 
-def summary(trial: Disturbed) -> dict[str, Any]:
+def summary(trial: PullRecord) -> dict[str, Any]:
     """Return the states (log K, L, F) before the pull and at the last moment before the object slipped, and the end."""
     rest = max(int((trial.pulled == 0).sum()), 1)
     slipped = torch.nonzero(trial.moved[rest:] > SLIP)[:, 0]

@@ -4,25 +4,27 @@ import functools
 
 import pytest
 import torch
-from train.pull_trials import Disturbed, Pull, disturb_grasp
+from train.pull_trials import PullRecord, RisingPull, pull_until_lost
 
 from tests.pinch import cylinder, pinch
 from torchgrasp.control import ClosingReference, closing_gains
 from torchgrasp.control.adaptive.impedance import Impedance
 from torchgrasp.control.adaptive.stability import lengths_of, load_stability, state_of
+from torchgrasp.evaluation.closing import GraspTrial
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 
 UP = torch.tensor([0.0, 0.0, 1.0]).double()
 
 
-def pulled(force: float, most: float, adapts: bool = False) -> Disturbed:
+def pulled(force: float, most: float, adapts: bool = False) -> PullRecord:
     pytest.importorskip("sapien")
     hand, grasp = pinch("allegro")
     mesh = cylinder()
     holding = functools.partial(Impedance, stability=load_stability(hand) if adapts else None)
     reference = ClosingReference.from_grasp(hand, grasp, force)
-    return disturb_grasp(reference, mesh, [mesh], holding, Pull(UP, 4.0, most, 1.5), 0.6)
+    trial = GraspTrial(hand, grasp, mesh, parts=[mesh])
+    return pull_until_lost(trial, reference, holding, RisingPull(UP, 4.0, most, 1.5), 0.6)
 
 
 def test_adaptation_keeps_what_a_weak_grasp_loses():

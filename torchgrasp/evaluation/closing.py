@@ -59,6 +59,7 @@ class TrialDriver:
     Args:
         trial: what is tried.
         spec: how it is tried.
+        reference: what the hand follows; None: that of the trial's hand and grasp.
 
     Raises:
         BadArgument: not exactly one row, a grasp of another hand or with numbers that are not finite, a pre-grasp
@@ -67,11 +68,11 @@ class TrialDriver:
         MeshError: the mesh is missing, open or without volume.
     """
 
-    def __init__(self, trial: GraspTrial, spec: TrialSpec) -> None:
+    def __init__(self, trial: GraspTrial, spec: TrialSpec, reference: ClosingReference | None = None) -> None:
         check_modes(spec.closing, spec.holding, trial.belief)
         self.trial, self.spec = trial, spec
         hand, grasp = trial.hand.to("cpu", torch.float64), trial.grasp.to("cpu", torch.float64)
-        self.reference = ClosingReference.from_grasp(hand, grasp, spec.force, spec.kp)
+        self.reference = reference or ClosingReference.from_grasp(hand, grasp, spec.force, spec.kp)
         hand.check_joints(grasp.pregrasp)
         if spec.approach and not abs(float(torch.linalg.vector_norm(grasp.approach)) - 1) < 1e-4:
             raise BadArgument("grasp", f"an approach along {grasp.approach[0].tolist()}", "a unit vector")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from train.pull_trials import Disturbed, Pull, disturb_grasp
+from train.pull_trials import PullRecord, RisingPull, pull_until_lost
 
 from benchmarks.common import Row
 from torchgrasp import ContactSpec, Grasps, Hand, Status, load_hand, plan_grasps
@@ -15,6 +15,7 @@ from torchgrasp.control.adaptive.impedance import GRASP_STIFFNESS, Impedance
 from torchgrasp.control.adaptive.stability import StabilityModel, lengths_of, load_stability, state_of
 from torchgrasp.control.holding import ForceHold
 from torchgrasp.datasets import read_views
+from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.evaluate import choose_rows
 from torchgrasp.linalg import unit
 from torchgrasp.sim.convex_parts import convex_parts
@@ -67,21 +68,22 @@ def pull_at(grasp: Grasps, hand: Hand, model: StabilityModel, mesh, parts, seed:
     generator = torch.Generator().manual_seed(seed)
     share = float(torch.rand((), generator=generator, dtype=torch.float64))
     strength = math.exp(math.log(STRENGTH[0]) + share * math.log(STRENGTH[1] / STRENGTH[0]))
-    pull = Pull(unit(torch.randn(3, generator=generator, dtype=torch.float64)), RATE, MOST, SECONDS)
+    pull = RisingPull(unit(torch.randn(3, generator=generator, dtype=torch.float64)), RATE, MOST, SECONDS)
     held: dict[str, Held] = {}
     for name in HOLDINGS:
         learned, adapts = name.endswith("learned forces"), "adapts" in name
         reference = ClosingReference.from_grasp(hand, grasp, strength, stability=model if learned else None)
         impedance = functools.partial(Impedance, stability=model if adapts else None)
         holding = ForceHold if name == "force" else impedance
-        trial = disturb_grasp(reference, mesh, parts, holding, pull, FRICTION, seed=seed)
+        given = GraspTrial(hand, grasp, mesh, seed, parts=parts)
+        trial = pull_until_lost(given, reference, holding, pull, FRICTION)
         if trial.overlap:
             return {}
         held[name] = judged(trial, model, reference.gains.desired_force.norm(dim=-1))
     return held
 
 
-def judged(trial: Disturbed, model: StabilityModel, desired: torch.Tensor) -> Held:
+def judged(trial: PullRecord, model: StabilityModel, desired: torch.Tensor) -> Held:
     """Return what a trial tells."""
     rest = max(int((trial.pulled == 0).sum()) - 1, 0)  # the forces have risen by then
     felt = trial.forces[rest]

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import torch
 import trimesh
 
 from benchmarks.common import Row
@@ -24,12 +23,10 @@ from torchgrasp import (
     load_object,
     plan_grasps,
 )
-from torchgrasp.control import ClosingReference, GraspController
 from torchgrasp.control.holding import ForceHold
+from torchgrasp.evaluation.closing import GraspTrial, TrialDriver
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.hand.hand import Actuator
-from torchgrasp.sim.convex_parts import convex_parts
-from torchgrasp.sim.hand import SimulatedHand
 from torchgrasp.sim.mjcf import OBJECT
 from torchgrasp.sim.mujoco_scene import MujocoScene
 from torchgrasp.sim.open import open_scene
@@ -153,17 +150,13 @@ def hold(
     hand: Hand, grasp: Grasps, mesh: trimesh.Trimesh, simulator: str, force: float, seed: int | None, lift: bool = True
 ) -> Held:
     """Close a hand with the uncertainty-aware controller, lift and hold, fingertips touching in points (no patch)."""
-    grasp, hand, mass = grasp.to(dtype=torch.float64), hand.to(dtype=torch.float64), 0.1 if lift else 0.02
-    start = {name: float(q) for name, q in hand.expand(grasp.pregrasp[0]).items()}
-    pose, tips = grasp.obj_from_hand[0].numpy(), tuple(hand.tip_links)
-    setup = SceneSpec(hand.urdf_path, pose, start, hand.actuators, tips, mesh, convex_parts(mesh), mass, patch=0.0)
-    scene = open_scene(setup, simulator)
-    generator = None if seed is None else torch.Generator().manual_seed(seed)
-    robot = SimulatedHand(scene, ClosingReference.from_grasp(hand, grasp, force), 100.0, generator)
-    controller, model = GraspController(robot.reference), robot.reference.model
-    observation = robot.tick(controller.targets)
-    while not controller.closed:
-        observation = robot.tick(controller.step(observation, robot.period))
+    spec = TrialSpec(
+        force=force, noise=seed is not None, mass=0.1 if lift else 0.02, patch=0.0, approach=0.0, simulator=simulator
+    )
+    run = TrialDriver(GraspTrial(hand, grasp, mesh, seed or 0), spec).open()
+    for _ in run.close():
+        pass
+    scene, controller, model = run.scene, run.controller, run.robot.reference.model
     drives = [hand.actuators[name] for name in scene.joint_names]
     kp, effort = (np.array([getattr(drive, key) for drive in drives]) for key in ("kp", "effort"))
     lower, upper = model.expand(model.lower).numpy(), model.expand(model.upper).numpy()
@@ -171,18 +164,17 @@ def hold(
     sums, torques, pressed = [], [], []
     for k in range(400):
         scene.lift(0.1 * min(k / 100, 1.0) * lift)
-        targets = controller.step(observation, robot.period)
-        observation = robot.tick(targets)
+        run.step()
         if k < 350:
             continue
         seen = scene.step()
         points = seen.moment / seen.weight[:, None]
         felt = np.einsum("cij,ci->j", scene.jacobian(points), seen.force)
-        driven = np.clip(kp * (targets.numpy() - scene.joints()), -effort, effort)
+        driven = np.clip(kp * (controller.targets.numpy() - scene.joints()), -effort, effort)
         sums.append(seen.force.sum(0))
         torques.append(np.where(np.abs(scene.joints() - middle) < reach, driven - felt, 0.0))
-        pressed.append(robot.force.sum())
-    weight = np.array([0.0, 0.0, mass * setup.gravity])
+        pressed.append(run.robot.force.sum())
+    weight = np.array([0.0, 0.0, spec.mass * spec.gravity])
     assert isinstance(controller.hold, ForceHold)
     return Held(
         float(np.linalg.norm(np.mean(sums, 0) - weight) / weight[2]),
