@@ -14,29 +14,21 @@ from torchgrasp.evaluation.pull import pull_grasp
 
 @dataclasses.dataclass(frozen=True)
 class ProtocolResult(Value):
-    """The outcome of one grasp; what was never measured is NaN.
+    """The outcome of a grasp of some `rank` under one `draw` of the error of pose; NaN was not measured.
 
-    Args:
-        rank: row of the grasp among the executable grasps of its view.
-        draw: number of the drawn error of pose.
-        passed: whether the grasp passed.
-        status: the reason if it did not.
-        moved: motion of the object's centre [m], in the world where it is pulled at, in the hand where it is lifted.
-        turned: rotation of the object [rad], likewise.
-        force: mean normal force of the fingers [N].
-        overlap: depth [m] of the hand in its grasp pose in the object, before a finger moves.
-        seconds: CPU time.
+    `moved` [m] and `turned` [rad] are the object's motion: in the world under a pull, in the hand in a lift. `force`
+    [N] is the fingers' mean normal force, `overlap` [m] as of `TrialDriver.grasp_overlap`, `seconds` CPU time.
     """
 
     rank: int
     draw: int
     passed: bool
     status: Status
-    moved: float
-    turned: float
-    force: float
-    overlap: float
-    seconds: float
+    moved: float = math.nan
+    turned: float = math.nan
+    force: float = math.nan
+    overlap: float = math.nan
+    seconds: float = math.nan
 
 
 def run_protocol(trial: GraspTrial, protocol: Protocol, rank: int = 0, draw: int = 0) -> ProtocolResult:

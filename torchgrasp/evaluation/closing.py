@@ -1,4 +1,4 @@
-"""The one driver of trials: opens a fresh scene, brings the hand to the object, closes it and presses."""
+"""The one driver of trials: it opens a fresh scene, brings the hand to the object, closes it and presses."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -27,22 +27,12 @@ if TYPE_CHECKING:
     import trimesh
 
 APPROACH_SPEED = 0.2
-"""Mean speed of the hand on its way to the pre-grasp [m/s]."""
+"""Mean speed of the hand on its way to the pre-grasp [m/s]: slow enough to push a light object without a blow."""
 
 
 @dataclasses.dataclass(frozen=True)
 class GraspTrial:
-    """One grasp to be tried on the true object.
-
-    Args:
-        hand: the hand that the grasp was planned for.
-        grasp: one row.
-        mesh: the true object [m], closed: a trimesh or a file.
-        seed: of the tactile sensor's noise.
-        error: true pose of the hand in its planned frame, unknown to the hand; None: the planned pose.
-        belief: the shape that the grasp was planned on, which touches revise while the hand closes; None: they do not.
-        parts: convex bodies that stand for the mesh; None: its own decomposition (`convex_parts`).
-    """
+    """One grasp to be tried on the true object; the arguments are those of `close_hand`."""
 
     hand: Hand
     grasp: Grasps
@@ -54,18 +44,15 @@ class GraspTrial:
 
 
 class TrialDriver:
-    """Makes the runs of a trial; every run has a scene of its own, so that no run depends on another.
+    """Checks a trial once and opens its runs, each in a scene of its own.
 
     Args:
-        trial: what is tried.
-        spec: how it is tried.
+        trial: the grasp and the object.
+        spec: how the hand closes, and the world around it.
         reference: what the hand follows; None: that of the trial's hand and grasp.
 
     Raises:
-        BadArgument: not exactly one row, a grasp of another hand or with numbers that are not finite, a pre-grasp
-            outside the joint limits, an approach that is no unit vector, an error that is no pose, or a belief for a
-            closing that does not follow the law (Eq. 25).
-        MeshError: the mesh is missing, open or without volume.
+        BadArgument, MeshError: as `close_hand`.
     """
 
     def __init__(self, trial: GraspTrial, spec: TrialSpec, reference: ClosingReference | None = None) -> None:
@@ -76,8 +63,7 @@ class TrialDriver:
         hand.check_joints(grasp.pregrasp)
         if spec.approach and not abs(float(torch.linalg.vector_norm(grasp.approach)) - 1) < 1e-4:
             raise BadArgument("grasp", f"an approach along {grasp.approach[0].tolist()}", "a unit vector")
-        mesh = read_mesh(trial.mesh)
-        drives = hand.actuators
+        mesh, drives = read_mesh(trial.mesh), hand.actuators
         if spec.kp is not None:
             drives = {name: drive._replace(kp=spec.kp) for name, drive in drives.items()}
         true_pose = apply_error(grasp.obj_from_hand[0], trial.error)
@@ -109,21 +95,14 @@ class TrialDriver:
         return TrialRun(self)
 
     def grasp_overlap(self) -> float:
-        """Return how deep [m] the simulated hand in its grasp pose is in the object, fingertips included."""
-        spec = dataclasses.replace(
-            self.scene_spec,
-            joints=_by_name(self.reference.hand, self.reference.joints),
-            approach=(0.0, 0.0, 0.0),
-            table=False,
-        )
-        return open_scene(spec, self.spec.simulator).penetration()
+        """Return the depth [m] of the simulated hand, in its grasp pose, in the object."""
+        joints = _by_name(self.reference.hand, self.reference.joints)
+        scene_spec = dataclasses.replace(self.scene_spec, joints=joints, approach=(0.0, 0.0, 0.0), table=False)
+        return open_scene(scene_spec, self.spec.simulator).penetration()
 
 
 class TrialRun:
-    """One run of a trial in a fresh scene.
-
-    The phases yield after every control tick, so that a caller can record or stop.
-    """
+    """One run of a trial. Its phases yield after every control tick, so that the caller can record or stop."""
 
     def __init__(self, driver: TrialDriver) -> None:
         spec, trial = driver.spec, driver.trial
@@ -136,14 +115,8 @@ class TrialRun:
 
     @property
     def starts(self) -> bool:
-        """Whether the opened hand overlaps object and table by no more than the trial allows."""
+        """Whether hand, object and table overlap by no more than the trial allows."""
         return self.overlap <= self.spec.overlap
-
-    def strained(self) -> bool:
-        """Return whether some drive is at its largest torque."""
-        hand, model = self.robot.reference.hand, self.robot.reference.model
-        effort = torch.tensor([hand.actuators[name].effort for name in model.joint_names])
-        return bool((model.kp * (self.controller.targets - self.observation.joints).abs() >= effort).any())
 
     def approach(self) -> Iterator[None]:
         """Bring the opened hand straight to its pre-grasp."""
@@ -167,9 +140,15 @@ class TrialRun:
         """Let the controller act for one control tick."""
         self.observation = self.robot.tick(self.controller.step(self.observation, self.robot.period))
 
+    def strained(self) -> bool:
+        """Return whether some drive is at its largest torque."""
+        hand, model = self.robot.reference.hand, self.robot.reference.model
+        effort = torch.tensor([hand.actuators[name].effort for name in model.joint_names])
+        return bool((model.kp * (self.controller.targets - self.observation.joints).abs() >= effort).any())
+
 
 def smooth_step(time: float) -> tuple[float, float]:
-    """Return place and speed of a motion from 0 to 1 that starts and ends at rest, at a time in [0, 1].
+    """Return place and speed, at a time in [0, 1], of a motion from 0 to 1 that starts and ends at rest.
 
     >>> smooth_step(0.5)
     (0.5, 1.5)

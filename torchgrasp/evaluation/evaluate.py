@@ -1,7 +1,7 @@
-"""How many of the library's grasps pass a protocol, each planned on what one camera saw.
+"""How many of the library's grasps pass a protocol, each planned on the view of one camera.
 
-Two rounds of tasks for worker processes (`run_tasks`): first every view is planned on, then every grasp is tried.
-Between the rounds the grasps lie as files in a folder, for export or another test.
+Worker processes (`run_tasks`) first plan on every view, then try every grasp. In between the grasps lie as files in a
+folder, for export or another test.
 """
 
 import contextlib
@@ -35,13 +35,13 @@ if TYPE_CHECKING:
     import trimesh
 
 MOST_FRICTION = 1.0
-"""Largest friction that grasps are planned for: MultiDex grants 3, which no fingertip has."""
+"""Largest friction that grasps are planned for: MultiDex grants 3, more than fingertips have."""
 
 PLAN_LIMIT, TRIAL_LIMIT = 900.0, 120.0
-"""Wall time [s] after which planning on a view, and a trial, are ended: twenty times what either takes."""
+"""Wall time [s] after which planning on a view, and an attempt, are ended: many times the usual."""
 
 Ranks = Literal["best", "spread"]
-"""Which of a view's grasps are tried: the best, or as many evenly spread over all ranks, the best one included."""
+"""Which of a view's grasps are tried: the best, or as many spread from the best to the worst."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,12 +49,12 @@ class EvaluationSpec(Value):
     """Which grasps of a folder of objects are evaluated.
 
     Args:
-        grasps: the most that are tried of each view.
-        ranks: which of a view's grasps are tried.
+        grasps: the most of each view.
+        ranks: which of a view's grasps.
         starts: of the contact planner.
-        complete: plan on the whole cloud with its normals: the value of a perfect shape.
-        only: names of objects to keep; (): all.
-        planned: take the grasps that an earlier call left in its folder, and plan nothing.
+        complete: plan on whole clouds with normals: the value of a perfect shape.
+        only: names of objects; (): all.
+        planned: take the grasps that an earlier call left in its folder.
         seed: of every random draw.
 
     Raises:
@@ -86,22 +86,22 @@ def evaluate(
     folder: Path | None = None,
     workers: int = 0,
 ) -> Generator[ViewScore, None, None]:
-    """Plan on every view of every object of a folder, try grasps of each, and yield the score of each view.
+    """Plan on every view of a folder of objects, try grasps, and yield the score of each view.
 
-    The planner sees the noisy cloud, the camera's position, the friction and the height of the table. The true mesh is
-    the simulator's alone. An object with bad files is refused and the others go on.
+    The planner knows the noisy cloud, the camera's position, the friction and the table. The true mesh is the
+    simulator's alone. An object with bad files is refused and the others go on.
 
     Args:
-        objects: folder with manifest.json, and for each object mesh.ply and noisy views.
+        objects: a folder as in `torchgrasp.datasets`.
         hand: the hand.
-        protocol: one of `PROTOCOLS` by name, or another.
+        protocol: itself, or its name in `PROTOCOLS`.
         spec: which grasps; None: `EvaluationSpec()`.
         folder: where the executable grasps of each view are kept, OBJECT_VIEW.safetensors; None: nowhere.
-        workers: processes, see `run_tasks`; the scores do not depend on their number.
+        workers: processes (`run_tasks`); the scores do not depend on their number.
 
     Raises:
         BadArgument: an unknown protocol, or no objects.
-        MissingExtra: the simulator, or with workers pebble, is not installed.
+        MissingExtra: the simulator, or pebble for workers, is not installed.
     """
     protocol, spec = find_protocol(protocol), EvaluationSpec() if spec is None else spec
     names = list_views(objects, spec.complete, spec.only)
@@ -111,31 +111,28 @@ def evaluate(
 def _evaluate(
     views: "list[_View]", protocol: Protocol, spec: EvaluationSpec, folder: Path | None, workers: int
 ) -> Generator[ViewScore, None, None]:
-    """Yield the scores: lazy, where `evaluate` names a bad argument at once."""
+    """Yield the scores; `evaluate` itself is not lazy, so that it names a bad argument at once."""
     with tempfile.TemporaryDirectory() as temporary:
-        shelf = Path(temporary) if folder is None else Path(folder)
-        views = [dataclasses.replace(view, shelf=shelf) for view in views]
-        planning = [(view, protocol.trial.friction, spec) for view in views]
-        plans = [_ended_plan(plan) for plan in run_tasks(_plan, planning, workers, PLAN_LIMIT)]
-        places = [
-            [
-                (row, draw)
-                for row in choose_rows(plan.executable, spec.grasps, spec.ranks)
-                for draw in range(protocol.noise.draws)
-            ]
-            for plan in plans
+        views = [dataclasses.replace(view, shelf=Path(folder or temporary)) for view in views]
+        plans = run_tasks(_plan, [(view, protocol.trial.friction, spec) for view in views], workers, PLAN_LIMIT)
+        scores = [
+            ViewScore(view.object, view.view, 0, math.nan, refusal=plan) if isinstance(plan, Status) else plan
+            for view, plan in zip(views, plans, strict=True)
         ]
-        trying = [
-            (view, protocol, spec.seed, *place) for view, mine in zip(views, places, strict=True) for place in mine
+        rows = [choose_rows(score.executable, spec.grasps, spec.ranks) for score in scores]
+        places = [[(row, draw) for row in chosen for draw in range(protocol.noise.draws)] for chosen in rows]
+        tasks = [
+            (view, protocol, spec.seed, *place) for view, some in zip(views, places, strict=True) for place in some
         ]
-        with contextlib.closing(run_tasks(_try, trying, workers, TRIAL_LIMIT)) as results:
-            for view, plan, mine in zip(views, plans, places, strict=True):
-                attempts = tuple(_ended_attempt(next(results), *place) for place in mine)
-                yield dataclasses.replace(plan, object=view.object, view=view.view, attempts=attempts)
+        with contextlib.closing(run_tasks(_try, tasks, workers, TRIAL_LIMIT)) as results:
+            for score, some in zip(scores, places, strict=True):
+                tried = [(*place, next(results)) for place in some]
+                attempts = (ProtocolResult(*x[:2], False, x[2]) if isinstance(x[2], Status) else x[2] for x in tried)
+                yield dataclasses.replace(score, attempts=tuple(attempts))
 
 
 def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
-    """Return which rows of a view's executable grasps are tried, in the order of their rank.
+    """Return the rows of a view's executable grasps that are tried.
 
     >>> choose_rows(100, 5, "best"), choose_rows(100, 5, "spread"), choose_rows(3, 5, "spread")
     ([0, 1, 2, 3, 4], [0, 25, 50, 74, 99], [0, 1, 2])
@@ -161,16 +158,16 @@ class _View:
 
     @property
     def file(self) -> Path:
-        """Where its grasps are kept."""
+        """The file of its grasps."""
         return self.shelf / f"{self.object}_{self.view}.safetensors"
 
     def load_hand(self) -> Hand:
-        """Load the hand, with its fingers."""
+        """Load the hand with its option of fingers."""
         return load_hand(self.hand.urdf_path.parent, self.hand.option)
 
 
 def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
-    """Plan on a view and keep the executable grasps, or count the kept ones."""
+    """Plan on a view and keep the executable grasps, or count those of an earlier call."""
     torch.set_num_threads(1)
     hand, score = view.load_hand(), ViewScore(view.object, view.view, 0, 0.0)
     started = time.process_time()
@@ -185,14 +182,11 @@ def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
         started = time.process_time()
         contacts = ContactSpec(friction=min(friction, MOST_FRICTION), table=0.0)
         stages: dict[str, Any] = {}
-        grasps = plan_grasps(
-            cloud,
-            hand,
-            contacts,
-            spec.starts,
-            spec.seed,
-            observer=lambda stage, _, value: stages.update({stage: value}),
-        )
+
+        def observe(stage: str, message: str, value: Any) -> None:
+            stages[stage] = value
+
+        grasps = plan_grasps(cloud, hand, contacts, spec.starts, spec.seed, observer=observe)
         executable = grasps[grasps.status == Status.OK]
         executable.save(view.file)
         refusal = Status.OK if len(executable) else _commonest_failure(grasps, stages["plan"])
@@ -205,7 +199,7 @@ def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
 
 
 def _commonest_failure(grasps: Grasps, plan: ContactPlan) -> Status:
-    """Return why most postures failed; without any posture, why most starts of the planner failed."""
+    """Return the commonest failure of the postures, or of the starts where there is no posture."""
     if len(grasps):
         counts = count_status(grasps.status)
     else:
@@ -223,17 +217,6 @@ def _try(view: _View, protocol: Protocol, seed: int, row: int, draw: int) -> Pro
 
 @functools.lru_cache(maxsize=2)
 def _read_solid(objects: Path, name: str) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh]]":
-    """Return an object's mesh and its convex parts: trials of one object follow each other."""
+    """Return an object's mesh and convex parts; trials of one object follow each other."""
     mesh = read_object_mesh(objects, name)
     return mesh, convex_parts(mesh)
-
-
-def _ended_plan(plan: ViewScore | Status) -> ViewScore:
-    """Return the score of planning, also where its process was ended."""
-    return ViewScore("", "", 0, math.nan, refusal=plan) if isinstance(plan, Status) else plan
-
-
-def _ended_attempt(attempt: ProtocolResult | Status, row: int, draw: int) -> ProtocolResult:
-    """Return the result of an attempt, also where its process was ended."""
-    unknown = dict.fromkeys(("moved", "turned", "force", "overlap", "seconds"), math.nan)
-    return ProtocolResult(row, draw, False, attempt, **unknown) if isinstance(attempt, Status) else attempt

@@ -1,4 +1,4 @@
-"""A simulated lift: the hand closes on the true object, lifts it off the table and holds it."""
+"""A simulated lift: the hand closes on the true object, lifts it and holds it."""
 
 import math
 import time
@@ -23,19 +23,19 @@ if TYPE_CHECKING:
     import trimesh
 
 LIFT_TIME = 1.0
-"""Time [s] in which the hand rises: over 0.1 m it accelerates by no more than 0.6 m/s^2."""
+"""Time [s] in which the hand rises: at most 0.6 m/s^2 over 0.1 m."""
 
 SHAKE_RATE = 5.0
-"""Frequency of the shaking [Hz]: at 3 mm the hand accelerates by 3 m/s^2."""
+"""Frequency of the shaking [Hz]: 3 m/s^2 at 3 mm."""
 
 JUDGED_TIME = 0.2
-"""Time [s] at the end of the hold in which the fingers' contacts are judged: one tick may miss a contact."""
+"""Time [s] at the end in which the fingers' contacts are judged: a single tick may miss one."""
 
 PUSHED_DISTANCE = 0.05
-"""Motion [m] of the object's centre while the hand closes that counts as pushed out: about its own size."""
+"""Motion [m] of the object's centre while the hand closes that counts as pushed out: about a hand's opening."""
 
 LOST_DISTANCE = 0.5
-"""Distance [m] from its start, beyond the lift, at which the object is gone and the trial over."""
+"""Distance [m], beyond the lift, at which the object is gone and the trial over: out of the hand's reach."""
 
 
 def close_hand(
@@ -51,26 +51,26 @@ def close_hand(
 ) -> ClosureResult:
     """Close a hand on the true object, lift it and hold it, in a fresh simulation.
 
-    The object stands on a table at the mesh's lowest point, in the frame of the grasp. The opened hand moves the last
-    `spec.approach` straight to its pre-grasp, then closes and presses (`GraspController`). It rises by
-    `spec.lift_height` and holds, shaken by `spec.shake`. The object is **held** if at the end its centre has risen by
-    at least half the lift, and at least two fingers touched it in most of the last `JUDGED_TIME`. The same arguments
-    give the same result to the last bit.
+    The object stands on a table at its mesh's lowest point. The opened hand moves the last `spec.approach` straight to
+    its pre-grasp, closes and presses (`GraspController`). It rises by `spec.lift_height` and holds, shaken by
+    `spec.shake`. The object is **held** if at the end its centre has risen by at least half the lift. At least two
+    fingers must have touched it in most of the last `JUDGED_TIME`. Equal arguments give equal bits.
 
     Args:
         grasp: one row.
         hand: the hand that the grasp was planned for.
-        mesh: the true object [m], closed: a trimesh or a file.
+        mesh: the true object [m], closed, in the frame of the grasp: a trimesh or a file.
         spec: of the trial; None: `TrialSpec()`.
         seed: of the tactile sensor's noise.
         error: true pose of the hand in its planned frame, unknown to the hand; None: the planned pose.
-        belief: the shape that the grasp was planned on, which touches revise while the hand closes; None: they do not.
+        belief: the shape that the grasp was planned on, revised by touches while the hand closes; None: no revision.
         parts: convex bodies that stand for the mesh; None: its own decomposition (`convex_parts`).
 
     Raises:
-        BadArgument: not exactly one row, a grasp of another hand or with numbers that are not finite, a pre-grasp
-            outside the joint limits, an approach that is no unit vector, an error that is no pose, or a belief for a
-            closing that does not follow the law (Eq. 25).
+        BadArgument: not exactly one row, or joints of another hand.
+        BadArgument: numbers that are not finite, or a pre-grasp outside the joint limits.
+        BadArgument: an approach that is no unit vector, or an error that is no (4, 4).
+        BadArgument: a belief for a closing that does not follow the law (Eq. 25).
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
     """
@@ -78,18 +78,18 @@ def close_hand(
 
 
 def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResult:
-    """Run a trial as `close_hand` does."""
+    """Run a trial; see `close_hand`."""
     started = time.perf_counter()
     lift = _Lift(TrialDriver(trial, TrialSpec() if spec is None else spec).open())
     return lift.result(lift.perform(), time.perf_counter() - started)
 
 
 class _ObjectLost(Exception):
-    """The object is gone: the trial is over before its time."""
+    """The object is gone."""
 
 
 class _Tick(NamedTuple):
-    """The truth at one control tick; `touching` counts the fingers that touch the object."""
+    """The truth at a control tick; `touching` counts the fingers on the object."""
 
     time: float
     forces: np.ndarray
@@ -132,7 +132,7 @@ class _Lift:
         return self._verdict()
 
     def _height(self, time: float, rising: float) -> tuple[float, float]:
-        """Return height [m] and speed [m/s] of the hand at a time [s] since it began to rise for `rising` seconds."""
+        """Return height [m] and speed [m/s] of the hand at a time [s]; it rises for `rising` seconds."""
         share, rate = smooth_step(min(time / rising, 1.0))
         height = self.spec.lift_height * share
         if time < rising or self.spec.shake == 0.0:
@@ -142,15 +142,9 @@ class _Lift:
         return height + self.spec.shake * math.sin(phase), self.spec.shake * frequency * math.cos(phase)
 
     def _record(self) -> None:
-        """Append one tick.
-
-        Raises:
-            FloatingPointError: the simulation has diverged.
-            _ObjectLost: the object is too far from its start.
-        """
+        """Append a tick; raise where the simulation has diverged or the object is gone."""
         robot, scene = self.run.robot, self.run.scene
-        now = robot.steps * self.spec.timestep
-        touching = int(robot.finger.sum())
+        now, touching = robot.steps * self.spec.timestep, int(robot.finger.sum())
         self.ticks.append(_Tick(now, robot.force, touching, scene.object_pose(), scene.hand_pose(), scene.joints()))
         moved = self._moved()
         if not np.isfinite(self.ticks[-1].joints).all() or not np.isfinite(moved):
@@ -169,7 +163,7 @@ class _Lift:
         return pose[:3, :3] @ self.run.scene.centre + pose[:3, 3]
 
     def _verdict(self) -> Status:
-        """Return the status of a finished trial: held, or the earliest thing that went wrong."""
+        """Return the status of a finished trial: held, or the first failure."""
         rise = np.array([self._centre(k)[2] - self._centre(0)[2] for k in range(len(self.ticks))])
         half = 0.5 * self.spec.lift_height
         judged = self.ticks[-self.run.robot.ticks(JUDGED_TIME) :]

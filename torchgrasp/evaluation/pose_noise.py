@@ -1,7 +1,4 @@
-"""Errors of pose that neither the planner nor the controller knows: of the hand, or of the object on its table.
-
-Both reach a trial as the error of the hand in its planned frame.
-"""
+"""Unknown errors of pose, of the hand or of the object; both reach a trial as an error of the hand."""
 
 import dataclasses
 
@@ -15,13 +12,7 @@ from torchgrasp.frames import inverse, rigid, rotation_from_vector
 
 @dataclasses.dataclass(frozen=True)
 class PoseNoise(Value):
-    """Errors of pose, uniform along and about each axis.
-
-    Args:
-        translation: largest error along each axis [m].
-        rotation: largest error about each axis [rad].
-        draws: errors that are drawn for each grasp.
-    """
+    """Uniform errors of at most `translation` [m] along and `rotation` [rad] about each axis; `draws` a grasp."""
 
     translation: float = 0.0
     rotation: float = 0.0
@@ -33,14 +24,12 @@ NO_NOISE = PoseNoise()
 
 
 def apply_error(obj_from_hand: Float[Tensor, "4 4"], error: Float[Tensor, "4 4"] | None) -> Float[Tensor, "4 4"]:
-    """Return the true pose of a hand on the CPU in float64, whatever device and dtype pose and error have.
+    """Return the true pose of a hand, on the CPU in float64, from its planned pose and its error.
 
-    Args:
-        obj_from_hand: the planned pose.
-        error: the true pose in the planned frame; None: the hand is where it was planned.
+    Both may be of any device and floating dtype. No error leaves the hand in its planned pose.
 
     Raises:
-        BadArgument: an error that is no finite floating (4, 4).
+        BadArgument: an error that is no finite (4, 4).
     """
     planned = obj_from_hand.to("cpu", torch.float64)
     return planned if error is None else planned @ check_tensor("error", error, (4, 4)).to("cpu", torch.float64)
@@ -56,9 +45,9 @@ def draw_hand_errors(noise: PoseNoise, grasps: int, seed: int) -> Float[Tensor, 
 
 
 def draw_object_poses(noise: PoseNoise, pivot: Float[Tensor, "3"], count: int, seed: int) -> Float[Tensor, "n 4 4"]:
-    """Draw poses of an object on its table, in the frame in which it was seen.
+    """Draw poses of an object on its table: moved along its two axes, rotated about the vertical through `pivot` [m].
 
-    The errors are along the table's two axes and about the vertical through `pivot` [m], a point of the object.
+    The frame is that in which the object was seen.
     """
     generator = torch.Generator().manual_seed(seed)
     drawn = 2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1

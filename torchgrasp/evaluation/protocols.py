@@ -1,7 +1,7 @@
-"""The tests that a grasp can be put to, by name: published pulls at the object, and lifts off a table.
+"""Tests of a grasp, by name: published pulls at the object, and lifts off a table.
 
-A pull test has neither table nor gravity. The hand is fixed and closes, by default in open loop. Then a constant force
-pulls at the object's mass centre along one axis of the world.
+A pull has neither table nor gravity. The fixed hand closes, by default in open loop. Then a constant force pulls at the
+object's mass centre.
 """
 
 import dataclasses
@@ -30,14 +30,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class PullSpec(Value):
-    """A pull at a grasped object along each of six directions, and how far the object may then move.
-
-    Args:
-        acceleration: force over mass [m/s^2].
-        seconds: duration of each pull.
-        distance: by which the object's centre may move from its start [m].
-        angle: by which the object may rotate [rad].
-    """
+    """Pulls at an object: force over mass [m/s^2] and duration [s], and the motion allowed [m, rad]."""
 
     acceleration: float
     seconds: float
@@ -47,13 +40,9 @@ class PullSpec(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Protocol(Value):
-    """A test of a grasp: a trial that ends in a lift, or in pulls at the object.
+    """A test of a grasp: a trial and, unless it lifts the object, pulls.
 
-    Args:
-        name: of the protocol.
-        trial: how the hand closes, the object's mass, friction, gravity and table.
-        pull: how the object is pulled at; None: it is lifted.
-        noise: errors of the hand's pose where the object is pulled at, of the object's where it is lifted.
+    `noise` is in the pose of the hand where it pulls, of the object where it lifts.
     """
 
     name: str
@@ -62,10 +51,7 @@ class Protocol(Value):
     noise: PoseNoise = NO_NOISE
 
     def with_trial(self, **changes: Any) -> "Protocol":
-        """Return the protocol with fields of its trial changed, such as `closing` or `force`.
-
-        Raises:
-            BadArgument: a number outside its range, or an unknown mode.
+        """Return the protocol with some fields of its trial changed; raises as `TrialSpec`.
 
         >>> find_protocol("tabletop").with_trial(closing="fixed").trial.closing
         'fixed'
@@ -83,7 +69,7 @@ _MULTIDEX = _DEXGRASPBENCH.with_trial(density=500.0, friction=3.0, patch=0.0, kp
 _HARD = _DEXGRASPBENCH.with_trial(friction=0.3, patch=0.002 / 0.3)
 
 PAPER = Protocol("paper", TrialSpec(), noise=PoseNoise(0.005, math.radians(5)))
-"""The paper's lift (Sec. 6.5). An error of the object's pose takes the place of the real robot's chance."""
+"""The paper's lift (Sec. 6.5); errors of the object's pose stand for the real robot's chance."""
 
 PROTOCOLS = {
     protocol.name: protocol
@@ -126,10 +112,7 @@ def find_protocol(protocol: Protocol | str) -> Protocol:
 def draw_error(
     protocol: Protocol, grasp: Grasps, mesh: "trimesh.Trimesh", row: int, draw: int, seed: int
 ) -> Float[Tensor, "4 4"]:
-    """Draw the error of the hand in its planned frame, for one row among a view's grasps and one draw.
-
-    In a pull the hand is off; in a lift the object is off on its table.
-    """
+    """Draw the error of the hand in its planned frame, for a row of a view's grasps and a draw."""
     noise = protocol.noise
     if protocol.pull is not None:
         return draw_hand_errors(noise, row + 1, seed)[row, draw]

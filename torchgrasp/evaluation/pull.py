@@ -1,4 +1,4 @@
-"""Published tests that pull at a grasped object in six directions, each direction in a fresh scene."""
+"""Pulls at a grasped object in six directions, each in a fresh scene."""
 
 import dataclasses
 import math
@@ -17,7 +17,7 @@ DIRECTIONS = tuple(np.array(sign) * axis for axis in np.eye(3) for sign in (-1.0
 """-x, +x, -y, +y, -z, +z of the world."""
 
 CHECK_SECONDS = 0.2
-"""Interval [s] between two looks at the object while it is pulled."""
+"""Interval [s] between two looks at the pulled object: ten in a pull of 2 s."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,10 +27,10 @@ class PullResult(Value):
     Args:
         passed: whether the object stayed in all six directions.
         status: of the last direction.
-        directions: number tried until the first failure.
+        directions: how many were tried.
         moved: largest motion of the object's centre [m].
         turned: largest rotation of the object [rad].
-        force: the fingers' mean normal force before the first pull [N]; NaN where the hand never closed.
+        force: mean normal force of the fingers before the first pull [N]; NaN if the hand never closed.
         seconds: CPU time.
     """
 
@@ -44,18 +44,14 @@ class PullResult(Value):
 
 
 def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") -> PullResult:
-    """Close a hand on the true object and pull at the object along the six axes of the world.
+    """Close a hand on the true object and pull along the world's axes, until the object moves too far.
 
-    The grasp passes if in no direction the object moves or rotates too far from its pose before the hand closed.
-
-    Args:
-        trial: what is tried.
-        protocol: one that pulls, itself or its name in `PROTOCOLS`.
+    Motion counts from the object's pose before the hand closed. `protocol` is one that pulls, or its name in
+    `PROTOCOLS`.
 
     Raises:
-        BadArgument: an unknown protocol or one that lifts; else as `TrialDriver`.
-        MeshError: the mesh is missing, open or without volume.
-        MissingExtra: the simulator is not installed.
+        BadArgument: an unknown protocol or one that lifts; else as `close_hand`.
+        MeshError, MissingExtra: as `close_hand`.
     """
     started = time.process_time()
     protocol = find_protocol(protocol)
