@@ -4,8 +4,7 @@ import dataclasses
 import math
 
 from torchgrasp.errors import Status
-from torchgrasp.evaluation.attempt import ProtocolResult
-from torchgrasp.evaluation.score import ViewScore
+from torchgrasp.evaluation.score import ProtocolResult, ViewScore
 
 GOOD = ProtocolResult(0, 0, True, Status.OK, 0.01, 0.1, 4.0, 0.002, 1.0)
 SLIPPED = dataclasses.replace(GOOD, rank=1, passed=False, status=Status.MOVED, overlap=0.004)

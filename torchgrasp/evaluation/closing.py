@@ -44,7 +44,7 @@ class GraspTrial:
 
 
 class TrialDriver:
-    """Checks a trial once and opens its runs, each in a scene of its own.
+    """A trial that was checked once, for any number of runs.
 
     Args:
         trial: the grasp and the object.
@@ -86,14 +86,6 @@ class TrialDriver:
             patch=spec.patch,
         )
 
-    def open(self) -> "TrialRun":
-        """Return a run in a fresh scene, before anything has moved.
-
-        Raises:
-            MissingExtra: the simulator is not installed.
-        """
-        return TrialRun(self)
-
     def grasp_overlap(self) -> float:
         """Return the depth [m] of the simulated hand, in its grasp pose, in the object."""
         joints = _by_name(self.reference.hand, self.reference.joints)
@@ -102,7 +94,10 @@ class TrialDriver:
 
 
 class TrialRun:
-    """One run of a trial. Its phases yield after every control tick, so that the caller can record or stop."""
+    """One run of a trial in a fresh scene; raises `MissingExtra` without the simulator.
+
+    The phases yield after every control tick, so that the caller can record or stop.
+    """
 
     def __init__(self, driver: TrialDriver) -> None:
         spec, trial = driver.spec, driver.trial

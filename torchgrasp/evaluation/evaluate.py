@@ -19,11 +19,12 @@ import torch
 from torchgrasp.base import Value, count_status
 from torchgrasp.datasets import list_views, read_object_mesh, read_view
 from torchgrasp.errors import BadArgument, GraspError, MissingExtra, Status
-from torchgrasp.evaluation.attempt import ProtocolResult, run_protocol
-from torchgrasp.evaluation.closing import GraspTrial
+from torchgrasp.evaluation.closing import GraspTrial, TrialDriver
+from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.evaluation.protocols import Protocol, draw_error, find_protocol
-from torchgrasp.evaluation.score import ViewScore
+from torchgrasp.evaluation.pull import pull_grasp
+from torchgrasp.evaluation.score import ProtocolResult, ViewScore
 from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.load import load_hand
 from torchgrasp.pipeline import digest, plan_grasps
@@ -141,6 +142,21 @@ def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
     if ranks == "best" or most < 2:
         return list(range(most))
     return [round(k * (executable - 1) / (most - 1)) for k in range(most)]
+
+
+def run_protocol(trial: GraspTrial, protocol: Protocol, rank: int = 0, draw: int = 0) -> ProtocolResult:
+    """Put one grasp to a protocol; see `pull_grasp` and `lift_grasp`."""
+    started = time.process_time()
+    overlap = TrialDriver(trial, protocol.trial).grasp_overlap()
+    if protocol.pull is not None:
+        pull = pull_grasp(trial, protocol)
+        status, moved, turned, force = pull.status, pull.moved, pull.turned, pull.force
+    else:
+        lift = lift_grasp(trial, protocol.trial)
+        status, (moved, turned) = lift.status, lift.object_motion
+        force = math.nan if status is Status.START_OVERLAP else float(lift.forces[-1].mean())
+    spent = time.process_time() - started
+    return ProtocolResult(rank, draw, status is Status.OK, status, moved, turned, force, overlap, spent)
 
 
 # -------------------------------------------------------------------------------------------- what a worker does

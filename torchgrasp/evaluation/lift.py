@@ -80,7 +80,7 @@ def close_hand(
 def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResult:
     """Run a trial; see `close_hand`."""
     started = time.perf_counter()
-    lift = _Lift(TrialDriver(trial, TrialSpec() if spec is None else spec).open())
+    lift = _Lift(TrialRun(TrialDriver(trial, TrialSpec() if spec is None else spec)))
     return lift.result(lift.perform(), time.perf_counter() - started)
 
 

@@ -19,10 +19,6 @@ class PoseNoise(Value):
     draws: int = 1
 
 
-NO_NOISE = PoseNoise()
-"""One draw of no error."""
-
-
 def apply_error(obj_from_hand: Float[Tensor, "4 4"], error: Float[Tensor, "4 4"] | None) -> Float[Tensor, "4 4"]:
     """Return the true pose of a hand, on the CPU in float64, from its planned pose and its error.
 

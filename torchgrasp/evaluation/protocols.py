@@ -15,7 +15,6 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.pose_noise import (
-    NO_NOISE,
     PoseNoise,
     draw_hand_errors,
     draw_object_poses,
@@ -48,7 +47,7 @@ class Protocol(Value):
     name: str
     trial: TrialSpec
     pull: PullSpec | None = None
-    noise: PoseNoise = NO_NOISE
+    noise: PoseNoise = dataclasses.field(default_factory=PoseNoise)
 
     def with_trial(self, **changes: Any) -> "Protocol":
         """Return the protocol with some fields of its trial changed; raises as `TrialSpec`.

@@ -22,16 +22,10 @@ CHECK_SECONDS = 0.2
 
 @dataclasses.dataclass(frozen=True)
 class PullResult(Value):
-    """The outcome of one grasp under pulls.
+    """The outcome of one grasp; `passed` if the object stayed in all six directions.
 
-    Args:
-        passed: whether the object stayed in all six directions.
-        status: of the last direction.
-        directions: how many were tried.
-        moved: largest motion of the object's centre [m].
-        turned: largest rotation of the object [rad].
-        force: mean normal force of the fingers before the first pull [N]; NaN if the hand never closed.
-        seconds: CPU time.
+    `status` is that of the last direction, `directions` their number. `moved` [m] and `turned` [rad] are the object's
+    largest motion. `force` [N] is the fingers' mean normal force before the first pull, NaN if the hand never closed.
     """
 
     passed: bool
@@ -60,7 +54,7 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
     driver = TrialDriver(trial, protocol.trial)
     status, moved, turned, force, tried = Status.OK, 0.0, 0.0, math.nan, 0
     while status is Status.OK and tried < len(DIRECTIONS):
-        pull = _Pull(driver.open(), protocol.pull)
+        pull = _Pull(TrialRun(driver), protocol.pull)
         status = pull.perform(DIRECTIONS[tried])
         moved, turned, tried = max(moved, pull.moved), max(turned, pull.turned), tried + 1
         force = pull.force if math.isnan(force) else force

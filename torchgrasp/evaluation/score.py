@@ -8,7 +8,6 @@ from typing import Any
 
 from torchgrasp.base import Value
 from torchgrasp.errors import Status
-from torchgrasp.evaluation.attempt import ProtocolResult
 
 STAGES: dict[str, tuple[Status, ...]] = {
     "start": (Status.START_OVERLAP,),
@@ -20,6 +19,25 @@ STAGES: dict[str, tuple[Status, ...]] = {
 
 Share = tuple[float, float, float, int]
 """A share, the ends of its 95 % Wilson interval, and the total."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ProtocolResult(Value):
+    """The outcome of a grasp of some `rank` under one `draw` of the error of pose; NaN was not measured.
+
+    `moved` [m] and `turned` [rad] are the object's motion: in the world under a pull, in the hand in a lift. `force`
+    [N] is the fingers' mean normal force, `overlap` [m] as of `TrialDriver.grasp_overlap`, `seconds` CPU time.
+    """
+
+    rank: int
+    draw: int
+    passed: bool
+    status: Status
+    moved: float = math.nan
+    turned: float = math.nan
+    force: float = math.nan
+    overlap: float = math.nan
+    seconds: float = math.nan
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,10 +10,9 @@ from sklearn.metrics import cohen_kappa_score, confusion_matrix
 
 from benchmarks.common import Row
 from torchgrasp import load_hand
-from torchgrasp.evaluation.attempt import ProtocolResult
 from torchgrasp.evaluation.evaluate import EvaluationSpec, evaluate
 from torchgrasp.evaluation.protocols import PROTOCOLS
-from torchgrasp.evaluation.score import ViewScore, share
+from torchgrasp.evaluation.score import ProtocolResult, ViewScore, share
 
 TESTS = ("dexgraspbench", "dexgraspbench-hard", "pose-noise", "paper")
 """Three that pull and one that lifts, the last two with an error of where hand or object stand."""

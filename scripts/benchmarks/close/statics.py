@@ -24,7 +24,7 @@ from torchgrasp import (
     plan_grasps,
 )
 from torchgrasp.control.holding import ForceHold
-from torchgrasp.evaluation.closing import GraspTrial, TrialDriver
+from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.sim.mjcf import OBJECT
@@ -153,7 +153,7 @@ def hold(
     spec = TrialSpec(
         force=force, noise=seed is not None, mass=0.1 if lift else 0.02, patch=0.0, approach=0.0, simulator=simulator
     )
-    run = TrialDriver(GraspTrial(hand, grasp, mesh, seed or 0), spec).open()
+    run = TrialRun(TrialDriver(GraspTrial(hand, grasp, mesh, seed or 0), spec))
     for _ in run.close():
         pass
     scene, controller, model = run.scene, run.controller, run.robot.reference.model
