@@ -1,4 +1,4 @@
-"""The one driver of trials: it opens a fresh scene, brings the hand to the object, closes it and presses."""
+"""The one driver of trials: a fresh scene, the approach, the closing and the pressing."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -32,7 +32,7 @@ APPROACH_SPEED = 0.2
 
 @dataclasses.dataclass(frozen=True)
 class GraspTrial:
-    """One grasp to be tried on the true object; the arguments are those of `close_hand`."""
+    """One grasp to be tried on the true object, as in `close_hand`."""
 
     hand: Hand
     grasp: Grasps
@@ -87,17 +87,14 @@ class TrialDriver:
         )
 
     def grasp_overlap(self) -> float:
-        """Return the depth [m] of the simulated hand, in its grasp pose, in the object."""
+        """Return the depth [m] of the hand's grasp pose in the object."""
         joints = _by_name(self.reference.hand, self.reference.joints)
         scene_spec = dataclasses.replace(self.scene_spec, joints=joints, approach=(0.0, 0.0, 0.0), table=False)
         return open_scene(scene_spec, self.spec.simulator).penetration()
 
 
 class TrialRun:
-    """One run of a trial in a fresh scene; raises `MissingExtra` without the simulator.
-
-    The phases yield after every control tick, so that the caller can record or stop.
-    """
+    """One run of a trial in a fresh scene; its phases yield after every control tick."""
 
     def __init__(self, driver: TrialDriver) -> None:
         spec, trial = driver.spec, driver.trial
@@ -110,7 +107,7 @@ class TrialRun:
 
     @property
     def starts(self) -> bool:
-        """Whether hand, object and table overlap by no more than the trial allows."""
+        """Whether no more overlaps than the trial allows."""
         return self.overlap <= self.spec.overlap
 
     def approach(self) -> Iterator[None]:
@@ -143,7 +140,7 @@ class TrialRun:
 
 
 def smooth_step(time: float) -> tuple[float, float]:
-    """Return place and speed, at a time in [0, 1], of a motion from 0 to 1 that starts and ends at rest.
+    """Return place and speed of a motion from rest at 0 to rest at 1.
 
     >>> smooth_step(0.5)
     (0.5, 1.5)
@@ -152,5 +149,5 @@ def smooth_step(time: float) -> tuple[float, float]:
 
 
 def _by_name(hand: Hand, joints: Float[Tensor, " h"]) -> dict[str, float]:
-    """Return the position [rad] of every joint of the URDF by its name."""
+    """Return every joint of the URDF [rad] by name."""
     return {name: float(q) for name, q in hand.expand(joints).items()}

@@ -1,7 +1,6 @@
-"""How many of the library's grasps pass a protocol, each planned on the view of one camera.
+"""Campaigns: how many grasps pass a protocol, planned on single views.
 
-Worker processes (`run_tasks`) first plan on every view, then try every grasp. In between the grasps lie as files in a
-folder, for export or another test.
+Worker processes (`run_tasks`) plan on every view, then try every grasp. In between, the grasps are files in a folder.
 """
 
 import contextlib
@@ -87,10 +86,10 @@ def evaluate(
     folder: Path | None = None,
     workers: int = 0,
 ) -> Generator[ViewScore, None, None]:
-    """Plan on every view of a folder of objects, try grasps, and yield the score of each view.
+    """Plan on every view of a folder of objects, and yield each view's score.
 
-    The planner knows the noisy cloud, the camera's position, the friction and the table. The true mesh is the
-    simulator's alone. An object with bad files is refused and the others go on.
+    The planner knows the noisy cloud, the camera, the friction and the table. Only the simulator knows the true mesh.
+    An object with bad files is refused and the others go on.
 
     Args:
         objects: a folder as in `torchgrasp.datasets`.
@@ -112,7 +111,7 @@ def evaluate(
 def _evaluate(
     views: "list[_View]", protocol: Protocol, spec: EvaluationSpec, folder: Path | None, workers: int
 ) -> Generator[ViewScore, None, None]:
-    """Yield the scores; `evaluate` itself is not lazy, so that it names a bad argument at once."""
+    """Yield the scores, lazily; `evaluate` checks at once."""
     with tempfile.TemporaryDirectory() as temporary:
         views = [dataclasses.replace(view, shelf=Path(folder or temporary)) for view in views]
         plans = run_tasks(_plan, [(view, protocol.trial.friction, spec) for view in views], workers, PLAN_LIMIT)
@@ -164,7 +163,7 @@ def run_protocol(trial: GraspTrial, protocol: Protocol, rank: int = 0, draw: int
 
 @dataclasses.dataclass(frozen=True)
 class _View:
-    """A view of an object and a hand by the names of their files; `shelf` is the folder of the grasps."""
+    """A view and a hand by their files; `shelf` is the folder of grasps."""
 
     objects: Path
     object: str
@@ -183,7 +182,7 @@ class _View:
 
 
 def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
-    """Plan on a view and keep the executable grasps, or count those of an earlier call."""
+    """Plan on a view, or count the grasps of an earlier call."""
     torch.set_num_threads(1)
     hand, score = view.load_hand(), ViewScore(view.object, view.view, 0, 0.0)
     started = time.process_time()
@@ -215,7 +214,7 @@ def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
 
 
 def _commonest_failure(grasps: Grasps, plan: ContactPlan) -> Status:
-    """Return the commonest failure of the postures, or of the starts where there is no posture."""
+    """Return the commonest failure: of postures, else of starts."""
     if len(grasps):
         counts = count_status(grasps.status)
     else:
@@ -233,6 +232,6 @@ def _try(view: _View, protocol: Protocol, seed: int, row: int, draw: int) -> Pro
 
 @functools.lru_cache(maxsize=2)
 def _read_solid(objects: Path, name: str) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh]]":
-    """Return an object's mesh and convex parts; trials of one object follow each other."""
+    """Return mesh and convex parts, kept for the next trial."""
     mesh = read_object_mesh(objects, name)
     return mesh, convex_parts(mesh)

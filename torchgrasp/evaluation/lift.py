@@ -1,4 +1,4 @@
-"""A simulated lift: the hand closes on the true object, lifts it and holds it."""
+"""A simulated lift of the true object."""
 
 import math
 import time
@@ -49,12 +49,12 @@ def close_hand(
     belief: ShapeGP | None = None,
     parts: "Sequence[trimesh.Trimesh] | None" = None,
 ) -> ClosureResult:
-    """Close a hand on the true object, lift it and hold it, in a fresh simulation.
+    """Close a hand on the true object, lift it and hold it, in simulation.
 
-    The object stands on a table at its mesh's lowest point. The opened hand moves the last `spec.approach` straight to
-    its pre-grasp, closes and presses (`GraspController`). It rises by `spec.lift_height` and holds, shaken by
-    `spec.shake`. The object is **held** if at the end its centre has risen by at least half the lift. At least two
-    fingers must have touched it in most of the last `JUDGED_TIME`. Equal arguments give equal bits.
+    The object stands on a table at its mesh's lowest point. The opened hand moves straight to its pre-grasp. It closes
+    and presses (`GraspController`), rises by `spec.lift_height` and holds, shaken by `spec.shake`. The object is
+    **held** if at the end its centre is up by half the lift, and if two fingers touched it in most of the last
+    `JUDGED_TIME`. Equal arguments give equal bits.
 
     Args:
         grasp: one row.
@@ -89,7 +89,7 @@ class _ObjectLost(Exception):
 
 
 class _Tick(NamedTuple):
-    """The truth at a control tick; `touching` counts the fingers on the object."""
+    """The truth at a tick; `touching` counts fingers on the object."""
 
     time: float
     forces: np.ndarray
@@ -132,7 +132,7 @@ class _Lift:
         return self._verdict()
 
     def _height(self, time: float, rising: float) -> tuple[float, float]:
-        """Return height [m] and speed [m/s] of the hand at a time [s]; it rises for `rising` seconds."""
+        """Return height [m] and speed [m/s] of a hand that rises for `rising` seconds."""
         share, rate = smooth_step(min(time / rising, 1.0))
         height = self.spec.lift_height * share
         if time < rising or self.spec.shake == 0.0:
@@ -142,7 +142,7 @@ class _Lift:
         return height + self.spec.shake * math.sin(phase), self.spec.shake * frequency * math.cos(phase)
 
     def _record(self) -> None:
-        """Append a tick; raise where the simulation has diverged or the object is gone."""
+        """Append a tick; raise if the simulation diverged or the object is gone."""
         robot, scene = self.run.robot, self.run.scene
         now, touching = robot.steps * self.spec.timestep, int(robot.finger.sum())
         self.ticks.append(_Tick(now, robot.force, touching, scene.object_pose(), scene.hand_pose(), scene.joints()))
@@ -201,7 +201,7 @@ class _Lift:
         )
 
     def _motion(self, hand_from_object: Float[Tensor, "t 4 4"]) -> ObjectMotion:
-        """Return the object's motion in the hand from the pre-grasp to the end."""
+        """Return the object's motion in the hand since the pre-grasp."""
         start, end = hand_from_object[self.arrived], hand_from_object[-1]
         centre = torch.from_numpy(self.run.scene.centre)[None]
         ends = apply(torch.stack([start, end]), centre.expand(2, 1, 3))[:, 0]

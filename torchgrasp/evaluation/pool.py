@@ -1,7 +1,7 @@
-"""Tasks on worker processes that may hang, crash or be killed: a failure costs its own task alone.
+"""Tasks on worker processes: one that hangs or dies costs its own task alone.
 
-A simulator is C++ code, which no exception stops. So every worker is a fresh process (spawn) with one thread of torch,
-and it ends with its parent.
+A simulator is C++ code, which no exception stops. So every worker is a fresh process (spawn) with one thread. It ends
+with its parent.
 """
 
 import multiprocessing
@@ -24,7 +24,7 @@ def run_tasks(
     """Yield `function(*task)` for each task, in the order of the tasks.
 
     A late task gives `Status.TIMED_OUT`, and its process is killed. A task whose process dies twice gives
-    `Status.WORKER_DIED`. All workers end when the caller stops listening: by an error, an interrupt, or `close()`.
+    `Status.WORKER_DIED`. All workers end when the caller stops listening.
 
     Args:
         function: of a module, so that a worker can import it.

@@ -1,4 +1,4 @@
-"""Unknown errors of pose, of the hand or of the object; both reach a trial as an error of the hand."""
+"""Errors of pose that the hand does not know: its own, or the object's."""
 
 import dataclasses
 
@@ -12,7 +12,7 @@ from torchgrasp.frames import inverse, rigid, rotation_from_vector
 
 @dataclasses.dataclass(frozen=True)
 class PoseNoise(Value):
-    """Uniform errors of at most `translation` [m] along and `rotation` [rad] about each axis; `draws` a grasp."""
+    """Uniform errors along and about each axis, at most [m, rad]; `draws` a grasp."""
 
     translation: float = 0.0
     rotation: float = 0.0
@@ -20,9 +20,9 @@ class PoseNoise(Value):
 
 
 def apply_error(obj_from_hand: Float[Tensor, "4 4"], error: Float[Tensor, "4 4"] | None) -> Float[Tensor, "4 4"]:
-    """Return the true pose of a hand, on the CPU in float64, from its planned pose and its error.
+    """Return the true pose of a hand from its planned pose and the error in it.
 
-    Both may be of any device and floating dtype. No error leaves the hand in its planned pose.
+    Both may be of any device and floating dtype; the result is on the CPU in float64.
 
     Raises:
         BadArgument: an error that is no finite (4, 4).
@@ -41,9 +41,9 @@ def draw_hand_errors(noise: PoseNoise, grasps: int, seed: int) -> Float[Tensor, 
 
 
 def draw_object_poses(noise: PoseNoise, pivot: Float[Tensor, "3"], count: int, seed: int) -> Float[Tensor, "n 4 4"]:
-    """Draw poses of an object on its table: moved along its two axes, rotated about the vertical through `pivot` [m].
+    """Draw poses of an object in the frame in which it was seen.
 
-    The frame is that in which the object was seen.
+    The object moves on its table and rotates about the vertical through `pivot` [m].
     """
     generator = torch.Generator().manual_seed(seed)
     drawn = 2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1
@@ -55,7 +55,7 @@ def draw_object_poses(noise: PoseNoise, pivot: Float[Tensor, "3"], count: int, s
 def error_from_object_pose(
     obj_from_hand: Float[Tensor, "4 4"], object_pose: Float[Tensor, "4 4"]
 ) -> Float[Tensor, "4 4"]:
-    """Return the error of a hand at its planned pose when the object is elsewhere.
+    """Return the error of a hand whose object is elsewhere.
 
     >>> error_from_object_pose(torch.eye(4), torch.eye(4)).equal(torch.eye(4))
     True

@@ -1,4 +1,4 @@
-"""Tests of a grasp, by name: published pulls at the object, and lifts off a table.
+"""Tests of a grasp: published pulls at the object, and lifts.
 
 A pull has neither table nor gravity. The fixed hand closes, by default in open loop. Then a constant force pulls at the
 object's mass centre.
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class PullSpec(Value):
-    """Pulls at an object: force over mass [m/s^2] and duration [s], and the motion allowed [m, rad]."""
+    """Pulls by a force over mass [m/s^2], and the motion allowed [m, rad]."""
 
     acceleration: float
     seconds: float
@@ -39,9 +39,9 @@ class PullSpec(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Protocol(Value):
-    """A test of a grasp: a trial and, unless it lifts the object, pulls.
+    """A test of a grasp: a trial that pulls at the object, or lifts it.
 
-    `noise` is in the pose of the hand where it pulls, of the object where it lifts.
+    Pulls have `noise` in the hand's pose, lifts in the object's.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Protocol(Value):
     noise: PoseNoise = dataclasses.field(default_factory=PoseNoise)
 
     def with_trial(self, **changes: Any) -> "Protocol":
-        """Return the protocol with some fields of its trial changed; raises as `TrialSpec`.
+        """Return the protocol with fields of its trial changed.
 
         >>> find_protocol("tabletop").with_trial(closing="fixed").trial.closing
         'fixed'
@@ -111,7 +111,7 @@ def find_protocol(protocol: Protocol | str) -> Protocol:
 def draw_error(
     protocol: Protocol, grasp: Grasps, mesh: "trimesh.Trimesh", row: int, draw: int, seed: int
 ) -> Float[Tensor, "4 4"]:
-    """Draw the error of the hand in its planned frame, for a row of a view's grasps and a draw."""
+    """Draw the hand's error for a row of a view's grasps and a draw."""
     noise = protocol.noise
     if protocol.pull is not None:
         return draw_hand_errors(noise, row + 1, seed)[row, draw]

@@ -1,4 +1,4 @@
-"""Pulls at a grasped object in six directions, each in a fresh scene."""
+"""Pulls at a grasped object in six directions."""
 
 import dataclasses
 import math
@@ -22,10 +22,10 @@ CHECK_SECONDS = 0.2
 
 @dataclasses.dataclass(frozen=True)
 class PullResult(Value):
-    """The outcome of one grasp; `passed` if the object stayed in all six directions.
+    """The outcome of a grasp: `passed` if the object stayed in every direction.
 
-    `status` is that of the last direction, `directions` their number. `moved` [m] and `turned` [rad] are the object's
-    largest motion. `force` [N] is the fingers' mean normal force before the first pull, NaN if the hand never closed.
+    `directions` counts those tried, `status` is of the last. `moved` [m] and `turned` [rad] are the largest motion.
+    `force` [N] is the fingers' mean before the first pull, NaN if they never closed.
     """
 
     passed: bool
@@ -38,10 +38,14 @@ class PullResult(Value):
 
 
 def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") -> PullResult:
-    """Close a hand on the true object and pull along the world's axes, until the object moves too far.
+    """Close a hand on the true object and pull along the world's axes.
 
-    Motion counts from the object's pose before the hand closed. `protocol` is one that pulls, or its name in
-    `PROTOCOLS`.
+    Every direction has a fresh scene. The first in which the object moves too far is the last. Motion counts from
+    before the hand closed.
+
+    Args:
+        trial: the grasp and the object.
+        protocol: one that pulls, or its name in `PROTOCOLS`.
 
     Raises:
         BadArgument: an unknown protocol or one that lifts; else as `close_hand`.
@@ -62,7 +66,7 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
 
 
 class _Pull:
-    """A pull along one direction, with the largest motion so far and the force before it."""
+    """A pull along one direction, with the largest motion so far."""
 
     def __init__(self, run: TrialRun, spec: PullSpec) -> None:
         self.run, self.spec = run, spec

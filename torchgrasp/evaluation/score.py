@@ -1,4 +1,4 @@
-"""Sums over attempts: shares with intervals, reasons of failure by stage, forces and times."""
+"""Sums over attempts: shares, failures by stage, forces and times."""
 
 import dataclasses
 import math
@@ -23,10 +23,10 @@ Share = tuple[float, float, float, int]
 
 @dataclasses.dataclass(frozen=True)
 class ProtocolResult(Value):
-    """The outcome of a grasp of some `rank` under one `draw` of the error of pose; NaN was not measured.
+    """The outcome of the grasp of a `rank` under a `draw` of pose errors; NaN: not measured.
 
-    `moved` [m] and `turned` [rad] are the object's motion: in the world under a pull, in the hand in a lift. `force`
-    [N] is the fingers' mean normal force, `overlap` [m] as of `TrialDriver.grasp_overlap`, `seconds` CPU time.
+    `moved` [m] and `turned` [rad] are the object's motion, in a lift that in the hand. `force` [N] is the fingers' mean
+    normal force. `overlap` [m] is the depth of the grasp pose in the object. `seconds` is CPU time.
     """
 
     rank: int
@@ -42,10 +42,9 @@ class ProtocolResult(Value):
 
 @dataclasses.dataclass(frozen=True)
 class ViewScore(Value):
-    """The outcome of the grasps of one view: `executable` counts the planner's offers.
+    """The outcome of a view, for which the planner offered `executable` grasps.
 
-    Without any, `refusal` is the commonest reason or what ended planning, and `note` may say more. `seconds` is the CPU
-    time of planning.
+    Without any, `refusal` is the commonest reason; `note` may say more. `seconds` is the CPU time of planning.
     """
 
     object: str
@@ -60,9 +59,9 @@ class ViewScore(Value):
 def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     """Return the numbers of an evaluation by name.
 
-    "gsr" is the share of all attempts that passed, "top1" the share among best-ranked grasps. In "top1" a view without
-    grasps counts as a failure for each draw. "objects" is the share of objects with a success, "refused" the number of
-    views without a grasp. "force_n", "overlap_mm", "plan_cpu_s" (a view) and "trial_cpu_s" (an attempt) are means.
+    "gsr" is the share of attempts that passed. "top1" is that of the best-ranked grasps; a view without grasps fails in
+    every draw. "objects" is the share of objects with a success. "refused" counts views without a grasp. "force_n",
+    "overlap_mm", "plan_cpu_s" (of a view) and "trial_cpu_s" (of an attempt) are means.
     """
     attempts = [attempt for score in scores for attempt in score.attempts]
     spent = [*(score.seconds for score in scores), *(a.seconds for a in attempts)]
