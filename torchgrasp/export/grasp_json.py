@@ -1,6 +1,6 @@
-"""Grasps as plain JSON for other programs: three postures of named joints, with forces, torques, frames and units.
+"""Grasps as plain JSON: three postures of named joints, with forces, torques, frames and units.
 
-DexGraspBench's own .npy is not written: it is a pickled dictionary, which can run code when it is read.
+DexGraspBench's own .npy is a pickled dictionary. It could run code when it is read, so it is not written.
 """
 
 from jaxtyping import Float
@@ -36,15 +36,11 @@ CONVENTIONS = {
 
 
 def format_grasps(hand: Hand, grasps: Grasps, force: float = 4.0) -> str:
-    """Return grasps as JSON: for each the pose, three postures by joint name, contacts, forces, torques and checks.
+    """Return grasps as JSON, with `CONVENTIONS`.
 
-    The hand comes to "pose" along "approach" in its "pregrasp" posture. It closes to "grasp" in the time given, and
-    presses towards "squeeze" in as much again. All joints move evenly.
-
-    Args:
-        hand: the hand of the grasps.
-        grasps: g rows.
-        force: normal force of the strongest finger [N].
+    The hand comes to "pose" along "approach" in its "pregrasp" posture. It closes to "grasp" in the time given.
+    In the same time again it presses towards "squeeze". All joints move evenly. The strongest finger presses with a
+    normal force of `force` [N].
 
     Raises:
         BadArgument: joints of another hand, or a force that is not positive.

@@ -1,4 +1,4 @@
-"""Grasps as keyframes of a MuJoCo model: the hand floats on a free joint, every joint has a position actuator."""
+"""Grasps as keyframes of a MuJoCo model. The hand has a free joint and position actuators."""
 
 import xml.etree.ElementTree as ET
 
@@ -22,14 +22,10 @@ POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 def format_keyframes(hand: Hand, grasps: Grasps, force: float = 4.0) -> str:
     """Return MJCF of the hand with four keyframes for each grasp: grasp_0_approach, _pregrasp, _grasp, _squeeze.
 
-    The world is the object's frame; the object may be added to it. `qpos` is the free joint, then the joints of the
-    model; `ctrl` is the targets of the actuators. The text elements "qpos" and "ctrl" name their order. The approach
-    has the joints of the pre-grasp. The squeeze has the joints of the grasp, and targets that press.
-
-    Args:
-        hand: the hand of the grasps.
-        grasps: g rows.
-        force: normal force of the strongest finger [N] in the squeeze.
+    The world is the object's frame. `qpos` is the free joint, then the joints of the model; `ctrl` is the targets of
+    the actuators. The text elements "qpos" and "ctrl" name their order. The approach has the joints of the pre-grasp.
+    The squeeze has the joints of the grasp and targets that press. `force` [N] is the normal force of the strongest
+    finger.
 
     Raises:
         BadArgument: joints of another hand, or a force that is not positive.

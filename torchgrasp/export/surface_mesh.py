@@ -13,9 +13,9 @@ SUFFIXES = (".ply", ".glb")
 
 
 def save_surface(surface: Surface, path: Path | str) -> Path:
-    """Write a surface as `.ply` or `.glb`, its vertices coloured by `std_m` from 0 (violet) to `largest_std` (yellow).
+    """Write a surface as `.ply` or `.glb`. Colours show `std_m`, from 0 (violet) to `largest_std` (yellow).
 
-    The `.ply` file also holds the number itself, the property `std_m` [m] of each vertex.
+    A `.ply` file also holds `std_m` [m] of every vertex.
 
     Raises:
         BadArgument: another suffix.

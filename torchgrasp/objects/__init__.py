@@ -24,14 +24,10 @@ MASSES = {"cylinder": 0.15, "jug": 0.20, "rabbit": 0.10, "spray": 0.15}
 
 @dataclasses.dataclass(frozen=True)
 class GraspObject:
-    """An object in metres, z up, resting at z = 0.
+    """An object in metres, z up, resting at z = 0, with its mass [kg].
 
-    Args:
-        name: of the object.
-        mesh: the true, closed surface.
-        parts: convex solids for simulation; their union is the object.
-        view: noisy view from one side, with its viewpoint.
-        mass: [kg].
+    `mesh` is the true, closed surface. The union of the convex `parts` replaces it in simulation. `view` is a noisy
+    cloud from one side, with its viewpoint.
     """
 
     name: str
