@@ -1,4 +1,4 @@
-"""Table 5, Fig. 7 and Fig. 8 of the paper: how far the learned model's joints are from true ones (Eq. 23)."""
+"""Table 5, Fig. 7 and Fig. 8 of the paper: errors of the learned model's joints (Eq. 23)."""
 
 import dataclasses
 import io
@@ -24,23 +24,24 @@ PUBLISHED = {
     "cases": [[0.03, 0.06, 0.27, 0.26], [0.17, 0.01, 0.27, 0.002], [0.04, 0.07, 0.25, 0.08], [0.03, 0.2, 0.06, 0.56]],
     "overall": [(0.16, 0.01), (0.17, 0.01), (0.21, 0.007), (0.36, 0.02)],
 }
-"""The paper's Table 5 by joint: its four cases, and the mean over all test postures with its deviation [rad]."""
+"""The paper's Table 5 by joint: four cases, and mean and deviation over all test postures [rad]."""
 PUBLISHED_ALLEGRO = 0.2
-"""What the paper says of Fig. 8: the average error is around this [rad]."""
+"""Average error in the paper's text on Fig. 8 [rad]."""
 CASES = (0.1, 0.4, 0.7, 0.95)
-"""Where the four cases are among the test postures ordered by their error; the paper does not say what its own are."""
+"""Quantiles of the error at which the four cases are taken; the paper does not explain its own choice."""
 TILE = (520, 416)
 """Width and height of one picture of Fig. 7 [pixels]."""
 EYE: Direction = (1.0, -0.7, 0.55)
+"""Direction from the hand to the viewer."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Errors:
-    """Test postures, what the model makes of their codes, and the distance between the two [rad]."""
+    """Test postures, the model's predictions from their codes, and the absolute errors [rad]."""
 
     hand: Hand
     joints: Float[Tensor, "n h"]
-    found: Float[Tensor, "n h"]
+    predicted: Float[Tensor, "n h"]
     error: Float[Tensor, "n h"]
 
     def cases(self) -> list[int]:
@@ -50,21 +51,21 @@ class Errors:
 
 
 def measure_errors(name: str, n: int, seed: int) -> Errors:
-    """Ask a shipped model for the joints of n test postures by their codes; the seed is not the one of its samples."""
+    """Predict the joints of n test postures with a shipped model; the seed must differ from the model's."""
     hand, mixture = load_hand(name), load_mixture(name)
     if str(seed) == mixture.meta["seed"]:
-        raise SystemExit(f"--seed {seed}: the model has learned from these postures; any other seed is a test")
+        raise SystemExit(f"--seed {seed}: the model was fitted to these postures; choose another seed")
     samples = sample_configurations(hand, n, seed)
-    found = mixture.joints(samples.q)
-    return Errors(hand, samples.joints, found, (found - samples.joints).abs())
+    predicted = mixture.joints(samples.q)
+    return Errors(hand, samples.joints, predicted, (predicted - samples.joints).abs())
 
 
 def table5(out: Path, n: int = 600_000, seed: int = 1) -> None:
     """Print Table 5: the Barrett model's mean absolute error by joint, with the paper's numbers beside ours.
 
     Args:
-        out: folder of table5.json; it is made where it does not exist.
-        n: test postures, which the model has not seen.
+        out: folder of table5.json.
+        n: held-out test postures.
         seed: of their draw.
     """
     errors = measure_errors("barrett", n, seed)
@@ -87,11 +88,11 @@ def table5(out: Path, n: int = 600_000, seed: int = 1) -> None:
 
 
 def fig7(out: Path, n: int = 600_000, seed: int = 1) -> None:
-    """Draw Fig. 7: true (solid) and predicted (sheer) joints of the Barrett hand in the four cases of Table 5.
+    """Draw Fig. 7: true (solid) and predicted (transparent) joints of the Barrett hand in the four cases of Table 5.
 
     Args:
-        out: folder of fig7.png; it is made where it does not exist.
-        n: test postures, which the model has not seen.
+        out: folder of fig7.png.
+        n: held-out test postures.
         seed: of their draw.
     """
     errors = measure_errors("barrett", n, seed)
@@ -99,7 +100,7 @@ def fig7(out: Path, n: int = 600_000, seed: int = 1) -> None:
     pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(19)
     for k, row in enumerate(errors.cases()):
         corner = (k % 2 * TILE[0], k // 2 * TILE[1])
-        picture = draw_both(errors.hand, errors.joints[row], errors.found[row])
+        picture = draw_both(errors.hand, errors.joints[row], errors.predicted[row])
         sheet.paste(picture.resize(TILE, Image.Resampling.LANCZOS), corner)
         numbers = ", ".join(f"{x:.2f}" for x in errors.error[row].tolist())
         pen.text((corner[0] + 12, corner[1] + 10), f"case {k + 1}: off by {numbers} rad", INK, font)
@@ -110,8 +111,8 @@ def fig8(out: Path, n: int = 600_000, seed: int = 1) -> None:
     """Draw Fig. 8: the Allegro model's mean absolute error of each of the 12 joints, with its deviation.
 
     Args:
-        out: folder of fig8.png and fig8.json; it is made where it does not exist.
-        n: test postures, which the model has not seen.
+        out: folder of fig8.png and fig8.json.
+        n: held-out test postures.
         seed: of their draw.
     """
     from matplotlib.figure import Figure
@@ -140,10 +141,10 @@ def fig8(out: Path, n: int = 600_000, seed: int = 1) -> None:
     print(out / "fig8.png")
 
 
-def draw_both(hand: Hand, true: Float[Tensor, "h"], found: Float[Tensor, "h"]) -> Image.Image:
-    """Draw a hand at its true joints, and sheer over it at those that were found."""
+def draw_both(hand: Hand, true: Float[Tensor, "h"], predicted: Float[Tensor, "h"]) -> Image.Image:
+    """Draw a hand at its true joints and, transparent, at the predicted ones."""
     canvas, corners = Canvas(), []
-    for joints, transparent in ((true, False), (found, True)):
+    for joints, transparent in ((true, False), (predicted, True)):
         for solid in solids_from_hand(hand, hand.expand_joints(joints), hand.tree.joint_names, torch.eye(4).double()):
             color = HAND if solid.finger == PARKED else FINGERS[solid.finger]
             canvas.add_mesh(solid.vertices, solid.faces, color, transparent=transparent)
@@ -152,14 +153,14 @@ def draw_both(hand: Hand, true: Float[Tensor, "h"], found: Float[Tensor, "h"]) -
 
 
 def _save(sheet: Image.Image, path: Path) -> None:
-    """Write a picture and say where."""
+    """Write a picture and print its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda temporary: sheet.save(temporary, format="PNG"))
     print(path)
 
 
 def _write(out: Path, name: str, content: dict[str, Any]) -> None:
-    """Write numbers as JSON, with the paper's."""
+    """Write numbers and the paper's numbers as JSON."""
     out.mkdir(parents=True, exist_ok=True)
     text = json.dumps(content | {"published": PUBLISHED}, indent=1)
     write_file(out / f"{name}.json", text)

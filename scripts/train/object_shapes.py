@@ -1,8 +1,8 @@
-"""The shapes of torchgrasp's own objects, built from exact geometry; `scripts/author_objects.py` writes the results.
+"""The shapes of torchgrasp's own objects from exact geometry; `author_objects.py` writes them.
 
-Every object is a union of convex solids, so its convex parts need no decomposition. Curved parts are coarser than
-the mesh (a physics engine takes at most 255 corners and 255 faces) and scaled to the volume of what they stand for.
-Needs manifold3d, a dependency of development only. Metres, z up, resting at z = 0.
+Every object is a union of convex solids, so its convex parts need no decomposition. A physics engine takes at most 255
+corners and 255 faces, so curved parts are coarser than the mesh; they have the same volume. The module needs
+manifold3d, a dependency of development only. Metres, z up, resting at z = 0.
 """
 
 import math
@@ -13,15 +13,15 @@ import manifold3d as m3
 import numpy as np
 
 SEGMENTS = 96
-"""Sides of a solid of revolution: its facets are 0.02 mm inside the circle at a radius of 33 mm."""
-FINE, COARSE = 48, 20
+"""Sides of a solid of revolution: at a radius of 33 mm the facets lie 0.02 mm inside the circle."""
+FINE_SIDES, COARSE_SIDES = 48, 20
 """Sides of the equator of an ellipsoid in the mesh and in the parts (102 corners, 200 faces)."""
 
 Vector = Sequence[float | int] | np.ndarray
 
 
 class Solid(NamedTuple):
-    """A convex solid: as it enters the mesh, and as it enters the convex parts."""
+    """A convex solid: fine for the mesh, coarse for the convex parts."""
 
     fine: m3.Manifold
     part: m3.Manifold
@@ -38,7 +38,7 @@ def author(name: str) -> tuple[m3.Manifold, list[np.ndarray]]:
     (1, 376)
     """
     solid, parts = {"cylinder": _cylinder, "rabbit": _rabbit, "spray": _spray, "jug": _jug}[name]()
-    # Parts that share a face leave slivers without volume behind: the object is the largest piece.
+    # Parts that share a face leave slivers without volume: the object is the largest piece.
     solid = max(solid.simplify(1e-6).decompose(), key=lambda piece: piece.volume())
     return solid, [np.asarray(p.hull().to_mesh64().vert_properties)[:, :3] for p in parts]
 
@@ -124,7 +124,7 @@ def _ellipsoid(centre: Vector, axes: Vector, pitch: float = 0.0, roll: float = 0
             .translate((centre[0], centre[1], centre[2]))
         )
 
-    fine, coarse = m3.Manifold.sphere(1.0, FINE), m3.Manifold.sphere(1.0, COARSE)
+    fine, coarse = m3.Manifold.sphere(1.0, FINE_SIDES), m3.Manifold.sphere(1.0, COARSE_SIDES)
     grow = (4 / 3 * math.pi / coarse.volume()) ** (1 / 3)
     return Solid(place(fine), place(coarse.scale((grow, grow, grow))))
 
@@ -132,7 +132,7 @@ def _ellipsoid(centre: Vector, axes: Vector, pitch: float = 0.0, roll: float = 0
 def _frusta(profile: Sequence[Vector], flatten: float = 1.0) -> Solid:
     """A solid of revolution of (radius, height) [m], convex as a whole; `flatten` scales it along y."""
 
-    def turn(segments: int, grow: float) -> m3.Manifold:
+    def revolve(segments: int, grow: float) -> m3.Manifold:
         angle = np.arange(segments) * 2 * np.pi / segments
         rings = [
             np.stack([r * grow * np.cos(angle), r * grow * flatten * np.sin(angle), np.full(segments, z)], -1)
@@ -142,7 +142,7 @@ def _frusta(profile: Sequence[Vector], flatten: float = 1.0) -> Solid:
 
     sides = 240 // len(profile) // 4 * 4
     area = math.sin(2 * math.pi / SEGMENTS) * SEGMENTS / (math.sin(2 * math.pi / sides) * sides)
-    return Solid(turn(SEGMENTS, 1.0), turn(sides, math.sqrt(area)))
+    return Solid(revolve(SEGMENTS, 1.0), revolve(sides, math.sqrt(area)))
 
 
 def _ring(outer: Sequence[Vector], inner: Sequence[Vector], pieces: int) -> tuple[m3.Manifold, list[m3.Manifold]]:

@@ -1,4 +1,4 @@
-"""How many Gaussians: the criterion and cross-validation over their number, beside Fig. 6 (b, d), with a picture."""
+"""The number of Gaussians: criterion and cross-validation beside Fig. 6 (b, d), with a picture."""
 
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from benchmarks.hand.model_selection import BicCurve, CrossValidation, bic_curve
 SWEEP = tuple(range(5, 61, 5))
 """Numbers of Gaussians; the paper's figure shows 5 to 60."""
 FIT = {"tolerance": 1e-3, "iterations": 100}
+"""Of every fit: as `fit_mixture`, but with a third of the steps, since there are hundreds of fits."""
 
 
 def bench_bic(n: int, folds: int, out: Path) -> list[Row]:
@@ -23,17 +24,17 @@ def bench_bic(n: int, folds: int, out: Path) -> list[Row]:
         folds: of the cross-validation.
         out: the picture.
     """
-    rows, found = [], {}
+    rows, curves = [], {}
     for name, paper in COMPONENTS.items():
         samples = draw(name, n + n // 4)
-        few = sorted({10, 20, 30, paper, 50, 60})
-        with tqdm(total=len(SWEEP) + len(few) * folds, desc=name, disable=None, leave=False) as bar:
+        numbers = sorted({10, 20, 30, paper, 50, 60})
+        with tqdm(total=len(SWEEP) + len(numbers) * folds, desc=name, disable=None, leave=False) as bar:
             curve = bic_curve(samples[:n], SWEEP, observer=lambda m, mixture: bar.update() and None, **FIT)
-            crossed = cross_validate(samples[n:], few, folds, observer=lambda m, fold: bar.update() and None, **FIT)
+            crossed = cross_validate(samples[n:], numbers, folds, observer=lambda m, fold: bar.update() and None, **FIT)
         print(name, curve, crossed, sep="\n")
-        found[name] = curve, crossed
+        curves[name] = curve, crossed
         rows.append(_row(name, paper, n, curve, crossed))
-    draw_selection(found, out)
+    draw_selection(curves, out)
     return rows
 
 
@@ -61,10 +62,10 @@ def _row(name: str, paper: int, n: int, curve: BicCurve, crossed: CrossValidatio
     )
 
 
-def draw_selection(found: dict[str, tuple[BicCurve, CrossValidation]], out: Path) -> None:
+def draw_selection(curves: dict[str, tuple[BicCurve, CrossValidation]], out: Path) -> None:
     """Draw a row for each hand: the criterion, the held-out log-likelihood, the held-out error."""
-    figure, axes = plt.subplots(len(found), 3, figsize=(12, 3.2 * len(found)), squeeze=False, layout="constrained")
-    for (name, (curve, crossed)), row in zip(found.items(), axes, strict=True):
+    figure, axes = plt.subplots(len(curves), 3, figsize=(12, 3.2 * len(curves)), squeeze=False, layout="constrained")
+    for (name, (curve, crossed)), row in zip(curves.items(), axes, strict=True):
         row[0].plot(curve.components, curve.bic / 1e6, "o-", ms=3)
         row[0].set_ylabel("BIC [10^6]")
         for axis, values, label in (

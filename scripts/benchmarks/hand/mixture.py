@@ -1,6 +1,6 @@
-"""The learned model beside its bars: expectation-maximisation against scikit-learn, its errors, queries.
+"""The learned model beside its bars: expectation-maximisation against scikit-learn, errors, queries.
 
-The models are fitted on 4x10^5 free postures and judged on 6x10^5 others, as in the paper.
+As in the paper, 4x10^5 free postures are fitted and 6x10^5 others are held out.
 """
 
 import functools
@@ -29,15 +29,16 @@ from torchgrasp.posture_model.shard import Shard
 
 COMPONENTS = {"allegro": 41, "barrett": 36}
 """The paper's numbers of Gaussians."""
-FASTER = {"allegro": 6.0, "barrett": 8.0}
+MIN_SPEEDUP = {"allegro": 6.0, "barrett": 8.0}
 """Least ratio of scikit-learn's time for a step to ours."""
 PAPER_ERRORS = {"barrett": (0.16, 0.17, 0.21, 0.36)}
-"""Mean absolute errors of Table 5 [rad], each a bar."""
+"""Mean absolute errors of Table 5 [rad]; each is a bar."""
 ALLEGRO_ERROR = 0.2
-"""Bar for the mean over the Allegro's twelve joints [rad]; what the paper reads off its Fig. 8."""
-STEPS = 4
-SEED = 977
-"""Of the postures that are held out."""
+"""Bar for the mean over the Allegro's twelve joints [rad]: the paper's reading of its Fig. 8."""
+EM_STEPS = 4
+"""Steps that are timed: enough for a steady mean."""
+HELD_OUT_SEED = 977
+"""Of the held-out postures: not the seed of a shipped model."""
 
 
 @functools.cache
@@ -47,7 +48,7 @@ def draw(name: str, n: int, sampling: Sampling = "uniform", seed: int = 0) -> Ha
 
 
 def bench_em(n: int) -> list[Row]:
-    """Take the same steps from the same start as scikit-learn, in both precisions; time, likelihood, memory."""
+    """Compare steps from the same start with scikit-learn in both precisions: time, likelihood, memory."""
     return [row for name in COMPONENTS for row in (*_bench_steps(name, n), _bench_memory(name, n))]
 
 
@@ -59,17 +60,18 @@ def _bench_steps(name: str, n: int) -> list[Row]:
     for dtype in (torch.float64, torch.float32):
         data, first = x.to(dtype), start.to(dtype)
         ours = least_seconds(functools.partial(_step, data, first), 3)
-        theirs, reached = _scikit_learn(data, first)
-        fit = expectation_maximisation(Shard(data), first, STEPS - 1, 0.0, 1e-6)
-        apart = abs(float(fit.log_likelihood[-1]) - reached)
+        theirs, log_likelihood = _scikit_learn(data, first)
+        fit = expectation_maximisation(Shard(data), first, EM_STEPS - 1, 0.0, 1e-6)
+        difference = abs(float(fit.log_likelihood[-1]) - log_likelihood)
         precise = dtype == torch.float64
         rows.append(
             Row(
                 f"{name}: an EM step, {n} x {x.shape[1]}, m = {m}, {dtype}, against scikit-learn",
-                f">= {FASTER[name]:g}x faster" + (f"; log-likelihood after {STEPS} within 1e-6" if precise else ""),
-                f"{theirs / ours:.1f}x ({ours:.3f} s against {theirs:.3f} s); {apart:.1g} nats a point apart",
-                theirs / ours >= FASTER[name] and (apart <= 1e-6 or not precise),
-                {"ours_s": ours, "theirs_s": theirs, "log_likelihood_apart": apart},
+                f">= {MIN_SPEEDUP[name]:g}x faster"
+                + (f"; log-likelihood after {EM_STEPS} within 1e-6" if precise else ""),
+                f"{theirs / ours:.1f}x ({ours:.3f} s against {theirs:.3f} s); {difference:.1g} nats a point apart",
+                theirs / ours >= MIN_SPEEDUP[name] and (difference <= 1e-6 or not precise),
+                {"ours_s": ours, "theirs_s": theirs, "log_likelihood_apart": difference},
             )
         )
     return rows
@@ -86,15 +88,15 @@ def _step(x: Float[Tensor, "n d"], start: Progress) -> None:
 
 
 def _scikit_learn(x: Float[Tensor, "n d"], start: Progress) -> tuple[float, float]:
-    """Return scikit-learn's time for a step [s], and the mean log-likelihood that it reports after the last.
+    """Return scikit-learn's time for a step [s], and its mean log-likelihood after the last step.
 
-    One step costs what `STEPS` steps take longer than one, which leaves out its own start.
+    The time is the difference of `EM_STEPS` steps and one step, without its own start.
     """
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.mixture import GaussianMixture
 
     parts = start.components
-    # scikit-learn asks for symmetry to 1e-8, which an inverse in single precision has not
+    # scikit-learn asks for symmetry to 1e-8, more than single precision gives
     precisions = torch.linalg.inv(parts.covariances.double())
     precisions = ((precisions + precisions.transpose(1, 2)) / 2).to(x.dtype)
     model = GaussianMixture(
@@ -113,30 +115,30 @@ def _scikit_learn(x: Float[Tensor, "n d"], start: Progress) -> tuple[float, floa
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
-        seconds = [least_seconds(functools.partial(fit, steps), 2) for steps in (1, STEPS)]
-    return (seconds[1] - seconds[0]) / (STEPS - 1), float(model.lower_bound_)
+        seconds = [least_seconds(functools.partial(fit, steps), 2) for steps in (1, EM_STEPS)]
+    return (seconds[1] - seconds[0]) / (EM_STEPS - 1), float(model.lower_bound_)
 
 
 def _bench_memory(name: str, n: int) -> Row:
-    """Fit from the samples, starts included, each in a process of its own, and compare how far the peaks rise."""
+    """Compare the rise of peak memory over a fit, starts included; each fit has a process of its own."""
     samples, m = draw(name, n), COMPONENTS[name]
     rises = []
     for action in (_fit_ours, _fit_theirs):
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             rises.append(pool.apply(_rise, (action, samples, m)))
     ours, theirs = rises
-    told = ours is not None and theirs is not None
+    measured = ours is not None and theirs is not None
     return Row(
         f"{name}: memory of a fit from {n} samples, its start included, over data and libraries, against scikit-learn",
         "<= half",
-        f"{ours:.0f} MiB against {theirs:.0f} MiB: {ours / theirs:.2f}" if told else "not told by this system",
-        ours <= theirs / 2 if told else None,
+        f"{ours:.0f} MiB against {theirs:.0f} MiB: {ours / theirs:.2f}" if measured else "not reported by this system",
+        ours <= theirs / 2 if measured else None,
         {"ours_mib": ours, "theirs_mib": theirs},
     )
 
 
 def _rise(action: Callable[[HandSamples, int], None], samples: HandSamples, m: int) -> float | None:
-    """Return the rise of the peak [MiB] during an action, after a small one that loads the libraries."""
+    """Return the rise of peak memory [MiB] during an action, after a small one that loads the libraries."""
     small = samples[: 100 * m]
     action(small, m)
     before = peak_mib()
@@ -158,46 +160,46 @@ def _fit_theirs(samples: HandSamples, m: int) -> None:
 
 
 def bench_mae(n: int) -> list[Row]:
-    """Judge models on six tenths of n postures, and any function of the code by the nearest of the other four tenths.
+    """Evaluate models on six tenths of n postures; the other four tenths bound any function of the code.
 
-    Of uniform postures it is the shipped model; for opposed fingertips one is fitted to the four tenths.
+    Uniform postures test the shipped model. For opposed fingertips a model is fitted to the four tenths.
     """
     rows = []
     for name, m in COMPONENTS.items():
         for sampling in get_args(Sampling):
-            learned, held_out = draw(name, 2 * n // 5, sampling), draw(name, 3 * n // 5, sampling, SEED)
+            learned, held_out = draw(name, 2 * n // 5, sampling), draw(name, 3 * n // 5, sampling, HELD_OUT_SEED)
             mixture = load_mixture(name) if sampling == "uniform" else fit_mixture(learned, m)
-            judged = evaluate_mixture(mixture, held_out)
-            print(judged)
-            rows.append(_errors_row(f"{name}, {sampling} postures", name, judged))
+            score = evaluate_mixture(mixture, held_out)
+            print(score)
+            rows.append(_errors_row(f"{name}, {sampling} postures", name, score))
             rows.append(_floor_row(f"{name}, {sampling} postures", learned, held_out))
     return rows
 
 
-def _errors_row(what: str, name: str, judged: MixtureScore) -> Row:
+def _errors_row(what: str, name: str, score: MixtureScore) -> Row:
     """Return the mean absolute error of Eq. (23) beside the paper's."""
-    errors, mean = judged.error.tolist(), judged.mean_error
+    errors, mean = score.error.tolist(), score.mean_error
     paper = PAPER_ERRORS.get(name)
     met = all(e <= p for e, p in zip(errors, paper, strict=True)) if paper else mean <= ALLEGRO_ERROR
     return Row(
-        f"{what}: mean absolute error of Eq. (23) on {judged.postures} held-out postures",
+        f"{what}: mean absolute error of Eq. (23) on {score.postures} held-out postures",
         f"<= {paper} rad" if paper else f"mean over the joints <= {ALLEGRO_ERROR:g} rad",
-        f"{mean:.3f} rad: {', '.join(f'{e:.3f}' for e in errors)}; nearest of four modes {judged.nearest_mode:.3f}",
+        f"{mean:.3f} rad: {', '.join(f'{e:.3f}' for e in errors)}; nearest of four modes {score.nearest_mode:.3f}",
         met,
-        judged.meta(),
+        score.meta(),
     )
 
 
 def _floor_row(what: str, learned: HandSamples, held_out: HandSamples, queries: int = 20_000) -> Row:
-    """Return the error of the median over the nearest codes, as many of them as serve best.
+    """Return the error of the median over the nearest codes, with the best number of neighbours.
 
-    With more samples it goes to the least error that any function of the code can have: what the code leaves open.
+    With more samples it converges to the least error of any function of the code: what the code leaves open.
     """
     centre, scale = learned.q.mean(0), learned.q.std(0)
     tree = cKDTree(((learned.q - centre) / scale).numpy())
-    near = tree.query(((held_out.q[:queries] - centre) / scale).numpy(), k=128)[1]
+    neighbours = tree.query(((held_out.q[:queries] - centre) / scale).numpy(), k=128)[1]
     joints, truth = learned.joints.numpy(), held_out.joints[:queries].numpy()
-    errors = {k: float(np.abs(np.median(joints[near[:, :k]], 1) - truth).mean()) for k in (8, 16, 32, 64, 128)}
+    errors = {k: float(np.abs(np.median(joints[neighbours[:, :k]], 1) - truth).mean()) for k in (8, 16, 32, 64, 128)}
     best = min(errors, key=lambda k: errors[k])
     return Row(
         f"{what}: what the code leaves open, by the median of its nearest of {len(learned)} codes",
@@ -209,15 +211,15 @@ def _floor_row(what: str, learned: HandSamples, held_out: HandSamples, queries: 
 
 
 def bench_queries(codes: int) -> list[Row]:
-    """Ask for all six assignments of held-out contacts (Eqs. 21-24), one guess each."""
+    """Query all six assignments of held-out contacts (Eqs. 21-24), one seed each."""
     rows = []
     for name in COMPONENTS:
         hand, mixture = load_hand(name), load_mixture(name)
-        held_out = sample_configurations(hand, codes, SEED)
+        held_out = sample_configurations(hand, codes, HELD_OUT_SEED)
         contacts = touched(hand, held_out.joints)
         seconds = least_seconds(lambda: query_mixture(hand, contacts, mixture, n_seeds=1), 2)  # noqa: B023
-        reach = mixture.energy(held_out.q)
-        shares = {r: float((reach < r).double().mean()) for r in (PAPER_ENERGY, DEFAULT_ENERGY)}
+        energy = mixture.energy(held_out.q)
+        shares = {r: float((energy < r).double().mean()) for r in (PAPER_ENERGY, DEFAULT_ENERGY)}
         accepted = {r: query_mixture(hand, contacts, mixture, n_seeds=1, max_energy=r) for r in shares}
         found = {r: len(guess.row.unique()) / codes for r, guess in accepted.items()}
         rows.append(

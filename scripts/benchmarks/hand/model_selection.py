@@ -1,4 +1,4 @@
-"""How many Gaussians: the Bayesian information criterion over their number, and cross-validation (Fig. 6 b, d)."""
+"""The number of Gaussians: Bayesian information criterion and cross-validation (Fig. 6 b, d)."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -19,13 +19,13 @@ from torchgrasp.posture_model.sample import HandSamples
 
 @dataclasses.dataclass(frozen=True)
 class BicCurve(Value):
-    """The criterion of the fits with each number of components; less is better."""
+    """The criterion for each number of components; less is better."""
 
     components: Int[Tensor, "k"]
     bic: Float[Tensor, "k"]
 
     def __str__(self) -> str:
-        """Return the curve as a table, and where it is least."""
+        """Return the curve as a table, with its minimum."""
         rows = [f"  {m:3d} {b:14.0f}" for m, b in zip(self.components.tolist(), self.bic.tolist(), strict=True)]
         least = int(self.components[self.bic.argmin()])
         end = ", the largest asked for: no minimum is seen" if least == int(self.components.max()) else ""
@@ -34,7 +34,7 @@ class BicCurve(Value):
 
 @dataclasses.dataclass(frozen=True)
 class CrossValidation(Value):
-    """Held-out log-likelihood a posture [nats] and mean absolute error [rad] of each number of components and fold."""
+    """Held-out mean log-likelihood [nats] and mean absolute error [rad] for each number of components and fold."""
 
     components: Int[Tensor, "k"]
     log_likelihood: Float[Tensor, "k f"]
@@ -60,15 +60,15 @@ def bic_curve(
     observer: Callable[[int, GraspMixture], None] = lambda m, mixture: None,
     **fit: Any,
 ) -> BicCurve:
-    """Fit mixtures of each number of components and return their criterion (Fig. 6 b, d).
+    """Fit a mixture for each number of components and return their criterion (Fig. 6 b, d).
 
-    Codes are exact functions of the joints: on such samples the criterion falls as far as one cares to look, and its
-    minimum chooses nothing. Read where it flattens, beside `cross_validate`.
+    Codes are exact functions of the joints, so the criterion keeps falling and its minimum chooses nothing. Read where
+    it flattens, beside `cross_validate`.
 
     Args:
-        samples: what is fitted.
-        components: the numbers to try.
-        checkpoints: folder in which every fit is kept, so that a sweep that was killed goes on where it stood.
+        samples: postures to fit.
+        components: numbers to try.
+        checkpoints: folder of the fits' checkpoints; a killed sweep continues from them.
         observer: called after each fit with its number of components and its mixture.
         fit: seed, iterations, tolerance and regularisation of `fit_mixture`.
 
@@ -82,13 +82,13 @@ def bic_curve(
     """
     if not components:
         raise BadArgument("components", "none", "at least one number")
-    found = []
+    criterion = []
     for m in components:
-        kept = None if checkpoints is None else Path(checkpoints) / f"em_{m}.safetensors"
-        mixture = fit_mixture(samples, m, checkpoint=kept, **fit)
-        found.append(float(mixture.meta["bic"]))
+        checkpoint = None if checkpoints is None else Path(checkpoints) / f"em_{m}.safetensors"
+        mixture = fit_mixture(samples, m, checkpoint=checkpoint, **fit)
+        criterion.append(float(mixture.meta["bic"]))
         observer(m, mixture)
-    return BicCurve(torch.tensor(list(components)), torch.tensor(found, dtype=torch.float64))
+    return BicCurve(torch.tensor(list(components)), torch.tensor(criterion, dtype=torch.float64))
 
 
 def cross_validate(
@@ -100,12 +100,12 @@ def cross_validate(
     observer: Callable[[int, int], None] = lambda m, fold: None,
     **fit: Any,
 ) -> CrossValidation:
-    """Fit on all folds but one and judge on that one, for each number of components (footnote 4 of the paper).
+    """Fit on all folds but one and evaluate on that one, for each number of components (footnote 4 of the paper).
 
     Args:
-        samples: what is divided.
-        components: the numbers to try.
-        folds: into how many parts.
+        samples: postures to divide.
+        components: numbers to try.
+        folds: number of parts.
         seed: of the division and of the starts.
         observer: called after each fit with its number of components and its fold.
         fit: iterations, tolerance and regularisation of `fit_mixture`.
@@ -128,7 +128,7 @@ def cross_validate(
     for k, m in enumerate(components):
         for fold, held_out in enumerate(parts):
             rest = torch.cat([part for part in parts if part is not held_out])
-            judged = evaluate_mixture(fit_mixture(samples[rest], m, seed=seed, **fit), samples[held_out])
-            error[k, fold], log_likelihood[k, fold] = judged.mean_error, judged.log_likelihood
+            score = evaluate_mixture(fit_mixture(samples[rest], m, seed=seed, **fit), samples[held_out])
+            error[k, fold], log_likelihood[k, fold] = score.mean_error, score.log_likelihood
             observer(m, fold)
     return CrossValidation(torch.tensor(list(components)), log_likelihood, error)

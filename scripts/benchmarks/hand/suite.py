@@ -1,4 +1,4 @@
-"""The hands beside their bars: kinematics, collision, samples, the learned model, and from contacts to postures."""
+"""The hands beside their bars: kinematics, collision, samples, learned model, inverse kinematics."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -31,17 +31,17 @@ def hand(
     """Measure the hands against their bars and against peers, in one run and on the same threads.
 
     Args:
-        objects: folder with manifest.json and a folder for each object; without it planned contacts are left out.
+        objects: folder with manifest.json and a folder for each object; planned contacts need it.
         only: subjects to measure: fk, collision, samples, codes, em, mae, queries, bic, planned.
         codes: held-out codes of each hand.
-        samples: free postures of each hand, of which the first four tenths are learned from.
-        queries: contact triples asked for in all six assignments.
-        peers: how many of them COBYLA gets.
+        samples: free postures of each hand; the first four tenths are fitted.
+        queries: contact triples, in all six assignments.
+        peers: number of codes that COBYLA solves, too.
         starts: of the contact planner on each object.
-        threads: of torch, for the library and its peers alike.
+        threads: of torch, for the library and its peers.
         seed: of every draw.
         quick: a tenth of everything.
-        out: where the numbers are written as JSON, and beside it the choice of components as a picture.
+        out: JSON file of the numbers; the picture of the model selection lies beside it.
     """
     torch.set_num_threads(threads)
     if quick:
@@ -57,13 +57,6 @@ def hand(
         "bic": lambda: bench_bic(samples // 5, 2 if quick else 10, out.with_name("bench_hand_components.png")),
         "planned": lambda: bench_planned(objects, starts, seed) if objects else [],
     }
-    settings = {
-        "threads": threads,
-        "codes": codes,
-        "peers": peers,
-        "samples": samples,
-        "queries": queries,
-        "starts": starts,
-    }
-    settings |= {"seed": seed, "torch": torch.__version__}
+    settings = {"threads": threads, "codes": codes, "peers": peers, "samples": samples, "queries": queries}
+    settings |= {"starts": starts, "seed": seed, "torch": torch.__version__}
     measure("hand", subjects, only, settings, out)
