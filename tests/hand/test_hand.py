@@ -6,9 +6,11 @@ import pytest
 import torch
 
 from torchgrasp.errors import BadArgument
+from torchgrasp.frames import rotation_from_rpy
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
-from torchgrasp.testing import largest_fk_error
+from torchgrasp.hand.urdf import read_urdf
+from torchgrasp.testing import largest_fk_error, random_joints
 
 HANDS = [("allegro", "default"), ("allegro", "paper_literal"), ("barrett", "default")]
 
@@ -18,18 +20,13 @@ def hand(request) -> Hand:
     return load_hand(*request.param)
 
 
-def postures(hand: Hand, n: int, generator: torch.Generator) -> torch.Tensor:
-    share = torch.rand(n, hand.dof, generator=generator, dtype=torch.float64)
-    return hand.lower + (hand.upper - hand.lower) * share
-
-
-def test_fk_equals_yourdfpy_coupled_joints_included(hand, generator):
-    error, link = largest_fk_error(hand, postures(hand, 200, generator))
+def test_fk_equals_yourdfpy_coupled_joints_included(hand):
+    error, link = largest_fk_error(hand, random_joints(hand, 200))
     assert error < 1e-6, link
 
 
-def test_fk_float32_within_a_micrometre(hand, generator):
-    joints = postures(hand, 500, generator)
+def test_fk_float32_within_a_micrometre(hand):
+    joints = random_joints(hand, 500)
     points, normals = hand.fingertips(joints)
     points32, normals32 = hand.fingertips(joints.float())
     assert points32.dtype == torch.float32
@@ -37,8 +34,8 @@ def test_fk_float32_within_a_micrometre(hand, generator):
     torch.testing.assert_close(normals32.double(), normals, atol=2e-6, rtol=0)
 
 
-def test_jacobian_equals_finite_differences(hand, generator):
-    joints = postures(hand, 20, generator)
+def test_jacobian_equals_finite_differences(hand):
+    joints = random_joints(hand, 20)
     jacobian, step = hand.jacobian(joints), 1e-5
     for j in range(hand.dof):
         shift = torch.zeros(hand.dof, dtype=torch.float64)
@@ -47,8 +44,18 @@ def test_jacobian_equals_finite_differences(hand, generator):
         torch.testing.assert_close(jacobian[..., j], difference, atol=1e-7, rtol=1e-6)
 
 
-def test_batch_equals_singles_and_keeps_its_shape(hand, generator):
-    joints = postures(hand, 6, generator).reshape(2, 3, hand.dof)
+def test_joint_axes_and_origins_give_the_derivative_of_any_point_of_a_link(hand):
+    joints, spheres = random_joints(hand, 1)[0], hand.collision_spheres
+    axes, origins = hand.tree.joint_axes(hand.link_poses(joints))
+    arms = hand.sphere_centres(joints)[:, None] - origins
+    velocities = torch.linalg.cross(axes.expand_as(arms), arms) * hand.tree.moves[spheres.link_index][..., None]
+    derivative = torch.einsum("sjx,jh->sxh", velocities, hand.actuated.coupling)
+    truth = torch.autograd.functional.jacobian(hand.sphere_centres, joints)
+    torch.testing.assert_close(derivative, truth, atol=2e-8, rtol=1e-6)
+
+
+def test_batch_equals_singles_and_keeps_its_shape(hand):
+    joints = random_joints(hand, 6).reshape(2, 3, hand.dof)
     points, normals = hand.fingertips(joints)
     assert points.shape == normals.shape == (2, 3, 3, 3)
     assert hand.jacobian(joints).shape == (2, 3, 3, 3, hand.dof)
@@ -60,8 +67,8 @@ def test_batch_equals_singles_and_keeps_its_shape(hand, generator):
     assert hand.self_clearance(empty).shape == (0, 3)
 
 
-def test_contact_lies_on_the_tips_sphere_along_the_normal(hand, generator):
-    joints = postures(hand, 50, generator)
+def test_contact_lies_on_the_tips_sphere_along_the_normal(hand):
+    joints = random_joints(hand, 50)
     points, normals = hand.fingertips(joints)
     radius = hand.tip_radius[:, None]
     torch.testing.assert_close(torch.linalg.vector_norm(normals, dim=-1), torch.ones(50, 3, dtype=torch.float64))
@@ -94,9 +101,9 @@ def test_barrett_is_the_published_hand():
     torch.testing.assert_close(points[0, 1:], points[2, 1:], atol=1e-6, rtol=0)
 
 
-def test_barrett_is_symmetric_left_to_right(generator):
+def test_barrett_is_symmetric_left_to_right():
     hand = load_hand("barrett")
-    joints = postures(hand, 20, generator)
+    joints = random_joints(hand, 20)
     mirrored = joints[:, [0, 2, 1, 3]]
     flip = torch.tensor([-1.0, 1, 1], dtype=torch.float64)
     middle = torch.tensor([0.0, 0, 0.0006], dtype=torch.float64)  # the fingers' middle plane is 0.6 mm off their axis
@@ -106,9 +113,9 @@ def test_barrett_is_symmetric_left_to_right(generator):
     torch.testing.assert_close(points[:, 0], others[:, 1] * flip, atol=2 * middle.norm().item() + 1e-6, rtol=0)
 
 
-def test_allegro_thumb_opposes_the_fingers(generator):
+def test_allegro_thumb_opposes_the_fingers():
     hand = load_hand("allegro")
-    joints = postures(hand, 500, generator)
+    joints = random_joints(hand, 500)
     joints = joints[hand.self_clearance(joints) > 0]
     _, normals = hand.fingertips(joints)
     cosines = (normals[:, :2] * normals[:, 2:]).sum(-1)
@@ -120,9 +127,6 @@ def test_allegro_thumb_opposes_the_fingers(generator):
 
 
 def test_spheres_cover_the_collision_shapes(hand):
-    from torchgrasp.frames import rotation_from_rpy
-    from torchgrasp.hand.urdf import read_urdf
-
     cover, generator = hand.collision_spheres, torch.Generator().manual_seed(0)
     for index, link in enumerate(read_urdf(hand.urdf_path).links):
         for shape in link.shapes:

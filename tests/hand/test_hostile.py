@@ -194,7 +194,7 @@ print(json.dumps({"outcomes": found, "seen": seen[:20]}))
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="limits are set as on Linux")
-def test_h1_h2_h3_h5_hostile_hands_are_refused_and_open_nothing(claw, tmp_path):
+def test_hostile_hands_are_refused_and_open_nothing(claw, tmp_path):
     (claw.parent / "hand.toml").write_text(draft_hand(claw))
     command = [sys.executable, "-c", textwrap.dedent(WATCHED), __file__, str(claw.parent)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
@@ -236,7 +236,7 @@ def replaced(value: Any, path: tuple[Any, ...], new: Any) -> Any:
     return dict(changed) if isinstance(value, dict) else [v for _, v in changed]
 
 
-def test_h5_every_value_of_a_hand_toml_in_every_wrong_type(claw):
+def test_every_value_of_a_hand_toml_in_every_wrong_type(claw):
     """A value of another type is refused by name, or is as good as the old one; nothing else ends the reading."""
     good = tomllib.loads(draft_hand(claw))
     good["self_collision"]["pairs"] = good["self_collision"]["pairs"][:2]
@@ -262,7 +262,7 @@ def test_h5_every_value_of_a_hand_toml_in_every_wrong_type(claw):
 # -------------------------------------------------------------------------------------------------- model files
 
 
-def test_h4_model_files_cut_at_every_byte_of_the_header_or_changed_are_refused(tmp_path):
+def test_model_files_cut_at_every_byte_of_the_header_or_changed_are_refused(tmp_path):
     whole = (hands_folder() / "barrett" / "mixture.safetensors").read_bytes()
     header = 8 + int.from_bytes(whole[:8], "little")
     rng, path = np.random.default_rng(0), tmp_path / "mixture.safetensors"
@@ -278,7 +278,7 @@ def test_h4_model_files_cut_at_every_byte_of_the_header_or_changed_are_refused(t
             pass
 
 
-def test_h4_other_model_files_are_refused(tmp_path):
+def test_other_model_files_are_refused(tmp_path):
     whole = (hands_folder() / "barrett" / "mixture.safetensors").read_bytes()
 
     class Payload:

@@ -8,7 +8,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.testing import reference_poses
+from torchgrasp.testing import random_joints, reference_poses
 
 BRANCHED = """<robot name="branched">
   <link name="tip"/><link name="base"/><link name="slider"/><link name="arm"/><link name="side"/><link name="bolt"/>
@@ -29,11 +29,6 @@ def hand(request) -> Hand:
     return load_hand(request.param)
 
 
-def postures(hand: Hand, n: int, generator: torch.Generator) -> torch.Tensor:
-    share = torch.rand(n, hand.dof, generator=generator, dtype=torch.float64)
-    return hand.lower + (hand.upper - hand.lower) * share
-
-
 def assert_same_poses(found: torch.Tensor, truth: torch.Tensor) -> None:
     assert float((found - truth)[..., :3, 3].abs().max()) < 1e-6  # [m]
     turn = found[..., :3, :3].mT @ truth[..., :3, :3]
@@ -44,15 +39,15 @@ def assert_same_poses(found: torch.Tensor, truth: torch.Tensor) -> None:
     assert float((turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 3).abs().max()) < 1e-6
 
 
-def test_fk_equals_pytorch_kinematics(hand, generator):
-    joints = postures(hand, 1000, generator)
+def test_fk_equals_pytorch_kinematics(hand):
+    joints = random_joints(hand, 1000)
     assert_same_poses(hand.link_poses(joints), reference_poses(read_urdf(hand.urdf_path), hand.expand_joints(joints)))
 
 
-def test_fk_and_jacobian_equal_pinocchios_by_joint_name(hand, generator):
+def test_fk_and_jacobian_equal_pinocchios_by_joint_name(hand):
     pin = pytest.importorskip("pinocchio")
     model = pin.buildModelFromUrdf(str(hand.urdf_path))
-    data, joints = model.createData(), postures(hand, 1000, generator)
+    data, joints = model.createData(), random_joints(hand, 1000)
     every = {name: values.tolist() for name, values in hand.expand(joints).items()}
     order = [every[name] for name in list(model.names)[1:]]
     frames = [model.getFrameId(name) for name in hand.tree.link_names]
@@ -75,15 +70,15 @@ def test_fk_and_jacobian_equal_pinocchios_by_joint_name(hand, generator):
     assert float((hand.link_poses(joints) - truth).abs().max()) < 1e-12
 
 
-def test_fk_is_differentiable_twice(hand, generator):
-    joints = postures(hand, 1, generator).requires_grad_()
+def test_fk_is_differentiable_twice(hand):
+    joints = random_joints(hand, 1).requires_grad_()
     for action in (hand.link_poses, hand.fingertips, hand.jacobian):
         assert torch.autograd.gradcheck(action, joints)
         assert torch.autograd.gradgradcheck(action, joints)
 
 
-def test_derivative_of_the_jacobian_is_symmetric(hand, generator):
-    second = torch.func.jacfwd(hand.jacobian)(postures(hand, 1, generator)[0])
+def test_derivative_of_the_jacobian_is_symmetric(hand):
+    second = torch.func.jacfwd(hand.jacobian)(random_joints(hand, 1)[0])
     torch.testing.assert_close(second, second.mT, atol=1e-12, rtol=0)  # as second derivatives are
 
 
@@ -98,8 +93,8 @@ def test_a_tree_of_every_kind_of_joint_is_that_of_pytorch_kinematics(tmp_path, g
     assert torch.autograd.gradgradcheck(tree.poses, values[:1].requires_grad_())
 
 
-def test_kinematics_keeps_dtype_and_follows_the_hand(hand, generator):
-    joints = postures(hand, 3, generator)
+def test_kinematics_keeps_dtype_and_follows_the_hand(hand):
+    joints = random_joints(hand, 3)
     moved = hand.to(torch.float32)
     assert moved.tree.tables.dtype == torch.float32
     torch.testing.assert_close(moved.link_poses(joints.float()), hand.link_poses(joints.float()), atol=1e-7, rtol=0)

@@ -1,7 +1,5 @@
 """Self-collision against exact distances of the URDF's shapes (coal), and against its own definition."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -11,10 +9,11 @@ from torchgrasp.frames import rotation_from_vector
 from torchgrasp.hand.collision_pairs import NEAR, collision_pairs
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import read_hand_toml
+from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.self_collision import self_collision_from_urdf
 from torchgrasp.hand.urdf import Mimic, read_urdf
-from torchgrasp.testing import check_hand
+from torchgrasp.testing import check_hand, random_joints
 
 HANDS = [("allegro", "default"), ("allegro", "paper_literal"), ("barrett", "default")]
 
@@ -28,17 +27,11 @@ def frames_of(hand: Hand, joints: torch.Tensor) -> torch.Tensor:
     return hand.tree.frames(hand.expand_joints(joints).T.contiguous())
 
 
-def postures(hand: Hand, n: int, generator: torch.Generator) -> torch.Tensor:
-    share = torch.rand(n, hand.dof, generator=generator, dtype=torch.float64)
-    return hand.lower + (hand.upper - hand.lower) * share
-
-
-def test_self_collision_agrees_with_exact_hulls(hand, generator, monkeypatch):
+def test_self_collision_agrees_with_exact_hulls(hand):
     pytest.importorskip("coal")
-    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "scripts"))
     from benchmarks.hand.coal_reference import exact_clearance
 
-    joints = postures(hand, 300, generator)
+    joints = random_joints(hand, 300)
     truth, found = exact_clearance(hand, joints), hand.self_clearance(joints).numpy()
     met, wrong = truth < 0, (truth < 0) != (found < 0)
     assert 0.1 < met.mean() < 0.5
@@ -49,8 +42,8 @@ def test_self_collision_agrees_with_exact_hulls(hand, generator, monkeypatch):
     assert (found[~met & ~wrong] >= truth[~met & ~wrong] / 3**0.5 - 1e-3).all()
 
 
-def test_clearance_is_the_least_of_all_pairs(hand, generator):
-    joints = postures(hand, 500, generator)
+def test_clearance_is_the_least_of_all_pairs(hand):
+    joints = random_joints(hand, 500)
     every = hand.self_collision.separations(frames_of(hand, joints), torch.inf)
     torch.testing.assert_close(hand.self_clearance(joints), every.amin(0), atol=1e-14, rtol=0)
     torch.testing.assert_close(hand.self_clearance(joints, chunk=7), every.amin(0), atol=1e-14, rtol=0)
@@ -61,15 +54,15 @@ def test_clearance_is_the_least_of_all_pairs(hand, generator):
     torch.testing.assert_close(near.clamp_max(0.002), every.clamp_max(0.002), atol=1e-14, rtol=0)
 
 
-def test_clearance_in_float32_is_that_in_float64(hand, generator):
-    joints = postures(hand, 500, generator).float()
+def test_clearance_in_float32_is_that_in_float64(hand):
+    joints = random_joints(hand, 500).float()
     found = hand.self_clearance(joints)
     assert found.dtype == torch.float32
     torch.testing.assert_close(found.double(), hand.self_clearance(joints.double()), atol=2e-5, rtol=0)
 
 
 def test_clearance_gradient_equals_finite_differences(hand, generator):
-    joints = postures(hand, 60, generator).requires_grad_()
+    joints = random_joints(hand, 60).requires_grad_()
     (gradient,) = torch.autograd.grad(hand.self_clearance(joints).sum(), joints)
     step = 1e-6 * torch.randn(60, hand.dof, generator=generator, dtype=torch.float64)
     with torch.no_grad():
@@ -79,7 +72,7 @@ def test_clearance_gradient_equals_finite_differences(hand, generator):
 
 
 def test_wrenches_are_the_derivative_by_a_motion_of_the_second_shape(hand, generator):
-    itself, frames = hand.self_collision, frames_of(hand, postures(hand, 1, generator))
+    itself, frames = hand.self_collision, frames_of(hand, random_joints(hand, 1))
     shaken = rotation_from_vector(0.1 * torch.randn(frames.shape[2], 3, generator=generator, dtype=torch.float64))
     frames = torch.einsum("lij,jkln->ikln", shaken, frames)  # no two axes are parallel, where it has kinks
     pair, row = torch.arange(len(itself.pairs)), torch.zeros(len(itself.pairs), dtype=torch.long)
@@ -96,9 +89,9 @@ def test_wrenches_are_the_derivative_by_a_motion_of_the_second_shape(hand, gener
         torch.testing.assert_close((step @ found)[mine], ((ahead - back) / 2)[mine], atol=1e-10, rtol=1e-4)
 
 
-def test_self_collision_rates_are_those_of_the_hands(generator):
+def test_self_collision_rates_are_those_of_the_hands():
     rates = [
-        float((h.self_clearance(postures(h, 3000, generator)) < 0).double().mean())
+        float((h.self_clearance(random_joints(h, 3000)) < 0).double().mean())
         for h in (load_hand("allegro"), load_hand("barrett"))
     ]
     assert 0.22 < rates[0] < 0.29  # 0.25 by exact hulls with the ring finger parked
@@ -145,8 +138,6 @@ def test_cylinders_are_within_two_percent(tmp_path):
         '<child link="ball"/><axis xyz="1 0 0"/><limit lower="0" upper="1"/></joint></robot>'
     )
     urdf = read_urdf(path)
-    from torchgrasp.hand.kinematics import tree_from_urdf
-
     tree, itself = tree_from_urdf(urdf), self_collision_from_urdf(urdf, None)
     around = torch.stack([torch.linspace(-4, 4, 200, dtype=torch.float64), torch.full((200,), 0.09).double()])
     error = itself.clearance(tree.frames(around)) - 0.03

@@ -11,12 +11,12 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
 
 LEFT_OUT = frozenset(frozenset(("palm", f"f{k}_med")) for k in (1, 2))
-"""Links that clear each other in the real hand by less than their boxes bulge, see Barrett's hand.toml."""
+"""Links of the Barrett hand that clear each other by less than their boxes bulge (see its hand.toml)."""
 MAKE = {"box": coal.Box, "sphere": coal.Sphere, "cylinder": coal.Cylinder}
 
 
 def exact_clearance(hand: Hand, joints: torch.Tensor) -> np.ndarray:
-    """Return the signed least distance [m] of all links that share no joint, whatever pairs hand.toml lists.
+    """Return the signed least distance [m] of all links without a common joint, listed in hand.toml or not.
 
     Args:
         hand: the hand.

@@ -1,6 +1,6 @@
 """Kinematics, self-collision and samples of the shipped hands beside their bars.
 
-Rates are of rows in all: with several threads each takes rows of its own, which is how samples are drawn.
+Rates count the rows of all threads. Every thread takes its own rows, as when samples are drawn.
 """
 
 import functools
@@ -26,21 +26,21 @@ from torchgrasp import load_hand
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.posture_model.dataset import load_samples
-from torchgrasp.testing import reference_poses
+from torchgrasp.testing import random_joints, reference_poses
 
 HANDS = ("allegro", "barrett")
-CONFIGURATIONS = 1000
+POSTURES = 1000
 """Random postures in which poses are compared."""
 RATE = {"allegro": 1e5, "barrett": 2e5}
 """Least rate of self-collision [1/s]."""
 SECONDS = {"allegro": 60.0, "barrett": 30.0}
 """Most time for 10^6 samples on disk [s], on two cores."""
-ROWS = 5000
-"""Rows of one call."""
+ROWS_PER_CALL = 5000
+"""Rows of one timed call."""
 
 
 def bench_fk(n: int, threads: int) -> list[Row]:
-    """Compare poses with pytorch-kinematics' and pinocchio's, and the time of tips and Jacobians with the former's."""
+    """Compare poses with pytorch-kinematics and pinocchio, and times with pytorch-kinematics."""
     rows = []
     for name in HANDS:
         hand = load_hand(name)
@@ -50,15 +50,9 @@ def bench_fk(n: int, threads: int) -> list[Row]:
     return rows
 
 
-def _postures(hand: Hand, n: int, seed: int, dtype: torch.dtype = torch.float64) -> Tensor:
-    """Draw postures uniformly within the limits."""
-    share = torch.rand(n, hand.dof, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    return (hand.lower + (hand.upper - hand.lower) * share).to(dtype)
-
-
 def _exactness(name: str, hand: Hand) -> Row:
-    """Compare every link's pose with two other readers', by joint name."""
-    joints = _postures(hand, CONFIGURATIONS, 1)
+    """Compare every link's pose with two other readers, by joint name."""
+    joints = random_joints(hand, POSTURES, 1)
     found = hand.link_poses(joints)
     model = pinocchio.buildModelFromUrdf(str(hand.urdf_path))
     data, every = model.createData(), {k: v.tolist() for k, v in hand.expand(joints).items()}
@@ -74,11 +68,11 @@ def _exactness(name: str, hand: Hand) -> Row:
     worst = {peer: _worst(found, poses) for peer, poses in peers.items()}
     told = "; ".join(f"{peer} {move:.1e} m, {turn:.1e} rad" for peer, (move, turn) in worst.items())
     met = max(max(errors) for errors in worst.values()) <= 1e-6
-    return Row(f"{name}: poses of all links, {CONFIGURATIONS} postures", "<= 1e-6 m, 1e-6 rad", told, met, worst)
+    return Row(f"{name}: poses of all links, {POSTURES} postures", "<= 1e-6 m, 1e-6 rad", told, met, worst)
 
 
 def _worst(found: Tensor, truth: Tensor) -> tuple[float, float]:
-    """Return the largest difference in place [m] and by angle [rad]."""
+    """Return the largest difference in position [m] and angle [rad]."""
     turn = found[..., :3, :3].mT @ truth[..., :3, :3]
     skew = (turn - turn.mT) / 2
     sine = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1).norm(dim=-1)
@@ -87,17 +81,17 @@ def _worst(found: Tensor, truth: Tensor) -> tuple[float, float]:
 
 def _differentiable(name: str, hand: Hand) -> Row:
     """Check first and second derivatives against finite differences."""
-    joints = _postures(hand, 1, 2).requires_grad_()
+    joints = random_joints(hand, 1, 2).requires_grad_()
     met = all(check(hand.fingertips, joints) for check in (torch.autograd.gradcheck, torch.autograd.gradgradcheck))
     return Row(f"{name}: gradcheck and gradgradcheck of the fingertips", "pass", "pass" if met else "fail", met, {})
 
 
 def _speed(name: str, hand: Hand, n: int, threads: int, dtype: torch.dtype) -> list[Row]:
-    """Time n fingertips and n Jacobians of contact points beside pytorch-kinematics'; both couple the joints.
+    """Time n fingertips and n Jacobians of contact points beside pytorch-kinematics; both couple the joints.
 
-    Its Jacobian has the three rows of rotation as well, which it cannot leave out and nothing here asks for.
+    The peer's Jacobian always has the three rows of rotation, too.
     """
-    joints, some = _postures(hand, n, 3, dtype), n // 10  # the peer's time is as long for each row
+    joints, some = random_joints(hand, n, 3).to(dtype), n // 10  # the peer's time is as long for each row
     xml = read_urdf(hand.urdf_path).kinematic_xml()
     chain: Any = pytorch_kinematics.build_chain_from_urdf(xml).to(dtype=dtype)
     make: Any = pytorch_kinematics.build_serial_chain_from_urdf
@@ -129,8 +123,8 @@ def _speed(name: str, hand: Hand, n: int, threads: int, dtype: torch.dtype) -> l
 
 
 def _seconds(action: Callable[[Tensor], object], rows: Tensor, threads: int, repeats: int = 3) -> float:
-    """Return the least time of an action on all rows, split over threads [s]; of one thread that of the processor."""
-    parts = rows.split(ROWS)
+    """Return the least time [s] of an action on all rows, split over threads; one thread counts processor time."""
+    parts = rows.split(ROWS_PER_CALL)
     torch.set_num_threads(1)
     clock = time.process_time if threads == 1 else time.perf_counter
 
@@ -153,7 +147,7 @@ def bench_collision(n: int, threads: int) -> list[Row]:
     rows = []
     for name in HANDS:
         hand = load_hand(name)
-        joints = _postures(hand, max(200, n // 100), 4)
+        joints = random_joints(hand, max(200, n // 100), 4)
         truth, found = exact_clearance(hand, joints), hand.self_clearance(joints).numpy()
         met, told = truth < 0, found < 0
         same, missed = float((met == told).mean()), float((met & ~told).mean())
@@ -165,7 +159,7 @@ def bench_collision(n: int, threads: int) -> list[Row]:
         for dtype in (torch.float64, torch.float32):
             for what, below in (("distances", torch.inf), ("verdicts", 0.0)):
                 action = functools.partial(hand.self_clearance, below=below)
-                rate = n / _seconds(action, _postures(hand, n, 5, dtype), threads)
+                rate = n / _seconds(action, random_joints(hand, n, 5).to(dtype), threads)
                 title = f"{name}: self-collision, {what}, {str(dtype).split('.')[-1]}, {threads} threads"
                 bar = f">= {RATE[name]:.0e} postures/s on two cores"
                 rows.append(Row(title, bar, f"{rate:.2e} postures/s", rate >= RATE[name], {"rate": rate}))
@@ -173,7 +167,7 @@ def bench_collision(n: int, threads: int) -> list[Row]:
 
 
 def bench_samples(n: int, threads: int) -> list[Row]:
-    """Write samples with the command, in a process of its own: time, memory, and the same bytes by one worker."""
+    """Write samples by the command in another process: time, memory, and the same bytes by one worker."""
     rows = []
     for name in HANDS:
         with tempfile.TemporaryDirectory() as folder:
@@ -193,7 +187,7 @@ def bench_samples(n: int, threads: int) -> list[Row]:
 
 
 def _command(name: str, n: int, out: Path, workers: int) -> tuple[float, float]:
-    """Run `torchgrasp hand sample`; return its time [s], start included, and the peak of memory so far [GiB]."""
+    """Run `torchgrasp hand sample`; return its time [s] and the peak of memory so far [GiB]."""
     arguments = ["hand", "sample", "--hand", name, "--n", str(n), "--out", str(out), "--workers", str(workers)]
     code = f"import sys; from torchgrasp.cli import main; sys.exit(main({arguments!r}))"
     began = time.perf_counter()
