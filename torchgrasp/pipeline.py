@@ -1,4 +1,4 @@
-"""The whole chain in one call: a partial point cloud in, ranked and certified grasps of a hand out."""
+"""The whole chain in one call: a partial point cloud in, ranked grasps of a hand out."""
 
 import dataclasses
 import hashlib
@@ -40,8 +40,7 @@ Observer = Callable[[str, str, Any], None]
 Mode = Literal["joint", "contact_first"]
 """How planned contacts become grasps.
 
-* "joint": random postures of the hand near each triple are the seeds. Where no seed succeeds on the contacts as they
-  are, contacts, pose and joints are solved together.
+* "joint": seeds are random postures near each triple; where none succeeds, the contacts slide with the hand.
 * "contact_first": as in the paper, the learned model's seeds move onto fixed contacts.
 """
 
@@ -56,9 +55,9 @@ def _ignore(stage: str, message: str, value: Any) -> None:
 
 
 def spread_rows(plan: ContactPlan, most: int) -> Int[Tensor, "k"]:
-    """Return at most `most` rows that succeeded, far apart from each other (greedy farthest point), in plan order.
+    """Return at most `most` successful rows, far apart from each other, in plan order.
 
-    Contacts in another order are the same triple, so each triple is sorted by height first.
+    Each triple is sorted by height first, because contacts in another order are the same triple.
     """
     rows = torch.nonzero(plan.status == Status.OK)[:, 0]
     if len(rows) <= most:
@@ -86,7 +85,7 @@ def digest(cloud: PointCloud) -> str:
 
 
 def closure_of(shape: ShapeGP, contacts: Contacts, friction: float, seed: int) -> Float[Tensor, "k"]:
-    """Return the probability of closure of each triple, 0 at the edge of the shape's domain."""
+    """Return the probability of closure of each triple, 0 at the edge of the domain."""
     closure, inside = torch.zeros_like(contacts.points[:, 0, 0]), well_inside(shape, contacts)
     draws = sample_surfaces(shape, contacts[inside])
     closure[inside] = closure_share(draws, friction, SURFACE_DRAWS, seed).to(closure)
@@ -104,7 +103,7 @@ def plan_grasps(
     shape: ShapeGP | None = None,
     observer: Observer = _ignore,
 ) -> Grasps:
-    """Plan grasps of a hand on the object of a partial point cloud: every stage of the library in one call.
+    """Plan grasps of a hand on the object of a partial point cloud.
 
     Args:
         cloud: what the camera saw [m]; missing normals and viewpoint are estimated.
@@ -113,8 +112,7 @@ def plan_grasps(
         starts: random starts of the contact planner.
         seed: of every random draw; the same seed gives bitwise the same grasps.
         mode: how planned contacts become grasps, see `Mode`. Only "contact_first" needs the hand's learned model.
-        shape: the object's shape where more is known than the cloud shows, as after a touch (`ShapeGP.update`); None:
-            it is fitted to the cloud.
+        shape: the object's shape if more is known than the cloud shows, as after a touch (`ShapeGP.update`).
         observer: called after each stage with its name, a line of counts, and its value.
 
     Returns:
@@ -167,7 +165,7 @@ def plan_grasps(
     grasps = solve_joint(problem, seeds, shape, spec) if mixture is None else solve_contact_first(problem, seeds)
     grasps = rank_by_success(grasps, _log_odds(grasps, shape, problem.center, spec, seed))
     meta = {"mode": mode, "mixture_sha256": mixture_sha256, "starts": str(starts), "seed": str(seed)}
-    grasps = dataclasses.replace(grasps, meta=_describe_hand(hand) | _describe_task(cloud, spec) | meta)
+    grasps = dataclasses.replace(grasps, meta=_metadata(cloud, hand, spec) | meta)
     observer("refine", f"{len(grasps)} refined: {describe(count_status(grasps.status))}", grasps)
     return grasps
 
@@ -183,28 +181,20 @@ def _log_odds(
 ) -> Float[Tensor, "k"]:
     """Return the log-odds of success of the executable grasps."""
     grasps = grasps[grasps.status == Status.OK]
-    if not len(grasps):
-        return grasps.score
     closure = closure_of(shape, grasps.contacts, spec.friction, seed)
     return success_log_odds(success_features(grasps.contacts, closure, grasps.normal_angle, center, spec.friction))
 
 
-def _describe_hand(hand: Hand) -> dict[str, str]:
-    """Return what a file of grasps says of the hand and of the numbers' meaning."""
+def _metadata(cloud: PointCloud, hand: Hand, spec: ContactSpec) -> dict[str, str]:
+    """Return what a file of grasps says of its input and of its numbers."""
     return {
         "hand": hand.name,
         "hand_sha256": hand.source.sha256,
+        "cloud_sha256": digest(cloud),
         "joint_names": ",".join(hand.joint_names),
         "finger_names": ",".join(hand.finger_names),
         "frames": "obj: the frame of the cloud; hand: the base link of the hand's URDF; a_from_b maps b into a",
         "units": "metre, radian",
-    }
-
-
-def _describe_task(cloud: PointCloud, spec: ContactSpec) -> dict[str, str]:
-    """Return what a file of grasps says of the cloud and the specification."""
-    return {
-        "cloud_sha256": digest(cloud),
         "friction": f"{spec.friction:g}",
         "planned_friction": f"{spec.planned_friction:g}",
         "table": "none" if spec.table is None else f"{spec.table:g}",

@@ -10,12 +10,9 @@ from torchgrasp.hand.self_collision import box_distance
 from torchgrasp.ik.sdf import field_from_surface
 
 
-@pytest.mark.parametrize("given", ["faces", "normals"])
-def test_distance_field_of_a_sphere(given, generator):
+def test_distance_field_of_a_sphere(generator):
     ball = trimesh.creation.icosphere(5, 0.04)
-    vertices = torch.tensor(ball.vertices)
-    normals = vertices / torch.linalg.vector_norm(vertices, dim=1, keepdim=True)
-    field = field_from_surface(vertices, torch.tensor(ball.faces) if given == "faces" else normals, margin=0.05)
+    field = field_of_mesh(ball, margin=0.05)
     points = 0.08 * (2 * torch.rand(4000, 3, generator=generator, dtype=torch.float64) - 1)
     distance, gradient = field.query(points)
     radius = torch.linalg.vector_norm(points, dim=1)
@@ -69,11 +66,8 @@ def test_bad_surfaces_are_named():
     vertices = torch.eye(3, dtype=torch.float64)
     with pytest.raises(BadArgument, match="faces"):
         field_from_surface(vertices, torch.tensor([[0, 1, 3]]))
-    with pytest.raises(BadArgument, match="normals"):
+    with pytest.raises((BadArgument, TypeError), match="faces"):
         field_from_surface(vertices, torch.ones(2, 3))
-    for spoilt in (0.0, float("nan")):
-        with pytest.raises(BadArgument, match="normal of length 0 or NaN"):
-            field_from_surface(vertices, vertices * torch.tensor([1.0, 1.0, spoilt], dtype=torch.float64))
     with pytest.raises(BadArgument, match="without area"):
         field_from_surface(vertices, torch.tensor([[0, 1, 1]]))
     with pytest.raises(BadArgument, match="spacing"):

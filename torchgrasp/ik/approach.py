@@ -1,4 +1,4 @@
-"""The straight path on which the opened hand reaches its pre-grasp, clear of the object and the table."""
+"""The straight path of the opened hand to its pre-grasp, clear of object and table."""
 
 import math
 
@@ -21,21 +21,18 @@ TILTED_DIRECTIONS = 8
 COARSE_STEPS = 8
 """Positions on each path for the choice, half a finger's width apart."""
 FINE_STEPS = 16
-"""Positions on the chosen path for its clearance. Between two of them a corner of the object comes less than 1 mm
-deeper into a link."""
+"""Positions on the chosen path. Between two of them a corner of the object is less than 1 mm deeper in a link."""
 NODE_ERROR = 1.2
-"""Spacings of the field by which `query` may lie below `nearest_node`. In the middle of a cell all eight nodes weigh
-alike, and the others are 1.12 spacings from the nearest on average."""
+"""Spacings by which `query` may lie below `nearest_node`: a cell's other nodes are on average 1.12 from the nearest."""
 
 
 def find_approach(
     hand: Hand, opened: Configuration, world: CollisionWorld
 ) -> tuple[Float[Tensor, "g 3"], Float[Tensor, "g"]]:
-    """Return a direction of approach for each pre-grasp, and the path's least clearance [m].
+    """Return a direction of approach for each pre-grasp, and the least clearance [m] of its path.
 
-    Candidates are the hand's approach axis, directions tilted from it and, above a table, straight down. The field's
-    nearest nodes rank their clearances to 3 mm. The first path of non-negative interpolated clearance is taken, else
-    the one of most clearance. The clearance is infinite without object and table.
+    Candidates are the hand's approach axis, tilted directions and, above a table, straight down. The field's nearest
+    nodes rank their paths to 3 mm. The first path of non-negative interpolated clearance is taken, else the clearest.
     """
     spheres = hand.collision_spheres
     centres = SpatialJacobian.at(hand, opened).points(spheres.link_index, spheres.center)
@@ -54,7 +51,7 @@ def find_approach(
 
 
 def approach_directions(hand: Hand, opened: Configuration, table: float | None) -> Float[Tensor, "g k 3"]:
-    """Return the candidate directions of motion, in the object's frame."""
+    """Return the candidate directions in the object's frame."""
     pose = opened.obj_from_hand
     axis = hand.approach.to(pose)
     axis = axis / torch.linalg.vector_norm(axis)
@@ -71,7 +68,7 @@ def approach_directions(hand: Hand, opened: Configuration, table: float | None) 
 
 
 def _path(centres: Float[Tensor, "g s 3"], direction: Float[Tensor, "g 3"], steps: int) -> Float[Tensor, "g p s 3"]:
-    """Return the spheres' centres along the path, the pre-grasp itself left out."""
+    """Return the spheres' centres along the path, without the pre-grasp itself."""
     back = torch.arange(1, steps + 1).to(centres) * (APPROACH_DISTANCE / steps)
     return centres[:, None] - back[:, None, None] * direction[:, None, None]
 
@@ -79,7 +76,7 @@ def _path(centres: Float[Tensor, "g s 3"], direction: Float[Tensor, "g 3"], step
 def _clearance(
     path: Float[Tensor, "g p s 3"], radius: Float[Tensor, " s"], world: CollisionWorld, exact: bool
 ) -> Float[Tensor, "g"]:
-    """Return the least clearance [m] of spheres along a path, from the field's interpolation or its nodes."""
+    """Return the least clearance [m] of spheres along a path, interpolated or by the nearest nodes."""
     least = torch.full_like(path[:, 0, 0, 0], math.inf)
     if world.field is not None:
         coarse = (world.field.nearest_node(path) - radius).flatten(1)
@@ -95,7 +92,7 @@ def _exact_least(
     coarse: Float[Tensor, "g n"],
     field: SignedDistanceField,
 ) -> Float[Tensor, "g"]:
-    """Return the least interpolated clearance [m]; only spheres that can have it are interpolated."""
+    """Return the least interpolated clearance [m]; only spheres that may have it are queried."""
     points, radii = path.flatten(1, 2), radius.repeat(path.shape[1])
     first = coarse.argmin(1)
     least = field.query(points[torch.arange(len(points), device=path.device), first])[0] - radii[first]

@@ -1,4 +1,4 @@
-"""What the grasp solvers are given, and how the candidates that they return become checked grasps."""
+"""What the grasp solvers are given, and how their candidates become checked grasps."""
 
 import dataclasses
 
@@ -21,9 +21,9 @@ from torchgrasp.values import Certificate, Contacts, Grasps
 
 @dataclasses.dataclass(frozen=True)
 class GraspProblem(Value):
-    """A hand, the planned contacts with their certificate, and the world around the object.
+    """A hand, planned contacts with their certificate, and the world around the object.
 
-    `center` is the estimated centre of the object [m]: grasps around it rank higher.
+    Grasps around `center`, the object's estimated centre [m], rank higher.
 
     Raises:
         BadArgument: contacts without `std_m`, by which the pre-grasp opens.
@@ -44,7 +44,7 @@ class GraspProblem(Value):
 class GraspCandidates(Batch):
     """Configurations of a hand on contacts; finger i touches contact i.
 
-    `permutation` tells which contact of its triple each finger has. `status` is that of the contacts alone.
+    `permutation` is the contact of its triple that each finger has. `status` is that of the contacts.
     """
 
     configuration: Configuration
@@ -55,7 +55,7 @@ class GraspCandidates(Batch):
 
 
 def check_candidates(problem: GraspProblem, candidates: GraspCandidates) -> Grasps:
-    """Return the candidates as grasps, with pre-grasp and approach where all else is right."""
+    """Return checked grasps, with pre-grasp and approach where all else is right."""
     hand, world = problem.hand, problem.world
     configuration, contacts, certificate = candidates.configuration, candidates.contacts, candidates.certificate
     unproven = (candidates.status == Status.OK) & ~certificate.closed

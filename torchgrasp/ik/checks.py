@@ -1,7 +1,7 @@
-"""Measure every refined grasp by its own geometry, whatever the solver believed.
+"""Errors of refined grasps, measured by their own geometry, whatever the solver believed.
 
-The frame-invariant code does not change when all three normals are negated, mirrored or rotated together. And a solver
-can stop anywhere. So tips, contact directions, joint limits and clearances are measured anew.
+The frame-invariant code stays the same when all normals are negated, mirrored or rotated together. A solver can stop
+anywhere. So everything is measured anew.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ from torchgrasp.plan.feasibility import first_violation
 from torchgrasp.values import Contacts
 
 TIP_TOLERANCE = 1 * MILLIMETRE
-"""Largest distance [m] of a fingertip from its contact: small beside a fingertip's radius."""
+"""Largest distance [m] of a fingertip from its contact: a tenth of a fingertip's radius or so."""
 TIP_PENETRATION = 2 * MILLIMETRE
 """Largest depth [m] of a fingertip in the estimated surface; a round tip at its contact has none."""
 ANGLE_TOLERANCE = math.radians(2)
@@ -30,7 +30,7 @@ ANGLE_TOLERANCE = math.radians(2)
 
 @dataclasses.dataclass(frozen=True)
 class GraspErrors(Batch):
-    """Errors of grasps; `Grasps` says what the fields mean."""
+    """Errors of grasps; `Grasps` explains the fields."""
 
     tip_error: Float[Tensor, "g 3"]
     normal_angle: Float[Tensor, "g 3"]
@@ -53,10 +53,9 @@ def normal_angle(spatial: SpatialJacobian, contacts: Contacts) -> Float[Tensor, 
 
 
 def measure_errors(hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld) -> GraspErrors:
-    """Measure tips, contact directions, joint limits and clearances; contact i is the one of finger i.
+    """Measure tips, contact directions, joint limits and clearances.
 
-    Returns:
-        The errors, with the `Status` of the first one out of tolerance. NaN is out of tolerance.
+    `status` names the first error out of tolerance. NaN is out of tolerance.
     """
     spatial = SpatialJacobian.at(hand, configuration)
     error, angle = tip_error(spatial, contacts), normal_angle(spatial, contacts)
@@ -76,6 +75,6 @@ def measure_errors(hand: Hand, configuration: Configuration, contacts: Contacts,
 
 
 def is_clear(hand: Hand, configuration: Configuration, world: CollisionWorld) -> Bool[Tensor, "g"]:
-    """Tell which hands, fingertips included, touch neither object nor table nor themselves."""
+    """Tell which hands touch nothing, not even with their fingertips."""
     links, _, table = link_clearance(SpatialJacobian.at(hand, configuration), world, tips_touch=False)
     return (links >= 0) & (table >= 0) & (hand.self_clearance(configuration.joints) >= 0)

@@ -1,4 +1,4 @@
-"""Clearances of a hand's links from the object, from the table, and from each other."""
+"""Clearances of a hand's links from the object, the table and each other."""
 
 import dataclasses
 import math
@@ -25,7 +25,7 @@ HINGES = 8
 
 @dataclasses.dataclass(frozen=True)
 class CollisionWorld(Value):
-    """The signed distance field of the object and the height of the table [m]; None where there is none."""
+    """The object's signed distance field and the table's height [m]; None: there is none."""
 
     field: SignedDistanceField | None = None
     table: float | None = None
@@ -38,7 +38,7 @@ def hinge(clearance: Float[Tensor, "g k"], jacobian: Float[Tensor, "g k d"], mar
 
 
 def least(clearance: Float[Tensor, "g s"]) -> tuple[Int[Tensor, "g 1"], Int[Tensor, "g k"]]:
-    """Return the rows and columns of the least clearances of each row."""
+    """Return rows and columns of the least clearances of each row."""
     index = clearance.topk(min(HINGES, clearance.shape[1]), dim=1, largest=False, sorted=False).indices
     return torch.arange(len(index), device=index.device)[:, None], index
 
@@ -46,7 +46,7 @@ def least(clearance: Float[Tensor, "g s"]) -> tuple[Int[Tensor, "g 1"], Int[Tens
 def collision_cost(
     centres: Float[Tensor, "*b s 3"], spheres: CollisionSpheres, world: CollisionWorld
 ) -> Float[Tensor, "*b"]:
-    """Return the sum of squared deficits of clearance [mm2] of a touching hand, by the field's nearest nodes."""
+    """Return the sum of squared clearance deficits [mm2] of a touching hand."""
     radius = spheres.radius.to(centres)
     cost = centres.new_zeros(centres.shape[:-2])
     if world.field is not None:
@@ -59,7 +59,7 @@ def collision_cost(
 
 
 def clearance_hinges(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> Residuals:
-    """Return hinges on the least clearances between links, from the object and from the table."""
+    """Return hinges on the least clearances of each kind."""
     hinges = [self_hinges(spatial)]
     if world.field is not None:
         hinges.append(object_hinges(spatial, world.field, tips_touch))
@@ -70,7 +70,7 @@ def clearance_hinges(spatial: SpatialJacobian, world: CollisionWorld, tips_touch
 
 
 def object_hinges(spatial: SpatialJacobian, field: SignedDistanceField, tips_touch: bool) -> Residuals:
-    """Return hinges on the least clearances of the links' spheres from the object."""
+    """Return hinges on the least clearances of the spheres from the object."""
     spheres = spatial.hand.collision_spheres
     centres = spatial.points(spheres.link_index, spheres.center)
     radius = spheres.radius.to(centres)
@@ -85,7 +85,7 @@ def object_hinges(spatial: SpatialJacobian, field: SignedDistanceField, tips_tou
 
 
 def table_hinges(spatial: SpatialJacobian, table: float, tips_touch: bool) -> Residuals:
-    """Return hinges on the least clearances of the links' spheres from the table."""
+    """Return hinges on the least clearances of the spheres from the table."""
     spheres = spatial.hand.collision_spheres
     centres = spatial.points(spheres.link_index, spheres.center)
     height = centres[..., 2] - spheres.radius.to(centres) - table
@@ -113,9 +113,9 @@ def self_hinges(spatial: SpatialJacobian) -> Residuals:
 def link_clearance(
     spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool
 ) -> tuple[Float[Tensor, "g"], Float[Tensor, "g"], Float[Tensor, "g"]]:
-    """Return the least clearances [m] of links and object, tips and object, and all and table; infinite without.
+    """Return the least clearances [m]: links from object, tips from object, all from table.
 
-    Tips that are meant to touch do not count as links.
+    Tips that are meant to touch are no links.
     """
     spheres = spatial.hand.collision_spheres
     centres = spatial.points(spheres.link_index, spheres.center)

@@ -1,8 +1,7 @@
-"""The paper's refinement: COBYLA on the sum of the tip distances, one grasp at a time (Sec. 6.3).
+"""The paper's refinement (Sec. 6.3): COBYLA on the sum of the tip distances, one grasp at a time.
 
-Only the joints are variables. The hand's pose follows from them by Eq. (24): the fingertips' virtual frame on that of
-the contacts. With the pose as six more variables SciPy's COBYLA stops millimetres away. Contact directions and
-collisions do not enter, they are checked afterwards.
+Only the joints are variables, the pose follows by Eq. (24). With the pose as six more variables SciPy's COBYLA stops
+millimetres away. Contact directions and collisions are checked afterwards.
 """
 
 import math
@@ -26,13 +25,9 @@ FIRST_RADIUS, LAST_RADIUS = 0.02, 1e-4
 def refine_by_cobyla(
     hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld
 ) -> Configuration:
-    """Return configurations whose pads are as near to their contacts as COBYLA brings them.
+    """Return configurations with the least distances of pads from contacts.
 
-    Args:
-        hand: finger i takes contact i.
-        configuration: starting joints, g rows; the pose is not used.
-        contacts: g rows.
-        world: not used, as in the paper.
+    The starting pose and the world are not used, as in the paper.
     """
     from scipy.optimize import minimize
 

@@ -1,8 +1,7 @@
-"""Where a placed hand's links are, and how points on them move with its pose and joints.
+"""Configurations of a free hand, and the Jacobians of points on its links.
 
-A row of a Jacobian is virtual work. The change of `directions . points` is the work of a unit force along the direction
-at the point. So a row is a wrench: force, then torque about the object's origin. Its derivative by a joint is the
-wrench times the joint's twist if the joint moves the link, else zero.
+A row of a Jacobian is virtual work: `directions . points` changes by the work of a unit force at the point. So a row is
+a wrench, force and torque about the object's origin. Its derivative by a joint is the wrench times the joint's twist.
 """
 
 import dataclasses
@@ -24,9 +23,9 @@ class Configuration(Batch):
     obj_from_hand: Float[Tensor, "g 4 4"]
 
     def integrate(self, hand: Hand, step: Float[Tensor, "g d"]) -> "Configuration":
-        """Return the configuration after a step (translation [m], rotation vector, joints), within the joint limits.
+        """Return the configuration after a step (translation [m], rotation vector, joints), clamped to the limits.
 
-        Translation and rotation are in the hand's axes. So a solver's path does not depend on the object's frame.
+        Translation and rotation are in the hand's axes, so solvers do not depend on the object's frame.
         """
         rotation, position = self.obj_from_hand[:, :3, :3], self.obj_from_hand[:, :3, 3]
         joints = (self.joints + step[:, 6:]).clamp(hand.lower.to(position), hand.upper.to(position))
@@ -36,7 +35,7 @@ class Configuration(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class SpatialJacobian(Value):
-    """Link poses and joint twists in the object's frame, from which every point's Jacobian follows."""
+    """Link poses and joint twists of a configuration, in the object's frame."""
 
     hand: Hand
     obj_from_link: Float[Tensor, "g l 4 4"]
@@ -69,7 +68,7 @@ class SpatialJacobian(Value):
         return (self.obj_from_link[:, links, :3, :3] @ local.to(self.obj_from_hand)[:, :, None])[..., 0]
 
     def jacobian(self, wrench: Float[Tensor, "g k 6"], links: Int[Tensor, "*g k"]) -> Float[Tensor, "g k d"]:
-        """Return the derivatives of rows, each the work of a wrench on a link, by pose and joints."""
+        """Return the derivatives by pose and joints of rows, each a wrench on a link."""
         force, torque = wrench.split(3, -1)
         rotation, origin = self.obj_from_hand[:, :3, :3], self.obj_from_hand[:, :3, 3]
         torque = torque - torch.linalg.cross(origin[:, None].expand_as(force), force)  # about the hand's origin

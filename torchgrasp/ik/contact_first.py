@@ -1,4 +1,4 @@
-"""The paper's way: configurations of the learned model move onto planned contacts, and the contacts stay fixed."""
+"""The paper's way: seeds of the learned model move onto planned contacts, which stay fixed."""
 
 from functools import partial
 
@@ -19,7 +19,7 @@ SEEDS_PER_ROUND = (2, 4)
 
 
 def rank_seeds(problem: GraspProblem, seeds: IKSeeds) -> Int[Tensor, "g"]:
-    """Return the rank of each seed within its triple, by the residuals from which refinement starts."""
+    """Return the rank of each seed within its triple, by its first residuals."""
     costs = [
         refinement_cost(
             problem.hand,
@@ -43,15 +43,7 @@ def refine_on_contacts(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
 
 
 def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
-    """Refine seeds into checked grasps with fixed contacts.
-
-    Args:
-        problem: the hand, the contacts and what is around them.
-        seeds: where the hand begins; `seeds.row` points into the contacts.
-
-    Returns:
-        One grasp for each triple that has seeds, those with `Status.OK` first, best first.
-    """
+    """Return a checked grasp on fixed contacts for each triple that has seeds, best first."""
     attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
     attempts.refine(seeds, rank_seeds(problem, seeds), SEEDS_PER_ROUND, partial(refine_on_contacts, problem))
     return best_grasps(attempts)

@@ -1,9 +1,8 @@
-"""Contacts, hand pose and joints solved together: the contacts slide to where this hand can take them.
+"""Contacts, hand pose and joints solved together: the contacts slide to where the hand reaches them.
 
 Contact-first planning loses triples that the hand reaches only through the object, the table or itself. Here the
-contact problem (Eqs. 10-13 and the margins of `ContactSpec`) and the hand's residuals form one least-squares problem.
-Its unknowns are pose, joints, contacts and the tensions of the contacts' balance. Contacts stay on flat surface above
-the table wherever they slide, and are certified anew.
+contact problem (Eqs. 10-13 and the margins of `ContactSpec`) and the hand's residuals are one least-squares problem.
+Its unknowns are pose, joints, contacts and the tensions of their balance. The contacts are certified anew.
 """
 
 import dataclasses
@@ -41,7 +40,7 @@ PROJECTIONS = 3
 
 @dataclasses.dataclass(frozen=True)
 class JointState(Batch):
-    """Hands with their contacts, normalised, and the tensions of their balance (`forces_from_tensions`)."""
+    """Hands, their normalised contacts, and the tensions of their balance (`forces_from_tensions`)."""
 
     configuration: Configuration
     points: Float[Tensor, "g 3 3"]
@@ -57,7 +56,7 @@ class JointState(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class JointProblem:
-    """The hand, the estimated object, what its contacts must satisfy, and the world around it.
+    """A hand, the estimated object, what its contacts must satisfy, and the world.
 
     `flatness` is the largest variation of the normal [rad] around a contact; None: any.
     """
@@ -69,12 +68,7 @@ class JointProblem:
     flatness: float | None
 
     def residuals(self, state: JointState, flat: FlatnessConstraint | None) -> Residuals:
-        """Return the residuals [mm], and their Jacobian by pose, joints, points and tensions.
-
-        Args:
-            state: g hands with their contacts.
-            flat: constraint of flat surface, linear about where it was evaluated.
-        """
+        """Return the residuals [mm], and their Jacobian by pose, joints, points and tensions."""
         hand, shape = self.hand, self.shape
         jet, spatial = triple_jet(shape, state.points), SpatialJacobian.at(hand, state.configuration)
         contacts = contacts_at(shape, state.points, jet)
@@ -93,9 +87,9 @@ class JointProblem:
     def _tips_by_points(
         self, spatial: SpatialJacobian, jet: TripleJet, outside: Bool[Tensor, "g 3"]
     ) -> Float[Tensor, "g 12 9"]:
-        """Return the derivative of the tip residuals by the contacts; `outside` tells active pad residuals.
+        """Return the derivative of the tip residuals by the contacts, for pads that are `outside` their cones.
 
-        A contact that slides carries its tip's target along and rotates the normal under the pad.
+        A sliding contact carries its tip's target along and rotates the normal under the pad.
         """
         hand, normals, normal_jacobian = self.hand, jet.normals, jet.normal_jacobian
         identity = torch.eye(3).to(normals)
@@ -107,7 +101,7 @@ class JointProblem:
         return torch.cat([-TIP_WEIGHT / MILLIMETRE * tips, PAD_WEIGHT * tilts], 1)
 
     def _contact_residuals(self, state: JointState, jet: TripleJet, flat: FlatnessConstraint | None) -> Residuals:
-        """Return the residuals [mm] of the contact problem, zero where a bound holds, by points and tensions."""
+        """Return the residuals [mm] of the contact problem, zero where a bound holds."""
         rows = self.contact_problem.constraints(state.points, state.tension, jet)
         violated = (rows.bounds > 0).to(rows.bounds)
         residuals = [rows.surface, violated * rows.bounds]
@@ -122,7 +116,7 @@ class JointProblem:
         return unit_length * torch.cat(residuals, 1), unit_length * torch.cat(jacobians, 1)
 
     def solve(self, state: JointState) -> JointState:
-        """Return hands and contacts that satisfy everything at once, as far as each row allows."""
+        """Return hands and contacts that satisfy all constraints, as far as each row allows."""
         for _ in range(STAGES):
             flat = None if self.flatness is None else flatness_constraint(self.shape, state.points, self.flatness)
 
@@ -143,17 +137,10 @@ def contacts_at(shape: Shape, points: Float[Tensor, "g 3 3"], jet: TripleJet) ->
 
 
 def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: ContactSpec) -> Grasps:
-    """Solve contacts, pose and joints together from seeds.
+    """Return a checked grasp for each triple that has seeds, best first; contacts slide where they must.
 
-    Args:
-        problem: the hand, the contacts from which it starts, and what is around them.
-        seeds: where the hand begins, best first within a row; `seeds.row` points into the contacts.
-        shape: the estimated object.
-        spec: what the contacts must satisfy.
-
-    Returns:
-        One grasp for each triple that has seeds, those with `Status.OK` first, best first. Contacts that slid are
-        projected on the surface and certified anew. A failure has a planning Status where its contacts failed.
+    The seeds of a triple are tried in their order. Slid contacts are projected on the surface and certified anew. A
+    failure has a planning Status where its contacts failed.
     """
     contact_problem = ContactProblem.of(shape, spec)
     joint_problem = JointProblem(problem.hand, shape, contact_problem, problem.world, spec.flatness)

@@ -1,8 +1,8 @@
-"""Random postures of a hand, and the nearest of them to contacts, clear of everything around.
+"""Random postures of a hand, from which the nearest to contacts become seeds.
 
-The learned model (`query_mixture`) answers with the few postures likely for a code, wherever object and table are. Here
-thousands of random postures are compared with every triple in all six assignments, by one matrix product. Clearances
-rank the nearest ones too, so a hand from above comes before one from below.
+The learned model (`query_mixture`) gives the few postures likely for a code, wherever object and table are. Here every
+triple is compared with thousands of postures in all assignments, by one matrix product. Clearances rank the nearest, so
+a hand from above comes before one from below.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ CANDIDATES = 64
 
 @dataclasses.dataclass(frozen=True)
 class PostureLibrary(Value):
-    """Postures of a hand, with tip `centres` in their virtual frame [m], `feature`s and collision `spheres` [m]."""
+    """Postures of a hand, with tip `centres` [m] in virtual frames, `feature`s and collision `spheres` [m]."""
 
     hand: Hand
     joints: Float[Tensor, "s h"]
@@ -51,25 +51,18 @@ class PostureLibrary(Value):
 
 
 def feature(centres: Float[Tensor, "*b 3 3"], pads: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 18"]:
-    """Return tip centres and pad axes in units of the slack of a rolling tip."""
+    """Return tip centres and pad axes in units of their slack."""
     return torch.cat([centres / LENGTH_SLACK, pads / COSINE_SLACK], -1).flatten(-2).float()
 
 
 def nearest_postures(library: PostureLibrary, contacts: Contacts, world: CollisionWorld, n_seeds: int = 8) -> IKSeeds:
-    """Return the postures that fit contacts best, placed by Eq. (24) with round tips' centres for fingertips.
+    """Return the postures nearest to contacts, placed by Eq. (24) with the tips' centres for fingertips.
 
-    Args:
-        library: postures of the hand.
-        contacts: triples on the object.
-        world: the object and the table.
-        n_seeds: postures for each triple.
-
-    Returns:
-        Seeds in the order of the contacts' rows, best first within a row, none of a degenerate row. `energy` is half
-        the squared distance of the features.
+    Seeds come in the order of the contacts' rows, best first within a row. A degenerate row has none. `energy` is half
+    the squared distance of the features.
 
     Raises:
-        BadArgument: `n_seeds` is not in [1, 64].
+        BadArgument: `n_seeds`, for each triple, is not in [1, 64].
     """
     if not 1 <= n_seeds <= CANDIDATES:
         raise BadArgument("n_seeds", n_seeds, f"1 to {CANDIDATES}")
@@ -90,7 +83,7 @@ def _nearest(
     world: CollisionWorld,
     n_seeds: int,
 ) -> IKSeeds:
-    """Return the seeds of some triples, each in the six orders of its contacts."""
+    """Return the seeds of some triples."""
     obj_from_vf = virtual_frame(centres)
     vf_from_obj = inverse(obj_from_vf)
     wanted, given = feature(apply(vf_from_obj, centres), rotate(vf_from_obj, inward)), library.feature

@@ -1,4 +1,4 @@
-"""From planned contacts to configurations of the hand that may touch them (Eqs. 21-24)."""
+"""From contacts to configurations that may touch them, by the learned model (Eqs. 21-24)."""
 
 import dataclasses
 
@@ -17,8 +17,8 @@ from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, GraspMixture
 from torchgrasp.values import Contacts, IKSeeds
 
 WRONG_SIDE = 0.3
-"""Mean cosine of the tips' and the object's outward normals above which a seed touches from inside. Codes do not know
-the side (`encode_fingertips`), so such seeds occur and are ranked last."""
+"""Mean cosine of tips' and contacts' outward normals above which a seed touches from inside. Codes do not know the
+side (`encode_fingertips`), so such seeds occur."""
 LENGTH_SLACK, COSINE_SLACK = 0.01, 0.5
 """Noise of a planned code in L [m] and N, because a tip may roll away from the pad's middle. On a can it raises the
 Barrett hand's share of certified triples within reach from 1 to 99 %, and most of these refine."""
@@ -29,12 +29,14 @@ TRIPLES_PER_PASS = 256
 def query_mixture(
     hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: int = 8, max_energy: float = DEFAULT_ENERGY
 ) -> IKSeeds:
-    """Ask the learned model for configurations that touch the contacts, in all six assignments (Eqs. 21-24).
+    """Return configurations of the learned model near the contacts, for all six assignments (Eqs. 21-24).
 
-    Codes are taken as observed with noise, because the tips may roll. For every assignment within reach (Eq. 21) the
-    joints are the conditional mean (Eq. 23) and the means of the most responsible components, clamped to the joint
-    limits. Eq. (24) places the hand: the virtual frame of its fingertips on that of the contacts. The fingertips are
-    still off by centimetres, until `refine`.
+    Codes are taken as noisy, because tips may roll. For every assignment within reach (Eq. 21) the joints are the
+    conditional mean (Eq. 23) and the means of the most responsible components. They are clamped to the limits. Eq. (24)
+    places the hand. The fingertips are still off by centimetres.
+
+    Seeds come in the order of the contacts' rows. Within a row the right side of the surface comes first, then the
+    smaller tip error. A degenerate or unreachable row has none.
 
     Args:
         hand: the hand.
@@ -42,10 +44,6 @@ def query_mixture(
         mixture: the hand's learned model.
         n_seeds: for each assignment, at most one more than the mixture has components.
         max_energy: threshold on the least f_i of Eq. (21); `PAPER_ENERGY` is the paper's.
-
-    Returns:
-        Seeds in the order of the contacts' rows. Within a row those on the right side of the surface come first, then
-        those of smaller tip error. A degenerate or unreachable row has none.
 
     Raises:
         BadArgument: a mixture of another hand, limits or fingertips, a number out of range, or malformed contacts.
@@ -99,7 +97,7 @@ def _query(hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: int, 
 
 
 def _seed_joints(mixture: GraspMixture, q: Float[Tensor, "a 6"], n_seeds: int) -> Float[Tensor, "a k h"]:
-    """Return the conditional mean of each code, then the means of its most responsible components."""
+    """Return the conditional mean, then the means of the most responsible components."""
     mean = mixture.joints(q)[:, None]
     if n_seeds == 1:
         return mean

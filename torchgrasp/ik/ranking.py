@@ -1,13 +1,9 @@
-"""Which grasp to try first: a geometric score for candidates, a calibrated probability of success for grasps.
+"""Which grasp to try first: a geometric score of candidates, a predicted probability of success of grasps.
 
-The paper ranks by the sum of the contacts' variances. Here `score` chooses among the candidates of one triple.
-`rank_by_success` orders the executable grasps by a logistic model fitted to simulated trials.
-
-A trial is DexGraspBench's pull test: the hand closes with 7 N, and the object must withstand its weight from six
-sides. Each grasp is run in five trials. It closes open loop and under uncertainty, at the planned friction and at half
-of it. Once more it closes under uncertainty, with the hand up to 5 mm and 5 degrees beside its plan. The probability is
-the expected share of such trials that hold. `scripts/train/success.py` fits the model and measures its calibration on
-objects left out. The trials are the Allegro hand's: other hands are ranked, but their probabilities are not calibrated.
+The paper ranks by the sum of the contacts' variances. Here `score` chooses among the candidates of a triple, and
+`rank_by_success` orders the executable grasps. Its model is logistic. It predicts the share of pull trials in which a
+grasp holds, over five closings, frictions and errors of pose (docs/closing.md). `scripts/train.py success` fits it to
+trials of the Allegro hand. The probabilities of other hands are not calibrated.
 """
 
 import dataclasses
@@ -15,6 +11,7 @@ import functools
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -44,7 +41,7 @@ MODEL = Path(__file__).with_name("success.json")
 
 
 def lexical_order(*keys: Tensor) -> Int[Tensor, "g"]:
-    """Return the ascending order of rows by the first key, ties by the next; equal rows keep their order.
+    """Return the ascending order of rows by the first key, ties by the next.
 
     >>> lexical_order(torch.tensor([1, 0, 1]), torch.tensor([2.0, 3.0, 1.0]))
     tensor([1, 2, 0])
@@ -56,7 +53,7 @@ def lexical_order(*keys: Tensor) -> Int[Tensor, "g"]:
 
 
 def rank_in_group(group: Int[Tensor, "g"], *keys: Tensor) -> Int[Tensor, "g"]:
-    """Return each row's rank among the rows of its group, by `lexical_order` of the keys.
+    """Return the rank of each row within its group, by `lexical_order` of the keys.
 
     >>> rank_in_group(torch.tensor([0, 1, 1, 1]), torch.tensor([1.0, 3.0, 2.0, 0.0]))
     tensor([0, 2, 1, 0])
@@ -69,9 +66,9 @@ def rank_in_group(group: Int[Tensor, "g"], *keys: Tensor) -> Int[Tensor, "g"]:
 
 
 def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
-    """Return the friction that suffices when all fingers press towards the contacts' centre.
+    """Return the friction with which all fingers can press towards the contacts' centre.
 
-    It is the tangent of the largest angle between an inward normal and the line to the centre.
+    It is the largest tangent between an inward normal and the line to the centre.
     """
     inward = unit(contacts.points.mean(1, keepdim=True) - contacts.points)
     cosine = -(inward * contacts.normals).sum(-1)
@@ -80,10 +77,7 @@ def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
 
 
 def score(contacts: Contacts, normal_angle: Float[Tensor, "g 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "g"]:
-    """Return the geometric score of candidates, larger is better.
-
-    Contacts near the object's centre, little friction and central pads are preferred.
-    """
+    """Return the score of candidates: central contacts, little friction and central pads are better."""
     offset = torch.linalg.vector_norm(contacts.points.mean(1) - center, dim=-1)
     return -(offset / OFFSET + centred_friction(contacts) + normal_angle.amax(1) / PAD_ANGLE)
 
@@ -97,13 +91,13 @@ def success_features(
 ) -> Float[Tensor, "g 5"]:
     """Return `FEATURES` of each grasp.
 
-    A hand that balances its forces needs the least friction (`least_friction_forces`). Fingers that press towards each
-    other need more. Where nothing balances, the angle needed is a right one.
+    Balanced forces need the least friction (`least_friction_forces`), forces to the centre more. Where nothing
+    balances, the friction angle is a right one.
 
     Args:
-        contacts: in the order of the fingers.
-        closure: probability of closure at this friction (`closure_share`).
-        normal_angle: between contact direction and pad [rad].
+        contacts: of the grasps.
+        closure: probability of closure at this friction.
+        normal_angle: see `Grasps`.
         center: estimated centre of the object [m].
         friction: of the trial, positive.
     """
@@ -115,25 +109,24 @@ def success_features(
 
 
 def success_log_odds(features: Float[Tensor, "g 5"]) -> Float[Tensor, "g"]:
-    """Return the log-odds of success of each grasp: log p / (1 - p).
+    """Return the log-odds of success, log p / (1 - p).
 
     >>> good, bad = torch.tensor([[6.9, 0.3, 0.3, 0.4, 0.5], [-1.0, 1.5, 0.8, 2.0, 0.9]])
     >>> success_log_odds(torch.stack([good, bad])).diff() < 0
     tensor([True])
     """
-    weights, bias = read_model()
-    return features @ features.new_tensor(weights) + bias
+    model = read_model()
+    return features @ features.new_tensor([model["weights"][name] for name in FEATURES]) + model["bias"]
 
 
 @functools.cache
-def read_model() -> tuple[tuple[float, ...], float]:
-    """Return the weights of `FEATURES` and the bias."""
-    model = json.loads(MODEL.read_text("utf-8"))
-    return tuple(model["weights"][name] for name in FEATURES), model["bias"]
+def read_model() -> dict[str, Any]:
+    """Return the content of `MODEL`."""
+    return json.loads(MODEL.read_text("utf-8"))
 
 
 def rank_by_success(grasps: Grasps, log_odds: Float[Tensor, "k"]) -> Grasps:
-    """Return grasps with the log-odds of success as score of the k executable ones, these first, best first."""
+    """Return grasps scored by the log-odds of the k executable ones, these first, best first."""
     failed, scores = grasps.status != Status.OK, grasps.score.clone()
     scores[~failed] = log_odds.to(scores)
     return dataclasses.replace(grasps, score=scores)[lexical_order(failed.int(), -scores)]

@@ -1,15 +1,9 @@
 """Move hands onto their contacts without touching anything else, by batched Levenberg-Marquardt.
 
-Seeds of the learned model (Eqs. 23-24) leave millimetres to centimetres between fingertips and contacts. Pose and
-joints are solved together, every seed a row of one batch. The residuals are
-
-* a round fingertip's centre one radius off the contact along its normal, so that the tip may roll; a tip that is not
-  round brings its contact point itself to the contact,
-* the contact direction inside a cone about the pad's axis,
-* hinges on the clearances of the links from object, table and each other.
-
-Every step ends within the joint limits. The paper's COBYLA minimises the tip distances alone, one grasp at a time. Here
-collision is part of the problem, because there most planned contacts are lost.
+Seeds leave millimetres to centimetres between fingertips and contacts. Pose and joints of all seeds are solved in one
+batch. A round fingertip's centre comes to one radius off its contact, so the tip may roll. A tip that is not round
+touches with its contact point. The contact direction stays inside a cone about the pad's axis. Hinges keep the links
+clear of object, table and each other, because there most planned contacts are lost.
 """
 
 import math
@@ -27,8 +21,7 @@ from torchgrasp.values import Contacts
 ROUND_PAD, FLAT_PAD = math.radians(60), math.radians(40)
 """Half angles [rad] of the cone about the pad's axis in which a round and a flat fingertip may touch: choices."""
 TIP_WEIGHT, PAD_WEIGHT = 2.0, 80.0
-"""Weights of a tip's millimetre and of a contact direction's cosine outside the cone; a millimetre of clearance has 1.
-So contact outweighs a margin of clearance."""
+"""Weights of a tip's millimetre and of a cosine outside the cone. A millimetre of clearance weighs 1: contact wins."""
 ITERATIONS = 40
 """Most steps of one refinement; a row that stalls stops earlier."""
 OPENING, OPENING_SIGMAS = 0.012, 3.0
@@ -43,7 +36,7 @@ def tip_targets(hand: Hand, contacts: Contacts) -> Float[Tensor, "g 3 3"]:
 def tip_residuals(
     spatial: SpatialJacobian, target: Float[Tensor, "g 3 3"], normals: Float[Tensor, "g 3 3"]
 ) -> Residuals:
-    """Return the tips' distances from their targets [mm] and the contact directions' excess over the pads' cones."""
+    """Return residuals of the tips from their targets, and of the contact directions outside the pads' cones."""
     hand = spatial.hand
     radius = hand.tip_radius.to(normals)
     tips = spatial.points(hand.tips.index, hand.tips.center)
@@ -88,17 +81,10 @@ def refinement_cost(
 def refine(
     hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld, solved: float = SOLVED
 ) -> Configuration:
-    """Return configurations with the fingertips on their contacts and the links clear, as far as each row allows.
+    """Return configurations with fingertips on contacts and clear links, as far as each row allows.
 
-    Args:
-        hand: finger i takes contact i.
-        configuration: starting pose and joints, g rows.
-        contacts: g rows.
-        world: the object and the table.
-        solved: sum of squared residuals [mm2] at which a row is done.
-
-    Returns:
-        As many rows; `measure_errors` tells which succeeded.
+    Finger i takes contact i. A row is done when its sum of squared residuals [mm2] is below `solved`. `measure_errors`
+    tells which rows succeeded.
     """
     target, normals = tip_targets(hand, contacts), contacts.normals
 
@@ -110,7 +96,7 @@ def refine(
 
 
 def settle_tips(hand: Hand, configuration: Configuration, contacts: Contacts, solved: float) -> Configuration:
-    """Return refined configurations with their tips on their contacts, whatever clearance that costs."""
+    """Return configurations with the tips on their contacts, whatever clearance it costs."""
     target, normals = tip_targets(hand, contacts), contacts.normals
 
     def evaluate(state: Configuration, rows: Int[Tensor, "a"]) -> Residuals:
@@ -125,9 +111,8 @@ def open_hand(
 ) -> Float[Tensor, "g h"]:
     """Return the joints of the pre-grasp: the same pose, the tips off their contacts, everything clear.
 
-    Each tip opens along its normal by `OPENING` plus three standard deviations of the surface, but not into the table.
-    So it starts outside the object even where the object is larger than estimated. Clearances are part of the problem,
-    because opening alone drives links into the object.
+    Each tip opens along its normal, but not into the table. The opening grows with the surface's standard deviation, so
+    a tip starts outside a larger object too. Opening without clearances drives links into the object.
     """
     normals, gap = contacts.normals, OPENING + OPENING_SIGMAS * contacts.require_std()
     target = tip_targets(hand, contacts) + gap[..., None] * normals

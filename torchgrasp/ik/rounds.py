@@ -1,6 +1,6 @@
-"""Rounds of refinement: the first seeds of every contact triple, then more seeds of the triples still unsolved.
+"""Rounds of refinement: the first seeds of every contact triple, then more of the unsolved ones.
 
-Most seeds fail and nothing tells which beforehand. But one of a triple's best seeds often succeeds.
+Most seeds fail, and nothing tells which. But one of a triple's best seeds often succeeds.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,7 +24,7 @@ def assign(contacts: Contacts, seeds: IKSeeds) -> Contacts:
 
 
 class Attempts(Generic[Result]):
-    """The results of all seeds refined so far, and which contact triples are still unsolved.
+    """The results of all refined seeds, and the contact triples still unsolved.
 
     Args:
         unsolved: the triples to be solved.
@@ -45,14 +45,7 @@ class Attempts(Generic[Result]):
     def refine(
         self, seeds: IKSeeds, rank: Int[Tensor, "g"], counts: Sequence[int], refine: Callable[[IKSeeds], Result]
     ) -> None:
-        """Refine the seeds of unsolved triples, so many more of each triple in every round.
-
-        Args:
-            seeds: `seeds.row` is the triple.
-            rank: of each seed within its triple; the lowest are refined first.
-            counts: seeds of a triple in each round.
-            refine: makes a result of each seed.
-        """
+        """Refine the next `counts[k]` seeds of each unsolved triple in round k, by their rank within the triple."""
         first = 0
         for count in counts:
             chosen = seeds[(rank >= first) & (rank < first + count) & self.unsolved[seeds.row]]
@@ -61,7 +54,7 @@ class Attempts(Generic[Result]):
                 self.add(refine(chosen), chosen.row)
 
     def best(self, keys: Callable[[Result], tuple[Tensor, ...]]) -> tuple[Result, Int[Tensor, "t"]]:
-        """Return the first result of each triple by `lexical_order` of the keys, and the triples."""
+        """Return the first result of each triple by `lexical_order` of the keys, and its triple."""
         results, row = join(self.results), torch.cat(self.rows)
         first = rank_in_group(row, *keys(results)) == 0
         return results[first], row[first]
@@ -73,7 +66,7 @@ def executable(grasps: Grasps) -> Bool[Tensor, "g"]:
 
 
 def best_grasps(attempts: Attempts[Grasps]) -> Grasps:
-    """Return one grasp of each triple, best first: a success, else a failure of certified contacts, else any."""
+    """Return a success of each triple, else a failure of certified contacts, else any; best first."""
 
     def keys(grasps: Grasps) -> tuple[Tensor, Tensor]:
         failed = ~executable(grasps)

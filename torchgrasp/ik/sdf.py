@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value, check_tensor
@@ -12,27 +12,27 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.mesh import closest_on_triangles
 
 BAND = 0.022
-"""Nodes whose interpolated distance [m] is below this are computed exactly; a finger is about as thick."""
+"""Nodes nearer to the surface [m] are computed exactly: a finger is about as thick."""
 COARSE = 3
-"""Spacings between the nodes of the coarse grid, from which the fine one is interpolated."""
+"""Spacings between the nodes of the coarse grid, between which distances are interpolated."""
 NEAREST_SAMPLES = 4
-"""Samples of the surface whose triangles are asked for the distance of one node."""
+"""Samples of the surface whose triangles are tried for one node."""
 MOST_NODES = 2e7
 """Largest grid: 160 MB."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SignedDistanceField(Value):
-    """Signed distance [m] on a grid in the object's frame, negative inside; node i is at origin + i * spacing."""
+    """Signed distances [m] on a grid, negative inside; node i is at origin + i * spacing."""
 
     origin: Float[Tensor, "3"]
     spacing: float
     values: Float[Tensor, "x y z"]
 
     def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the value [m] at the node nearest to each point: at most 0.87 spacings off inside the grid.
+        """Return the value [m] at the node nearest to each point, at most 0.87 spacings off.
 
-        Outside the grid the value at its border is returned, which is too small.
+        Outside the grid it is the value at the border, which is too small.
         """
         flat = 0
         for x, low, count in zip(points.unbind(-1), self.origin.tolist(), self.values.shape, strict=True):
@@ -41,9 +41,9 @@ class SignedDistanceField(Value):
         return self.values.reshape(-1)[flat].to(points)
 
     def query(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
-        """Return the trilinear signed distance [m] at points [m] and its derivative by them.
+        """Return the trilinear signed distance [m] at points [m], and its gradient.
 
-        Outside the grid the distance from the grid is added to the value at its border.
+        Outside the grid the distance to the grid is added.
         """
         shape = torch.tensor(self.values.shape, device=points.device)
         position = (points - self.origin.to(points)) / self.spacing
@@ -67,30 +67,23 @@ class SignedDistanceField(Value):
 
 
 def field_from_surface(
-    vertices: Float[Tensor, "v 3"],
-    faces_or_normals: Shaped[Tensor, "f 3"],
-    spacing: float = 0.003,
-    margin: float = 0.08,
+    vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], spacing: float = 0.003, margin: float = 0.08
 ) -> SignedDistanceField:
-    """Return the signed distance field of a surface, negative on the side opposite to its normals.
-
-    With faces the distance is to the nearest triangles, wound consistently outward. With normals it is to the tangent
-    planes of the nearest vertices, which must be dense. The surface may be open: the side follows from the normals near
-    the closest point.
+    """Return the signed distance field of a triangle mesh, wound outward. The mesh may be open.
 
     Args:
-        vertices: of the surface [m].
-        faces_or_normals: integer faces (f, 3) into the vertices, or an outward normal for each vertex.
+        vertices: of the mesh [m].
+        faces: three vertices each.
         spacing: of the nodes [m].
-        margin: of the grid around the surface [m].
+        margin: of the grid around the mesh [m].
 
     Raises:
-        BadArgument: wrong shapes, faces that name no vertex, or a grid of more than 2e7 nodes.
+        BadArgument: wrong shapes, faces that name no vertex or have no area, or a grid of more than 2e7 nodes.
     """
     check_tensor("vertices", vertices, (None, 3))
     if not 1e-4 <= spacing <= 0.1 or not 0 <= margin <= 1:
         raise BadArgument("spacing, margin", (spacing, margin), "spacing in [1e-4, 0.1], margin in [0, 1]")
-    surface = _Surface(vertices, faces_or_normals)
+    surface = _Surface(vertices, faces)
     low, high = vertices.amin(0).double() - margin, vertices.amax(0).double() + margin
     # the coarse nodes are every third of the fine ones
     counts = [COARSE * max(1, int(c)) + 1 for c in torch.ceil((high - low) / (COARSE * spacing)).tolist()]
@@ -109,7 +102,7 @@ def field_from_surface(
 
 
 def _upsample(values: np.ndarray, axis: int) -> np.ndarray:
-    """Interpolate COARSE - 1 nodes between the nodes of one axis, linearly."""
+    """Interpolate the fine nodes between the coarse nodes of one axis."""
     nodes = np.moveaxis(values, axis, 0)
     steps = [nodes[:-1] + k / COARSE * (nodes[1:] - nodes[:-1]) for k in range(COARSE)]
     fine = np.stack(steps, 1).reshape(-1, *nodes.shape[1:])
@@ -117,53 +110,36 @@ def _upsample(values: np.ndarray, axis: int) -> np.ndarray:
 
 
 class _Surface:
-    """Dense samples of a surface in a tree, for the distances of many points to it."""
+    """Samples of a mesh in a tree, 2 mm apart, which find the triangles near a point."""
 
-    def __init__(self, vertices: Tensor, faces_or_normals: Tensor):
+    def __init__(self, vertices: Tensor, faces: Tensor):
         from scipy.spatial import KDTree
 
-        points, other = vertices.detach().cpu().double().numpy(), faces_or_normals.detach().cpu().numpy()
-        if other.ndim != 2 or other.shape[1] != 3 or len(other) == 0:
-            raise BadArgument("faces_or_normals", f"shape {other.shape}", "(f, 3) with f >= 1")
-        if faces_or_normals.is_floating_point():
-            if len(other) != len(points):
-                raise BadArgument("faces_or_normals", f"{len(other)} normals", f"{len(points)}, one for each vertex")
-            if not np.linalg.norm(other, axis=1).min() > 0:  # NaN included
-                raise BadArgument("faces_or_normals", "a normal of length 0 or NaN", "normals with a direction")
-            self.triangles, self.owner = None, np.arange(len(points))
-            self.samples, self.normals = points, other / np.linalg.norm(other, axis=1, keepdims=True)
-            self.tree = KDTree(self.samples)
-            spread = self.tree.query(points, k=min(4, len(points)))[0]
-            self.pitch = float(np.median(spread[:, -1]))
-            return
-        if other.min() < 0 or other.max() >= len(points):
-            raise BadArgument("faces_or_normals", f"faces {other.min()}..{other.max()}", f"0..{len(points) - 1}")
-        corners = points[other]
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area = np.linalg.norm(cross, axis=1) / 2
-        corners, cross, area = corners[area > 1e-14], cross[area > 1e-14], area[area > 1e-14]
+        if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0 or faces.is_floating_point():
+            raise BadArgument("faces", f"{faces.dtype} of shape {tuple(faces.shape)}", "integers (f, 3) with f >= 1")
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise BadArgument("faces", f"faces {int(faces.min())}..{int(faces.max())}", f"0..{len(vertices) - 1}")
+        corners = vertices.detach().cpu().double().numpy()[faces.cpu().numpy()]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+        corners, area = corners[area > 1e-14], area[area > 1e-14]
         if len(area) == 0:
-            raise BadArgument("faces_or_normals", "faces without area", "a surface")
-        rng, count = np.random.default_rng(0), int(np.clip(area.sum() / 4e-6, 2000, 40_000))  # 2 mm apart
+            raise BadArgument("faces", "faces without area", "a surface")
+        rng, count = np.random.default_rng(0), int(np.clip(area.sum() / 0.002**2, 2000, 40_000))
         owner = np.repeat(np.arange(len(area)), rng.multinomial(count, area / area.sum()))
         u, v = np.sort(rng.random((2, len(owner))), axis=0)
         weights = np.stack([u, v - u, 1 - v], 1)
-        spread = (corners[owner] * weights[:, :, None]).sum(1)
+        samples = (corners[owner] * weights[:, :, None]).sum(1)
         self.owner = np.concatenate([np.arange(len(area)), owner])
-        self.samples = np.concatenate([corners.mean(1), spread])
         self.triangles, self.normals = corners, _pseudonormals(corners)
-        self.tree, self.pitch = KDTree(self.samples), 0.0
+        self.tree = KDTree(np.concatenate([corners.mean(1), samples]))
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the signed distances [m] of points (n, 3), chunk by chunk to stay in the cache."""
+        """Return the signed distances [m] of points (n, 3), in chunks that stay in the cache."""
         return np.concatenate([self._distance(points[k : k + 8192]) for k in range(0, max(1, len(points)), 8192)])
 
     def _distance(self, points: np.ndarray) -> np.ndarray:
-        if self.triangles is None:
-            length, index = self.tree.query(points)
-            along = ((points - self.samples[index]) * self.normals[index]).sum(1)
-            return np.copysign(np.maximum(np.abs(along), length - self.pitch), along)
-        _, index = self.tree.query(points, k=min(NEAREST_SAMPLES, len(self.samples)))
+        """Return the signed distances of one chunk."""
+        _, index = self.tree.query(points, k=min(NEAREST_SAMPLES, len(self.owner)))
         owner = self.owner[index.reshape(len(points), -1)]
         feet, feature = closest_on_triangles(np.repeat(points, owner.shape[1], 0), self.triangles[owner.reshape(-1)])
         gap = points[:, None] - feet.reshape(*owner.shape, 3)
@@ -174,10 +150,10 @@ class _Surface:
 
 
 def _pseudonormals(corners: np.ndarray) -> np.ndarray:
-    """Return pseudonormals (f, 7, 3) of each triangle's face, three sides and three corners.
+    """Return pseudonormals (f, 7, 3) of each triangle's face, sides and corners (Baerentzen and Aanaes, 2005).
 
-    The pseudonormal at a point's closest point tells its side of the surface (Baerentzen and Aanaes, 2005). It is the
-    sum of the two face normals at a side, and their sum weighted by angle at a corner.
+    The pseudonormal at the closest point tells the side of the surface. Sides add up the normals of two faces, corners
+    those of all faces, weighted by angle.
     """
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     face /= np.linalg.norm(face, axis=1, keepdims=True)

@@ -1,10 +1,11 @@
-"""Inverse kinematics of contacts: joints and pose with which a hand touches them, and nothing of itself.
+"""Inverse kinematics of contacts: joints and pose of a hand that touches them, but not itself.
 
-Seeds of the learned model come first (Eqs. 21-24). Rows that these leave unsolved get the hand's random postures
-nearest to their contacts. Each seed is refined by Levenberg-Marquardt, or by the paper's COBYLA, and measured again.
+Seeds of the learned model come first (Eqs. 21-24), then the nearest random postures. Each seed is refined by
+Levenberg-Marquardt, or by the paper's COBYLA, and measured anew.
 """
 
 import dataclasses
+from functools import partial
 from typing import Literal, get_args
 
 import torch
@@ -37,16 +38,14 @@ EXACT = 1e-6
 """Sum of squared residuals [mm2] at which a row is done: 0.5 um at a fingertip."""
 EXACT_TIPS = 5e-5
 """Tip error [m] above which a solved row is tried further: another configuration may have none."""
-SEEDS_PER_PASS = 512
-"""Seeds refined at a time: their temporaries stay in the cache."""
 
 
 @dataclasses.dataclass(frozen=True)
 class IKSolution(Batch):
     """A configuration for each row of contacts; finger i touches contact `permutation[:, i]`.
 
-    `tip_error` [m] and `normal_angle` [rad] are each fingertip's. `clearance` [m] is the links' least from each other
-    and from the world. `attempts` counts the refined seeds. A row without seeds holds NaN, and `status` tells why.
+    `clearance` [m] is the least of the links from each other and from the world. `attempts` counts the refined seeds.
+    A row without seeds holds NaN.
     """
 
     joints: Float[Tensor, "b h"]
@@ -78,8 +77,8 @@ def solve_ik(
         library: the hand's random postures; None: drawn when they are needed, in about a second.
 
     Returns:
-        One row for each of the contacts. Under `Status.OK` every tip is within 1 mm of its contact and inside its
-        pad's cone, and every link is clear. An unsolved row is the best attempt, with its Status.
+        One row for each triple. With `Status.OK` every tip is within 1 mm of its contact and inside its pad's cone,
+        and every link is clear. Else the row is the best attempt.
 
     Raises:
         BadArgument: contacts that are no finite triples, a mixture of another hand, an unknown method.
@@ -97,37 +96,39 @@ def solve_ik(
     world = CollisionWorld() if world is None else world
     move = refine_by_cobyla if method == "cobyla" else refine_exactly
 
-    def refine_seeds(seeds: IKSeeds) -> IKSolution:
+    def refine_pass(seeds: IKSeeds) -> IKSolution:
         """Refine seeds and measure what came of them."""
         taken, start = assign(contacts, seeds), Configuration(seeds.joints, seeds.obj_from_hand)
         configuration = move(hand, start, taken, world)
         errors = measure_errors(hand, configuration, taken, world)
-        return IKSolution(
-            configuration.joints, configuration.obj_from_hand, seeds.permutation, errors.tip_error,
-            errors.normal_angle, errors.clearance, torch.ones_like(errors.status), errors.status,
-        )  # fmt: skip
+        placed = configuration.joints, configuration.obj_from_hand, seeds.permutation
+        measured = errors.tip_error, errors.normal_angle, errors.clearance
+        return IKSolution(*placed, *measured, torch.ones_like(errors.status), errors.status)
 
-    def refine_in_passes(seeds: IKSeeds) -> IKSolution:
-        """Refine seeds pass by pass."""
-        passes = range(0, max(len(seeds), 1), SEEDS_PER_PASS)
-        return join([refine_seeds(seeds[k : k + SEEDS_PER_PASS]) for k in passes])
-
-    def learned_seeds(some: Contacts) -> IKSeeds:
-        assert mixture is not None
-        return query_mixture(hand, some, mixture, n_seeds=SEEDS_PER_ASSIGNMENT)
+    def refine_seeds(seeds: IKSeeds) -> IKSolution:
+        """Refine seeds pass by pass, so that the temporaries stay in the cache."""
+        return join([refine_pass(seeds[k : k + 512]) for k in range(0, max(len(seeds), 1), 512)])
 
     def library_seeds(some: Contacts) -> IKSeeds:
+        """Return seeds of the posture library, which may have to be drawn."""
         return nearest_postures(PostureLibrary.of(hand) if library is None else library, some, world, LIBRARY_ATTEMPTS)
 
-    attempts = Attempts(~degenerate(contacts.points), _is_exact)
+    sources = [(library_seeds, LIBRARY_ATTEMPTS)]
+    if mixture is not None:
+        learned_seeds = partial(query_mixture, hand, mixture=mixture, n_seeds=SEEDS_PER_ASSIGNMENT)
+        sources = [(learned_seeds, LEARNED_ATTEMPTS), *sources]
+
+    def is_exact(solution: IKSolution) -> Bool[Tensor, "k"]:
+        return (solution.status == Status.OK) & (solution.tip_error.amax(1) <= EXACT_TIPS)
+
+    attempts = Attempts(~degenerate(contacts.points), is_exact)
     attempts.add(_no_solution(hand, contacts), torch.arange(len(contacts), device=contacts.points.device))
-    sources = [(learned_seeds, LEARNED_ATTEMPTS)] if mixture is not None else []
-    for source, count in [*sources, (library_seeds, LIBRARY_ATTEMPTS)]:
+    for source, count in sources:
         rows = torch.nonzero(attempts.unsolved)[:, 0]
         if len(rows):
             seeds = source(contacts[rows])
             seeds = dataclasses.replace(seeds, row=rows[seeds.row])
-            attempts.refine(seeds, rank_in_group(seeds.row), [1] * count, refine_in_passes)
+            attempts.refine(seeds, rank_in_group(seeds.row), [1] * count, refine_seeds)
     solution, row = attempts.best(lambda tried: ((tried.status != Status.OK).int(), tried.tip_error.amax(1)))
     counts = torch.bincount(torch.cat(attempts.rows), minlength=len(contacts)) - 1
     return dataclasses.replace(solution[row.argsort()], attempts=counts)
@@ -136,23 +137,16 @@ def solve_ik(
 def refine_exactly(
     hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld
 ) -> Configuration:
-    """Refine until the tips are exact, giving up margins of clearance where the checks allow it."""
+    """Refine until the tips are exact, giving up margins of clearance that are not needed."""
     refined = refine(hand, configuration, contacts, world, EXACT)
     settled = settle_tips(hand, refined, contacts, EXACT)
     return pick(measure_errors(hand, settled, contacts, world).status == Status.OK, settled, refined)
 
 
-def _is_exact(solution: IKSolution) -> Bool[Tensor, "b"]:
-    """Tell which rows are solved, and exactly."""
-    return (solution.status == Status.OK) & (solution.tip_error.amax(1) <= EXACT_TIPS)
-
-
 def _no_solution(hand: Hand, contacts: Contacts) -> IKSolution:
-    """Return rows without a configuration: out of reach, or degenerate."""
+    """Return rows out of reach, or degenerate."""
     b, nan = len(contacts), torch.full((), torch.nan).to(contacts.points)
     order = torch.arange(3, device=nan.device).expand(b, 3)
     status = torch.where(degenerate(contacts.points), int(Status.DEGENERATE), int(Status.OUT_OF_REACH))
-    return IKSolution(
-        nan.expand(b, hand.dof), nan.expand(b, 4, 4), order, nan.expand(b, 3), nan.expand(b, 3), nan.expand(b),
-        torch.zeros_like(status), status,
-    )  # fmt: skip
+    placed = nan.expand(b, hand.dof), nan.expand(b, 4, 4), order
+    return IKSolution(*placed, nan.expand(b, 3), nan.expand(b, 3), nan.expand(b), torch.zeros_like(status), status)
