@@ -155,6 +155,18 @@ def test_bad_trials_are_refused(bad):
         TrialSpec(**bad)
 
 
+def test_fingertips_come_from_the_hand_unless_they_are_given():
+    spec = ContactSpec()
+    assert (spec.fingertip_radius, spec.least_separation) == (0.012, 0.026)
+    assert spec.for_fingertips(0.012) == spec.for_fingertips(0.0) == dataclasses.replace(spec, tip_radius=0.012)
+    wide = spec.for_fingertips(0.02)
+    assert wide.fingertip_radius == 0.02 and wide.least_separation == pytest.approx(0.042)
+    given = ContactSpec(tip_radius=0.005, separation=0.01)
+    assert given.for_fingertips(0.02) == given
+    assert (given.fingertip_radius, given.least_separation) == (0.005, 0.01)
+    assert ContactSpec(tip_radius=0.0).least_separation == 0.026
+
+
 def test_paper_spec_has_no_margins():
     spec = ContactSpec.paper()
     assert spec.planned_friction == spec.friction == 0.8

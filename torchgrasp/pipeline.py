@@ -132,6 +132,7 @@ def plan_grasps(
         raise BadArgument("hand", type(hand).__name__, "a Hand from load_hand")
     if mode not in get_args(Mode):
         raise BadArgument("mode", repr(mode), "'joint' or 'contact_first'")
+    spec = spec.for_fingertips(float(hand.tip_radius.max()))
     mixture, mixture_sha256 = _read_mixture(hand) if mode == "contact_first" else (None, "none")
 
     if shape is None:

@@ -9,25 +9,29 @@ from torchgrasp.errors import BadArgument
 Simulator = Literal["sapien", "mujoco"]
 """What can simulate a scene."""
 
+TIP_RADIUS, SEPARATION = 0.012, 0.026
+"""Radius [m] of the Allegro's fingertips, and the least distance [m] of contacts for them: their width and 2 mm.
+Smaller tips get as much room: the link behind a tip is wider than its sphere."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ContactSpec(Value):
-    """What a set of three contacts must satisfy (Eqs. 10-14). `ContactSpec.paper()` is the paper's own.
+    """What three contacts must satisfy (Eqs. 10-14). `ContactSpec.paper()` is the paper's own.
 
-    The margins beyond the paper each have a measured reason: a certificate on the estimated surface is lost on the
-    true one unless the contacts are planned with less friction than is there, on flat surface, a fingertip apart.
+    The estimated surface is not the true one. Hence the margins beyond the paper: contacts are planned with less
+    friction than there is, on flat surface, a fingertip apart. `docs/planning.md` has their measured worth.
 
     Args:
-        friction: coefficient of friction between fingertip and object, as it will be executed.
+        friction: coefficient of friction between fingertip and object at execution.
         edges: edges of the linearised friction cone, at least 3.
         max_variance: S_thresh of Eq. (12), a variance in normalised units.
         friction_margin: contacts are planned and certified with `friction * friction_margin`.
-        separation: least distance between two contacts [m]; fingertips are 24 mm wide.
+        separation: least distance between two contacts [m]; None: the width of the fingertips and 2 mm.
         flatness: largest angle [rad] between the normals of the surface within 8 mm of a contact; None: not checked.
         table: height [m] of the table's plane, whose normal is the z axis of the cloud's frame; None: no table.
         contact_height: least height of a contact above the table [m].
-        tip_radius: of the fingertips [m], which must lie above the table, too; 0: they are points.
-        start_radius: radius of the sphere from which starts are drawn, in normalised units (Sec. 6.2; the paper: 0.1).
+        tip_radius: radius [m] of the fingertips, which must lie above the table; 0: points. None: the hand's.
+        start_radius: normalised radius of the sphere from which starts are drawn (Sec. 6.2; the paper: 0.1).
 
     Raises:
         BadArgument: a number outside its range.
@@ -40,11 +44,11 @@ class ContactSpec(Value):
     edges: int = 8
     max_variance: float = 0.03
     friction_margin: float = 0.5
-    separation: float = 0.026
+    separation: float | None = None
     flatness: float | None = 0.44
     table: float | None = None
     contact_height: float = 0.012
-    tip_radius: float = 0.012
+    tip_radius: float | None = None
     start_radius: float = 0.9
 
     def __post_init__(self) -> None:
@@ -54,11 +58,11 @@ class ContactSpec(Value):
             ("edges", self.edges, 3, 1024),
             ("max_variance", self.max_variance, 1e-12, 1e6),
             ("friction_margin", self.friction_margin, 1e-3, 1.0),
-            ("separation", self.separation, 0.0, 1.0),
+            ("separation", self.least_separation, 0.0, 1.0),
             ("flatness", 0.1 if self.flatness is None else self.flatness, 1e-3, 3.1416),
             ("table", 0.0 if self.table is None else self.table, -1e6, 1e6),
             ("contact_height", self.contact_height, -1.0, 1.0),
-            ("tip_radius", self.tip_radius, 0.0, 1.0),
+            ("tip_radius", self.fingertip_radius, 0.0, 1.0),
             ("start_radius", self.start_radius, 1e-6, 1.2),
         ]
         for name, value, low, high in ranges:
@@ -68,6 +72,24 @@ class ContactSpec(Value):
     def planned_friction(self) -> float:
         """The friction with which contacts are planned and certified."""
         return self.friction * self.friction_margin
+
+    @property
+    def fingertip_radius(self) -> float:
+        """The radius [m] of fingertips that contacts make room for."""
+        return TIP_RADIUS if self.tip_radius is None else self.tip_radius
+
+    @property
+    def least_separation(self) -> float:
+        """The least distance [m] between two contacts."""
+        wider = 2 * max(self.fingertip_radius - TIP_RADIUS, 0.0)
+        return SEPARATION + wider if self.separation is None else self.separation
+
+    def for_fingertips(self, radius: float) -> "ContactSpec":
+        """Return the spec for fingertips of a hand, where it does not say their radius [m] itself.
+
+        Room is made for at least `TIP_RADIUS`.
+        """
+        return self if self.tip_radius is not None else dataclasses.replace(self, tip_radius=max(radius, TIP_RADIUS))
 
     @classmethod
     def paper(cls, friction: float = 0.8, edges: int = 8, max_variance: float = 0.03) -> "ContactSpec":

@@ -82,7 +82,7 @@ def test_grasps_satisfy_every_constraint(scene, grasps):
     torch.testing.assert_close(good.contacts.normals, seen.normal, atol=1e-6, rtol=0)
     assert bool(certify(good.contacts, spec).closed.all()) and bool(good.certificate.closed.all())
     sides = torch.linalg.vector_norm(good.contacts.points - good.contacts.points.roll(1, 1), dim=-1)
-    assert float(sides.min()) >= spec.separation
+    assert float(sides.min()) >= spec.least_separation
     centres = apply(good.obj_from_hand, hand.tip_centres(good.joints))
     gap = centres - good.contacts.points - hand.tip_radius[:, None] * good.contacts.normals
     assert float(torch.linalg.vector_norm(gap, dim=-1).max()) <= 1e-3

@@ -77,7 +77,7 @@ def test_bounds_name_ball_separation_and_table(ellipsoid, generator):
     assert bounds.shape == (6, 15)
     assert torch.equal(bounds[:, 6:9] > 0, torch.linalg.vector_norm(points, dim=-1) > INSIDE * 1.35)
     apart = torch.linalg.vector_norm(points - points.roll(-1, 1), dim=-1) * ellipsoid.scale
-    assert torch.equal(bounds[:, 9:12] > 0, apart < SPEC.separation / INSIDE)
+    assert torch.equal(bounds[:, 9:12] > 0, apart < SPEC.least_separation / INSIDE)
     height = ellipsoid.metres(points)[..., 2]
     above = bounds[:, 12:] <= 0
     assert bool((height[above] >= 0.47 + 0.012).all())

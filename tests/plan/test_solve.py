@@ -40,12 +40,12 @@ def test_eq10_to_eq13_hold_for_every_row_that_is_ok(ellipsoid, name):
     assert float(good.coefficients.min()) > 0
     torch.testing.assert_close(good.coefficients.sum((1, 2)), torch.ones(len(good), dtype=torch.float64))
     apart = torch.linalg.vector_norm(good.contacts.points - good.contacts.points.roll(1, 1), dim=-1)
-    assert float(apart.min()) >= spec.separation
+    assert float(apart.min()) >= spec.least_separation
     assert not bool(degenerate(good.contacts.points).any())
     if spec.table is not None:
         height = good.contacts.points[..., 2]
         assert float(height.min()) >= spec.table + spec.contact_height
-        tip = height + spec.tip_radius * (good.contacts.normals[..., 2] - 1)
+        tip = height + spec.fingertip_radius * (good.contacts.normals[..., 2] - 1)
         assert float(tip.min()) >= spec.table - 1e-12
     if spec.flatness is not None:
         assert float(normal_variation(ellipsoid, x, good.contacts.normals).max()) <= spec.flatness

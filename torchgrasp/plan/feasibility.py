@@ -40,7 +40,7 @@ def check_feasibility(shape: Shape, spec: ContactSpec, points: Float[Tensor, "b 
         Status.OFF_SURFACE: (jet.distance.abs() <= ON_SURFACE).all(-1),
         Status.TOO_UNCERTAIN: ((jet.variance >= 0) & (jet.variance < spec.max_variance)).all(-1),
         Status.BELOW_TABLE: (points[..., 2] >= lowest).all(-1),
-        Status.TOO_CLOSE: apart >= spec.separation,
+        Status.TOO_CLOSE: apart >= spec.least_separation,
         Status.DEGENERATE: ~degenerate(points),
     }
     if spec.flatness is not None:

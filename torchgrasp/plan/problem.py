@@ -153,10 +153,10 @@ class ContactProblem:
             friction=spec.planned_friction * math.cos(math.pi / spec.edges),
             max_variance=spec.max_variance,
             domain_radius=float(shape.domain_radius),
-            separation=max(spec.separation / float(shape.scale), LEAST_SIDE),
+            separation=max(spec.least_separation / float(shape.scale), LEAST_SIDE),
             table=table,
             contact_height=spec.contact_height / float(shape.scale),
-            tip_radius=spec.tip_radius / float(shape.scale),
+            tip_radius=spec.fingertip_radius / float(shape.scale),
         )
 
     def least_height(self, normals: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
