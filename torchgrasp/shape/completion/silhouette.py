@@ -1,4 +1,4 @@
-"""What each view says of the hidden side: the object stays within its outline and behind its seen surface."""
+"""Bounds on the hidden side from each view: the object stays within its outline and behind its visible surface."""
 
 import dataclasses
 
@@ -14,17 +14,17 @@ from torchgrasp.values import PointCloud
 
 CELLS = 4.0
 """Cells of the raster for the typical spacing of the cloud's pixels."""
-GROW, SHRINK = 2.0, 1.65
-"""The outline is the union of discs of 2 spacings about the pixels, shrunk by 1.65: holes close, the rim stays."""
 MAX_CELLS = 320
 """Cells of the raster along the cloud's longer side, at most."""
+GROW, SHRINK = 2.0, 1.65
+"""The outline is the union of discs of 2 spacings about the pixels, shrunk by 1.65: holes close, the rim stays."""
 FRONT_MARGIN = 0.002
-"""How far [m] a point may lie in front of the seen surface: noise of the camera."""
+"""A point may lie this far [m] in front of the visible surface: noise of the camera."""
 BEHIND, PIXELS = 0.3, 6
-"""A point lies behind one of its six nearest pixels when it is deeper by so many radii of the cloud than a slope of 45
-degrees would explain."""
-MOST_BEHIND = 0.2
-"""Share of points behind others from which a cloud is no single view."""
+"""A point lies behind one of its six nearest pixels when it is deeper by this share of the cloud's radius than a slope
+of 45 degrees would explain."""
+MAX_BEHIND = 0.2
+"""Share of points behind others in a single view, at most: between views and whole surfaces (docs/shape.md)."""
 TIE = 2e-9
 """Relative difference of squared distances that rounding can make: on a raster many points are equally far, and the
 frame must not decide between them."""
@@ -32,11 +32,16 @@ frame must not decide between them."""
 
 @dataclasses.dataclass(frozen=True)
 class Silhouette(Value):
-    """The outline and the seen depth of a cloud in a raster of the camera's plane at depth 1.
+    """The outline and the visible depth of a view, in a raster of the camera's plane at depth 1.
 
-    `outside` is the signed distance to the outline (positive outside), in the plane at depth 1; `depth` [m] is that
-    of the nearest seen pixel. `rim` and `rim_normals` are points of the outline at the seen depth, in the cloud's
-    frame, with the normals of the cone that the outline and the camera span.
+    Args:
+        viewpoint: position of the camera [m].
+        axes: right, down and forward axis of the camera, as rows.
+        corner, cell: first node of the raster and distance of its nodes, at depth 1.
+        outside: signed distance to the outline at depth 1, positive outside.
+        depth: depth [m] of the nearest visible pixel.
+        rim: points of the outline [m] at the visible depth.
+        rim_normals: normals there of the cone that the camera and the outline span.
     """
 
     viewpoint: Float[Tensor, "3"]
@@ -54,35 +59,32 @@ class Silhouette(Value):
         return outside * depth
 
     def violation(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return how far [m] points stand out of the hull, or else in front of the seen surface; 0 where hidden."""
-        outside, seen, depth = self._look_up(points)
-        in_front = (seen - depth - FRONT_MARGIN).clamp_min(0)
+        """Return how far [m] points are outside the hull or in front of the visible surface; 0 where hidden."""
+        outside, visible, depth = self._look_up(points)
+        in_front = (visible - depth - FRONT_MARGIN).clamp_min(0)
         return torch.where(outside > 0, outside * depth, in_front)
 
     def _look_up(self, points: Float[Tensor, "*b 3"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return outline distance, seen depth and own depth of points."""
+        """Return the outline's distance, the visible depth and the own depth of points."""
         local = (points - self.viewpoint) @ self.axes.T
         depth = local[..., 2].clamp_min(1e-9)  # behind the camera is far outside
-        place = (local[..., :2] / depth[..., None] - self.corner) / self.cell
-        limit = torch.tensor(self.outside.shape, dtype=place.dtype, device=place.device).flip(0) - 1
-        clamped = torch.minimum(place.clamp_min(0), limit)
+        position = (local[..., :2] / depth[..., None] - self.corner) / self.cell
+        limit = torch.tensor(self.outside.shape, dtype=position.dtype, device=position.device).flip(0) - 1
+        clamped = torch.minimum(position.clamp_min(0), limit)
         column, row = torch.round(clamped).long().unbind(-1)
-        beyond = torch.linalg.vector_norm(place - clamped, dim=-1) * self.cell
+        beyond = torch.linalg.vector_norm(position - clamped, dim=-1) * self.cell
         return self.outside[row, column] + beyond, self.depth[row, column], depth
 
 
 @dataclasses.dataclass(frozen=True)
 class Outlines(Value):
-    """The silhouettes of all views of one object: what one of them rules out is ruled out.
-
-    `rim` and `rim_normals` are those of all views.
-    """
+    """The silhouettes of all views of one object; each view's bounds hold."""
 
     views: tuple[Silhouette, ...]
 
     @property
     def rim(self) -> Float[Tensor, "k 3"]:
-        """Points of the outlines [m]."""
+        """Points of all outlines [m]."""
         return torch.cat([view.rim for view in self.views])
 
     @property
@@ -91,46 +93,43 @@ class Outlines(Value):
         return torch.cat([view.rim_normals for view in self.views])
 
     def hull_distance(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the signed distance [m] to the visual hull: positive where some camera would have seen the object."""
+        """Return the signed distance [m] to the visual hull of all views."""
         return torch.stack([view.hull_distance(points) for view in self.views]).amax(0)
 
     def violation(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return how far [m] points stand out of the hull or in front of a seen surface, the worst view's."""
+        """Return the greatest violation [m] of a view."""
         return torch.stack([view.violation(points) for view in self.views]).amax(0)
 
 
 def silhouettes(cloud: PointCloud) -> Outlines:
-    """Return the silhouette of every view of a cloud, whose viewpoints are known.
+    """Return the silhouette of every view of a cloud with viewpoints.
 
     Raises:
-        BadArgument: a camera that has not the whole of its view in front of it, or no single view.
+        BadArgument: part of a view is beside or behind its camera, or a view shows both sides of the object.
 
     >>> cap = torch.rand(99, 3).double() * torch.tensor([0.1, 0.1, 0.01])
     >>> len(silhouettes(PointCloud(cap, viewpoint=torch.tensor([0.0, 0.0, 9.0]).double())).views)
     1
     """
-    parts = [(part, part.viewpoint) for part in cloud.split_views()]
-    for part, _ in parts:
-        _check_view(part)
-    return Outlines(tuple(silhouette(part, eye) for part, eye in parts if eye is not None))
+    views = [(view.points, view.viewpoint) for view in cloud.split_views()]
+    for points, viewpoint in views:
+        assert viewpoint is not None
+        _check_view(points, viewpoint)
+    return Outlines(tuple(silhouette(points, viewpoint) for points, viewpoint in views if viewpoint is not None))
 
 
-def silhouette(cloud: PointCloud, viewpoint: Float[Tensor, "3"], n_rim: int = 16) -> Silhouette:
-    """Return the silhouette of a cloud seen from a viewpoint, from the cloud alone.
+def silhouette(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"], n_rim: int = 16) -> Silhouette:
+    """Return the silhouette of the points [m] of one view.
 
     Args:
-        cloud: points [m] of one view.
-        viewpoint: the camera's position [m], all points in front of it.
+        points: of one view, all in front of the camera.
+        viewpoint: position of the camera [m].
         n_rim: number of points on the outline, evenly spread.
     """
     from scipy.ndimage import distance_transform_edt
     from scipy.spatial import KDTree
 
-    points, viewpoint = cloud.points.double().cpu(), viewpoint.double().cpu()
-    axes = _camera_axes((points.amax(0) + points.amin(0)) / 2 - viewpoint)
-    local = (points - viewpoint) @ axes.T
-    pixels = (local[:, :2] / local[:, 2:]).numpy()
-    depths = local[:, 2].numpy()
+    axes, pixels, depths = (t.numpy() for t in _project(points, viewpoint))
     distance, _ = KDTree(pixels).query(pixels, k=min(5, len(pixels)))
     spacing = float(np.median(distance[:, -1]))
     low, high = pixels.min(0), pixels.max(0)
@@ -140,58 +139,61 @@ def silhouette(cloud: PointCloud, viewpoint: Float[Tensor, "3"], n_rim: int = 16
     shape = tuple(np.ceil((high - low) / cell).astype(int)[::-1] + 2 * margin + 1)
     corner = low - margin * cell
     column, row = np.round((pixels - corner) / cell).astype(int).T
-    order = np.argsort(-depths)  # where pixels share a cell the nearest to the camera is written last
-    seen = np.zeros(shape)
-    seen[row[order], column[order]] = depths[order]
-    nearest = np.asarray(distance_transform_edt(seen == 0, return_distances=False, return_indices=True))
-    grown = _fill_pores(_distance(seen == 0) * cell <= GROW * spacing, spacing / cell)
+    order = np.argsort(-depths)  # of pixels that share a cell the nearest to the camera is written last
+    raster = np.zeros(shape)
+    raster[row[order], column[order]] = depths[order]
+    nearest = np.asarray(distance_transform_edt(raster == 0, return_distances=False, return_indices=True))
+    grown = _fill_pores(_distance(raster == 0) * cell <= GROW * spacing, spacing / cell)
     inside = _distance(grown) * cell > SHRINK * spacing
     outside = (_distance(~inside) - _distance(inside)) * cell
     outside += np.where(inside, 0.5, -0.5) * cell  # the outline runs between two cells
     rim, rim_normals = _rim(outside, corner, cell, pixels, depths, n_rim)
+    origin, axes = viewpoint.double().cpu(), torch.from_numpy(axes)
     return Silhouette(
-        viewpoint=viewpoint,
+        viewpoint=origin,
         axes=axes,
         corner=torch.from_numpy(corner),
         cell=cell,
         outside=torch.from_numpy(outside),
-        depth=torch.from_numpy(seen[tuple(nearest)]),
-        rim=torch.from_numpy(rim) @ axes + viewpoint,
+        depth=torch.from_numpy(raster[tuple(nearest)]),
+        rim=torch.from_numpy(rim) @ axes + origin,
         rim_normals=torch.from_numpy(rim_normals) @ axes,
     )
 
 
-def _check_view(view: PointCloud) -> None:
-    """Refuse a viewpoint from which part of its view lies beside or behind the camera, or behind other parts."""
-    points, viewpoint = view.points, view.viewpoint
-    assert viewpoint is not None
+def _check_view(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> None:
+    """Refuse points beside or behind the camera, and points that no camera sees at once."""
     forward = (points.amax(0) + points.amin(0)) / 2 - viewpoint
     behind = int(((points - viewpoint) @ forward <= 0).sum())
     if behind:
         found = f"{viewpoint.tolist()} m, with {behind} of {len(points)} points beside or behind it"
         raise BadArgument("viewpoint", found, "the position of a camera that has the whole cloud in front of it")
-    share = _share_behind(view, viewpoint)
-    if share > MOST_BEHIND:
+    share = _share_behind(points, viewpoint)
+    if share > MAX_BEHIND:
         found = f"{share:.0%} of the points behind others, which no camera sees at once"
         raise BadArgument("cloud", found, "a single view, the viewpoint of each point, or outward normals")
 
 
-def _share_behind(cloud: PointCloud, viewpoint: Float[Tensor, "3"]) -> float:
-    """Return the share of the points that lie behind others: of a single view few, of a whole surface about half.
-
-    Of 63 noisy views of 21 objects, of 40 points or more, it is .15 at most, of 14 whole surfaces .23 at least; but of
-    a plate seen face on it is 0.
-    """
+def _share_behind(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> float:
+    """Return the share of points that lie behind others: small for a single view, about half for a whole surface."""
     from scipy.spatial import KDTree
 
-    points, viewpoint = cloud.points.double().cpu(), viewpoint.double().cpu()
-    middle = (points.amax(0) + points.amin(0)) / 2
-    local = (points - viewpoint) @ _camera_axes(middle - viewpoint).T
-    depth, pixels = local[:, 2], local[:, :2] / local[:, 2:]
+    _, pixels, depth = _project(points, viewpoint)
     apart, index = KDTree(pixels.numpy()).query(pixels.numpy(), k=min(PIXELS, len(pixels)))
     deeper = depth[:, None] - depth[torch.from_numpy(index)] - torch.from_numpy(apart) * depth[:, None]
-    radius = torch.linalg.vector_norm(points - middle, dim=-1).max()
+    points = points.double().cpu()
+    radius = torch.linalg.vector_norm(points - (points.amax(0) + points.amin(0)) / 2, dim=-1).max()
     return float((deeper.amax(1) > BEHIND * radius).double().mean())
+
+
+def _project(
+    points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]
+) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "n 2"], Float[Tensor, "n"]]:
+    """Return the axes of a camera that looks at the points, their pixels at depth 1, and their depths [m]."""
+    points, viewpoint = points.double().cpu(), viewpoint.double().cpu()
+    axes = _camera_axes((points.amax(0) + points.amin(0)) / 2 - viewpoint)
+    local = (points - viewpoint) @ axes.T
+    return axes, local[:, :2] / local[:, 2:], local[:, 2]
 
 
 def _camera_axes(forward: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
@@ -204,7 +206,7 @@ def _camera_axes(forward: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
 
 
 def _fill_pores(mask: np.ndarray, radius: float) -> np.ndarray:
-    """Return the mask without holes that no disc of the radius fits in: gaps between samples, not real holes."""
+    """Fill the holes of a mask in which no disc of the radius fits: gaps between samples, not real holes."""
     from scipy.ndimage import label
 
     holes = np.zeros(mask.shape, dtype=np.int64)
@@ -216,7 +218,7 @@ def _fill_pores(mask: np.ndarray, radius: float) -> np.ndarray:
 
 
 def _distance(mask: np.ndarray) -> np.ndarray:
-    """Return the distance of each cell of the mask to the nearest cell outside it, in cells."""
+    """Return the distance, in cells, of each cell of the mask to the nearest cell outside."""
     from scipy.ndimage import distance_transform_edt
 
     return np.asarray(distance_transform_edt(mask))
@@ -225,7 +227,7 @@ def _distance(mask: np.ndarray) -> np.ndarray:
 def _rim(
     outside: np.ndarray, corner: np.ndarray, cell: float, pixels: np.ndarray, depths: np.ndarray, n: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return n points of the outline in the camera's frame, at the depth of the seen pixels nearby, and normals."""
+    """Return n points of the outline in the camera's frame, at the depth of nearby pixels, and their normals."""
     from scipy.ndimage import gaussian_filter
     from scipy.spatial import KDTree
 
@@ -233,15 +235,14 @@ def _rim(
     smooth = gaussian_filter(outside, 3.0)
     slope = np.stack([np.gradient(smooth, axis=axis)[row, column] for axis in (1, 0)], -1)
     slope /= np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-12)
-    place = corner + cell * np.stack([column, row], -1)
-    if len(place) == 0:
+    position = corner + cell * np.stack([column, row], -1)
+    if len(position) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3))
-    flat = torch.from_numpy(np.concatenate([place, np.zeros((len(place), 1))], -1))
-    picks = farthest_points(flat, n, tie=TIE).numpy()
-    place, slope = place[picks], slope[picks]
-    _, index = KDTree(pixels).query(place, k=min(4, len(pixels)))
-    depth = np.median(depths[index].reshape(len(place), -1), axis=-1)
-    ray = np.concatenate([place, np.ones((len(place), 1))], -1)
+    picks = farthest_points(torch.from_numpy(position), n, tie=TIE).numpy()
+    position, slope = position[picks], slope[picks]
+    _, index = KDTree(pixels).query(position, k=min(4, len(pixels)))
+    depth = np.median(depths[index].reshape(len(position), -1), axis=-1)
+    ray = np.concatenate([position, np.ones((len(position), 1))], -1)
     # The cone's normal is perpendicular to the ray and to the outline's tangent, and leans with the slope.
-    across = np.concatenate([slope, -(slope * place).sum(-1, keepdims=True)], -1)
+    across = np.concatenate([slope, -(slope * position).sum(-1, keepdims=True)], -1)
     return ray * depth[:, None], across / np.linalg.norm(across, axis=-1, keepdims=True)

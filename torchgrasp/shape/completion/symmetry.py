@@ -1,4 +1,4 @@
-"""Planes of symmetry of a partial cloud: found by matching its mirror image against the cloud and free space."""
+"""Mirror planes of a partial cloud: its mirror image should fall onto the cloud, not into free space."""
 
 import dataclasses
 import math
@@ -12,34 +12,38 @@ from torchgrasp.linalg import farthest_points, fibonacci_sphere, unit
 from torchgrasp.shape.completion.silhouette import TIE, Outlines, silhouettes
 from torchgrasp.values import PointCloud
 
-TAU = 0.003
-"""Distance [m] over which a mirrored point stops matching the cloud."""
+MATCH_DISTANCE = 0.003
+"""Distance [m] over which a mirrored point stops matching the cloud: a few times the camera's noise."""
 PROBES = 150
-"""Points of the cloud with which a plane is scored."""
+"""Points of the cloud that score a plane."""
 OFFSETS = 17
 """Offsets tried for each direction of a plane."""
 ANGLES, FINE_ANGLES = 24, 96
-"""Directions of vertical planes tried when gravity is known, and when an axis is, too."""
+"""Directions of vertical planes tried on a table, and about a known axis."""
 DIRECTIONS = 80
-"""Directions of planes tried when it is not."""
-FACING = 0.35
-"""A plane whose normal has less than this cosine with the view contains the view, and adds no hidden points."""
+"""Directions of planes tried without a table."""
+MIN_FACING, FACING = 0.35, 0.7
+"""Cosine of a plane's normal with the view below which the plane hides no points, and from which it lies across."""
 ONE_SIDED = 0.05
-"""Length of the mean of the directions of view (level ones when gravity is known) from which one side was not seen."""
+"""Length of the mean direction of view from which on one side of the object was not seen."""
+RIM_PRIOR = 0.15
+"""Loss of score at a quarter of the cloud's size from the rim, without a table: a view ends near the mirror plane."""
 MAX_PLANES = 4
-"""Mirror planes used, at most, besides the one across the view that is added when none of them is."""
+"""Mirror planes used, at most, beside the one across the view."""
 WITHIN = 0.12
-"""Planes are used whose score is within this of the best one's."""
+"""Planes are used whose score is within this of the best."""
 SQUARE, SQUARE_PRIOR = 0.1, 0.1
-"""Greatest cosine between planes at right angles, and what a plane's score gains by one with the best of all: most
-things with two planes of symmetry have them so, and the view may well show only one."""
+"""Greatest cosine between planes at right angles, and the score that a plane gains by being at right angles to the
+best: most objects with two mirror planes have them so, and a view may show only one."""
 APART = math.cos(math.radians(25.0))
-"""Cosine of the least angle between two planes."""
+"""Cosine of the least angle between two planes: closer ones mirror to the same points."""
+MAX_VIOLATION = 0.15
+"""Mean violation of free space, in [0, 1], that a plane across the view may have."""
 
 
 @dataclasses.dataclass(frozen=True)
-class SymmetryScene:
-    """What planes are scored against: the cloud, its outline and the table; and the points that they are scored by."""
+class SymmetryScorer:
+    """What mirror planes are scored against: the cloud, its outlines and the table; `probes` are mirrored."""
 
     points: Tensor
     normals: Tensor
@@ -50,28 +54,28 @@ class SymmetryScene:
     probe_normals: Tensor
 
     @classmethod
-    def of(cls, cloud: PointCloud, table: float | None) -> "SymmetryScene":
-        """Return the scene of a cloud with normals, scored by all of it."""
+    def of(cls, cloud: PointCloud, table: float | None) -> "SymmetryScorer":
+        """Return the scorer of a cloud with normals, with probes from all of it."""
         from scipy.spatial import KDTree
 
         assert cloud.normals is not None
         tree = KDTree(cloud.points.numpy())
         whole = cls(cloud.points, cloud.normals, tree, silhouettes(cloud), table, cloud.points[:0], cloud.normals[:0])
-        return whole.scored_by(torch.arange(len(cloud)))
+        return whole.for_part(torch.arange(len(cloud)))
 
-    def scored_by(self, rows: Int[Tensor, "k"]) -> "SymmetryScene":
-        """Return the same scene, scored by some points of the cloud."""
+    def for_part(self, rows: Int[Tensor, "k"]) -> "SymmetryScorer":
+        """Return the scorer with probes from some points of the cloud."""
         rows = rows[farthest_points(self.points[rows], PROBES, tie=TIE)]
         return dataclasses.replace(self, probes=self.points[rows], probe_normals=self.normals[rows])
 
     @property
     def center(self) -> Tensor:
-        """The centre of the cloud's box."""
+        """Centre of the cloud's box [m]."""
         return (self.points.amax(0) + self.points.amin(0)) / 2
 
     @property
     def size(self) -> float:
-        """The longest side of the cloud's box [m]."""
+        """Longest side of the cloud's box [m]."""
         return float((self.points.amax(0) - self.points.amin(0)).max())
 
     def nearest(self, points: Tensor, limit: float = math.inf) -> tuple[Tensor, Tensor]:
@@ -82,109 +86,89 @@ class SymmetryScene:
         return torch.from_numpy(distance).reshape(shape), index
 
     def score(self, planes: Float[Tensor, "p 4"]) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
-        """Return the score of planes, and the mean violation of free space that it contains, in [0, 1]."""
+        """Return the score of planes n.x = o, given as (n, o), and their mean violation of free space in [0, 1].
+
+        The score is the share of mirrored probes on the cloud with the right normal, minus twice the violation.
+        """
         mirrored = reflect(self.probes, planes[:, None])
-        turned = turn(self.probe_normals, planes[:, None])
-        distance, index = self.nearest(mirrored, 4 * TAU)
-        agreement = (turned * self.normals[index]).sum(-1).clamp_min(0)
-        match = (torch.exp(-0.5 * (distance / TAU) ** 2) * agreement).mean(-1)
-        violation = self.outline.violation(mirrored)
+        normals = reflect_directions(self.probe_normals, planes[:, None])
+        distance, index = self.nearest(mirrored, 4 * MATCH_DISTANCE)
+        agreement = (normals * self.normals[index]).sum(-1).clamp_min(0)
+        match = (torch.exp(-0.5 * (distance / MATCH_DISTANCE) ** 2) * agreement).mean(-1)
+        depth = self.outline.violation(mirrored)
         if self.table is not None:
-            violation = violation + (self.table - mirrored[..., 2]).clamp_min(0)
-        bad = ((violation / TAU).clamp_max(3.0) ** 2 / 9.0).mean(-1)
-        return match - 2.0 * bad, bad
+            depth = depth + (self.table - mirrored[..., 2]).clamp_min(0)
+        violation = ((depth / MATCH_DISTANCE).clamp_max(3.0) ** 2 / 9.0).mean(-1)
+        return match - 2.0 * violation, violation
 
 
-def find_planes(scene: SymmetryScene) -> tuple[Float[Tensor, "p 4"], Float[Tensor, "p"]]:
-    """Return the mirror planes of a scene, best first, and their scores."""
-    size = scene.size
-    view = torch.stack([unit(scene.center - seen.viewpoint) for seen in scene.outline.views]).mean(0)
-    if scene.table is None:
-        directions = fibonacci_sphere(2 * DIRECTIONS)[:DIRECTIONS]  # a half sphere: n and -n are one
-        rim_prior = 0.15
+def find_planes(scorer: SymmetryScorer) -> tuple[Float[Tensor, "p 4"], Float[Tensor, "p"]]:
+    """Return the mirror planes of a cloud, best first, and their scores.
+
+    Planes come from a grid, of vertical planes on a table. The best are refined, with one across the view added.
+    """
+    view = torch.stack([unit(scorer.center - seen.viewpoint) for seen in scorer.outline.views]).mean(0)
+    if scorer.table is None:
+        directions = fibonacci_sphere(2 * DIRECTIONS)[:DIRECTIONS]  # half a sphere: n and -n are one
     else:
-        angle = torch.arange(ANGLES, dtype=torch.float64) * math.pi / ANGLES
-        directions = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
+        directions = _level_directions(ANGLES)
         view = view * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
-        rim_prior = 0.0
-    # Seen from above, or from sides that are far apart, no direction is hidden alone, and every plane may add points.
-    told = float(torch.linalg.vector_norm(view)) > ONE_SIDED
-    facing = (directions @ unit(view)).abs() if told else torch.ones(len(directions), dtype=torch.float64)
-    along = scene.points @ directions.T
-    low, high = along.amin(0), along.amax(0)
-    middle, half = (low + high) / 2, ((high - low) / 2).clamp_min(0.15 * size)
-    steps = torch.linspace(-1, 1, OFFSETS, dtype=torch.float64)
-    offsets = middle[:, None] + half[:, None] * steps
-    grid = torch.cat([directions[:, None].expand(-1, OFFSETS, -1), offsets[..., None]], -1)
-    scores, bad = (s.reshape(offsets.shape) for s in scene.score(grid.reshape(-1, 4)))
-    if rim_prior:
-        rim = (scene.outline.rim @ directions.T).median(0).values
-        scores = scores - rim_prior * ((offsets - rim[:, None]) / (0.25 * size)) ** 2
-
+    # From above, or from sides that are far apart, no side alone is hidden, and every plane may add points.
+    one_sided = float(torch.linalg.vector_norm(view)) > ONE_SIDED
+    facing = (directions @ unit(view)).abs() if one_sided else torch.ones(len(directions), dtype=torch.float64)
+    grid = _plane_grid(scorer, directions)
+    scores, violation = (s.reshape(grid.shape[:2]) for s in scorer.score(grid.reshape(-1, 4)))
+    if scorer.table is None:
+        rim = (scorer.outline.rim @ directions.T).median(0).values
+        scores = scores - RIM_PRIOR * ((grid[..., 3] - rim[:, None]) / (0.25 * scorer.size)) ** 2
     strongest = directions[scores.max(1).values.argmax()]
     scores = scores + SQUARE_PRIOR * ((directions @ strongest).abs() < SQUARE)[:, None]
-    best, where = scores.max(1)
-    order = [i for i in torch.argsort(best, descending=True, stable=True).tolist() if facing[i] > FACING]
-    chosen: list[int] = []
-    for i in order:
-        if len(chosen) == MAX_PLANES or best[i] <= best[order[0]] - WITHIN:
-            break
-        if all(abs(float(directions[i] @ directions[j])) < APART for j in chosen):
-            chosen.append(i)
-    picks = [(i, int(where[i])) for i in chosen]
-    if not any(facing[i] > 0.7 for i in chosen):
+
+    picks = _pick_planes(scores, directions, facing)
+    if not any(facing[i] > FACING for i, _ in picks):
         # A box seen on an edge: its end faces match well, but only a plane across the view shows the hidden side.
-        allowed = torch.where((bad < 0.15) & (facing > 0.7)[:, None], scores, -torch.inf)
+        allowed = torch.where((violation < MAX_VIOLATION) & (facing > FACING)[:, None], scores, -torch.inf)
         across = int(allowed.argmax())
         if bool(torch.isfinite(allowed.reshape(-1)[across])):
             picks.append((across // OFFSETS, across % OFFSETS))
     if not picks:
-        return scene.points.new_zeros(0, 4), scene.points.new_zeros(0)
-    refined = torch.stack([_refine(scene, grid[i, k]) for i, k in picks])
-    final, _ = scene.score(refined)
+        return scorer.points.new_zeros(0, 4), scorer.points.new_zeros(0)
+    refined = torch.stack([_refine(scorer, grid[i, k]) for i, k in picks])
+    final, _ = scorer.score(refined)
     order = torch.argsort(final, descending=True, stable=True)
     return refined[order], final[order]
 
 
-def find_upright_plane(
-    scene: SymmetryScene, center: Float[Tensor, "2"], part: Float[Tensor, "n 3"]
+def find_plane_through_axis(
+    scorer: SymmetryScorer, center: Float[Tensor, "2"], part: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "1 4"], Float[Tensor, "1"]]:
-    """Return the plane through an upright axis about which a part that stands out is symmetric, and its score.
+    """Return the mirror plane of a part through a vertical axis at `center`, and its score.
 
-    Handles and spouts lie on such a plane: what is less aside of it is favoured, even where their other half is hidden.
+    Prefers the plane with least extent of the part normal to it, even if the other half is occluded: handles and
+    spouts lie in such a plane.
     """
-    angle = torch.arange(FINE_ANGLES, dtype=torch.float64) * math.pi / FINE_ANGLES
-    normals = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
+    normals = _level_directions(FINE_ANGLES)
     planes = torch.cat([normals, (normals[:, :2] @ center)[:, None]], -1)
     arm = part[:, :2] - center
-    aside = (arm @ normals[:, :2].T).square().mean(0) / arm.square().sum(1).mean()
-    scores, _ = scene.score(planes)
-    best = (scores - aside).argmax()
+    extent = (arm @ normals[:, :2].T).square().mean(0) / arm.square().sum(1).mean()
+    scores, _ = scorer.score(planes)
+    best = (scores - extent).argmax()
     return planes[best][None], scores[best][None]
 
 
-def _refine(scene: SymmetryScene, plane: Float[Tensor, "4"]) -> Float[Tensor, "4"]:
-    """Return the plane after three searches on a grid of turns and offsets, each half as wide as the last."""
-    steps = torch.tensor([-1.0, 0.0, 1.0], dtype=plane.dtype)
-    for width in (1.0, 0.5, 0.25):
-        near = planes_near(scene, plane, 0.06 * width * steps, 0.04 * scene.size * width * steps)
-        plane = near[scene.score(near)[0].argmax()]
-    return plane
-
-
 def planes_near(
-    scene: SymmetryScene, plane: Float[Tensor, "4"], turns: Float[Tensor, "t"], shifts: Float[Tensor, "s"]
+    scorer: SymmetryScorer, plane: Float[Tensor, "4"], angles: Float[Tensor, "t"], shifts: Float[Tensor, "s"]
 ) -> Float[Tensor, "p 4"]:
-    """Return a plane turned about each of its free axes [rad] and shifted [m]; a table leaves the vertical axis."""
+    """Return a plane rotated about each of its axes [rad] and shifted [m]; on a table only about the vertical."""
     normal = plane[:3]
-    if scene.table is not None:
+    if scorer.table is not None:
         sideways = torch.stack([-normal[1], normal[0], torch.zeros_like(normal[0])])[None]
     else:
         sideways = torch.linalg.svd(normal[None], full_matrices=True).Vh[1:]
-    turned = torch.cartesian_prod(*[turns] * len(sideways)).reshape(-1, len(sideways))
-    normals = unit(normal + turned @ sideways)
-    # Turn about the cloud's centre, not about a frame's origin that may be far away.
-    offsets = plane[3] + (normals - normal) @ scene.center
+    tilts = torch.cartesian_prod(*[angles] * len(sideways)).reshape(-1, len(sideways))
+    normals = unit(normal + tilts @ sideways)
+    # Rotate about the cloud's centre: a frame's origin may be far away.
+    offsets = plane[3] + (normals - normal) @ scorer.center
     return torch.cat([normals.repeat_interleave(len(shifts), 0), (offsets[:, None] + shifts).reshape(-1, 1)], 1)
 
 
@@ -194,6 +178,45 @@ def reflect(points: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]) -> Floa
     return points - 2.0 * height * plane[..., :3]
 
 
-def turn(normals: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]) -> Float[Tensor, "*d 3"]:
+def reflect_directions(directions: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]) -> Float[Tensor, "*d 3"]:
     """Mirror directions across a plane."""
-    return normals - 2.0 * (normals * plane[..., :3]).sum(-1, keepdim=True) * plane[..., :3]
+    return directions - 2.0 * (directions * plane[..., :3]).sum(-1, keepdim=True) * plane[..., :3]
+
+
+def _level_directions(n: int) -> Float[Tensor, "n 3"]:
+    """Return n horizontal unit vectors over half a turn."""
+    angle = torch.arange(n, dtype=torch.float64) * math.pi / n
+    return torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
+
+
+def _plane_grid(scorer: SymmetryScorer, directions: Float[Tensor, "d 3"]) -> Float[Tensor, "d k 4"]:
+    """Return planes with these normals at offsets over the cloud's extent."""
+    along = scorer.points @ directions.T
+    low, high = along.amin(0), along.amax(0)
+    middle, half = (low + high) / 2, ((high - low) / 2).clamp_min(0.15 * scorer.size)
+    offsets = middle[:, None] + half[:, None] * torch.linspace(-1, 1, OFFSETS, dtype=torch.float64)
+    return torch.cat([directions[:, None].expand(-1, OFFSETS, -1), offsets[..., None]], -1)
+
+
+def _pick_planes(
+    scores: Float[Tensor, "d k"], directions: Float[Tensor, "d 3"], facing: Float[Tensor, "d"]
+) -> list[tuple[int, int]]:
+    """Return direction and offset of the best planes that face the view and lie apart."""
+    best, offset = scores.max(1)
+    order = [i for i in torch.argsort(best, descending=True, stable=True).tolist() if facing[i] > MIN_FACING]
+    chosen: list[int] = []
+    for i in order:
+        if len(chosen) == MAX_PLANES or best[i] <= best[order[0]] - WITHIN:
+            break
+        if all(abs(float(directions[i] @ directions[j])) < APART for j in chosen):
+            chosen.append(i)
+    return [(i, int(offset[i])) for i in chosen]
+
+
+def _refine(scorer: SymmetryScorer, plane: Float[Tensor, "4"]) -> Float[Tensor, "4"]:
+    """Return the plane after three grid searches over rotations and shifts, each half as wide as the last."""
+    steps = torch.tensor([-1.0, 0.0, 1.0], dtype=plane.dtype)
+    for width in (1.0, 0.5, 0.25):
+        near = planes_near(scorer, plane, 0.06 * width * steps, 0.04 * scorer.size * width * steps)
+        plane = near[scorer.score(near)[0].argmax()]
+    return plane
