@@ -8,12 +8,19 @@ python scripts/train.py success --objects DIR                     the predicted 
 python scripts/train.py objects                                   meshes, convex parts and views of the own objects
 """
 
+import sys
+
 import tyro
 from train.author_objects import objects
 from train.posture_model import posture_model
 from train.stability import stability
 from train.success import success
 
+from torchgrasp.errors import GraspError
+
 if __name__ == "__main__":
     commands = {"posture-model": posture_model, "stability": stability, "success": success, "objects": objects}
-    tyro.extras.subcommand_cli_from_dict(commands, prog="train.py", description="Files that torchgrasp ships.")
+    try:
+        tyro.extras.subcommand_cli_from_dict(commands, prog="train.py", description="Files that torchgrasp ships.")
+    except GraspError as error:
+        sys.exit(f"train.py: {error}")

@@ -9,10 +9,13 @@ import torch
 
 from tests.rings import ring, run_python
 from torchgrasp.errors import BadArgument, ModelFileError, OutputError
+from torchgrasp.files import load_tensors
+from torchgrasp.posture_model.checkpoint import Checkpoint
 from torchgrasp.posture_model.em import Progress
 from torchgrasp.posture_model.fit import fit_mixture
 from torchgrasp.posture_model.mixture import GraspMixture, load_mixture
 from torchgrasp.posture_model.sample import HandSamples
+from torchgrasp.posture_model.shard import Shard
 
 
 def parameters(mixture: GraspMixture) -> torch.Tensor:
@@ -126,6 +129,26 @@ torch.distributed.destroy_process_group()
     # One process goes on where two stood.
     longer = fit_mixture(ring(), 5, seed=3, iterations=30, tolerance=0.0, checkpoint=tmp_path / "fit")
     assert longer.meta["iterations"] == "30"
+
+
+class OtherProcesses(Shard):
+    """A shard beside two others, whose checkpoints stand at 1 and at 3 steps."""
+
+    def sum(self, x):
+        return x + torch.tensor([1 + 3, 1 + 9])
+
+
+def test_processes_whose_checkpoints_differ_are_all_refused(tmp_path):
+    path = tmp_path / "fit.safetensors"
+    mixture = fit_mixture(ring(), 5, iterations=2, checkpoint=path)
+    shapes = {"weights", "means", "covariances", "reseeded", "log_likelihood", "centre", "scale"}
+    tensors, meta = load_tensors(path, "em", shapes)
+    settings = {name: meta[name] for name in ("rows", "components", "seed", "starts", "regularisation")}
+    alone = Checkpoint(path, Shard(ring().rows()), tensors["centre"], tensors["scale"], settings)
+    progress = alone.load()
+    assert progress is not None and len(progress.log_likelihood) == 2 == int(mixture.meta["iterations"])
+    with pytest.raises(BadArgument, match="some processes see"):  # although 2 steps are the mean of 1, 2 and 3
+        dataclasses.replace(alone, shard=OtherProcesses(ring().rows(), 1, 3)).load()
 
 
 def test_distributed_without_a_group_is_named():

@@ -40,18 +40,18 @@ def test_a_folder_holds_what_sample_configurations_returns_for_any_number_of_wor
     write_samples(hand, spec, tmp_path / "three", workers=3)
     assert contents(tmp_path / "one") == contents(tmp_path / "three")
     assert len(contents(tmp_path / "one")) == 5
-    found, truth = load_samples(tmp_path / "one"), sample_configurations(hand, 1700, seed=3, sampling=sampling)
-    assert found == written
-    assert len(found) == 1700
-    assert [len(chunk) for chunk in found] == [500, 500, 500, 200]
-    everything = found.read()
+    result, truth = load_samples(tmp_path / "one"), sample_configurations(hand, 1700, seed=3, sampling=sampling)
+    assert result == written
+    assert len(result) == 1700
+    assert [len(chunk) for chunk in result] == [500, 500, 500, 200]
+    everything = result.read()
     assert torch.equal(everything.joints, truth.joints)
     assert torch.equal(everything.q, truth.q)
     assert everything.meta == truth.meta
     assert everything.joint_names == truth.joint_names
-    assert torch.equal(found.read(600).joints, truth.joints[:600])
+    assert torch.equal(result.read(600).joints, truth.joints[:600])
     with pytest.raises(BadArgument, match="n: found 1701"):
-        found.read(1701)
+        result.read(1701)
 
 
 HELD_RUN = """

@@ -39,18 +39,18 @@ def test_eq19_features_give_the_gaussian_density(generator):
     means = torch.randn(m, d, generator=generator, dtype=torch.float64)
     weights = torch.tensor([0.2, 0.3, 0.5], dtype=torch.float64)
     x = torch.randn(50, d, generator=generator, dtype=torch.float64)
-    found = coefficients_from_components(Components(weights, means, covariances)) @ features_from_data(x)
+    result = coefficients_from_components(Components(weights, means, covariances)) @ features_from_data(x)
     for k in range(m):
         gaussian = torch.distributions.MultivariateNormal(means[k], covariances[k])
-        torch.testing.assert_close(found[k], gaussian.log_prob(x) + weights[k].log(), rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(result[k], gaussian.log_prob(x) + weights[k].log(), rtol=1e-9, atol=1e-9)
 
 
 def test_eq20_one_component_is_the_sample_mean_and_covariance():
     x = clustered()
-    found = components_from_sums(features_from_data(x).sum(1)[None], len(x), 0.0)
-    torch.testing.assert_close(found.weights, torch.ones(1, dtype=torch.float64))
-    torch.testing.assert_close(found.means[0], x.mean(0), atol=1e-12, rtol=0)
-    torch.testing.assert_close(found.covariances[0], torch.cov(x.T, correction=0))
+    result = components_from_sums(features_from_data(x).sum(1)[None], len(x), 0.0)
+    torch.testing.assert_close(result.weights, torch.ones(1, dtype=torch.float64))
+    torch.testing.assert_close(result.means[0], x.mean(0), atol=1e-12, rtol=0)
+    torch.testing.assert_close(result.covariances[0], torch.cov(x.T, correction=0))
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
@@ -139,12 +139,12 @@ def test_a_component_is_placed_anew_three_times_and_no_more():
     sums, _ = expectation(Shard(x), components)
     sums[2] = 0.0
     for before in range(MAX_RESEEDS):
-        found, reseeded = maximisation(sums, len(x), 0.0, torch.tensor([0, 0, before]))
+        result, reseeded = maximisation(sums, len(x), 0.0, torch.tensor([0, 0, before]))
         assert reseeded.tolist() == [0, 0, before + 1]
         heaviest = int(components_from_sums(sums, len(x), 0.0).weights.argmax())
-        torch.testing.assert_close(found.weights[2], found.weights[heaviest])
+        torch.testing.assert_close(result.weights[2], result.weights[heaviest])
         # half of the heaviest each, to either side: its mean is kept
-        middle = (found.means[2] + found.means[heaviest]) / 2
+        middle = (result.means[2] + result.means[heaviest]) / 2
         torch.testing.assert_close(middle, sums[heaviest, 1:6] / sums[heaviest, 0])
     with pytest.raises(IndefiniteCovariance, match=r"component 2, of 0\.0 rows, collapsed 4 times"):
         maximisation(sums, len(x), 0.0, torch.tensor([0, 0, MAX_RESEEDS]))

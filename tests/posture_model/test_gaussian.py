@@ -36,13 +36,13 @@ def as_peer(mixture: GaussianMixture) -> Peer:
 def test_eq19_log_prob_equals_scikit_learn_and_scipy(generator):
     mixture = random_mixture()
     x = 2 * torch.randn(50, 4, generator=generator, dtype=torch.float64)
-    found = mixture.log_prob(x).numpy()
-    np.testing.assert_allclose(found, as_peer(mixture).score_samples(x.numpy()), rtol=1e-9, atol=1e-9)
+    result = mixture.log_prob(x).numpy()
+    np.testing.assert_allclose(result, as_peer(mixture).score_samples(x.numpy()), rtol=1e-9, atol=1e-9)
     parts = [
         float(w) * scipy.stats.multivariate_normal(mean.numpy(), covariance.numpy()).pdf(x.numpy())
         for w, mean, covariance in zip(mixture.weights, mixture.means, mixture.covariances, strict=True)
     ]
-    np.testing.assert_allclose(found, np.log(sum(parts)), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(result, np.log(sum(parts)), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("names", [s for k in (1, 2, 3) for s in itertools.permutations(NAMES, k)])
@@ -57,19 +57,19 @@ def test_eq22_every_marginal_is_the_density_of_a_part(names, generator):
     np.testing.assert_allclose(mixture.marginal(names).log_prob(x).exp(), density, rtol=1e-9)
 
 
-@pytest.mark.parametrize("seen", [s for k in (1, 2, 3) for s in itertools.permutations(NAMES, k)])
-def test_eq23_every_conditional_is_joint_over_marginal(seen, generator):
+@pytest.mark.parametrize("observed", [s for k in (1, 2, 3) for s in itertools.permutations(NAMES, k)])
+def test_eq23_every_conditional_is_joint_over_marginal(observed, generator):
     mixture = random_mixture()
-    values = torch.randn(len(seen), generator=generator, dtype=torch.float64)
-    found = mixture.condition(dict(zip(seen, values.tolist(), strict=True)))
-    rest = tuple(name for name in NAMES if name not in seen)
-    assert found.names == rest
+    values = torch.randn(len(observed), generator=generator, dtype=torch.float64)
+    result = mixture.condition(dict(zip(observed, values.tolist(), strict=True)))
+    rest = tuple(name for name in NAMES if name not in observed)
+    assert result.names == rest
     x = torch.randn(6, len(rest), generator=generator, dtype=torch.float64)
     whole = torch.zeros(6, 4, dtype=torch.float64)
     whole[:, [NAMES.index(name) for name in rest]] = x
-    whole[:, [NAMES.index(name) for name in seen]] = values
-    bayes = mixture.log_prob(whole) - mixture.marginal(seen).log_prob(values)
-    torch.testing.assert_close(found.log_prob(x), bayes, rtol=1e-9, atol=1e-9)
+    whole[:, [NAMES.index(name) for name in observed]] = values
+    bayes = mixture.log_prob(whole) - mixture.marginal(observed).log_prob(values)
+    torch.testing.assert_close(result.log_prob(x), bayes, rtol=1e-9, atol=1e-9)
 
 
 def test_conditions_one_after_the_other_are_both_at_once():
@@ -82,10 +82,10 @@ def test_conditions_one_after_the_other_are_both_at_once():
 
 def test_an_observation_far_away_leaves_the_components_that_allow_it():
     mixture = random_mixture(seed=5)
-    found = mixture.condition({"b": 1e3})
-    assert 1 <= len(found.weights) <= 3
-    assert bool(found.means.isfinite().all())
-    assert math.isclose(float(found.weights.sum()), 1.0, rel_tol=1e-12)
+    result = mixture.condition({"b": 1e3})
+    assert 1 <= len(result.weights) <= 3
+    assert bool(result.means.isfinite().all())
+    assert math.isclose(float(result.weights.sum()), 1.0, rel_tol=1e-12)
 
 
 def test_samples_have_the_density_of_the_mixture():

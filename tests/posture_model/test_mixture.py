@@ -38,7 +38,7 @@ def test_eq19_log_prob_is_the_density_of_the_mixture(generator):
     torch.testing.assert_close(mixture.log_prob(x), density.log(), rtol=1e-9, atol=1e-9)
 
 
-def test_eq21_eq22_reach_is_half_the_least_squared_mahalanobis_distance(generator):
+def test_eq21_eq22_energy_is_half_the_least_squared_mahalanobis_distance(generator):
     mixture = random_mixture(4)
     q = torch.randn(30, 6, 6, generator=generator, dtype=torch.float64)
     each = []
@@ -53,9 +53,9 @@ def test_eq21_thresholds_accept_what_their_names_say():
     mixture = random_mixture(1)
     factor = torch.linalg.cholesky(mixture.covariances[0, 2:, 2:])
     noise = torch.from_numpy(np.random.default_rng(0).normal(size=(n, 6)))
-    reach = mixture.energy(mixture.means[0, 2:] + noise @ factor.T)
+    energy = mixture.energy(mixture.means[0, 2:] + noise @ factor.T)
     for threshold, probability in ((PAPER_ENERGY, chi2.cdf(4.0, 6)), (DEFAULT_ENERGY, 0.99)):
-        accepted = float((reach < threshold).double().mean())
+        accepted = float((energy < threshold).double().mean())
         assert abs(accepted - probability) < 3 * math.sqrt(probability * (1 - probability) / n)
     assert abs(chi2.cdf(2 * PAPER_ENERGY, 6) - 0.323) < 5e-4
 
@@ -66,10 +66,10 @@ def test_eq23_conditional_mean_is_brute_force_bayes():
     q = mixture.means[:2, 2:] + 0.1
     axis = torch.linspace(-12, 12, 401, dtype=torch.float64)
     grid = torch.cartesian_prod(axis, axis)
-    for one, found in zip(q, mixture.joints(q), strict=True):
+    for one, result in zip(q, mixture.joints(q), strict=True):
         log_density = mixture.log_prob(torch.cat([grid, one.expand(len(grid), 6)], -1))
         weight = torch.softmax(log_density, 0)
-        torch.testing.assert_close(found, weight @ grid, rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(result, weight @ grid, rtol=1e-9, atol=1e-9)
 
 
 def test_eq23_modes_recover_the_mean_and_come_in_order(generator):
@@ -172,15 +172,15 @@ def test_bad_mixtures_do_not_exist():
         good.log_prob(torch.zeros(3, 5))
 
 
-def test_a_loosened_mixture_is_the_one_of_noisy_codes(generator):
-    """Adding noise to samples of the mixture gives samples of the loosened one."""
+def test_a_mixture_with_observation_noise_is_that_of_noisy_codes(generator):
+    """Adding noise to samples of the mixture gives samples of the noisy one."""
     mixture = load_mixture("barrett").with_observation_noise(0.0, 0.0)
     assert torch.equal(mixture.covariances, load_mixture("barrett").covariances)
-    loose = mixture.with_observation_noise(0.01, 0.5)
-    added = torch.linalg.eigvalsh(loose.covariances - mixture.covariances)
+    noisy = mixture.with_observation_noise(0.01, 0.5)
+    added = torch.linalg.eigvalsh(noisy.covariances - mixture.covariances)
     assert float(added.min()) >= -1e-12
     q = mixture.means[:, -6:]
-    assert bool((loose.energy(q + 0.01) <= mixture.energy(q + 0.01)).all())
+    assert bool((noisy.energy(q + 0.01) <= mixture.energy(q + 0.01)).all())
     # one component: the posterior of the joints is the regression on a noisy observation
     noise = torch.diag(torch.tensor([0.01**2] * 3 + [0.5**2] * 3, dtype=torch.float64))
     joint, code = slice(None, -6), slice(-6, None)

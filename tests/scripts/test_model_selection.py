@@ -23,9 +23,9 @@ def islands(n: int = 1500, m: int = 4) -> HandSamples:
 
 
 def test_bic_finds_the_number_of_true_components():
-    seen = []
-    curve = bic_curve(islands(), (1, 2, 3, 4, 5, 6), observer=lambda m, mixture: seen.append(m))
-    assert seen == [1, 2, 3, 4, 5, 6]
+    observed = []
+    curve = bic_curve(islands(), (1, 2, 3, 4, 5, 6), observer=lambda m, mixture: observed.append(m))
+    assert observed == [1, 2, 3, 4, 5, 6]
     assert int(curve.components[curve.bic.argmin()]) == 4
     assert str(curve).endswith("least at 4")
     assert str(bic_curve(islands(), (1, 2))).endswith("no minimum is seen")
@@ -52,8 +52,8 @@ def test_a_killed_sweep_goes_on(tmp_path):
 
 def test_cross_validation_judges_each_posture_once_and_by_others():
     samples = islands(400)
-    found = cross_validate(samples, (1, 4), folds=4, seed=1)
-    assert found.log_likelihood.shape == found.error.shape == (2, 4)
+    result = cross_validate(samples, (1, 4), folds=4, seed=1)
+    assert result.log_likelihood.shape == result.error.shape == (2, 4)
     # One Gaussian by hand: the same division, the moments of three parts, the density on the fourth.
     parts = torch.randperm(400, generator=torch.Generator().manual_seed(1)).tensor_split(4)
     x = samples.rows()
@@ -61,25 +61,25 @@ def test_cross_validation_judges_each_posture_once_and_by_others():
         rest = torch.cat([part for part in parts if part is not held_out])
         gaussian = torch.distributions.MultivariateNormal(x[rest].mean(0), torch.cov(x[rest].T, correction=0))
         expected = float(gaussian.log_prob(x[held_out]).mean())
-        assert math.isclose(float(found.log_likelihood[0, fold]), expected, abs_tol=1e-3)
-    assert bool((found.log_likelihood[1] > found.log_likelihood[0]).all())
-    assert bool((found.error[1] < found.error[0]).all())
-    assert "4 folds" in str(found)
+        assert math.isclose(float(result.log_likelihood[0, fold]), expected, abs_tol=1e-3)
+    assert bool((result.log_likelihood[1] > result.log_likelihood[0]).all())
+    assert bool((result.error[1] < result.error[0]).all())
+    assert "4 folds" in str(result)
 
 
 def test_a_judgement_is_what_it_says():
     samples = islands(600)
     mixture = fit_mixture(samples[:400], 4)
     held_out = samples[400:]
-    found = evaluate_mixture(mixture, held_out)
+    result = evaluate_mixture(mixture, held_out)
     error = (mixture.joints(held_out.q) - held_out.joints).abs()
-    torch.testing.assert_close(found.error, error.mean(0))
-    torch.testing.assert_close(found.deviation, error.std(0))
-    assert math.isclose(found.mean_error, float(error.mean()))
+    torch.testing.assert_close(result.error, error.mean(0))
+    torch.testing.assert_close(result.deviation, error.std(0))
+    assert math.isclose(result.mean_error, float(error.mean()))
     accepted = [float((mixture.energy(held_out.q) < r).double().mean()) for r in (PAPER_ENERGY, DEFAULT_ENERGY)]
-    assert [found.paper_coverage, found.default_coverage] == accepted
-    assert found.meta()["acceptance_paper_coverage"] == f"{accepted[0]:.4f}"
-    assert "within reach" in str(found) and "a " in str(found)
+    assert [result.paper_coverage, result.default_coverage] == accepted
+    assert result.meta()["acceptance_paper_coverage"] == f"{accepted[0]:.4f}"
+    assert "within reach" in str(result) and "a " in str(result)
 
 
 def test_bad_arguments():
