@@ -6,7 +6,7 @@ import torch
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import rotation_from_vector
-from torchgrasp.hand.collision_pairs import NEAR, collision_pairs
+from torchgrasp.hand.collision_pairs import MEETING_DISTANCE, collision_pairs
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.kinematics import tree_from_urdf
@@ -38,7 +38,9 @@ def test_self_collision_agrees_with_exact_hulls(hand):
     assert wrong.mean() < 0.01
     assert (wrong & met).mean() < 0.01
     np.testing.assert_allclose(found[met & ~wrong], truth[met & ~wrong], atol=1e-3)  # Barrett's palm is a prism
-    assert (found.clip(max=NEAR)[~met] <= truth[~met] + 1e-3).all()  # pairs farther apart than that are not tested
+    assert (
+        found.clip(max=MEETING_DISTANCE)[~met] <= truth[~met] + 1e-3
+    ).all()  # pairs farther apart than that are not tested
     assert (found[~met & ~wrong] >= truth[~met & ~wrong] / 3**0.5 - 1e-3).all()
 
 

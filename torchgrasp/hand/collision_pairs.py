@@ -12,7 +12,7 @@ from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.self_collision import self_collision_from_urdf
 from torchgrasp.hand.urdf import Mimic, Urdf
 
-NEAR = 0.002
+MEETING_DISTANCE = 0.002
 """Links that come nearer than this [m] in some posture are a pair to test."""
 ALWAYS = 0.98
 """Links that overlap in a larger share of the postures overlap by construction, and are no pair to test."""
@@ -47,11 +47,11 @@ def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, 
     links, owner = torch.unique(shapes.link[shapes.pairs].sort(1).values, dim=0, return_inverse=True)
     met, near = torch.zeros(2, len(links))
     for values in draw_postures(urdf, coupling, n, seed).split(ROWS_PER_CHUNK, 1):
-        apart = shapes.separations(tree.frames(values), NEAR)
+        apart = shapes.separations(tree.frames(values), MEETING_DISTANCE)
         least = apart.new_full((len(links), apart.shape[1]), torch.inf)
         least = least.scatter_reduce(0, owner[:, None].expand_as(apart), apart, "amin")
         met += (least < 0).sum(1)
-        near += (least < NEAR).sum(1)
+        near += (least < MEETING_DISTANCE).sum(1)
     meeting = links[(near > 0) & (met <= ALWAYS * n)]
     return [(tree.link_names[i], tree.link_names[j]) for i, j in meeting.tolist()]
 

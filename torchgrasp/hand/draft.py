@@ -21,7 +21,7 @@ from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import map_points, tree_from_urdf
 from torchgrasp.hand.urdf import Joint, Shape, Triple, Urdf, read_urdf
 
-POSTURES = 20_000
+DRAFT_POSTURES = 20_000
 """Random postures from which pads and approach are guessed."""
 MEETING_SHARE = 0.1
 """Share of the postures that tells where the fingers meet: those with the nearest fingertips."""
@@ -70,7 +70,7 @@ def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = No
     grasping = {joint for tip in chosen[:3] for joint in chains[tip]}
     moved = grasping | {coupling[j].source for j in grasping if j in coupling}
     parked = {j.name: min(max(0.0, j.lower), j.upper) for j in free if j.name not in moved}
-    frames = tree_from_urdf(urdf).frames(draw_postures(urdf, coupling, POSTURES, seed))
+    frames = tree_from_urdf(urdf).frames(draw_postures(urdf, coupling, DRAFT_POSTURES, seed))
     pads, approach = guess_pads(urdf, frames, chosen)
     kp = STIFFNESS * min((j.effort for j in free if j.effort > 0), default=1.0)
 

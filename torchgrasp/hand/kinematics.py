@@ -23,7 +23,7 @@ class KinematicTree(Value):
     `child[j]` is the link that joint j moves, or 0 outside this part. `axis` is in that link's frame. `prismatic` is 1
     for a joint that slides. `moves[l, j]` is 1 if joint j moves link l.
 
-    `tables` sorts the links by level; `level_sizes` counts them. `joint` is the joint of each link, 0 for a fixed one.
+    The links of `tables` are sorted by level; `level_sizes` counts them. `joint` moves each of them, 0 if it is fixed.
     `parent` indexes the level above. `straight[k]`: level k's parents are exactly level k-1, in order. `places` gives
     level and index of each of `link_names`. `slides`: some joint is prismatic.
     """
