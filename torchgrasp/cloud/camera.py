@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.cloud.depth import check_intrinsics, check_rigid, cloud_from_depth
 from torchgrasp.errors import BadArgument, MeshError
-from torchgrasp.frames import inverse, rigid, rotate
+from torchgrasp.frames import apply, inverse, rigid, rotate
 from torchgrasp.values import PointCloud
 
 if TYPE_CHECKING:
@@ -25,11 +25,7 @@ BASELINE = 0.055
 
 
 def default_intrinsics() -> Float[Tensor, "3 3"]:
-    """Return the intrinsics [px] of the default camera, 640 x 480.
-
-    >>> default_intrinsics()[0, 0].item()
-    616.0
-    """
+    """Return the intrinsics [px] of the default camera."""
     rows = [[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]]
     return torch.tensor(rows, dtype=torch.float64)
 
@@ -168,7 +164,7 @@ def _cast(
     row, column = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
     x, y = (column - intrinsics[0, 2]) / intrinsics[0, 0], (row - intrinsics[1, 2]) / intrinsics[1, 1]
     rays = torch.stack([x, y, torch.ones_like(x)], -1)
-    inside = _within_image_box(mesh, obj_from_camera, intrinsics, row, column)
+    inside = _in_image_box(mesh, obj_from_camera, x, y)
     direction = rotate(obj_from_camera, rays[inside]).numpy()
     origin = obj_from_camera[:3, 3].numpy()
     face = np.asarray(mesh.ray.intersects_first(np.broadcast_to(origin, direction.shape), direction))
@@ -184,21 +180,16 @@ def _cast(
     return images[0], images[1]
 
 
-def _within_image_box(
-    mesh: "trimesh.Trimesh",
-    obj_from_camera: Float[Tensor, "4 4"],
-    intrinsics: Float[Tensor, "3 3"],
-    row: Float[Tensor, "h w"],
-    column: Float[Tensor, "h w"],
-) -> Tensor:
-    """Tell which pixels lie in the box of the mesh's image; all of them if the mesh reaches behind the camera."""
-    camera_from_obj = inverse(obj_from_camera)
+def _in_image_box(
+    mesh: "trimesh.Trimesh", obj_from_camera: Float[Tensor, "4 4"], x: Float[Tensor, "h w"], y: Float[Tensor, "h w"]
+) -> Bool[Tensor, "h w"]:
+    """Tell which rays (x, y, 1) meet the box of the mesh's image; all if the mesh reaches behind the camera."""
     vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
-    x, y, z = (vertices @ camera_from_obj[:3, :3].T + camera_from_obj[:3, 3]).unbind(-1)
-    if float(z.min()) <= 1e-3:
-        return torch.ones_like(row, dtype=torch.bool)
-    u, v = intrinsics[0, 0] * x / z + intrinsics[0, 2], intrinsics[1, 1] * y / z + intrinsics[1, 2]
-    return (column >= u.min() - 1) & (column <= u.max() + 1) & (row >= v.min() - 1) & (row <= v.max() + 1)
+    u, v, depth = apply(inverse(obj_from_camera), vertices).unbind(-1)
+    if float(depth.min()) <= 1e-3:
+        return torch.ones_like(x, dtype=torch.bool)
+    u, v, margin = u / depth, v / depth, 1e-2
+    return (x >= u.min() - margin) & (x <= u.max() + margin) & (y >= v.min() - margin) & (y <= v.max() + margin)
 
 
 def _add_noise(

@@ -15,58 +15,43 @@ from torchgrasp.cloud.prepare import FACING, MAX_POINTS, clean_cloud
 from torchgrasp.values import PointCloud
 
 DENSITY_NEIGHBOURS = 8
-"""Neighbours whose disc gives the density: enough to average a raster's gaps."""
+"""Neighbours whose disc gives the density: a raster's eight."""
 MANY_OUTLIERS = 0.05
-"""Share of outliers above which the object was cut out badly; flying pixels at a rim are fewer."""
+"""Share of outliers above which the object was cut out badly: rims alone give fewer."""
 SPARSE = 0.1
-"""Spacing over the longest side above which a shape is guessed more than measured: ten points a side."""
+"""Spacing over the longest side above which a shape is mostly guessed: ten points a side."""
 LARGE = 0.4
-"""Longest side [m] of what a hand of some 20 cm can hold."""
+"""Longest side [m] above which a cloud is hardly one object for a hand."""
 NOISY = 0.003
-"""Noise [m] above which normals are poor: as much as the spread of 25 neighbours at 1 mm spacing."""
+"""Noise [m] above which normals are poor: the radius of 25 neighbours at 1 mm spacing."""
 FLAT = 1e-3
-"""Thickness over length below which a cloud is one face: less than a camera's noise."""
+"""Thickness over length below which a cloud is one face: below any camera's noise."""
 FLIPPED = 0.03
-"""Share of flipped normals that edges and rims of good clouds explain."""
+"""Share of flipped normals worth advice: a few at edges are no harm."""
 TABLE_HEIGHT, TABLE_SHARE = 0.004, 0.2
-"""The lowest 4 mm, a camera's noise either way, hold this share of the points where the table was not cut away."""
+"""A table is a level layer of 4 mm, a camera's noise, that holds a fifth of the points."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CloudReport(Value):
-    """What a cloud is like.
-
-    Args:
-        points: number of points.
-        size: sides of the box along the axes [m].
-        spacing: median distance to the nearest point [m].
-        density: median number of points per square metre.
-        noise: median rms about local planes [m].
-        copies: number of coincident points.
-        outliers: number of points far from their neighbours.
-        normals: check of the given normals; None: none are given.
-        viewpoint: camera [m]; None for a whole surface.
-        viewpoint_given: whether the viewpoint is given, not estimated.
-        facing: share of normals that face the viewpoint.
-        advice: a sentence for each thing that could be better.
-    """
+    """What a cloud is like, and a sentence of advice for each thing that could be better."""
 
     points: int
-    size: tuple[float, float, float]
-    spacing: float
-    density: float
-    noise: float
-    copies: int
-    outliers: int
-    normals: NormalCheck | None
-    viewpoint: Float[Tensor, "*points 3"] | None
-    viewpoint_given: bool
-    facing: float
+    size: tuple[float, float, float]  # sides of the box along the axes [m]
+    spacing: float  # median distance to the nearest point [m]
+    density: float  # median number of points per square metre
+    noise: float  # median rms about local planes [m]
+    copies: int  # coincident points
+    outliers: int  # points far from their neighbours
+    normals: NormalCheck | None  # of the given normals
+    viewpoint: Float[Tensor, "*points 3"] | None  # [m]; None: a whole surface
+    viewpoint_given: bool  # else it is estimated
+    facing: float  # share of normals that face the viewpoint
     advice: tuple[str, ...]
 
 
 def diagnose_cloud(cloud: PointCloud) -> CloudReport:
-    """Measure a cloud and advise what would make it a better one for grasping; nothing is changed.
+    """Measure a cloud, and advise what would make it better for grasping.
 
     Args:
         cloud: points [m] of one object, with or without normals and viewpoint.
@@ -85,7 +70,7 @@ def diagnose_cloud(cloud: PointCloud) -> CloudReport:
     if check is not None and not check.oriented:
         distinct = PointCloud(distinct.points, None, distinct.viewpoint)
     clean = clean_cloud(distinct)
-    # Normals of the clean cloud face the viewpoint by construction; given ones can tell a whole surface.
+    # Clean normals face the viewpoint by construction; given ones tell a whole surface.
     judged = clean if distinct.normals is None else distinct
     viewpoint = clean.viewpoint if judged.viewpoint is None else judged.viewpoint
     assert judged.normals is not None
@@ -149,42 +134,34 @@ def _describe_viewpoint(report: CloudReport) -> str:
 
 def _advise(report: CloudReport, clean: PointCloud) -> list[str]:
     """Return a sentence for each thing that could be better."""
-    advice: list[str] = []
-    longest, outliers = max(report.size), report.outliers / report.points
-    if longest > LARGE:
-        advice.append(f"{longest:.2f} m is large for a hand: is it a whole scene? Cut the object out")
-    if report.points > 2 * MAX_POINTS:
-        voxel = 1.0 / math.sqrt(max(report.density * MAX_POINTS / report.points, 1e-12))
-        advice.append(f"{MAX_POINTS} points are enough: voxel_downsample(cloud, {voxel:.2g}) keeps about as many")
-    if outliers > MANY_OUTLIERS:
-        advice.append(f"{100 * outliers:.0f} % of the points are outliers: cut the object out more closely")
-    if report.spacing > SPARSE * longest:
-        advice.append(f"a point every {1e3 * report.spacing:.0f} mm is sparse: the shape is mostly guessed")
-    if report.noise > NOISY:
-        advice.append(f"{1e3 * report.noise:.1f} mm of noise blur the normals: come closer, or average several images")
-    spread = torch.linalg.svdvals((clean.points - clean.points.mean(0)).double())
-    if float(spread[2]) < FLAT * float(spread[0]):
-        advice.append("all points lie in one plane: the thickness is a guess; take a view that shows two sides")
-    if report.normals is not None and report.normals.oriented:
-        flipped = float(report.normals.flipped.double().mean())
-        if flipped > FLIPPED:
-            advice.append(f"{100 * flipped:.0f} % of the normals look flipped: leave them out, new ones are fitted")
-        if report.viewpoint_given and report.facing < 1 - FACING:
-            advice.append("the normals point away from the camera: turn them round, or leave them out")
-    if report.normals is not None and not report.normals.oriented:
-        advice.append("the signs of the normals are random: leave them out, or have the program orient them")
-    if not report.viewpoint_given and report.viewpoint is not None:
-        advice.append("the camera's position is a guess: give it (--viewpoint, or a line in the file)")
-    advice += _advise_on_table(clean)
-    return advice
-
-
-def _advise_on_table(clean: PointCloud) -> list[str]:
-    """Return advice if the lowest points look like a table: level, facing up, and many."""
+    longest, outliers, given = max(report.size), report.outliers / report.points, report.viewpoint_given
+    voxel = 1.0 / math.sqrt(max(report.density * MAX_POINTS / report.points, 1e-12))
+    thickness, _, length = torch.linalg.svdvals((clean.points - clean.points.mean(0)).double()).sort().values.tolist()
+    oriented = report.normals is not None and report.normals.oriented
+    flipped = 0.0 if report.normals is None else float(report.normals.flipped.double().mean())
+    away = oriented and given and report.facing < 1 - FACING
     assert clean.normals is not None
     z = clean.points[:, 2]
-    low = (z < float(z.min()) + TABLE_HEIGHT) & (clean.normals[:, 2] > 0.9)
-    share = float(low.double().mean())
-    if share < TABLE_SHARE or float(z.max() - z.min()) < 2 * TABLE_HEIGHT:
-        return []
-    return [f"a level plane at the bottom holds {100 * share:.0f} % of the points: if it is the table, cut it away"]
+    layer = float(((z < float(z.min()) + TABLE_HEIGHT) & (clean.normals[:, 2] > 0.9)).double().mean())
+    table = layer >= TABLE_SHARE and float(z.max() - z.min()) >= 2 * TABLE_HEIGHT
+    thin = f"{MAX_POINTS} points are enough: voxel_downsample(cloud, {voxel:.2g}) keeps about as many"
+    rules = [
+        (longest > LARGE, f"{longest:.2f} m is large for a hand: is it a whole scene? Cut the object out"),
+        (report.points > 2 * MAX_POINTS, thin),
+        (outliers > MANY_OUTLIERS, f"{outliers:.0%} of the points are outliers: cut the object out more closely"),
+        (
+            report.spacing > SPARSE * longest,
+            f"{1e3 * report.spacing:.0f} mm between points: the shape is mostly guessed",
+        ),
+        (
+            report.noise > NOISY,
+            f"{1e3 * report.noise:.1f} mm of noise blur the normals: come closer, or average images",
+        ),
+        (thickness < FLAT * length, "all points lie in one plane: the thickness is a guess; show two sides"),
+        (oriented and flipped > FLIPPED, f"{flipped:.0%} of the normals look flipped: leave them out to fit new ones"),
+        (away, "the normals point away from the camera: turn them round, or leave them out"),
+        (report.normals is not None and not oriented, "the signs of the normals are random: leave them out"),
+        (report.viewpoint is not None and not given, "the camera's position is a guess: give it with --viewpoint"),
+        (table, f"a level plane holds the lowest {layer:.0%} of the points: if it is a table, cut it away"),
+    ]
+    return [sentence for applies, sentence in rules if applies]

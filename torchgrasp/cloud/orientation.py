@@ -1,4 +1,4 @@
-"""Which side of a surface is outside: the signs of given normals, and a camera that was or can have been there."""
+"""Which side of a surface is outside: the signs of given normals, and the camera's position."""
 
 import dataclasses
 import math
@@ -15,21 +15,21 @@ from torchgrasp.linalg import fibonacci_sphere, unit
 from torchgrasp.values import PointCloud
 
 N_NEIGHBOURS = 8
-"""Neighbours that a normal is compared with: enough for a majority, near enough to share a side."""
+"""Neighbours that a normal is compared with: enough for a majority."""
 MIN_COSINE = 0.7
-"""Least cosine, of either sign, of normals that are compared: 45 degrees; across an edge signs say nothing."""
+"""Least |cosine| of normals that are compared, 45 degrees: across an edge signs say nothing."""
 MAX_HEIGHT = 0.3
-"""Greatest height over the tangent plane, per distance; a higher neighbour may be the other side of a thin wall."""
+"""Greatest height over the tangent plane, per distance: beyond may be the other side of a thin wall."""
 MAX_OPPOSED = 0.35
-"""Share of opposite pairs from which on signs say nothing: random ones make .5 of them, 10 % of flips .18."""
+"""Share of opposite pairs that means random signs: these give .5, 10 % of flips .18."""
 MIN_PAIRS = 20
-"""Fewest pairs that can tell random signs: of fewer a share of .35 may be chance."""
+"""Fewest pairs that can tell random signs: with fewer a share of .35 may be chance."""
 UNIT_TOLERANCE = 1e-3
-"""Deviation of a unit normal's length: a text file rounds to three digits."""
+"""Deviation of a unit normal's length: text files round to three digits."""
 N_DIRECTIONS = 400
-"""Directions tried for an unknown viewpoint, about 10 degrees apart: finer than normals tell."""
+"""Directions tried for an unknown viewpoint: about 10 degrees apart."""
 SOFTNESS = 0.3
-"""Cosine over which a normal's vote changes from away to towards: normals near the rim, of either side, count little."""
+"""Cosine over which a normal's vote changes sides: normals near the rim count little."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +40,7 @@ class NormalCheck(Value):
         flipped: which normals oppose most of their neighbours'.
         opposed: share of opposite normals among pairs of neighbours.
         oriented: whether the signs can be trusted.
-        scaled: number of normals that are not of unit length; functions that use normals normalise them.
+        scaled: number of normals that are not of unit length; their users normalise them.
     """
 
     flipped: Bool[Tensor, "n"]
@@ -50,7 +50,7 @@ class NormalCheck(Value):
 
 
 def check_normals(cloud: PointCloud) -> NormalCheck:
-    """Compare the given normals of neighbouring points; nothing is changed.
+    """Compare the given normals of neighbouring points.
 
     Raises:
         BadArgument: a cloud without normals; see also `check_cloud`.
@@ -87,15 +87,14 @@ def compare_normals(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"])
 def estimate_viewpoint(cloud: PointCloud) -> Float[Tensor, "3"]:
     """Return a camera position [m] from which the cloud can have been seen in a single view.
 
-    All normals of a view point into the camera's hemisphere, and an object bulges away from the centre of its box
-    (along the principal axes). Among 400 directions v the best maximises sum_i w_i tanh(n_i.v / 0.3) with
-    w_i = n_i.(p_i - centre), the same for either sign of n_i. The camera is 4 radii of the cloud away.
+    Normals of a view face the camera, and objects bulge. So the direction v maximises sum_i w_i tanh(n_i.v / 0.3)
+    with w_i = n_i.(p_i - centre), which holds for either sign of n_i; the centre is that of the box along the
+    principal axes. The camera is 4 radii away.
 
-    The origin wins where it scores at least 0.8 times as much and the cloud looks as if in its camera's frame:
-    within 45 degrees of z and more than 2 radii away.
+    A cloud that seems to be in its camera's frame was seen from the origin: it lies within 45 degrees of z, more
+    than 2 radii away, and the origin scores at least 0.8 of the best.
 
-    On noisy views of eight objects 99.9 % of the normals come out as with the true camera. A single flat face, or the
-    inside of a bowl, does not tell its two sides apart: give the viewpoint you know.
+    The two sides of a flat face, or of a bowl, cannot be told apart: give the viewpoint if you know it.
 
     Args:
         cloud: points [m] of one object, seen from one side.
@@ -112,21 +111,18 @@ def estimate_viewpoint(cloud: PointCloud) -> Float[Tensor, "3"]:
 
 def guess_viewpoint(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
     """Return the viewpoint [m] that best explains normals of unknown sign; see `estimate_viewpoint`."""
-    # The box along the principal axes: a box along the frame's axes would make the guess depend on the frame.
-    axes = torch.linalg.svd(points - points.mean(0), full_matrices=False).Vh
+    axes = torch.linalg.svd(points - points.mean(0), full_matrices=False).Vh  # independent of the frame
     along = points @ axes.T
     centre = (along.amax(0) + along.amin(0)) / 2 @ axes
     radius = torch.linalg.vector_norm(points - centre, dim=-1).max()
     bulge = (normals * (points - centre)).sum(-1)
     directions = fibonacci_sphere(N_DIRECTIONS).to(points)
-    origin = -centre / torch.linalg.vector_norm(centre).clamp_min(1e-300)
-    # In pieces, so that the memory for a cloud of a whole depth image stays bounded.
-    pieces = torch.cat([directions, origin[None]]).split(64)
+    away = torch.linalg.vector_norm(centre)
+    origin = -centre / away.clamp_min(1e-300)
+    pieces = torch.cat([directions, origin[None]]).split(64)  # bounds the memory for whole depth images
     score = torch.cat([(bulge[:, None] * torch.tanh(normals @ piece.T / SOFTNESS)).mean(0) for piece in pieces])
     best = score[:-1].argmax()
-    in_camera_frame = (centre[2] > math.cos(math.pi / 4) * torch.linalg.vector_norm(centre)) & (
-        torch.linalg.vector_norm(centre) > 2 * radius
-    )
+    in_camera_frame = (centre[2] > math.cos(math.pi / 4) * away) & (away > 2 * radius)
     if bool(in_camera_frame & (score[-1] >= 0.8 * score[best])):
         return torch.zeros_like(centre)
     return centre + 4 * radius * directions[best]
@@ -141,5 +137,5 @@ def orient_normals(normals: Float[Tensor, "n 3"], outward: Float[Tensor, "n 3"])
 def share_facing(
     points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "*views 3"]
 ) -> float:
-    """Return the share of outward normals that face the camera: nearly 1 of a view, about half of a whole surface."""
+    """Return the share of outward normals that face the camera: nearly 1 of a view, half of a whole surface."""
     return float((((viewpoint - points) * normals).sum(-1) > 0).double().mean())

@@ -1,4 +1,4 @@
-"""From what the camera saw to what a shape is fitted to: distinct points without outliers, with outward normals."""
+"""From what the camera saw to what a shape is fitted to."""
 
 import dataclasses
 
@@ -15,23 +15,23 @@ from torchgrasp.linalg import unit
 from torchgrasp.values import PointCloud
 
 OFFSET_RATIO = 4.5
-"""Distance of an outlier from its quadric over the median rms of the quadrics: beyond the tails of a camera's noise."""
+"""Distance of an outlier from its quadric, in median rms of the quadrics: beyond Gaussian noise."""
 FACING = 0.9
-"""Share of normals that face the camera of a view; the others are noise at the rim."""
+"""Least share of a view's normals that face the camera: noise turns some at the rim."""
 MAX_POINTS = 2000
-"""Points that a shape is fitted to, at most: its selection is linear in them and gains nothing from more."""
+"""Most points that a shape is fitted to: they bound the time of its selection."""
 MAX_VIEWS, MIN_VIEW_POINTS = 16, 10
-"""Cameras of a merged cloud, at most, and fewest points of each: an object has few sides, an outline many points."""
+"""Most cameras of a merged cloud, each of which costs an outline, and fewest points that give one."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PreparedCloud(Value):
-    """A cloud that was checked and prepared once, by `prepare_cloud`; later stages check nothing.
+    """A cloud that `prepare_cloud` has checked: later stages check nothing.
 
     Args:
-        cloud: distinct points [m] with outward unit normals, in the dtype that was given.
-        points, normals: at most 2000 of them in float64.
-        viewpoint: camera [m] of all `points`, or of each; None: not needed.
+        cloud: distinct points [m] with outward normals, in the given dtype.
+        points, normals: at most 2000 of them, in float64 and of unit length.
+        viewpoint: the camera [m] of all `points`, or of each; None: unknown.
     """
 
     cloud: PointCloud
@@ -41,25 +41,24 @@ class PreparedCloud(Value):
 
     @property
     def one_sided(self) -> bool:
-        """Whether the cloud is a view, whose normals face the camera, and has a hidden side."""
+        """Whether the cloud is a view, with a hidden side, and not a whole surface."""
         return self.viewpoint is not None and share_facing(self.points, self.normals, self.viewpoint) >= FACING
 
 
 def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = True) -> PreparedCloud:
     """Check a cloud and return what a shape is fitted to.
 
-    Given normals of random signs are ignored: a view with them would pass for a whole surface. A viewpoint that
-    the given normals do not face is ignored: the cloud is a whole surface.
+    Normals of random signs are ignored: a view with them would pass for a whole surface. If the given normals do not
+    face the viewpoint, the cloud is a whole surface, and `clean` ignores the viewpoint.
 
     Args:
-        cloud: points [m] of one object, of one view or several.
+        cloud: points [m] of one or several views of one object.
         generator: draws 2000 of the points if there are more.
-        clean: whether to remove outliers, fit all normals anew and estimate a missing viewpoint; else normals are
-            fitted only where none are given.
+        clean: remove outliers, fit all normals anew and estimate a missing viewpoint; else fit missing normals only.
 
     Raises:
         BadArgument, SuspiciousScale: see `check_cloud`; more than 16 cameras.
-        TooFewPoints: see `check_cloud`; fewer than 10 points of one of several cameras.
+        TooFewPoints: see `check_cloud`; fewer than 10 points of one camera of several.
     """
     cloud = remove_duplicates(cloud)
     points, normals, viewpoint = cloud.points, cloud.normals, cloud.viewpoint
@@ -68,9 +67,7 @@ def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = T
         if len(count) > MAX_VIEWS:
             raise BadArgument("viewpoint", f"{len(count)} different cameras", f"at most {MAX_VIEWS}")
         if int(count.min()) < MIN_VIEW_POINTS:
-            raise TooFewPoints(
-                "points", f"{int(count.min())} points of one view", f"at least {MIN_VIEW_POINTS} of each"
-            )
+            raise TooFewPoints("points", f"{count.min()} points of one view", f"at least {MIN_VIEW_POINTS} of each")
     if normals is not None and not compare_normals(points.double(), normals.double()).oriented:
         normals = None
     if clean and normals is not None and viewpoint is not None and share_facing(points, normals, viewpoint) < FACING:
@@ -91,8 +88,8 @@ def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = T
 def estimate_normals(cloud: PointCloud) -> PointCloud:
     """Return the distinct points of a cloud with outward unit normals of local quadrics.
 
-    Normals point towards the viewpoint, or else to the side of the normals that the cloud has, or else towards
-    the viewpoint that `estimate_viewpoint` finds, which the result then carries.
+    Outward is towards the viewpoint; without one, the side of the given normals; without either, towards the
+    viewpoint of `estimate_viewpoint`, which the result then carries.
 
     Args:
         cloud: points [m] of one object; of one view unless it has normals.
@@ -107,10 +104,10 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
 
 
 def clean_cloud(cloud: PointCloud) -> PointCloud:
-    """Return the cloud without outliers, each point moved onto its local quadric, with outward normals.
+    """Return the inliers moved onto their local quadrics, with outward normals as of `estimate_normals`.
 
-    Outliers are far from their neighbours (`remove_outliers`), or further from their quadric than 4.5 times the median
-    rms. The move takes the noise of a simulated depth camera from 0.94 to 0.65 mm rms, and shrinks no curved surface.
+    Outliers are far from their neighbours (`remove_outliers`) or from their quadric: more than 4.5 times the median
+    rms. The move takes the noise of a simulated depth camera from 0.94 to 0.65 mm rms.
 
     Args:
         cloud: points [m] of one object; of one view unless it has normals.
@@ -126,7 +123,7 @@ def clean_cloud(cloud: PointCloud) -> PointCloud:
 
 
 def _fit_normals(cloud: PointCloud, clean: bool) -> PointCloud:
-    """Return distinct points with oriented normals of local quadrics; `clean` ones without outliers and on those."""
+    """Return distinct points with outward normals; if `clean`, inliers on their quadrics."""
     if clean:
         cloud = cloud.select(find_inliers(cloud.points.double()))
     points = cloud.points

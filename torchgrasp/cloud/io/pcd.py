@@ -1,4 +1,4 @@
-"""The PCD format of the Point Cloud Library: points, normals and the viewpoint."""
+"""The PCD format of the Point Cloud Library."""
 
 from typing import Any
 
@@ -6,17 +6,17 @@ import numpy as np
 
 from torchgrasp.cloud.io.text import MAX_POINTS, read_table
 
-FIELDS = ("FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
+KEYWORDS = ("FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
+"""Header lines that are read; the format has VERSION besides."""
 
 
 def parse_pcd(data: bytes) -> dict[str, Any]:
-    r"""Return points, normals and viewpoint of the bytes of a PCD file, None for what it does not have.
+    r"""Return points, normals and viewpoint of a PCD file; None for what it lacks.
 
-    Many writers fill VIEWPOINT with the default `0 0 0 1 0 0 0` without knowing it. The default is believed only
-    where a camera can be: outside the bounding box of the points.
+    Many writers fill VIEWPOINT with the default `0 0 0 1 0 0 0`. It counts only outside the points' bounding box.
 
     Raises:
-        ValueError: the bytes are no PCD file, are compressed, or fewer than its header promises.
+        ValueError: no PCD file; compressed data; fewer bytes than the header promises.
 
     >>> parse_pcd(b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 1\nDATA ascii\n1 2 3\n")["points"]
     array([[1., 2., 3.]])
@@ -39,13 +39,9 @@ def parse_pcd(data: bytes) -> dict[str, Any]:
         columns = {name: table[:, s] for name, s in zip(names, starts, strict=True) if name in wanted}
     elif encoding == "binary":
         letters = {"F": "f", "I": "i", "U": "u"}
-        # Padding fields are all called "_": the index makes the names of the dtype unique.
-        dtype = np.dtype(
-            [
-                (f"{i}", f"<{letters[k.upper()]}{int(s)}", (c,))
-                for i, (k, s, c) in enumerate(zip(kinds, sizes, counts, strict=True))
-            ]
-        )
+        # Padding fields are all called "_": columns go by number.
+        formats = [f"({c},)<{letters[k.upper()]}{int(s)}" for k, s, c in zip(kinds, sizes, counts, strict=True)]
+        dtype = np.dtype({"names": [str(i) for i in range(len(names))], "formats": formats})
         if count * dtype.itemsize > len(body):
             raise ValueError(f"{len(body)} bytes, fewer than {count} points have")
         rows = np.frombuffer(body, dtype=dtype, count=count)
@@ -58,7 +54,7 @@ def parse_pcd(data: bytes) -> dict[str, Any]:
 
 
 def _split_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
-    """Split a PCD file into its header, words by keyword, and the bytes behind it."""
+    """Split a PCD file into the words of its header, by keyword, and the data."""
     header: dict[str, list[str]] = {}
     start = 0
     while "DATA" not in header:
@@ -66,14 +62,14 @@ def _split_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
         if stop < 0 or stop > 65536:
             raise ValueError("no PCD header")
         words = data[start:stop].decode("ascii").split("#")[0].split()
-        if words and words[0].upper() in FIELDS:
+        if words and words[0].upper() in KEYWORDS:
             header[words[0].upper()] = words[1:]
         start = stop + 1
     return header, data[start:]
 
 
 def _viewpoint(header: dict[str, list[str]], points: np.ndarray) -> np.ndarray | None:
-    """Return the position in VIEWPOINT, or None if there is none or only the default inside the cloud's box."""
+    """Return the position in VIEWPOINT; None without one, or if it is the default within the cloud's box."""
     if "VIEWPOINT" not in header:
         return None
     numbers = np.array([float(x) for x in header["VIEWPOINT"]])

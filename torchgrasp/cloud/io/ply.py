@@ -1,4 +1,4 @@
-"""The PLY format: points, normals and a viewpoint in and out; a mesh becomes points of its surface."""
+"""The PLY format, read and written; of a mesh, points of its surface are read."""
 
 import io
 from typing import Any
@@ -8,22 +8,22 @@ import numpy as np
 from torchgrasp.cloud.io.text import MAX_POINTS, read_table
 
 MAX_MESH_TEXT = 64 * 2**20
-"""Bytes of the largest mesh that is read from text: the parser makes some 20 bytes of each."""
+"""Most bytes of a mesh in text: the parser needs 20 times the memory."""
 MESH_POINTS = 2000
-"""Points drawn from the surface of a mesh."""
-
+"""Points drawn from the surface of a mesh: as many as a shape is fitted to."""
 TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2"},
     **{"uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
     **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
 }
+"""NumPy's types of PLY's, by the format's old and new names."""
 
 
 def parse_ply(data: bytes) -> dict[str, Any]:
-    """Return points, normals and viewpoint of the bytes of a PLY file, None for what it does not have.
+    """Return points, normals and viewpoint of a PLY file; None for what it lacks.
 
     Raises:
-        ValueError: the bytes are no PLY file, or fewer than its header promises.
+        ValueError: no PLY file; fewer bytes than the header promises.
 
     >>> parse_ply(format_ply(np.ones((5, 3)), viewpoint=np.zeros(3)))["viewpoint"].tolist()
     [0.0, 0.0, 0.0]
@@ -47,7 +47,7 @@ def parse_ply(data: bytes) -> dict[str, Any]:
                 raise ValueError(f"the header line {line!r}")
     if encoding not in ("ascii", "binary_little_endian", "binary_big_endian"):
         raise ValueError(f"the encoding {encoding!r}")
-    # Before anything is made of the body: a mesh has twice as many faces as corners.
+    # Before the body is parsed: a mesh has twice as many faces as corners.
     if any(not 0 <= count <= 2 * MAX_POINTS for _, count, _ in elements):
         raise ValueError(f"elements {[(name, count) for name, count, _ in elements]}; at most {MAX_POINTS} points")
     if any(name == "face" and count > 0 for name, count, _ in elements):
@@ -60,14 +60,12 @@ def parse_ply(data: bytes) -> dict[str, Any]:
     _, count, properties = elements[0]
     columns = _read_columns(body, encoding, count, properties)
     points = np.stack([columns[name] for name in "xyz"], axis=-1)
-    normals = None
-    if "nx" in columns:
-        normals = np.stack([columns[name] for name in ("nx", "ny", "nz")], axis=-1)
+    normals = np.stack([columns[f"n{axis}"] for axis in "xyz"], axis=-1) if "nx" in columns else None
     return {"points": points, "normals": normals, "viewpoint": viewpoint}
 
 
 def format_ply(points: np.ndarray, normals: np.ndarray | None = None, viewpoint: np.ndarray | None = None) -> bytes:
-    """Return the bytes of a binary PLY file; the viewpoint goes into a comment line that `parse_ply` understands."""
+    """Return the bytes of a binary PLY file, with the viewpoint in a comment line that `parse_ply` reads."""
     lines = ["ply", "format binary_little_endian 1.0"]
     if viewpoint is not None:
         lines.append("comment viewpoint " + " ".join(repr(float(x)) for x in viewpoint))
@@ -79,7 +77,7 @@ def format_ply(points: np.ndarray, normals: np.ndarray | None = None, viewpoint:
 
 
 def _split_header(data: bytes) -> tuple[list[str], bytes]:
-    """Split a PLY file into the lines of its header and the bytes behind it."""
+    """Split a PLY file into the lines of its header and the data."""
     end = data.find(b"end_header", 0, 65536)
     stop = data.find(b"\n", end) + 1
     if not data.startswith(b"ply") or end < 0 or stop == 0:
@@ -104,11 +102,10 @@ def _read_columns(body: bytes, encoding: str, count: int, properties: list[tuple
 
 
 def _sample_mesh(data: bytes) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return points of a mesh's surface, and outward normals if the mesh is closed and consistently wound."""
+    """Return surface points of a mesh, and outward normals if it is closed and consistently wound."""
     import trimesh
 
-    # No resolver is given: a texture named in the header is not looked for.
-    try:
+    try:  # without a resolver: a texture that the header names is not opened
         mesh = trimesh.load(io.BytesIO(data), file_type="ply", process=False, skip_materials=True)
     except Exception as error:  # the parser raises whatever the bytes provoke
         raise ValueError(f"a mesh that cannot be parsed ({error})") from error

@@ -1,4 +1,4 @@
-"""Point clouds from files and into files; a file from a stranger is refused by name, and runs no code."""
+"""Point clouds from and to files. A malformed file is refused by name; none runs code."""
 
 import io
 import zipfile
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchgrasp.base import check_tensor
-from torchgrasp.cloud.check import check_cloud
+from torchgrasp.cloud.check import MIN_POINTS, check_cloud
 from torchgrasp.cloud.io.pcd import parse_pcd
 from torchgrasp.cloud.io.ply import format_ply, parse_ply
 from torchgrasp.cloud.io.text import MAX_POINTS, read_lines
@@ -20,31 +20,26 @@ from torchgrasp.files import write_file
 from torchgrasp.values import PointCloud
 
 MAX_BYTES = 512 * 2**20
-"""Largest file, and largest unpacked content, that is read."""
-SUFFIXES = (".ply", ".pcd", ".npz", ".npy", ".xyz")
-"""The formats, by suffix."""
+"""Most bytes of a file, and of its unpacked content: some 100 for each of `MAX_POINTS`."""
 
 
 def read_cloud(path: Path | str, viewpoint: Sequence[float | int] | Tensor | None = None) -> PointCloud:
-    """Read the point cloud of one object from a file; numbers come back as float64, lengths are metres.
+    """Read the point cloud of one object from a file, in metres and float64.
 
-    * `.ply`, ascii or binary: x y z, optionally nx ny nz; the camera's position from a header line
-      `comment viewpoint x y z`. If the file has faces it is a mesh, and 2000 points of its surface are drawn,
-      with their outward normals where the mesh is closed.
-    * `.pcd`, ascii or binary: x y z, optionally normal_x normal_y normal_z; the camera's position from VIEWPOINT,
-      except from the default `0 0 0 1 0 0 0` when that point lies within the cloud's bounding box.
+    * `.ply`, ascii or binary: x y z, optionally nx ny nz; the viewpoint from a header line
+      `comment viewpoint x y z`. Of a mesh 2000 surface points are drawn, with normals if it is closed.
+    * `.pcd`, ascii or binary: x y z, optionally normal_x normal_y normal_z; the viewpoint from VIEWPOINT, unless it
+      is the default `0 0 0 1 0 0 0` and within the cloud's bounding box.
     * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3) and `viewpoint` (3,), or (n, 3) of several views.
     * `.npy`, `.xyz` (text): an (n, 3) array, or (n, 6) with normals.
 
     Args:
         path: the file.
-        viewpoint: the camera's position (3,) [m] in the cloud's frame; it replaces the one in the file.
+        viewpoint: the camera's position (3,) [m] in the cloud's frame, instead of the file's.
 
     Raises:
-        CloudFileError: no such file, an unknown suffix, content that is not what the suffix says, more than
-            512 MB or 5 million points.
-        BadArgument: a viewpoint that is no three numbers, a non-finite number (a pixel without depth belongs left
-            out), or points on one line.
+        CloudFileError: no such file; an unknown suffix; malformed content; more than 512 MB or 5 million points.
+        BadArgument: a viewpoint other than three numbers; a non-finite number; points on one line.
         TooFewPoints: fewer than 4 distinct points.
         SuspiciousScale: an extent outside [5 mm, 2 m].
 
@@ -55,57 +50,51 @@ def read_cloud(path: Path | str, viewpoint: Sequence[float | int] | Tensor | Non
     position = None if viewpoint is None else _check_viewpoint(viewpoint)
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise CloudFileError("path", path, f"a file ending in {', '.join(SUFFIXES)}")
+    parsers = {".ply": parse_ply, ".pcd": parse_pcd, ".npz": _parse_npz, ".npy": _parse_npy, ".xyz": _parse_text}
+    if suffix not in parsers:
+        raise CloudFileError("path", path, f"a file ending in {', '.join(parsers)}")
     if not path.is_file():
         raise CloudFileError("path", f"{path}, which is no file", f"a {suffix} file")
     if path.stat().st_size > MAX_BYTES:
         raise CloudFileError("path", f"{path} of {path.stat().st_size} bytes", f"at most {MAX_BYTES} bytes")
-    parse = {".ply": parse_ply, ".pcd": parse_pcd, ".npz": _parse_npz, ".npy": _parse_npy, ".xyz": _parse_text}[suffix]
     try:
-        arrays = parse(path.read_bytes())
-    except Exception as error:  # zlib, zipfile, the tokenizer, numpy and trimesh each raise their own for spoilt bytes
+        arrays = parsers[suffix](path.read_bytes())
+    except Exception as error:  # zlib, zipfile, numpy and trimesh each raise their own
         raise CloudFileError("path", f"{path}: {error!r}", f"a well-formed {suffix} file") from error
     arrays = {name: _check_array(path, name, array) for name, array in arrays.items() if array is not None}
-    points, normals = arrays["points"], arrays.get("normals")
-    if len(points) < 4:
-        raise TooFewPoints("path", f"{path} with {len(points)} points", "at least 4 points")
-    if position is not None:
-        arrays["viewpoint"] = position
-    return check_cloud(PointCloud(points, normals, arrays.get("viewpoint")))
+    points = arrays["points"]
+    if len(points) < MIN_POINTS:
+        raise TooFewPoints("path", f"{path} with {len(points)} points", f"at least {MIN_POINTS} points")
+    position = arrays.get("viewpoint") if position is None else position
+    return check_cloud(PointCloud(points, arrays.get("normals"), position))
 
 
 def save_cloud(cloud: PointCloud, path: Path | str) -> Path:
-    """Write a cloud as `.npz` (exact) or binary `.ply` (float32, for other programs), atomically.
-
-    Both keep normals and viewpoint, and `read_cloud` reads both back.
+    """Write a cloud with normals and viewpoint as `.npz` (exact) or binary `.ply` (float32), atomically.
 
     Raises:
-        BadArgument: another suffix, or several views for `.ply`, which has one viewpoint.
+        BadArgument: another suffix; several views for `.ply`, which has one viewpoint.
         OutputError: the file cannot be written.
 
     >>> save_cloud(PointCloud(torch.rand(9, 3)), "cloud.txt")
     Traceback (most recent call last):
     torchgrasp.errors.BadArgument: path: found cloud.txt, allowed is a file ending in .npz or .ply
     """
-    path = Path(path)
+    path, buffer = Path(path), io.BytesIO()
     fields = {"points": cloud.points, "normals": cloud.normals, "viewpoint": cloud.viewpoint}
     arrays = {name: value.detach().cpu().numpy() for name, value in fields.items() if value is not None}
-    if path.suffix.lower() == ".npz":
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, **arrays)  # pyright: ignore[reportArgumentType]
-        content = buffer.getvalue()
-    elif path.suffix.lower() == ".ply":
-        if cloud.viewpoint is not None and cloud.viewpoint.ndim == 2:
-            raise BadArgument("path", path, "a file ending in .npz, for a cloud of several views")
-        content = format_ply(**arrays)
-    else:
+    if path.suffix.lower() not in (".npz", ".ply"):
         raise BadArgument("path", path, "a file ending in .npz or .ply")
-    return write_file(path, content)
+    if path.suffix.lower() == ".npz":
+        np.savez_compressed(buffer, **arrays)  # pyright: ignore[reportArgumentType]
+        return write_file(path, buffer.getvalue())
+    if cloud.viewpoint is not None and cloud.viewpoint.ndim == 2:
+        raise BadArgument("path", path, "a file ending in .npz, for a cloud of several views")
+    return write_file(path, format_ply(**arrays))
 
 
 def _check_viewpoint(viewpoint: Any) -> Tensor:
-    """Return a position in float64, or refuse what is no three finite numbers."""
+    """Return a position in float64; refuse anything but three finite numbers."""
     try:
         position = torch.as_tensor(viewpoint, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -120,9 +109,7 @@ def _check_array(path: Path, name: str, array: Any) -> Tensor:
     if array.dtype.kind not in "fiu":
         raise CloudFileError("path", f"{path}: {name} of type {array.dtype}", "real numbers")
     if len(array.shape) != len(shape) or array.shape[-1] != 3:
-        raise CloudFileError(
-            "path", f"{path}: {name} of shape {array.shape}", "shape (n, 3), or (3,) for one viewpoint"
-        )
+        raise CloudFileError("path", f"{path}: {name} of shape {array.shape}", "(n, 3), or (3,) for one viewpoint")
     if len(array) > MAX_POINTS:
         raise CloudFileError("path", f"{path} with {len(array)} points", f"at most {MAX_POINTS} points")
     bad = int((~np.isfinite(array)).reshape(-1, 3).any(1).sum())
@@ -144,7 +131,7 @@ def _parse_npy(data: bytes) -> dict[str, Any]:
 
 
 def _array_from_npy(data: bytes) -> np.ndarray:
-    """Return the array of a .npy file; its header is believed only as far as there are bytes behind it."""
+    """Return the array of a .npy file, whose header may not promise more than the bytes hold."""
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
     if version not in ((1, 0), (2, 0)):
@@ -161,7 +148,7 @@ def _array_from_npy(data: bytes) -> np.ndarray:
 
 
 def _parse_npz(data: bytes) -> dict[str, Any]:
-    """Parse the bytes of a .npz file, its unpacked size checked before anything is unpacked."""
+    """Parse the bytes of a .npz file, whose unpacked size is checked first."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         names = {f"{name}.npy": name for name in ("points", "normals", "viewpoint")}
         members = [info for info in archive.infolist() if info.filename in names]
@@ -173,5 +160,5 @@ def _parse_npz(data: bytes) -> dict[str, Any]:
 
 
 def _parse_text(data: bytes) -> dict[str, Any]:
-    """Parse text: three or six numbers a line, separated by blanks or commas; `#` starts a comment."""
+    """Parse text of three or six numbers a line; see `read_lines`."""
     return _split_columns(read_lines(data))

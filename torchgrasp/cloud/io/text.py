@@ -1,4 +1,4 @@
-"""Numbers from text, in memory of the order of the file: a list of its words would be ten times as large."""
+"""Numbers from text, without a list of its words, which would need ten times the memory."""
 
 import io
 import warnings
@@ -8,18 +8,18 @@ import numpy as np
 from jaxtyping import Float
 
 MAX_POINTS = 5_000_000
-"""Most points that are read."""
+"""Most points that are read: more than the largest depth images have."""
 MAX_COLUMNS = 16
-"""Most numbers a point of a text file may have, beside which position and normal are lost."""
+"""Most numbers of a point: position, normal, colour and a few more."""
 MAX_LINE = 4096
-"""Longest line [characters] of a plain text file."""
+"""Longest line [characters]: 16 numbers of 256 characters."""
 
 
 def read_table(data: bytes, rows: int, columns: int) -> Float[np.ndarray, "rows columns"]:
-    r"""Return the first rows of a table of numbers that are separated by white space.
+    r"""Return the first rows of a table of numbers separated by white space.
 
     Raises:
-        ValueError: more rows or columns than are read, fewer numbers, or something that is no number.
+        ValueError: too many rows or columns; too few numbers; a word that is no number.
 
     >>> read_table(b"1 2\n3 4\n5 6", 2, 2).tolist()
     [[1.0, 2.0], [3.0, 4.0]]
@@ -38,10 +38,10 @@ def read_table(data: bytes, rows: int, columns: int) -> Float[np.ndarray, "rows 
 
 
 def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
-    r"""Return the numbers of text, a row a line: separated by blanks or commas, `#` starts a comment.
+    r"""Return the numbers of text, a row a line, separated by blanks or commas; `#` starts a comment.
 
     Raises:
-        ValueError: no numbers, lines of different length, a line or a file that is too long.
+        ValueError: no numbers; lines of different length; a line or file that is too long.
 
     >>> read_lines(b"# x y z\n1, 2, 3\n").tolist()
     [[1.0, 2.0, 3.0]]
