@@ -1,12 +1,11 @@
 """The learned model of a hand's stable grasps: bodies are grasped and pulled at, and a mixture learns those that held.
 
-python scripts/make_force.py allegro --workers 2
+python scripts/train.py stability allegro --workers 2
 """
 
 import dataclasses
 import functools
 import math
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,14 +31,18 @@ from torchgrasp import (
 from torchgrasp.base import Batch
 from torchgrasp.control import ClosingReference
 from torchgrasp.control.adaptive.impedance import Impedance
-from torchgrasp.control.adaptive.stability import StabilityModel, fit_stability, lengths_of, stability_path, state_of
-from torchgrasp.errors import GraspError
+from torchgrasp.control.adaptive.stability import FILE, NAMES, StabilityModel, lengths_of, state_of
+from torchgrasp.errors import BadArgument, GraspError
 from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.frames import rigid, rotation_from_vector
 from torchgrasp.linalg import unit
 from torchgrasp.posture_model.compatibility import describe_compatibility
+from torchgrasp.posture_model.em import expectation_maximisation
+from torchgrasp.posture_model.gaussian import GaussianMixture
+from torchgrasp.posture_model.kmeans import start_components
+from torchgrasp.posture_model.shard import Shard
 from train.pull_trials import PullRecord, RisingPull, pull_until_lost
 
 SIZES = {
@@ -59,10 +62,13 @@ STRENGTH, SPRINGS, FRICTION, PULL = (1.0, 8.0), (20.0, 500.0), (0.4, 1.0), (0.5,
 friction, and the pull [N]."""
 
 SHIFT, TURN = 0.005, math.radians(5)
-"""Up to which the hand stands beside its plan, along and about each of its axes [m, rad]."""
+"""Largest error of the hand's pose along and about each of its axes [m, rad]."""
 
 SLIP, TILT = 0.01, math.radians(15)
 """Motion [m] and turn [rad] under the pull up to which a grasp counts as stable."""
+
+REGULARISATION = 0.05
+"""Variance that a fit adds to every number, relative to its variance over the trials: there are a few hundred of them."""
 
 
 def body(name: str) -> tuple[trimesh.Trimesh, list[trimesh.Trimesh]]:
@@ -82,42 +88,42 @@ def body(name: str) -> tuple[trimesh.Trimesh, list[trimesh.Trimesh]]:
     return mesh, [mesh]
 
 
-def rehearse(hand_name: str, name: str, trials: int, seed: int) -> list[dict[str, Any]]:
-    """Disturb grasps of one body, and say of each what its state was before and under the pull, and how it ended."""
+def pull_body(hand_name: str, name: str, trials: int, seed: int) -> list[dict[str, Any]]:
+    """Pull at grasps of one body; return the states of each before and under the pull, and how it ended."""
     hand = load_hand(hand_name)
     mesh, parts = body(name)
     grasps = grasps_of(name, hand, mesh, seed)
-    found = []
+    rows = []
     for k in range(trials if len(grasps) else 0):
         generator = torch.Generator().manual_seed(1_000_000 * seed + 1000 * BODIES.index(name) + k)
-        trial = rehearse_once(grasps, hand, mesh, parts, generator, k)
+        grasp = grasps[int(torch.randint(len(grasps), (1,), generator=generator))]
+        trial = pull_once(hand, grasp, mesh, parts, generator, k)
         if not trial.overlap:
-            found.append({"body": float(BODIES.index(name)), **summary(trial)})
-    return found
+            rows.append({"body": float(BODIES.index(name)), **summary(trial)})
+    return rows
 
 
 def grasps_of(name: str, hand: Hand, mesh: trimesh.Trimesh, seed: int) -> Grasps:
     """Plan grasps of a body that is seen from all around."""
     points, faces = trimesh.sample.sample_surface(mesh, POINTS, seed=seed)  # pyright: ignore[reportAssignmentType]
     cloud = PointCloud(torch.from_numpy(np.array(points)), torch.from_numpy(np.array(mesh.face_normals[faces])))
-    found = plan_grasps(cloud, hand, ContactSpec(), STARTS, seed)
-    return found[found.status == Status.OK][:GRASPS]
+    grasps = plan_grasps(cloud, hand, ContactSpec(), STARTS, seed)
+    return grasps[grasps.status == Status.OK][:GRASPS]
 
 
-def rehearse_once(
-    grasps: Grasps,
+def pull_once(
     hand: Hand,
+    grasp: Grasps,
     mesh: trimesh.Trimesh,
     parts: list[trimesh.Trimesh],
     generator: torch.Generator,
     seed: int,
 ) -> PullRecord:
-    """Disturb one of the grasps; everything is drawn by the trial's own generator."""
+    """Pull at one grasp; everything is drawn by the trial's own generator."""
 
     def draw(low: float, high: float) -> float:
         return low + (high - low) * float(torch.rand((), generator=generator, dtype=torch.float64))
 
-    grasp = grasps[int(torch.randint(len(grasps), (1,), generator=generator))]
     strength = math.exp(draw(*map(math.log, STRENGTH)))
     springs = torch.tensor([math.exp(draw(*map(math.log, SPRINGS))) for _ in range(3)], dtype=torch.float64)
     friction, most = draw(*FRICTION), draw(*PULL)
@@ -131,7 +137,7 @@ def rehearse_once(
 
 
 def summary(trial: PullRecord) -> dict[str, Any]:
-    """Return the states (log K, L, F) before the pull and at the last moment before the object slipped, and the end."""
+    """Return the states (`NAMES`) before the pull and at the last moment before the object slipped, and the end."""
     rest = max(int((trial.pulled == 0).sum()), 1)
     slipped = torch.nonzero(trial.moved[rest:] > SLIP)[:, 0]
     last = rest + (int(slipped[0]) if len(slipped) else len(trial.moved) - rest)
@@ -145,7 +151,7 @@ def summary(trial: PullRecord) -> dict[str, Any]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Rehearsals(Batch):
+class PullTrials(Batch):
     """Trials: states before the pull and late under it, the body's number, and whether it was lost or stable."""
 
     before: Float[Tensor, "n 9"]
@@ -161,30 +167,60 @@ class Rehearsals(Batch):
         return fit_stability(stable, others, components, meta, seed)
 
 
-def rehearsals_of(hand: str, trials: int, seed: int, workers: int) -> Rehearsals:
-    """Rehearse on every body, in the same order whatever the number of workers."""
+TENSORS = tuple(field.name for field in dataclasses.fields(PullTrials))
+"""What a file of trials holds."""
+
+
+def fit_stability(
+    stable: Float[Tensor, "n 9"],
+    others: Float[Tensor, "k 9"],
+    components: int,
+    meta: dict[str, str] | None = None,
+    seed: int = 0,
+) -> StabilityModel:
+    """Fit a mixture of some components to the states of stable grasps, and one to the states of all others.
+
+    Raises:
+        BadArgument: hardly more states than a component has dimensions.
+        IndefiniteCovariance: a component collapsed.
+    """
+    share = len(stable) / (len(stable) + len(others))
+    return StabilityModel(_fit(stable, components, seed), _fit(others, components, seed), share, meta or {})
+
+
+def _fit(states: Float[Tensor, "n 9"], components: int, seed: int) -> GaussianMixture:
+    """Fit one mixture to standardised states."""
+    n, d = states.shape
+    if not 1 <= components <= n // (d + 2):
+        raise BadArgument("components", f"{components} for {n} states", f"1 to {n // (d + 2)}")
+    centre, scale = states.mean(0), states.std(0, correction=0)
+    shard = Shard((states - centre) / scale)
+    start = start_components(shard, components, seed, REGULARISATION)
+    fitted = expectation_maximisation(shard, start, 300, 1e-4, REGULARISATION).components
+    covariances = fitted.covariances * scale[:, None] * scale
+    return GaussianMixture(fitted.weights, fitted.means * scale + centre, covariances, NAMES)
+
+
+def run_trials(hand: str, trials: int, seed: int, workers: int) -> PullTrials:
+    """Run the trials of every body, in the same order whatever the number of workers."""
     tasks = [(hand, name, trials, seed) for name in BODIES]
-    found: list[dict[str, Any]] = []
-    for rows in tqdm(run_tasks(rehearse, tasks, workers, limit=3600), "bodies", len(tasks), disable=None):
+    done: list[dict[str, Any]] = []
+    for rows in tqdm(run_tasks(pull_body, tasks, workers, limit=3600), "bodies", len(tasks), disable=None):
         if isinstance(rows, Status):
-            raise GraspError(f"a body could not be rehearsed: {rows.sentence}")
-        found += rows
-    names = [field.name for field in dataclasses.fields(Rehearsals)]
-    return Rehearsals(*(torch.tensor([row[name] for row in found], dtype=torch.float64) for name in names))
+            raise GraspError(f"the trials of a body failed: {rows.sentence}")
+        done += rows
+    return PullTrials(*(torch.tensor([row[name] for row in done], dtype=torch.float64) for name in TENSORS))
 
 
-def judge(trials: Rehearsals, components: int, seed: int) -> dict[str, float]:
-    """Return what the model is worth on each body when it was fitted on all others, and a single Gaussian's density."""
+def cross_validate(trials: PullTrials, components: int, seed: int) -> dict[str, float]:
+    """Return the scores of the model, and of a single Gaussian, each on a body that it was not fitted on."""
     odds, density, single = torch.zeros(3, len(trials), dtype=torch.float64)
     for body in trials.body.unique():
         out = trials.body == body
         model, other = (trials[~out].fit(m, seed) for m in (components, 1))
         late = trials.late[out]
-        odds[out], density[out], single[out] = (
-            model.log_odds(late),
-            model.stable.log_prob(late),
-            other.stable.log_prob(late),
-        )
+        odds[out], density[out] = model.log_odds(late), model.stable.log_prob(late)
+        single[out] = other.stable.log_prob(late)
     stable, lost = trials.stable > 0, trials.lost > 0
     return {
         "auc": area(odds[stable], odds[lost]),
@@ -195,53 +231,45 @@ def judge(trials: Rehearsals, components: int, seed: int) -> dict[str, float]:
 
 
 def area(high: Float[Tensor, "n"], low: Float[Tensor, "m"]) -> float:
-    """Return the share of pairs in which `high` is higher, half for ties: the area under the ROC curve."""
+    """Return the area under the ROC curve: the share of pairs in which `high` is higher, ties counted half."""
     return float((high[:, None] > low).double().mean() + 0.5 * (high[:, None] == low).double().mean())
 
 
-def main(
+def stability(
     hand: Annotated[str, tyro.conf.Positional],
     trials: int = 20,
     components: int | None = None,
     seed: int = 0,
     workers: int = 1,
-    rehearsals: Path | None = None,
+    keep: Path | None = None,
     out: Path | None = None,
 ) -> None:
-    """Rehearse, fit, judge on bodies left out, and write.
+    """Learn which grasps of a hand are stable from simulated pulls.
 
     Args:
         hand: name of a shipped hand, or the folder of another.
         trials: of each body.
         components: Gaussians of each mixture; default: 1 to 3, whichever is likeliest on bodies left out.
         seed: of every draw.
-        workers: processes that rehearse.
-        rehearsals: file in which the trials are kept, and from which they are taken where it exists.
+        workers: processes that run trials.
+        keep: file in which the trials are kept, and from which they are taken where it exists.
         out: file to write; default: stability.safetensors in the hand's folder.
     """
+    torch.set_num_threads(1)  # small products: further threads only spin
     robot = load_hand(hand)
-    names = [field.name for field in dataclasses.fields(Rehearsals)]
-    if rehearsals is not None and rehearsals.exists():
-        done = Rehearsals(**load_tensors(rehearsals, "rehearsals", set(names))[0])
+    if keep is not None and keep.exists():
+        done = PullTrials(**load_tensors(keep, "pull_trials", set(TENSORS))[0])
     else:
-        done = rehearsals_of(hand, trials, seed, workers)
-        if rehearsals is not None:
-            save_tensors(rehearsals, "rehearsals", {name: getattr(done, name) for name in names}, {"hand": hand})
+        done = run_trials(hand, trials, seed, workers)
+        if keep is not None:
+            save_tensors(keep, "pull_trials", {name: getattr(done, name) for name in TENSORS}, {"hand": hand})
     stable, lost = int(done.stable.sum()), int(done.lost.sum())
     print(f"{robot.name}: {len(done)} trials on {len(BODIES)} bodies, {stable} stable, {lost} lost")
-    tried = {m: judge(done, m, seed) for m in ((1, 2, 3) if components is None else (components,))}
-    components = max(tried, key=lambda m: tried[m]["log_likelihood"])
-    judged = tried[components]
-    print(f"{components} Gaussians: " + ", ".join(f"{name} {value:.3f}" for name, value in judged.items()))
+    scores = {m: cross_validate(done, m, seed) for m in ((1, 2, 3) if components is None else (components,))}
+    components = max(scores, key=lambda m: scores[m]["log_likelihood"])
+    best = scores[components]
+    print(f"{components} Gaussians: " + ", ".join(f"{name} {value:.3f}" for name, value in best.items()))
     meta = {**describe_compatibility(robot), "joint_names": ",".join(robot.joint_names), "bodies": ",".join(BODIES)}
     meta |= {"trials": str(len(done)), "stable": str(stable), "seed": str(seed)}
-    model = done.fit(components, seed, meta | {k: f"{v:.4f}" for k, v in judged.items()})
-    print(f"written: {model.save(out or stability_path(hand))}")
-
-
-if __name__ == "__main__":
-    torch.set_num_threads(1)  # small products: further threads only spin
-    try:
-        tyro.cli(main)
-    except GraspError as error:
-        sys.exit(f"make_force: {error}")
+    model = done.fit(components, seed, meta | {k: f"{v:.4f}" for k, v in best.items()})
+    print(f"written: {model.save(out or robot.urdf_path.parent / FILE)}")

@@ -4,15 +4,14 @@ import dataclasses
 
 import pytest
 import torch
+from train.stability import fit_stability
 
 from torchgrasp.control.adaptive.stability import (
     LEAST_FORCE,
     NAMES,
     StabilityModel,
-    fit_stability,
     lengths_of,
     load_stability,
-    read_stability,
     state_of,
 )
 from torchgrasp.errors import BadArgument, ModelFileError
@@ -91,16 +90,16 @@ def test_preferred_forces_are_the_regression_on_the_lengths(model: StabilityMode
 def test_the_file_is_read_back_and_refused_by_another_hand(model: StabilityModel, tmp_path):
     path = model.save(tmp_path / "stability.safetensors")
     assert path.stat().st_size < 100_000
-    again = read_stability(path, load_hand("allegro"))
+    again = load_stability(load_hand("allegro"), path)
     assert torch.equal(again.stable.means, model.stable.means)
     assert torch.equal(again.log_odds(states(5, 1.0, 4)), model.log_odds(states(5, 1.0, 4)))
     with pytest.raises(BadArgument, match="joints"):
-        read_stability(path, load_hand("barrett"))
+        load_stability(load_hand("barrett"), path)
     with pytest.raises(BadArgument, match="fingertips"):
-        read_stability(path, load_hand("allegro_biotac"))
+        load_stability(load_hand("allegro_biotac"), path)
     (tmp_path / "broken.safetensors").write_bytes(path.read_bytes()[:200])
     with pytest.raises(ModelFileError):
-        read_stability(tmp_path / "broken.safetensors", load_hand("allegro"))
+        load_stability(load_hand("allegro"), tmp_path / "broken.safetensors")
 
 
 def test_shipped_models_are_of_their_hands():
