@@ -11,7 +11,7 @@ from torchgrasp.control.tactile import (
     FLAT_RADIUS,
     NOISE,
     PLACE_NOISE,
-    RATE,
+    SAMPLING_RATE,
     TANGENTIAL_NOISE,
     TipContact,
     low_pass,
@@ -59,7 +59,7 @@ def test_samples_come_at_the_sensor_s_rate_and_are_held_in_between():
     assert {b - a for a, b in itertools.pairwise(changes)} == {4} and len(changes) > 20
     held = run([2.0] * 300, period=0.004, seed=1)
     fresh = sum(not torch.equal(a.reading, b.reading) for a, b in zip(held[1:], held, strict=False))
-    assert fresh == pytest.approx(300 * 0.004 * RATE, abs=1.5)
+    assert fresh == pytest.approx(300 * 0.004 * SAMPLING_RATE, abs=1.5)
 
 
 def test_without_noise_the_truth_is_felt():

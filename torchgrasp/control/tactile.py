@@ -1,10 +1,9 @@
-"""A tactile fingertip: what the controller may know of a contact, from the simulator's truth.
+"""A tactile fingertip: what a controller may know of a contact, from the simulator's truth.
 
-The force lags by a 20 Hz low-pass and carries white noise of the paper's size (Sec. 6.5), 0.1 N along the normal and
-0.3 N across it. The place of a contact on the tip is known to 1.5 mm; on a round tip the place is the normal, which is
-then known to 1.5 mm over the tip's radius (7 degrees on 12 mm). A fingertip samples at a rate of its own and holds the
-last sample in between. The contact flag switches with hysteresis on a slower average, because a single noisy reading
-crosses 0.2 N twice a second.
+The force lags behind a 20 Hz low-pass and carries the noise of the paper's sensor (Sec. 6.5). The place of a contact is
+known to 1.5 mm. On a round tip the place gives the normal, known to 1.5 mm over the tip's radius. A fingertip samples
+at its own rate and holds the last sample in between. The contact flag switches with hysteresis on a slower average:
+one noisy reading crosses 0.2 N twice a second.
 """
 
 import dataclasses
@@ -17,20 +16,20 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.linalg import unit
 
-RATE = 100.0
-"""Samples a second [Hz] of a fingertip."""
+SAMPLING_RATE = 100.0
+"""Of a fingertip [Hz]: one sample for each tick of a controller at 100 Hz."""
 
 NOISE = 0.1
-"""Standard deviation of a reading of the normal force [N] (Sec. 6.5)."""
+"""Standard deviation of the normal force [N] (Sec. 6.5)."""
 
 TANGENTIAL_NOISE = 0.3
 """Standard deviation of each component of the force along the surface [N] (Sec. 6.5)."""
 
 PLACE_NOISE = 1.5e-3
-"""Standard deviation of a contact's place on the fingertip [m], in each direction along its surface."""
+"""Standard deviation of a contact's place [m] in each direction along the fingertip: 7 degrees on 12 mm."""
 
 FLAT_RADIUS = 0.012
-"""Radius [m] by which the noise of the place becomes that of the normal on a tip that is not round (radius 0)."""
+"""Radius [m] that relates the noise of place and normal on a tip that is not round: that of the Allegro's round ones."""
 
 CUTOFF = 20.0
 """Cut-off of the force's first-order low-pass [Hz]: a lag of 8 ms."""
@@ -39,7 +38,7 @@ FLAG_CUTOFF = 5.0
 """Cut-off of the average behind the contact flag [Hz]; it leaves 0.04 N of the noise at 100 Hz."""
 
 TOUCH_ON = 0.2
-"""A fingertip is in contact once the average exceeds this [N] ..."""
+"""A fingertip is in contact once the average exceeds this [N]: twice the noise, five times what the average leaves ..."""
 
 TOUCH_OFF = 0.1
 """... and until it falls below this [N]."""
@@ -47,10 +46,13 @@ TOUCH_OFF = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class TipContact(Value):
-    """The truth of three fingertips, averaged over a tick, in any one frame.
+    """True contacts of three fingertips, averaged over a tick, in any one frame.
 
-    `normal_force` [N] is along the contact normals, `forces` [N] all that the tips exert on the object. `points` [m]
-    and outward `normals` of the contacts are NaN where nothing touches.
+    Args:
+        normal_force: along the contact normals [N].
+        forces: of the tips on the object [N], friction included.
+        points: of contact [m]; NaN where nothing touches.
+        normals: outward; NaN where nothing touches.
     """
 
     normal_force: Float[Tensor, "*b 3"]
@@ -61,11 +63,17 @@ class TipContact(Value):
 
 @dataclasses.dataclass(frozen=True)
 class TactileState(Value):
-    """What the fingertips report: the last sample of the force and of the contact, and whether there is one.
+    """What three fingertips report, and their memory.
 
-    `reading` [N] is the normal force, `forces` [N] the full one, `points` [m] and `normals` the sensed contact, NaN
-    where nothing touched. The sensor's memory: `lagged` [N] are normal force (first) and full force behind the
-    low-pass, `average` [N] the slow mean of the readings, `age` [s] the time since the sample.
+    Args:
+        reading: normal force of the last sample [N].
+        forces: full force of the last sample [N].
+        contact: whether each tip feels contact.
+        points: sensed contacts [m]; NaN where nothing touched.
+        normals: of the sensed contacts; NaN where nothing touched.
+        lagged: normal force (first) and full force behind the low-pass [N].
+        average: slow mean of the readings [N].
+        age: time since the last sample [s].
     """
 
     reading: Float[Tensor, "*b 3"]
@@ -87,12 +95,12 @@ def no_contact(*batch: int) -> TactileState:
     lagged = torch.zeros(*batch, 3, 4, dtype=torch.float64)
     zero, vectors = lagged[..., 0], lagged[..., 1:]
     nothing = torch.full_like(vectors, torch.nan)
-    return TactileState(zero, vectors, zero > 0, nothing, nothing, lagged, zero, 1 / RATE)
+    return TactileState(zero, vectors, zero > 0, nothing, nothing, lagged, zero, 1 / SAMPLING_RATE)
 
 
 def measure(
     tactile: TactileState,
-    press: TipContact,
+    truth: TipContact,
     pads: Float[Tensor, "*#b 3 3"],
     radius: Float[Tensor, "3"],
     period: float,
@@ -101,39 +109,38 @@ def measure(
     """Return what the fingertips report one tick later.
 
     Args:
-        touch: their state before.
-        press: the truth, averaged over the tick.
-        pads: outward normals of a surface that the pads face: what is along and what across a force in the air.
+        tactile: their state before.
+        truth: true contacts during the tick.
+        pads: outward normals of a surface that the pads face; they direct the noise of a tip in the air.
         radius: of the tips [m]; 0: not round (`FLAT_RADIUS`).
         period: of the tick [s].
         generator: draws the noise; None: no noise.
     """
-    force = torch.cat([press.normal_force[..., None], press.forces], dim=-1)
+    force = torch.cat([truth.normal_force[..., None], truth.forces], dim=-1)
     lagged = tactile.lagged + low_pass(CUTOFF, period) * (force - tactile.lagged)
-    age = tactile.age + period
-    if age < 1 / RATE - 1e-9:
+    age, interval = tactile.age + period, 1 / SAMPLING_RATE
+    if age < interval - 1e-9:
         return dataclasses.replace(tactile, lagged=lagged, age=age)
     reading, forces = lagged[..., 0], lagged[..., 1:]
-    points, normals = press.points, press.normals
+    points, normals = truth.points, truth.normals
     if generator is not None:
         along = torch.where(torch.isfinite(normals), normals, pads)
-        drawn = torch.randn(2, *forces.shape, generator=generator, dtype=forces.dtype)
-        push = (drawn[0] * along).sum(-1, keepdim=True)
-        across = drawn - (drawn * along).sum(-1, keepdim=True) * along
+        noise = torch.randn(2, *forces.shape, generator=generator, dtype=forces.dtype)
+        push = (noise[0] * along).sum(-1, keepdim=True)
+        across = noise - (noise * along).sum(-1, keepdim=True) * along
         reading = reading + NOISE * push[..., 0]
         forces = forces - NOISE * push * along + TANGENTIAL_NOISE * across[0]
-        bend = torch.where(radius > 0, radius, FLAT_RADIUS)[:, None]
-        normals = unit(press.normals + PLACE_NOISE / bend * across[1])
-        points = press.points + bend * (press.normals - normals)
-    average = tactile.average + low_pass(FLAG_CUTOFF, max(period, 1 / RATE)) * (reading - tactile.average)
+        curvature_radius = torch.where(radius > 0, radius, FLAT_RADIUS)[:, None]
+        normals = unit(truth.normals + PLACE_NOISE / curvature_radius * across[1])
+        points = truth.points + curvature_radius * (truth.normals - normals)
+    average = tactile.average + low_pass(FLAG_CUTOFF, max(period, interval)) * (reading - tactile.average)
     contact = torch.where(tactile.contact, average > TOUCH_OFF, average > TOUCH_ON)
-    return TactileState(
-        reading, forces, contact, points, normals, lagged, average, min(max(age - 1 / RATE, 0.0), 1 / RATE)
-    )
+    age = min(max(age - interval, 0.0), interval)
+    return TactileState(reading, forces, contact, points, normals, lagged, average, age)
 
 
 def low_pass(cutoff: float, period: float) -> float:
-    """Return the share of the new value in a first-order low-pass of a cut-off [Hz] sampled with a period [s].
+    """Return the share of the new value in a first-order low-pass with a cut-off [Hz] and a period [s].
 
     >>> round(low_pass(20.0, 0.01), 3)
     0.715

@@ -1,10 +1,9 @@
-"""What the hand believes of the surface while it closes: a touch that surprises moves it, and the contacts in the air.
+"""The shape as touches revise it while the hand closes: a surprising touch moves the contacts of fingers in the air.
 
-A fingertip that feels the object where the surface was not expected is an observation of it. It is added to the shape's
-posterior (`ShapeGP.update`), and each finger that is still in the air then aims where its own line, through its
-planned contact along the planned normal, meets the surface now. Where that is, how it faces and how certain it is are
-the target, the normal and the covariance of Eqs. (26-27) from then on. An update takes about 10 ms of one core, a tick
-at 100 Hz, once for each finger at most. A tick without one takes microseconds.
+A touch where the surface was not expected is an observation, which the shape's posterior takes up (`ShapeGP.update`).
+Each finger in the air then aims where the line through its planned contact meets the revised surface. Place, normal and
+uncertainty there become target, normal and covariance of Eqs. (26-27). An update takes about 10 ms of one core, a tick
+at 100 Hz, at most once for each finger.
 """
 
 import dataclasses
@@ -24,37 +23,37 @@ from torchgrasp.shape.surface import newton_step
 from torchgrasp.values import ShapeEstimate
 
 SURPRISE = 2.0
-"""A contact surprises from this many standard deviations off the expected surface on."""
+"""Distance from the expected surface, in standard deviations, from which on a touch surprises: 5 % by chance."""
 
 FARTHEST = 0.02
-"""How far [m] along its line a contact may be moved; a line that meets no surface within it keeps its contact."""
+"""How far [m] along its line a contact may be moved: one that meets no surface within this stays where it was."""
 
 NEWTON_STEPS = 6
-"""Steps along a line towards the surface."""
+"""Steps along a line towards the surface; Newton's method converges quadratically."""
 
 LEAST_SLOPE = 0.3
-"""Least cosine of a line and the normal with which a step is computed: a grazing line steps no further."""
+"""Least cosine of line and normal in a step: it bounds the step of a grazing line."""
 
 
 class Belief:
-    """The shape in the hand's frame, which touches revise.
+    """The shape, and which fingers have touched it.
 
     Args:
-        shape: as it was planned on.
-        obj_from_hand: where the hand believes to stand.
+        shape: as the grasp was planned on.
+        obj_from_hand: planned pose of the hand.
     """
 
     def __init__(self, shape: ShapeGP, obj_from_hand: Float[Tensor, "4 4"]) -> None:
         self.shape, self.obj_from_hand = shape, obj_from_hand.double()
         self.hand_from_obj = inverse(self.obj_from_hand)
-        self.felt = torch.zeros(3, dtype=torch.bool)
+        self.touched = torch.zeros(3, dtype=torch.bool)
 
     def revise(self, observation: Observation, reference: ClosingReference) -> ClosingReference:
         """Return the reference itself, or, after a touch that surprised, one replanned for the fingers in the air."""
-        fresh = observation.contact & ~self.felt & torch.isfinite(observation.points + observation.normals).all(-1)
+        fresh = observation.contact & ~self.touched & torch.isfinite(observation.points + observation.normals).all(-1)
         if not bool(fresh.any()):
             return reference
-        self.felt = self.felt | fresh
+        self.touched = self.touched | fresh
         points = apply(self.obj_from_hand, observation.points[fresh])
         inside = self.shape.contains(points)
         points, normals = points[inside], rotate(self.obj_from_hand, observation.normals[fresh])[inside]
@@ -65,12 +64,8 @@ class Belief:
         surprising = along.abs() > (SURPRISE * deviation).clamp_max(0.99 * FARTHEST)
         if not bool(surprising.any()):
             return reference
-        self.shape = self.shape.update(
-            points[surprising],
-            normals[surprising],
-            noise=PLACE_NOISE,
-            normal_noise=PLACE_NOISE / FLAT_RADIUS,
-        )
+        points, normals = points[surprising], normals[surprising]
+        self.shape = self.shape.update(points, normals, noise=PLACE_NOISE, normal_noise=PLACE_NOISE / FLAT_RADIUS)
         return self._replan(~observation.contact, reference)
 
     def _replan(self, air: Bool[Tensor, "3"], reference: ClosingReference) -> ClosingReference:
@@ -96,7 +91,7 @@ class Belief:
     def _meet(
         self, points: Float[Tensor, "n 3"], lines: Float[Tensor, "n 3"]
     ) -> tuple[Float[Tensor, "n"], ShapeEstimate]:
-        """Return how far [m] from points along lines the surface is met, `FARTHEST` at most, and the estimate there."""
+        """Return how far [m] along lines from points the surface lies, at most `FARTHEST`, and the estimate there."""
         along = torch.zeros_like(points[:, 0])
         for _ in range(NEWTON_STEPS):
             off, normal = self._distance(points + along[:, None] * lines)
@@ -104,13 +99,13 @@ class Belief:
         return along, self.shape.predict(self.shape.metres(self._within(points + along[:, None] * lines)))
 
     def _distance(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
-        """Return how far points are outside the surface [m], to first order, and its outward normal there."""
+        """Return the distance [m] of points from the surface, to first order, and the outward normal there."""
         value, gradient = self.shape.mean_and_gradient(self._within(points))
         length = torch.linalg.vector_norm(gradient, dim=-1)
         return self.shape.scale * value / length, gradient / length[:, None]
 
     def _within(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Return points normalised; one outside the ball in which the posterior is valid gives the nearest inside."""
+        """Return normalised points, moved into the ball in which the posterior is valid."""
         x = self.shape.normalise(points)
         far = torch.linalg.vector_norm(x, dim=-1, keepdim=True) / (0.999 * self.shape.domain_radius)
         return x / far.clamp_min(1.0)

@@ -1,10 +1,10 @@
 """Object-level impedance [6]: the grasp is a spring in the hand, and the fingers are springs to each other.
 
-The virtual frame of the three fingertips (Eqs. 15-17) stands for the object, which no sensor sees. A wrench pulls it
-back to where it was in the hand when the object was grasped; the fingers share that wrench. Internal forces press
-whatever the wrench: the desired ones, which turn with the frame, and springs along the sides of the triangle. These
-sides span the whole null space of the grasp map. Springs from the fingertips to the frame's origin, as in [6], balance
-only in the proportion of their lengths: two fingers against a thumb would press 30 to 45 degrees off their normals.
+The virtual frame of the three fingertips (Eqs. 15-17) stands for the object, which no sensor sees. A wrench pulls the
+frame back to where it was when the object was grasped, and the fingers share that wrench. Internal forces press at the
+same time: the desired forces, which turn with the frame, and springs along the sides of the triangle of fingertips.
+These sides span the null space of the grasp map. Springs to the frame's origin, as in [6], balance only in proportion
+to their lengths: two fingers against a thumb would press 30 to 45 degrees off their normals.
 
 [6] M. Li, H. Yin, K. Tahara and A. Billard, "Learning object-level impedance control for robust grasping and dexterous
 manipulation", ICRA 2014.
@@ -30,40 +30,35 @@ TRANSLATION_STIFFNESS = 1200.0
 """Of the virtual frame's origin [N/m]: 0.1 kg sags by 1 mm."""
 
 ROTATION_STIFFNESS = 4.0
-"""Of the virtual frame's axes [N m/rad]."""
+"""Of the virtual frame's axes [N m/rad]: 1200 N/m at arms of 58 mm."""
 
 GRASP_STIFFNESS = 100.0
-"""Of the spring along each side of the triangle of fingertips [N/m]."""
+"""Of the spring along each side of the triangle of fingertips [N/m]: 1 N for 10 mm, soft beside the desired forces."""
 
 MOST_SHARE = 1.0
-"""The wrench asks of no finger for more than this share of the strongest desired force."""
+"""Largest force of a finger for the wrench, as a share of the strongest desired force: it stays pressed."""
 
 SURE = math.log(3)
-"""Log-odds of stability from which on a grasp is left as it is: a lost object costs more than a firmer grasp."""
+"""Log-odds above which a grasp is left as it is, three to one: a lost object costs more than a firmer grasp."""
 
 MOST_RAISE = 2.0
-"""How many times the desired forces a grasp that turns unstable may ask for."""
+"""Largest multiple of the desired forces of an unstable grasp: the drives' torque must suffice."""
 
 ADAPTATION_RATE = 8.0
-"""Rate [1/s] at which an unstable grasp becomes firmer and stiffer."""
+"""Rate [1/s] at which an unstable grasp becomes firmer and stiffer, a third of the sensor's bandwidth at most."""
 
 READING_CUTOFF = 2.0
 """Cut-off [Hz] of the mean reading by which stability is judged: noise must not look like a slip."""
 
 SETTLING = 0.3
-"""Time [s] after the squeeze has risen before stability is judged: by then the mean has followed it."""
+"""Time [s] from full forces to the first judgement: by then the mean reading has followed."""
 
 
 def grasp_map(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 6 9"]:
-    """Return the matrix that turns three forces at `points` into force and torque about their centre.
+    """Return the matrix that maps three forces at `points` to force and torque about their centre.
 
-    >>> grasp_map(torch.eye(3)) @ internal_forces(torch.eye(3)).flatten(1).T
-    tensor([[0., 0., 0.],
-            [0., 0., 0.],
-            [0., 0., 0.],
-            [0., 0., 0.],
-            [0., 0., 0.],
-            [0., 0., 0.]])
+    >>> (grasp_map(torch.eye(3)) @ internal_forces(torch.eye(3)).flatten(1).T).abs().max()
+    tensor(0.)
     """
     arms = points - points.mean(-2, keepdim=True)
     eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*arms.shape[:-2], 3, 3)
@@ -76,22 +71,22 @@ def restoring_wrench(
     translation: float = TRANSLATION_STIFFNESS,
     rotation: float = ROTATION_STIFFNESS,
 ) -> Float[Tensor, "*b 6"]:
-    """Return the force [N] and torque [N m] about the virtual frame's origin that turn it back to `rest`.
+    """Return force [N] and torque [N m] about the virtual frame's origin that restore it to `rest`.
 
-    The torque is along the axis of the turn and grows with the sine of its angle.
+    The torque is along the axis of the rotation error and proportional to the sine of its angle.
 
     >>> restoring_wrench(torch.eye(4), torch.eye(4))
     tensor([0., 0., 0., 0., 0., 0.])
     """
-    axes, wanted = hand_from_vf[..., :3, :3].mT, rest[..., :3, :3].mT
-    turn = 0.5 * torch.linalg.cross(axes, wanted).sum(-2)
-    return torch.cat([translation * (rest[..., :3, 3] - hand_from_vf[..., :3, 3]), rotation * turn], -1)
+    axes, desired = hand_from_vf[..., :3, :3].mT, rest[..., :3, :3].mT
+    error = 0.5 * torch.linalg.cross(axes, desired).sum(-2)
+    return torch.cat([translation * (rest[..., :3, 3] - hand_from_vf[..., :3, 3]), rotation * error], -1)
 
 
 def shared_forces(
     points: Float[Tensor, "*b 3 3"], wrench: Float[Tensor, "*b 6"], most: Float[Tensor, "*b"]
 ) -> Float[Tensor, "*b 3 3"]:
-    """Return the smallest forces at `points` that add up to a wrench, scaled so that none exceeds `most` [N]."""
+    """Return the smallest forces at `points` that sum to a wrench, scaled so that none exceeds `most` [N]."""
     forces = (torch.linalg.pinv(grasp_map(points)) @ wrench[..., None])[..., 0].unflatten(-1, (3, 3))
     largest = torch.linalg.vector_norm(forces, dim=-1).amax(-1)
     return forces * (most / torch.maximum(largest, most))[..., None, None]
@@ -100,12 +95,9 @@ def shared_forces(
 def spring_forces(
     points: Float[Tensor, "*b 3 3"], lengths: Float[Tensor, "*b 3"], stiffness: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 3 3"]:
-    """Return the forces of springs along the sides (0, 1), (1, 2) and (2, 0) of a triangle, which always balance.
+    """Return the forces of springs [N/m] along the `side_lengths` of a triangle, at rest at `lengths` [m].
 
-    Args:
-        points: fingertips [m].
-        lengths: of the sides at which the springs are free of force [m].
-        stiffness: of each spring [N/m].
+    They balance whatever the lengths.
     """
     return torch.einsum("...k,...kci->...ci", stiffness * (side_lengths(points) - lengths), internal_forces(points))
 
@@ -116,15 +108,14 @@ def side_lengths(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
 
 
 class Impedance:
-    """Hold what is grasped as a spring in the hand: the joints' torques are J^T f, set as targets q + J^T f / kp.
+    """Hold the object as a spring in the hand: the joint torques are J^T f, set as targets q + J^T f / kp.
 
-    At rest in the grasp's pose the forces are the desired ones, balanced anew for the contacts that were really made.
-    One common factor keeps the sum of what the fingertips feel at what was asked for. Motions of the joints that move
-    no fingertip are held where they were.
+    At rest the forces are the desired ones, balanced at the sensed contacts. One common factor keeps the sensed sum at
+    what was asked for. Joint motions that move no fingertip are held at the posture of the start.
 
-    With a `stability` model it judges at every tick whether the grasp is stable. Below `SURE` the grasp becomes firmer,
-    up to `MOST_RAISE` times, and its springs approach those of stable grasps of the same lengths. It never loosens
-    again: the object may still be heavy.
+    With a `stability` model every tick judges whether the grasp is stable. Below `SURE` it becomes firmer, up to
+    `MOST_RAISE` times, and its springs approach those of stable grasps of the same lengths. It never loosens again: the
+    object may still be heavy.
 
     Args:
         reference: of the closing.
@@ -181,7 +172,7 @@ class Impedance:
         self.springs = self.springs * (preferred.springs / self.springs) ** share
 
     def forces(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-        """Return the forces of the fingers on the object [N], in the hand's frame, for where the fingertips are."""
+        """Return the forces of fingertips at `tips` [m] on the object [N], in the hand's frame."""
         frame = self._frame(tips)
         desired = self.raised * self.factor * self.desired @ frame[:3, :3].T
         most = MOST_SHARE * torch.linalg.vector_norm(desired, dim=-1).amax()
@@ -189,12 +180,12 @@ class Impedance:
         return desired + springs + shared_forces(tips, restoring_wrench(frame, self.rest), most)
 
     def _frame(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "4 4"]:
-        """Return the virtual frame; tips on a line, as when the object is gone, keep the last one."""
+        """Return the virtual frame; tips on a line, as when the object is gone, keep the last frame."""
         if not bool(degenerate(tips)):
             self.frame = virtual_frame(tips)
         return self.frame
 
     def _actuated(self, joints: Float[Tensor, " j"]) -> Float[Tensor, " h"]:
-        """Return the actuated joints that come nearest to all joints, each weighted with its stiffness."""
+        """Return the actuated joints nearest to all joints, in least squares weighted by stiffness."""
         weighted = self.model.coupling * self.model.kp[:, None]
         return weighted.T @ (joints - self.model.offset) / self.stiffness
