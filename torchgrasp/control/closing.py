@@ -21,13 +21,13 @@ POSE_TIME = 0.4
 """Time [s] from pre-grasp to grasp in open loop, and as much from grasp to squeeze."""
 
 WAITING_FORCE = 0.3
-"""Force [N] with which a finger that touches waits for the others: less than the table's friction on a light object."""
+"""Force [N] of a finger that waits for the others: less than the table's friction on a light object."""
 
 PATIENCE = 1.5
-"""Time [s] for which the first finger waits for the last before the hand presses with those that touch."""
+"""Longest wait [s] of the first finger for the last: a fingertip travels 60 mm in it."""
 
 SETTLED = 0.1
-"""Time [s] for which all fingers must feel contact before the hand presses."""
+"""Time [s] for which all fingers must feel contact before the hand presses: ten samples."""
 
 STOP_FORCE = 0.5
 """Force [N] at which a finger of the position baseline stops (Sec. 6.5)."""
@@ -36,13 +36,13 @@ AIM_DEPTH = 0.02
 """How far [m] the position baseline aims behind the planned contacts, to reach a displaced object (docs/closing.md)."""
 
 STOP_DISTANCE = 1e-3
-"""Distance [m] from its target at which a finger of the position baseline stops."""
+"""Distance [m] from its target at which a finger of the position baseline stops: well below the sensors' errors."""
 
 INTEGRAL_RATE = 2.0
 """Integral gain [1/s^2] of the position baseline (docs/closing.md)."""
 
 IMPATIENCE = 0.25
-"""Time [s] of waiting for a late finger in which its drives may press harder by as much as they may at first."""
+"""Time [s] of waiting for a late finger in which `LEAD` grows by itself, against what holds the finger back."""
 
 LEAD = 0.04
 """Largest lead [rad] of a joint's target over the joint while closing. It bounds the force of a link that is stopped
@@ -71,9 +71,9 @@ class UncertaintyClosing:
 
     A finger in the air searches along its contact's normal, beyond the planned contact if need be. Before the first
     touch the fingers keep pace, so that they arrive together. A finger that touches is force-controlled whatever its
-    position error: where a calibrated shape is wrong, Eq. (26) would press on towards the planned point. It waits with
-    `WAITING_FORCE`, so that the object stays where it is, until all touch or `PATIENCE` is over. The holding raises the
-    full forces: three separate loops would not keep their balance and would push the object (docs/closing.md).
+    position error: where the shape is wrong, Eq. (26) would press on towards the planned point. It waits with
+    `WAITING_FORCE` until all touch or `PATIENCE` is over, so that the object stays where it is. The holding raises the
+    full forces, because three separate loops would push the object (docs/closing.md).
     """
 
     def __init__(self, reference: ClosingReference, revise: Revision | None = None) -> None:

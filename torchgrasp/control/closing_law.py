@@ -1,7 +1,7 @@
 """The closing law (Eqs. 25-28): position control far from a contact, force control near it, weighted by uncertainty.
 
-Everything here is pure and batched over leading axes. Gains are rates (position gain in 1/s, force gain in m/s per
-newton) and `joint_step` takes the control period, so that the same gains mean the same motion at 100 and at 250 Hz.
+All functions are pure and batched over leading axes. Gains are rates (position gain in 1/s, force gain in m/s per
+newton), so that the same gains mean the same motion at any control period.
 """
 
 import torch
@@ -11,25 +11,24 @@ from torch import Tensor
 from torchgrasp.linalg import cholesky, limit_norm, squared_mahalanobis
 
 POSITION_FLOOR = 0.005
-"""Isotropic standard deviation [m] that is added to the one along the normal. Eq. (27) needs it: for a normal along
-an axis two diagonal entries of Sigma_cov are 0 and their inverse is infinite. 5 mm is the accuracy of the rest of the
-chain (hand pose, joint zeros)."""
+"""Isotropic standard deviation [m] of Sigma_cov: the accuracy of hand pose and joint zeros. Without it the inverse in
+Eq. (27) is infinite for a normal along an axis."""
 
 POSITION_RATE = 4.0
-"""Position gain [1/s] of a contact without uncertainty: alpha_p = POSITION_RATE * POSITION_FLOOR**2."""
+"""Position gain [1/s] of a contact without uncertainty, which makes alpha_p = POSITION_RATE * POSITION_FLOOR**2."""
 
 FORCE_BANDWIDTH = 15.0
-"""Bandwidth [rad/s] of the force loop of a force without uncertainty: alpha_f is this times the fingertip's
-compliance times FORCE_FLOOR**2. The 20 Hz filter of the sensor keeps 15 rad/s stable."""
+"""Bandwidth [rad/s] of the force loop without uncertainty: alpha_f is this times the fingertip's compliance times
+FORCE_FLOOR**2. The sensor's 20 Hz filter leaves 15 rad/s stable."""
 
 FORCE_FLOOR = 0.3
-"""Isotropic standard deviation [N] of the desired force: the tactile sensor's accuracy along the surface."""
+"""Isotropic standard deviation [N] of Sigma_fd: the tactile sensor's accuracy along the surface."""
 
 MAX_SPEED = 0.04
-"""Largest speed [m/s] of a fingertip under the law."""
+"""Largest speed [m/s] of a fingertip under the law: 0.4 mm between two samples of its sensor."""
 
 MAX_STEP = 0.05
-"""Largest change [rad] of any joint in one tick."""
+"""Largest change [rad] of any joint in one tick: it bounds the step near a singular posture."""
 
 DAMPING = 1e-5
 """Damping [m^2] of the inverse Jacobian; a finger's own J J^T is of the order 1e-3 m^2."""
@@ -38,7 +37,7 @@ DAMPING = 1e-5
 def surface_covariance(
     normals: Float[Tensor, "*b 3"], std_m: Float[Tensor, "*b"], floor: float = POSITION_FLOOR
 ) -> Float[Tensor, "*b 3 3"]:
-    """Return Sigma_cov of Eq. (27) [m^2]: the shape's deviation along the normal over an isotropic floor [m].
+    """Return Sigma_cov of Eq. (27) [m^2]: the shape's variance along the normal plus that of an isotropic floor [m].
 
     >>> surface_covariance(torch.tensor([0.0, 0.0, 1.0]), torch.tensor(0.01), floor=0.002).diagonal() * 1e6
     tensor([  4.,   4., 104.])
@@ -48,7 +47,7 @@ def surface_covariance(
 
 
 def blend(error: Float[Tensor, "*b 3"], covariance: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """Return lambda of Eq. (26): 1 at the contact, falling to 0 as the error [m] exceeds the shape's uncertainty.
+    """Return lambda of Eq. (26): 1 at the contact, near 0 where the error [m] exceeds the shape's uncertainty.
 
     Raises:
         IndefiniteCovariance: a covariance is not positive definite.
@@ -63,7 +62,7 @@ def blend(error: Float[Tensor, "*b 3"], covariance: Float[Tensor, "*b 3 3"]) -> 
 def position_gain(covariance: Float[Tensor, "*b 3 3"], alpha_p: float | None = None) -> Float[Tensor, "*b 3"]:
     """Return the diagonal of K_P [1/s] of Eq. (27): alpha_p [m^2/s] over the diagonal of Sigma_cov.
 
-    With the default alpha_p a contact of no uncertainty has the gain `POSITION_RATE`, and none exceeds it.
+    The default alpha_p gives a contact without uncertainty the gain `POSITION_RATE`; no gain exceeds it.
 
     >>> position_gain(POSITION_FLOOR**2 * torch.eye(3))
     tensor([4., 4., 4.])
@@ -79,7 +78,7 @@ def force_gain(covariance: Float[Tensor, "*b 3 3"], alpha_f: Float[Tensor, "*b"]
 
 
 def damped_inverse(jacobian: Float[Tensor, "*b m h"], damping: float = DAMPING) -> Float[Tensor, "*b h m"]:
-    """Return J^T (J J^T + damping I)^-1, by whichever of the two normal matrices is smaller."""
+    """Return J^T (J J^T + damping I)^-1, by the smaller of the two normal matrices."""
     m, h = jacobian.shape[-2:]
     transposed = jacobian.transpose(-1, -2)
     if m <= h:
@@ -97,7 +96,7 @@ def tip_velocity(
     force_gain: Float[Tensor, "*b 3"],
     max_speed: float = MAX_SPEED,
 ) -> Float[Tensor, "*b 3"]:
-    """Return the bracket of Eq. (25) [m/s] for each fingertip, no faster than `max_speed`; the direction is kept."""
+    """Return the bracket of Eq. (25) [m/s] for each fingertip, shortened to `max_speed`."""
     share = blend[..., None]
     velocity = (1 - share) * position_gain * position_error + share * force_gain * force_error
     return limit_norm(velocity, max_speed)
@@ -113,16 +112,16 @@ def joint_step(
 ) -> Float[Tensor, "*b h"]:
     """Return the change of the joints [rad] in one tick, Eq. (25), by damped least squares over all three fingers.
 
-    The paper's J^-1 does not exist for fingers of four joints, nor for coupled ones. Motions of the joints that move
-    no fingertip follow `posture_error` [rad] with POSITION_RATE, so that the links stay where they were planned.
+    The paper's J^-1 does not exist for fingers of four joints, nor for coupled fingers. Joint motions that move no
+    fingertip reduce `posture_error` at `POSITION_RATE`, so that the links stay where they were planned.
 
     Args:
         jacobian: of the three fingertips [m/rad].
         velocity: of the three fingertips [m/s] (`tip_velocity`).
         period: of the controller [s].
-        posture_error: planned minus present joints, or None.
+        posture_error: planned minus present joints [rad]; None: ignored.
         damping: of the inverse [m^2].
-        max_step: the whole step is shortened so that no joint moves further [rad].
+        max_step: largest change of a joint [rad]; a longer step is scaled down as a whole.
 
     >>> joint_step(torch.zeros(3, 3, 4), torch.ones(3, 3), 0.01)
     tensor([0., 0., 0., 0.])
@@ -131,7 +130,7 @@ def joint_step(
     inverse_jacobian = damped_inverse(stacked, damping)
     step = (inverse_jacobian @ (velocity.flatten(-2) * period)[..., None])[..., 0]
     if posture_error is not None:
-        wish = POSITION_RATE * period * posture_error
-        step = step + wish - (inverse_jacobian @ (stacked @ wish[..., None]))[..., 0]
+        correction = POSITION_RATE * period * posture_error
+        step = step + correction - (inverse_jacobian @ (stacked @ correction[..., None]))[..., 0]
     largest = step.abs().amax(-1, keepdim=True)
     return step * (max_step / largest.clamp_min(max_step))

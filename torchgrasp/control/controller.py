@@ -19,10 +19,10 @@ Step = Callable[[Observation, float], Float[Tensor, " j"]]
 """Turns what is known, and the time to the next tick [s], into the targets of all joints [rad]."""
 
 CLOSING_TIME = 4.0
-"""Longest time [s] that closing may take before the hand presses with what it has."""
+"""Longest time [s] of closing before the hand presses with what it has: a fingertip travels 0.16 m in it."""
 
 PRESSING_TIME = 0.5
-"""Time [s] between the end of closing and the moment at which the hand counts as closed: the forces build up."""
+"""Time [s] from the end of closing until the hand counts as closed: the forces have risen (`RAMP`)."""
 
 
 def check_modes(closing: str, holding: str, belief: object = None) -> None:

@@ -14,7 +14,7 @@ from torchgrasp.plan.internal_forces import least_friction_forces
 from torchgrasp.values import Grasps
 
 FORCE_SPREAD = 0.1
-"""Relative standard deviation of the desired normal force, where no stability model gives that of Eq. (28)."""
+"""Relative standard deviation of the desired normal force: a stand-in for the learned one of Eq. (28)."""
 
 
 def desired_forces(

@@ -9,7 +9,7 @@ from torchgrasp.control.reference import ClosingReference
 from torchgrasp.plan.internal_forces import least_friction_forces
 
 RAMP = 0.4
-"""Time [s] in which the forces rise to the desired ones."""
+"""Time [s] in which the forces rise to the desired ones: the sensor lags by 8 ms only."""
 
 
 class ForceHold:

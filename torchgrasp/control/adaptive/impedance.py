@@ -42,10 +42,10 @@ SURE = math.log(3)
 """Log-odds above which a grasp is left as it is, three to one: a lost object costs more than a firmer grasp."""
 
 MOST_RAISE = 2.0
-"""Largest multiple of the desired forces of an unstable grasp: the drives' torque must suffice."""
+"""Largest multiple of the desired forces that an unstable grasp asks for (docs/closing.md)."""
 
 ADAPTATION_RATE = 8.0
-"""Rate [1/s] at which an unstable grasp becomes firmer and stiffer, a third of the sensor's bandwidth at most."""
+"""Rate [1/s] at which an unstable grasp becomes firmer and stiffer: slower than the mean reading that it follows."""
 
 READING_CUTOFF = 2.0
 """Cut-off [Hz] of the mean reading by which stability is judged: noise must not look like a slip."""
