@@ -1,9 +1,12 @@
 """Three point fingers that slide along x, y and z around a pinched block: what tests of the controllers start from."""
 
+import dataclasses
+
 import torch
 
-from torchgrasp.control import ClosingReference, ControlModel, Observation
+from torchgrasp.control import ClosingReference, Observation, no_contact
 from torchgrasp.control.closing_law import surface_covariance
+from torchgrasp.hand.joints import ActuatedJoints
 from torchgrasp.hand.load import load_hand
 from torchgrasp.values import ClosingGains
 
@@ -27,24 +30,21 @@ GAINS = ClosingGains(
 
 
 def reference(coupling: torch.Tensor | None = None) -> ClosingReference:
-    """Joint 3 i + k moves finger i along axis k; the hand itself only lends its name."""
+    """Joint 3 i + k moves finger i along axis k; a shipped hand lends what the controllers do not read."""
     coupling = torch.eye(9).double() if coupling is None else coupling
     h = coupling.shape[1]
-    ones, zero = torch.ones(h).double(), torch.zeros(h).double()
-    model = ControlModel(
-        joint_names=tuple(f"slide_{k}" for k in range(9)),
-        coupling=coupling,
-        offset=torch.zeros(9).double(),
-        actuated=tuple(range(h)),
-        kp=torch.full((9,), 2.0).double(),
-        lower=-ones,
-        upper=ones,
-        radius=real([0.01, 0.01, 0.01]),
+    ones, zero, names = torch.ones(h).double(), torch.zeros(h).double(), tuple(f"slide_{k}" for k in range(9))
+    hand = load_hand("barrett")
+    hand = dataclasses.replace(
+        hand,
+        actuated=ActuatedJoints(names[:h], -ones, ones, coupling, torch.zeros(9).double()),
+        tree=dataclasses.replace(hand.tree, joint_names=names),
+        tips=dataclasses.replace(hand.tips, radius=real([0.01, 0.01, 0.01])),
     )
     return ClosingReference(
-        hand=load_hand("barrett"),
+        hand=hand,
+        kp=torch.full((9,), 2.0).double(),
         obj_from_hand=torch.eye(4).double(),
-        model=model,
         pregrasp=zero,
         joints=zero,
         squeeze=zero + 0.02,
@@ -56,13 +56,13 @@ def reference(coupling: torch.Tensor | None = None) -> ClosingReference:
 def observation(off: float = 0.02, reading=(0.0, 0.0, 0.0), contact=FREE, joints=None) -> Observation:
     """Tips `off` metres away from their contacts along the normals; sensed contacts are the planned ones."""
     touched = contact[:, None]
-    return Observation(
-        joints=torch.zeros(9).double() if joints is None else joints,
-        tips=TARGET + (0.01 + off) * NORMALS,
-        jacobian=torch.eye(9).double().reshape(3, 3, 9),
+    tactile = dataclasses.replace(
+        no_contact(),
         reading=real(reading),
         forces=-real(reading)[:, None] * NORMALS,
         contact=contact,
         points=torch.where(touched, TARGET, torch.nan),
         normals=torch.where(touched, NORMALS, torch.nan),
     )
+    joints = torch.zeros(9).double() if joints is None else joints
+    return Observation(joints, TARGET + (0.01 + off) * NORMALS, torch.eye(9).double().reshape(3, 3, 9), tactile)

@@ -106,7 +106,7 @@ def _pull(run: TrialRun, holding: Holding, pull: RisingPull) -> list[tuple[Tenso
         force = pull.force((k - pressing + 1) * robot.period)
         scene.pull(force * pull.direction.numpy())
         observation = robot.tick(hold(observation, robot.period))
-        readings = readings + observation.reading / every
+        readings = readings + observation.tactile.reading / every
         pose = scene.object_pose()
         if not np.isfinite(pose).all():
             break

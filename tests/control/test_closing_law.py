@@ -204,7 +204,7 @@ def test_bad_arguments_are_named():
     grasp = grasp_of(hand)
     with pytest.raises(BadArgument, match="grasp: found 0 rows"):
         closing_gains(grasp[:0], hand)
-    with pytest.raises(BadArgument, match="grasp: found 12 joints"):
+    with pytest.raises(BadArgument, match="grasps: found 12 joints"):
         closing_gains(grasp, load_hand("barrett"))
     spoilt = dataclasses.replace(grasp, obj_from_hand=grasp.obj_from_hand * float("nan"))
     with pytest.raises(BadArgument, match="obj_from_hand: found nan"):

@@ -3,14 +3,13 @@
 from torchgrasp.control.controller import GraspController
 from torchgrasp.control.forces import Squeeze, squeeze
 from torchgrasp.control.observation import Observation, observe
-from torchgrasp.control.reference import ClosingReference, ControlModel, closing_gains
+from torchgrasp.control.reference import ClosingReference, closing_gains
 from torchgrasp.control.tactile import TactileState, TipContact, measure, no_contact
 from torchgrasp.values import ClosingGains
 
 __all__ = [
     "ClosingGains",
     "ClosingReference",
-    "ControlModel",
     "GraspController",
     "Observation",
     "Squeeze",

@@ -54,7 +54,7 @@ class OpenLoopClosing:
 
     def __init__(self, reference: ClosingReference) -> None:
         poses = (reference.pregrasp, reference.joints, reference.squeeze)
-        self.poses = torch.stack([reference.model.expand(pose) for pose in poses])
+        self.poses = torch.stack([reference.expand(pose) for pose in poses])
         self.time, self.done = 0.0, False
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
@@ -86,8 +86,8 @@ class UncertaintyClosing:
         """Return the targets of all joints for the next tick."""
         if self.revise is not None:
             self.reference = self.revise(observation, self.reference)
-        reference, model, gains = self.reference, self.reference.model, self.reference.gains
-        normals, contact = reference.normals, observation.contact
+        reference, gains, coupling = self.reference, self.reference.gains, self.reference.hand.actuated.coupling
+        normals, contact = reference.normals, observation.tactile.contact
         self.waiting = self.waiting + period if bool(contact.any()) else 0.0
         self.settled = self.settled + period if bool(contact.all()) else 0.0
         self.done = self.settled >= SETTLED or self.waiting >= PATIENCE
@@ -96,14 +96,15 @@ class UncertaintyClosing:
         ahead = -(error * normals).sum(-1)  # how far the planned contact still lies ahead of each fingertip
         error = error + ahead.clamp_max(0.0)[:, None] * normals
         share = torch.where(contact, 1.0, blend(error, gains.covariance))
-        force_error = -(desired - observation.reading)[:, None] * normals
+        force_error = -(desired - observation.tactile.reading)[:, None] * normals
         velocity = tip_velocity(error, force_error, share, gains.position_gain, gains.force_gain)
         velocity = velocity * self._pace(ahead, contact)[:, None]
-        step = joint_step(observation.jacobian @ model.coupling, velocity, period, reference.joints - self.target)
-        actuated = observation.joints[list(model.actuated)]
+        step = joint_step(observation.jacobian @ coupling, velocity, period, reference.joints - self.target)
+        actuated = reference.pick(observation.joints)
         lead = LEAD * (1 + self.waiting / IMPATIENCE)
-        self.target = model.clamp(torch.minimum(torch.maximum(self.target + step, actuated - lead), actuated + lead))
-        return model.expand(self.target)
+        target = torch.minimum(torch.maximum(self.target + step, actuated - lead), actuated + lead)
+        self.target = reference.clamp(target)
+        return reference.expand(self.target)
 
     def _pace(self, ahead: Float[Tensor, "3"], contact: Bool[Tensor, "3"]) -> Float[Tensor, "3"]:
         """Return the share of its speed that each finger may go, so that fingers in the air arrive together."""
@@ -144,15 +145,16 @@ class PositionClosing:
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets of all joints for the next tick."""
-        model = self.reference.model
-        error = self.aim - self.reference.contact_points(observation.tips)
+        reference = self.reference
+        error = self.aim - reference.contact_points(observation.tips)
         arrived = torch.linalg.vector_norm(error, dim=-1) < STOP_DISTANCE
-        self.stopped = self.stopped | arrived | (observation.reading >= STOP_FORCE)
+        self.stopped = self.stopped | arrived | (observation.tactile.reading >= STOP_FORCE)
         self.done = bool(self.stopped.all())
         self.integral = self.integral + period * error
         demand = POSITION_RATE * error + INTEGRAL_RATE * self.integral
         gain, position_only = torch.ones_like(demand), torch.zeros_like(demand[:, 0])
         velocity = tip_velocity(demand, torch.zeros_like(demand), position_only, gain, gain)
         velocity = torch.where(self.stopped[:, None], 0.0, velocity)
-        self.target = model.clamp(self.target + joint_step(observation.jacobian @ model.coupling, velocity, period))
-        return model.expand(self.target)
+        step = joint_step(observation.jacobian @ reference.hand.actuated.coupling, velocity, period)
+        self.target = reference.clamp(self.target + step)
+        return reference.expand(self.target)

@@ -58,13 +58,13 @@ class GraspController:
     >>> grasp = plan_grasps(load_object("cylinder").view, hand, ContactSpec(table=0.0), starts=20)[0]
     >>> reference = ClosingReference.from_grasp(hand, grasp)
     >>> controller, tactile, joints = GraspController(reference), no_contact(), reference.pregrasp
-    >>> normals, radius = reference.normals, reference.model.radius
+    >>> normals, radius = reference.normals, hand.tip_radius.double()
     >>> while not controller.closed:
     ...     points = reference.contact_points(hand.tip_centres(joints))
     ...     push = 2e3 * ((reference.gains.target - points) * normals).sum(-1).clamp_min(0.0)
     ...     contact = TipContact(push, -push[:, None] * normals, points, normals)
     ...     tactile = measure(tactile, contact, normals, radius, 1 / 200)
-    ...     joints = controller.step(observe(hand, joints, tactile), 1 / 200)[list(reference.model.actuated)]
+    ...     joints = reference.pick(controller.step(observe(hand, joints, tactile), 1 / 200))
     >>> bool(tactile.contact.all())
     True
     """
@@ -80,7 +80,7 @@ class GraspController:
         self.reference = reference
         self.closing = _closing(reference, closing, belief)
         self._hold, self.hold = _holding(reference, holding), None
-        self.targets = reference.model.expand(reference.pregrasp)
+        self.targets = reference.expand(reference.pregrasp)
         self.time, self.pressed = 0.0, 0.0
 
     @property

@@ -85,15 +85,21 @@ def squeeze(hand: Hand, grasps: Grasps, force: float = 4.0, kp: float | None = N
     >>> lead.shape[1], bool((lead.abs().amax(1) > 0.01).all())
     (12, True)
     """
-    if grasps.joints.shape[-1] != hand.dof:
-        raise BadArgument("grasps", f"{grasps.joints.shape[-1]} joints", f"the {hand.dof} of {hand.name}")
-    for name, value in (("force", force), ("kp", 1.0 if kp is None else kp)):
-        if not 0.0 < value < 1e6:
-            raise BadArgument(name, value, "a number in (0, 10^6)")
+    check_squeeze(hand, grasps, force, kp)
     hand, joints = hand.to(torch.float64), grasps.joints.double()
     return press(
         joints, hand.jacobian(joints), desired_forces(*contacts_in_hand(grasps), force), joint_stiffness(hand, kp)
     )
+
+
+def check_squeeze(hand: Hand, grasps: Grasps, force: float, kp: float | None) -> None:
+    """Raise `BadArgument` unless the grasps have the hand's joints, and force and stiffness are positive."""
+    if grasps.joints.shape[-1] != hand.dof:
+        raise BadArgument("grasps", f"{grasps.joints.shape[-1]} joints", f"the {hand.dof} of {hand.name}")
+    if not 0.0 < force < 1e3:
+        raise BadArgument("force", force, "a number in (0, 1000) [N]")
+    if kp is not None and not 0.0 < kp < 1e6:
+        raise BadArgument("kp", kp, "a number in (0, 10^6) [N m/rad]")
 
 
 def press(

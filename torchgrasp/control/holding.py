@@ -27,7 +27,7 @@ class ForceHold:
     def __init__(self, reference: ClosingReference, observation: Observation, start: Float[Tensor, " j"]) -> None:
         self.start, self.rest = start, observation.joints
         forces, self.strength = held_forces(reference, observation)
-        self.lead = torch.einsum("cij,ci->j", observation.jacobian, forces) / reference.model.kp
+        self.lead = torch.einsum("cij,ci->j", observation.jacobian, forces) / reference.kp
         self.factor, self.time = 1.0, 0.0
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
@@ -52,7 +52,7 @@ class PositionHold:
 
 def regulate(factor: float, observation: Observation, strength: float, period: float) -> float:
     """Return the common factor of all forces one tick later: it integrates what the sensed sum lacks [share/s]."""
-    lacking = 1 - float(observation.reading.sum()) / strength
+    lacking = 1 - float(observation.tactile.reading.sum()) / strength
     return min(max(factor + period * lacking, 0.5), 1.5)
 
 
@@ -63,11 +63,11 @@ def held_forces(reference: ClosingReference, observation: Observation) -> tuple[
     """
     gains, normals = reference.gains, reference.normals
     forces = gains.desired_force
-    if bool(torch.isfinite(observation.points).all()) and bool(torch.isfinite(observation.normals).all()):
+    sensed = observation.tactile
+    if bool(torch.isfinite(sensed.points).all()) and bool(torch.isfinite(sensed.normals).all()):
         push = -(forces * normals).sum(-1)
         preferred = push[None] if gains.force_source == "stability" else None
-        sensed = observation.points[None], observation.normals[None]
-        balanced = least_friction_forces(*sensed, float(push.max()), preferred)[0]
+        balanced = least_friction_forces(sensed.points[None], sensed.normals[None], float(push.max()), preferred)[0]
         if bool(torch.isfinite(balanced).all()):
-            forces, normals = balanced, observation.normals
+            forces, normals = balanced, sensed.normals
     return forces, float(-(forces * normals).sum())

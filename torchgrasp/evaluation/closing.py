@@ -134,9 +134,9 @@ class TrialRun:
 
     def strained(self) -> bool:
         """Return whether some drive is at its largest torque."""
-        hand, model = self.robot.reference.hand, self.robot.reference.model
-        effort = torch.tensor([hand.actuators[name].effort for name in model.joint_names])
-        return bool((model.kp * (self.controller.targets - self.observation.joints).abs() >= effort).any())
+        reference = self.robot.reference
+        effort = torch.tensor([reference.hand.actuators[name].effort for name in reference.hand.tree.joint_names])
+        return bool((reference.kp * (self.controller.targets - self.observation.joints).abs() >= effort).any())
 
 
 def smooth_step(time: float) -> tuple[float, float]:

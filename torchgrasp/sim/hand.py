@@ -32,7 +32,7 @@ class SimulatedHand:
         control_rate: float,
         generator: torch.Generator | None,
     ) -> None:
-        self.scene, self.reference, self.generator = scene, reference.reorder(scene.joint_names), generator
+        self.scene, self.reference, self.generator = scene, reference, generator
         self.substeps = max(1, round(1 / (control_rate * scene.timestep)))
         self.period = self.substeps * scene.timestep
         self.steps, self.first_touch = 0, [float("inf")] * 3
@@ -41,10 +41,13 @@ class SimulatedHand:
             [reference.hand.tips.center.double(), torch.ones(3, 1, dtype=torch.float64)], dim=-1
         ).numpy()
         self.tactile = no_contact()
+        names = reference.hand.tree.joint_names
+        self._to_scene = [names.index(name) for name in scene.joint_names]
+        self._from_scene = [scene.joint_names.index(name) for name in names]
 
     def tick(self, targets: Float[Tensor, " j"]) -> Observation:
         """Drive the joints for one control period and return what the robot then knows."""
-        self.scene.drive(targets.numpy())
+        self.scene.drive(targets[self._to_scene].numpy())
         impulse, moment, weight, force = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))
         for _ in range(self.substeps):
             seen = self.scene.step()
@@ -74,10 +77,7 @@ class SimulatedHand:
         directions = torch.from_numpy(np.concatenate([force, normals]) @ turn)
         places = torch.from_numpy((np.concatenate([points, centres]) - origin) @ turn)
         press = TipContact(torch.from_numpy(self.force), directions[:3], places[:3], directions[3:])
-        normals, radius = self.reference.normals, self.reference.model.radius
+        normals, radius = self.reference.normals, self.reference.hand.tip_radius
         self.tactile = measure(self.tactile, press, normals, radius, self.period, self.generator)
-        joints, jacobian = (
-            torch.from_numpy(self.scene.joints()),
-            torch.from_numpy(turn.T @ self.scene.jacobian(centres)),
-        )
-        return Observation.join(joints, places[3:], jacobian, self.tactile)
+        joints, jacobian = self.scene.joints()[self._from_scene], self.scene.jacobian(centres)[..., self._from_scene]
+        return Observation(torch.from_numpy(joints), places[3:], torch.from_numpy(turn.T @ jacobian), self.tactile)

@@ -150,16 +150,16 @@ def hold(
     hand: Hand, grasp: Grasps, mesh: trimesh.Trimesh, simulator: str, force: float, seed: int | None, lift: bool = True
 ) -> Held:
     """Close a hand with the uncertainty-aware controller, lift and hold, fingertips touching in points (no patch)."""
-    spec = TrialSpec(
-        force=force, noise=seed is not None, mass=0.1 if lift else 0.02, patch=0.0, approach=0.0, simulator=simulator
-    )
+    mass, noise = 0.1 if lift else 0.02, seed is not None
+    spec = TrialSpec(force=force, mass=mass, patch=0.0, approach=0.0, noise=noise, simulator=simulator)
     run = TrialRun(TrialDriver(GraspTrial(hand, grasp, mesh, seed or 0), spec))
+    scene, robot, controller = run.scene, run.robot, run.controller
     for _ in run.close():
         pass
-    scene, controller, model = run.scene, run.controller, run.robot.reference.model
-    drives = [hand.actuators[name] for name in scene.joint_names]
-    kp, effort = (np.array([getattr(drive, key) for drive in drives]) for key in ("kp", "effort"))
-    lower, upper = model.expand(model.lower).numpy(), model.expand(model.upper).numpy()
+    reference, names = robot.reference, hand.tree.joint_names
+    order = [scene.joint_names.index(name) for name in names]
+    effort = np.array([hand.actuators[name].effort for name in names])
+    lower, upper = (reference.expand(limit).numpy() for limit in (reference.hand.lower, reference.hand.upper))
     middle, reach = (lower + upper) / 2, (upper - lower) / 2 - 2e-3  # at a stop the stop carries part of the load
     sums, torques, pressed = [], [], []
     for k in range(400):
@@ -167,14 +167,14 @@ def hold(
         run.step()
         if k < 350:
             continue
-        seen = scene.step()
-        points = seen.moment / seen.weight[:, None]
-        felt = np.einsum("cij,ci->j", scene.jacobian(points), seen.force)
-        driven = np.clip(kp * (controller.targets.numpy() - scene.joints()), -effort, effort)
-        sums.append(seen.force.sum(0))
-        torques.append(np.where(np.abs(scene.joints() - middle) < reach, driven - felt, 0.0))
-        pressed.append(run.robot.force.sum())
-    weight = np.array([0.0, 0.0, spec.mass * spec.gravity])
+        contacts = scene.step()
+        points, joints = contacts.moment / contacts.weight[:, None], scene.joints()[order]
+        from_tips = np.einsum("cij,ci->j", scene.jacobian(points), contacts.force)[order]
+        driven = np.clip(reference.kp.numpy() * (controller.targets.numpy() - joints), -effort, effort)
+        sums.append(contacts.force.sum(0))
+        torques.append(np.where(np.abs(joints - middle) < reach, driven - from_tips, 0.0))
+        pressed.append(robot.force.sum())
+    weight = np.array([0.0, 0.0, mass * spec.gravity])
     assert isinstance(controller.hold, ForceHold)
     return Held(
         float(np.linalg.norm(np.mean(sums, 0) - weight) / weight[2]),

@@ -36,9 +36,8 @@ def at(radius: float):
 def felt(point: torch.Tensor, normal: torch.Tensor):
     seen = observation(contact=FIRST, reading=(0.3, 0.0, 0.0))
     nothing = torch.full((2, 3), torch.nan, dtype=torch.float64)
-    return dataclasses.replace(
-        seen, points=torch.cat([point[None], nothing]), normals=torch.cat([normal[None], nothing])
-    )
+    points, normals = torch.cat([point[None], nothing]), torch.cat([normal[None], nothing])
+    return dataclasses.replace(seen, tactile=dataclasses.replace(seen.tactile, points=points, normals=normals))
 
 
 def surface_point(shape, direction: torch.Tensor) -> torch.Tensor:

@@ -162,6 +162,6 @@ def test_coupled_joints_get_the_torque_of_their_actuator():
     seen = observation(0.0, contact=TOUCHING, joints=joints)
     hold = Impedance(body, seen, seen.joints)
     targets = [hold(seen, PERIOD) for _ in range(round(RAMP / PERIOD) + 1)][-1]
-    torque = coupling.T @ (body.model.kp * (targets - seen.joints))
+    torque = coupling.T @ (body.kp * (targets - seen.joints))
     wanted = coupling.T @ (seen.jacobian.flatten(0, 1).T @ hold.forces(seen.tips).flatten())
     assert torch.allclose(torque, wanted, atol=1e-9)

@@ -50,13 +50,17 @@ class Belief:
 
     def revise(self, observation: Observation, reference: ClosingReference) -> ClosingReference:
         """Return the reference itself, or, after a touch that surprised, one replanned for the fingers in the air."""
-        fresh = observation.contact & ~self.touched & torch.isfinite(observation.points + observation.normals).all(-1)
+        fresh = (
+            observation.tactile.contact
+            & ~self.touched
+            & torch.isfinite(observation.tactile.points + observation.tactile.normals).all(-1)
+        )
         if not bool(fresh.any()):
             return reference
         self.touched = self.touched | fresh
-        points = apply(self.obj_from_hand, observation.points[fresh])
+        points = apply(self.obj_from_hand, observation.tactile.points[fresh])
         inside = self.shape.contains(points)
-        points, normals = points[inside], rotate(self.obj_from_hand, observation.normals[fresh])[inside]
+        points, normals = points[inside], rotate(self.obj_from_hand, observation.tactile.normals[fresh])[inside]
         if not len(points):
             return reference
         along, expected = self._meet(points, normals)
@@ -66,7 +70,7 @@ class Belief:
             return reference
         points, normals = points[surprising], normals[surprising]
         self.shape = self.shape.update(points, normals, noise=PLACE_NOISE, normal_noise=PLACE_NOISE / FLAT_RADIUS)
-        return self._replan(~observation.contact, reference)
+        return self._replan(~observation.tactile.contact, reference)
 
     def _replan(self, air: Bool[Tensor, "3"], reference: ClosingReference) -> ClosingReference:
         """Return the reference with the contacts of the fingers in the air on the revised surface."""

@@ -133,9 +133,9 @@ class Impedance:
         springs: Float[Tensor, "3"] | None = None,
         stability: StabilityModel | None = None,
     ) -> None:
-        self.model, self.stability = reference.model, stability
-        self.springs = torch.full_like(self.model.radius, GRASP_STIFFNESS) if springs is None else springs
-        self.stiffness = actuated_stiffness(self.model.coupling, self.model.kp)
+        self.reference, self.stability, self.coupling = reference, stability, reference.hand.actuated.coupling
+        self.springs = torch.full((3,), GRASP_STIFFNESS).to(observation.tips) if springs is None else springs
+        self.stiffness = actuated_stiffness(self.coupling, reference.kp)
         forces, self.strength = held_forces(reference, observation)
         self.frame = rigid(torch.eye(3).to(observation.tips), observation.tips.mean(0))
         self.rest, self.lengths = self._frame(observation.tips), side_lengths(observation.tips)
@@ -143,22 +143,22 @@ class Impedance:
         self.posture = self._actuated(observation.joints)
         self.lead = self._actuated(start) - self.posture
         self.factor, self.raised, self.time = 1.0, 1.0, 0.0
-        self.reading = observation.reading
+        self.reading = observation.tactile.reading
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets of all joints for the next tick."""
         self.time += period
         share = min(self.time / RAMP, 1.0)
-        self.reading = self.reading + low_pass(READING_CUTOFF, period) * (observation.reading - self.reading)
+        self.reading = self.reading + low_pass(READING_CUTOFF, period) * (observation.tactile.reading - self.reading)
         if share == 1.0:
             self.factor = regulate(self.factor, observation, self.raised * self.strength, period)
             self._adapt(observation, period)
         posture = self._actuated(observation.joints)
-        jacobian = (observation.jacobian @ self.model.coupling).flatten(0, 1)
+        jacobian = (observation.jacobian @ self.coupling).flatten(0, 1)
         lead = jacobian.T @ self.forces(observation.tips).flatten() / self.stiffness
         drift = self.posture - posture
         drift = drift - damped_inverse(jacobian) @ (jacobian @ drift)
-        return self.model.expand(posture + drift + self.lead + share * (lead - self.lead))
+        return self.reference.expand(posture + drift + self.lead + share * (lead - self.lead))
 
     def _adapt(self, observation: Observation, period: float) -> None:
         """Become firmer, and as stiff as stable grasps of these lengths, as long as the grasp may be unstable."""
@@ -187,5 +187,5 @@ class Impedance:
 
     def _actuated(self, joints: Float[Tensor, " j"]) -> Float[Tensor, " h"]:
         """Return the actuated joints nearest to all joints, in least squares weighted by stiffness."""
-        weighted = self.model.coupling * self.model.kp[:, None]
-        return weighted.T @ (joints - self.model.offset) / self.stiffness
+        weighted = self.coupling * self.reference.kp[:, None]
+        return weighted.T @ (joints - self.reference.hand.actuated.offset) / self.stiffness

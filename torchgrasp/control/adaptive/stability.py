@@ -168,8 +168,8 @@ def load_stability(hand: Hand, path: Path | str | None = None) -> StabilityModel
     try:
         joints, share = tuple(meta["joint_names"].split(",")), float(meta.pop("share"))
         stable, others = (
-            GaussianMixture(*(tensors[f"{kind}.{part}"] for k, part in PARTS if k == kind), NAMES)
-            for kind in ("stable", "others")
+            GaussianMixture(tensors[f"{k}.weights"], tensors[f"{k}.means"], tensors[f"{k}.covariances"], NAMES)
+            for k in ("stable", "others")
         )
         model = StabilityModel(stable, others, share, {k: v for k, v in meta.items() if k not in ("kind", "version")})
     except (KeyError, AttributeError, ValueError) as error:
