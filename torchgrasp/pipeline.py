@@ -80,7 +80,7 @@ def describe(counts: dict[Status, int]) -> str:
 
 
 def digest(cloud: PointCloud) -> str:
-    """Return the SHA-256 of the points, so that a result names its input."""
+    """Return the SHA-256 of the points, by which results name their input."""
     return hashlib.sha256(cloud.points.detach().cpu().double().contiguous().numpy().tobytes()).hexdigest()
 
 

@@ -1,4 +1,4 @@
-"""What the grasp solvers are given, and how their candidates become checked grasps."""
+"""What grasp solvers are given, and how candidates become checked grasps."""
 
 import dataclasses
 
@@ -21,7 +21,7 @@ from torchgrasp.values import Certificate, Contacts, Grasps
 
 @dataclasses.dataclass(frozen=True)
 class GraspProblem(Value):
-    """A hand, planned contacts with their certificate, and the world around the object.
+    """A hand, certified contacts, and the world around the object.
 
     Grasps around `center`, the object's estimated centre [m], rank higher.
 
@@ -55,7 +55,7 @@ class GraspCandidates(Batch):
 
 
 def check_candidates(problem: GraspProblem, candidates: GraspCandidates) -> Grasps:
-    """Return checked grasps, with pre-grasp and approach where all else is right."""
+    """Return checked grasps; those right so far get pre-grasp and approach."""
     hand, world = problem.hand, problem.world
     configuration, contacts, certificate = candidates.configuration, candidates.contacts, candidates.certificate
     unproven = (candidates.status == Status.OK) & ~certificate.closed

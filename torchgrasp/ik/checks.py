@@ -1,4 +1,4 @@
-"""Errors of refined grasps, measured by their own geometry, whatever the solver believed.
+"""Errors of grasps, measured from geometry, whatever a solver believed.
 
 The frame-invariant code stays the same when all normals are negated, mirrored or rotated together. A solver can stop
 anywhere. So everything is measured anew.
@@ -39,7 +39,7 @@ class GraspErrors(Batch):
 
 
 def tip_error(spatial: SpatialJacobian, contacts: Contacts) -> Float[Tensor, "g 3"]:
-    """Return the distance [m] of each fingertip's touching point from its contact."""
+    """Return the distance [m] of each fingertip from its contact."""
     hand = spatial.hand
     return torch.linalg.vector_norm(
         spatial.points(hand.tips.index, hand.tips.center) - tip_targets(hand, contacts), dim=-1
@@ -47,7 +47,7 @@ def tip_error(spatial: SpatialJacobian, contacts: Contacts) -> Float[Tensor, "g 
 
 
 def normal_angle(spatial: SpatialJacobian, contacts: Contacts) -> Float[Tensor, "g 3"]:
-    """Return the angle [rad] between each pad's axis and the contact's inward normal."""
+    """Return the angle [rad] between pad axes and inward normals."""
     pads = spatial.directions(spatial.hand.tips.index, spatial.hand.tips.normal)
     return torch.acos((-(pads * contacts.normals).sum(-1)).clamp(-1.0, 1.0))
 

@@ -1,4 +1,4 @@
-"""Clearances of a hand's links from the object, the table and each other."""
+"""Clearances of links from the object, the table and each other."""
 
 import dataclasses
 import math
@@ -25,7 +25,7 @@ HINGES = 8
 
 @dataclasses.dataclass(frozen=True)
 class CollisionWorld(Value):
-    """The object's signed distance field and the table's height [m]; None: there is none."""
+    """The object's signed distance field and the table's height [m], if any."""
 
     field: SignedDistanceField | None = None
     table: float | None = None
@@ -46,7 +46,7 @@ def least(clearance: Float[Tensor, "g s"]) -> tuple[Int[Tensor, "g 1"], Int[Tens
 def collision_cost(
     centres: Float[Tensor, "*b s 3"], spheres: CollisionSpheres, world: CollisionWorld
 ) -> Float[Tensor, "*b"]:
-    """Return the sum of squared clearance deficits [mm2] of a touching hand."""
+    """Return the squared clearance deficits [mm2] of a touching hand."""
     radius = spheres.radius.to(centres)
     cost = centres.new_zeros(centres.shape[:-2])
     if world.field is not None:
@@ -70,7 +70,7 @@ def clearance_hinges(spatial: SpatialJacobian, world: CollisionWorld, tips_touch
 
 
 def object_hinges(spatial: SpatialJacobian, field: SignedDistanceField, tips_touch: bool) -> Residuals:
-    """Return hinges on the least clearances of the spheres from the object."""
+    """Return hinges on the spheres' least clearances from the object."""
     spheres = spatial.hand.collision_spheres
     centres = spatial.points(spheres.link_index, spheres.center)
     radius = spheres.radius.to(centres)
@@ -85,7 +85,7 @@ def object_hinges(spatial: SpatialJacobian, field: SignedDistanceField, tips_tou
 
 
 def table_hinges(spatial: SpatialJacobian, table: float, tips_touch: bool) -> Residuals:
-    """Return hinges on the least clearances of the spheres from the table."""
+    """Return hinges on the spheres' least clearances from the table."""
     spheres = spatial.hand.collision_spheres
     centres = spatial.points(spheres.link_index, spheres.center)
     height = centres[..., 2] - spheres.radius.to(centres) - table
@@ -98,7 +98,7 @@ def table_hinges(spatial: SpatialJacobian, table: float, tips_touch: bool) -> Re
 
 
 def self_hinges(spatial: SpatialJacobian) -> Residuals:
-    """Return hinges on the least clearances of the links from each other."""
+    """Return hinges on the links' least clearances from each other."""
     pairs, frames = spatial.hand.self_collision, spatial.obj_from_link[:, :, :3].permute(2, 3, 1, 0).contiguous()
     separation = pairs.separations(frames, SELF_CLEARANCE).T
     row, index = least(separation)

@@ -1,6 +1,6 @@
 """The paper's refinement (Sec. 6.3): COBYLA on the sum of the tip distances, one grasp at a time.
 
-Only the joints are variables, the pose follows by Eq. (24). With the pose as six more variables SciPy's COBYLA stops
+Only the joints are variables, the pose follows by Eq. (24). With the pose as six more variables COBYLA stops
 millimetres away. Contact directions and collisions are checked afterwards.
 """
 

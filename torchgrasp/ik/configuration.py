@@ -1,4 +1,4 @@
-"""Configurations of a free hand, and the Jacobians of points on its links.
+"""Configurations of a free hand, and Jacobians of points on it.
 
 A row of a Jacobian is virtual work: `directions . points` changes by the work of a unit force at the point. So a row is
 a wrench, force and torque about the object's origin. Its derivative by a joint is the wrench times the joint's twist.
@@ -35,7 +35,7 @@ class Configuration(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class SpatialJacobian(Value):
-    """Link poses and joint twists of a configuration, in the object's frame."""
+    """Link poses and joint twists in the object's frame."""
 
     hand: Hand
     obj_from_link: Float[Tensor, "g l 4 4"]

@@ -1,4 +1,4 @@
-"""The paper's way: seeds of the learned model move onto planned contacts, which stay fixed."""
+"""The paper's way: the learned model's seeds move onto fixed contacts."""
 
 from functools import partial
 
@@ -19,7 +19,7 @@ SEEDS_PER_ROUND = (2, 4)
 
 
 def rank_seeds(problem: GraspProblem, seeds: IKSeeds) -> Int[Tensor, "g"]:
-    """Return the rank of each seed within its triple, by its first residuals."""
+    """Return each seed's rank within its triple, by its first residuals."""
     costs = [
         refinement_cost(
             problem.hand,

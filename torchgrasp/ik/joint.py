@@ -1,8 +1,8 @@
-"""Contacts, hand pose and joints solved together: the contacts slide to where the hand reaches them.
+"""Contacts, pose and joints solved together: contacts slide to where the hand reaches them.
 
 Contact-first planning loses triples that the hand reaches only through the object, the table or itself. Here the
 contact problem (Eqs. 10-13 and the margins of `ContactSpec`) and the hand's residuals are one least-squares problem.
-Its unknowns are pose, joints, contacts and the tensions of their balance. The contacts are certified anew.
+Its unknowns are pose, joints, contacts and tensions. The contacts are certified anew.
 """
 
 import dataclasses
@@ -40,14 +40,14 @@ PROJECTIONS = 3
 
 @dataclasses.dataclass(frozen=True)
 class JointState(Batch):
-    """Hands, their normalised contacts, and the tensions of their balance (`forces_from_tensions`)."""
+    """Hands, their normalised contacts, and the tensions of the balance (`forces_from_tensions`)."""
 
     configuration: Configuration
     points: Float[Tensor, "g 3 3"]
     tension: Float[Tensor, "g 3"]
 
     def integrate(self, hand: Hand, step: Float[Tensor, "g d"]) -> "JointState":
-        """Return the state after a step of pose, joints, points and tensions."""
+        """Return the state after a step of all unknowns."""
         by_hand, by_points, by_tension = step.split([6 + hand.dof, 9, 3], 1)
         points = self.points + by_points.unflatten(1, (3, 3))
         tension = normalise_tensions(points, self.tension + by_tension)
@@ -56,7 +56,7 @@ class JointState(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class JointProblem:
-    """A hand, the estimated object, what its contacts must satisfy, and the world.
+    """A hand, the estimated object, its contact problem, and the world.
 
     `flatness` is the largest variation of the normal [rad] around a contact; None: any.
     """
@@ -68,10 +68,10 @@ class JointProblem:
     flatness: float | None
 
     def residuals(self, state: JointState, flat: FlatnessConstraint | None) -> Residuals:
-        """Return the residuals [mm], and their Jacobian by pose, joints, points and tensions."""
+        """Return the residuals [mm], and their Jacobian by all unknowns."""
         hand, shape = self.hand, self.shape
         jet, spatial = triple_jet(shape, state.points), SpatialJacobian.at(hand, state.configuration)
-        contacts = contacts_at(shape, state.points, jet)
+        contacts = Contacts(shape.metres(state.points), jet.normals)
         tips, tips_by_hand = tip_residuals(spatial, tip_targets(hand, contacts), jet.normals)
         links, links_by_hand = clearance_hinges(spatial, self.world, tips_touch=True)
         tips_by_points = self._tips_by_points(spatial, jet, tips[:, 9:] > 0)
@@ -87,7 +87,7 @@ class JointProblem:
     def _tips_by_points(
         self, spatial: SpatialJacobian, jet: TripleJet, outside: Bool[Tensor, "g 3"]
     ) -> Float[Tensor, "g 12 9"]:
-        """Return the derivative of the tip residuals by the contacts, for pads that are `outside` their cones.
+        """Return the derivative of the tip residuals by the contacts; pads count `outside` their cones.
 
         A sliding contact carries its tip's target along and rotates the normal under the pad.
         """
@@ -101,7 +101,7 @@ class JointProblem:
         return torch.cat([-TIP_WEIGHT / MILLIMETRE * tips, PAD_WEIGHT * tilts], 1)
 
     def _contact_residuals(self, state: JointState, jet: TripleJet, flat: FlatnessConstraint | None) -> Residuals:
-        """Return the residuals [mm] of the contact problem, zero where a bound holds."""
+        """Return residuals [mm] of the contact problem, zero where bounds hold."""
         rows = self.contact_problem.constraints(state.points, state.tension, jet)
         violated = (rows.bounds > 0).to(rows.bounds)
         residuals = [rows.surface, violated * rows.bounds]
@@ -130,12 +130,6 @@ class JointProblem:
         return state
 
 
-def contacts_at(shape: Shape, points: Float[Tensor, "g 3 3"], jet: TripleJet) -> Contacts:
-    """Return contacts at normalised points [m]."""
-    std = shape.std_factor * shape.scale * jet.variance.sqrt()
-    return Contacts(shape.metres(points), jet.normals, jet.variance, std)
-
-
 def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: ContactSpec) -> Grasps:
     """Return a checked grasp for each triple that has seeds, best first; contacts slide where they must.
 
@@ -146,7 +140,7 @@ def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: Conta
     joint_problem = JointProblem(problem.hand, shape, contact_problem, problem.world, spec.flatness)
 
     def refine_sliding(seeds: IKSeeds) -> Grasps:
-        """Return a checked grasp for each seed, its contacts free to slide."""
+        """Return a checked grasp for each seed, with sliding contacts."""
         points = shape.normalise(assign(problem.contacts, seeds).points)
         start = Configuration(seeds.joints, seeds.obj_from_hand)
         tension = normalise_tensions(points, points.new_ones(len(points), 3))

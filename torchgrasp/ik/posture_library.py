@@ -1,4 +1,4 @@
-"""Random postures of a hand, from which the nearest to contacts become seeds.
+"""Random postures of a hand, the nearest of which become seeds.
 
 The learned model (`query_mixture`) gives the few postures likely for a code, wherever object and table are. Here every
 triple is compared with thousands of postures in all assignments, by one matrix product. Clearances rank the nearest, so

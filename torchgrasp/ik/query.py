@@ -1,10 +1,8 @@
-"""From contacts to configurations that may touch them, by the learned model (Eqs. 21-24)."""
+"""Seeds of the learned model for contacts (Eqs. 21-24)."""
 
 import dataclasses
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from torchgrasp.base import join
 from torchgrasp.errors import BadArgument
@@ -29,14 +27,14 @@ TRIPLES_PER_PASS = 256
 def query_mixture(
     hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: int = 8, max_energy: float = DEFAULT_ENERGY
 ) -> IKSeeds:
-    """Return configurations of the learned model near the contacts, for all six assignments (Eqs. 21-24).
+    """Return the learned model's configurations near the contacts, in all six assignments (Eqs. 21-24).
 
     Codes are taken as noisy, because tips may roll. For every assignment within reach (Eq. 21) the joints are the
     conditional mean (Eq. 23) and the means of the most responsible components. They are clamped to the limits. Eq. (24)
     places the hand. The fingertips are still off by centimetres.
 
-    Seeds come in the order of the contacts' rows. Within a row the right side of the surface comes first, then the
-    smaller tip error. A degenerate or unreachable row has none.
+    Seeds come in the order of the contacts' rows. Within a row the right side of the surface comes first, then
+    the smaller tip error. A degenerate or unreachable row has none.
 
     Args:
         hand: the hand.
@@ -71,7 +69,10 @@ def _query(hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: int, 
     code = encode((contacts.points.double(), contacts.normals.double()))
     energy = mixture.energy(code)
     row, assignment = torch.nonzero(energy < max_energy, as_tuple=True)  # NaN is not less
-    joints = _seed_joints(mixture, code.q[row, assignment], n_seeds)
+    q = code.q[row, assignment]
+    joints = mixture.joints(q)[:, None]
+    if n_seeds > 1:
+        joints = torch.cat([joints, mixture.modes(q, n_seeds - 1)[0]], dim=1)
     joints = joints.clamp(hand.lower.to(joints), hand.upper.to(joints)).flatten(0, 1)
 
     # From here on one row a seed.
@@ -94,11 +95,3 @@ def _query(hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: int, 
         energy=energy[row, assignment].to(dtype),
         tip_error=tip_error.to(dtype),
     )[order]
-
-
-def _seed_joints(mixture: GraspMixture, q: Float[Tensor, "a 6"], n_seeds: int) -> Float[Tensor, "a k h"]:
-    """Return the conditional mean, then the means of the most responsible components."""
-    mean = mixture.joints(q)[:, None]
-    if n_seeds == 1:
-        return mean
-    return torch.cat([mean, mixture.modes(q, n_seeds - 1)[0]], dim=1)

@@ -2,7 +2,7 @@
 
 The paper ranks by the sum of the contacts' variances. Here `score` chooses among the candidates of a triple, and
 `rank_by_success` orders the executable grasps. Its model is logistic. It predicts the share of pull trials in which a
-grasp holds, over five closings, frictions and errors of pose (docs/closing.md). `scripts/train.py success` fits it to
+grasp holds (docs/closing.md). `scripts/train.py success` fits it to
 trials of the Allegro hand. The probabilities of other hands are not calibrated.
 """
 
@@ -41,7 +41,7 @@ MODEL = Path(__file__).with_name("success.json")
 
 
 def lexical_order(*keys: Tensor) -> Int[Tensor, "g"]:
-    """Return the ascending order of rows by the first key, ties by the next.
+    """Return the order of rows by the first key, ties by the next.
 
     >>> lexical_order(torch.tensor([1, 0, 1]), torch.tensor([2.0, 3.0, 1.0]))
     tensor([1, 2, 0])
@@ -66,7 +66,7 @@ def rank_in_group(group: Int[Tensor, "g"], *keys: Tensor) -> Int[Tensor, "g"]:
 
 
 def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
-    """Return the friction with which all fingers can press towards the contacts' centre.
+    """Return the friction with which fingers can press towards the contacts' centre.
 
     It is the largest tangent between an inward normal and the line to the centre.
     """
@@ -77,7 +77,7 @@ def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
 
 
 def score(contacts: Contacts, normal_angle: Float[Tensor, "g 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "g"]:
-    """Return the score of candidates: central contacts, little friction and central pads are better."""
+    """Return scores: central contacts, little friction and central pads are better."""
     offset = torch.linalg.vector_norm(contacts.points.mean(1) - center, dim=-1)
     return -(offset / OFFSET + centred_friction(contacts) + normal_angle.amax(1) / PAD_ANGLE)
 
@@ -89,17 +89,10 @@ def success_features(
     center: Float[Tensor, "3"],
     friction: float,
 ) -> Float[Tensor, "g 5"]:
-    """Return `FEATURES` of each grasp.
+    """Return `FEATURES` of each grasp at a trial's friction, at which `closure` is the probability of closure.
 
     Balanced forces need the least friction (`least_friction_forces`), forces to the centre more. Where nothing
     balances, the friction angle is a right one.
-
-    Args:
-        contacts: of the grasps.
-        closure: probability of closure at this friction.
-        normal_angle: see `Grasps`.
-        center: estimated centre of the object [m].
-        friction: of the trial, positive.
     """
     offset = torch.linalg.vector_norm(contacts.points.mean(1) - center, dim=-1) / OFFSET
     least = tangential_ratio(least_friction_forces(contacts.points, contacts.normals), contacts.normals).amax(-1)

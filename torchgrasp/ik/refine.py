@@ -1,4 +1,4 @@
-"""Move hands onto their contacts without touching anything else, by batched Levenberg-Marquardt.
+"""Move hands onto their contacts and clear of all else, by batched Levenberg-Marquardt.
 
 Seeds leave millimetres to centimetres between fingertips and contacts. Pose and joints of all seeds are solved in one
 batch. A round fingertip's centre comes to one radius off its contact, so the tip may roll. A tip that is not round
@@ -29,14 +29,14 @@ OPENING, OPENING_SIGMAS = 0.012, 3.0
 
 
 def tip_targets(hand: Hand, contacts: Contacts) -> Float[Tensor, "g 3 3"]:
-    """Return the centres (`Hand.tip_centres`) of tips that touch their contacts [m]."""
+    """Return the centres [m] (`Hand.tip_centres`) of touching tips."""
     return contacts.points + hand.tip_radius.to(contacts.normals)[:, None] * contacts.normals
 
 
 def tip_residuals(
     spatial: SpatialJacobian, target: Float[Tensor, "g 3 3"], normals: Float[Tensor, "g 3 3"]
 ) -> Residuals:
-    """Return residuals of the tips from their targets, and of the contact directions outside the pads' cones."""
+    """Return the residuals of the tips' centres and of the contact directions."""
     hand = spatial.hand
     radius = hand.tip_radius.to(normals)
     tips = spatial.points(hand.tips.index, hand.tips.center)
@@ -61,46 +61,38 @@ def grasp_residuals(
     configuration: Configuration,
     target: Float[Tensor, "g 3 3"],
     normals: Float[Tensor, "g 3 3"],
-    world: CollisionWorld,
+    world: CollisionWorld | None,
     tips_touch: bool,
 ) -> Residuals:
-    """Return the residuals of tips, pads and clearances."""
+    """Return the residuals of tips, pads and, in a world, clearances."""
     spatial = SpatialJacobian.at(hand, configuration)
-    tips, links = tip_residuals(spatial, target, normals), clearance_hinges(spatial, world, tips_touch)
+    tips = tip_residuals(spatial, target, normals)
+    if world is None:
+        return tips
+    links = clearance_hinges(spatial, world, tips_touch)
     return torch.cat([tips[0], links[0]], 1), torch.cat([tips[1], links[1]], 1)
 
 
 def refinement_cost(
     hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld
 ) -> Float[Tensor, "g"]:
-    """Return the sum of squared residuals of each row, which `refine` lowers."""
+    """Return the sum of squared residuals, which `refine` lowers."""
     target = tip_targets(hand, contacts)
     return grasp_residuals(hand, configuration, target, contacts.normals, world, tips_touch=True)[0].square().sum(1)
 
 
 def refine(
-    hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld, solved: float = SOLVED
+    hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld | None, solved: float = SOLVED
 ) -> Configuration:
-    """Return configurations with fingertips on contacts and clear links, as far as each row allows.
+    """Return configurations with fingertips on contacts and clear links, as far as possible.
 
-    Finger i takes contact i. A row is done when its sum of squared residuals [mm2] is below `solved`. `measure_errors`
-    tells which rows succeeded.
+    Finger i takes contact i. A row is done when its squared residuals [mm2] sum to less than `solved`. Without a world
+    all clearances are ignored, those between links too.
     """
     target, normals = tip_targets(hand, contacts), contacts.normals
 
     def evaluate(state: Configuration, rows: Int[Tensor, "a"]) -> Residuals:
         return grasp_residuals(hand, state, target[rows], normals[rows], world, tips_touch=True)
-
-    problem = LeastSquares(evaluate, lambda x, step: x.integrate(hand, step), solved)
-    return levenberg_marquardt(problem, configuration, ITERATIONS)
-
-
-def settle_tips(hand: Hand, configuration: Configuration, contacts: Contacts, solved: float) -> Configuration:
-    """Return configurations with the tips on their contacts, whatever clearance it costs."""
-    target, normals = tip_targets(hand, contacts), contacts.normals
-
-    def evaluate(state: Configuration, rows: Int[Tensor, "a"]) -> Residuals:
-        return tip_residuals(SpatialJacobian.at(hand, state), target[rows], normals[rows])
 
     problem = LeastSquares(evaluate, lambda x, step: x.integrate(hand, step), solved)
     return levenberg_marquardt(problem, configuration, ITERATIONS)

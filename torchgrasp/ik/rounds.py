@@ -1,4 +1,4 @@
-"""Rounds of refinement: the first seeds of every contact triple, then more of the unsolved ones.
+"""Rounds of refinement: first seeds of every triple, then more of the unsolved ones.
 
 Most seeds fail, and nothing tells which. But one of a triple's best seeds often succeeds.
 """
@@ -19,12 +19,12 @@ Result = TypeVar("Result", bound=Batch)
 
 
 def assign(contacts: Contacts, seeds: IKSeeds) -> Contacts:
-    """Return the contacts of each seed in the order of the fingers."""
+    """Return each seed's contacts in the order of the fingers."""
     return map_tensors(lambda x: x[seeds.row[:, None], seeds.permutation], contacts)
 
 
 class Attempts(Generic[Result]):
-    """The results of all refined seeds, and the contact triples still unsolved.
+    """The results of all refined seeds, and the triples still unsolved.
 
     Args:
         unsolved: the triples to be solved.
@@ -45,7 +45,7 @@ class Attempts(Generic[Result]):
     def refine(
         self, seeds: IKSeeds, rank: Int[Tensor, "g"], counts: Sequence[int], refine: Callable[[IKSeeds], Result]
     ) -> None:
-        """Refine the next `counts[k]` seeds of each unsolved triple in round k, by their rank within the triple."""
+        """Refine the next `counts[k]` seeds of each unsolved triple in round k, in the order of `rank`."""
         first = 0
         for count in counts:
             chosen = seeds[(rank >= first) & (rank < first + count) & self.unsolved[seeds.row]]

@@ -17,8 +17,6 @@ COARSE = 3
 """Spacings between the nodes of the coarse grid, between which distances are interpolated."""
 NEAREST_SAMPLES = 4
 """Samples of the surface whose triangles are tried for one node."""
-MOST_NODES = 2e7
-"""Largest grid: 160 MB."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +39,7 @@ class SignedDistanceField(Value):
         return self.values.reshape(-1)[flat].to(points)
 
     def query(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
-        """Return the trilinear signed distance [m] at points [m], and its gradient.
+        """Return the trilinear signed distance [m] and its gradient.
 
         Outside the grid the distance to the grid is added.
         """
@@ -69,13 +67,9 @@ class SignedDistanceField(Value):
 def field_from_surface(
     vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], spacing: float = 0.003, margin: float = 0.08
 ) -> SignedDistanceField:
-    """Return the signed distance field of a triangle mesh, wound outward. The mesh may be open.
+    """Return the signed distance field of a triangle mesh [m], wound outward; it may be open.
 
-    Args:
-        vertices: of the mesh [m].
-        faces: three vertices each.
-        spacing: of the nodes [m].
-        margin: of the grid around the mesh [m].
+    The nodes are `spacing` [m] apart and reach to `margin` [m] around the mesh.
 
     Raises:
         BadArgument: wrong shapes, faces that name no vertex or have no area, or a grid of more than 2e7 nodes.
@@ -87,7 +81,7 @@ def field_from_surface(
     low, high = vertices.amin(0).double() - margin, vertices.amax(0).double() + margin
     # the coarse nodes are every third of the fine ones
     counts = [COARSE * max(1, int(c)) + 1 for c in torch.ceil((high - low) / (COARSE * spacing)).tolist()]
-    if np.prod(np.array(counts, dtype=float)) > MOST_NODES:
+    if np.prod(np.array(counts, dtype=float)) > 2e7:  # 160 MB
         raise BadArgument("spacing", spacing, f"a coarser grid than {counts} nodes")
     origin = low.cpu().numpy()
     lines = [origin[k] + spacing * np.arange(counts[k]) for k in range(3)]
@@ -110,7 +104,7 @@ def _upsample(values: np.ndarray, axis: int) -> np.ndarray:
 
 
 class _Surface:
-    """Samples of a mesh in a tree, 2 mm apart, which find the triangles near a point."""
+    """A tree of samples of a mesh, by which near triangles are found."""
 
     def __init__(self, vertices: Tensor, faces: Tensor):
         from scipy.spatial import KDTree
@@ -134,7 +128,7 @@ class _Surface:
         self.tree = KDTree(np.concatenate([corners.mean(1), samples]))
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the signed distances [m] of points (n, 3), in chunks that stay in the cache."""
+        """Return the signed distances [m] of points (n, 3), chunk by chunk."""
         return np.concatenate([self._distance(points[k : k + 8192]) for k in range(0, max(1, len(points)), 8192)])
 
     def _distance(self, points: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Inverse kinematics of contacts: joints and pose of a hand that touches them, but not itself.
+"""Inverse kinematics of contacts: joints and pose of a hand that touches nothing else.
 
 Seeds of the learned model come first (Eqs. 21-24), then the nearest random postures. Each seed is refined by
 Levenberg-Marquardt, or by the paper's COBYLA, and measured anew.
@@ -23,7 +23,7 @@ from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
 from torchgrasp.ik.query import query_mixture
 from torchgrasp.ik.ranking import rank_in_group
-from torchgrasp.ik.refine import refine, settle_tips
+from torchgrasp.ik.refine import refine
 from torchgrasp.ik.rounds import Attempts, assign
 from torchgrasp.posture_model.mixture import GraspMixture
 from torchgrasp.values import Contacts, IKSeeds
@@ -44,8 +44,8 @@ EXACT_TIPS = 5e-5
 class IKSolution(Batch):
     """A configuration for each row of contacts; finger i touches contact `permutation[:, i]`.
 
-    `clearance` [m] is the least of the links from each other and from the world. `attempts` counts the refined seeds.
-    A row without seeds holds NaN.
+    `clearance` [m] is the links' least, from each other and the world. `attempts` counts the refined seeds. A row
+    without seeds holds NaN.
     """
 
     joints: Float[Tensor, "b h"]
@@ -66,7 +66,7 @@ def solve_ik(
     method: Method = "levenberg_marquardt",
     library: PostureLibrary | None = None,
 ) -> IKSolution:
-    """Return configurations whose fingertips touch the contacts in any assignment, free of self-collision.
+    """Return configurations that touch the contacts in any assignment, without self-collision.
 
     Args:
         hand: the hand.
@@ -106,11 +106,11 @@ def solve_ik(
         return IKSolution(*placed, *measured, torch.ones_like(errors.status), errors.status)
 
     def refine_seeds(seeds: IKSeeds) -> IKSolution:
-        """Refine seeds pass by pass, so that the temporaries stay in the cache."""
+        """Refine seeds in passes whose temporaries stay in the cache."""
         return join([refine_pass(seeds[k : k + 512]) for k in range(0, max(len(seeds), 1), 512)])
 
     def library_seeds(some: Contacts) -> IKSeeds:
-        """Return seeds of the posture library, which may have to be drawn."""
+        """Return seeds of the library, drawn if need be."""
         return nearest_postures(PostureLibrary.of(hand) if library is None else library, some, world, LIBRARY_ATTEMPTS)
 
     sources = [(library_seeds, LIBRARY_ATTEMPTS)]
@@ -137,9 +137,9 @@ def solve_ik(
 def refine_exactly(
     hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld
 ) -> Configuration:
-    """Refine until the tips are exact, giving up margins of clearance that are not needed."""
+    """Refine until the tips are exact, giving up needless margins of clearance."""
     refined = refine(hand, configuration, contacts, world, EXACT)
-    settled = settle_tips(hand, refined, contacts, EXACT)
+    settled = refine(hand, refined, contacts, None, EXACT)
     return pick(measure_errors(hand, settled, contacts, world).status == Status.OK, settled, refined)
 
 
