@@ -97,6 +97,18 @@ def put(whole: SomeBatch, at: Int[Tensor, "a"], part: SomeBatch) -> SomeBatch:
     return map_tensors(lambda rows, new: rows.index_copy(0, at, new), whole, part)
 
 
+def named_tensors(value: Value, prefix: str = "") -> dict[str, Tensor]:
+    """Return every tensor inside a value by its dotted field name."""
+    tensors: dict[str, Tensor] = {}
+    for field in dataclasses.fields(value):  # pyright: ignore[reportArgumentType]
+        inner = getattr(value, field.name)
+        if isinstance(inner, Tensor):
+            tensors[prefix + field.name] = inner
+        elif isinstance(inner, Value):
+            tensors |= named_tensors(inner, f"{prefix}{field.name}.")
+    return tensors
+
+
 def count_status(status: Int[Tensor, "*b"]) -> dict[Status, int]:
     """Count the rows of each status, the most frequent first.
 

@@ -1,4 +1,4 @@
-"""What a user asks of the contacts and of a simulated trial: numbers with names, units, ranges and defaults."""
+"""Options of contacts and of simulated trials, with units, ranges and defaults."""
 
 import dataclasses
 from typing import Literal, get_args
@@ -7,7 +7,7 @@ from torchgrasp.base import Value, check_number
 from torchgrasp.errors import BadArgument
 
 Simulator = Literal["sapien", "mujoco"]
-"""What can simulate a scene."""
+"""The simulators."""
 
 TIP_RADIUS, SEPARATION = 0.012, 0.026
 """Radius [m] of the Allegro's fingertips, and the least distance [m] of contacts for them: their width and 2 mm.
@@ -18,8 +18,8 @@ Smaller tips get as much room: the link behind a tip is wider than its sphere.""
 class ContactSpec(Value):
     """What three contacts must satisfy (Eqs. 10-14). `ContactSpec.paper()` is the paper's own.
 
-    The estimated surface is not the true one. Hence the margins beyond the paper: contacts are planned with less
-    friction than there is, on flat surface, a fingertip apart. `docs/planning.md` has their measured worth.
+    The estimated surface differs from the true one, so contacts keep margins beyond the paper: less friction, flat
+    surface, a distance of a fingertip. `docs/planning.md` has their measured worth.
 
     Args:
         friction: coefficient of friction between fingertip and object at execution.
@@ -53,20 +53,19 @@ class ContactSpec(Value):
 
     def __post_init__(self) -> None:
         """Check every range once, where the value is made."""
-        ranges: list[tuple[str, float, float, float]] = [
-            ("friction", self.friction, 0.0, 10.0),
-            ("edges", self.edges, 3, 1024),
-            ("max_variance", self.max_variance, 1e-12, 1e6),
-            ("friction_margin", self.friction_margin, 1e-3, 1.0),
-            ("separation", self.least_separation, 0.0, 1.0),
-            ("flatness", 0.1 if self.flatness is None else self.flatness, 1e-3, 3.1416),
-            ("table", 0.0 if self.table is None else self.table, -1e6, 1e6),
-            ("contact_height", self.contact_height, -1.0, 1.0),
-            ("tip_radius", self.fingertip_radius, 0.0, 1.0),
-            ("start_radius", self.start_radius, 1e-6, 1.2),
-        ]
-        for name, value, low, high in ranges:
-            check_number(name, value, low, high)
+        _check_ranges(
+            self,
+            friction=(0.0, 10.0),
+            edges=(3, 1024),
+            max_variance=(1e-12, 1e6),
+            friction_margin=(1e-3, 1.0),
+            separation=(0.0, 1.0),
+            flatness=(1e-3, 3.1416),
+            table=(-1e6, 1e6),
+            contact_height=(-1.0, 1.0),
+            tip_radius=(0.0, 1.0),
+            start_radius=(1e-6, 1.2),
+        )
 
     @property
     def planned_friction(self) -> float:
@@ -85,10 +84,7 @@ class ContactSpec(Value):
         return SEPARATION + wider if self.separation is None else self.separation
 
     def for_fingertips(self, radius: float) -> "ContactSpec":
-        """Return the spec for fingertips of a hand, where it does not say their radius [m] itself.
-
-        Room is made for at least `TIP_RADIUS`.
-        """
+        """Return the spec with the fingertip radius [m] of a hand, at least `TIP_RADIUS`; a given radius stays."""
         return self if self.tip_radius is not None else dataclasses.replace(self, tip_radius=max(radius, TIP_RADIUS))
 
     @classmethod
@@ -110,25 +106,25 @@ class TrialSpec(Value):
 
     Args:
         closing: how the hand closes: "uncertainty" (Eqs. 25-28), "fixed" (Eq. 25 with constant gains), "position"
-            (isotropic PI that stops at 0.5 N, the paper's baseline) or "open_loop" (pre-grasp, grasp, squeeze).
-        holding: how it presses from then on: "force" (joints stay where they are), "impedance" (the grasp is a spring
-            in the hand) or "position" (no more than it does already). The open loop keeps its squeeze.
-        mass: of the object [kg].
-        friction: of every contact.
+            (PI control until 0.5 N, the paper's baseline) or "open_loop" (pre-grasp, grasp, squeeze).
+        holding: how the closed hand presses: "force" (balanced forces), "impedance" (the grasp is a spring in the hand)
+            or "position" (joints stay at their targets). In open loop the squeeze stays.
+        mass: mass of the object [kg].
+        friction: coefficient of friction of every contact.
         gravity: [m/s^2].
-        approach: length [m] of the straight way on which the opened hand comes to its pre-grasp; 0: it is there.
+        approach: length [m] of the straight path to the pre-grasp; 0: the hand starts there.
         lift_height: [m].
-        hold_time: [s] after the lift.
+        hold_time: time [s] after the lift.
         shake: amplitude [m] of a vertical sinusoid of 5 Hz during the hold.
         force: desired normal force of the strongest finger [N].
-        noise: whether the tactile sensor has noise (0.1 N normal, 0.3 N tangential, 1.5 mm of a contact's place).
+        noise: whether the tactile sensor is noisy: 0.1 N normal, 0.3 N tangential, 1.5 mm of contact position.
         timestep: of the simulator [s].
         control_rate: of the controller [Hz].
         simulator: "sapien" or "mujoco".
-        density: of the object [kg/m^3], which gives its mass; None: `mass` does.
-        patch: radius [m] of a fingertip's contact patch, whose torsional friction is friction x force x patch.
+        density: density of the object [kg/m^3]; it replaces `mass` unless None.
+        patch: radius [m] of the contact patch of a fingertip; torsional friction is friction x force x patch.
         kp: stiffness of all joint drives [N m/rad]; None: the hand's own.
-        overlap: largest overlap [m] of the opened hand with object or table at the start: convex parts bulge a little.
+        overlap: largest overlap [m] at the start, because convex parts bulge a little.
         table: whether the object stands on a table.
 
     Raises:
@@ -162,31 +158,36 @@ class TrialSpec(Value):
         for name in ("closing", "holding", "simulator"):
             if getattr(self, name) not in get_args(fields[name]):
                 raise BadArgument(name, repr(getattr(self, name)), f"one of {', '.join(get_args(fields[name]))}")
-        ranges = {
-            "mass": (1e-3, 10.0),
-            "friction": (0.0, 10.0),
-            "gravity": (0.0, 100.0),
-            "approach": (0.0, 1.0),
-            "lift_height": (0.0, 1.0),
-            "hold_time": (0.0, 60.0),
-            "shake": (0.0, 0.02),
-            "force": (0.01, 100.0),
-            "timestep": (1e-4, 1 / 60),
-            "control_rate": (10.0, 1000.0),
-            "density": (1.0, 1e5),
-            "patch": (0.0, 1.0),
-            "kp": (1e-3, 1e6),
-            "overlap": (0.0, 1.0),
-        }
-        for name, (low, high) in ranges.items():
-            if getattr(self, name) is not None:
-                check_number(name, getattr(self, name), low, high)
+        _check_ranges(
+            self,
+            mass=(1e-3, 10.0),
+            friction=(0.0, 10.0),
+            gravity=(0.0, 100.0),
+            approach=(0.0, 1.0),
+            lift_height=(0.0, 1.0),
+            hold_time=(0.0, 60.0),
+            shake=(0.0, 0.02),
+            force=(0.01, 100.0),
+            timestep=(1e-4, 1 / 60),
+            control_rate=(10.0, 1000.0),
+            density=(1.0, 1e5),
+            patch=(0.0, 1.0),
+            kp=(1e-3, 1e6),
+            overlap=(0.0, 1.0),
+        )
         if not self.control_rate * self.timestep < 1 + 1e-9:
             found = f"{self.control_rate:g} Hz with a timestep of {self.timestep:g} s"
             raise BadArgument("control_rate", found, "a period of at least one timestep")
 
 
+def _check_ranges(spec: Value, **ranges: tuple[float | int, float | int]) -> None:
+    """Raise `BadArgument` for the first field outside its range; None is allowed where it is a default."""
+    for name, (low, high) in ranges.items():
+        if getattr(spec, name) is not None:
+            check_number(name, getattr(spec, name), low, high)
+
+
 def check_simulator(simulator: str) -> None:
-    """Raise `BadArgument` when there is no such simulator."""
+    """Raise `BadArgument` for an unknown simulator."""
     if simulator not in get_args(Simulator):
         raise BadArgument("simulator", repr(simulator), f"one of {', '.join(get_args(Simulator))}")

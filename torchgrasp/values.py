@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch, Value, check_tensor
+from torchgrasp.base import Batch, Value, check_tensor, named_tensors
 from torchgrasp.errors import BadArgument, ModelFileError, Status, TooFewPoints
 from torchgrasp.files import load_tensors, save_tensors
 
@@ -224,7 +224,7 @@ class Grasps(Batch):
         Raises:
             OutputError: the file cannot be written.
         """
-        save_tensors(path, "grasps", _flatten(self), self.meta)
+        save_tensors(path, "grasps", named_tensors(self), self.meta)
 
 
 def load_grasps(path: Path | str) -> Grasps:
@@ -247,18 +247,6 @@ def load_grasps(path: Path | str) -> Grasps:
     return Grasps(**values, meta={k: v for k, v in meta.items() if k not in ("kind", "version")})
 
 
-def _flatten(value: Any, prefix: str = "") -> dict[str, Tensor]:
-    """Return every tensor inside a value by its dotted field name."""
-    tensors: dict[str, Tensor] = {}
-    for field in dataclasses.fields(value):
-        inner = getattr(value, field.name)
-        if isinstance(inner, Tensor):
-            tensors[prefix + field.name] = inner
-        elif dataclasses.is_dataclass(inner):
-            tensors |= _flatten(inner, f"{prefix}{field.name}.")
-    return tensors
-
-
 # -------------------------------------------------------------------------------------------------- closing on it
 
 
@@ -266,7 +254,7 @@ def _flatten(value: Any, prefix: str = "") -> dict[str, Tensor]:
 class ClosingGains(Value):
     """Gains of the closing controller for each finger, in the frame of the hand (Eqs. 26-28).
 
-    `force_source` is "analytic", or "learned" if the stability model gave the desired forces.
+    `force_source` is "analytic", or "stability" if the stability model chose among the balanced forces.
     """
 
     target: Float[Tensor, "3 3"]
