@@ -1,4 +1,4 @@
-"""What the camera saw: read, checked, merged, cleaned, and prepared for a shape."""
+"""Point clouds: read, checked, merged, cleaned and prepared."""
 
 from torchgrasp.cloud.camera import look_at, partial_view, render_depth
 from torchgrasp.cloud.check import check_cloud, remove_duplicates

@@ -1,4 +1,4 @@
-"""A virtual depth camera: exact depth images of a mesh, and views with the errors of a real sensor."""
+"""A virtual depth camera, exact or with the noise of a real one."""
 
 import math
 from typing import TYPE_CHECKING
@@ -36,7 +36,7 @@ def look_at(
     distance: float = 0.5,
     target: "Float[Tensor, '3'] | trimesh.Trimesh | None" = None,
 ) -> Float[Tensor, "4 4"]:
-    """Return obj_from_camera of a camera that looks at a target; its image is upright, with z of the object up.
+    """Return obj_from_camera of an upright camera that looks at a target.
 
     Args:
         azimuth: direction from the target to the camera, from x towards y [deg].
@@ -76,7 +76,7 @@ def render_depth(
     intrinsics: Float[Tensor, "3 3"] | None = None,
     size: tuple[int, int] = (HEIGHT, WIDTH),
 ) -> Float[Tensor, "h w"]:
-    """Return the exact depth image [m] of a mesh in float64, 0 where a pixel sees nothing.
+    """Return the exact depth image [m] of a mesh, 0 where nothing is.
 
     Args:
         mesh: in the object frame [m].
@@ -104,15 +104,13 @@ def partial_view(
     noise: bool = True,
     seed: int = 0,
 ) -> PointCloud:
-    """Return n points [m] that the default depth camera sees of a mesh, with the viewpoint and without normals.
+    """Return n points [m] that the default camera sees of a mesh. They have a viewpoint and no normals.
 
-    The noise is that of an active stereo camera:
+    The noise is that of an active stereo camera.
 
-    * disparity: white noise of 0.12 px, in steps of 1/32 px (0.9 mm at 0.5 m, growing with the squared depth);
-    * a smooth bias of 0.8 mm rms over 12 px;
-    * rims: a quarter of the pixels fly off backwards by 8 mm on average, and a third is missing;
-    * 1 % of all pixels is missing;
-    * grazing surfaces fade out between 72.5 and 87 degrees from their normal.
+    Disparities have white noise of 0.12 px and steps of 1/32 px: 0.9 mm at 0.5 m. A smooth bias has 0.8 mm rms
+    over 12 px. At rims a quarter of the pixels fly off backwards by 8 mm on average, and a third is missing. Of all
+    pixels 1 % is missing. Grazing surfaces fade out between 72.5 and 87 degrees.
 
     Args:
         mesh: in the object frame [m].
@@ -156,7 +154,7 @@ def _cast(
     intrinsics: Float[Tensor, "3 3"],
     size: tuple[int, int],
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """Return depth [m] and the cosine between ray and face normal, both 0 where nothing is seen."""
+    """Return depth [m] and |cosine| of ray and face normal, both 0 where nothing is."""
     height, width = size
     if not (1 <= height <= 4096 and 1 <= width <= 4096):
         raise BadArgument("size", size, "height and width in [1, 4096] pixels")
@@ -183,7 +181,7 @@ def _cast(
 def _in_image_box(
     mesh: "trimesh.Trimesh", obj_from_camera: Float[Tensor, "4 4"], x: Float[Tensor, "h w"], y: Float[Tensor, "h w"]
 ) -> Bool[Tensor, "h w"]:
-    """Tell which rays (x, y, 1) meet the box of the mesh's image; all if the mesh reaches behind the camera."""
+    """Tell which rays (x, y, 1) may meet the mesh."""
     vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
     u, v, depth = apply(inverse(obj_from_camera), vertices).unbind(-1)
     if float(depth.min()) <= 1e-3:
@@ -195,7 +193,7 @@ def _in_image_box(
 def _add_noise(
     depth: Float[Tensor, "h w"], cosine: Float[Tensor, "h w"], generator: torch.Generator
 ) -> Float[Tensor, "h w"]:
-    """Return the depth image [m] with the noise that `partial_view` describes."""
+    """Add the noise that `partial_view` describes to a depth image [m]."""
     from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
     def normal() -> Tensor:

@@ -1,4 +1,4 @@
-"""Refusals of a cloud that no grasp can be planned on, each with its own name."""
+"""Refusals of clouds that no grasp can be planned on."""
 
 import torch
 from jaxtyping import Float, Int
@@ -19,9 +19,9 @@ LINE_RATIO = 1e-6
 
 
 def check_cloud(cloud: PointCloud) -> PointCloud:
-    """Return the cloud itself, or raise the error that names what is wrong with it.
+    """Return the cloud itself, or raise what is wrong with it.
 
-    A flat cloud, such as one face of a box, is accepted.
+    A flat cloud, as of one face, is accepted.
 
     Args:
         cloud: points [m], with or without normals and viewpoint.
@@ -40,9 +40,9 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
 
 
 def remove_duplicates(cloud: PointCloud) -> PointCloud:
-    """Check the cloud, and return it with each group of coincident points reduced to its first, in order.
+    """Check a cloud and return it without copies of its points.
 
-    Copies would count as independent measurements of the surface. Points closer than 1e-9 of the extent coincide.
+    Copies would count as independent measurements. Points closer than 1e-9 of the extent are copies; the first stays.
 
     Raises:
         BadArgument, TooFewPoints, SuspiciousScale: see `check_cloud`.
@@ -79,7 +79,7 @@ def remove_duplicates(cloud: PointCloud) -> PointCloud:
 
 
 def _distinct_rows(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:
-    """Return the ascending indices of the first point of each group of coincident points."""
+    """Return the ascending indices of the first of all coincident points."""
     from scipy.spatial import KDTree
 
     points = points.detach().double()
@@ -97,7 +97,7 @@ def _distinct_rows(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:
 
 
 def _remedy(extent: float) -> str:
-    """Guess what is wrong with the unit, in words."""
+    """Guess what is wrong with the unit."""
     if extent < MIN_EXTENT:
         return "lengths are metres: is this cloud normalised, or in another unit?"
     return f"lengths are metres: is this cloud in mm (then its extent is {extent / 1000:.3g} m), or a whole scene?"

@@ -1,4 +1,4 @@
-"""From a depth image to a point cloud with a viewpoint."""
+"""From depth images to point clouds."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,10 +17,10 @@ def cloud_from_depth(
     mask: Bool[Tensor, "h w"] | None = None,
     camera_pose: Float[Tensor, "4 4"] | None = None,
 ) -> PointCloud:
-    """Return the points of a pinhole camera's depth image, with the camera as viewpoint.
+    """Return the points of a pinhole camera's depth image.
 
-    A pixel (row v, column u) of depth z is the point z ((u - cx) / fx, (v - cy) / fy, 1) in the camera's frame:
-    x right, y down, z forward. Depths of 0, NaN or infinity are not measured.
+    A pixel (row v, column u) of depth z is the point z ((u - cx) / fx, (v - cy) / fy, 1). The camera's frame has x
+    right, y down and z forward. Depths of 0, NaN or infinity are not measured. The camera is the viewpoint.
 
     Args:
         depth: distance along the optical axis [m]; integer images in mm need `depth.double() / 1000`.
@@ -65,7 +65,7 @@ def cloud_from_depth(
 
 
 def check_intrinsics(intrinsics: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-    """Return the intrinsics of a pinhole camera; raise `BadArgument` for anything else."""
+    """Return the intrinsics of a pinhole camera; refuse others."""
     k = check_tensor("intrinsics", intrinsics, (3, 3))
     if not (k[0, 0] > 0 and k[1, 1] > 0) or k[0, 1] != 0 or k[1, 0] != 0 or k[2].tolist() != [0, 0, 1]:
         raise BadArgument("intrinsics", k.tolist(), "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0")
@@ -73,7 +73,7 @@ def check_intrinsics(intrinsics: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
 
 
 def check_rigid(name: str, pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    """Return a rigid transform (a rotation to 1e-4 and a translation); raise `BadArgument` for anything else."""
+    """Return a transform that is rigid to 1e-4; refuse others."""
     check_tensor(name, pose, (4, 4))
     rotation, eye = pose[:3, :3].double(), torch.eye(3, dtype=torch.float64, device=pose.device)
     error = float((rotation @ rotation.T - eye).abs().max())

@@ -1,4 +1,4 @@
-"""A report on a cloud, and advice that would make it a better one for grasping."""
+"""A report on a cloud, with advice for a better one."""
 
 import dataclasses
 import math
@@ -34,7 +34,7 @@ TABLE_HEIGHT, TABLE_SHARE = 0.004, 0.2
 
 @dataclasses.dataclass(frozen=True)
 class CloudReport(Value):
-    """What a cloud is like, and a sentence of advice for each thing that could be better."""
+    """What a cloud is like, and what could be better."""
 
     points: int
     size: tuple[float, float, float]  # sides of the box along the axes [m]
@@ -51,7 +51,7 @@ class CloudReport(Value):
 
 
 def diagnose_cloud(cloud: PointCloud) -> CloudReport:
-    """Measure a cloud, and advise what would make it better for grasping.
+    """Measure a cloud, and advise what would improve it.
 
     Args:
         cloud: points [m] of one object, with or without normals and viewpoint.

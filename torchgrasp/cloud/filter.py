@@ -12,10 +12,10 @@ MIN_VOXEL, MAX_VOXEL = 1e-5, 1.0
 
 
 def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
-    """Return one measured point a voxel, the nearest to the voxel's centre; the order is kept.
+    """Return one point a voxel, the nearest to its centre.
 
-    The grid starts at the cloud's lowest corner, so that the choice moves with the cloud. Points are not averaged:
-    the mean of the two sides of a thin wall lies on neither.
+    The grid starts at the cloud's lowest corner and moves with it. Points are not averaged, as a mean may lie
+    inside a thin wall. Their order is kept.
 
     Args:
         cloud: points [m], with or without normals and viewpoint.
@@ -47,9 +47,9 @@ def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
 
 
 def remove_outliers(cloud: PointCloud) -> PointCloud:
-    """Return the distinct points of a cloud without outliers, such as flying pixels behind a rim.
+    """Return a cloud without copies and outliers, such as flying pixels.
 
-    The mean distance of an outlier to its 8 nearest neighbours is more than 2.5 times the median one.
+    Outliers have a mean distance to 8 neighbours above 2.5 times the median.
 
     Args:
         cloud: points [m], with or without normals and viewpoint.

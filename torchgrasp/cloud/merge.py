@@ -18,11 +18,10 @@ from torchgrasp.values import PointCloud
 def merge_clouds(
     clouds: Sequence[PointCloud], poses: Sequence[Float[Tensor, "4 4"]] | Float[Tensor, "k 4 4"]
 ) -> PointCloud:
-    """Return the points of several views in one frame, with outward normals and the camera of each point.
+    """Return several views in one frame, with normals and the camera of each point.
 
-    `estimate_normals` gives normals to a view without them. `fit_shape` uses each camera's outline and free space. If
-    some view has normals but no viewpoint, as part of a scan from all sides, the result has no viewpoint.
-    Regions seen twice stay twice as dense; `voxel_downsample` evens the density.
+    `estimate_normals` gives normals to a view without them. `fit_shape` uses each camera's outline and free space. A view with normals but without viewpoint leaves the result without viewpoint.
+    Overlaps stay twice as dense; `voxel_downsample` evens them.
 
     Args:
         clouds: points [m] of the views, each in its own frame.
@@ -58,7 +57,7 @@ def merge_clouds(
 
 
 def _view_in_frame(cloud: PointCloud, obj_from_cloud: Float[Tensor, "4 4"]) -> PointCloud:
-    """Return a view with unit normals in the frame of the result, moved in float64."""
+    """Return a view with unit normals in the frame of the result."""
     cloud = estimate_normals(cloud) if cloud.normals is None else cloud
     assert cloud.normals is not None
     pose, dtype = obj_from_cloud.to(cloud.points).double(), cloud.points.dtype

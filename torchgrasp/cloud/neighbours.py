@@ -1,4 +1,4 @@
-"""What a point's neighbours tell: whether it is an outlier, the plane about it, and the quadric below it."""
+"""Outliers, local planes and local quadrics, from the nearest points."""
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ FLATNESS = 1e-3
 
 
 def nearest(points: Float[Tensor, "n 3"], k: int) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
-    """Return distances and indices of the k nearest points of each point, itself first; fewer in a small cloud."""
+    """Return distances and indices of the k nearest points, itself first. A small cloud has fewer."""
     from scipy.spatial import KDTree
 
     array = points.detach().cpu().numpy()
@@ -29,7 +29,7 @@ def nearest(points: Float[Tensor, "n 3"], k: int) -> tuple[Float[Tensor, "n k"],
 
 
 def find_inliers(points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-    """Tell which points lie near others: mean distance to 8 neighbours at most 2.5 times the median one."""
+    """Tell which points are no outliers; see `remove_outliers`."""
     distance, _ = nearest(points, OUTLIER_NEIGHBOURS + 1)
     spacing = distance[:, 1:].mean(-1)
     return spacing <= OUTLIER_RATIO * spacing.median()
@@ -38,9 +38,9 @@ def find_inliers(points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
 def fit_planes(
     points: Float[Tensor, "n 3"],
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
-    """Return unit normals of unknown sign of the planes through the 25 nearest points, and weighted rms [m].
+    """Return normals of local planes, of unknown sign, and weighted rms [m].
 
-    Weights are exp(-(d / 0.7 d_25)^2).
+    The weights of 25 neighbours are exp(-(d / 0.7 d_25)^2).
     """
     near, weight = _neighbourhood(points, PLANE_NEIGHBOURS)
     mean_squares, axes = _principal_axes(near, weight)
@@ -50,11 +50,10 @@ def fit_planes(
 def fit_quadrics(
     points: Float[Tensor, "n 3"],
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"]]:
-    """Return each point's foot on its local quadric, the unit normal there, and the quadric's weighted rms [m].
+    """Return feet on local quadrics, unit normals there, and weighted rms [m].
 
-    The height over the plane of the 30 nearest points is a polynomial of degree 2, fitted by weighted least squares.
-    A plane would flatten curved surfaces: points of a ball of radius r move inward by s^2 / 2r for neighbours
-    that spread over s.
+    Weighted least squares fit the height over the plane of 30 neighbours. Planes would move points of a ball of
+    radius r inward by s^2 / 2r, where s is the neighbours' spread.
     """
     near, weight = _neighbourhood(points, QUADRIC_NEIGHBOURS)
     _, axes = _principal_axes(near, weight)
@@ -73,7 +72,7 @@ def fit_quadrics(
 
 
 def _neighbourhood(points: Float[Tensor, "n 3"], k: int) -> tuple[Float[Tensor, "n k 3"], Float[Tensor, "n k"]]:
-    """Return the k nearest points of each and their weights, whose sum is 1."""
+    """Return the k nearest points and their normalised weights."""
     distance, index = nearest(points, k)
     weight = torch.exp(-((distance / (0.7 * distance[:, -1:])) ** 2))
     return points[index], weight / weight.sum(-1, keepdim=True)
@@ -82,7 +81,7 @@ def _neighbourhood(points: Float[Tensor, "n 3"], k: int) -> tuple[Float[Tensor, 
 def _principal_axes(
     near: Float[Tensor, "n k 3"], weight: Float[Tensor, "n k"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
-    """Return weighted mean squares along the principal axes, least first, and the axes as columns."""
+    """Return mean squares along the principal axes, ascending, and the axes as columns."""
     difference = near - (weight[..., None] * near).sum(1)[:, None]
     scatter = (weight[..., None] * difference).transpose(-1, -2) @ difference
     mean_squares, axes = torch.linalg.eigh(scatter)

@@ -1,4 +1,4 @@
-"""Which side of a surface is outside: the signs of given normals, and the camera's position."""
+"""Which side is outside, by given normals or the camera."""
 
 import dataclasses
 import math
@@ -67,7 +67,7 @@ def check_normals(cloud: PointCloud) -> NormalCheck:
 
 
 def compare_normals(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> NormalCheck:
-    """Compare the normals of neighbouring points, of any length but zero."""
+    """Compare the normals of neighbouring points."""
     distance, index = nearest(points, N_NEIGHBOURS + 1)
     directions = unit(normals)
     cosine = (directions[:, None] * directions[index[:, 1:]]).sum(-1)
@@ -85,16 +85,16 @@ def compare_normals(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"])
 
 
 def estimate_viewpoint(cloud: PointCloud) -> Float[Tensor, "3"]:
-    """Return a camera position [m] from which the cloud can have been seen in a single view.
+    """Return a camera position [m] that explains a single view.
 
-    Normals of a view face the camera, and objects bulge. So the direction v maximises sum_i w_i tanh(n_i.v / 0.3)
-    with w_i = n_i.(p_i - centre), which holds for either sign of n_i; the centre is that of the box along the
-    principal axes. The camera is 4 radii away.
+    Normals of a view face the camera, and objects bulge. The direction v maximises sum_i w_i tanh(n_i.v / 0.3),
+    where w_i = n_i.(p_i - centre) makes the sign of n_i irrelevant. The centre is that of the principal box. The
+    camera is 4 radii away.
 
-    A cloud that seems to be in its camera's frame was seen from the origin: it lies within 45 degrees of z, more
-    than 2 radii away, and the origin scores at least 0.8 of the best.
+    The origin is preferred if it scores 0.8 of the best and the cloud looks like one in its camera's frame. Such a
+    cloud lies within 45 degrees of z, more than 2 radii away.
 
-    The two sides of a flat face, or of a bowl, cannot be told apart: give the viewpoint if you know it.
+    The sides of a flat face or a bowl look alike: give a known viewpoint.
 
     Args:
         cloud: points [m] of one object, seen from one side.
@@ -110,7 +110,7 @@ def estimate_viewpoint(cloud: PointCloud) -> Float[Tensor, "3"]:
 
 
 def guess_viewpoint(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
-    """Return the viewpoint [m] that best explains normals of unknown sign; see `estimate_viewpoint`."""
+    """Return the viewpoint [m] of `estimate_viewpoint`, for normals of unknown sign."""
     axes = torch.linalg.svd(points - points.mean(0), full_matrices=False).Vh  # independent of the frame
     along = points @ axes.T
     centre = (along.amax(0) + along.amin(0)) / 2 @ axes
@@ -137,5 +137,5 @@ def orient_normals(normals: Float[Tensor, "n 3"], outward: Float[Tensor, "n 3"])
 def share_facing(
     points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "*views 3"]
 ) -> float:
-    """Return the share of outward normals that face the camera: nearly 1 of a view, half of a whole surface."""
+    """Return the share of normals that face the camera. A view has nearly 1, a whole surface half."""
     return float((((viewpoint - points) * normals).sum(-1) > 0).double().mean())

@@ -41,15 +41,15 @@ class PreparedCloud(Value):
 
     @property
     def one_sided(self) -> bool:
-        """Whether the cloud is a view, with a hidden side, and not a whole surface."""
+        """Whether the cloud is a view and has a hidden side."""
         return self.viewpoint is not None and share_facing(self.points, self.normals, self.viewpoint) >= FACING
 
 
 def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = True) -> PreparedCloud:
-    """Check a cloud and return what a shape is fitted to.
+    """Check a cloud, and return what a shape is fitted to.
 
-    Normals of random signs are ignored: a view with them would pass for a whole surface. If the given normals do not
-    face the viewpoint, the cloud is a whole surface, and `clean` ignores the viewpoint.
+    Normals of random signs are ignored: they make a view look whole. The viewpoint is ignored if `clean` and the
+    given normals do not face it: the surface is whole.
 
     Args:
         cloud: points [m] of one or several views of one object.
@@ -86,10 +86,10 @@ def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = T
 
 
 def estimate_normals(cloud: PointCloud) -> PointCloud:
-    """Return the distinct points of a cloud with outward unit normals of local quadrics.
+    """Return a cloud without copies, with outward normals of local quadrics.
 
-    Outward is towards the viewpoint; without one, the side of the given normals; without either, towards the
-    viewpoint of `estimate_viewpoint`, which the result then carries.
+    Outward is towards the viewpoint, or else the side of given normals. Without both, the result gets the viewpoint
+    of `estimate_viewpoint`.
 
     Args:
         cloud: points [m] of one object; of one view unless it has normals.
@@ -104,10 +104,10 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
 
 
 def clean_cloud(cloud: PointCloud) -> PointCloud:
-    """Return the inliers moved onto their local quadrics, with outward normals as of `estimate_normals`.
+    """Return the inliers, on their local quadrics, with outward normals.
 
-    Outliers are far from their neighbours (`remove_outliers`) or from their quadric: more than 4.5 times the median
-    rms. The move takes the noise of a simulated depth camera from 0.94 to 0.65 mm rms.
+    Outliers are those of `remove_outliers`, and points over 4.5 median rms from their quadric. The noise of a
+    simulated camera falls from 0.94 to 0.65 mm rms.
 
     Args:
         cloud: points [m] of one object; of one view unless it has normals.
@@ -123,7 +123,7 @@ def clean_cloud(cloud: PointCloud) -> PointCloud:
 
 
 def _fit_normals(cloud: PointCloud, clean: bool) -> PointCloud:
-    """Return distinct points with outward normals; if `clean`, inliers on their quadrics."""
+    """Fit outward normals to distinct points, and clean them if asked."""
     if clean:
         cloud = cloud.select(find_inliers(cloud.points.double()))
     points = cloud.points

@@ -11,7 +11,7 @@ KEYWORDS = ("FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "
 
 
 def parse_pcd(data: bytes) -> dict[str, Any]:
-    r"""Return points, normals and viewpoint of a PCD file; None for what it lacks.
+    r"""Return points, normals and viewpoint of a PCD file, or None.
 
     Many writers fill VIEWPOINT with the default `0 0 0 1 0 0 0`. It counts only outside the points' bounding box.
 
@@ -54,7 +54,7 @@ def parse_pcd(data: bytes) -> dict[str, Any]:
 
 
 def _split_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
-    """Split a PCD file into the words of its header, by keyword, and the data."""
+    """Split a PCD file into its header's words and the data."""
     header: dict[str, list[str]] = {}
     start = 0
     while "DATA" not in header:
@@ -69,7 +69,7 @@ def _split_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
 
 
 def _viewpoint(header: dict[str, list[str]], points: np.ndarray) -> np.ndarray | None:
-    """Return the position in VIEWPOINT; None without one, or if it is the default within the cloud's box."""
+    """Return the position in VIEWPOINT; None for the default within the cloud."""
     if "VIEWPOINT" not in header:
         return None
     numbers = np.array([float(x) for x in header["VIEWPOINT"]])

@@ -1,4 +1,4 @@
-"""The PLY format, read and written; of a mesh, points of its surface are read."""
+"""The PLY format; of meshes, points of the surface are read."""
 
 import io
 from typing import Any
@@ -20,7 +20,7 @@ TYPES = {
 
 
 def parse_ply(data: bytes) -> dict[str, Any]:
-    """Return points, normals and viewpoint of a PLY file; None for what it lacks.
+    """Return points, normals and viewpoint of a PLY file, or None.
 
     Raises:
         ValueError: no PLY file; fewer bytes than the header promises.
@@ -65,7 +65,7 @@ def parse_ply(data: bytes) -> dict[str, Any]:
 
 
 def format_ply(points: np.ndarray, normals: np.ndarray | None = None, viewpoint: np.ndarray | None = None) -> bytes:
-    """Return the bytes of a binary PLY file, with the viewpoint in a comment line that `parse_ply` reads."""
+    """Return a binary PLY file. A comment line holds the viewpoint."""
     lines = ["ply", "format binary_little_endian 1.0"]
     if viewpoint is not None:
         lines.append("comment viewpoint " + " ".join(repr(float(x)) for x in viewpoint))
@@ -77,7 +77,7 @@ def format_ply(points: np.ndarray, normals: np.ndarray | None = None, viewpoint:
 
 
 def _split_header(data: bytes) -> tuple[list[str], bytes]:
-    """Split a PLY file into the lines of its header and the data."""
+    """Split a PLY file into its header's lines and the data."""
     end = data.find(b"end_header", 0, 65536)
     stop = data.find(b"\n", end) + 1
     if not data.startswith(b"ply") or end < 0 or stop == 0:
@@ -102,7 +102,7 @@ def _read_columns(body: bytes, encoding: str, count: int, properties: list[tuple
 
 
 def _sample_mesh(data: bytes) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return surface points of a mesh, and outward normals if it is closed and consistently wound."""
+    """Return surface points of a mesh, with normals if it is closed."""
     import trimesh
 
     try:  # without a resolver: a texture that the header names is not opened

@@ -24,10 +24,10 @@ MAX_BYTES = 512 * 2**20
 
 
 def read_cloud(path: Path | str, viewpoint: Sequence[float | int] | Tensor | None = None) -> PointCloud:
-    """Read the point cloud of one object from a file, in metres and float64.
+    """Read the point cloud of one object, in metres and float64.
 
     * `.ply`, ascii or binary: x y z, optionally nx ny nz; the viewpoint from a header line
-      `comment viewpoint x y z`. Of a mesh 2000 surface points are drawn, with normals if it is closed.
+      `comment viewpoint x y z`. A mesh gives 2000 surface points, with normals if closed.
     * `.pcd`, ascii or binary: x y z, optionally normal_x normal_y normal_z; the viewpoint from VIEWPOINT, unless it
       is the default `0 0 0 1 0 0 0` and within the cloud's bounding box.
     * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3) and `viewpoint` (3,), or (n, 3) of several views.
@@ -70,7 +70,7 @@ def read_cloud(path: Path | str, viewpoint: Sequence[float | int] | Tensor | Non
 
 
 def save_cloud(cloud: PointCloud, path: Path | str) -> Path:
-    """Write a cloud with normals and viewpoint as `.npz` (exact) or binary `.ply` (float32), atomically.
+    """Write a cloud as `.npz` (exact) or binary `.ply` (float32), atomically.
 
     Raises:
         BadArgument: another suffix; several views for `.ply`, which has one viewpoint.
@@ -94,7 +94,7 @@ def save_cloud(cloud: PointCloud, path: Path | str) -> Path:
 
 
 def _check_viewpoint(viewpoint: Any) -> Tensor:
-    """Return a position in float64; refuse anything but three finite numbers."""
+    """Return three finite numbers in float64; refuse others."""
     try:
         position = torch.as_tensor(viewpoint, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -103,7 +103,7 @@ def _check_viewpoint(viewpoint: Any) -> Tensor:
 
 
 def _check_array(path: Path, name: str, array: Any) -> Tensor:
-    """Return a numeric array of a file as float64, or refuse the file."""
+    """Return an array as float64, or refuse its file."""
     array = np.asarray(array)
     shape = (3,) if name == "viewpoint" and array.ndim == 1 else (None, 3)
     if array.dtype.kind not in "fiu":
@@ -126,12 +126,12 @@ def _split_columns(table: np.ndarray) -> dict[str, Any]:
 
 
 def _parse_npy(data: bytes) -> dict[str, Any]:
-    """Parse the bytes of a .npy file."""
+    """Parse a .npy file."""
     return _split_columns(_array_from_npy(data))
 
 
 def _array_from_npy(data: bytes) -> np.ndarray:
-    """Return the array of a .npy file, whose header may not promise more than the bytes hold."""
+    """Return the array of a .npy file, which must hold what its header promises."""
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
     if version not in ((1, 0), (2, 0)):
@@ -148,7 +148,7 @@ def _array_from_npy(data: bytes) -> np.ndarray:
 
 
 def _parse_npz(data: bytes) -> dict[str, Any]:
-    """Parse the bytes of a .npz file, whose unpacked size is checked first."""
+    """Parse a .npz file after a check of its unpacked size."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         names = {f"{name}.npy": name for name in ("points", "normals", "viewpoint")}
         members = [info for info in archive.infolist() if info.filename in names]
@@ -160,5 +160,5 @@ def _parse_npz(data: bytes) -> dict[str, Any]:
 
 
 def _parse_text(data: bytes) -> dict[str, Any]:
-    """Parse text of three or six numbers a line; see `read_lines`."""
+    """Parse text of three or six numbers a line."""
     return _split_columns(read_lines(data))

@@ -1,4 +1,4 @@
-"""Numbers from text, without a list of its words, which would need ten times the memory."""
+"""Numbers from text. A list of its words would need ten times the memory."""
 
 import io
 import warnings
@@ -16,7 +16,7 @@ MAX_LINE = 4096
 
 
 def read_table(data: bytes, rows: int, columns: int) -> Float[np.ndarray, "rows columns"]:
-    r"""Return the first rows of a table of numbers separated by white space.
+    r"""Return the first rows of a table separated by white space.
 
     Raises:
         ValueError: too many rows or columns; too few numbers; a word that is no number.
@@ -38,7 +38,7 @@ def read_table(data: bytes, rows: int, columns: int) -> Float[np.ndarray, "rows 
 
 
 def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
-    r"""Return the numbers of text, a row a line, separated by blanks or commas; `#` starts a comment.
+    r"""Return lines of numbers, separated by blanks or commas. `#` starts a comment.
 
     Raises:
         ValueError: no numbers; lines of different length; a line or file that is too long.
