@@ -17,7 +17,7 @@ def check(
     /,
     viewpoint: tuple[float, float, float] | None = None,
 ) -> int:
-    """Report size, density, noise, outliers, normals and viewpoint of a point cloud, and what would make it better.
+    """Report what a point cloud is like, and what would improve it.
 
     Args:
         cloud: point cloud of one object in metres, z up (.ply, .pcd, .npy, .npz, .xyz).
@@ -53,14 +53,14 @@ def render(
     no_noise: bool = False,
     seed: int = 0,
 ) -> int:
-    """Write the point cloud that a depth camera sees of a mesh, with the noise of an active stereo camera.
+    """Write the point cloud that a depth camera sees of a mesh.
 
     Args:
         mesh: closed mesh of an object in metres, z up (.ply, .obj, .stl, ...).
         out: point cloud to write (.npz or .ply), with the viewpoint.
         camera: where the camera is.
         points: number of points; fewer if fewer pixels see the object.
-        no_noise: an exact camera.
+        no_noise: an exact camera, not an active stereo camera.
         seed: of the noise and of the choice of points.
     """
     check_seed(seed)

@@ -11,7 +11,7 @@ from torchgrasp.values import PointCloud
 
 @contextlib.contextmanager
 def naming(option: str, *names: str) -> Iterator[None]:
-    """Rename the argument of an error from one of `names` to the option that set it."""
+    """Name the option in errors about the arguments `names`."""
     try:
         yield
     except BadArgument as error:
@@ -21,7 +21,7 @@ def naming(option: str, *names: str) -> Iterator[None]:
 
 
 def check_folder(path: Path) -> None:
-    """Refuse a folder that cannot be made or written, by trying; nothing of the trial remains.
+    """Refuse a folder that cannot be made or written, by a trial.
 
     Raises:
         OutputError: the folder cannot be made or written.
@@ -48,7 +48,7 @@ def check_seed(seed: int) -> None:
 
 
 def table_height(cloud: PointCloud, table: float | None, no_table: bool) -> float | None:
-    """Return the height [m] of the table: the given one, none, or the cloud's lowest point."""
+    """Return the table's height [m], by default the cloud's lowest point."""
     return None if no_table else float(cloud.points[:, 2].min()) if table is None else table
 
 

@@ -87,13 +87,17 @@ def _distinct_rows(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:
     tolerance = SAME_POINT * float((points.amax(0) - low).max())
     # Points that share a cell of half the tolerance coincide: one point a cell leaves few pairs among many copies.
     _, group = torch.unique(torch.floor((points - low) / (tolerance / 2)), dim=0, return_inverse=True)
-    order = torch.arange(len(group), device=group.device)
-    first = torch.full_like(order, len(order)).scatter_reduce(0, group, order, "amin")
-    rows = torch.sort(first[first < len(order)]).values
+    rows = first_of_each(group).sort().values
     pairs = KDTree(points[rows].cpu().numpy()).query_pairs(tolerance, output_type="ndarray")
     keep = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
     keep[torch.from_numpy(pairs[:, 1]).to(rows.device)] = False  # the first index of a pair is the smaller one
     return rows[keep]
+
+
+def first_of_each(group: Int[Tensor, "n"]) -> Int[Tensor, "groups"]:
+    """Return the first index of each group, for numbers of groups without gaps."""
+    order = torch.arange(len(group), device=group.device)
+    return torch.full_like(order, len(order)).scatter_reduce(0, group, order, "amin")[: int(group.max()) + 1]
 
 
 def _remedy(extent: float) -> str:

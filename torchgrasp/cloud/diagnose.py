@@ -100,36 +100,28 @@ def format_report(report: CloudReport) -> str:
     """
     copies = f" ({report.copies} of them copies)" * bool(report.copies)
     sides = " x ".join(f"{1e3 * s:.0f}" for s in report.size)
+    check, normals = report.normals, "none; planes are fitted"
+    if check is not None and check.oriented:
+        scaled = f", {check.scaled} not of unit length" * bool(check.scaled)
+        normals = f"given, {int(check.flipped.sum())} look flipped{scaled}"
+    elif check is not None:
+        normals = f"given, of random signs ({check.opposed:.0%} of neighbours are opposite); ignored"
+    viewpoint = "none; the normals tell inside from outside"
+    if report.viewpoint is not None:
+        cameras = report.viewpoint.reshape(-1, 3).unique(dim=0).tolist()
+        places = " and ".join(f"({x:.3f}, {y:.3f}, {z:.3f})" for x, y, z in cameras)
+        origin = "given" if report.viewpoint_given else "estimated"
+        viewpoint = f"{origin}, {places} m; {report.facing:.0%} of the normals face it"
     lines = [
         ("points", f"{report.points}{copies}"),
         ("size", f"{sides} mm, if the numbers are metres"),
         ("spacing", f"{1e3 * report.spacing:.2g} mm, {1e-4 * report.density:.3g} points per cm2"),
         ("noise", f"{1e3 * report.noise:.2g} mm about local planes"),
         ("outliers", f"{report.outliers} ({100 * report.outliers / report.points:.1f} %)"),
-        ("normals", _describe_normals(report.normals)),
-        ("viewpoint", _describe_viewpoint(report)),
+        ("normals", normals),
+        ("viewpoint", viewpoint),
     ]
-    return "\n".join([f"{name:12}{text}" for name, text in lines] + [f"advice      {text}" for text in report.advice])
-
-
-def _describe_normals(check: NormalCheck | None) -> str:
-    """Describe given normals in words."""
-    if check is None:
-        return "none; planes are fitted"
-    if not check.oriented:
-        return f"given, of random signs ({100 * check.opposed:.0f} % of neighbours are opposite); ignored"
-    scaled = f", {check.scaled} not of unit length" * bool(check.scaled)
-    return f"given, {int(check.flipped.sum())} look flipped{scaled}"
-
-
-def _describe_viewpoint(report: CloudReport) -> str:
-    """Describe the viewpoint in words."""
-    if report.viewpoint is None:
-        return "none; the normals tell inside from outside"
-    cameras = report.viewpoint.reshape(-1, 3).unique(dim=0).tolist()
-    places = " and ".join(f"({x:.3f}, {y:.3f}, {z:.3f})" for x, y, z in cameras)
-    origin = "given" if report.viewpoint_given else "estimated"
-    return f"{origin}, {places} m; {100 * report.facing:.0f} % of the normals face it"
+    return "\n".join(f"{name:12}{text}" for name, text in [*lines, *(("advice", text) for text in report.advice)])
 
 
 def _advise(report: CloudReport, clean: PointCloud) -> list[str]:

@@ -2,7 +2,7 @@
 
 import torch
 
-from torchgrasp.cloud.check import MIN_POINTS, check_cloud, remove_duplicates
+from torchgrasp.cloud.check import MIN_POINTS, check_cloud, first_of_each, remove_duplicates
 from torchgrasp.cloud.neighbours import find_inliers
 from torchgrasp.errors import BadArgument, TooFewPoints
 from torchgrasp.values import PointCloud
@@ -36,14 +36,10 @@ def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
     cell = torch.floor(place)
     _, group = torch.unique(cell, dim=0, return_inverse=True)
     order = torch.argsort(torch.linalg.vector_norm(place - cell - 0.5, dim=-1), stable=True)
-    order = order[torch.argsort(group[order], stable=True)]
-    first = torch.ones(len(order), dtype=torch.bool, device=order.device)
-    first[1:] = group[order][1:] != group[order][:-1]
-    keep = torch.zeros_like(first)
-    keep[order[first]] = True
-    if int(keep.sum()) < MIN_POINTS:
-        raise TooFewPoints("points", f"{int(keep.sum())} voxels of {voxel:g} m", f"at least {MIN_POINTS}")
-    return cloud.select(keep)
+    rows = order[first_of_each(group[order])].sort().values
+    if len(rows) < MIN_POINTS:
+        raise TooFewPoints("points", f"{len(rows)} voxels of {voxel:g} m", f"at least {MIN_POINTS}")
+    return cloud.select(rows)
 
 
 def remove_outliers(cloud: PointCloud) -> PointCloud:

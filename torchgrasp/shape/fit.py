@@ -1,4 +1,4 @@
-"""From a cloud to a shape: what is observed, and where, to fix the seen and the hidden side."""
+"""From a cloud to a shape: what is observed on its seen and its hidden side."""
 
 import dataclasses
 import math
@@ -24,28 +24,23 @@ from torchgrasp.values import PointCloud
 OUTER_POINTS = 20
 """Points outside (Sec. 3.1)."""
 OUTER_RADIUS = 1.2
-"""Radius, normalised, of the sphere of the points outside."""
+"""Radius, normalised, of the sphere of the points outside (Sec. 3.1)."""
 NORMAL_NOISE = 0.05
-"""Standard deviation of a seen normal."""
+"""Standard deviation of a seen normal: 3 degrees."""
 RIM_NOISE = 0.002
-"""Standard deviation [m] of a rim point's position."""
+"""Standard deviation [m] of a rim point: 2.5 pixels of a camera at 0.5 m."""
 RIM_NORMAL_NOISE = 0.5
 """Standard deviation of a rim normal; a smaller one bends the seen side."""
 MIRROR_NORMAL_NOISE = 0.25
-"""Standard deviation of a mirrored normal."""
+"""Standard deviation of a mirrored normal: 14 degrees, the median error of the hidden side."""
 CAMERA_STD_FACTOR = 0.5
-"""Real deviations over the raw posterior's: one number, with which 96 % of the hidden sides of 24 noisy views of eight
-scanned objects lie within two std_m, and 75 % within one (mean over views), and at least 80 % of each within two. A
-wedge whose slope is hidden, of which nothing but a wrong plane of symmetry can be seen, has far less (33 %)."""
+"""Real deviations over the posterior's: with it 96 % of the hidden sides of 24 noisy views lie within two std_m."""
 FREE_NOISE = 0.003
-"""Standard deviation [m] of the least distance observed where the shape reached into free space."""
+"""Standard deviation [m] of the least distance observed in free space, which is a bound, not a measurement."""
 FREE_ROUNDS = 3
-"""Times that a shape is pushed out of free space."""
+"""Times that a shape is pushed out of free space; a push may bulge it elsewhere."""
 BUDGETS = {"camera": 85, "paper": 70}
-"""Points observed by default, rim and mirrored points apart. From 70 to 85 to 100 the error of the seen surface falls
-from .68 to .61 to .56 mm and from 9.9 to 9.2 to 8.6 degrees; planning takes 1.5, 1.6 and 1.8 s."""
-
-
+"""Points observed by default: fewer lose accuracy on the seen side, more cost planning time."""
 MAX_BUDGET = 1000
 """Greatest budget, and the limit of "sure": its factor has 4000 rows."""
 
@@ -64,36 +59,32 @@ def fit_shape(
 ) -> ShapeGP:
     """Return the posterior of an object's shape given a partial cloud, Eqs. (2)-(9).
 
-    `support="camera"` cleans the cloud, adds the outline seen by the camera and the mirrored cloud as noisier
-    observations, and takes every signed distance in metres over the scale, so that gradients agree with unit normals.
-    Where the shape then reaches into space that the camera saw empty, or under the table, it is pushed out.
-    The hidden side is then off by 2.5 mm (median), not 7. `support="paper"` observes what the paper does: the
-    centre of the cloud at d = -1 and 20 random points on a sphere of 1.2 at d = +1. Its `std_m` is the paper's own,
-    std_factor 1, and wide: one and two of them hold 83 % and 96 % of the hidden surface, not 68 % and 95 %.
+    "camera" cleans the cloud and observes metric distances. It adds the outline and the mirrored cloud as noisier
+    observations. It pushes the shape out of free space and out of the table.
+
+    "paper" observes the cloud's centre at d = -1 and 20 random points around it at d = +1. Its `std_m` is wide: it
+    holds 83 % of the hidden surface.
 
     Args:
-        cloud: points [m] of one object, of one view or of several (`merge_clouds`). A missing viewpoint is estimated.
-            "camera" fits normals anew; given ones tell a whole surface from a single view, and "paper" observes them;
-            their signs must agree with each other (`check_normals`), else they are left aside. Walls thinner than the
-            cloud's spacing merge.
-        noise: standard deviation of an observed signed distance, normalised; of normals too for "paper".
-        budget: points of the observed set: the one inside, 20 outside, and the rest the most informative ones of
-            the cloud; None: 85 for "camera", whose rim and mirrored points come on top, and 70 for "paper".
-            "sure": points of the cloud are taken until the variance at none of them exceeds `noise`, the paper's
-            rule, and 1000 at most in all.
+        cloud: points [m] of one object, of one view or of several (`merge_clouds`), prepared by `prepare_cloud`. Given
+            normals tell a whole surface from a view. Walls thinner than the cloud's spacing merge.
+        noise: standard deviation of an observed signed distance, normalised; for "paper" of normals too.
+        budget: number of observed points: 1 inside, 20 outside, the rest the most informative of the cloud. None:
+            85 for "camera", besides rim and mirrored points, and 70 for "paper". "sure": until no point's variance
+            exceeds `noise`, the paper's rule, 1000 at most.
         psi_scale: psi over the longest distance of the observations; below 1.34 the covariance may be indefinite.
         support: "camera" or "paper".
         seed: of the random draws.
-        table: height [m] of a table that the object stands on, with normal z; only "camera" uses it.
-        kernel: "thin_plate", "matern52" or "rbf" of the length that psi tells (see `kernel_by_name`), or a `Kernel` of
+        table: height [m] of the table, whose normal is z; only "camera" uses it.
+        kernel: "thin_plate", "matern52" or "rbf" with the length of psi (`kernel_by_name`); or a `Kernel` of
             normalised distances.
-        criterion: which point of the cloud is the most informative: that of the greatest "variance", of the greatest
-            "error", its mean signed distance, or of the greatest |error| + 2 sqrt(variance), "both".
+        criterion: what the most informative point has most of: "variance"; "error", the mean's distance from 0;
+            "both", |error| + 2 sqrt(variance).
 
     Raises:
-        BadArgument: an argument out of range, a cloud that `check_cloud` refuses, a viewpoint that has not the
-            whole of its view in front of it, or more than 16 of them; for "camera" a whole surface without normals.
-        TooFewPoints: fewer than 10 points of one of several views.
+        BadArgument: an argument out of range; a cloud that `prepare_cloud` refuses; a view that is not wholly in
+            front of its camera; for "camera" a whole surface without normals.
+        TooFewPoints: see `prepare_cloud`.
         IndefiniteCovariance: `psi_scale` is too small, or the kernel too long for the noise.
 
     >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
@@ -108,7 +99,7 @@ def fit_shape(
     x = beside.frame.normalise(seen.points)
     candidates = on_surface(x, seen.normals, torch.full_like(x[:, 0], noise), beside.normal_noise)
 
-    # The kernel's length is that of all candidates from the start, so that one factor grows from first to last.
+    # The kernel's length is that of all candidates, so that one factor grows from the first to the last.
     every = join(beside.anchors, candidates, *(part for part, _ in beside.parts))
     psi = psi_scale * longest_distance(every.x)
     kernel = kernel_by_name(kernel, psi) if isinstance(kernel, str) else kernel
@@ -132,15 +123,15 @@ def fit_shape(
 
 @dataclasses.dataclass(frozen=True)
 class _Support:
-    """What is observed beside the points of the cloud, and the normalised frame.
+    """The normalised frame, and what is observed beside the cloud.
 
     Args:
         frame: the normalised one.
         anchors: points inside and outside.
         normal_noise: standard deviation of the cloud's normals.
         std_factor: see `ShapeGP`.
-        parts: rim and mirrored points, with the errors that their distances share; see `append_observations`.
-        free: points of free space and the least signed distance there; None: none is known.
+        parts: rim and mirrored points, and the errors that their distances share; see `append_observations`.
+        free: points of free space, and the least signed distance there.
     """
 
     frame: Normalisation
@@ -152,7 +143,7 @@ class _Support:
 
 
 def _paper_support(seen: PreparedCloud, noise: float, generator: torch.Generator) -> _Support:
-    """Return the paper's own: the cloud's centre inside and 20 random points outside (Sec. 3.1)."""
+    """Return the paper's support: the centre, and random points outside (Sec. 3.1)."""
     center = seen.points.mean(0)
     scale = float(torch.linalg.vector_norm(seen.points - center, dim=-1).max())
     sphere = unit(torch.randn(OUTER_POINTS, 3, dtype=torch.float64, generator=generator)).to(center)
@@ -165,7 +156,7 @@ def _paper_support(seen: PreparedCloud, noise: float, generator: torch.Generator
 
 
 def _camera_support(seen: PreparedCloud, noise: float, table: float | None) -> _Support:
-    """Return metric distances inside and outside; of a view also the outline, mirrored points and free space."""
+    """Return metric distances; of a view also outline, mirrored points and free space."""
     center = (seen.points.amin(0) + seen.points.amax(0)) / 2
     frame = Normalisation(center, float(torch.linalg.vector_norm(seen.points - center, dim=-1).max()))
     surface, inside, parts, free = seen.points, True, (), None
@@ -192,7 +183,7 @@ def _observe_completion(completion: Completion, frame: Normalisation) -> tuple[t
 
     outline = completion.outline
     mirrored = observe(completion.points, completion.normals, LEAST_NOISE, MIRROR_NORMAL_NOISE)
-    tilt = (completion.asymmetry / PART).to(frame.center)  # of a field of that deviation, alike over that length
+    tilt = (completion.asymmetry / PART).to(frame.center)  # slope of a field with that deviation and length
     mirrored = dataclasses.replace(mirrored, normal_noise=torch.hypot(mirrored.normal_noise, tilt))
     rim = observe(outline.rim, outline.rim_normals, RIM_NOISE, RIM_NORMAL_NOISE)
     return (rim, None), (mirrored, completion.deviations.to(frame.center) / frame.scale)

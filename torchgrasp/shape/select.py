@@ -1,4 +1,4 @@
-"""The most informative points of a cloud, Sec. 3.2: a pivoted Cholesky factorisation in blocks of four rows."""
+"""The most informative points, by pivoted Cholesky in blocks of four rows."""
 
 import dataclasses
 import math
@@ -22,7 +22,7 @@ Criterion = Literal["variance", "error", "both"]
 
 @dataclasses.dataclass(frozen=True)
 class Selection(Value):
-    """Rows of the selected candidates, the most informative first, and the posterior given them."""
+    """Rows of the picks, in order, and the posterior given them."""
 
     picks: Int[Tensor, "picks"]
     posterior: Posterior
@@ -36,18 +36,16 @@ def select_points(
     criterion: Criterion = "variance",
     stop: float = -math.inf,
 ) -> Selection:
-    """Return the candidates to observe, each the most informative one given those before it (Sec. 3.2).
+    """Pick candidates to observe, each the most informative given the former.
 
-    The most informative point has the greatest posterior variance, the greatest |mean signed distance|, or the
-    greatest |mean| + 2 sqrt(variance). One Cholesky factor grows by four rows a pick and becomes the posterior's own;
-    nothing is refitted. A pick costs O(rows n).
+    One Cholesky factor grows by four rows a pick. It becomes the posterior's own.
 
     Args:
         candidates: points of the surface, normalised, all with normals.
         known: what is observed already, such as points inside and outside.
         kernel: of the posterior.
         budget: greatest number of picks.
-        criterion: "variance", "error" or "both".
+        criterion: greatest posterior variance; greatest |mean distance| ("error"); |mean| + 2 sqrt(variance) ("both").
         stop: the selection ends when no candidate has a greater variance.
 
     Raises:
