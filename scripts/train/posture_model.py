@@ -12,9 +12,10 @@ from tqdm import tqdm
 from torchgrasp.errors import BadArgument
 from torchgrasp.files import write_file
 from torchgrasp.hand.draft import draft_hand
-from torchgrasp.posture_model import Progress, evaluate_mixture, fit_mixture, sample_configurations
+from torchgrasp.posture_model import Progress, fit_mixture, sample_configurations
 from torchgrasp.posture_model.mixture import mixture_path
 from torchgrasp.testing import check_hand
+from train.mixture_score import evaluate_mixture
 
 PAPER_COMPONENTS = {"allegro": 41, "barrett": 36}
 """The paper's numbers of Gaussians (Sec. 6.3)."""

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 from benchmarks.hand.model_selection import bic_curve, cross_validate
+from train.mixture_score import evaluate_mixture
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.posture_model.evaluate import evaluate_mixture
 from torchgrasp.posture_model.fit import bic, fit_mixture
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY
 from torchgrasp.posture_model.sample import HandSamples

@@ -7,7 +7,6 @@ from torchgrasp.posture_model.em import Progress
 from torchgrasp.posture_model.fit import bic, fit_mixture
 from torchgrasp.posture_model.gaussian import GaussianMixture
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture, load_mixture
-from torchgrasp.posture_model.evaluate import MixtureScore, evaluate_mixture
 
 __all__ = [
     "encode",
@@ -25,6 +24,4 @@ __all__ = [
     "PAPER_ENERGY",
     "DEFAULT_ENERGY",
     "load_mixture",
-    "MixtureScore",
-    "evaluate_mixture",
 ]

@@ -14,13 +14,13 @@ import torch
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
+from train.mixture_score import MixtureScore, evaluate_mixture
 
 from benchmarks.common import Row, least_seconds, peak_mib
 from benchmarks.hand.query import touched
 from torchgrasp import load_hand, load_mixture
 from torchgrasp.ik.query import query_mixture
 from torchgrasp.posture_model.em import Progress, expectation, expectation_maximisation, maximisation
-from torchgrasp.posture_model.evaluate import MixtureScore, evaluate_mixture
 from torchgrasp.posture_model.fit import fit_mixture
 from torchgrasp.posture_model.kmeans import start_components
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY

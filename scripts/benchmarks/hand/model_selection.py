@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from train.mixture_score import evaluate_mixture
 
 from torchgrasp.base import Value
 from torchgrasp.errors import BadArgument
-from torchgrasp.posture_model.evaluate import evaluate_mixture
 from torchgrasp.posture_model.fit import fit_mixture
 from torchgrasp.posture_model.mixture import GraspMixture
 from torchgrasp.posture_model.sample import HandSamples
