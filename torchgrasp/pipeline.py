@@ -26,13 +26,12 @@ from torchgrasp.linalg import farthest_points
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure_probability import closure_share
 from torchgrasp.plan.solve import plan_contacts
-from torchgrasp.plan.surface_samples import sample_surfaces, well_inside
 from torchgrasp.posture_model.mixture import GraspMixture, load_mixture, mixture_path
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ContactSpec
-from torchgrasp.values import ContactPlan, Contacts, Grasps, PointCloud
+from torchgrasp.values import ContactPlan, Grasps, PointCloud
 
 Observer = Callable[[str, str, Any], None]
 """Called after each stage with its name, one line about it, and its value."""
@@ -82,14 +81,6 @@ def describe(counts: dict[Status, int]) -> str:
 def digest(cloud: PointCloud) -> str:
     """Return the SHA-256 of the points, by which results name their input."""
     return hashlib.sha256(cloud.points.detach().cpu().double().contiguous().numpy().tobytes()).hexdigest()
-
-
-def closure_of(shape: ShapeGP, contacts: Contacts, friction: float, seed: int) -> Float[Tensor, "k"]:
-    """Return the probability of closure of each triple, 0 at the edge of the domain."""
-    closure, inside = torch.zeros_like(contacts.points[:, 0, 0]), well_inside(shape, contacts)
-    draws = sample_surfaces(shape, contacts[inside])
-    closure[inside] = closure_share(draws, friction, SURFACE_DRAWS, seed).to(closure)
-    return closure
 
 
 def plan_grasps(
@@ -182,7 +173,7 @@ def _log_odds(
 ) -> Float[Tensor, "k"]:
     """Return the log-odds of success of the executable grasps."""
     grasps = grasps[grasps.status == Status.OK]
-    closure = closure_of(shape, grasps.contacts, spec.friction, seed)
+    closure = closure_share(shape, grasps.contacts, spec.friction, SURFACE_DRAWS, seed)
     return success_log_odds(success_features(grasps.contacts, closure, grasps.normal_angle, center, spec.friction))
 
 

@@ -6,6 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.half_ball import ball
+from torchgrasp.shape.gp import ShapeGP
+
 
 @dataclasses.dataclass(frozen=True)
 class AnalyticJet:
@@ -59,3 +62,8 @@ class Ellipsoid:
 @pytest.fixture
 def ellipsoid() -> Ellipsoid:
     return Ellipsoid()
+
+
+@pytest.fixture(scope="session")
+def doubtful() -> ShapeGP:
+    return ball(-0.2, std_factor=0.4)

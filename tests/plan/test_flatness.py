@@ -1,13 +1,13 @@
-"""Rows for flat surface: their bound against `normal_variation`, their slope against automatic differentiation."""
+"""Normal variation against a sphere's closed form; the constraint against it and automatic differentiation."""
 
 import dataclasses
+import math
 
 import torch
 from torch import Tensor
 
 from torchgrasp.linalg import unit
-from torchgrasp.plan.flatness import GUIDE_POINTS, INSIDE, flatness_constraint
-from torchgrasp.plan.normal_variation import RING_RADIUS, normal_variation
+from torchgrasp.plan.flatness import GUIDING_POINTS, INSIDE, RING_RADIUS, flatness_constraint, normal_variation
 from torchgrasp.plan.problem import triple_jet
 from torchgrasp.plan.solver import project
 from torchgrasp.plan.wrench import tangents
@@ -17,20 +17,28 @@ def on_surface(ellipsoid, generator, count: int) -> Tensor:
     return project(ellipsoid, torch.randn(count, 3, 3, generator=generator, dtype=torch.float64), steps=8)
 
 
-def test_rows_of_a_sphere_change_sign_at_the_angle_under_which_the_ring_is_seen(ellipsoid, generator):
+def test_variation_on_a_sphere_is_the_angle_under_which_the_ring_is_seen_from_its_centre(ellipsoid, generator):
+    sphere = dataclasses.replace(ellipsoid, axes=(0.5, 0.5, 0.5))
+    points = 0.5 * unit(torch.randn(5, 3, 3, generator=generator, dtype=torch.float64))
+    found = normal_variation(sphere, points, triple_jet(sphere, points).normals)
+    expected = math.atan(RING_RADIUS / (0.5 * sphere.scale))
+    torch.testing.assert_close(found, torch.full_like(found, expected))
+
+
+def test_values_on_a_sphere_change_sign_at_the_angle_under_which_the_ring_is_seen(ellipsoid, generator):
     sphere = dataclasses.replace(ellipsoid, axes=(0.5, 0.5, 0.5))
     points = 0.5 * unit(torch.randn(5, 3, 3, generator=generator, dtype=torch.float64))
     angle = float(normal_variation(sphere, points, triple_jet(sphere, points).normals).mean())
     for limit, sign in ((0.99 * angle / INSIDE, 1), (1.01 * angle / INSIDE, -1)):
         value = flatness_constraint(sphere, points, limit).value
-        assert value.shape == (5, 3 * GUIDE_POINTS)
+        assert value.shape == (5, 3 * GUIDING_POINTS)
         assert bool((sign * value > 0).all())
 
 
 def test_slope_against_automatic_differentiation(ellipsoid, generator):
     """The ring's tangents are carried along without spin, as t - n (n . t) does to first order."""
     points, limit = on_surface(ellipsoid, generator, 4), 0.3
-    guide = flatness_constraint(ellipsoid, points, limit)
+    constraint = flatness_constraint(ellipsoid, points, limit)
     normals = triple_jet(ellipsoid, points).normals
     first = tangents(points, normals)
     second = torch.linalg.cross(normals, first)
@@ -38,8 +46,8 @@ def test_slope_against_automatic_differentiation(ellipsoid, generator):
 
     def values(x: Tensor) -> Tensor:
         normal, rows = unit(x * inverse), []
-        for k in range(GUIDE_POINTS):
-            angle = torch.tensor(2 * torch.pi * k / GUIDE_POINTS, dtype=torch.float64)
+        for k in range(GUIDING_POINTS):
+            angle = torch.tensor(2 * torch.pi * k / GUIDING_POINTS, dtype=torch.float64)
             t = angle.cos() * first + angle.sin() * second
             t = t - normal * (normal * t).sum(-1, keepdim=True)
             other = unit((x + RING_RADIUS / ellipsoid.scale * t) * inverse)
@@ -47,9 +55,9 @@ def test_slope_against_automatic_differentiation(ellipsoid, generator):
         return RING_RADIUS / ellipsoid.scale * torch.cat(rows, 1)
 
     slope = torch.autograd.functional.jacobian(lambda x: values(x).sum(0), points).permute(1, 0, 2, 3).flatten(2)
-    torch.testing.assert_close(guide.by_points, slope)
-    offset = values(points) - guide.value
+    torch.testing.assert_close(constraint.by_points, slope)
+    offset = values(points) - constraint.value
     torch.testing.assert_close(offset, offset[:1, :1].expand_as(offset))
     step = 1e-3 * torch.randn(points.shape, generator=generator, dtype=torch.float64)
-    linear = guide.value + (guide.by_points @ step.flatten(1)[..., None])[..., 0]
-    torch.testing.assert_close(guide.rows(points + step), linear)
+    linear = constraint.value + (constraint.by_points @ step.flatten(1)[..., None])[..., 0]
+    torch.testing.assert_close(constraint.values(points + step), linear)

@@ -11,10 +11,10 @@ from torchgrasp.linalg import unit
 from torchgrasp.objects import load_object
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure_probability import closure_probability
-from torchgrasp.plan.improve import raise_probability
-from torchgrasp.plan.objectives import differentiate_cost, epsilon_cost, min_weight_cost
+from torchgrasp.plan.objectives import differentiate_cost, epsilon_cost, min_weight_cost, raise_probability
 from torchgrasp.plan.problem import triple_jet
 from torchgrasp.plan.solve import plan_contacts
+from torchgrasp.plan.solver import start_state
 from torchgrasp.plan.wrench import wrenches
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.specs import ContactSpec
@@ -90,7 +90,7 @@ def test_the_gradient_of_a_cost_follows_the_normals_along_the_surface(ellipsoid,
 
     points = 0.8 * torch.randn(4, 3, 3, generator=generator, dtype=torch.float64)
     wanted = torch.autograd.functional.jacobian(lambda x: value(x).sum(), points)
-    found, gradient = differentiate_cost(cost, ellipsoid, points, triple_jet(ellipsoid, points))
+    found, gradient = differentiate_cost(cost, ellipsoid, start_state(ellipsoid, points))
     torch.testing.assert_close(found, value(points))
     torch.testing.assert_close(gradient[:, :9], wanted.flatten(1))
     assert not bool(gradient[:, 9:].any())

@@ -10,7 +10,7 @@ from torchgrasp.frames import degenerate
 from torchgrasp.linalg import unit
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.feasibility import check_feasibility, first_violation
-from torchgrasp.plan.normal_variation import normal_variation
+from torchgrasp.plan.flatness import normal_variation
 from torchgrasp.plan.solve import plan_chunk, plan_contacts
 from torchgrasp.plan.solver import project
 from torchgrasp.plan.starts import draw_in
@@ -99,9 +99,9 @@ def test_a_time_budget_bounds_how_many_starts_are_planned_and_changes_no_row(ell
     monkeypatch.setattr("torchgrasp.plan.solve.time.monotonic", lambda: now[0])
     whole = plan_contacts(ellipsoid, ContactSpec.paper(), starts=120)
 
-    def slow(shape, spec, first, stages, cost, plan=plan_chunk):
+    def slow(shape, spec, first, stages, improve, plan=plan_chunk):
         now[0] += 0.01 * len(first)  # [s]: a hundred starts a second
-        return plan(shape, spec, first, stages, cost)
+        return plan(shape, spec, first, stages, improve)
 
     monkeypatch.setattr("torchgrasp.plan.solve.plan_chunk", slow)
     for seconds, rows in ((1e-9, 25), (0.3, 25), (0.5, 50), (1.0, 100), (9.0, 120)):
@@ -113,7 +113,7 @@ def test_a_time_budget_bounds_how_many_starts_are_planned_and_changes_no_row(ell
 
 
 def test_more_starts_only_add_rows(ellipsoid, monkeypatch):
-    monkeypatch.setattr("torchgrasp.plan.starts.CHUNK", 5)
+    monkeypatch.setattr("torchgrasp.plan.starts.STARTS_PER_CHUNK", 5)
     for spec in SPECS.values():
         few, many = (plan_contacts(ellipsoid, spec, starts=count) for count in (10, 15))
         torch.testing.assert_close(few.contacts.points, many.contacts.points[:10])

@@ -1,6 +1,7 @@
 """Steps of a batch: onto the surface and along it, never uphill, each triple by itself; and what they reach."""
 
 import dataclasses
+from functools import partial
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from torchgrasp.linalg import unit
 from torchgrasp.objects import load_object
+from torchgrasp.plan.objectives import differentiate_cost
 from torchgrasp.plan.problem import ContactProblem, forces_from_tensions
 from torchgrasp.plan.solve import plan_contacts
 from torchgrasp.plan.solver import (
@@ -92,8 +94,13 @@ def test_an_objective_joins_with_the_same_pull_whatever_its_unit(ellipsoid, gene
     def height(points: Tensor, normals: Tensor) -> Tensor:
         return points[..., 2].sum(-1)
 
-    metres = descend(ellipsoid, problem, state, STAGE, height)
-    millimetres = descend(ellipsoid, problem, state, STAGE, lambda points, normals: 1000 * height(points, normals))
+    def millimetre_height(points: Tensor, normals: Tensor) -> Tensor:
+        return 1000 * height(points, normals)
+
+    metres, millimetres = (
+        descend(ellipsoid, problem, state, STAGE, partial(differentiate_cost, cost, ellipsoid))
+        for cost in (height, millimetre_height)
+    )
     torch.testing.assert_close(metres.points, millimetres.points)
     without = descend(ellipsoid, problem, state, STAGE)
     low, high = (float(height(s.points, s.points).mean()) for s in (metres, without))

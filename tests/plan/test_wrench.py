@@ -1,5 +1,6 @@
 """Wrenches and the exact closure test, each against its own definition or another method."""
 
+import itertools
 import math
 
 import pytest
@@ -102,3 +103,18 @@ def test_rank_is_low_for_coincident_and_collinear_contacts(generator):
     line = points[:, :1] + torch.arange(3, dtype=torch.float64)[:, None] * points[:, 1:2]
     assert bool((rank_ratio(wrenches(line, normals, 0.5)) < 1e-9).all())
     assert bool((rank_ratio(wrenches(points[:, :1].expand(-1, 3, -1), normals, 0.5)) < 1e-9).all())
+
+
+def test_a_triple_is_closed_if_and_only_if_internal_forces_lie_inside_its_cones(generator):
+    points = torch.randn(200, 3, 3, generator=generator, dtype=torch.float64)
+    noise = torch.randn(200, 3, 3, generator=generator, dtype=torch.float64)
+    normals = unit(unit(points - points.mean(1, keepdim=True)) + 0.3 * noise)
+    grid = torch.tensor(list(itertools.product(range(-8, 9), repeat=3)), dtype=torch.float64)
+    forces = grid[grid.abs().sum(1) > 0, :, None] * unit(points.roll(-1, 1) - points)[:, None]  # along the sides
+    force = unit(forces - forces.roll(1, 2))
+    cosine = -(force * normals[:, None]).sum(-1)
+    exists = (cosine > torch.tensor(0.6, dtype=torch.float64).atan().cos()).all(-1).any(-1)
+    closed = closed_exact(points, normals, 0.6)
+    assert bool((closed | ~exists).all())
+    assert int((closed & ~exists).sum()) < 0.05 * int(closed.sum())  # the grid is coarse
+    assert 50 < int(closed.sum()) < 180

@@ -107,7 +107,7 @@ class JointProblem:
         residuals = [rows.surface, violated * rows.bounds]
         jacobians = [rows.surface_by_x, violated[..., None] * rows.bounds_by_x]
         if flat is not None:
-            variation = flat.rows(state.points)
+            variation = flat.values(state.points)
             violated = (variation > 0).to(variation)
             by_points = violated[..., None] * flat.by_points
             residuals.append(violated * variation)

@@ -1,8 +1,8 @@
-"""Certificates of frictional form closure, Eq. (13): a verdict for every triple, and the numbers that prove it.
+"""Certificates of frictional form closure, Eq. (13): a verdict for every triple, with the numbers that prove it.
 
-A closed row has a balance, an open one a witness: a wrench that no contact opposes. Both are found together for all
-rows at once (see `margin`), and a proof needs no trust in who found it: the balance bounds the margin from below, the
-witness from above. Only where the two leave the verdict open, HiGHS decides.
+The proof of a closed row is a balance phi; the proof of an open row is a witness, a wrench that no contact opposes. The
+balance bounds the margin from below, the witness from above, whoever found them. A batched simplex (`closure_lp`) finds
+both. HiGHS decides the rows whose bounds leave the verdict open.
 """
 
 import numpy as np
@@ -18,36 +18,37 @@ from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Certificate, Contacts
 
 EXACT = 1e-13
-"""Largest |W phi| of a balance that needs no solver: with full rank, phi less than 1e-9 away balances exactly."""
+"""Largest |W phi| of a balance that needs no solver: with full rank, a phi less than 1e-9 away balances exactly."""
 
 GAP = 1e-9
-"""Largest difference of the two bounds of a proven margin, which must be as far from `MIN_MARGIN`."""
+"""Largest difference of the two bounds of a proven margin, which must lie twice as far from `MIN_MARGIN`."""
 
 MAX_RESIDUAL = 1e-6
-"""Largest |W phi| of a balance that HiGHS found, for wrenches of length about 1."""
+"""Largest |W phi| of a balance found by HiGHS, for wrenches of length about 1."""
 
 STRICT = 1e-10
-"""Tolerances of HiGHS, the least it takes. By its own, 1e-7, margins come out 1e-8 off, on the wrong side of 1e-6."""
+"""Tolerance of HiGHS, its least. With its default, 1e-7, margins err by 1e-8 and may cross `MIN_MARGIN`."""
 
 UNIT_TOLERANCE = 1e-3
-"""How far the length of a given normal may be from 1."""
+"""Largest difference of a given normal's length from 1: what rounding in a text file leaves."""
 
 
 def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
-    """Prove that each triple has frictional form closure, Eq. (13), or that it has not, in float64.
+    """Prove in float64 that each triple has frictional form closure, Eq. (13), or that it has not.
 
-    The margin is that of max s: W phi = 0, sum phi = 1, phi >= s, with `spec.edges` edges of each cone at
-    `spec.planned_friction`. A row is closed with a margin of 1e-6 and full rank. Of a row that is not, every edge
-    wrench has a product with the witness of at least 0 to rounding, or of at least minus the margin where that lies
-    between 0 and 1e-6. Of a row that lacks only rank, the witness is the direction in which its wrenches are least. A
-    row with a number that is not finite is not closed and holds NaN. The margin is -inf where no phi balances.
+    The margin is max s: W phi = 0, sum phi = 1, phi >= s, with `spec.edges` edges a cone at `spec.planned_friction`. It
+    is -inf where no phi balances. Closed rows have a margin of 1e-6 or more and full rank.
+
+    The witness v of an open row separates: v.w >= 0 for every edge wrench w, to rounding. With a margin between 0 and
+    1e-6, v.w >= -margin. In a row that lacks only rank, v is the direction in which the wrenches are least. Rows with
+    numbers that are not finite are not closed and hold NaN.
 
     Args:
-        contacts: triples of any planner, outward unit normals; other fields are not read.
+        contacts: triples of any planner, with outward unit normals; other fields are not read.
         spec: friction and edges; `ContactSpec()` by default.
 
     Raises:
-        BadArgument: `contacts` of a wrong shape, or with normals that are not of length 1 (to 1e-3); no `ContactSpec`.
+        BadArgument: contacts of a wrong shape, normals that are not of length 1 (to 1e-3), or no `ContactSpec`.
 
     >>> corners = torch.tensor([[[1.0, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0]]])
     >>> certify(Contacts(corners, corners)).closed
@@ -57,21 +58,21 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     if not isinstance(spec, ContactSpec):
         raise BadArgument("spec", type(spec).__name__, "a ContactSpec")
     points, normals = _checked(contacts)
-    whole = torch.isfinite(points).flatten(1).all(-1) & torch.isfinite(normals).flatten(1).all(-1)
+    finite = torch.isfinite(points).flatten(1).all(-1) & torch.isfinite(normals).flatten(1).all(-1)
     margin, ratio, residual = (torch.full((len(points),), torch.nan, dtype=torch.float64) for _ in range(3))
     witness = torch.full((len(points), 6), torch.nan, dtype=torch.float64)
-    points = points[whole]
-    wrench = wrenches(points, normals[whole], spec.planned_friction, spec.edges)
-    ratio[whole] = rank_ratio(wrench)
-    spans = (ratio[whole] >= MIN_RANK_RATIO) & ~degenerate(points)
-    margin[whole], residual[whole], witness[whole] = _prove(wrench.flatten(1, 2))
+    points = points[finite]
+    wrench = wrenches(points, normals[finite], spec.planned_friction, spec.edges)
+    ratio[finite] = rank_ratio(wrench)
+    full_rank = (ratio[finite] >= MIN_RANK_RATIO) & ~degenerate(points)
+    margin[finite], residual[finite], witness[finite] = _prove(wrench.flatten(1, 2))
     balanced = (margin >= MIN_MARGIN) & (residual <= MAX_RESIDUAL)
     closed = balanced.clone()
-    closed[whole] &= spans
+    closed[finite] &= full_rank
     lacking = torch.nonzero(balanced & ~closed)[:, 0]
     if len(lacking):
-        least = wrench[torch.nonzero(balanced[whole] & ~spans)[:, 0]].flatten(1, 2)
-        witness[lacking] = torch.linalg.svd(least, full_matrices=False).Vh[:, -1]
+        flat = wrench[torch.nonzero(balanced[finite] & ~full_rank)[:, 0]].flatten(1, 2)
+        witness[lacking] = torch.linalg.svd(flat, full_matrices=False).Vh[:, -1]
     device = contacts.points.device
     return Certificate(*(t.to(device) for t in (margin, ratio, residual, closed, witness)))
 
@@ -79,50 +80,28 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
 def _prove(
     wrench: Float[Tensor, "b m 6"],
 ) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b 6"]]:
-    """Return margin, residual and witness of each row, by HiGHS where those of the batch prove no verdict."""
+    """Return margin, residual and witness of each row, by HiGHS where the batch proves no verdict."""
     phi, witness = solve_closure_lp(wrench)
     residual = (phi[:, None] @ wrench)[:, 0].abs().amax(-1)
-    margin, most = phi.amin(-1), bound_margin(wrench, witness)
-    none = most < -1 / GAP
-    margin, residual = torch.where(none, -torch.inf, margin), torch.where(none, torch.inf, residual)
-    proven = (residual <= EXACT) & (most - margin <= GAP) & ((margin - MIN_MARGIN).abs() > 2 * GAP)
-    for row in torch.nonzero(~(proven | none))[:, 0].tolist():
-        margin[row], residual[row], found = solve_by_highs(wrench[row].numpy())
-        witness[row] = witness[row] if found is None else torch.from_numpy(found)
+    margin, upper = phi.amin(-1), bound_margin(wrench, witness)
+    unbalanced = upper < -1 / GAP
+    margin, residual = torch.where(unbalanced, -torch.inf, margin), torch.where(unbalanced, torch.inf, residual)
+    proven = (residual <= EXACT) & (upper - margin <= GAP) & ((margin - MIN_MARGIN).abs() > 2 * GAP)
+    for row in torch.nonzero(~(proven | unbalanced))[:, 0].tolist():
+        margin[row], residual[row], dual = solve_by_highs(wrench[row].numpy())
+        witness[row] = witness[row] if dual is None else torch.from_numpy(dual)
     return margin, residual, witness
 
 
 def bound_margin(wrench: Float[Tensor, "b m 6"], witness: Float[Tensor, "b 6"]) -> Float[Tensor, "b"]:
-    """Return the upper bound of the margin that any wrench w proves, whoever found it; NaN for a w of no use.
+    """Return the upper bound of the margin that a wrench w proves; NaN for a w of no use.
 
-    With g_k = w.w_k, phi_k = s + psi_k and psi >= 0: 0 = sum phi g >= s sum g + (1 - m s) min g, and therefore
+    Let g_k = w.w_k and phi_k = s + psi_k with psi >= 0. Then 0 = sum phi g >= s sum g + (1 - m s) min g, and therefore
     s <= -min g / sum(g - min g).
     """
     product = (wrench @ witness[..., None])[..., 0]
     least = product.amin(-1)
     return -least / (product - least[:, None]).sum(-1)
-
-
-def _checked(contacts: Contacts) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3 3"]]:
-    """Return points and normals in float64 on the CPU; refuse shapes and lengths that are wrong."""
-    if not isinstance(contacts, Contacts):
-        raise BadArgument("contacts", type(contacts).__name__, "Contacts")
-    for name, value in (("points", contacts.points), ("normals", contacts.normals)):
-        if value.ndim != 3 or value.shape[1:] != (3, 3) or not value.is_floating_point():
-            found = f"shape {tuple(value.shape)} of {value.dtype}"
-            raise BadArgument(f"contacts.{name}", found, "floating numbers of shape b x 3 x 3")
-    if len(contacts.points) != len(contacts.normals):
-        found = f"{len(contacts.points)} and {len(contacts.normals)} rows"
-        raise BadArgument("contacts.points and contacts.normals", found, "as many rows of each")
-    points, normals = contacts.points.detach().double().cpu(), contacts.normals.detach().double().cpu()
-    off = (torch.linalg.vector_norm(normals, dim=-1) - 1).abs() > UNIT_TOLERANCE  # False for NaN: those are not closed
-    if bool(off.any()):
-        row, contact = torch.nonzero(off)[0].tolist()
-        length = float(torch.linalg.vector_norm(normals[row, contact]))
-        raise BadArgument(
-            "contacts.normals", f"length {length:.4g} at row {row}, contact {contact}", "unit vectors (to 1e-3)"
-        )
-    return points, normals
 
 
 def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None]:
@@ -136,7 +115,7 @@ def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None]
     equations = np.zeros((7, m + 1))
     equations[:6, :m], equations[:6, m] = wrench.T, wrench.sum(0)
     equations[6, :m], equations[6, m] = 1.0, m
-    found = linprog(
+    solution = linprog(
         c=np.r_[np.zeros(m), -1.0],
         A_eq=equations,
         b_eq=np.r_[np.zeros(6), 1.0],
@@ -144,7 +123,32 @@ def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None]
         method="highs",
         options={"primal_feasibility_tolerance": STRICT, "dual_feasibility_tolerance": STRICT},
     )
-    if found.x is None:
+    if solution.x is None:
         return -np.inf, np.inf, None
-    phi, dual = found.x[:m] + found.x[m], found.eqlin.marginals[:6]
-    return float(found.x[m]), float(np.abs(phi @ wrench).max()), -dual / np.linalg.norm(dual)
+    phi, dual = solution.x[:m] + solution.x[m], solution.eqlin.marginals[:6]
+    return float(solution.x[m]), float(np.abs(phi @ wrench).max()), -dual / np.linalg.norm(dual)
+
+
+def check_unit(normals: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
+    """Return the contacts' normals; raise `BadArgument` where one is not of length 1. NaN passes."""
+    length = torch.linalg.vector_norm(normals, dim=-1)
+    wrong = torch.nonzero((length - 1).abs() > UNIT_TOLERANCE)
+    if len(wrong):
+        row, contact = wrong[0].tolist()
+        found = f"length {float(length[row, contact]):.4g} at row {row}, contact {contact}"
+        raise BadArgument("contacts.normals", found, "unit vectors (to 1e-3)")
+    return normals
+
+
+def _checked(contacts: Contacts) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3 3"]]:
+    """Return points and normals in float64 on the CPU; refuse wrong shapes and lengths."""
+    if not isinstance(contacts, Contacts):
+        raise BadArgument("contacts", type(contacts).__name__, "Contacts")
+    for name, value in (("points", contacts.points), ("normals", contacts.normals)):
+        if value.ndim != 3 or value.shape[1:] != (3, 3) or not value.is_floating_point():
+            found = f"shape {tuple(value.shape)} of {value.dtype}"
+            raise BadArgument(f"contacts.{name}", found, "floating numbers of shape b x 3 x 3")
+    if len(contacts.points) != len(contacts.normals):
+        found = f"{len(contacts.points)} and {len(contacts.normals)} rows"
+        raise BadArgument("contacts.points and contacts.normals", found, "as many rows of each")
+    return contacts.points.detach().double().cpu(), check_unit(contacts.normals.detach().double().cpu())

@@ -1,7 +1,7 @@
-"""How probable it is that planned contacts are closed on the real surface, of which only a posterior is known.
+"""The probability that planned contacts are closed on the real surface, of which only a posterior is known.
 
-The fingers come along the planned normals and touch where they meet a surface drawn from the posterior (`plan/lines`).
-The draw is closed if the three points they touch, with the normals there, are for round cones.
+Fingers come along the planned normals and stop on a surface drawn from the posterior (`line_posterior`). The draw is
+closed if the three touched points, with the normals there, are closed for round cones.
 """
 
 import dataclasses
@@ -12,14 +12,14 @@ from torch import Tensor
 
 from torchgrasp.base import Batch
 from torchgrasp.errors import BadArgument
-from torchgrasp.plan.surface_samples import SurfaceSamples, first_contact, sample_surfaces
+from torchgrasp.plan.line_posterior import LinePosterior, first_contact, line_posterior, well_inside
 from torchgrasp.plan.wrench import closed_exact
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts
 
-CHUNK = 8192
-"""Drawn triples that are judged at a time."""
+DRAWS_PER_CHUNK = 8192
+"""Drawn triples that are judged at a time: their tensors take about 20 MB."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,17 +35,16 @@ def closure_probability(
 ) -> ClosureProbability:
     """Return how probable closure is on the uncertain surface, by Monte Carlo.
 
-    `spec.max_variance` says which contacts are allowed, the probability which of them to prefer:
-    `plan[probability.probability.argsort(descending=True)]` ranks a plan. All rows share the same draws, so that
-    their order does not hang on chance alone, and no row depends on those beside it.
+    `spec.max_variance` says which contacts are allowed; the probability says which to prefer. All rows share the draws,
+    and no row depends on another.
 
     Args:
         shape: the posterior.
-        contacts: triples [m] of any planner with outward unit normals, within the domain of the shape. A finger that
+        contacts: triples [m] of any planner with outward unit normals, inside the domain of the shape. A finger that
             meets no surface within 12 standard deviations of its contact does not close.
-        spec: its `friction`, that of execution, is the one that counts, not the smaller `planned_friction`.
-        n: draws; the standard error is at most 1 / (2 sqrt(n)), 0.01 with 2500. It is that of (k + 1) / (n + 2)
-            after k closed draws, and never 0.
+        spec: its `friction` counts, that of execution, not `planned_friction`.
+        n: number of draws. The standard error is at most 1 / (2 sqrt(n)): 0.01 for 2500. It is that of
+            (k + 1) / (n + 2) for k closed draws, and so never 0.
         seed: of the draws.
 
     Raises:
@@ -67,28 +66,27 @@ def closure_probability(
     for name, value, least in (("n", n, 1), ("seed", seed, 0)):
         if not isinstance(value, int) or not least <= value < 2**63:
             raise BadArgument(name, value, f"an integer from {least}")
-    lines = sample_surfaces(shape, contacts)
-    closed = closure_share(lines, spec.friction, n, seed)
-    middle = (n * closed + 1) / (n + 2)
-    error = torch.sqrt(middle * (1 - middle) / n)
-    return ClosureProbability(closed, error)
+    share = closed_share(line_posterior(shape, contacts), spec.friction, n, seed)
+    middle = (n * share + 1) / (n + 2)
+    return ClosureProbability(share, torch.sqrt(middle * (1 - middle) / n))
 
 
-def closure_share(lines: SurfaceSamples, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:
-    """Draw the surface along the fingers' lines and return the share of draws that are closed.
+def closure_share(shape: ShapeGP, contacts: Contacts, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:
+    """Return the share of n draws that are closed, 0 for contacts at the edge of the domain."""
+    inside = well_inside(shape, contacts)
+    share = contacts.points.new_zeros(len(contacts))
+    share[inside] = closed_share(line_posterior(shape, contacts[inside]), friction, n, seed).to(share)
+    return share
 
-    Args:
-        lines: of the triples.
-        friction: of the round cones.
-        n: draws, the same for all triples.
-        seed: of the draws.
-    """
+
+def closed_share(lines: LinePosterior, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:
+    """Draw n surfaces along the fingers' lines, the same for all rows, and return the share that is closed."""
     generator = torch.Generator().manual_seed(seed)
     count = lines.points.new_zeros(len(lines))
-    at_once = min(n, CHUNK)
+    at_once = min(n, DRAWS_PER_CHUNK)
     for start in range(0, n, at_once):
         standard = torch.randn(min(at_once, n - start), lines.root.shape[-1], dtype=torch.float64, generator=generator)
-        for rows in torch.arange(len(lines), device=count.device).split(max(CHUNK // len(standard), 1)):
+        for rows in torch.arange(len(lines), device=count.device).split(max(DRAWS_PER_CHUNK // len(standard), 1)):
             points, normals = first_contact(lines[rows], standard.to(count) @ lines.root[rows])
             closed = closed_exact(points.flatten(0, 1), normals.flatten(0, 1), friction)
             count[rows] += closed.unflatten(0, points.shape[:2]).sum(1)

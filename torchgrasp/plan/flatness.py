@@ -1,4 +1,7 @@
-"""Rows that keep sliding contacts on flat surface: how the bend around a contact changes as it moves."""
+"""Flatness of the surface around contacts: the variation of the normal on a ring of a fingertip's size.
+
+`normal_variation` judges a plan. `flatness_constraint` keeps contacts that slide on flat surface.
+"""
 
 import dataclasses
 import math
@@ -8,54 +11,74 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Batch
-from torchgrasp.plan.normal_variation import RING_RADIUS
+from torchgrasp.linalg import unit
 from torchgrasp.plan.problem import Shape, triple_jet
+from torchgrasp.plan.solver import project
 from torchgrasp.plan.wrench import cone_edges, tangents
 
-GUIDE_POINTS = 4
-"""Points of the ring that guide; `bend` judges on more."""
+RING_RADIUS = 0.008
+"""Radius [m] of the ring around a contact: within a fingertip, whose radius is 12 mm."""
+
+JUDGED_POINTS, GUIDING_POINTS = 8, 4
+"""Points of the ring on which a plan is judged, and fewer that guide a solver."""
+
 INSIDE = 0.95
-"""Share of the largest bend that is asked for, since the points judged lie between these."""
+"""Share of the largest variation that guiding points allow: the judged points lie between them."""
+
+
+def ring_directions(
+    normals: Float[Tensor, "b 3 3"], points: Float[Tensor, "b 3 3"], n: int
+) -> Float[Tensor, "b 3 n 3"]:
+    """Return n unit tangents around each contact: the edges of a cone of friction 1 without its axis."""
+    return cone_edges(normals, tangents(points, normals), 1.0, n) + normals[:, :, None]
+
+
+def normal_variation(
+    shape: Shape, points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]
+) -> Float[Tensor, "b 3"]:
+    """Return the largest angle [rad] between a contact's normal and the normals on its ring, moved onto the surface."""
+    around = ring_directions(normals, points, JUDGED_POINTS)
+    ring = points[:, :, None] + RING_RADIUS / float(shape.scale) * around
+    _, gradient = shape.mean_and_gradient(project(shape, ring.flatten(1, 2), steps=1).flatten(0, 1))
+    there = unit(gradient).unflatten(0, ring.shape[:3])
+    here = normals[:, :, None].expand_as(there)
+    sine = torch.linalg.vector_norm(torch.linalg.cross(here, there), dim=-1)
+    return torch.atan2(sine, (here * there).sum(-1)).amax(-1)
 
 
 @dataclasses.dataclass(frozen=True)
 class FlatnessConstraint(Batch):
-    """Rows <= 0 for flat surface around the contacts, linear about the points `at` where they were evaluated.
+    """Values <= 0 on flat surface, linear about the points `at` of their evaluation.
 
-    The ring costs as much as several steps of a solver, so its rows are evaluated rarely.
+    A ring costs as much as several steps of a solver, so it is evaluated rarely.
     """
 
     value: Float[Tensor, "b k"]
     by_points: Float[Tensor, "b k 9"]
     at: Float[Tensor, "b 3 3"]
 
-    def rows(self, points: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b k"]:
-        """Return the rows at points near those of the evaluation."""
+    def values(self, points: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b k"]:
+        """Return the values at points nearby."""
         return self.value + (self.by_points @ (points - self.at).flatten(1)[..., None])[..., 0]
 
 
 def flatness_constraint(shape: Shape, points: Float[Tensor, "b 3 3"], flatness: float) -> FlatnessConstraint:
-    """Evaluate the chord |n - n_k| of the normals at a contact and on its ring, less that of the angle `flatness`.
+    """Evaluate the chords |n - n_k| between a contact's normal and its ring's, less the chord of `flatness` [rad].
 
-    Rows are lengths: chords times the ring's radius.
-
-    Args:
-        shape: the estimated object.
-        points: contacts, normalised.
-        flatness: the largest bend [rad].
+    Values are lengths: chords times the ring's radius. Points are normalised.
     """
     jet, radius = triple_jet(shape, points), RING_RADIUS / float(shape.scale)
     identity = torch.eye(3, dtype=points.dtype, device=points.device)
-    # A cone of friction 1 without its axis is a ring of unit tangents, which turn with the normal.
-    around = cone_edges(jet.normals, tangents(points, jet.normals), 1.0, GUIDE_POINTS) + jet.normals[:, :, None]
-    around, normal, turn = around.transpose(1, 2), jet.normals[:, None], jet.normal_jacobian[:, None]
-    place = points[:, None] + radius * around  # (b, k, 3, 3)
-    place_by_point = identity - radius * normal[..., :, None] * (around[..., None, :] @ turn)
-    there = triple_jet(shape, place.flatten(0, 1))
-    difference = there.normals.view_as(place) - normal
+    around = ring_directions(jet.normals, points, GUIDING_POINTS).transpose(1, 2)
+    normal, normal_jacobian = jet.normals[:, None], jet.normal_jacobian[:, None]
+    ring = points[:, None] + radius * around  # (b, k, 3, 3)
+    # The ring turns with the normal at its centre.
+    ring_by_point = identity - radius * normal[..., :, None] * (around[..., None, :] @ normal_jacobian)
+    there = triple_jet(shape, ring.flatten(0, 1))
+    difference = there.normals.view_as(ring) - normal
     chord = torch.linalg.vector_norm(difference, dim=-1)
     direction = difference / torch.where(chord == 0, 1.0, chord)[..., None]
-    change = there.normal_jacobian.view(*place.shape, 3) @ place_by_point - turn
+    change = there.normal_jacobian.view(*ring.shape, 3) @ ring_by_point - normal_jacobian
     slope = (direction[..., None, :] @ change)[..., 0, :]
     by_points = torch.einsum("bkij,il->bkilj", radius * slope, identity).flatten(3).flatten(1, 2)
     value = radius * (chord - 2 * math.sin(INSIDE * flatness / 2)).flatten(1)

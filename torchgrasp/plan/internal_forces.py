@@ -1,8 +1,7 @@
 """Internal forces of three contacts: in equilibrium, and with the least tangential part.
 
-The grasp map of three points has a null space of three dimensions: a push along each side of the triangle. Every
-balanced set of forces is such a combination, so the search is over directions in three dimensions whatever the grasp,
-and balance holds by construction.
+The grasp map of three points has a null space of three dimensions, spanned by a push along each side of the triangle.
+The search goes over directions in it, so that balance holds by construction.
 """
 
 import math
@@ -13,23 +12,23 @@ from torch import Tensor
 
 from torchgrasp.linalg import GOLDEN_ANGLE, fibonacci_sphere, unit
 
-DIRECTIONS = 1024
-"""Directions in the null space that are tried before the search closes in on the best."""
+DIRECTIONS, NEIGHBOURS = 1024, 64
+"""Directions in the null space that are tried first, 0.06 rad apart, and around the best in each refinement."""
 
-REFINEMENTS = 24
-"""Rounds of the search, each within 0.75 times the distance of the one before: 0.06 rad down to 1e-4 rad."""
+REFINEMENTS, SHRINK = 24, 0.75
+"""Rounds of the search, and the radius of each over the last: from 0.12 rad down to 1e-4 rad."""
 
 EVENNESS = 0.01
 """Worth of equal normal forces against the friction angle (its tangent): it decides only between equally good sets."""
 
-LEANING = 0.2
-"""Worth of the wished proportions of the normal forces against the friction angle (its tangent)."""
+PREFERENCE = 0.2
+"""Worth of the preferred proportions of the normal forces against the friction angle (its tangent)."""
 
 
 def internal_forces(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3 3"]:
     """Return the null space of the grasp map: `[..., k, i, :]` is the force at contact i when pair k is pressed.
 
-    Pairs are (0, 1), (1, 2) and (2, 0); each presses along its side of the triangle, so forces and torques cancel.
+    Pairs are (0, 1), (1, 2) and (2, 0). Each presses along its side of the triangle, so forces and torques cancel.
 
     >>> internal_forces(torch.eye(3)).sum(1).abs().max()
     tensor(0.)
@@ -53,19 +52,18 @@ def least_friction_forces(
     points: Float[Tensor, "*b 3 3"],
     normals: Float[Tensor, "*b 3 3"],
     strongest: float = 4.0,
-    wish: Float[Tensor, "*#b 3"] | None = None,
+    preferred: Float[Tensor, "*#b 3"] | None = None,
 ) -> Float[Tensor, "*b 3 3"]:
     """Return forces of the fingers on the object [N] in equilibrium that need the least friction.
 
-    They lie inside a friction cone whenever any balanced set does, because the largest ratio of tangential to normal
-    force is what is minimised (a quasi-convex problem in the two-dimensional sphere of the null space). For two
-    fingers against a thumb the thumb's force is the sum of the others'.
+    The largest ratio of tangential to normal force is minimised, so the forces lie in the friction cones whenever any
+    balanced set does. Of two fingers against a thumb, the thumb's force is the sum of the others'.
 
     Args:
         points: contacts [m].
         normals: outward unit normals of the object.
         strongest: normal force of the strongest finger [N].
-        wish: normal forces, whose proportions decide between sets that need nearly the same friction; None: equal ones.
+        preferred: normal forces whose proportions decide between sets that need nearly the same friction; None: equal.
 
     Returns:
         Forces; NaN rows where no balanced set pushes at all three contacts.
@@ -76,16 +74,15 @@ def least_friction_forces(
     tensor([ 1.,  1., -2.])
     """
     basis = internal_forces(points)
-    spots = fibonacci_sphere(DIRECTIONS, GOLDEN_ANGLE, 0.0).to(points)
-    shape = points.shape[:-2]
-    wish = None if wish is None else (wish / wish.amax(-1, keepdim=True))[..., None, :]
-    weights, cost = _best(spots.expand(*shape, -1, 3), basis, normals, wish)
-    near, reach = fibonacci_sphere(64, GOLDEN_ANGLE, 0.0).to(points), 4 / math.sqrt(DIRECTIONS)
+    directions = fibonacci_sphere(DIRECTIONS, GOLDEN_ANGLE, 0.0).to(points).expand(*points.shape[:-2], -1, 3)
+    preferred = None if preferred is None else (preferred / preferred.amax(-1, keepdim=True))[..., None, :]
+    weights, cost = _best(directions, basis, normals, preferred)
+    around, radius = fibonacci_sphere(NEIGHBOURS, GOLDEN_ANGLE, 0.0).to(points), 4 / math.sqrt(DIRECTIONS)
     for _ in range(REFINEMENTS):
-        around = unit(weights[..., None, :] + reach * near)
-        around = torch.cat([weights[..., None, :], around], dim=-2)
-        weights, cost = _best(around, basis, normals, wish)
-        reach *= 0.75
+        near = unit(weights[..., None, :] + radius * around)
+        near = torch.cat([weights[..., None, :], near], dim=-2)
+        weights, cost = _best(near, basis, normals, preferred)
+        radius *= SHRINK
     forces = torch.einsum("...k,...kci->...ci", weights, basis)
     push = -(forces * normals).sum(-1)
     scaled = forces * (strongest / push.amax(-1))[..., None, None]
@@ -96,17 +93,17 @@ def _best(
     weights: Float[Tensor, "*b k 3"],
     basis: Float[Tensor, "*b 3 3 3"],
     normals: Float[Tensor, "*b 3 3"],
-    wish: Float[Tensor, "*#b 1 3"] | None,
+    preferred: Float[Tensor, "*#b 1 3"] | None,
 ) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b"]]:
-    """Return the combination that needs the least friction among k, and its cost (infinite: some contact pulls)."""
+    """Return the combination that needs the least friction among k, and its cost; infinite where a contact pulls."""
     forces = torch.einsum("...jk,...kci->...jci", weights, basis)
     normals = normals[..., None, :, :]
     push = -(forces * normals).sum(-1)
-    if wish is None:
-        preference = EVENNESS * push.amax(-1) / push.amin(-1).clamp_min(1e-12)
+    if preferred is None:
+        uneven = EVENNESS * push.amax(-1) / push.amin(-1).clamp_min(1e-12)
     else:
-        preference = LEANING * torch.linalg.vector_norm(push / push.amax(-1, keepdim=True) - wish, dim=-1)
-    cost = tangential_ratio(forces, normals.expand_as(forces)).amax(-1) + preference
+        uneven = PREFERENCE * torch.linalg.vector_norm(push / push.amax(-1, keepdim=True) - preferred, dim=-1)
+    cost = tangential_ratio(forces, normals.expand_as(forces)).amax(-1) + uneven
     least = cost.argmin(-1)
     index = least[..., None, None].expand(*least.shape, 1, 3)
     return weights.gather(-2, index)[..., 0, :], cost.gather(-1, least[..., None])[..., 0]

@@ -1,10 +1,11 @@
-"""The contact planning problem, Eqs. (10)-(14), for a batch of contact triples: rows and their analytic Jacobian.
+"""The contact planning problem, Eqs. (10)-(14), for a batch of triples: constraints and their analytic Jacobian.
 
-Unknowns x of a triple are its points (3, 3) in normalised units and the tensions (3) of the sides of its triangle.
-Eq. (13) asks for forces in the friction cones that balance. Three forces balance if and only if each is the sum of
-the pulls along the two sides that meet at its contact (internal forces: Yoshikawa and Nagai, IEEE Trans. Robotics and
-Automation 7, 1991), so that W phi = 0 holds by construction, whatever the tensions, and only the cones are left: a
-row for each contact. Normals are no unknowns: Eq. (11) defines them. Every inequality is written as a row <= 0.
+Unknowns x of a triple are its points (3, 3), normalised, and the tensions (3) of the sides of its triangle.
+
+Eq. (13) asks for forces in the friction cones that balance. Three forces balance if and only if each is the sum of the
+pulls along the two sides at its contact (Yoshikawa and Nagai, IEEE Trans. Robotics and Automation 7, 1991). So
+W phi = 0 holds by construction, whatever the tensions, and one inequality for each cone is left. Normals are no
+unknowns: Eq. (11) defines them. Every inequality is written as a bound <= 0.
 """
 
 import dataclasses
@@ -20,13 +21,13 @@ from torchgrasp.linalg import unit
 from torchgrasp.specs import ContactSpec
 
 INSIDE = 0.99
-"""Inequalities are solved to this share of their bound, so that the last steps onto the surface stay inside."""
+"""Inequalities are solved to this share of their bound: the last steps onto the surface stay inside it."""
 
 CONE_MARGIN = 0.02
-"""By so much the cosine between force and inward normal must exceed that of the cone: strictly inside, as phi > 0."""
+"""The cosine between force and inward normal exceeds that of the cone by this much: strictly inside, as phi > 0."""
 
 LEAST_SIDE = 0.05
-"""Least distance of two contacts, normalised: coincident ones balance, but their wrenches do not span (rank 6)."""
+"""Least distance of two contacts, normalised: coincident ones balance, but their wrenches lack rank."""
 
 
 @runtime_checkable
@@ -47,7 +48,7 @@ class Jet(Protocol):
 
 @runtime_checkable
 class Shape(Protocol):
-    """What the planner asks of a shape: a `ShapeGP`, or any other implicit surface with an uncertainty."""
+    """The planner's view of a shape: a `ShapeGP`, or another implicit surface with an uncertainty."""
 
     @property
     def scale(self) -> float: ...  # noqa: D102
@@ -59,6 +60,11 @@ class Shape(Protocol):
     def mean_and_gradient(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]: ...  # noqa: D102
     def normalise(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]: ...  # noqa: D102
     def metres(self, x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]: ...  # noqa: D102
+
+
+def device_of(shape: Shape) -> torch.device:
+    """Return the device of a shape: the CPU for one that names none."""
+    return getattr(shape, "device", torch.device("cpu"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +79,7 @@ class TripleJet(Batch):
 
     @property
     def normals(self) -> Float[Tensor, "b 3 3"]:
-        """The outward unit normals, Eq. (11): the posterior gradient is not of length 1 and is normalised."""
+        """The outward unit normals, Eq. (11); the posterior gradient is not of length 1."""
         return unit(self.gradient)
 
     @property
@@ -92,9 +98,9 @@ def triple_jet(shape: Shape, points: Float[Tensor, "b 3 3"]) -> TripleJet:
 
 @dataclasses.dataclass(frozen=True)
 class Constraints(Batch):
-    """Values and Jacobians (the nine coordinates, then the three tensions) of the rows at a batch of triples.
+    """Values and Jacobians (nine coordinates, then three tensions) of the constraints at a batch of triples.
 
-    `bounds` are, three each: cones, variances, the domain's ball, sides, and with a table heights.
+    `bounds` are three each for cones, variances, the domain's ball, sides, and with a table heights.
     """
 
     centre: Float[Tensor, "b 3"]
@@ -118,9 +124,9 @@ class Constraints(Batch):
 def forces_from_tensions(
     points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"]
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3 3"]]:
-    """Return the forces on the object at the contacts and the sides, each from a contact to the next.
+    """Return the forces on the object at the contacts, and the sides, each from a contact to the next.
 
-    The tension of a side pulls its two ends towards each other in proportion to its length: no net force or torque.
+    The tension of a side pulls its two ends together in proportion to its length: no net force or torque.
     """
     sides = points.roll(-1, 1) - points
     pull = tension[..., None] * sides
@@ -131,7 +137,7 @@ def forces_from_tensions(
 class ContactProblem:
     """Eqs. (10)-(14) and the margins of `ContactSpec`, in the normalised units of one shape.
 
-    `friction` is that of the round cone inside the cone with edges; `separation` is at least `LEAST_SIDE`; `table` is
+    `friction` is that of the round cone inside the cone with edges. `separation` is at least `LEAST_SIDE`. `table` is
     the z coordinate of its plane, -inf without one.
     """
 
@@ -146,38 +152,36 @@ class ContactProblem:
     @classmethod
     def of(cls, shape: Shape, spec: ContactSpec) -> "ContactProblem":
         """Return the problem of a shape and a specification."""
-        table = -math.inf
+        table, scale = -math.inf, float(shape.scale)
         if spec.table is not None:
             table = float(shape.normalise(torch.tensor([0.0, 0.0, spec.table], dtype=torch.float64))[2])
         return cls(
             friction=spec.planned_friction * math.cos(math.pi / spec.edges),
             max_variance=spec.max_variance,
             domain_radius=float(shape.domain_radius),
-            separation=max(spec.least_separation / float(shape.scale), LEAST_SIDE),
+            separation=max(spec.least_separation / scale, LEAST_SIDE),
             table=table,
-            contact_height=spec.contact_height / float(shape.scale),
-            tip_radius=spec.fingertip_radius / float(shape.scale),
+            contact_height=spec.contact_height / scale,
+            tip_radius=spec.fingertip_radius / scale,
         )
 
     def least_height(self, normals: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the least z coordinate of contacts with these normals, at which a round fingertip is on the table."""
+        """Return the least z coordinate of contacts with these normals: a round fingertip then rests on the table."""
         return self.table + (self.tip_radius * (1 - normals[..., 2])).clamp_min(self.contact_height)
 
     def constraints(self, points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"], jet: TripleJet) -> Constraints:
-        """Evaluate all rows and their Jacobians.
+        """Evaluate all constraints and their Jacobians.
 
         Args:
             points: contacts, normalised.
             tension: of the side from each contact to the next.
             jet: the shape at the points.
         """
-        b = len(points)
-        identity = torch.eye(3, dtype=points.dtype, device=points.device)
+        b, identity = len(points), torch.eye(3, dtype=points.dtype, device=points.device)
         threshold, ball = self.max_variance * INSIDE, self.domain_radius * INSIDE
-        half_slope = 2 * threshold**0.5  # the slope of variance at the threshold, for a deviation that grows linearly
+        half_slope = 2 * threshold**0.5  # slope of the variance at the threshold, for a linear standard deviation
         sides = points.roll(-1, 1) - points
         length = torch.linalg.vector_norm(sides, dim=-1)
-        along = sides / length[..., None]
         cones, cones_by_x = self._cones(points, tension, jet)
         values = [
             cones,
@@ -185,30 +189,35 @@ class ContactProblem:
             ((points * points).sum(-1) - ball**2) / (2 * ball),
             self.separation / INSIDE - length,
         ]
-        apart = _own(along)
-        apart = apart - apart.unflatten(2, (4, 3))[:, :, [2, 0, 1, 3]].flatten(2)  # of a side's end
-        slopes = [cones_by_x, _own(jet.variance_gradient / half_slope), _own(points / ball), apart]
+        sides_by_x = _by_own_point(sides / length[..., None])
+        sides_by_x = sides_by_x - sides_by_x.unflatten(2, (4, 3))[:, :, [2, 0, 1, 3]].flatten(2)  # a side's other end
+        jacobians = [
+            cones_by_x,
+            _by_own_point(jet.variance_gradient / half_slope),
+            _by_own_point(points / ball),
+            sides_by_x,
+        ]
         if self.table > -math.inf:
             lowest = self.least_height(jet.normals)
             values.append(lowest - points[..., 2] + (1 - INSIDE) * 0.1)
             by_tip = self.tip_radius * (lowest > self.table + self.contact_height)[..., None]
-            slopes.append(_own(-identity[2] - by_tip * jet.normal_jacobian[..., 2, :]))
+            jacobians.append(_by_own_point(-identity[2] - by_tip * jet.normal_jacobian[..., 2, :]))
         return Constraints(
             centre=points.mean(1),
             surface=jet.distance,
             bounds=torch.cat(values, 1),
             centre_by_x=torch.cat([identity.repeat(1, 3) / 3, torch.zeros_like(identity)], 1).expand(b, 3, 12),
-            surface_by_x=_own(jet.gradient),
-            bounds_by_x=torch.cat(slopes, 1),
+            surface_by_x=_by_own_point(jet.gradient),
+            bounds_by_x=torch.cat(jacobians, 1),
         )
 
     def _cones(
         self, points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"], jet: TripleJet
     ) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 3 12"]]:
-        """Return for each contact by how much its force leaves its cone: cosines, which no size of forces changes.
+        """Return by how much each force leaves its cone, as a cosine, which no size of forces changes.
 
-        With u = f / |f| the row is n.u + cosine, df = (1 - u u^T) / |f| of n its slope by the force, and u dn by the
-        normal, which turns with its own point.
+        With u = f / |f| the bound is n.u + cosine. Its derivative by the force is (1 - u u^T) n / |f|, and by the
+        normal, which turns with its own point, u.
         """
         normals = jet.normals
         force, sides = forces_from_tensions(points, tension)
@@ -217,13 +226,13 @@ class ContactProblem:
         outward = (normals * direction).sum(-1, keepdim=True)
         by_force = (normals - outward * direction) / size
         steep = torch.linalg.vector_norm(jet.gradient, dim=-1, keepdim=True)
-        turned = (direction - outward * normals) / steep  # (1 - n n^T) u / |g|, which the Hessian carries to the point
-        by_normal = (turned[..., None, :] @ jet.hessian)[..., 0, :]
+        across = (direction - outward * normals) / steep  # (1 - n n^T) u / |g|, which the Hessian carries to the point
+        by_point = (across[..., None, :] @ jet.hessian)[..., 0, :]
         before = tension.roll(1, 1)
         blocks = by_force.new_zeros(len(points), 3, 4, 3)
         for i in range(3):
             after, other = (i + 1) % 3, (i + 2) % 3
-            blocks[:, i, i] = by_normal[:, i] - (tension[:, i] + before[:, i])[:, None] * by_force[:, i]
+            blocks[:, i, i] = by_point[:, i] - (tension[:, i] + before[:, i])[:, None] * by_force[:, i]
             blocks[:, i, after] = tension[:, i, None] * by_force[:, i]
             blocks[:, i, other] = before[:, i, None] * by_force[:, i]
             blocks[:, i, 3, i] = (by_force[:, i] * sides[:, i]).sum(-1)
@@ -232,9 +241,9 @@ class ContactProblem:
         return outward[..., 0] + cosine + CONE_MARGIN, blocks.flatten(2)
 
 
-def _own(slope: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 12"]:
-    """Lay out the Jacobian of three rows of which row i depends on point i alone."""
-    whole = slope.new_zeros(len(slope), 3, 12)
+def _by_own_point(slope: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 12"]:
+    """Lay out the Jacobian of three values of which value i depends on point i alone."""
+    jacobian = slope.new_zeros(len(slope), 3, 12)
     for i in range(3):
-        whole[:, i, 3 * i : 3 * i + 3] = slope[:, i]
-    return whole
+        jacobian[:, i, 3 * i : 3 * i + 3] = slope[:, i]
+    return jacobian

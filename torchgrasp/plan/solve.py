@@ -10,7 +10,7 @@ from torch import Tensor
 from torchgrasp.base import join, pick, put
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.plan.feasibility import check_feasibility
-from torchgrasp.plan.improve import Improve, Objective, improver
+from torchgrasp.plan.objectives import Improvement, Objective, improvement
 from torchgrasp.plan.problem import ContactProblem, Shape
 from torchgrasp.plan.solver import FINISH, Stage, descend, project, start_state
 from torchgrasp.plan.starts import check_starts, drawn_starts, given_starts
@@ -21,18 +21,17 @@ SEARCH = (Stage(centre=3.0, cones=0.3, steps=10), Stage(centre=1.0, cones=3.0, s
     Stage(centre=0.3, cones=0.3, steps=8),
     Stage(centre=0.3, cones=3.0, steps=8),
 )
-"""Stages from starts anywhere: centre and closure by turns, as if Eq. (14) were a constraint, which most often it can
-be: contacts that are free to move about a body can have their centre in its centre. Each turn leads out of places
-where the other is stuck, and triples with both are left alone. Where the centre cannot be reached the last two stages
-give way."""
+"""Stages from starts anywhere: centre and closure by turns, each of which leads out of places where the other is stuck.
+The last two give way where the centre cannot be reached."""
 
-IMPROVE = (Stage(centre=0.3, cones=3.0, steps=8),)
-"""Stages from surveyed starts, most of which are feasible but for rounding: towards the centre, Eq. (14)."""
+TO_CENTRE = (Stage(centre=0.3, cones=3.0, steps=8),)
+"""The stage from triples of candidates, most of which are feasible but for rounding: towards the centre, Eq. (14)."""
 
-FEW = 25
-"""Starts of which the first tell the pace where time is limited: with less the overhead of each step outweighs them."""
+LEAST_STARTS = 25
+"""Fewest starts at a time under a time budget: with less, the overhead of each step outweighs them."""
 
 Chunk = tuple[Float[Tensor, "_ 3 3"], tuple[Stage, ...]]
+"""Normalised starts on the surface, and the stages from there."""
 
 
 def plan_contacts(
@@ -46,29 +45,28 @@ def plan_contacts(
 ) -> ContactPlan:
     """Plan three contacts from each of many starts, Eqs. (10)-(14): one row a start, in the order of the starts.
 
-    A row that fails carries the `Status` of the first constraint that it violates; where no contacts can satisfy them
-    all rows do. Points are in metres and the frame of the cloud, normals outward. With `spec.flatness` drawn starts
-    are surveyed (see `drawn_starts`); where the descent from a feasible start fails, the start itself is the plan. The
-    result is deterministic without `time_budget`; a plan from 500 or 1000 starts begins one from more.
+    A row that fails carries the `Status` of the first constraint it violates. Points are in metres and the frame of
+    the cloud, normals outward. A feasible start from which the descent fails is itself the plan. Without
+    `time_budget` the result is deterministic, and a plan from 500 or 1000 starts begins one from more.
 
     Args:
         shape: a `ShapeGP`, or another implicit surface with the same methods.
         spec: what the contacts must satisfy; `ContactSpec()` by default.
-        starts: the number of starts, drawn on the sphere of `spec.start_radius` (Sec. 6.2), or starting points [m].
+        starts: number of starts, drawn from the sphere of `spec.start_radius` (Sec. 6.2), or starting points [m].
         seed: seed of the draw.
-        objective: what is minimised: "center", Eq. (14); "epsilon", minus the radius of the largest ball in the hull of
-            the wrenches (Ferrari and Canny 1992; 0.1 s a start); "min_weight", minus the greatest margin of the
-            certificate; "probability", minus the share of 400 surfaces drawn from a `ShapeGP` on which the contacts
-            are closed at `spec.friction`, 0 in failed rows (0.02 s a start); or a function of contacts (b, 3, 3) [m]
-            and outward unit normals (b, 3, 3) that returns costs (b,), each of its own row alone, differentiable by
-            autograd, in any unit. `quality` holds the values. All but "center" begin where that ends, and a row
-            only changes for a lower value.
-        time_budget: seconds of wall time for the call: of all starts as many are planned as will fit, at the pace of
-            those before, and never less than 25. None: all.
+        objective: what is minimised, from where the centre was reached; `quality` holds its values.
+            * "center": Eq. (14) alone.
+            * "epsilon": minus the radius of the largest ball in the hull of the wrenches (Ferrari and Canny 1992).
+            * "min_weight": minus the greatest margin of the certificate.
+            * "probability": minus the share of 400 surfaces drawn from a `ShapeGP` on which the contacts are closed
+              at `spec.friction`; 0 in failed rows.
+            * a function of contacts (b, 3, 3) [m] and outward unit normals (b, 3, 3) that returns costs (b,), each of
+              its own row alone, differentiable by autograd, in any unit.
+        time_budget: seconds of wall time for the call. As many starts are planned as will fit, at least 25. None: all.
 
     Raises:
-        BadArgument: `starts` is not positive, of a wrong shape, or outside the shape's domain; an unknown objective,
-            or a cost that returns no number for each row or has no gradient; another argument is not what it should be.
+        BadArgument: `starts` not positive, of a wrong shape, or outside the shape's domain; an unknown objective, or
+            a cost without a number for each row or without a gradient; another wrong argument.
 
     Source of the scheme: penalties and Levenberg-Marquardt, Nocedal and Wright, Numerical Optimization, ch. 10, 17.
 
@@ -81,40 +79,33 @@ def plan_contacts(
     check_starts(shape, spec, starts, seed)
     if time_budget is not None and not time_budget > 0:  # also refuses NaN
         raise BadArgument("time_budget", time_budget, "a positive number of seconds, or None")
-    improve = improver(objective, shape, spec, seed)
+    improve = improvement(objective, shape, spec, seed)
     chunks = _chunks(shape, spec, starts, seed)
     if time_budget is not None:
         chunks = _within(time_budget, chunks)
     return join([plan_chunk(shape, spec, first, stages, improve) for first, stages in chunks])
 
 
+def _chunks(shape: Shape, spec: ContactSpec, starts: int | Float[Tensor, "b 3 3"], seed: int) -> Iterator[Chunk]:
+    """Yield starts and stages, chunk by chunk."""
+    if isinstance(starts, Tensor):
+        return ((first, SEARCH) for first in given_starts(shape, starts))
+    stages = SEARCH if spec.flatness is None else TO_CENTRE
+    return ((first, stages) for first in drawn_starts(shape, spec, starts, seed))
+
+
 def _within(seconds: float, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
-    """Yield as much of the chunks as will be planned in time, at the pace of what was."""
-    began, done, fits = time.monotonic(), 0, FEW
+    """Yield as much of the chunks as will be planned in time, at the pace so far."""
+    began, done, fits = time.monotonic(), 0, LEAST_STARTS
     for first, stages in chunks:
         while len(first) > 0:
             if done:
                 used = time.monotonic() - began
                 fits = int((seconds - used) * done / used)
-            if fits < FEW:
+            if fits < LEAST_STARTS:
                 return
             yield first[:fits], stages
             done, first = done + len(first[:fits]), first[fits:]
-
-
-def _chunks(
-    shape: Shape,
-    spec: ContactSpec,
-    starts: int | Float[Tensor, "b 3 3"],
-    seed: int,
-) -> Iterator[Chunk]:
-    """Yield normalised starts on the surface and the stages from there, chunk by chunk."""
-    if isinstance(starts, Tensor):
-        for first in given_starts(shape, starts):
-            yield first, SEARCH
-    else:
-        for first in drawn_starts(shape, spec, starts, seed):
-            yield first, SEARCH if spec.flatness is None else IMPROVE
 
 
 def plan_chunk(
@@ -122,15 +113,15 @@ def plan_chunk(
     spec: ContactSpec,
     first: Float[Tensor, "b 3 3"],
     stages: tuple[Stage, ...],
-    improve: Improve | None = None,
+    improve: Improvement | None = None,
 ) -> ContactPlan:
     """Plan from normalised starts on the surface; a feasible start from which nothing is found is itself the plan."""
     problem = ContactProblem.of(shape, spec)
     state = start_state(shape, first)
     for stage in (*stages, FINISH):
         state = descend(shape, problem, state, stage)
-    found = check_feasibility(shape, spec, project(shape, state.points, steps=3))
-    lost = torch.nonzero(found.status != Status.OK)[:, 0]
-    begun = check_feasibility(shape, spec, first[lost])
-    found = put(found, lost, pick(begun.status == Status.OK, begun, found[lost]))
-    return found if improve is None else improve(found, state.tension)
+    plan = check_feasibility(shape, spec, project(shape, state.points, steps=3))
+    failed = torch.nonzero(plan.status != Status.OK)[:, 0]
+    begun = check_feasibility(shape, spec, first[failed])
+    plan = put(plan, failed, pick(begun.status == Status.OK, begun, plan[failed]))
+    return plan if improve is None else improve(plan, state.tension)

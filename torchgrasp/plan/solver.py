@@ -5,6 +5,7 @@ evaluation and lets steps be long.
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,7 +14,6 @@ from torch import Tensor
 from torchgrasp.base import Batch
 from torchgrasp.linalg import limit_norm
 from torchgrasp.optim import Linearisation, Problem, Step, levenberg_marquardt
-from torchgrasp.plan.objectives import Cost, differentiate_cost
 from torchgrasp.plan.problem import ContactProblem, Shape, TripleJet, forces_from_tensions, triple_jet
 from torchgrasp.shape.surface import newton_step
 
@@ -59,6 +59,10 @@ class State(Batch):
     jet: TripleJet
 
 
+StateCost = Callable[[State], tuple[Float[Tensor, "b"], Float[Tensor, "b 12"]]]
+"""The cost of triples and its gradient by points and tensions."""
+
+
 @dataclasses.dataclass(frozen=True)
 class LinearConstraints(Linearisation):
     """Weighted residuals of the constraints, their weights, and the Jacobian without these.
@@ -85,7 +89,7 @@ class Descent(Problem[State, LinearConstraints]):
     shape: Shape
     problem: ContactProblem
     stage: Stage
-    objective: Cost | None = None
+    objective: StateCost | None = None
     pull: Float[Tensor, "b"] | None = None
 
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> LinearConstraints:
@@ -99,7 +103,7 @@ class Descent(Problem[State, LinearConstraints]):
         residual = weight * constraints.values
         cost, downhill = residual.square().sum(1) / 2, None
         if self.objective is not None and self.pull is not None:
-            value, gradient = differentiate_cost(self.objective, self.shape, state.points, state.jet)
+            value, gradient = self.objective(state)
             pull = self.pull[rows]
             cost, downhill = cost + pull * value, -pull[:, None] * gradient
         inside = torch.linalg.vector_norm(state.points, dim=-1).amax(-1) < self.problem.domain_radius
@@ -152,14 +156,16 @@ def promised_decrease(model: LinearConstraints, x: Float[Tensor, "a 12"]) -> Flo
     return promised if model.downhill is None else promised + (model.downhill * x).sum(1)
 
 
-def descend(shape: Shape, problem: ContactProblem, state: State, stage: Stage, objective: Cost | None = None) -> State:
+def descend(
+    shape: Shape, problem: ContactProblem, state: State, stage: Stage, objective: StateCost | None = None
+) -> State:
     """Return the triples after a stage.
 
     An `objective` joins with a weight at which its first gradient has the length `PULL`: its unit does not matter.
     """
     pull = None
     if objective is not None:
-        length = torch.linalg.vector_norm(differentiate_cost(objective, shape, state.points, state.jet)[1], dim=-1)
+        length = torch.linalg.vector_norm(objective(state)[1], dim=-1)
         pull = PULL / torch.where(length > 0, length, 1.0)
     return levenberg_marquardt(Descent(shape, problem, stage, objective, pull), state, stage.steps)
 

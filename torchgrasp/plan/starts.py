@@ -1,4 +1,4 @@
-"""Where planning starts: points on a sphere as in the paper, or triples surveyed on the surface, or given points."""
+"""Starts of the planner: points on a sphere as in the paper, candidate contacts on the surface, or given points."""
 
 from collections.abc import Iterator
 
@@ -9,36 +9,33 @@ from torch import Tensor
 from torchgrasp.base import check_tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
-from torchgrasp.plan.normal_variation import normal_variation
-from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet
+from torchgrasp.plan.flatness import normal_variation
+from torchgrasp.plan.problem import ContactProblem, Shape, device_of, triple_jet
 from torchgrasp.plan.solver import project
 from torchgrasp.plan.wrench import closed_exact
 from torchgrasp.specs import ContactSpec
 
-SURVEY = 700
-"""Triples of surface points that are surveyed for certain and flat places: 2100 points cover a hand-sized object in
-steps of about 4 mm."""
+CANDIDATE_TRIPLES = 700
+"""Triples of surface points among which candidates are found: 2100 points are 4 mm apart on a hand-sized object."""
+
+CANDIDATE_FLATNESS = 0.9
+"""Share of the largest normal variation that a candidate may have: its ring turns with the triple it joins."""
 
 FAR = 0.1
-"""A start with a point further than this from the surface (normalised signed distance) is no guess of contacts."""
+"""A start with a point farther than this from the surface (normalised signed distance) is no guess of contacts."""
 
 NEAR_CENTRE = 0.1
-"""Such a start is drawn in to this distance from the centre (the paper's radius), about which it is shifted."""
+"""Normalised distance from the centre to which such a start is drawn in: the paper's radius of starts."""
 
-DRAWS, ROUNDS = 20, 8
-"""Triples drawn for each start that is wanted, in each of at most so many rounds; of those on certain and flat
-surface 2 to 10 % are closed."""
+TRIPLES_PER_START, ROUNDS = 20, 8
+"""Triples drawn for each start in one round, and most rounds: 2 to 10 % of the candidates' triples are closed."""
 
-
-CHUNK = 500
-"""Starts that are planned at once: memory is bounded, and results come early."""
+STARTS_PER_CHUNK = 500
+"""Starts planned at once: memory is bounded, and a plan from fewer starts begins one from more."""
 
 
 def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor, seed: int) -> None:
-    """Refuse starts that are no positive number, of a wrong shape, or outside the shape's domain, by `BadArgument`.
-
-    What is no shape, specification or seed is refused, too.
-    """
+    """Raise `BadArgument` for wrong arguments of `plan_contacts`."""
     if not isinstance(shape, Shape):
         raise BadArgument("shape", type(shape).__name__, "a ShapeGP, or an implicit surface with the same methods")
     if not isinstance(seed, int) or not 0 <= seed < 2**63:
@@ -49,11 +46,9 @@ def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor, seed: in
         points = shape.normalise(check_tensor("starts", starts, (None, 3, 3)))
         farthest = float(torch.linalg.vector_norm(points, dim=-1).max()) if len(points) else 0.0
         if farthest > shape.domain_radius:
-            raise BadArgument(
-                "starts",
-                f"a point {farthest * float(shape.scale):.4g} m from the shape's centre",
-                f"at most {float(shape.domain_radius) * float(shape.scale):.4g} m, where the shape is known",
-            )
+            found = f"a point {farthest * float(shape.scale):.4g} m from the shape's centre"
+            allowed = f"at most {float(shape.domain_radius) * float(shape.scale):.4g} m, where the shape is known"
+            raise BadArgument("starts", found, allowed)
     elif isinstance(starts, bool) or not isinstance(starts, int) or starts < 1:
         raise BadArgument("starts", repr(starts), "a positive number, or starting points of shape b x 3 x 3 [m]")
     elif spec.start_radius > shape.domain_radius:
@@ -62,43 +57,40 @@ def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor, seed: in
 
 def given_starts(shape: Shape, starts: Float[Tensor, "b 3 3"]) -> Iterator[Float[Tensor, "_ 3 3"]]:
     """Yield normalised starts on the surface from given points [m], chunk by chunk."""
-    device = getattr(shape, "device", torch.device("cpu"))  # a stand-in without one lives on the CPU
-    for points in starts.detach().to(device, torch.float64).split(CHUNK):
+    for points in starts.detach().to(device_of(shape), torch.float64).split(STARTS_PER_CHUNK):
         yield project(shape, draw_in(shape, shape.normalise(points)), steps=6)
 
 
 def drawn_starts(shape: Shape, spec: ContactSpec, starts: int, seed: int) -> Iterator[Float[Tensor, "_ 3 3"]]:
-    """Yield as many normalised starts on the surface as `starts` says, chunk by chunk.
+    """Yield so many normalised starts on the surface, chunk by chunk.
 
     Without `spec.flatness` each is three points of the sphere of `spec.start_radius`, moved onto the surface
-    (Sec. 6.2). With it such points are surveyed first: starts are triples of those
-    that are certain, flat, inside and above the table, and closed ones come first in each chunk. The centre of a flat
-    grasp may lie 30 mm from the object's, and a descent from the paper's starts rarely finds its way there.
+    (Sec. 6.2). With it, each is a triple of `candidate_contacts`: a flat grasp's centre may lie 30 mm from the
+    object's, and the paper's starts rarely descend there.
     """
-    device = getattr(shape, "device", torch.device("cpu"))
     generator = torch.Generator().manual_seed(seed)
 
     def draw(count: int) -> Float[Tensor, "_ 3 3"]:
-        drawn = spec.start_radius * unit(torch.randn(count, 3, 3, generator=generator, dtype=torch.float64))
-        return drawn.to(device)
+        points = unit(torch.randn(count, 3, 3, generator=generator, dtype=torch.float64))
+        return (spec.start_radius * points).to(device_of(shape))
 
-    places = None
+    candidates = None
     if spec.flatness is not None:
-        places = survey(shape, spec, project(shape, draw(SURVEY), steps=6))
-    for begin in range(0, starts, CHUNK):
-        count = min(CHUNK, starts - begin)
-        if places is None:
+        candidates = candidate_contacts(shape, spec, project(shape, draw(CANDIDATE_TRIPLES), steps=6))
+    for begin in range(0, starts, STARTS_PER_CHUNK):
+        count = min(STARTS_PER_CHUNK, starts - begin)
+        if candidates is None:
             yield project(shape, draw_in(shape, draw(count)), steps=6)
         else:
-            yield surveyed_triples(shape, spec, *places, count, generator)
+            yield candidate_triples(ContactProblem.of(shape, spec), *candidates, count, generator)
 
 
 def draw_in(shape: Shape, points: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
-    """Return normalised starts of which those off the surface are shifted to the centre and drawn in towards it.
+    """Return normalised starts; those off the surface are shifted to the centre and drawn in towards it.
 
-    A point off the surface is only a direction to look in. From far away each contact ends on the part of the surface
-    that is nearest to it, uncertain or not; from near the centre the three spread over what faces them, and their
-    own centre, Eq. (14), begins where it should end. Starts on the surface are guesses of contacts and stay.
+    A point off the surface is only a direction to search in. From far away each contact ends on the nearest part of
+    the surface, uncertain or not. From near the centre the three spread over the parts that face them, with their own
+    centre where Eq. (14) wants it. Starts on the surface are guesses of contacts and stay.
     """
     distance, _ = shape.mean_and_gradient(points.flatten(0, 1))
     far = distance.view(points.shape[:2]).abs().amax(-1) > FAR
@@ -108,44 +100,42 @@ def draw_in(shape: Shape, points: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 
     return torch.where(far[:, None, None], drawn, points)
 
 
-def survey(
+def candidate_contacts(
     shape: Shape, spec: ContactSpec, points: Float[Tensor, "s 3 3"]
 ) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]]:
-    """Return the good places among surface points, with their normals; all of them where there are less than three."""
+    """Return the certain, flat surface points inside the domain and above the table, with their normals.
+
+    All points are returned where fewer than three qualify.
+    """
     problem = ContactProblem.of(shape, spec)
     jet = triple_jet(shape, points)
     good = (jet.distance.abs() < 1e-4) & (jet.variance >= 0) & (jet.variance < spec.max_variance)
     good &= torch.linalg.vector_norm(points, dim=-1) < problem.domain_radius
     good &= points[..., 2] > problem.least_height(jet.normals)
     if spec.flatness is not None:
-        good &= (
-            normal_variation(shape, points, jet.normals) < 0.9 * spec.flatness
-        )  # the ring of another triple is turned
-    if int(good.sum()) < 3:  # nothing to choose from
+        good &= normal_variation(shape, points, jet.normals) < CANDIDATE_FLATNESS * spec.flatness
+    if int(good.sum()) < 3:
         good = torch.ones_like(good)
     return points[good], jet.normals[good]
 
 
-def surveyed_triples(
-    shape: Shape,
-    spec: ContactSpec,
-    places: Float[Tensor, "p 3"],
+def candidate_triples(
+    problem: ContactProblem,
+    points: Float[Tensor, "p 3"],
     normals: Float[Tensor, "p 3"],
     starts: int,
     generator: torch.Generator,
 ) -> Float[Tensor, "b 3 3"]:
-    """Return triples of places, closed and separate ones first."""
-    problem = ContactProblem.of(shape, spec)
-    found, wanted = [], starts
+    """Return random triples of candidates: closed and separate ones first, any others where these are too few."""
+    triples, missing = [], starts
     for _ in range(ROUNDS):
-        choice = torch.randint(len(places), (DRAWS * starts, 3), generator=generator).to(places.device)
-        triple = places[choice]
-        choice = choice[torch.linalg.vector_norm(triple - triple.roll(1, 1), dim=-1).amin(-1) > problem.separation]
-        closed = choice[closed_exact(places[choice], normals[choice], problem.friction)][:wanted]
-        found.append(places[closed])
-        wanted -= len(closed)
-        if wanted == 0:
+        choice = torch.randint(len(points), (TRIPLES_PER_START * starts, 3), generator=generator).to(points.device)
+        corners = points[choice]
+        choice = choice[torch.linalg.vector_norm(corners - corners.roll(1, 1), dim=-1).amin(-1) > problem.separation]
+        closed = choice[closed_exact(points[choice], normals[choice], problem.friction)][:missing]
+        triples.append(points[closed])
+        missing -= len(closed)
+        if missing == 0:
             break
-    # Too few are closed: the rest descend from triples that are not.
-    found.append(places[torch.randint(len(places), (wanted, 3), generator=generator).to(places.device)])
-    return torch.cat(found)
+    triples.append(points[torch.randint(len(points), (missing, 3), generator=generator).to(points.device)])
+    return torch.cat(triples)

@@ -1,7 +1,7 @@
 """Contact wrenches of three frictional contacts, and the exact closure test (Eq. 13).
 
-All normals given here are the outward ones of the surface; a fingertip pushes along their negative. Torques are
-taken about the contacts' centre and divided by the contacts' radius, so that nothing depends on units or origin.
+Normals are the outward ones of the surface; a fingertip pushes against them. Torques are about the contacts' centre,
+over the contacts' radius, so that nothing depends on units or origin.
 """
 
 import itertools
@@ -15,35 +15,31 @@ from torchgrasp.frames import degenerate
 from torchgrasp.linalg import unit
 
 BALANCED = 1e-9
-"""Largest |W phi| of coefficients that are called balanced: rounding in float64, far below any wrench (about 1)."""
+"""Largest |W phi| of balanced coefficients: above rounding in float64, far below any wrench (about 1)."""
 
 MIN_MARGIN = 1e-6
-"""Least coefficient called positive, ten times the tolerance of the certificate's solver; equal ones are 1 / (3 e)."""
+"""Least positive coefficient: far above the certificate's errors, far below equal coefficients, 1 / (3 e)."""
 
 MIN_RANK_RATIO = 1e-3
-"""Least singular value of the wrench matrix over its largest; Eq. (13) alone also holds for contacts on a line."""
+"""Least singular value of the wrench matrix over its largest. Eq. (13) alone also holds for contacts on a line."""
 
 PARALLEL = 1e-9
-"""Planar wrenches (of length about 1) whose cross product is shorter than this span no plane."""
+"""Planar wrenches (of length about 1) with a shorter cross product are parallel: above rounding in float64."""
 
 
 def centre_and_radius(points: Float[Tensor, "b 3 3"]) -> tuple[Float[Tensor, "b 1 3"], Float[Tensor, "b 1 1"]]:
-    """Return the contacts' centre and their root-mean-square distance from it, both in the unit of `points`.
-
-    Coincident contacts have the radius 1: their torques are zero in any unit.
-    """
+    """Return the contacts' centre and their root-mean-square distance from it; 1 where that is 0."""
     centre = points.mean(-2, keepdim=True)
     radius = torch.linalg.vector_norm(points - centre, dim=(-2, -1), keepdim=True) / math.sqrt(3.0)
     return centre, torch.where(radius == 0, 1.0, radius)
 
 
 def tangents(points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
-    """Return for each contact the unit tangent that lies in the plane of the three contacts.
+    """Return for each contact the unit tangent in the plane of the three contacts.
 
-    No field of tangents on the sphere is free of a seam. Fixed by the plane of the contacts it turns with the object,
-    and its only seam is a normal perpendicular to that plane, where no friction below infinity gives closure: the
-    three forces of a balance are coplanar. Edges along it also lose the least of the round cone. On the seam itself,
-    and for contacts on a line, an arbitrary tangent stands in, so that the result is finite.
+    It turns with the object. Its seam, which every field of tangents has, is a normal perpendicular to the plane; no
+    friction closes such a contact, because three forces in balance are coplanar. There, and for contacts on a line,
+    the tangent is arbitrary, but finite.
     """
     plane = torch.linalg.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
     inside = torch.linalg.cross(plane[:, None].expand_as(normals), normals)
@@ -59,11 +55,11 @@ def tangents(points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]) ->
 def cone_edges(
     normals: Float[Tensor, "*b 3"], tangent: Float[Tensor, "*b 3"], friction: float, edges: int
 ) -> Float[Tensor, "*b e 3"]:
-    """Return the edges of the linearised friction cones: forces on the object with a normal part of 1.
+    """Return the edges of the linearised friction cones: forces on the object with a normal component of 1.
 
     Args:
         normals: outward unit normals.
-        tangent: a unit tangent at each contact, along which the first edge leans.
+        tangent: unit tangent at each contact; the first edge leans along it.
         friction: coefficient of friction.
         edges: edges of each cone.
     """
@@ -82,7 +78,7 @@ def wrenches(
         points: contacts in any unit of length.
         normals: outward unit normals.
         friction: coefficient of friction.
-        edges: edges of each linearised cone.
+        edges: edges of each cone.
 
     >>> wrenches(torch.eye(3)[None], torch.eye(3)[None], friction=0.5).shape
     torch.Size([1, 3, 8, 6])
@@ -102,9 +98,9 @@ def rank_ratio(wrench: Float[Tensor, "b 3 e 6"]) -> Float[Tensor, "b"]:
 def closed_exact(points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"], friction: float) -> Bool[Tensor, "b"]:
     """Tell which triples have frictional form closure with round cones, exactly: Eq. (13) as edges go to infinity.
 
-    Three forces in balance lie in the plane of the contacts. What each cone cuts from that plane is an angle about
-    the projected normal, and the six planar wrenches at its ends must positively span the plane's wrenches: no plane
-    through two of them may have all others on one side.
+    Three forces in balance lie in the plane of the contacts. Each cone cuts an angle about the projected normal from
+    the plane. The six planar wrenches along its sides must positively span all planar wrenches: no plane through two
+    of them has the others on one side.
 
     Args:
         points: contacts in any unit of length.

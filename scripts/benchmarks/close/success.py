@@ -28,7 +28,8 @@ from torchgrasp.files import format_json, write_atomically, write_file
 from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.ranking import success_features
 from torchgrasp.objects import list_objects, load_object
-from torchgrasp.pipeline import closure_of
+from torchgrasp.pipeline import SURFACE_DRAWS
+from torchgrasp.plan.closure_probability import closure_share
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
@@ -168,7 +169,7 @@ def known_of(
         return []
     grasps = load_grasps(shelf / f"{name}_{view}.safetensors")[torch.tensor(ranks)]
     shape, center = shape_of(source, name, view)
-    closure = closure_of(shape, grasps.contacts, friction, 0)
+    closure = closure_share(shape, grasps.contacts, friction, SURFACE_DRAWS, 0)
     return success_features(grasps.contacts, closure, grasps.normal_angle, center, friction).tolist()
 
 

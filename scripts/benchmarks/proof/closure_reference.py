@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchgrasp.linalg import unit
-from torchgrasp.plan.surface_samples import FOOTPRINT
+from torchgrasp.plan.line_posterior import FOOTPRINT
 from torchgrasp.plan.wrench import closed_exact, tangents
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.joint_posterior import distance_covariance

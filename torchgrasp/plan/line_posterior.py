@@ -1,0 +1,165 @@
+"""The uncertain surface along the lines of three fingers, and where fingers meet a surface drawn from it.
+
+A finger comes along the planned normal n of its contact x. It stops at x + t n where the distance d turns negative: at
+the t nearest to 0, if there are several. The normal there is along the gradient w.
+
+(d, w) is sampled jointly at 5 nodes of each line and interpolated linearly; outside the nodes deviations are constant.
+The mean of d is followed on a finer and longer grid.
+
+Two choices make the deviations those of real surfaces (docs/planning.md):
+
+* All covariances are scaled by `std_factor`^2: real surfaces deviate that much less than sqrt(variance).
+* w deviates like a difference quotient of d over a fingertip's width. A sample of the thin plate is rough, and no
+  finger feels its gradient at a point.
+"""
+
+import dataclasses
+import functools
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.base import Batch, check_tensor
+from torchgrasp.errors import BadArgument
+from torchgrasp.linalg import unit
+from torchgrasp.plan.certify import check_unit
+from torchgrasp.plan.wrench import tangents
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.joint_posterior import distance_covariance, symmetric_root
+from torchgrasp.values import Contacts
+
+FOOTPRINT = 0.012
+"""Half the width [m] over which a fingertip feels the slope of the surface: the radius of its sphere."""
+
+NODES = (4.0, 1.5, 0.0, -1.5, -4.0)
+"""Nodes of a line, in standard deviations of the surface at its contact: three err by 0.07, five by 0.02 at most."""
+
+OUTER_GRID = (12.0, 9.0, 6.5, 4.0, 3.375, 2.75, 2.125, 1.5, 1.125, 0.75, 0.375, 0.0)
+"""Outer half of the grid, in the same unit; it holds all nodes."""
+
+TRIPLES_PER_CHUNK = 32
+"""Triples whose joint posterior is made at a time: 105 x 105 distances each, which stay in the cache."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LinePosterior(Batch):
+    """The Gaussian of (d, w) on the lines x + t n of three fingers, from outside in; all is normalised.
+
+    Args:
+        points: planned contacts x.
+        normals: outward unit normals n.
+        deviation: standard deviation of d at the contact, the unit of nodes and grid.
+        distance: mean of d on the grid.
+        slope: mean of w at the nodes.
+        root: symmetric root of the covariance of (d, w) at the nodes, line by line, node by node.
+    """
+
+    points: Float[Tensor, "b 3 3"]
+    normals: Float[Tensor, "b 3 3"]
+    deviation: Float[Tensor, "b 3"]
+    distance: Float[Tensor, "b 3 23"]
+    slope: Float[Tensor, "b 3 5 3"]
+    root: Float[Tensor, "b 60 60"]
+
+
+@functools.cache
+def grid() -> Float[Tensor, "23"]:
+    """Return the grid in standard deviations, from outside in."""
+    return torch.tensor([*OUTER_GRID, *(-t for t in reversed(OUTER_GRID[:-1]))], dtype=torch.float64)
+
+
+@functools.cache
+def grid_weights() -> Float[Tensor, "23 5"]:
+    """Return the weights of the nodes in the deviations on the grid.
+
+    >>> grid_weights()[[0, 3, 7, 9]].tolist()
+    [[1.0, 0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0], [0.0, 0.5, 0.5, 0.0, 0.0]]
+    """
+    return interpolation(grid(), torch.tensor(NODES, dtype=torch.float64))
+
+
+def interpolation(at: Float[Tensor, "*b"], nodes: Float[Tensor, "k"]) -> Float[Tensor, "*b k"]:
+    """Return the weights of descending nodes in the value at each place: linear between, constant outside."""
+    held = torch.minimum(torch.maximum(at, nodes[-1]), nodes[0])[..., None]
+    gaps = nodes[:-1] - nodes[1:]
+    share = ((nodes[:-1] - held) / gaps).clamp(0, 1)  # how far each gap has been passed
+    return torch.cat([torch.ones_like(held), share], -1) - torch.cat([share, torch.zeros_like(held)], -1)
+
+
+def well_inside(shape: ShapeGP, contacts: Contacts) -> Bool[Tensor, "b"]:
+    """Tell which triples are a footprint or more inside the domain, where `line_posterior` is defined."""
+    radius = torch.linalg.vector_norm(shape.normalise(contacts.points.detach().double().to(shape.device)), dim=-1)
+    return (radius + FOOTPRINT / shape.scale <= shape.domain_radius).all(-1)
+
+
+def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
+    """Return the posterior of the surface along the fingers' lines.
+
+    Raises:
+        BadArgument: contacts of a wrong shape, not finite, within a footprint of the domain's edge, or without unit
+            normals.
+    """
+    for name, value in (("points", contacts.points), ("normals", contacts.normals)):
+        check_tensor(f"contacts.{name}", value, (len(contacts), 3, 3))
+    points = shape.normalise(contacts.points.detach().double().to(shape.device))
+    normals = check_unit(contacts.normals.detach().double().to(shape.device))
+    if not bool(well_inside(shape, contacts).all()):
+        raise BadArgument("contacts.points", "a contact at the edge of the domain", "contacts further inside")
+    deviation = shape.std_factor * shape.jet(points.flatten(0, 1)).variance.sqrt().reshape(points.shape[:2])
+    nodes = deviation[..., None] * torch.tensor(NODES).to(deviation)
+    covariance = points.new_empty(len(points), 12 * len(NODES), 12 * len(NODES))
+    for rows in torch.arange(len(points), device=points.device).split(TRIPLES_PER_CHUNK):
+        covariance[rows] = node_covariance(shape, points[rows], normals[rows], nodes[rows])
+    slope = shape.mean_and_gradient((points[:, :, None] + nodes[..., None] * normals[:, :, None]).reshape(-1, 3))[1]
+    t = deviation[..., None] * grid().to(deviation)
+    distance = shape.mean((points[:, :, None] + t[..., None] * normals[:, :, None]).reshape(-1, 3))
+    prior = float(shape.prior_block()[0, 0])
+    root = symmetric_root(shape.std_factor**2 * covariance, prior, "contacts within the domain")
+    return LinePosterior(points, normals, deviation, distance.reshape(t.shape), slope.reshape(*nodes.shape, 3), root)
+
+
+def node_covariance(
+    shape: ShapeGP, points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"], nodes: Float[Tensor, "b 3 5"]
+) -> Float[Tensor, "b 60 60"]:
+    """Return the posterior covariance of (d, w) at the nodes, w by difference quotients of d along three axes.
+
+    Nodes outside the domain, where there is no posterior, take the covariance at its edge.
+    """
+    width = FOOTPRINT / shape.scale
+    along = (points * normals).sum(-1)
+    half_chord = (along**2 + (shape.domain_radius - width) ** 2 - (points**2).sum(-1)).sqrt()
+    nodes = torch.maximum(torch.minimum(nodes, (half_chord - along)[..., None]), -(half_chord + along)[..., None])
+    first = tangents(points, normals)
+    axes = torch.stack([normals, first, torch.linalg.cross(normals, first)], 2)  # (b, line, axis, 3)
+    around = torch.cat([torch.zeros_like(axes[:, :, :1]), axes, -axes], 2) * width
+    places = points[:, :, None] + nodes[..., None] * normals[:, :, None]
+    queries = places[:, :, :, None] + around[:, :, None]  # (b, line, node, 7, 3)
+    weights = points.new_zeros(*points.shape[:2], 4, 7)
+    weights[..., 0, 0] = 1.0
+    weights[..., 1:, 1:] = torch.cat([axes, -axes], 2).mT / (2 * width)
+    values = distance_covariance(shape, queries.flatten(1, 3)).unflatten(2, (3, -1, 7)).unflatten(1, (3, -1, 7))
+    half = torch.einsum("bimp,bikpjlq->bikmjlq", weights, values)
+    return torch.einsum("bikmjlq,bjnq->bikmjln", half, weights).flatten(4).flatten(1, 3)
+
+
+def first_contact(
+    lines: LinePosterior, drawn: Float[Tensor, "b n 60"]
+) -> tuple[Float[Tensor, "b n 3 3"], Float[Tensor, "b n 3 3"]]:
+    """Return where the fingers stop for drawn deviations, and the outward normals there.
+
+    Rows are NaN where a finger meets no surface on its grid.
+    """
+    deviation = drawn.unflatten(-1, (3, len(NODES), 4))
+    distance = lines.distance[:, None] + deviation[..., 0] @ grid_weights().to(drawn).T
+    crosses = (distance[..., :-1] > 0) & (distance[..., 1:] <= 0)
+    t = grid().to(drawn)
+    far = torch.where(crosses, t[:-1].abs(), torch.inf)
+    nearest, before = far.min(-1, keepdim=True)
+    high, low = distance.gather(-1, before), distance.gather(-1, before + 1)
+    stop = torch.lerp(t[before], t[before + 1], high / (high - low))
+    stop = torch.where(torch.isinf(nearest), torch.nan, stop)
+    weights = interpolation(stop, torch.tensor(NODES).to(stop))  # (b, n, 3, 1, k)
+    slope = lines.slope[:, None] + deviation[..., 1:]
+    motion = stop * lines.deviation[:, None, :, None]
+    return lines.points[:, None] + motion * lines.normals[:, None], unit((weights @ slope)[..., 0, :])
