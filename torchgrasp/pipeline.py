@@ -138,11 +138,10 @@ def plan_grasps(
     plan = plan_contacts(shape, spec, starts, seed)
     observer("plan", f"{starts} starts: {describe(count_status(plan.status))}", plan)
 
-    contacts = plan.contacts[spread_rows(plan, TRIPLES)]
-    certificate = certify(contacts, spec)
-    closed, offered = certificate.closed, len(contacts)
-    contacts, certificate = contacts[closed], certificate[closed]
-    message = f"{len(contacts)} of {offered} triples closed at friction {spec.planned_friction:g}"
+    offered = plan.contacts[spread_rows(plan, TRIPLES)]
+    certificate = certify(offered, spec)
+    contacts, certificate = offered[certificate.closed], certificate[certificate.closed]
+    message = f"{len(contacts)} of {len(offered)} triples closed at friction {spec.planned_friction:g}"
     observer("certify", message, certificate)
 
     world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), spec.table)

@@ -39,8 +39,8 @@ from torchgrasp.report.solids import PARKED, solids_from_hand
 from torchgrasp.shape.surface import Surface, extract_surface
 
 SPEC = ContactSpec(table=0.0)
-TRIPLES, GUESSES, TRIED = 80, 6, 16
-"""Certified triples of each object, guesses of the learned model for each assignment, and how many are refined."""
+TRIPLES, SEEDS, TRIED = 80, 6, 16
+"""Certified triples of each object, seeds of the learned model for each assignment, and how many are refined."""
 TILE = (450, 360)
 """Width and height of one picture [pixels]."""
 APART = 0.1
@@ -85,7 +85,7 @@ def grasps(out: Path, starts: int = 300, seed: int = 0) -> None:
 
 
 def take(name: str, starts: int, seed: int) -> tuple[Taken, Taken]:
-    """Return the grasps of the Allegro and the Barrett hand on one object, from the learned models' guesses."""
+    """Return the grasps of the Allegro and the Barrett hand on one object, from the learned models' seeds."""
     shape = fit_shape(load_object(name).view, seed=seed, table=SPEC.table)
     surface = extract_surface(shape)
     world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), SPEC.table)
@@ -96,7 +96,7 @@ def take(name: str, starts: int, seed: int) -> tuple[Taken, Taken]:
     found = []
     for hand in (load_hand("allegro"), load_hand("barrett")):
         problem = GraspProblem(hand, contacts, certificate, world, surface.vertices.mean(0))
-        seeds = query_mixture(hand, contacts, load_mixture(hand.name), GUESSES)
+        seeds = query_mixture(hand, contacts, load_mixture(hand.name), SEEDS)
         seeds = seeds[rank_seeds(problem, seeds) < TRIED]
         refined = refine_on_contacts(problem, seeds)
         good = refined.status == Status.OK

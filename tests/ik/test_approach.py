@@ -108,7 +108,7 @@ def test_the_path_turns_with_hand_and_frame():
 
 
 def test_what_is_called_free_is_free_where_the_nearest_node_errs(generator):
-    """Nodes 3 cm apart rank the paths badly; one that is free is found all the same, and its clearance is exact."""
+    """Nodes 3 cm apart rank the paths badly; one that is free is chosen all the same, and its clearance is exact."""
     hand, grasp = pinch("allegro")
     posture = Configuration(grasp.pregrasp, grasp.obj_from_hand)
     centres = SpatialJacobian.at(hand, posture).points(hand.collision_spheres.link_index, hand.collision_spheres.center)
@@ -121,8 +121,8 @@ def test_what_is_called_free_is_free_where_the_nearest_node_errs(generator):
         field = field_of(wall_of(normal, middle + (room.max() - 1e-3) * normal), middle, half=0.42, spacing=0.03)
         by_node = torch.stack([(field.nearest_node(path) - radius).min() for path in paths]).argmax()
         erred += int(room[by_node] < room.max() - 1e-3)
-        found, clearance = find_approach(hand, posture, CollisionWorld(field, None))
-        which = (directions - found).norm(dim=1).argmin()
+        direction, clearance = find_approach(hand, posture, CollisionWorld(field, None))
+        which = (directions - direction).norm(dim=1).argmin()
         assert float(clearance) == pytest.approx(float(room[which] - room.max() + 1e-3), abs=1e-12)
         assert float(clearance) >= 0
     assert erred > 2

@@ -34,23 +34,23 @@ def touched(library: PostureLibrary, poses: torch.Tensor) -> Contacts:
 
 
 def test_eq24_postures_of_the_library_are_found_and_placed(library, poses):
-    found = nearest_postures(library, touched(library, poses), CollisionWorld(NOTHING), n_seeds=3)
-    assert found.row.tolist() == [i for i in range(12) for _ in range(3)]
-    best = found[torch.arange(0, 36, 3)]
+    seeds = nearest_postures(library, touched(library, poses), CollisionWorld(NOTHING), n_seeds=3)
+    assert seeds.row.tolist() == [i for i in range(12) for _ in range(3)]
+    best = seeds[torch.arange(0, 36, 3)]
     torch.testing.assert_close(best.joints, library.joints[:12])
     torch.testing.assert_close(best.obj_from_hand, poses)
     assert best.permutation.tolist() == [[0, 1, 2]] * 12
     assert float(best.tip_error.max()) < 1e-9
     assert float(best.energy.max()) < 1e-3  # rounding of single precision
-    assert bool((best.energy <= found.energy.view(12, 3).T).all())
+    assert bool((best.energy <= seeds.energy.view(12, 3).T).all())
 
 
 def test_the_order_of_the_contacts_does_not_matter(library, poses):
     contacts, order = touched(library, poses), [2, 0, 1]
     turned = Contacts(contacts.points[:, order], contacts.normals[:, order])
-    found = nearest_postures(library, turned, CollisionWorld(NOTHING), n_seeds=1)
-    torch.testing.assert_close(found.joints, library.joints[:12])
-    assert found.permutation.tolist() == [[1, 2, 0]] * 12  # finger i takes the contact that was its own
+    seeds = nearest_postures(library, turned, CollisionWorld(NOTHING), n_seeds=1)
+    torch.testing.assert_close(seeds.joints, library.joints[:12])
+    assert seeds.permutation.tolist() == [[1, 2, 0]] * 12  # finger i takes the contact that was its own
 
 
 def test_a_table_moves_clear_postures_to_the_front(library, poses):
@@ -85,11 +85,11 @@ def test_degenerate_triples_have_no_seeds_and_same_seed_same_bits(library, poses
     points, normals = contacts.points.clone(), contacts.normals.clone()
     points[4], normals[4] = line, up
     mixed = Contacts(points, normals)
-    found = nearest_postures(library, mixed, CollisionWorld(NOTHING), n_seeds=2)
-    assert 4 not in found.row.tolist() and len(found) == 22
+    seeds = nearest_postures(library, mixed, CollisionWorld(NOTHING), n_seeds=2)
+    assert 4 not in seeds.row.tolist() and len(seeds) == 22
     same = PostureLibrary.of(library.hand, 400, seed=3)
     again = nearest_postures(same, mixed, CollisionWorld(NOTHING), n_seeds=2)
-    assert torch.equal(found.joints, again.joints) and torch.equal(found.obj_from_hand, again.obj_from_hand)
+    assert torch.equal(seeds.joints, again.joints) and torch.equal(seeds.obj_from_hand, again.obj_from_hand)
     assert len(nearest_postures(library, mixed[:0], CollisionWorld(NOTHING))) == 0
     with pytest.raises(BadArgument, match="n_seeds"):
         nearest_postures(library, mixed, CollisionWorld(NOTHING), n_seeds=0)

@@ -85,9 +85,9 @@ def ring(lift=0.0, shift=0.0):
 
 def test_features_of_a_triangle_by_hand():
     cone = math.atan(0.5)
-    found = success_features(ring(lift=0.2), CLOSED, PADS, CENTER, 0.5)[0]
+    features = success_features(ring(lift=0.2), CLOSED, PADS, CENTER, 0.5)[0]
     torch.testing.assert_close(
-        found, torch.tensor([math.log(9), 1.5, 0.2 / cone, 0.2 / cone, 0.2], dtype=torch.float64), atol=1e-3, rtol=0
+        features, torch.tensor([math.log(9), 1.5, 0.2 / cone, 0.2 / cone, 0.2], dtype=torch.float64), atol=1e-3, rtol=0
     )
     # Forces that meet where the normals do need no friction; those to the centre, half a radius aside, do.
     _, offset, least, lean, _ = success_features(ring(shift=0.01), CLOSED, PADS, CENTER, 0.5)[0]

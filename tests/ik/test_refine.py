@@ -95,13 +95,13 @@ def test_disturbed_postures_come_back(hand, ball):
     g = len(truth.joints)
     scale = torch.cat([torch.full((3,), 0.005), torch.full((3,), 0.17), torch.full((hand.dof,), 0.15)]).double()
     start = truth.integrate(hand, torch.randn(g, 6 + hand.dof, generator=rng, dtype=torch.float64) * scale)
-    found = refine(hand, start, contacts, far(ball))
-    error = tip_error(SpatialJacobian.at(hand, found), contacts).amax(1)
+    refined = refine(hand, start, contacts, far(ball))
+    error = tip_error(SpatialJacobian.at(hand, refined), contacts).amax(1)
     assert float((error < MILLIMETRE).double().mean()) > 0.95
-    assert bool((found.joints >= hand.lower).all())
-    assert bool((found.joints <= hand.upper).all())
+    assert bool((refined.joints >= hand.lower).all())
+    assert bool((refined.joints <= hand.upper).all())
     assert bool(
-        (refinement_cost(hand, found, contacts, far(ball)) <= refinement_cost(hand, start, contacts, far(ball))).all()
+        (refinement_cost(hand, refined, contacts, far(ball)) <= refinement_cost(hand, start, contacts, far(ball))).all()
     )
 
 

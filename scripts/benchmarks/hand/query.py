@@ -40,7 +40,7 @@ Result = TypeVar("Result")
 
 
 def bench_codes(codes: int, peers: int) -> list[Row]:
-    """Solve held-out codes of both hands, and some of them with COBYLA from the likeliest guess.
+    """Solve held-out codes of both hands, and some of them with COBYLA from the likeliest seed.
 
     Args:
         codes: of each hand.
@@ -104,7 +104,7 @@ def _solved_row(hand: str, what: str, solution: IKSolution, seconds: float, bar:
 
 
 def _cobyla_row(hand: Hand, mixture: GraspMixture, contacts: Contacts, ours: IKSolution, seconds: float) -> Row:
-    """Return the row of COBYLA from the first guess alone, one try a code."""
+    """Return the row of COBYLA from the first seed alone, one try a code."""
     seeds, asked = timed(lambda: query_mixture(hand, contacts, mixture, n_seeds=SEEDS_PER_ASSIGNMENT))
     seeds = seeds[rank_in_group(seeds.row) == 0]
     taken, start = assign(contacts, seeds), Configuration(seeds.joints, seeds.obj_from_hand)
@@ -130,7 +130,7 @@ def _cobyla_row(hand: Hand, mixture: GraspMixture, contacts: Contacts, ours: IKS
     worse = [float(x.quantile(0.9)) for x in (mine, error)]
     ratio = each / seconds
     return Row(
-        f"COBYLA (SciPy) from the first guess, {len(contacts)} of these codes, {hand.name}",
+        f"COBYLA (SciPy) from the first seed, {len(contacts)} of these codes, {hand.name}",
         f">= {RATIO:g}x slower, at equal or larger error (median and 90 %)",
         f"{ratio:.0f}x ({1e3 * each:.0f} ms a code, {1e3 * scipy:.0f} ms of them SciPy's own: {scipy / seconds:.0f}x); "
         f"error median {medians[1]:.1e} mm (ours {medians[0]:.1e}), 90 % {worse[1]:.1e} mm (ours {worse[0]:.1e}); "

@@ -3,7 +3,7 @@
 A start is certified when its planned contacts are (default specification with a table, LP margin and rank). A grasp is
 executable when every fingertip is within 1 mm of its contact and inside its pad's cone, joints within their
 limits, and links and pre-grasp clear of the estimated surface, the table and each other. The cost of a grasp is the
-processor's time of planning, certificates, guesses and solving; the shape and its distance field are given.
+processor's time of planning, certificates, seeds and solving; the shape and its distance field are given.
 """
 
 import time
@@ -42,7 +42,7 @@ def bench_executable(views: list[Any], starts: int, seed: int) -> list[Row]:
     """Count executable grasps of both hands and modes on the first view of each object."""
     first = {name: cloud for name, _, cloud, _ in reversed(views)}
     hands = {name: load_hand(name) for name in ("allegro", "barrett")}
-    found: dict[tuple[str, str], dict[str, dict[str, Any]]] = {}
+    results: dict[tuple[str, str], dict[str, dict[str, Any]]] = {}
     for name, cloud in tqdm(first.items(), desc="executable", disable=None, leave=False):
         shape = fit_shape(cloud, seed=seed, table=SPEC.table)
         surface = extract_surface(shape)
@@ -64,14 +64,14 @@ def bench_executable(views: list[Any], starts: int, seed: int) -> list[Row]:
                     seeds = query_mixture(hand, contacts, load_mixture(hand_name))
                     grasps = solve_contact_first(problem, seeds)
                 good = int((grasps.status == Status.OK).sum())
-                found.setdefault((hand_name, mode), {})[name] = {
+                results.setdefault((hand_name, mode), {})[name] = {
                     "certified": len(contacts),
                     "executable": good,
                     "share": good / max(len(contacts), 1),
                     "ms": 1e3 * (planned + time.process_time() - began) / max(good, 1),
                     "blocked": count_blockers(hand, grasps, world),
                 }
-    return [_row(*key, objects, starts) for key, objects in found.items()]
+    return [_row(*key, objects, starts) for key, objects in results.items()]
 
 
 def count_blockers(hand: Hand, grasps: Grasps, world: CollisionWorld) -> dict[str, float]:
