@@ -27,7 +27,7 @@ from torchgrasp import PointCloud, ShapeGP, fit_shape, list_objects, load_object
 from torchgrasp.files import write_atomically
 from torchgrasp.report.canvas import Canvas, draw_bar
 from torchgrasp.report.palette import INK, PAPER
-from torchgrasp.report.pictures import turned, view_of
+from torchgrasp.report.pictures import rotated, view_of
 from torchgrasp.shape.surface import Surface, extract_surface
 
 TILE = (340, 360)
@@ -69,7 +69,7 @@ def fig4(out: Path, seed: int = 0) -> None:
     most = 1e3 * max(float(surface.std_m.quantile(0.99)) for _, _, surfaces, _ in scenes for surface in surfaces)
     sheet = Image.new("RGB", (TILE[0] * len(scenes), TILE[1] * len(ROWS) + 110), PAPER)
     for column, (thing, clouds, surfaces, arrows) in enumerate(scenes):
-        eye = turned(view_of(thing.view), TURN)
+        eye = rotated(view_of(thing.view), TURN)
         corners = np.asarray(thing.mesh.vertices)
         rows = ((clouds[0], None), (surfaces[0], arrows[0]), (clouds[1], None), (surfaces[1], arrows[1]))
         for row, (what, normals) in enumerate(rows):

@@ -33,9 +33,9 @@ from torchgrasp.ik.query import query_mixture
 from torchgrasp.ik.sdf import field_from_surface
 from torchgrasp.pipeline import spread_rows
 from torchgrasp.report.canvas import Canvas
-from torchgrasp.report.palette import AXES, FINGERS, HAND, INK, OBJECT, PAPER
+from torchgrasp.report.palette import AXES, FINGERS, INK, OBJECT, PAPER
 from torchgrasp.report.pictures import Direction, facing
-from torchgrasp.report.solids import PARKED, solids_from_hand
+from torchgrasp.report.solids import solids_from_hand
 from torchgrasp.shape.surface import Surface, extract_surface
 
 SPEC = ContactSpec(table=0.0)
@@ -160,7 +160,7 @@ def draw(taken: Taken, index: int, eye: Direction) -> Image.Image:
     joints = hand.expand_joints(grasp.joints[0])
     solids = solids_from_hand(hand, joints, hand.tree.joint_names, grasp.obj_from_hand[0])
     for solid in solids:
-        canvas.add_mesh(solid.vertices, solid.faces, HAND if solid.finger == PARKED else FINGERS[solid.finger])
+        canvas.add_mesh(solid.vertices, solid.faces, solid.color)
     _add_frame(canvas, contacts)
     corners = np.concatenate([vertices, *(s.vertices for s in solids)])
     return Image.open(io.BytesIO(canvas.render_png(corners, eye)))

@@ -27,7 +27,7 @@ from torchgrasp.linalg import farthest_points
 from torchgrasp.plan.closure_probability import closure_probability
 from torchgrasp.report.canvas import Canvas, draw_bar
 from torchgrasp.report.palette import INK, PAPER
-from torchgrasp.report.pictures import turned
+from torchgrasp.report.pictures import rotated
 from torchgrasp.shape.surface import Surface, extract_surface
 
 THRESHOLDS = (0.03, 0.06, 0.10)
@@ -161,7 +161,7 @@ def draw(surface: Surface, contacts: Contacts, most: float) -> Image.Image:
     canvas = Canvas()
     canvas.add_values(vertices, surface.faces.numpy(), normals, 1e3 * surface.std_m.numpy(), most, "viridis")
     canvas.add_arrows(points, outward, ARROW, RED)
-    eyes = [turned((1.0, 0.0, 0.45), angle) for angle in range(0, 360, 15)]
+    eyes = [rotated((1.0, 0.0, 0.45), angle) for angle in range(0, 360, 15)]
     facing = [np.sort(outward @ eye) for eye in eyes]
     eye = eyes[int(np.argmax([f[0] + 0.5 * f[1] for f in facing]))]
     corners = np.concatenate([vertices, points + ARROW * outward])

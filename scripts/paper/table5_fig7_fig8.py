@@ -16,9 +16,9 @@ from torchgrasp import Hand, load_hand, load_mixture
 from torchgrasp.files import write_atomically, write_file
 from torchgrasp.posture_model.sample import sample_configurations
 from torchgrasp.report.canvas import Canvas
-from torchgrasp.report.palette import FINGERS, GRID, HAND, INK, PAPER
+from torchgrasp.report.palette import FINGERS, GRID, INK, PAPER
 from torchgrasp.report.pictures import Direction
-from torchgrasp.report.solids import PARKED, solids_from_hand
+from torchgrasp.report.solids import solids_from_hand
 
 PUBLISHED = {
     "cases": [[0.03, 0.06, 0.27, 0.26], [0.17, 0.01, 0.27, 0.002], [0.04, 0.07, 0.25, 0.08], [0.03, 0.2, 0.06, 0.56]],
@@ -146,8 +146,7 @@ def draw_both(hand: Hand, true: Float[Tensor, "h"], predicted: Float[Tensor, "h"
     canvas, corners = Canvas(), []
     for joints, transparent in ((true, False), (predicted, True)):
         for solid in solids_from_hand(hand, hand.expand_joints(joints), hand.tree.joint_names, torch.eye(4).double()):
-            color = HAND if solid.finger == PARKED else FINGERS[solid.finger]
-            canvas.add_mesh(solid.vertices, solid.faces, color, transparent=transparent)
+            canvas.add_mesh(solid.vertices, solid.faces, solid.color, transparent=transparent)
             corners.append(solid.vertices)
     return Image.open(io.BytesIO(canvas.render_png(np.concatenate(corners), EYE)))
 

@@ -1,7 +1,10 @@
-"""The command line, one file a group of commands: grasps, clouds, hands, shapes.
+"""The command line, one file for each group of commands.
 
-Exit codes: 0 the job is done; 1 no grasp is executable, or the object was not held; 2 a bad input, with one sentence
-on stderr; 130 interrupted.
+Exit codes:
+    0: the job is done.
+    1: no grasp is executable, or the object was not held.
+    2: a bad input, with one sentence on stderr.
+    130: interrupted.
 """
 
 import os
@@ -33,7 +36,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code; every error of this library ends as one sentence on stderr."""
+    """Run the command line; return its exit code. Errors end as one sentence on stderr."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given == ["--version"]:
         from torchgrasp import __version__
@@ -62,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _join_group(given: list[str]) -> list[str]:
-    """Return the arguments with the name of a group and its command as one word; a group alone asks for help.
+    """Join a group and its command into one word; a group alone asks for help.
 
     >>> _join_group(["cloud", "check", "a.ply"]), _join_group(["cloud"])
     (['cloud check', 'a.ply'], ['--help'])

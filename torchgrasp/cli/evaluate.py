@@ -8,8 +8,8 @@ from torchgrasp.cli.common import check_seed, naming
 from torchgrasp.cli.grasps import check_simulator
 from torchgrasp.columns import format_columns, format_line
 from torchgrasp.errors import Status
-from torchgrasp.evaluation.evaluate import EvaluationSpec, Ranks
-from torchgrasp.evaluation.evaluate import evaluate as evaluate_views
+from torchgrasp.evaluation.campaign import EvaluationSpec, Ranks
+from torchgrasp.evaluation.campaign import evaluate as evaluate_views
 from torchgrasp.evaluation.protocols import find_protocol
 from torchgrasp.evaluation.score import ViewScore, summarise
 from torchgrasp.files import format_json, hold_folder, write_file
@@ -38,29 +38,27 @@ def evaluate(
     workers: int = 1,
     seed: int = 0,
 ) -> int:
-    """Plan on each noisy view of a folder's objects and put the best grasps through a protocol in simulation.
+    """Plan on each noisy view of a folder's objects and test the best grasps in simulation.
 
-    Prints a line for each view, then the shares with 95 % Wilson intervals. Writes evaluate.json, evaluate.html, and
-    the grasps of each view into the folder grasps.
+    Prints a line for each view, then shares with 95 % Wilson intervals. Writes evaluate.json, evaluate.html, and a
+    folder of grasps.
 
     Args:
         objects: folder with manifest.json, and for each object mesh.ply and noisy views.
         hand: allegro, allegro_biotac, barrett, or the folder of another hand.
         out: folder of the results; it is made where it does not exist, and no other run may use it meanwhile.
         protocol: which test; see torchgrasp.evaluation.protocols.
-        closing: how the hand closes; by default open loop where the object is pulled at, under uncertainty where it is
-            lifted.
+        closing: how the hand closes; by default in open loop before a pull, under uncertainty before a lift.
         holding: how the hand presses from then on.
         simulator: sapien or mujoco.
-        force: normal force of the strongest finger [N]; by default 7 where the object is pulled at, 4 where it is
-            lifted.
+        force: normal force of the strongest finger [N]; by default 7 before a pull, 4 before a lift.
         grasps: the most that are tried of each view.
         ranks: which of them: the best, or as many spread over all ranks.
         starts: random starts of the contact planner.
         complete: plan on the whole cloud instead of each view.
         only: names of objects to keep; by default all.
-        planned: folder "grasps" of an earlier run: its grasps are put to the test, and nothing is planned.
-        workers: processes that share the work; the results do not depend on how many.
+        planned: folder "grasps" of an earlier run, whose grasps are tested.
+        workers: processes; the results do not depend on their number.
         seed: of every random draw.
     """
     check_seed(seed)
@@ -99,7 +97,7 @@ def print_score(score: ViewScore) -> None:
 
 
 def print_summary(protocol: str, summary: dict[str, Any]) -> None:
-    """Print the shares, the failures by stage, and the cost."""
+    """Print shares, failures by stage, and cost."""
     print(f"\n{protocol}")
     rows = []
     for key, text in SHARE_NAMES.items():

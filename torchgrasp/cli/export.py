@@ -22,7 +22,7 @@ def export(
     most: int = 20,
     force: float = 4.0,
 ) -> int:
-    """Write the best executable grasps of a file for replay: pre-grasp, grasp and squeeze, joints by their names.
+    """Write the best executable grasps of a file for replay, with joints by name.
 
     Args:
         grasps: grasps.safetensors of `torchgrasp grasp`, or a file of the folder grasps of `torchgrasp evaluate`.
@@ -33,14 +33,14 @@ def export(
         force: normal force of the strongest finger [N] in the squeeze.
     """
     with naming("GRASPS", "path"):
-        found = load_grasps(grasps)
+        planned = load_grasps(grasps)
     with naming("--hand", "hand", "name"):
-        robot = load_hand(found.meta.get("hand", "") if hand is None else hand)
-    if found.meta.get("hand_sha256") != robot.source.sha256:
+        robot = load_hand(planned.meta.get("hand", "") if hand is None else hand)
+    if planned.meta.get("hand_sha256") != robot.source.sha256:
         raise BadArgument("--hand", f"{robot.name}, whose files are not those that were planned with", "the same hand")
     if most < 1:
         raise BadArgument("--most", most, "at least 1")
-    best = found[found.status == Status.OK][:most]
+    best = planned[planned.status == Status.OK][:most]
     with naming("--force", "force"):
         text = (format_grasps if format == "json" else format_keyframes)(robot, best, force)
     with naming("--out", "path"):

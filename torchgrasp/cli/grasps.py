@@ -1,4 +1,4 @@
-"""`torchgrasp grasp`: from a cloud to grasps and on to a held object; `torchgrasp objects` lists what to try it on."""
+"""`torchgrasp grasp`: from a cloud to a held object; `torchgrasp objects` lists examples."""
 
 import dataclasses
 import importlib
@@ -36,7 +36,7 @@ PLANNING = ("shape", "plan", "certify", "query", "refine")
 
 
 def objects() -> int:
-    """List the objects that come with torchgrasp: a noisy view to plan on and the true mesh to close on."""
+    """List the objects that come with torchgrasp, with a noisy view and a true mesh."""
     for name in list_objects():
         print(f"{name} ({MASSES[name]:g} kg)\n  view: {DATA / name / 'view.ply'}\n  mesh: {DATA / name / 'mesh.ply'}")
     return 0
@@ -57,7 +57,7 @@ def grasp(
     friction: float = 0.8,
     mode: Mode = "joint",
 ) -> int:
-    """Plan grasps of the object of a partial point cloud, and close on it in simulation.
+    """Plan grasps of the object in a partial cloud, and close on it in simulation.
 
     Writes grasps.safetensors and report.html into the output folder.
 
@@ -88,12 +88,12 @@ def grasp(
     with naming("--hand", "hand", "name"):
         the_hand = load_hand(hand)
     with naming("CLOUD", "path", "points", "normals"), naming("--viewpoint", "viewpoint"):
-        seen = read_cloud(cloud, viewpoint)
+        partial = read_cloud(cloud, viewpoint)
     true_mesh, parts = None, None
     if mesh is not None:
         with naming("--mesh", "mesh"):
             true_mesh, parts = read_true_mesh(mesh)
-    height = table_height(seen, table, no_table)
+    height = table_height(partial, table, no_table)
     with naming("--friction", "friction"), naming("--table", "table"):
         spec = ContactSpec(friction=friction, table=height)
         trial = TrialSpec(friction=friction)
@@ -102,13 +102,13 @@ def grasp(
     with _Progress((*PLANNING, *extra, "report")) as progress:
         origin = "no table" if height is None else f"table at z = {height:.3f} m"
         origin += " (lowest point)" * (height is not None and table is None)
-        camera = "camera known" if seen.viewpoint is not None else "camera estimated"
-        progress.end("cloud", f"{len(seen)} points, {camera}, {origin}")
-        grasps = plan_grasps(seen, the_hand, spec, starts, seed, mode=mode, observer=progress.end)
+        camera = "camera known" if partial.viewpoint is not None else "camera estimated"
+        progress.end("cloud", f"{len(partial)} points, {camera}, {origin}")
+        grasps = plan_grasps(partial, the_hand, spec, starts, seed, mode=mode, observer=progress.end)
         surface = extract_surface(progress.values["shape"])
         name = object_name(cloud if mesh is None else mesh)
         plan = progress.values["plan"]
-        run = Run(name, cloud, seen, the_hand, spec, surface, grasps, tuple(progress.stages), plan)
+        run = Run(name, cloud, partial, the_hand, spec, surface, grasps, tuple(progress.stages), plan)
         if close and true_mesh is not None and len(run.executable):
             closure = close_hand(run.executable[0], the_hand, true_mesh, trial, seed=seed, parts=parts)
             progress.end("closing", f"{closure.time[-1]:.1f} s simulated, {closure.status.name.lower()}")
@@ -125,7 +125,7 @@ def grasp(
 
 
 def check_simulator(name: Simulator = "sapien") -> None:
-    """Refuse a simulator that is not installed, or that lacks a library of the system.
+    """Refuse a simulator that cannot be loaded.
 
     Raises:
         MissingExtra: it is not installed.
@@ -143,7 +143,7 @@ def check_simulator(name: Simulator = "sapien") -> None:
 
 
 def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] | None]":
-    """Read a closed mesh, and its convex parts when it is one of the objects that come with torchgrasp.
+    """Read a closed mesh; an object of torchgrasp comes with its convex parts.
 
     Raises:
         MeshError: the mesh is missing, open, or without volume.
@@ -156,7 +156,7 @@ def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] 
 
 
 def object_name(path: Path) -> str:
-    """Name an object by its file, or by the file's folder where the file has a generic name.
+    """Name an object by its file, or by the folder of a generic file.
 
     >>> object_name(Path("objects/jug/mesh.ply")), object_name(Path("mug.pcd"))
     ('jug', 'mug')
@@ -166,7 +166,7 @@ def object_name(path: Path) -> str:
 
 
 class _Progress:
-    """A line on stdout for each stage that ended, and on a terminal a bar that names the stage under way."""
+    """A line for each stage that ended; on a terminal a bar names the stage under way."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self.names = names

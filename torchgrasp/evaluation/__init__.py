@@ -1,1 +1,37 @@
-"""Simulated trials: lifts, pulls, protocols and scores."""
+"""What is asked of a grasp: trials in simulation, published protocols, campaigns and their scores."""
+
+from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
+from torchgrasp.evaluation.campaign import EvaluationSpec, evaluate, run_protocol
+from torchgrasp.evaluation.lift import close_hand, lift_grasp
+from torchgrasp.evaluation.pool import run_tasks
+from torchgrasp.evaluation.pose_noise import PoseNoise, apply_error, draw_hand_errors, draw_object_poses
+from torchgrasp.evaluation.protocols import PROTOCOLS, Protocol, PullSpec, draw_error, find_protocol
+from torchgrasp.evaluation.pull import PullResult, pull_grasp
+from torchgrasp.evaluation.score import ProtocolResult, ViewScore, share, summarise
+
+__all__ = [
+    "PROTOCOLS",
+    "EvaluationSpec",
+    "GraspTrial",
+    "PoseNoise",
+    "Protocol",
+    "ProtocolResult",
+    "PullResult",
+    "PullSpec",
+    "TrialDriver",
+    "TrialRun",
+    "ViewScore",
+    "apply_error",
+    "close_hand",
+    "draw_error",
+    "draw_hand_errors",
+    "draw_object_poses",
+    "evaluate",
+    "find_protocol",
+    "lift_grasp",
+    "pull_grasp",
+    "run_protocol",
+    "run_tasks",
+    "share",
+    "summarise",
+]

@@ -1,1 +1,7 @@
-"""Pictures and one HTML page of a run."""
+"""Pages and pictures: of a run, of an evaluation, of a hand. No OpenGL, no display."""
+
+from torchgrasp.report.evaluation import write_evaluation
+from torchgrasp.report.page import draw_pictures, write_report
+from torchgrasp.report.run import Run, Stage, verdict
+
+__all__ = ["Run", "Stage", "draw_pictures", "verdict", "write_evaluation", "write_report"]

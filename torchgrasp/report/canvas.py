@@ -1,4 +1,4 @@
-"""A canvas for one still: collects meshes, points and a table top, frames them, and returns a PNG."""
+"""A canvas for one still: it collects shapes, frames them, and returns a PNG."""
 
 import io
 
@@ -12,10 +12,10 @@ SIZE = (900, 720)
 """Width and height of a still [pixels]."""
 
 VIEW_ANGLE = np.deg2rad(24.0)
-"""Vertical angle of view of the camera."""
+"""Vertical angle of view [rad]: of a long lens, which distorts little."""
 
-SHARP = np.deg2rad(40.0)
-"""Edges that bend by more are drawn sharp."""
+SHARP_ANGLE = np.deg2rad(40.0)
+"""Bend [rad] from which on an edge is sharp: those of boxes are, those of a cylinder of 40 sides are not."""
 
 
 class Canvas:
@@ -33,7 +33,7 @@ class Canvas:
         normals: Float[np.ndarray, "v 3"] | None = None,
         transparent: bool = False,
     ) -> None:
-        """Add a mesh of one colour, smooth where it has `normals`, else with sharp edges where it bends much."""
+        """Add a mesh of one colour; without `normals` its edges are sharp where it bends much."""
         corners = vertices[faces]
         bent = _sharp_normals(vertices, faces) if normals is None else normals[faces]
         triangles = _triangles(corners, bent, np.broadcast_to(rgb(color), corners.shape))
@@ -48,25 +48,25 @@ class Canvas:
         most: float,
         colors: str,
     ) -> None:
-        """Add a smooth mesh coloured by values at its vertices, from 0 to `most`, by a colour map of matplotlib."""
-        self.solid.append(_triangles(vertices[faces], normals[faces], _mapped(values / most, colors)[faces]))
+        """Add a smooth mesh coloured by values from 0 to `most` at its vertices."""
+        self.solid.append(_triangles(vertices[faces], normals[faces], _colors(values / most, colors)[faces]))
 
     def add_points(self, points: Float[np.ndarray, "n 3"], values: Float[np.ndarray, " n"], colors: str) -> None:
-        """Add points as small balls, coloured by their values."""
+        """Add points as small balls, coloured by values."""
         from trimesh import creation
 
         size = 0.006 * float(np.linalg.norm(np.ptp(points, axis=0)))
         ball = creation.icosphere(subdivisions=1, radius=1.0)
         corners = (points[:, None, None] + size * ball.vertices[ball.faces]).reshape(-1, 3, 3)
         normals = np.tile(ball.vertices[ball.faces], (len(points), 1, 1))
-        shade = _mapped((values - values.min()) / max(float(np.ptp(values)), 1e-12), colors)
+        shade = _colors((values - values.min()) / max(float(np.ptp(values)), 1e-12), colors)
         shades = np.broadcast_to(np.repeat(shade, len(ball.faces), 0)[:, None], corners.shape)
         self.solid.append(_triangles(corners, normals, shades))
 
     def add_arrows(
         self, starts: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"], length: float, color: str
     ) -> None:
-        """Add arrows of one length [m] in unit directions, each from a small ball: observed points with normals."""
+        """Add arrows of one length [m] in unit directions, each from a small ball."""
         from trimesh import creation
 
         head = creation.cone(radius=0.1, height=0.35, sections=8)
@@ -79,9 +79,9 @@ class Canvas:
         for start, direction in zip(starts, directions, strict=True):
             side = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
             side /= np.linalg.norm(side)
-            turn = np.stack([side, np.cross(direction, side), direction])
+            axes = np.stack([side, np.cross(direction, side), direction])
             for part in upright:
-                self.add_mesh(length * np.asarray(part.vertices) @ turn + start, np.asarray(part.faces), color)
+                self.add_mesh(length * np.asarray(part.vertices) @ axes + start, np.asarray(part.faces), color)
 
     def add_disc(self, center: tuple[float, float, float], radius: float, color: str) -> None:
         """Add a level disc without light and shade."""
@@ -98,11 +98,11 @@ class Canvas:
         direction: tuple[float, float, float],
         bar: tuple[str, float, str] | None = None,
     ) -> bytes:
-        """Frame `corners` from a direction, slightly from above, and return the PNG.
+        """Frame `corners` [m] from a direction and return the PNG.
 
         Args:
-            corners: points that the frame holds [m].
-            direction: from them to the camera; its height is kept between 15 and 40 degrees.
+            corners: points that the frame holds.
+            direction: to the camera; its height is kept between 15 and 40 degrees.
             bar: title, largest value and colour map of a bar at the bottom.
         """
         from PIL import Image
@@ -118,7 +118,7 @@ class Canvas:
 
 
 def frame_camera(corners: Float[np.ndarray, "n 3"], direction: tuple[float, float, float], drop: float = 0.0) -> Camera:
-    """Return a camera that sees all `corners`; `drop` is the share of the picture left empty below them."""
+    """Return a camera that sees all `corners` and a `drop`, the empty share of the picture below."""
     x, y, z = direction
     flat = float(np.hypot(x, y))
     if flat < 1e-9:
@@ -129,8 +129,8 @@ def frame_camera(corners: Float[np.ndarray, "n 3"], direction: tuple[float, floa
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
     frame = np.stack([right, np.cross(back, right), back])
-    seen = corners @ frame.T
-    middle, half = (seen.min(0) + seen.max(0)) / 2, np.ptp(seen, axis=0) / 2
+    local = corners @ frame.T
+    middle, half = (local.min(0) + local.max(0)) / 2, np.ptp(local, axis=0) / 2
     # The nearest corners look largest, so the distance is counted from them.
     reach = max(half[1] / (1.0 - 1.5 * drop), half[0] * SIZE[1] / SIZE[0]) / np.tan(VIEW_ANGLE / 2)
     distance = half[2] + 1.12 * reach
@@ -144,7 +144,7 @@ def _triangles(corners: np.ndarray, normals: np.ndarray, colors: np.ndarray) -> 
 
 
 def _sharp_normals(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> Float[np.ndarray, "f 3 3"]:
-    """Return a normal for each corner of each face: the mean over the faces there that bend by less than `SHARP`."""
+    """Return for each corner of a face the mean normal of the faces there, up to `SHARP_ANGLE`."""
     a, b, c = vertices[faces].transpose(1, 0, 2)
     weighted = np.cross(b - a, c - a)  # as long as twice the face's area
     flat = weighted / np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-300)
@@ -157,27 +157,27 @@ def _sharp_normals(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> Flo
     corner = np.repeat(np.arange(len(at)), counts[at])
     offset = np.arange(len(corner)) - np.repeat(np.cumsum(counts[at]) - counts[at], counts[at])
     other = order[start[at[corner]] + offset]
-    near = (flat[corner // 3] * flat[other // 3]).sum(1) > np.cos(SHARP)
+    near = (flat[corner // 3] * flat[other // 3]).sum(1) > np.cos(SHARP_ANGLE)
     sums = np.zeros((len(at), 3))
     np.add.at(sums, corner[near], weighted[other[near] // 3])
     return (sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-300)).reshape(-1, 3, 3)
 
 
-def _mapped(values: np.ndarray, colors: str) -> np.ndarray:
-    """Return the colours of values in [0, 1] by a colour map of matplotlib."""
+def _colors(values: np.ndarray, colors: str) -> np.ndarray:
+    """Return the colours of values in [0, 1] by a map of matplotlib."""
     import matplotlib
 
     return matplotlib.colormaps[colors](np.clip(values, 0.0, 1.0))[:, :3]
 
 
 def draw_bar(image: object, title: str, most: float, colors: str) -> None:
-    """Draw a colour bar from 0 to `most` with its title at the bottom of a picture."""
+    """Draw a titled colour bar from 0 to `most` at the bottom of a picture."""
     from PIL import Image, ImageDraw, ImageFont
 
     assert isinstance(image, Image.Image)
     width, height = image.size
     left, right, top, bottom = 200, width - 200, height - 28, height - 12
-    ramp = _mapped(np.linspace(0.0, 1.0, right - left), colors)
+    ramp = _colors(np.linspace(0.0, 1.0, right - left), colors)
     strip = (255 * np.broadcast_to(ramp, (bottom - top, *ramp.shape)) + 0.5).astype(np.uint8)
     image.paste(Image.fromarray(strip), (left, top))
     draw, font = ImageDraw.Draw(image), ImageFont.load_default(23)

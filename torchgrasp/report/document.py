@@ -1,4 +1,4 @@
-"""Pages as single HTML files: no script, no link, pictures inside, every text escaped."""
+"""Pages as single HTML files: no script, no link, every text escaped."""
 
 import html
 from collections.abc import Collection, Iterable, Sequence
@@ -7,7 +7,7 @@ POLICY = (
     '<meta http-equiv="Content-Security-Policy" '
     "content=\"default-src 'none'; img-src data:; style-src 'unsafe-inline'\">"
 )
-"""A page opened from a file may load nothing from elsewhere, whatever a name in it says."""
+"""The page may load nothing from elsewhere, whatever a name in it says."""
 
 STYLE = """
 body { margin: 0; background: #f3f2ee; color: #22262b; font: 16px/1.5 system-ui, "Segoe UI", "DejaVu Sans", sans-serif }
@@ -39,7 +39,7 @@ class Markup(str):
 
 
 def format_document(title: str, body: Sequence[str]) -> str:
-    """Return a page with its heads in order; every part of the body is HTML."""
+    """Return a page; every part of the body is HTML."""
     head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{escape(title)}</title>'
     content = "\n".join(body)
     return (
@@ -51,7 +51,7 @@ def format_document(title: str, body: Sequence[str]) -> str:
 def format_html_table(
     heads: Sequence[str], rows: Iterable[Sequence[str]], numbers: Collection[int] = (), code: Collection[int] = ()
 ) -> str:
-    """Return a table; columns in `numbers` are set flush right, those in `code` in a fixed width."""
+    """Return a table: columns in `numbers` flush right, in `code` in fixed width."""
 
     def cell(tag: str, column: int, value: str) -> str:
         inner = f"<code>{escape(value)}</code>" if column in code and tag == "td" else escape(value)
@@ -64,5 +64,5 @@ def format_html_table(
 
 
 def escape(value: object) -> str:
-    """Return anything as text that HTML takes literally, and `Markup` as it is."""
+    """Return text that HTML takes literally; `Markup` stays."""
     return value if isinstance(value, Markup) else html.escape(str(value), quote=True)

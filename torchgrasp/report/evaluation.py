@@ -1,4 +1,4 @@
-"""The results of an evaluation as a page: shares with their intervals, by object and view, and what went wrong."""
+"""The page of an evaluation: shares with intervals, and failures."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,13 +14,7 @@ WIDTH, HEIGHT = 180, 16
 
 
 def write_evaluation(path: Path | str, title: str, asked: Mapping[str, object], scores: Sequence[ViewScore]) -> Path:
-    """Write the page of an evaluation, atomically.
-
-    Args:
-        path: of the HTML file.
-        title: of the page.
-        asked: what was evaluated, by name.
-        scores: of `evaluate`.
+    """Write the page of an evaluation, atomically: the scores of `evaluate`, and its settings by name.
 
     Raises:
         OutputError: the file cannot be written.
@@ -30,23 +24,24 @@ def write_evaluation(path: Path | str, title: str, asked: Mapping[str, object], 
 
 def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[ViewScore]) -> str:
     """Return the page of an evaluation as text."""
-    found = summarise(scores)
-    value, low, high, total = found["gsr"]
+    summary = summarise(scores)
+    value, low, high, total = summary["gsr"]
     verdict = f"{value:.0%} of {total} attempts passed (95 % interval {low:.0%} to {high:.0%})."
+    heads = ("what", "share", "with its 95 % interval, 0 to 100 %", "interval", "of")
     body = [
         f"<h1>{escape(title)}</h1>",
         f'<p class="verdict{"" if value else " bad"}">{escape(verdict)}</p>',
         "<h2>Shares</h2>",
         format_html_table(
-            SHARES, [_share_row(name, found[key]) for key, name in SHARE_NAMES.items()], numbers={1, 3, 4}
+            heads, [_share_row(name, summary[key]) for key, name in SHARE_NAMES.items()], numbers={1, 3, 4}
         ),
         "<h2>By object and view</h2>",
-        _objects(scores, found["by_object"]),
+        _objects(scores, summary["by_object"]),
         "<h2>What went wrong, by stage</h2>",
-        _failures(found["failures"]),
+        _failures(summary["failures"]),
         *_notes(scores),
         "<h2>Forces, overlap and time</h2>",
-        format_html_table(("what", "value"), _figures(found), numbers={1}),
+        format_html_table(("what", "value"), _figures(summary), numbers={1}),
         "<h2>What was asked</h2>",
         format_html_table(("what", "value"), [(k.replace("_", " "), str(v)) for k, v in asked.items()], code={1}),
     ]
@@ -60,16 +55,14 @@ SHARE_NAMES = {
 }
 """The shares of a summary in words."""
 
-SHARES = ("what", "share", "with its 95 % interval, 0 to 100 %", "interval", "of")
 
-
-def bar(found: Share) -> Markup:
-    """Draw a share as a mark and its interval as a line, on a scale from 0 to 1.
+def bar(share: Share) -> Markup:
+    """Draw a share as a mark and its interval as a line, from 0 to 1.
 
     >>> bar((0.5, 0.25, 0.75, 8)).count("<line")
     2
     """
-    value, low, high, _ = (x * (WIDTH - 8) + 4 for x in found)
+    value, low, high, _ = (x * (WIDTH - 8) + 4 for x in share)
     middle = HEIGHT / 2
     return Markup(
         f'<svg class="bar" viewBox="0 0 {WIDTH} {HEIGHT}" role="img">'
@@ -79,10 +72,10 @@ def bar(found: Share) -> Markup:
     )
 
 
-def _share_row(name: str, found: Share) -> tuple[str, ...]:
+def _share_row(name: str, share: Share) -> tuple[str, ...]:
     """Return a share in numbers and drawn."""
-    value, low, high, total = found
-    return name, f"{value:.1%}", bar(found), f"{low:.1%} to {high:.1%}", str(total)
+    value, low, high, total = share
+    return name, f"{value:.1%}", bar(share), f"{low:.1%} to {high:.1%}", str(total)
 
 
 def _objects(scores: Sequence[ViewScore], by_object: Mapping[str, Any]) -> str:
@@ -100,34 +93,35 @@ def _objects(scores: Sequence[ViewScore], by_object: Mapping[str, Any]) -> str:
 
 
 def _cell(score: ViewScore) -> str:
-    """Return how many of a view's attempts passed, or why there were none."""
+    """Return the passed attempts of a view, or its refusal."""
     passed = sum(attempt.passed for attempt in score.attempts)
     return f"{passed} / {len(score.attempts)}" if score.attempts else score.refusal.name.lower()
 
 
-def _failures(found: Mapping[str, Mapping[str, int]]) -> str:
-    """Return the table of reasons, each with its sentence and a bar as long as it is frequent."""
-    most = max((n for reasons in found.values() for n in reasons.values()), default=1)
+def _failures(failures: Mapping[str, Mapping[str, int]]) -> str:
+    """Return the table of failures, each with its sentence and a bar."""
+    most = max((n for reasons in failures.values() for n in reasons.values()), default=1)
     rows = [
-        (stage, name.lower(), str(n), _length(n / most), Status[name].sentence)
-        for stage, reasons in found.items()
+        (
+            stage,
+            name.lower(),
+            str(n),
+            Markup(f'<span class="swatch" style="width:{160 * n / most:.0f}px"></span>'),
+            Status[name].sentence,
+        )
+        for stage, reasons in failures.items()
         for name, n in reasons.items()
     ]
     return format_html_table(("stage", "reason", "count", "", "meaning"), rows, numbers={2})
 
 
-def _length(part: float) -> Markup:
-    """Draw a part of 1 as a length."""
-    return Markup(f'<span class="swatch" style="width:{160 * part:.0f}px"></span>')
-
-
 def _notes(scores: Sequence[ViewScore]) -> list[str]:
-    """Return what more is known of views that were refused."""
+    """Return the table of notes on refused views."""
     rows = [(score.object, score.view, score.note) for score in scores if score.note]
     return ["<h3>Refused</h3>", format_html_table(("object", "view", "why"), rows)] if rows else []
 
 
-def _figures(found: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return forces, overlap and times in words."""
     names = {
         "force_n": ("mean normal force of a finger [N]", ".2f"),
@@ -137,5 +131,7 @@ def _figures(found: Mapping[str, Any]) -> list[tuple[str, str]]:
         "trial_cpu_s": ("CPU time of an attempt [s]", ".2f"),
         "cpu_s": ("CPU time in all [s]", ".0f"),
     }
-    rows = [(text, "-" if found[key] is None else format(found[key], style)) for key, (text, style) in names.items()]
-    return [("views without a grasp", str(found["refused"])), ("grasps offered", str(found["executable"])), *rows]
+    rows = [
+        (text, "-" if summary[key] is None else format(summary[key], style)) for key, (text, style) in names.items()
+    ]
+    return [("views without a grasp", str(summary["refused"])), ("grasps offered", str(summary["executable"])), *rows]

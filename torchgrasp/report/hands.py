@@ -13,7 +13,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.linalg import unit
 from torchgrasp.report.canvas import SIZE, Canvas
 from torchgrasp.report.palette import AXES, FINGERS, GRID, HAND, INK, PAPER
-from torchgrasp.report.pictures import Direction, turned
+from torchgrasp.report.pictures import Direction, rotated
 from torchgrasp.report.solids import PARKED, finger_of_links, solids_from_hand
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
     font = ImageFont.load_default(20)
     views = [
         ("a posture with the pads face to face", joints, EYE),
-        ("the same from another side", joints, turned(EYE, 110.0)),
+        ("the same from another side", joints, rotated(EYE, 110.0)),
         ("every joint at its lower limit", hand.lower.to(joints), EYE),
         ("every joint at its upper limit", hand.upper.to(joints), EYE),
     ]
@@ -74,7 +74,7 @@ def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> byte
     points, normals = (x.cpu().numpy() for x in hand.fingertips(joints[None].double()))
     canvas = Canvas()
     for solid in solids:
-        canvas.add_mesh(solid.vertices, solid.faces, HAND if solid.finger == PARKED else FINGERS[solid.finger])
+        canvas.add_mesh(solid.vertices, solid.faces, solid.color)
     for color, point, normal in zip(FINGERS, points[0], normals[0], strict=True):
         canvas.add_arrows(point[None], normal[None], NORMAL, color)
     frame = FRAME * float(np.linalg.norm(np.ptp(solids[0].vertices, axis=0)))

@@ -19,19 +19,19 @@ from torchgrasp.report.pictures import (
     draw_surface,
     draw_tick,
     facing,
-    turned,
+    rotated,
     view_of,
 )
 from torchgrasp.report.plots import plot_forces, plot_motion
 from torchgrasp.report.run import Run, verdict
 from torchgrasp.values import Grasps
 
-ROWS = 10
-"""How many grasps the table lists."""
+LISTED_GRASPS = 10
+"""Grasps in the table: a screenful."""
 
 
 def write_report(path: Path | str, run: Run) -> Path:
-    """Draw the pictures of a run and write them with its tables as one HTML file, atomically.
+    """Write pictures and tables of a run as one HTML file, atomically.
 
     Raises:
         OutputError: the file cannot be written.
@@ -40,13 +40,13 @@ def write_report(path: Path | str, run: Run) -> Path:
 
 
 def draw_pictures(run: Run) -> dict[str, list[tuple[str, bytes]]]:
-    """Draw every picture of a run: for each section its captions and PNGs."""
+    """Draw every picture of a run: captions and PNGs by section."""
     view, table, best = view_of(run.cloud), run.spec.table, run.executable
     sections = {
         "Seen and unseen": [
             ("The cloud from the camera's side, coloured by height.", draw_cloud(run.cloud, table)),
             ("The estimated surface from the camera's side.", draw_surface(run.surface, view, table)),
-            ("The same from behind, where nothing was seen.", draw_surface(run.surface, turned(view, 180.0), table)),
+            ("The same from behind, where nothing was seen.", draw_surface(run.surface, rotated(view, 180.0), table)),
         ]
     }
     if len(best):
@@ -54,10 +54,10 @@ def draw_pictures(run: Run) -> dict[str, list[tuple[str, bytes]]]:
         sections["The best grasp"] = [
             ("Contacts with outward normals.", draw_contacts(run.surface, best.contacts[0], front, table)),
             ("The hand on the estimated surface.", draw_grasp(run.surface, run.hand, best[0], front, table)),
-            ("The same from another side.", draw_grasp(run.surface, run.hand, best[0], turned(front, 60.0), table)),
+            ("The same from another side.", draw_grasp(run.surface, run.hand, best[0], rotated(front, 60.0), table)),
         ]
     if run.closure is not None and run.mesh is not None:
-        side = turned(facing(best), 20.0) if len(best) else view
+        side = rotated(facing(best), 20.0) if len(best) else view
         sections["Closing on the true object"] = [
             ("Before the hand comes.", draw_tick(run.mesh, run.hand, run.closure, 0, side)),
             ("At the end.", draw_tick(run.mesh, run.hand, run.closure, -1, side)),
@@ -82,7 +82,9 @@ def format_page(run: Run, pictures: dict[str, list[tuple[str, bytes]]]) -> str:
         format_html_table(("stage", "result", "seconds"), stages, numbers={2}),
     ]
     if len(run.executable):
-        body += [f"<h2>Best grasps ({min(ROWS, len(run.executable))} of {len(run.executable)})</h2>", _grasps(run)]
+        rows = grasp_rows(run.executable)
+        body.append(f"<h2>Best grasps ({len(rows)} of {len(run.executable)})</h2>")
+        body.append(format_html_table(GRASP_COLUMNS, rows, numbers=range(len(GRASP_COLUMNS))))
     if run.plan is not None:
         body += ["<h2>What became of every start</h2>", _statuses(run.plan.status)]
     if len(run.grasps):
@@ -92,8 +94,8 @@ def format_page(run: Run, pictures: dict[str, list[tuple[str, bytes]]]) -> str:
     return format_document(title, body)
 
 
-def grasp_rows(grasps: Grasps, most: int = ROWS) -> list[tuple[str, ...]]:
-    """Return the first rows of grasps as text, in the order of `GRASP_COLUMNS`."""
+def grasp_rows(grasps: Grasps, most: int = LISTED_GRASPS) -> list[tuple[str, ...]]:
+    """Return the first grasps as text, in the order of `GRASP_COLUMNS`."""
     rows = []
     for rank, grasp in enumerate(grasps[: min(most, len(grasps))], 1):
         rows.append(
@@ -111,7 +113,7 @@ def grasp_rows(grasps: Grasps, most: int = ROWS) -> list[tuple[str, ...]]:
 
 
 GRASP_COLUMNS = ("rank", "success", "tip error mm", "clearance mm", "pad angle deg", "closure margin", "surface std mm")
-"""Heads of `grasp_rows`; errors, angles and deviations are those of the worst finger."""
+"""Heads of `grasp_rows`; errors, angles and deviations are of the worst finger."""
 
 
 def _statuses(status: Int[Tensor, "b"]) -> str:
@@ -120,13 +122,8 @@ def _statuses(status: Int[Tensor, "b"]) -> str:
     return format_html_table(("count", "status", "meaning"), rows, numbers={0})
 
 
-def _grasps(run: Run) -> str:
-    """Return the table of the best grasps."""
-    return format_html_table(GRASP_COLUMNS, grasp_rows(run.executable), numbers=set(range(len(GRASP_COLUMNS))))
-
-
 def _section(name: str, shots: Sequence[tuple[str, bytes]], run: Run) -> str:
-    """Return a section of pictures, with the colours of the fingers where a hand or contacts are shown."""
+    """Return a section of pictures, with the fingers' colours where they show."""
     legend = "".join(
         f'<span class="dot" style="background:{color}"></span>{escape(finger)}'
         for finger, color in zip(run.hand.finger_names, FINGERS, strict=True)

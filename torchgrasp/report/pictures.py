@@ -1,4 +1,4 @@
-"""Stills of a run as the bytes of PNG files; lengths in metres, z up."""
+"""Stills of a run as PNGs; lengths in metres, z up."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -11,8 +11,8 @@ from torch import Tensor
 from torchgrasp.frames import apply
 from torchgrasp.hand.hand import Hand
 from torchgrasp.report.canvas import Canvas
-from torchgrasp.report.palette import FINGERS, HAND, OBJECT, TABLE
-from torchgrasp.report.solids import PARKED, Solid, solids_from_hand
+from torchgrasp.report.palette import FINGERS, OBJECT, TABLE
+from torchgrasp.report.solids import solids_from_hand
 from torchgrasp.shape.surface import Surface
 from torchgrasp.values import ClosureResult, Contacts, Grasps, PointCloud
 
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 Direction = tuple[float, float, float]
 
-MOST_POINTS = 3000
-"""How many points of a cloud are drawn."""
+DRAWN_POINTS = 3000
+"""Points drawn of a cloud: more would hide each other."""
 
 
 def draw_cloud(cloud: PointCloud, table: float | None = None) -> bytes:
-    """Draw the points that the camera saw, from where it saw them, coloured by height."""
+    """Draw a cloud from its camera, coloured by height."""
     points = _array(cloud.points)
-    points = points[:: -(-len(points) // MOST_POINTS)]
+    points = points[:: -(-len(points) // DRAWN_POINTS)]
     canvas = Canvas()
     canvas.add_points(points, points[:, 2], "cividis")
     _add_table(canvas, points, table)
@@ -46,7 +46,7 @@ def draw_surface(surface: Surface, direction: Direction, table: float | None = N
 
 
 def draw_contacts(surface: Surface, contacts: Contacts, direction: Direction, table: float | None = None) -> bytes:
-    """Draw the three contacts of the first row and their outward normals on the estimated surface."""
+    """Draw the first row's contacts and outward normals on the estimated surface."""
     vertices = _array(surface.vertices)
     canvas = Canvas()
     canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, _array(surface.normals), transparent=True)
@@ -56,14 +56,15 @@ def draw_contacts(surface: Surface, contacts: Contacts, direction: Direction, ta
 
 
 def draw_grasp(surface: Surface, hand: Hand, grasp: Grasps, direction: Direction, table: float | None = None) -> bytes:
-    """Draw the hand of the first row on the estimated surface, one colour a finger."""
+    """Draw the first row's hand on the estimated surface, one colour a finger."""
     joints = hand.expand_joints(grasp.joints[0].double())
     solids = solids_from_hand(hand, joints, hand.tree.joint_names, grasp.obj_from_hand[0])
     vertices = _array(surface.vertices)
     canvas = Canvas()
     canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, _array(surface.normals))
     _add_contacts(canvas, grasp.contacts)
-    _add_solids(canvas, solids)
+    for solid in solids:
+        canvas.add_mesh(solid.vertices, solid.faces, solid.color)
     corners = np.concatenate([vertices, *(s.vertices for s in solids)])
     _add_table(canvas, corners, table)
     return canvas.render_png(corners, direction)
@@ -77,15 +78,9 @@ def draw_tick(
     direction: Direction,
     ticks: Sequence[int] = (0, -1),
 ) -> bytes:
-    """Draw the true object and the hand at one tick of a closure, framed so that the pictures of `ticks` match.
+    """Draw the true object and the hand at a tick of a closure.
 
-    Args:
-        mesh: the true object [m].
-        hand: the hand that closed.
-        closure: the record of the trial.
-        tick: which tick; negative counts from the end.
-        direction: from where it is seen.
-        ticks: all ticks that share the frame.
+    Pictures of the same `ticks` share their frame. A negative tick counts from the end.
     """
     local = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
     places = {t: apply(closure.object_pose[t].double(), local).numpy() for t in (tick, *ticks)}
@@ -94,14 +89,15 @@ def draw_tick(
     }
     canvas = Canvas()
     canvas.add_mesh(places[tick], np.asarray(mesh.faces), OBJECT)
-    _add_solids(canvas, postures[tick])
+    for solid in postures[tick]:
+        canvas.add_mesh(solid.vertices, solid.faces, solid.color)
     corners = np.concatenate([*places.values(), *(s.vertices for solids in postures.values() for s in solids)])
     _add_table(canvas, corners, float(places[ticks[0]][:, 2].min()))
     return canvas.render_png(corners, direction)
 
 
 def view_of(cloud: PointCloud) -> Direction:
-    """Return the direction from the cloud to its camera, or a default that looks down from the front."""
+    """Return the direction from a cloud to its camera, by default from the front."""
     first = cloud.split_views()[0].viewpoint
     if first is None:
         return (1.0, -0.8, 0.6)
@@ -110,9 +106,9 @@ def view_of(cloud: PointCloud) -> Direction:
 
 
 def facing(grasp: Grasps) -> Direction:
-    """Return a direction from which the first row shows its fingers on both sides of the object, not behind the palm.
+    """Return a direction that shows the first row's fingers on both sides of the object.
 
-    It is square to the horizontal direction along which the contacts press, on the side away from the palm.
+    It is square to the horizontal direction of the pressing, away from the palm.
     """
     normals = grasp.contacts.normals[0, :, :2].detach().cpu().double()
     press = torch.linalg.eigh(normals.T @ normals).eigenvectors[:, 1]
@@ -122,10 +118,10 @@ def facing(grasp: Grasps) -> Direction:
     return (x, y, 0.4)
 
 
-def turned(direction: Direction, degrees: float) -> Direction:
-    """Return a direction turned about z.
+def rotated(direction: Direction, degrees: float) -> Direction:
+    """Return a direction rotated about z.
 
-    >>> [round(x, 3) for x in turned((1.0, 0.0, 0.5), 90.0)]
+    >>> [round(x, 3) for x in rotated((1.0, 0.0, 0.5), 90.0)]
     [0.0, 1.0, 0.5]
     """
     x, y, z = direction
@@ -138,24 +134,10 @@ def _array(value: Float[Tensor, "*b"]) -> np.ndarray:
     return value.detach().cpu().double().numpy()
 
 
-def _add_solids(canvas: Canvas, solids: Sequence[Solid]) -> None:
-    """Add the hand's solids, one colour a finger."""
-    for solid in solids:
-        canvas.add_mesh(solid.vertices, solid.faces, HAND if solid.finger == PARKED else FINGERS[solid.finger])
-
-
 def _add_contacts(canvas: Canvas, contacts: Contacts) -> None:
-    """Add the contacts of the first row as balls with arrows along the outward normals."""
-    from trimesh import creation
-    from trimesh.geometry import align_vectors
-
-    ball = creation.icosphere(subdivisions=2, radius=0.004)
-    shaft = creation.cylinder(0.0013, segment=[(0.0, 0.0, 0.0), (0.0, 0.0, 0.034)], sections=20)
-    head = creation.cone(0.0034, 0.012, sections=24).apply_translation((0.0, 0.0, 0.033))
+    """Add the first row's contacts with arrows along the outward normals."""
     for color, point, normal in zip(FINGERS, _array(contacts.points[0]), _array(contacts.normals[0]), strict=True):
-        turn = np.asarray(align_vectors((0.0, 0.0, 1.0), normal))[:3, :3]
-        for part in (ball, shaft, head):
-            canvas.add_mesh(part.vertices @ turn.T + point, np.asarray(part.faces), color)
+        canvas.add_arrows(point[None], normal[None], 0.045, color)
 
 
 def _add_table(canvas: Canvas, corners: np.ndarray, table: float | None) -> None:

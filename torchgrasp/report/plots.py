@@ -1,4 +1,4 @@
-"""Plots of a closure over time, drawn by matplotlib without a window or global state, as the bytes of PNG files."""
+"""Plots of a closure over time as PNGs, by matplotlib without window or global state."""
 
 import io
 from typing import Any
@@ -24,7 +24,7 @@ def plot_forces(closure: ClosureResult, finger_names: tuple[str, ...]) -> bytes:
 
 
 def plot_motion(closure: ClosureResult) -> bytes:
-    """Plot how high the object and the hand are above their start [mm], and how far the object turned in the hand."""
+    """Plot the rise of object and hand [mm], and the object's rotation in the hand."""
     time = closure.time.cpu().numpy()
     hand_from_object = inverse(closure.hand_pose) @ closure.object_pose
     start = hand_from_object[:1]
@@ -47,7 +47,7 @@ def plot_motion(closure: ClosureResult) -> bytes:
 
 
 def _figure() -> tuple[Any, Any]:
-    """Return a figure with one pair of axes over time."""
+    """Return a figure and its axes over time."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

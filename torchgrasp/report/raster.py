@@ -1,7 +1,7 @@
 """Triangles to pixels in numpy: stills without OpenGL, the same bytes on every machine.
 
-Renderers on OpenGL need system libraries, and without them VTK ends the process with a segmentation fault. A report has
-eight stills of some 10^4 triangles; half a second each is all that this costs.
+Renderers on OpenGL need system libraries; without these VTK ends the process. A still of 10^4 triangles takes half a
+second here.
 """
 
 import dataclasses
@@ -10,18 +10,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 SAMPLES = 2
-"""Samples of a pixel along each axis."""
+"""Samples of a pixel along each axis: enough for smooth edges."""
 
 AMBIENT, KEY, FILL, SHINE = 0.52, 0.50, 0.22, 0.08
-"""Strengths of the light from everywhere, of the two lamps, and of the highlight."""
+"""Strengths of the ambient light, the two lamps and the highlight: chosen by eye."""
 
 LAMPS = ((-0.45, 0.65, 0.62), (0.70, 0.10, 0.60))
-"""Directions to the key and the fill lamp in the camera's frame (right, up, back)."""
+"""Directions to the two lamps in the camera's frame (right, up, back): chosen by eye."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Triangles:
-    """Triangles to draw: corners, normals and colours in [0, 1] at each corner; unlit ones keep their colours."""
+    """Corners of triangles, with their normals and colours in [0, 1]; unlit ones keep their colours."""
 
     corners: Float[np.ndarray, "t 3 3"]
     normals: Float[np.ndarray, "t 3 3"]
@@ -31,7 +31,7 @@ class Triangles:
 
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """A pinhole camera; the rows of `frame` are its right, up and back directions, `angle` its vertical view [rad]."""
+    """A pinhole camera: rows of `frame` are right, up and back; `angle` is the vertical view [rad]."""
 
     position: Float[np.ndarray, "3"]
     frame: Float[np.ndarray, "3 3"]
@@ -40,7 +40,7 @@ class Camera:
 
 @dataclasses.dataclass(frozen=True)
 class _Hits:
-    """The nearest triangle of each pixel that one covers, and the weights of its corners there."""
+    """The nearest triangle of each covered pixel, and the weights of its corners."""
 
     pixel: Int[np.ndarray, " k"]
     triangle: Int[np.ndarray, " k"]
@@ -49,7 +49,7 @@ class _Hits:
 
 
 def concatenate(parts: list[Triangles]) -> Triangles:
-    """Return all triangles of several sets as one; there may be none."""
+    """Return all triangles of several sets, or of none, as one."""
     empty = np.zeros((0, 3, 3))
     return Triangles(
         np.concatenate([empty, *(p.corners for p in parts)]),
@@ -67,7 +67,7 @@ def render(
     background: tuple[float, float, float],
     opacity: float = 0.5,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the picture of opaque triangles, with the nearest layer of sheer ones blended over them."""
+    """Return the picture of opaque triangles under the nearest layer of transparent ones."""
     width, height = size[0] * SAMPLES, size[1] * SAMPLES
     image = np.empty((width * height, 3))
     image[:] = background
@@ -76,8 +76,8 @@ def render(
     depth = np.full(width * height, np.inf)
     depth[hits.pixel] = hits.depth
     veil = _cast(transparent, camera, width, height)
-    seen = veil.depth < depth[veil.pixel]
-    veil = _Hits(veil.pixel[seen], veil.triangle[seen], veil.weights[seen], veil.depth[seen])
+    front = veil.depth < depth[veil.pixel]
+    veil = _Hits(veil.pixel[front], veil.triangle[front], veil.weights[front], veil.depth[front])
     image[veil.pixel] += opacity * (_shade(transparent, veil, camera) - image[veil.pixel])
     grid = image.reshape(size[1], SAMPLES, size[0], SAMPLES, 3)
     boxes = sum(grid[:, i, :, j] for i in range(SAMPLES) for j in range(SAMPLES)) / SAMPLES**2
@@ -85,7 +85,7 @@ def render(
 
 
 def _cast(triangles: Triangles, camera: Camera, width: int, height: int) -> _Hits:
-    """Find what each pixel sees: cut every triangle into rows of pixels, and keep the nearest at each pixel."""
+    """Cut triangles into rows of pixels, and keep the nearest at each pixel."""
     local = (triangles.corners - camera.position) @ camera.frame.T
     away = np.maximum(-local[..., 2], 1e-6)  # the scene is framed in front of the camera
     focal = height / 2 / np.tan(camera.angle / 2)
@@ -136,7 +136,7 @@ def _cast(triangles: Triangles, camera: Camera, width: int, height: int) -> _Hit
 def _ranges(
     begin: Int[np.ndarray, " t"], end: Int[np.ndarray, " t"]
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Return all integers of the ranges [begin, end), with the range that each belongs to."""
+    """Return all integers of the ranges [begin, end), each with its range."""
     counts = np.maximum(end - begin, 0)
     owner = np.repeat(np.arange(len(begin)), counts)
     start = np.cumsum(counts) - counts
@@ -144,7 +144,7 @@ def _ranges(
 
 
 def _shade(triangles: Triangles, hits: _Hits, camera: Camera) -> Float[np.ndarray, "k 3"]:
-    """Light the hits with two lamps that are fixed to the camera; both sides of a triangle are lit."""
+    """Light both sides of the hits, by two lamps fixed to the camera."""
     color = np.einsum("kci,kc->ki", triangles.colors[hits.triangle], hits.weights)
     normal = np.einsum("kci,kc->ki", triangles.normals[hits.triangle], hits.weights) @ camera.frame.T
     normal /= np.maximum(np.sqrt(np.einsum("ki,ki->k", normal, normal)), 1e-12)[:, None]

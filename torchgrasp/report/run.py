@@ -1,4 +1,4 @@
-"""One run from cloud to grasps, and perhaps to a closure: what the report shows, and its verdicts in words."""
+"""A run from cloud to grasps and closure, and its verdict in words."""
 
 import dataclasses
 import math
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """A stage that ended: its name, one line about its result, and its wall time [s]."""
+    """A stage that ended: name, result in a line, wall time [s]."""
 
     name: str
     message: str
@@ -27,7 +27,7 @@ class Stage:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """Everything that a report shows; `closure` was simulated with the true object `mesh`, or both are None."""
+    """Everything that a report shows; `closure` is that on the true `mesh`, or both are None."""
 
     object_name: str
     source: Path
@@ -51,14 +51,14 @@ def verdict(run: Run) -> str:
     """Say in one sentence what the run ended with."""
     if run.closure is not None:
         return closing_sentence(run.closure, run.hand.name, run.object_name)
-    found = len(run.executable)
-    if found:
-        return f"The {run.hand.name} hand has {found} executable grasp{'s' * (found > 1)} of the {run.object_name}."
+    count = len(run.executable)
+    if count:
+        return f"The {run.hand.name} hand has {count} executable grasp{'s' * (count > 1)} of the {run.object_name}."
     return refusal(run)
 
 
 def closing_sentence(closure: ClosureResult, hand_name: str, object_name: str) -> str:
-    """Say whether the object was held, how high it was lifted and how far it moved in the hand."""
+    """Say whether the object was held, its rise and its motion in the hand."""
     if not closure.held:
         return f"The {hand_name} hand did not hold the {object_name}: {closure.status.sentence}."
     rise = float(closure.object_pose[-1, 2, 3] - closure.object_pose[0, 2, 3])
@@ -70,7 +70,7 @@ def closing_sentence(closure: ClosureResult, hand_name: str, object_name: str) -
 
 
 def refusal(run: Run) -> str:
-    """Say why no grasp is executable: the number of candidates, or of starts where there is none, for each reason."""
+    """Say why no grasp is executable, with the number of postures or starts for each reason."""
     head = f"The {run.hand.name} hand has no executable grasp of the {run.object_name}"
     if len(run.grasps):
         failed, total = run.grasps.status, f"{len(run.grasps)} postures"

@@ -1,4 +1,4 @@
-"""The hand as solids to draw: the collision shapes of its URDF in the poses of their links, each with its finger."""
+"""A hand as solids to draw: the collision shapes of its URDF, each with its finger."""
 
 import dataclasses
 from typing import TYPE_CHECKING
@@ -10,33 +10,35 @@ from torch import Tensor
 
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import Shape, read_urdf
+from torchgrasp.report.palette import FINGERS, HAND
 
 if TYPE_CHECKING:
     import trimesh
 
 PARKED = -1
-"""Instead of a finger: a link that no grasping finger owns, such as the palm or a parked finger."""
+"""Finger of a link that no grasping finger owns, such as the palm."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Solid:
-    """A triangle mesh in the frame of the picture, and the grasping finger (0, 1, 2) or `PARKED` that it is part of."""
+    """A triangle mesh in the picture's frame, of a grasping finger (0, 1, 2) or `PARKED`."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: np.ndarray
     finger: int
 
+    @property
+    def color(self) -> str:
+        """The finger's colour, or that of the palm."""
+        return HAND if self.finger == PARKED else FINGERS[self.finger]
+
 
 def solids_from_hand(
     hand: Hand, joints: Float[Tensor, " j"], names: tuple[str, ...], obj_from_hand: Float[Tensor, "4 4"]
 ) -> list[Solid]:
-    """Return the shapes of a hand at one posture.
+    """Return the shapes of a hand whose base has a pose in the picture's frame.
 
-    Args:
-        hand: the hand.
-        joints: every movable joint of its URDF [rad].
-        names: the names of `joints`.
-        obj_from_hand: the pose of the hand's base in the frame of the picture.
+    `joints` [rad] are all movable joints of the URDF, in the order of `names`.
     """
     values = torch.stack([joints[names.index(n)] for n in hand.tree.joint_names]).double()
     poses = (obj_from_hand.double() @ hand.tree.poses(values[None])[0]).cpu().numpy()
@@ -52,18 +54,18 @@ def solids_from_hand(
 
 
 def finger_of_links(hand: Hand) -> dict[str, int]:
-    """Return the finger of every link: the one whose fingertip is moved by all joints that move the link."""
+    """Return each link's finger: all joints that move the link move this fingertip alone."""
     moves = hand.tree.moves.bool().cpu()
-    found = {}
+    finger_of = {}
     for link, name in enumerate(hand.tree.link_names):
         mine = moves[link]
         owners = [f for f in range(3) if bool(mine.any()) and bool(moves[hand.tips.index[f]][mine].all())]
-        found[name] = owners[0] if len(owners) == 1 else PARKED
-    return found
+        finger_of[name] = owners[0] if len(owners) == 1 else PARKED
+    return finger_of
 
 
 def _mesh(shape: Shape) -> "trimesh.Trimesh":
-    """Return the mesh of a box, a cylinder or a sphere in the frame of its link."""
+    """Return the mesh of a shape in the frame of its link."""
     from trimesh import creation
     from trimesh.transformations import euler_matrix
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from benchmarks.common import Row
 from torchgrasp import Status, TrialSpec, close_hand, fit_shape, load_hand, plan_grasps
 from torchgrasp.datasets import list_views, read_object_mesh, read_view
-from torchgrasp.evaluation.evaluate import choose_rows
+from torchgrasp.evaluation.campaign import choose_rows
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.evaluation.protocols import PAPER, draw_error
 from torchgrasp.evaluation.score import share

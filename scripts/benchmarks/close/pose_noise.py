@@ -6,7 +6,7 @@ from pathlib import Path
 
 from benchmarks.common import Row
 from torchgrasp import load_hand
-from torchgrasp.evaluation.evaluate import EvaluationSpec, evaluate
+from torchgrasp.evaluation.campaign import EvaluationSpec, evaluate
 from torchgrasp.evaluation.protocols import PROTOCOLS
 from torchgrasp.evaluation.score import share
 

@@ -20,7 +20,7 @@ from benchmarks.common import Row
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.io.read import save_cloud
 from torchgrasp.datasets import list_views, read_view
-from torchgrasp.evaluation.evaluate import EvaluationSpec, evaluate
+from torchgrasp.evaluation.campaign import EvaluationSpec, evaluate
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.evaluation.protocols import PROTOCOLS
 from torchgrasp.evaluation.score import share

@@ -13,7 +13,7 @@ from benchmarks.close.stability import bench_force
 from benchmarks.close.statics import bench_checks
 from benchmarks.close.success import bench_success
 from benchmarks.common import Row, measure
-from torchgrasp.evaluation.evaluate import EvaluationSpec
+from torchgrasp.evaluation.campaign import EvaluationSpec
 
 SUBJECTS = ("checks", "speed", "ablation", "agreement", "force", "noise", "success")
 

@@ -13,8 +13,8 @@ from tests.pinch import cylinder, pinch
 from tests.scores import GOOD, SCORES, STUCK
 from torchgrasp import cli
 from torchgrasp.errors import BadArgument, Status
+from torchgrasp.evaluation.campaign import EvaluationSpec, choose_rows, evaluate, run_protocol
 from torchgrasp.evaluation.closing import GraspTrial
-from torchgrasp.evaluation.evaluate import EvaluationSpec, choose_rows, evaluate, run_protocol
 from torchgrasp.evaluation.protocols import PROTOCOLS, Protocol
 from torchgrasp.evaluation.score import STAGES, share, summarise
 from torchgrasp.files import hold_folder
