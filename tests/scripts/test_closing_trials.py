@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from paper import closing_trials as tables
-from paper.closing_trials import THRESHOLDS, Cell, difference, threshold_cells, trend, trend_over_grasps
+from paper import closing_trials
+from paper.closing_trials import THRESHOLDS, Cell, TableSpec, threshold_cells
+from paper.tables6_7 import difference, trend, trend_over_grasps
 
 from torchgrasp.errors import Status
 
@@ -48,8 +49,8 @@ def test_the_interval_over_grasps_is_that_of_resampled_grasps() -> None:
 
 @pytest.mark.sim
 def test_a_greater_threshold_admits_less_certain_contacts(monkeypatch) -> None:
-    monkeypatch.setattr(tables, "THRESHOLDS", (0.03, 0.10))
-    (found,) = threshold_cells(None, only=("cylinder",), workers=0, trials=2, starts=16)
+    monkeypatch.setattr(closing_trials, "THRESHOLDS", (0.03, 0.10))
+    (found,) = threshold_cells(TableSpec(("allegro",), only=("cylinder",), trials=2, starts=16), workers=0)
     assert [cell.row for cell in found] == ["0.03", "0.10"]
     assert all(len(cell.statuses) == 3 for cell in found)  # two trials at least, of three grasps equally many
     assert found[0].std_m < found[1].std_m

@@ -1,4 +1,4 @@
-"""What each part of the closing is worth: the same grasps with the same errors, one part after the other."""
+"""The worth of each part of the closing: the same grasps with the same errors, part by part."""
 
 import functools
 import time
@@ -7,10 +7,8 @@ from pathlib import Path
 from benchmarks.common import Row
 from torchgrasp import Status, TrialSpec, close_hand, fit_shape, load_hand, plan_grasps
 from torchgrasp.datasets import list_views, read_object_mesh, read_view
+from torchgrasp.evaluation import PROTOCOLS, draw_error, run_tasks, share
 from torchgrasp.evaluation.campaign import choose_rows
-from torchgrasp.evaluation.pool import run_tasks
-from torchgrasp.evaluation.protocols import PAPER, draw_error
-from torchgrasp.evaluation.score import share
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ContactSpec
 
@@ -25,6 +23,8 @@ PARTS = {
 }
 """Trials and whether touches revise the shape; each row differs from one above it by one part."""
 
+PAPER = PROTOCOLS["paper"]
+
 LIMIT = 3600.0
 """Wall time [s] for one view and hand."""
 
@@ -37,10 +37,10 @@ def bench_ablation(objects: Path, tries: int, starts: int, seed: int, workers: i
         for name, view in list_views(objects)
     ]
     cases = []
-    for task, found in zip(tasks, run_tasks(_close_view, tasks, workers, LIMIT), strict=True):
-        if isinstance(found, Status):
-            raise SystemExit(f"{task[1]} {task[2]} {task[3]}: {found.sentence}")
-        cases += [(task[3], *case) for case in found]
+    for task, outcome in zip(tasks, run_tasks(_close_view, tasks, workers, LIMIT), strict=True):
+        if isinstance(outcome, Status):
+            raise SystemExit(f"{task[1]} {task[2]} {task[3]}: {outcome.sentence}")
+        cases += [(task[3], *case) for case in outcome]
     return [_row(part, [case for case in cases if case[1] == part]) for part in PARTS]
 
 
@@ -64,16 +64,16 @@ def _close_view(
     """Return part, status, motion in the hand [m] and CPU time [s] of every trial of one view and hand."""
     hand, cloud = load_hand(hand_name), read_view(objects, name, view)
     shape = fit_shape(cloud, seed=seed, table=0.0)
-    found = plan_grasps(cloud, hand, ContactSpec(friction=PAPER.trial.friction, table=0.0), starts, seed, shape=shape)
-    found = found[found.status == Status.OK]
+    grasps = plan_grasps(cloud, hand, ContactSpec(friction=PAPER.trial.friction, table=0.0), starts, seed, shape=shape)
+    grasps = grasps[grasps.status == Status.OK]
     mesh = read_object_mesh(objects, name)
     close = functools.partial(close_hand, hand=hand, mesh=mesh, parts=convex_parts(mesh))
     cases = []
-    for row in choose_rows(len(found), tries, "spread"):
-        error = draw_error(PAPER, found[row], mesh, row, 0, seed)
+    for row in choose_rows(len(grasps), tries, "spread"):
+        error = draw_error(PAPER, grasps[row], mesh, row, 0, seed)
         for part, (spec, revises) in PARTS.items():
             belief = shape if revises else None
             began = time.process_time()
-            result = close(found[row], spec=spec, seed=seed, error=error, belief=belief)
+            result = close(grasps[row], spec=spec, seed=seed, error=error, belief=belief)
             cases.append((part, result.status.name, result.object_motion.distance, time.process_time() - began))
     return cases
