@@ -9,7 +9,9 @@ import torch
 import trimesh
 
 from tests.pinch import QUICK, close, cylinder, digest, digest_elsewhere, pinch
+from torchgrasp.control import observe
 from torchgrasp.errors import BadArgument, MeshError, Status
+from torchgrasp.evaluation import GraspTrial, TrialDriver, TrialRun, close_hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.specs import TrialSpec
 
@@ -39,7 +41,7 @@ def test_same_seed_same_bits_here_and_in_another_process():
     assert digest_elsewhere("allegro", "sapien", 3) == digest(first)
 
 
-def test_controllers_differ_and_waiting_keeps_the_object_still():
+def test_closings_differ_and_waiting_keeps_the_object_still():
     """The object stands 8 mm off: the finger that meets it first must not push it away before the others touch."""
     mesh = cylinder((0.0, 0.008))
     aware = close("allegro", mesh, dataclasses.replace(QUICK, noise=False))
@@ -48,7 +50,7 @@ def test_controllers_differ_and_waiting_keeps_the_object_still():
     assert aware.held
 
 
-def test_the_hand_may_stand_beside_where_it_was_planned_and_may_be_shaken():
+def test_the_hand_may_be_beside_its_planned_pose_and_may_be_shaken():
     aside = torch.eye(4, dtype=torch.float64)
     aside[0, 3] = 0.004
     result = close("allegro", spec=dataclasses.replace(QUICK, shake=0.003, hold_time=0.5), error=aside.float())
@@ -62,10 +64,10 @@ def test_the_hand_may_stand_beside_where_it_was_planned_and_may_be_shaken():
 def test_the_hand_comes_straight_to_where_it_was_planned():
     _, grasp = pinch("allegro")
     result = close("allegro", spec=QUICK)
-    way = result.hand_pose[:, :3, 3] - grasp.obj_from_hand[0, :3, 3]
-    along = way @ grasp.approach[0]
+    path = result.hand_pose[:, :3, 3] - grasp.obj_from_hand[0, :3, 3]
+    along = path @ grasp.approach[0]
     coming = int(along.argmax())
-    aside = way - along[:, None] * grasp.approach[0]
+    aside = path - along[:, None] * grasp.approach[0]
     assert float(along[1]) == pytest.approx(-TrialSpec().approach, abs=1e-3)
     assert abs(float(along[coming])) < 1e-3
     assert float(aside[1:coming].norm(dim=-1).max()) < 1e-4
@@ -76,30 +78,18 @@ def test_the_hand_comes_straight_to_where_it_was_planned():
 def test_all_a_fingertip_exerts_is_felt_friction_included():
     """At rest the tips carry the object: their full forces sum to its weight, their normal parts are the readings."""
     pytest.importorskip("sapien")
-    from torchgrasp.control import ClosingReference, GraspController, observe
-    from torchgrasp.sim.convex_parts import convex_parts
-    from torchgrasp.sim.hand import SimulatedHand
-    from torchgrasp.sim.open import open_scene
-    from torchgrasp.sim.scene import SceneSpec
-
     hand, grasp = pinch("allegro")
-    start = {name: float(q) for name, q in hand.expand(grasp.pregrasp[0]).items()}
-    stands, mesh = grasp.obj_from_hand[0].numpy(), cylinder()
-    tips = tuple(hand.tip_links)
-    scene = open_scene(SceneSpec(hand.urdf_path, stands, start, hand.actuators, tips, mesh, convex_parts(mesh), 0.1))
-    robot = SimulatedHand(scene, ClosingReference.from_grasp(hand, grasp), 100.0, None)
-    controller = GraspController(robot.reference)
-    observation = robot.tick(controller.targets)
-    while not controller.closed:
-        observation = robot.tick(controller.step(observation, robot.period))
+    run = TrialRun(TrialDriver(GraspTrial(hand, grasp, cylinder()), TrialSpec(approach=0.0, noise=False)))
+    for _ in run.close():
+        pass
     for k in range(200):
-        scene.lift(min(k, 100) * 5e-4)
-        observation = robot.tick(controller.step(observation, robot.period))
-    total = (grasp.obj_from_hand[0, :3, :3] @ observation.tactile.forces.T).sum(1)
+        run.scene.lift(min(k, 100) * 5e-4)
+        run.step()
+    observation, tactile = run.observation, run.observation.tactile
+    total = (grasp.obj_from_hand[0, :3, :3] @ tactile.forces.T).sum(1)
     assert torch.allclose(total, torch.tensor([0, 0, 0.981]).double(), atol=0.02)
-    tactile = observation.tactile
     assert torch.allclose(-(tactile.forces * tactile.normals).sum(-1), tactile.reading, atol=0.02)
-    alone = observe(hand, robot.reference.pick(observation.joints), tactile)
+    alone = observe(hand, run.robot.reference.pick(observation.joints), tactile)
     assert torch.allclose(alone.tips, observation.tips, atol=1e-5)
     assert torch.allclose(alone.jacobian, observation.jacobian, atol=1e-5)
 
@@ -126,8 +116,6 @@ def test_too_little_friction_leaves_the_object_behind():
 
 
 def test_bad_arguments_are_refused():
-    from torchgrasp.evaluation.lift import close_hand
-
     hand, grasp = pinch("allegro")
     with pytest.raises(BadArgument, match="grasp: found 0 rows"):
         close_hand(grasp[:0], hand, cylinder())
