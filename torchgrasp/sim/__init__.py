@@ -1,1 +1,8 @@
-"""The simulated world that a controller acts in: SAPIEN or MuJoCo."""
+"""The simulated world: a scene of table, object and mounted hand in SAPIEN or MuJoCo, and the hand's sensors in it."""
+
+from torchgrasp.sim.convex_parts import convex_parts
+from torchgrasp.sim.hand import SimulatedHand
+from torchgrasp.sim.open import open_scene
+from torchgrasp.sim.scene import Scene, SceneSpec, StepContacts
+
+__all__ = ["Scene", "SceneSpec", "SimulatedHand", "StepContacts", "convex_parts", "open_scene"]

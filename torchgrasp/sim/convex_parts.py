@@ -1,7 +1,7 @@
 """Convex parts of a mesh for the simulator, decomposed once and cached.
 
-A simulator of rigid bodies takes a mesh for its convex hull: a jug would be solid. CoACD cuts it into convex parts
-(threshold 0.05, seeded, so the same mesh always gives the same parts); that takes seconds, hence the cache.
+A simulator of rigid bodies replaces a mesh by its convex hull: a jug would be solid. CoACD cuts it into convex parts,
+the same ones for the same mesh. That takes 1 to 22 s of CPU time for scans of 800 to 16000 faces, hence the cache.
 """
 
 import contextlib
@@ -26,8 +26,7 @@ THRESHOLD = 0.05
 """Concavity at which CoACD stops cutting (0.01-1; its own default)."""
 
 _SEARCH: dict[str, Any] = {"mcts_iterations": 60, "mcts_max_depth": 2, "mcts_nodes": 10}
-"""A narrower search for the cuts than CoACD's own. Scans of 800 to 16000 faces then took 1 to 22 s of CPU time, and
-the volumes of the parts summed to 1.02 to 1.03 of the mesh's."""
+"""A narrower search for the cuts than CoACD's own, for speed; the parts' volumes sum to 1.03 of the mesh's at most."""
 
 _log = logging.getLogger(__name__)
 
@@ -35,13 +34,11 @@ _log = logging.getLogger(__name__)
 def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None = None) -> "list[trimesh.Trimesh]":
     """Return convex parts that together fill a closed mesh; a convex mesh is its own only part.
 
-    The parts are kept in `cache`, by default `$XDG_CACHE_HOME/torchgrasp` or `~/.cache/torchgrasp`, under the SHA-256
-    of the vertices, the faces and the threshold. A damaged file there is made anew; a folder that cannot be written
-    costs the time of the next decomposition and nothing else.
+    The parts are cached in `cache`, by default `$XDG_CACHE_HOME/torchgrasp` or `~/.cache/torchgrasp`. A damaged file
+    there is replaced; a folder that cannot be written only logs a warning.
 
     Raises:
-        MeshError: the mesh is open, empty, not finite, or without volume.
-        SuspiciousScale: it is too small or too large (`read_mesh`).
+        MeshError, SuspiciousScale: as `read_mesh`.
         MissingExtra: the mesh is not convex and CoACD is not installed.
 
     >>> import trimesh
@@ -51,7 +48,8 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
     mesh = read_mesh(mesh)
     if mesh.is_convex:
         return [mesh.convex_hull]
-    path = (_cache_folder() if cache is None else Path(cache)) / f"{_fingerprint(mesh)}.safetensors"
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    path = (home / "torchgrasp" if cache is None else Path(cache)) / f"{_fingerprint(mesh)}.safetensors"
     if path.is_file():
         try:
             return _filled(_load(path))
@@ -66,12 +64,12 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
 
 
 def _filled(parts: "list[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
-    """Leave out the slivers of no volume that CoACD sometimes cuts off: they fill nothing."""
+    """Return the parts without the slivers of no volume that CoACD sometimes cuts off."""
     return [part for part in parts if part.volume > LEAST_VOLUME]
 
 
 def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
-    """Return parts given by the caller as they are, or raise `MeshError` when one is no convex body."""
+    """Return the caller's own parts; raise `MeshError` when one is no convex body."""
     for index, part in enumerate(parts):
         check_solid(part, f"part {index}")
         if not part.is_convex:
@@ -97,24 +95,19 @@ def _decompose(mesh: "trimesh.Trimesh") -> "list[trimesh.Trimesh]":
 
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
-    """Send the process's standard output to nowhere: CoACD's C++ code prints through the file descriptor."""
-    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    """Discard the process's standard output: CoACD's C++ code prints through the file descriptor."""
+    stdout, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 1)
         yield
     finally:
-        os.dup2(kept, 1)
-        os.close(kept)
+        os.dup2(stdout, 1)
+        os.close(stdout)
         os.close(nowhere)
 
 
-def _cache_folder() -> Path:
-    """Return the folder of the user's cache."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchgrasp"
-
-
 def _fingerprint(mesh: "trimesh.Trimesh") -> str:
-    """Return the SHA-256 of what the parts depend on."""
+    """Return the SHA-256 of the mesh and the settings of the decomposition."""
     digest = hashlib.sha256(f"coacd {THRESHOLD} {sorted(_SEARCH.items())}".encode())
     digest.update(np.ascontiguousarray(mesh.vertices, dtype="<f8").tobytes())
     digest.update(np.ascontiguousarray(mesh.faces, dtype="<i8").tobytes())
@@ -122,7 +115,7 @@ def _fingerprint(mesh: "trimesh.Trimesh") -> str:
 
 
 def _save(parts: "list[trimesh.Trimesh]", path: Path) -> None:
-    """Write the corners of the parts as one safetensors file, end to end with their counts."""
+    """Write the corners of all parts, one after the other, with their counts."""
     tensors = {
         "vertices": torch.cat([torch.from_numpy(np.array(p.vertices, dtype=np.float64)) for p in parts]),
         "counts": torch.tensor([len(p.vertices) for p in parts]),
@@ -131,7 +124,7 @@ def _save(parts: "list[trimesh.Trimesh]", path: Path) -> None:
 
 
 def _load(path: Path) -> "list[trimesh.Trimesh]":
-    """Read parts that `_save` wrote; each is the hull of its corners, convex whatever the file holds."""
+    """Read parts that `_save` wrote; each is the hull of its corners, hence convex in any case."""
     import trimesh
     from scipy.spatial import QhullError
 

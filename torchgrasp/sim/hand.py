@@ -1,83 +1,71 @@
-"""A hand in a simulated scene as its controllers know it: joint targets in, and a tick later what the robot sees."""
+"""A hand in a simulated scene as its controller knows it: joint targets in, an observation out one tick later."""
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.control.observation import Observation
-from torchgrasp.control.reference import ClosingReference
-from torchgrasp.control.tactile import TipContact, measure, no_contact
-from torchgrasp.sim.scene import Scene
+from torchgrasp.control import ClosingReference, Observation, TipContact, measure, no_contact
+from torchgrasp.sim.scene import Scene, StepContacts
 
 
 class SimulatedHand:
     """The hand of a scene, with tactile fingertips.
 
-    After each tick `force` (3,) holds the true normal forces [N] averaged over it, `finger` which fingers touched in
-    its last step, `steps` counts the steps of the simulator so far, and `first_touch` tells at which of them each
-    fingertip first touched, infinite for none.
+    After each tick, `force` (3,) holds the mean true normal forces [N] and `finger` the fingers that touched in its
+    last step. `steps` counts the steps of the simulator; `first_touch` is the step of each fingertip's first contact,
+    infinite before it.
 
     Args:
         scene: at its start.
-        reference: what it follows.
+        reference: what the hand follows.
         control_rate: ticks a second [Hz].
         generator: draws the noise of the fingertips; None: no noise.
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        reference: ClosingReference,
-        control_rate: float,
-        generator: torch.Generator | None,
+        self, scene: Scene, reference: ClosingReference, control_rate: float, generator: torch.Generator | None
     ) -> None:
         self.scene, self.reference, self.generator = scene, reference, generator
         self.substeps = max(1, round(1 / (control_rate * scene.timestep)))
         self.period = self.substeps * scene.timestep
         self.steps, self.first_touch = 0, [float("inf")] * 3
-        self.force, self.finger = np.zeros(3), np.zeros(3, dtype=bool)
-        self._centres = torch.cat(
-            [reference.hand.tips.center.double(), torch.ones(3, 1, dtype=torch.float64)], dim=-1
-        ).numpy()
-        self.tactile = no_contact()
-        names = reference.hand.tree.joint_names
+        self.force, self.finger, self.tactile = np.zeros(3), np.zeros(3, dtype=bool), no_contact()
+        names, centres = reference.hand.tree.joint_names, reference.hand.tips.center.double()
+        self._centres = torch.cat([centres, torch.ones(3, 1, dtype=torch.float64)], dim=-1).numpy()
         self._to_scene = [names.index(name) for name in scene.joint_names]
         self._from_scene = [scene.joint_names.index(name) for name in names]
 
     def tick(self, targets: Float[Tensor, " j"]) -> Observation:
         """Drive the joints for one control period and return what the robot then knows."""
         self.scene.drive(targets[self._to_scene].numpy())
-        impulse, moment, weight, force = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))
+        contacts = StepContacts.none()
         for _ in range(self.substeps):
-            seen = self.scene.step()
+            step = self.scene.step()
             self.steps += 1
-            impulse += seen.impulse
-            moment += seen.moment
-            weight += seen.weight
-            force += seen.force / self.substeps
-            self.finger = seen.finger
-            for i in np.flatnonzero(seen.weight > 0):
+            contacts.accumulate(step, self.substeps)
+            self.finger = step.finger
+            for i in np.flatnonzero(step.weight > 0):
                 self.first_touch[i] = min(self.first_touch[i], self.steps)
-        self.force = np.linalg.norm(impulse, axis=-1) / self.period
-        return self._sight(impulse, moment, weight, force)
+        self.force = np.linalg.norm(contacts.impulse, axis=-1) / self.period
+        return self._observe(contacts)
 
     def ticks(self, seconds: float) -> int:
-        """Count the control ticks in a time [s]."""
+        """Return the number of control ticks in a time [s], at least one."""
         return max(1, round(seconds / self.period))
 
-    def _sight(self, impulse: np.ndarray, moment: np.ndarray, weight: np.ndarray, force: np.ndarray) -> Observation:
-        """Return the hand's own knowledge, in its frame: the true contacts only as the fingertips sense them."""
-        stands = self.scene.hand_pose()
-        turn, origin = stands[:3, :3], stands[:3, 3]
+    def _observe(self, contacts: StepContacts) -> Observation:
+        """Return the hand's own knowledge, in its frame: contacts only as the fingertips sense them."""
+        world_from_hand = self.scene.hand_pose()
+        rotation, origin = world_from_hand[:3, :3], world_from_hand[:3, 3]
         centres = (self.scene.tip_poses() @ self._centres[:, :, None])[:, :3, 0]
         with np.errstate(invalid="ignore", divide="ignore"):
-            points = moment / weight[:, None]
-            normals = -impulse / np.linalg.norm(impulse, axis=-1, keepdims=True)
-        directions = torch.from_numpy(np.concatenate([force, normals]) @ turn)
-        places = torch.from_numpy((np.concatenate([points, centres]) - origin) @ turn)
-        press = TipContact(torch.from_numpy(self.force), directions[:3], places[:3], directions[3:])
+            points = contacts.moment / contacts.weight[:, None]
+            normals = -contacts.impulse / np.linalg.norm(contacts.impulse, axis=-1, keepdims=True)
+        vectors = torch.from_numpy(np.concatenate([contacts.force, normals]) @ rotation)
+        places = torch.from_numpy((np.concatenate([points, centres]) - origin) @ rotation)
+        truth = TipContact(torch.from_numpy(self.force), vectors[:3], places[:3], vectors[3:])
         normals, radius = self.reference.normals, self.reference.hand.tip_radius
-        self.tactile = measure(self.tactile, press, normals, radius, self.period, self.generator)
+        self.tactile = measure(self.tactile, truth, normals, radius, self.period, self.generator)
         joints, jacobian = self.scene.joints()[self._from_scene], self.scene.jacobian(centres)[..., self._from_scene]
-        return Observation(torch.from_numpy(joints), places[3:], torch.from_numpy(turn.T @ jacobian), self.tactile)
+        return Observation(torch.from_numpy(joints), places[3:], torch.from_numpy(rotation.T @ jacobian), self.tactile)

@@ -1,10 +1,10 @@
-"""The simulators of a scene, by name; each is loaded when it is asked for."""
+"""The simulators of a scene by name; each is imported when it is asked for."""
 
 from torchgrasp.sim.scene import Scene, SceneSpec
 from torchgrasp.specs import check_simulator
 
 
-def open_scene(setup: SceneSpec, simulator: str = "sapien") -> Scene:
+def open_scene(spec: SceneSpec, simulator: str = "sapien") -> Scene:
     """Return a fresh scene at its start.
 
     Raises:
@@ -16,7 +16,7 @@ def open_scene(setup: SceneSpec, simulator: str = "sapien") -> Scene:
     if simulator == "mujoco":
         from torchgrasp.sim.mujoco_scene import MujocoScene
 
-        return MujocoScene(setup)
+        return MujocoScene(spec)
     from torchgrasp.sim.sapien_scene import SapienScene
 
-    return SapienScene(setup)
+    return SapienScene(spec)

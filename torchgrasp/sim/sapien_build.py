@@ -1,10 +1,13 @@
 """Build a scene in SAPIEN.
 
-Settings that differ from SAPIEN's defaults each have a measured reason: joints get an armature of 1e-3 kg m^2 (without
-it the implicit drives lose a third of their torque in a contact), friction 0.8 or as told on every shape, the hand's
-links feel neither gravity nor each other, sleeping is off (a sleeping body keeps stale contacts), the object's inertia
-is set with its mass, and penetrations are resolved at 1 m/s at most. PhysX keeps 255 faces of a convex part at most: a
-ball of 30 mm loses up to 0.5 mm, and a finely divided cylinder becomes an 18-gon.
+Settings that differ from SAPIEN's defaults each have a measured reason:
+
+* Joints get an armature: without it the implicit drives lose a third of their torque in a contact.
+* The hand's links feel neither gravity nor each other.
+* Sleeping is off, because a sleeping body keeps stale contacts.
+* The object's inertia is set with its mass, and penetrations are resolved at 1 m/s at most.
+
+PhysX keeps at most 255 faces of a convex part: a ball of 30 mm loses up to 0.5 mm.
 """
 
 import tempfile
@@ -16,11 +19,11 @@ import numpy as np
 
 from torchgrasp.errors import MissingExtra
 from torchgrasp.sim.mount import MOUNT_DRIVE, mount_slides, mounted_urdf
-from torchgrasp.sim.scene import ARMATURE, TABLE, SceneSpec, check_drives
+from torchgrasp.sim.scene import ARMATURE, TABLE, SceneSpec
 
 
 class Built(NamedTuple):
-    """SAPIEN's own objects: the system that computes, the scene that steps, the object's body and the hand."""
+    """SAPIEN's own objects: physics system, scene, the object's body, and the hand."""
 
     system: Any
     scene: Any
@@ -28,7 +31,7 @@ class Built(NamedTuple):
     hand: Any
 
 
-def build(setup: SceneSpec) -> Built:
+def build(spec: SceneSpec) -> Built:
     """Return a scene with table, object and hand at their start.
 
     Raises:
@@ -36,18 +39,18 @@ def build(setup: SceneSpec) -> Built:
         MissingExtra: SAPIEN is not installed.
     """
     sapien, physx = _import_sapien()
-    physx.set_scene_config(gravity=np.array([0, 0, -setup.gravity], np.float32), enable_tgs=True, enable_pcm=True)
+    physx.set_scene_config(gravity=np.array([0, 0, -spec.gravity], np.float32), enable_tgs=True, enable_pcm=True)
     physx.set_shape_config(contact_offset=0.002, rest_offset=0.0)
     physx.set_body_config(solver_position_iterations=10, solver_velocity_iterations=1, sleep_threshold=0.0)
     system = physx.PhysxCpuSystem()
     scene = sapien.Scene([system])
-    scene.timestep = setup.timestep
-    material = physx.PhysxMaterial(setup.friction, setup.friction, 0.0)
-    if setup.table:
-        _place(sapien, scene, "table", _table(physx, material), float(setup.mesh.bounds[0, 2]) - TABLE[2] / 2)
-    body = _object(sapien, physx, material, setup)
+    scene.timestep = spec.timestep
+    material = physx.PhysxMaterial(spec.friction, spec.friction, 0.0)
+    if spec.table:
+        _place(sapien, scene, "table", _table(physx, material), float(spec.mesh.bounds[0, 2]) - TABLE[2] / 2)
+    body = _object(sapien, physx, material, spec)
     _place(sapien, scene, "object", body, 0.0)
-    return Built(system, scene, body, _hand(scene, material, setup))
+    return Built(system, scene, body, _hand(scene, material, spec))
 
 
 def _place(sapien: Any, scene: Any, name: str, body: Any, height: float) -> None:
@@ -66,19 +69,19 @@ def _table(physx: Any, material: Any) -> Any:
     return body
 
 
-def _object(sapien: Any, physx: Any, material: Any, setup: SceneSpec) -> Any:
-    """Return the object where its mesh is; mass centre and inertia are those of the mesh, filled evenly."""
+def _object(sapien: Any, physx: Any, material: Any, spec: SceneSpec) -> Any:
+    """Return the object in the frame of its mesh, with the mass centre and inertia of an even filling."""
     body = physx.PhysxRigidDynamicComponent()
-    for part in setup.parts:
+    for part in spec.parts:
         vertices = np.asarray(part.vertices, np.float32)
         shape = physx.PhysxCollisionShapeConvexMesh(vertices, np.ones(3, np.float32), material)
-        shape.min_patch_radius = setup.patch
+        shape.min_patch_radius = spec.patch
         body.attach(shape)
-    moments, axes = np.linalg.eigh(np.asarray(setup.mesh.moment_inertia) * (setup.mass / setup.mesh.volume))
+    moments, axes = np.linalg.eigh(np.asarray(spec.mesh.moment_inertia) * (spec.mass / spec.mesh.volume))
     axes = axes * np.array([1.0, 1.0, np.sign(np.linalg.det(axes))])
     frame = np.eye(4)
-    frame[:3, :3], frame[:3, 3] = axes, setup.mesh.center_mass
-    body.mass = setup.mass
+    frame[:3, :3], frame[:3, 3] = axes, spec.mesh.center_mass
+    body.mass = spec.mass
     body.cmass_local_pose = sapien.Pose(frame)
     body.inertia = moments.astype(np.float32)
     body.max_depenetration_velocity = 1.0
@@ -86,24 +89,24 @@ def _object(sapien: Any, physx: Any, material: Any, setup: SceneSpec) -> Any:
     return body
 
 
-def _hand(scene: Any, material: Any, setup: SceneSpec) -> Any:
-    """Load the hand, strip what the simulator gets wrong, and set it to its start."""
+def _hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
+    """Load the hand on its mount and set it to its start."""
     loader = scene.create_urdf_loader()
     loader.fix_root_link = True
     loader.set_material(material.static_friction, material.dynamic_friction, 0.0)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "hand.urdf"
-        file.write_text(mounted_urdf(setup), encoding="utf-8")
+        file.write_text(mounted_urdf(spec), encoding="utf-8")
         hand = loader.load(str(file))
-    slides = {slide.name: slide for slide in mount_slides(setup)}
-    check_drives(setup, [j.name for j in hand.active_joints if j.name not in slides])
+    slides = {slide.name: slide for slide in mount_slides(spec)}
+    spec.check_drives([j.name for j in hand.active_joints if j.name not in slides])
     start = []
     for joint in hand.active_joints:
         joint.set_friction(0.0)
         if joint.name in slides:
             drive, position = MOUNT_DRIVE, slides[joint.name].start
         else:
-            drive, position = setup.drives[joint.name], float(setup.joints[joint.name])
+            drive, position = spec.drives[joint.name], float(spec.joints[joint.name])
             joint.set_armature(np.array([ARMATURE], np.float32))
         joint.set_drive_properties(drive.kp, drive.kd, force_limit=drive.effort)
         joint.set_drive_target(position)
@@ -115,13 +118,13 @@ def _hand(scene: Any, material: Any, setup: SceneSpec) -> Any:
             groups = shape.get_collision_groups()
             groups[2] |= 1  # shapes that share such a bit do not collide: the hand with itself
             shape.set_collision_groups(groups)
-            if link.name in setup.tip_links:
-                shape.min_patch_radius = setup.patch
+            if link.name in spec.tip_links:
+                shape.min_patch_radius = spec.patch
     return hand
 
 
 def _import_sapien() -> tuple[Any, Any]:
-    """Import SAPIEN; its warning about a missing system Vulkan does not concern physics."""
+    """Import SAPIEN, silencing its warning about a missing Vulkan: physics needs none."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

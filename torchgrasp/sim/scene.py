@@ -1,12 +1,13 @@
-"""The simulated scene of one trial, whatever simulates it: table, object and a hand that can be lifted.
+"""The simulated scene of one trial, whatever simulates it: table, object and a hand on a mount.
 
-`SceneSpec` says what is in the scene, `Scene` what can be done with it. Every trial opens a fresh one: only then are two
-runs equal to the last bit. Positions are in the object's frame, which is the world's.
+Every trial opens a fresh scene: only then are two runs equal to the last bit. Positions are in the world's frame, which
+is the frame of the grasp.
 """
 
+import abc
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,11 +21,13 @@ PATCH_RADIUS = 0.005
 """Radius [m] of the patch in which a soft fingertip touches."""
 
 ARMATURE = 1e-3
-"""Inertia [kg m^2] that each motor's rotor adds to its joint."""
+"""Inertia [kg m^2] that each motor's rotor adds to its joint; PhysX's implicit drives need one (`sapien_build`)."""
 
 TABLE = (2.0, 2.0, 0.1)
-"""Size of the table [m]; its top is where the mesh is lowest."""
+"""Size of the table [m]; its top is at the lowest point of the mesh."""
 
+LIFT_JOINT, APPROACH_JOINT = "torchgrasp_lift", "torchgrasp_approach"
+"""Prismatic joints of the mount: along the world's z axis, and along the approach, 0 where the hand has arrived."""
 
 STILL = np.zeros(3)
 """No force, no torque."""
@@ -38,8 +41,8 @@ class SceneSpec:
         urdf_path: of the hand.
         world_from_hand: pose of the hand (4, 4).
         joints: start position of every joint of the URDF by name [rad].
-        drives: stiffness, damping and largest torque of every joint by name.
-        tip_links: the three fingertips' links, in the order of the fingers.
+        drives: of every joint by name.
+        tip_links: the three fingertips' links, in grasp order.
         mesh: the closed object, for its table height, mass centre and inertia.
         parts: convex bodies that make up its surface.
         mass: of the object [kg].
@@ -47,9 +50,9 @@ class SceneSpec:
         gravity: [m/s^2].
         timestep: [s].
         travel: how far the hand can be lifted [m].
-        approach: the straight way [m] in the world on which the hand comes to its pose; it starts at its other end.
+        approach: displacement [m] from the hand's start to its pose.
         table: whether there is one.
-        patch: radius [m] of the patch in which a fingertip touches; its torsional friction is friction x force x patch.
+        patch: radius [m] of a fingertip's contact patch; torsional friction is friction x force x patch.
     """
 
     urdf_path: Path | str
@@ -68,15 +71,23 @@ class SceneSpec:
     table: bool = True
     patch: float = PATCH_RADIUS
 
+    def check_drives(self, names: list[str]) -> None:
+        """Raise `BadArgument` when one of the hand's joints has no start or no drive."""
+        missing = [name for name in names if name not in self.joints or name not in self.drives]
+        if missing:
+            raise BadArgument("joints", f"no position or drive for {missing}", "one for every joint of the URDF")
+
 
 @dataclasses.dataclass(frozen=True)
 class StepContacts:
-    """The true state after one step: contacts of the fingertips with the object, summed over the step.
+    """True contacts of the three fingers with the object, summed over a step.
 
-    `impulse` [N s] (3, 3) is along the contact normals (friction is not in it) and acts on the object; `moment` [N s m]
-    and `weight` [N s] sum the contact points weighted by impulse, so that their quotient is the mean contact point;
-    `finger` tells which fingers touch, by the tip or by the link that carries it; `force` [N] (3, 3) is what each
-    fingertip that touches exerts on the object, friction included.
+    Args:
+        impulse: normal impulse on the object (3, 3) [N s]; friction is not in it.
+        moment: contact points weighted by the size of their impulse (3, 3) [N s m].
+        weight: sum of these sizes (3,) [N s]; `moment / weight` is the mean contact point.
+        finger: which fingers touch (3,), by the tip or by the link that carries it.
+        force: of each fingertip on the object (3, 3) [N], friction included.
     """
 
     impulse: np.ndarray
@@ -85,65 +96,88 @@ class StepContacts:
     finger: np.ndarray
     force: np.ndarray
 
+    @classmethod
+    def none(cls) -> "StepContacts":
+        """Return sums to add contacts to."""
+        return cls(np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), np.zeros(3, dtype=bool), np.zeros((3, 3)))
 
-@runtime_checkable
-class Scene(Protocol):
-    """Table, object and hand; arrays are in the world's axes, and of joints in the order of `joint_names`.
+    def add(self, finger: int, impulse: np.ndarray, size: float, point: np.ndarray) -> None:
+        """Add a contact of a fingertip, with its impulse [N s], the impulse's size and its place [m]."""
+        self.impulse[finger] += impulse
+        self.moment[finger] += size * point
+        self.weight[finger] += size
 
-    `centre` is the object's mass centre in its own frame [m] and `timestep` in seconds.
+    def accumulate(self, step: "StepContacts", count: int) -> None:
+        """Add one of `count` steps: impulses are summed, forces are averaged."""
+        self.impulse[:] += step.impulse
+        self.moment[:] += step.moment
+        self.weight[:] += step.weight
+        self.force[:] += step.force / count
+
+
+class Scene(abc.ABC):
+    """Table, object and hand. Arrays are in the world's axes; joints are in the order of `joint_names`.
+
+    `centre` is the object's mass centre in its own frame [m], `timestep` is in seconds. A simulator sets `joint_names`
+    and its own handles of the object, the hand's root link and the fingertips' links.
     """
 
     joint_names: tuple[str, ...]
-    centre: np.ndarray
-    timestep: float
+    body: Any
+    root: Any
+    tips: list[Any]
 
+    def __init__(self, spec: SceneSpec) -> None:
+        self.timestep, self.centre = spec.timestep, np.asarray(spec.mesh.center_mass, float)
+
+    @abc.abstractmethod
     def step(self) -> StepContacts:
         """Advance by one timestep and report the contacts between fingertips and object."""
-        ...
 
+    @abc.abstractmethod
     def drive(self, targets: np.ndarray) -> None:
         """Set the target [rad] of every driven joint."""
-        ...
 
+    @abc.abstractmethod
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
         """Let a force [N] at the object's mass centre and a torque [N m] act on it from now on."""
-        ...
 
-    def lift(self, height: float, speed: float = 0.0) -> None:
-        """Set the height [m] that the hand is to be lifted to, and the speed [m/s] at which that target moves."""
-        ...
-
-    def approach(self, left: float, speed: float = 0.0) -> None:
-        """Set what is to be left [m] of the hand's approach, and the speed [m/s] at which it goes on."""
-        ...
-
+    @abc.abstractmethod
     def joints(self) -> np.ndarray:
         """Return the position of every driven joint [rad]."""
-        ...
+
+    @abc.abstractmethod
+    def jacobian(self, points: np.ndarray) -> np.ndarray:
+        """Return d points / d driven joints (3, 3, j), each point fixed to its fingertip [m/rad or 1]."""
+
+    @abc.abstractmethod
+    def penetration(self) -> float:
+        """Return the depth [m] of the hand in object or table, before anything has moved."""
+
+    @abc.abstractmethod
+    def _pose(self, body: Any) -> np.ndarray:
+        """Return the pose (4, 4) of a body by its handle."""
+
+    @abc.abstractmethod
+    def _move_mount(self, joint: str, target: float, speed: float) -> None:
+        """Set the target [m] of a joint of the mount, and the speed [m/s] at which the target moves."""
+
+    def lift(self, height: float, speed: float = 0.0) -> None:
+        """Set the height [m] to which the hand is lifted, and the speed [m/s] at which this target moves."""
+        self._move_mount(LIFT_JOINT, height, speed)
+
+    def approach(self, left: float, speed: float = 0.0) -> None:
+        """Set the remaining length [m] of the hand's approach, and the speed [m/s] at which it shrinks."""
+        self._move_mount(APPROACH_JOINT, -left, speed)
 
     def object_pose(self) -> np.ndarray:
         """Return the object's pose (4, 4)."""
-        ...
+        return self._pose(self.body)
 
     def hand_pose(self) -> np.ndarray:
         """Return the pose (4, 4) of the hand's root link, after at least one step."""
-        ...
+        return self._pose(self.root)
 
     def tip_poses(self) -> np.ndarray:
         """Return the poses (3, 4, 4) of the fingertips' links."""
-        ...
-
-    def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return d points / d driven joints (3, 3, j), each point fixed to its fingertip [m/rad or 1]."""
-        ...
-
-    def penetration(self) -> float:
-        """Return how deep [m] the hand is in the object or the table; to be asked before anything else moves."""
-        ...
-
-
-def check_drives(setup: SceneSpec, names: list[str]) -> None:
-    """Raise `BadArgument` when one of the hand's joints has no start or no drive."""
-    missing = [name for name in names if name not in setup.joints or name not in setup.drives]
-    if missing:
-        raise BadArgument("joints", f"no position or drive for {missing}", "one for every joint of the URDF")
+        return np.stack([self._pose(tip) for tip in self.tips])
