@@ -48,7 +48,7 @@ def test_too_large_a_voxel_is_named():
 
 
 @pytest.mark.parametrize("name", list_objects())
-def test_strays_go_and_hardly_anything_else(name):
+def test_outliers_go_and_hardly_anything_else(name):
     view = load_object(name).view
     directions = torch.randn(10, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     far = view.points.mean(0) + 0.4 * directions / torch.linalg.vector_norm(directions, dim=-1, keepdim=True)

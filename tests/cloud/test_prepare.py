@@ -62,7 +62,7 @@ def test_given_normals_decide_the_side_of_a_cloud_seen_from_all_around():
     assert ((inward.normals * inward.points).sum(-1) < 0).all()
 
 
-def test_stray_points_go_and_the_others_come_closer_to_the_surface():
+def test_outliers_go_and_the_others_come_closer_to_the_surface():
     for name in list_objects():
         thing = load_object(name)
         generator = torch.Generator().manual_seed(0)
@@ -96,7 +96,7 @@ def test_results_scale_with_the_cloud_and_keep_its_dtype(ball_view):
     assert single.points.dtype == single.normals.dtype == torch.float32
 
 
-def test_the_smallest_cloud_and_a_cloud_of_strays():
+def test_the_smallest_cloud_and_a_cloud_of_copies():
     points = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]], dtype=torch.float64)
     normals = estimate_normals(PointCloud(points, None, torch.ones(3, dtype=torch.float64))).normals
     assert torch.isfinite(normals).all()

@@ -168,7 +168,7 @@ def test_gradients_are_refused_and_strides_do_not_matter(name):
         torch.testing.assert_close(one, other)
 
 
-def test_strays_go_lengths_do_not_matter_and_zero_is_refused():
+def test_outliers_go_lengths_do_not_matter_and_zero_is_refused():
     cloud = ball(400)
     generator = torch.Generator().manual_seed(5)
     far = 0.15 * unit(torch.randn(40, 3, generator=generator, dtype=torch.float64))

@@ -1,6 +1,7 @@
 """A virtual depth camera, exact or with the noise of a real one."""
 
 import math
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -61,12 +62,11 @@ def look_at(
     away = torch.tensor([math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)], dtype=torch.float64)
     right = torch.tensor([-math.sin(a), math.cos(a), 0.0], dtype=torch.float64)
     down = torch.linalg.cross(-away, right)
-    if target is None:
-        centre = torch.zeros(3, dtype=torch.float64)
-    elif isinstance(target, Tensor):
-        centre = target.double()
-    else:
-        centre = torch.from_numpy(np.asarray(_with_faces(target).bounds).mean(0))
+    if target is not None and not isinstance(target, Tensor):
+        if not len(target.faces):
+            raise MeshError("target", "no faces", "a mesh with a surface")
+        target = torch.from_numpy(np.asarray(target.bounds).mean(0))
+    centre = torch.zeros(3, dtype=torch.float64) if target is None else target.double()
     return rigid(torch.stack([right, down, -away], -1), centre + distance * away)
 
 
@@ -106,11 +106,9 @@ def partial_view(
 ) -> PointCloud:
     """Return n points [m] that the default camera sees of a mesh. They have a viewpoint and no normals.
 
-    The noise is that of an active stereo camera.
-
-    Disparities have white noise of 0.12 px and steps of 1/32 px: 0.9 mm at 0.5 m. A smooth bias has 0.8 mm rms
-    over 12 px. At rims a quarter of the pixels fly off backwards by 8 mm on average, and a third is missing. Of all
-    pixels 1 % is missing. Grazing surfaces fade out between 72.5 and 87 degrees.
+    The noise is that of an active stereo camera. Disparities have white noise of 0.12 px and steps of 1/32 px: 0.9 mm
+    at 0.5 m. A smooth bias has 0.8 mm rms over 12 px. At rims a quarter of the pixels fly off backwards by 8 mm on
+    average, and a third is missing. Of all pixels 1 % is missing. Surfaces fade out between 72.5 and 87 degrees.
 
     Args:
         mesh: in the object frame [m].
@@ -141,13 +139,6 @@ def partial_view(
     return PointCloud(cloud.points[rows], None, cloud.viewpoint)
 
 
-def _with_faces(mesh: "trimesh.Trimesh") -> "trimesh.Trimesh":
-    """Return the mesh, or refuse one without faces."""
-    if not len(mesh.faces):
-        raise MeshError("mesh", "no faces", "a mesh with a surface")
-    return mesh
-
-
 def _cast(
     mesh: "trimesh.Trimesh",
     obj_from_camera: Float[Tensor, "4 4"],
@@ -155,11 +146,11 @@ def _cast(
     size: tuple[int, int],
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
     """Return depth [m] and |cosine| of ray and face normal, both 0 where nothing is."""
-    height, width = size
-    if not (1 <= height <= 4096 and 1 <= width <= 4096):
+    if not all(1 <= pixels <= 4096 for pixels in size):
         raise BadArgument("size", size, "height and width in [1, 4096] pixels")
-    _with_faces(mesh)
-    row, column = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    if not len(mesh.faces):
+        raise MeshError("mesh", "no faces", "a mesh with a surface")
+    row, column = torch.meshgrid(*(torch.arange(pixels).double() for pixels in size), indexing="ij")
     x, y = (column - intrinsics[0, 2]) / intrinsics[0, 0], (row - intrinsics[1, 2]) / intrinsics[1, 1]
     rays = torch.stack([x, y, torch.ones_like(x)], -1)
     inside = _in_image_box(mesh, obj_from_camera, x, y)
@@ -173,7 +164,7 @@ def _cast(
     z = ((corner - origin) * normal).sum(-1) / against
     cosine = np.abs(against) / np.linalg.norm(direction[hit], axis=-1)
     where = torch.nonzero(inside)[torch.from_numpy(hit)]
-    images = torch.zeros(2, height, width, dtype=torch.float64)
+    images = torch.zeros(2, *size, dtype=torch.float64)
     images[:, where[:, 0], where[:, 1]] = torch.from_numpy(np.stack([z, cosine]))
     return images[0], images[1]
 
@@ -196,12 +187,8 @@ def _add_noise(
     """Add the noise that `partial_view` describes to a depth image [m]."""
     from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
-    def normal() -> Tensor:
-        return torch.randn(depth.shape, generator=generator, dtype=torch.float64)
-
-    def uniform() -> Tensor:
-        return torch.rand(depth.shape, generator=generator, dtype=torch.float64)
-
+    normal = partial(torch.randn, depth.shape, generator=generator, dtype=torch.float64)
+    uniform = partial(torch.rand, depth.shape, generator=generator, dtype=torch.float64)
     measured = depth > 0
     disparity = FOCAL * BASELINE / torch.where(measured, depth, 1.0) + 0.12 * normal()
     noisy = FOCAL * BASELINE / (torch.round(32 * disparity) / 32).clamp_min(1 / 32)

@@ -23,9 +23,6 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
 
     A flat cloud, as of one face, is accepted.
 
-    Args:
-        cloud: points [m], with or without normals and viewpoint.
-
     Raises:
         BadArgument: not a `PointCloud`; a non-finite number; a tensor that requires a gradient; points that all
             coincide or lie on a line; a normal of length zero.

@@ -53,9 +53,6 @@ class CloudReport(Value):
 def diagnose_cloud(cloud: PointCloud) -> CloudReport:
     """Measure a cloud, and advise what would improve it.
 
-    Args:
-        cloud: points [m] of one object, with or without normals and viewpoint.
-
     Raises:
         BadArgument, TooFewPoints, SuspiciousScale: see `check_cloud`.
 

@@ -18,7 +18,7 @@ def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
     inside a thin wall. Their order is kept.
 
     Args:
-        cloud: points [m], with or without normals and viewpoint.
+        cloud: points [m].
         voxel: side of a voxel [m], in [1e-5, 1].
 
     Raises:
@@ -46,9 +46,6 @@ def remove_outliers(cloud: PointCloud) -> PointCloud:
     """Return a cloud without copies and outliers, such as flying pixels.
 
     Outliers have a mean distance to 8 neighbours above 2.5 times the median.
-
-    Args:
-        cloud: points [m], with or without normals and viewpoint.
 
     Raises:
         BadArgument, SuspiciousScale: see `check_cloud`.

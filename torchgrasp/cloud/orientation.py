@@ -96,9 +96,6 @@ def estimate_viewpoint(cloud: PointCloud) -> Float[Tensor, "3"]:
 
     The sides of a flat face or a bowl look alike: give a known viewpoint.
 
-    Args:
-        cloud: points [m] of one object, seen from one side.
-
     Raises:
         BadArgument, TooFewPoints, SuspiciousScale: see `check_cloud`.
 

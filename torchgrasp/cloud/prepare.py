@@ -75,24 +75,21 @@ def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = T
     cloud = PointCloud(points, normals, viewpoint)
     if clean or normals is None:
         cloud = _fit_normals(cloud, clean)
-    double = cloud.to(torch.float64)
-    if clean and double.viewpoint is None:
-        guess = guess_viewpoint(double.points, fit_planes(double.points)[0]).to(points.dtype)
-        double = PointCloud(double.points, double.normals, guess.double())
-    if len(double) > MAX_POINTS:
-        double = double.select(torch.randperm(len(double), generator=generator)[:MAX_POINTS].to(points.device))
-    assert double.normals is not None
-    return PreparedCloud(cloud, double.points, unit(double.normals), double.viewpoint)
+    precise = cloud.to(torch.float64)
+    if clean and precise.viewpoint is None:
+        guess = guess_viewpoint(precise.points, fit_planes(precise.points)[0]).to(points.dtype)
+        precise = PointCloud(precise.points, precise.normals, guess.double())
+    if len(precise) > MAX_POINTS:
+        precise = precise.select(torch.randperm(len(precise), generator=generator)[:MAX_POINTS].to(points.device))
+    assert precise.normals is not None
+    return PreparedCloud(cloud, precise.points, unit(precise.normals), precise.viewpoint)
 
 
 def estimate_normals(cloud: PointCloud) -> PointCloud:
     """Return a cloud without copies, with outward normals of local quadrics.
 
-    Outward is towards the viewpoint, or else the side of given normals. Without both, the result gets the viewpoint
-    of `estimate_viewpoint`.
-
-    Args:
-        cloud: points [m] of one object; of one view unless it has normals.
+    Outward is towards the viewpoint, or else the side of given normals. A single view without both
+    gets the viewpoint of `estimate_viewpoint`.
 
     Raises:
         BadArgument, TooFewPoints, SuspiciousScale: see `check_cloud`.
@@ -108,9 +105,6 @@ def clean_cloud(cloud: PointCloud) -> PointCloud:
 
     Outliers are those of `remove_outliers`, and points over 4.5 median rms from their quadric. The noise of a
     simulated camera falls from 0.94 to 0.65 mm rms.
-
-    Args:
-        cloud: points [m] of one object; of one view unless it has normals.
 
     Raises:
         BadArgument, SuspiciousScale: see `check_cloud`.

@@ -50,7 +50,13 @@ def read_cloud(path: Path | str, viewpoint: Sequence[float | int] | Tensor | Non
     position = None if viewpoint is None else _check_viewpoint(viewpoint)
     path = Path(path)
     suffix = path.suffix.lower()
-    parsers = {".ply": parse_ply, ".pcd": parse_pcd, ".npz": _parse_npz, ".npy": _parse_npy, ".xyz": _parse_text}
+    parsers = {
+        ".ply": parse_ply,
+        ".pcd": parse_pcd,
+        ".npz": _parse_npz,
+        ".npy": lambda data: _split_columns(_array_from_npy(data)),
+        ".xyz": lambda data: _split_columns(read_lines(data)),
+    }
     if suffix not in parsers:
         raise CloudFileError("path", path, f"a file ending in {', '.join(parsers)}")
     if not path.is_file():
@@ -125,11 +131,6 @@ def _split_columns(table: np.ndarray) -> dict[str, Any]:
     return {"points": table[:, :3], "normals": table[:, 3:] if table.shape[1] == 6 else None}
 
 
-def _parse_npy(data: bytes) -> dict[str, Any]:
-    """Parse a .npy file."""
-    return _split_columns(_array_from_npy(data))
-
-
 def _array_from_npy(data: bytes) -> np.ndarray:
     """Return the array of a .npy file, which must hold what its header promises."""
     stream = io.BytesIO(data)
@@ -157,8 +158,3 @@ def _parse_npz(data: bytes) -> dict[str, Any]:
         if sum(info.file_size for info in members) > MAX_BYTES:
             raise ValueError(f"arrays of more than {MAX_BYTES} bytes")
         return {names[info.filename]: _array_from_npy(archive.read(info)) for info in members}
-
-
-def _parse_text(data: bytes) -> dict[str, Any]:
-    """Parse text of three or six numbers a line."""
-    return _split_columns(read_lines(data))
