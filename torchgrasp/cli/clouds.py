@@ -69,7 +69,13 @@ def render(
     with naming("MESH", "mesh"):
         solid = read_mesh(mesh)
     options = [naming(f"--{name}", name) for name in ("azimuth", "elevation", "distance")]
-    with options[0], options[1], options[2], naming("--points", "n"), naming("MESH", "points", "depth", "mesh", "target"):
+    with (
+        options[0],
+        options[1],
+        options[2],
+        naming("--points", "n"),
+        naming("MESH", "points", "depth", "mesh", "target"),
+    ):
         pose = look_at(camera.azimuth, camera.elevation, camera.distance, solid)
         cloud = partial_view(solid, pose, points, not no_noise, seed)
     with naming("--out", "path"):
