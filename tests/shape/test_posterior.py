@@ -37,10 +37,6 @@ def _known(n: int = 40, extra: int = 0) -> Observations:
     return Observations(x, distance, x, has, sigma, 2.5 * sigma)
 
 
-def _part(known: Observations, rows: Tensor | slice) -> Observations:
-    return Observations(**{name: value[rows] for name, value in vars(known).items()})
-
-
 def _fit(known: Observations, kernel: str | Kernel = "thin_plate") -> ShapeGP:
     return condition(known, Normalisation(CENTER, SCALE), PointCloud(SCALE * known.x + CENTER), kernel=kernel)
 
@@ -184,12 +180,12 @@ def test_updates_equal_a_refit(name: str, with_normals: bool):
     if not with_normals:
         has = torch.arange(len(known.x)) < len(known.x) - 6
         known = Observations(**{**vars(known), "has_normal": known.has_normal & has})
-    first, rest = _part(known, slice(0, -6)), _part(known, slice(-6, None))
+    first, rest = known[slice(0, -6)], known[slice(-6, None)]
     shape = _fit(first, name)
     refit = condition(known, Normalisation(CENTER, SCALE), shape.cloud, kernel=shape.kernel)
     updated = shape
     for rows in (slice(0, 1), slice(1, 3), slice(3, 6)):  # one after the other, and several at once
-        new = _part(rest, rows)
+        new = rest[rows]
         normals = 3.0 * new.normal if with_normals else None  # of any length
         updated = updated.update(shape.metres(new.x), normals, noise=0.02 * SCALE, normal_noise=0.05)
     torch.testing.assert_close(updated.x, refit.x, rtol=0, atol=1e-12)
@@ -210,7 +206,7 @@ def test_errors_that_new_observations_share_equal_a_dense_solve():
     """Some of the new points have normals, and the errors of their distances two common causes."""
     known, kernel = _known(30, extra=6), kernel_by_name("thin_plate", 3.6)
     known = Observations(**{**vars(known), "has_normal": known.has_normal & (torch.arange(len(known.x)) % 3 > 0)})
-    old, new = _part(known, slice(0, -6)), _part(known, slice(-6, None))
+    old, new = known[slice(0, -6)], known[slice(-6, None)]
     rng = torch.Generator().manual_seed(1)
     shared = 0.1 * torch.randn(6, 2, dtype=torch.float64, generator=rng)
     found = append_observations(posterior_given(old, kernel), new, shared)

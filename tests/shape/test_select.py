@@ -7,12 +7,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchgrasp.base import join
 from torchgrasp.errors import IndefiniteCovariance
 from torchgrasp.linalg import unit
 from torchgrasp.shape.condition import posterior_given
 from torchgrasp.shape.gradient_kernel import covariance
 from torchgrasp.shape.kernel import kernel_by_name, thin_plate
-from torchgrasp.shape.observations import Observations, join, on_surface
+from torchgrasp.shape.observations import Observations, on_surface
 from torchgrasp.shape.select import Criterion, Selection, select_points
 
 PSI = 3.6
@@ -141,7 +142,7 @@ def test_picking_stops_when_every_point_is_as_certain_as_asked():
 def test_the_factor_of_the_selection_is_that_of_the_posterior(criterion: Criterion):
     x, known = _scene(120)
     found = _select(x, known, 20, criterion)
-    every = join(known, _on_surface(x).select(found.picks))
+    every = join([known, _on_surface(x)[found.picks]])
     grown, fresh = found.posterior, posterior_given(every, PLATE)
     assert torch.equal(grown.x, fresh.x) and torch.equal(grown.has_normal, fresh.has_normal)
     torch.testing.assert_close(grown.weights, fresh.weights, rtol=0, atol=1e-7)

@@ -1,4 +1,4 @@
-"""How true a shape is: errors of the estimated surface and coverage of its k-sigma band, against the true mesh."""
+"""Accuracy of a shape against the true mesh: errors of the surface, coverage of its k-sigma band."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
     import trimesh
 
 HIDDEN = 0.006
-"""Distance [m] from the cloud beyond which the true surface counts as never seen."""
+"""Distance [m] from the cloud beyond which the true surface counts as hidden."""
 SURE_VARIANCE = 0.03
-"""The paper's threshold of the variance, normalised, under which a planner takes contacts."""
+"""Variance, normalised, below which a planner takes contacts (the paper's threshold)."""
 RESOLUTION = 56
 """Cells of the grid of the estimated surface along the domain's diameter."""
 SAMPLES = 3000
 """Points on the true and on the estimated surface."""
 TABLE_FACE = 0.002
-"""Height [m] over the lowest point up to which surface that looks down is the face on the table."""
+"""Height [m] over the lowest point within which downward surface is the face on the table."""
 
 Row = dict[str, Any]
-"""Plain numbers by name; lengths in mm, angles in degrees, shares in [0, 1], NaN where nothing was measured."""
+"""Numbers by name: lengths in mm, angles in degrees, shares in [0, 1], NaN where nothing was measured."""
 
 
 def measure_accuracy(
@@ -43,7 +43,7 @@ def measure_accuracy(
     table: bool = True,
     only: Sequence[str] = (),
 ) -> list[Row]:
-    """Return a row of `measure_shape` for every noisy view of a folder of objects, with "object" and "view" in it.
+    """Return a row of `measure_shape` for every noisy view of a folder, with "object" and "view".
 
     Args:
         objects: a folder as `torchgrasp.datasets` reads it.
@@ -53,7 +53,7 @@ def measure_accuracy(
         only: names of objects to keep; all of them if empty.
 
     Raises:
-        BadArgument: no manifest, or one without objects to measure.
+        BadArgument: no manifest, or no object to measure.
     """
     return [
         {"object": name, "view": view}
@@ -63,19 +63,26 @@ def measure_accuracy(
 
 
 def measure_shape(shape: ShapeGP, mesh: "trimesh.Trimesh", cloud: PointCloud, seed: int = 0) -> Row:
-    """Return how far the shape is from the true mesh, where it was seen and where not, and how true its std_m is.
+    """Return errors of a shape and the coverage of its std_m, by name.
 
-    Names begin with "seen_" (true surface within 6 mm of the cloud), "hidden_" (the rest, without the face on the
-    table) or "sure_" (estimated surface of variance < 0.03). For seen and hidden: "median_mm" and "p90_mm" from the
-    true surface to the estimated one, "normal_deg" (median) between their normals, "within_1", "_2", "_3": the share
-    whose signed distance is within 1, 2, 3 std_m of zero; "raw_1", "_2", "_3" the same with the paper's own standard
-    deviation, sqrt(variance), in place of std_m. For sure: median_mm, normal_deg, and "share" of the surface. True
-    surface outside the shape's domain counts as missed by every band.
+    Names begin with the part of the surface:
+
+    * "seen_": true surface within 6 mm of the cloud.
+    * "hidden_": the other true surface, without the face on the table.
+    * "sure_": estimated surface of variance below 0.03.
+
+    Names end with the measure:
+
+    * "median_mm", "p90_mm": distance between true and estimated surface.
+    * "normal_deg": median angle between their normals.
+    * "within_1", "_2", "_3": share of the true surface within k std_m. Surface outside the domain is missed.
+    * "raw_1", "_2", "_3": the same with the paper's own deviation, sqrt(variance).
+    * "share": share of the estimated surface that is sure.
 
     Args:
         shape: the posterior [m].
         mesh: the true surface in the frame of the cloud [m].
-        cloud: what was seen, before cleaning.
+        cloud: what the camera saw, before cleaning.
         seed: of the samples.
     """
     from scipy.spatial import KDTree
@@ -87,14 +94,14 @@ def measure_shape(shape: ShapeGP, mesh: "trimesh.Trimesh", cloud: PointCloud, se
     far = torch.from_numpy(KDTree(cloud.points.numpy()).query(points.numpy())[0]) > HIDDEN
 
     surface = extract_surface(shape, RESOLUTION).mesh()
-    at, _ = nearest_on_mesh(surface, points)
-    error = torch.linalg.vector_norm(at - points, dim=-1)
+    feet, _ = nearest_on_mesh(surface, points)
+    error = torch.linalg.vector_norm(feet - points, dim=-1)
     # The surface may reach a little over the domain, where `predict` refuses.
-    angle = _angle(unit(shape.jet(shape.normalise(at)).gradient), normals)
+    angle = _angle(unit(shape.jet(shape.normalise(feet)).gradient), normals)
     inside = shape.contains(points)
-    found = shape.predict(points[inside])
+    estimate = shape.predict(points[inside])
     ratio = torch.full_like(error, torch.inf)
-    ratio[inside] = found.distance.abs() * shape.scale / found.std_m
+    ratio[inside] = estimate.distance.abs() * shape.scale / estimate.std_m
     row: Row = {}
     for name, where in (("seen", ~far), ("hidden", far)):
         row |= {
@@ -107,11 +114,11 @@ def measure_shape(shape: ShapeGP, mesh: "trimesh.Trimesh", cloud: PointCloud, se
 
     ours, _ = sample_mesh(surface, SAMPLES, generator)
     ours = ours[shape.contains(ours)]
-    found = shape.predict(ours)
-    sure = found.variance < SURE_VARIANCE
-    at, true_normal = nearest_on_mesh(mesh, ours[sure])
-    row["sure_median_mm"] = 1e3 * _quantile(torch.linalg.vector_norm(at - ours[sure], dim=-1), 0.5)
-    row["sure_normal_deg"] = _quantile(_angle(found.normal[sure], true_normal), 0.5)
+    estimate = shape.predict(ours)
+    sure = estimate.variance < SURE_VARIANCE
+    feet, true_normal = nearest_on_mesh(mesh, ours[sure])
+    row["sure_median_mm"] = 1e3 * _quantile(torch.linalg.vector_norm(feet - ours[sure], dim=-1), 0.5)
+    row["sure_normal_deg"] = _quantile(_angle(estimate.normal[sure], true_normal), 0.5)
     row["sure_share"] = _share(sure)
     return row
 

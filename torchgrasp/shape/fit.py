@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import join
 from torchgrasp.cloud.prepare import PreparedCloud, prepare_cloud
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import fibonacci_sphere, unit
@@ -16,7 +17,7 @@ from torchgrasp.shape.completion.free_space import free_space, free_space_violat
 from torchgrasp.shape.condition import check_kernel, longest_distance
 from torchgrasp.shape.gp import Normalisation, ShapeGP
 from torchgrasp.shape.kernel import Kernel, KernelName, kernel_by_name
-from torchgrasp.shape.observations import Observations, join, off_surface, on_surface
+from torchgrasp.shape.observations import Observations, off_surface, on_surface
 from torchgrasp.shape.select import Criterion, select_points
 from torchgrasp.shape.update import append_observations
 from torchgrasp.values import PointCloud
@@ -100,7 +101,7 @@ def fit_shape(
     candidates = on_surface(x, seen.normals, torch.full_like(x[:, 0], noise), beside.normal_noise)
 
     # The kernel's length is that of all candidates, so that one factor grows from the first to the last.
-    every = join(beside.anchors, candidates, *(part for part, _ in beside.parts))
+    every = join([beside.anchors, candidates, *(part for part, _ in beside.parts)])
     psi = psi_scale * longest_distance(every.x)
     kernel = kernel_by_name(kernel, psi) if isinstance(kernel, str) else kernel
     most, stop = (MAX_BUDGET, noise) if budget == "sure" else (budget or BUDGETS[support], -math.inf)

@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Value, check_tensor
+from torchgrasp.base import Value, check_tensor, map_tensors
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
 from torchgrasp.shape.joint_posterior import JointEstimate, draw_samples, joint_estimate
-from torchgrasp.shape.observations import Observations
+from torchgrasp.shape.observations import Observations, on_surface
 from torchgrasp.shape.posterior import Posterior
 from torchgrasp.shape.update import append_observations
 from torchgrasp.values import PointCloud, ShapeEstimate
@@ -86,10 +86,6 @@ class ShapeGP(Posterior, Normalisation):
             cloud=cloud,
         )
 
-    def append(self, new: Observations) -> "ShapeGP":
-        """Return the shape given further observations, normalised, with the same kernel and domain."""
-        return dataclasses.replace(self, **_fields(append_observations(self, new), Posterior))
-
     def to(self, *args: Any, **kwargs: Any) -> "ShapeGP":
         """Return the shape on another device; it stays in float64, which its condition number of 1e7 needs."""
         device = torch.empty(0, device=self.x.device).to(*args, **kwargs).device
@@ -97,7 +93,7 @@ class ShapeGP(Posterior, Normalisation):
 
     @property
     def device(self) -> torch.device:
-        """Where the shape lives; planners put their points there."""
+        """Device of the shape; planners put their points there."""
         return self.x.device
 
     def contains(self, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
@@ -107,78 +103,56 @@ class ShapeGP(Posterior, Normalisation):
     def predict(self, points: Float[Tensor, "*b 3"]) -> ShapeEstimate:
         """Return signed distance, normal and their covariance at query points, Eqs. (7)-(8).
 
-        The estimate carries no gradient to the points; `jet` returns the derivatives.
+        The estimate carries no gradient to the points; `jet` and `differentiate` return derivatives.
 
         Args:
             points: query points [m] in the cloud's frame.
-
-        Raises:
-            BadArgument: non-finite numbers, or a point outside the ball in which the posterior is valid. A thin
-                plate's variance turns negative out there, and would pass for certainty.
 
         Returns:
             The estimate in the dtype of `points`; see `ShapeEstimate` for units.
-        """
-        x = self._queries("points", points)
-        mean, spread = self.estimate(x)
-        variance = spread[:, 0, 0]
-        found = ShapeEstimate(
-            distance=mean[:, 0],
-            normal=unit(mean[:, 1:]),
-            variance=variance,
-            covariance=spread,
-            std_m=self.std_factor * self.scale * torch.sqrt(variance),
-        )
-        return _shaped(found, points)
-
-    def differentiate(self, points: Float[Tensor, "*b 3"]) -> ShapeDerivatives:
-        """Return the derivatives of distance, normal and variance by the query points, in closed form.
-
-        Args:
-            points: query points [m] in the cloud's frame.
 
         Raises:
-            BadArgument: as `predict`.
-
-        Returns:
-            The derivatives in the dtype of `points`.
+            BadArgument: non-finite numbers, or a point outside the domain: there a thin plate's variance turns
+                negative and would pass for certainty.
         """
-        jet = self.jet(self._queries("points", points))
+        mean, covariance = self.estimate(self._queries(points))
+        variance = covariance[:, 0, 0]
+        std_m = self.std_factor * self.scale * torch.sqrt(variance)
+        return _reshape(ShapeEstimate(mean[:, 0], unit(mean[:, 1:]), variance, covariance, std_m), points)
+
+    def differentiate(self, points: Float[Tensor, "*b 3"]) -> ShapeDerivatives:
+        """Return the derivatives of distance, normal and variance by the query points [m], in closed form.
+
+        Raises:
+            BadArgument: see `predict`.
+        """
+        jet = self.jet(self._queries(points))
         length = torch.linalg.vector_norm(jet.gradient, dim=-1)[:, None, None]
         normal = jet.gradient[:, :, None] / length
         along = normal @ (normal.transpose(1, 2) @ jet.hessian)
-        found = ShapeDerivatives(
+        rows = ShapeDerivatives(
             distance=jet.gradient / self.scale,
             normal=(jet.hessian - along) / (length * self.scale),
             variance=jet.variance_gradient / self.scale,
         )
-        return _shaped(found, points)
+        return _reshape(rows, points)
 
     def joint(self, points: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of (d, w) at up to 1000 points: mean (k, 4), covariance (4k, 4k), normalised.
-
-        Args:
-            points: query points [m] in the cloud's frame.
+        """Return the joint posterior of (d, w) at up to 1000 points [m], normalised.
 
         Raises:
-            BadArgument: as `predict`, or too many points.
+            BadArgument: see `predict`; too many points.
         """
-        x = self._queries("points", check_tensor("points", points, (None, 3)))
+        x = self._queries(check_tensor("points", points, (None, 3)))
         if len(x) > MAX_JOINT:
             raise BadArgument("points", f"{len(x)} points", f"at most {MAX_JOINT} points at once")
-        found = joint_estimate(self, x)
-        return JointEstimate(found.mean.to(points.dtype), found.covariance.to(points.dtype))
+        return joint_estimate(self, x).to(points.dtype)
 
     def sample(self, points: Float[Tensor, "k 3"], n: int, seed: int = 0) -> Float[Tensor, "n k 4"]:
-        """Draw (d, w) at up to 1000 points jointly from the posterior, normalised; w is no unit vector.
-
-        Args:
-            points: query points [m] in the cloud's frame.
-            n: number of samples.
-            seed: of the draws.
+        """Draw (d, w) jointly at up to 1000 points [m] from the posterior, n times, normalised; w is no unit vector.
 
         Raises:
-            BadArgument: as `joint`, or an `n` or a `seed` that is no integer from 0.
+            BadArgument: see `joint`; an `n` or a `seed` that is no integer from 0.
         """
         for name, value in (("n", n), ("seed", seed)):
             if not isinstance(value, int) or not 0 <= value < 2**63:
@@ -196,8 +170,7 @@ class ShapeGP(Posterior, Normalisation):
     ) -> "ShapeGP":
         """Return the shape given further points of the surface, too: a finger's touch, a second view.
 
-        The factor is extended, not computed anew: the posterior is that of all observations at once, with the kernel
-        and the domain of this one. `cloud` stays what the camera saw.
+        The result equals the posterior of all observations at once, with this kernel and domain; `cloud` stays.
 
         Args:
             points: on the surface [m], in the cloud's frame.
@@ -206,7 +179,7 @@ class ShapeGP(Posterior, Normalisation):
             normal_noise: standard deviation of the components of a unit normal.
 
         Raises:
-            BadArgument: a wrong argument, or a point outside the ball in which the posterior is valid.
+            BadArgument: a wrong argument, or a point outside the domain.
 
         >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
         >>> from torchgrasp import fit_shape
@@ -214,7 +187,7 @@ class ShapeGP(Posterior, Normalisation):
         >>> touched.predict(torch.tensor([0.0, 0.0, 0.045])).distance.abs() < 0.01
         tensor(True)
         """
-        x = self._queries("points", check_tensor("points", points, (None, 3)))
+        x = self._queries(check_tensor("points", points, (None, 3)))
         for name, value in (("noise", noise), ("normal_noise", normal_noise)):
             if not 0.0 < value < float("inf"):  # also refuses NaN
                 raise BadArgument(name, value, "a positive number")
@@ -222,26 +195,26 @@ class ShapeGP(Posterior, Normalisation):
         if normals is not None:
             direction = unit(check_tensor("normals", normals, (len(x), 3)).to(x))
             check_tensor("normals", direction, (len(x), 3))  # a normal of length 0 has become NaN
-        new = Observations(
-            x,
-            torch.zeros_like(x[:, 0]),
-            direction,
-            torch.full_like(x[:, 0], float(normals is not None), dtype=torch.bool),
-            torch.full_like(x[:, 0], noise / self.scale),
-            torch.full_like(x[:, 0], normal_noise),
-        )
-        return self.append(new)
+        new = on_surface(x, direction, torch.full_like(x[:, 0], noise / self.scale), normal_noise)
+        return self.append(dataclasses.replace(new, has_normal=new.has_normal & (normals is not None)))
 
-    def _queries(self, name: str, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "q 3"]:
-        """Return query points [m] as a list in the normalised frame; refuse what lies outside the domain."""
-        flat = _check_queries(points).reshape(-1, 3)
+    def append(self, new: Observations) -> "ShapeGP":
+        """Return the shape given further observations, normalised, with the same kernel and domain."""
+        return dataclasses.replace(self, **_fields(append_observations(self, new), Posterior))
+
+    def _queries(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "q 3"]:
+        """Return query points [m] as a list in the normalised frame; refuse points outside the domain."""
+        if not isinstance(points, Tensor) or points.ndim < 1 or points.shape[-1] != 3:
+            found = f"shape {tuple(points.shape)}" if isinstance(points, Tensor) else type(points).__name__
+            raise BadArgument("points", found, "a tensor of shape (..., 3)")
+        flat = check_tensor("points", points.reshape(-1, 3), (None, 3))
         x = self.normalise(flat.detach().double().to(self.device))
         radius = torch.linalg.vector_norm(x, dim=-1)
         outside = radius > self.domain_radius
         if bool(outside.any()):
             first = int(torch.nonzero(outside)[0])
             raise BadArgument(
-                name,
+                "points",
                 f"{int(outside.sum())} of {len(flat)} points outside the domain, the first {flat[first].tolist()} m, "
                 f"{float(radius[first]) * self.scale:.4g} m from the centre",
                 f"points within {self.domain_radius * self.scale:.4g} m of {self.center.tolist()} m",
@@ -249,21 +222,11 @@ class ShapeGP(Posterior, Normalisation):
         return x
 
 
-def _check_queries(points: Any) -> Float[Tensor, "*b 3"]:
-    """Return the query points; refuse what is no finite floating tensor of triples."""
-    if not isinstance(points, Tensor) or points.ndim < 1 or points.shape[-1] != 3:
-        found = f"shape {tuple(points.shape)}" if isinstance(points, Tensor) else type(points).__name__
-        raise BadArgument("points", found, "a tensor of shape (..., 3)")
-    check_tensor("points", points.reshape(-1, 3), (None, 3))
-    return points
-
-
-def _shaped(rows: Any, points: Float[Tensor, "*b 3"]) -> Any:
+def _reshape(rows: Any, points: Float[Tensor, "*b 3"]) -> Any:
     """Return a value of rows in the dtype, on the device and with the batch shape of the query points."""
-    fields = _fields(rows.to(points), type(rows))
-    return type(rows)(**{name: t.reshape(points.shape[:-1] + t.shape[1:]) for name, t in fields.items()})
+    return map_tensors(lambda t: t.to(points).reshape(points.shape[:-1] + t.shape[1:]), rows)
 
 
-def _fields(value: Value, kind: type) -> dict[str, Any]:
+def _fields(value: Value, kind: type[Value]) -> dict[str, Any]:
     """Return the fields of a value that a kind of value has."""
-    return {f.name: getattr(value, f.name) for f in dataclasses.fields(kind)}
+    return {f.name: getattr(value, f.name) for f in dataclasses.fields(kind)}  # pyright: ignore[reportArgumentType]

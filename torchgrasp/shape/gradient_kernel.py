@@ -1,4 +1,4 @@
-"""Covariances of signed distances and normals, derived from any radial kernel k(r), Eqs. (2)-(5)."""
+"""Covariances of signed distances and normals from a radial kernel k(r), Eqs. (2)-(5)."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,10 +14,10 @@ def covariance(
     other_has_normal: Bool[Tensor, "m"],
     profile: Profile,
 ) -> Float[Tensor, "rows columns"]:
-    """Return the covariance between the observations at two sets of points by autograd of the profile, Eqs. (2)-(5).
+    """Return the covariance of the observations at two sets of points, by autograd of the profile, Eqs. (2)-(5).
 
-    A point with a normal has four rows (d, w1, w2, w3), another point only d. Rows are ordered by component: all d,
-    then w1, w2 and w3 of the points with normals. This is the definition; the posterior uses `cross_covariance`.
+    This is the definition. Rows and columns are ordered by component: d of all points, then w1, w2 and w3 of the
+    points with normals.
 
     Args:
         x, other: points, normalised.
@@ -46,19 +46,19 @@ def cross_covariance(
 ) -> Float[Tensor, "4 q rows"]:
     """Return the covariance of (d, w) at points x with the observations at points y, Eqs. (2)-(5).
 
-    With d = x - y and k', k'' the derivatives of the kernel in r^2 / 2, the blocks are k, k' d, -k' d^T and
-    -k' I - k'' d d^T. In Eq. (5) one derivative is of each argument; both of the same argument would flip the sign of
-    the block and make the matrix indefinite.
+    With d = x - y and the derivatives k', k'' of the kernel in r^2 / 2, the blocks are k, k' d, -k' d^T and
+    -k' I - k'' d d^T. Eq. (5) takes one derivative in each argument: two in the same argument would flip the sign and
+    make the matrix indefinite.
 
     Args:
         kernel: the radial kernel.
         x: points, normalised.
-        y: points, of which the first `n_oriented` are observed with normals.
-        n_oriented: see `y`.
+        y: observed points, those with normals first.
+        n_oriented: number of observed points with normals.
         out: where to write the result; new memory costs more than the arithmetic.
 
     Returns:
-        For each component of (d, w) at x a matrix with the columns of `covariance`: first all d, then w1, w2, w3.
+        A matrix for each component of (d, w) at x, with the columns of `covariance`.
     """
     n = len(y)
     d, r = separations(x, y)
@@ -84,7 +84,7 @@ def cross_covariance(
 
 
 def separations(x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"]) -> tuple[list[Tensor], Float[Tensor, "q n"]]:
-    """Return x - y component by component, and its length, without the cancellation of |x|^2 - 2 x.y + |y|^2."""
+    """Return the components of x - y and its length, without the cancellation of |x|^2 - 2 x.y + |y|^2."""
     d = [x[:, m, None] - y[None, :, m] for m in range(3)]
     return d, (d[0] * d[0]).addcmul_(d[1], d[1]).addcmul_(d[2], d[2]).sqrt_()
 
@@ -106,5 +106,5 @@ def covariance_rows(
 
 
 def gram(kernel: Kernel, x: Float[Tensor, "n 3"], n_oriented: int) -> Float[Tensor, "rows rows"]:
-    """Return the covariance of what is observed at points, of which the first `n_oriented` have normals; symmetric."""
+    """Return the covariance of observations, of which the first `n_oriented` have normals."""
     return covariance_rows(kernel, x, n_oriented, x, n_oriented)

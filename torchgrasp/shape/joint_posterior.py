@@ -1,4 +1,4 @@
-"""The joint posterior of distances and normals at several points, and samples of it."""
+"""The joint posterior of distances and normals at several points, and samples from it."""
 
 import dataclasses
 
@@ -12,15 +12,15 @@ from torchgrasp.shape.gradient_kernel import gram
 from torchgrasp.shape.posterior import Posterior
 
 ROUNDING = 1e-8
-"""Eigenvalues of a posterior covariance above minus this times the prior variance are zeros, rounded."""
+"""Negative eigenvalues of a covariance, over the prior variance, that are zero to rounding."""
 
 
 @dataclasses.dataclass(frozen=True)
 class JointEstimate(Value):
-    """The joint posterior of (d, w) at k points, normalised: `mean` and `covariance`, point by point.
+    """The joint posterior of (d, w) at k points, normalised and point by point.
 
-    `w` is the gradient of the distance, not of unit length. `covariance.reshape(k, 4, k, 4)` has the block of points
-    i and j at [i, :, j].
+    The gradient w of the distance has no unit length. `covariance.reshape(k, 4, k, 4)[i, :, j]` is the block of
+    points i and j.
     """
 
     mean: Float[Tensor, "k 4"]
@@ -28,7 +28,7 @@ class JointEstimate(Value):
 
 
 def joint_estimate(posterior: Posterior, x: Float[Tensor, "k 3"]) -> JointEstimate:
-    """Return the mean and the 4k x 4k covariance of (d, w) at normalised points, Eqs. (7)-(8) for all at once."""
+    """Return the joint posterior of (d, w) at normalised points, Eqs. (7)-(8)."""
     k = len(x)
     cross = posterior.cross(x)
     mean = (cross @ posterior.weights).T
@@ -40,7 +40,7 @@ def joint_estimate(posterior: Posterior, x: Float[Tensor, "k 3"]) -> JointEstima
 
 
 def distance_covariance(posterior: Posterior, x: Float[Tensor, "b k 3"]) -> Float[Tensor, "b k k"]:
-    """Return the covariances of the distances alone at each of many sets of normalised points, Eq. (8)."""
+    """Return the covariance of the distances in each of b sets of normalised points, Eq. (8)."""
     b, k = x.shape[:2]
     cross = posterior.cross(x.flatten(0, 1))[0]
     whitened = torch.linalg.solve_triangular(posterior.factor, posterior.ordered(cross.T), upper=False)
@@ -50,15 +50,14 @@ def distance_covariance(posterior: Posterior, x: Float[Tensor, "b k 3"]) -> Floa
 
 
 def symmetric_root(covariance: Float[Tensor, "*b k k"], prior: float, remedy: str) -> Float[Tensor, "*b k k"]:
-    """Return the symmetric root of covariances, which no choice of basis among equal eigenvalues changes.
+    """Return the symmetric root of covariances; it does not depend on the basis of equal eigenvalues.
 
-    Points that coincide, or that are known exactly, leave eigenvalues of zero, which rounding makes negative: those
-    within `ROUNDING` of zero are zero.
+    Coinciding points leave eigenvalues of zero, which rounding makes negative. Within `ROUNDING` they count as zero.
 
     Args:
         covariance: positive semidefinite to rounding.
         prior: the prior variance of a distance, the scale of rounding.
-        remedy: what to do about one that is not.
+        remedy: what to do if a covariance is indefinite.
 
     Raises:
         IndefiniteCovariance: an eigenvalue is negative by more than rounding.
@@ -70,17 +69,7 @@ def symmetric_root(covariance: Float[Tensor, "*b k k"], prior: float, remedy: st
 
 
 def draw_samples(joint: JointEstimate, prior: float, n: int, seed: int) -> Float[Tensor, "n k 4"]:
-    """Draw from a joint posterior with the symmetric root of its covariance.
-
-    Args:
-        joint: what to draw from.
-        prior: the prior variance of a distance, the scale of rounding.
-        n: number of samples.
-        seed: of the draws.
-
-    Raises:
-        IndefiniteCovariance: an eigenvalue is negative by more than rounding.
-    """
+    """Draw n samples from a joint posterior; see `symmetric_root` for `prior` and errors."""
     root = symmetric_root(joint.covariance, prior, "query points within the domain")
     generator = torch.Generator().manual_seed(seed)
     draws = torch.randn(n, len(root), dtype=torch.float64, generator=generator).to(root)

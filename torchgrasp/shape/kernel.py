@@ -23,8 +23,6 @@ NEAR = 1e-5
 """Below this distance k'(r)/r is k''(r/2), its midpoint rule: exact for the thin plate, and no 0/0."""
 LEAST_PSI = 4.0 / 3.0
 """psi over the diameter of a ball in which the thin plate kernel is positive definite (dense limit: 1.313)."""
-PLATE_REMEDY = "use a psi_scale of at least 1.34: the thin plate kernel is a covariance only within 3/4 psi"
-NOISE_REMEDY = "use more noise, or a shorter length of the kernel"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +42,7 @@ class Kernel:
 
     profile: Profile
     diameter: float = math.inf
-    remedy: str = NOISE_REMEDY
+    remedy: str = "use more noise, or a shorter length of the kernel"
     closed_form: Callable[[Tensor, int], tuple[Tensor, ...]] | None = None
 
     def derivatives(self, r: Float[Tensor, "*s"], count: int) -> tuple[Float[Tensor, "*s"], ...]:
@@ -55,8 +53,8 @@ class Kernel:
 def differentiate(profile: Profile, r: Float[Tensor, "*s"], count: int) -> tuple[Float[Tensor, "*s"], ...]:
     """Return the first `count` (at most 4) of k, dk/du, d2k/du2 and d3k/du3 with u = r^2 / 2, by autograd.
 
-    All derivatives of the covariance are polynomials in them and in the difference of two points. The first is
-    k'(r)/r, which tends to k''(0). The others may be infinite at r = 0 and are 0 there: their factors vanish faster.
+    Covariances and their derivatives are polynomials in these and in the difference of two points. dk/du is k'(r)/r,
+    which tends to k''(0). The others are 0 at r = 0, where they may be infinite: their factors vanish faster.
 
     >>> differentiate(lambda r: torch.exp(-(r**2)), torch.zeros(1), 2)
     (tensor([1.]), tensor([-2.]))
@@ -76,8 +74,8 @@ def differentiate(profile: Profile, r: Float[Tensor, "*s"], count: int) -> tuple
 def thin_plate(r: Float[Tensor, "*s"], psi: float) -> Float[Tensor, "*s"]:
     """Return the thin plate kernel 2 r^3 - 3 psi r^2 + psi^3, Eq. (6).
 
-    It is a covariance only within a ball of diameter 3/4 psi. The paper takes the longest distance of the data as
-    psi: three points and two normals then suffice for a negative eigenvalue.
+    It is a covariance only within a ball of diameter 3/4 psi. The paper's psi, the longest distance of the data, is
+    too small: three points and two normals then give a negative eigenvalue.
 
     Args:
         r: distances, normalised.
@@ -92,7 +90,8 @@ def thin_plate(r: Float[Tensor, "*s"], psi: float) -> Float[Tensor, "*s"]:
 
 def thin_plate_kernel(psi: float) -> Kernel:
     """Return the thin plate kernel with the closed form of its derivatives."""
-    return Kernel(partial(thin_plate, psi=psi), psi / LEAST_PSI, PLATE_REMEDY, partial(_differentiate_thin_plate, psi))
+    remedy = "use a psi_scale of at least 1.34: the thin plate kernel is a covariance only within 3/4 psi"
+    return Kernel(partial(thin_plate, psi=psi), psi / LEAST_PSI, remedy, partial(_differentiate_thin_plate, psi))
 
 
 def matern52_kernel(length: float, variance: float = 1.0) -> Kernel:

@@ -94,7 +94,7 @@ def select_points(
         count += 1
     picks, rows = picks[:count], old + 4 * count
     by_pick = torch.arange(4 * count, device=x.device).reshape(4, count).T.flatten()
-    observed = candidates.select(picks)
+    observed = candidates[picks]
     return Selection(picks, extend_posterior(start, observed, factor[:rows, :rows], whitened[:rows, n], by_pick))
 
 

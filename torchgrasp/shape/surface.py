@@ -1,4 +1,4 @@
-"""The zero level of the shape as a triangle mesh, Eq. (9): for pictures and for collision fields."""
+"""The zero level of the shape, Eq. (9): a triangle mesh of it, and Newton steps onto it."""
 
 import dataclasses
 from typing import TYPE_CHECKING
@@ -17,18 +17,18 @@ if TYPE_CHECKING:
     import trimesh
 
 NEWTON_STEPS = 3
-"""Steps that move the vertices of marching cubes onto the zero level."""
+"""Newton steps from marching cubes onto the zero level: enough for 1e-6 of the scale."""
 LEAST_SLOPE = 1e-12
 """Least squared gradient with which a Newton step is computed: a stationary vertex stays."""
 LEAST_SHARE = 0.02
-"""A sheet of the zero level is kept when at least this share of the cloud lies nearest to it (an ear, a handle)."""
+"""Share of the cloud nearest to a sheet of the zero level from which on the sheet is kept: an ear, a handle."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Surface(Value):
-    """A closed or cut-off triangle mesh of the estimated surface, wound outward.
+    """A triangle mesh of the estimated surface, wound outward, open at the edge of the domain.
 
-    `normals` are unit gradients of the mean at the vertices; `std_m` [m] is how far the surface may be off there.
+    At the vertices [m], `normals` are unit gradients of the mean, and `std_m` [m] is the surface's deviation.
     """
 
     vertices: Float[Tensor, "v 3"]
@@ -44,10 +44,9 @@ class Surface(Value):
 
 
 def extract_surface(shape: ShapeGP, resolution: int = 48) -> Surface:
-    """Return the zero level of the mean that carries the cloud, Eq. (9), within the ball where the shape holds.
+    """Return the zero level of the mean, Eq. (9), within the domain, by marching cubes and Newton steps.
 
-    Marching cubes on a grid, then three Newton steps for each vertex. Of several sheets those are kept that carry at
-    least 2 % of the cloud; the others are artefacts far from all observations.
+    Sheets near less than 2 % of the cloud are left out: artefacts far from all observations.
 
     Args:
         shape: the posterior.
@@ -74,8 +73,7 @@ def extract_surface(shape: ShapeGP, resolution: int = 48) -> Surface:
     corners, faces, _, _ = marching_cubes(
         np.nan_to_num(volume, nan=1.0), 0.0, mask=~np.isnan(volume), spacing=(step,) * 3, gradient_direction="ascent"
     )
-    keep = _carries_cloud(corners - radius, faces, shape)
-    used, faces = np.unique(faces[keep], return_inverse=True)
+    used, faces = np.unique(faces[_carry_cloud(corners - radius, faces, shape)], return_inverse=True)
     x = torch.from_numpy(corners[used].astype(np.float64) - radius).to(device)
     faces = torch.from_numpy(faces.reshape(-1, 3).astype(np.int64)).to(device)
     for _ in range(NEWTON_STEPS):
@@ -100,18 +98,18 @@ def newton_step(
     direction: Float[Tensor, "n 3"],
     least_slope: float = 0.0,
 ) -> Float[Tensor, "n"]:
-    """Return the multiple of `direction` that leads onto the zero level, Eq. (9), to first order.
+    """Return the step along `direction` onto the zero level to first order, as a multiple of it.
 
     Args:
         value, gradient: of the mean.
-        direction: where to go, often the gradient itself.
+        direction: of the step, such as the gradient itself.
         least_slope: a smaller derivative along the direction counts as this one.
     """
     return -value / (gradient * direction).sum(-1).clamp_min(least_slope)
 
 
-def _carries_cloud(corners: np.ndarray, faces: np.ndarray, shape: ShapeGP) -> np.ndarray:
-    """Return which faces belong to sheets that carry enough of the cloud."""
+def _carry_cloud(corners: np.ndarray, faces: np.ndarray, shape: ShapeGP) -> np.ndarray:
+    """Tell which faces belong to sheets that carry enough of the cloud."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
@@ -119,7 +117,7 @@ def _carries_cloud(corners: np.ndarray, faces: np.ndarray, shape: ShapeGP) -> np
     edges = np.concatenate([faces[:, :2], faces[:, 1:]])
     graph = coo_matrix((np.ones(len(edges)), edges.T), shape=(len(corners), len(corners)))
     _, label = connected_components(graph, directed=False)
-    seen = shape.normalise(shape.cloud.points.to(shape.x)).cpu().numpy()
-    _, nearest = KDTree(corners).query(seen)
-    share = np.bincount(label[nearest], minlength=label.max() + 1) / len(seen)
+    cloud = shape.normalise(shape.cloud.points.to(shape.x)).cpu().numpy()
+    _, nearest = KDTree(corners).query(cloud)
+    share = np.bincount(label[nearest], minlength=label.max() + 1) / len(cloud)
     return (share >= min(LEAST_SHARE, share.max()))[label[faces[:, 0]]]

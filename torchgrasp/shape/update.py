@@ -1,4 +1,4 @@
-"""Later observations: rows appended to the Cholesky factor of a posterior, at O(rows^2) each."""
+"""Later observations: rows appended to the Cholesky factor of a posterior, in O(rows^2) each."""
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,16 +13,16 @@ from torchgrasp.shape.posterior import Posterior
 def append_observations(
     posterior: Posterior, new: Observations, shared: Float[Tensor, "n c"] | None = None
 ) -> Posterior:
-    """Return the posterior given `new` observations, too; it equals the one of all observations at once.
+    """Return the posterior given `new` observations, too; it equals the posterior of all observations at once.
 
-    With B = L^-1 K(old, new), the factor grows by the rows [B^T, C], C being the Cholesky factor of what the old
-    observations leave of K(new, new) + noise.
+    With B = L^-1 K(old, new) the factor grows by the rows [B^T, C]. C is the Cholesky factor of
+    K(new, new) + noise - B^T B.
 
     Args:
         posterior: the one to extend.
         new: normalised, float64, on the posterior's device.
-        shared: errors that the new distances have in common, a column of deviations for each independent cause; they
-            add shared shared^T to the covariance of the distances' own noise. None: there are none.
+        shared: correlated errors of the new distances, a column of deviations for each independent cause. They add
+            shared shared^T to the noise; None: there are none.
 
     Raises:
         IndefiniteCovariance: the new points are too far away for the kernel.
@@ -54,14 +54,14 @@ def extend_posterior(
     whitened: Float[Tensor, "rows"],
     new_order: Int[Tensor, "fresh"] | None = None,
 ) -> Posterior:
-    """Return the posterior given `new` observations, too, whose rows have been appended to the factor already.
+    """Return the posterior given `new` observations, too, from the factor of all rows.
 
     Args:
         posterior: given the old observations.
-        new: the later ones, those with normals first.
+        new: later observations, those with normals first.
         factor: of old and new rows.
         whitened: L^-1 y of old and new rows.
-        new_order: row of `Observations.rows` that each of the factor's new rows stands for; None: the same.
+        new_order: row of `Observations.rows` for each new row of the factor; None: the same.
     """
     old, total = len(posterior.factor), len(factor)
     solved = torch.linalg.solve_triangular(factor.T, whitened[:, None], upper=True)[:, 0]
@@ -77,12 +77,12 @@ def extend_posterior(
 
 
 def _row_of_each(old: Bool[Tensor, "n"], new: Bool[Tensor, "m"]) -> Int[Tensor, "rows"]:
-    """Return where the rows of old and new points, listed one set after the other, are among the rows of both."""
+    """Return the row in the joint order for each old row and then each new row."""
     n, m, near, fresh = len(old), len(new), int(old.sum()), int(new.sum())
     total, oriented = n + m, near + fresh
     line = torch.arange(total, device=old.device)
-    place = torch.cat([line[:near], oriented + line[: n - near]])  # of old points: those with normals stay first
-    placed = torch.cat([near + line[:fresh], oriented + (n - near) + line[: m - fresh]])
-    before = [place] + [total + c * oriented + line[:near] for c in range(3)]
-    after = [placed] + [total + c * oriented + near + line[:fresh] for c in range(3)]
+    moved = torch.cat([line[:near], oriented + line[: n - near]])  # of old points: those with normals stay first
+    added = torch.cat([near + line[:fresh], oriented + (n - near) + line[: m - fresh]])
+    before = [moved] + [total + c * oriented + line[:near] for c in range(3)]
+    after = [added] + [total + c * oriented + near + line[:fresh] for c in range(3)]
     return torch.cat(before + after)

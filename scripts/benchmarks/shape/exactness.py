@@ -9,6 +9,7 @@ from tqdm import tqdm
 
 from benchmarks.common import Row, least_seconds, random_view
 from benchmarks.shape.gpytorch_peer import select_by_refitting
+from torchgrasp.base import join
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.frames import rotation_from_vector
 from torchgrasp.linalg import cholesky, fibonacci_sphere
@@ -17,7 +18,7 @@ from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import Normalisation, ShapeGP
 from torchgrasp.shape.gradient_kernel import gram
 from torchgrasp.shape.kernel import kernel_by_name
-from torchgrasp.shape.observations import Observations, join, off_surface, on_surface
+from torchgrasp.shape.observations import Observations, off_surface, on_surface
 from torchgrasp.shape.select import select_points
 from torchgrasp.values import PointCloud
 
@@ -178,10 +179,10 @@ def bench_update(n: int = 70, seeds: int = 10) -> Row:
         x, cloud = x / 1.1, PointCloud(x, normals)  # so that the touched point lies in the domain of the others
         origin = torch.zeros(3, dtype=torch.float64)
         seen = observe(x[:n], normals[:n])
-        seen = join(seen, observe_support(x[:n]))
+        seen = join([seen, observe_support(x[:n])])
         before = condition(seen, Normalisation(origin, 1.0), cloud, PSI_SCALE)
         touch = partial(before.update, x[n:], normals[n:], noise=NOISE, normal_noise=NOISE)
-        every = join(seen, observe(x[n:], normals[n:]))
+        every = join([seen, observe(x[n:], normals[n:])])
         refit = partial(condition, every, origin, 1.0, cloud, PSI_SCALE, kernel=before.kernel)
         after, whole = touch(), refit()
         points = queries_in(before, 300)

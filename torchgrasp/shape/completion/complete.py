@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Value
+from torchgrasp.base import Batch, Value, join
 from torchgrasp.linalg import farthest_points
 from torchgrasp.shape.completion.revolution import find_revolution
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
@@ -107,7 +107,7 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
     images = _mirror(parts)
     images.sort(key=lambda image: -image.score)
     merged = _merge(scorer, _Image.of(scorer, torch.arange(0), len(planes)), images)
-    chosen = merged.select(farthest_points(merged.points, budget, tie=TIE))
+    chosen = merged[farthest_points(merged.points, budget, tie=TIE)]
     return Completion(
         points=chosen.points,
         normals=chosen.normals,
@@ -130,7 +130,7 @@ class _Part:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Image:
+class _Image(Batch):
     """A mirrored part [m]: its score, infinite before any mirror, and the errors of its points.
 
     `variance` [m^2] is the asymmetry's. `shared` [m] is the motion of a point across the surface with each plane and
@@ -150,20 +150,6 @@ class _Image:
         near = NEARBY ** (2 if scorer.table is not None else 3)
         shared = points.new_zeros(len(rows), n_planes, near)
         return cls(points, scorer.normals[rows], math.inf, torch.zeros_like(points[:, 0]), shared)
-
-    def select(self, rows: Tensor) -> "_Image":
-        """Return some of the points."""
-        return _Image(self.points[rows], self.normals[rows], self.score, self.variance[rows], self.shared[rows])
-
-    def join(self, other: "_Image") -> "_Image":
-        """Return the points of both images, with this one's score."""
-        return _Image(
-            torch.cat([self.points, other.points]),
-            torch.cat([self.normals, other.normals]),
-            self.score,
-            torch.cat([self.variance, other.variance]),
-            torch.cat([self.shared, other.shared]),
-        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -231,11 +217,11 @@ def _merge(scorer: SymmetryScorer, merged: _Image, images: list[_Image]) -> _Ima
 
     for image in images:
         distance, _ = scorer.nearest(image.points)
-        new = image.select((distance > NEW) & _allowed(scorer, image.points))
-        if len(merged.points) and len(new.points):
+        new = image[(distance > NEW) & _allowed(scorer, image.points)]
+        if len(merged) and len(new):
             distance, _ = KDTree(merged.points.numpy()).query(new.points.numpy())
-            new = new.select(torch.from_numpy(distance) > SPACING)
-        merged = merged.join(new.select(_thin(new.points)))
+            new = new[torch.from_numpy(distance) > SPACING]
+        merged = join([merged, new[_thin(new.points)]])
     return merged
 
 

@@ -23,7 +23,7 @@ MAX_RADIUS = 1.15
 LEAST_DISTANCE = 0.001
 """Least distance [m] of a probe from the object: a smaller one says nothing."""
 TOLERANCE = 0.002
-"""The shape may reach this far [m] into free space: less than the camera's noise is no violation."""
+"""The shape may reach this far [m] into free space: two to three times the noise of a camera."""
 MAX_PROBES = 16
 """Probes that are observed in one round, at most."""
 

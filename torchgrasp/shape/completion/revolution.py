@@ -11,7 +11,7 @@ STEEP = 0.3
 HALF_WEIGHT = 0.004
 """Distance [m] of a normal's line from the axis at which it has half the weight in the fit."""
 ITERATIONS = 30
-"""Fits with new weights; after these the axis rests."""
+"""Fits with new weights: the axis then rests to the last bit."""
 MISS, LEAST_RADIUS = 0.2, 0.01
 """A normal meets the axis if its line passes it within this share of the point's radius, at least of this one [m]."""
 SLICE, THICKNESS = 0.004, 0.004
