@@ -1,8 +1,8 @@
-"""Folders of objects: true meshes with simulated or real views, described by a manifest.
+"""Folders of objects: true meshes and views of them.
 
-`manifest.json` has "objects" by name, each with "views" by name, each with "T_object_camera" (4x4), and optionally
-"suggested_scale". Each object has a folder with `mesh.ply` and `<view>_noisy.ply` [m], resting at z = 0. Meshes and
-clouds are returned times the suggested scale, at which a hand can grasp the object.
+`manifest.json` holds "objects" by name. An object has "views" by name, each with "T_object_camera" (4x4). Its folder
+has `mesh.ply` and `<view>_noisy.ply` [m], resting at z = 0. All readers apply the object's "suggested_scale"
+(default 1), at which a hand can grasp it.
 """
 
 import json
@@ -25,7 +25,7 @@ WHOLE = "whole"
 
 
 def list_views(objects: Path, whole: bool = False, only: Sequence[str] = ()) -> list[tuple[str, str]]:
-    """Return pairs of an object and a view, sorted; with `whole` the one view `WHOLE` of each object.
+    """Return sorted pairs of object and view; with `whole` one view `WHOLE` of each object.
 
     Args:
         objects: the folder.
@@ -40,7 +40,7 @@ def list_views(objects: Path, whole: bool = False, only: Sequence[str] = ()) -> 
 
 
 def read_view(objects: Path, name: str, view: str, camera: bool = True) -> PointCloud:
-    """Return the noisy cloud of a view, without normals; without its viewpoint if not `camera`."""
+    """Return a noisy view without normals, with its viewpoint if `camera`."""
     entry, folder = _read_manifest(objects, [name])[name], Path(objects) / name
     if view == WHOLE:
         cloud = read_cloud(folder / "full_normals.ply")
@@ -69,7 +69,7 @@ def _scale(entry: dict[str, Any]) -> float:
 
 
 def _read_manifest(objects: Path, only: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return the entries of the objects asked for, sorted by name; all of them if none is asked for."""
+    """Return the entries of the objects asked for, sorted; all of them if `only` is empty."""
     manifest = Path(objects) / "manifest.json"
     if not manifest.is_file():
         raise BadArgument("objects", str(objects), "a folder with a manifest.json")

@@ -21,7 +21,7 @@ SEARCH_SAMPLES, SEARCH_TRIANGLES = 20_000, 8
 
 
 def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
-    """Return a closed mesh [m] from a file or a trimesh, checked and never repaired.
+    """Return a closed mesh [m], checked and never repaired.
 
     Raises:
         MeshError: no mesh in the file, non-finite vertices, an open surface, faces that are not all turned outward, or
@@ -70,7 +70,7 @@ def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
 def sample_mesh(
     mesh: "trimesh.Trimesh", n: int, generator: np.random.Generator
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Return n random points of a mesh, evenly by area, and their face normals."""
+    """Return n random points of a mesh, by area, and their normals."""
     points, _, normals = _sample(mesh, n, generator)
     return torch.from_numpy(points), torch.from_numpy(normals)
 
@@ -78,9 +78,9 @@ def sample_mesh(
 def nearest_on_mesh(
     mesh: "trimesh.Trimesh", points: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Return the nearest point of a mesh to each point, and its face normal.
+    """Return the nearest point of a mesh to each point, with its normal.
 
-    Only the triangles of the nearest samples are tried: much faster than a search over all triangles.
+    Only the triangles of the nearest samples are tried, for speed.
     """
     from scipy.spatial import KDTree
 
@@ -98,9 +98,9 @@ def nearest_on_mesh(
 
 
 def closest_on_triangles(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the closest point (n, 3) of each triangle (n, 3 corners, 3) to each point, and the feature it lies on.
+    """Return the closest point of each triangle (n, 3 corners, 3) to each point, and its feature.
 
-    Feature 0 is the face, 1 to 3 the sides ab, bc, ca, 4 to 6 the corners a, b, c.
+    Features: 0 the face, 1 to 3 the sides ab, bc, ca, 4 to 6 the corners a, b, c.
     """
     a, u, v = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     w = points - a
@@ -136,7 +136,7 @@ def _sample(
 
 
 def _face_normals(mesh: "trimesh.Trimesh", faces: np.ndarray) -> np.ndarray:
-    """Return unit normals of faces by their winding; trimesh has none for very thin ones."""
+    """Return unit normals of faces by their winding, also of very thin ones."""
     a, b, c = np.asarray(mesh.triangles)[faces].transpose(1, 0, 2)
     across = np.cross(b - a, c - a)
     return across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-300)

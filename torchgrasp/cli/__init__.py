@@ -30,7 +30,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "hand check": hands.check,
     "hand sample": hands.sample,
     "shape surface": shapes.surface,
-    "shape accuracy": shapes.measure_accuracy,
+    "shape accuracy": shapes.accuracy,
 }
 """The commands by name."""
 

@@ -1,4 +1,4 @@
-"""`torchgrasp shape`: the estimated surface as a mesh, and how true its uncertainty is."""
+"""`torchgrasp shape`: the estimated surface as a mesh, and its accuracy."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -8,8 +8,7 @@ import tyro
 from torchgrasp.cli.common import check_seed, check_table, naming, table_height
 from torchgrasp.cloud.io.read import read_cloud
 from torchgrasp.export import check_surface_path, largest_std, save_surface
-from torchgrasp.shape.accuracy import format_table
-from torchgrasp.shape.accuracy import measure_accuracy as calibrate_shapes
+from torchgrasp.shape.accuracy import format_table, measure_accuracy
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import extract_surface
 
@@ -25,7 +24,7 @@ def surface(
     resolution: int = 64,
     seed: int = 0,
 ) -> int:
-    """Write the estimated surface of the object of a partial point cloud, coloured by how far it may be off.
+    """Write the estimated surface of an object, coloured by its standard deviation.
 
     Args:
         cloud: point cloud of one object in metres, z up (.ply, .pcd, .npy, .npz, .xyz).
@@ -33,7 +32,7 @@ def surface(
         viewpoint: position of the camera in the frame of the cloud; by default the file's, else it is estimated.
         table: height of the table [m]; by default the lowest point of the cloud.
         no_table: there is no table.
-        support: what is assumed of the hidden side: what the camera tells, or the paper's points.
+        support: what is observed of the hidden side: outline, symmetry and free space, or the paper's points.
         resolution: cells along the diameter of the surface's domain, 8 to 256.
         seed: of every random draw.
     """
@@ -42,35 +41,35 @@ def surface(
     with naming("--out", "path"):
         check_surface_path(out)
     with naming("CLOUD", "path", "points", "normals"), naming("--viewpoint", "viewpoint"):
-        seen = read_cloud(cloud, viewpoint)
+        points = read_cloud(cloud, viewpoint)
         with naming("--table", "table"):
-            shape = fit_shape(seen, support=support, seed=seed, table=table_height(seen, table, no_table))
+            shape = fit_shape(points, support=support, seed=seed, table=table_height(points, table, no_table))
     with naming("--resolution", "resolution"):
-        found = extract_surface(shape, resolution)
+        mesh = extract_surface(shape, resolution)
     with naming("--out", "path"):
-        save_surface(found, out)
-    middle = float(found.std_m.median())
-    print(f"{len(found.vertices)} vertices, {len(found.faces)} faces, {out}")
-    print(f"standard deviation: median {1e3 * middle:.1f} mm, {1e3 * largest_std(found):.1f} mm where it is yellow")
+        save_surface(mesh, out)
+    middle = float(mesh.std_m.median())
+    print(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces, {out}")
+    print(f"standard deviation: median {1e3 * middle:.1f} mm, {1e3 * largest_std(mesh):.1f} mm where it is yellow")
     return 0
 
 
-def measure_accuracy(
+def accuracy(
     objects: Path,
     support: Literal["camera", "paper"] = "camera",
     no_camera: bool = False,
     no_table: bool = False,
     only: tuple[str, ...] = (),
 ) -> int:
-    """Print how far estimated surfaces are from true meshes, and how many points lie within 1, 2, 3 std_m.
+    """Print errors of estimated surfaces against true meshes, and the coverage of std_m.
 
     Args:
         objects: folder with manifest.json, and for each object mesh.ply and noisy views.
-        support: what is assumed of the hidden side: what the camera tells, or the paper's points.
+        support: what is observed of the hidden side: outline, symmetry and free space, or the paper's points.
         no_camera: estimate the camera's position in place of taking the manifest's.
         no_table: do not tell where the table is.
         only: names of objects to keep; by default all.
     """
     with naming("--objects", "objects", "path"):
-        print(format_table(calibrate_shapes(objects, support, not no_camera, not no_table, only)))
+        print(format_table(measure_accuracy(objects, support, not no_camera, not no_table, only)))
     return 0

@@ -1,4 +1,4 @@
-"""Accuracy of a shape against the true mesh: errors of the surface, coverage of its k-sigma band."""
+"""Errors of a shape against the true mesh, and coverage of its std_m."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -43,7 +43,7 @@ def measure_accuracy(
     table: bool = True,
     only: Sequence[str] = (),
 ) -> list[Row]:
-    """Return a row of `measure_shape` for every noisy view of a folder, with "object" and "view".
+    """Return `measure_shape` of every noisy view of a folder, with "object" and "view".
 
     Args:
         objects: a folder as `torchgrasp.datasets` reads it.
@@ -63,7 +63,7 @@ def measure_accuracy(
 
 
 def measure_shape(shape: ShapeGP, mesh: "trimesh.Trimesh", cloud: PointCloud, seed: int = 0) -> Row:
-    """Return errors of a shape and the coverage of its std_m, by name.
+    """Return errors of a shape and the coverage of its std_m.
 
     Names begin with the part of the surface:
 
@@ -124,7 +124,7 @@ def measure_shape(shape: ShapeGP, mesh: "trimesh.Trimesh", cloud: PointCloud, se
 
 
 def format_table(rows: Sequence[Row]) -> str:
-    """Return rows of `measure_accuracy` as a table, one line a view, then the mean of each object and of all views."""
+    """Return rows of `measure_accuracy` as a table with means."""
     within = ("hidden 1 2 3 sd", "seen 1 2 3 sd", "paper's 1 2 3 sd")
     table: list[tuple[str, ...]] = [("object", "view", "seen mm", "hidden mm  deg", *within, "sure mm  deg")]
 
@@ -150,7 +150,7 @@ def format_table(rows: Sequence[Row]) -> str:
 
 
 def mean_row(rows: Sequence[Row]) -> Row:
-    """Return the mean of every number over rows, those left out where nothing was measured."""
+    """Return the mean of every number over the rows that measured it."""
     numbers = [key for key, value in rows[0].items() if isinstance(value, float)]
     table = {key: np.array([row[key] for row in rows]) for key in numbers}
     return {key: float(v[np.isfinite(v)].mean()) if np.isfinite(v).any() else float("nan") for key, v in table.items()}

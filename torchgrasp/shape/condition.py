@@ -1,4 +1,4 @@
-"""From observations to the posterior of a shape: the kernel's length, the factor and the weights, Eqs. (7)-(9)."""
+"""From observations to the posterior of a shape, Eqs. (7)-(9)."""
 
 import torch
 from jaxtyping import Float
@@ -59,7 +59,7 @@ def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
 
 
 def check_kernel(posterior: Posterior, least_noise: float) -> None:
-    """Refuse observations further apart than the kernel's diameter, unless K is positive definite there.
+    """Refuse observations beyond the kernel's diameter, unless K is positive definite.
 
     Generous noise on some rows can hide an indefinite K from the factorisation. So K is factored again with the
     least standard deviation of all rows.

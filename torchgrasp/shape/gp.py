@@ -75,7 +75,7 @@ class ShapeGP(Posterior, Normalisation):
     def of(
         cls, posterior: Posterior, normalisation: Normalisation, cloud: PointCloud, psi: float, std_factor: float = 1.0
     ) -> "ShapeGP":
-        """Return the shape of a posterior, valid as far as the observations and the kernel reach."""
+        """Return the shape of a posterior, with its domain."""
         reach = REACH * float(torch.linalg.vector_norm(posterior.x, dim=-1).max())
         return cls(
             **_fields(posterior, Posterior),
@@ -87,7 +87,7 @@ class ShapeGP(Posterior, Normalisation):
         )
 
     def to(self, *args: Any, **kwargs: Any) -> "ShapeGP":
-        """Return the shape on another device; it stays in float64, which its condition number of 1e7 needs."""
+        """Return the shape on another device. Its condition number of 1e7 needs float64."""
         device = torch.empty(0, device=self.x.device).to(*args, **kwargs).device
         return super().to(device)
 
@@ -97,13 +97,13 @@ class ShapeGP(Posterior, Normalisation):
         return self.x.device
 
     def contains(self, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
-        """Tell which points [m] lie in the ball in which the posterior is valid."""
+        """Tell which points [m] lie in the domain."""
         return torch.linalg.vector_norm(self.normalise(points), dim=-1) <= self.domain_radius
 
     def predict(self, points: Float[Tensor, "*b 3"]) -> ShapeEstimate:
         """Return signed distance, normal and their covariance at query points, Eqs. (7)-(8).
 
-        The estimate carries no gradient to the points; `jet` and `differentiate` return derivatives.
+        It carries no gradient to the points; see `differentiate`.
 
         Args:
             points: query points [m] in the cloud's frame.
@@ -121,7 +121,7 @@ class ShapeGP(Posterior, Normalisation):
         return _reshape(ShapeEstimate(mean[:, 0], unit(mean[:, 1:]), variance, covariance, std_m), points)
 
     def differentiate(self, points: Float[Tensor, "*b 3"]) -> ShapeDerivatives:
-        """Return the derivatives of distance, normal and variance by the query points [m], in closed form.
+        """Return distance, normal and variance differentiated by the query points [m].
 
         Raises:
             BadArgument: see `predict`.
@@ -149,7 +149,7 @@ class ShapeGP(Posterior, Normalisation):
         return joint_estimate(self, x).to(points.dtype)
 
     def sample(self, points: Float[Tensor, "k 3"], n: int, seed: int = 0) -> Float[Tensor, "n k 4"]:
-        """Draw (d, w) jointly at up to 1000 points [m] from the posterior, n times, normalised; w is no unit vector.
+        """Draw (d, w) jointly at up to 1000 points [m], n times, normalised.
 
         Raises:
             BadArgument: see `joint`; an `n` or a `seed` that is no integer from 0.
@@ -168,9 +168,9 @@ class ShapeGP(Posterior, Normalisation):
         noise: float = 0.001,
         normal_noise: float = 0.05,
     ) -> "ShapeGP":
-        """Return the shape given further points of the surface, too: a finger's touch, a second view.
+        """Return the shape given further points, too: a finger's touch, a second view.
 
-        The result equals the posterior of all observations at once, with this kernel and domain; `cloud` stays.
+        Equals the posterior of all observations at once. Kernel, domain and `cloud` stay.
 
         Args:
             points: on the surface [m], in the cloud's frame.
@@ -203,7 +203,7 @@ class ShapeGP(Posterior, Normalisation):
         return dataclasses.replace(self, **_fields(append_observations(self, new), Posterior))
 
     def _queries(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "q 3"]:
-        """Return query points [m] as a list in the normalised frame; refuse points outside the domain."""
+        """Return normalised query points as a list; refuse points outside the domain."""
         if not isinstance(points, Tensor) or points.ndim < 1 or points.shape[-1] != 3:
             found = f"shape {tuple(points.shape)}" if isinstance(points, Tensor) else type(points).__name__
             raise BadArgument("points", found, "a tensor of shape (..., 3)")
@@ -223,7 +223,7 @@ class ShapeGP(Posterior, Normalisation):
 
 
 def _reshape(rows: Any, points: Float[Tensor, "*b 3"]) -> Any:
-    """Return a value of rows in the dtype, on the device and with the batch shape of the query points."""
+    """Return rows in the dtype, on the device and with the batch shape of the points."""
     return map_tensors(lambda t: t.to(points).reshape(points.shape[:-1] + t.shape[1:]), rows)
 
 

@@ -14,10 +14,9 @@ def covariance(
     other_has_normal: Bool[Tensor, "m"],
     profile: Profile,
 ) -> Float[Tensor, "rows columns"]:
-    """Return the covariance of the observations at two sets of points, by autograd of the profile, Eqs. (2)-(5).
+    """Return the covariance of observations by autograd of the profile, Eqs. (2)-(5): the definition.
 
-    This is the definition. Rows and columns are ordered by component: d of all points, then w1, w2 and w3 of the
-    points with normals.
+    Rows and columns are ordered by component: all d, then w1, w2, w3 of points with normals.
 
     Args:
         x, other: points, normalised.
@@ -44,11 +43,10 @@ def cross_covariance(
     n_oriented: int,
     out: Float[Tensor, "4 q rows"] | None = None,
 ) -> Float[Tensor, "4 q rows"]:
-    """Return the covariance of (d, w) at points x with the observations at points y, Eqs. (2)-(5).
+    """Return the covariance of (d, w) at x with observations at y, Eqs. (2)-(5).
 
-    With d = x - y and the derivatives k', k'' of the kernel in r^2 / 2, the blocks are k, k' d, -k' d^T and
-    -k' I - k'' d d^T. Eq. (5) takes one derivative in each argument: two in the same argument would flip the sign and
-    make the matrix indefinite.
+    The blocks are k, k' d, -k' d^T and -k' I - k'' d d^T. Here d = x - y, and k', k'' are derivatives in r^2 / 2.
+    Eq. (5) takes one derivative in each argument: two in one argument would make the matrix indefinite.
 
     Args:
         kernel: the radial kernel.
@@ -84,7 +82,7 @@ def cross_covariance(
 
 
 def separations(x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"]) -> tuple[list[Tensor], Float[Tensor, "q n"]]:
-    """Return the components of x - y and its length, without the cancellation of |x|^2 - 2 x.y + |y|^2."""
+    """Return the components of x - y and its length, without cancellation."""
     d = [x[:, m, None] - y[None, :, m] for m in range(3)]
     return d, (d[0] * d[0]).addcmul_(d[1], d[1]).addcmul_(d[2], d[2]).sqrt_()
 
@@ -92,7 +90,7 @@ def separations(x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"]) -> tuple[list[
 def covariance_rows(
     kernel: Kernel, x: Float[Tensor, "n 3"], n_oriented: int, y: Float[Tensor, "m 3"], other_oriented: int
 ) -> Float[Tensor, "rows columns"]:
-    """Return `covariance` for points of which the first `n_oriented` and `other_oriented` have normals.
+    """Return `covariance` for points sorted with normals first.
 
     >>> from torchgrasp.shape.kernel import rbf_kernel
     >>> x = torch.rand(5, 3, dtype=torch.float64)

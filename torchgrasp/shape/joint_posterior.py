@@ -1,4 +1,4 @@
-"""The joint posterior of distances and normals at several points, and samples from it."""
+"""The joint posterior at several points, and samples from it."""
 
 import dataclasses
 
@@ -17,10 +17,9 @@ ROUNDING = 1e-8
 
 @dataclasses.dataclass(frozen=True)
 class JointEstimate(Value):
-    """The joint posterior of (d, w) at k points, normalised and point by point.
+    """The joint posterior of (d, w) at k points, point by point and normalised.
 
-    The gradient w of the distance has no unit length. `covariance.reshape(k, 4, k, 4)[i, :, j]` is the block of
-    points i and j.
+    The gradient w has no unit length. Points i and j have the block `covariance.reshape(k, 4, k, 4)[i, :, j]`.
     """
 
     mean: Float[Tensor, "k 4"]
@@ -40,7 +39,7 @@ def joint_estimate(posterior: Posterior, x: Float[Tensor, "k 3"]) -> JointEstima
 
 
 def distance_covariance(posterior: Posterior, x: Float[Tensor, "b k 3"]) -> Float[Tensor, "b k k"]:
-    """Return the covariance of the distances in each of b sets of normalised points, Eq. (8)."""
+    """Return the covariance of the distances within sets of normalised points, Eq. (8)."""
     b, k = x.shape[:2]
     cross = posterior.cross(x.flatten(0, 1))[0]
     whitened = torch.linalg.solve_triangular(posterior.factor, posterior.ordered(cross.T), upper=False)
@@ -50,7 +49,7 @@ def distance_covariance(posterior: Posterior, x: Float[Tensor, "b k 3"]) -> Floa
 
 
 def symmetric_root(covariance: Float[Tensor, "*b k k"], prior: float, remedy: str) -> Float[Tensor, "*b k k"]:
-    """Return the symmetric root of covariances; it does not depend on the basis of equal eigenvalues.
+    """Return the symmetric root of covariances, unique even with equal eigenvalues.
 
     Coinciding points leave eigenvalues of zero, which rounding makes negative. Within `ROUNDING` they count as zero.
 

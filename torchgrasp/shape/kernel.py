@@ -1,6 +1,6 @@
-"""Radial kernels k(r) of the shape: the thin plate of the paper, Matern 5/2, the squared exponential, or your own.
+"""Radial kernels k(r): the paper's thin plate, Matern 5/2, the squared exponential, or your own.
 
-A kernel is its scalar profile; autograd gives the derivatives. A closed form of them may be registered as a speed-up.
+Autograd of the scalar profile gives the derivatives. A closed form may be registered as a speed-up.
 """
 
 import dataclasses
@@ -51,10 +51,10 @@ class Kernel:
 
 
 def differentiate(profile: Profile, r: Float[Tensor, "*s"], count: int) -> tuple[Float[Tensor, "*s"], ...]:
-    """Return the first `count` (at most 4) of k, dk/du, d2k/du2 and d3k/du3 with u = r^2 / 2, by autograd.
+    """Return k and its derivatives in u = r^2 / 2 by autograd, `count` in all, at most 4.
 
-    Covariances and their derivatives are polynomials in these and in the difference of two points. dk/du is k'(r)/r,
-    which tends to k''(0). The others are 0 at r = 0, where they may be infinite: their factors vanish faster.
+    dk/du is k'(r)/r, which tends to k''(0). Higher derivatives are 0 at r = 0, where they may be infinite. In every
+    covariance a factor vanishes faster.
 
     >>> differentiate(lambda r: torch.exp(-(r**2)), torch.zeros(1), 2)
     (tensor([1.]), tensor([-2.]))
@@ -74,8 +74,8 @@ def differentiate(profile: Profile, r: Float[Tensor, "*s"], count: int) -> tuple
 def thin_plate(r: Float[Tensor, "*s"], psi: float) -> Float[Tensor, "*s"]:
     """Return the thin plate kernel 2 r^3 - 3 psi r^2 + psi^3, Eq. (6).
 
-    It is a covariance only within a ball of diameter 3/4 psi. The paper's psi, the longest distance of the data, is
-    too small: three points and two normals then give a negative eigenvalue.
+    It is a covariance only within a ball of diameter 3/4 psi. The paper's psi is the longest distance of the data.
+    Three points and two normals then suffice for a negative eigenvalue.
 
     Args:
         r: distances, normalised.
@@ -95,7 +95,7 @@ def thin_plate_kernel(psi: float) -> Kernel:
 
 
 def matern52_kernel(length: float, variance: float = 1.0) -> Kernel:
-    """Return the Matern kernel v (1 + s + s^2 / 3) exp(-s) with s = sqrt(5) r / length and v = `variance`.
+    """Return Matern 5/2: variance (1 + s + s^2 / 3) exp(-s) with s = sqrt(5) r / length.
 
     >>> float(matern52_kernel(1.0).profile(torch.zeros(())))
     1.0
@@ -110,7 +110,7 @@ def matern52_kernel(length: float, variance: float = 1.0) -> Kernel:
 
 
 def rbf_kernel(length: float, variance: float = 1.0) -> Kernel:
-    """Return the squared exponential kernel v exp(-r^2 / (2 length^2)) with v = `variance`.
+    """Return the squared exponential kernel: variance exp(-r^2 / (2 length^2)).
 
     >>> float(rbf_kernel(1.0).profile(torch.zeros(())))
     1.0
@@ -120,9 +120,9 @@ def rbf_kernel(length: float, variance: float = 1.0) -> Kernel:
 
 
 def kernel_by_name(name: str, psi: float) -> Kernel:
-    """Return a kernel with the prior variances of the thin plate: k(0) = psi^3 and k''(0) = -6 psi.
+    """Return a kernel with k(0) = psi^3 and k''(0) = -6 psi, as the thin plate has.
 
-    The squared exponential then has the length psi / sqrt(6), and Matern 5/2 has sqrt(5/18) psi.
+    The lengths are psi / sqrt(6) for "rbf" and sqrt(5/18) psi for "matern52".
 
     Args:
         name: "thin_plate", "matern52" or "rbf".

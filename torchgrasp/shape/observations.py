@@ -24,7 +24,7 @@ class Observations(Batch):
     normal_noise: Float[Tensor, "n"]
 
     def rows(self) -> tuple[Float[Tensor, "rows"], Float[Tensor, "rows"]]:
-        """Return the observed numbers and their noise variances, in the order of `covariance`'s rows."""
+        """Return the observed numbers and their noise variances, as `covariance` orders rows."""
         y = torch.cat([self.distance, self.normal[self.has_normal].T.reshape(-1)])
         noise = torch.cat([self.distance_noise, self.normal_noise[self.has_normal].repeat(3)])
         return y, noise * noise
@@ -35,7 +35,7 @@ class Observations(Batch):
         return float(torch.cat([self.distance_noise, self.normal_noise[self.has_normal]]).min())
 
     def with_normals_first(self) -> "Observations":
-        """Return the observations with the points that have normals first, else in their order."""
+        """Return the observations, those with normals first."""
         return self[torch.argsort(~self.has_normal, stable=True)]
 
 

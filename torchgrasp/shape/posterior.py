@@ -1,4 +1,4 @@
-"""The posterior of distance and normal in the normalised frame: mean, derivatives and covariances, Eqs. (7)-(8)."""
+"""The posterior in the normalised frame: mean, derivatives and covariances, Eqs. (7)-(8)."""
 
 import dataclasses
 from collections.abc import Callable
@@ -23,10 +23,7 @@ WIDTH = 24
 
 @dataclasses.dataclass(frozen=True)
 class SurfaceJet(Value):
-    """The posterior mean to second order and its variance to first, at normalised points.
-
-    The gradients do not have unit length.
-    """
+    """The mean to second order and the variance to first; gradients do not have unit length."""
 
     distance: Float[Tensor, "q"]
     gradient: Float[Tensor, "q 3"]
@@ -37,7 +34,7 @@ class SurfaceJet(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Posterior(Value):
-    """A Gaussian process on distances and normals given observations, normalised and in float64.
+    """A Gaussian process given observations of distances and normals; normalised, in float64.
 
     Args:
         x: observed points, those with normals first.
@@ -68,8 +65,7 @@ class Posterior(Value):
     def whiteners(self) -> list[Float[Tensor, "columns width"]]:
         """L^-T in about four blocks of columns, without the zeros below.
 
-        Products with them have five eighths of the arithmetic of a dense one. At 280 rows they are a sixth faster
-        than a triangular solve, which has half of it.
+        Products with them take five eighths of a dense one's arithmetic. They are faster than a triangular solve.
         """
         rows = len(self.factor)
         inverse = torch.linalg.solve_triangular(
@@ -99,10 +95,7 @@ class Posterior(Value):
         return in_chunks(evaluate, x, 2048)[0]
 
     def mean_and_gradient(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]:
-        """Return the mean signed distance and its gradient at normalised points, at O(n) a point.
-
-        With the c_j of `jet` the gradient is sum_j c_j d - k' b_j: two matrix products.
-        """
+        """Return the mean signed distance and its gradient at normalised points; see `jet`."""
 
         def evaluate(x: Tensor) -> tuple[Tensor, Tensor]:
             a, b = self._split_weights()
@@ -144,10 +137,10 @@ class Posterior(Value):
         return in_chunks(evaluate, x, size)  # pyright: ignore[reportReturnType]
 
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
-        """Return the mean to second order and the variance to first at normalised points: no check, no autograd.
+        """Return mean and variance with derivatives at normalised points: no check, no autograd.
 
-        The weights (a, b) belong to distances and normals; d = x - x_j, and k', k'', k''' are the derivatives of the
-        kernel in |d|^2 / 2. Then:
+        (a, b) are the weights of distances and normals. With d = x - x_j, k', k'' and k''' are derivatives in
+        |d|^2 / 2.
 
         * mean: sum_j a_j k - k' d.b_j
         * gradient: sum_j c_j d - k' b_j with c_j = k' a_j - k'' d.b_j
@@ -163,7 +156,7 @@ class Posterior(Value):
         return cross_covariance(self.kernel, here, here, 1)[:, 0]
 
     def cross(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "4 q rows"]:
-        """Return the covariance of (d, w) at points with the observations, in the columns of `covariance`."""
+        """Return the covariance of (d, w) at points with the observations."""
         return cross_covariance(self.kernel, x, self.x, self.n_oriented)
 
     def _split_weights(self) -> tuple[Float[Tensor, "n"], Float[Tensor, "near 3"]]:
@@ -212,7 +205,7 @@ def _sum_differences(c: Float[Tensor, "q n"], x: Float[Tensor, "q 3"], y: Float[
 
 
 def in_chunks(evaluate: Callable[[Tensor], tuple[Any, ...]], x: Tensor, size: int) -> tuple[Any, ...]:
-    """Evaluate a function of the leading axis piece by piece, so that memory stays bounded."""
+    """Evaluate a function of the leading axis in chunks of bounded memory."""
     if len(x) <= size:
         return evaluate(x)
     whole: tuple[Any, ...] = ()

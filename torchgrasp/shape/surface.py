@@ -26,9 +26,9 @@ LEAST_SHARE = 0.02
 
 @dataclasses.dataclass(frozen=True)
 class Surface(Value):
-    """A triangle mesh of the estimated surface, wound outward, open at the edge of the domain.
+    """A triangle mesh of the surface [m], wound outward, open at the edge of the domain.
 
-    At the vertices [m], `normals` are unit gradients of the mean, and `std_m` [m] is the surface's deviation.
+    Normals are unit gradients of the mean; `std_m` [m] is the surface's standard deviation.
     """
 
     vertices: Float[Tensor, "v 3"]
@@ -46,7 +46,7 @@ class Surface(Value):
 def extract_surface(shape: ShapeGP, resolution: int = 48) -> Surface:
     """Return the zero level of the mean, Eq. (9), within the domain, by marching cubes and Newton steps.
 
-    Sheets near less than 2 % of the cloud are left out: artefacts far from all observations.
+    Sheets near less than 2 % of the cloud are artefacts and left out.
 
     Args:
         shape: the posterior.
@@ -98,7 +98,7 @@ def newton_step(
     direction: Float[Tensor, "n 3"],
     least_slope: float = 0.0,
 ) -> Float[Tensor, "n"]:
-    """Return the step along `direction` onto the zero level to first order, as a multiple of it.
+    """Return the Newton step onto the zero level, as a multiple of `direction`.
 
     Args:
         value, gradient: of the mean.

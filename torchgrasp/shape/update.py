@@ -1,4 +1,4 @@
-"""Later observations: rows appended to the Cholesky factor of a posterior, in O(rows^2) each."""
+"""Later observations, as rows appended to the Cholesky factor."""
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,10 +13,9 @@ from torchgrasp.shape.posterior import Posterior
 def append_observations(
     posterior: Posterior, new: Observations, shared: Float[Tensor, "n c"] | None = None
 ) -> Posterior:
-    """Return the posterior given `new` observations, too; it equals the posterior of all observations at once.
+    """Return the posterior given `new` observations, too, as if all had come at once.
 
-    With B = L^-1 K(old, new) the factor grows by the rows [B^T, C]. C is the Cholesky factor of
-    K(new, new) + noise - B^T B.
+    The factor L grows by the rows [B^T, C] with B = L^-1 K(old, new). C is the factor of K(new, new) + noise - B^T B.
 
     Args:
         posterior: the one to extend.
@@ -77,7 +76,7 @@ def extend_posterior(
 
 
 def _row_of_each(old: Bool[Tensor, "n"], new: Bool[Tensor, "m"]) -> Int[Tensor, "rows"]:
-    """Return the row in the joint order for each old row and then each new row."""
+    """Return the row in the joint order of each old and each new row."""
     n, m, near, fresh = len(old), len(new), int(old.sum()), int(new.sum())
     total, oriented = n + m, near + fresh
     line = torch.arange(total, device=old.device)

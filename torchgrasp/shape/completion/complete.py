@@ -1,4 +1,4 @@
-"""The hidden side by symmetry: the cloud, mirrored across the planes that the cloud and free space support."""
+"""The hidden side as the mirror image of the visible one."""
 
 import dataclasses
 import math
@@ -37,17 +37,17 @@ PART = 0.02
 TEMPERATURE = 0.1
 """A plane's probability is proportional to exp(score / temperature)."""
 NEARBY, NEARBY_ANGLE, NEARBY_SHIFT = 5, 0.15, 0.045
-"""Planes tried near one for its uncertainty: along each axis, to that angle [rad] and that share of the cloud's size."""
+"""Planes tried near one for its uncertainty: steps of each axis, greatest angle [rad] and share of the cloud's size."""
 PENALTY = 0.05
 """Score that an image of an image loses: of two equal points the one mirrored once is kept."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Completion(Value):
-    """Points of the hidden side with correlated errors across the surface, so that they do not average out.
+    """Points of the hidden side. Their errors across the surface are correlated and do not average out.
 
-    The covariance of the errors is LEAST_NOISE^2 I + deviations deviations^T [m^2]: independent noise, one error for
-    each uncertain plane, and a smooth field of length scale `PART`, the asymmetry.
+    The covariance is LEAST_NOISE^2 I + deviations deviations^T [m^2]. The deviations are errors of the planes and a
+    smooth field of length scale `PART`, the asymmetry.
 
     Args:
         points: [m].
@@ -71,7 +71,7 @@ class Completion(Value):
     def deviations(self) -> Float[Tensor, "m k"]:
         """Correlated errors [m], a column for each independent cause.
 
-        The plane's error also hides local asymmetry, so it counts in the smooth field, too.
+        The errors by plane are local, too: they also count in the smooth field.
         """
         local = torch.sqrt(self.asymmetry**2 + (self.shared**2).sum(1))
         alike = torch.exp(-0.5 * (torch.cdist(self.points, self.points) / PART) ** 2)
@@ -81,11 +81,11 @@ class Completion(Value):
 def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 50) -> Completion:
     """Return the hidden side that the cloud's symmetry suggests, with its uncertainty.
 
-    The cloud is mirrored across its best planes and across pairs of them. A mirrored point is kept where the camera saw
-    nothing, the visual hull allows it, and no point of a better plane is near. Low scores mean large asymmetry.
+    The cloud is mirrored across its best planes and across pairs of them. Points of better planes come first. No view
+    may exclude a point, and no other point may be near. Low scores mean large asymmetry.
 
-    On a table a body of revolution and its attached part have planes of their own. Any plane through the axis explains
-    the body, and only the part tells the plane of a handle.
+    On a table, a body of revolution and its attached part are mirrored separately. Any plane through the axis
+    explains the body. The part alone tells the plane of a handle.
 
     Args:
         cloud: clean points [m] of one view or several, with outward unit normals and viewpoints.
@@ -131,10 +131,10 @@ class _Part:
 
 @dataclasses.dataclass(frozen=True)
 class _Image(Batch):
-    """A mirrored part [m]: its score, infinite before any mirror, and the errors of its points.
+    """A mirrored part [m]; its score is infinite before any mirror.
 
-    `variance` [m^2] is the asymmetry's. `shared` [m] is the motion of a point across the surface with each plane and
-    each nearby plane, times the root of the probability.
+    `variance` [m^2] is the asymmetry's. `shared` [m] is a point's motion with each nearby plane, weighted by the
+    root of the plane's probability.
     """
 
     points: Tensor
@@ -181,7 +181,7 @@ class _Mirror:
 
 
 def _split(scorer: SymmetryScorer) -> list[_Part]:
-    """Return the cloud as one part, or a body of revolution and its attached part as two."""
+    """Split the cloud into a body of revolution and its attached part, if it is one."""
     every = torch.arange(len(scorer.points))
     revolution = None if scorer.table is None else find_revolution(scorer.points, scorer.normals)
     if revolution is None:
@@ -196,7 +196,7 @@ def _split(scorer: SymmetryScorer) -> list[_Part]:
 
 
 def _mirror(parts: list[_Part]) -> list[_Image]:
-    """Return the images of each part across each plane, and across one of the best two and another."""
+    """Return the images of each part across each plane and across pairs of planes."""
     total, images, before = sum(len(part.planes) for part in parts), [], 0
     for part in parts:
         original = _Image.of(part.scorer, part.rows, total)
@@ -212,7 +212,7 @@ def _mirror(parts: list[_Part]) -> list[_Image]:
 
 
 def _merge(scorer: SymmetryScorer, merged: _Image, images: list[_Image]) -> _Image:
-    """Add the allowed points of images to `merged`, image by image, at least `SPACING` apart."""
+    """Add the allowed points of images to `merged`, at least `SPACING` apart."""
     from scipy.spatial import KDTree
 
     for image in images:
@@ -226,7 +226,7 @@ def _merge(scorer: SymmetryScorer, merged: _Image, images: list[_Image]) -> _Ima
 
 
 def _allowed(scorer: SymmetryScorer, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-    """Tell which points neither the outline, nor the visible surface, nor the table excludes."""
+    """Tell which points neither a view nor the table excludes."""
     outline = scorer.outline
     allowed = (outline.hull_distance(points) < HULL_MARGIN) & (outline.violation(points) < FRONT_MARGIN)
     return allowed if scorer.table is None else allowed & (points[:, 2] > scorer.table - TABLE_MARGIN)

@@ -1,4 +1,4 @@
-"""Free space: where the camera or the table excludes the object, the shape must be outside."""
+"""Free space, which the camera or the table excludes from the object."""
 
 import torch
 from jaxtyping import Float
@@ -31,10 +31,10 @@ MAX_PROBES = 16
 def free_space(
     outline: Outlines, frame: Normalisation, table: float | None = None
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
-    """Return points beside the outline and below the table, normalised, and the least signed distance there.
+    """Return points of free space and their least signed distance, both normalised.
 
-    The distances are lower bounds: to the outline's edge less its error, and to the table's top. Observed everywhere
-    as distances they would inflate the object to its visual hull; see `free_space_violations`.
+    The points lie beside the outline and below the table. The distances are lower bounds. Observed everywhere they
+    would inflate the object to its visual hull.
 
     Args:
         outline: silhouettes of the views.
@@ -57,7 +57,7 @@ def free_space(
 
 
 def free_space_violations(shape: ShapeGP, x: Float[Tensor, "n 3"], least: Float[Tensor, "n"]) -> Tensor:
-    """Return the rows of free space that the shape reaches into, the worst first, then spread: at most 16.
+    """Return at most 16 rows of free space that the shape reaches into, the worst first.
 
     Observed at their least distance they push the shape out.
 
@@ -72,7 +72,7 @@ def free_space_violations(shape: ShapeGP, x: Float[Tensor, "n 3"], least: Float[
 
 
 def _points_beside(outline: Silhouette, origin: Float[Tensor, "3"], scale: float) -> Float[Tensor, "n 3"]:
-    """Return points [m] along rays beside an outline, over the depth of the object."""
+    """Return points [m] on rays beside an outline, over the object's depth."""
     depth = float(outline.depth.median())
     rays = [_rays_beside(outline, offset / depth) for offset in OFFSETS]
     middle = float((origin - outline.viewpoint) @ outline.axes[2])
@@ -81,7 +81,7 @@ def _points_beside(outline: Silhouette, origin: Float[Tensor, "3"], scale: float
 
 
 def _rays_beside(outline: Silhouette, offset: float) -> Float[Tensor, "k 3"]:
-    """Return rays of the camera's frame, of depth 1, beside the outline by an offset in the plane at depth 1."""
+    """Return rays at an offset from the outline, in the camera's frame and up to depth 1."""
     near = (outline.outside - offset).abs() <= 0.75 * outline.cell
     row, column = torch.nonzero(near, as_tuple=True)
     position = outline.corner + outline.cell * torch.stack([column, row], -1).double()

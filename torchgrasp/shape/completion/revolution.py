@@ -1,4 +1,4 @@
-"""Bodies of revolution: the vertical axis that the normals of most of a cloud meet, and the points around it."""
+"""Bodies of revolution: a vertical axis that the normals of most points meet."""
 
 import dataclasses
 
@@ -26,17 +26,16 @@ ONE_WAY = 0.95
 
 @dataclasses.dataclass(frozen=True)
 class Revolution:
-    """A body of revolution in a cloud: its vertical axis at `center` [m], and a mask of its points."""
+    """A body of revolution about the vertical axis at `center` [m]; `body` masks its points."""
 
     center: Float[Tensor, "2"]
     body: Bool[Tensor, "n"]
 
 
 def find_revolution(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Revolution | None:
-    """Return the body of revolution about a vertical axis that most points belong to; None: there is none.
+    """Return the body of revolution that most points belong to; None: there is none.
 
-    The normals of a surface of revolution meet its axis. The axis is fitted to their lines by reweighted least
-    squares (Cauchy), so that a handle does not draw it.
+    The axis is fitted to the lines along the normals. Reweighted least squares (Cauchy) ignore a handle.
 
     >>> angle = torch.linspace(-1.5, 1.5, 200).double()
     >>> level = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], 1)

@@ -1,4 +1,4 @@
-"""Bounds on the hidden side from each view: the object stays within its outline and behind its visible surface."""
+"""Silhouettes: the object stays within its outline and behind its visible surface."""
 
 import dataclasses
 
@@ -32,7 +32,7 @@ frame must not decide between them."""
 
 @dataclasses.dataclass(frozen=True)
 class Silhouette(Value):
-    """The outline and the visible depth of a view, in a raster of the camera's plane at depth 1.
+    """Outline and visible depth of a view, on a raster at depth 1.
 
     Args:
         viewpoint: position of the camera [m].
@@ -54,12 +54,12 @@ class Silhouette(Value):
     rim_normals: Float[Tensor, "k 3"]
 
     def hull_distance(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the signed distance [m] to the visual hull: positive where the object would have been seen."""
+        """Return the signed distance [m] to the visual hull, positive outside."""
         outside, _, depth = self._look_up(points)
         return outside * depth
 
     def violation(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return how far [m] points are outside the hull or in front of the visible surface; 0 where hidden."""
+        """Return the distance [m] by which points violate the view; 0 where hidden."""
         outside, visible, depth = self._look_up(points)
         in_front = (visible - depth - FRONT_MARGIN).clamp_min(0)
         return torch.where(outside > 0, outside * depth, in_front)
@@ -162,34 +162,29 @@ def silhouette(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"], n_ri
 
 
 def _check_view(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> None:
-    """Refuse points beside or behind the camera, and points that no camera sees at once."""
+    """Refuse points that no camera at the viewpoint sees at once."""
+    from scipy.spatial import KDTree
+
     forward = (points.amax(0) + points.amin(0)) / 2 - viewpoint
     behind = int(((points - viewpoint) @ forward <= 0).sum())
     if behind:
         found = f"{viewpoint.tolist()} m, with {behind} of {len(points)} points beside or behind it"
         raise BadArgument("viewpoint", found, "the position of a camera that has the whole cloud in front of it")
-    share = _share_behind(points, viewpoint)
-    if share > MAX_BEHIND:
-        found = f"{share:.0%} of the points behind others, which no camera sees at once"
-        raise BadArgument("cloud", found, "a single view, the viewpoint of each point, or outward normals")
-
-
-def _share_behind(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> float:
-    """Return the share of points that lie behind others: small for a single view, about half for a whole surface."""
-    from scipy.spatial import KDTree
-
     _, pixels, depth = _project(points, viewpoint)
     apart, index = KDTree(pixels.numpy()).query(pixels.numpy(), k=min(PIXELS, len(pixels)))
     deeper = depth[:, None] - depth[torch.from_numpy(index)] - torch.from_numpy(apart) * depth[:, None]
     points = points.double().cpu()
     radius = torch.linalg.vector_norm(points - (points.amax(0) + points.amin(0)) / 2, dim=-1).max()
-    return float((deeper.amax(1) > BEHIND * radius).double().mean())
+    share = float((deeper.amax(1) > BEHIND * radius).double().mean())
+    if share > MAX_BEHIND:
+        found = f"{share:.0%} of the points behind others, which no camera sees at once"
+        raise BadArgument("cloud", found, "a single view, the viewpoint of each point, or outward normals")
 
 
 def _project(
     points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "n 2"], Float[Tensor, "n"]]:
-    """Return the axes of a camera that looks at the points, their pixels at depth 1, and their depths [m]."""
+    """Return the axes of a camera that faces the points, and their pixels and depths [m]."""
     points, viewpoint = points.double().cpu(), viewpoint.double().cpu()
     axes = _camera_axes((points.amax(0) + points.amin(0)) / 2 - viewpoint)
     local = (points - viewpoint) @ axes.T
@@ -197,7 +192,7 @@ def _project(
 
 
 def _camera_axes(forward: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """Return right, down and forward axes of a camera that looks along `forward`, as rows."""
+    """Return right, down and forward axis of a camera, as rows."""
     forward = unit(forward)
     helper = torch.zeros_like(forward)
     helper[forward.abs().argmin()] = 1.0
@@ -206,7 +201,7 @@ def _camera_axes(forward: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
 
 
 def _fill_pores(mask: np.ndarray, radius: float) -> np.ndarray:
-    """Fill the holes of a mask in which no disc of the radius fits: gaps between samples, not real holes."""
+    """Fill holes of a mask in which no disc of the radius fits: gaps between samples."""
     from scipy.ndimage import label
 
     holes = np.zeros(mask.shape, dtype=np.int64)
@@ -218,7 +213,7 @@ def _fill_pores(mask: np.ndarray, radius: float) -> np.ndarray:
 
 
 def _distance(mask: np.ndarray) -> np.ndarray:
-    """Return the distance, in cells, of each cell of the mask to the nearest cell outside."""
+    """Return the distance [cells] of each cell to the nearest cell outside the mask."""
     from scipy.ndimage import distance_transform_edt
 
     return np.asarray(distance_transform_edt(mask))
@@ -227,7 +222,7 @@ def _distance(mask: np.ndarray) -> np.ndarray:
 def _rim(
     outside: np.ndarray, corner: np.ndarray, cell: float, pixels: np.ndarray, depths: np.ndarray, n: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return n points of the outline in the camera's frame, at the depth of nearby pixels, and their normals."""
+    """Return n points of the outline at the depth of nearby pixels, and their normals."""
     from scipy.ndimage import gaussian_filter
     from scipy.spatial import KDTree
 

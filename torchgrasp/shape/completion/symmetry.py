@@ -1,4 +1,4 @@
-"""Mirror planes of a partial cloud: its mirror image should fall onto the cloud, not into free space."""
+"""Mirror planes of a partial cloud: the image falls onto the cloud, not into free space."""
 
 import dataclasses
 import math
@@ -43,7 +43,7 @@ MAX_VIOLATION = 0.15
 
 @dataclasses.dataclass(frozen=True)
 class SymmetryScorer:
-    """What mirror planes are scored against: the cloud, its outlines and the table; `probes` are mirrored."""
+    """Scores mirror planes: mirrored `probes` against the cloud, its outlines and the table."""
 
     points: Tensor
     normals: Tensor
@@ -55,7 +55,7 @@ class SymmetryScorer:
 
     @classmethod
     def of(cls, cloud: PointCloud, table: float | None) -> "SymmetryScorer":
-        """Return the scorer of a cloud with normals, with probes from all of it."""
+        """Return the scorer of a cloud with normals, all of it probed."""
         from scipy.spatial import KDTree
 
         assert cloud.normals is not None
@@ -79,16 +79,16 @@ class SymmetryScorer:
         return float((self.points.amax(0) - self.points.amin(0)).max())
 
     def nearest(self, points: Tensor, limit: float = math.inf) -> tuple[Tensor, Tensor]:
-        """Return distance [m] and index of the nearest point of the cloud; infinity and 0 beyond the limit."""
+        """Return the nearest point's distance [m] and index; infinity and 0 beyond the limit."""
         distance, index = self.tree.query(points.reshape(-1, 3).numpy(), distance_upper_bound=limit)  # pyright: ignore
         shape = points.shape[:-1]
         index = torch.from_numpy(np.where(np.isinf(distance), 0, index)).reshape(shape)
         return torch.from_numpy(distance).reshape(shape), index
 
     def score(self, planes: Float[Tensor, "p 4"]) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
-        """Return the score of planes n.x = o, given as (n, o), and their mean violation of free space in [0, 1].
+        """Return scores of planes n.x = o, as (n, o), and violations of free space.
 
-        The score is the share of mirrored probes on the cloud with the right normal, minus twice the violation.
+        A violation is in [0, 1]. The score is the match with the cloud minus twice the violation.
         """
         mirrored = reflect(self.probes, planes[:, None])
         normals = reflect_directions(self.probe_normals, planes[:, None])
@@ -105,7 +105,7 @@ class SymmetryScorer:
 def find_planes(scorer: SymmetryScorer) -> tuple[Float[Tensor, "p 4"], Float[Tensor, "p"]]:
     """Return the mirror planes of a cloud, best first, and their scores.
 
-    Planes come from a grid, of vertical planes on a table. The best are refined, with one across the view added.
+    Planes come from a grid, vertical ones on a table. The best are refined.
     """
     view = torch.stack([unit(scorer.center - seen.viewpoint) for seen in scorer.outline.views]).mean(0)
     if scorer.table is None:
@@ -142,10 +142,9 @@ def find_planes(scorer: SymmetryScorer) -> tuple[Float[Tensor, "p 4"], Float[Ten
 def find_plane_through_axis(
     scorer: SymmetryScorer, center: Float[Tensor, "2"], part: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "1 4"], Float[Tensor, "1"]]:
-    """Return the mirror plane of a part through a vertical axis at `center`, and its score.
+    """Return the mirror plane of a part through the vertical axis at `center`, with its score.
 
-    Prefers the plane with least extent of the part normal to it, even if the other half is occluded: handles and
-    spouts lie in such a plane.
+    Prefers the plane with least extent normal to it, even if the other half is occluded.
     """
     normals = _level_directions(FINE_ANGLES)
     planes = torch.cat([normals, (normals[:, :2] @ center)[:, None]], -1)
@@ -159,7 +158,7 @@ def find_plane_through_axis(
 def planes_near(
     scorer: SymmetryScorer, plane: Float[Tensor, "4"], angles: Float[Tensor, "t"], shifts: Float[Tensor, "s"]
 ) -> Float[Tensor, "p 4"]:
-    """Return a plane rotated about each of its axes [rad] and shifted [m]; on a table only about the vertical."""
+    """Return a plane rotated about its axes [rad] and shifted [m]. A table leaves the vertical axis."""
     normal = plane[:3]
     if scorer.table is not None:
         sideways = torch.stack([-normal[1], normal[0], torch.zeros_like(normal[0])])[None]
@@ -201,7 +200,7 @@ def _plane_grid(scorer: SymmetryScorer, directions: Float[Tensor, "d 3"]) -> Flo
 def _pick_planes(
     scores: Float[Tensor, "d k"], directions: Float[Tensor, "d 3"], facing: Float[Tensor, "d"]
 ) -> list[tuple[int, int]]:
-    """Return direction and offset of the best planes that face the view and lie apart."""
+    """Return the best planes that face the view and lie apart: rows of the grid."""
     best, offset = scores.max(1)
     order = [i for i in torch.argsort(best, descending=True, stable=True).tolist() if facing[i] > MIN_FACING]
     chosen: list[int] = []
@@ -214,7 +213,7 @@ def _pick_planes(
 
 
 def _refine(scorer: SymmetryScorer, plane: Float[Tensor, "4"]) -> Float[Tensor, "4"]:
-    """Return the plane after three grid searches over rotations and shifts, each half as wide as the last."""
+    """Return the plane after three grid searches, each half as wide as the last."""
     steps = torch.tensor([-1.0, 0.0, 1.0], dtype=plane.dtype)
     for width in (1.0, 0.5, 0.25):
         near = planes_near(scorer, plane, 0.06 * width * steps, 0.04 * scorer.size * width * steps)
