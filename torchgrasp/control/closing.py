@@ -1,7 +1,4 @@
-"""How the fingers come to the object: in open loop, under the law (Eq. 25), or as the paper's position baseline.
-
-Each closing turns an `Observation` into joint targets and says when it is `done`.
-"""
+"""How the fingers reach the object: in open loop, under the law (Eq. 25), or as the paper's position baseline."""
 
 import dataclasses
 from collections.abc import Callable
@@ -18,35 +15,19 @@ Revision = Callable[[Observation, ClosingReference], ClosingReference]
 """Revises the reference by what the fingers feel (`Belief.revise`)."""
 
 POSE_TIME = 0.4
-"""Time [s] from pre-grasp to grasp in open loop, and as much from grasp to squeeze."""
+"""Time [s] from pre-grasp to grasp in open loop, and again from grasp to squeeze."""
 
-WAITING_FORCE = 0.3
-"""Force [N] of a finger that waits for the others: less than the table's friction on a light object."""
+WAITING_FORCE, SETTLED, PATIENCE = 0.3, 0.1, 1.5
+"""Force [N] of a finger that waits for the others, less than the table's friction on a light object. The waiting ends
+once all have touched for ten samples [s], or after a time [s] in which a fingertip travels 60 mm."""
 
-PATIENCE = 1.5
-"""Longest wait [s] of the first finger for the last: a fingertip travels 60 mm in it."""
+LEAD, IMPATIENCE = 0.04, 0.25
+"""Largest lead [rad] of a target over its joint: it bounds the force of a link that is stopped unfelt. While the others
+wait for a finger, the lead grows by itself in each such time [s]."""
 
-SETTLED = 0.1
-"""Time [s] for which all fingers must feel contact before the hand presses: ten samples."""
-
-STOP_FORCE = 0.5
-"""Force [N] at which a finger of the position baseline stops (Sec. 6.5)."""
-
-AIM_DEPTH = 0.02
-"""How far [m] the position baseline aims behind the planned contacts, to reach a displaced object (docs/closing.md)."""
-
-STOP_DISTANCE = 1e-3
-"""Distance [m] from its target at which a finger of the position baseline stops: well below the sensors' errors."""
-
-INTEGRAL_RATE = 2.0
-"""Integral gain [1/s^2] of the position baseline (docs/closing.md)."""
-
-IMPATIENCE = 0.25
-"""Time [s] of waiting for a late finger in which `LEAD` grows by itself, against what holds the finger back."""
-
-LEAD = 0.04
-"""Largest lead [rad] of a joint's target over the joint while closing. It bounds the force of a link that is stopped
-elsewhere than at its fingertip, which no sensor feels."""
+STOP_FORCE, STOP_DISTANCE, AIM_DEPTH, INTEGRAL_RATE = 0.5, 1e-3, 0.02, 2.0
+"""The position baseline: force [N] (Sec. 6.5) and distance to the target [m] at which a finger stops. The target's depth
+behind the planned contact [m] and the integral gain [1/s^2] are tuned (docs/closing.md)."""
 
 
 class OpenLoopClosing:
@@ -70,10 +51,9 @@ class UncertaintyClosing:
     """The uncertainty-aware controller (Eqs. 25-28), with fingers that wait for each other.
 
     A finger in the air searches along its contact's normal, beyond the planned contact if need be. Before the first
-    touch the fingers keep pace, so that they arrive together. A finger that touches is force-controlled whatever its
-    position error: where the shape is wrong, Eq. (26) would press on towards the planned point. It waits with
-    `WAITING_FORCE` until all touch or `PATIENCE` is over, so that the object stays where it is. The holding raises the
-    full forces, because three separate loops would push the object (docs/closing.md).
+    touch the fingers keep pace. A finger that touches is force-controlled whatever its position error: where the shape
+    is wrong, Eq. (26) would press on. It waits with `WAITING_FORCE` for the others. The holding then raises the full
+    forces, because three separate loops would push the object (docs/closing.md).
     """
 
     def __init__(self, reference: ClosingReference, revise: Revision | None = None) -> None:
@@ -115,7 +95,7 @@ class UncertaintyClosing:
 
 
 class FixedGainClosing(UncertaintyClosing):
-    """`UncertaintyClosing` with equal gains for every contact and direction, to measure what the uncertainty is worth."""
+    """`UncertaintyClosing` with equal gains for every contact and direction."""
 
     def __init__(self, reference: ClosingReference, revise: Revision | None = None) -> None:
         gains = reference.gains
@@ -129,11 +109,7 @@ class FixedGainClosing(UncertaintyClosing):
 
 
 class PositionClosing:
-    """The paper's baseline: an isotropic PI position controller per fingertip that stops at `STOP_FORCE` (Table 7).
-
-    It aims `AIM_DEPTH` behind the planned contacts: aimed at the contacts, most closings end before all fingers touch
-    (docs/closing.md).
-    """
+    """The paper's baseline (Table 7): an isotropic PI position controller per fingertip that stops at `STOP_FORCE`."""
 
     def __init__(self, reference: ClosingReference) -> None:
         self.reference = reference

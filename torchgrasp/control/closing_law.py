@@ -15,7 +15,7 @@ POSITION_FLOOR = 0.005
 Eq. (27) is infinite for a normal along an axis."""
 
 POSITION_RATE = 4.0
-"""Position gain [1/s] of a contact without uncertainty, which makes alpha_p = POSITION_RATE * POSITION_FLOOR**2."""
+"""Position gain [1/s] of a contact without uncertainty, the largest: alpha_p = POSITION_RATE * POSITION_FLOOR**2."""
 
 FORCE_BANDWIDTH = 15.0
 """Bandwidth [rad/s] of the force loop without uncertainty: alpha_f is this times the fingertip's compliance times
@@ -28,7 +28,7 @@ MAX_SPEED = 0.04
 """Largest speed [m/s] of a fingertip under the law: 0.4 mm between two samples of its sensor."""
 
 MAX_STEP = 0.05
-"""Largest change [rad] of any joint in one tick: it bounds the step near a singular posture."""
+"""Largest change [rad] of any joint in one tick: it scales steps near a singular posture."""
 
 DAMPING = 1e-5
 """Damping [m^2] of the inverse Jacobian; a finger's own J J^T is of the order 1e-3 m^2."""
@@ -59,16 +59,13 @@ def blend(error: Float[Tensor, "*b 3"], covariance: Float[Tensor, "*b 3 3"]) -> 
     return torch.exp(-0.5 * squared_mahalanobis(error, factor))
 
 
-def position_gain(covariance: Float[Tensor, "*b 3 3"], alpha_p: float | None = None) -> Float[Tensor, "*b 3"]:
+def position_gain(covariance: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
     """Return the diagonal of K_P [1/s] of Eq. (27): alpha_p [m^2/s] over the diagonal of Sigma_cov.
-
-    The default alpha_p gives a contact without uncertainty the gain `POSITION_RATE`; no gain exceeds it.
 
     >>> position_gain(POSITION_FLOOR**2 * torch.eye(3))
     tensor([4., 4., 4.])
     """
-    alpha_p = POSITION_RATE * POSITION_FLOOR**2 if alpha_p is None else alpha_p
-    return alpha_p / covariance.diagonal(dim1=-2, dim2=-1)
+    return POSITION_RATE * POSITION_FLOOR**2 / covariance.diagonal(dim1=-2, dim2=-1)
 
 
 def force_gain(covariance: Float[Tensor, "*b 3 3"], alpha_f: Float[Tensor, "*b"] | float) -> Float[Tensor, "*b 3"]:
@@ -94,12 +91,11 @@ def tip_velocity(
     blend: Float[Tensor, "*b"],
     position_gain: Float[Tensor, "*b 3"],
     force_gain: Float[Tensor, "*b 3"],
-    max_speed: float = MAX_SPEED,
 ) -> Float[Tensor, "*b 3"]:
-    """Return the bracket of Eq. (25) [m/s] for each fingertip, shortened to `max_speed`."""
+    """Return the bracket of Eq. (25) [m/s] for each fingertip, shortened to `MAX_SPEED`."""
     share = blend[..., None]
     velocity = (1 - share) * position_gain * position_error + share * force_gain * force_error
-    return limit_norm(velocity, max_speed)
+    return limit_norm(velocity, MAX_SPEED)
 
 
 def joint_step(
@@ -108,7 +104,6 @@ def joint_step(
     period: float,
     posture_error: Float[Tensor, "*b h"] | None = None,
     damping: float = DAMPING,
-    max_step: float = MAX_STEP,
 ) -> Float[Tensor, "*b h"]:
     """Return the change of the joints [rad] in one tick, Eq. (25), by damped least squares over all three fingers.
 
@@ -121,7 +116,6 @@ def joint_step(
         period: of the controller [s].
         posture_error: planned minus present joints [rad]; None: ignored.
         damping: of the inverse [m^2].
-        max_step: largest change of a joint [rad]; a longer step is scaled down as a whole.
 
     >>> joint_step(torch.zeros(3, 3, 4), torch.ones(3, 3), 0.01)
     tensor([0., 0., 0., 0.])
@@ -133,4 +127,4 @@ def joint_step(
         correction = POSITION_RATE * period * posture_error
         step = step + correction - (inverse_jacobian @ (stacked @ correction[..., None]))[..., 0]
     largest = step.abs().amax(-1, keepdim=True)
-    return step * (max_step / largest.clamp_min(max_step))
+    return step * (MAX_STEP / largest.clamp_min(MAX_STEP))

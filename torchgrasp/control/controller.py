@@ -1,4 +1,4 @@
-"""A grasp from the first motion of the fingers to the last of the hold: one state machine, without a simulator."""
+"""The controller of a grasp, from the first motion of the fingers to the end of the hold; it needs no simulator."""
 
 import functools
 from collections.abc import Callable
@@ -35,16 +35,14 @@ def check_modes(closing: str, holding: str, belief: object = None) -> None:
 
 
 class GraspController:
-    """Close a hand and hold what it grasped: an `Observation` goes in at every tick, joint targets come out.
+    """Close a hand and hold the object: an `Observation` goes in at every tick, joint targets come out.
 
-    A closing brings the fingers to the object until it is done or `CLOSING_TIME` is over; then a holding presses.
-    `closed` turns true `PRESSING_TIME` later: from then on the hand may be lifted, while it is stepped on. The open
-    loop ends with its squeeze, keeps it, and is closed at once.
+    A closing brings the fingers to the object, then a holding presses. `closed` turns true `PRESSING_TIME` later: from
+    then on the hand may be lifted, with further steps. The open loop keeps its squeeze.
 
     Args:
         reference: what the hand follows.
-        closing: as in `TrialSpec`.
-        holding: as in `TrialSpec`.
+        closing, holding: as in `TrialSpec`.
         belief: the shape that the grasp was planned on, which touches revise under the law (Eq. 25); None: they do not.
 
     Raises:

@@ -13,10 +13,9 @@ RAMP = 0.4
 
 
 class ForceHold:
-    """Press with balanced forces by J^T f / kp; the joints stay compliant about where they are.
+    """Press with forces that are balanced at the sensed contacts; the joints stay compliant about where they are.
 
-    The forces rise together and are balanced for the sensed contacts. One common factor keeps their sum at what was
-    asked for: three force loops, one for each finger, would drift and push the object along.
+    One common factor keeps the sum of the forces. A loop for each finger would drift and push the object.
 
     Args:
         reference: of the closing.

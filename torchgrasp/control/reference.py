@@ -61,16 +61,13 @@ class ClosingReference(Value):
     ) -> "ClosingReference":
         """Derive the reference of one grasp.
 
-        Desired forces are balanced. Where no balanced set presses at all contacts, each finger presses along its normal
-        with `force`; a certified grasp has a balanced set.
-
         Args:
             hand: the hand.
             grasp: one row, planned for it.
             force: normal force of the strongest finger [N].
             kp: stiffness of every joint's drive [N m/rad]; None: the hand's own.
-            stability: chooses among balanced forces that need nearly as little friction, and gives their covariance;
-                None: the covariance is proportional to the force.
+            stability: chooses among balanced forces of nearly equal friction, and gives their covariance; None: it is
+                proportional to the force.
 
         Raises:
             BadArgument: not exactly one row, joints of another hand, a force or stiffness that is not positive, or

@@ -1,9 +1,7 @@
 """A tactile fingertip: what a controller may know of a contact, from the simulator's truth.
 
-The force lags behind a 20 Hz low-pass and carries the noise of the paper's sensor (Sec. 6.5). The place of a contact is
-known to 1.5 mm. On a round tip the place gives the normal, known to 1.5 mm over the tip's radius. A fingertip samples
-at its own rate and holds the last sample in between. The contact flag switches with hysteresis on a slower average:
-one noisy reading crosses 0.2 N twice a second.
+The force lags behind a low-pass and is noisy. The place of a contact is noisy, too; on a round tip its normal follows
+from the place. A fingertip samples at its own rate and holds the last sample in between.
 """
 
 import dataclasses
@@ -19,40 +17,25 @@ from torchgrasp.linalg import unit
 SAMPLING_RATE = 100.0
 """Of a fingertip [Hz]: one sample for each tick of a controller at 100 Hz."""
 
-NOISE = 0.1
-"""Standard deviation of the normal force [N] (Sec. 6.5)."""
+NOISE, TANGENTIAL_NOISE = 0.1, 0.3
+"""Standard deviation of the normal force, and of each component across it [N] (Sec. 6.5)."""
 
-TANGENTIAL_NOISE = 0.3
-"""Standard deviation of each component of the force along the surface [N] (Sec. 6.5)."""
+PLACE_NOISE, FLAT_RADIUS = 1.5e-3, 0.012
+"""Standard deviation of a contact's place along the tip [m]: 7 degrees of its normal on the Allegro's radius [m], which
+also stands for tips that are not round."""
 
-PLACE_NOISE = 1.5e-3
-"""Standard deviation of a contact's place [m] in each direction along the fingertip: 7 degrees on 12 mm."""
+CUTOFF, FLAG_CUTOFF = 20.0, 5.0
+"""Cut-off of the force's low-pass [Hz], a lag of 8 ms; of the average behind the contact flag: 0.04 N of noise pass."""
 
-FLAT_RADIUS = 0.012
-"""Radius [m] that relates the noise of place and normal on a tip that is not round: that of the Allegro's round ones."""
-
-CUTOFF = 20.0
-"""Cut-off of the force's first-order low-pass [Hz]: a lag of 8 ms."""
-
-FLAG_CUTOFF = 5.0
-"""Cut-off of the average behind the contact flag [Hz]; it leaves 0.04 N of the noise at 100 Hz."""
-
-TOUCH_ON = 0.2
-"""A fingertip is in contact once the average exceeds this [N]: twice the noise, five times what the average leaves ..."""
-
-TOUCH_OFF = 0.1
-"""... and until it falls below this [N]."""
+TOUCH_ON, TOUCH_OFF = 0.2, 0.1
+"""Averages [N] at which the contact flag switches: a single noisy reading crosses 0.2 N twice a second."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TipContact(Value):
     """True contacts of three fingertips, averaged over a tick, in any one frame.
 
-    Args:
-        normal_force: along the contact normals [N].
-        forces: of the tips on the object [N], friction included.
-        points: of contact [m]; NaN where nothing touches.
-        normals: outward; NaN where nothing touches.
+    `forces` [N] act on the object, friction included. `points` [m] and outward `normals` are NaN without contact.
     """
 
     normal_force: Float[Tensor, "*b 3"]
@@ -65,15 +48,9 @@ class TipContact(Value):
 class TactileState(Value):
     """What three fingertips report, and their memory.
 
-    Args:
-        reading: normal force of the last sample [N].
-        forces: full force of the last sample [N].
-        contact: whether each tip feels contact.
-        points: sensed contacts [m]; NaN where nothing touched.
-        normals: of the sensed contacts; NaN where nothing touched.
-        lagged: normal force (first) and full force behind the low-pass [N].
-        average: slow mean of the readings [N].
-        age: time since the last sample [s].
+    `reading` [N] is the normal force, `forces` [N] the full one. `points` [m] and `normals` are NaN without contact.
+    The memory: `lagged` [N] holds normal force and full force behind the low-pass, `average` [N] the slow mean of the
+    readings, `age` [s] the time since the last sample.
     """
 
     reading: Float[Tensor, "*b 3"]

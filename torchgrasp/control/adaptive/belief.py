@@ -1,9 +1,7 @@
-"""The shape as touches revise it while the hand closes: a surprising touch moves the contacts of fingers in the air.
+"""The shape as touches revise it: a surprising touch moves the contacts of the fingers that are still in the air.
 
-A touch where the surface was not expected is an observation, which the shape's posterior takes up (`ShapeGP.update`).
-Each finger in the air then aims where the line through its planned contact meets the revised surface. Place, normal and
-uncertainty there become target, normal and covariance of Eqs. (26-27). An update takes about 10 ms of one core, a tick
-at 100 Hz, at most once for each finger.
+Such a touch is an observation of the shape (`ShapeGP.update`). Each finger in the air then aims where the line through
+its planned contact meets the revised surface. An update takes about 10 ms of one core, a tick at 100 Hz.
 """
 
 import dataclasses
@@ -23,25 +21,17 @@ from torchgrasp.shape.surface import newton_step
 from torchgrasp.values import ShapeEstimate
 
 SURPRISE = 2.0
-"""Distance from the expected surface, in standard deviations, from which on a touch surprises: 5 % by chance."""
+"""A touch surprises beyond so many standard deviations from the expected surface: 5 % do so by chance."""
 
 FARTHEST = 0.02
-"""How far [m] along its line a contact may be moved: one that meets no surface within this stays where it was."""
+"""Largest motion of a contact along its line [m]; one that meets no surface within it stays."""
 
-NEWTON_STEPS = 6
-"""Steps along a line towards the surface; Newton's method converges quadratically."""
-
-LEAST_SLOPE = 0.3
-"""Least cosine of line and normal in a step: it bounds the step of a grazing line."""
+NEWTON_STEPS, LEAST_SLOPE = 6, 0.3
+"""Steps along a line to the surface, which converge quadratically; least cosine of line and normal, against grazing."""
 
 
 class Belief:
-    """The shape, and which fingers have touched it.
-
-    Args:
-        shape: as the grasp was planned on.
-        obj_from_hand: planned pose of the hand.
-    """
+    """A shape, the planned pose of the hand, and which fingers have touched."""
 
     def __init__(self, shape: ShapeGP, obj_from_hand: Float[Tensor, "4 4"]) -> None:
         self.shape, self.obj_from_hand = shape, obj_from_hand.double()

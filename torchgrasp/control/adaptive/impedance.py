@@ -1,10 +1,9 @@
 """Object-level impedance [6]: the grasp is a spring in the hand, and the fingers are springs to each other.
 
-The virtual frame of the three fingertips (Eqs. 15-17) stands for the object, which no sensor sees. A wrench pulls the
-frame back to where it was when the object was grasped, and the fingers share that wrench. Internal forces press at the
-same time: the desired forces, which turn with the frame, and springs along the sides of the triangle of fingertips.
-These sides span the null space of the grasp map. Springs to the frame's origin, as in [6], balance only in proportion
-to their lengths: two fingers against a thumb would press 30 to 45 degrees off their normals.
+The virtual frame of the three fingertips (Eqs. 15-17) stands for the object, which no sensor sees. A wrench restores
+the frame to its pose at the grasp. Internal forces press at the same time: the desired forces, which turn with the
+frame, and springs along the sides of the triangle of fingertips, which span the null space of the grasp map. Springs to
+the frame's origin, as in [6], would press two fingers and a thumb 30 to 45 degrees off their normals.
 
 [6] M. Li, H. Yin, K. Tahara and A. Billard, "Learning object-level impedance control for robust grasping and dexterous
 manipulation", ICRA 2014.
@@ -26,32 +25,24 @@ from torchgrasp.control.tactile import low_pass
 from torchgrasp.frames import degenerate, rigid, skew, virtual_frame
 from torchgrasp.plan.internal_forces import internal_forces
 
-TRANSLATION_STIFFNESS = 1200.0
-"""Of the virtual frame's origin [N/m]: 0.1 kg sags by 1 mm."""
-
-ROTATION_STIFFNESS = 4.0
-"""Of the virtual frame's axes [N m/rad]: 1200 N/m at arms of 58 mm."""
+TRANSLATION_STIFFNESS, ROTATION_STIFFNESS = 1200.0, 4.0
+"""Of the virtual frame [N/m, N m/rad]: 0.1 kg sags by 1 mm."""
 
 GRASP_STIFFNESS = 100.0
-"""Of the spring along each side of the triangle of fingertips [N/m]: 1 N for 10 mm, soft beside the desired forces."""
+"""Of the spring along each side of the triangle of fingertips [N/m]: soft beside the desired forces."""
 
 MOST_SHARE = 1.0
 """Largest force of a finger for the wrench, as a share of the strongest desired force: it stays pressed."""
 
 SURE = math.log(3)
-"""Log-odds above which a grasp is left as it is, three to one: a lost object costs more than a firmer grasp."""
+"""Log-odds of stability above which a grasp is left as it is: a lost object costs more than a firmer grasp."""
 
-MOST_RAISE = 2.0
-"""Largest multiple of the desired forces that an unstable grasp asks for (docs/closing.md)."""
+MOST_RAISE, ADAPTATION_RATE = 2.0, 8.0
+"""Largest multiple of the desired forces of an unstable grasp (docs/closing.md), and the rate [1/s] of the change."""
 
-ADAPTATION_RATE = 8.0
-"""Rate [1/s] at which an unstable grasp becomes firmer and stiffer: slower than the mean reading that it follows."""
-
-READING_CUTOFF = 2.0
-"""Cut-off [Hz] of the mean reading by which stability is judged: noise must not look like a slip."""
-
-SETTLING = 0.3
-"""Time [s] from full forces to the first judgement: by then the mean reading has followed."""
+READING_CUTOFF, SETTLING = 2.0, 0.3
+"""Stability is judged by readings below this cut-off [Hz], since noise must not look like a slip, and from this time
+[s] after the forces have risen, when the filtered readings have followed."""
 
 
 def grasp_map(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 6 9"]:
@@ -73,7 +64,7 @@ def restoring_wrench(
 ) -> Float[Tensor, "*b 6"]:
     """Return force [N] and torque [N m] about the virtual frame's origin that restore it to `rest`.
 
-    The torque is along the axis of the rotation error and proportional to the sine of its angle.
+    The torque is proportional to the sine of the rotation error.
 
     >>> restoring_wrench(torch.eye(4), torch.eye(4))
     tensor([0., 0., 0., 0., 0., 0.])
@@ -95,10 +86,7 @@ def shared_forces(
 def spring_forces(
     points: Float[Tensor, "*b 3 3"], lengths: Float[Tensor, "*b 3"], stiffness: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 3 3"]:
-    """Return the forces of springs [N/m] along the `side_lengths` of a triangle, at rest at `lengths` [m].
-
-    They balance whatever the lengths.
-    """
+    """Return the forces of springs [N/m] along the sides of a triangle, at rest at `lengths` [m]; they balance."""
     return torch.einsum("...k,...kci->...ci", stiffness * (side_lengths(points) - lengths), internal_forces(points))
 
 
@@ -110,18 +98,13 @@ def side_lengths(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
 class Impedance:
     """Hold the object as a spring in the hand: the joint torques are J^T f, set as targets q + J^T f / kp.
 
-    At rest the forces are the desired ones, balanced at the sensed contacts. One common factor keeps the sensed sum at
-    what was asked for. Joint motions that move no fingertip are held at the posture of the start.
-
-    With a `stability` model every tick judges whether the grasp is stable. Below `SURE` it becomes firmer, up to
-    `MOST_RAISE` times, and its springs approach those of stable grasps of the same lengths. It never loosens again: the
-    object may still be heavy.
+    At rest the forces are the desired ones, balanced at the sensed contacts. Joint motions that move no fingertip are
+    held. A grasp that a `stability` model judges unstable becomes firmer, and its springs approach those of stable
+    grasps. It never loosens again: the object may still be heavy.
 
     Args:
-        reference: of the closing.
-        observation: at the end of the closing.
-        start: the last targets of all joints [rad].
-        springs: stiffness [N/m] along the sides (0, 1), (1, 2), (2, 0) of the triangle; None: `GRASP_STIFFNESS`.
+        reference, observation, start: as for `ForceHold`.
+        springs: stiffness [N/m] along the `side_lengths`; None: `GRASP_STIFFNESS`.
         stability: of the hand's grasps; None: the grasp does not adapt.
     """
 

@@ -1,9 +1,8 @@
 """Which grasps are stable [6]: Gaussian mixtures over stiffness, virtual-frame lengths and tactile forces of a hand.
 
-`scripts/train.py stability` learns them from simulated grasps that were pulled at. Conditioned on the lengths of a
-grasp, the mixture of stable grasps tells how firmly and how stiffly they press, Sigma_fd of Eq. (28) included. Whether
-a grasp in progress is stable follows from Bayes' rule with a second mixture, of grasps that were lost. The density of
-the stable grasps alone, as in [6], also falls with objects that were rare among the trials.
+`scripts/train.py stability` learns them from simulated pulls. The mixture of stable grasps tells how grasps of given
+lengths press, Sigma_fd of Eq. (28) included. Whether a grasp is stable follows from Bayes' rule with a second mixture,
+of unstable grasps: the density of the stable ones alone, as in [6], is low for rare objects, too.
 """
 
 import dataclasses
@@ -26,7 +25,7 @@ STIFFNESS, LENGTHS, FORCES = ("logK1", "logK2", "logK3"), ("logL1", "logL2", "lo
 """Logarithms of spring stiffness [N/m], of the tips' distances from their virtual frame [m], of normal forces [N]."""
 
 NAMES = (*STIFFNESS, *LENGTHS, *FORCES)
-"""The state of a grasp. Logarithms: twice as strong is as far from a grasp as half as strong."""
+"""The state of a grasp; by logarithms twice as strong is as far as half as strong."""
 
 LEAST_FORCE = 0.05
 """Normal force [N] below which a finger counts as pressing with this: half the sensor's noise."""
@@ -38,12 +37,7 @@ FILE = "stability.safetensors"
 def state_of(
     springs: Float[Tensor, "*b 3"], lengths: Float[Tensor, "*b 3"], forces: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 9"]:
-    """Return the state (`NAMES`) of a grasp.
-
-    Args:
-        springs: stiffness along the sides of the triangle of fingertips [N/m].
-        lengths: `lengths_of` the fingertips [m].
-        forces: normal forces [N].
+    """Return the state (`NAMES`) of a grasp by spring stiffness [N/m], `lengths_of` its tips [m], and forces [N].
 
     >>> state_of(torch.ones(3), torch.ones(3), torch.ones(3))
     tensor([0., 0., 0., 0., 0., 0., 0., 0., 0.])
@@ -95,8 +89,6 @@ class StabilityModel(Value):
     def preferred_forces(self, tips: Float[Tensor, "3 3"], force: float | None = None) -> PreferredForces:
         """Return how stable grasps of the same lengths press, by conditioning the mixture as in [6].
 
-        The covariance of the logarithms is carried over to the forces by the derivative at their mean.
-
         Args:
             tips: centres of the fingertips [m], in any frame.
             force: given force [N] of the finger that is expected to press hardest; None: none is given.
@@ -121,10 +113,9 @@ class StabilityModel(Value):
         return PreferredForces(forces, forces[:, None] * covariance * forces, rest.marginal(STIFFNESS).mean().exp())
 
     def log_odds(self, state: Float[Tensor, "*b 9"]) -> Float[Tensor, "*b"]:
-        """Return the log-odds that a grasp withstands the trials' pulls, by Bayes' rule.
+        """Return the log-odds that a grasp is stable, by Bayes' rule.
 
-        Only stiffness and forces count: with the lengths, which tell more of the body than of the grasp, the estimate
-        is worse on new bodies.
+        Only stiffness and forces count. The lengths tell more of the body than of the grasp.
         """
         stable, others = self._without_lengths
         judged = torch.cat([state[..., :3], state[..., 6:]], -1)
