@@ -23,14 +23,10 @@ FK_TOLERANCE = 1e-6
 
 
 def check_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
-    """Check a hand's files and return the hand.
+    """Check a shipped hand, or one in a folder, with a finger option, and return it.
 
     The law covers coupling, limits, drives, masses, pads, parked joints and self-collision. The forward kinematics
     must equal those of pytorch-kinematics and of yourdfpy, which applies `<mimic>` by itself.
-
-    Args:
-        name_or_path: a shipped hand, or the folder of another one.
-        fingers: the finger option of its hand.toml.
 
     Raises:
         HandFileError: a file breaks a rule; the message names the file, what was found and what is allowed.
@@ -54,12 +50,7 @@ def check_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
 
 
 def find_faults(name_or_path: str | Path, fingers: str = "default") -> Iterator[HandFileError]:
-    """Yield every broken rule of a hand that can be loaded.
-
-    Raises:
-        HandFileError: the hand cannot be loaded.
-        BadArgument: the hand has no such option.
-    """
+    """Yield every broken rule of a hand; raises as `load_hand` if it cannot be loaded."""
     spec = read_hand_toml(find_hand(name_or_path) / "hand.toml", fingers)
     urdf, hand = read_urdf(spec.urdf), load_hand(name_or_path, fingers)
     yield from _wrong_bodies(urdf)

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import check_whole
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.self_collision import self_collision_from_urdf
@@ -21,15 +22,9 @@ ROWS_PER_CHUNK = 1000
 
 
 def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, seed: int = 0) -> list[tuple[str, str]]:
-    """Return the pairs of links that meet in some postures, but not in nearly all. Neighbours are left out.
+    """Return the pairs of links that meet in some of n random postures, but not in nearly all, without neighbours.
 
-    Every joint is uniform within its limits, so that the pairs serve all finger options.
-
-    Args:
-        urdf: the hand's tree, with collision shapes.
-        coupling: which joint follows which; the other joints move freely.
-        n: number of postures.
-        seed: of the draws.
+    Every joint is uniform within its limits, so that the pairs serve all finger options; coupled joints follow.
 
     Raises:
         BadArgument: n outside [1, 10^7], or a coupling with joints that the URDF does not have.
@@ -39,8 +34,7 @@ def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, 
     >>> collision_pairs(read_urdf(find_hand("allegro") / "hand.urdf"), {}, n=100)[0]
     ('palm', 'thumb_medial')
     """
-    if not 1 <= n <= 10**7:
-        raise BadArgument("n", n, "a whole number in [1, 10^7]")
+    check_whole("n", n, 1, 10**7)
     tree, shapes = tree_from_urdf(urdf), self_collision_from_urdf(urdf, None)
     if not len(shapes.pairs):
         return []

@@ -1,8 +1,7 @@
 """Spheres that cover the hand's links, for clearance from object and table.
 
-Each collision shape is cut into cells, one sphere each. The spheres stand out of flat faces by up to 4 mm. No surface
-with a radius of curvature above 25 mm reaches a face between them. Edges of fingers stick out of the spheres by up to
-4 mm, corners of the palm by 9 mm.
+Each collision shape is cut into cells, one sphere each. Fingers' edges stick out of them by up to 4 mm, corners of the
+palm by 9 mm. No surface with a radius of curvature above 25 mm reaches a face between them.
 """
 
 import dataclasses
@@ -57,14 +56,9 @@ def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
             # a tip's contact is known exactly: no sphere may touch before it
             centers, radius = _cover(shape, cell, 0.0 if touching else BULGE)
             rows += [(index, center, radius, finger, touching) for center in centers]
-    link_index, center, radius, finger, touching = zip(*rows, strict=True) if rows else ((), (), (), (), ())
-    return CollisionSpheres(
-        torch.tensor(link_index, dtype=torch.long),
-        torch.tensor(center, dtype=torch.float64).reshape(-1, 3),
-        torch.tensor(radius, dtype=torch.float64),
-        torch.tensor(finger, dtype=torch.long),
-        torch.tensor(touching, dtype=torch.bool),
-    )
+    link_index, center, radius, finger, touching = zip(*rows, strict=True)
+    center, radius = torch.tensor(center, dtype=torch.float64), torch.tensor(radius, dtype=torch.float64)
+    return CollisionSpheres(torch.tensor(link_index), center, radius, torch.tensor(finger), torch.tensor(touching))
 
 
 def _cover(shape: Shape, cell: float, bulge: float) -> tuple[list[Triple], float]:

@@ -32,8 +32,7 @@ TILT = math.radians(30)
 SHORT_ARM = 1e-3
 """A joint whose axis passes a tip nearer than this [m] does not move it."""
 STIFFNESS, DAMPING = 4.0, 0.03
-"""Drive [N m/rad] for each N m of the weakest joint's effort, and its damping [N m s/rad] for each N m/rad: about
-those of the shipped hands."""
+"""Drive [rad^-1] per N m of the weakest joint's effort, and its damping [s]: about those of the shipped hands."""
 
 Vector = Float[np.ndarray, "3"]
 
@@ -43,15 +42,14 @@ def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = No
 
     Args:
         path: of the URDF.
-        tips: the links of the three grasping fingertips in grasp order, then those of the fingers to park; by default
-            the ends of the tree's branches, which must be three.
+        tips: links of the three grasping fingertips in grasp order, then of the fingers to park; by default the ends of
+            the tree's branches, which must be three.
         name: of the hand; by default the robot's.
         seed: of the random postures.
 
     Raises:
         HandFileError: the URDF is missing or malformed.
-        BadArgument: `tips` are not three or more links that have collision shapes and that joints move; without
-            `tips`, the branches are not three. The message lists the ends of the branches.
+        BadArgument: fewer than three tips, or one without a collision shape or a joint that moves it.
 
     >>> from torchgrasp.hand.load import find_hand
     >>> text = draft_hand(find_hand("barrett") / "hand.urdf")
@@ -64,7 +62,11 @@ def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = No
     if len(chosen) < 3 or (not tips and len(chosen) > 3) or len(set(chosen)) < len(chosen):
         wanted = f"three links in grasp order, then those to park; the branches of {urdf.path} end in {list(ends)}"
         raise BadArgument("tips", list(tips) or "none", wanted)
-    chains = {tip: _chain(urdf, tip, ends) for tip in chosen}
+    chains = {tip: tuple(j.name for j in urdf.movers(tip)[::-1]) for tip in chosen}
+    shaped = {x.name for x in urdf.links if x.shapes}
+    for tip in chosen:
+        if tip not in shaped or not chains[tip]:
+            raise BadArgument("tips", tip, f"links with a collision shape that joints move, as {list(ends)}")
     coupling = {j.name: j.mimic for j in urdf.movable if j.mimic is not None}
     free = [j for j in urdf.movable if j.name not in coupling]
     grasping = {joint for tip in chosen[:3] for joint in chains[tip]}
@@ -116,15 +118,6 @@ def fingertip_links(urdf: Urdf) -> tuple[str, ...]:
     return tuple(e for e in dict.fromkeys(ends) if urdf.movers(e))
 
 
-def _chain(urdf: Urdf, tip: str, ends: Sequence[str]) -> tuple[str, ...]:
-    """Return the movable joints above a fingertip from the palm outward; refuse other links."""
-    shaped = {x.name for x in urdf.links if x.shapes}
-    joints = tuple(j.name for j in urdf.movers(tip)[::-1])
-    if tip not in shaped or not joints:
-        raise BadArgument("tips", tip, f"links with a collision shape that joints move, as {list(ends)}")
-    return joints
-
-
 def guess_pads(urdf: Urdf, frames: Float[Tensor, "3 4 l n"], tips: Sequence[str]) -> tuple[tuple[Pad, ...], Triple]:
     """Guess the pads of the tips and the direction out of the palm, from the links' frames in random postures."""
     links = {x.name: i for i, x in enumerate(urdf.links)}
@@ -153,7 +146,7 @@ def guess_pads(urdf: Urdf, frames: Float[Tensor, "3 4 l n"], tips: Sequence[str]
 
 
 def _motion(urdf: Urdf, tip: str, core: Vector) -> tuple[Joint, Vector, Vector]:
-    """Return the last joint that moves a tip, the tip's direction of motion and that of its arm, in its frame."""
+    """Return the last joint that moves a tip, and the directions of motion and of the arm in the tip's frame."""
     tip_from_above = np.eye(4)
     for joint in urdf.joints_above(tip):
         if joint.kind != "fixed":

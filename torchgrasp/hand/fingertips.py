@@ -15,10 +15,7 @@ from torchgrasp.hand.urdf import Urdf
 
 @dataclasses.dataclass(frozen=True)
 class Fingertips(Value):
-    """The fingertips in grasp order, with the pads in the frames of the tip links.
-
-    `index` locates the tip links in the whole tree. `contact` and `center` are in metres, `normal` points outward.
-    `radius` [m] is that of the tip's sphere about `center`; 0: the tip touches in `contact` alone.
+    """The fingertips in grasp order, each with the `Pad` in the frame of its link and the link's index in the tree.
 
     Each tip is fixed to a carrier, the last link that a joint moves. `chains` is the tree that leads to the carriers,
     and `carrier` their index in it.
@@ -52,16 +49,17 @@ def tips_from_files(spec: HandSpec, urdf: Urdf) -> Fingertips:
     """Return the fingertips of the chosen fingers."""
     links = [x.name for x in urdf.links]
     one, two, three = spec.fingers
+    contact, normal, center, radius = zip(*(f.pad for f in spec.fingers), strict=True)
     carriers, poses = zip(*(pose_in_carrier(urdf, f.tip_link) for f in spec.fingers), strict=True)
     chains = tree_from_urdf(urdf, carriers)
     return Fingertips(
         names=(one.name, two.name, three.name),
         links=(one.tip_link, two.tip_link, three.tip_link),
         index=torch.tensor([links.index(f.tip_link) for f in spec.fingers]),
-        contact=torch.tensor([f.pad.contact for f in spec.fingers], dtype=torch.float64),
-        normal=torch.tensor([f.pad.normal for f in spec.fingers], dtype=torch.float64),
-        center=torch.tensor([f.pad.center for f in spec.fingers], dtype=torch.float64),
-        radius=torch.tensor([f.pad.radius for f in spec.fingers], dtype=torch.float64),
+        contact=torch.tensor(contact, dtype=torch.float64),
+        normal=torch.tensor(normal, dtype=torch.float64),
+        center=torch.tensor(center, dtype=torch.float64),
+        radius=torch.tensor(radius, dtype=torch.float64),
         chains=chains,
         carrier=torch.tensor([chains.link_names.index(name) for name in carriers]),
         carrier_from_tip=torch.stack(poses, -1)[..., None],

@@ -36,11 +36,10 @@ class HandSource(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Hand(Value):
-    """A robot hand with three grasping fingers. Positions are in the palm's frame (the URDF's root), in metres.
+    """A robot hand with three grasping fingers, in grasp order. Positions [m] are in the palm's frame, the URDF's root.
 
     `joints` (.., h) are the actuated joints of the grasping fingers, in the order of `joint_names`. Every method raises
-    `BadArgument` for joints of a wrong count or dtype, and for NaN or infinity. Fingers are in grasp order. `approach`
-    points out of the palm. `actuators` has all joints of the URDF.
+    `BadArgument` for joints of a wrong count or dtype, and for NaN or infinity. `approach` points out of the palm.
     """
 
     name: str
@@ -94,11 +93,7 @@ class Hand(Value):
         return self.tips.radius
 
     def check_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b h"]:
-        """Return `joints` if they are finite and within the limits.
-
-        Raises:
-            BadArgument: with the first joint's name, value and limits.
-        """
+        """Return `joints` if they are within the limits; raise `BadArgument` with the first other joint."""
         self.actuated.check_limits(joints)
         return joints
 
@@ -171,10 +166,8 @@ class Hand(Value):
         """
         self.actuated.check(joints)
         rows = joints.reshape(-1, joints.shape[-1])
-        parts = [
-            self.self_collision.clearance(self.tree.frames(self._columns(part)), below) for part in rows.split(chunk)
-        ]
-        return torch.cat(parts).reshape(joints.shape[:-1]) if parts else rows.new_zeros(joints.shape[:-1])
+        frames = (self.tree.frames(self._columns(part)) for part in rows.split(chunk))
+        return torch.cat([self.self_collision.clearance(x, below) for x in frames]).reshape(joints.shape[:-1])
 
     def _columns(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "j n"]:
         """Return every movable joint of the URDF, with the postures last."""

@@ -24,10 +24,7 @@ MAX_BYTES = 1024 * 1024
 
 
 class Pad(NamedTuple):
-    """Where a fingertip touches, in the tip link's frame [m].
-
-    `radius` is that of the tip's sphere about `center`; 0: the tip touches in `contact` alone.
-    """
+    """Where a tip touches, in its link's frame [m]: on a sphere about `center`, or in `contact` alone (radius 0)."""
 
     contact: Triple
     normal: Triple
@@ -44,6 +41,10 @@ class Finger(NamedTuple):
     pad: Pad
 
 
+Grasping = tuple[Finger, Finger, Finger]
+"""The three grasping fingers, in grasp order."""
+
+
 @dataclasses.dataclass(frozen=True)
 class HandSpec:
     """A hand.toml with one of its finger options chosen."""
@@ -57,7 +58,7 @@ class HandSpec:
     kp: float
     kd: float
     option: str
-    fingers: tuple[Finger, Finger, Finger]
+    fingers: Grasping
     all_fingers: tuple[Finger, ...]
     parked: dict[str, float]
     coupling: dict[str, Mimic]
@@ -65,25 +66,22 @@ class HandSpec:
     data: bytes
 
     def wrong(self, found: str, allowed: str) -> HandFileError:
-        """Make the error for a rule that the file breaks."""
+        """Make the error for a broken rule."""
         return HandFileError("hand.toml", f"{self.path}: {found}", allowed)
 
 
 def _is_number(value: Any) -> bool:
-    """Tell whether a value is a finite number; an integer of more than 308 digits is none."""
     try:
         return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-    except OverflowError:
+    except OverflowError:  # an integer of more than 308 digits
         return False
 
 
 def _is_word(value: Any) -> bool:
-    """Tell whether a value is a printable text of 1 to 200 letters."""
     return isinstance(value, str) and 0 < len(value) <= 200 and value.isprintable()
 
 
 def _is_texts(value: Any) -> bool:
-    """Tell whether a value is a list of texts."""
     return isinstance(value, list) and all(isinstance(x, str) for x in value)
 
 
@@ -96,45 +94,35 @@ class _Table:
         self.path, self.name, self.table, self.read = path, name, table, set[str]()
 
     def wrong(self, key: str, allowed: str) -> HandFileError:
-        """Make the error for a key."""
         value = repr(self.table[key])[:80] if key in self.table else "nothing"
         return HandFileError("hand.toml", f"{self.path}: {self.name}{key} = {value}", allowed)
 
     def value(self, key: str, right: Callable[[Any], bool], allowed: str) -> Any:
-        """Read a value that must be right."""
         self.read.add(key)
         if not right(self.table.get(key)):
             raise self.wrong(key, allowed)
         return self.table[key]
 
     def text(self, key: str) -> str:
-        """Read a word."""
         return self.value(key, _is_word, "a text of 1 to 200 letters")
 
     def texts(self, key: str) -> tuple[str, ...]:
-        """Read a list of words."""
         return tuple(self.value(key, _is_texts, "a list of texts"))
 
     def number(self, key: str, low: float = -math.inf, high: float = math.inf) -> float:
-        """Read a finite number in a range."""
-        return float(
-            self.value(key, lambda x: _is_number(x) and low <= x <= high, f"a finite number in [{low:g}, {high:g}]")
-        )
+        allowed = f"a finite number in [{low:g}, {high:g}]"
+        return float(self.value(key, lambda x: _is_number(x) and low <= x <= high, allowed))
 
     def triple(self, key: str) -> Triple:
-        """Read three finite numbers."""
-        x, y, z = self.value(
-            key, lambda v: isinstance(v, list) and len(v) == 3 and all(map(_is_number, v)), "three finite numbers"
-        )
+        allowed = "three finite numbers"
+        x, y, z = self.value(key, lambda v: isinstance(v, list) and len(v) == 3 and all(map(_is_number, v)), allowed)
         return float(x), float(y), float(z)
 
     def inner(self, key: str, optional: bool = False) -> "_Table":
-        """Read a table inside."""
         self.read.add(key)
         return _Table(self.path, f"{self.name}{key}.", self.table.get(key, {} if optional else None))
 
     def tables(self, key: str) -> list["_Table"]:
-        """Read a list of tables inside."""
         self.read.add(key)
         value = self.table.get(key, [])
         if not isinstance(value, list) or len(value) > 1000:
@@ -149,12 +137,7 @@ class _Table:
 
 
 def read_hand_toml(path: Path | str, fingers: str = "default") -> HandSpec:
-    """Read and check a hand.toml, with one of its finger options.
-
-    Raises:
-        HandFileError: with the file, the key, what was found and what is allowed.
-        BadArgument: `fingers` names no option of this hand.
-    """
+    """Read and check a hand.toml with a finger option; raises `HandFileError`, or `BadArgument` for another option."""
     path = Path(path)
     data = read_bounded("hand.toml", path, "a hand.toml", MAX_BYTES)
     try:
@@ -198,10 +181,8 @@ def _finger(table: _Table) -> Finger:
     return finger
 
 
-def _option(
-    top: _Table, known: tuple[Finger, ...], name: str
-) -> tuple[tuple[Finger, Finger, Finger], dict[str, float]]:
-    """Return the three grasping fingers in grasp order, and the parked joints with their values."""
+def _option(top: _Table, known: tuple[Finger, ...], name: str) -> tuple[Grasping, dict[str, float]]:
+    """Return the grasping fingers, and the parked joints with their values."""
     options = top.inner("options")
     if name not in options.table:
         raise BadArgument("fingers", repr(name), f"one of {sorted(options.table)}")
@@ -212,7 +193,8 @@ def _option(
     park = option.inner("parked", optional=True)
     parked = {joint: park.number(joint) for joint in park.table}
     option.done()
-    return (by_name[names[0]], by_name[names[1]], by_name[names[2]]), parked
+    one, two, three = (by_name[finger] for finger in names)
+    return (one, two, three), parked
 
 
 def _coupling(top: _Table) -> dict[str, Mimic]:

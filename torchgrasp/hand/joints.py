@@ -19,8 +19,7 @@ ROUNDING = 1e-6
 class ActuatedJoints(Value):
     """Joints that move the grasping fingers, with their limits [rad or m].
 
-    All joints of the URDF are `coupling @ joints + offset`. Coupled joints follow actuated ones; parked joints are
-    constant.
+    All joints of the URDF are `coupling @ joints + offset`: coupled joints follow, parked joints are constant.
     """
 
     names: tuple[str, ...]
@@ -50,7 +49,7 @@ class ActuatedJoints(Value):
         """Refuse joints beyond their limits, too."""
         self.check(joints)
         low, high = self.lower.to(joints), self.upper.to(joints)
-        wrong = ~((joints >= low - ROUNDING) & (joints <= high + ROUNDING))
+        wrong = (joints < low - ROUNDING) | (joints > high + ROUNDING)
         if bool(wrong.any()):
             value, k = _first(joints, wrong)
             allowed = f"[{self.lower[k].item():.6g}, {self.upper[k].item():.6g}]"

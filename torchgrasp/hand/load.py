@@ -24,11 +24,7 @@ def hands_folder() -> Path:
 
 
 def find_hand(name_or_path: str | Path) -> Path:
-    """Return the folder of a hand, given a shipped name, a folder or a hand.toml.
-
-    Raises:
-        HandFileError: there is no such hand; the message lists the shipped ones.
-    """
+    """Return the folder of a hand, given a shipped name, a folder or a hand.toml; raises `HandFileError`."""
     shipped = hands_folder()
     names = sorted(p.parent.name for p in shipped.glob("*/hand.toml"))
     if isinstance(name_or_path, str) and name_or_path in names:
@@ -57,8 +53,7 @@ def load_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
     spec = read_hand_toml(find_hand(name_or_path) / "hand.toml", fingers)
     urdf = read_urdf(spec.urdf)
     _check_names(spec, urdf)
-    _check_coupling(spec, urdf)
-    _check_shapes(spec, urdf)
+    _check_mimics_and_shapes(spec, urdf)
     return Hand(
         name=spec.name,
         source=HandSource(spec.option, urdf.path, hashlib.sha256(spec.data + b"\0" + urdf.data).hexdigest()),
@@ -90,16 +85,12 @@ def _check_names(spec: HandSpec, urdf: Urdf) -> None:
         raise spec.wrong(f"parked joint {min(both)!r}", "joints that neither grasp nor follow another")
 
 
-def _check_coupling(spec: HandSpec, urdf: Urdf) -> None:
-    """Refuse a hand.toml that contradicts a mimic joint of the URDF."""
+def _check_mimics_and_shapes(spec: HandSpec, urdf: Urdf) -> None:
+    """Refuse mimic joints that hand.toml contradicts, a fingertip without a shape, and shapes on fingertips alone."""
     for joint in urdf.joints:
         if joint.mimic is not None and spec.coupling.get(joint.name) != joint.mimic:
             found = f"joint {joint.name} follows {spec.coupling.get(joint.name, 'nothing')}"
             raise spec.wrong(found, f"the coupling of the URDF: {joint.mimic}")
-
-
-def _check_shapes(spec: HandSpec, urdf: Urdf) -> None:
-    """Refuse fingertips without a collision shape, and a hand whose other links have none."""
     tips, bare = {f.tip_link for f in spec.fingers}, {x.name for x in urdf.links if not x.shapes}
     if tips & bare:
         raise urdf.wrong(f"link {min(tips & bare)} without collision", "a shape for every fingertip")

@@ -34,14 +34,12 @@ class _BoundedBuilder(ET.TreeBuilder):
         self.depth = self.count = 0
 
     def start(self, tag: Any, attrs: Any) -> Any:
-        """Count an element in."""
         self.depth, self.count = self.depth + 1, self.count + 1
         if self.depth > MAX_DEPTH or self.count > MAX_ELEMENTS:
             raise HandFileError("urdf", "a too large XML tree", f"depth {MAX_DEPTH}, {MAX_ELEMENTS} elements at most")
         return super().start(tag, attrs)
 
     def end(self, tag: Any) -> Any:
-        """Count an element out."""
         self.depth -= 1
         return super().end(tag)
 
@@ -49,8 +47,7 @@ class _BoundedBuilder(ET.TreeBuilder):
 def parse_urdf(path: Path, data: bytes) -> ET.Element:
     """Parse the bytes of a URDF; refuse declarations by which XML could reach other files or explode.
 
-    Raises:
-        HandFileError: another encoding, malformed or too deep XML, an unknown element, or a mesh outside the folder.
+    Another encoding, malformed or too deep XML, an unknown element, or a mesh outside the folder is refused, too.
     """
     # anywhere, comments included: what looks like a comment may be hidden in a processing instruction
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
@@ -80,9 +77,8 @@ def parse_urdf(path: Path, data: bytes) -> ET.Element:
 
 def _check_mesh_name(path: Path, name: str) -> None:
     """Refuse a mesh outside the hand's folder or not a regular file, without opening it."""
-    refusal = HandFileError(
-        "urdf", f"{path}: mesh {name[:80]!r}", "a relative .stl or .obj of at most 50 MiB inside the hand's folder"
-    )
+    allowed = "a relative .stl or .obj of at most 50 MiB inside the hand's folder"
+    refusal = HandFileError("urdf", f"{path}: mesh {name[:80]!r}", allowed)
     if not 0 < len(name) <= 255 or ":" in name or "\\" in name or Path(name).suffix.lower() not in (".stl", ".obj"):
         raise refusal
     mesh = path.parent.resolve() / name

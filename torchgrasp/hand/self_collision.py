@@ -45,8 +45,7 @@ class SelfCollision(Value):
     def clearance(self, frames: Float[Tensor, "3 4 l n"], below: float = torch.inf) -> Float[Tensor, " n"]:
         """Return the signed least separation [m] of the pairs; infinite without pairs.
 
-        Pairs are skipped by their bounding spheres. The upper bound is `below`, or the least distance of two inscribed
-        spheres. Values above `below` are some larger number.
+        Values above `below` are some larger number: pairs are skipped by their bounding and inscribed spheres.
         """
         least = frames.new_full(frames.shape[3:], torch.inf)
         if not len(self.pairs):
@@ -72,7 +71,7 @@ class SelfCollision(Value):
     ) -> Float[Tensor, "6 k"]:
         """Return the derivative of separations by a twist (translation, rotation) of the second shape.
 
-        It is a wrench (force, torque) about the frames' origin. The first shape takes its negative.
+        It is a wrench about the frames' origin. The first shape takes its negative.
         """
         if not len(pair):
             return frames.new_zeros(6, 0)
@@ -151,13 +150,9 @@ def box_separation(
 ) -> Float[Tensor, " k"]:
     """Return the largest separation [m] of two boxes along 15 axes (Gottschalk et al., 1996).
 
-    Boxes overlap where it is negative; its size is then the least translation that parts them. Apart, it is a lower
-    bound of the distance, exact where a face or two crossing edges are nearest.
-
-    Args:
-        a, b: rotations of the boxes; column i, `a[:, i]`, is axis i.
-        gap: from the centre of the first to that of the second [m].
-        half_a, half_b: half sizes [m].
+    Overlap is negative, its size the least translation that parts the boxes. Apart, the value is a lower bound of the
+    distance, exact where a face or two crossing edges are nearest. Column i of the rotations `a` and `b` is axis i.
+    `gap` [m] reaches from the first centre to the second; `half_a` and `half_b` [m] are half sizes.
 
     >>> still, x = torch.eye(3)[..., None], torch.tensor([[3.0], [0.0], [0.0]])
     >>> box_separation(still, still, x, torch.ones(3, 1), torch.ones(3, 1))
@@ -189,9 +184,8 @@ def box_distance(points: Float[Tensor, "*b 3"], half: Float[Tensor, "*b 3"]) -> 
     ox, oy, oz = (points.abs() - half).unbind(-1)
     px, py, pz = ox.clamp_min(0), oy.clamp_min(0), oz.clamp_min(0)
     squared = px * px + py * py + pz * pz
+    outside, inside = squared > 0, torch.maximum(torch.maximum(ox, oy), oz)
     # the root's derivative is infinite at 0; there the largest coordinate is the distance
-    outside = squared > 0
-    inside = torch.maximum(torch.maximum(ox, oy), oz)
     return torch.where(outside, torch.sqrt(torch.where(outside, squared, 1.0)), inside)
 
 
@@ -202,17 +196,17 @@ def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None
     if pairs is None:
         tested -= {frozenset((j.parent, j.child)) for j in urdf.joints}
     shapes = [(i, *part) for i, link in enumerate(urdf.links) for shape in link.shapes for part in _parts(shape)]
-    link, rotation, center, half, radius = zip(*shapes, strict=True) if shapes else ((), (), (), (), ())
+    link, rotation, center, half, radius = zip(*shapes, strict=True)
     kinds: tuple[list[tuple[int, int]], ...] = ([], [], [])
     for one, two in itertools.combinations(range(len(shapes)), 2):
         if frozenset((names[link[one]], names[link[two]])) in tested:
             spheres = radius[one] > 0, radius[two] > 0
             kinds[sum(spheres)].append((two, one) if spheres == (False, True) else (one, two))
     return SelfCollision(
-        link=torch.tensor(link, dtype=torch.long),
-        rotation=torch.stack(rotation, -1) if shapes else torch.zeros(3, 3, 0, dtype=torch.float64),
-        center=torch.tensor(center, dtype=torch.float64).reshape(-1, 3),
-        half=torch.tensor(half, dtype=torch.float64).reshape(-1, 3),
+        link=torch.tensor(link),
+        rotation=torch.stack(rotation, -1),
+        center=torch.tensor(center, dtype=torch.float64),
+        half=torch.tensor(half, dtype=torch.float64),
         radius=torch.tensor(radius, dtype=torch.float64),
         pairs=torch.tensor([pair for kind in kinds for pair in kind], dtype=torch.long).reshape(-1, 2),
         kinds=(len(kinds[0]), len(kinds[1]), len(kinds[2])),

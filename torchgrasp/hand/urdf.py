@@ -81,7 +81,7 @@ class Urdf:
     data: bytes
 
     def wrong(self, found: str, allowed: str) -> HandFileError:
-        """Make the error for a rule that the file breaks."""
+        """Make the error for a broken rule."""
         return HandFileError("urdf", f"{self.path}: {found}", allowed)
 
     @functools.cached_property
@@ -98,7 +98,7 @@ class Urdf:
         return tuple(chain)
 
     def movers(self, link: str) -> tuple[Joint, ...]:
-        """Return the movable ones of `joints_above`."""
+        """Return the movable joints above a link."""
         return tuple(j for j in self.joints_above(link) if j.kind != "fixed")
 
     def kinematic_xml(self) -> bytes:
@@ -119,11 +119,7 @@ class Urdf:
 
 
 def read_urdf(path: Path | str) -> Urdf:
-    """Read and check a URDF file of at most 4 MiB. Meshes outside its folder are refused; none is opened.
-
-    Raises:
-        HandFileError: with the file, what was found and what is allowed.
-    """
+    """Read and check a URDF file of at most 4 MiB, without opening meshes; raises `HandFileError`."""
     path = Path(path)
     data = read_bounded("urdf", path, "a URDF file", MAX_BYTES)
     robot, reader = parse_urdf(path, data), _Reader(path)
@@ -139,7 +135,6 @@ class _Reader:
         self.path = path
 
     def refuse(self, found: str, allowed: str) -> NoReturn:
-        """Raise the error for what was found."""
         raise HandFileError("urdf", f"{self.path}: {found}", allowed)
 
     def numbers(
@@ -156,16 +151,13 @@ class _Reader:
         return values
 
     def number(self, where: str, element: ET.Element | None, key: str, default: float | None = None) -> float:
-        """Read a finite number."""
         return self.numbers(where, element, key, 1, default)[0]
 
     def triple(self, where: str, element: ET.Element | None, key: str, default: float | None = None) -> Triple:
-        """Read three finite numbers."""
         x, y, z = self.numbers(where, element, key, 3, default)
         return x, y, z
 
     def name(self, element: ET.Element | None, key: str, where: str) -> str:
-        """Read a name that must be there."""
         name = "" if element is None else element.get(key, "")
         if not 0 < len(name) <= 200:
             self.refuse(f"{where} without a name", f"a {key} of 1 to 200 letters")
@@ -236,8 +228,8 @@ class _Reader:
             source = self.name(follow, "joint", f"{where}: a mimic")
             ratio, offset = self.number(where, follow, "multiplier", 1.0), self.number(where, follow, "offset", 0.0)
             mimic = Mimic(source, ratio, offset)
-        axis = (x / length, y / length, z / length)
-        return Joint(name, kind, parent, child, xyz, rpy, axis, lower, upper, effort, velocity, mimic)
+        unit = (x / length, y / length, z / length)
+        return Joint(name, kind, parent, child, xyz, rpy, unit, lower, upper, effort, velocity, mimic)
 
     def check_tree(self, links: tuple[Link, ...], joints: tuple[Joint, ...]) -> str:
         """Return the root of a tree that reaches every link exactly once."""
@@ -250,10 +242,9 @@ class _Reader:
             twice = sorted(n for n, times in Counter(listed).items() if times > 1)
             if twice:
                 self.refuse(f"{what} {twice[0]!r} twice", f"every {what} once")
-        for j in joints:
-            for link in (j.parent, j.child):
-                if link not in known:
-                    self.refuse(f"joint {j.name} names link {link!r}", "a link of the file")
+        for name, link in ((j.name, link) for j in joints for link in (j.parent, j.child)):
+            if link not in known:
+                self.refuse(f"joint {name} names link {link!r}", "a link of the file")
         roots = sorted(known - {j.child for j in joints})
         if len(roots) != 1:
             self.refuse(f"roots {roots}" if roots else "a cycle and no root", "exactly one root link")
@@ -264,10 +255,9 @@ class _Reader:
         if len(reached) < len(names):
             self.refuse(f"a cycle around {sorted(known - reached)[0]!r}", "a tree")
         movable = {j.name: j for j in joints if j.kind != "fixed"}
-        for j in joints:
-            source = j.mimic.source if j.mimic is not None else None
-            if source is not None and source not in movable:
+        for j, source in ((j, j.mimic.source) for j in joints if j.mimic):
+            if source not in movable:
                 self.refuse(f"joint {j.name} mimics {source!r}", "a movable joint of the file")
-            if source is not None and movable[source].mimic is not None:
+            if movable[source].mimic:
                 self.refuse(f"joint {j.name} mimics a coupled joint", "an independent joint")
         return roots[0]

@@ -17,8 +17,7 @@ from torchgrasp.posture_model.shard import Shard
 class Checkpoint:
     """The file of one fit; without a path nothing is kept. Process 0 writes it, all processes read it.
 
-    Mean and standard deviation identify the data. The settings are the numbers of rows, components and starts, the
-    seed and the regularisation.
+    Mean and standard deviation identify the data, `settings` the fit.
     """
 
     path: Path | None
@@ -38,9 +37,7 @@ class Checkpoint:
     def load(self) -> Progress | None:
         """Return the saved state, or None when there is no file yet.
 
-        Raises:
-            ModelFileError: the file is damaged, or is no checkpoint.
-            BadArgument: the checkpoint of another fit, or not all processes read the same state.
+        A damaged file raises `ModelFileError`; the checkpoint of another fit, or of some processes, `BadArgument`.
         """
         progress = self._read(self.path) if self.path and self.path.exists() else None
         steps = len(progress.log_likelihood) if progress else 0
@@ -69,7 +66,6 @@ class Checkpoint:
             t, dtype = tensors[name], torch.int64 if name == "reseeded" else torch.float64
             if (shape != (-1,) and t.shape != shape) or t.dtype != dtype:
                 raise ModelFileError("checkpoint", f"{path}: {name} {tuple(t.shape)} {t.dtype}", str(shape))
-        device = self.centre.device
-        components = Components(*(tensors[k].to(device) for k in ("weights", "means", "covariances")))
-        history = tensors["log_likelihood"].to(device)
-        return Progress(components, tensors["reseeded"].to(device), history, meta.get("jumped") == "True")
+        components = Components(tensors["weights"], tensors["means"], tensors["covariances"])
+        progress = Progress(components, tensors["reseeded"], tensors["log_likelihood"], meta.get("jumped") == "True")
+        return progress.to(self.centre.device)

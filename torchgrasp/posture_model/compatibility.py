@@ -21,8 +21,7 @@ def describe_compatibility(hand: Hand) -> dict[str, str]:
 def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: Hand) -> None:
     """Refuse a model of another hand, or of other fingers, limits or fingertips, with `BadArgument`.
 
-    Masses, motors and collision shapes may have changed. A model without `hand_codes`, such as one of measured
-    postures, is recognised by its joint names.
+    A model without `hand_codes`, such as one of measured postures, is recognised by its joint names.
     """
     if joint_names != hand.joint_names:
         raise BadArgument("mixture", f"joints {joint_names}", f"the joints {hand.joint_names} of the hand")

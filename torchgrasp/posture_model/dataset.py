@@ -1,7 +1,6 @@
 """Samples of a hand in a folder of chunks: a killed run continues, and the bytes do not depend on the workers.
 
-`samples.json` describes the samples; `chunk-000000.safetensors` and so on hold 10^4 postures each. A chunk depends
-on (seed, chunk) alone and is moved into place whole.
+A chunk depends on (seed, chunk) alone and is moved into place whole.
 """
 
 import dataclasses
@@ -26,11 +25,9 @@ from torchgrasp.posture_model.sample import (
 )
 
 MANIFEST = "samples.json"
-"""The file that describes a folder."""
-
+"""File that describes the samples of a folder."""
 MAX_MANIFEST = 1024 * 1024
 """Most bytes of a manifest: the file of a stranger must not fill the memory."""
-
 META_KEYS = ("hand", "fingers", "hand_sha256", "hand_codes", "seed", "sampling")
 """The keys of `SampleSpec.meta`."""
 
@@ -45,11 +42,9 @@ class SampleFolder:
     meta: dict[str, str]
 
     def __len__(self) -> int:
-        """Count the postures."""
         return self.n
 
     def __iter__(self) -> Iterator[HandSamples]:
-        """Read one chunk after another."""
         return (self.chunk(i) for i in range(len(chunk_counts(self.n))))
 
     def chunk(self, i: int) -> HandSamples:
@@ -93,7 +88,7 @@ def write_samples(
     """Write the samples of `sample_configurations` chunk by chunk, and return the folder.
 
     The same call continues a run that was interrupted or killed. `workers` threads draw at the same time. The observer
-    is called with the number of postures on disk at first, then with that of every new chunk.
+    gets the number of postures on disk at first, then that of every new chunk.
 
     Raises:
         BadArgument: workers outside [1, 1024], or a hand whose postures are hardly ever kept.
@@ -114,11 +109,11 @@ def write_samples(
     with hold_folder(samples.folder):
         _begin(samples.folder, json.dumps(content, indent=1) + "\n")
         missing = [i for i in range(len(counts)) if not samples.holds(i)]  # a damaged chunk is drawn again
-        needed = 8 * sum(counts[i] for i in missing) * (hand.dof + 6)
-        free = shutil.disk_usage(samples.folder).free
+        lacking = sum(counts[i] for i in missing)
+        needed, free = 8 * lacking * (hand.dof + 6), shutil.disk_usage(samples.folder).free
         if free < needed:
             raise OutputError("folder", f"{folder}, {free} bytes free", f"{needed} bytes")
-        observer(sum(counts) - sum(counts[i] for i in missing))
+        observer(spec.n - lacking)
         pool = ThreadPoolExecutor(workers)
         try:
             for count in pool.map(write, missing):
@@ -131,8 +126,7 @@ def write_samples(
 def load_samples(folder: Path | str) -> SampleFolder:
     """Open a complete folder of samples.
 
-    Raises:
-        ModelFileError: no such folder, an unfinished one, or a damaged manifest.
+    An unfinished folder, or a damaged manifest, raises `ModelFileError`.
 
     >>> import tempfile
     >>> from torchgrasp.hand.load import load_hand
@@ -152,8 +146,7 @@ def load_samples(folder: Path | str) -> SampleFolder:
     except (OSError, ValueError, RecursionError) as error:
         raise ModelFileError("folder", f"{path}: {error}", allowed) from error
     chunks = len(chunk_counts(samples.n))
-    missing = sum(not samples.path(i).is_file() for i in range(chunks))
-    if missing:
+    if missing := sum(not samples.path(i).is_file() for i in range(chunks)):
         allowed = "a finished folder: run the command that began it again"
         raise ModelFileError("folder", f"{folder} without {missing} of {chunks} chunks", allowed)
     return samples
@@ -164,9 +157,8 @@ def _parse_manifest(folder: Path, manifest: Any) -> SampleFolder:
     fixed = {"torchgrasp": "samples", "version": 1, "chunk": CHUNK_POSTURES}
     if not isinstance(manifest, dict) or any(manifest.get(key) != value for key, value in fixed.items()):
         raise ValueError("another kind of file, or of another version")
-    n: Any = manifest.get("n")
-    names: Any = manifest.get("joint_names")
-    meta: dict[str, Any] = {key: manifest.get(key) for key in META_KEYS}
+    n, names = manifest.get("n"), manifest.get("joint_names")
+    meta = {key: manifest.get(key) for key in META_KEYS}
     sound = isinstance(n, int) and not isinstance(n, bool) and 1 <= n <= MAX_SAMPLES
     sound = sound and isinstance(names, list) and 0 < len(names) <= 1000
     if not (sound and all(isinstance(x, str) for x in (*names, *meta.values()))):

@@ -20,10 +20,8 @@ from torchgrasp.posture_model.shard import Shard
 
 CACHED_ROWS = 2048
 """Rows of one pass: their features and responsibilities stay in the cache."""
-
 SINGULAR_VARIANCE = 1e-12
 """A conditional variance of this size is rounding, beside the data's variance of 1."""
-
 MAX_RESEEDS = 3
 """A component that collapses more often shows that the data support fewer components."""
 
@@ -41,8 +39,8 @@ class Components(Value):
 class Progress(Value):
     """State of a fit. With the data it determines the next step.
 
-    `reseeded` counts how often each component was placed anew, and `log_likelihood` [nats] is the mean over the data
-    before each step. After a jump, which places a component anew, the likelihood may fall.
+    `reseeded` counts how often each component was placed anew, a jump after which the likelihood may fall.
+    `log_likelihood` [nats] is the mean over the data before each step.
     """
 
     components: Components
@@ -69,10 +67,7 @@ def expectation_maximisation(
     """Iterate until a step raises the mean log-likelihood by less than `tolerance` [nats].
 
     `iterations` bounds the number of steps, steps before `start` included. `regularisation` is added to the diagonal of
-    every covariance.
-
-    Raises:
-        IndefiniteCovariance: a component collapsed more than `MAX_RESEEDS` times, or the start is indefinite.
+    every covariance. An indefinite start or a component that collapses too often raises `IndefiniteCovariance`.
     """
     n, state = shard.count(), start
     while True:
@@ -96,10 +91,8 @@ def expectation(shard: Shard, components: Components) -> tuple[Float[Tensor, "m 
     floor = math.log(torch.finfo(x.dtype).tiny) / 2  # far below rounding; denormal numbers are slow
     for rows in x.split(CACHED_ROWS):
         phi = features_from_data(rows, features[:, : len(rows)])
-        responsibility = torch.mm(
-            coefficients, phi, out=joint[:, : len(rows)]
-        )  # log joint density (m, rows) until here
-        # log-sum-exp written out, because its exponentials are the responsibilities before normalisation
+        # log joint density (m, rows), then log-sum-exp written out: its exponentials are the responsibilities
+        responsibility = torch.mm(coefficients, phi, out=joint[:, : len(rows)])
         largest = responsibility.amax(0)
         density = responsibility.sub_(largest).clamp_(min=floor).exp_().sum(0)
         sums.addmm_(responsibility.div_(density), phi.T)
@@ -126,12 +119,8 @@ def coefficients_from_components(components: Components) -> Float[Tensor, "m f"]
     whitening = whitening_matrices(components.covariances)
     precision = whitening.transpose(-1, -2) @ whitening
     linear = (precision @ means[..., None])[..., 0]
-    constant = (
-        components.weights.log()
-        - 0.5 * d * math.log(2 * math.pi)
-        + whitening.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        - 0.5 * (linear * means).sum(-1)
-    )
+    log_scale = whitening.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    constant = components.weights.log() - 0.5 * d * math.log(2 * math.pi) + log_scale - 0.5 * (linear * means).sum(-1)
     i, j = torch.triu_indices(d, d, device=means.device)
     quadratic = precision[:, i, j] * torch.where(i == j, -0.5, -1.0)  # a mixed product occurs twice in the square
     return torch.cat([constant[:, None], linear, quadratic], dim=1)
@@ -143,11 +132,8 @@ def maximisation(
     """Return the most likely components for the weighted sums; collapsed components are placed anew.
 
     A component collapses if its covariance is singular, or if its responsibilities sum to less than the d + 1 rows that
-    span one. The heaviest component is then split across its longest axis, and one half replaces it. This needs no
-    data, so every process does the same.
-
-    Raises:
-        IndefiniteCovariance: every component collapsed, or one of them more than `MAX_RESEEDS` times.
+    span one. The heaviest component is then split across its longest axis, and one half replaces it. If every component
+    collapses, or one more than `MAX_RESEEDS` times, `IndefiniteCovariance` is raised.
     """
     components = components_from_sums(sums, n, regularisation)
     weights, means, covariances = components.weights.clone(), components.means.clone(), components.covariances.clone()
@@ -180,6 +166,5 @@ def components_from_sums(sums: Float[Tensor, "m f"], n: int, regularisation: flo
     second = sums.new_zeros(len(sums), d, d)
     second[:, i, j] = sums[:, d + 1 :] / count
     second[:, j, i] = second[:, i, j]
-    covariances = second - means[:, :, None] * means[:, None, :]
-    covariances = covariances + regularisation * torch.eye(d, dtype=sums.dtype, device=sums.device)
-    return Components(count[:, 0] / n, means, covariances)
+    ridge = regularisation * torch.eye(d, dtype=sums.dtype, device=sums.device)
+    return Components(count[:, 0] / n, means, second - means[:, :, None] * means[:, None, :] + ridge)

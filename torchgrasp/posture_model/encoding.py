@@ -13,7 +13,6 @@ from torchgrasp.values import ContactCode, Contacts
 
 PERMUTATIONS: tuple[tuple[int, int, int], ...] = tuple(itertools.permutations(range(3)))  # pyright: ignore[reportAssignmentType]
 """The six assignments of three contacts to three fingers: finger i touches contact `PERMUTATIONS[k][i]`."""
-
 CODE_NAMES = ("L1", "L2", "L3", "N1", "N2", "N3")
 """The numbers of a code q = (L, N): three lengths [m], three cosines."""
 
@@ -24,10 +23,6 @@ def encode_fingertips(points: Float[Tensor, "*b 3 3"], normals: Float[Tensor, "*
     L_i is the distance [m] of point i from the centre of the points; N is n1.n2, n1.n3 and n2.n3. Rigid motion does
     not change the code. Negated normals do not change it either, so fingertips have the code of the contacts that they
     touch. Nor do a mirror image or a rotation of the normals alone: every match has to be checked afterwards.
-
-    Args:
-        points: fingertips or contacts [m] in the order of the fingers, any frame.
-        normals: their unit normals, same frame.
 
     >>> encode_fingertips(torch.eye(3), torch.eye(3))[3:]
     tensor([0., 0., 0.])
@@ -64,12 +59,10 @@ def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
     flat = degenerate(ordered_points).any(1)  # in any order: at the threshold rounding may distinguish them
     bad = flat[:, None, None]
     # A degenerate row gets another triangle, so that one call frames all rows.
-    triangle = torch.eye(3, dtype=points.dtype, device=points.device)
-    frames = virtual_frame(torch.where(bad[..., None], triangle, ordered_points))
-    nan = torch.full((), float("nan"), dtype=points.dtype, device=points.device)
+    frames = virtual_frame(torch.where(bad[..., None], torch.eye(3).to(points), ordered_points))
     return ContactCode(
-        q=torch.where(bad, nan, encode_fingertips(ordered_points, ordered_normals)),
-        obj_from_vf=torch.where(bad[..., None], nan, frames),
+        q=torch.where(bad, torch.nan, encode_fingertips(ordered_points, ordered_normals)),
+        obj_from_vf=torch.where(bad[..., None], torch.nan, frames),
         status=torch.where(flat, int(Status.DEGENERATE), int(Status.OK)),
         permutation=order,
     )

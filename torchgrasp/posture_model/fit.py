@@ -10,7 +10,7 @@ from torch import Tensor
 from torchgrasp.base import check_number, check_tensor, check_whole
 from torchgrasp.errors import BadArgument
 from torchgrasp.posture_model.checkpoint import Checkpoint
-from torchgrasp.posture_model.em import Fit, Progress, expectation_maximisation
+from torchgrasp.posture_model.em import Progress, expectation_maximisation
 from torchgrasp.posture_model.encoding import CODE_NAMES
 from torchgrasp.posture_model.kmeans import start_components
 from torchgrasp.posture_model.mixture import GraspMixture
@@ -19,7 +19,6 @@ from torchgrasp.posture_model.shard import Shard
 
 MAX_REGULARISATION = 1e-6
 """Largest variance added to a dimension, relative to the data's: scikit-learn's default, which is absolute there."""
-
 TRIAL_STEPS = 20
 """Steps of EM before starts are compared; a whole fit takes some hundred."""
 
@@ -49,10 +48,8 @@ def fit_mixture(
         tolerance: stop when a step raises the mean log-likelihood by less [nats].
         regularisation: variance added to every dimension of a component, relative to its variance over all samples.
         starts: k-means starts of consecutive seeds. Each takes `TRIAL_STEPS` steps; the likeliest continues.
-        checkpoint: file that holds the fit after every further step. If it exists, the fit continues from it to the
-            same bits on the same machine; iterations and tolerance may differ.
-        distributed: whether `samples` are the shard of one process under torchrun. All processes get the same
-            mixture, and must see the same checkpoint.
+        checkpoint: file that holds the fit after every further step. A fit continues from it to the same bits.
+        distributed: whether `samples` are the shard of one process under torchrun. All must see the same checkpoint.
         observer: called after every step.
 
     Raises:
@@ -79,8 +76,8 @@ def fit_mixture(
     names = (*samples.joint_names, *CODE_NAMES)
     centre, scale = _standardise(shard, names)
 
-    counts = {"rows": n, "components": components, "seed": seed, "starts": starts, "regularisation": regularisation}
-    settings = {name: str(value) for name, value in counts.items()}
+    fixed = {"rows": n, "components": components, "seed": seed, "starts": starts, "regularisation": regularisation}
+    settings = {name: str(value) for name, value in fixed.items()}
     saved = Checkpoint(None if checkpoint is None else Path(checkpoint), shard, centre, scale, settings)
     start = saved.load()
     if start is None:
@@ -92,15 +89,24 @@ def fit_mixture(
         observer(progress)
 
     fit = expectation_maximisation(shard, start, iterations, tolerance, regularisation, observe)
-    log_likelihood = float(fit.log_likelihood[-1] - scale.log().sum())
-    report = {"samples": str(n), "fit_seed": str(seed), "fit_starts": str(starts)}
+    log_likelihood = float(fit.log_likelihood[-1] - scale.log().sum())  # in the samples' units
+    report = {
+        "samples": str(n),
+        "fit_seed": str(seed),
+        "fit_starts": str(starts),
+        "iterations": str(len(fit.log_likelihood) - 1),
+        "converged": str(fit.converged).lower(),
+        "reseeded": str(int(fit.reseeded.sum())),
+        "log_likelihood": f"{log_likelihood:.6f}",
+        "bic": f"{_criterion(n * log_likelihood, n, fit.components.means):.1f}",
+    }
     return GraspMixture(
         weights=fit.components.weights,
         means=fit.components.means * scale + centre,
         covariances=fit.components.covariances * scale[:, None] * scale,
         names=names,
         regularisation=regularisation,
-        meta=samples.meta | report | _outcome(fit, n, log_likelihood),
+        meta=samples.meta | report,
     )
 
 
@@ -141,14 +147,3 @@ def _likeliest(shard: Shard, starts: list[Progress], regularisation: float) -> P
     fits = [expectation_maximisation(shard, start, TRIAL_STEPS, 0.0, regularisation) for start in starts]
     best = max(fits, key=lambda fit: float(fit.log_likelihood[-1]))
     return Progress(best.components, best.reseeded, best.log_likelihood[:-1], best.jumped)
-
-
-def _outcome(fit: Fit, n: int, log_likelihood: float) -> dict[str, str]:
-    """Return what a fit reports; the mean log-likelihood is in the samples' units."""
-    return {
-        "iterations": str(len(fit.log_likelihood) - 1),
-        "converged": str(fit.converged).lower(),
-        "reseeded": str(int(fit.reseeded.sum())),
-        "log_likelihood": f"{log_likelihood:.6f}",
-        "bic": f"{_criterion(n * log_likelihood, n, fit.components.means):.1f}",
-    }

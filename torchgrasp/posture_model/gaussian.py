@@ -21,12 +21,6 @@ ROWS_PER_CHUNK = 8192
 class GaussianMixture(Value):
     """A mixture of m Gaussians over d named dimensions (Eqs. 19-20), evaluated in float64.
 
-    Args:
-        weights: pi_i, non-negative, with sum 1.
-        means: mu_i.
-        covariances: Sigma_i, symmetric and positive definite.
-        names: of the dimensions.
-
     Raises:
         BadArgument: inconsistent shapes, weights that are negative or do not sum to 1, an indefinite or asymmetric
             covariance, a name twice.
@@ -42,7 +36,6 @@ class GaussianMixture(Value):
     names: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        """Check everything once, where the value is made."""
         m, d = len(self.weights), len(self.names)
         check_tensor("weights", self.weights, (m,))
         check_tensor("means", self.means, (m, d))
@@ -53,10 +46,10 @@ class GaussianMixture(Value):
         if d < 1 or len(set(self.names)) < d:
             raise BadArgument("names", self.names, "at least one, each once")
         scale = self.covariances.diagonal(dim1=-2, dim2=-1).abs().sqrt()
-        skewness = (self.covariances - self.covariances.transpose(-1, -2)).abs()
+        skewness = (self.covariances - self.covariances.mT).abs()
         if bool((skewness > 1e-6 * scale[:, :, None] * scale[:, None, :]).any()):
             raise BadArgument("covariances", "an asymmetric matrix", "symmetric positive definite matrices")
-        _, info = torch.linalg.cholesky_ex(self.covariances.double())
+        info = torch.linalg.cholesky_ex(self.covariances.double()).info
         if bool((info != 0).any()):
             found = f"an indefinite matrix in component {int(info.nonzero()[0])}"
             raise BadArgument("covariances", found, "symmetric positive definite matrices")
@@ -97,10 +90,8 @@ class GaussianMixture(Value):
     def condition(self, given: dict[str, float]) -> "GaussianMixture":
         """Return the density of the other dimensions given the values of some: bracket and h_i of Eq. (23).
 
-        Components of weight 0 are left out.
-
-        Raises:
-            BadArgument: an unknown name, a value that is not finite, or all dimensions given.
+        Components of weight 0 are left out. Unknown names, values that are not finite, and all dimensions raise
+        `BadArgument`.
         """
         observed = self._index(tuple(given))
         rest = [i for i in range(len(self.names)) if i not in observed]
@@ -117,8 +108,7 @@ class GaussianMixture(Value):
         means = means[:, rest] + (cross @ offset)[..., 0]
         covariances = covariances[:, rest][:, :, rest] - cross @ cross.transpose(-1, -2)
         covariances = (covariances + covariances.transpose(-1, -2)) / 2
-        possible = weights > 0
-        names = tuple(self.names[i] for i in rest)
+        possible, names = weights > 0, tuple(self.names[i] for i in rest)
         return GaussianMixture(weights[possible], means[possible], covariances[possible], names)
 
     def mean(self) -> Float[Tensor, "d"]:
@@ -139,7 +129,6 @@ class GaussianMixture(Value):
         return Whitening(matrix, (matrix @ means[..., None])[..., 0], log_scale)
 
     def _index(self, names: Sequence[str]) -> list[int]:
-        """Return the indices of dimensions."""
         unknown = [name for name in names if name not in self.names]
         if unknown or len(set(names)) < len(names):
             raise BadArgument("names", unknown or tuple(names), f"some of {', '.join(self.names)}, each once")

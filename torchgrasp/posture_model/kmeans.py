@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument
@@ -12,22 +12,17 @@ from torchgrasp.posture_model.shard import Shard
 
 SUBSAMPLE = 20_000
 """Rows among which k-means++ chooses its centres: some hundred for each component."""
-
 LLOYD_ROUNDS = 10
 """Rounds of Lloyd's algorithm: EM follows, so the clusters need not converge."""
 
 
 def start_components(shard: Shard, m: int, seed: int, regularisation: float) -> Progress:
-    """Return the clusters of k-means as m components; the draws do not depend on the number of processes.
-
-    Fewer different rows than components raise `BadArgument`.
-    """
+    """Return the clusters of k-means as m components; fewer different rows raise `BadArgument`."""
     generator = torch.Generator().manual_seed(seed)
     centres = _plus_plus(_subsample(shard, generator), m, generator)
     for _ in range(LLOYD_ROUNDS):
         sums = _sums_of_clusters(shard, centres, _ones_and_data)
-        moved = sums[:, 1:] / sums[:, :1]
-        centres = torch.where(sums[:, :1] > 0, moved, centres)  # a centre without data stays
+        centres = torch.where(sums[:, :1] > 0, sums[:, 1:] / sums[:, :1], centres)  # a centre without data stays
     sums = _sums_of_clusters(shard, centres, features_from_data)
     n = round(float(sums[:, 0].sum()))
     components, reseeded = maximisation(sums, n, regularisation, torch.zeros(m, dtype=torch.long, device=sums.device))
@@ -40,8 +35,8 @@ def _subsample(shard: Shard, generator: torch.Generator) -> Float[Tensor, "s d"]
     lengths = x.new_zeros(shard.processes, dtype=torch.int64)
     lengths[shard.rank] = len(x)
     lengths = shard.sum(lengths)
-    before = lengths[: shard.rank].sum()
-    pick = torch.randperm(int(lengths.sum()), generator=generator)[:SUBSAMPLE].to(x.device) - before
+    order = torch.randperm(int(lengths.sum()), generator=generator)  # the same for any number of processes
+    pick = order[:SUBSAMPLE].to(x.device) - lengths[: shard.rank].sum()
     here = (pick >= 0) & (pick < len(x))
     pool = x.new_zeros(len(pick), x.shape[1])
     pool[here] = x[pick[here]]
@@ -67,7 +62,8 @@ def _sums_of_clusters(
     """Return the sums of the features over each cluster."""
     sums = centres.new_zeros(len(centres), len(features(centres[:1])))
     for rows in shard.rows.split(CACHED_ROWS):
-        member = assign_clusters(rows, centres)[:, None] == torch.arange(len(centres), device=rows.device)
+        nearest = (0.5 * (centres**2).sum(1) - rows @ centres.T).argmin(1)
+        member = nearest[:, None] == torch.arange(len(centres), device=rows.device)
         sums.addmm_(member.T.to(rows), features(rows).T)
     return shard.sum(sums)
 
@@ -75,8 +71,3 @@ def _sums_of_clusters(
 def _ones_and_data(x: Float[Tensor, "r d"]) -> Float[Tensor, "f r"]:
     """Return the features [1, x_i], one column a row."""
     return torch.cat([torch.ones_like(x[:, :1]), x], dim=1).T
-
-
-def assign_clusters(x: Float[Tensor, "n d"], centres: Float[Tensor, "m d"]) -> Int[Tensor, "n"]:
-    """Return the index of the nearest centre for every row."""
-    return (0.5 * (centres**2).sum(1) - x @ centres.T).argmin(1)

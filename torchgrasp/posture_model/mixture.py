@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import check_whole
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.hand.load import find_hand
@@ -17,27 +18,22 @@ from torchgrasp.values import ContactCode
 
 PAPER_ENERGY = 2.0
 """The paper's threshold on f_i of Eq. (21). It accepts 32 % of the codes of a single component (chi-square_6 < 4)."""
-
 DEFAULT_ENERGY = 8.405946915
 """Half the 99 % quantile of chi-square_6: it accepts 99 % of the codes of a single component."""
 
 
 @dataclasses.dataclass(frozen=True)
 class GraspMixture(GaussianMixture):
-    """The joint density of joints and codes of one hand (Eqs. 19-20).
+    """The joint density of joints and codes of one hand (Eqs. 19-20); the names must end with `CODE_NAMES`.
 
     The dimensions are the joints [rad], in the order of the hand, then the code: L1 L2 L3 [m] N1 N2 N3. The fit added
     `regularisation` to every variance, relative to the samples' variance. `meta` describes hand, samples and fit.
-
-    Raises:
-        BadArgument: as `GaussianMixture`, or names that do not end with `CODE_NAMES`.
     """
 
     regularisation: float = 0.0
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
 
     def __post_init__(self) -> None:
-        """Check the names, too."""
         super().__post_init__()
         if self.names[-6:] != CODE_NAMES or len(self.names) < 7:
             raise BadArgument("names", self.names, f"the joints' names, then {', '.join(CODE_NAMES)}")
@@ -80,9 +76,8 @@ class GraspMixture(GaussianMixture):
 
         def expect(q: Float[Tensor, "n 6"]) -> Float[Tensor, "n h"]:
             # sum_i h_i A_i (q, 1) as one matrix product
-            weighted = (
-                self._log_responsibility(q).exp()[:, :, None] * torch.cat([q, torch.ones_like(q[:, :1])], 1)[:, None]
-            )
+            extended = torch.cat([q, torch.ones_like(q[:, :1])], 1)
+            weighted = self._log_responsibility(q).exp()[:, :, None] * extended[:, None]
             return weighted.flatten(1) @ self._stacked_regression
 
         return map_rows(expect, _codes(code))
@@ -90,13 +85,10 @@ class GraspMixture(GaussianMixture):
     def modes(self, q: Float[Tensor, "*b 6"], k: int) -> tuple[Float[Tensor, "*b k h"], Float[Tensor, "*b k"]]:
         """Return the conditional means of the k components most responsible for a code, and their h_i of Eq. (23).
 
-        If several postures have the code, their mean (Eq. 23) may be none of them.
-
-        Raises:
-            BadArgument: k outside [1, m], or codes of another length than 6.
+        If several postures have the code, their mean (Eq. 23) may be none of them. A k outside [1, m], or codes of
+        another length than 6, raise `BadArgument`.
         """
-        if not 1 <= k <= len(self.weights):
-            raise BadArgument("k", k, f"1 to {len(self.weights)} (the mixture's components)")
+        check_whole("k", k, 1, len(self.weights))
 
         def take(q: Float[Tensor, "n 6"]) -> Float[Tensor, "n k d"]:
             top = self._log_responsibility(q).topk(k, dim=-1)
@@ -112,16 +104,10 @@ class GraspMixture(GaussianMixture):
     def with_observation_noise(self, lengths: float, cosines: float) -> "GraspMixture":
         """Return the mixture of codes observed with independent Gaussian noise, whose variances are added to Sigma_q.
 
-        A round fingertip rolls, so its contact differs from the middle of its pad by some millimetres. The codes of
-        the Barrett hand fill a thin manifold of four dimensions. Without noise, Eq. (21) would then refuse almost every
-        contact triple within reach.
-
-        Args:
-            lengths: standard deviation [m] of L1 L2 L3, at least 0.
-            cosines: standard deviation of N1 N2 N3, at least 0.
+        `lengths` [m] and `cosines` are standard deviations of L1 L2 L3 and N1 N2 N3. A round fingertip rolls, so its
+        contact differs from the middle of its pad by some millimetres. The codes of the Barrett hand fill a thin
+        manifold of four dimensions. Without noise, Eq. (21) would then refuse almost every contact triple within reach.
         """
-        if not (lengths >= 0 and cosines >= 0):
-            raise BadArgument("lengths, cosines", (lengths, cosines), "two numbers of at least 0")
         noise = torch.zeros(len(self.names)).to(self.covariances)
         noise[-6:-3], noise[-3:] = lengths**2, cosines**2
         return dataclasses.replace(self, covariances=self.covariances + torch.diag(noise))
@@ -157,16 +143,13 @@ def load_mixture(name_or_path: Path | str) -> GraspMixture:
     """
     path = mixture_path(name_or_path)
     tensors, meta = load_tensors(path, "mixture", {"weights", "means", "covariances"})
-    weights, means, covariances = (tensors[name].shape for name in ("weights", "means", "covariances"))
-    sound = len(means) == 2 and weights == means[:1] and covariances == (*means, means[1])
-    if not sound or any(t.dtype != torch.float64 for t in tensors.values()):
-        found = {name: (str(t.dtype), *t.shape) for name, t in tensors.items()}
-        raise ModelFileError("path", f"{path}: {found}", "float64 tensors of shapes (m), (m, d) and (m, d, d)")
+    if any(t.dtype != torch.float64 for t in tensors.values()):
+        raise ModelFileError("path", f"{path}: {[str(t.dtype) for t in tensors.values()]}", "float64 tensors")
     try:
         names, regularisation = tuple(meta.pop("names").split()), float(meta.pop("regularisation"))
         rest = {k: v for k, v in meta.items() if k not in ("kind", "version")}
         return GraspMixture(**tensors, names=names, regularisation=regularisation, meta=rest)
-    except (KeyError, AttributeError, ValueError) as error:
+    except (KeyError, AttributeError, TypeError, ValueError) as error:
         raise ModelFileError("path", f"{path}: {error}", "a mixture that GraspMixture.save wrote") from error
 
 

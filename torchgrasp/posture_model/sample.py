@@ -18,13 +18,10 @@ from torchgrasp.posture_model.encoding import encode_fingertips
 
 CHUNK_POSTURES = 10_000
 """Free postures from one generator. It is no argument, because another number gives a seed other postures."""
-
 BLOCK_POSTURES = 2_000
 """Postures that a generator draws at a time. It is fixed for the same reason."""
-
 MAX_SAMPLES = 10**8
 """Most postures of one set: a hundred times the paper's million (Sec. 6.3)."""
-
 OPPOSED_COSINE = -0.5
 """Largest cosine of the normals of two opposed pads: they are at most 60 degrees from opposite."""
 
@@ -47,15 +44,10 @@ class HandSamples(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class SampleSpec(Value):
-    """Which postures are drawn.
+    """Which n free postures are drawn: "uniform" as in the paper, or "opposed", with two pads face to face.
 
-    Args:
-        n: number of free postures, at most `MAX_SAMPLES`.
-        seed: of the draws. Chunk i comes from (seed, i) alone, so fewer samples are a prefix of more.
-        sampling: "uniform" as in the paper, or "opposed": only postures with two pads face to face.
-
-    Raises:
-        BadArgument: a number out of range, or another sampling.
+    Chunk i comes from (seed, i) alone, so fewer samples are a prefix of more. Numbers out of range and other samplings
+    raise `BadArgument`.
     """
 
     n: int
@@ -63,7 +55,6 @@ class SampleSpec(Value):
     sampling: Sampling = "uniform"
 
     def __post_init__(self) -> None:
-        """Check every range once, where the value is made."""
         check_whole("n", self.n, 1, MAX_SAMPLES)
         check_whole("seed", self.seed, 0, 2**63 - 1)
         if self.sampling not in get_args(Sampling):
