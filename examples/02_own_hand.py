@@ -16,7 +16,7 @@ shutil.copy(load_hand("barrett").urdf_path, folder / "hand.urdf")  # stands for 
 
 write_file(folder / "hand.toml", draft_hand(folder / "hand.urdf"))  # as `torchgrasp hand new`; read it and mend it
 hand = check_hand(folder)  # as `torchgrasp hand check`: raises with the rule that a file breaks
-print(f"{hand.name}: {hand.dof} actuated joints, fingers {', '.join(hand.finger_names)}")
+print(f"{hand.name}: {hand.dof} actuated joints, fingers {', '.join(hand.tips.names)}")
 
 grasps = plan_grasps(load_object("cylinder").view, hand, starts=50)
 print({status.name: count for status, count in count_status(grasps.status).items()})

@@ -118,7 +118,7 @@ def test_tips_limits_and_clearances_hold(run):
         assert float(hand.self_clearance(joints).min()) >= 0
     centres = hand.tip_centres(good.joints)
     centres = centres @ good.obj_from_hand[:, :3, :3].transpose(1, 2) + good.obj_from_hand[:, None, :3, 3]
-    touching = centres - hand.tip_radius[:, None] * good.contacts.normals
+    touching = centres - hand.tips.radius[:, None] * good.contacts.normals
     assert float((touching - good.contacts.points).norm(dim=-1).max()) <= 0.002 + 1e-9
     spheres = hand.sphere_centres(good.joints)
     spheres = spheres @ good.obj_from_hand[:, :3, :3].transpose(1, 2) + good.obj_from_hand[:, None, :3, 3]

@@ -63,7 +63,7 @@ def test_a_contact_inside_its_tip_is_told(tmp_path, shape, depth):
     assert pad in toml
     point = 'contact = [0, 0, {}]\nnormal = [0.0, 0.0, 1.0]\ntip = "point"'
     (tmp_path / "hand.toml").write_text(toml.replace(pad, point.format(depth), 1))
-    assert check_hand(tmp_path).tip_radius[0] == 0
+    assert check_hand(tmp_path).tips.radius[0] == 0
     (tmp_path / "hand.toml").write_text(toml.replace(pad, point.format(depth - 0.001), 1))
     with pytest.raises(HandFileError, match="inside"):
         check_hand(tmp_path)

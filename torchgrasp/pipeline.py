@@ -123,7 +123,7 @@ def plan_grasps(
         raise BadArgument("hand", type(hand).__name__, "a Hand from load_hand")
     if mode not in get_args(Mode):
         raise BadArgument("mode", repr(mode), "'joint' or 'contact_first'")
-    spec = spec.for_fingertips(float(hand.tip_radius.max()))
+    spec = spec.for_fingertips(float(hand.tips.radius.max()))
     mixture, mixture_sha256 = _read_mixture(hand) if mode == "contact_first" else (None, "none")
 
     if shape is None:
@@ -183,7 +183,7 @@ def _metadata(cloud: PointCloud, hand: Hand, spec: ContactSpec) -> dict[str, str
         "hand_sha256": hand.source.sha256,
         "cloud_sha256": digest(cloud),
         "joint_names": ",".join(hand.joint_names),
-        "finger_names": ",".join(hand.finger_names),
+        "finger_names": ",".join(hand.tips.names),
         "frames": "obj: the frame of the cloud; hand: the base link of the hand's URDF; a_from_b maps b into a",
         "units": "metre, radian",
         "friction": f"{spec.friction:g}",

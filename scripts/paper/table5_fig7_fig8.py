@@ -126,7 +126,7 @@ def fig8(out: Path, n: int = 600_000, seed: int = 1) -> None:
     axes.axhline(PUBLISHED_ALLEGRO, color="#d62728", linestyle="--", linewidth=1.3, label="the paper: around 0.2 rad")
     axes.axhline(float(mean.mean()), color=INK, linewidth=1.3, label=f"our mean {mean.mean():.3f} rad")
     axes.set_xticks(place, [name.removeprefix("joint_") for name in errors.hand.joint_names])
-    axes.set_xlabel(f"joint ({', '.join(errors.hand.finger_names)})", color=INK)
+    axes.set_xlabel(f"joint ({', '.join(errors.hand.tips.names)})", color=INK)
     axes.set_ylabel("mean absolute error [rad]", color=INK)
     axes.grid(axis="y", color=GRID, linewidth=0.7)
     axes.set_axisbelow(True)

@@ -34,7 +34,7 @@ def test_the_json_replays_to_the_planned_tips(name):
     w, x, y, z = row["pose"]["quaternion_wxyz"]
     turn, place = Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(row["pose"]["position"])
     for i, contact in enumerate(row["contacts"]):
-        assert contact["finger"] == hand.finger_names[i]
+        assert contact["finger"] == hand.tips.names[i]
         tip = robot.get_transform(contact["link"], content["hand"]["root"])
         point = turn @ (tip @ np.append(hand.tips.contact[i].numpy(), 1.0))[:3] + place
         np.testing.assert_allclose(point, planned_tips(hand, grasp)[i], atol=1e-9)
@@ -59,7 +59,7 @@ def test_mujoco_loads_the_keyframes_and_places_the_tips(name):
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("grasp_0_grasp").id)
     mujoco.mj_kinematics(model, data)
-    for i, link in enumerate(hand.tip_links):
+    for i, link in enumerate(hand.tips.links):
         point = data.body(link).xmat.reshape(3, 3) @ hand.tips.contact[i].numpy() + data.body(link).xpos
         np.testing.assert_allclose(point, planned_tips(hand, grasp)[i], atol=1e-9)
     pressed = hand.expand(squeeze(hand, grasp, 5.0).joints)

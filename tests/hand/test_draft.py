@@ -27,7 +27,7 @@ def test_a_draft_for_the_claw_passes_the_law(claw):
     found = hand.expand(joints)
     for finger in ("left", "right", "thumb"):
         torch.testing.assert_close(found[f"{finger}_follow"], -0.7 * found[f"{finger}_bend"] + 0.1)
-    assert hand.tip_radius.tolist() == [0.011] * 3
+    assert hand.tips.radius.tolist() == [0.011] * 3
     assert hand.approach.tolist() == [0, 0, 1]
     # hardly bent, each pad looks to the middle of the fingertips
     points, normals = hand.fingertips(torch.tensor([[0.0, 0.1] * 3], dtype=torch.float64))
@@ -59,7 +59,7 @@ def test_a_tip_that_is_not_round_gets_a_pad_on_its_side(claw, tip):
     torch.testing.assert_close(
         hand.tips.contact[0], torch.tensor([depth, 0, 0.015 - (0.009 if "box" in tip else 0.008)]).double()
     )
-    assert hand.tips.normal[0].tolist() == [1, 0, 0] and hand.tip_radius[0] == 0
+    assert hand.tips.normal[0].tolist() == [1, 0, 0] and hand.tips.radius[0] == 0
     # what tells whether a tip is in the object reaches its contact and no farther
     cover, first = hand.collision_spheres, hand.collision_spheres.link_index == hand.tips.index[0]
     reach = (cover.center[first] @ hand.tips.normal[0] + cover.radius[first]).max()
@@ -111,7 +111,7 @@ def test_a_third_hand_goes_the_whole_way(claw, mode):
     hand.check_joints(good.joints)
     centres = apply(good.obj_from_hand, hand.tip_centres(good.joints))
     outward = good.contacts.normals
-    miss = (centres - hand.tip_radius[:, None] * outward - good.contacts.points).norm(dim=-1)
+    miss = (centres - hand.tips.radius[:, None] * outward - good.contacts.points).norm(dim=-1)
     assert float(miss.max()) <= 1e-3
     pads = rotate(good.obj_from_hand, hand.fingertips(good.joints)[1])
     assert float((pads * outward).sum(-1).max()) < -0.4  # a pad faces the surface

@@ -70,7 +70,7 @@ def test_batch_equals_singles_and_keeps_its_shape(hand):
 def test_contact_lies_on_the_tips_sphere_along_the_normal(hand):
     joints = random_joints(hand, 50)
     points, normals = hand.fingertips(joints)
-    radius = hand.tip_radius[:, None]
+    radius = hand.tips.radius[:, None]
     torch.testing.assert_close(torch.linalg.vector_norm(normals, dim=-1), torch.ones(50, 3, dtype=torch.float64))
     torch.testing.assert_close(hand.tip_centres(joints) + radius * normals, points, atol=1e-8, rtol=0)
 
@@ -181,9 +181,9 @@ def test_tactile_fingertips_reach_23_mm_farther_and_change_nothing_else():
     reach = []
     for hand in (stock, tactile):
         poses = hand.link_poses(torch.zeros(hand.dof, dtype=torch.float64))
-        tips = torch.linalg.inv(poses[[hand.tree.link_names.index(f"{f}_distal") for f in hand.finger_names]])
+        tips = torch.linalg.inv(poses[[hand.tree.link_names.index(f"{f}_distal") for f in hand.tips.names]])
         centres = (tips @ poses[hand.tips.index])[:, :3, 3]
-        reach.append(centres[:, 2] + hand.tip_radius)
+        reach.append(centres[:, 2] + hand.tips.radius)
     torch.testing.assert_close(reach[0], torch.tensor([0.0387, 0.0387, 0.0543]).double(), rtol=0, atol=1e-6)
     torch.testing.assert_close(reach[1], torch.tensor([0.0618, 0.0618, 0.0774]).double(), rtol=0, atol=2e-4)
     same = [name for name in stock.tree.link_names if not name.endswith("tip")]

@@ -60,7 +60,7 @@ def test_a_hand_that_cannot_open_says_so(touching):
     problem, candidate = touching
     hand, joints = problem.hand, candidate.configuration.joints
     tip, normal = hand.tip_centres(joints)[0, 2], hand.fingertips(joints)[1][0, 2]
-    middle = tip + (hand.tip_radius[2] + 0.004 - 0.001) * normal
+    middle = tip + (hand.tips.radius[2] + 0.004 - 0.001) * normal
     ball = distance_field(middle, 0.02, 0.0005, lambda offset: offset.norm(dim=-1) - 0.004)
     touched = dataclasses.replace(problem, world=CollisionWorld(ball))
     assert check_candidates(touched, candidate).status.tolist() == [Status.OK]

@@ -41,7 +41,7 @@ def test_grasps_are_checked_and_ranked():
     row = certificate.margin.tolist().index(float(grasps.certificate.margin[0]))
     torch.testing.assert_close(grasps.contacts.points[0], contacts.points[row, grasps.permutation[0]])
     tips = apply(grasps.obj_from_hand, hand.tip_centres(grasps.joints))[good]
-    gap = torch.linalg.vector_norm(tips, dim=-1) - 0.035 - hand.tip_radius
+    gap = torch.linalg.vector_norm(tips, dim=-1) - 0.035 - hand.tips.radius
     assert float(gap.abs().max()) < 2.1e-3
     assert len(solve_contact_first(problem, seeds[:0])) == 0
     with pytest.raises(BadArgument, match="std_m"):

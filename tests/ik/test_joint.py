@@ -84,7 +84,7 @@ def test_grasps_satisfy_every_constraint(scene, grasps):
     sides = torch.linalg.vector_norm(good.contacts.points - good.contacts.points.roll(1, 1), dim=-1)
     assert float(sides.min()) >= spec.least_separation
     centres = apply(good.obj_from_hand, hand.tip_centres(good.joints))
-    gap = centres - good.contacts.points - hand.tip_radius[:, None] * good.contacts.normals
+    gap = centres - good.contacts.points - hand.tips.radius[:, None] * good.contacts.normals
     assert float(torch.linalg.vector_norm(gap, dim=-1).max()) <= 1e-3
     assert bool((good.joints >= hand.lower).all()) and bool((good.joints <= hand.upper).all())
     cover = hand.collision_spheres

@@ -121,7 +121,7 @@ def test_errors_name_what_is_wrong(hand, ball):
     assert (measure_errors(hand, posture, shifted, far(ball)).status == Status.TIP_ERROR).all()
 
     inside_out = Contacts(
-        contacts.points - 2 * hand.tip_radius[:, None] * -contacts.normals,
+        contacts.points - 2 * hand.tips.radius[:, None] * -contacts.normals,
         -contacts.normals,
     )
     assert (measure_errors(hand, posture, inside_out, far(ball)).status == Status.NORMAL_ANGLE).all()

@@ -30,7 +30,7 @@ def miss(hand, solution, contacts):
     at = torch.arange(len(contacts))[:, None]
     points, normals = contacts.points[at, solution.permutation], contacts.normals[at, solution.permutation]
     centres = apply(solution.obj_from_hand, hand.tip_centres(solution.joints))
-    return (centres - hand.tip_radius[:, None] * normals - points).norm(dim=-1)
+    return (centres - hand.tips.radius[:, None] * normals - points).norm(dim=-1)
 
 
 @pytest.mark.parametrize("learned", [True, False])

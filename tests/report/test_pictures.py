@@ -59,6 +59,6 @@ def test_pictures_are_reproducible(run):
 
 @pytest.mark.parametrize("plot", ["forces", "motion"])
 def test_plots_decode_and_draw_lines(run, plot):
-    png = plot_forces(run.closure, run.hand.finger_names) if plot == "forces" else plot_motion(run.closure)
+    png = plot_forces(run.closure, run.hand.tips.names) if plot == "forces" else plot_motion(run.closure)
     pixels = decode(png)
     assert (np.abs(pixels - pixels[0, 0]).sum(-1) > 60).mean() > 0.01

@@ -9,7 +9,7 @@ def test_every_fingertip_belongs_to_its_finger_and_the_palm_to_none():
     for name in ("allegro", "barrett"):
         hand = load_hand(name)
         fingers = finger_of_links(hand)
-        assert [fingers[tip] for tip in hand.tip_links] == [0, 1, 2]
+        assert [fingers[tip] for tip in hand.tips.links] == [0, 1, 2]
         assert fingers[hand.tree.link_names[0]] == PARKED
 
 

@@ -60,7 +60,7 @@ def build(name, mesh, simulator="sapien", **options):
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec([0.3, -0.8, 1.1]).as_matrix(), [0.05, -0.1, 0.6]
     start = {k: float(v) for k, v in hand.expand(joints).items()}
-    args = (hand.urdf_path, pose, start, hand.actuators, hand.tip_links, mesh, [mesh.convex_hull], 0.36)
+    args = (hand.urdf_path, pose, start, hand.actuators, hand.tips.links, mesh, [mesh.convex_hull], 0.36)
     return hand, joints, torch.from_numpy(pose), open_scene(SceneSpec(*args, **options), simulator)
 
 
@@ -209,7 +209,7 @@ def test_joints_without_a_drive_are_named(simulator):
     from torchgrasp.sim.scene import SceneSpec
 
     mesh, hand = standing(), load_hand("barrett")
-    setup = SceneSpec(hand.urdf_path, np.eye(4), {}, hand.actuators, hand.tip_links, mesh, [mesh], 0.1)
+    setup = SceneSpec(hand.urdf_path, np.eye(4), {}, hand.actuators, hand.tips.links, mesh, [mesh], 0.1)
     with pytest.raises(BadArgument, match=r"no position or drive for .*spread"):
         open_scene(setup, simulator)
     with pytest.raises(BadArgument, match="simulator: found 'bullet'"):

@@ -100,7 +100,7 @@ def test_the_scene_as_mjcf_is_a_model_of_its_own():
     hand, grasp = pinch("allegro")
     start = {k: float(v) for k, v in hand.expand(grasp.pregrasp[0]).items()}
     mesh, where = cylinder(), grasp.obj_from_hand[0].numpy()
-    setup = SceneSpec(hand.urdf_path, where, start, hand.actuators, hand.tip_links, mesh, [mesh], 0.1, patch=0.0)
+    setup = SceneSpec(hand.urdf_path, where, start, hand.actuators, hand.tips.links, mesh, [mesh], 0.1, patch=0.0)
     model = mujoco.MjModel.from_xml_string(scene_mjcf(setup))
     assert model.nu == len(hand.tree.joint_names) + 1
     assert model.body("torchgrasp_object").mass[0] == pytest.approx(0.1)

@@ -56,7 +56,7 @@ class GraspController:
     >>> grasp = plan_grasps(load_object("cylinder").view, hand, ContactSpec(table=0.0), starts=20)[0]
     >>> reference = ClosingReference.from_grasp(hand, grasp)
     >>> controller, tactile, joints = GraspController(reference), no_contact(), reference.pregrasp
-    >>> normals, radius = reference.normals, hand.tip_radius.double()
+    >>> normals, radius = reference.normals, hand.tips.radius.double()
     >>> while not controller.closed:
     ...     points = reference.contact_points(hand.tip_centres(joints))
     ...     push = 2e3 * ((reference.gains.target - points) * normals).sum(-1).clamp_min(0.0)

@@ -86,7 +86,7 @@ class ClosingReference(Value):
         points, normals = contacts_in_hand(grasp)
         preferred = deviation = None
         if stability is not None:
-            preferred = stability.preferred_forces(points[0] + hand.tip_radius[:, None] * normals[0], force)
+            preferred = stability.preferred_forces(points[0] + hand.tips.radius[:, None] * normals[0], force)
             deviation = preferred.covariance.diagonal()[None].sqrt()
         forces = desired_forces(points, normals, force, None if preferred is None else preferred.forces[None])
         covariance, jacobian = surface_covariance(normals, std_m), hand.jacobian(grasp.joints)
@@ -129,7 +129,7 @@ class ClosingReference(Value):
 
     def contact_points(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
         """Return the points [m] of fingertips with given centres [m] that touch first along the planned normals."""
-        return tips - self.hand.tip_radius[:, None] * self.normals
+        return tips - self.hand.tips.radius[:, None] * self.normals
 
 
 def closing_gains(

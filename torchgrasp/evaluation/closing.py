@@ -73,7 +73,7 @@ class TrialDriver:
             world_from_hand=true_pose.numpy(),
             joints=_by_name(hand, grasp.pregrasp[0]),
             drives=drives,
-            tip_links=tuple(hand.tip_links),
+            tip_links=tuple(hand.tips.links),
             mesh=mesh,
             parts=convex_parts(mesh) if trial.parts is None else check_parts(trial.parts),
             mass=spec.mass if spec.density is None else spec.density * float(mesh.volume),

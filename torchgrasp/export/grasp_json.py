@@ -69,7 +69,7 @@ def format_grasps(hand: Hand, grasps: Grasps, force: float = 4.0) -> str:
                     "std_m": None if std is None else float(std[row, i]),
                     "tip_error": float(grasps.tip_error[row, i]),
                 }
-                for i, (finger, link) in enumerate(zip(hand.finger_names, hand.tip_links, strict=True))
+                for i, (finger, link) in enumerate(zip(hand.tips.names, hand.tips.links, strict=True))
             ],
             "clearance": float(grasps.clearance[row]),
             "closure_margin": float(grasps.certificate.margin[row]),

@@ -15,10 +15,10 @@ from torchgrasp.hand.urdf import Urdf
 
 @dataclasses.dataclass(frozen=True)
 class Fingertips(Value):
-    """The fingertips in grasp order, each with the `Pad` in the frame of its link and the link's index in the tree.
+    """Names and links of the fingers in grasp order, with the `Pad` of each in the link's frame.
 
-    Each tip is fixed to a carrier, the last link that a joint moves. `chains` is the tree that leads to the carriers,
-    and `carrier` their index in it.
+    `index` locates the links in the whole tree. Each tip is fixed to a carrier, the last link that a joint moves.
+    `chains` is the tree that leads to the carriers, `carrier` their index in it.
     """
 
     names: tuple[str, str, str]

@@ -77,21 +77,6 @@ class Hand(Value):
         """Upper limits of the actuated joints [rad]."""
         return self.actuated.upper
 
-    @property
-    def finger_names(self) -> tuple[str, str, str]:
-        """Names of the grasping fingers."""
-        return self.tips.names
-
-    @property
-    def tip_links(self) -> tuple[str, str, str]:
-        """Links of the fingertips."""
-        return self.tips.links
-
-    @property
-    def tip_radius(self) -> Float[Tensor, "3"]:
-        """Radii of the tips' spheres [m]; 0: the tip touches in one point alone."""
-        return self.tips.radius
-
     def check_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b h"]:
         """Return `joints` if they are within the limits; raise `BadArgument` with the first other joint."""
         self.actuated.check_limits(joints)

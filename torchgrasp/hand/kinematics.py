@@ -21,9 +21,11 @@ class KinematicTree(Value):
     """The links and movable joints of a URDF in the order of the file, or a part of the tree.
 
     `child[j]` is the link that joint j moves, or 0 outside this part; `axis` is in its frame. `prismatic` is 1 for a
-    joint that slides, `moves[l, j]` if joint j moves link l. The links of `tables` are sorted by level; `level_sizes`
-    counts them. `joint` moves each of them, 0 if it is fixed. `parent` indexes the level above. `straight[k]`: level k has
-    exactly level k-1 as parents, in order. `places` gives level and index of each of `link_names`.
+    joint that slides, `moves[l, j]` if joint j moves link l.
+
+    The links of `tables` are sorted by level; `level_sizes` counts them. `joint` moves each, 0 if it is fixed. `parent`
+    indexes the level above; in a `straight` level it counts 0, 1, 2 up to that level's size. `places` gives level and
+    index of each of `link_names`.
     """
 
     link_names: tuple[str, ...]

@@ -62,7 +62,7 @@ def measure_errors(hand: Hand, configuration: Configuration, contacts: Contacts,
     links, tips, table = link_clearance(spatial, world, tips_touch=True)
     between = hand.self_clearance(configuration.joints)
     lower, upper = hand.lower.to(error), hand.upper.to(error)
-    cone = torch.where(hand.tip_radius.to(error) > 0, ROUND_PAD, FLAT_PAD) + ANGLE_TOLERANCE
+    cone = torch.where(hand.tips.radius.to(error) > 0, ROUND_PAD, FLAT_PAD) + ANGLE_TOLERANCE
     conditions = {
         Status.TIP_ERROR: (error <= TIP_TOLERANCE).all(1),
         Status.NORMAL_ANGLE: (angle <= cone).all(1),

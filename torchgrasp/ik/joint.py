@@ -93,7 +93,7 @@ class JointProblem:
         """
         hand, normals, normal_jacobian = self.hand, jet.normals, jet.normal_jacobian
         identity = torch.eye(3).to(normals)
-        target = float(self.shape.scale) * identity + hand.tip_radius.to(normals)[:, None, None] * normal_jacobian
+        target = float(self.shape.scale) * identity + hand.tips.radius.to(normals)[:, None, None] * normal_jacobian
         pads = spatial.directions(hand.tips.index, hand.tips.normal)
         tilt = (pads[..., None, :] @ normal_jacobian)[..., 0, :] * outside[..., None]
         tips = torch.einsum("gixy,ij->gixjy", target, identity).flatten(3).flatten(1, 2)

@@ -66,7 +66,7 @@ def nearest_postures(library: PostureLibrary, contacts: Contacts, world: Collisi
     """
     if not 1 <= n_seeds <= CANDIDATES:
         raise BadArgument("n_seeds", n_seeds, f"1 to {CANDIDATES}")
-    radius, order = library.hand.tip_radius.double(), torch.tensor(PERMUTATIONS, device=contacts.points.device)
+    radius, order = library.hand.tips.radius.double(), torch.tensor(PERMUTATIONS, device=contacts.points.device)
     inward = -contacts.normals.double()[:, order]
     centres = contacts.points.double()[:, order] - radius[:, None] * inward  # (n, 6, 3, 3)
     rows = torch.nonzero(~degenerate(centres).any(1))[:, 0]

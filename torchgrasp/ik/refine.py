@@ -30,7 +30,7 @@ OPENING, OPENING_SIGMAS = 0.012, 3.0
 
 def tip_targets(hand: Hand, contacts: Contacts) -> Float[Tensor, "g 3 3"]:
     """Return the centres [m] (`Hand.tip_centres`) of touching tips."""
-    return contacts.points + hand.tip_radius.to(contacts.normals)[:, None] * contacts.normals
+    return contacts.points + hand.tips.radius.to(contacts.normals)[:, None] * contacts.normals
 
 
 def tip_residuals(
@@ -38,7 +38,7 @@ def tip_residuals(
 ) -> Residuals:
     """Return the residuals of the tips' centres and of the contact directions."""
     hand = spatial.hand
-    radius = hand.tip_radius.to(normals)
+    radius = hand.tips.radius.to(normals)
     tips = spatial.points(hand.tips.index, hand.tips.center)
     finger = torch.arange(3, device=tips.device)
     coordinate = finger.repeat_interleave(3)
@@ -109,7 +109,7 @@ def open_hand(
     normals, gap = contacts.normals, OPENING + OPENING_SIGMAS * contacts.require_std()
     target = tip_targets(hand, contacts) + gap[..., None] * normals
     if world.table is not None:
-        lowest = world.table + CLEARANCE + hand.tip_radius.to(target)
+        lowest = world.table + CLEARANCE + hand.tips.radius.to(target)
         target = torch.stack([*target.unbind(-1)[:2], torch.maximum(target[..., 2], lowest)], -1)
 
     def evaluate(state: Configuration, rows: Int[Tensor, "a"]) -> Residuals:

@@ -4,7 +4,7 @@ from torchgrasp.posture_model.encoding import encode
 from torchgrasp.posture_model.sample import HandSamples, SampleSpec, sample_configurations
 from torchgrasp.posture_model.dataset import SampleFolder, load_samples, write_samples
 from torchgrasp.posture_model.em import Progress
-from torchgrasp.posture_model.fit import bic, fit_mixture
+from torchgrasp.posture_model.fit import fit_mixture
 from torchgrasp.posture_model.gaussian import GaussianMixture
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture, load_mixture
 
@@ -18,7 +18,6 @@ __all__ = [
     "load_samples",
     "Progress",
     "fit_mixture",
-    "bic",
     "GaussianMixture",
     "GraspMixture",
     "PAPER_ENERGY",

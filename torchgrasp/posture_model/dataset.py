@@ -20,7 +20,7 @@ from torchgrasp.posture_model.sample import (
     MAX_SAMPLES,
     HandSamples,
     SampleSpec,
-    chunk_counts,
+    chunk_sizes,
     draw_chunk,
 )
 
@@ -45,11 +45,11 @@ class SampleFolder:
         return self.n
 
     def __iter__(self) -> Iterator[HandSamples]:
-        return (self.chunk(i) for i in range(len(chunk_counts(self.n))))
+        return (self.chunk(i) for i in range(len(chunk_sizes(self.n))))
 
     def chunk(self, i: int) -> HandSamples:
         """Read chunk i; raises `ModelFileError` if it is missing, damaged, or belongs to other samples."""
-        path, count = self.path(i), chunk_counts(self.n)[i]
+        path, count = self.path(i), chunk_sizes(self.n)[i]
         tensors, meta = load_tensors(path, "samples", {"joints", "q"})
         shapes = tuple(tuple(tensors[name].shape) for name in ("joints", "q"))
         wanted = (count, len(self.joint_names)), (count, 6)
@@ -63,7 +63,7 @@ class SampleFolder:
         """Read the first `n` postures into memory; by default all. Raises `BadArgument` for n outside [1, len]."""
         n = self.n if n is None else n
         check_whole("n", n, 1, self.n)
-        return join([self.chunk(i) for i in range(len(chunk_counts(n)))])[:n]
+        return join([self.chunk(i) for i in range(len(chunk_sizes(n)))])[:n]
 
     def path(self, i: int) -> Path:
         """Return the file of chunk i."""
@@ -95,7 +95,7 @@ def write_samples(
         OutputError: the folder holds other samples, another run is writing it, or the disk is full.
     """
     check_whole("workers", workers, 1, 1024)
-    counts, meta = chunk_counts(spec.n), spec.meta(hand)
+    counts, meta = chunk_sizes(spec.n), spec.meta(hand)
     samples = SampleFolder(Path(folder), spec.n, hand.joint_names, meta)
     content = {"torchgrasp": "samples", "version": 1, "n": spec.n, "chunk": CHUNK_POSTURES}
     content |= {"joint_names": hand.joint_names, **meta}
@@ -145,7 +145,7 @@ def load_samples(folder: Path | str) -> SampleFolder:
         samples = _parse_manifest(folder, json.loads(path.read_text("utf-8")))
     except (OSError, ValueError, RecursionError) as error:
         raise ModelFileError("folder", f"{path}: {error}", allowed) from error
-    chunks = len(chunk_counts(samples.n))
+    chunks = len(chunk_sizes(samples.n))
     if missing := sum(not samples.path(i).is_file() for i in range(chunks)):
         allowed = "a finished folder: run the command that began it again"
         raise ModelFileError("folder", f"{folder} without {missing} of {chunks} chunks", allowed)
@@ -157,8 +157,9 @@ def _parse_manifest(folder: Path, manifest: Any) -> SampleFolder:
     fixed = {"torchgrasp": "samples", "version": 1, "chunk": CHUNK_POSTURES}
     if not isinstance(manifest, dict) or any(manifest.get(key) != value for key, value in fixed.items()):
         raise ValueError("another kind of file, or of another version")
-    n, names = manifest.get("n"), manifest.get("joint_names")
-    meta = {key: manifest.get(key) for key in META_KEYS}
+    n: Any = manifest.get("n")
+    names: Any = manifest.get("joint_names")
+    meta: dict[str, Any] = {key: manifest.get(key) for key in META_KEYS}
     sound = isinstance(n, int) and not isinstance(n, bool) and 1 <= n <= MAX_SAMPLES
     sound = sound and isinstance(names, list) and 0 < len(names) <= 1000
     if not (sound and all(isinstance(x, str) for x in (*names, *meta.values()))):

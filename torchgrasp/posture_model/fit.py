@@ -38,7 +38,8 @@ def fit_mixture(
 ) -> GraspMixture:
     """Fit the mixture of Eqs. (19)-(20) to sampled postures by expectation-maximisation from a k-means start.
 
-    The mixture's `meta` reports iterations, convergence, components placed anew, mean log-likelihood and BIC.
+    The mixture's `meta` reports iterations, convergence, components placed anew, mean log-likelihood and BIC. Codes are
+    exact functions of the joints, so BIC keeps falling as components are added: read its elbow, not its minimum.
 
     Args:
         samples: postures and their codes.
@@ -90,6 +91,8 @@ def fit_mixture(
 
     fit = expectation_maximisation(shard, start, iterations, tolerance, regularisation, observe)
     log_likelihood = float(fit.log_likelihood[-1] - scale.log().sum())  # in the samples' units
+    m, d = fit.components.means.shape
+    parameters = (m - 1) + m * d + m * d * (d + 1) // 2  # of weights, means and full covariances
     report = {
         "samples": str(n),
         "fit_seed": str(seed),
@@ -98,7 +101,7 @@ def fit_mixture(
         "converged": str(fit.converged).lower(),
         "reseeded": str(int(fit.reseeded.sum())),
         "log_likelihood": f"{log_likelihood:.6f}",
-        "bic": f"{_criterion(n * log_likelihood, n, fit.components.means):.1f}",
+        "bic": f"{-2 * n * log_likelihood + parameters * math.log(n):.1f}",
     }
     return GraspMixture(
         weights=fit.components.weights,
@@ -108,22 +111,6 @@ def fit_mixture(
         regularisation=regularisation,
         meta=samples.meta | report,
     )
-
-
-def bic(mixture: GraspMixture, samples: HandSamples) -> float:
-    """Return the Bayesian information criterion of a mixture on samples; less is better.
-
-    Codes are exact functions of the joints, so the criterion keeps falling as components are added. Read its elbow
-    beside the error on held-out postures, not its minimum.
-    """
-    return _criterion(float(mixture.log_prob(samples.rows().double()).sum()), len(samples), mixture.means)
-
-
-def _criterion(log_likelihood: float, n: int, means: Float[Tensor, "m d"]) -> float:
-    """Return -2 log-likelihood + free parameters x log(n), with full covariances."""
-    m, d = means.shape
-    free = (m - 1) + m * d + m * d * (d + 1) // 2
-    return -2 * log_likelihood + free * math.log(n)
 
 
 def _standardise(shard: Shard, names: tuple[str, ...]) -> tuple[Float[Tensor, "d"], Float[Tensor, "d"]]:

@@ -89,21 +89,21 @@ def sample_configurations(
     check_whole("workers", workers, 1, 1024)
     parts = []
     with ThreadPoolExecutor(workers) as pool:
-        for part in pool.map(lambda i: draw_chunk(hand, spec, i), range(len(chunk_counts(n)))):
+        for part in pool.map(lambda i: draw_chunk(hand, spec, i), range(len(chunk_sizes(n)))):
             parts.append(part)
             observer(len(part[0]))
     joints, q, _ = zip(*parts, strict=True)
     return HandSamples(torch.cat(joints), torch.cat(q), hand.joint_names, spec.meta(hand))
 
 
-def chunk_counts(n: int) -> list[int]:
+def chunk_sizes(n: int) -> list[int]:
     """Return the number of postures of each chunk: `CHUNK_POSTURES`, and the rest in the last."""
     return [min(CHUNK_POSTURES, n - first) for first in range(0, n, CHUNK_POSTURES)]
 
 
 def draw_chunk(hand: Hand, spec: SampleSpec, i: int) -> tuple[Float[Tensor, "n h"], Float[Tensor, "n 6"], int]:
     """Return the kept postures of chunk i, their codes, and the number of postures drawn for them."""
-    count, parts, kept = chunk_counts(spec.n)[i], [], 0
+    count, parts, kept = chunk_sizes(spec.n)[i], [], 0
     blocks = _draw_blocks(hand, np.random.default_rng((spec.seed, i)), spec.sampling)
     while kept < count:
         parts.append(next(blocks))

@@ -61,7 +61,7 @@ def draw_pictures(run: Run) -> dict[str, list[tuple[str, bytes]]]:
         sections["Closing on the true object"] = [
             ("Before the hand comes.", draw_tick(run.mesh, run.hand, run.closure, 0, side)),
             ("At the end.", draw_tick(run.mesh, run.hand, run.closure, -1, side)),
-            ("Normal force of each fingertip.", plot_forces(run.closure, run.hand.finger_names)),
+            ("Normal force of each fingertip.", plot_forces(run.closure, run.hand.tips.names)),
             ("Motion of hand and object.", plot_motion(run.closure)),
         ]
     return sections
@@ -126,7 +126,7 @@ def _section(name: str, shots: Sequence[tuple[str, bytes]], run: Run) -> str:
     """Return a section of pictures, with the fingers' colours where they show."""
     legend = "".join(
         f'<span class="dot" style="background:{color}"></span>{escape(finger)}'
-        for finger, color in zip(run.hand.finger_names, FINGERS, strict=True)
+        for finger, color in zip(run.hand.tips.names, FINGERS, strict=True)
     )
     figures = "\n".join(
         f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{base64.b64encode(png).decode("ascii")}">'

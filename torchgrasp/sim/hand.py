@@ -65,7 +65,7 @@ class SimulatedHand:
         vectors = torch.from_numpy(np.concatenate([contacts.force, normals]) @ rotation)
         places = torch.from_numpy((np.concatenate([points, centres]) - origin) @ rotation)
         truth = TipContact(torch.from_numpy(self.force), vectors[:3], places[:3], vectors[3:])
-        normals, radius = self.reference.normals, self.reference.hand.tip_radius
+        normals, radius = self.reference.normals, self.reference.hand.tips.radius
         self.tactile = measure(self.tactile, truth, normals, radius, self.period, self.generator)
         joints, jacobian = self.scene.joints()[self._from_scene], self.scene.jacobian(centres)[..., self._from_scene]
         return Observation(torch.from_numpy(joints), places[3:], torch.from_numpy(rotation.T @ jacobian), self.tactile)

@@ -114,7 +114,7 @@ def resting_force(simulator: str, hand: Hand) -> float:
     pose, joints = np.eye(4), hand.expand(0.5 * (hand.lower + hand.upper))
     pose[2, 3] = 1.0
     start = {name: float(q) for name, q in joints.items()}
-    setup = SceneSpec(hand.urdf_path, pose, start, hand.actuators, tuple(hand.tip_links), box, [box], 0.36)
+    setup = SceneSpec(hand.urdf_path, pose, start, hand.actuators, tuple(hand.tips.links), box, [box], 0.36)
     scene = open_scene(setup, simulator)
     forces = []
     for _ in range(200):

@@ -95,14 +95,14 @@ def _speed(name: str, hand: Hand, n: int, threads: int, dtype: torch.dtype) -> l
     xml = read_urdf(hand.urdf_path).kinematic_xml()
     chain: Any = pytorch_kinematics.build_chain_from_urdf(xml).to(dtype=dtype)
     make: Any = pytorch_kinematics.build_serial_chain_from_urdf
-    fingers = [make(xml, link).to(dtype=dtype) for link in hand.tip_links]
+    fingers = [make(xml, link).to(dtype=dtype) for link in hand.tips.links]
     order = [hand.tree.joint_names.index(x) for x in chain.get_joint_parameter_names()]
     orders = [[hand.tree.joint_names.index(x) for x in f.get_joint_parameter_names()] for f in fingers]
     coupling, contact = hand.actuated.coupling.to(dtype), hand.tips.contact.to(dtype)
 
     def peers_tips(rows: Tensor) -> None:
         poses = chain.forward_kinematics_tensor(hand.expand_joints(rows)[:, order])
-        tips = poses[[chain.frame_to_idx[link] for link in hand.tip_links]]
+        tips = poses[[chain.frame_to_idx[link] for link in hand.tips.links]]
         torch.einsum("fnij,fj->nfi", tips[..., :3, :3], contact) + tips[..., :3, 3].transpose(0, 1)
 
     def peers_jacobian(rows: Tensor) -> None:
