@@ -47,7 +47,7 @@ controller, robot, tactile = GraspController(reference), FakeRobot(reference), n
 ticks = 0
 while not controller.closed:  # then lift the arm, and go on stepping
     # `measure` filters the forces and flags contacts; a sensor that does so itself fills a `TactileState`
-    tactile = measure(tactile, robot.read_fingertips(), reference.normals, hand.tip_radius.double(), PERIOD)
+    tactile = measure(tactile, robot.read_fingertips(), reference.normals, hand.tips.radius.double(), PERIOD)
     robot.send(controller.step(observe(hand, robot.read_joints(), tactile), PERIOD))
     ticks += 1
 print(f"closed after {ticks * PERIOD:.2f} s, the fingers press with {tactile.reading.numpy().round(1)} N")

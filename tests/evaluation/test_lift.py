@@ -79,21 +79,9 @@ def test_all_a_fingertip_exerts_is_felt_friction_included():
     """At rest the tips carry the object: their full forces sum to its weight, their normal parts are the readings."""
     pytest.importorskip("sapien")
     hand, grasp = pinch("allegro")
-<<<<<<< HEAD
     run = TrialRun(TrialDriver(GraspTrial(hand, grasp, cylinder()), TrialSpec(approach=0.0, noise=False)))
     for _ in run.close():
         pass
-=======
-    start = {name: float(q) for name, q in hand.expand(grasp.pregrasp[0]).items()}
-    stands, mesh = grasp.obj_from_hand[0].numpy(), cylinder()
-    tips = tuple(hand.tips.links)
-    scene = open_scene(SceneSpec(hand.urdf_path, stands, start, hand.actuators, tips, mesh, convex_parts(mesh), 0.1))
-    robot = SimulatedHand(scene, ClosingReference.from_grasp(hand, grasp), 100.0, None)
-    controller = GraspController(robot.reference)
-    observation = robot.tick(controller.targets)
-    while not controller.closed:
-        observation = robot.tick(controller.step(observation, robot.period))
->>>>>>> 0a1281e (Hand.tips holds names, links and radii alone; BIC is reported by the fit)
     for k in range(200):
         run.scene.lift(min(k, 100) * 5e-4)
         run.step()
