@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from torchgrasp.cli.common import check_seed, naming
-from torchgrasp.cli.grasps import check_simulator
+from torchgrasp.cli.grasps import import_simulator
 from torchgrasp.columns import format_columns, format_line
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.campaign import EvaluationSpec, Ranks
@@ -62,7 +62,7 @@ def evaluate(
         seed: of every random draw.
     """
     check_seed(seed)
-    check_simulator(simulator)
+    import_simulator(simulator)
     with naming("--hand", "hand", "name"):
         the_hand = load_hand(hand)
     changes = {"closing": closing, "force": force, "holding": holding, "simulator": simulator}

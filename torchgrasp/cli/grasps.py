@@ -80,7 +80,7 @@ def grasp(
     if close and mesh is None:
         raise BadArgument("--close", "no --mesh", "--close together with --mesh")
     if close:
-        check_simulator()
+        import_simulator()
     check_table(table, no_table)
     if not 1 <= starts <= 1_000_000:
         raise BadArgument("--starts", starts, "an integer in [1, 1000000]")
@@ -124,8 +124,8 @@ def grasp(
     return 0 if done else 1
 
 
-def check_simulator(name: Simulator = "sapien") -> None:
-    """Refuse a simulator that cannot be loaded.
+def import_simulator(name: Simulator = "sapien") -> None:
+    """Import a simulator, before any work.
 
     Raises:
         MissingExtra: it is not installed.

@@ -52,7 +52,7 @@ class TrialDriver:
         reference: what the hand follows; None: that of the trial's hand and grasp.
 
     Raises:
-        BadArgument, MeshError: as `close_hand`.
+        BadArgument, MeshError: as in `close_hand`.
     """
 
     def __init__(self, trial: GraspTrial, spec: TrialSpec, reference: ClosingReference | None = None) -> None:

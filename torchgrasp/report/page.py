@@ -117,7 +117,7 @@ GRASP_COLUMNS = ("rank", "success", "tip error mm", "clearance mm", "pad angle d
 
 
 def _statuses(status: Int[Tensor, "b"]) -> str:
-    """Return the table of statuses and how often each came."""
+    """Return the table of statuses with their counts."""
     rows = [(str(n), s.name.lower(), s.sentence) for s, n in count_status(status).items()]
     return format_html_table(("count", "status", "meaning"), rows, numbers={0})
 
