@@ -58,26 +58,30 @@ class Protocol(Value):
         return dataclasses.replace(self, trial=dataclasses.replace(self.trial, **changes))
 
 
-# PhysX resists torsion by friction x force x patch: the patch is the torsional coefficient [m] over the sliding one.
 _FLOATING = TrialSpec(
     closing="open_loop", force=7.0, mass=0.1, friction=0.6, patch=0.02 / 0.6, kp=5.0, overlap=0.01,
     gravity=0.0, table=False, approach=0.0, lift_height=0.0,
 )  # fmt: skip
-_DEXGRASPBENCH = Protocol("dexgraspbench", _FLOATING, PullSpec(10.0, 2.0, 0.05, math.radians(15)))
-_MULTIDEX = _DEXGRASPBENCH.with_trial(density=500.0, friction=3.0, patch=0.0, kp=None)
-_HARD = _DEXGRASPBENCH.with_trial(friction=0.3, patch=0.002 / 0.3)
+"""DexGraspBench's. PhysX resists torsion by friction x force x patch [m]: the ratio of both frictions."""
 
-PAPER = Protocol("paper", TrialSpec(), noise=PoseNoise(0.005, math.radians(5)))
-"""The paper's lift (Sec. 6.5); errors of the object's pose stand for the real robot's chance."""
+_PULL = PullSpec(10.0, 2.0, 0.05, math.radians(15))
+"""DexGraspBench's."""
+
+_POSE_NOISE = PoseNoise(0.005, math.radians(5))
+"""As large as in Get a Grip (CoRL 2024)."""
 
 PROTOCOLS = {
     protocol.name: protocol
     for protocol in (
-        dataclasses.replace(_MULTIDEX, name="multidex", pull=PullSpec(0.5, 1.0, 0.02, math.inf)),
-        _DEXGRASPBENCH,
-        dataclasses.replace(_HARD, name="dexgraspbench-hard"),
-        dataclasses.replace(_DEXGRASPBENCH, name="pose-noise", noise=PoseNoise(0.005, math.radians(5), draws=20)),
-        PAPER,
+        Protocol(
+            "multidex",
+            dataclasses.replace(_FLOATING, density=500.0, friction=3.0, patch=0.0, kp=None),
+            PullSpec(0.5, 1.0, 0.02, math.inf),
+        ),
+        Protocol("dexgraspbench", _FLOATING, _PULL),
+        Protocol("dexgraspbench-hard", dataclasses.replace(_FLOATING, friction=0.3, patch=0.002 / 0.3), _PULL),
+        Protocol("pose-noise", _FLOATING, _PULL, dataclasses.replace(_POSE_NOISE, draws=20)),
+        Protocol("paper", TrialSpec(), noise=_POSE_NOISE),
         Protocol("tabletop", TrialSpec(friction=0.6, shake=0.003)),
     )
 }
@@ -86,8 +90,8 @@ PROTOCOLS = {
 * multidex: MultiDex as D(R,O) runs it (arXiv 2410.01702).
 * dexgraspbench: force closure for floating objects (as of BODex, arXiv 2412.16490).
 * dexgraspbench-hard: the same with halved friction, as in Dexonomy (arXiv 2504.18829).
-* pose-noise: the same with an error of the hand's pose, as large as in Get a Grip (CoRL 2024).
-* paper: the paper's lift at friction 0.8.
+* pose-noise: the same with errors of the hand's pose.
+* paper: the paper's lift (Sec. 6.5) at friction 0.8; errors of the object's pose stand for a real robot's chance.
 * tabletop: a lift by 0.1 m at friction 0.6, held for 2 s while the hand shakes.
 """
 
