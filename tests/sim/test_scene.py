@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from benchmarks.close import statics
 from scipy.spatial.transform import Rotation
 
 from torchgrasp.errors import BadArgument, HandFileError
@@ -22,15 +23,15 @@ def test_euler_angles_rebuild_the_rotation():
         assert np.abs(again - matrix).max() < 1e-7
 
 
-def carried(urdf_path, **options):
+def mounted(urdf_path, **options):
     ball = trimesh.creation.icosphere(radius=0.02)
     return mounted_urdf(SceneSpec(urdf_path, np.eye(4), {}, {}, (), ball, [ball], 0.1, **options))
 
 
-def test_carried_urdf_holds_geometry_and_the_joints_of_the_carriage():
+def test_the_mounted_urdf_holds_geometry_and_the_joints_of_the_mount():
     path = load_hand("barrett").urdf_path
-    assert APPROACH_JOINT not in carried(path)
-    text = carried(path, approach=(0.0, 0.06, -0.08))
+    assert APPROACH_JOINT not in mounted(path)
+    text = mounted(path, approach=(0.0, 0.06, -0.08))
     assert LIFT_JOINT in text
     assert 'xyz="0 0.6 -0.8"' in text
     assert "<mimic" not in text
@@ -40,10 +41,10 @@ def test_carried_urdf_holds_geometry_and_the_joints_of_the_carriage():
 
 def test_files_that_are_no_hand_are_refused(tmp_path):
     with pytest.raises(HandFileError):
-        carried(tmp_path / "none.urdf")
+        mounted(tmp_path / "none.urdf")
     (tmp_path / "two.urdf").write_text('<robot name="r"><link name="a"/><link name="b"/></robot>')
     with pytest.raises(HandFileError, match="one root link"):
-        carried(tmp_path / "two.urdf")
+        mounted(tmp_path / "two.urdf")
 
 
 SIMULATORS = ["sapien", "mujoco"]
@@ -79,17 +80,9 @@ def test_resting_weight(timestep, simulator):
     forces = []
     for _ in range(200):
         scene.step()
-        forces.append(support(scene))
+        forces.append(statics.support(scene))
     assert np.mean(forces[100:]) == pytest.approx(0.36 * 9.81, rel=5e-3)
     assert np.abs(scene.object_pose() - np.eye(4)).max() < 1e-4
-
-
-def support(scene):
-    """The force [N] with which all contacts hold up the object."""
-    if hasattr(scene, "data"):
-        return scene.data.joint("torchgrasp_object").qfrc_constraint[2]
-    impulse = sum(np.asarray(p.impulse) for c in scene.system.get_contacts() for p in c.points)
-    return np.abs(impulse)[2] / scene.timestep
 
 
 @pytest.mark.sim

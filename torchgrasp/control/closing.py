@@ -26,8 +26,8 @@ LEAD, IMPATIENCE = 0.04, 0.25
 wait for a finger, the lead grows by itself in each such time [s]."""
 
 STOP_FORCE, STOP_DISTANCE, AIM_DEPTH, INTEGRAL_RATE = 0.5, 1e-3, 0.02, 2.0
-"""The position baseline: force [N] (Sec. 6.5) and distance to the target [m] at which a finger stops. The target's depth
-behind the planned contact [m] and the integral gain [1/s^2] are tuned (docs/closing.md)."""
+"""The position baseline: force [N] (Sec. 6.5) and distance to its target [m] at which a finger stops. The depth
+of this target behind the planned contact [m] and the integral gain [1/s^2] are tuned (docs/closing.md)."""
 
 
 class OpenLoopClosing:

@@ -1,4 +1,4 @@
-"""Forces and stability: what the model of stable grasps knows of unseen objects, and how hard held objects are lost."""
+"""Stability: what a hand's stability model knows of unseen objects, and at which pull held objects are lost."""
 
 import dataclasses
 import functools
@@ -11,6 +11,7 @@ from train.pull_trials import PullRecord, RisingPull, pull_until_lost
 
 from benchmarks.common import Row
 from torchgrasp import ContactSpec, Grasps, Hand, Status, load_hand, plan_grasps
+from torchgrasp.control import ClosingReference
 from torchgrasp.control.adaptive.impedance import GRASP_STIFFNESS, Impedance
 from torchgrasp.control.adaptive.stability import StabilityModel, lengths_of, load_stability, state_of
 from torchgrasp.control.holding import ForceHold
@@ -24,31 +25,31 @@ FRICTION, STRENGTH = 0.6, (1.0, 8.0)
 """Of every contact; and the strongest finger's desired force [N], drawn evenly in its logarithm for each grasp."""
 
 RATE, MOST, SECONDS = 4.0, 16.0, 4.0
-"""The pull rises by so much [N/s], to so much [N], in so long [s]."""
+"""Rate [N/s], end [N] and duration [s] of the rising pull."""
 
 AGAINST = 3.0
-"""The stability before the pull is to tell which grasps keep their object at this pull [N]."""
+"""Pull [N] for which the stability before it is judged."""
 
 HOLDINGS = ("force", "impedance", "impedance that adapts", "impedance that adapts, learned forces")
-"""What holds; the last takes its desired forces, too, from the stability model."""
+"""Holdings that are compared; the last takes its desired forces from the stability model, too."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Held:
-    """One grasp under a rising pull: at which it was lost [N], the odds before it, and the error of its forces."""
+    """One grasp under a rising pull: the pull at its loss [N], the log-odds before it, and the error of its forces."""
 
     lost_at: float
-    odds: float
+    log_odds: float
     error: float
 
 
-def bench_force(objects: Path, tries: int, starts: int, seed: int) -> list[Row]:
+def bench_stability(objects: Path, tries: int, starts: int, seed: int) -> list[Row]:
     """Pull at `tries` grasps of the first view of every object until they are lost, with both hands."""
     rows: list[Row] = []
     for hand in (load_hand("allegro"), load_hand("barrett")):
         model = load_stability(hand)
         assert model is not None
-        found: dict[str, list[Held]] = {name: [] for name in HOLDINGS}
+        results: dict[str, list[Held]] = {name: [] for name in HOLDINGS}
         for _, view, cloud, mesh in read_views(objects):
             if view != "view0":
                 continue
@@ -57,9 +58,9 @@ def bench_force(objects: Path, tries: int, starts: int, seed: int) -> list[Row]:
             for row in choose_rows(len(grasps), tries, "spread"):
                 held = pull_at(grasps[row], hand, model, mesh, parts, 1000 * seed + row)
                 for name, one in held.items():
-                    found[name].append(one)
-        rows += [likelihood_row(hand, model), odds_row(hand, found["impedance"]), error_row(hand, found)]
-        rows += [lost_row(hand, found)]
+                    results[name].append(one)
+        rows += [likelihood_row(hand, model), odds_row(hand, results["impedance"]), error_row(hand, results)]
+        rows += [lost_row(hand, results)]
     return rows
 
 
@@ -79,48 +80,48 @@ def pull_at(grasp: Grasps, hand: Hand, model: StabilityModel, mesh, parts, seed:
         trial = pull_until_lost(given, reference, holding, pull, FRICTION)
         if trial.overlap:
             return {}
-        held[name] = judged(trial, model, reference.gains.desired_force.norm(dim=-1))
+        held[name] = score(trial, model, reference.gains.desired_force.norm(dim=-1))
     return held
 
 
-def judged(trial: PullRecord, model: StabilityModel, desired: torch.Tensor) -> Held:
-    """Return what a trial tells."""
+def score(trial: PullRecord, model: StabilityModel, desired: torch.Tensor) -> Held:
+    """Return the loss of a trial, and log-odds and error of its forces before the pull."""
     rest = max(int((trial.pulled == 0).sum()) - 1, 0)  # the forces have risen by then
-    felt = trial.forces[rest]
-    state = state_of(torch.full((3,), GRASP_STIFFNESS, dtype=torch.float64), lengths_of(trial.tips[rest]), felt)
-    error = float(((felt - desired) / desired).abs().mean())
+    forces = trial.forces[rest]
+    state = state_of(torch.full((3,), GRASP_STIFFNESS, dtype=torch.float64), lengths_of(trial.tips[rest]), forces)
+    error = float(((forces - desired) / desired).abs().mean())
     return Held(float(trial.pulled[-1]) if trial.lost else MOST, float(model.log_odds(state)), error)
 
 
 def likelihood_row(hand: Hand, model: StabilityModel) -> Row:
-    """Return what the training found on bodies left out."""
-    told = {name: float(model.meta[name]) for name in ("log_likelihood", "log_likelihood_of_one_gaussian", "auc")}
+    """Return the training's scores on bodies left out."""
+    scores = {name: float(model.meta[name]) for name in ("log_likelihood", "log_likelihood_of_one_gaussian", "auc")}
     measured = (
-        f"{told['log_likelihood']:.2f} nats a state, one Gaussian {told['log_likelihood_of_one_gaussian']:.2f};"
-        f" AUC of the odds {told['auc']:.2f}, of the density alone {float(model.meta['auc_of_the_density']):.2f}"
+        f"{scores['log_likelihood']:.2f} nats a state, one Gaussian {scores['log_likelihood_of_one_gaussian']:.2f};"
+        f" AUC of the odds {scores['auc']:.2f}, of the density alone {float(model.meta['auc_of_the_density']):.2f}"
     )
-    return Row(f"{hand.name}: the model of stable grasps on authored bodies left out", "-", measured, None, told)
+    return Row(f"{hand.name}: the model of stable grasps on authored bodies left out", "-", measured, None, scores)
 
 
 def odds_row(hand: Hand, held: list[Held]) -> Row:
     """Return how well the odds before the pull rank unseen grasps."""
-    kept, lost = ([h.odds for h in held if (h.lost_at > AGAINST) is which] for which in (True, False))
+    kept, lost = ([h.log_odds for h in held if (h.lost_at > AGAINST) is which] for which in (True, False))
     pairs = np.subtract.outer(kept, lost)
     auc = float(((pairs > 0) + 0.5 * (pairs == 0)).mean()) if pairs.size else math.nan
     measured = f"AUC {auc:.2f} over {len(held)} grasps, {len(lost)} of them lost below {AGAINST:g} N"
     return Row(f"{hand.name}: odds of stability on unseen objects", "> 0.5", measured, auc > 0.5, {"auc": auc})
 
 
-def error_row(hand: Hand, found: dict[str, list[Held]]) -> Row:
+def error_row(hand: Hand, results: dict[str, list[Held]]) -> Row:
     """Return how far the forces at rest are from the desired ones."""
-    errors = {name: float(np.median([h.error for h in held])) for name, held in found.items()}
+    errors = {name: float(np.median([h.error for h in held])) for name, held in results.items()}
     measured = ", ".join(f"{name} {error:.0%}" for name, error in errors.items())
     return Row(f"{hand.name}: median error of the normal forces at rest", "-", measured, None, errors)
 
 
-def lost_row(hand: Hand, found: dict[str, list[Held]]) -> Row:
+def lost_row(hand: Hand, results: dict[str, list[Held]]) -> Row:
     """Return the mean pull at which the object is lost, and the paired gain over the holding by forces."""
-    pulls = {name: np.array([h.lost_at for h in held]) for name, held in found.items()}
+    pulls = {name: np.array([h.lost_at for h in held]) for name, held in results.items()}
     base, parts, numbers = pulls["force"], [], {}
     for name, at in pulls.items():
         gain = at - base

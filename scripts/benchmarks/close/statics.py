@@ -199,7 +199,7 @@ def planned(name: str) -> tuple[Hand, Grasps, trimesh.Trimesh, list[trimesh.Trim
     return hand, grasps[grasps.status == Status.OK][0], given.mesh, given.parts
 
 
-def bench_checks() -> list[Row]:
+def bench_statics() -> list[Row]:
     """Check both simulators, with both hands where a hand is in it."""
     return [row for simulator in SIMULATORS for row in check_rows(simulator)]
 

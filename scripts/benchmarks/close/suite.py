@@ -1,4 +1,4 @@
-"""Closing the hand beside its bars: simulators against statics and each other, parts of the closing, speed, forces."""
+"""Closing the hand beside its bars: simulators against statics and each other, the closing's parts, speed, stability."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -9,13 +9,13 @@ from benchmarks.close.ablation import bench_ablation
 from benchmarks.close.pose_noise import bench_noise
 from benchmarks.close.simulator_agreement import bench_agreement
 from benchmarks.close.speed import bench_closing_speed
-from benchmarks.close.stability import bench_force
-from benchmarks.close.statics import bench_checks
+from benchmarks.close.stability import bench_stability
+from benchmarks.close.statics import bench_statics
 from benchmarks.close.success import bench_success
 from benchmarks.common import Row, measure
 from torchgrasp.evaluation.campaign import EvaluationSpec
 
-SUBJECTS = ("checks", "speed", "ablation", "agreement", "force", "noise", "success")
+SUBJECTS = ("statics", "speed", "ablation", "agreement", "stability", "noise", "success")
 
 
 def close(
@@ -34,7 +34,7 @@ def close(
 
     Args:
         objects: folder with manifest.json and a folder for each object; without it what needs grasps is left out.
-        only: subjects to measure: checks, speed, ablation, agreement, force, noise, success.
+        only: subjects to measure: statics, speed, ablation, agreement, stability, noise, success.
         hands: of noise and success; agreement takes both.
         tries: grasps of each view: the best for noise, else spread over all ranks.
         draws: errors of the hand's pose for each grasp.
@@ -47,11 +47,11 @@ def close(
     torch.set_num_threads(threads)
     spec = EvaluationSpec(tries, starts=starts, seed=seed)
     subjects: dict[str, Callable[[], list[Row]]] = {
-        "checks": bench_checks,
+        "statics": bench_statics,
         "speed": bench_closing_speed,
         "ablation": lambda: bench_ablation(objects, tries, starts, seed, workers) if objects else [],
         "agreement": lambda: bench_agreement(objects, spec, workers) if objects else [],
-        "force": lambda: bench_force(objects, tries, starts, seed) if objects else [],
+        "stability": lambda: bench_stability(objects, tries, starts, seed) if objects else [],
         "noise": lambda: bench_noise(objects, hands, draws, spec, workers) if objects else [],
         "success": lambda: bench_success(objects, hands, tries, workers, out.parent / "success") if objects else [],
     }
