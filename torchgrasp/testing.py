@@ -17,7 +17,7 @@ from torchgrasp.hand.load import find_hand, load_hand
 from torchgrasp.hand.urdf import Shape, Urdf, read_urdf
 
 FK_POSTURES = 50
-"""Random postures in which the kinematics are compared; each takes about a millisecond."""
+"""Random postures in which kinematics are compared, a millisecond each."""
 FK_TOLERANCE = 1e-6
 """Largest difference [m, and entries of rotations] between two readers of the same URDF: a micrometre."""
 

@@ -24,10 +24,8 @@ ROWS_PER_CHUNK = 1000
 def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, seed: int = 0) -> list[tuple[str, str]]:
     """Return the pairs of links that meet in some of n random postures, but not in nearly all, without neighbours.
 
-    Every joint is uniform within its limits, so that the pairs serve all finger options; coupled joints follow.
-
-    Raises:
-        BadArgument: n outside [1, 10^7], or a coupling with joints that the URDF does not have.
+    Every joint is uniform within its limits, so that the pairs serve all finger options. An n outside [1, 10^7], or a
+    coupling with joints that the URDF lacks, raises `BadArgument`.
 
     >>> from torchgrasp.hand.load import find_hand
     >>> from torchgrasp.hand.urdf import read_urdf
@@ -43,7 +41,7 @@ def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, 
     for values in draw_postures(urdf, coupling, n, seed).split(ROWS_PER_CHUNK, 1):
         apart = shapes.separations(tree.frames(values), MEETING_DISTANCE)
         least = apart.new_full((len(links), apart.shape[1]), torch.inf)
-        least = least.scatter_reduce(0, owner[:, None].expand_as(apart), apart, "amin")
+        least.scatter_reduce_(0, owner[:, None].expand_as(apart), apart, "amin")
         met += (least < 0).sum(1)
         near += (least < MEETING_DISTANCE).sum(1)
     meeting = links[(near > 0) & (met <= ALWAYS * n)]

@@ -1,4 +1,4 @@
-"""Spheres that cover the hand's links, for clearance from object and table.
+"""Spheres that cover the hand's links: clearance from object and table.
 
 Each collision shape is cut into cells, one sphere each. Fingers' edges stick out of them by up to 4 mm, corners of the
 palm by 9 mm. No surface with a radius of curvature above 25 mm reaches a face between them.
@@ -31,10 +31,7 @@ INSET = 0.001
 
 @dataclasses.dataclass(frozen=True)
 class CollisionSpheres(Value):
-    """Spheres fixed to links: `center` [m] in the link's frame, `radius` [m].
-
-    `finger` is the index in grasp order, -1 for the palm, -2 for parked fingers. `touching` marks the fingertips.
-    """
+    """Spheres [m] fixed to links. `finger`: index in grasp order, -1 palm, -2 parked; `touching`: fingertips."""
 
     link_index: Int[Tensor, " s"]
     center: Float[Tensor, "s 3"]
@@ -62,7 +59,7 @@ def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
 
 
 def _cover(shape: Shape, cell: float, bulge: float) -> tuple[list[Triple], float]:
-    """Return the centres and the radius of the spheres that cover a shape."""
+    """Return centres and radius of the spheres that cover a shape."""
     if shape.kind == "sphere":
         return [shape.xyz], shape.size[0]
     cylinder = shape.kind == "cylinder"

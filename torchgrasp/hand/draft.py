@@ -1,7 +1,7 @@
 """A first hand.toml for a URDF: fingers, pads, coupling, pairs of links.
 
-A URDF does not say where a finger's pad is. Here the pad faces the way in which the finger's last joint bends. A joint
-bends to the side with most of its range. If both sides have as much, it bends towards the other fingertips.
+A URDF does not say where a finger's pad is. Here the pad faces where the finger's last joint bends. A joint bends to
+the side with most of its range; if both have as much, towards the other fingertips.
 """
 
 import json
@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import rotation_from_rpy
+from torchgrasp.frames import rigid, rotation_from_rpy
 from torchgrasp.hand.collision_pairs import collision_pairs, draw_postures
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import map_points, tree_from_urdf
@@ -75,7 +75,6 @@ def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = No
     frames = tree_from_urdf(urdf).frames(draw_postures(urdf, coupling, DRAFT_POSTURES, seed))
     pads, approach = guess_pads(urdf, frames, chosen)
     kp = STIFFNESS * min((j.effort for j in free if j.effort > 0), default=1.0)
-
     names = {tip: tip.removesuffix("_tip") for tip in chosen}
     lines = [
         "# A draft. Lengths [m], angles [rad], in the link frames of the URDF. Look over what is marked CHECK.",
@@ -110,7 +109,7 @@ def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = No
 
 
 def fingertip_links(urdf: Urdf) -> tuple[str, ...]:
-    """Return the last link with a collision shape of every movable branch."""
+    """Return every movable branch's last link with a collision shape."""
     parents, shaped = {j.parent for j in urdf.joints}, {x.name for x in urdf.links if x.shapes}
     ends = []
     for link in (x.name for x in urdf.links if x.name not in parents):
@@ -156,9 +155,8 @@ def _motion(urdf: Urdf, tip: str, core: Vector) -> tuple[Joint, Vector, Vector]:
             if length > SHORT_ARM:
                 arm = arm - (arm @ axis) * axis
                 return joint, motion / length, arm / max(float(np.linalg.norm(arm)), SHORT_ARM)
-        above_from_link = np.eye(4)
-        above_from_link[:3, :3], above_from_link[:3, 3] = rotation_from_rpy(joint.rpy).numpy(), joint.xyz
-        tip_from_above = tip_from_above @ np.linalg.inv(above_from_link)
+        above_from_link = rigid(rotation_from_rpy(joint.rpy), torch.tensor(joint.xyz, dtype=torch.float64))
+        tip_from_above = tip_from_above @ np.linalg.inv(above_from_link.numpy())
     raise BadArgument("tips", tip, "links that a joint moves")
 
 
@@ -203,5 +201,4 @@ def _triple(x: Vector) -> Triple:
 
 
 def _toml(x: object) -> str:
-    """Write texts and numbers, or lists of them, as TOML reads them back."""
     return json.dumps(x, ensure_ascii=False)

@@ -40,7 +40,7 @@ class Fingertips(Value):
         return contact, map_directions(pose, self.normal)[..., 0].T, center
 
     def frames(self, values: Float[Tensor, "j n"]) -> tuple[Float[Tensor, "3 4 l n"], Float[Tensor, "3 4 3 n"]]:
-        """Return the frames of all links of `chains`, and those of the carriers."""
+        """Return the frames of all links of `chains` and of the carriers."""
         frames = self.chains.frames(values)
         return frames, frames.index_select(2, self.carrier)
 

@@ -27,7 +27,7 @@ class Actuator(NamedTuple):
 
 
 class HandSource(NamedTuple):
-    """Origin of a hand: finger option, URDF, and SHA-256 of hand.toml and URDF together."""
+    """Origin of a hand: finger option, URDF, SHA-256 of both files."""
 
     option: str
     urdf_path: Path
@@ -87,11 +87,11 @@ class Hand(Value):
         return dict(zip(self.tree.joint_names, self.expand_joints(joints).unbind(-1), strict=True))
 
     def expand_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
-        """Return every movable joint of the URDF, ordered as `tree.joint_names`."""
+        """Return every movable joint of the URDF, as in `tree.joint_names`."""
         return self.actuated.expand(joints)
 
     def link_poses(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b l 4 4"]:
-        """Return `hand_from_link` of every link, ordered as `tree.link_names`."""
+        """Return `hand_from_link` of every link, as in `tree.link_names`."""
         values = self.expand_joints(joints)
         poses = self.tree.poses(values.reshape(-1, values.shape[-1]))
         return poses.reshape(*joints.shape[:-1], *poses.shape[1:])
@@ -141,13 +141,9 @@ class Hand(Value):
     ) -> Float[Tensor, "*b"]:
         """Return the signed least separation [m] of links that can meet; negative: they overlap.
 
-        hand.toml lists the pairs, palm and parked fingers included. An overlap is the least translation that parts two
-        links. Apart, the value is a lower bound of the distance, exact where a face is nearest.
-
-        Args:
-            joints: postures [rad].
-            below: values above this [m] are lower bounds only; 0, for a verdict alone, is twice as fast.
-            chunk: rows taken at a time, which bounds the memory and keeps the work in the cache.
+        hand.toml lists the pairs. An overlap is the least translation that parts two links. Apart, the value is a lower
+        bound of the distance, exact where a face is nearest. Values above `below` [m] are any lower bounds; 0, for a
+        verdict alone, is twice as fast. `chunk` rows at a time bound the memory and stay in the cache.
         """
         self.actuated.check(joints)
         rows = joints.reshape(-1, joints.shape[-1])

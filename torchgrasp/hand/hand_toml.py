@@ -1,7 +1,4 @@
-"""Reading of hand.toml, which completes the URDF of a grasping hand.
-
-It lists fingers, pads, coupled joints, parked joints and pairs of links that can meet.
-"""
+"""Reading of hand.toml: fingers, pads, coupled and parked joints, pairs of links that can meet."""
 
 import dataclasses
 import math
@@ -86,7 +83,7 @@ def _is_texts(value: Any) -> bool:
 
 
 class _Table:
-    """A toml table that names itself in complaints and records which keys were read."""
+    """A table that names itself in complaints and records the keys read."""
 
     def __init__(self, path: Path, name: str, table: Any):
         if not isinstance(table, dict):
@@ -163,7 +160,6 @@ def read_hand_toml(path: Path | str, fingers: str = "default") -> HandSpec:
 
 
 def _finger(table: _Table) -> Finger:
-    """Read a finger with a unit normal and a contact on its sphere."""
     kind = table.text("tip")
     if kind not in ("sphere", "point"):
         raise table.wrong("tip", "'sphere' or 'point'")
@@ -211,7 +207,7 @@ def _coupling(top: _Table) -> dict[str, Mimic]:
 
 
 def _pairs(top: _Table) -> tuple[tuple[str, str], ...] | None:
-    """Read the pairs of links to test for self-collision; None: not listed."""
+    """Read the pairs of links to test for self-collision."""
     table, pairs = top.inner("self_collision", optional=True), None
     if "pairs" in table.table:
 

@@ -17,10 +17,7 @@ ROUNDING = 1e-6
 
 @dataclasses.dataclass(frozen=True)
 class ActuatedJoints(Value):
-    """Joints that move the grasping fingers, with their limits [rad or m].
-
-    All joints of the URDF are `coupling @ joints + offset`: coupled joints follow, parked joints are constant.
-    """
+    """Joints that move the grasping fingers [rad or m]; the URDF's joints are `coupling @ joints + offset`."""
 
     names: tuple[str, ...]
     lower: Float[Tensor, " h"]

@@ -1,7 +1,6 @@
 """Forward kinematics of a URDF's tree, level by level, for all postures at once.
 
-The child's frame in its parent is `constant + sine sin q + cosine cos q + slide q`, entry by entry. The four tables are
-made once. `torchgrasp.testing.check_hand` compares the result with pytorch-kinematics and with yourdfpy.
+The child's frame in its parent is `constant + sine sin q + cosine cos q + slide q`, with four tables made once.
 """
 
 import dataclasses
@@ -63,7 +62,7 @@ class KinematicTree(Value):
         return torch.stack([frames[level][:, :, index] for level, index in self.places], 2)
 
     def poses(self, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
-        """Return `root_from_link` of every link, for joints in rad or m."""
+        """Return `root_from_link` of every link for joints [rad or m]."""
         frames = self.frames(values.T.contiguous())
         last = frames.new_tensor([0.0, 0.0, 0.0, 1.0])[:, None, None].expand(1, 4, *frames.shape[2:])
         return torch.cat([frames, last]).permute(3, 2, 0, 1)
@@ -118,7 +117,7 @@ def tree_from_urdf(urdf: Urdf, ends: Collection[str] | None = None) -> Kinematic
 
 
 def pose_in_carrier(urdf: Urdf, link: str) -> tuple[str, Float[Tensor, "3 4"]]:
-    """Return the carrier of a link, which a joint moves, and the link's frame in it."""
+    """Return the carrier of a link and the link's frame in it."""
     above = {j.child: j for j in urdf.joints}
     pose = _tables(None)[0]
     while link in above and above[link].kind == "fixed":
@@ -129,7 +128,7 @@ def pose_in_carrier(urdf: Urdf, link: str) -> tuple[str, Float[Tensor, "3 4"]]:
 
 
 def _tables(joint: Joint | None) -> Float[Tensor, "4 3 4"]:
-    """Return the four tables of a joint; None: the identity of the root."""
+    """Return the tables of a joint; None: the identity of the root."""
     tables = torch.zeros(4, 3, 4, dtype=torch.float64)
     constant, sine, cosine, slide = tables
     if joint is None:

@@ -27,7 +27,7 @@ def read_bounded(source: str, path: Path, wanted: str, most: int) -> bytes:
 
 
 class _BoundedBuilder(ET.TreeBuilder):
-    """A tree builder that stops at too deep or too many elements."""
+    """A tree builder that refuses too deep or too many elements."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -45,10 +45,7 @@ class _BoundedBuilder(ET.TreeBuilder):
 
 
 def parse_urdf(path: Path, data: bytes) -> ET.Element:
-    """Parse the bytes of a URDF; refuse declarations by which XML could reach other files or explode.
-
-    Another encoding, malformed or too deep XML, an unknown element, or a mesh outside the folder is refused, too.
-    """
+    """Parse a URDF's bytes; refuse XML that reaches other files or explodes, unknown elements, meshes elsewhere."""
     # anywhere, comments included: what looks like a comment may be hidden in a processing instruction
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
         raise HandFileError("urdf", f"{path}: a DOCTYPE or ENTITY declaration", "no declarations")

@@ -1,6 +1,6 @@
 """Signed separations of a hand's links, by their collision shapes.
 
-The sign is exact for boxes and spheres. A cylinder becomes a prism of twelve sides, off by 2 % of the radius.
+Boxes and spheres are exact. A cylinder becomes a prism of twelve sides, 2 % off.
 """
 
 import dataclasses
@@ -28,10 +28,9 @@ Placed = tuple[Float[Tensor, "3 3 s n"], Float[Tensor, "3 s n"]]
 
 @dataclasses.dataclass(frozen=True)
 class SelfCollision(Value):
-    """Boxes and spheres fixed to links, in link frames [m], and the pairs to test.
+    """Boxes (`radius` 0) and spheres (`half` sizes 0) fixed to links, in link frames [m], and the pairs to test.
 
-    A sphere has `half` sizes of 0, a box a `radius` of 0. `pairs` lists box and box first, then sphere and box, then
-    sphere and sphere. `kinds` counts each.
+    `pairs` lists box and box, sphere and box, sphere and sphere. `kinds` counts each.
     """
 
     link: Int[Tensor, " s"]
@@ -43,7 +42,7 @@ class SelfCollision(Value):
     kinds: tuple[int, int, int]
 
     def clearance(self, frames: Float[Tensor, "3 4 l n"], below: float = torch.inf) -> Float[Tensor, " n"]:
-        """Return the signed least separation [m] of the pairs; infinite without pairs.
+        """Return the signed least separation [m]; infinite without pairs.
 
         Values above `below` are some larger number: pairs are skipped by their bounding and inscribed spheres.
         """
@@ -69,10 +68,7 @@ class SelfCollision(Value):
     def wrenches(
         self, frames: Float[Tensor, "3 4 l n"], pair: Int[Tensor, " k"], row: Int[Tensor, " k"]
     ) -> Float[Tensor, "6 k"]:
-        """Return the derivative of separations by a twist (translation, rotation) of the second shape.
-
-        It is a wrench about the frames' origin. The first shape takes its negative.
-        """
+        """Return the derivative of separations by a twist (translation, rotation) of the second shape."""
         if not len(pair):
             return frames.new_zeros(6, 0)
         axes, center = (x.detach() for x in self._place(frames))
@@ -150,8 +146,8 @@ def box_separation(
 ) -> Float[Tensor, " k"]:
     """Return the largest separation [m] of two boxes along 15 axes (Gottschalk et al., 1996).
 
-    Overlap is negative, its size the least translation that parts the boxes. Apart, the value is a lower bound of the
-    distance, exact where a face or two crossing edges are nearest. Column i of the rotations `a` and `b` is axis i.
+    Overlap is negative: the least translation that parts the boxes. Apart, the value is a lower bound of the distance,
+    exact where a face or two crossing edges are nearest. Column i of the rotations `a` and `b` is axis i.
     `gap` [m] reaches from the first centre to the second; `half_a` and `half_b` [m] are half sizes.
 
     >>> still, x = torch.eye(3)[..., None], torch.tensor([[3.0], [0.0], [0.0]])
@@ -176,7 +172,7 @@ def box_separation(
 
 
 def box_distance(points: Float[Tensor, "*b 3"], half: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-    """Return the signed distance of points from boxes about the origin; negative inside.
+    """Return the distance of points from boxes about the origin, negative inside.
 
     >>> box_distance(torch.tensor([[2.0, 0, 0], [0.0, 0, 0.5]]), torch.ones(2, 3))
     tensor([ 1.0000, -0.5000])

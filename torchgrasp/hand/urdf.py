@@ -53,7 +53,7 @@ class Link:
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """A joint of the tree; the limits of a fixed one are 0."""
+    """A joint of the tree; a fixed one has limits of 0."""
 
     name: str
     kind: str
@@ -90,7 +90,7 @@ class Urdf:
         return tuple(j for j in self.joints if j.kind != "fixed")
 
     def joints_above(self, link: str) -> tuple[Joint, ...]:
-        """Return the joints between a link and the root, the nearest first."""
+        """Return the joints from a link to the root, nearest first."""
         above, chain = {j.child: j for j in self.joints}, []
         while link in above:
             chain.append(above[link])
@@ -140,7 +140,7 @@ class _Reader:
     def numbers(
         self, where: str, element: ET.Element | None, key: str, n: int, default: float | None = None
     ) -> tuple[float, ...]:
-        """Read n finite numbers from an attribute; the element may be missing."""
+        """Read n finite numbers from an attribute."""
         text = None if element is None else element.get(key)
         if text is None and default is not None:
             return (default,) * n
@@ -164,7 +164,6 @@ class _Reader:
         return name
 
     def origin(self, where: str, element: ET.Element) -> tuple[Triple, Triple]:
-        """Read an element's origin; none means the identity."""
         origin, where = element.find("origin"), f"{where} origin"
         return self.triple(where, origin, "xyz", 0.0), self.triple(where, origin, "rpy", 0.0)
 
@@ -184,7 +183,7 @@ class _Reader:
         return Link(name, mass, com, inertia, tuple(self.shape(name, c) for c in element.findall("collision")))
 
     def shape(self, link: str, collision: ET.Element) -> Shape:
-        """Read one collision shape; planner and simulator could not see a mesh."""
+        """Read a collision shape; planner and simulator see no mesh."""
         where = f"link {link} collision"
         xyz, rpy = self.origin(where, collision)
         geometry = collision.find("geometry")
@@ -204,7 +203,6 @@ class _Reader:
         return Shape(g.tag, size, xyz, rpy)
 
     def joint(self, element: ET.Element) -> Joint:
-        """Read a joint; a movable one needs a unit axis and ordered limits."""
         name = self.name(element, "name", "a joint")
         where, kind = f"joint {name}", element.get("type", "")
         if kind not in ("revolute", "prismatic", "fixed"):
@@ -232,7 +230,7 @@ class _Reader:
         return Joint(name, kind, parent, child, xyz, rpy, unit, lower, upper, effort, velocity, mimic)
 
     def check_tree(self, links: tuple[Link, ...], joints: tuple[Joint, ...]) -> str:
-        """Return the root of a tree that reaches every link exactly once."""
+        """Check that a tree reaches every link once; return its root."""
         names = [x.name for x in links]
         known = set(names)
         if not 0 < len(links) <= MAX_LINKS:

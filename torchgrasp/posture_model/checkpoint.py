@@ -35,10 +35,7 @@ class Checkpoint:
         save_tensors(self.path, "em", tensors, {**self.settings, "jumped": str(progress.jumped)})
 
     def load(self) -> Progress | None:
-        """Return the saved state, or None when there is no file yet.
-
-        A damaged file raises `ModelFileError`; the checkpoint of another fit, or of some processes, `BadArgument`.
-        """
+        """Return the saved state, or None; raises `ModelFileError` or, for another fit's state, `BadArgument`."""
         progress = self._read(self.path) if self.path and self.path.exists() else None
         steps = len(progress.log_likelihood) if progress else 0
         # Processes at different steps would wait for each other for ever. Equal steps have no variance.

@@ -19,10 +19,7 @@ def describe_compatibility(hand: Hand) -> dict[str, str]:
 
 
 def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: Hand) -> None:
-    """Refuse a model of another hand, or of other fingers, limits or fingertips, with `BadArgument`.
-
-    A model without `hand_codes`, such as one of measured postures, is recognised by its joint names.
-    """
+    """Refuse a model of another hand, fingers, limits or fingertips; without `hand_codes`, of other joint names."""
     if joint_names != hand.joint_names:
         raise BadArgument("mixture", f"joints {joint_names}", f"the joints {hand.joint_names} of the hand")
     if "hand_codes" not in meta:

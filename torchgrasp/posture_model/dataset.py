@@ -1,7 +1,4 @@
-"""Samples of a hand in a folder of chunks: a killed run continues, and the bytes do not depend on the workers.
-
-A chunk depends on (seed, chunk) alone and is moved into place whole.
-"""
+"""Samples of a hand in a folder of chunks, each of (seed, chunk) alone and moved into place whole."""
 
 import dataclasses
 import json
@@ -15,14 +12,7 @@ from torchgrasp.base import check_whole, join
 from torchgrasp.errors import ModelFileError, OutputError
 from torchgrasp.files import LOCK, hold_folder, load_tensors, save_tensors, write_file
 from torchgrasp.hand.hand import Hand
-from torchgrasp.posture_model.sample import (
-    CHUNK_POSTURES,
-    MAX_SAMPLES,
-    HandSamples,
-    SampleSpec,
-    chunk_sizes,
-    draw_chunk,
-)
+from torchgrasp.posture_model.sample import CHUNK_POSTURES, HandSamples, SampleSpec, chunk_sizes, draw_chunk
 
 MANIFEST = "samples.json"
 """File that describes the samples of a folder."""
@@ -85,7 +75,7 @@ def write_samples(
     workers: int = 1,
     observer: Callable[[int], object] = lambda count: None,
 ) -> SampleFolder:
-    """Write the samples of `sample_configurations` chunk by chunk, and return the folder.
+    """Write samples as of `sample_configurations` chunk by chunk.
 
     The same call continues a run that was interrupted or killed. `workers` threads draw at the same time. The observer
     gets the number of postures on disk at first, then that of every new chunk.
@@ -160,11 +150,11 @@ def _parse_manifest(folder: Path, manifest: Any) -> SampleFolder:
     n: Any = manifest.get("n")
     names: Any = manifest.get("joint_names")
     meta: dict[str, Any] = {key: manifest.get(key) for key in META_KEYS}
-    sound = isinstance(n, int) and not isinstance(n, bool) and 1 <= n <= MAX_SAMPLES
-    sound = sound and isinstance(names, list) and 0 < len(names) <= 1000
-    if not (sound and all(isinstance(x, str) for x in (*names, *meta.values()))):
+    counted = isinstance(n, int) and not isinstance(n, bool)
+    named = isinstance(names, list) and 0 < len(names) <= 1000
+    if not (counted and named and all(isinstance(x, str) for x in (*names, *meta.values()))):
         raise ValueError("damaged")
-    return SampleFolder(folder, n, tuple(names), meta)
+    return SampleFolder(folder, SampleSpec(n).n, tuple(names), meta)
 
 
 def _begin(folder: Path, manifest: str) -> None:

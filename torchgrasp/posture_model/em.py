@@ -37,10 +37,10 @@ class Components(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Progress(Value):
-    """State of a fit. With the data it determines the next step.
+    """State of a fit: with the data it determines the next step.
 
     `reseeded` counts how often each component was placed anew, a jump after which the likelihood may fall.
-    `log_likelihood` [nats] is the mean over the data before each step.
+    `log_likelihood` [nats] is the data's mean before each step.
     """
 
     components: Components
@@ -66,8 +66,8 @@ def expectation_maximisation(
 ) -> Fit:
     """Iterate until a step raises the mean log-likelihood by less than `tolerance` [nats].
 
-    `iterations` bounds the number of steps, steps before `start` included. `regularisation` is added to the diagonal of
-    every covariance. An indefinite start or a component that collapses too often raises `IndefiniteCovariance`.
+    `iterations` bounds the number of steps, steps before `start` included. `regularisation` is added to every variance.
+    An indefinite start, or a component that collapses too often, raises `IndefiniteCovariance`.
     """
     n, state = shard.count(), start
     while True:
@@ -107,8 +107,7 @@ def features_from_data(x: Float[Tensor, "n d"], out: Float[Tensor, "f n"] | None
     out = x.new_empty(1 + d + d * (d + 1) // 2, n) if out is None else out
     out[0] = 1
     columns = out[1 : 1 + d].copy_(x.T)
-    products = out[1 + d :].split(list(range(d, 0, -1)))
-    for i, product in enumerate(products):
+    for i, product in enumerate(out[1 + d :].split(list(range(d, 0, -1)))):
         torch.mul(columns[i:], columns[i], out=product)
     return out
 
@@ -131,9 +130,9 @@ def maximisation(
 ) -> tuple[Components, Int[Tensor, "m"]]:
     """Return the most likely components for the weighted sums; collapsed components are placed anew.
 
-    A component collapses if its covariance is singular, or if its responsibilities sum to less than the d + 1 rows that
-    span one. The heaviest component is then split across its longest axis, and one half replaces it. If every component
-    collapses, or one more than `MAX_RESEEDS` times, `IndefiniteCovariance` is raised.
+    A component collapses if its covariance is singular or its responsibilities sum to less than d + 1 rows. Half of the
+    heaviest component, split across its longest axis, then replaces it. If every component collapses, or one more than
+    `MAX_RESEEDS` times, `IndefiniteCovariance` is raised.
     """
     components = components_from_sums(sums, n, regularisation)
     weights, means, covariances = components.weights.clone(), components.means.clone(), components.covariances.clone()

@@ -36,10 +36,7 @@ def encode_fingertips(points: Float[Tensor, "*b 3 3"], normals: Float[Tensor, "*
 def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
     """Encode contact triples for all six assignments of contacts to fingers, Eqs. (15)-(18).
 
-    A triple that spans no virtual frame holds NaN and `Status.DEGENERATE`.
-
-    Args:
-        contacts: `Contacts`, or a pair (points (b, 3, 3) [m], unit normals (b, 3, 3)).
+    Points [m] and unit normals are (b, 3, 3). A triple without a virtual frame holds NaN and `Status.DEGENERATE`.
 
     Raises:
         BadArgument: wrong shapes, non-finite numbers, or normals whose length is not 1 within 1e-3.

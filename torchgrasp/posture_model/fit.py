@@ -42,16 +42,13 @@ def fit_mixture(
     exact functions of the joints, so BIC keeps falling as components are added: read its elbow, not its minimum.
 
     Args:
-        samples: postures and their codes.
         components: m, the number of Gaussians.
-        seed: of the start.
         iterations: largest number of steps.
         tolerance: stop when a step raises the mean log-likelihood by less [nats].
         regularisation: variance added to every dimension of a component, relative to its variance over all samples.
         starts: k-means starts of consecutive seeds. Each takes `TRIAL_STEPS` steps; the likeliest continues.
         checkpoint: file that holds the fit after every further step. A fit continues from it to the same bits.
         distributed: whether `samples` are the shard of one process under torchrun. All must see the same checkpoint.
-        observer: called after every step.
 
     Raises:
         BadArgument: too few samples, a joint that does not vary, a number out of range, the checkpoint of another fit.

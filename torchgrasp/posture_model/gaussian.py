@@ -65,7 +65,7 @@ class GaussianMixture(Value):
         return self.weights.double().log() + (self.whitening.log_scale - 0.5 * self.whitening.squared(x))
 
     def sample(self, n: int, seed: int = 0) -> Float[Tensor, "n d"]:
-        """Draw n rows; raises `BadArgument` if n or seed is out of range."""
+        """Draw n rows; n or seed out of range raises `BadArgument`."""
         check_whole("n", n, 0, 2**63 - 1)
         check_whole("seed", seed, 0, 2**63 - 1)
         generator = torch.Generator().manual_seed(seed)
@@ -83,15 +83,13 @@ class GaussianMixture(Value):
     def marginal(self, names: Sequence[str]) -> "GaussianMixture":
         """Return the marginal density of some dimensions, Eq. (22); raises `BadArgument` for an unknown name."""
         index = self._index(names)
-        means, covariances = self.means.double(), self.covariances.double()
-        block = covariances[:, index][:, :, index]
-        return GaussianMixture(self.weights.double(), means[:, index], block, tuple(names))
+        block = self.covariances.double()[:, index][:, :, index]
+        return GaussianMixture(self.weights.double(), self.means.double()[:, index], block, tuple(names))
 
     def condition(self, given: dict[str, float]) -> "GaussianMixture":
         """Return the density of the other dimensions given the values of some: bracket and h_i of Eq. (23).
 
-        Components of weight 0 are left out. Unknown names, values that are not finite, and all dimensions raise
-        `BadArgument`.
+        Components of weight 0 are left out. Unknown names or non-finite values raise `BadArgument`.
         """
         observed = self._index(tuple(given))
         rest = [i for i in range(len(self.names)) if i not in observed]
@@ -116,7 +114,7 @@ class GaussianMixture(Value):
         return self.weights.double() @ self.means.double()
 
     def covariance(self) -> Float[Tensor, "d d"]:
-        """Return the covariance of all dimensions, within components and between their means."""
+        """Return the covariance, within components and between their means."""
         offset = self.means.double() - self.mean()
         within = torch.einsum("m,mij->ij", self.weights.double(), self.covariances.double())
         return within + torch.einsum("m,mi,mj->ij", self.weights.double(), offset, offset)
@@ -157,7 +155,7 @@ def map_rows(function: Callable[[Float[Tensor, "n d"]], Tensor], x: Float[Tensor
 
 
 def whitening_matrices(covariances: Float[Tensor, "m d d"]) -> Float[Tensor, "m d d"]:
-    """Return the lower-triangular W with W^T W = Sigma^-1 of every covariance; raises `IndefiniteCovariance`."""
+    """Return the lower-triangular W with W^T W = Sigma^-1; raises `IndefiniteCovariance`."""
     factor = cholesky(covariances, "a component's covariance", "use fewer components or more samples")
     eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
     return torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)

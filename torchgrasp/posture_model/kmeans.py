@@ -69,5 +69,4 @@ def _sums_of_clusters(
 
 
 def _ones_and_data(x: Float[Tensor, "r d"]) -> Float[Tensor, "f r"]:
-    """Return the features [1, x_i], one column a row."""
     return torch.cat([torch.ones_like(x[:, :1]), x], dim=1).T

@@ -63,16 +63,12 @@ class GraspMixture(GaussianMixture):
     def energy(self, code: ContactCode | Float[Tensor, "*b 6"]) -> Float[Tensor, "*b"]:
         """Return min_i f_i of Eq. (21): half the squared Mahalanobis distance to the nearest component.
 
-        The hand reaches codes below a threshold, `DEFAULT_ENERGY` or `PAPER_ENERGY`. NaN gives NaN. Codes of another
-        length than 6 raise `BadArgument`.
+        The hand reaches codes below `DEFAULT_ENERGY`, or `PAPER_ENERGY`. NaN gives NaN.
         """
         return map_rows(lambda q: 0.5 * self._code.whitening.squared(q).amin(-1), _codes(code))
 
     def joints(self, code: ContactCode | Float[Tensor, "*b 6"]) -> Float[Tensor, "*b h"]:
-        """Return the expected joints [rad] given a code, Eq. (23); they may lie outside the hand's limits.
-
-        NaN gives NaN. Codes of another length than 6 raise `BadArgument`.
-        """
+        """Return the expected joints [rad] given a code, Eq. (23), which may pass the limits; NaN gives NaN."""
 
         def expect(q: Float[Tensor, "n 6"]) -> Float[Tensor, "n h"]:
             # sum_i h_i A_i (q, 1) as one matrix product
@@ -85,8 +81,7 @@ class GraspMixture(GaussianMixture):
     def modes(self, q: Float[Tensor, "*b 6"], k: int) -> tuple[Float[Tensor, "*b k h"], Float[Tensor, "*b k"]]:
         """Return the conditional means of the k components most responsible for a code, and their h_i of Eq. (23).
 
-        If several postures have the code, their mean (Eq. 23) may be none of them. A k outside [1, m], or codes of
-        another length than 6, raise `BadArgument`.
+        If several postures have the code, their mean may be none of them. A k outside [1, m] raises `BadArgument`.
         """
         check_whole("k", k, 1, len(self.weights))
 
@@ -104,9 +99,9 @@ class GraspMixture(GaussianMixture):
     def with_observation_noise(self, lengths: float, cosines: float) -> "GraspMixture":
         """Return the mixture of codes observed with independent Gaussian noise, whose variances are added to Sigma_q.
 
-        `lengths` [m] and `cosines` are standard deviations of L1 L2 L3 and N1 N2 N3. A round fingertip rolls, so its
-        contact differs from the middle of its pad by some millimetres. The codes of the Barrett hand fill a thin
-        manifold of four dimensions. Without noise, Eq. (21) would then refuse almost every contact triple within reach.
+        `lengths` [m] and `cosines` are standard deviations. A round fingertip rolls, so its contact differs from the
+        middle of its pad by some millimetres. The Barrett hand's codes fill a thin manifold of four dimensions. Without
+        noise, Eq. (21) would then refuse almost every contact triple within reach.
         """
         noise = torch.zeros(len(self.names)).to(self.covariances)
         noise[-6:-3], noise[-3:] = lengths**2, cosines**2
@@ -134,9 +129,7 @@ def _codes(code: ContactCode | Tensor) -> Float[Tensor, "*b 6"]:
 def load_mixture(name_or_path: Path | str) -> GraspMixture:
     """Read a mixture by the name or folder of its hand, or by the path of its .safetensors file.
 
-    Raises:
-        HandFileError: no such hand.
-        ModelFileError: the file is missing, malformed, or holds no mixture.
+    An unknown hand raises `HandFileError`, a missing or malformed file `ModelFileError`.
 
     >>> load_mixture("allegro").means.shape
     torch.Size([41, 18])

@@ -19,7 +19,7 @@ from torchgrasp.posture_model.encoding import encode_fingertips
 CHUNK_POSTURES = 10_000
 """Free postures from one generator. It is no argument, because another number gives a seed other postures."""
 BLOCK_POSTURES = 2_000
-"""Postures that a generator draws at a time. It is fixed for the same reason."""
+"""Postures that a generator draws at a time; fixed for the same reason."""
 MAX_SAMPLES = 10**8
 """Most postures of one set: a hundred times the paper's million (Sec. 6.3)."""
 OPPOSED_COSINE = -0.5
@@ -38,7 +38,7 @@ class HandSamples(Batch):
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
 
     def rows(self) -> Float[Tensor, "n d"]:
-        """Return joints and codes side by side, as the mixture models them."""
+        """Return joints and codes side by side."""
         return torch.cat([self.joints, self.q], dim=-1)
 
 
@@ -46,8 +46,7 @@ class HandSamples(Batch):
 class SampleSpec(Value):
     """Which n free postures are drawn: "uniform" as in the paper, or "opposed", with two pads face to face.
 
-    Chunk i comes from (seed, i) alone, so fewer samples are a prefix of more. Numbers out of range and other samplings
-    raise `BadArgument`.
+    Chunk i comes from (seed, i) alone, so fewer samples are a prefix of more. Other values raise `BadArgument`.
     """
 
     n: int
@@ -61,7 +60,7 @@ class SampleSpec(Value):
             raise BadArgument("sampling", repr(self.sampling), f"one of {get_args(Sampling)}")
 
     def meta(self, hand: Hand) -> dict[str, str]:
-        """Return the metadata of samples: all that distinguishes them but their number."""
+        """Return what distinguishes samples, but for their number."""
         return {**describe_compatibility(hand), "seed": str(self.seed), "sampling": self.sampling}
 
 
@@ -75,11 +74,8 @@ def sample_configurations(
 ) -> HandSamples:
     """Draw postures uniformly within the joint limits and keep those free of self-collision (Sec. 6.3).
 
-    `SampleSpec` explains n, seed and sampling. `workers` threads draw at the same time, with the same result. The
-    observer is called after every chunk with its number of postures.
-
-    Raises:
-        BadArgument: an argument out of range, or a hand whose postures are hardly ever kept.
+    `SampleSpec` explains n, seed and sampling. The observer gets every chunk's number of postures. An argument out of
+    range, or a hand whose postures are hardly ever kept, raises `BadArgument`.
 
     >>> from torchgrasp.hand.load import load_hand
     >>> sample_configurations(load_hand("barrett"), 100).q.shape
