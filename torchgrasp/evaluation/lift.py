@@ -80,8 +80,11 @@ def close_hand(
 def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResult:
     """Run a trial; see `close_hand`."""
     started = time.perf_counter()
-    lift = _Lift(TrialRun(TrialDriver(trial, TrialSpec() if spec is None else spec)))
-    return lift.result(lift.perform(), time.perf_counter() - started)
+    driver = TrialDriver(trial, TrialSpec() if spec is None else spec)
+    run = TrialRun(driver)
+    lift = _Lift(run)
+    status = lift.perform()
+    return lift.result(status, time.perf_counter() - started)
 
 
 class _ObjectLost(Exception):
