@@ -1,8 +1,12 @@
 """What importing torchgrasp does and leaves alone, and what its source never contains."""
 
+import importlib
+import inspect
+import pkgutil
 import re
 import subprocess
 import sys
+import typing
 from pathlib import Path
 
 import pytest
@@ -61,3 +65,58 @@ def test_source_has_no_neural_network_pickle_or_global_random_state(path):
     }
     found = [name for name, pattern in forbidden.items() if re.search(pattern, text, re.MULTILINE)]
     assert found == []
+
+
+def public_names():
+    """Every public name of the package and of its subpackages, with the object."""
+    import torchgrasp
+
+    packages = [torchgrasp]
+    for found in pkgutil.walk_packages(torchgrasp.__path__, "torchgrasp."):
+        if found.ispkg:
+            packages.append(importlib.import_module(found.name))
+    return {f"{p.__name__}.{name}": getattr(p, name) for p in packages for name in getattr(p, "__all__", ())}
+
+
+def types_of(annotation):
+    """The classes of the package that an annotation names, in unions and containers too."""
+    if isinstance(annotation, type) and annotation.__module__.startswith("torchgrasp"):
+        yield annotation
+    for inner in typing.get_args(annotation):
+        yield from types_of(inner)
+
+
+def hints(thing):
+    """The annotations of a function, or of the public methods and fields of a class; simulators' own types are left."""
+    try:
+        return list(typing.get_type_hints(thing).values())
+    except NameError:  # a type that is imported for type checkers alone, such as trimesh.Trimesh
+        return [x for x in getattr(thing, "__annotations__", {}).values() if not isinstance(x, str)]
+
+
+def test_what_public_functions_take_and_return_is_public():
+    import torchgrasp.errors
+
+    names = public_names()
+    public = {id(value) for value in [*names.values(), *vars(torchgrasp.errors).values()]}
+    hidden = set()
+    for name, thing in names.items():
+        parts = [thing]
+        if isinstance(thing, type):
+            parts += [m for key, m in vars(thing).items() if not key.startswith("_") and inspect.isfunction(m)]
+        elif not inspect.isfunction(thing):
+            continue
+        for kind in (kind for part in parts for hint in hints(part) for kind in types_of(hint)):
+            if id(kind) not in public and not kind.__name__.startswith("_"):
+                hidden.add(f"{kind.__module__}.{kind.__qualname__} in {name}")
+    assert hidden == set()
+
+
+def test_every_subpackage_names_its_public_things():
+    import torchgrasp
+
+    silent = []
+    for found in pkgutil.walk_packages(torchgrasp.__path__, "torchgrasp."):
+        if found.ispkg and not getattr(importlib.import_module(found.name), "__all__", None):
+            silent.append(found.name)
+    assert silent == []

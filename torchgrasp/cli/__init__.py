@@ -19,6 +19,8 @@ from torchgrasp.cli.evaluate import evaluate
 from torchgrasp.cli.export import export
 from torchgrasp.errors import GraspError
 
+__all__ = ["COMMANDS", "main"]
+
 COMMANDS: dict[str, Callable[..., int]] = {
     "grasp": grasps.grasp,
     "evaluate": evaluate,

@@ -1,8 +1,30 @@
 """The robot model: a hand's URDF and hand.toml, its kinematics and its collision shapes."""
 
 from torchgrasp.hand.draft import draft_hand
-from torchgrasp.hand.hand import Actuator, Hand
+from torchgrasp.hand.collision_spheres import CollisionSpheres
+from torchgrasp.hand.fingertips import Fingertips
+from torchgrasp.hand.hand import Actuator, Hand, HandSource
+from torchgrasp.hand.joints import ActuatedJoints
+from torchgrasp.hand.kinematics import KinematicTree
+from torchgrasp.hand.self_collision import SelfCollision
 from torchgrasp.hand.load import find_hand, hands_folder, load_hand
-from torchgrasp.hand.urdf import Urdf, read_urdf
+from torchgrasp.hand.urdf import Joint, Link, Urdf, read_urdf
 
-__all__ = ["Actuator", "Hand", "Urdf", "draft_hand", "find_hand", "hands_folder", "load_hand", "read_urdf"]
+__all__ = [
+    "ActuatedJoints",
+    "Actuator",
+    "CollisionSpheres",
+    "Fingertips",
+    "Hand",
+    "HandSource",
+    "Joint",
+    "KinematicTree",
+    "Link",
+    "SelfCollision",
+    "Urdf",
+    "draft_hand",
+    "find_hand",
+    "hands_folder",
+    "load_hand",
+    "read_urdf",
+]

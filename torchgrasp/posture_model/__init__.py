@@ -3,7 +3,7 @@
 from torchgrasp.posture_model.encoding import encode
 from torchgrasp.posture_model.sample import HandSamples, SampleSpec, sample_configurations
 from torchgrasp.posture_model.dataset import SampleFolder, load_samples, write_samples
-from torchgrasp.posture_model.em import Progress
+from torchgrasp.posture_model.em import Components, Progress
 from torchgrasp.posture_model.fit import fit_mixture
 from torchgrasp.posture_model.gaussian import GaussianMixture
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture, load_mixture
@@ -16,6 +16,7 @@ __all__ = [
     "SampleFolder",
     "write_samples",
     "load_samples",
+    "Components",
     "Progress",
     "fit_mixture",
     "GaussianMixture",
