@@ -8,7 +8,7 @@ from torchgrasp.hand.joints import ActuatedJoints
 from torchgrasp.hand.kinematics import KinematicTree
 from torchgrasp.hand.self_collision import SelfCollision
 from torchgrasp.hand.load import find_hand, hands_folder, load_hand
-from torchgrasp.hand.urdf import Joint, Link, Urdf, read_urdf
+from torchgrasp.hand.urdf import Joint, Link, Mimic, Shape, Urdf, read_urdf
 
 __all__ = [
     "ActuatedJoints",
@@ -20,7 +20,9 @@ __all__ = [
     "Joint",
     "KinematicTree",
     "Link",
+    "Mimic",
     "SelfCollision",
+    "Shape",
     "Urdf",
     "draft_hand",
     "find_hand",
