@@ -1,4 +1,4 @@
-"""The whole chain in one call: a partial point cloud in, ranked grasps of a hand out."""
+"""From a partial point cloud to ranked grasps, in one call."""
 
 import dataclasses
 import hashlib
@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, Literal, get_args
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from torchgrasp.base import count_status
@@ -26,7 +26,7 @@ from torchgrasp.linalg import farthest_points
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure_probability import closure_share
 from torchgrasp.plan.solve import plan_contacts
-from torchgrasp.posture_model.mixture import GraspMixture, load_mixture, mixture_path
+from torchgrasp.posture_model.mixture import load_mixture, mixture_path
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
@@ -35,34 +35,23 @@ from torchgrasp.values import ContactPlan, Grasps, PointCloud
 
 Observer = Callable[[str, str, Any], None]
 """Called after each stage with its name, one line about it, and its value."""
-
 Mode = Literal["joint", "contact_first"]
 """How planned contacts become grasps.
 
 * "joint": seeds are random postures near each triple; where none succeeds, the contacts slide with the hand.
 * "contact_first": as in the paper, the learned model's seeds move onto fixed contacts.
 """
-
-TRIPLES = 250
-"""How many planned contact triples are certified and offered to the hand."""
-SURFACE_DRAWS = 600
-"""Surfaces drawn for the probability of closure: its standard error is then 0.02."""
-
-
-def _ignore(stage: str, message: str, value: Any) -> None:
-    """Observe nothing."""
+TRIPLES, SURFACE_DRAWS = 250, 600
+"""Planned triples offered to the hand; surfaces drawn for the probability of closure, whose error is then 0.02."""
 
 
 def spread_rows(plan: ContactPlan, most: int) -> Int[Tensor, "k"]:
-    """Return at most `most` successful rows, far apart from each other, in plan order.
-
-    Each triple is sorted by height first, because contacts in another order are the same triple.
-    """
+    """Return at most `most` successful rows, far apart, in plan order."""
     rows = torch.nonzero(plan.status == Status.OK)[:, 0]
     if len(rows) <= most:
         return rows
     points = plan.contacts.points[rows]
-    order = torch.argsort(points[..., 2], dim=1, stable=True)
+    order = torch.argsort(points[..., 2], dim=1, stable=True)  # contacts in another order are the same triple
     points = points.gather(1, order[..., None].expand(-1, -1, 3)).flatten(1)
     chosen = farthest_points(points, most, first=int(plan.quality[rows].argmin()))
     return rows[chosen.sort().values]
@@ -92,22 +81,22 @@ def plan_grasps(
     *,
     mode: Mode = "joint",
     shape: ShapeGP | None = None,
-    observer: Observer = _ignore,
+    observer: Observer = lambda stage, message, value: None,
 ) -> Grasps:
     """Plan grasps of a hand on the object of a partial point cloud.
 
     Args:
         cloud: what the camera saw [m]; missing normals and viewpoint are estimated.
         hand: from `load_hand`.
-        spec: what the contacts must satisfy; None: `ContactSpec()`.
+        spec: the constraints on contacts; None: `ContactSpec()`.
         starts: random starts of the contact planner.
         seed: of every random draw; the same seed gives bitwise the same grasps.
-        mode: how planned contacts become grasps, see `Mode`. Only "contact_first" needs the hand's learned model.
+        mode: see `Mode`. Only "contact_first" needs the hand's learned model.
         shape: the object's shape if more is known than the cloud shows, as after a touch (`ShapeGP.update`).
-        observer: called after each stage with its name, a line of counts, and its value.
+        observer: called after each stage, see `Observer`.
 
     Returns:
-        Grasps, those with `Status.OK` first, best first. The others say what they lack. There may be none.
+        Grasps, those with `Status.OK` first, best first. There may be none.
 
     Raises:
         BadArgument: an argument of the wrong type or range, or a cloud that no object of graspable size gives.
@@ -124,8 +113,10 @@ def plan_grasps(
     if mode not in get_args(Mode):
         raise BadArgument("mode", repr(mode), "'joint' or 'contact_first'")
     spec = spec.for_fingertips(float(hand.tips.radius.max()))
-    mixture, mixture_sha256 = _read_mixture(hand) if mode == "contact_first" else (None, "none")
-
+    mixture, mixture_sha256 = None, "none"
+    if mode == "contact_first":
+        path = mixture_path(hand.urdf_path.parent)
+        mixture, mixture_sha256 = load_mixture(path), sha256(path)
     if shape is None:
         shape = fit_shape(cloud, seed=seed, table=spec.table)
     else:
@@ -150,34 +141,21 @@ def plan_grasps(
         seeds = nearest_postures(PostureLibrary.of(hand, seed=seed), contacts, world)
     else:
         seeds = query_mixture(hand, contacts, mixture.to(shape.device))
-    reached = len(torch.unique(seeds.row))
-    observer("query", f"{len(seeds)} seeds for {reached} of {len(contacts)} triples", seeds)
+    observer("query", f"{len(seeds)} seeds for {len(torch.unique(seeds.row))} of {len(contacts)} triples", seeds)
 
     grasps = solve_joint(problem, seeds, shape, spec) if mixture is None else solve_contact_first(problem, seeds)
-    grasps = rank_by_success(grasps, _log_odds(grasps, shape, problem.center, spec, seed))
+    good = grasps[grasps.status == Status.OK]
+    closure = closure_share(shape, good.contacts, spec.friction, SURFACE_DRAWS, seed)
+    features = success_features(good.contacts, closure, good.normal_angle, problem.center, spec.friction)
+    grasps = rank_by_success(grasps, success_log_odds(features))
     meta = {"mode": mode, "mixture_sha256": mixture_sha256, "starts": str(starts), "seed": str(seed)}
     grasps = dataclasses.replace(grasps, meta=_metadata(cloud, hand, spec) | meta)
     observer("refine", f"{len(grasps)} refined: {describe(count_status(grasps.status))}", grasps)
     return grasps
 
 
-def _read_mixture(hand: Hand) -> tuple[GraspMixture, str]:
-    """Return the learned model beside the hand's URDF, and its hash."""
-    path = mixture_path(hand.urdf_path.parent)
-    return load_mixture(path), sha256(path)
-
-
-def _log_odds(
-    grasps: Grasps, shape: ShapeGP, center: Float[Tensor, "3"], spec: ContactSpec, seed: int
-) -> Float[Tensor, "k"]:
-    """Return the log-odds of success of the executable grasps."""
-    grasps = grasps[grasps.status == Status.OK]
-    closure = closure_share(shape, grasps.contacts, spec.friction, SURFACE_DRAWS, seed)
-    return success_log_odds(success_features(grasps.contacts, closure, grasps.normal_angle, center, spec.friction))
-
-
 def _metadata(cloud: PointCloud, hand: Hand, spec: ContactSpec) -> dict[str, str]:
-    """Return what a file of grasps says of its input and of its numbers."""
+    """Return the origin and the units of grasps, for their file."""
     return {
         "hand": hand.name,
         "hand_sha256": hand.source.sha256,

@@ -21,9 +21,7 @@ from torchgrasp.values import Certificate, Contacts, Grasps
 
 @dataclasses.dataclass(frozen=True)
 class GraspProblem(Value):
-    """A hand, certified contacts, and the world around the object.
-
-    Grasps around `center`, the object's estimated centre [m], rank higher.
+    """A hand, certified contacts and the world; grasps around `center`, the object's centre [m], rank higher.
 
     Raises:
         BadArgument: contacts without `std_m`, by which the pre-grasp opens.
@@ -42,10 +40,7 @@ class GraspProblem(Value):
 
 @dataclasses.dataclass(frozen=True)
 class GraspCandidates(Batch):
-    """Configurations of a hand on contacts; finger i touches contact i.
-
-    `permutation` is the contact of its triple that each finger has. `status` is that of the contacts.
-    """
+    """Configurations with finger i on contact i, the triple's `permutation[:, i]`; `status` is that of the contacts."""
 
     configuration: Configuration
     contacts: Contacts

@@ -1,8 +1,4 @@
-"""Errors of grasps, measured from geometry, whatever a solver believed.
-
-The frame-invariant code stays the same when all normals are negated, mirrored or rotated together. A solver can stop
-anywhere. So everything is measured anew.
-"""
+"""Errors of grasps, measured anew from geometry: a solver can stop anywhere, and a code does not tell mirror images."""
 
 import dataclasses
 import math
@@ -20,10 +16,8 @@ from torchgrasp.ik.refine import FLAT_PAD, ROUND_PAD, tip_targets
 from torchgrasp.plan.feasibility import first_violation
 from torchgrasp.values import Contacts
 
-TIP_TOLERANCE = 1 * MILLIMETRE
-"""Largest distance [m] of a fingertip from its contact: a tenth of a fingertip's radius or so."""
-TIP_PENETRATION = 2 * MILLIMETRE
-"""Largest depth [m] of a fingertip in the estimated surface; a round tip at its contact has none."""
+TIP_TOLERANCE, TIP_PENETRATION = 1 * MILLIMETRE, 2 * MILLIMETRE
+"""Largest distance [m] of a tip from its contact, a tenth of its radius or so, and depth in the estimated surface."""
 ANGLE_TOLERANCE = math.radians(2)
 """How far [rad] a contact direction may lie outside the pad's cone: a soft residual leaves a little."""
 
@@ -38,28 +32,14 @@ class GraspErrors(Batch):
     status: Int[Tensor, "g"]
 
 
-def tip_error(spatial: SpatialJacobian, contacts: Contacts) -> Float[Tensor, "g 3"]:
-    """Return the distance [m] of each fingertip from its contact."""
-    hand = spatial.hand
-    return torch.linalg.vector_norm(
-        spatial.points(hand.tips.index, hand.tips.center) - tip_targets(hand, contacts), dim=-1
-    )
-
-
-def normal_angle(spatial: SpatialJacobian, contacts: Contacts) -> Float[Tensor, "g 3"]:
-    """Return the angle [rad] between pad axes and inward normals."""
-    pads = spatial.directions(spatial.hand.tips.index, spatial.hand.tips.normal)
-    return torch.acos((-(pads * contacts.normals).sum(-1)).clamp(-1.0, 1.0))
-
-
 def measure_errors(hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld) -> GraspErrors:
-    """Measure tips, contact directions, joint limits and clearances.
-
-    `status` names the first error out of tolerance. NaN is out of tolerance.
-    """
+    """Measure grasps; `status` names the first error out of tolerance, as NaN is."""
     spatial = SpatialJacobian.at(hand, configuration)
-    error, angle = tip_error(spatial, contacts), normal_angle(spatial, contacts)
-    links, tips, table = link_clearance(spatial, world, tips_touch=True)
+    tips = spatial.points(hand.tips.index, hand.tips.center)
+    error = torch.linalg.vector_norm(tips - tip_targets(hand, contacts), dim=-1)
+    pads = spatial.directions(hand.tips.index, hand.tips.normal)
+    angle = torch.acos((-(pads * contacts.normals).sum(-1)).clamp(-1.0, 1.0))  # from the inward normal
+    links, depth, table = link_clearance(spatial, world, tips_touch=True)
     between = hand.self_clearance(configuration.joints)
     lower, upper = hand.lower.to(error), hand.upper.to(error)
     cone = torch.where(hand.tips.radius.to(error) > 0, ROUND_PAD, FLAT_PAD) + ANGLE_TOLERANCE
@@ -68,7 +48,7 @@ def measure_errors(hand: Hand, configuration: Configuration, contacts: Contacts,
         Status.NORMAL_ANGLE: (angle <= cone).all(1),
         Status.JOINT_LIMITS: ((configuration.joints >= lower - 1e-9) & (configuration.joints <= upper + 1e-9)).all(1),
         Status.SELF_COLLISION: between >= 0,
-        Status.OBJECT_COLLISION: (links >= 0) & (tips >= -TIP_PENETRATION),
+        Status.OBJECT_COLLISION: (links >= 0) & (depth >= -TIP_PENETRATION),
         Status.TABLE_COLLISION: table >= 0,
     }
     return GraspErrors(error, angle, torch.stack([links, table, between]).amin(0), first_violation(conditions))

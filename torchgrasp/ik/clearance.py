@@ -47,8 +47,7 @@ def collision_cost(
     centres: Float[Tensor, "*b s 3"], spheres: CollisionSpheres, world: CollisionWorld
 ) -> Float[Tensor, "*b"]:
     """Return the squared clearance deficits [mm2] of a touching hand."""
-    radius = spheres.radius.to(centres)
-    cost = centres.new_zeros(centres.shape[:-2])
+    radius, cost = spheres.radius.to(centres), centres.new_zeros(centres.shape[:-2])
     if world.field is not None:
         deficit = (CLEARANCE + radius - world.field.nearest_node(centres)) * ~spheres.touching
         cost = cost + deficit.clamp_min(0).square().sum(-1)
@@ -59,42 +58,30 @@ def collision_cost(
 
 
 def clearance_hinges(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> Residuals:
-    """Return hinges on the least clearances of each kind."""
-    hinges = [self_hinges(spatial)]
-    if world.field is not None:
-        hinges.append(object_hinges(spatial, world.field, tips_touch))
-    if world.table is not None:
-        hinges.append(table_hinges(spatial, world.table, tips_touch))
-    residuals, jacobians = zip(*hinges, strict=True)
-    return torch.cat(residuals, 1), torch.cat(jacobians, 1)
-
-
-def object_hinges(spatial: SpatialJacobian, field: SignedDistanceField, tips_touch: bool) -> Residuals:
-    """Return hinges on the spheres' least clearances from the object."""
-    spheres = spatial.hand.collision_spheres
+    """Return hinges on the least clearances of the links from each other, the object and the table."""
+    hinges, spheres = [self_hinges(spatial)], spatial.hand.collision_spheres
     centres = spatial.points(spheres.link_index, spheres.center)
     radius = spheres.radius.to(centres)
-    coarse = field.nearest_node(centres) - radius
-    if tips_touch:
-        coarse = torch.where(spheres.touching, math.inf, coarse)
-    row, index = least(coarse)
-    nearest = centres[row, index]
-    distance, gradient = field.query(nearest)
-    clearance = distance - radius[index] + torch.where(torch.isinf(coarse[row, index]), 1.0, 0.0)
-    return hinge(clearance, spatial.jacobian(wrench_of(nearest, gradient), spheres.link_index[index]), CLEARANCE)
-
-
-def table_hinges(spatial: SpatialJacobian, table: float, tips_touch: bool) -> Residuals:
-    """Return hinges on the spheres' least clearances from the table."""
-    spheres = spatial.hand.collision_spheres
-    centres = spatial.points(spheres.link_index, spheres.center)
-    height = centres[..., 2] - spheres.radius.to(centres) - table
-    if tips_touch:  # their contacts decide how low these are
-        height = height + CLEARANCE * spheres.touching
-    row, index = least(height)
-    up = torch.tensor([0.0, 0.0, 1.0]).to(centres).expand(*index.shape, 3)
-    jacobian = spatial.jacobian(wrench_of(centres[row, index], up), spheres.link_index[index])
-    return hinge(height[row, index], jacobian, CLEARANCE)
+    if world.field is not None:
+        coarse = world.field.nearest_node(centres) - radius
+        if tips_touch:
+            coarse = torch.where(spheres.touching, math.inf, coarse)
+        row, index = least(coarse)
+        nearest = centres[row, index]
+        distance, gradient = world.field.query(nearest)
+        clearance = distance - radius[index] + torch.where(torch.isinf(coarse[row, index]), 1.0, 0.0)
+        jacobian = spatial.jacobian(wrench_of(nearest, gradient), spheres.link_index[index])
+        hinges.append(hinge(clearance, jacobian, CLEARANCE))
+    if world.table is not None:
+        height = centres[..., 2] - radius - world.table
+        if tips_touch:  # their contacts decide how low they are
+            height = height + CLEARANCE * spheres.touching
+        row, index = least(height)
+        up = torch.tensor([0.0, 0.0, 1.0]).to(centres).expand(*index.shape, 3)
+        jacobian = spatial.jacobian(wrench_of(centres[row, index], up), spheres.link_index[index])
+        hinges.append(hinge(height[row, index], jacobian, CLEARANCE))
+    residuals, jacobians = zip(*hinges, strict=True)
+    return torch.cat(residuals, 1), torch.cat(jacobians, 1)
 
 
 def self_hinges(spatial: SpatialJacobian) -> Residuals:
@@ -113,10 +100,7 @@ def self_hinges(spatial: SpatialJacobian) -> Residuals:
 def link_clearance(
     spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool
 ) -> tuple[Float[Tensor, "g"], Float[Tensor, "g"], Float[Tensor, "g"]]:
-    """Return the least clearances [m]: links from object, tips from object, all from table.
-
-    Tips that are meant to touch are no links.
-    """
+    """Return the least clearances [m]: links (no touching tips) from object, tips from object, all from table."""
     spheres = spatial.hand.collision_spheres
     centres = spatial.points(spheres.link_index, spheres.center)
     radius = spheres.radius.to(centres)

@@ -1,7 +1,6 @@
 """The paper's refinement (Sec. 6.3): COBYLA on the sum of the tip distances, one grasp at a time.
 
-Only the joints are variables, the pose follows by Eq. (24). With the pose as six more variables COBYLA stops
-millimetres away. Contact directions and collisions are checked afterwards.
+Only the joints are variables: with the pose, here from Eq. (24), as six more, COBYLA stops millimetres away.
 """
 
 import math
@@ -25,10 +24,7 @@ FIRST_RADIUS, LAST_RADIUS = 0.02, 1e-4
 def refine_by_cobyla(
     hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld
 ) -> Configuration:
-    """Return configurations with the least distances of pads from contacts.
-
-    The starting pose and the world are not used, as in the paper.
-    """
+    """Return configurations of least tip distances; starting pose and world are not used, as in the paper."""
     from scipy.optimize import minimize
 
     bounds = list(zip(hand.lower.tolist(), hand.upper.tolist(), strict=True))

@@ -1,7 +1,7 @@
 """Configurations of a free hand, and Jacobians of points on it.
 
-A row of a Jacobian is virtual work: `directions . points` changes by the work of a unit force at the point. So a row is
-a wrench, force and torque about the object's origin. Its derivative by a joint is the wrench times the joint's twist.
+A row of a Jacobian is the virtual work of a unit force at a point: a wrench about the object's origin. Its derivative
+by a joint is the wrench times the joint's twist.
 """
 
 import dataclasses
@@ -23,10 +23,7 @@ class Configuration(Batch):
     obj_from_hand: Float[Tensor, "g 4 4"]
 
     def integrate(self, hand: Hand, step: Float[Tensor, "g d"]) -> "Configuration":
-        """Return the configuration after a step (translation [m], rotation vector, joints), clamped to the limits.
-
-        Translation and rotation are in the hand's axes, so solvers do not depend on the object's frame.
-        """
+        """Step by a translation [m], a rotation vector (both in the hand's axes) and joints, clamped to the limits."""
         rotation, position = self.obj_from_hand[:, :3, :3], self.obj_from_hand[:, :3, 3]
         joints = (self.joints + step[:, 6:]).clamp(hand.lower.to(position), hand.upper.to(position))
         position = position + (rotation @ step[:, :3, None])[..., 0]

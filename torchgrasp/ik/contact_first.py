@@ -10,7 +10,7 @@ from torchgrasp.errors import Status
 from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.ranking import rank_in_group
-from torchgrasp.ik.refine import refine, refinement_cost
+from torchgrasp.ik.refine import grasp_residuals, refine, tip_targets
 from torchgrasp.ik.rounds import Attempts, assign, best_grasps, executable
 from torchgrasp.values import Grasps, IKSeeds
 
@@ -20,23 +20,19 @@ SEEDS_PER_ROUND = (2, 4)
 
 def rank_seeds(problem: GraspProblem, seeds: IKSeeds) -> Int[Tensor, "g"]:
     """Return each seed's rank within its triple, by its first residuals."""
-    costs = [
-        refinement_cost(
-            problem.hand,
-            Configuration(part.joints, part.obj_from_hand),
-            assign(problem.contacts, part),
-            problem.world,
-        )
-        # 256 seeds at a time: their temporaries stay in the cache
-        for part in (seeds[rows] for rows in torch.arange(len(seeds), device=seeds.row.device).split(256))
-    ]
-    return rank_in_group(seeds.row, torch.cat(costs)) if costs else seeds.row
+    costs = []
+    for rows in torch.arange(len(seeds), device=seeds.row.device).split(256):  # their temporaries stay in the cache
+        part = seeds[rows]
+        start, contacts = Configuration(part.joints, part.obj_from_hand), assign(problem.contacts, part)
+        target = tip_targets(problem.hand, contacts)
+        residual, _ = grasp_residuals(problem.hand, start, target, contacts.normals, problem.world, tips_touch=True)
+        costs.append(residual.square().sum(1))
+    return rank_in_group(seeds.row, torch.cat(costs))
 
 
 def refine_on_contacts(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
     """Return a checked grasp for each seed, its contacts fixed."""
-    contacts = assign(problem.contacts, seeds)
-    start = Configuration(seeds.joints, seeds.obj_from_hand)
+    contacts, start = assign(problem.contacts, seeds), Configuration(seeds.joints, seeds.obj_from_hand)
     configuration = refine(problem.hand, start, contacts, problem.world)
     certificate, status = problem.certificate[seeds.row], torch.full_like(seeds.row, Status.OK)
     return check_candidates(problem, GraspCandidates(configuration, contacts, certificate, seeds.permutation, status))

@@ -1,16 +1,16 @@
 """Contacts, pose and joints solved together: contacts slide to where the hand reaches them.
 
-Contact-first planning loses triples that the hand reaches only through the object, the table or itself. Here the
-contact problem (Eqs. 10-13 and the margins of `ContactSpec`) and the hand's residuals are one least-squares problem.
-Its unknowns are pose, joints, contacts and tensions. The contacts are certified anew.
+The contact problem (Eqs. 10-13 and the margins of `ContactSpec`) and the hand's residuals are one least-squares
+problem. Its unknowns are pose, joints, contacts and tensions.
 """
 
 import dataclasses
 from functools import partial
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchgrasp.base import Batch
 from torchgrasp.hand.hand import Hand
@@ -34,8 +34,6 @@ FIXED_SEEDS, SLIDING_SEEDS = (2,), (2, 6)
 """Seeds refined of each unsolved triple in a round: first on fixed contacts, which costs little, then sliding."""
 STAGES, STEPS = 3, 8
 """Stages of so many steps; each stage begins by linearising the constraint of flat surface, which costs most."""
-PROJECTIONS = 3
-"""Newton steps that bring the contacts onto the surface at the end; the solver leaves them within 0.1 mm."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,10 +54,7 @@ class JointState(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class JointProblem:
-    """A hand, the estimated object, its contact problem, and the world.
-
-    `flatness` is the largest variation of the normal [rad] around a contact; None: any.
-    """
+    """A hand and its object; `flatness` is the largest variation of the normal [rad] around a contact; None: any."""
 
     hand: Hand
     shape: Shape
@@ -87,10 +82,7 @@ class JointProblem:
     def _tips_by_points(
         self, spatial: SpatialJacobian, jet: TripleJet, outside: Bool[Tensor, "g 3"]
     ) -> Float[Tensor, "g 12 9"]:
-        """Return the derivative of the tip residuals by the contacts; pads count `outside` their cones.
-
-        A sliding contact carries its tip's target along and rotates the normal under the pad.
-        """
+        """Return the derivative of the tip residuals by the contacts; pads count `outside` their cones."""
         hand, normals, normal_jacobian = self.hand, jet.normals, jet.normal_jacobian
         identity = torch.eye(3).to(normals)
         target = float(self.shape.scale) * identity + hand.tips.radius.to(normals)[:, None, None] * normal_jacobian
@@ -103,29 +95,23 @@ class JointProblem:
     def _contact_residuals(self, state: JointState, jet: TripleJet, flat: FlatnessConstraint | None) -> Residuals:
         """Return residuals [mm] of the contact problem, zero where bounds hold."""
         rows = self.contact_problem.constraints(state.points, state.tension, jet)
-        violated = (rows.bounds > 0).to(rows.bounds)
-        residuals = [rows.surface, violated * rows.bounds]
-        jacobians = [rows.surface_by_x, violated[..., None] * rows.bounds_by_x]
+        bounds, bounds_by_x = rows.bounds, rows.bounds_by_x
         if flat is not None:
-            variation = flat.values(state.points)
-            violated = (variation > 0).to(variation)
-            by_points = violated[..., None] * flat.by_points
-            residuals.append(violated * variation)
-            jacobians.append(torch.cat([by_points, torch.zeros_like(by_points[..., :3])], 2))
-        unit_length = float(self.shape.scale) / MILLIMETRE
-        return unit_length * torch.cat(residuals, 1), unit_length * torch.cat(jacobians, 1)
+            bounds = torch.cat([bounds, flat.values(state.points)], 1)
+            bounds_by_x = torch.cat([bounds_by_x, pad(flat.by_points, (0, 3))], 1)
+        violated, unit_length = (bounds > 0).to(bounds), float(self.shape.scale) / MILLIMETRE
+        residual = torch.cat([rows.surface, violated * bounds], 1)
+        jacobian = torch.cat([rows.surface_by_x, violated[..., None] * bounds_by_x], 1)
+        return unit_length * residual, unit_length * jacobian
 
     def solve(self, state: JointState) -> JointState:
         """Return hands and contacts that satisfy all constraints, as far as each row allows."""
         for _ in range(STAGES):
             flat = None if self.flatness is None else flatness_constraint(self.shape, state.points, self.flatness)
-
-            def evaluate(
-                state: JointState, rows: Int[Tensor, "a"], flat: FlatnessConstraint | None = flat
-            ) -> Residuals:
-                return self.residuals(state, None if flat is None else flat[rows])
-
-            sliding = LeastSquares(evaluate, lambda x, step: x.integrate(self.hand, step))
+            sliding = LeastSquares(
+                lambda x, rows, flat=flat: self.residuals(x, None if flat is None else flat[rows]),
+                lambda x, step: x.integrate(self.hand, step),
+            )
             state = levenberg_marquardt(sliding, state, STEPS)
         return state
 
@@ -133,8 +119,8 @@ class JointProblem:
 def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: ContactSpec) -> Grasps:
     """Return a checked grasp for each triple that has seeds, best first; contacts slide where they must.
 
-    The seeds of a triple are tried in their order. Slid contacts are projected on the surface and certified anew. A
-    failure has a planning Status where its contacts failed.
+    The seeds of a triple are tried in their order. Slid contacts are certified anew; their failures have a planning
+    `Status`.
     """
     contact_problem = ContactProblem.of(shape, spec)
     joint_problem = JointProblem(problem.hand, shape, contact_problem, problem.world, spec.flatness)
@@ -145,7 +131,8 @@ def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: Conta
         start = Configuration(seeds.joints, seeds.obj_from_hand)
         tension = normalise_tensions(points, points.new_ones(len(points), 3))
         state = joint_problem.solve(JointState(start, points, tension))
-        plan = check_feasibility(shape, spec, project(shape, state.points, PROJECTIONS))
+        on_surface = project(shape, state.points, 3)  # Newton steps; the solver leaves contacts within 0.1 mm
+        plan = check_feasibility(shape, spec, on_surface)
         certificate = certify(plan.contacts, spec)
         candidates = GraspCandidates(state.configuration, plan.contacts, certificate, seeds.permutation, plan.status)
         return check_candidates(problem, candidates)

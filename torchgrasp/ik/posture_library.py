@@ -1,18 +1,16 @@
 """Random postures of a hand, the nearest of which become seeds.
 
-The learned model (`query_mixture`) gives the few postures likely for a code, wherever object and table are. Here every
-triple is compared with thousands of postures in all assignments, by one matrix product. Clearances rank the nearest, so
+One matrix product compares every triple with thousands of postures in all assignments. Clearances rank the nearest, so
 a hand from above comes before one from below.
 """
 
 import dataclasses
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value, join
-from torchgrasp.errors import BadArgument
+from torchgrasp.base import Value, check_whole, join
 from torchgrasp.frames import apply, degenerate, inverse, rotate, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, collision_cost
@@ -64,48 +62,28 @@ def nearest_postures(library: PostureLibrary, contacts: Contacts, world: Collisi
     Raises:
         BadArgument: `n_seeds`, for each triple, is not in [1, 64].
     """
-    if not 1 <= n_seeds <= CANDIDATES:
-        raise BadArgument("n_seeds", n_seeds, f"1 to {CANDIDATES}")
-    radius, order = library.hand.tips.radius.double(), torch.tensor(PERMUTATIONS, device=contacts.points.device)
-    inward = -contacts.normals.double()[:, order]
-    centres = contacts.points.double()[:, order] - radius[:, None] * inward  # (n, 6, 3, 3)
-    rows = torch.nonzero(~degenerate(centres).any(1))[:, 0]
-    # 64 triples at a time bound the memory, and the work stays in the cache.
-    parts = [_nearest(library, centres[row], inward[row], row, world, n_seeds) for row in rows.split(64)]
+    check_whole("n_seeds", n_seeds, 1, CANDIDATES)
+    permutations, given = torch.tensor(PERMUTATIONS, device=contacts.points.device), library.feature
+    radius, inward = library.hand.tips.radius.double(), -contacts.normals.double()[:, permutations]
+    centres = contacts.points.double()[:, permutations] - radius[:, None] * inward  # (n, 6, 3, 3)
+    parts = []
+    for row in torch.nonzero(~degenerate(centres).any(1))[:, 0].split(64):  # bounds the memory
+        obj_from_vf = virtual_frame(centres[row])
+        vf_from_obj = inverse(obj_from_vf)
+        wanted = feature(apply(vf_from_obj, centres[row]), rotate(vf_from_obj, inward[row]))
+        energy = wanted.square().sum(-1)[..., None] / 2 + given.square().sum(-1) / 2 - wanted @ given.T
+        energy, index = energy.flatten(1).topk(CANDIDATES, 1, largest=False)
+        order, sample = index // len(given), index % len(given)
+        b = torch.arange(len(row), device=row.device)[:, None]
+        obj_from_hand = obj_from_vf[b, order] @ library.vf_from_hand[sample]
+        spheres = apply(obj_from_hand.float(), library.spheres[sample])
+        tips = 2 * energy * (TIP_WEIGHT * LENGTH_SLACK / MILLIMETRE) ** 2  # squared millimetres, weighed as in `refine`
+        cost = tips + collision_cost(spheres, library.hand.collision_spheres, world)
+        best = cost.topk(n_seeds, 1, largest=False).indices.flatten()
+        b = b.repeat_interleave(n_seeds)  # from here on one row a seed
+        order, sample = order[b, best], sample[b, best]
+        gap = apply(obj_from_vf[b, order], library.centres[sample]) - centres[row[b], order]
+        tip_error, energy = torch.linalg.vector_norm(gap, dim=-1), energy[b, best].double()
+        joints, pose = library.joints[sample], obj_from_hand[b, best]
+        parts.append(IKSeeds(joints, pose, row[b], permutations[order], energy, tip_error))
     return join(parts).to(contacts.points.dtype)
-
-
-def _nearest(
-    library: PostureLibrary,
-    centres: Float[Tensor, "b 6 3 3"],
-    inward: Float[Tensor, "b 6 3 3"],
-    row: Int[Tensor, "b"],
-    world: CollisionWorld,
-    n_seeds: int,
-) -> IKSeeds:
-    """Return the seeds of some triples."""
-    obj_from_vf = virtual_frame(centres)
-    vf_from_obj = inverse(obj_from_vf)
-    wanted, given = feature(apply(vf_from_obj, centres), rotate(vf_from_obj, inward)), library.feature
-    energy = wanted.square().sum(-1)[..., None] / 2 + given.square().sum(-1) / 2 - wanted @ given.T
-    energy, index = energy.flatten(1).topk(CANDIDATES, 1, largest=False)
-    order, sample = index // len(given), index % len(given)
-    b = torch.arange(len(row), device=row.device)[:, None]
-    obj_from_hand = obj_from_vf[b, order] @ library.vf_from_hand[sample]
-    spheres = apply(obj_from_hand.float(), library.spheres[sample])
-    tips = 2 * energy * (TIP_WEIGHT * LENGTH_SLACK / MILLIMETRE) ** 2  # squared millimetres, weighed as in `refine`
-    cost = tips + collision_cost(spheres, library.hand.collision_spheres, world)
-    best = cost.topk(n_seeds, 1, largest=False).indices.flatten()
-
-    # From here on one row a seed.
-    b = b.repeat_interleave(n_seeds)
-    order, sample = order[b, best], sample[b, best]
-    gap = apply(obj_from_vf[b, order], library.centres[sample]) - centres[b, order]
-    return IKSeeds(
-        joints=library.joints[sample],
-        obj_from_hand=obj_from_hand[b, best],
-        row=row[b],
-        permutation=torch.tensor(PERMUTATIONS, device=row.device)[order],
-        energy=energy[b, best].double(),
-        tip_error=torch.linalg.vector_norm(gap, dim=-1),
-    )

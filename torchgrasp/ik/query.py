@@ -4,7 +4,7 @@ import dataclasses
 
 import torch
 
-from torchgrasp.base import join
+from torchgrasp.base import check_whole, join
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, degenerate, inverse, rotate, virtual_frame
 from torchgrasp.hand.hand import Hand
@@ -15,13 +15,9 @@ from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, GraspMixture
 from torchgrasp.values import Contacts, IKSeeds
 
 WRONG_SIDE = 0.3
-"""Mean cosine of tips' and contacts' outward normals above which a seed touches from inside. Codes do not know the
-side (`encode_fingertips`), so such seeds occur."""
+"""Mean cosine of tips' and contacts' outward normals above which a seed touches from inside: codes have no side."""
 LENGTH_SLACK, COSINE_SLACK = 0.01, 0.5
-"""Noise of a planned code in L [m] and N, because a tip may roll away from the pad's middle. On a can it raises the
-Barrett hand's share of certified triples within reach from 1 to 99 %, and most of these refine."""
-TRIPLES_PER_PASS = 256
-"""Triples answered at a time: their configurations stay in the cache."""
+"""Noise of a planned code in L [m] and N, because a tip may roll away from its pad's middle."""
 
 
 def query_mixture(
@@ -31,13 +27,10 @@ def query_mixture(
 
     Codes are taken as noisy, because tips may roll. For every assignment within reach (Eq. 21) the joints are the
     conditional mean (Eq. 23) and the means of the most responsible components. They are clamped to the limits. Eq. (24)
-    places the hand. The fingertips are still off by centimetres.
-
-    Seeds come in the order of the contacts' rows. Within a row the right side of the surface comes first, then
-    the smaller tip error. A degenerate or unreachable row has none.
+    places the hand. The fingertips are still off by centimetres. Seeds come in the order of the contacts' rows. Within
+    a row the right side of the surface comes first, then the smaller tip error. An unreachable row has none.
 
     Args:
-        hand: the hand.
         contacts: triples on the object.
         mixture: the hand's learned model.
         n_seeds: for each assignment, at most one more than the mixture has components.
@@ -52,20 +45,18 @@ def query_mixture(
     >>> seeds = query_mixture(load_hand("allegro"), Contacts(points, 20 * points), load_mixture("allegro"))
     """
     check_compatible(mixture.meta, mixture.joint_names, hand)
-    if not 1 <= n_seeds <= len(mixture.weights) + 1:
-        raise BadArgument("n_seeds", n_seeds, f"1 to {len(mixture.weights) + 1}")
+    check_whole("n_seeds", n_seeds, 1, len(mixture.weights) + 1)
     if not max_energy > 0:
         raise BadArgument("max_energy", max_energy, "a positive number")
     noisy = mixture.with_observation_noise(LENGTH_SLACK, COSINE_SLACK)
-    firsts = range(0, max(len(contacts), 1), TRIPLES_PER_PASS)
-    parts = [_query(hand, contacts[k : k + TRIPLES_PER_PASS], noisy, n_seeds, max_energy) for k in firsts]
+    firsts = range(0, max(len(contacts), 1), 256)  # their configurations stay in the cache
+    parts = [_query(hand, contacts[k : k + 256], noisy, n_seeds, max_energy) for k in firsts]
     rows = torch.cat([part.row + k for part, k in zip(parts, firsts, strict=True)])
     return dataclasses.replace(join(parts), row=rows)
 
 
 def _query(hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: int, max_energy: float) -> IKSeeds:
     """Return the seeds of some triples."""
-    dtype = contacts.points.dtype
     code = encode((contacts.points.double(), contacts.normals.double()))
     energy = mixture.energy(code)
     row, assignment = torch.nonzero(energy < max_energy, as_tuple=True)  # NaN is not less
@@ -74,7 +65,6 @@ def _query(hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: int, 
     if n_seeds > 1:
         joints = torch.cat([joints, mixture.modes(q, n_seeds - 1)[0]], dim=1)
     joints = joints.clamp(hand.lower.to(joints), hand.upper.to(joints)).flatten(0, 1)
-
     # From here on one row a seed.
     row, assignment = row.repeat_interleave(n_seeds), assignment.repeat_interleave(n_seeds)
     tips, tip_normals = hand.fingertips(joints)
@@ -87,11 +77,5 @@ def _query(hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: int, 
     tip_error = torch.linalg.vector_norm(apply(obj_from_hand, tips) - points, dim=-1)
     wrong_side = (rotate(obj_from_hand, tip_normals) * normals).sum(-1).mean(-1) > WRONG_SIDE
     order = lexical_order(row, wrong_side.int(), tip_error.amax(-1))
-    return IKSeeds(
-        joints=joints.to(dtype),
-        obj_from_hand=obj_from_hand.to(dtype),
-        row=row,
-        permutation=permutation,
-        energy=energy[row, assignment].to(dtype),
-        tip_error=tip_error.to(dtype),
-    )[order]
+    seeds = IKSeeds(joints, obj_from_hand, row, permutation, energy[row, assignment], tip_error)
+    return seeds[order].to(contacts.points.dtype)

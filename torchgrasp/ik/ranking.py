@@ -1,17 +1,13 @@
 """Which grasp to try first: a geometric score of candidates, a predicted probability of success of grasps.
 
-The paper ranks by the sum of the contacts' variances. Here `score` chooses among the candidates of a triple, and
-`rank_by_success` orders the executable grasps. Its model is logistic. It predicts the share of pull trials in which a
-grasp holds (docs/closing.md). `scripts/train.py success` fits it to
-trials of the Allegro hand. The probabilities of other hands are not calibrated.
+`score` chooses among the candidates of a triple, a logistic model orders the executable grasps (docs/closing.md).
+`scripts/train.py success` fits it to trials of the Allegro hand; it is not calibrated for other hands.
 """
 
 import dataclasses
-import functools
 import json
 import math
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -22,11 +18,8 @@ from torchgrasp.linalg import unit
 from torchgrasp.plan.internal_forces import least_friction_forces, tangential_ratio
 from torchgrasp.values import Contacts, Grasps
 
-OFFSET = 0.02
-"""Offset [m] of the contacts' centre from the object's that costs one point: a choice."""
-PAD_ANGLE = 0.8
-"""Angle [rad] between contact direction and pad that costs one point: a choice."""
-
+OFFSET, PAD_ANGLE = 0.02, 0.8
+"""Offset [m] of the contacts' centre, and angle [rad] between contact direction and pad, that cost a point: choices."""
 FEATURES = (
     "log-odds of closure",
     "offset of the contacts' centre over 20 mm",
@@ -35,7 +28,6 @@ FEATURES = (
     "mean angle of the pads",
 )
 """What the model of success knows of a grasp, in this order."""
-
 MODEL = Path(__file__).with_name("success.json")
 """Weights and bias of the model, and what they were fitted on."""
 
@@ -66,10 +58,7 @@ def rank_in_group(group: Int[Tensor, "g"], *keys: Tensor) -> Int[Tensor, "g"]:
 
 
 def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
-    """Return the friction with which fingers can press towards the contacts' centre.
-
-    It is the largest tangent between an inward normal and the line to the centre.
-    """
+    """Return the largest tangent between an inward normal and the line to the contacts' centre."""
     inward = unit(contacts.points.mean(1, keepdim=True) - contacts.points)
     cosine = -(inward * contacts.normals).sum(-1)
     sine = torch.linalg.vector_norm(torch.linalg.cross(inward, contacts.normals), dim=-1)
@@ -89,11 +78,7 @@ def success_features(
     center: Float[Tensor, "3"],
     friction: float,
 ) -> Float[Tensor, "g 5"]:
-    """Return `FEATURES` of each grasp at a trial's friction, at which `closure` is the probability of closure.
-
-    Balanced forces need the least friction (`least_friction_forces`), forces to the centre more. Where nothing
-    balances, the friction angle is a right one.
-    """
+    """Return `FEATURES` of each grasp at a trial's friction, at which `closure` is the probability of closure."""
     offset = torch.linalg.vector_norm(contacts.points.mean(1) - center, dim=-1) / OFFSET
     least = tangential_ratio(least_friction_forces(contacts.points, contacts.normals), contacts.normals).amax(-1)
     angles = torch.atan(torch.stack([least, centred_friction(contacts)], dim=-1)) / math.atan(friction)
@@ -108,14 +93,8 @@ def success_log_odds(features: Float[Tensor, "g 5"]) -> Float[Tensor, "g"]:
     >>> success_log_odds(torch.stack([good, bad])).diff() < 0
     tensor([True])
     """
-    model = read_model()
+    model = json.loads(MODEL.read_text("utf-8"))
     return features @ features.new_tensor([model["weights"][name] for name in FEATURES]) + model["bias"]
-
-
-@functools.cache
-def read_model() -> dict[str, Any]:
-    """Return the content of `MODEL`."""
-    return json.loads(MODEL.read_text("utf-8"))
 
 
 def rank_by_success(grasps: Grasps, log_odds: Float[Tensor, "k"]) -> Grasps:

@@ -1,9 +1,7 @@
-"""Move hands onto their contacts and clear of all else, by batched Levenberg-Marquardt.
+"""Move hands onto their contacts and clear of all else: pose and joints by batched Levenberg-Marquardt.
 
-Seeds leave millimetres to centimetres between fingertips and contacts. Pose and joints of all seeds are solved in one
-batch. A round fingertip's centre comes to one radius off its contact, so the tip may roll. A tip that is not round
-touches with its contact point. The contact direction stays inside a cone about the pad's axis. Hinges keep the links
-clear of object, table and each other, because there most planned contacts are lost.
+A round fingertip's centre comes to one radius off its contact, so the tip may roll; another tip touches with its
+contact point. The contact direction stays inside a cone about the pad's axis.
 """
 
 import math
@@ -11,6 +9,7 @@ import math
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, clearance_hinges
@@ -73,21 +72,12 @@ def grasp_residuals(
     return torch.cat([tips[0], links[0]], 1), torch.cat([tips[1], links[1]], 1)
 
 
-def refinement_cost(
-    hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld
-) -> Float[Tensor, "g"]:
-    """Return the sum of squared residuals, which `refine` lowers."""
-    target = tip_targets(hand, contacts)
-    return grasp_residuals(hand, configuration, target, contacts.normals, world, tips_touch=True)[0].square().sum(1)
-
-
 def refine(
     hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld | None, solved: float = SOLVED
 ) -> Configuration:
-    """Return configurations with fingertips on contacts and clear links, as far as possible.
+    """Return configurations with finger i on contact i and clear links, as far as possible.
 
-    Finger i takes contact i. A row is done when its squared residuals [mm2] sum to less than `solved`. Without a world
-    all clearances are ignored, those between links too.
+    A row is done when its squared residuals [mm2] sum to less than `solved`. Without a world, links may collide.
     """
     target, normals = tip_targets(hand, contacts), contacts.normals
 
@@ -101,10 +91,9 @@ def refine(
 def open_hand(
     hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld
 ) -> Float[Tensor, "g h"]:
-    """Return the joints of the pre-grasp: the same pose, the tips off their contacts, everything clear.
+    """Return the joints of the pre-grasp: the same pose, each tip off its contact along the normal, everything clear.
 
-    Each tip opens along its normal, but not into the table. The opening grows with the surface's standard deviation, so
-    a tip starts outside a larger object too. Opening without clearances drives links into the object.
+    The opening grows with the surface's standard deviation, so a tip starts outside a larger object too.
     """
     normals, gap = contacts.normals, OPENING + OPENING_SIGMAS * contacts.require_std()
     target = tip_targets(hand, contacts) + gap[..., None] * normals
@@ -116,7 +105,5 @@ def open_hand(
         residual, jacobian = grasp_residuals(hand, state, target[rows], normals[rows], world, tips_touch=False)
         return residual, jacobian[..., 6:]
 
-    def integrate(state: Configuration, step: Float[Tensor, "a d"]) -> Configuration:
-        return state.integrate(hand, torch.cat([step.new_zeros(len(step), 6), step], 1))
-
-    return levenberg_marquardt(LeastSquares(evaluate, integrate), configuration, ITERATIONS).joints
+    problem = LeastSquares(evaluate, lambda x, step: x.integrate(hand, pad(step, (6, 0))))  # the pose stays
+    return levenberg_marquardt(problem, configuration, ITERATIONS).joints

@@ -1,7 +1,4 @@
-"""Rounds of refinement: first seeds of every triple, then more of the unsolved ones.
-
-Most seeds fail, and nothing tells which. But one of a triple's best seeds often succeeds.
-"""
+"""Rounds of refinement: first a triple's best seeds, one of which often succeeds, then more of the unsolved."""
 
 from collections.abc import Callable, Sequence
 from typing import Generic, TypeVar
@@ -24,12 +21,7 @@ def assign(contacts: Contacts, seeds: IKSeeds) -> Contacts:
 
 
 class Attempts(Generic[Result]):
-    """The results of all refined seeds, and the triples still unsolved.
-
-    Args:
-        unsolved: the triples to be solved.
-        solves: tells which results solve their triple.
-    """
+    """The results of all refined seeds, and the `unsolved` triples; `solves` tells which results solve theirs."""
 
     def __init__(self, unsolved: Bool[Tensor, "b"], solves: Callable[[Result], Bool[Tensor, "k"]]):
         self.unsolved, self.solves = unsolved, solves

@@ -13,10 +13,8 @@ from torchgrasp.mesh import closest_on_triangles
 
 BAND = 0.022
 """Nodes nearer to the surface [m] are computed exactly: a finger is about as thick."""
-COARSE = 3
-"""Spacings between the nodes of the coarse grid, between which distances are interpolated."""
-NEAREST_SAMPLES = 4
-"""Samples of the surface whose triangles are tried for one node."""
+COARSE, NEAREST_SAMPLES = 3, 4
+"""Spacings between nodes of the coarse grid, which is interpolated; surface samples whose triangles a node tries."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,10 +26,7 @@ class SignedDistanceField(Value):
     values: Float[Tensor, "x y z"]
 
     def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the value [m] at the node nearest to each point, at most 0.87 spacings off.
-
-        Outside the grid it is the value at the border, which is too small.
-        """
+        """Return the value [m] at the nearest node, at most 0.87 spacings off; outside the grid it is too small."""
         flat = 0
         for x, low, count in zip(points.unbind(-1), self.origin.tolist(), self.values.shape, strict=True):
             node = torch.round((x - low) / self.spacing).clamp_(0, count - 1)
@@ -39,10 +34,7 @@ class SignedDistanceField(Value):
         return self.values.reshape(-1)[flat].to(points)
 
     def query(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
-        """Return the trilinear signed distance [m] and its gradient.
-
-        Outside the grid the distance to the grid is added.
-        """
+        """Return the trilinear signed distance [m] and its gradient; beyond the grid the distance to it is added."""
         shape = torch.tensor(self.values.shape, device=points.device)
         position = (points - self.origin.to(points)) / self.spacing
         inside = torch.minimum(position.clamp_min(0), (shape - 1).to(points))
@@ -128,26 +120,24 @@ class _Surface:
         self.tree = KDTree(np.concatenate([corners.mean(1), samples]))
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the signed distances [m] of points (n, 3), chunk by chunk."""
-        return np.concatenate([self._distance(points[k : k + 8192]) for k in range(0, max(1, len(points)), 8192)])
-
-    def _distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the signed distances of one chunk."""
-        _, index = self.tree.query(points, k=min(NEAREST_SAMPLES, len(self.owner)))
-        owner = self.owner[index.reshape(len(points), -1)]
-        feet, feature = closest_on_triangles(np.repeat(points, owner.shape[1], 0), self.triangles[owner.reshape(-1)])
-        gap = points[:, None] - feet.reshape(*owner.shape, 3)
-        squared = (gap * gap).sum(-1)
-        rows, best = np.arange(len(points)), squared.argmin(1)
-        normal = self.normals[owner[rows, best], feature.reshape(owner.shape)[rows, best]]
-        return np.copysign(np.sqrt(squared[rows, best]), (gap[rows, best] * normal).sum(1))
+        """Return the signed distances [m] of points (n, 3)."""
+        parts = []
+        for part in (points[k : k + 8192] for k in range(0, max(1, len(points)), 8192)):
+            _, index = self.tree.query(part, k=min(NEAREST_SAMPLES, len(self.owner)))
+            owner = self.owner[index.reshape(len(part), -1)]
+            feet, feature = closest_on_triangles(np.repeat(part, owner.shape[1], 0), self.triangles[owner.reshape(-1)])
+            gap = part[:, None] - feet.reshape(*owner.shape, 3)
+            squared = (gap * gap).sum(-1)
+            rows, best = np.arange(len(part)), squared.argmin(1)
+            normal = self.normals[owner[rows, best], feature.reshape(owner.shape)[rows, best]]
+            parts.append(np.copysign(np.sqrt(squared[rows, best]), (gap[rows, best] * normal).sum(1)))
+        return np.concatenate(parts)
 
 
 def _pseudonormals(corners: np.ndarray) -> np.ndarray:
     """Return pseudonormals (f, 7, 3) of each triangle's face, sides and corners (Baerentzen and Aanaes, 2005).
 
-    The pseudonormal at the closest point tells the side of the surface. Sides add up the normals of two faces, corners
-    those of all faces, weighted by angle.
+    Sides add up the normals of two faces, corners the normals of all faces, weighted by angle.
     """
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     face /= np.linalg.norm(face, axis=1, keepdims=True)

@@ -1,7 +1,6 @@
 """Inverse kinematics of contacts: joints and pose of a hand that touches nothing else.
 
-Seeds of the learned model come first (Eqs. 21-24), then the nearest random postures. Each seed is refined by
-Levenberg-Marquardt, or by the paper's COBYLA, and measured anew.
+Seeds of the learned model come first (Eqs. 21-24), then the nearest random postures.
 """
 
 import dataclasses
@@ -34,18 +33,15 @@ SEEDS_PER_ASSIGNMENT = 2
 """Seeds of the learned model for each assignment: the conditional mean (Eq. 23) and the likeliest component's."""
 LEARNED_ATTEMPTS, LIBRARY_ATTEMPTS = 4, 8
 """Seeds of the learned model and of the posture library that are refined before a row is given up."""
-EXACT = 1e-6
-"""Sum of squared residuals [mm2] at which a row is done: 0.5 um at a fingertip."""
-EXACT_TIPS = 5e-5
-"""Tip error [m] above which a solved row is tried further: another configuration may have none."""
+EXACT, EXACT_TIPS = 1e-6, 5e-5
+"""Sum of squared residuals [mm2] at which a seed is done, and tip error [m] above which further seeds are tried."""
 
 
 @dataclasses.dataclass(frozen=True)
 class IKSolution(Batch):
     """A configuration for each row of contacts; finger i touches contact `permutation[:, i]`.
 
-    `clearance` [m] is the links' least, from each other and the world. `attempts` counts the refined seeds. A row
-    without seeds holds NaN.
+    `clearance` [m] is the links' least; `attempts` counts the refined seeds. A row without seeds holds NaN.
     """
 
     joints: Float[Tensor, "b h"]
@@ -69,7 +65,6 @@ def solve_ik(
     """Return configurations that touch the contacts in any assignment, without self-collision.
 
     Args:
-        hand: the hand.
         contacts: b triples; `std_m` and `variance` are not used.
         mixture: the hand's learned model; None: only the library gives seeds.
         world: what the links must not touch; None: only each other.
@@ -77,8 +72,8 @@ def solve_ik(
         library: the hand's random postures; None: drawn when they are needed, in about a second.
 
     Returns:
-        One row for each triple. With `Status.OK` every tip is within 1 mm of its contact and inside its pad's cone,
-        and every link is clear. Else the row is the best attempt.
+        The best attempt for each triple. With `Status.OK` every tip is within 1 mm of its contact and inside its pad's
+        cone, and every link is clear.
 
     Raises:
         BadArgument: contacts that are no finite triples, a mixture of another hand, an unknown method.
@@ -96,33 +91,29 @@ def solve_ik(
     world = CollisionWorld() if world is None else world
     move = refine_by_cobyla if method == "cobyla" else refine_exactly
 
-    def refine_pass(seeds: IKSeeds) -> IKSolution:
-        """Refine seeds and measure what came of them."""
-        taken, start = assign(contacts, seeds), Configuration(seeds.joints, seeds.obj_from_hand)
-        configuration = move(hand, start, taken, world)
-        errors = measure_errors(hand, configuration, taken, world)
-        placed = configuration.joints, configuration.obj_from_hand, seeds.permutation
-        measured = errors.tip_error, errors.normal_angle, errors.clearance
-        return IKSolution(*placed, *measured, torch.ones_like(errors.status), errors.status)
-
     def refine_seeds(seeds: IKSeeds) -> IKSolution:
-        """Refine seeds in passes whose temporaries stay in the cache."""
-        return join([refine_pass(seeds[k : k + 512]) for k in range(0, max(len(seeds), 1), 512)])
+        parts = []
+        for part in (seeds[k : k + 512] for k in range(0, max(len(seeds), 1), 512)):  # temporaries stay in the cache
+            taken = assign(contacts, part)
+            configuration = move(hand, Configuration(part.joints, part.obj_from_hand), taken, world)
+            errors = measure_errors(hand, configuration, taken, world)
+            placed = configuration.joints, configuration.obj_from_hand, part.permutation
+            measured = errors.tip_error, errors.normal_angle, errors.clearance
+            parts.append(IKSolution(*placed, *measured, torch.ones_like(errors.status), errors.status))
+        return join(parts)
 
     def library_seeds(some: Contacts) -> IKSeeds:
-        """Return seeds of the library, drawn if need be."""
         return nearest_postures(PostureLibrary.of(hand) if library is None else library, some, world, LIBRARY_ATTEMPTS)
-
-    sources = [(library_seeds, LIBRARY_ATTEMPTS)]
-    if mixture is not None:
-        learned_seeds = partial(query_mixture, hand, mixture=mixture, n_seeds=SEEDS_PER_ASSIGNMENT)
-        sources = [(learned_seeds, LEARNED_ATTEMPTS), *sources]
 
     def is_exact(solution: IKSolution) -> Bool[Tensor, "k"]:
         return (solution.status == Status.OK) & (solution.tip_error.amax(1) <= EXACT_TIPS)
 
     attempts = Attempts(~degenerate(contacts.points), is_exact)
     attempts.add(_no_solution(hand, contacts), torch.arange(len(contacts), device=contacts.points.device))
+    sources = [(library_seeds, LIBRARY_ATTEMPTS)]
+    if mixture is not None:
+        learned_seeds = partial(query_mixture, hand, mixture=mixture, n_seeds=SEEDS_PER_ASSIGNMENT)
+        sources = [(learned_seeds, LEARNED_ATTEMPTS), *sources]
     for source, count in sources:
         rows = torch.nonzero(attempts.unsolved)[:, 0]
         if len(rows):
@@ -145,8 +136,7 @@ def refine_exactly(
 
 def _no_solution(hand: Hand, contacts: Contacts) -> IKSolution:
     """Return rows out of reach, or degenerate."""
-    b, nan = len(contacts), torch.full((), torch.nan).to(contacts.points)
-    order = torch.arange(3, device=nan.device).expand(b, 3)
+    b, nan = len(contacts), contacts.points.new_full((), torch.nan)
     status = torch.where(degenerate(contacts.points), int(Status.DEGENERATE), int(Status.OUT_OF_REACH))
-    placed = nan.expand(b, hand.dof), nan.expand(b, 4, 4), order
+    placed = nan.expand(b, hand.dof), nan.expand(b, 4, 4), torch.arange(3, device=nan.device).expand(b, 3)
     return IKSolution(*placed, nan.expand(b, 3), nan.expand(b, 3), nan.expand(b), torch.zeros_like(status), status)
