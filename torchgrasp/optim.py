@@ -1,6 +1,6 @@
 """Levenberg-Marquardt for a batch of small problems, each row with its own damping.
 
-`levenberg_marquardt` is the loop; a `Problem` says what a step is and when it is good. Nocedal and Wright, Numerical
+`levenberg_marquardt` is the loop. A `Problem` says how steps are made and judged. See Nocedal and Wright, Numerical
 Optimization, ch. 10.
 """
 
@@ -27,14 +27,14 @@ LOST = 30.0
 
 @dataclasses.dataclass(frozen=True)
 class Linearisation(Batch):
-    """The `cost` of rows at a state; a problem adds what its next step needs."""
+    """The cost of rows at a state; a problem adds its linear model."""
 
     cost: Float[Tensor, "a"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Step(Batch):
-    """A step `x` of each row, and whether the row takes it; a row that does not is left alone from then on."""
+    """A step `x` of each row. A row that does not take it is left alone from then on."""
 
     x: Float[Tensor, "a d"]
     taken: Bool[Tensor, "a"]
@@ -45,13 +45,13 @@ Model = TypeVar("Model", bound=Linearisation)
 
 
 class Problem(abc.ABC, Generic[State, Model]):
-    """Costs to be lowered, one a row, and the rules by which their steps are made and judged."""
+    """A cost for each row, with the rules by which steps are made and judged."""
 
     first_damping: float = 1e-2
 
     @abc.abstractmethod
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> Model:
-        """Return the cost and its linear model at the states of some rows."""
+        """Return cost and linear model of some rows at their states."""
 
     @abc.abstractmethod
     def step(self, model: Model, damping: Float[Tensor, "a"]) -> Step:
@@ -65,15 +65,15 @@ class Problem(abc.ABC, Generic[State, Model]):
     def judge(
         self, model: Model, trial: Model, step: Step, damping: Float[Tensor, "a"]
     ) -> tuple[Bool[Tensor, "a"], Float[Tensor, "a"]]:
-        """Tell which steps are accepted, and return the damping of the next ones."""
+        """Return which steps are accepted, and the next damping."""
 
     def refuse(self, model: Model, trial: Model) -> Model:
-        """Return the model of rows whose step is refused: by default the one before."""
+        """Return the model after a refused step: by default the one before."""
         return model
 
 
 def levenberg_marquardt(problem: Problem[State, Model], state: State, steps: int) -> State:
-    """Lower the cost of every row by at most so many damped Gauss-Newton steps, of one evaluation each."""
+    """Lower the cost of every row by damped Gauss-Newton steps of one evaluation each."""
     whole, rows = state, torch.arange(len(state))
     model = problem.linearise(state, rows)
     rows, damping = rows.to(model.cost.device), torch.full_like(model.cost, problem.first_damping)
@@ -109,7 +109,7 @@ class LinearResiduals(Linearisation):
 class LeastSquares(Problem[State, LinearResiduals]):
     """The sum of squared residuals of each row.
 
-    A row of infinite damping rests: its last step gained too little, or none is to be found.
+    A row rests, with infinite damping, when a step gained too little or damping does not help.
 
     Args:
         residuals: residuals and Jacobian at the states of some rows; the rows' numbers are given, too.
@@ -127,7 +127,7 @@ class LeastSquares(Problem[State, LinearResiduals]):
         return LinearResiduals(residual.square().sum(1), residual, jacobian)
 
     def step(self, model: LinearResiduals, damping: Float[Tensor, "a"]) -> Step:
-        """Return the damped step, shortened to `LARGEST_STEP`; zero without a factor, until damping makes one."""
+        """Return the damped step, at most `LARGEST_STEP`; zero where there is no factor yet."""
         normal = model.jacobian.mT @ model.jacobian
         diagonal = normal.diagonal(dim1=1, dim2=2)
         # Relative damping alone would leave a joint that moves nothing undamped.

@@ -1,8 +1,8 @@
-"""Certificates of frictional form closure, Eq. (13): a verdict for every triple, with the numbers that prove it.
+"""Certificates of frictional form closure, Eq. (13): a verdict for every triple, with its proof.
 
-The proof of a closed row is a balance phi; the proof of an open row is a witness, a wrench that no contact opposes. The
-balance bounds the margin from below, the witness from above, whoever found them. A batched simplex (`closure_lp`) finds
-both. HiGHS decides the rows whose bounds leave the verdict open.
+The proof of closure is a balance phi. The proof against it is a witness: a wrench that no contact opposes. Either is
+checked, whoever found it: phi bounds the margin from below, the witness from above. A batched simplex (`closure_lp`)
+finds both. HiGHS decides where their bounds leave the verdict open.
 """
 
 import numpy as np
@@ -19,16 +19,12 @@ from torchgrasp.values import Certificate, Contacts
 
 EXACT = 1e-13
 """Largest |W phi| of a balance that needs no solver: with full rank, a phi less than 1e-9 away balances exactly."""
-
 GAP = 1e-9
 """Largest difference of the two bounds of a proven margin, which must lie twice as far from `MIN_MARGIN`."""
-
 MAX_RESIDUAL = 1e-6
 """Largest |W phi| of a balance found by HiGHS, for wrenches of length about 1."""
-
 STRICT = 1e-10
 """Tolerance of HiGHS, its least. With its default, 1e-7, margins err by 1e-8 and may cross `MIN_MARGIN`."""
-
 UNIT_TOLERANCE = 1e-3
 """Largest difference of a given normal's length from 1: what rounding in a text file leaves."""
 
@@ -36,12 +32,12 @@ UNIT_TOLERANCE = 1e-3
 def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     """Prove in float64 that each triple has frictional form closure, Eq. (13), or that it has not.
 
-    The margin is max s: W phi = 0, sum phi = 1, phi >= s, with `spec.edges` edges a cone at `spec.planned_friction`. It
-    is -inf where no phi balances. Closed rows have a margin of 1e-6 or more and full rank.
+    The margin is max s: W phi = 0, sum phi = 1, phi >= s. The cones have `spec.edges` edges at `spec.planned_friction`.
+    The margin is -inf where no phi balances. Closed rows have a margin of at least 1e-6 and full rank.
 
     The witness v of an open row separates: v.w >= 0 for every edge wrench w, to rounding. With a margin between 0 and
-    1e-6, v.w >= -margin. In a row that lacks only rank, v is the direction in which the wrenches are least. Rows with
-    numbers that are not finite are not closed and hold NaN.
+    1e-6, v.w >= -margin. Where only rank is lacking, the wrenches are least along v. Rows that are not finite are open
+    and hold NaN.
 
     Args:
         contacts: triples of any planner, with outward unit normals; other fields are not read.
@@ -80,7 +76,7 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
 def _prove(
     wrench: Float[Tensor, "b m 6"],
 ) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b 6"]]:
-    """Return margin, residual and witness of each row, by HiGHS where the batch proves no verdict."""
+    """Return margin, residual and witness, by HiGHS where the batch proves nothing."""
     phi, witness = solve_closure_lp(wrench)
     residual = (phi[:, None] @ wrench)[:, 0].abs().amax(-1)
     margin, upper = phi.amin(-1), bound_margin(wrench, witness)
@@ -94,10 +90,10 @@ def _prove(
 
 
 def bound_margin(wrench: Float[Tensor, "b m 6"], witness: Float[Tensor, "b 6"]) -> Float[Tensor, "b"]:
-    """Return the upper bound of the margin that a wrench w proves; NaN for a w of no use.
+    """Return the upper bound of the margin that a wrench w proves; NaN for a useless w.
 
-    Let g_k = w.w_k and phi_k = s + psi_k with psi >= 0. Then 0 = sum phi g >= s sum g + (1 - m s) min g, and therefore
-    s <= -min g / sum(g - min g).
+    With g_k = w.w_k, phi = s + psi and psi >= 0: 0 = sum phi g >= s sum g + (1 - m s) min g.
+    Hence s <= -min g / sum(g - min g).
     """
     product = (wrench @ witness[..., None])[..., 0]
     least = product.amin(-1)
@@ -105,9 +101,9 @@ def bound_margin(wrench: Float[Tensor, "b m 6"], witness: Float[Tensor, "b 6"]) 
 
 
 def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None]:
-    """Return the largest s of one wrench matrix (m, 6), the largest |W phi| of its solution, and a witness.
+    """Return the margin s of one wrench matrix (m, 6), the largest |W phi|, and a witness.
 
-    With phi = s + psi and psi >= 0 the programme has seven equations and no inequality.
+    The programme has seven equations in s and psi = phi - s >= 0.
     """
     from scipy.optimize import linprog
 
@@ -130,7 +126,7 @@ def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None]
 
 
 def check_unit(normals: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
-    """Return the contacts' normals; raise `BadArgument` where one is not of length 1. NaN passes."""
+    """Return the contacts' normals; raise `BadArgument` for a length other than 1. NaN passes."""
     length = torch.linalg.vector_norm(normals, dim=-1)
     wrong = torch.nonzero((length - 1).abs() > UNIT_TOLERANCE)
     if len(wrong):
@@ -141,7 +137,7 @@ def check_unit(normals: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
 
 
 def _checked(contacts: Contacts) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3 3"]]:
-    """Return points and normals in float64 on the CPU; refuse wrong shapes and lengths."""
+    """Return checked points and normals in float64 on the CPU."""
     if not isinstance(contacts, Contacts):
         raise BadArgument("contacts", type(contacts).__name__, "Contacts")
     for name, value in (("points", contacts.points), ("normals", contacts.normals)):

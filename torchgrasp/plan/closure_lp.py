@@ -1,13 +1,12 @@
 """The greatest margin of a balance, Eq. (13), for many grasps at once: a simplex method on a batch.
 
-The programme is max s: W phi = 0, sum phi = 1, phi >= s over m wrenches a_k with mean a. With c_k = m (a - a_k) its
-dual is max a.v: c_k.v <= 1 in six unknowns, and s = 1/m - a.v. The c_k sum to zero, so v = 0 is feasible: no start has
-to be found. At the optimum a = sum lambda_k c_k with lambda >= 0 on six tight rows, and
+Over m wrenches a_k with mean a, the programme is max s: W phi = 0, sum phi = 1, phi >= s. With c_k = m (a - a_k) its
+dual is max a.v: c_k.v <= 1, in six unknowns, and s = 1/m - a.v. v = 0 is feasible, so no start has to be found. At the
+optimum a = sum lambda_k c_k with lambda >= 0 on six tight rows. Then
 
     phi_k = s + m lambda_k  balances with margin s;      w = v has  w . a_k >= -s  for all k.
 
-Both prove themselves: phi that the margin is at least s, w that it is at most s. Where s <= 0, w separates: no contact
-can push against it.
+phi proves that the margin is at least s, w that it is at most s. Where s <= 0, no contact can push against w.
 """
 
 import torch
@@ -16,25 +15,21 @@ from torch import Tensor
 
 PIVOTS = 100
 """Most pivots of one grasp: six reach a vertex, and with 24 wrenches fewer than 30 more reach the optimum."""
-
 OPTIMAL = 1e-12
 """Multipliers below this are zero: the objective grows no further."""
-
 ARTIFICIAL_GAIN = 1e3
 """Added to the gain of the artificial rows, far above any multiplier: they leave first."""
-
 BLOCKING = 1e-11
 """A bound approached more slowly than this, for each unit of the step, is parallel to it."""
-
 GRASPS_PER_CHUNK = 2048
 """Grasps at a time: their tableaux stay in the cache."""
 
 
 def solve_closure_lp(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b 6"]]:
-    """Return for each grasp a balance phi of the greatest margin, and a unit wrench that bounds the margin from above.
+    """Return the balance phi of the greatest margin of each grasp, and the unit witness of the margin.
 
-    Both are candidates: rounding, degenerate wrenches or too few pivots may spoil them, which `certify` checks. Where
-    nothing balances, w.a_k is the same positive number for all k, and phi is meaningless.
+    Rounding, degenerate wrenches or too few pivots may spoil either, so `certify` checks them. Where nothing balances,
+    the witness opposes all wrenches alike, and phi is meaningless.
 
     Args:
         wrench: the primitive wrenches, float64.

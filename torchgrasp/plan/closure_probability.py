@@ -1,7 +1,7 @@
-"""The probability that planned contacts are closed on the real surface, of which only a posterior is known.
+"""The probability that planned contacts are closed on the real surface.
 
-Fingers come along the planned normals and stop on a surface drawn from the posterior (`line_posterior`). The draw is
-closed if the three touched points, with the normals there, are closed for round cones.
+Fingers come along the planned normals and stop on a surface drawn from the posterior (`line_posterior`). The draw
+counts if the touched points are closed for round cones.
 """
 
 import dataclasses
@@ -35,8 +35,7 @@ def closure_probability(
 ) -> ClosureProbability:
     """Return how probable closure is on the uncertain surface, by Monte Carlo.
 
-    `spec.max_variance` says which contacts are allowed; the probability says which to prefer. All rows share the draws,
-    and no row depends on another.
+    All rows share the draws, and no row depends on another.
 
     Args:
         shape: the posterior.
@@ -72,7 +71,7 @@ def closure_probability(
 
 
 def closure_share(shape: ShapeGP, contacts: Contacts, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:
-    """Return the share of n draws that are closed, 0 for contacts at the edge of the domain."""
+    """Return the share of n draws that are closed; 0 at the edge of the domain."""
     inside = well_inside(shape, contacts)
     share = contacts.points.new_zeros(len(contacts))
     share[inside] = closed_share(line_posterior(shape, contacts[inside]), friction, n, seed).to(share)
@@ -80,7 +79,7 @@ def closure_share(shape: ShapeGP, contacts: Contacts, friction: float, n: int, s
 
 
 def closed_share(lines: LinePosterior, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:
-    """Draw n surfaces along the fingers' lines, the same for all rows, and return the share that is closed."""
+    """Return the share of n drawn surfaces on which the fingers' triples are closed."""
     generator = torch.Generator().manual_seed(seed)
     count = lines.points.new_zeros(len(lines))
     at_once = min(n, DRAWS_PER_CHUNK)

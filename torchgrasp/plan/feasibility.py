@@ -1,4 +1,4 @@
-"""Whether contacts satisfy the problem: triples evaluated anew against every constraint, however they were found."""
+"""Whether contacts satisfy the problem, however they were found."""
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -18,7 +18,7 @@ ON_SURFACE = 1e-6
 
 
 def check_feasibility(shape: Shape, spec: ContactSpec, points: Float[Tensor, "b 3 3"]) -> ContactPlan:
-    """Return triples at normalised `points` with the coefficients of their balance and the status of each."""
+    """Evaluate triples at normalised `points` against every constraint."""
     jet = triple_jet(shape, points)
     normals, metres = jet.normals, shape.metres(points)
     wrench = wrenches(points, normals, spec.planned_friction, spec.edges)
@@ -55,7 +55,7 @@ def check_feasibility(shape: Shape, spec: ContactSpec, points: Float[Tensor, "b 
 
 
 def first_violation(good: dict[Status, Bool[Tensor, "b"]]) -> Int[Tensor, "b"]:
-    """Return for each row the first status whose condition it does not meet, in the dictionary's order; else OK."""
+    """Return the first status whose condition a row does not meet, in the dictionary's order; else OK."""
     met = torch.stack(list(good.values()))
     codes = torch.tensor([*good, Status.OK], device=met.device)
     return codes[torch.where(met.all(0), len(good), (~met).to(torch.uint8).argmax(0))]

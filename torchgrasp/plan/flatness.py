@@ -1,6 +1,6 @@
-"""Flatness of the surface around contacts: the variation of the normal on a ring of a fingertip's size.
+"""Flatness of the surface around contacts: how the normal varies on a ring of a fingertip's size.
 
-`normal_variation` judges a plan. `flatness_constraint` keeps contacts that slide on flat surface.
+`normal_variation` judges a plan. `flatness_constraint` keeps sliding contacts on flat surface.
 """
 
 import dataclasses
@@ -18,10 +18,8 @@ from torchgrasp.plan.wrench import cone_edges, tangents
 
 RING_RADIUS = 0.008
 """Radius [m] of the ring around a contact: within a fingertip, whose radius is 12 mm."""
-
 JUDGED_POINTS, GUIDING_POINTS = 8, 4
 """Points of the ring on which a plan is judged, and fewer that guide a solver."""
-
 INSIDE = 0.95
 """Share of the largest variation that guiding points allow: the judged points lie between them."""
 
@@ -29,14 +27,14 @@ INSIDE = 0.95
 def ring_directions(
     normals: Float[Tensor, "b 3 3"], points: Float[Tensor, "b 3 3"], n: int
 ) -> Float[Tensor, "b 3 n 3"]:
-    """Return n unit tangents around each contact: the edges of a cone of friction 1 without its axis."""
+    """Return n unit tangents around each contact: a cone of friction 1 without its axis."""
     return cone_edges(normals, tangents(points, normals), 1.0, n) + normals[:, :, None]
 
 
 def normal_variation(
     shape: Shape, points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]
 ) -> Float[Tensor, "b 3"]:
-    """Return the largest angle [rad] between a contact's normal and the normals on its ring, moved onto the surface."""
+    """Return the largest angle [rad] between the normals at a contact and on its ring."""
     around = ring_directions(normals, points, JUDGED_POINTS)
     ring = points[:, :, None] + RING_RADIUS / float(shape.scale) * around
     _, gradient = shape.mean_and_gradient(project(shape, ring.flatten(1, 2), steps=1).flatten(0, 1))
@@ -50,7 +48,7 @@ def normal_variation(
 class FlatnessConstraint(Batch):
     """Values <= 0 on flat surface, linear about the points `at` of their evaluation.
 
-    A ring costs as much as several steps of a solver, so it is evaluated rarely.
+    A ring costs as much as several steps of a solver: evaluate it rarely.
     """
 
     value: Float[Tensor, "b k"]
@@ -63,9 +61,9 @@ class FlatnessConstraint(Batch):
 
 
 def flatness_constraint(shape: Shape, points: Float[Tensor, "b 3 3"], flatness: float) -> FlatnessConstraint:
-    """Evaluate the chords |n - n_k| between a contact's normal and its ring's, less the chord of `flatness` [rad].
+    """Evaluate |n - n_k| for the normals at a contact and on its ring, less the chord of `flatness` [rad].
 
-    Values are lengths: chords times the ring's radius. Points are normalised.
+    Values are lengths: chords times the ring's radius.
     """
     jet, radius = triple_jet(shape, points), RING_RADIUS / float(shape.scale)
     identity = torch.eye(3, dtype=points.dtype, device=points.device)

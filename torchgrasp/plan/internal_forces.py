@@ -1,7 +1,7 @@
-"""Internal forces of three contacts: in equilibrium, and with the least tangential part.
+"""Internal forces of three contacts: in equilibrium, with the least friction.
 
-The grasp map of three points has a null space of three dimensions, spanned by a push along each side of the triangle.
-The search goes over directions in it, so that balance holds by construction.
+A push along each side of the triangle spans the null space of the grasp map. The search goes over directions in it:
+balance holds by construction.
 """
 
 import math
@@ -14,21 +14,18 @@ from torchgrasp.linalg import GOLDEN_ANGLE, fibonacci_sphere, unit
 
 DIRECTIONS, NEIGHBOURS = 1024, 64
 """Directions in the null space that are tried first, 0.06 rad apart, and around the best in each refinement."""
-
 REFINEMENTS, SHRINK = 24, 0.75
 """Rounds of the search, and the radius of each over the last: from 0.12 rad down to 1e-4 rad."""
-
 EVENNESS = 0.01
 """Worth of equal normal forces against the friction angle (its tangent): it decides only between equally good sets."""
-
 PREFERENCE = 0.2
 """Worth of the preferred proportions of the normal forces against the friction angle (its tangent)."""
 
 
 def internal_forces(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3 3"]:
-    """Return the null space of the grasp map: `[..., k, i, :]` is the force at contact i when pair k is pressed.
+    """Return the null space of the grasp map: `[..., k, i, :]` is the force at contact i under push k.
 
-    Pairs are (0, 1), (1, 2) and (2, 0). Each presses along its side of the triangle, so forces and torques cancel.
+    Pushes are between contacts (0, 1), (1, 2) and (2, 0), along their side: forces and torques cancel.
 
     >>> internal_forces(torch.eye(3)).sum(1).abs().max()
     tensor(0.)
@@ -42,7 +39,7 @@ def internal_forces(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3 3"
 
 
 def tangential_ratio(forces: Float[Tensor, "*b 3 3"], normals: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
-    """Return tangential over normal force at each contact: the friction it needs; infinite where it pulls."""
+    """Return tangential over normal force, the friction needed; infinite where a contact pulls."""
     push = -(forces * normals).sum(-1)
     tangential = torch.linalg.vector_norm(forces + push[..., None] * normals, dim=-1)
     return torch.where(push > 0, tangential / push.clamp_min(1e-12), torch.inf)
@@ -54,10 +51,10 @@ def least_friction_forces(
     strongest: float = 4.0,
     preferred: Float[Tensor, "*#b 3"] | None = None,
 ) -> Float[Tensor, "*b 3 3"]:
-    """Return forces of the fingers on the object [N] in equilibrium that need the least friction.
+    """Return the balanced forces of the fingers on the object [N] that need the least friction.
 
-    The largest ratio of tangential to normal force is minimised, so the forces lie in the friction cones whenever any
-    balanced set does. Of two fingers against a thumb, the thumb's force is the sum of the others'.
+    They lie in the friction cones whenever any balanced set does. A thumb against two fingers presses with the sum of
+    their forces.
 
     Args:
         points: contacts [m].
@@ -95,7 +92,7 @@ def _best(
     normals: Float[Tensor, "*b 3 3"],
     preferred: Float[Tensor, "*#b 1 3"] | None,
 ) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b"]]:
-    """Return the combination that needs the least friction among k, and its cost; infinite where a contact pulls."""
+    """Return the best of k combinations, and its cost; infinite where a contact pulls."""
     forces = torch.einsum("...jk,...kci->...jci", weights, basis)
     normals = normals[..., None, :, :]
     push = -(forces * normals).sum(-1)

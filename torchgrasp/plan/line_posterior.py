@@ -1,16 +1,13 @@
-"""The uncertain surface along the lines of three fingers, and where fingers meet a surface drawn from it.
+"""The uncertain surface along the lines of three fingers, and where fingers meet it.
 
 A finger comes along the planned normal n of its contact x. It stops at x + t n where the distance d turns negative: at
-the t nearest to 0, if there are several. The normal there is along the gradient w.
+the smallest |t|. The normal there is along the gradient w.
 
-(d, w) is sampled jointly at 5 nodes of each line and interpolated linearly; outside the nodes deviations are constant.
-The mean of d is followed on a finer and longer grid.
+(d, w) is sampled jointly at 5 nodes per line and interpolated linearly; deviations are constant outside. The mean of d
+is followed on a finer and longer grid.
 
-Two choices make the deviations those of real surfaces (docs/planning.md):
-
-* All covariances are scaled by `std_factor`^2: real surfaces deviate that much less than sqrt(variance).
-* w deviates like a difference quotient of d over a fingertip's width. A sample of the thin plate is rough, and no
-  finger feels its gradient at a point.
+Deviations are those of real surfaces (docs/planning.md). Covariances are scaled by `std_factor`^2. w deviates like a
+difference quotient of d over a fingertip's width: no finger feels the rough gradient at a point.
 """
 
 import dataclasses
@@ -31,20 +28,17 @@ from torchgrasp.values import Contacts
 
 FOOTPRINT = 0.012
 """Half the width [m] over which a fingertip feels the slope of the surface: the radius of its sphere."""
-
 NODES = (4.0, 1.5, 0.0, -1.5, -4.0)
 """Nodes of a line, in standard deviations of the surface at its contact: three err by 0.07, five by 0.02 at most."""
-
 OUTER_GRID = (12.0, 9.0, 6.5, 4.0, 3.375, 2.75, 2.125, 1.5, 1.125, 0.75, 0.375, 0.0)
 """Outer half of the grid, in the same unit; it holds all nodes."""
-
 TRIPLES_PER_CHUNK = 32
 """Triples whose joint posterior is made at a time: 105 x 105 distances each, which stay in the cache."""
 
 
 @dataclasses.dataclass(frozen=True)
 class LinePosterior(Batch):
-    """The Gaussian of (d, w) on the lines x + t n of three fingers, from outside in; all is normalised.
+    """The Gaussian of (d, w) on the lines x + t n, from outside in, normalised.
 
     Args:
         points: planned contacts x.
@@ -80,7 +74,7 @@ def grid_weights() -> Float[Tensor, "23 5"]:
 
 
 def interpolation(at: Float[Tensor, "*b"], nodes: Float[Tensor, "k"]) -> Float[Tensor, "*b k"]:
-    """Return the weights of descending nodes in the value at each place: linear between, constant outside."""
+    """Return the weights of descending nodes at each place: linear between, constant outside."""
     held = torch.minimum(torch.maximum(at, nodes[-1]), nodes[0])[..., None]
     gaps = nodes[:-1] - nodes[1:]
     share = ((nodes[:-1] - held) / gaps).clamp(0, 1)  # how far each gap has been passed
@@ -88,7 +82,7 @@ def interpolation(at: Float[Tensor, "*b"], nodes: Float[Tensor, "k"]) -> Float[T
 
 
 def well_inside(shape: ShapeGP, contacts: Contacts) -> Bool[Tensor, "b"]:
-    """Tell which triples are a footprint or more inside the domain, where `line_posterior` is defined."""
+    """Tell which triples are a footprint or more inside the domain."""
     radius = torch.linalg.vector_norm(shape.normalise(contacts.points.detach().double().to(shape.device)), dim=-1)
     return (radius + FOOTPRINT / shape.scale <= shape.domain_radius).all(-1)
 
@@ -122,9 +116,9 @@ def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
 def node_covariance(
     shape: ShapeGP, points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"], nodes: Float[Tensor, "b 3 5"]
 ) -> Float[Tensor, "b 60 60"]:
-    """Return the posterior covariance of (d, w) at the nodes, w by difference quotients of d along three axes.
+    """Return the posterior covariance of (d, w) at the nodes, w by difference quotients of d.
 
-    Nodes outside the domain, where there is no posterior, take the covariance at its edge.
+    Nodes outside the domain take the covariance at its edge.
     """
     width = FOOTPRINT / shape.scale
     along = (points * normals).sum(-1)
@@ -146,10 +140,7 @@ def node_covariance(
 def first_contact(
     lines: LinePosterior, drawn: Float[Tensor, "b n 60"]
 ) -> tuple[Float[Tensor, "b n 3 3"], Float[Tensor, "b n 3 3"]]:
-    """Return where the fingers stop for drawn deviations, and the outward normals there.
-
-    Rows are NaN where a finger meets no surface on its grid.
-    """
+    """Return where the fingers stop for drawn deviations, and the normals there; NaN without a surface."""
     deviation = drawn.unflatten(-1, (3, len(NODES), 4))
     distance = lines.distance[:, None] + deviation[..., 0] @ grid_weights().to(drawn).T
     crosses = (distance[..., :-1] > 0) & (distance[..., 1:] <= 0)

@@ -1,8 +1,4 @@
-"""Objectives of a plan besides Eq. (14): costs of contacts, lowered from where the centre was reached.
-
-Named costs are Ferrari and Canny's epsilon, the least weight of the certificate, and the probability of closure. A user
-may give a cost of one's own.
-"""
+"""Objectives of a plan besides Eq. (14): costs of contacts, lowered from where the centre was reached."""
 
 import dataclasses
 from collections.abc import Callable
@@ -29,31 +25,23 @@ from torchgrasp.values import ContactPlan
 
 Cost = Callable[[Tensor, Tensor], Tensor]
 """Contacts (b, 3, 3) [m] and outward unit normals (b, 3, 3) in, a cost (b,) out, differentiable by autograd."""
-
 Objective = Literal["center", "epsilon", "min_weight", "probability"] | Cost
 """What a plan minimises."""
-
 Improvement = Callable[[ContactPlan, Float[Tensor, "b 3"]], ContactPlan]
 """A plan and the tensions of its triangles in, the improved plan out. `quality` then holds the cost."""
-
 DOWN = Stage(centre=0.0, cones=3.0, steps=15)
 """The stage down a cost; feasibility alone is beside it."""
-
 ON_FACET = 1e-9
 """Wrenches (of about unit length) this near a facet are its corners: far above rounding."""
-
 MOVES, FIRST_MOVE, SHRINK = 12, 0.01, 0.85
 """Moves towards a more probable closure: their number, the length of the first [m], and each over the last.
 The lengths fall from a fingertip's to 2 mm, below which 400 draws tell nothing."""
-
 SURFACE_DRAWS = 400
 """Surfaces on which a move is judged: the standard error is at most 0.025, and less for differences on equal draws."""
 
 
 def improvement(objective: Objective, shape: Shape, spec: ContactSpec, seed: int) -> Improvement | None:
-    """Return what improves a plan; None for "center", which is one of the problem's own residuals.
-
-    A user's cost is tried on two triples first.
+    """Return what improves a plan; None for "center". A user's cost is tried on two triples first.
 
     Raises:
         BadArgument: an unknown name, a cost without a number for each row or without a gradient, or "probability"
@@ -98,10 +86,9 @@ def lower_cost(
 def raise_probability(
     shape: ShapeGP, spec: ContactSpec, seed: int, plan: ContactPlan, tension: Float[Tensor, "b 3"]
 ) -> ContactPlan:
-    """Return the plan with a more probable closure in its OK rows; `quality` is minus the probability.
+    """Return the plan with a more probable closure in its OK rows.
 
-    A count of draws has no gradient. Random moves along the surface, the same for all rows, are kept where they raise
-    it.
+    A count of draws has no gradient: random moves along the surface are kept where they raise it.
     """
 
     def with_probability(plan: ContactPlan) -> ContactPlan:
@@ -125,9 +112,9 @@ def raise_probability(
 def min_weight_cost(
     spec: ContactSpec, points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]
 ) -> Float[Tensor, "b"]:
-    """Return minus the greatest margin s: W phi = 0, sum phi = 1, phi >= s, with its derivative.
+    """Return minus the margin s of the certificate, with its derivative.
 
-    By duality ds = -v . sum phi_k da_k for the wrenches a_k and the optimum v of the dual (see `closure_lp`).
+    By duality ds = -v . sum phi_k da_k (see `closure_lp`).
     """
     wrench = wrenches(points, normals, spec.planned_friction, spec.edges).flatten(1, 2)
     fixed = wrench.detach()
@@ -142,11 +129,10 @@ def min_weight_cost(
 def epsilon_cost(
     spec: ContactSpec, points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]
 ) -> Float[Tensor, "b"]:
-    """Return minus Ferrari and Canny's epsilon, the radius of the largest ball in the hull of the wrenches.
+    """Return minus Ferrari and Canny's epsilon: the radius of the largest ball in the hull of the wrenches.
 
-    It is the least offset u . sum lambda_k w_k of a facet with unit normal u. The weights lambda of the corners w_k
-    are those of the foot of the perpendicular, where u and lambda are stationary. With the origin outside, epsilon is
-    minus its distance from the farthest facet. Qhull builds each hull, in about 5 ms.
+    It is the least offset u . sum lambda_k w_k of a facet with unit normal u and corners w_k, at the foot of the
+    perpendicular: u and lambda are stationary there. It is negative with the origin outside. Qhull takes 5 ms a hull.
     """
     from scipy.spatial import ConvexHull, QhullError
 
@@ -168,7 +154,7 @@ def epsilon_cost(
 
 
 def evaluate_cost(cost: Cost, points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b"]:
-    """Return the cost of contacts [m]; `BadArgument` where it is not one number a row."""
+    """Return the cost of contacts [m]; raise `BadArgument` without one number a row."""
     value = cost(points, normals)
     if not isinstance(value, Tensor) or value.shape != points.shape[:1]:
         shape = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
@@ -179,7 +165,7 @@ def evaluate_cost(cost: Cost, points: Float[Tensor, "b 3 3"], normals: Float[Ten
 def cost_gradients(
     cost: Cost, points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]
 ) -> tuple[Float[Tensor, "b"], Float[Tensor, "b 3 3"], Float[Tensor, "b 3 3"]]:
-    """Return the cost of contacts [m] and its gradients by points and by normals; `BadArgument` without gradients."""
+    """Return the cost of contacts [m] and its gradients by points and normals."""
     with torch.enable_grad():
         leaves = points.detach().requires_grad_(), normals.detach().requires_grad_()
         value = evaluate_cost(cost, *leaves)
@@ -190,11 +176,8 @@ def cost_gradients(
 
 
 def differentiate_cost(cost: Cost, shape: Shape, state: State) -> tuple[Float[Tensor, "b"], Float[Tensor, "b 12"]]:
-    """Return the cost of triples and its gradient by normalised points and (zero) by tensions.
-
-    A normal changes with its point: dn = (1 - n n^T) H dx / |g|.
-    """
-    jet, normals = state.jet, state.jet.normals
+    """Return the cost of triples and its gradient by normalised points and (zero) tensions."""
+    jet, normals = state.jet, state.jet.normals  # dn = (1 - n n^T) H dx / |g|
     value, by_point, by_normal = cost_gradients(cost, shape.metres(state.points), normals)
     across = by_normal - (by_normal * normals).sum(-1, keepdim=True) * normals
     steep = torch.linalg.vector_norm(jet.gradient, dim=-1, keepdim=True)

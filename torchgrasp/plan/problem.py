@@ -1,11 +1,11 @@
-"""The contact planning problem, Eqs. (10)-(14), for a batch of triples: constraints and their analytic Jacobian.
+"""The contact planning problem, Eqs. (10)-(14), for a batch of triples.
 
-Unknowns x of a triple are its points (3, 3), normalised, and the tensions (3) of the sides of its triangle.
+Unknowns x of a triple are its normalised points (3, 3) and the tensions (3) of its triangle's sides. Eq. (11) defines
+the normals. Eq. (13) asks for balanced forces in the friction cones. Three forces balance if and only if each is the
+sum of the pulls along the two sides at its contact [1]. So W phi = 0 holds whatever the tensions; one inequality for
+each cone is left. Every inequality is a bound <= 0.
 
-Eq. (13) asks for forces in the friction cones that balance. Three forces balance if and only if each is the sum of the
-pulls along the two sides at its contact (Yoshikawa and Nagai, IEEE Trans. Robotics and Automation 7, 1991). So
-W phi = 0 holds by construction, whatever the tensions, and one inequality for each cone is left. Normals are no
-unknowns: Eq. (11) defines them. Every inequality is written as a bound <= 0.
+[1] Yoshikawa and Nagai, IEEE Trans. Robotics and Automation 7, 1991.
 """
 
 import dataclasses
@@ -22,17 +22,15 @@ from torchgrasp.specs import ContactSpec
 
 INSIDE = 0.99
 """Inequalities are solved to this share of their bound: the last steps onto the surface stay inside it."""
-
 CONE_MARGIN = 0.02
 """The cosine between force and inward normal exceeds that of the cone by this much: strictly inside, as phi > 0."""
-
 LEAST_SIDE = 0.05
 """Least distance of two contacts, normalised: coincident ones balance, but their wrenches lack rank."""
 
 
 @runtime_checkable
 class Jet(Protocol):
-    """The shape's mean and variance at query points with their derivatives, in normalised units."""
+    """The shape's mean and variance at query points with their derivatives, normalised."""
 
     @property
     def distance(self) -> Tensor: ...  # noqa: D102
@@ -48,7 +46,7 @@ class Jet(Protocol):
 
 @runtime_checkable
 class Shape(Protocol):
-    """The planner's view of a shape: a `ShapeGP`, or another implicit surface with an uncertainty."""
+    """A `ShapeGP`, or another implicit surface with an uncertainty."""
 
     @property
     def scale(self) -> float: ...  # noqa: D102
@@ -63,7 +61,7 @@ class Shape(Protocol):
 
 
 def device_of(shape: Shape) -> torch.device:
-    """Return the device of a shape: the CPU for one that names none."""
+    """Return the device of a shape, by default the CPU."""
     return getattr(shape, "device", torch.device("cpu"))
 
 
@@ -79,12 +77,12 @@ class TripleJet(Batch):
 
     @property
     def normals(self) -> Float[Tensor, "b 3 3"]:
-        """The outward unit normals, Eq. (11); the posterior gradient is not of length 1."""
+        """The outward unit normals, Eq. (11)."""
         return unit(self.gradient)
 
     @property
     def normal_jacobian(self) -> Float[Tensor, "b 3 3 3"]:
-        """The derivative of each normal by its point: (1 - n n^T) H / |g|."""
+        """The derivatives of the normals by their points, (1 - n n^T) H / |g|."""
         n, steep = self.normals, torch.linalg.vector_norm(self.gradient, dim=-1)[..., None, None]
         return (self.hessian - n[..., :, None] * (n[..., None, :] @ self.hessian)) / steep
 
@@ -98,9 +96,9 @@ def triple_jet(shape: Shape, points: Float[Tensor, "b 3 3"]) -> TripleJet:
 
 @dataclasses.dataclass(frozen=True)
 class Constraints(Batch):
-    """Values and Jacobians (nine coordinates, then three tensions) of the constraints at a batch of triples.
+    """Values of the constraints, and Jacobians by nine coordinates and three tensions.
 
-    `bounds` are three each for cones, variances, the domain's ball, sides, and with a table heights.
+    `bounds` are three each: cones, variances, domain, sides, and with a table heights.
     """
 
     centre: Float[Tensor, "b 3"]
@@ -124,9 +122,9 @@ class Constraints(Batch):
 def forces_from_tensions(
     points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"]
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3 3"]]:
-    """Return the forces on the object at the contacts, and the sides, each from a contact to the next.
+    """Return the forces on the object at the contacts, and the sides from each contact to the next.
 
-    The tension of a side pulls its two ends together in proportion to its length: no net force or torque.
+    A tension pulls the ends of its side together, in proportion to its length.
     """
     sides = points.roll(-1, 1) - points
     pull = tension[..., None] * sides
@@ -166,17 +164,11 @@ class ContactProblem:
         )
 
     def least_height(self, normals: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the least z coordinate of contacts with these normals: a round fingertip then rests on the table."""
+        """Return the least z coordinate of contacts: a round fingertip then rests on the table."""
         return self.table + (self.tip_radius * (1 - normals[..., 2])).clamp_min(self.contact_height)
 
     def constraints(self, points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"], jet: TripleJet) -> Constraints:
-        """Evaluate all constraints and their Jacobians.
-
-        Args:
-            points: contacts, normalised.
-            tension: of the side from each contact to the next.
-            jet: the shape at the points.
-        """
+        """Evaluate all constraints and their Jacobians; `jet` is the shape at the points."""
         b, identity = len(points), torch.eye(3, dtype=points.dtype, device=points.device)
         threshold, ball = self.max_variance * INSIDE, self.domain_radius * INSIDE
         half_slope = 2 * threshold**0.5  # slope of the variance at the threshold, for a linear standard deviation
@@ -214,10 +206,10 @@ class ContactProblem:
     def _cones(
         self, points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"], jet: TripleJet
     ) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 3 12"]]:
-        """Return by how much each force leaves its cone, as a cosine, which no size of forces changes.
+        """Return by how much each force leaves its cone, as a cosine.
 
-        With u = f / |f| the bound is n.u + cosine. Its derivative by the force is (1 - u u^T) n / |f|, and by the
-        normal, which turns with its own point, u.
+        With u = f / |f| the bound is n.u + cosine. Its derivatives are (1 - u u^T) n / |f| by the force, and u by the
+        normal, which turns with its point.
         """
         normals = jet.normals
         force, sides = forces_from_tensions(points, tension)
@@ -242,7 +234,7 @@ class ContactProblem:
 
 
 def _by_own_point(slope: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 12"]:
-    """Lay out the Jacobian of three values of which value i depends on point i alone."""
+    """Return the Jacobian of three values, each of its own point alone."""
     jacobian = slope.new_zeros(len(slope), 3, 12)
     for i in range(3):
         jacobian[:, i, 3 * i : 3 * i + 3] = slope[:, i]

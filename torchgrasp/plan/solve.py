@@ -23,13 +23,10 @@ SEARCH = (Stage(centre=3.0, cones=0.3, steps=10), Stage(centre=1.0, cones=3.0, s
 )
 """Stages from starts anywhere: centre and closure by turns, each of which leads out of places where the other is stuck.
 The last two give way where the centre cannot be reached."""
-
 TO_CENTRE = (Stage(centre=0.3, cones=3.0, steps=8),)
 """The stage from triples of candidates, most of which are feasible but for rounding: towards the centre, Eq. (14)."""
-
 LEAST_STARTS = 25
 """Fewest starts at a time under a time budget: with less, the overhead of each step outweighs them."""
-
 Chunk = tuple[Float[Tensor, "_ 3 3"], tuple[Stage, ...]]
 """Normalised starts on the surface, and the stages from there."""
 
@@ -45,9 +42,9 @@ def plan_contacts(
 ) -> ContactPlan:
     """Plan three contacts from each of many starts, Eqs. (10)-(14): one row a start, in the order of the starts.
 
-    A row that fails carries the `Status` of the first constraint it violates. Points are in metres and the frame of
-    the cloud, normals outward. A feasible start from which the descent fails is itself the plan. Without
-    `time_budget` the result is deterministic, and a plan from 500 or 1000 starts begins one from more.
+    A failed row carries the `Status` of the first constraint it violates. Where a descent fails, a feasible start is
+    itself the plan. Without `time_budget` the result is deterministic. A plan from 500 or 1000 starts begins one from
+    more.
 
     Args:
         shape: a `ShapeGP`, or another implicit surface with the same methods.
@@ -95,7 +92,7 @@ def _chunks(shape: Shape, spec: ContactSpec, starts: int | Float[Tensor, "b 3 3"
 
 
 def _within(seconds: float, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
-    """Yield as much of the chunks as will be planned in time, at the pace so far."""
+    """Yield as many starts as will be planned in time, at the pace so far."""
     began, done, fits = time.monotonic(), 0, LEAST_STARTS
     for first, stages in chunks:
         while len(first) > 0:
@@ -115,7 +112,7 @@ def plan_chunk(
     stages: tuple[Stage, ...],
     improve: Improvement | None = None,
 ) -> ContactPlan:
-    """Plan from normalised starts on the surface; a feasible start from which nothing is found is itself the plan."""
+    """Plan from normalised starts on the surface."""
     problem = ContactProblem.of(shape, spec)
     state = start_state(shape, first)
     for stage in (*stages, FINISH):

@@ -1,7 +1,7 @@
-"""The solver of a `ContactProblem`: Levenberg-Marquardt along the surface, each triple with its own damping.
+"""The solver of a `ContactProblem`: Levenberg-Marquardt along the surface.
 
-Every step ends on the surface: one Newton step of the mean alone brings the points back. It costs a fraction of a full
-evaluation and lets steps be long.
+After every step one Newton step of the mean brings the points back to the surface. It costs a fraction of a full
+evaluation, and steps may be long.
 """
 
 import dataclasses
@@ -19,16 +19,12 @@ from torchgrasp.shape.surface import newton_step
 
 LONGEST_STEP = 0.3
 """A point moves at most this far in a step (normalised): about the range in which the surface is smooth."""
-
 TENSION_DAMPING = 0.1
 """Damping of the tensions relative to that of the points: tensions may change faster."""
-
 PULL = 0.1
 """Length of an objective's weighted gradient at the start of its stage: a tenth of a unit constraint row."""
-
 SURFACE = 10.0
 """Weight of the surface: a step off it would be undone by the projection, which the cones then resist."""
-
 BOUNDS = 3.0
 """Weight of all bounds but the cones, as great as that of the cones in the last stage."""
 
@@ -52,7 +48,7 @@ FINISH = Stage(centre=0.0, cones=3.0, steps=30, settled=1e-8)
 
 @dataclasses.dataclass(frozen=True)
 class State(Batch):
-    """Triples at normalised `points` with the tensions of their sides, and the shape there."""
+    """Triples with the tensions of their sides, and the shape at their normalised points."""
 
     points: Float[Tensor, "b 3 3"]
     tension: Float[Tensor, "b 3"]
@@ -65,9 +61,9 @@ StateCost = Callable[[State], tuple[Float[Tensor, "b"], Float[Tensor, "b 12"]]]
 
 @dataclasses.dataclass(frozen=True)
 class LinearConstraints(Linearisation):
-    """Weighted residuals of the constraints, their weights, and the Jacobian without these.
+    """Weighted residuals, their weights, and the Jacobian without weights.
 
-    `inside` tells whether all points are in the domain. `downhill` is minus the gradient of an objective.
+    `inside`: all points are in the domain. `downhill`: minus the gradient of an objective.
     """
 
     residual: Float[Tensor, "a r"]
@@ -84,7 +80,7 @@ class LinearConstraints(Linearisation):
 
 @dataclasses.dataclass(frozen=True)
 class Descent(Problem[State, LinearConstraints]):
-    """Half the sum of a stage's weighted squares; with an objective, plus its value times the row's `pull`."""
+    """The cost of a stage: half the sum of weighted squares, plus `pull` times an objective."""
 
     shape: Shape
     problem: ContactProblem
@@ -93,7 +89,7 @@ class Descent(Problem[State, LinearConstraints]):
     pull: Float[Tensor, "b"] | None = None
 
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> LinearConstraints:
-        """Evaluate the constraints and the objective with their derivatives; bounds that hold weigh nothing."""
+        """Evaluate constraints and objective; bounds that hold weigh nothing."""
         constraints = self.problem.constraints(state.points, state.tension, state.jet)
         bounds = torch.full_like(constraints.bounds, BOUNDS)
         bounds[:, :3] = self.stage.cones
@@ -110,10 +106,7 @@ class Descent(Problem[State, LinearConstraints]):
         return LinearConstraints(cost, residual, weight, constraints.jacobian, inside, downhill)
 
     def step(self, model: LinearConstraints, damping: Float[Tensor, "a"]) -> Step:
-        """Return the damped step, in which no point moves farther than `LONGEST_STEP`.
-
-        It is NaN, and the row rests, where the normal equations are not positive definite.
-        """
+        """Return the damped step, no point farther than `LONGEST_STEP`. Rows without a factor rest."""
         jacobian = model.weighted_jacobian
         scale = torch.tensor([1.0] * 9 + [TENSION_DAMPING] * 3, dtype=jacobian.dtype, device=jacobian.device)
         normal = jacobian.mT @ jacobian + torch.diag_embed(damping[:, None] * scale)
@@ -134,23 +127,23 @@ class Descent(Problem[State, LinearConstraints]):
     def judge(
         self, model: LinearConstraints, trial: LinearConstraints, step: Step, damping: Float[Tensor, "a"]
     ) -> tuple[Bool[Tensor, "a"], Float[Tensor, "a"]]:
-        """Accept a decrease inside the domain; damp the more, the less of its promise a step keeps (Nielsen's rule)."""
+        """Accept a decrease inside the domain; damp by the kept share of its promise (Nielsen)."""
         kept = (model.cost - trial.cost) / promised_decrease(model, step.x)
         accepted = (kept > 0) & trial.inside  # NaN is not accepted
         eased = damping * (1 - (2 * kept - 1) ** 3).clamp(min=1 / 5, max=2.0)
         return accepted, torch.where(accepted, eased.clamp(min=1e-9), (4 * damping).clamp(max=1e9))
 
     def refuse(self, model: LinearConstraints, trial: LinearConstraints) -> LinearConstraints:
-        """Return the model with the mean of the Jacobians at both ends of the refused step (a bundle of gradients).
+        """Return the model with the mean Jacobian of both ends of the step (a bundle of gradients).
 
-        Near an observation the normals of a thin plate turn in a cusp. The step from either side leads across it, and
-        only the mean points down along it.
+        Near an observation a thin plate's normals turn in a cusp. Steps from either side lead across it; the mean
+        points down along it.
         """
         return dataclasses.replace(model, jacobian=(model.jacobian + trial.jacobian) / 2)
 
 
 def promised_decrease(model: LinearConstraints, x: Float[Tensor, "a 12"]) -> Float[Tensor, "a"]:
-    """Return by how much a step lowers the cost of the linear model."""
+    """Return by how much a step lowers the model's cost."""
     linear = model.residual + (model.weighted_jacobian @ x[..., None])[..., 0]
     promised = (model.residual.square().sum(1) - linear.square().sum(1)) / 2
     return promised if model.downhill is None else promised + (model.downhill * x).sum(1)
@@ -159,10 +152,7 @@ def promised_decrease(model: LinearConstraints, x: Float[Tensor, "a 12"]) -> Flo
 def descend(
     shape: Shape, problem: ContactProblem, state: State, stage: Stage, objective: StateCost | None = None
 ) -> State:
-    """Return the triples after a stage.
-
-    An `objective` joins with a weight at which its first gradient has the length `PULL`: its unit does not matter.
-    """
+    """Return the triples after a stage; an objective's first gradient is weighted to the length `PULL`."""
     pull = None
     if objective is not None:
         length = torch.linalg.vector_norm(objective(state)[1], dim=-1)
@@ -171,7 +161,7 @@ def descend(
 
 
 def project(shape: Shape, points: Float[Tensor, "b k 3"], steps: int) -> Float[Tensor, "b k 3"]:
-    """Move normalised points along the gradient onto f_d = 0 by Newton steps of the mean alone."""
+    """Move normalised points onto f_d = 0 by Newton steps along the gradient."""
     x = points.flatten(0, 1)
     for _ in range(steps):
         distance, gradient = shape.mean_and_gradient(x)
@@ -180,12 +170,12 @@ def project(shape: Shape, points: Float[Tensor, "b k 3"], steps: int) -> Float[T
 
 
 def start_state(shape: Shape, points: Float[Tensor, "b 3 3"]) -> State:
-    """Return the state of triples at `points` with equal tensions: each force points to the contacts' centre."""
+    """Return the state of triples with equal tensions: forces point to the contacts' centre."""
     tension = normalise_tensions(points, points.new_ones(len(points), 3))
     return State(points, tension, triple_jet(shape, points))
 
 
 def normalise_tensions(points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
-    """Return the tensions over the mean size of the forces, on which no constraint depends."""
+    """Return the tensions for which the mean size of the forces is 1."""
     force, _ = forces_from_tensions(points, tension)
     return tension / torch.linalg.vector_norm(force, dim=-1).mean(-1, keepdim=True)

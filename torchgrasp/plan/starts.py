@@ -1,4 +1,4 @@
-"""Starts of the planner: points on a sphere as in the paper, candidate contacts on the surface, or given points."""
+"""Starts of the planner: on the paper's sphere, from candidate contacts, or given."""
 
 from collections.abc import Iterator
 
@@ -17,19 +17,14 @@ from torchgrasp.specs import ContactSpec
 
 CANDIDATE_TRIPLES = 700
 """Triples of surface points among which candidates are found: 2100 points are 4 mm apart on a hand-sized object."""
-
 CANDIDATE_FLATNESS = 0.9
 """Share of the largest normal variation that a candidate may have: its ring turns with the triple it joins."""
-
 FAR = 0.1
 """A start with a point farther than this from the surface (normalised signed distance) is no guess of contacts."""
-
 NEAR_CENTRE = 0.1
 """Normalised distance from the centre to which such a start is drawn in: the paper's radius of starts."""
-
 TRIPLES_PER_START, ROUNDS = 20, 8
 """Triples drawn for each start in one round, and most rounds: 2 to 10 % of the candidates' triples are closed."""
-
 STARTS_PER_CHUNK = 500
 """Starts planned at once: memory is bounded, and a plan from fewer starts begins one from more."""
 
@@ -56,17 +51,17 @@ def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor, seed: in
 
 
 def given_starts(shape: Shape, starts: Float[Tensor, "b 3 3"]) -> Iterator[Float[Tensor, "_ 3 3"]]:
-    """Yield normalised starts on the surface from given points [m], chunk by chunk."""
+    """Yield normalised starts on the surface from given points [m]."""
     for points in starts.detach().to(device_of(shape), torch.float64).split(STARTS_PER_CHUNK):
         yield project(shape, draw_in(shape, shape.normalise(points)), steps=6)
 
 
 def drawn_starts(shape: Shape, spec: ContactSpec, starts: int, seed: int) -> Iterator[Float[Tensor, "_ 3 3"]]:
-    """Yield so many normalised starts on the surface, chunk by chunk.
+    """Yield normalised starts on the surface.
 
-    Without `spec.flatness` each is three points of the sphere of `spec.start_radius`, moved onto the surface
-    (Sec. 6.2). With it, each is a triple of `candidate_contacts`: a flat grasp's centre may lie 30 mm from the
-    object's, and the paper's starts rarely descend there.
+    Without `spec.flatness` they are the paper's: points of the sphere of `spec.start_radius`, moved onto the surface
+    (Sec. 6.2). With it they are triples of `candidate_contacts`. The centre of a flat grasp may lie 30 mm from the
+    object's, where the paper's starts rarely end.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -86,11 +81,10 @@ def drawn_starts(shape: Shape, spec: ContactSpec, starts: int, seed: int) -> Ite
 
 
 def draw_in(shape: Shape, points: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
-    """Return normalised starts; those off the surface are shifted to the centre and drawn in towards it.
+    """Return normalised starts, those off the surface drawn in around the centre.
 
-    A point off the surface is only a direction to search in. From far away each contact ends on the nearest part of
-    the surface, uncertain or not. From near the centre the three spread over the parts that face them, with their own
-    centre where Eq. (14) wants it. Starts on the surface are guesses of contacts and stay.
+    A point off the surface is only a direction. From far away it ends on the nearest surface, uncertain or not. From
+    near the centre the three spread over the surface that faces them, centred as Eq. (14) wants.
     """
     distance, _ = shape.mean_and_gradient(points.flatten(0, 1))
     far = distance.view(points.shape[:2]).abs().amax(-1) > FAR
@@ -103,9 +97,9 @@ def draw_in(shape: Shape, points: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 
 def candidate_contacts(
     shape: Shape, spec: ContactSpec, points: Float[Tensor, "s 3 3"]
 ) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]]:
-    """Return the certain, flat surface points inside the domain and above the table, with their normals.
+    """Return the surface points that are certain, flat, inside and above the table, with normals.
 
-    All points are returned where fewer than three qualify.
+    Where fewer than three qualify, all are returned.
     """
     problem = ContactProblem.of(shape, spec)
     jet = triple_jet(shape, points)
@@ -126,7 +120,7 @@ def candidate_triples(
     starts: int,
     generator: torch.Generator,
 ) -> Float[Tensor, "b 3 3"]:
-    """Return random triples of candidates: closed and separate ones first, any others where these are too few."""
+    """Return random triples of candidates, closed and separate as far as there are enough."""
     triples, missing = [], starts
     for _ in range(ROUNDS):
         choice = torch.randint(len(points), (TRIPLES_PER_START * starts, 3), generator=generator).to(points.device)

@@ -1,7 +1,7 @@
 """Contact wrenches of three frictional contacts, and the exact closure test (Eq. 13).
 
-Normals are the outward ones of the surface; a fingertip pushes against them. Torques are about the contacts' centre,
-over the contacts' radius, so that nothing depends on units or origin.
+Normals are outward unit normals of the surface; fingertips push against them. Torques are about the contacts' centre,
+over the contacts' radius: units and origin do not matter.
 """
 
 import itertools
@@ -16,30 +16,26 @@ from torchgrasp.linalg import unit
 
 BALANCED = 1e-9
 """Largest |W phi| of balanced coefficients: above rounding in float64, far below any wrench (about 1)."""
-
 MIN_MARGIN = 1e-6
 """Least positive coefficient: far above the certificate's errors, far below equal coefficients, 1 / (3 e)."""
-
 MIN_RANK_RATIO = 1e-3
 """Least singular value of the wrench matrix over its largest. Eq. (13) alone also holds for contacts on a line."""
-
 PARALLEL = 1e-9
 """Planar wrenches (of length about 1) with a shorter cross product are parallel: above rounding in float64."""
 
 
 def centre_and_radius(points: Float[Tensor, "b 3 3"]) -> tuple[Float[Tensor, "b 1 3"], Float[Tensor, "b 1 1"]]:
-    """Return the contacts' centre and their root-mean-square distance from it; 1 where that is 0."""
+    """Return the contacts' centre and root-mean-square radius; 1 for a radius of 0."""
     centre = points.mean(-2, keepdim=True)
     radius = torch.linalg.vector_norm(points - centre, dim=(-2, -1), keepdim=True) / math.sqrt(3.0)
     return centre, torch.where(radius == 0, 1.0, radius)
 
 
 def tangents(points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
-    """Return for each contact the unit tangent in the plane of the three contacts.
+    """Return the unit tangent at each contact that lies in the plane of the contacts.
 
-    It turns with the object. Its seam, which every field of tangents has, is a normal perpendicular to the plane; no
-    friction closes such a contact, because three forces in balance are coplanar. There, and for contacts on a line,
-    the tangent is arbitrary, but finite.
+    It turns with the object. For a normal perpendicular to the plane it is arbitrary: no friction closes there, because
+    balanced forces are coplanar. So it is for contacts on a line.
     """
     plane = torch.linalg.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
     inside = torch.linalg.cross(plane[:, None].expand_as(normals), normals)
@@ -55,14 +51,7 @@ def tangents(points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]) ->
 def cone_edges(
     normals: Float[Tensor, "*b 3"], tangent: Float[Tensor, "*b 3"], friction: float, edges: int
 ) -> Float[Tensor, "*b e 3"]:
-    """Return the edges of the linearised friction cones: forces on the object with a normal component of 1.
-
-    Args:
-        normals: outward unit normals.
-        tangent: unit tangent at each contact; the first edge leans along it.
-        friction: coefficient of friction.
-        edges: edges of each cone.
-    """
+    """Return the edges of the linearised cones: forces of normal component 1, the first leaning along `tangent`."""
     angle = torch.arange(edges, dtype=normals.dtype, device=normals.device) * (2 * math.pi / edges)
     other = torch.linalg.cross(normals, tangent)
     lean = angle.cos()[:, None] * tangent[..., None, :] + angle.sin()[:, None] * other[..., None, :]
@@ -72,13 +61,7 @@ def cone_edges(
 def wrenches(
     points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"], friction: float, edges: int = 8
 ) -> Float[Tensor, "b 3 e 6"]:
-    """Return the primitive contact wrenches w of Eq. (13): force, then torque about the centre over the radius.
-
-    Args:
-        points: contacts in any unit of length.
-        normals: outward unit normals.
-        friction: coefficient of friction.
-        edges: edges of each cone.
+    """Return the primitive contact wrenches w of Eq. (13): force, then torque.
 
     >>> wrenches(torch.eye(3)[None], torch.eye(3)[None], friction=0.5).shape
     torch.Size([1, 3, 8, 6])
@@ -90,22 +73,17 @@ def wrenches(
 
 
 def rank_ratio(wrench: Float[Tensor, "b 3 e 6"]) -> Float[Tensor, "b"]:
-    """Return the smallest over the largest singular value of the 6 x 3e wrench matrix of each row."""
+    """Return the smallest over the largest singular value of each wrench matrix."""
     values = torch.linalg.svdvals(wrench.flatten(1, 2))
     return values[:, -1] / values[:, 0]
 
 
 def closed_exact(points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"], friction: float) -> Bool[Tensor, "b"]:
-    """Tell which triples have frictional form closure with round cones, exactly: Eq. (13) as edges go to infinity.
+    """Tell which triples have frictional form closure with round cones: Eq. (13) as edges go to infinity.
 
-    Three forces in balance lie in the plane of the contacts. Each cone cuts an angle about the projected normal from
-    the plane. The six planar wrenches along its sides must positively span all planar wrenches: no plane through two
-    of them has the others on one side.
-
-    Args:
-        points: contacts in any unit of length.
-        normals: outward unit normals.
-        friction: coefficient of friction; degenerate and non-finite rows are not closed.
+    Balanced forces lie in the plane of the contacts. Each cone cuts an angle about the projected normal from it. The
+    six planar wrenches along these angles must positively span the planar wrenches: no plane through two of them has
+    the others on one side. Degenerate and non-finite rows are not closed.
     """
     centre, radius = centre_and_radius(points)
     arm = (points - centre) / radius
