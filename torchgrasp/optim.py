@@ -40,6 +40,9 @@ class Step(Batch):
     taken: Bool[Tensor, "a"]
 
 
+Damping = Float[Tensor, "a"]
+Verdict = tuple[Bool[Tensor, "a"], Damping]
+"""Which steps are accepted, and the damping of the next ones."""
 State = TypeVar("State", bound=Batch)
 Model = TypeVar("Model", bound=Linearisation)
 
@@ -54,7 +57,7 @@ class Problem(abc.ABC, Generic[State, Model]):
         """Return cost and linear model of some rows at their states."""
 
     @abc.abstractmethod
-    def step(self, model: Model, damping: Float[Tensor, "a"]) -> Step:
+    def step(self, model: Model, damping: Damping) -> Step:
         """Solve the damped normal equations."""
 
     @abc.abstractmethod
@@ -62,10 +65,8 @@ class Problem(abc.ABC, Generic[State, Model]):
         """Return the states after a step."""
 
     @abc.abstractmethod
-    def judge(
-        self, model: Model, trial: Model, step: Step, damping: Float[Tensor, "a"]
-    ) -> tuple[Bool[Tensor, "a"], Float[Tensor, "a"]]:
-        """Return which steps are accepted, and the next damping."""
+    def judge(self, model: Model, trial: Model, step: Step, damping: Damping) -> Verdict:
+        """Compare the models before and after a step."""
 
     def refuse(self, model: Model, trial: Model) -> Model:
         """Return the model after a refused step: by default the one before."""
@@ -126,7 +127,7 @@ class LeastSquares(Problem[State, LinearResiduals]):
         residual, jacobian = self.residuals(state, rows)
         return LinearResiduals(residual.square().sum(1), residual, jacobian)
 
-    def step(self, model: LinearResiduals, damping: Float[Tensor, "a"]) -> Step:
+    def step(self, model: LinearResiduals, damping: Damping) -> Step:
         """Return the damped step, at most `LARGEST_STEP`; zero where there is no factor yet."""
         normal = model.jacobian.mT @ model.jacobian
         diagonal = normal.diagonal(dim1=1, dim2=2)
@@ -141,9 +142,7 @@ class LeastSquares(Problem[State, LinearResiduals]):
         """Return the states after a step."""
         return self.moved(state, x)
 
-    def judge(
-        self, model: LinearResiduals, trial: LinearResiduals, step: Step, damping: Float[Tensor, "a"]
-    ) -> tuple[Bool[Tensor, "a"], Float[Tensor, "a"]]:
+    def judge(self, model: LinearResiduals, trial: LinearResiduals, step: Step, damping: Damping) -> Verdict:
         """Accept what lowers the sum."""
         better = trial.cost < model.cost
         rests = torch.where(better, trial.cost > (1 - STALLED) * model.cost, damping > LOST)

@@ -8,15 +8,7 @@ from torch import Tensor
 
 from tests.half_ball import ball
 from torchgrasp.shape.gp import ShapeGP
-
-
-@dataclasses.dataclass(frozen=True)
-class AnalyticJet:
-    distance: Tensor
-    gradient: Tensor
-    hessian: Tensor
-    variance: Tensor
-    variance_gradient: Tensor
+from torchgrasp.shape.posterior import SurfaceJet
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,11 +29,11 @@ class Ellipsoid:
     def doubt_at(self, x: Tensor) -> Tensor:
         return self.doubt * (1 - x @ x.new_tensor(self.view)) ** 2
 
-    def jet(self, x: Tensor) -> AnalyticJet:
+    def jet(self, x: Tensor) -> SurfaceJet:
         inverse = 1 / x.new_tensor(self.axes) ** 2
         view = x.new_tensor(self.view)
         behind = 1 - x @ view
-        return AnalyticJet(
+        return SurfaceJet(
             self.value(x),
             x * inverse,
             torch.diag(inverse).expand(len(x), 3, 3),

@@ -37,7 +37,7 @@ def triples(ellipsoid, generator: torch.Generator, count: int = 40) -> Tensor:
 
 def cost(ellipsoid, state: State) -> Tensor:
     problem = ContactProblem.of(ellipsoid, SPEC)
-    return Descent(ellipsoid, problem, STAGE).linearise(state, torch.arange(len(state))).cost
+    return Descent(ellipsoid, problem, STAGE, None, None).linearise(state, torch.arange(len(state))).cost
 
 
 def test_all_forces_that_balance_at_three_contacts_are_tensions_of_their_sides(ellipsoid, generator):
@@ -73,7 +73,7 @@ def test_a_stage_leaves_no_triple_worse_and_all_near_the_surface(ellipsoid, gene
 
 def test_steps_are_bounded_and_promise_what_the_linear_model_keeps(ellipsoid, generator):
     state = start_state(ellipsoid, triples(ellipsoid, generator))
-    descent = Descent(ellipsoid, ContactProblem.of(ellipsoid, SPEC), STAGE)
+    descent = Descent(ellipsoid, ContactProblem.of(ellipsoid, SPEC), STAGE, None, None)
     model = descent.linearise(state, torch.arange(40))
     step = descent.step(model, torch.full((40,), descent.first_damping, dtype=torch.float64))
     moved = torch.linalg.vector_norm(step.x[:, :9].unflatten(1, (3, 3)), dim=-1).amax(-1)

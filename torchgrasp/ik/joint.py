@@ -25,8 +25,9 @@ from torchgrasp.optim import LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.flatness import FlatnessConstraint, flatness_constraint
-from torchgrasp.plan.problem import ContactProblem, Shape, TripleJet, triple_jet
+from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet
 from torchgrasp.plan.solver import normalise_tensions, project
+from torchgrasp.shape.posterior import SurfaceJet
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts, Grasps, IKSeeds
 
@@ -80,7 +81,7 @@ class JointProblem:
         return residual, jacobian
 
     def _tips_by_points(
-        self, spatial: SpatialJacobian, jet: TripleJet, outside: Bool[Tensor, "g 3"]
+        self, spatial: SpatialJacobian, jet: SurfaceJet, outside: Bool[Tensor, "g 3"]
     ) -> Float[Tensor, "g 12 9"]:
         """Return the derivative of the tip residuals by the contacts; pads count `outside` their cones."""
         hand, normals, normal_jacobian = self.hand, jet.normals, jet.normal_jacobian
@@ -92,7 +93,7 @@ class JointProblem:
         tilts = torch.einsum("giy,ij->gijy", tilt, identity).flatten(2)
         return torch.cat([-TIP_WEIGHT / MILLIMETRE * tips, PAD_WEIGHT * tilts], 1)
 
-    def _contact_residuals(self, state: JointState, jet: TripleJet, flat: FlatnessConstraint | None) -> Residuals:
+    def _contact_residuals(self, state: JointState, jet: SurfaceJet, flat: FlatnessConstraint | None) -> Residuals:
         """Return residuals [mm] of the contact problem, zero where bounds hold."""
         rows = self.contact_problem.constraints(state.points, state.tension, jet)
         bounds, bounds_by_x = rows.bounds, rows.bounds_by_x

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import degenerate
 from torchgrasp.plan.closure_lp import solve_closure_lp
-from torchgrasp.plan.wrench import MIN_MARGIN, MIN_RANK_RATIO, rank_ratio, wrenches
+from torchgrasp.plan.wrench import MIN_MARGIN, MIN_RANK_RATIO, Triples, rank_ratio, wrenches
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Certificate, Contacts
 
@@ -125,7 +125,7 @@ def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None]
     return float(solution.x[m]), float(np.abs(phi @ wrench).max()), -dual / np.linalg.norm(dual)
 
 
-def check_unit(normals: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
+def check_unit(normals: Triples) -> Triples:
     """Return the contacts' normals; raise `BadArgument` for a length other than 1. NaN passes."""
     length = torch.linalg.vector_norm(normals, dim=-1)
     wrong = torch.nonzero((length - 1).abs() > UNIT_TOLERANCE)
@@ -136,15 +136,12 @@ def check_unit(normals: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
     return normals
 
 
-def _checked(contacts: Contacts) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3 3"]]:
+def _checked(contacts: Contacts) -> tuple[Triples, Triples]:
     """Return checked points and normals in float64 on the CPU."""
     if not isinstance(contacts, Contacts):
         raise BadArgument("contacts", type(contacts).__name__, "Contacts")
     for name, value in (("points", contacts.points), ("normals", contacts.normals)):
-        if value.ndim != 3 or value.shape[1:] != (3, 3) or not value.is_floating_point():
+        if value.shape != (*contacts.points.shape[:1], 3, 3) or not value.is_floating_point():
             found = f"shape {tuple(value.shape)} of {value.dtype}"
-            raise BadArgument(f"contacts.{name}", found, "floating numbers of shape b x 3 x 3")
-    if len(contacts.points) != len(contacts.normals):
-        found = f"{len(contacts.points)} and {len(contacts.normals)} rows"
-        raise BadArgument("contacts.points and contacts.normals", found, "as many rows of each")
+            raise BadArgument(f"contacts.{name}", found, "floating numbers of shape b x 3 x 3, as many of each")
     return contacts.points.detach().double().cpu(), check_unit(contacts.normals.detach().double().cpu())

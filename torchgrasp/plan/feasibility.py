@@ -1,7 +1,7 @@
 """Whether contacts satisfy the problem, however they were found."""
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchgrasp.errors import Status
@@ -9,7 +9,7 @@ from torchgrasp.frames import degenerate
 from torchgrasp.plan.closure_lp import solve_closure_lp
 from torchgrasp.plan.flatness import normal_variation
 from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet
-from torchgrasp.plan.wrench import BALANCED, MIN_MARGIN, MIN_RANK_RATIO, rank_ratio, wrenches
+from torchgrasp.plan.wrench import BALANCED, MIN_MARGIN, MIN_RANK_RATIO, Triples, rank_ratio, wrenches
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan, Contacts
 
@@ -17,7 +17,7 @@ ON_SURFACE = 1e-6
 """Largest |f_d| of a contact on the surface, normalised: 0.1 um on a hand-sized object, far above rounding."""
 
 
-def check_feasibility(shape: Shape, spec: ContactSpec, points: Float[Tensor, "b 3 3"]) -> ContactPlan:
+def check_feasibility(shape: Shape, spec: ContactSpec, points: Triples) -> ContactPlan:
     """Evaluate triples at normalised `points` against every constraint."""
     jet = triple_jet(shape, points)
     normals, metres = jet.normals, shape.metres(points)

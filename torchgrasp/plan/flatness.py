@@ -14,7 +14,7 @@ from torchgrasp.base import Batch
 from torchgrasp.linalg import unit
 from torchgrasp.plan.problem import Shape, triple_jet
 from torchgrasp.plan.solver import project
-from torchgrasp.plan.wrench import cone_edges, tangents
+from torchgrasp.plan.wrench import Triples, cone_edges, tangents
 
 RING_RADIUS = 0.008
 """Radius [m] of the ring around a contact: within a fingertip, whose radius is 12 mm."""
@@ -24,16 +24,12 @@ INSIDE = 0.95
 """Share of the largest variation that guiding points allow: the judged points lie between them."""
 
 
-def ring_directions(
-    normals: Float[Tensor, "b 3 3"], points: Float[Tensor, "b 3 3"], n: int
-) -> Float[Tensor, "b 3 n 3"]:
+def ring_directions(normals: Triples, points: Triples, n: int) -> Float[Tensor, "b 3 n 3"]:
     """Return n unit tangents around each contact: a cone of friction 1 without its axis."""
     return cone_edges(normals, tangents(points, normals), 1.0, n) + normals[:, :, None]
 
 
-def normal_variation(
-    shape: Shape, points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]
-) -> Float[Tensor, "b 3"]:
+def normal_variation(shape: Shape, points: Triples, normals: Triples) -> Float[Tensor, "b 3"]:
     """Return the largest angle [rad] between the normals at a contact and on its ring."""
     around = ring_directions(normals, points, JUDGED_POINTS)
     ring = points[:, :, None] + RING_RADIUS / float(shape.scale) * around
@@ -53,14 +49,14 @@ class FlatnessConstraint(Batch):
 
     value: Float[Tensor, "b k"]
     by_points: Float[Tensor, "b k 9"]
-    at: Float[Tensor, "b 3 3"]
+    at: Triples
 
-    def values(self, points: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b k"]:
+    def values(self, points: Triples) -> Float[Tensor, "b k"]:
         """Return the values at points nearby."""
         return self.value + (self.by_points @ (points - self.at).flatten(1)[..., None])[..., 0]
 
 
-def flatness_constraint(shape: Shape, points: Float[Tensor, "b 3 3"], flatness: float) -> FlatnessConstraint:
+def flatness_constraint(shape: Shape, points: Triples, flatness: float) -> FlatnessConstraint:
     """Evaluate |n - n_k| for the normals at a contact and on its ring, less the chord of `flatness` [rad].
 
     Values are lengths: chords times the ring's radius.

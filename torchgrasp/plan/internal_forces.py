@@ -71,36 +71,29 @@ def least_friction_forces(
     tensor([ 1.,  1., -2.])
     """
     basis = internal_forces(points)
-    directions = fibonacci_sphere(DIRECTIONS, GOLDEN_ANGLE, 0.0).to(points).expand(*points.shape[:-2], -1, 3)
     preferred = None if preferred is None else (preferred / preferred.amax(-1, keepdim=True))[..., None, :]
-    weights, cost = _best(directions, basis, normals, preferred)
+
+    def best(weights: Float[Tensor, "*b k 3"]) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b"]]:
+        """Return the best of k combinations, and its cost; infinite where a contact pulls."""
+        forces = torch.einsum("...jk,...kci->...jci", weights, basis)
+        outward = normals[..., None, :, :]
+        push = -(forces * outward).sum(-1)
+        if preferred is None:
+            uneven = EVENNESS * push.amax(-1) / push.amin(-1).clamp_min(1e-12)
+        else:
+            uneven = PREFERENCE * torch.linalg.vector_norm(push / push.amax(-1, keepdim=True) - preferred, dim=-1)
+        cost = tangential_ratio(forces, outward.expand_as(forces)).amax(-1) + uneven
+        least = cost.argmin(-1, keepdim=True)
+        index = least[..., None].expand(*least.shape, 3)
+        return weights.gather(-2, index)[..., 0, :], cost.gather(-1, least)[..., 0]
+
+    weights, cost = best(fibonacci_sphere(DIRECTIONS, GOLDEN_ANGLE, 0.0).to(points).expand(*points.shape[:-2], -1, 3))
     around, radius = fibonacci_sphere(NEIGHBOURS, GOLDEN_ANGLE, 0.0).to(points), 4 / math.sqrt(DIRECTIONS)
     for _ in range(REFINEMENTS):
         near = unit(weights[..., None, :] + radius * around)
-        near = torch.cat([weights[..., None, :], near], dim=-2)
-        weights, cost = _best(near, basis, normals, preferred)
+        weights, cost = best(torch.cat([weights[..., None, :], near], dim=-2))
         radius *= SHRINK
     forces = torch.einsum("...k,...kci->...ci", weights, basis)
     push = -(forces * normals).sum(-1)
     scaled = forces * (strongest / push.amax(-1))[..., None, None]
     return torch.where(torch.isfinite(cost)[..., None, None], scaled, torch.nan)
-
-
-def _best(
-    weights: Float[Tensor, "*b k 3"],
-    basis: Float[Tensor, "*b 3 3 3"],
-    normals: Float[Tensor, "*b 3 3"],
-    preferred: Float[Tensor, "*#b 1 3"] | None,
-) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b"]]:
-    """Return the best of k combinations, and its cost; infinite where a contact pulls."""
-    forces = torch.einsum("...jk,...kci->...jci", weights, basis)
-    normals = normals[..., None, :, :]
-    push = -(forces * normals).sum(-1)
-    if preferred is None:
-        uneven = EVENNESS * push.amax(-1) / push.amin(-1).clamp_min(1e-12)
-    else:
-        uneven = PREFERENCE * torch.linalg.vector_norm(push / push.amax(-1, keepdim=True) - preferred, dim=-1)
-    cost = tangential_ratio(forces, normals.expand_as(forces)).amax(-1) + uneven
-    least = cost.argmin(-1)
-    index = least[..., None, None].expand(*least.shape, 1, 3)
-    return weights.gather(-2, index)[..., 0, :], cost.gather(-1, least[..., None])[..., 0]

@@ -21,7 +21,7 @@ from torchgrasp.base import Batch, check_tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
 from torchgrasp.plan.certify import check_unit
-from torchgrasp.plan.wrench import tangents
+from torchgrasp.plan.wrench import Triples, tangents
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.joint_posterior import distance_covariance, symmetric_root
 from torchgrasp.values import Contacts
@@ -49,8 +49,8 @@ class LinePosterior(Batch):
         root: symmetric root of the covariance of (d, w) at the nodes, line by line, node by node.
     """
 
-    points: Float[Tensor, "b 3 3"]
-    normals: Float[Tensor, "b 3 3"]
+    points: Triples
+    normals: Triples
     deviation: Float[Tensor, "b 3"]
     distance: Float[Tensor, "b 3 23"]
     slope: Float[Tensor, "b 3 5 3"]
@@ -114,7 +114,7 @@ def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
 
 
 def node_covariance(
-    shape: ShapeGP, points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"], nodes: Float[Tensor, "b 3 5"]
+    shape: ShapeGP, points: Triples, normals: Triples, nodes: Float[Tensor, "b 3 5"]
 ) -> Float[Tensor, "b 60 60"]:
     """Return the posterior covariance of (d, w) at the nodes, w by difference quotients of d.
 

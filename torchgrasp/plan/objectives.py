@@ -18,7 +18,7 @@ from torchgrasp.plan.closure_probability import closure_share
 from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.problem import ContactProblem, Shape, device_of
 from torchgrasp.plan.solver import FINISH, Stage, State, descend, project, start_state
-from torchgrasp.plan.wrench import wrenches
+from torchgrasp.plan.wrench import Triples, wrenches
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan
@@ -109,9 +109,7 @@ def raise_probability(
     return put(dataclasses.replace(plan, quality=torch.zeros_like(plan.quality)), good, best)
 
 
-def min_weight_cost(
-    spec: ContactSpec, points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]
-) -> Float[Tensor, "b"]:
+def min_weight_cost(spec: ContactSpec, points: Triples, normals: Triples) -> Float[Tensor, "b"]:
     """Return minus the margin s of the certificate, with its derivative.
 
     By duality ds = -v . sum phi_k da_k (see `closure_lp`).
@@ -126,9 +124,7 @@ def min_weight_cost(
     return (dual * change).sum(-1) - margin
 
 
-def epsilon_cost(
-    spec: ContactSpec, points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]
-) -> Float[Tensor, "b"]:
+def epsilon_cost(spec: ContactSpec, points: Triples, normals: Triples) -> Float[Tensor, "b"]:
     """Return minus Ferrari and Canny's epsilon: the radius of the largest ball in the hull of the wrenches.
 
     It is the least offset u . sum lambda_k w_k of a facet with unit normal u and corners w_k, at the foot of the
@@ -153,7 +149,7 @@ def epsilon_cost(
     return torch.stack(costs) if costs else points.new_zeros(0)
 
 
-def evaluate_cost(cost: Cost, points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b"]:
+def evaluate_cost(cost: Cost, points: Triples, normals: Triples) -> Float[Tensor, "b"]:
     """Return the cost of contacts [m]; raise `BadArgument` without one number a row."""
     value = cost(points, normals)
     if not isinstance(value, Tensor) or value.shape != points.shape[:1]:
@@ -162,9 +158,7 @@ def evaluate_cost(cost: Cost, points: Float[Tensor, "b 3 3"], normals: Float[Ten
     return value
 
 
-def cost_gradients(
-    cost: Cost, points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]
-) -> tuple[Float[Tensor, "b"], Float[Tensor, "b 3 3"], Float[Tensor, "b 3 3"]]:
+def cost_gradients(cost: Cost, points: Triples, normals: Triples) -> tuple[Float[Tensor, "b"], Triples, Triples]:
     """Return the cost of contacts [m] and its gradients by points and normals."""
     with torch.enable_grad():
         leaves = points.detach().requires_grad_(), normals.detach().requires_grad_()

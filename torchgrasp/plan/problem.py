@@ -16,8 +16,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Batch
-from torchgrasp.linalg import unit
+from torchgrasp.base import Batch, map_tensors
+from torchgrasp.plan.wrench import Triples
+from torchgrasp.shape.posterior import SurfaceJet
 from torchgrasp.specs import ContactSpec
 
 INSIDE = 0.99
@@ -26,22 +27,6 @@ CONE_MARGIN = 0.02
 """The cosine between force and inward normal exceeds that of the cone by this much: strictly inside, as phi > 0."""
 LEAST_SIDE = 0.05
 """Least distance of two contacts, normalised: coincident ones balance, but their wrenches lack rank."""
-
-
-@runtime_checkable
-class Jet(Protocol):
-    """The shape's mean and variance at query points with their derivatives, normalised."""
-
-    @property
-    def distance(self) -> Tensor: ...  # noqa: D102
-    @property
-    def gradient(self) -> Tensor: ...  # noqa: D102
-    @property
-    def hessian(self) -> Tensor: ...  # noqa: D102
-    @property
-    def variance(self) -> Tensor: ...  # noqa: D102
-    @property
-    def variance_gradient(self) -> Tensor: ...  # noqa: D102
 
 
 @runtime_checkable
@@ -54,7 +39,7 @@ class Shape(Protocol):
     def domain_radius(self) -> float: ...  # noqa: D102
     @property
     def std_factor(self) -> float: ...  # noqa: D102
-    def jet(self, x: Float[Tensor, "q 3"]) -> Jet: ...  # noqa: D102
+    def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet: ...  # noqa: D102
     def mean_and_gradient(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]: ...  # noqa: D102
     def normalise(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]: ...  # noqa: D102
     def metres(self, x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]: ...  # noqa: D102
@@ -65,33 +50,9 @@ def device_of(shape: Shape) -> torch.device:
     return getattr(shape, "device", torch.device("cpu"))
 
 
-@dataclasses.dataclass(frozen=True)
-class TripleJet(Batch):
-    """The shape at the three points of each triple."""
-
-    distance: Float[Tensor, "b 3"]
-    gradient: Float[Tensor, "b 3 3"]
-    hessian: Float[Tensor, "b 3 3 3"]
-    variance: Float[Tensor, "b 3"]
-    variance_gradient: Float[Tensor, "b 3 3"]
-
-    @property
-    def normals(self) -> Float[Tensor, "b 3 3"]:
-        """The outward unit normals, Eq. (11)."""
-        return unit(self.gradient)
-
-    @property
-    def normal_jacobian(self) -> Float[Tensor, "b 3 3 3"]:
-        """The derivatives of the normals by their points, (1 - n n^T) H / |g|."""
-        n, steep = self.normals, torch.linalg.vector_norm(self.gradient, dim=-1)[..., None, None]
-        return (self.hessian - n[..., :, None] * (n[..., None, :] @ self.hessian)) / steep
-
-
-def triple_jet(shape: Shape, points: Float[Tensor, "b 3 3"]) -> TripleJet:
+def triple_jet(shape: Shape, points: Triples) -> SurfaceJet:
     """Evaluate the shape at all points of all triples."""
-    jet = shape.jet(points.flatten(0, 1))
-    fields = (jet.distance, jet.gradient, jet.hessian, jet.variance, jet.variance_gradient)
-    return TripleJet(*(f.unflatten(0, points.shape[:2]) for f in fields))
+    return map_tensors(lambda x: x.unflatten(0, points.shape[:2]), shape.jet(points.flatten(0, 1)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,9 +80,7 @@ class Constraints(Batch):
         return torch.cat([self.centre_by_x, self.surface_by_x, self.bounds_by_x], 1)
 
 
-def forces_from_tensions(
-    points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"]
-) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3 3"]]:
+def forces_from_tensions(points: Triples, tension: Float[Tensor, "b 3"]) -> tuple[Triples, Triples]:
     """Return the forces on the object at the contacts, and the sides from each contact to the next.
 
     A tension pulls the ends of its side together, in proportion to its length.
@@ -167,7 +126,7 @@ class ContactProblem:
         """Return the least z coordinate of contacts: a round fingertip then rests on the table."""
         return self.table + (self.tip_radius * (1 - normals[..., 2])).clamp_min(self.contact_height)
 
-    def constraints(self, points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"], jet: TripleJet) -> Constraints:
+    def constraints(self, points: Triples, tension: Float[Tensor, "b 3"], jet: SurfaceJet) -> Constraints:
         """Evaluate all constraints and their Jacobians; `jet` is the shape at the points."""
         b, identity = len(points), torch.eye(3, dtype=points.dtype, device=points.device)
         threshold, ball = self.max_variance * INSIDE, self.domain_radius * INSIDE
@@ -204,7 +163,7 @@ class ContactProblem:
         )
 
     def _cones(
-        self, points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"], jet: TripleJet
+        self, points: Triples, tension: Float[Tensor, "b 3"], jet: SurfaceJet
     ) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 3 12"]]:
         """Return by how much each force leaves its cone, as a cosine.
 
@@ -233,7 +192,7 @@ class ContactProblem:
         return outward[..., 0] + cosine + CONE_MARGIN, blocks.flatten(2)
 
 
-def _by_own_point(slope: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 12"]:
+def _by_own_point(slope: Triples) -> Float[Tensor, "b 3 12"]:
     """Return the Jacobian of three values, each of its own point alone."""
     jacobian = slope.new_zeros(len(slope), 3, 12)
     for i in range(3):

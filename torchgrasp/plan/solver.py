@@ -13,8 +13,9 @@ from torch import Tensor
 
 from torchgrasp.base import Batch
 from torchgrasp.linalg import limit_norm
-from torchgrasp.optim import Linearisation, Problem, Step, levenberg_marquardt
-from torchgrasp.plan.problem import ContactProblem, Shape, TripleJet, forces_from_tensions, triple_jet
+from torchgrasp.optim import Damping, Linearisation, Problem, Step, Verdict, levenberg_marquardt
+from torchgrasp.plan.problem import ContactProblem, Shape, SurfaceJet, forces_from_tensions, triple_jet
+from torchgrasp.plan.wrench import Triples
 from torchgrasp.shape.surface import newton_step
 
 LONGEST_STEP = 0.3
@@ -50,9 +51,9 @@ FINISH = Stage(centre=0.0, cones=3.0, steps=30, settled=1e-8)
 class State(Batch):
     """Triples with the tensions of their sides, and the shape at their normalised points."""
 
-    points: Float[Tensor, "b 3 3"]
+    points: Triples
     tension: Float[Tensor, "b 3"]
-    jet: TripleJet
+    jet: SurfaceJet
 
 
 StateCost = Callable[[State], tuple[Float[Tensor, "b"], Float[Tensor, "b 12"]]]
@@ -85,8 +86,8 @@ class Descent(Problem[State, LinearConstraints]):
     shape: Shape
     problem: ContactProblem
     stage: Stage
-    objective: StateCost | None = None
-    pull: Float[Tensor, "b"] | None = None
+    objective: StateCost | None
+    pull: Float[Tensor, "b"] | None
 
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> LinearConstraints:
         """Evaluate constraints and objective; bounds that hold weigh nothing."""
@@ -105,7 +106,7 @@ class Descent(Problem[State, LinearConstraints]):
         inside = torch.linalg.vector_norm(state.points, dim=-1).amax(-1) < self.problem.domain_radius
         return LinearConstraints(cost, residual, weight, constraints.jacobian, inside, downhill)
 
-    def step(self, model: LinearConstraints, damping: Float[Tensor, "a"]) -> Step:
+    def step(self, model: LinearConstraints, damping: Damping) -> Step:
         """Return the damped step, no point farther than `LONGEST_STEP`. Rows without a factor rest."""
         jacobian = model.weighted_jacobian
         scale = torch.tensor([1.0] * 9 + [TENSION_DAMPING] * 3, dtype=jacobian.dtype, device=jacobian.device)
@@ -124,9 +125,7 @@ class Descent(Problem[State, LinearConstraints]):
         points = project(self.shape, state.points + x[:, :9].unflatten(1, (3, 3)), steps=1)
         return State(points, normalise_tensions(points, state.tension + x[:, 9:]), triple_jet(self.shape, points))
 
-    def judge(
-        self, model: LinearConstraints, trial: LinearConstraints, step: Step, damping: Float[Tensor, "a"]
-    ) -> tuple[Bool[Tensor, "a"], Float[Tensor, "a"]]:
+    def judge(self, model: LinearConstraints, trial: LinearConstraints, step: Step, damping: Damping) -> Verdict:
         """Accept a decrease inside the domain; damp by the kept share of its promise (Nielsen)."""
         kept = (model.cost - trial.cost) / promised_decrease(model, step.x)
         accepted = (kept > 0) & trial.inside  # NaN is not accepted
@@ -169,13 +168,13 @@ def project(shape: Shape, points: Float[Tensor, "b k 3"], steps: int) -> Float[T
     return x.view_as(points)
 
 
-def start_state(shape: Shape, points: Float[Tensor, "b 3 3"]) -> State:
+def start_state(shape: Shape, points: Triples) -> State:
     """Return the state of triples with equal tensions: forces point to the contacts' centre."""
     tension = normalise_tensions(points, points.new_ones(len(points), 3))
     return State(points, tension, triple_jet(shape, points))
 
 
-def normalise_tensions(points: Float[Tensor, "b 3 3"], tension: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
+def normalise_tensions(points: Triples, tension: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
     """Return the tensions for which the mean size of the forces is 1."""
     force, _ = forces_from_tensions(points, tension)
     return tension / torch.linalg.vector_norm(force, dim=-1).mean(-1, keepdim=True)

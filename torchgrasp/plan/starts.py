@@ -12,7 +12,7 @@ from torchgrasp.linalg import unit
 from torchgrasp.plan.flatness import normal_variation
 from torchgrasp.plan.problem import ContactProblem, Shape, device_of, triple_jet
 from torchgrasp.plan.solver import project
-from torchgrasp.plan.wrench import closed_exact
+from torchgrasp.plan.wrench import Triples, closed_exact
 from torchgrasp.specs import ContactSpec
 
 CANDIDATE_TRIPLES = 700
@@ -50,7 +50,7 @@ def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor, seed: in
         raise BadArgument("spec.start_radius", spec.start_radius, f"at most {float(shape.domain_radius):.4g}")
 
 
-def given_starts(shape: Shape, starts: Float[Tensor, "b 3 3"]) -> Iterator[Float[Tensor, "_ 3 3"]]:
+def given_starts(shape: Shape, starts: Triples) -> Iterator[Float[Tensor, "_ 3 3"]]:
     """Yield normalised starts on the surface from given points [m]."""
     for points in starts.detach().to(device_of(shape), torch.float64).split(STARTS_PER_CHUNK):
         yield project(shape, draw_in(shape, shape.normalise(points)), steps=6)
@@ -80,7 +80,7 @@ def drawn_starts(shape: Shape, spec: ContactSpec, starts: int, seed: int) -> Ite
             yield candidate_triples(ContactProblem.of(shape, spec), *candidates, count, generator)
 
 
-def draw_in(shape: Shape, points: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
+def draw_in(shape: Shape, points: Triples) -> Triples:
     """Return normalised starts, those off the surface drawn in around the centre.
 
     A point off the surface is only a direction. From far away it ends on the nearest surface, uncertain or not. From
@@ -95,7 +95,7 @@ def draw_in(shape: Shape, points: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 
 
 
 def candidate_contacts(
-    shape: Shape, spec: ContactSpec, points: Float[Tensor, "s 3 3"]
+    shape: Shape, spec: ContactSpec, points: Triples
 ) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]]:
     """Return the surface points that are certain, flat, inside and above the table, with normals.
 
@@ -119,7 +119,7 @@ def candidate_triples(
     normals: Float[Tensor, "p 3"],
     starts: int,
     generator: torch.Generator,
-) -> Float[Tensor, "b 3 3"]:
+) -> Triples:
     """Return random triples of candidates, closed and separate as far as there are enough."""
     triples, missing = [], starts
     for _ in range(ROUNDS):

@@ -14,6 +14,8 @@ from torch import Tensor
 from torchgrasp.frames import degenerate
 from torchgrasp.linalg import unit
 
+Triples = Float[Tensor, "b 3 3"]
+"""A vector at each of three contacts in every row: points or normals."""
 BALANCED = 1e-9
 """Largest |W phi| of balanced coefficients: above rounding in float64, far below any wrench (about 1)."""
 MIN_MARGIN = 1e-6
@@ -24,14 +26,14 @@ PARALLEL = 1e-9
 """Planar wrenches (of length about 1) with a shorter cross product are parallel: above rounding in float64."""
 
 
-def centre_and_radius(points: Float[Tensor, "b 3 3"]) -> tuple[Float[Tensor, "b 1 3"], Float[Tensor, "b 1 1"]]:
+def centre_and_radius(points: Triples) -> tuple[Float[Tensor, "b 1 3"], Float[Tensor, "b 1 1"]]:
     """Return the contacts' centre and root-mean-square radius; 1 for a radius of 0."""
     centre = points.mean(-2, keepdim=True)
     radius = torch.linalg.vector_norm(points - centre, dim=(-2, -1), keepdim=True) / math.sqrt(3.0)
     return centre, torch.where(radius == 0, 1.0, radius)
 
 
-def tangents(points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
+def tangents(points: Triples, normals: Triples) -> Triples:
     """Return the unit tangent at each contact that lies in the plane of the contacts.
 
     It turns with the object. For a normal perpendicular to the plane it is arbitrary: no friction closes there, because
@@ -58,9 +60,7 @@ def cone_edges(
     return friction * lean - normals[..., None, :]
 
 
-def wrenches(
-    points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"], friction: float, edges: int = 8
-) -> Float[Tensor, "b 3 e 6"]:
+def wrenches(points: Triples, normals: Triples, friction: float, edges: int = 8) -> Float[Tensor, "b 3 e 6"]:
     """Return the primitive contact wrenches w of Eq. (13): force, then torque.
 
     >>> wrenches(torch.eye(3)[None], torch.eye(3)[None], friction=0.5).shape
@@ -78,7 +78,7 @@ def rank_ratio(wrench: Float[Tensor, "b 3 e 6"]) -> Float[Tensor, "b"]:
     return values[:, -1] / values[:, 0]
 
 
-def closed_exact(points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"], friction: float) -> Bool[Tensor, "b"]:
+def closed_exact(points: Triples, normals: Triples, friction: float) -> Bool[Tensor, "b"]:
     """Tell which triples have frictional form closure with round cones: Eq. (13) as edges go to infinity.
 
     Balanced forces lie in the plane of the contacts. Each cone cuts an angle about the projected normal from it. The

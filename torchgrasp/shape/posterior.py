@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from torchgrasp.base import Value
+from torchgrasp.base import Batch, Value
+from torchgrasp.linalg import unit
 from torchgrasp.shape.gradient_kernel import cross_covariance, separations
 from torchgrasp.shape.kernel import Kernel
 
@@ -22,14 +23,25 @@ WIDTH = 24
 
 
 @dataclasses.dataclass(frozen=True)
-class SurfaceJet(Value):
+class SurfaceJet(Batch):
     """The mean to second order and the variance to first; gradients do not have unit length."""
 
-    distance: Float[Tensor, "q"]
-    gradient: Float[Tensor, "q 3"]
-    hessian: Float[Tensor, "q 3 3"]
-    variance: Float[Tensor, "q"]
-    variance_gradient: Float[Tensor, "q 3"]
+    distance: Float[Tensor, "*b"]
+    gradient: Float[Tensor, "*b 3"]
+    hessian: Float[Tensor, "*b 3 3"]
+    variance: Float[Tensor, "*b"]
+    variance_gradient: Float[Tensor, "*b 3"]
+
+    @property
+    def normals(self) -> Float[Tensor, "*b 3"]:
+        """The outward unit normals, Eq. (11)."""
+        return unit(self.gradient)
+
+    @property
+    def normal_jacobian(self) -> Float[Tensor, "*b 3 3"]:
+        """The derivatives of the normals by their points, (1 - n n^T) H / |g|."""
+        n, steep = self.normals, torch.linalg.vector_norm(self.gradient, dim=-1)[..., None, None]
+        return (self.hessian - n[..., :, None] * (n[..., None, :] @ self.hessian)) / steep
 
 
 @dataclasses.dataclass(frozen=True)
