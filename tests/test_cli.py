@@ -274,7 +274,6 @@ def test_cloud_render_writes_what_cloud_check_and_shape_surface_read(tmp_path, c
         (["shape", "surface", VIEW, "--out", "a.ply", "--table", "0", "--no-table"], "--table"),
         (["shape", "surface", "no.ply", "--out", "a.ply"], "CLOUD: found no.ply"),
         (["shape", "surface", VIEW, "--out", "a.ply", "--resolution", "4"], "--resolution: found 4"),
-        (["shape", "accuracy", "--objects", "nowhere"], "--objects: found nowhere"),
     ],
 )
 def test_bad_options_are_named_and_nothing_is_left(words, start, tmp_path, capsys, monkeypatch):

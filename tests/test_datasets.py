@@ -10,7 +10,7 @@ import trimesh
 
 from torchgrasp import PointCloud
 from torchgrasp.cloud.io.read import save_cloud
-from torchgrasp.datasets import list_views, read_object_mesh, read_view, read_views
+from torchgrasp.datasets import list_views, read_object_mesh, read_view
 from torchgrasp.errors import BadArgument, MeshError
 
 
@@ -41,8 +41,8 @@ def test_views_are_listed_in_order(folder: Path):
 
 
 def test_views_and_meshes_come_at_the_suggested_scale(folder: Path):
-    ((name, view, cloud, mesh), _) = list(read_views(folder, only=["box"]))
-    assert (name, view) == ("box", "view0") and cloud.normals is None
+    cloud, mesh = read_view(folder, "box", "view0"), read_object_mesh(folder, "box")
+    assert cloud.normals is None
     assert cloud.points.abs().max().item() == pytest.approx(0.05) and mesh.volume == pytest.approx(1e-3)
     assert cloud.viewpoint is not None and cloud.viewpoint.tolist() == pytest.approx([0.0, 0.0, 1.0])
     assert read_view(folder, "box", "view0", camera=False).viewpoint is None

@@ -6,7 +6,7 @@ has `mesh.ply` and `<view>_noisy.ply` [m], resting at z = 0. All readers apply t
 """
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,14 +53,6 @@ def read_view(objects: Path, name: str, view: str, camera: bool = True) -> Point
 def read_object_mesh(objects: Path, name: str) -> "trimesh.Trimesh":
     """Return the true mesh of an object; raises as `read_mesh`."""
     return read_mesh(Path(objects) / name / "mesh.ply").apply_scale(_scale(_read_manifest(objects, [name])[name]))
-
-
-def read_views(
-    objects: Path, camera: bool = True, only: Sequence[str] = ()
-) -> Iterator[tuple[str, str, PointCloud, "trimesh.Trimesh"]]:
-    """Yield object, view, noisy cloud and true mesh of every view."""
-    for name, view in list_views(objects, only=only):
-        yield name, view, read_view(objects, name, view, camera), read_object_mesh(objects, name)
 
 
 def _scale(entry: dict[str, Any]) -> float:

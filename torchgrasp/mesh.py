@@ -1,12 +1,9 @@
-"""True meshes: read and checked, sampled, and the nearest point of one."""
+"""True meshes, read and checked, and closest points of triangles."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from torchgrasp.cloud.check import MAX_EXTENT, MIN_EXTENT
 from torchgrasp.errors import MeshError, SuspiciousScale
@@ -16,8 +13,6 @@ if TYPE_CHECKING:
 
 LEAST_VOLUME = 1e-12
 """Volume [m^3] from which on a mesh is a body: a cube of 0.1 mm."""
-SEARCH_SAMPLES, SEARCH_TRIANGLES = 20_000, 8
-"""Samples of a surface, and how many of them give the triangles among which its nearest point is sought."""
 
 
 def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
@@ -67,36 +62,6 @@ def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
         raise MeshError("mesh", f"{name} of volume {volume:.3g} m^3", "a positive volume, faces turned outward")
 
 
-def sample_mesh(
-    mesh: "trimesh.Trimesh", n: int, generator: np.random.Generator
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Return n random points of a mesh, by area, and their normals."""
-    points, _, normals = _sample(mesh, n, generator)
-    return torch.from_numpy(points), torch.from_numpy(normals)
-
-
-def nearest_on_mesh(
-    mesh: "trimesh.Trimesh", points: Float[Tensor, "n 3"]
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Return the nearest point of a mesh to each point, with its normal.
-
-    Only the triangles of the nearest samples are tried, for speed.
-    """
-    from scipy.spatial import KDTree
-
-    if not len(points):
-        return points, points
-    samples, faces, _ = _sample(mesh, SEARCH_SAMPLES, np.random.default_rng(0))
-    queries = points.numpy()
-    _, index = KDTree(samples).query(queries, k=SEARCH_TRIANGLES)
-    candidates = faces[index]  # (n, SEARCH_TRIANGLES)
-    corners = np.asarray(mesh.triangles)[candidates.reshape(-1)]
-    feet = closest_on_triangles(np.repeat(queries, SEARCH_TRIANGLES, 0), corners)[0].reshape(*candidates.shape, 3)
-    best = np.linalg.norm(feet - queries[:, None], axis=-1).argmin(1)
-    rows = np.arange(len(queries))
-    return torch.from_numpy(feet[rows, best]), torch.from_numpy(_face_normals(mesh, candidates[rows, best]))
-
-
 def closest_on_triangles(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the closest point of each triangle (n, 3 corners, 3) to each point, and its feature.
 
@@ -120,23 +85,3 @@ def closest_on_triangles(points: np.ndarray, triangles: np.ndarray) -> tuple[np.
     best[out], along = feet[rows, k], along[rows, k]
     feature[out] = np.where(along <= 0, 4 + k, np.where(along >= 1, 4 + (k + 1) % 3, 1 + k))
     return best, feature
-
-
-def _sample(
-    mesh: "trimesh.Trimesh", n: int, generator: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return n random points evenly by area, their faces and the faces' normals."""
-    corners = np.asarray(mesh.triangles)
-    area = np.cumsum(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1))
-    face = np.minimum(np.searchsorted(area, generator.random(n) * area[-1]), len(area) - 1)
-    u, v = generator.random((2, n))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    a, b, c = corners[face].transpose(1, 0, 2)
-    return a + u[:, None] * (b - a) + v[:, None] * (c - a), face, _face_normals(mesh, face)
-
-
-def _face_normals(mesh: "trimesh.Trimesh", faces: np.ndarray) -> np.ndarray:
-    """Return unit normals of faces by their winding, also of very thin ones."""
-    a, b, c = np.asarray(mesh.triangles)[faces].transpose(1, 0, 2)
-    across = np.cross(b - a, c - a)
-    return across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-300)

@@ -32,7 +32,6 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "hand check": hands.check,
     "hand sample": hands.sample,
     "shape surface": shapes.surface,
-    "shape accuracy": shapes.accuracy,
 }
 """The commands by name."""
 

@@ -1,4 +1,4 @@
-"""`torchgrasp shape`: the estimated surface as a mesh, and its accuracy."""
+"""`torchgrasp shape`: the estimated surface as a mesh."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -8,7 +8,6 @@ import tyro
 from torchgrasp.cli.common import check_seed, check_table, naming, table_height
 from torchgrasp.cloud.io.read import read_cloud
 from torchgrasp.export import check_surface_path, largest_std, save_surface
-from torchgrasp.shape.accuracy import format_table, measure_accuracy
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import extract_surface
 
@@ -51,25 +50,4 @@ def surface(
     middle = float(mesh.std_m.median())
     print(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces, {out}")
     print(f"standard deviation: median {1e3 * middle:.1f} mm, {1e3 * largest_std(mesh):.1f} mm where it is yellow")
-    return 0
-
-
-def accuracy(
-    objects: Path,
-    support: Literal["camera", "paper"] = "camera",
-    no_camera: bool = False,
-    no_table: bool = False,
-    only: tuple[str, ...] = (),
-) -> int:
-    """Print errors of estimated surfaces against true meshes, and the coverage of std_m.
-
-    Args:
-        objects: folder with manifest.json, and for each object mesh.ply and noisy views.
-        support: what is observed of the hidden side: outline, symmetry and free space, or the paper's points.
-        no_camera: estimate the camera's position in place of taking the manifest's.
-        no_table: do not tell where the table is.
-        only: names of objects to keep; by default all.
-    """
-    with naming("--objects", "objects", "path"):
-        print(format_table(measure_accuracy(objects, support, not no_camera, not no_table, only)))
     return 0

@@ -10,12 +10,12 @@ import torch
 from train.pull_trials import PullRecord, RisingPull, pull_until_lost
 
 from benchmarks.common import Row
+from benchmarks.ground_truth import read_views
 from torchgrasp import ContactSpec, Grasps, Hand, Status, load_hand, plan_grasps
 from torchgrasp.control import ClosingReference
 from torchgrasp.control.adaptive.impedance import GRASP_STIFFNESS, Impedance
 from torchgrasp.control.adaptive.stability import StabilityModel, lengths_of, load_stability, state_of
 from torchgrasp.control.holding import ForceHold
-from torchgrasp.datasets import read_views
 from torchgrasp.evaluation.campaign import choose_rows
 from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.linalg import unit

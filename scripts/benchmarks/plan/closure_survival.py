@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from benchmarks.ground_truth import nearest_on_mesh, sample_mesh
+from benchmarks.shape.accuracy import RESOLUTION, SURE_VARIANCE
 from torchgrasp.linalg import unit
-from torchgrasp.mesh import nearest_on_mesh, sample_mesh
 from torchgrasp.plan.wrench import closed_exact
-from torchgrasp.shape.accuracy import RESOLUTION, SURE_VARIANCE
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
 

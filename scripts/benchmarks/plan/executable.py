@@ -14,8 +14,8 @@ import torch
 from tqdm import tqdm
 
 from benchmarks.common import Row
+from benchmarks.ground_truth import read_views
 from torchgrasp import ContactSpec, Grasps, Hand, Status, certify, fit_shape, load_hand, load_mixture, plan_contacts
-from torchgrasp.datasets import read_views
 from torchgrasp.frames import apply
 from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.checks import TIP_PENETRATION

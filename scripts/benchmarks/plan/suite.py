@@ -7,12 +7,12 @@ from pathlib import Path
 import torch
 
 from benchmarks.common import Row, least_seconds, measure
+from benchmarks.ground_truth import read_views
 from benchmarks.plan.executable import bench_executable
 from benchmarks.plan.ipopt_comparison import POINTS, bench_peers
 from benchmarks.plan.scaling import bench_anytime, bench_growth, bench_memory
 from benchmarks.plan.true_surface import bench_fields, bench_objectives, bench_truth
 from torchgrasp import ContactSpec, Status, certify, fit_shape, plan_contacts
-from torchgrasp.datasets import read_views
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.values import PointCloud
 

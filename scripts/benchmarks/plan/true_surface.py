@@ -9,8 +9,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks.common import Row
+from benchmarks.ground_truth import nearest_on_mesh
 from torchgrasp import ContactSpec, Status, fit_shape, plan_contacts
-from torchgrasp.mesh import nearest_on_mesh
 from torchgrasp.plan.wrench import closed_exact
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.values import Contacts

@@ -11,12 +11,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks.common import Row, least_seconds, measure
+from benchmarks.ground_truth import nearest_on_mesh, read_views
 from benchmarks.proof.closure_reference import redrawn_closure
 from benchmarks.proof.exact_lp import exact_margin, proves_margin_above, proves_margin_below, wrench_matrix
-from torchgrasp.datasets import read_views
 from torchgrasp.errors import Status
 from torchgrasp.linalg import unit
-from torchgrasp.mesh import nearest_on_mesh
 from torchgrasp.objects import list_objects, load_object
 from torchgrasp.plan.certify import certify, solve_by_highs
 from torchgrasp.plan.closure_lp import solve_closure_lp

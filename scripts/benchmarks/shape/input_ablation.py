@@ -7,10 +7,10 @@ import torch
 from tqdm import tqdm
 
 from benchmarks.common import Row
+from benchmarks.ground_truth import read_views
+from benchmarks.shape.accuracy import Row as View
+from benchmarks.shape.accuracy import mean_row, measure_accuracy, measure_shape
 from torchgrasp.cloud.merge import merge_clouds
-from torchgrasp.datasets import read_views
-from torchgrasp.shape.accuracy import Row as View
-from torchgrasp.shape.accuracy import mean_row, measure_accuracy, measure_shape
 from torchgrasp.shape.fit import fit_shape
 
 WEAKER = {

@@ -10,13 +10,13 @@ import torch
 from tqdm import tqdm
 
 from benchmarks.common import Row, least_seconds, measure
+from benchmarks.ground_truth import read_views
 from benchmarks.plan.closure_survival import closure_survival
+from benchmarks.shape.accuracy import Row as View
+from benchmarks.shape.accuracy import format_table, mean_row, measure_shape
 from benchmarks.shape.exactness import bench_cholesky, bench_laws, bench_refusals, bench_selection, bench_update
 from benchmarks.shape.input_ablation import bench_inputs
 from benchmarks.shape.speed import bench_growth, bench_memory, bench_queries, bench_raw
-from torchgrasp.datasets import read_views
-from torchgrasp.shape.accuracy import Row as View
-from torchgrasp.shape.accuracy import format_table, mean_row, measure_shape
 from torchgrasp.shape.fit import fit_shape
 
 SUBJECTS = (

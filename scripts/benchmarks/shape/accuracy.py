@@ -2,17 +2,16 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from benchmarks.ground_truth import nearest_on_mesh, read_views, sample_mesh
 from torchgrasp.columns import format_columns
-from torchgrasp.datasets import read_views
 from torchgrasp.linalg import unit
-from torchgrasp.mesh import nearest_on_mesh, sample_mesh
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
@@ -36,29 +35,20 @@ Row = dict[str, Any]
 """Numbers by name: lengths in mm, angles in degrees, shares in [0, 1], NaN where nothing was measured."""
 
 
-def measure_accuracy(
-    objects: Path,
-    support: Literal["camera", "paper"] = "camera",
-    camera: bool = True,
-    table: bool = True,
-    only: Sequence[str] = (),
-) -> list[Row]:
+def measure_accuracy(objects: Path, camera: bool = True, table: bool = True) -> list[Row]:
     """Return `measure_shape` of every noisy view of a folder, with "object" and "view".
 
     Args:
         objects: a folder as `torchgrasp.datasets` reads it.
-        support: of `fit_shape`.
         camera: whether the camera's position is given.
         table: whether the table is given.
-        only: names of objects to keep; all of them if empty.
 
     Raises:
         BadArgument: no manifest, or no object to measure.
     """
     return [
-        {"object": name, "view": view}
-        | measure_shape(fit_shape(cloud, support=support, table=0.0 if table else None), mesh, cloud)
-        for name, view, cloud, mesh in read_views(objects, camera, only)
+        {"object": name, "view": view} | measure_shape(fit_shape(cloud, table=0.0 if table else None), mesh, cloud)
+        for name, view, cloud, mesh in read_views(objects, camera)
     ]
 
 

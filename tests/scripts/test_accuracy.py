@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-
-from torchgrasp.shape.accuracy import (
+from benchmarks.shape.accuracy import (
     format_table,
     mean_row,
     measure_accuracy,
     measure_shape,
 )
+
 from torchgrasp.shape.condition import condition
 from torchgrasp.shape.gp import Normalisation, ShapeGP
 from torchgrasp.shape.observations import Observations

@@ -1,0 +1,76 @@
+"""Views of objects with their true meshes; samples and nearest points of a mesh."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.datasets import list_views, read_object_mesh, read_view
+from torchgrasp.mesh import closest_on_triangles
+from torchgrasp.values import PointCloud
+
+if TYPE_CHECKING:
+    import trimesh
+
+SEARCH_SAMPLES, SEARCH_TRIANGLES = 20_000, 8
+"""Samples of a surface, and how many of them give the triangles among which its nearest point is sought."""
+
+
+def read_views(objects: Path, camera: bool = True) -> Iterator[tuple[str, str, PointCloud, "trimesh.Trimesh"]]:
+    """Yield object, view, noisy cloud and true mesh of every view."""
+    for name, view in list_views(objects):
+        yield name, view, read_view(objects, name, view, camera), read_object_mesh(objects, name)
+
+
+def sample_mesh(
+    mesh: "trimesh.Trimesh", n: int, generator: np.random.Generator
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Return n random points of a mesh, by area, and their normals."""
+    points, _, normals = _sample(mesh, n, generator)
+    return torch.from_numpy(points), torch.from_numpy(normals)
+
+
+def nearest_on_mesh(
+    mesh: "trimesh.Trimesh", points: Float[Tensor, "n 3"]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Return the nearest point of a mesh to each point, with its normal.
+
+    Only the triangles of the nearest samples are tried, for speed.
+    """
+    from scipy.spatial import KDTree
+
+    if not len(points):
+        return points, points
+    samples, faces, _ = _sample(mesh, SEARCH_SAMPLES, np.random.default_rng(0))
+    queries = points.numpy()
+    _, index = KDTree(samples).query(queries, k=SEARCH_TRIANGLES)
+    candidates = faces[index]  # (n, SEARCH_TRIANGLES)
+    corners = np.asarray(mesh.triangles)[candidates.reshape(-1)]
+    feet = closest_on_triangles(np.repeat(queries, SEARCH_TRIANGLES, 0), corners)[0].reshape(*candidates.shape, 3)
+    best = np.linalg.norm(feet - queries[:, None], axis=-1).argmin(1)
+    rows = np.arange(len(queries))
+    return torch.from_numpy(feet[rows, best]), torch.from_numpy(_face_normals(mesh, candidates[rows, best]))
+
+
+def _sample(
+    mesh: "trimesh.Trimesh", n: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return n random points evenly by area, their faces and the faces' normals."""
+    corners = np.asarray(mesh.triangles)
+    area = np.cumsum(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1))
+    face = np.minimum(np.searchsorted(area, generator.random(n) * area[-1]), len(area) - 1)
+    u, v = generator.random((2, n))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    a, b, c = corners[face].transpose(1, 0, 2)
+    return a + u[:, None] * (b - a) + v[:, None] * (c - a), face, _face_normals(mesh, face)
+
+
+def _face_normals(mesh: "trimesh.Trimesh", faces: np.ndarray) -> np.ndarray:
+    """Return unit normals of faces by their winding, also of very thin ones."""
+    a, b, c = np.asarray(mesh.triangles)[faces].transpose(1, 0, 2)
+    across = np.cross(b - a, c - a)
+    return across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-300)
