@@ -90,7 +90,7 @@ def pull_until_lost(
         friction: of every contact.
     """
     spec = TrialSpec(mass=MASS, friction=friction, gravity=0.0, approach=0.0, lift_height=0.0, table=False)
-    run = TrialRun(TrialDriver(trial, spec, reference))
+    run = TrialDriver(trial, spec, reference).open()
     return _record(_pull(run, holding, pull) if run.starts else [], overlap=not run.starts)
 
 

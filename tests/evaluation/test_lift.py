@@ -11,7 +11,7 @@ import trimesh
 from tests.pinch import QUICK, close, cylinder, digest, digest_elsewhere, pinch
 from torchgrasp.control import observe
 from torchgrasp.errors import BadArgument, MeshError, Status
-from torchgrasp.evaluation import GraspTrial, TrialDriver, TrialRun, close_hand
+from torchgrasp.evaluation import GraspTrial, TrialDriver, close_hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.specs import TrialSpec
 
@@ -79,7 +79,7 @@ def test_all_a_fingertip_exerts_is_felt_friction_included():
     """At rest the tips carry the object: their full forces sum to its weight, their normal parts are the readings."""
     pytest.importorskip("sapien")
     hand, grasp = pinch("allegro")
-    run = TrialRun(TrialDriver(GraspTrial(hand, grasp, cylinder()), TrialSpec(approach=0.0, noise=False)))
+    run = TrialDriver(GraspTrial(hand, grasp, cylinder()), TrialSpec(approach=0.0, noise=False)).open()
     for _ in run.close():
         pass
     for k in range(200):

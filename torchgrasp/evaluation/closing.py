@@ -86,6 +86,10 @@ class TrialDriver:
             patch=spec.patch,
         )
 
+    def open(self) -> "TrialRun":
+        """Return a run in a fresh scene; raises `MissingExtra` without the simulator."""
+        return TrialRun(self)
+
     def grasp_overlap(self) -> float:
         """Return the depth [m] of the hand's grasp pose in the object."""
         joints = _by_name(self.reference.hand, self.reference.joints)

@@ -81,7 +81,7 @@ def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResul
     """Run a trial; see `close_hand`."""
     started = time.perf_counter()
     driver = TrialDriver(trial, TrialSpec() if spec is None else spec)
-    run = TrialRun(driver)
+    run = driver.open()
     lift = _Lift(run)
     status = lift.perform()
     return lift.result(status, time.perf_counter() - started)

@@ -58,7 +58,7 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
     driver = TrialDriver(trial, protocol.trial)
     status, moved, turned, force, tried = Status.OK, 0.0, 0.0, math.nan, 0
     while status is Status.OK and tried < len(DIRECTIONS):
-        pull = _Pull(TrialRun(driver), protocol.pull)
+        pull = _Pull(driver.open(), protocol.pull)
         status = pull.perform(DIRECTIONS[tried])
         moved, turned, tried = max(moved, pull.moved), max(turned, pull.turned), tried + 1
         force = pull.force if math.isnan(force) else force

@@ -24,7 +24,7 @@ from torchgrasp import (
     plan_grasps,
 )
 from torchgrasp.control.holding import ForceHold
-from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
+from torchgrasp.evaluation.closing import GraspTrial, TrialDriver
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.sim.mjcf import OBJECT
@@ -152,7 +152,7 @@ def hold(
     """Close a hand with the uncertainty-aware controller, lift and hold, fingertips touching in points (no patch)."""
     mass, noise = 0.1 if lift else 0.02, seed is not None
     spec = TrialSpec(force=force, mass=mass, patch=0.0, approach=0.0, noise=noise, simulator=simulator)
-    run = TrialRun(TrialDriver(GraspTrial(hand, grasp, mesh, seed or 0), spec))
+    run = TrialDriver(GraspTrial(hand, grasp, mesh, seed or 0), spec).open()
     scene, robot, controller = run.scene, run.robot, run.controller
     for _ in run.close():
         pass
