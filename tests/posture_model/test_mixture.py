@@ -190,3 +190,9 @@ def test_a_mixture_with_observation_noise_is_that_of_noisy_codes(generator):
     ).with_observation_noise(0.01, 0.5)
     expected = mean[joint] + sigma[joint, code] @ torch.linalg.solve(sigma[code, code] + noise, q[1] - mean[code])
     torch.testing.assert_close(single.joints(q[1]), expected)
+
+
+@pytest.mark.parametrize("given", [(-0.001, 0.0), (0.0, -0.1), (math.nan, 0.0)])
+def test_observation_noise_is_a_deviation(given):
+    with pytest.raises(BadArgument):
+        load_mixture("barrett").with_observation_noise(*given)

@@ -63,6 +63,16 @@ class Hand(Value):
         return self.actuated.names
 
     @property
+    def finger_names(self) -> tuple[str, ...]:
+        """Names of the grasping fingers, in grasp order."""
+        return self.tips.names
+
+    @property
+    def tip_radius(self) -> Float[Tensor, "3"]:
+        """Radii of the fingertips [m]; 0: a flat or pointed tip."""
+        return self.tips.radius
+
+    @property
     def dof(self) -> int:
         """Number of actuated joints, h."""
         return len(self.actuated.names)

@@ -1,6 +1,7 @@
 """The learned model of a hand: a Gaussian mixture over joints and codes (Eqs. 19-23)."""
 
 import dataclasses
+import math
 import functools
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import check_whole
+from torchgrasp.base import check_number, check_whole
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.hand.load import find_hand
@@ -103,6 +104,8 @@ class GraspMixture(GaussianMixture):
         middle of its pad by some millimetres. The Barrett hand's codes fill a thin manifold of four dimensions. Without
         noise, Eq. (21) would then refuse almost every contact triple within reach.
         """
+        check_number("lengths", lengths, 0.0, math.inf)
+        check_number("cosines", cosines, 0.0, math.inf)
         noise = torch.zeros(len(self.names)).to(self.covariances)
         noise[-6:-3], noise[-3:] = lengths**2, cosines**2
         return dataclasses.replace(self, covariances=self.covariances + torch.diag(noise))
