@@ -1,8 +1,8 @@
 """The learned model of a hand: a Gaussian mixture over joints and codes (Eqs. 19-23)."""
 
 import dataclasses
-import math
 import functools
+import math
 from pathlib import Path
 
 import torch
