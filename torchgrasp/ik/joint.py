@@ -120,11 +120,9 @@ class JointProblem:
 def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: ContactSpec) -> Grasps:
     """Return a checked grasp for each triple that has seeds, best first; contacts slide where they must.
 
-    The seeds of a triple are tried in their order. Slid contacts are certified anew; their failures have a planning
-    `Status`.
+    Seeds are tried in their order. Slid contacts are certified anew; their failures have a planning `Status`.
     """
-    contact_problem = ContactProblem.of(shape, spec)
-    joint_problem = JointProblem(problem.hand, shape, contact_problem, problem.world, spec.flatness)
+    joint_problem = JointProblem(problem.hand, shape, ContactProblem.of(shape, spec), problem.world, spec.flatness)
 
     def refine_sliding(seeds: IKSeeds) -> Grasps:
         """Return a checked grasp for each seed, with sliding contacts."""
