@@ -1,4 +1,4 @@
-"""Closing and holding: the controller of a real or a simulated hand, from grasp and sensors to joint targets."""
+"""The controller of a hand, real or simulated: grasp and sensors in, joint targets out."""
 
 from torchgrasp.control.controller import GraspController
 from torchgrasp.control.forces import Squeeze, squeeze

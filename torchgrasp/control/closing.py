@@ -50,10 +50,10 @@ class OpenLoopClosing:
 class UncertaintyClosing:
     """The uncertainty-aware controller (Eqs. 25-28), with fingers that wait for each other.
 
-    A finger in the air searches along its contact's normal, beyond the planned contact if need be. Before the first
+    A finger in the air searches along its contact's normal, even beyond the contact. Before the first
     touch the fingers keep pace. A finger that touches is force-controlled whatever its position error: where the shape
     is wrong, Eq. (26) would press on. It waits with `WAITING_FORCE` for the others. The holding then raises the full
-    forces, because three separate loops would push the object (docs/closing.md).
+    forces: three separate loops would push the object (docs/closing.md).
     """
 
     def __init__(self, reference: ClosingReference, revise: Revision | None = None) -> None:
@@ -87,7 +87,7 @@ class UncertaintyClosing:
         return reference.expand(self.target)
 
     def _pace(self, ahead: Float[Tensor, "3"], contact: Bool[Tensor, "3"]) -> Float[Tensor, "3"]:
-        """Return the share of its speed that each finger may go, so that fingers in the air arrive together."""
+        """Return each finger's share of its speed with which all arrive together."""
         if bool(contact.any()):
             return torch.ones_like(ahead)
         left = ahead.clamp_min(0.0) + POSITION_FLOOR

@@ -1,7 +1,6 @@
 """The closing law (Eqs. 25-28): position control far from a contact, force control near it, weighted by uncertainty.
 
-All functions are pure and batched over leading axes. Gains are rates (position gain in 1/s, force gain in m/s per
-newton), so that the same gains mean the same motion at any control period.
+All functions are pure and batched over leading axes. Position gains are in 1/s, force gains in m/s per newton.
 """
 
 import torch
@@ -75,7 +74,7 @@ def force_gain(covariance: Float[Tensor, "*b 3 3"], alpha_f: Float[Tensor, "*b"]
 
 
 def damped_inverse(jacobian: Float[Tensor, "*b m h"], damping: float = DAMPING) -> Float[Tensor, "*b h m"]:
-    """Return J^T (J J^T + damping I)^-1, by the smaller of the two normal matrices."""
+    """Return J^T (J J^T + damping I)^-1."""
     m, h = jacobian.shape[-2:]
     transposed = jacobian.transpose(-1, -2)
     if m <= h:
@@ -107,8 +106,8 @@ def joint_step(
 ) -> Float[Tensor, "*b h"]:
     """Return the change of the joints [rad] in one tick, Eq. (25), by damped least squares over all three fingers.
 
-    The paper's J^-1 does not exist for fingers of four joints, nor for coupled fingers. Joint motions that move no
-    fingertip reduce `posture_error` at `POSITION_RATE`, so that the links stay where they were planned.
+    The paper's J^-1 does not exist for coupled fingers, nor for four joints. Joint motions that move no fingertip
+    reduce `posture_error` at `POSITION_RATE`.
 
     Args:
         jacobian: of the three fingertips [m/rad].

@@ -1,4 +1,4 @@
-"""The controller of a grasp, from the first motion of the fingers to the end of the hold; it needs no simulator."""
+"""The controller of a grasp, from closing to the end of the hold; it needs no simulator."""
 
 import functools
 from collections.abc import Callable
@@ -35,10 +35,10 @@ def check_modes(closing: str, holding: str, belief: object = None) -> None:
 
 
 class GraspController:
-    """Close a hand and hold the object: an `Observation` goes in at every tick, joint targets come out.
+    """Close a hand and hold the object: observations in, joint targets out.
 
-    A closing brings the fingers to the object, then a holding presses. `closed` turns true `PRESSING_TIME` later: from
-    then on the hand may be lifted, with further steps. The open loop keeps its squeeze.
+    A closing brings the fingers to the object, then a holding presses. `closed` turns true `PRESSING_TIME` later:
+    then the hand may be lifted, with further steps. The open loop keeps its squeeze.
 
     Args:
         reference: what the hand follows.
@@ -83,13 +83,13 @@ class GraspController:
 
     @property
     def closed(self) -> bool:
-        """Whether the hand has closed as far as it will, and pressed: it may be lifted."""
+        """Whether the hand has closed and pressed: it may be lifted."""
         if isinstance(self.closing, OpenLoopClosing):
             return self.closing.done
         return self.pressed >= PRESSING_TIME - 1e-9
 
     def step(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
-        """Return the targets of all joints [rad] for the next tick, which comes after a period [s]."""
+        """Return the targets of all joints [rad] for the next tick, a period [s] later."""
         over = self.closing.done or self.time >= CLOSING_TIME
         if self.hold is None and over and not isinstance(self.closing, OpenLoopClosing):
             self.hold = self._hold(self.reference, observation, self.targets)
@@ -121,7 +121,7 @@ def _closing(
 def _holding(
     reference: ClosingReference, mode: HoldingMode
 ) -> Callable[[ClosingReference, Observation, Float[Tensor, " j"]], Step]:
-    """Return what makes the holding of a mode; only the impedance reads the hand's stability model."""
+    """Return the maker of a holding; only the impedance reads the stability model."""
     if mode == "impedance":
         from torchgrasp.control.adaptive.impedance import Impedance
         from torchgrasp.control.adaptive.stability import load_stability

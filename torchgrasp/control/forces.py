@@ -44,14 +44,14 @@ def force_covariance(
 
 
 def contacts_in_hand(grasps: Grasps) -> tuple[Float[Tensor, "g 3 3"], Float[Tensor, "g 3 3"]]:
-    """Return the planned contact points [m] and outward normals in the hand's frame, in float64."""
+    """Return planned contact points [m] and normals in the hand's frame."""
     hand_from_obj = inverse(grasps.obj_from_hand.double())
     contacts = grasps.contacts
     return apply(hand_from_obj, contacts.points.double()), rotate(hand_from_obj, contacts.normals.double())
 
 
 class Squeeze(NamedTuple):
-    """The third pose of a grasp: joint targets [rad], forces on the object in the hand's frame [N], torques [N m]."""
+    """The third pose of a grasp: joint targets [rad], forces on the object [N], torques [N m]."""
 
     joints: Float[Tensor, "g h"]
     forces: Float[Tensor, "g 3 3"]
@@ -85,7 +85,7 @@ def squeeze(hand: Hand, grasps: Grasps, force: float = 4.0, kp: float | None = N
 
 
 def check_squeeze(hand: Hand, grasps: Grasps, force: float, kp: float | None) -> None:
-    """Raise `BadArgument` unless the grasps have the hand's joints, and force and stiffness are positive."""
+    """Refuse joints of another hand, and a force or stiffness that is not positive."""
     if grasps.joints.shape[-1] != hand.dof:
         raise BadArgument("grasps", f"{grasps.joints.shape[-1]} joints", f"the {hand.dof} of {hand.name}")
     if not 0.0 < force < 1e3:
@@ -100,6 +100,6 @@ def press(
     forces: Float[Tensor, "g 3 3"],
     stiffness: Float[Tensor, " h"],
 ) -> Squeeze:
-    """Return the `Squeeze` by which joints of a stiffness [N m/rad] exert forces [N] at the contacts."""
+    """Return the `Squeeze` with which joints of a stiffness [N m/rad] exert forces [N]."""
     torques = torch.einsum("gcih,gci->gh", jacobian, forces)
     return Squeeze(joints + torques / stiffness, forces, torques)

@@ -13,7 +13,7 @@ RAMP = 0.4
 
 
 class ForceHold:
-    """Press with forces that are balanced at the sensed contacts; the joints stay compliant about where they are.
+    """Press with forces that are balanced at the sensed contacts; the joints stay compliant.
 
     One common factor keeps the sum of the forces. A loop for each finger would drift and push the object.
 
@@ -50,15 +50,15 @@ class PositionHold:
 
 
 def regulate(factor: float, observation: Observation, strength: float, period: float) -> float:
-    """Return the common factor of all forces one tick later: it integrates what the sensed sum lacks [share/s]."""
+    """Return the common factor of the forces a tick later; it integrates the missing share of their sum."""
     lacking = 1 - float(observation.tactile.reading.sum()) / strength
     return min(max(factor + period * lacking, 0.5), 1.5)
 
 
 def held_forces(reference: ClosingReference, observation: Observation) -> tuple[Float[Tensor, "3 3"], float]:
-    """Return forces on the object [N] that are balanced at the sensed contacts, and the sum of their normal parts.
+    """Return forces [N] that are balanced at the sensed contacts, and their normal sum.
 
-    The planned forces are kept unless all three fingers touch and some balanced set presses at their contacts.
+    The planned forces stay where a finger is in the air or no balanced set presses.
     """
     gains, normals = reference.gains, reference.normals
     forces = gains.desired_force

@@ -1,4 +1,4 @@
-"""What a robot knows of itself at a control tick; no simulator is needed."""
+"""What a robot knows of itself at a control tick."""
 
 import dataclasses
 
@@ -29,7 +29,7 @@ class Observation(Value):
 
 
 def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> Observation:
-    """Return the observation of a robot that reads its actuated joints [rad] and its fingertips."""
+    """Return the observation of a robot with actuated joints [rad] and fingertips as read."""
     joints = joints.double()
     tips = hand.tip_centres(joints)
     axes, origins = hand.tree.joint_axes(hand.link_poses(joints))

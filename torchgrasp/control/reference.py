@@ -1,4 +1,4 @@
-"""What a closing hand follows, derived once from hand and grasp: three poses, contacts and gains."""
+"""What a closing hand follows: poses, contacts and gains, derived once."""
 
 import dataclasses
 import functools
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class ClosingReference(Value):
-    """What a closing hand follows, in the hand's frame; joints are actuated ones [rad].
+    """What a closing hand follows, in its frame; joints are actuated [rad].
 
     Args:
         hand: the hand, in float64.
@@ -111,7 +111,7 @@ class ClosingReference(Value):
         )
 
     def expand(self, actuated: Float[Tensor, " h"]) -> Float[Tensor, " j"]:
-        """Return all joints of the URDF; unlike `Hand.expand_joints` it lets NaN through, as a lost simulation has."""
+        """Return all joints of the URDF; NaN, as of a diverged simulation, may pass."""
         return self.hand.actuated.coupling @ actuated + self.hand.actuated.offset
 
     def pick(self, joints: Float[Tensor, " j"]) -> Float[Tensor, " h"]:
@@ -128,7 +128,7 @@ class ClosingReference(Value):
         return torch.minimum(torch.maximum(actuated, self.hand.lower), self.hand.upper)
 
     def contact_points(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-        """Return the points [m] of fingertips with given centres [m] that touch first along the planned normals."""
+        """Return the first points to touch [m] of fingertips with given centres [m]."""
         return tips - self.hand.tips.radius[:, None] * self.normals
 
 

@@ -1,4 +1,4 @@
-"""The stiffness of position-controlled joints, and how far a fingertip yields when it is pushed."""
+"""Stiffness of position-controlled joints, and compliance of fingertips."""
 
 import torch
 from jaxtyping import Float
@@ -8,13 +8,13 @@ from torchgrasp.hand.hand import Hand
 
 
 def drive_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, " j"]:
-    """Return the stiffness [N m/rad] of every joint of the URDF: `kp` everywhere, or the hand's own (None)."""
+    """Return the stiffness [N m/rad] of every joint of the URDF; `kp` None: its own."""
     kps = [hand.actuators[name].kp if kp is None else kp for name in hand.tree.joint_names]
     return torch.tensor(kps, dtype=torch.float64)
 
 
 def actuated_stiffness(coupling: Float[Tensor, "j h"], kp: Float[Tensor, " j"]) -> Float[Tensor, "h"]:
-    """Return the stiffness [N m/rad] of each actuated joint: its own drive and the drives of its coupled joints.
+    """Return the stiffness [N m/rad] of each actuated joint, coupled joints included.
 
     >>> actuated_stiffness(torch.tensor([[1.0], [0.5]]), torch.tensor([4.0, 4.0]))
     tensor([5.])
@@ -23,7 +23,7 @@ def actuated_stiffness(coupling: Float[Tensor, "j h"], kp: Float[Tensor, " j"]) 
 
 
 def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
-    """Return `actuated_stiffness` of a hand whose drives have the stiffness `kp` [N m/rad]; None: its own."""
+    """Return a hand's `actuated_stiffness`, all drives with `kp` [N m/rad]; None: its own."""
     coupling = hand.actuated.coupling
     return actuated_stiffness(coupling, drive_stiffness(hand, kp).to(coupling))
 
@@ -31,6 +31,6 @@ def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
 def tip_compliance(
     jacobian: Float[Tensor, "*b 3 3 h"], normals: Float[Tensor, "*b 3 3"], stiffness: Float[Tensor, "h"]
 ) -> Float[Tensor, "*b 3"]:
-    """Return how far [m/N] each fingertip yields along its normal when the joints have a stiffness [N m/rad]."""
+    """Return the compliance [m/N] of each fingertip along its normal, by joint stiffness [N m/rad]."""
     along = torch.einsum("...cih,...ci->...ch", jacobian, normals)
     return (along**2 / stiffness).sum(-1)

@@ -1,7 +1,7 @@
-"""A tactile fingertip: what a controller may know of a contact, from the simulator's truth.
+"""A tactile fingertip: what a controller knows of a contact.
 
-The force lags behind a low-pass and is noisy. The place of a contact is noisy, too; on a round tip its normal follows
-from the place. A fingertip samples at its own rate and holds the last sample in between.
+The force lags behind a low-pass and is noisy. So is the place of a contact, and with it the normal
+of a round tip. Samples come at the sensor's own rate.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ TOUCH_ON, TOUCH_OFF = 0.2, 0.1
 
 @dataclasses.dataclass(frozen=True)
 class TipContact(Value):
-    """True contacts of three fingertips, averaged over a tick, in any one frame.
+    """True contacts of three fingertips, averaged over a tick.
 
     `forces` [N] act on the object, friction included. `points` [m] and outward `normals` are NaN without contact.
     """
@@ -49,8 +49,8 @@ class TactileState(Value):
     """What three fingertips report, and their memory.
 
     `reading` [N] is the normal force, `forces` [N] the full one. `points` [m] and `normals` are NaN without contact.
-    The memory: `lagged` [N] holds normal force and full force behind the low-pass, `average` [N] the slow mean of the
-    readings, `age` [s] the time since the last sample.
+    `lagged` [N] is normal force and full force behind the low-pass. `average` [N] is the slow mean of the readings.
+    `age` [s] counts from the last sample.
     """
 
     reading: Float[Tensor, "*b 3"]
@@ -117,7 +117,7 @@ def measure(
 
 
 def low_pass(cutoff: float, period: float) -> float:
-    """Return the share of the new value in a first-order low-pass with a cut-off [Hz] and a period [s].
+    """Return the new value's share in a first-order low-pass, by cut-off [Hz] and period [s].
 
     >>> round(low_pass(20.0, 0.01), 3)
     0.715

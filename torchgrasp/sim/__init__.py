@@ -1,4 +1,4 @@
-"""The simulated world: a scene of table, object and mounted hand in SAPIEN or MuJoCo, and the hand's sensors in it."""
+"""The simulated world: table, object and mounted hand in SAPIEN or MuJoCo."""
 
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.sim.hand import SimulatedHand

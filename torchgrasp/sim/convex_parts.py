@@ -1,7 +1,7 @@
 """Convex parts of a mesh for the simulator, decomposed once and cached.
 
-A simulator of rigid bodies replaces a mesh by its convex hull: a jug would be solid. CoACD cuts it into convex parts,
-the same ones for the same mesh. That takes 1 to 22 s of CPU time for scans of 800 to 16000 faces, hence the cache.
+A simulator replaces a mesh by its convex hull: a jug would be solid. CoACD cuts it into convex parts, always the same.
+For scans of 800 to 16000 faces that takes 1 to 22 s.
 """
 
 import contextlib
@@ -32,10 +32,10 @@ _log = logging.getLogger(__name__)
 
 
 def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None = None) -> "list[trimesh.Trimesh]":
-    """Return convex parts that together fill a closed mesh; a convex mesh is its own only part.
+    """Return convex parts that fill a closed mesh, one if it is convex.
 
-    The parts are cached in `cache`, by default `$XDG_CACHE_HOME/torchgrasp` or `~/.cache/torchgrasp`. A damaged file
-    there is replaced; a folder that cannot be written only logs a warning.
+    `cache` is by default `$XDG_CACHE_HOME/torchgrasp` or `~/.cache/torchgrasp`. A damaged file there is replaced. A
+    folder that cannot be written costs a warning.
 
     Raises:
         MeshError, SuspiciousScale: as `read_mesh`.
@@ -64,12 +64,12 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
 
 
 def _filled(parts: "list[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
-    """Return the parts without the slivers of no volume that CoACD sometimes cuts off."""
+    """Return the parts without CoACD's occasional slivers of no volume."""
     return [part for part in parts if part.volume > LEAST_VOLUME]
 
 
 def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
-    """Return the caller's own parts; raise `MeshError` when one is no convex body."""
+    """Return the caller's own parts, refusing any that is not convex."""
     for index, part in enumerate(parts):
         check_solid(part, f"part {index}")
         if not part.is_convex:
@@ -95,7 +95,7 @@ def _decompose(mesh: "trimesh.Trimesh") -> "list[trimesh.Trimesh]":
 
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
-    """Discard the process's standard output: CoACD's C++ code prints through the file descriptor."""
+    """Discard standard output at its file descriptor, where CoACD prints."""
     stdout, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 1)
@@ -115,7 +115,7 @@ def _fingerprint(mesh: "trimesh.Trimesh") -> str:
 
 
 def _save(parts: "list[trimesh.Trimesh]", path: Path) -> None:
-    """Write the corners of all parts, one after the other, with their counts."""
+    """Write the corners of all parts with their counts."""
     tensors = {
         "vertices": torch.cat([torch.from_numpy(np.array(p.vertices, dtype=np.float64)) for p in parts]),
         "counts": torch.tensor([len(p.vertices) for p in parts]),
@@ -124,7 +124,7 @@ def _save(parts: "list[trimesh.Trimesh]", path: Path) -> None:
 
 
 def _load(path: Path) -> "list[trimesh.Trimesh]":
-    """Read parts that `_save` wrote; each is the hull of its corners, hence convex in any case."""
+    """Read parts that `_save` wrote, as hulls of their corners."""
     import trimesh
     from scipy.spatial import QhullError
 

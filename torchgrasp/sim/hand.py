@@ -1,4 +1,4 @@
-"""A hand in a simulated scene as its controller knows it: joint targets in, an observation out one tick later."""
+"""A simulated hand as its controller knows it: joint targets in, observations out."""
 
 import numpy as np
 import torch
@@ -12,9 +12,8 @@ from torchgrasp.sim.scene import Scene, StepContacts
 class SimulatedHand:
     """The hand of a scene, with tactile fingertips.
 
-    After each tick, `force` (3,) holds the mean true normal forces [N] and `finger` the fingers that touched in its
-    last step. `steps` counts the steps of the simulator; `first_touch` is the step of each fingertip's first contact,
-    infinite before it.
+    `force` (3,) are the true normal forces [N], averaged over the last tick. `finger` flags contacts in its last step.
+    `steps` counts steps of the simulator. `first_touch` is the step of each fingertip's first contact, infinite before.
 
     Args:
         scene: at its start.
@@ -37,7 +36,7 @@ class SimulatedHand:
         self._from_scene = [scene.joint_names.index(name) for name in names]
 
     def tick(self, targets: Float[Tensor, " j"]) -> Observation:
-        """Drive the joints for one control period and return what the robot then knows."""
+        """Drive the joints for one control period; return what the robot knows."""
         self.scene.drive(targets[self._to_scene].numpy())
         contacts = StepContacts.none()
         for _ in range(self.substeps):
@@ -51,11 +50,11 @@ class SimulatedHand:
         return self._observe(contacts)
 
     def ticks(self, seconds: float) -> int:
-        """Return the number of control ticks in a time [s], at least one."""
+        """Return the control ticks in a time [s], at least one."""
         return max(1, round(seconds / self.period))
 
     def _observe(self, contacts: StepContacts) -> Observation:
-        """Return the hand's own knowledge, in its frame: contacts only as the fingertips sense them."""
+        """Return the hand's own knowledge: contacts only as the fingertips sense them."""
         world_from_hand = self.scene.hand_pose()
         rotation, origin = world_from_hand[:3, :3], world_from_hand[:3, 3]
         centres = (self.scene.tip_poses() @ self._centres[:, :, None])[:, :3, 0]

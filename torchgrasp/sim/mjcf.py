@@ -1,8 +1,8 @@
-"""A scene as MJCF, MuJoCo's own format, with the solver's settings of the published protocols.
+"""A scene as MJCF, MuJoCo's format, with the solver settings of published protocols.
 
 Joints have the same armature, drives and friction as in SAPIEN. Torsional friction is a length in MuJoCo: friction
-times the radius of the contact patch. The hand feels neither gravity nor itself. The table is a plane, on which a flat
-bottom gets several contacts. MuJoCo's automatic reset is off: a lost object would return and count as held.
+times patch radius. The hand feels neither gravity nor itself. The table is a plane: a flat bottom gets several
+contacts. Automatic reset is off, which would return a lost object.
 """
 
 import xml.etree.ElementTree as ET
@@ -30,7 +30,7 @@ SOLREF, SOLIMP = "0.005 1", "0.5 0.99 0.0001"
 
 
 def scene_mjcf(spec: SceneSpec) -> str:
-    """Return a scene of table, object and hand with all joints at zero.
+    """Return a scene as XML, all joints at zero.
 
     Actuators are positional and named like their joints.
 
@@ -66,7 +66,7 @@ def scene_mjcf(spec: SceneSpec) -> str:
 
 
 def _add_object(asset: ET.Element, world: ET.Element, spec: SceneSpec) -> None:
-    """Add the object in the frame of its mesh, with the mass centre and inertia of an even filling."""
+    """Add the object with the mass centre and inertia of an even filling."""
     body = ET.SubElement(world, "body", name=OBJECT)
     ET.SubElement(body, "freejoint", name=OBJECT)
     inertia = np.asarray(spec.mesh.moment_inertia) * (spec.mass / spec.mesh.volume)
@@ -88,7 +88,7 @@ def _add_hand(world: ET.Element, spec: SceneSpec, urdf: Urdf) -> None:
 
 
 def add_links(parent: ET.Element, urdf: Urdf, parent_from_root: np.ndarray) -> ET.Element:
-    """Add the links of a hand to a body, from the root outwards, and return the root's body."""
+    """Add the links of a hand to a body; return the root's body."""
     links = {link.name: link for link in urdf.links}
     root = _add_link(parent, links[urdf.root], parent_from_root[:3, 3], parent_from_root[:3, :3])
     bodies = {urdf.root: root}
@@ -118,20 +118,20 @@ def _add_link(parent: ET.Element, link: Link, place: Iterable[float], rotation: 
 
 
 def add_drive(actuator: ET.Element, joint: str, drive: Actuator) -> None:
-    """Add a motor with the torque kp (target - q) - kd dq/dt, limited to the effort."""
+    """Add a motor of torque kp (target - q) - kd dq/dt, limited to the effort."""
     gains = {"kp": repr(drive.kp), "kv": repr(drive.kd), "forcerange": format_numbers((-drive.effort, drive.effort))}
     ET.SubElement(actuator, "position", gains, name=joint, joint=joint)
 
 
 def _weigh(body: ET.Element, mass: float, centre: Iterable[float], inertia: Iterable[float]) -> None:
-    """Give a body its mass [kg], centre [m] and inertia (xx, xy, xz, yy, yz, zz) [kg m^2] in its own axes."""
+    """Set a body's mass [kg], centre [m] and inertia (xx, xy, xz, yy, yz, zz) [kg m^2]."""
     xx, xy, xz, yy, yz, zz = inertia
     tensor = format_numbers((xx, yy, zz, xy, xz, yz))
     ET.SubElement(body, "inertial", mass=repr(float(mass)), pos=format_numbers(centre), fullinertia=tensor)
 
 
 def _bits(kind: int, others: int) -> dict[str, str]:
-    """Return a shape's own collision group and the groups that it collides with."""
+    """Return a shape's collision group and the groups it hits."""
     return {"contype": str(kind), "conaffinity": str(others)}
 
 

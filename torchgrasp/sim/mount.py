@@ -1,6 +1,6 @@
-"""The mount of a simulated hand: a vertical prismatic joint that lifts it and, if needed, one along its approach.
+"""The mount of a simulated hand: prismatic joints that lift it and move it along its approach.
 
-Also the hand's URDF for SAPIEN: fixed to this mount at the pose of the grasp, geometry only.
+Also the hand's URDF on this mount, for SAPIEN.
 """
 
 import math
@@ -22,7 +22,7 @@ WRIST_JOINT = "torchgrasp_wrist"
 
 
 class Slide(NamedTuple):
-    """A prismatic joint of the mount: name, unit axis in the world, limits and start [m]."""
+    """A prismatic joint of the mount: name, axis in the world, limits, start [m]."""
 
     name: str
     axis: tuple[float, float, float]
@@ -46,7 +46,7 @@ def mounted_urdf(spec: SceneSpec) -> str:
     """Return the URDF of the hand on its mount.
 
     `<visual>` and `<material>` are left out: they need a render device. So are `<mimic>`, `<transmission>` and
-    `<gazebo>`: SAPIEN transmits force through mimic joints wrongly, and coupled joints get targets of their own.
+    `<gazebo>`: SAPIEN's mimic joints transmit wrong forces. Coupled joints get targets of their own.
 
     Raises:
         HandFileError: the file is no sound URDF (`read_urdf`).
@@ -79,7 +79,7 @@ def mounted_urdf(spec: SceneSpec) -> str:
 
 
 def euler_from_rotation(rotation: np.ndarray) -> tuple[float, float, float]:
-    """Return roll, pitch, yaw [rad] of a rotation, as URDF wants them: R = Rz(yaw) Ry(pitch) Rx(roll).
+    """Return a URDF's roll, pitch, yaw [rad]: R = Rz(yaw) Ry(pitch) Rx(roll).
 
     At a pitch of 90 degrees only yaw - roll is fixed; roll is 0 there.
 

@@ -14,8 +14,8 @@ from torchgrasp.sim.scene import STILL, Scene, SceneSpec, StepContacts
 class MujocoScene(Scene):
     """Table, object and hand in one MuJoCo model.
 
-    A step is MuJoCo's second half (from forces to the new state) followed by its first (poses and contacts of that
-    state), so that poses are current between steps.
+    A step is MuJoCo's second half (forces to state), then its first (state to poses and contacts). Poses are therefore
+    current between steps.
     """
 
     def __init__(self, spec: SceneSpec) -> None:
@@ -44,7 +44,7 @@ class MujocoScene(Scene):
         mujoco.mj_step1(model, data)
 
     def _map_contacts(self, table: bool) -> None:
-        """Remember the body of each shape, and the finger of each body: of its tip, and of what the tip is fixed to."""
+        """Map shapes to bodies, and tips and their parent bodies to fingers."""
         model = self.model
         self._body_of = model.geom_bodyid.tolist()
         self._table = model.geom(TABLE).id if table else -1
@@ -84,7 +84,7 @@ class MujocoScene(Scene):
         self.data.ctrl[self._motors] = targets
 
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
-        """Let a force [N] and a torque [N m] act on the object from now on."""
+        """Apply a force [N] and a torque [N m] to the object from now on."""
         self.data.xfrc_applied[self.body] = [*force, *torque]
 
     def joints(self) -> np.ndarray:
@@ -107,7 +107,7 @@ class MujocoScene(Scene):
         return deepest
 
     def _diverged(self) -> bool:
-        """Return whether the state has left all bounds; from then on nothing moves and every pose is NaN."""
+        """Return whether the state has left all bounds: then every pose is NaN."""
         if self.data.warning.number[self._mujoco.mjtWarning.mjWARN_BADQPOS :].any():
             self.data.qpos[:] = self.data.xpos[:] = np.nan
             return True
@@ -125,7 +125,7 @@ class MujocoScene(Scene):
 
 
 def _import_mujoco() -> Any:
-    """Import MuJoCo; its warnings are counted (`_diverged`), not written to a file in the working folder."""
+    """Import MuJoCo; its warnings are counted (`_diverged`), not written to a file."""
     try:
         import mujoco
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""The simulators of a scene by name; each is imported when it is asked for."""
+"""The simulators of a scene by name, imported on demand."""
 
 from torchgrasp.sim.scene import Scene, SceneSpec
 from torchgrasp.specs import check_simulator

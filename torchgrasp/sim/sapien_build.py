@@ -5,9 +5,10 @@ Settings that differ from SAPIEN's defaults each have a measured reason:
 * Joints get an armature: without it the implicit drives lose a third of their torque in a contact.
 * The hand's links feel neither gravity nor each other.
 * Sleeping is off, because a sleeping body keeps stale contacts.
-* The object's inertia is set with its mass, and penetrations are resolved at 1 m/s at most.
+* The object's inertia is set with its mass.
+* Penetrations are resolved at 1 m/s at most.
 
-PhysX keeps at most 255 faces of a convex part: a ball of 30 mm loses up to 0.5 mm.
+PhysX keeps 255 faces of a convex part: a ball of 30 mm loses 0.5 mm.
 """
 
 import tempfile
@@ -54,7 +55,7 @@ def build(spec: SceneSpec) -> Built:
 
 
 def _place(sapien: Any, scene: Any, name: str, body: Any, height: float) -> None:
-    """Add an entity of one body to the scene, at a height [m] above the origin."""
+    """Add an entity of one body to the scene, at a height [m]."""
     entity = sapien.Entity()
     entity.name = name
     entity.add_component(body)
@@ -70,7 +71,7 @@ def _table(physx: Any, material: Any) -> Any:
 
 
 def _object(sapien: Any, physx: Any, material: Any, spec: SceneSpec) -> Any:
-    """Return the object in the frame of its mesh, with the mass centre and inertia of an even filling."""
+    """Return the object with the mass centre and inertia of an even filling."""
     body = physx.PhysxRigidDynamicComponent()
     for part in spec.parts:
         vertices = np.asarray(part.vertices, np.float32)

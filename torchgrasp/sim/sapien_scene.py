@@ -28,7 +28,7 @@ class SapienScene(Scene):
         self._map_joints()
 
     def _map_contacts(self) -> None:
-        """Remember the finger of each link: of its tip, and of the link to which the tip is fixed."""
+        """Map tips and their parent links to fingers."""
         self._tip_of = {link.name: i for i, link in enumerate(self.tips)}
         self._finger_of = dict(self._tip_of)
         for i, tip in enumerate(self.tips):
@@ -36,7 +36,7 @@ class SapienScene(Scene):
                 self._finger_of.setdefault(tip.parent.name, i)
 
     def _map_joints(self) -> None:
-        """Prepare the geometric Jacobian: each driven joint's frame in its link, and the tips that it moves."""
+        """Prepare the Jacobian: each driven joint's frame in its link, and the tips it moves."""
         self._frames = [_matrix(j.pose_in_child) for j in self._driven]
         self._slides = np.array([j.type == "prismatic" for j in self._driven])
         self._moves = np.zeros((len(self.tips), len(self._driven)))
@@ -74,10 +74,10 @@ class SapienScene(Scene):
         return contacts
 
     def _add_forces(self, contacts: StepContacts) -> None:
-        """Add the force that each touching fingertip exerts, as a sensor between tip and finger measures it.
+        """Add the force of each touching fingertip, as a sensor at its base measures it.
 
-        SAPIEN reports contacts without friction. The wrench of an incoming joint is complete; its axes are those of
-        the joint in the child.
+        SAPIEN reports contacts without friction. The wrench of an incoming joint is complete; its axes are
+        the joint's in the child.
         """
         touching = np.flatnonzero(contacts.weight > 0)
         if len(touching):
@@ -92,7 +92,7 @@ class SapienScene(Scene):
             joint.set_drive_target(float(target))
 
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
-        """Let a force [N] and a torque [N m] act on the object from now on."""
+        """Apply a force [N] and a torque [N m] to the object from now on."""
         self._force, self._torque = np.asarray(force, np.float32), np.asarray(torque, np.float32)
 
     def joints(self) -> np.ndarray:
@@ -109,7 +109,7 @@ class SapienScene(Scene):
         return columns.transpose(0, 2, 1)
 
     def penetration(self) -> float:
-        """Return the depth [m] of the hand in object or table, after one step without the object's weight."""
+        """Return the depth [m] of the hand in object or table after a weightless step."""
         self.body.disable_gravity = True
         self.scene.step()
         self.body.disable_gravity = False

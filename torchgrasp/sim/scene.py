@@ -1,7 +1,6 @@
-"""The simulated scene of one trial, whatever simulates it: table, object and a hand on a mount.
+"""The simulated scene of one trial: table, object and a hand on a mount.
 
-Every trial opens a fresh scene: only then are two runs equal to the last bit. Positions are in the world's frame, which
-is the frame of the grasp.
+Every trial opens a fresh scene: only then do two runs give equal bits. The world's frame is that of the grasp.
 """
 
 import abc
@@ -72,7 +71,7 @@ class SceneSpec:
     patch: float = PATCH_RADIUS
 
     def check_drives(self, names: list[str]) -> None:
-        """Raise `BadArgument` when one of the hand's joints has no start or no drive."""
+        """Refuse joints without a start or a drive."""
         missing = [name for name in names if name not in self.joints or name not in self.drives]
         if missing:
             raise BadArgument("joints", f"no position or drive for {missing}", "one for every joint of the URDF")
@@ -80,7 +79,7 @@ class SceneSpec:
 
 @dataclasses.dataclass(frozen=True)
 class StepContacts:
-    """True contacts of the three fingers with the object, summed over a step.
+    """True contacts of three fingers with the object, summed over a step.
 
     Args:
         impulse: normal impulse on the object (3, 3) [N s]; friction is not in it.
@@ -102,7 +101,7 @@ class StepContacts:
         return cls(np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), np.zeros(3, dtype=bool), np.zeros((3, 3)))
 
     def add(self, finger: int, impulse: np.ndarray, size: float, point: np.ndarray) -> None:
-        """Add a contact of a fingertip, with its impulse [N s], the impulse's size and its place [m]."""
+        """Add a contact of a fingertip by impulse [N s], its size, and place [m]."""
         self.impulse[finger] += impulse
         self.moment[finger] += size * point
         self.weight[finger] += size
@@ -118,8 +117,8 @@ class StepContacts:
 class Scene(abc.ABC):
     """Table, object and hand. Arrays are in the world's axes; joints are in the order of `joint_names`.
 
-    `centre` is the object's mass centre in its own frame [m], `timestep` is in seconds. A simulator sets `joint_names`
-    and its own handles of the object, the hand's root link and the fingertips' links.
+    `centre` [m] is the object's mass centre in its own frame, `timestep` is in seconds. A simulator sets `joint_names`
+    and its handles of bodies.
     """
 
     joint_names: tuple[str, ...]
@@ -140,7 +139,7 @@ class Scene(abc.ABC):
 
     @abc.abstractmethod
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
-        """Let a force [N] at the object's mass centre and a torque [N m] act on it from now on."""
+        """Apply a force [N] at the object's mass centre and a torque [N m] from now on."""
 
     @abc.abstractmethod
     def joints(self) -> np.ndarray:
@@ -148,11 +147,11 @@ class Scene(abc.ABC):
 
     @abc.abstractmethod
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return d points / d driven joints (3, 3, j), each point fixed to its fingertip [m/rad or 1]."""
+        """Return d points / d driven joints (3, 3, j) of points on the fingertips."""
 
     @abc.abstractmethod
     def penetration(self) -> float:
-        """Return the depth [m] of the hand in object or table, before anything has moved."""
+        """Return the initial depth [m] of the hand in object or table."""
 
     @abc.abstractmethod
     def _pose(self, body: Any) -> np.ndarray:
@@ -160,14 +159,14 @@ class Scene(abc.ABC):
 
     @abc.abstractmethod
     def _move_mount(self, joint: str, target: float, speed: float) -> None:
-        """Set the target [m] of a joint of the mount, and the speed [m/s] at which the target moves."""
+        """Set target [m] and target speed [m/s] of a joint of the mount."""
 
     def lift(self, height: float, speed: float = 0.0) -> None:
-        """Set the height [m] to which the hand is lifted, and the speed [m/s] at which this target moves."""
+        """Set target height [m] and speed [m/s] of the hand."""
         self._move_mount(LIFT_JOINT, height, speed)
 
     def approach(self, left: float, speed: float = 0.0) -> None:
-        """Set the remaining length [m] of the hand's approach, and the speed [m/s] at which it shrinks."""
+        """Set the remaining length [m] of the approach, and its speed [m/s]."""
         self._move_mount(APPROACH_JOINT, -left, speed)
 
     def object_pose(self) -> np.ndarray:
@@ -175,7 +174,7 @@ class Scene(abc.ABC):
         return self._pose(self.body)
 
     def hand_pose(self) -> np.ndarray:
-        """Return the pose (4, 4) of the hand's root link, after at least one step."""
+        """Return the pose (4, 4) of the hand's root, after at least one step."""
         return self._pose(self.root)
 
     def tip_poses(self) -> np.ndarray:

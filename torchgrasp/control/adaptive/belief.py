@@ -1,4 +1,4 @@
-"""The shape as touches revise it: a surprising touch moves the contacts of the fingers that are still in the air.
+"""Touches revise the shape: a surprising one moves the contacts of the fingers in the air.
 
 Such a touch is an observation of the shape (`ShapeGP.update`). Each finger in the air then aims where the line through
 its planned contact meets the revised surface. An update takes about 10 ms of one core, a tick at 100 Hz.
@@ -39,7 +39,7 @@ class Belief:
         self.touched = torch.zeros(3, dtype=torch.bool)
 
     def revise(self, observation: Observation, reference: ClosingReference) -> ClosingReference:
-        """Return the reference itself, or, after a touch that surprised, one replanned for the fingers in the air."""
+        """Return the reference, replanned for the fingers in the air after a surprising touch."""
         fresh = (
             observation.tactile.contact
             & ~self.touched
@@ -63,7 +63,7 @@ class Belief:
         return self._replan(~observation.tactile.contact, reference)
 
     def _replan(self, air: Bool[Tensor, "3"], reference: ClosingReference) -> ClosingReference:
-        """Return the reference with the contacts of the fingers in the air on the revised surface."""
+        """Return the reference with the remaining contacts on the revised surface."""
         gains = reference.gains
         start, lines = apply(self.obj_from_hand, gains.target), rotate(self.obj_from_hand, reference.normals)
         along, surface = self._meet(start, lines)
@@ -85,7 +85,7 @@ class Belief:
     def _meet(
         self, points: Float[Tensor, "n 3"], lines: Float[Tensor, "n 3"]
     ) -> tuple[Float[Tensor, "n"], ShapeEstimate]:
-        """Return how far [m] along lines from points the surface lies, at most `FARTHEST`, and the estimate there."""
+        """Return the distance [m] along lines to the surface, at most `FARTHEST`, and the estimate there."""
         along = torch.zeros_like(points[:, 0])
         for _ in range(NEWTON_STEPS):
             off, normal = self._distance(points + along[:, None] * lines)
@@ -93,13 +93,13 @@ class Belief:
         return along, self.shape.predict(self.shape.metres(self._within(points + along[:, None] * lines)))
 
     def _distance(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
-        """Return the distance [m] of points from the surface, to first order, and the outward normal there."""
+        """Return first-order distance [m] from the surface and outward normal at points."""
         value, gradient = self.shape.mean_and_gradient(self._within(points))
         length = torch.linalg.vector_norm(gradient, dim=-1)
         return self.shape.scale * value / length, gradient / length[:, None]
 
     def _within(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Return normalised points, moved into the ball in which the posterior is valid."""
+        """Return normalised points, moved into the posterior's domain."""
         x = self.shape.normalise(points)
         far = torch.linalg.vector_norm(x, dim=-1, keepdim=True) / (0.999 * self.shape.domain_radius)
         return x / far.clamp_min(1.0)

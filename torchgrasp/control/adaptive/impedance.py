@@ -1,4 +1,4 @@
-"""Object-level impedance [6]: the grasp is a spring in the hand, and the fingers are springs to each other.
+"""Object-level impedance [6]: the grasp is a spring in the hand, with springs between the fingers.
 
 The virtual frame of the three fingertips (Eqs. 15-17) stands for the object, which no sensor sees. A wrench restores
 the frame to its pose at the grasp. Internal forces press at the same time: the desired forces, which turn with the
@@ -46,7 +46,7 @@ READING_CUTOFF, SETTLING = 2.0, 0.3
 
 
 def grasp_map(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 6 9"]:
-    """Return the matrix that maps three forces at `points` to force and torque about their centre.
+    """Return the map from three forces at `points` to force and torque about their centre.
 
     >>> (grasp_map(torch.eye(3)) @ internal_forces(torch.eye(3)).flatten(1).T).abs().max()
     tensor(0.)
@@ -62,7 +62,7 @@ def restoring_wrench(
     translation: float = TRANSLATION_STIFFNESS,
     rotation: float = ROTATION_STIFFNESS,
 ) -> Float[Tensor, "*b 6"]:
-    """Return force [N] and torque [N m] about the virtual frame's origin that restore it to `rest`.
+    """Return force [N] and torque [N m] that restore the virtual frame to `rest`.
 
     The torque is proportional to the sine of the rotation error.
 
@@ -77,7 +77,7 @@ def restoring_wrench(
 def shared_forces(
     points: Float[Tensor, "*b 3 3"], wrench: Float[Tensor, "*b 6"], most: Float[Tensor, "*b"]
 ) -> Float[Tensor, "*b 3 3"]:
-    """Return the smallest forces at `points` that sum to a wrench, scaled so that none exceeds `most` [N]."""
+    """Return the smallest forces that sum to a wrench, scaled down to `most` [N]."""
     forces = (torch.linalg.pinv(grasp_map(points)) @ wrench[..., None])[..., 0].unflatten(-1, (3, 3))
     largest = torch.linalg.vector_norm(forces, dim=-1).amax(-1)
     return forces * (most / torch.maximum(largest, most))[..., None, None]
@@ -86,7 +86,7 @@ def shared_forces(
 def spring_forces(
     points: Float[Tensor, "*b 3 3"], lengths: Float[Tensor, "*b 3"], stiffness: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 3 3"]:
-    """Return the forces of springs [N/m] along the sides of a triangle, at rest at `lengths` [m]; they balance."""
+    """Return the balanced forces of springs [N/m] along the sides of a triangle, at rest at `lengths` [m]."""
     return torch.einsum("...k,...kci->...ci", stiffness * (side_lengths(points) - lengths), internal_forces(points))
 
 
@@ -96,11 +96,11 @@ def side_lengths(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
 
 
 class Impedance:
-    """Hold the object as a spring in the hand: the joint torques are J^T f, set as targets q + J^T f / kp.
+    """Hold the object as a spring in the hand, by joint targets q + J^T f / kp.
 
     At rest the forces are the desired ones, balanced at the sensed contacts. Joint motions that move no fingertip are
-    held. A grasp that a `stability` model judges unstable becomes firmer, and its springs approach those of stable
-    grasps. It never loosens again: the object may still be heavy.
+    held. A grasp that a `stability` model judges unstable becomes firmer and stiffer. It never loosens again: the
+    object may still be heavy.
 
     Args:
         reference, observation, start: as for `ForceHold`.
@@ -144,7 +144,7 @@ class Impedance:
         return self.reference.expand(posture + drift + self.lead + share * (lead - self.lead))
 
     def _adapt(self, observation: Observation, period: float) -> None:
-        """Become firmer, and as stiff as stable grasps of these lengths, as long as the grasp may be unstable."""
+        """Make an unstable grasp firmer, and as stiff as stable grasps of these lengths."""
         if self.stability is None or self.time < RAMP + SETTLING:
             return
         state = state_of(self.springs, lengths_of(observation.tips), self.reading)
@@ -155,7 +155,7 @@ class Impedance:
         self.springs = self.springs * (preferred.springs / self.springs) ** share
 
     def forces(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-        """Return the forces of fingertips at `tips` [m] on the object [N], in the hand's frame."""
+        """Return the fingertips' forces on the object [N]."""
         frame = self._frame(tips)
         desired = self.raised * self.factor * self.desired @ frame[:3, :3].T
         most = MOST_SHARE * torch.linalg.vector_norm(desired, dim=-1).amax()
@@ -163,12 +163,12 @@ class Impedance:
         return desired + springs + shared_forces(tips, restoring_wrench(frame, self.rest), most)
 
     def _frame(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "4 4"]:
-        """Return the virtual frame; tips on a line, as when the object is gone, keep the last frame."""
+        """Return the virtual frame, or the last one where the tips are on a line."""
         if not bool(degenerate(tips)):
             self.frame = virtual_frame(tips)
         return self.frame
 
     def _actuated(self, joints: Float[Tensor, " j"]) -> Float[Tensor, " h"]:
-        """Return the actuated joints nearest to all joints, in least squares weighted by stiffness."""
+        """Return the actuated joints nearest to all joints, weighted by stiffness."""
         weighted = self.coupling * self.reference.kp[:, None]
         return weighted.T @ (joints - self.reference.hand.actuated.offset) / self.stiffness

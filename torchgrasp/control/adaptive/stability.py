@@ -1,8 +1,8 @@
-"""Which grasps are stable [6]: Gaussian mixtures over stiffness, virtual-frame lengths and tactile forces of a hand.
+"""Which grasps are stable [6]: Gaussian mixtures over stiffness, lengths and tactile forces.
 
-`scripts/train.py stability` learns them from simulated pulls. The mixture of stable grasps tells how grasps of given
-lengths press, Sigma_fd of Eq. (28) included. Whether a grasp is stable follows from Bayes' rule with a second mixture,
-of unstable grasps: the density of the stable ones alone, as in [6], is low for rare objects, too.
+`scripts/train.py stability` learns them from simulated pulls. One mixture tells how stable grasps press,
+Sigma_fd of Eq. (28) included. Stability itself follows from Bayes' rule with a second mixture, of
+unstable grasps. The density of stable grasps alone, as in [6], is low for rare objects, too.
 """
 
 import dataclasses
@@ -37,7 +37,7 @@ FILE = "stability.safetensors"
 def state_of(
     springs: Float[Tensor, "*b 3"], lengths: Float[Tensor, "*b 3"], forces: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 9"]:
-    """Return the state (`NAMES`) of a grasp by spring stiffness [N/m], `lengths_of` its tips [m], and forces [N].
+    """Return the state (`NAMES`) of springs [N/m], `lengths_of` tips [m] and forces [N].
 
     >>> state_of(torch.ones(3), torch.ones(3), torch.ones(3))
     tensor([0., 0., 0., 0., 0., 0., 0., 0., 0.])
@@ -52,7 +52,7 @@ def lengths_of(tips: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
 
 @dataclasses.dataclass(frozen=True)
 class PreferredForces(Value):
-    """How stable grasps press: normal forces [N], their covariance [N^2], and the springs' stiffness [N/m]."""
+    """How stable grasps press: normal forces [N], covariance [N^2], spring stiffness [N/m]."""
 
     forces: Float[Tensor, "3"]
     covariance: Float[Tensor, "3 3"]
@@ -87,7 +87,7 @@ class StabilityModel(Value):
             raise BadArgument("share", self.share, "a number in (0, 1)")
 
     def preferred_forces(self, tips: Float[Tensor, "3 3"], force: float | None = None) -> PreferredForces:
-        """Return how stable grasps of the same lengths press, by conditioning the mixture as in [6].
+        """Return how stable grasps of the same lengths press [6].
 
         Args:
             tips: centres of the fingertips [m], in any frame.
