@@ -133,7 +133,7 @@ def test_eq25_damped_inverse_is_the_regularised_least_squares(h):
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-9, 1e-3, 1.0, 1e3])
-def test_i12_eq25_is_bounded_and_finite_for_any_state(scale):
+def test_eq25_is_bounded_and_finite_for_any_state(scale):
     """10^5 states in all: fingers that nothing moves, singular ones, and gains from zero to almost infinite."""
     n = 20_000
     jacobian = scale * draw(n, 3, 3, 12, seed=1)
