@@ -25,7 +25,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from torchgrasp import PointCloud, ShapeGP, fit_shape, list_objects, load_object
 from torchgrasp.files import write_atomically
-from torchgrasp.report.canvas import Canvas, draw_bar
+from torchgrasp.report.canvas import Canvas, draw_bar, map_colors
 from torchgrasp.report.palette import INK, PAPER
 from torchgrasp.report.pictures import rotated, view_of
 from torchgrasp.shape.surface import Surface, extract_surface
@@ -108,10 +108,11 @@ def draw(
         canvas.add_points(points, points[:, 2], "cividis")
     else:
         vertices, faces, normals = what.vertices.numpy(), what.faces.numpy(), what.normals.numpy()
-        canvas.add_values(vertices, faces, normals, 1e3 * what.std_m.numpy(), most, "viridis")
+        canvas.add_mesh(vertices, faces, map_colors(1e3 * what.std_m.numpy() / most, "viridis"), normals)
         corners = np.concatenate([corners, vertices])
     if arrows:
-        canvas.add_arrows(*arrows, ARROW * float(np.linalg.norm(np.ptp(corners, axis=0))), INK)
+        length = ARROW * float(np.linalg.norm(np.ptp(corners, axis=0)))
+        canvas.add_arrows(*arrows, length, (INK,) * len(arrows[0]))
     picture = Image.open(io.BytesIO(canvas.render_png(corners, eye)))
     width, height = round(picture.width * TILE[1] / picture.height), TILE[1]
     left = (width - TILE[0]) // 2  # the objects are taller than wide

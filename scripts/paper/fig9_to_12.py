@@ -32,9 +32,9 @@ from torchgrasp.ik.contact_first import rank_seeds, refine_on_contacts
 from torchgrasp.ik.query import query_mixture
 from torchgrasp.ik.sdf import field_from_surface
 from torchgrasp.pipeline import spread_rows
-from torchgrasp.report.canvas import Canvas
+from torchgrasp.report.canvas import Canvas, Direction
 from torchgrasp.report.palette import AXES, FINGERS, INK, OBJECT, PAPER
-from torchgrasp.report.pictures import Direction, facing
+from torchgrasp.report.pictures import facing
 from torchgrasp.report.solids import solids_from_hand
 from torchgrasp.shape.surface import Surface, extract_surface
 
@@ -168,8 +168,6 @@ def draw(taken: Taken, index: int, eye: Direction) -> Image.Image:
 
 def _add_frame(canvas: Canvas, contacts: Contacts) -> None:
     """Add the normals of a triple and its virtual frame."""
-    for color, point, normal in zip(FINGERS, contacts.points[0].numpy(), contacts.normals[0].numpy(), strict=True):
-        canvas.add_arrows(point[None], normal[None], NORMAL, color)
+    canvas.add_arrows(contacts.points[0].numpy(), contacts.normals[0].numpy(), NORMAL, FINGERS)
     frame = virtual_frame(contacts.points[0]).numpy()
-    for k, color in enumerate(AXES):
-        canvas.add_arrows(frame[None, :3, 3], frame[None, :3, k], FRAME, color)
+    canvas.add_arrows(np.tile(frame[:3, 3], (3, 1)), frame[:3, :3].T, FRAME, AXES)

@@ -25,7 +25,7 @@ from torchgrasp import (
 from torchgrasp.files import write_atomically, write_file
 from torchgrasp.linalg import farthest_points
 from torchgrasp.plan.closure_probability import closure_probability
-from torchgrasp.report.canvas import Canvas, draw_bar
+from torchgrasp.report.canvas import Canvas, draw_bar, map_colors
 from torchgrasp.report.palette import INK, PAPER
 from torchgrasp.report.pictures import rotated
 from torchgrasp.shape.surface import Surface, extract_surface
@@ -159,8 +159,9 @@ def draw(surface: Surface, contacts: Contacts, most: float) -> Image.Image:
     vertices, normals = surface.vertices.numpy(), surface.normals.numpy()
     points, outward = contacts.points[0].numpy(), contacts.normals[0].numpy()
     canvas = Canvas()
-    canvas.add_values(vertices, surface.faces.numpy(), normals, 1e3 * surface.std_m.numpy(), most, "viridis")
-    canvas.add_arrows(points, outward, ARROW, RED)
+    colors = map_colors(1e3 * surface.std_m.numpy() / most, "viridis")
+    canvas.add_mesh(vertices, surface.faces.numpy(), colors, normals)
+    canvas.add_arrows(points, outward, ARROW, (RED,) * len(points))
     eyes = [rotated((1.0, 0.0, 0.45), angle) for angle in range(0, 360, 15)]
     facing = [np.sort(outward @ eye) for eye in eyes]
     eye = eyes[int(np.argmax([f[0] + 0.5 * f[1] for f in facing]))]

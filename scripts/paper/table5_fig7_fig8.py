@@ -15,9 +15,8 @@ from torch import Tensor
 from torchgrasp import Hand, load_hand, load_mixture
 from torchgrasp.files import write_atomically, write_file
 from torchgrasp.posture_model.sample import sample_configurations
-from torchgrasp.report.canvas import Canvas
+from torchgrasp.report.canvas import Canvas, Direction
 from torchgrasp.report.palette import FINGERS, GRID, INK, PAPER
-from torchgrasp.report.pictures import Direction
 from torchgrasp.report.solids import solids_from_hand
 
 PUBLISHED = {

@@ -51,8 +51,8 @@ def test_triangles_that_share_edges_leave_no_crack_and_the_nearer_wins():
 
 
 def test_a_sheer_layer_is_blended_only_in_front():
-    front = render(square(0.0, 3.0, RED), square(0.5, 3.0, BLUE), LOOK, (20, 20), WHITE, opacity=0.5)
-    behind = render(square(0.0, 3.0, RED), square(-0.5, 3.0, BLUE), LOOK, (20, 20), WHITE, opacity=0.5)
+    front = render(square(0.0, 3.0, RED), square(0.5, 3.0, BLUE), LOOK, (20, 20), WHITE)
+    behind = render(square(0.0, 3.0, RED), square(-0.5, 3.0, BLUE), LOOK, (20, 20), WHITE)
     np.testing.assert_allclose(front.astype(int), np.broadcast_to((128, 0, 128), front.shape), atol=1)
     assert (behind == (255, 0, 0)).all()
 

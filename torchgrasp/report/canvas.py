@@ -5,8 +5,10 @@ import io
 import numpy as np
 from jaxtyping import Float
 
-from torchgrasp.report.palette import INK, PAPER, rgb
+from torchgrasp.report.palette import INK, PAPER, TABLE, rgb
 from torchgrasp.report.raster import Camera, Triangles, concatenate, render
+
+Direction, Colors = tuple[float, float, float], tuple[str, ...]
 
 SIZE = (900, 720)
 """Width and height of a still [pixels]."""
@@ -29,27 +31,15 @@ class Canvas:
         self,
         vertices: Float[np.ndarray, "v 3"],
         faces: np.ndarray,
-        color: str,
+        color: str | Float[np.ndarray, "v 3"],
         normals: Float[np.ndarray, "v 3"] | None = None,
         transparent: bool = False,
     ) -> None:
-        """Add a mesh of one colour; without `normals` its edges are sharp where it bends much."""
+        """Add a mesh of one colour or of one a vertex; without `normals` its edges are sharp where it bends much."""
         corners = vertices[faces]
         bent = _sharp_normals(vertices, faces) if normals is None else normals[faces]
-        triangles = _triangles(corners, bent, np.broadcast_to(rgb(color), corners.shape))
-        (self.transparent if transparent else self.solid).append(triangles)
-
-    def add_values(
-        self,
-        vertices: Float[np.ndarray, "v 3"],
-        faces: np.ndarray,
-        normals: Float[np.ndarray, "v 3"],
-        values: Float[np.ndarray, " v"],
-        most: float,
-        colors: str,
-    ) -> None:
-        """Add a smooth mesh coloured by values from 0 to `most` at its vertices."""
-        self.solid.append(_triangles(vertices[faces], normals[faces], _colors(values / most, colors)[faces]))
+        shade = np.broadcast_to(rgb(color), corners.shape) if isinstance(color, str) else color[faces]
+        (self.transparent if transparent else self.solid).append(_triangles(corners, bent, shade))
 
     def add_points(self, points: Float[np.ndarray, "n 3"], values: Float[np.ndarray, " n"], colors: str) -> None:
         """Add points as small balls, coloured by values."""
@@ -59,14 +49,14 @@ class Canvas:
         ball = creation.icosphere(subdivisions=1, radius=1.0)
         corners = (points[:, None, None] + size * ball.vertices[ball.faces]).reshape(-1, 3, 3)
         normals = np.tile(ball.vertices[ball.faces], (len(points), 1, 1))
-        shade = _colors((values - values.min()) / max(float(np.ptp(values)), 1e-12), colors)
+        shade = map_colors((values - values.min()) / max(float(np.ptp(values)), 1e-12), colors)
         shades = np.broadcast_to(np.repeat(shade, len(ball.faces), 0)[:, None], corners.shape)
         self.solid.append(_triangles(corners, normals, shades))
 
     def add_arrows(
-        self, starts: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"], length: float, color: str
+        self, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"], length: float, colors: Colors
     ) -> None:
-        """Add arrows of one length [m] in unit directions, each from a small ball."""
+        """Add arrows of one length [m] in unit directions, each in its colour and from a small ball."""
         from trimesh import creation
 
         head = creation.cone(radius=0.1, height=0.35, sections=8)
@@ -76,34 +66,31 @@ class Canvas:
             creation.cylinder(radius=0.035, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, 0.75]], sections=8),
             head,
         )
-        for start, direction in zip(starts, directions, strict=True):
+        for start, direction, color in zip(points, directions, colors, strict=True):
             side = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
             side /= np.linalg.norm(side)
             axes = np.stack([side, np.cross(direction, side), direction])
             for part in upright:
                 self.add_mesh(length * np.asarray(part.vertices) @ axes + start, np.asarray(part.faces), color)
 
-    def add_disc(self, center: tuple[float, float, float], radius: float, color: str) -> None:
-        """Add a level disc without light and shade."""
+    def add_table(self, corners: Float[np.ndarray, "n 3"], height: float | None) -> None:
+        """Add a round table top under `corners` at a height [m], without light and shade; None: no table."""
+        if height is None:
+            return
+        center = np.append((corners[:, :2].min(0) + corners[:, :2].max(0)) / 2, height - 1e-3)
+        radius = 0.55 * float(np.linalg.norm(np.ptp(corners[:, :2], axis=0))) + 0.02
         angle = np.linspace(0.0, 2 * np.pi, 121)
-        rim = np.array(center) + radius * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], 1)
+        rim = center + radius * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], 1)
         corners = np.stack([np.broadcast_to(center, (120, 3)), rim[:-1], rim[1:]], 1)
-        normals = np.broadcast_to((0.0, 0.0, 1.0), corners.shape)
-        shade = np.broadcast_to(rgb(color), corners.shape)
-        self.solid.append(Triangles(corners, normals, shade, np.zeros(len(corners), dtype=bool)))
+        normals, shade = (np.broadcast_to(row, corners.shape) for row in ((0.0, 0.0, 1.0), rgb(TABLE)))
+        self.solid.append(_triangles(corners, normals, shade, lit=False))
 
     def render_png(
-        self,
-        corners: Float[np.ndarray, "n 3"],
-        direction: tuple[float, float, float],
-        bar: tuple[str, float, str] | None = None,
+        self, corners: Float[np.ndarray, "n 3"], direction: Direction, bar: tuple[str, float, str] | None = None
     ) -> bytes:
-        """Frame `corners` [m] from a direction and return the PNG.
+        """Return a PNG that shows all `corners` [m], seen from a direction between 15 and 40 degrees above the table.
 
-        Args:
-            corners: points that the frame holds.
-            direction: to the camera; its height is kept between 15 and 40 degrees.
-            bar: title, largest value and colour map of a bar at the bottom.
+        `bar` is title, largest value and colour map of a bar at the bottom.
         """
         from PIL import Image
 
@@ -117,7 +104,7 @@ class Canvas:
         return buffer.getvalue()
 
 
-def frame_camera(corners: Float[np.ndarray, "n 3"], direction: tuple[float, float, float], drop: float = 0.0) -> Camera:
+def frame_camera(corners: Float[np.ndarray, "n 3"], direction: Direction, drop: float = 0.0) -> Camera:
     """Return a camera that sees all `corners` and a `drop`, the empty share of the picture below."""
     x, y, z = direction
     flat = float(np.hypot(x, y))
@@ -138,9 +125,9 @@ def frame_camera(corners: Float[np.ndarray, "n 3"], direction: tuple[float, floa
     return Camera(center + back * distance, frame, float(VIEW_ANGLE))
 
 
-def _triangles(corners: np.ndarray, normals: np.ndarray, colors: np.ndarray) -> Triangles:
-    """Return lit triangles."""
-    return Triangles(corners, normals, colors, np.ones(len(corners), dtype=bool))
+def _triangles(corners: np.ndarray, normals: np.ndarray, colors: np.ndarray, lit: bool = True) -> Triangles:
+    """Return triangles that the lamps light or not."""
+    return Triangles(corners, normals, colors, np.full(len(corners), lit))
 
 
 def _sharp_normals(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> Float[np.ndarray, "f 3 3"]:
@@ -163,7 +150,7 @@ def _sharp_normals(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> Flo
     return (sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-300)).reshape(-1, 3, 3)
 
 
-def _colors(values: np.ndarray, colors: str) -> np.ndarray:
+def map_colors(values: Float[np.ndarray, " n"], colors: str) -> Float[np.ndarray, "n 3"]:
     """Return the colours of values in [0, 1] by a map of matplotlib."""
     import matplotlib
 
@@ -177,11 +164,10 @@ def draw_bar(image: object, title: str, most: float, colors: str) -> None:
     assert isinstance(image, Image.Image)
     width, height = image.size
     left, right, top, bottom = 200, width - 200, height - 28, height - 12
-    ramp = _colors(np.linspace(0.0, 1.0, right - left), colors)
+    ramp = map_colors(np.linspace(0.0, 1.0, right - left), colors)
     strip = (255 * np.broadcast_to(ramp, (bottom - top, *ramp.shape)) + 0.5).astype(np.uint8)
     image.paste(Image.fromarray(strip), (left, top))
     draw, font = ImageDraw.Draw(image), ImageFont.load_default(23)
     for i in range(4):
-        place = (left + i * (right - left) / 3, top - 5)
-        draw.text(place, f"{most * i / 3:.1f}", INK, font, anchor="ms")
+        draw.text((left + i * (right - left) / 3, top - 5), f"{most * i / 3:.1f}", INK, font, anchor="ms")
     draw.text(((left + right) / 2, top - 34), title, INK, font, anchor="ms")

@@ -39,9 +39,9 @@ class Markup(str):
 
 
 def format_document(title: str, body: Sequence[str]) -> str:
-    """Return a page; every part of the body is HTML."""
+    """Return a page under its title as text; every part of the body is HTML."""
     head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{escape(title)}</title>'
-    content = "\n".join(body)
+    content = "\n".join([f"<h1>{escape(title)}</h1>", *body])
     return (
         f'<!doctype html>\n<html lang="en">\n<head>{POLICY}{head}<style>{STYLE}</style></head>\n'
         f"<body><main>\n{content}\n</main></body>\n</html>\n"

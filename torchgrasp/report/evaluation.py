@@ -12,6 +12,13 @@ from torchgrasp.report.document import Markup, escape, format_document, format_h
 WIDTH, HEIGHT = 180, 16
 """Size of a bar [pixels]."""
 
+SHARE_NAMES = {
+    "gsr": "grasps that pass",
+    "top1": "best-ranked grasps that pass",
+    "objects": "objects with a grasp that passes",
+}
+"""The shares of a summary in words."""
+
 
 def write_evaluation(path: Path | str, title: str, asked: Mapping[str, object], scores: Sequence[ViewScore]) -> Path:
     """Write the page of an evaluation, atomically: the scores of `evaluate`, and its settings by name.
@@ -28,32 +35,23 @@ def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[
     value, low, high, total = summary["gsr"]
     verdict = f"{value:.0%} of {total} attempts passed (95 % interval {low:.0%} to {high:.0%})."
     heads = ("what", "share", "with its 95 % interval, 0 to 100 %", "interval", "of")
+    shares = [(name, *_share_cells(summary[key], 1)) for key, name in SHARE_NAMES.items()]
+    notes = [(score.object, score.view, score.note) for score in scores if score.note]
     body = [
-        f"<h1>{escape(title)}</h1>",
         f'<p class="verdict{"" if value else " bad"}">{escape(verdict)}</p>',
         "<h2>Shares</h2>",
-        format_html_table(
-            heads, [_share_row(name, summary[key]) for key, name in SHARE_NAMES.items()], numbers={1, 3, 4}
-        ),
+        format_html_table(heads, shares, numbers={1, 3, 4}),
         "<h2>By object and view</h2>",
         _objects(scores, summary["by_object"]),
         "<h2>What went wrong, by stage</h2>",
         _failures(summary["failures"]),
-        *_notes(scores),
+        *(["<h3>Refused</h3>", format_html_table(("object", "view", "why"), notes)] if notes else []),
         "<h2>Forces, overlap and time</h2>",
         format_html_table(("what", "value"), _figures(summary), numbers={1}),
         "<h2>What was asked</h2>",
         format_html_table(("what", "value"), [(k.replace("_", " "), str(v)) for k, v in asked.items()], code={1}),
     ]
     return format_document(title, body)
-
-
-SHARE_NAMES = {
-    "gsr": "grasps that pass",
-    "top1": "best-ranked grasps that pass",
-    "objects": "objects with a grasp that passes",
-}
-"""The shares of a summary in words."""
 
 
 def bar(share: Share) -> Markup:
@@ -72,53 +70,36 @@ def bar(share: Share) -> Markup:
     )
 
 
-def _share_row(name: str, share: Share) -> tuple[str, ...]:
+def _share_cells(share: Share, digits: int) -> tuple[str, ...]:
     """Return a share in numbers and drawn."""
-    value, low, high, total = share
-    return name, f"{value:.1%}", bar(share), f"{low:.1%} to {high:.1%}", str(total)
+    value, low, high = (f"{x:.{digits}%}" for x in share[:3])
+    return value, bar(share), f"{low} to {high}", str(share[3])
 
 
 def _objects(scores: Sequence[ViewScore], by_object: Mapping[str, Any]) -> str:
     """Return the table of objects, with a column for each view."""
     views = sorted({score.view for score in scores})
-    of = {(score.object, score.view): score for score in scores}
+    outcome = {}
+    for score in scores:
+        passed = f"{sum(attempt.passed for attempt in score.attempts)} / {len(score.attempts)}"
+        outcome[score.object, score.view] = passed if score.attempts else score.refusal.name.lower()
     rows = []
     for name, row in by_object.items():
-        cells = [_cell(of[name, view]) if (name, view) in of else "" for view in views]
-        value, low, high, total = row["gsr"]
-        shares = f"{value:.0%}", bar(row["gsr"]), f"{low:.0%} to {high:.0%}", str(total), f"{row['top1'][0]:.0%}"
-        rows.append((name, *shares, *cells))
+        cells = [outcome.get((name, view), "") for view in views]
+        rows.append((name, *_share_cells(row["gsr"], 0), f"{row['top1'][0]:.0%}", *cells))
     heads = ("object", "pass", "with its 95 % interval", "interval", "of", "best-ranked", *views)
     return format_html_table(heads, rows, numbers={1, 3, 4, 5, *range(6, 6 + len(views))})
-
-
-def _cell(score: ViewScore) -> str:
-    """Return the passed attempts of a view, or its refusal."""
-    passed = sum(attempt.passed for attempt in score.attempts)
-    return f"{passed} / {len(score.attempts)}" if score.attempts else score.refusal.name.lower()
 
 
 def _failures(failures: Mapping[str, Mapping[str, int]]) -> str:
     """Return the table of failures, each with its sentence and a bar."""
     most = max((n for reasons in failures.values() for n in reasons.values()), default=1)
-    rows = [
-        (
-            stage,
-            name.lower(),
-            str(n),
-            Markup(f'<span class="swatch" style="width:{160 * n / most:.0f}px"></span>'),
-            Status[name].sentence,
-        )
-        for stage, reasons in failures.items()
-        for name, n in reasons.items()
-    ]
+    rows = []
+    for stage, reasons in failures.items():
+        for name, n in reasons.items():
+            swatch = Markup(f'<span class="swatch" style="width:{160 * n / most:.0f}px"></span>')
+            rows.append((stage, name.lower(), str(n), swatch, Status[name].sentence))
     return format_html_table(("stage", "reason", "count", "", "meaning"), rows, numbers={2})
-
-
-def _notes(scores: Sequence[ViewScore]) -> list[str]:
-    """Return the table of notes on refused views."""
-    rows = [(score.object, score.view, score.note) for score in scores if score.note]
-    return ["<h3>Refused</h3>", format_html_table(("object", "view", "why"), rows)] if rows else []
 
 
 def _figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:

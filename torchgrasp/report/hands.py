@@ -1,7 +1,6 @@
 """One picture of a hand: pads, the palm's frame, joint limits."""
 
 import io
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,9 +10,9 @@ from torch import Tensor
 
 from torchgrasp.hand.hand import Hand
 from torchgrasp.linalg import unit
-from torchgrasp.report.canvas import SIZE, Canvas
+from torchgrasp.report.canvas import SIZE, Canvas, Direction
 from torchgrasp.report.palette import AXES, FINGERS, GRID, HAND, INK, PAPER
-from torchgrasp.report.pictures import Direction, rotated
+from torchgrasp.report.pictures import rotated
 from torchgrasp.report.solids import PARKED, finger_of_links, solids_from_hand
 
 if TYPE_CHECKING:
@@ -28,8 +27,6 @@ NORMAL = 0.03
 """Length of the arrows along the pads' normals [m], about a fingertip's."""
 FRAME = 0.6
 """Length of the palm's axes over the palm's diagonal: they reach out of it."""
-EYE = (1.0, -0.9, 0.5)
-"""Direction from which the hand is seen: front, right, above."""
 
 
 def opposed_posture(hand: Hand, joints: Float[Tensor, "n h"]) -> Float[Tensor, "h"]:
@@ -47,18 +44,18 @@ def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
     """
     from PIL import Image, ImageDraw, ImageFont
 
-    font = ImageFont.load_default(20)
+    font, eye = ImageFont.load_default(20), (1.0, -0.9, 0.5)
     views = [
-        ("a posture with the pads face to face", joints, EYE),
-        ("the same from another side", joints, rotated(EYE, 110.0)),
-        ("every joint at its lower limit", hand.lower.to(joints), EYE),
-        ("every joint at its upper limit", hand.upper.to(joints), EYE),
+        ("a posture with the pads face to face", joints, eye),
+        ("the same from another side", joints, rotated(eye, 110.0)),
+        ("every joint at its lower limit", hand.lower.to(joints), eye),
+        ("every joint at its upper limit", hand.upper.to(joints), eye),
     ]
     width, height = TILE
     sheet = Image.new("RGB", (2 * width, 2 * height + BAR * (hand.dof + 2)), PAPER)
     pen = ImageDraw.Draw(sheet)
-    for k, (title, posture, eye) in enumerate(views):
-        picture = Image.open(io.BytesIO(draw_posture(hand, posture, eye)))
+    for k, (title, posture, direction) in enumerate(views):
+        picture = Image.open(io.BytesIO(draw_posture(hand, posture, direction)))
         x, y = k % 2 * width, k // 2 * height
         sheet.paste(picture.resize(TILE, Image.Resampling.LANCZOS), (x, y))
         pen.text((x + 16, y + 12), title, INK, font)
@@ -75,11 +72,9 @@ def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> byte
     canvas = Canvas()
     for solid in solids:
         canvas.add_mesh(solid.vertices, solid.faces, solid.color)
-    for color, point, normal in zip(FINGERS, points[0], normals[0], strict=True):
-        canvas.add_arrows(point[None], normal[None], NORMAL, color)
+    canvas.add_arrows(points[0], normals[0], NORMAL, FINGERS)
     frame = FRAME * float(np.linalg.norm(np.ptp(solids[0].vertices, axis=0)))
-    for color, axis in zip(AXES, np.eye(3), strict=True):
-        canvas.add_arrows(np.zeros((1, 3)), axis[None], frame, color)
+    canvas.add_arrows(np.zeros((3, 3)), np.eye(3), frame, AXES)
     corners = [points[0], points[0] + NORMAL * normals[0], frame * np.eye(3), *(s.vertices for s in solids)]
     return canvas.render_png(np.concatenate(corners), eye)
 
@@ -101,7 +96,7 @@ def _draw_limits(
         pen.text((right + 20, y), " to ".join(f"{np.rad2deg(e):.0f}" for e in ends), INK, font)
 
 
-def _fingers_of_joints(hand: Hand) -> Sequence[int]:
+def _fingers_of_joints(hand: Hand) -> list[int]:
     """Return the finger of each actuated joint; `PARKED` for one that moves several."""
     fingers = finger_of_links(hand)
     child = [fingers[hand.tree.link_names[k]] for k in hand.tree.child.tolist()]

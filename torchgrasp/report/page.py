@@ -26,9 +26,6 @@ from torchgrasp.report.plots import plot_forces, plot_motion
 from torchgrasp.report.run import Run, verdict
 from torchgrasp.values import Grasps
 
-LISTED_GRASPS = 10
-"""Grasps in the table: a screenful."""
-
 
 def write_report(path: Path | str, run: Run) -> Path:
     """Write pictures and tables of a run as one HTML file, atomically.
@@ -74,7 +71,6 @@ def format_page(run: Run, pictures: dict[str, list[tuple[str, bytes]]]) -> str:
     stages = [(s.name, s.message, f"{s.seconds:.1f}") for s in run.stages]
     stages.append(("total", "", f"{sum(s.seconds for s in run.stages):.1f}"))
     body = [
-        f"<h1>{escape(title)}</h1>",
         f'<p class="source">from {escape(run.source)}, {len(run.cloud)} points</p>',
         f'<p class="verdict{"" if good else " bad"}">{escape(verdict(run))}</p>',
         *(_section(name, shots, run) for name, shots in pictures.items()),
@@ -94,22 +90,20 @@ def format_page(run: Run, pictures: dict[str, list[tuple[str, bytes]]]) -> str:
     return format_document(title, body)
 
 
-def grasp_rows(grasps: Grasps, most: int = LISTED_GRASPS) -> list[tuple[str, ...]]:
+def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
     """Return the first grasps as text, in the order of `GRASP_COLUMNS`."""
-    rows = []
-    for rank, grasp in enumerate(grasps[: min(most, len(grasps))], 1):
-        rows.append(
-            (
-                str(rank),
-                f"{float(grasp.success[0]):.0%}",
-                f"{1e3 * float(grasp.tip_error[0].max()):.2f}",
-                f"{1e3 * float(grasp.clearance[0]):.1f}",
-                f"{math.degrees(float(grasp.normal_angle[0].max())):.0f}",
-                f"{float(grasp.certificate.margin[0]):.4f}",
-                "" if grasp.contacts.std_m is None else f"{1e3 * float(grasp.contacts.std_m[0].max()):.1f}",
-            )
+    return [
+        (
+            str(rank),
+            f"{float(grasp.success[0]):.0%}",
+            f"{1e3 * float(grasp.tip_error[0].max()):.2f}",
+            f"{1e3 * float(grasp.clearance[0]):.1f}",
+            f"{math.degrees(float(grasp.normal_angle[0].max())):.0f}",
+            f"{float(grasp.certificate.margin[0]):.4f}",
+            "" if grasp.contacts.std_m is None else f"{1e3 * float(grasp.contacts.std_m[0].max()):.1f}",
         )
-    return rows
+        for rank, grasp in enumerate(grasps[:most], 1)
+    ]
 
 
 GRASP_COLUMNS = ("rank", "success", "tip error mm", "clearance mm", "pad angle deg", "closure margin", "surface std mm")

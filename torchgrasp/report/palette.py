@@ -1,25 +1,18 @@
-"""The colours that pictures, plots and the page share."""
+"""The colours that pictures, plots and pages share."""
 
 FINGERS = ("#2f6db5", "#23967f", "#e0762f")
 """The three fingers, in grasp order."""
 
+AXES = ("#d62728", "#2ca02c", "#1f4fd8")
+"""A frame's x, y and z."""
+
 HAND = "#a9b0ba"
 """The palm and parked fingers."""
 
-OBJECT = "#e9d7b3"
-"""The object."""
+OBJECT, TABLE = "#e9d7b3", "#eceae4"
 
-TABLE = "#eceae4"
-"""The table."""
-
-INK = "#22262b"
-"""Lines and letters."""
-
-PAPER = "#fcfcfa"
-"""What is drawn on."""
-
-GRID = "#dcdad3"
-"""Grid lines."""
+PAPER, INK, GRID = "#fcfcfa", "#22262b", "#dcdad3"
+"""The background, lines with letters, and grid lines."""
 
 
 def rgb(color: str) -> tuple[float, float, float]:
@@ -30,7 +23,3 @@ def rgb(color: str) -> tuple[float, float, float]:
     """
     red, green, blue = (int(color[i : i + 2], 16) / 255 for i in (1, 3, 5))
     return red, green, blue
-
-
-AXES = ("#d62728", "#2ca02c", "#1f4fd8")
-"""Colours of a frame's x, y and z."""

@@ -1,6 +1,5 @@
 """Stills of a run as PNGs; lengths in metres, z up."""
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,8 +9,8 @@ from torch import Tensor
 
 from torchgrasp.frames import apply
 from torchgrasp.hand.hand import Hand
-from torchgrasp.report.canvas import Canvas
-from torchgrasp.report.palette import FINGERS, OBJECT, TABLE
+from torchgrasp.report.canvas import Canvas, Direction, map_colors
+from torchgrasp.report.palette import FINGERS, OBJECT
 from torchgrasp.report.solids import solids_from_hand
 from torchgrasp.shape.surface import Surface
 from torchgrasp.values import ClosureResult, Contacts, Grasps, PointCloud
@@ -19,19 +18,17 @@ from torchgrasp.values import ClosureResult, Contacts, Grasps, PointCloud
 if TYPE_CHECKING:
     import trimesh
 
-Direction = tuple[float, float, float]
-
-DRAWN_POINTS = 3000
-"""Points drawn of a cloud: more would hide each other."""
+ARROW = 0.045
+"""Length of the arrows along normals [m]: twice a fingertip's."""
 
 
 def draw_cloud(cloud: PointCloud, table: float | None = None) -> bytes:
     """Draw a cloud from its camera, coloured by height."""
     points = _array(cloud.points)
-    points = points[:: -(-len(points) // DRAWN_POINTS)]
+    points = points[:: -(-len(points) // 3000)]  # more would hide each other
     canvas = Canvas()
     canvas.add_points(points, points[:, 2], "cividis")
-    _add_table(canvas, points, table)
+    canvas.add_table(points, table)
     return canvas.render_png(points, view_of(cloud))
 
 
@@ -40,8 +37,9 @@ def draw_surface(surface: Surface, direction: Direction, table: float | None = N
     vertices, std_mm = _array(surface.vertices), 1e3 * _array(surface.std_m)
     most = max(float(np.quantile(std_mm, 0.99)), 1e-3)
     canvas = Canvas()
-    canvas.add_values(vertices, surface.faces.cpu().numpy(), _array(surface.normals), std_mm, most, "viridis")
-    _add_table(canvas, vertices, table)
+    faces, colors = surface.faces.cpu().numpy(), map_colors(std_mm / most, "viridis")
+    canvas.add_mesh(vertices, faces, colors, _array(surface.normals))
+    canvas.add_table(vertices, table)
     return canvas.render_png(vertices, direction, bar=("standard deviation of the surface [mm]", most, "viridis"))
 
 
@@ -50,8 +48,8 @@ def draw_contacts(surface: Surface, contacts: Contacts, direction: Direction, ta
     vertices = _array(surface.vertices)
     canvas = Canvas()
     canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, _array(surface.normals), transparent=True)
-    _add_contacts(canvas, contacts)
-    _add_table(canvas, vertices, table)
+    canvas.add_arrows(_array(contacts.points[0]), _array(contacts.normals[0]), ARROW, FINGERS)
+    canvas.add_table(vertices, table)
     return canvas.render_png(vertices, direction)
 
 
@@ -62,37 +60,26 @@ def draw_grasp(surface: Surface, hand: Hand, grasp: Grasps, direction: Direction
     vertices = _array(surface.vertices)
     canvas = Canvas()
     canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, _array(surface.normals))
-    _add_contacts(canvas, grasp.contacts)
+    canvas.add_arrows(_array(grasp.contacts.points[0]), _array(grasp.contacts.normals[0]), ARROW, FINGERS)
     for solid in solids:
         canvas.add_mesh(solid.vertices, solid.faces, solid.color)
     corners = np.concatenate([vertices, *(s.vertices for s in solids)])
-    _add_table(canvas, corners, table)
+    canvas.add_table(corners, table)
     return canvas.render_png(corners, direction)
 
 
-def draw_tick(
-    mesh: "trimesh.Trimesh",
-    hand: Hand,
-    closure: ClosureResult,
-    tick: int,
-    direction: Direction,
-    ticks: Sequence[int] = (0, -1),
-) -> bytes:
-    """Draw the true object and the hand at a tick of a closure.
-
-    Pictures of the same `ticks` share their frame. A negative tick counts from the end.
-    """
+def draw_tick(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, tick: int, direction: Direction) -> bytes:
+    """Draw the true object and the hand at the first (0) or the last (-1) tick; both pictures share their frame."""
     local = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
-    places = {t: apply(closure.object_pose[t].double(), local).numpy() for t in (tick, *ticks)}
-    postures = {
-        t: solids_from_hand(hand, closure.joints[t], closure.joint_names, closure.hand_pose[t]) for t in (tick, *ticks)
-    }
+    places = {t: apply(closure.object_pose[t].double(), local).numpy() for t in (0, -1)}
+    names = closure.joint_names
+    postures = {t: solids_from_hand(hand, closure.joints[t], names, closure.hand_pose[t]) for t in (0, -1)}
     canvas = Canvas()
     canvas.add_mesh(places[tick], np.asarray(mesh.faces), OBJECT)
     for solid in postures[tick]:
         canvas.add_mesh(solid.vertices, solid.faces, solid.color)
     corners = np.concatenate([*places.values(), *(s.vertices for solids in postures.values() for s in solids)])
-    _add_table(canvas, corners, float(places[ticks[0]][:, 2].min()))
+    canvas.add_table(corners, float(places[0][:, 2].min()))
     return canvas.render_png(corners, direction)
 
 
@@ -106,10 +93,7 @@ def view_of(cloud: PointCloud) -> Direction:
 
 
 def facing(grasp: Grasps) -> Direction:
-    """Return a direction that shows the first row's fingers on both sides of the object.
-
-    It is square to the horizontal direction of the pressing, away from the palm.
-    """
+    """Return a direction across the first row's horizontal pressing, away from the palm: it shows all fingers."""
     normals = grasp.contacts.normals[0, :, :2].detach().cpu().double()
     press = torch.linalg.eigh(normals.T @ normals).eigenvectors[:, 1]
     across = torch.stack([-press[1], press[0]])
@@ -132,18 +116,3 @@ def rotated(direction: Direction, degrees: float) -> Direction:
 def _array(value: Float[Tensor, "*b"]) -> np.ndarray:
     """Return a tensor as an array of doubles."""
     return value.detach().cpu().double().numpy()
-
-
-def _add_contacts(canvas: Canvas, contacts: Contacts) -> None:
-    """Add the first row's contacts with arrows along the outward normals."""
-    for color, point, normal in zip(FINGERS, _array(contacts.points[0]), _array(contacts.normals[0]), strict=True):
-        canvas.add_arrows(point[None], normal[None], 0.045, color)
-
-
-def _add_table(canvas: Canvas, corners: np.ndarray, table: float | None) -> None:
-    """Add a round table top under what is drawn."""
-    if table is None:
-        return
-    x, y = (corners[:, :2].min(0) + corners[:, :2].max(0)) / 2
-    radius = 0.55 * float(np.linalg.norm(np.ptp(corners[:, :2], axis=0))) + 0.02
-    canvas.add_disc((float(x), float(y), table - 1e-3), radius, TABLE)

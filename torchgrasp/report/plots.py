@@ -27,8 +27,8 @@ def plot_motion(closure: ClosureResult) -> bytes:
     """Plot the rise of object and hand [mm], and the object's rotation in the hand."""
     time = closure.time.cpu().numpy()
     hand_from_object = inverse(closure.hand_pose) @ closure.object_pose
-    start = hand_from_object[:1]
-    turned = torch.rad2deg(rotation_angle((inverse(start) @ hand_from_object)[..., :3, :3])).cpu().numpy()
+    since_start = inverse(hand_from_object[:1]) @ hand_from_object
+    turned = torch.rad2deg(rotation_angle(since_start[..., :3, :3])).cpu().numpy()
     figure, axes = _figure()
     for pose, name, color in ((closure.hand_pose, "hand", "#7c8591"), (closure.object_pose, "object", "#b5792a")):
         rise = 1e3 * (pose[:, 2, 3] - pose[0, 2, 3]).cpu().numpy()

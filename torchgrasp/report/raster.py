@@ -1,10 +1,6 @@
-"""Triangles to pixels in numpy: stills without OpenGL, the same bytes on every machine.
+"""Triangles to pixels in numpy: stills without OpenGL and its system libraries, the same bytes on every machine."""
 
-Renderers on OpenGL need system libraries; without these VTK ends the process. A still of 10^4 triangles takes half a
-second here.
-"""
-
-import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -14,13 +10,11 @@ SAMPLES = 2
 
 AMBIENT, KEY, FILL, SHINE = 0.52, 0.50, 0.22, 0.08
 """Strengths of the ambient light, the two lamps and the highlight: chosen by eye."""
-
 LAMPS = ((-0.45, 0.65, 0.62), (0.70, 0.10, 0.60))
 """Directions to the two lamps in the camera's frame (right, up, back): chosen by eye."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Triangles:
+class Triangles(NamedTuple):
     """Corners of triangles, with their normals and colours in [0, 1]; unlit ones keep their colours."""
 
     corners: Float[np.ndarray, "t 3 3"]
@@ -29,8 +23,7 @@ class Triangles:
     lit: Bool[np.ndarray, " t"]
 
 
-@dataclasses.dataclass(frozen=True)
-class Camera:
+class Camera(NamedTuple):
     """A pinhole camera: rows of `frame` are right, up and back; `angle` is the vertical view [rad]."""
 
     position: Float[np.ndarray, "3"]
@@ -38,8 +31,7 @@ class Camera:
     angle: float
 
 
-@dataclasses.dataclass(frozen=True)
-class _Hits:
+class _Hits(NamedTuple):
     """The nearest triangle of each covered pixel, and the weights of its corners."""
 
     pixel: Int[np.ndarray, " k"]
@@ -51,12 +43,8 @@ class _Hits:
 def concatenate(parts: list[Triangles]) -> Triangles:
     """Return all triangles of several sets, or of none, as one."""
     empty = np.zeros((0, 3, 3))
-    return Triangles(
-        np.concatenate([empty, *(p.corners for p in parts)]),
-        np.concatenate([empty, *(p.normals for p in parts)]),
-        np.concatenate([empty, *(p.colors for p in parts)]),
-        np.concatenate([np.zeros(0, dtype=bool), *(p.lit for p in parts)]),
-    )
+    none = Triangles(empty, empty, empty, np.zeros(0, dtype=bool))
+    return Triangles(*(np.concatenate(column) for column in zip(none, *parts, strict=True)))
 
 
 def render(
@@ -65,20 +53,18 @@ def render(
     camera: Camera,
     size: tuple[int, int],
     background: tuple[float, float, float],
-    opacity: float = 0.5,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the picture of opaque triangles under the nearest layer of transparent ones."""
+    """Return the picture of opaque triangles under the nearest layer of transparent ones, which hides half of them."""
     width, height = size[0] * SAMPLES, size[1] * SAMPLES
-    image = np.empty((width * height, 3))
-    image[:] = background
+    image = np.tile(background, (width * height, 1))
     hits = _cast(solid, camera, width, height)
     image[hits.pixel] = _shade(solid, hits, camera)
     depth = np.full(width * height, np.inf)
     depth[hits.pixel] = hits.depth
     veil = _cast(transparent, camera, width, height)
     front = veil.depth < depth[veil.pixel]
-    veil = _Hits(veil.pixel[front], veil.triangle[front], veil.weights[front], veil.depth[front])
-    image[veil.pixel] += opacity * (_shade(transparent, veil, camera) - image[veil.pixel])
+    veil = _Hits(*(column[front] for column in veil))
+    image[veil.pixel] += 0.5 * (_shade(transparent, veil, camera) - image[veil.pixel])
     grid = image.reshape(size[1], SAMPLES, size[0], SAMPLES, 3)
     boxes = sum(grid[:, i, :, j] for i in range(SAMPLES) for j in range(SAMPLES)) / SAMPLES**2
     return (255.0 * np.clip(boxes, 0.0, 1.0) + 0.5).astype(np.uint8)
@@ -133,9 +119,7 @@ def _cast(triangles: Triangles, camera: Camera, width: int, height: int) -> _Hit
     return _Hits(pixel[keep], triangle[keep], weights, depth[keep])
 
 
-def _ranges(
-    begin: Int[np.ndarray, " t"], end: Int[np.ndarray, " t"]
-) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+def _ranges(begin: np.ndarray, end: np.ndarray) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
     """Return all integers of the ranges [begin, end), each with its range."""
     counts = np.maximum(end - begin, 0)
     owner = np.repeat(np.arange(len(begin)), counts)

@@ -36,10 +36,7 @@ class Solid:
 def solids_from_hand(
     hand: Hand, joints: Float[Tensor, " j"], names: tuple[str, ...], obj_from_hand: Float[Tensor, "4 4"]
 ) -> list[Solid]:
-    """Return the shapes of a hand whose base has a pose in the picture's frame.
-
-    `joints` [rad] are all movable joints of the URDF, in the order of `names`.
-    """
+    """Return the shapes of a hand, at all movable joints [rad] of its URDF in the order of `names`."""
     values = torch.stack([joints[names.index(n)] for n in hand.tree.joint_names]).double()
     poses = (obj_from_hand.double() @ hand.tree.poses(values[None])[0]).cpu().numpy()
     shapes = {link.name: link.shapes for link in read_urdf(hand.urdf_path).links}
