@@ -18,7 +18,7 @@ from torchgrasp.base import Value
 from torchgrasp.datasets import list_views, read_object_mesh, read_view
 from torchgrasp.errors import Status
 from torchgrasp.evaluation import PROTOCOLS, close_hand, draw_object_poses, run_tasks
-from torchgrasp.evaluation.pose_noise import error_from_object_pose
+from torchgrasp.evaluation.protocols import error_from_object_pose
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.objects import list_objects, load_object

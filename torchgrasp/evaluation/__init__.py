@@ -4,8 +4,8 @@ from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
 from torchgrasp.evaluation.campaign import EvaluationSpec, evaluate, run_protocol
 from torchgrasp.evaluation.lift import close_hand, lift_grasp
 from torchgrasp.evaluation.pool import run_tasks
-from torchgrasp.evaluation.pose_noise import PoseNoise, apply_error, draw_hand_errors, draw_object_poses
-from torchgrasp.evaluation.protocols import PROTOCOLS, Protocol, PullSpec, draw_error, find_protocol
+from torchgrasp.evaluation.protocols import PROTOCOLS, PoseNoise, Protocol, PullSpec, apply_error
+from torchgrasp.evaluation.protocols import draw_error, draw_hand_errors, draw_object_poses, find_protocol
 from torchgrasp.evaluation.pull import PullResult, pull_grasp
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore, share, summarise
 

@@ -1,11 +1,9 @@
-"""Campaigns: how many grasps pass a protocol, planned on single views.
-
-Worker processes (`run_tasks`) plan on every view, then try every grasp. In between, the grasps are files in a folder.
-"""
+"""Campaigns: workers plan on every view, keep the grasps as files, then put every grasp to a protocol."""
 
 import contextlib
 import dataclasses
 import functools
+import itertools
 import math
 import tempfile
 import time
@@ -15,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import torch
 
-from torchgrasp.base import Value, count_status
+from torchgrasp.base import Value, check_whole, count_status
 from torchgrasp.datasets import list_views, read_object_mesh, read_view
 from torchgrasp.errors import BadArgument, GraspError, MissingExtra, Status
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver
@@ -29,14 +27,13 @@ from torchgrasp.hand.load import load_hand
 from torchgrasp.pipeline import digest, plan_grasps
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ContactSpec
-from torchgrasp.values import ContactPlan, Grasps, load_grasps
+from torchgrasp.values import load_grasps
 
 if TYPE_CHECKING:
     import trimesh
 
 MOST_FRICTION = 1.0
 """Largest friction that grasps are planned for: MultiDex grants 3, more than fingertips have."""
-
 PLAN_LIMIT, TRIAL_LIMIT = 900.0, 120.0
 """Wall time [s] after which planning on a view, and an attempt, are ended: many times the usual."""
 
@@ -70,9 +67,7 @@ class EvaluationSpec(Value):
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check the ranges once, where the value is made."""
-        if self.grasps < 1:
-            raise BadArgument("grasps", self.grasps, "at least 1")
+        check_whole("grasps", self.grasps, 1, 1_000_000)
         if self.ranks not in get_args(Ranks):
             raise BadArgument("ranks", repr(self.ranks), f"one of {', '.join(get_args(Ranks))}")
 
@@ -88,8 +83,7 @@ def evaluate(
 ) -> Generator[ViewScore, None, None]:
     """Plan on every view of a folder of objects, and yield each view's score.
 
-    The planner knows the noisy cloud, the camera, the friction and the table. Only the simulator knows the true mesh.
-    An object with bad files is refused and the others go on.
+    Only the simulator knows the true mesh. An object with bad files is refused and the others go on.
 
     Args:
         objects: a folder as in `torchgrasp.datasets`.
@@ -120,14 +114,12 @@ def _evaluate(
             for view, plan in zip(views, plans, strict=True)
         ]
         rows = [choose_rows(score.executable, spec.grasps, spec.ranks) for score in scores]
-        places = [[(row, draw) for row in chosen for draw in range(protocol.noise.draws)] for chosen in rows]
-        tasks = [
-            (view, protocol, spec.seed, *place) for view, some in zip(views, places, strict=True) for place in some
-        ]
+        places = [list(itertools.product(chosen, range(protocol.noise.draws))) for chosen in rows]
+        tasks = [(view, protocol, spec.seed, *at) for view, some in zip(views, places, strict=True) for at in some]
         with contextlib.closing(run_tasks(_try, tasks, workers, TRIAL_LIMIT)) as results:
             for score, some in zip(scores, places, strict=True):
-                tried = [(*place, next(results)) for place in some]
-                attempts = (ProtocolResult(*x[:2], False, x[2]) if isinstance(x[2], Status) else x[2] for x in tried)
+                tried = [(at, next(results)) for at in some]
+                attempts = (ProtocolResult(*at, False, x) if isinstance(x, Status) else x for at, x in tried)
                 yield dataclasses.replace(score, attempts=tuple(attempts))
 
 
@@ -158,12 +150,9 @@ def run_protocol(trial: GraspTrial, protocol: Protocol, rank: int = 0, draw: int
     return ProtocolResult(rank, draw, status is Status.OK, status, moved, turned, force, overlap, spent)
 
 
-# -------------------------------------------------------------------------------------------- what a worker does
-
-
 @dataclasses.dataclass(frozen=True)
 class _View:
-    """A view and a hand by their files; `shelf` is the folder of grasps."""
+    """A view and a hand by their files; `shelf` is the folder of grasps, `file` holds those of this view."""
 
     objects: Path
     object: str
@@ -173,16 +162,14 @@ class _View:
 
     @property
     def file(self) -> Path:
-        """The file of its grasps."""
         return self.shelf / f"{self.object}_{self.view}.safetensors"
 
     def load_hand(self) -> Hand:
-        """Load the hand with its option of fingers."""
         return load_hand(self.hand.urdf_path.parent, self.hand.option)
 
 
 def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
-    """Plan on a view, or count the grasps of an earlier call."""
+    """Plan on a view, or count the grasps of an earlier call; without any, name the commonest failure."""
     torch.set_num_threads(1)
     hand, score = view.load_hand(), ViewScore(view.object, view.view, 0, 0.0)
     started = time.process_time()
@@ -196,30 +183,25 @@ def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
             return dataclasses.replace(score, executable=len(grasps))
         started = time.process_time()
         contacts = ContactSpec(friction=min(friction, MOST_FRICTION), table=0.0)
-        stages: dict[str, Any] = {}
-
-        def observe(stage: str, message: str, value: Any) -> None:
-            stages[stage] = value
-
-        grasps = plan_grasps(cloud, hand, contacts, spec.starts, spec.seed, observer=observe)
-        executable = grasps[grasps.status == Status.OK]
+        values: dict[str, Any] = {}
+        grasps = plan_grasps(
+            cloud,
+            hand,
+            contacts,
+            spec.starts,
+            spec.seed,
+            observer=lambda stage, _, value: values.update({stage: value}),
+        )
+        executable, starts = grasps[grasps.status == Status.OK], values["plan"].status
         executable.save(view.file)
-        refusal = Status.OK if len(executable) else _commonest_failure(grasps, stages["plan"])
+        failed = count_status(grasps.status if len(grasps) else starts[starts != Status.OK])
+        refusal = Status.OK if len(executable) else next(iter(failed), Status.OUT_OF_REACH)
         score = dataclasses.replace(score, executable=len(executable), refusal=refusal)
     except MissingExtra:
         raise
     except GraspError as error:
         score = dataclasses.replace(score, refusal=Status.BAD_OBJECT, note=" ".join(str(error).split()))
     return dataclasses.replace(score, seconds=time.process_time() - started)
-
-
-def _commonest_failure(grasps: Grasps, plan: ContactPlan) -> Status:
-    """Return the commonest failure: of postures, else of starts."""
-    if len(grasps):
-        counts = count_status(grasps.status)
-    else:
-        counts = {s: n for s, n in count_status(plan.status).items() if s is not Status.OK}
-    return max(counts, key=lambda status: counts[status], default=Status.OUT_OF_REACH)
 
 
 def _try(view: _View, protocol: Protocol, seed: int, row: int, draw: int) -> ProtocolResult:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchgrasp.control.controller import GraspController, check_modes
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.errors import BadArgument
-from torchgrasp.evaluation.pose_noise import apply_error
+from torchgrasp.evaluation.protocols import apply_error
 from torchgrasp.hand.hand import Hand
 from torchgrasp.mesh import read_mesh
 from torchgrasp.shape.gp import ShapeGP
@@ -46,10 +46,7 @@ class GraspTrial:
 class TrialDriver:
     """A trial that was checked once, for any number of runs.
 
-    Args:
-        trial: the grasp and the object.
-        spec: how the hand closes, and the world around it.
-        reference: what the hand follows; None: that of the trial's hand and grasp.
+    The hand follows `reference`; None: that of the trial's hand and grasp.
 
     Raises:
         BadArgument, MeshError: as in `close_hand`.

@@ -24,16 +24,12 @@ if TYPE_CHECKING:
 
 LIFT_TIME = 1.0
 """Time [s] in which the hand rises: at most 0.6 m/s^2 over 0.1 m."""
-
 SHAKE_RATE = 5.0
 """Frequency of the shaking [Hz]: 3 m/s^2 at 3 mm."""
-
 JUDGED_TIME = 0.2
 """Time [s] at the end in which the fingers' contacts are judged: a single tick may miss one."""
-
 PUSHED_DISTANCE = 0.05
 """Motion [m] of the object's centre while the hand closes that counts as pushed out: about a hand's opening."""
-
 LOST_DISTANCE = 0.5
 """Distance [m], beyond the lift, at which the object is gone and the trial over: out of the hand's reach."""
 
@@ -51,10 +47,9 @@ def close_hand(
 ) -> ClosureResult:
     """Close a hand on the true object, lift it and hold it, in simulation.
 
-    The object stands on a table at its mesh's lowest point. The opened hand moves straight to its pre-grasp. It closes
-    and presses (`GraspController`), rises by `spec.lift_height` and holds, shaken by `spec.shake`. The object is
-    **held** if at the end its centre is up by half the lift, and if two fingers touched it in most of the last
-    `JUDGED_TIME`. Equal arguments give equal bits.
+    The object stands on a table at its mesh's lowest point. The opened hand moves straight to its pre-grasp, closes and
+    presses (`GraspController`), rises and holds. The object is **held** if at the end its centre is up by half the
+    lift, and two fingers touched it in most of the last `JUDGED_TIME`. Equal arguments give equal bits.
 
     Args:
         grasp: one row.
@@ -67,10 +62,8 @@ def close_hand(
         parts: convex bodies that stand for the mesh; None: its own decomposition (`convex_parts`).
 
     Raises:
-        BadArgument: not exactly one row, or joints of another hand.
-        BadArgument: numbers that are not finite, or a pre-grasp outside the joint limits.
-        BadArgument: an approach that is no unit vector, or an error that is no (4, 4).
-        BadArgument: a belief for a closing that does not follow the law (Eq. 25).
+        BadArgument: not exactly one row, joints of another hand, a pre-grasp outside the limits, an approach that is no
+            unit vector, an error that is no finite (4, 4), or a belief for a closing without the law of Eq. (25).
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
     """
@@ -92,14 +85,15 @@ class _ObjectLost(Exception):
 
 
 class _Tick(NamedTuple):
-    """The truth at a tick; `touching` counts fingers on the object."""
+    """The truth at a tick; `touching` counts fingers on the object, `centre` is the object's mass centre [m]."""
 
     time: float
     forces: np.ndarray
-    touching: int
     object_pose: np.ndarray
     hand_pose: np.ndarray
     joints: np.ndarray
+    touching: int
+    centre: np.ndarray
 
 
 class _Lift:
@@ -147,8 +141,9 @@ class _Lift:
     def _record(self) -> None:
         """Append a tick; raise if the simulation diverged or the object is gone."""
         robot, scene = self.run.robot, self.run.scene
-        now, touching = robot.steps * self.spec.timestep, int(robot.finger.sum())
-        self.ticks.append(_Tick(now, robot.force, touching, scene.object_pose(), scene.hand_pose(), scene.joints()))
+        now, touching, pose = robot.steps * self.spec.timestep, int(robot.finger.sum()), scene.object_pose()
+        centre = pose[:3, :3] @ scene.centre + pose[:3, 3]
+        self.ticks.append(_Tick(now, robot.force, pose, scene.hand_pose(), scene.joints(), touching, centre))
         moved = self._moved()
         if not np.isfinite(self.ticks[-1].joints).all() or not np.isfinite(moved):
             raise FloatingPointError
@@ -158,19 +153,13 @@ class _Lift:
 
     def _moved(self) -> float:
         """Return the distance [m] of the object's centre from its start."""
-        return float(np.linalg.norm(self._centre(-1) - self._centre(0)))
-
-    def _centre(self, tick: int) -> np.ndarray:
-        """Return the object's mass centre [m] in the world at a tick."""
-        pose = self.ticks[tick].object_pose
-        return pose[:3, :3] @ self.run.scene.centre + pose[:3, 3]
+        return float(np.linalg.norm(self.ticks[-1].centre - self.ticks[0].centre))
 
     def _verdict(self) -> Status:
         """Return the status of a finished trial: held, or the first failure."""
-        rise = np.array([self._centre(k)[2] - self._centre(0)[2] for k in range(len(self.ticks))])
+        rise = np.array([tick.centre[2] - self.ticks[0].centre[2] for tick in self.ticks])
         half = 0.5 * self.spec.lift_height
-        judged = self.ticks[-self.run.robot.ticks(JUDGED_TIME) :]
-        gripped = np.array([tick.touching >= 2 for tick in judged])
+        gripped = np.array([tick.touching >= 2 for tick in self.ticks[-self.run.robot.ticks(JUDGED_TIME) :]])
         if rise[-1] >= half and gripped.mean() > 0.5:
             return Status.OK
         if not np.isfinite(self.run.robot.first_touch).all():
@@ -183,11 +172,16 @@ class _Lift:
 
     def result(self, status: Status, seconds: float) -> ClosureResult:
         """Return the record as a value."""
-        time, forces, _, object_pose, hand_pose, joints = (
+        time, forces, object_pose, hand_pose, joints, *_ = (
             torch.from_numpy(np.stack(column)) for column in zip(*self.ticks, strict=True)
         )
         first_touch = self.run.robot.first_touch
         touched = [finger for finger in range(3) if np.isfinite(first_touch[finger])]
+        hand_from_object = inverse(hand_pose) @ object_pose
+        start, end = hand_from_object[self.arrived], hand_from_object[-1]
+        centres = apply(torch.stack([start, end]), torch.from_numpy(self.run.scene.centre).expand(2, 1, 3))[:, 0]
+        distance = float(torch.linalg.vector_norm(centres[1] - centres[0]))
+        angle = float(rotation_angle(start[:3, :3].T @ end[:3, :3]))
         return ClosureResult(
             held=status is Status.OK,
             status=status,
@@ -198,15 +192,7 @@ class _Lift:
             joints=joints,
             joint_names=self.run.scene.joint_names,
             contact_order=tuple(sorted(touched, key=lambda finger: first_touch[finger])),
-            object_motion=self._motion(inverse(hand_pose) @ object_pose),
+            object_motion=ObjectMotion(distance, angle),
             start_overlap=self.run.overlap,
             seconds=seconds,
         )
-
-    def _motion(self, hand_from_object: Float[Tensor, "t 4 4"]) -> ObjectMotion:
-        """Return the object's motion in the hand since the pre-grasp."""
-        start, end = hand_from_object[self.arrived], hand_from_object[-1]
-        centre = torch.from_numpy(self.run.scene.centre)[None]
-        ends = apply(torch.stack([start, end]), centre.expand(2, 1, 3))[:, 0]
-        distance = float(torch.linalg.vector_norm(ends[1] - ends[0]))
-        return ObjectMotion(distance, float(rotation_angle(start[:3, :3].T @ end[:3, :3])))

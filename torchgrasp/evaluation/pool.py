@@ -1,9 +1,6 @@
-"""Tasks on worker processes: one that hangs or dies costs its own task alone.
+"""Tasks on worker processes: a simulator, which is C++ code, may hang or die, and costs its own task alone."""
 
-A simulator is C++ code, which no exception stops. So every worker is a fresh process (spawn) with one thread. It ends
-with its parent.
-"""
-
+import math
 import multiprocessing
 import os
 import threading
@@ -13,7 +10,8 @@ from typing import Any, TypeVar
 
 import torch
 
-from torchgrasp.errors import BadArgument, MissingExtra, Status
+from torchgrasp.base import check_number, check_whole
+from torchgrasp.errors import MissingExtra, Status
 
 Result = TypeVar("Result")
 
@@ -23,7 +21,7 @@ def run_tasks(
 ) -> Generator[Result | Status, None, None]:
     """Yield `function(*task)` for each task, in the order of the tasks.
 
-    A late task gives `Status.TIMED_OUT`, and its process is killed. A task whose process dies twice gives
+    A worker is a fresh process of one thread. A late task gives `Status.TIMED_OUT`, a task whose process dies twice
     `Status.WORKER_DIED`. All workers end when the caller stops listening.
 
     Args:
@@ -33,17 +31,15 @@ def run_tasks(
         limit: wall time of a task [s].
 
     Raises:
-        BadArgument: workers below 0, or a limit that is not positive.
+        BadArgument: workers outside [0, 1024], or a limit below 1 ms.
         MissingExtra: pebble is not installed.
         Exception: of a task, when its turn comes.
 
     >>> list(run_tasks(pow, [(2, 3), (3, 2)], workers=0))
     [8, 9]
     """
-    if workers < 0:
-        raise BadArgument("workers", workers, "at least 0")
-    if not limit > 0:
-        raise BadArgument("limit", limit, "a positive number of seconds")
+    check_whole("workers", workers, 0, 1024)
+    check_number("limit", limit, 1e-3, math.inf)
     return _run(function, tasks, workers, limit) if workers else (function(*task) for task in tasks)
 
 
@@ -75,13 +71,12 @@ def _run(
 
 
 def _begin(function: Callable[..., Any]) -> None:
-    """Prepare a worker: one thread, and no life without the parent."""
+    """Prepare a worker: one thread, and no life without the parent, however that ends."""
     torch.set_num_threads(1)
     parent = multiprocessing.parent_process()
     assert parent is not None
 
     def follow() -> None:
-        """End when the parent has ended, however it did."""
         parent.join()
         os._exit(1)
 

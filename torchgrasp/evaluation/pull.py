@@ -22,10 +22,9 @@ CHECK_SECONDS = 0.2
 
 @dataclasses.dataclass(frozen=True)
 class PullResult(Value):
-    """The outcome of a grasp: `passed` if the object stayed in every direction.
+    """Whether the object stayed in every direction, and its largest motion [m, rad].
 
-    `directions` counts those tried, `status` is of the last. `moved` [m] and `turned` [rad] are the largest motion.
-    `force` [N] is the fingers' mean before the first pull, NaN if they never closed.
+    `directions` were tried, `status` is of the last. `force` [N] is the fingers' mean before the first pull, or NaN.
     """
 
     passed: bool
@@ -38,14 +37,9 @@ class PullResult(Value):
 
 
 def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") -> PullResult:
-    """Close a hand on the true object and pull along the world's axes.
+    """Close a hand on the true object and pull along the world's axes, each in a fresh scene until one fails.
 
-    Every direction has a fresh scene. The first in which the object moves too far is the last. Motion counts from
-    before the hand closed.
-
-    Args:
-        trial: the grasp and the object.
-        protocol: one that pulls, or its name in `PROTOCOLS`.
+    Motion counts from before the hand closed. `protocol` may be a name in `PROTOCOLS`.
 
     Raises:
         BadArgument: an unknown protocol or one that lifts; else as `close_hand`.
@@ -56,51 +50,43 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
     if protocol.pull is None:
         raise BadArgument("protocol", f"{protocol.name!r}, which lifts", "one that pulls")
     driver = TrialDriver(trial, protocol.trial)
-    status, moved, turned, force, tried = Status.OK, 0.0, 0.0, math.nan, 0
+    status, largest, force, tried = Status.OK, np.zeros(2), math.nan, 0
     while status is Status.OK and tried < len(DIRECTIONS):
-        pull = _Pull(driver.open(), protocol.pull)
-        status = pull.perform(DIRECTIONS[tried])
-        moved, turned, tried = max(moved, pull.moved), max(turned, pull.turned), tried + 1
-        force = pull.force if math.isnan(force) else force
+        status, motion, pressed = _pull(driver.open(), protocol.pull, DIRECTIONS[tried])
+        largest, tried = np.maximum(largest, motion), tried + 1
+        force = pressed if math.isnan(force) else force
+    moved, turned = largest.tolist()
     return PullResult(status is Status.OK, status, tried, moved, turned, force, time.process_time() - started)
 
 
-class _Pull:
-    """A pull along one direction, with the largest motion so far."""
-
-    def __init__(self, run: TrialRun, spec: PullSpec) -> None:
-        self.run, self.spec = run, spec
-        self.start = run.scene.object_pose()
-        self.moved, self.turned, self.force = 0.0, 0.0, math.nan
-
-    def perform(self, direction: np.ndarray) -> Status:
-        """Close the hand, pull at the object, and return the status."""
-        run = self.run
-        if not run.starts:
-            return Status.START_OVERLAP
-        for _ in run.close():
-            pass
-        self.force = float(run.robot.force.mean())
-        status = self._look()
+def _pull(run: TrialRun, spec: PullSpec, direction: np.ndarray) -> tuple[Status, np.ndarray, float]:
+    """Close the hand and pull; return status, largest motion [m, rad], and the force [N] before the pull."""
+    if not run.starts:
+        return Status.START_OVERLAP, np.zeros(2), math.nan
+    start = run.scene.object_pose()
+    for _ in run.close():
+        pass
+    force = float(run.robot.force.mean())
+    status, motion = _look(run, spec, start)
+    if status is not Status.OK:
+        return Status.EJECTED if status is Status.MOVED else status, motion, force
+    run.scene.pull(spec.acceleration * run.mass * direction)
+    largest = np.zeros(2)
+    for _ in range(round(spec.seconds / CHECK_SECONDS)):
+        for _ in range(run.robot.ticks(CHECK_SECONDS)):
+            run.step()
+        status, motion = _look(run, spec, start)
+        largest = np.maximum(largest, motion)
         if status is not Status.OK:
-            return Status.EJECTED if status is Status.MOVED else status
-        run.scene.pull(self.spec.acceleration * run.mass * direction)
-        self.moved = self.turned = 0.0
-        for _ in range(round(self.spec.seconds / CHECK_SECONDS)):
-            for _ in range(run.robot.ticks(CHECK_SECONDS)):
-                run.step()
-            status = self._look()
-            if status is not Status.OK:
-                break
-        return status
+            break
+    return status, largest, force
 
-    def _look(self) -> Status:
-        """Compare the object's pose with its start."""
-        pose, centre = self.run.scene.object_pose(), np.append(self.run.scene.centre, 1.0)
-        if not np.isfinite(pose).all():
-            self.moved = self.turned = math.inf
-            return Status.UNSTABLE
-        moved = float(np.linalg.norm((pose @ centre - self.start @ centre)[:3]))
-        turned = float(rotation_angle(torch.from_numpy(self.start[:3, :3].T @ pose[:3, :3])))
-        self.moved, self.turned = max(self.moved, moved), max(self.turned, turned)
-        return Status.OK if moved < self.spec.distance and turned < self.spec.angle else Status.MOVED
+
+def _look(run: TrialRun, spec: PullSpec, start: np.ndarray) -> tuple[Status, np.ndarray]:
+    """Return how far [m, rad] the object is from its start, and whether that is allowed."""
+    pose, centre = run.scene.object_pose(), np.append(run.scene.centre, 1.0)
+    if not np.isfinite(pose).all():
+        return Status.UNSTABLE, np.full(2, math.inf)
+    moved = np.linalg.norm((pose @ centre - start @ centre)[:3])
+    turned = float(rotation_angle(torch.from_numpy(start[:3, :3].T @ pose[:3, :3])))
+    return Status.OK if moved < spec.distance and turned < spec.angle else Status.MOVED, np.array([moved, turned])

@@ -25,8 +25,8 @@ Share = tuple[float, float, float, int]
 class ProtocolResult(Value):
     """The outcome of the grasp of a `rank` under a `draw` of pose errors; NaN: not measured.
 
-    `moved` [m] and `turned` [rad] are the object's motion, in a lift that in the hand. `force` [N] is the fingers' mean
-    normal force. `overlap` [m] is the depth of the grasp pose in the object. `seconds` is CPU time.
+    The object moved by `moved` [m] and `turned` [rad], in a lift relative to the hand. `force` [N] is the fingers' mean
+    normal force, `overlap` [m] the depth of the grasp pose in the object, `seconds` CPU time.
     """
 
     rank: int
@@ -59,19 +59,22 @@ class ViewScore(Value):
 def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     """Return the numbers of an evaluation by name.
 
-    "gsr" is the share of attempts that passed. "top1" is that of the best-ranked grasps; a view without grasps fails in
-    every draw. "objects" is the share of objects with a success. "refused" counts views without a grasp. "force_n",
-    "overlap_mm", "plan_cpu_s" (of a view) and "trial_cpu_s" (of an attempt) are means.
+    "gsr" is the share of attempts that passed, "top1" that of the best-ranked grasps; a view without grasps fails in
+    every draw. "objects" is the share of objects with a success. "refused" counts views without a grasp, "failures" the
+    reasons of each stage. "force_n", "overlap_mm", "plan_cpu_s" (of a view) and "trial_cpu_s" are means.
     """
     attempts = [attempt for score in scores for attempt in score.attempts]
     spent = [*(score.seconds for score in scores), *(a.seconds for a in attempts)]
     names = sorted({score.object for score in scores})
     by_object = {name: _shares([score for score in scores if score.object == name]) for name in names}
     passed = sum(row["gsr"][0] > 0 for row in by_object.values())
+    reasons_of = {"planning": Counter(s.refusal.name for s in scores if not s.attempts)}
+    for stage, reasons in STAGES.items():
+        reasons_of[stage] = Counter(a.status.name for a in attempts if not a.passed and a.status in reasons)
     return {
         **_shares(scores),
         "objects": share(passed, len(names)),
-        "failures": failures(scores),
+        "failures": {stage: dict(counts.most_common()) for stage, counts in reasons_of.items() if counts},
         "force_n": _mean(a.force for a in attempts),
         "overlap_mm": _mean(1e3 * a.overlap for a in attempts),
         "overlap_mm_max": max((1e3 * a.overlap for a in attempts if not math.isnan(a.overlap)), default=None),
@@ -80,15 +83,6 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
         "cpu_s": sum(x for x in spent if not math.isnan(x)),
         "by_object": by_object,
     }
-
-
-def failures(scores: Sequence[ViewScore]) -> dict[str, dict[str, int]]:
-    """Count the reasons of failure of each stage that has any."""
-    reasons_of = {"planning": Counter(s.refusal.name for s in scores if not s.attempts)}
-    failed = [attempt.status for score in scores for attempt in score.attempts if not attempt.passed]
-    for stage, reasons in STAGES.items():
-        reasons_of[stage] = Counter(status.name for status in failed if status in reasons)
-    return {stage: dict(counts.most_common()) for stage, counts in reasons_of.items() if counts}
 
 
 def share(count: int, total: int) -> Share:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.evaluation.pose_noise import (
+from torchgrasp.evaluation.protocols import (
     PoseNoise,
     apply_error,
     draw_hand_errors,
