@@ -8,7 +8,8 @@ from jaxtyping import Float
 from torchgrasp.report.palette import INK, PAPER, TABLE, rgb
 from torchgrasp.report.raster import Camera, Triangles, concatenate, render
 
-Direction, Colors = tuple[float, float, float], tuple[str, ...]
+Direction = tuple[float, float, float]
+Colors = tuple[str, ...]
 
 SIZE = (900, 720)
 """Width and height of a still [pixels]."""
