@@ -25,12 +25,7 @@ WHOLE = "whole"
 
 
 def list_views(objects: Path, whole: bool = False, only: Sequence[str] = ()) -> list[tuple[str, str]]:
-    """Return sorted pairs of object and view; with `whole` one view `WHOLE` of each object.
-
-    Args:
-        objects: the folder.
-        whole: see above.
-        only: names of objects to keep; all of them if empty.
+    """Return sorted pairs of object and view. `only` selects objects; with `whole` each has one view, `WHOLE`.
 
     Raises:
         BadArgument: no manifest, or none of the objects in it.

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from tests.covariance import covariance
 from torchgrasp.linalg import unit
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure_lp import solve_closure_lp
 from torchgrasp.plan.wrench import wrenches
-from torchgrasp.shape.gradient_kernel import covariance
 from torchgrasp.shape.kernel import kernel_by_name, thin_plate
 from torchgrasp.shape.observations import on_surface
 from torchgrasp.shape.select import select_points

@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.covariance import covariance
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.linalg import unit
 from torchgrasp.shape.condition import condition, longest_distance
 from torchgrasp.shape.gp import Normalisation, ShapeGP
-from torchgrasp.shape.gradient_kernel import covariance
 from torchgrasp.shape.kernel import thin_plate
 from torchgrasp.shape.observations import Observations
 from torchgrasp.values import PointCloud

@@ -8,11 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.covariance import covariance
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.linalg import unit
 from torchgrasp.shape.condition import condition, posterior_given
 from torchgrasp.shape.gp import Normalisation, ShapeGP
-from torchgrasp.shape.gradient_kernel import covariance, cross_covariance
+from torchgrasp.shape.gradient_kernel import cross_covariance
 from torchgrasp.shape.joint_posterior import JointEstimate, draw_samples
 from torchgrasp.shape.kernel import Kernel, differentiate, kernel_by_name, matern52_kernel, rbf_kernel, thin_plate
 from torchgrasp.shape.observations import Observations

@@ -7,11 +7,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.covariance import covariance
 from torchgrasp.base import join
 from torchgrasp.errors import IndefiniteCovariance
 from torchgrasp.linalg import unit
 from torchgrasp.shape.condition import posterior_given
-from torchgrasp.shape.gradient_kernel import covariance
 from torchgrasp.shape.kernel import kernel_by_name, thin_plate
 from torchgrasp.shape.observations import Observations, on_surface
 from torchgrasp.shape.select import Criterion, Selection, select_points

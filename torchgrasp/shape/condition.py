@@ -21,14 +21,10 @@ def condition(
     std_factor: float = 1.0,
     kernel: str | Kernel = "thin_plate",
 ) -> ShapeGP:
-    """Return the shape given observations, with psi = `psi_scale` times their longest distance.
+    """Return the shape given normalised observations.
 
     Args:
-        observations: of the surface, normalised.
-        normalisation: the frame of the observations.
-        cloud: what the camera saw.
-        psi_scale: 1 is the paper's psi, whose covariance is indefinite.
-        std_factor: see `ShapeGP`.
+        psi_scale: psi over the longest distance of the observations; 1 is the paper's, whose covariance is indefinite.
         kernel: a name (see `kernel_by_name`), or any `Kernel` of normalised distances.
 
     Raises:
@@ -44,11 +40,7 @@ def condition(
 
 
 def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
-    """Return the posterior given observations, by one Cholesky factorisation of their covariance.
-
-    Raises:
-        IndefiniteCovariance: the points are too far apart for the kernel.
-    """
+    """Return the posterior given observations, by one Cholesky factorisation of their covariance."""
     observations = observations.with_normals_first()
     y, noise = observations.rows()
     matrix = gram(kernel, observations.x, int(observations.has_normal.sum()))
@@ -61,11 +53,7 @@ def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
 def check_kernel(posterior: Posterior, least_noise: float) -> None:
     """Refuse observations beyond the kernel's diameter, unless K is positive definite.
 
-    Generous noise on some rows can hide an indefinite K from the factorisation. So K is factored again with the
-    least standard deviation of all rows.
-
-    Raises:
-        IndefiniteCovariance: K is not positive definite.
+    Generous noise on some rows can hide an indefinite K: K is factored again with the least noise of all rows.
     """
     kernel = posterior.kernel
     if longest_distance(posterior.x) > kernel.diameter:
@@ -75,9 +63,5 @@ def check_kernel(posterior: Posterior, least_noise: float) -> None:
 
 
 def longest_distance(x: Float[Tensor, "n 3"]) -> float:
-    """Return the longest distance between two of the points.
-
-    >>> longest_distance(torch.tensor([[0.0, 0, 0], [0, 3, 4]]))
-    5.0
-    """
+    """Return the longest distance between two of the points."""
     return float(torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist").max())

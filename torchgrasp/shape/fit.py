@@ -126,13 +126,8 @@ def fit_shape(
 class _Support:
     """The normalised frame, and what is observed beside the cloud.
 
-    Args:
-        frame: the normalised one.
-        anchors: points inside and outside.
-        normal_noise: standard deviation of the cloud's normals.
-        std_factor: see `ShapeGP`.
-        parts: rim and mirrored points, and the errors that their distances share; see `append_observations`.
-        free: points of free space, and the least signed distance there.
+    `anchors` are points inside and outside; `normal_noise` is the cloud's. `parts` are rim and mirrored
+    points, with the errors that their distances share. `free` holds points of free space and least distances there.
     """
 
     frame: Normalisation

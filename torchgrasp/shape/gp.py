@@ -40,13 +40,7 @@ class Normalisation(Value):
 
 @dataclasses.dataclass(frozen=True)
 class ShapeDerivatives(Value):
-    """Derivatives of an estimate by the query point, per metre.
-
-    Args:
-        distance: gradient of `ShapeEstimate.distance`.
-        normal: derivative [i, j] of component i of the unit normal by coordinate j.
-        variance: gradient of the variance.
-    """
+    """Derivatives of a `ShapeEstimate` by the query point, per metre: `normal[i, j]` is d normal_i / d point_j."""
 
     distance: Float[Tensor, "*b 3"]
     normal: Float[Tensor, "*b 3 3"]
@@ -58,8 +52,6 @@ class ShapeGP(Posterior, Normalisation):
     """The posterior of an object's shape: g of Eq. (1), conditioned on observations. `fit_shape` makes it.
 
     Args:
-        x, has_normal, weights, factor, order, kernel: see `Posterior`.
-        center, scale: see `Normalisation`.
         psi: length of the kernel, normalised: the thin plate's parameter.
         domain_radius: radius, normalised, of the ball in which the posterior is valid.
         std_factor: ratio of the surface's real deviations to sqrt(variance), from hidden sides of known objects.
@@ -101,15 +93,9 @@ class ShapeGP(Posterior, Normalisation):
         return torch.linalg.vector_norm(self.normalise(points), dim=-1) <= self.domain_radius
 
     def predict(self, points: Float[Tensor, "*b 3"]) -> ShapeEstimate:
-        """Return signed distance, normal and their covariance at query points, Eqs. (7)-(8).
+        """Return signed distance, normal and their covariance at points [m] in the cloud's frame, Eqs. (7)-(8).
 
-        It carries no gradient to the points; see `differentiate`.
-
-        Args:
-            points: query points [m] in the cloud's frame.
-
-        Returns:
-            The estimate in the dtype of `points`; see `ShapeEstimate` for units.
+        The estimate has the dtype of `points`. It carries no gradient to them; see `differentiate`.
 
         Raises:
             BadArgument: non-finite numbers, or a point outside the domain: there a thin plate's variance turns
@@ -121,11 +107,7 @@ class ShapeGP(Posterior, Normalisation):
         return _reshape(ShapeEstimate(mean[:, 0], unit(mean[:, 1:]), variance, covariance, std_m), points)
 
     def differentiate(self, points: Float[Tensor, "*b 3"]) -> ShapeDerivatives:
-        """Return distance, normal and variance differentiated by the query points [m].
-
-        Raises:
-            BadArgument: see `predict`.
-        """
+        """Return distance, normal and variance differentiated by the query points [m]. Raises as `predict`."""
         jet = self.jet(self._queries(points))
         length = torch.linalg.vector_norm(jet.gradient, dim=-1)[:, None, None]
         normal = jet.gradient[:, :, None] / length
@@ -138,22 +120,14 @@ class ShapeGP(Posterior, Normalisation):
         return _reshape(rows, points)
 
     def joint(self, points: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of (d, w) at up to 1000 points [m], normalised.
-
-        Raises:
-            BadArgument: see `predict`; too many points.
-        """
+        """Return the joint posterior of (d, w) at up to 1000 points [m], normalised. Raises as `predict`."""
         x = self._queries(check_tensor("points", points, (None, 3)))
         if len(x) > MAX_JOINT:
             raise BadArgument("points", f"{len(x)} points", f"at most {MAX_JOINT} points at once")
         return joint_estimate(self, x).to(points.dtype)
 
     def sample(self, points: Float[Tensor, "k 3"], n: int, seed: int = 0) -> Float[Tensor, "n k 4"]:
-        """Draw (d, w) jointly at up to 1000 points [m], n times, normalised.
-
-        Raises:
-            BadArgument: see `joint`; an `n` or a `seed` that is no integer from 0.
-        """
+        """Draw (d, w) jointly at up to 1000 points [m], n times, normalised. Raises as `predict`."""
         for name, value in (("n", n), ("seed", seed)):
             if not isinstance(value, int) or not 0 <= value < 2**63:
                 raise BadArgument(name, value, "an integer from 0")

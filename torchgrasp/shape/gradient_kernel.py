@@ -1,39 +1,10 @@
 """Covariances of signed distances and normals from a radial kernel k(r), Eqs. (2)-(5)."""
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.shape.kernel import Kernel, Profile
-
-
-def covariance(
-    x: Float[Tensor, "n 3"],
-    other: Float[Tensor, "m 3"],
-    has_normal: Bool[Tensor, "n"],
-    other_has_normal: Bool[Tensor, "m"],
-    profile: Profile,
-) -> Float[Tensor, "rows columns"]:
-    """Return the covariance of observations by autograd of the profile, Eqs. (2)-(5): the definition.
-
-    Rows and columns are ordered by component: all d, then w1, w2, w3 of points with normals.
-
-    Args:
-        x, other: points, normalised.
-        has_normal, other_has_normal: which points are observed with their normal.
-        profile: the radial kernel, e.g. `functools.partial(thin_plate, psi=3.6)`.
-
-    Returns:
-        The blocks, without a gradient to the points.
-
-    >>> x, mask = torch.rand(5, 3), torch.tensor([True, True, False, False, False])
-    >>> covariance(x, x, mask, mask, lambda r: torch.exp(-(r**2))).shape
-    torch.Size([11, 11])
-    """
-    # Detached as the derivatives of the profile are: a gradient through one factor alone would be wrong.
-    blocks = cross_covariance(Kernel(profile), x.detach(), other.detach(), len(other)).flatten(0, 1)
-    rows, columns = (torch.cat([torch.ones_like(mask), mask.repeat(3)]) for mask in (has_normal, other_has_normal))
-    return blocks[rows][:, columns]
+from torchgrasp.shape.kernel import Kernel
 
 
 def cross_covariance(
@@ -43,20 +14,13 @@ def cross_covariance(
     n_oriented: int,
     out: Float[Tensor, "4 q rows"] | None = None,
 ) -> Float[Tensor, "4 q rows"]:
-    """Return the covariance of (d, w) at x with observations at y, Eqs. (2)-(5).
+    """Return the covariance of each component of (d, w) at x with observations at y, Eqs. (2)-(5).
 
     The blocks are k, k' d, -k' d^T and -k' I - k'' d d^T. Here d = x - y, and k', k'' are derivatives in r^2 / 2.
     Eq. (5) takes one derivative in each argument: two in one argument would make the matrix indefinite.
 
-    Args:
-        kernel: the radial kernel.
-        x: points, normalised.
-        y: observed points, those with normals first.
-        n_oriented: number of observed points with normals.
-        out: where to write the result; new memory costs more than the arithmetic.
-
-    Returns:
-        A matrix for each component of (d, w) at x, with the columns of `covariance`.
+    The first `n_oriented` of y have normals. Columns go by component: d of all, then w1, w2, w3 with normals. `out`
+    takes the result: new memory costs more than the arithmetic.
     """
     n = len(y)
     d, r = separations(x, y)
@@ -90,13 +54,7 @@ def separations(x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"]) -> tuple[list[
 def covariance_rows(
     kernel: Kernel, x: Float[Tensor, "n 3"], n_oriented: int, y: Float[Tensor, "m 3"], other_oriented: int
 ) -> Float[Tensor, "rows columns"]:
-    """Return `covariance` for points sorted with normals first.
-
-    >>> from torchgrasp.shape.kernel import rbf_kernel
-    >>> x = torch.rand(5, 3, dtype=torch.float64)
-    >>> covariance_rows(rbf_kernel(1.0), x, 2, x, 0).shape
-    torch.Size([11, 5])
-    """
+    """Return the covariance of two lists of observations. Points with normals are first."""
     block = cross_covariance(kernel, x, y, other_oriented)
     if n_oriented == len(x):
         return block.flatten(0, 1)

@@ -51,15 +51,8 @@ def distance_covariance(posterior: Posterior, x: Float[Tensor, "b k 3"]) -> Floa
 def symmetric_root(covariance: Float[Tensor, "*b k k"], prior: float, remedy: str) -> Float[Tensor, "*b k k"]:
     """Return the symmetric root of covariances, unique even with equal eigenvalues.
 
-    Coinciding points leave eigenvalues of zero, which rounding makes negative. Within `ROUNDING` they count as zero.
-
-    Args:
-        covariance: positive semidefinite to rounding.
-        prior: the prior variance of a distance, the scale of rounding.
-        remedy: what to do if a covariance is indefinite.
-
-    Raises:
-        IndefiniteCovariance: an eigenvalue is negative by more than rounding.
+    Coinciding points leave eigenvalues of zero, which rounding makes negative. Down to -`ROUNDING` times the `prior`
+    variance they count as zero. `IndefiniteCovariance` is raised below, with the `remedy`.
     """
     values, vectors = torch.linalg.eigh(covariance)
     if values.numel() and not float(values.min()) >= -ROUNDING * prior:

@@ -74,12 +74,8 @@ def differentiate(profile: Profile, r: Float[Tensor, "*s"], count: int) -> tuple
 def thin_plate(r: Float[Tensor, "*s"], psi: float) -> Float[Tensor, "*s"]:
     """Return the thin plate kernel 2 r^3 - 3 psi r^2 + psi^3, Eq. (6).
 
-    It is a covariance only within a ball of diameter 3/4 psi. The paper's psi is the longest distance of the data.
-    Three points and two normals then suffice for a negative eigenvalue.
-
-    Args:
-        r: distances, normalised.
-        psi: the distance at which the kernel and its slope vanish.
+    The kernel and its slope vanish at r = psi. It is a covariance only within a ball of diameter 3/4 psi. With the
+    paper's psi, the longest distance of the data, three points and two normals may have a negative eigenvalue.
 
     >>> thin_plate(torch.tensor([0.0, 2.0]), psi=2.0)
     tensor([8., 0.])
@@ -120,13 +116,9 @@ def rbf_kernel(length: float, variance: float = 1.0) -> Kernel:
 
 
 def kernel_by_name(name: str, psi: float) -> Kernel:
-    """Return a kernel with k(0) = psi^3 and k''(0) = -6 psi, as the thin plate has.
+    """Return "thin_plate", "matern52" or "rbf" with k(0) = psi^3 and k''(0) = -6 psi, as the thin plate has.
 
     The lengths are psi / sqrt(6) for "rbf" and sqrt(5/18) psi for "matern52".
-
-    Args:
-        name: "thin_plate", "matern52" or "rbf".
-        psi: normalised.
 
     Raises:
         BadArgument: another name.

@@ -24,7 +24,7 @@ class Observations(Batch):
     normal_noise: Float[Tensor, "n"]
 
     def rows(self) -> tuple[Float[Tensor, "rows"], Float[Tensor, "rows"]]:
-        """Return the observed numbers and their noise variances, as `covariance` orders rows."""
+        """Return the observed numbers and their noise variances, distances first, then normals by component."""
         y = torch.cat([self.distance, self.normal[self.has_normal].T.reshape(-1)])
         noise = torch.cat([self.distance_noise, self.normal_noise[self.has_normal].repeat(3)])
         return y, noise * noise

@@ -50,11 +50,9 @@ class Posterior(Value):
 
     Args:
         x: observed points, those with normals first.
-        has_normal: which points have normals.
-        weights: (K + noise)^-1 y, in the order of `covariance`'s rows.
+        weights: (K + noise)^-1 y, in the order of `gram`'s rows.
         factor: lower Cholesky factor of K + noise. Later observations are last, wherever their points are in `x`.
-        order: row of `covariance` for each row of the factor; None: the same.
-        kernel: the radial kernel.
+        order: row of `gram` for each row of the factor; None: the same.
     """
 
     x: Float[Tensor, "n 3"]
@@ -66,7 +64,7 @@ class Posterior(Value):
 
     @cached_property
     def precision(self) -> Float[Tensor, "rows rows"]:
-        """(K + noise)^-1, in the order of `covariance`'s rows."""
+        """(K + noise)^-1, in the order of `gram`'s rows."""
         inverse = torch.cholesky_inverse(self.factor)
         if self.order is None:
             return inverse
@@ -92,7 +90,7 @@ class Posterior(Value):
         return int(self.has_normal.sum())
 
     def ordered(self, rows: Shaped[Tensor, "rows *c"]) -> Shaped[Tensor, "rows *c"]:
-        """Bring rows from the order of `covariance` into that of the factor."""
+        """Bring rows from the order of `gram` into that of the factor."""
         return rows if self.order is None else rows[self.order]
 
     def mean(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q"]:

@@ -41,22 +41,13 @@ def select_points(
     One Cholesky factor grows by four rows a pick. It becomes the posterior's own.
 
     Args:
-        candidates: points of the surface, normalised, all with normals.
+        candidates: points of the surface, all with normals.
         known: what is observed already, such as points inside and outside.
-        kernel: of the posterior.
-        budget: greatest number of picks.
         criterion: greatest posterior variance; greatest |mean distance| ("error"); |mean| + 2 sqrt(variance) ("both").
         stop: the selection ends when no candidate has a greater variance.
-
-    Raises:
-        IndefiniteCovariance: the points are too far apart for the kernel.
     """
-    x, start, n, budget = (
-        candidates.x,
-        posterior_given(known, kernel),
-        len(candidates.x),
-        min(budget, len(candidates.x)),
-    )
+    x, start = candidates.x, posterior_given(known, kernel)
+    n, budget = len(x), min(budget, len(x))
     old, rows = len(start.factor), len(start.factor) + 4 * budget
     factor = x.new_zeros(rows, rows).T  # by columns, as the solver wants it: it copies any other matrix
     factor[:old, :old] = start.factor

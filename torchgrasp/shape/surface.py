@@ -46,11 +46,7 @@ class Surface(Value):
 def extract_surface(shape: ShapeGP, resolution: int = 48) -> Surface:
     """Return the zero level of the mean, Eq. (9), within the domain, by marching cubes and Newton steps.
 
-    Sheets near less than 2 % of the cloud are artefacts and left out.
-
-    Args:
-        shape: the posterior.
-        resolution: cells along the diameter of the domain.
+    `resolution` counts cells along the domain's diameter. Sheets near less than 2 % of the cloud are left out.
 
     Raises:
         BadArgument: a resolution outside [8, 256], or a mean without zero level.
@@ -98,13 +94,7 @@ def newton_step(
     direction: Float[Tensor, "n 3"],
     least_slope: float = 0.0,
 ) -> Float[Tensor, "n"]:
-    """Return the Newton step onto the zero level, as a multiple of `direction`.
-
-    Args:
-        value, gradient: of the mean.
-        direction: of the step, such as the gradient itself.
-        least_slope: a smaller derivative along the direction counts as this one.
-    """
+    """Return the Newton step onto the zero level, as a multiple of `direction`. Slopes are at least `least_slope`."""
     return -value / (gradient * direction).sum(-1).clamp_min(least_slope)
 
 

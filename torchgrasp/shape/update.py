@@ -17,14 +17,8 @@ def append_observations(
 
     The factor L grows by the rows [B^T, C] with B = L^-1 K(old, new). C is the factor of K(new, new) + noise - B^T B.
 
-    Args:
-        posterior: the one to extend.
-        new: normalised, float64, on the posterior's device.
-        shared: correlated errors of the new distances, a column of deviations for each independent cause. They add
-            shared shared^T to the noise; None: there are none.
-
-    Raises:
-        IndefiniteCovariance: the new points are too far away for the kernel.
+    `shared` holds correlated errors of the new distances, a column of deviations for each independent cause. They add
+    shared shared^T to the noise.
     """
     kernel = posterior.kernel
     if shared is not None:
@@ -55,12 +49,8 @@ def extend_posterior(
 ) -> Posterior:
     """Return the posterior given `new` observations, too, from the factor of all rows.
 
-    Args:
-        posterior: given the old observations.
-        new: later observations, those with normals first.
-        factor: of old and new rows.
-        whitened: L^-1 y of old and new rows.
-        new_order: row of `Observations.rows` for each new row of the factor; None: the same.
+    In `new` points with normals are first. `whitened` is L^-1 y. `new_order` gives the row of `Observations.rows` for
+    each new row of the factor; None: the same.
     """
     old, total = len(posterior.factor), len(factor)
     solved = torch.linalg.solve_triangular(factor.T, whitened[:, None], upper=True)[:, 0]

@@ -50,13 +50,10 @@ class Completion(Value):
     smooth field of length scale `PART`, the asymmetry.
 
     Args:
-        points: [m].
-        normals: outward, unit.
         shared: standard deviations [m] of the errors by plane.
         asymmetry: standard deviation [m] of the smooth field.
         planes: the planes n.x = o that were used, as (n, o), the best of each part first.
         scores: of the planes: 1 if the mirror image lies on the cloud, below .15 for no support.
-        outline: silhouettes of the views.
     """
 
     points: Float[Tensor, "m 3"]
@@ -87,13 +84,7 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
     On a table, a body of revolution and its attached part are mirrored separately. Any plane through the axis
     explains the body. The part alone tells the plane of a handle.
 
-    Args:
-        cloud: clean points [m] of one view or several, with outward unit normals and viewpoints.
-        table: height [m] of the table, whose normal is z; None: not known.
-        budget: greatest number of points.
-
-    Raises:
-        BadArgument: see `silhouettes`.
+    The cloud is clean, with outward normals and viewpoints. The table has its height [m] and normal z.
 
     >>> from torchgrasp.linalg import unit
     >>> eye = torch.tensor([0.0, 0.0, 1.0]).double()
@@ -108,15 +99,8 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
     images.sort(key=lambda image: -image.score)
     merged = _merge(scorer, _Image.of(scorer, torch.arange(0), len(planes)), images)
     chosen = merged[farthest_points(merged.points, budget, tie=TIE)]
-    return Completion(
-        points=chosen.points,
-        normals=chosen.normals,
-        shared=chosen.shared.flatten(1),
-        asymmetry=chosen.variance.sqrt(),
-        planes=planes,
-        scores=scores,
-        outline=scorer.outline,
-    )
+    shared, asymmetry = chosen.shared.flatten(1), chosen.variance.sqrt()
+    return Completion(chosen.points, chosen.normals, shared, asymmetry, planes, scores, scorer.outline)
 
 
 @dataclasses.dataclass(frozen=True)

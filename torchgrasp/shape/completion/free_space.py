@@ -33,13 +33,8 @@ def free_space(
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
     """Return points of free space and their least signed distance, both normalised.
 
-    The points lie beside the outline and below the table. The distances are lower bounds. Observed everywhere they
-    would inflate the object to its visual hull.
-
-    Args:
-        outline: silhouettes of the views.
-        frame: the normalised one.
-        table: height [m] of the table, whose normal is z; None: not known.
+    The points lie beside the outline and below the table of this height [m]. The distances are lower bounds. Observed
+    everywhere they would inflate the object to its visual hull.
     """
     origin, scale = frame.center.double().cpu(), frame.scale
     points = torch.cat([_points_beside(view, origin, scale) for view in outline.views])
@@ -60,10 +55,6 @@ def free_space_violations(shape: ShapeGP, x: Float[Tensor, "n 3"], least: Float[
     """Return at most 16 rows of free space that the shape reaches into, the worst first.
 
     Observed at their least distance they push the shape out.
-
-    Args:
-        shape: the posterior.
-        x, least: of `free_space`.
     """
     short = shape.mean(x) - least
     rows = torch.nonzero(short < -TOLERANCE / shape.scale)[:, 0]

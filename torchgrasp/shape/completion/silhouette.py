@@ -35,7 +35,6 @@ class Silhouette(Value):
     """Outline and visible depth of a view, on a raster at depth 1.
 
     Args:
-        viewpoint: position of the camera [m].
         axes: right, down and forward axis of the camera, as rows.
         corner, cell: first node of the raster and distance of its nodes, at depth 1.
         outside: signed distance to the outline at depth 1, positive outside.
@@ -118,14 +117,8 @@ def silhouettes(cloud: PointCloud) -> Outlines:
     return Outlines(tuple(silhouette(points, viewpoint) for points, viewpoint in views if viewpoint is not None))
 
 
-def silhouette(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"], n_rim: int = 16) -> Silhouette:
-    """Return the silhouette of the points [m] of one view.
-
-    Args:
-        points: of one view, all in front of the camera.
-        viewpoint: position of the camera [m].
-        n_rim: number of points on the outline, evenly spread.
-    """
+def silhouette(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> Silhouette:
+    """Return the silhouette of the points [m] of one view, all in front of the camera."""
     from scipy.ndimage import distance_transform_edt
     from scipy.spatial import KDTree
 
@@ -147,7 +140,7 @@ def silhouette(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"], n_ri
     inside = _distance(grown) * cell > SHRINK * spacing
     outside = (_distance(~inside) - _distance(inside)) * cell
     outside += np.where(inside, 0.5, -0.5) * cell  # the outline runs between two cells
-    rim, rim_normals = _rim(outside, corner, cell, pixels, depths, n_rim)
+    rim, rim_normals = _rim(outside, corner, cell, pixels, depths)
     origin, axes = viewpoint.double().cpu(), torch.from_numpy(axes)
     return Silhouette(
         viewpoint=origin,
@@ -220,9 +213,9 @@ def _distance(mask: np.ndarray) -> np.ndarray:
 
 
 def _rim(
-    outside: np.ndarray, corner: np.ndarray, cell: float, pixels: np.ndarray, depths: np.ndarray, n: int
+    outside: np.ndarray, corner: np.ndarray, cell: float, pixels: np.ndarray, depths: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return n points of the outline at the depth of nearby pixels, and their normals."""
+    """Return 16 evenly spread points of the outline at the depth of nearby pixels, and their normals."""
     from scipy.ndimage import gaussian_filter
     from scipy.spatial import KDTree
 
@@ -233,7 +226,7 @@ def _rim(
     position = corner + cell * np.stack([column, row], -1)
     if len(position) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3))
-    picks = farthest_points(torch.from_numpy(position), n, tie=TIE).numpy()
+    picks = farthest_points(torch.from_numpy(position), 16, tie=TIE).numpy()
     position, slope = position[picks], slope[picks]
     _, index = KDTree(pixels).query(position, k=min(4, len(pixels)))
     depth = np.median(depths[index].reshape(len(position), -1), axis=-1)
