@@ -32,15 +32,9 @@ class Linearisation(Batch):
     cost: Float[Tensor, "a"]
 
 
-@dataclasses.dataclass(frozen=True)
-class Step(Batch):
-    """A step `x` of each row. A row that does not take it is left alone from then on."""
-
-    x: Float[Tensor, "a d"]
-    taken: Bool[Tensor, "a"]
-
-
 Damping = Float[Tensor, "a"]
+Steps = tuple[Float[Tensor, "a d"], Bool[Tensor, "a"]]
+"""A step of each row, and whether the row takes it; a row that does not is left alone from then on."""
 Verdict = tuple[Bool[Tensor, "a"], Damping]
 """Which steps are accepted, and the damping of the next ones."""
 State = TypeVar("State", bound=Batch)
@@ -57,7 +51,7 @@ class Problem(abc.ABC, Generic[State, Model]):
         """Return cost and linear model of some rows at their states."""
 
     @abc.abstractmethod
-    def step(self, model: Model, damping: Damping) -> Step:
+    def step(self, model: Model, damping: Damping) -> Steps:
         """Solve the damped normal equations."""
 
     @abc.abstractmethod
@@ -65,7 +59,7 @@ class Problem(abc.ABC, Generic[State, Model]):
         """Return the states after a step."""
 
     @abc.abstractmethod
-    def judge(self, model: Model, trial: Model, step: Step, damping: Damping) -> Verdict:
+    def judge(self, model: Model, trial: Model, x: Float[Tensor, "a d"], damping: Damping) -> Verdict:
         """Compare the models before and after a step."""
 
     def refuse(self, model: Model, trial: Model) -> Model:
@@ -79,16 +73,15 @@ def levenberg_marquardt(problem: Problem[State, Model], state: State, steps: int
     model = problem.linearise(state, rows)
     rows, damping = rows.to(model.cost.device), torch.full_like(model.cost, problem.first_damping)
     for _ in range(steps):
-        step = problem.step(model, damping)
-        if not bool(step.taken.all()):
+        x, taken = problem.step(model, damping)
+        if not bool(taken.all()):
             whole = put(whole, rows, state)
-            if not bool(step.taken.any()):
+            if not bool(taken.any()):
                 return whole
-            rows, damping = rows[step.taken], damping[step.taken]
-            state, model, step = state[step.taken], model[step.taken], step[step.taken]
-        trial_state = problem.move(state, step.x)
+            rows, state, model, x, damping = rows[taken], state[taken], model[taken], x[taken], damping[taken]
+        trial_state = problem.move(state, x)
         trial = problem.linearise(trial_state, rows)
-        accepted, damping = problem.judge(model, trial, step, damping)
+        accepted, damping = problem.judge(model, trial, x, damping)
         state = pick(accepted, trial_state, state)
         model = pick(accepted, trial, problem.refuse(model, trial))
     return put(whole, rows, state)
@@ -108,14 +101,9 @@ class LinearResiduals(Linearisation):
 
 @dataclasses.dataclass(frozen=True)
 class LeastSquares(Problem[State, LinearResiduals]):
-    """The sum of squared residuals of each row.
+    """The sum of squared `residuals` of each row, which is done below `solved`; `moved` gives states after a step.
 
     A row rests, with infinite damping, when a step gained too little or damping does not help.
-
-    Args:
-        residuals: residuals and Jacobian at the states of some rows; the rows' numbers are given, too.
-        moved: the states after a step.
-        solved: a row whose sum is below this is done.
     """
 
     residuals: Callable[[State, Int[Tensor, "a"]], Residuals]
@@ -127,7 +115,7 @@ class LeastSquares(Problem[State, LinearResiduals]):
         residual, jacobian = self.residuals(state, rows)
         return LinearResiduals(residual.square().sum(1), residual, jacobian)
 
-    def step(self, model: LinearResiduals, damping: Damping) -> Step:
+    def step(self, model: LinearResiduals, damping: Damping) -> Steps:
         """Return the damped step, at most `LARGEST_STEP`; zero where there is no factor yet."""
         normal = model.jacobian.mT @ model.jacobian
         diagonal = normal.diagonal(dim1=1, dim2=2)
@@ -136,13 +124,15 @@ class LeastSquares(Problem[State, LinearResiduals]):
         x = -torch.cholesky_solve(model.jacobian.mT @ model.residual[..., None], factor)[..., 0]
         x = torch.where((info == 0)[:, None], x, 0.0)
         x = x * (LARGEST_STEP / x.abs().amax(1, keepdim=True).clamp_min(LARGEST_STEP))
-        return Step(x, ~(model.cost < self.solved) & torch.isfinite(damping))
+        return x, ~(model.cost < self.solved) & torch.isfinite(damping)
 
     def move(self, state: State, x: Float[Tensor, "a d"]) -> State:
         """Return the states after a step."""
         return self.moved(state, x)
 
-    def judge(self, model: LinearResiduals, trial: LinearResiduals, step: Step, damping: Damping) -> Verdict:
+    def judge(
+        self, model: LinearResiduals, trial: LinearResiduals, x: Float[Tensor, "a d"], damping: Damping
+    ) -> Verdict:
         """Accept what lowers the sum."""
         better = trial.cost < model.cost
         rests = torch.where(better, trial.cost > (1 - STALLED) * model.cost, damping > LOST)

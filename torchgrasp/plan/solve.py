@@ -66,8 +66,6 @@ def plan_contacts(
         BadArgument: `starts` not positive, of a wrong shape, or outside the shape's domain; an unknown objective, or
             a cost without a number for each row or without a gradient; another wrong argument.
 
-    Source of the scheme: penalties and Levenberg-Marquardt, Nocedal and Wright, Numerical Optimization, ch. 10, 17.
-
     >>> from torchgrasp import fit_shape, load_object
     >>> plan = plan_contacts(fit_shape(load_object("jug").view), ContactSpec.paper(), starts=8)
     >>> plan.contacts.points.shape

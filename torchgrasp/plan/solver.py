@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchgrasp.base import Batch
 from torchgrasp.linalg import limit_norm
-from torchgrasp.optim import Damping, Linearisation, Problem, Step, Verdict, levenberg_marquardt
+from torchgrasp.optim import Damping, Linearisation, Problem, Steps, Verdict, levenberg_marquardt
 from torchgrasp.plan.problem import ContactProblem, Shape, SurfaceJet, forces_from_tensions, triple_jet
 from torchgrasp.plan.wrench import Triples
 from torchgrasp.shape.surface import newton_step
@@ -106,7 +106,7 @@ class Descent(Problem[State, LinearConstraints]):
         inside = torch.linalg.vector_norm(state.points, dim=-1).amax(-1) < self.problem.domain_radius
         return LinearConstraints(cost, residual, weight, constraints.jacobian, inside, downhill)
 
-    def step(self, model: LinearConstraints, damping: Damping) -> Step:
+    def step(self, model: LinearConstraints, damping: Damping) -> Steps:
         """Return the damped step, no point farther than `LONGEST_STEP`. Rows without a factor rest."""
         jacobian = model.weighted_jacobian
         scale = torch.tensor([1.0] * 9 + [TENSION_DAMPING] * 3, dtype=jacobian.dtype, device=jacobian.device)
@@ -118,16 +118,18 @@ class Descent(Problem[State, LinearConstraints]):
         x = torch.where((failed == 0)[:, None], x, torch.nan)
         length = torch.linalg.vector_norm(x[:, :9].unflatten(1, (3, 3)), dim=-1).amax(-1)
         shrink = (length / LONGEST_STEP).clamp(min=1.0)
-        return Step(x / shrink[:, None], length / shrink > self.stage.settled)  # NaN is not longer
+        return x / shrink[:, None], length / shrink > self.stage.settled  # NaN is not longer
 
     def move(self, state: State, x: Float[Tensor, "a 12"]) -> State:
         """Return the triples moved along the surface."""
         points = project(self.shape, state.points + x[:, :9].unflatten(1, (3, 3)), steps=1)
         return State(points, normalise_tensions(points, state.tension + x[:, 9:]), triple_jet(self.shape, points))
 
-    def judge(self, model: LinearConstraints, trial: LinearConstraints, step: Step, damping: Damping) -> Verdict:
+    def judge(
+        self, model: LinearConstraints, trial: LinearConstraints, x: Float[Tensor, "a 12"], damping: Damping
+    ) -> Verdict:
         """Accept a decrease inside the domain; damp by the kept share of its promise (Nielsen)."""
-        kept = (model.cost - trial.cost) / promised_decrease(model, step.x)
+        kept = (model.cost - trial.cost) / promised_decrease(model, x)
         accepted = (kept > 0) & trial.inside  # NaN is not accepted
         eased = damping * (1 - (2 * kept - 1) ** 3).clamp(min=1 / 5, max=2.0)
         return accepted, torch.where(accepted, eased.clamp(min=1e-9), (4 * damping).clamp(max=1e9))
