@@ -55,17 +55,17 @@ def closure_survival(shape: ShapeGP, mesh: "trimesh.Trimesh", seed: int = 0) -> 
     use = (jet.variance < SURE_VARIANCE) & (points[:, 2] > float(mesh.bounds[0, 2]) + LEAST_HEIGHT)
     true_points, true_normals = nearest_on_mesh(mesh, points)
 
-    found: dict[str, float] = {}
+    shares: dict[str, float] = {}
     for name, rows, friction in (("sure", use, 0.6), ("flat", use & flat, 0.4)):
         triples = _triples(points, torch.nonzero(rows)[:, 0], generator)
         closed = closed_exact(points[triples], normals[triples], friction)
-        kept = triples[closed]
+        closed_triples = triples[closed]
         for judged in (0.6, 0.8):
-            still = closed_exact(true_points[kept], true_normals[kept], judged)
-            enough = len(kept) >= LEAST_CLOSED
-            found[f"{name}_{judged}"] = float(still.double().mean()) if enough else math.nan
-        found[f"{name}_yield"] = len(kept) / len(triples) if len(triples) else 0.0
-    return found
+            still_closed = closed_exact(true_points[closed_triples], true_normals[closed_triples], judged)
+            enough = len(closed_triples) >= LEAST_CLOSED
+            shares[f"{name}_{judged}"] = float(still_closed.double().mean()) if enough else math.nan
+        shares[f"{name}_yield"] = len(closed_triples) / len(triples) if len(triples) else 0.0
+    return shares
 
 
 def _triples(points: Float[Tensor, "n 3"], rows: Tensor, generator: np.random.Generator) -> Tensor:

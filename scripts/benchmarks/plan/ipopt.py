@@ -66,9 +66,9 @@ def ipopt_planner(shape: ShapeGP, spec: ContactSpec, hessian: Hessian) -> Callab
     def solve(start: Tensor) -> tuple[Tensor, float, str]:
         first = np.r_[start.numpy().ravel(), np.full(3 * spec.edges, 1 / (3 * spec.edges))]
         began = time.perf_counter() if torch.get_num_threads() > 1 else time.process_time()
-        found = solver(x0=first, lbx=least, lbg=lower, ubg=upper)
+        solution = solver(x0=first, lbx=least, lbg=lower, ubg=upper)
         ended = time.perf_counter() if torch.get_num_threads() > 1 else time.process_time()
-        contacts = torch.from_numpy(np.array(found["x"]).ravel()[:9].reshape(3, 3).copy())
+        contacts = torch.from_numpy(np.array(solution["x"]).ravel()[:9].reshape(3, 3).copy())
         return contacts, ended - began, str(solver.stats()["return_status"])
 
     return solve
@@ -102,9 +102,9 @@ def feasible(shape: ShapeGP, spec: ContactSpec, points: Tensor) -> Tensor:
     phi >= s, by SciPy's HiGHS.
     """
     good = torch.linalg.vector_norm(points, dim=-1).amax(-1) < shape.domain_radius  # False for NaN
-    found = shape.predict(shape.metres(torch.where(good[:, None, None], points, 0.0)))
-    good &= (found.distance.abs() <= 1e-5).all(-1) & (found.variance <= spec.max_variance + 1e-6).all(-1)
-    wrench = wrenches(points, found.normal, spec.planned_friction, spec.edges).flatten(1, 2)
+    estimate = shape.predict(shape.metres(torch.where(good[:, None, None], points, 0.0)))
+    good &= (estimate.distance.abs() <= 1e-5).all(-1) & (estimate.variance <= spec.max_variance + 1e-6).all(-1)
+    wrench = wrenches(points, estimate.normal, spec.planned_friction, spec.edges).flatten(1, 2)
     for row in torch.nonzero(good)[:, 0].tolist():
         values = torch.linalg.svdvals(wrench[row])
         good[row] = bool(values[-1] >= MIN_RANK_RATIO * values[0]) and _margin(wrench[row].numpy()) > 1e-8
@@ -118,7 +118,7 @@ def _margin(wrench: np.ndarray) -> float:
     equations[:6, :m], equations[:6, m] = wrench.T, wrench.sum(0)
     equations[6, :m], equations[6, m] = 1.0, m
     bounds = [(0, None)] * m + [(None, None)]
-    found = linprog(
+    solution = linprog(
         np.r_[np.zeros(m), -1.0], A_eq=equations, b_eq=np.r_[np.zeros(6), 1.0], bounds=bounds, method="highs"
     )
-    return -np.inf if found.x is None else float(found.x[m])
+    return -np.inf if solution.x is None else float(solution.x[m])

@@ -66,15 +66,15 @@ def bench_peers(views: list[Any], starts: int, tries: int, seed: int, threads: i
             began = clock()
             plan = plan_contacts(shape, spec, first)
             seconds = clock() - began
-            found = shape.normalise(plan.contacts.points)
+            points = shape.normalise(plan.contacts.points)
             peers, times = {}, {}
             for hessian in hessians:
                 solve = ipopt_planner(shape, spec, hessian)
                 use = shape.normalise(first[: tries if hessian == "limited-memory" else max(tries // 4, 1)])
                 answers = [solve(x) for x in use]
                 peers[hessian], times[hessian] = torch.stack([a for a, _, _ in answers]), sum(t for _, t, _ in answers)
-            good, peers_good = feasible(shape, spec, found), {h: feasible(shape, spec, x) for h, x in peers.items()}
-            cost, peers_cost = _cost(found), {h: _cost(x) for h, x in peers.items()}
+            good, peers_good = feasible(shape, spec, points), {h: feasible(shape, spec, x) for h, x in peers.items()}
+            cost, peers_cost = _cost(points), {h: _cost(x) for h, x in peers.items()}
             reached = [cost[good], *(peers_cost[h][peers_good[h]] for h in hessians)]
             best = float(torch.cat(reached).min()) if sum(map(len, reached)) else 0.0
             ours.add(good, cost, seconds, best)

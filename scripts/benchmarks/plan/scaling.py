@@ -96,9 +96,9 @@ def bench_anytime(longest: float, out: Path) -> Row:
 def _within(shape: ShapeGP, spec: ContactSpec, budget: float) -> tuple[float, int, float]:
     """Return the seconds that a plan within the budget took, its certified grasps, and the greatest margin."""
     began = time.perf_counter()
-    found = plan_contacts(shape, spec, 10**6, time_budget=budget)
+    plan = plan_contacts(shape, spec, 10**6, time_budget=budget)
     seconds = time.perf_counter() - began
-    certificate = certify(found[found.status == Status.OK].contacts, spec)
+    certificate = certify(plan[plan.status == Status.OK].contacts, spec)
     return seconds, int(certificate.closed.sum()), float(certificate.margin.max())
 
 

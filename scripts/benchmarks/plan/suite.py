@@ -104,6 +104,6 @@ def _seconds_on(threads: int, action: Callable[[], object]) -> float:
 
 def _first(shape: ShapeGP, spec: ContactSpec) -> None:
     """Plan from ten starts and certify."""
-    found = plan_contacts(shape, spec, 10)
-    if not bool(certify(found[found.status == Status.OK].contacts, spec).closed.any()):
+    plan = plan_contacts(shape, spec, 10)
+    if not bool(certify(plan[plan.status == Status.OK].contacts, spec).closed.any()):
         raise RuntimeError("no certified grasp from ten starts")

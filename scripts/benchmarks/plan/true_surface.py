@@ -71,26 +71,28 @@ def bench_truth(views: list[Any], starts: int, seed: int) -> Row:
 
 def bench_fields(views: list[Any], starts: int, seed: int) -> Row:
     """Change one field of the default specification at a time."""
-    found: dict[str, list[tuple[float, float]]] = {"default": [], **{name: [] for name in CHANGED}}
+    results: dict[str, list[tuple[float, float]]] = {"default": [], **{name: [] for name in CHANGED}}
     for _, _, cloud, mesh in tqdm(views, desc="fields", disable=None, leave=False):
         shape = fit_shape(cloud, table=0.0)
         for label, spec in {"default": DEFAULT, **CHANGED}.items():
             share, survived = survive(shape, spec, mesh, starts, seed)
             if survived is not None:
-                found[label].append((share, survived))
-    mean = {label: [sum(column) / len(column) for column in zip(*pairs, strict=True)] for label, pairs in found.items()}
+                results[label].append((share, survived))
+    mean = {
+        label: [sum(column) / len(column) for column in zip(*pairs, strict=True)] for label, pairs in results.items()
+    }
     return Row(
         f"one field of the specification changed: certified of the starts, and of these closed at friction {FRICTION}",
         "none",
         "; ".join(f"{label} {share:.0%} {survived:.3f}" for label, (share, survived) in mean.items()),
         None,
-        {"found": found},
+        {"found": results},
     )
 
 
 def bench_objectives(views: list[Any], starts: int, seed: int) -> Row:
     """Plan for each named objective with the default specification; the better quarter is that of least quality."""
-    found: dict[str, list[tuple[float, float, float]]] = {name: [] for name in OBJECTIVES}
+    results: dict[str, list[tuple[float, float, float]]] = {name: [] for name in OBJECTIVES}
     clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter
     for _, _, cloud, mesh in tqdm(views, desc="objectives", disable=None, leave=False):
         shape = fit_shape(cloud, table=0.0)
@@ -102,8 +104,8 @@ def bench_objectives(views: list[Any], starts: int, seed: int) -> Row:
             if len(good):
                 closed = closed_on_mesh(good.contacts, mesh).double()
                 best = closed[good.quality.argsort()[: max(len(good) // 4, 1)]]
-                found[name].append((float(closed.mean()), float(best.mean()), 1e3 * seconds / starts))
-    mean = {name: [sum(column) / len(column) for column in zip(*rows, strict=True)] for name, rows in found.items()}
+                results[name].append((float(closed.mean()), float(best.mean()), 1e3 * seconds / starts))
+    mean = {name: [sum(column) / len(column) for column in zip(*rows, strict=True)] for name, rows in results.items()}
     return Row(
         f"{starts} starts planned for each objective: closed at friction {FRICTION}, all and the better quarter",
         "none",
@@ -111,7 +113,7 @@ def bench_objectives(views: list[Any], starts: int, seed: int) -> Row:
             f"{name} {every:.3f} {best:.3f}, {each:.1f} ms a start" for name, (every, best, each) in mean.items()
         ),
         None,
-        {"found": found},
+        {"found": results},
     )
 
 

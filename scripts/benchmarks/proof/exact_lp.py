@@ -76,14 +76,14 @@ def exact_margin(wrench: np.ndarray) -> Fraction:
     equations[6, :m], equations[6, m] = 1.0, m
     objective, right = np.r_[np.zeros(m), -1.0], np.r_[np.zeros(6), 1.0]
     bounds, strict = [(0, None)] * m + [(None, None)], dict.fromkeys(TOLERANCES, 1e-10)
-    found = linprog(objective, A_eq=equations, b_eq=right, bounds=bounds, method="highs", options=strict)
-    if found.x is None:
+    solution = linprog(objective, A_eq=equations, b_eq=right, bounds=bounds, method="highs", options=strict)
+    if solution.x is None:
         raise ArithmeticError("no coefficients balance")
     whole = np.zeros((7, m + 1), dtype=object)
     whole[:6, :m], whole[:6, m] = wrench.T, [sum(column) for column in wrench.T]
     whole[6, :m], whole[6, m] = 1, m
     last = np.array([0] * 6 + [1], dtype=object)
-    largest = sorted(range(m), key=lambda k: -found.x[k])[:NEAR_BASIS]  # of equal ones, not every six are a basis
+    largest = sorted(range(m), key=lambda k: -solution.x[k])[:NEAR_BASIS]  # of equal ones, not every six are a basis
     columns = next(([*six, m] for six in combinations(largest, 6) if _feasible(whole[:, [*six, m]], last)), None)
     if columns is None:
         raise ArithmeticError("the basis is not feasible")
@@ -101,8 +101,8 @@ def exact_margin(wrench: np.ndarray) -> Fraction:
 
 def _feasible(basis: np.ndarray, right: np.ndarray) -> bool:
     """Tell whether a basis has a solution without negative coefficients; the margin, its last unknown, is free."""
-    found = solve(basis, right)
-    return found is not None and min(found[:-1]) >= 0
+    values = solve(basis, right)
+    return values is not None and min(values[:-1]) >= 0
 
 
 def solve(matrix: np.ndarray, right: np.ndarray) -> list[Fraction] | None:

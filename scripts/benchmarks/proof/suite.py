@@ -77,32 +77,32 @@ def bench_certificates(grasps: int, seed: int) -> list[Row]:
     for friction, edges in tqdm(list(zip(FRICTIONS, EDGES, strict=True)), desc="frictions", disable=None, leave=False):
         spec = ContactSpec(friction=friction, edges=edges, friction_margin=1.0)
         contacts = border_triples(each, spec, generator)
-        found = certify(contacts, spec)
+        certificate = certify(contacts, spec)
         phi, _ = solve_closure_lp(
             wrenches(contacts.points, contacts.normals, spec.planned_friction, edges).flatten(1, 2)
         )
-        nearest.append(float((found.margin - MIN_MARGIN).abs().median()))
+        nearest.append(float((certificate.margin - MIN_MARGIN).abs().median()))
         for i in range(each):
             points, normals = contacts.points[i].numpy(), contacts.normals[i].numpy()
-            if not found.closed[i] and found.margin[i] >= MIN_MARGIN:
+            if not certificate.closed[i] and certificate.margin[i] >= MIN_MARGIN:
                 counts["degenerate"] += 1
                 wrong += not has_low_rank(points, normals, friction, edges)
                 continue
             matrix = wrench_matrix(points, normals, friction, edges)
-            if found.closed[i]:
+            if certificate.closed[i]:
                 counts["closed"] += 1
                 wrong += not proves_margin_above(matrix, phi[i].numpy(), bound)
             else:
                 counts["open"] += 1
-                wrong += not proves_margin_below(matrix, found.witness[i].numpy(), bound)
-            if i % 50 == 0 and torch.isfinite(found.margin[i]):
+                wrong += not proves_margin_below(matrix, certificate.witness[i].numpy(), bound)
+            if i % 50 == 0 and torch.isfinite(certificate.margin[i]):
                 try:
                     exact = float(exact_margin(matrix))
                 except ArithmeticError:
                     aside += 1
                     continue
                 sampled += 1
-                worst = max(worst, abs(exact - float(found.margin[i])))
+                worst = max(worst, abs(exact - float(certificate.margin[i])))
     total = sum(counts.values())
     spec = ContactSpec(friction=0.5, friction_margin=1.0)
     contacts = random_contacts(10_000, generator)
@@ -240,12 +240,12 @@ def bench_objects(objects: Path, starts: int, seed: int) -> list[Row]:
             contacts, margin = certified(shape, spec, starts, seed)
             if not len(contacts):
                 continue
-            found = closure_probability(shape, contacts, ContactSpec(friction=0.6), seed=seed)
+            closure = closure_probability(shape, contacts, ContactSpec(friction=0.6), seed=seed)
             points, normals = nearest_on_mesh(mesh, contacts.points.flatten(0, 1))
             true = closed_exact(points.reshape(-1, 3, 3), normals.reshape(-1, 3, 3), 0.6)
             asked[name].append(
                 {
-                    "probability": found.probability,
+                    "probability": closure.probability,
                     "sum of variances": -contacts.require_std().square().sum(1),
                     "margin": margin,
                     "true": true,
