@@ -17,7 +17,7 @@ from torchgrasp.values import Contacts, IKSeeds
 WRONG_SIDE = 0.3
 """Mean cosine of tips' and contacts' outward normals above which a seed touches from inside: codes have no side."""
 LENGTH_SLACK, COSINE_SLACK = 0.01, 0.5
-"""Noise of a planned code in L [m] and N: tips roll. Without it the Barrett reaches 1 % of a can's triples, not 99 %."""
+"""Noise of a planned code in L [m] and N: tips roll. Without it the Barrett reaches 1 % of a can's triples, not 99."""
 
 
 def query_mixture(
@@ -26,7 +26,7 @@ def query_mixture(
     """Return the learned model's configurations near the contacts, in all six assignments (Eqs. 21-24).
 
     For every assignment within reach (Eq. 21) the joints are the conditional mean (Eq. 23) and the means of the most
-    responsible components, clamped to the limits. Eq. (24) places the hand. The fingertips are still off by centimetres.
+    responsible components, clamped to the limits. Eq. (24) places the hand. Fingertips are still off by centimetres.
     Seeds come in the order of the contacts' rows. Within a row the right side of the surface comes first, then the
     smaller tip error. An unreachable row has none.
 
