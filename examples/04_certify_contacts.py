@@ -19,5 +19,5 @@ for closed, margin, witness in zip(certificate.closed, certificate.margin, certi
     print(told)
 
 hand = load_hand("allegro")
-solution = solve_ik(contacts, hand, load_mixture("allegro"))
+solution = solve_ik(hand, contacts, load_mixture("allegro"))
 print(solution.status, (1e3 * solution.tip_error).round(decimals=2))

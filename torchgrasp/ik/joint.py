@@ -10,7 +10,6 @@ from functools import partial
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torchgrasp.base import Batch
 from torchgrasp.hand.hand import Hand
@@ -99,7 +98,8 @@ class JointProblem:
         bounds, bounds_by_x = rows.bounds, rows.bounds_by_x
         if flat is not None:
             bounds = torch.cat([bounds, flat.values(state.points)], 1)
-            bounds_by_x = torch.cat([bounds_by_x, pad(flat.by_points, (0, 3))], 1)
+            by_tension = torch.zeros_like(flat.by_points[..., :3])
+            bounds_by_x = torch.cat([bounds_by_x, torch.cat([flat.by_points, by_tension], 2)], 1)
         violated, unit_length = (bounds > 0).to(bounds), float(self.shape.scale) / MILLIMETRE
         residual = torch.cat([rows.surface, violated * bounds], 1)
         jacobian = torch.cat([rows.surface_by_x, violated[..., None] * bounds_by_x], 1)

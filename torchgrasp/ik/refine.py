@@ -9,7 +9,6 @@ import math
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, clearance_hinges
@@ -105,5 +104,8 @@ def open_hand(
         residual, jacobian = grasp_residuals(hand, state, target[rows], normals[rows], world, tips_touch=False)
         return residual, jacobian[..., 6:]
 
-    problem = LeastSquares(evaluate, lambda x, step: x.integrate(hand, pad(step, (6, 0))))  # the pose stays
+    def integrate(state: Configuration, step: Float[Tensor, "a h"]) -> Configuration:
+        return state.integrate(hand, torch.cat([step.new_zeros(len(step), 6), step], 1))  # the pose stays
+
+    problem = LeastSquares(evaluate, integrate)
     return levenberg_marquardt(problem, configuration, ITERATIONS).joints
