@@ -84,6 +84,8 @@ def solve_ik(
     >>> bool(solution.tip_error.max() < 1e-3)
     True
     """
+    if not isinstance(hand, Hand):
+        raise BadArgument("hand", type(hand).__name__, "a Hand from load_hand")
     check_tensor("contacts.points", contacts.points, (None, 3, 3))
     check_tensor("contacts.normals", contacts.normals, (len(contacts), 3, 3))
     if method not in get_args(Method):
