@@ -1,10 +1,6 @@
 """The command line, one file for each group of commands.
 
-Exit codes:
-    0: the job is done.
-    1: no grasp is executable, or the object was not held.
-    2: a bad input, with one sentence on stderr.
-    130: interrupted.
+Exit codes: 0 done, 1 no executable grasp or object not held, 2 a bad input named on stderr, 130 interrupted.
 """
 
 import os

@@ -1,13 +1,12 @@
 """`torchgrasp cloud`: check a cloud, or render one from a mesh."""
 
-import dataclasses
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from torchgrasp.cli.common import check_seed, naming
-from torchgrasp.cloud import diagnose_cloud, format_report, look_at, partial_view, read_cloud, save_cloud
+from torchgrasp.cli.common import check_seed, naming, read_view
+from torchgrasp.cloud import diagnose_cloud, format_report, look_at, partial_view, save_cloud
 from torchgrasp.errors import BadArgument
 from torchgrasp.mesh import read_mesh
 
@@ -23,32 +22,18 @@ def check(
         cloud: point cloud of one object in metres, z up (.ply, .pcd, .npy, .npz, .xyz).
         viewpoint: position of the camera in the frame of the cloud; by default the file's, else it is estimated.
     """
-    with naming("FILE", "path", "points", "normals"), naming("--viewpoint", "viewpoint"):
-        report = diagnose_cloud(read_cloud(cloud, viewpoint))
-    print(format_report(report))
+    with naming(points="FILE", normals="FILE"):
+        print(format_report(diagnose_cloud(read_view("FILE", cloud, viewpoint))))
     return 0
-
-
-@dataclasses.dataclass(frozen=True)
-class CameraPosition:
-    """Where the camera is, seen from the centre of the mesh.
-
-    Args:
-        azimuth: direction of the camera, from x towards y, in degrees.
-        elevation: of the camera above the horizontal, in degrees.
-        distance: from the centre of the mesh to the camera, in metres.
-    """
-
-    azimuth: float = 30.0
-    elevation: float = 30.0
-    distance: float = 0.5
 
 
 def render(
     mesh: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MESH")],
     /,
     out: Path,
-    camera: Annotated[CameraPosition, tyro.conf.arg(name="")] = CameraPosition(),
+    azimuth: float = 30.0,
+    elevation: float = 30.0,
+    distance: float = 0.5,
     points: int = 1000,
     no_noise: bool = False,
     seed: int = 0,
@@ -58,7 +43,9 @@ def render(
     Args:
         mesh: closed mesh of an object in metres, z up (.ply, .obj, .stl, ...).
         out: point cloud to write (.npz or .ply), with the viewpoint.
-        camera: where the camera is.
+        azimuth: direction of the camera from the mesh, from x towards y, in degrees.
+        elevation: of the camera above the horizontal, in degrees.
+        distance: from the centre of the mesh to the camera, in metres.
         points: number of points; fewer if fewer pixels see the object.
         no_noise: an exact camera, not an active stereo camera.
         seed: of the noise and of the choice of points.
@@ -66,19 +53,11 @@ def render(
     check_seed(seed)
     if out.suffix.lower() not in (".npz", ".ply"):
         raise BadArgument("--out", out, "a file ending in .npz or .ply")
-    with naming("MESH", "mesh"):
+    angles = {name: f"--{name}" for name in ("azimuth", "elevation", "distance")}
+    with naming(**angles, n="--points", points="MESH", depth="MESH", mesh="MESH"):
         solid = read_mesh(mesh)
-    options = [naming(f"--{name}", name) for name in ("azimuth", "elevation", "distance")]
-    with (
-        options[0],
-        options[1],
-        options[2],
-        naming("--points", "n"),
-        naming("MESH", "points", "depth", "mesh", "target"),
-    ):
-        pose = look_at(camera.azimuth, camera.elevation, camera.distance, solid)
-        cloud = partial_view(solid, pose, points, not no_noise, seed)
-    with naming("--out", "path"):
+        cloud = partial_view(solid, look_at(azimuth, elevation, distance, solid), points, not no_noise, seed)
+    with naming(path="--out"):
         save_cloud(cloud, out)
     print(f"{len(cloud)} points, {out}")
     return 0

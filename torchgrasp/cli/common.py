@@ -5,27 +5,30 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from torchgrasp.cloud.io.read import read_cloud
 from torchgrasp.errors import BadArgument, OutputError
 from torchgrasp.values import PointCloud
 
 
 @contextlib.contextmanager
-def naming(option: str, *names: str) -> Iterator[None]:
-    """Name the option in errors about the arguments `names`."""
+def naming(**options: str) -> Iterator[None]:
+    """Name the options in errors about the arguments."""
     try:
         yield
     except BadArgument as error:
-        if error.argument not in names:
+        if error.argument not in options:
             raise
-        raise type(error)(option, error.found, error.allowed) from error
+        raise type(error)(options[error.argument], error.found, error.allowed) from error
+
+
+def read_view(option: str, path: Path, viewpoint: tuple[float, float, float] | None) -> PointCloud:
+    """Read the cloud of an option."""
+    with naming(path=option, points=option, normals=option, viewpoint="--viewpoint"):
+        return read_cloud(path, viewpoint)
 
 
 def check_folder(path: Path) -> None:
-    """Refuse a folder that cannot be made or written, by a trial.
-
-    Raises:
-        OutputError: the folder cannot be made or written.
-    """
+    """Refuse a folder that cannot be made or written, by a trial."""
     made: list[Path] = []
     try:
         for folder in reversed([path, *path.parents]):
@@ -49,10 +52,6 @@ def check_seed(seed: int) -> None:
 
 def table_height(cloud: PointCloud, table: float | None, no_table: bool) -> float | None:
     """Return the table's height [m], by default the cloud's lowest point."""
-    return None if no_table else float(cloud.points[:, 2].min()) if table is None else table
-
-
-def check_table(table: float | None, no_table: bool) -> None:
-    """Refuse a table's height together with `--no-table`."""
     if table is not None and no_table:
         raise BadArgument("--table", f"{table:g} and --no-table", "one of the two")
+    return None if no_table else float(cloud.points[:, 2].min()) if table is None else table

@@ -63,16 +63,15 @@ def evaluate(
     """
     check_seed(seed)
     import_simulator(simulator)
-    with naming("--hand", "hand", "name"):
+    with naming(hand="--hand", name="--hand"):
         the_hand = load_hand(hand)
     changes = {"closing": closing, "force": force, "holding": holding, "simulator": simulator}
-    with naming("--force", "force"):
+    with naming(force="--force", grasps="--grasps"):
         test = find_protocol(protocol).with_trial(**{name: x for name, x in changes.items() if x is not None})
-    with naming("--grasps", "grasps"):
         spec = EvaluationSpec(grasps, ranks, starts, complete, only, planned is not None, seed)
     scores = []
-    with naming("--out", "folder", "path"), hold_folder(out):
-        with naming("--objects", "objects", "path"), naming("--workers", "workers"):
+    with naming(folder="--out", path="--out"), hold_folder(out):
+        with naming(objects="--objects", path="--objects", workers="--workers"):
             folder = planned or out / "grasps"
             for score in evaluate_views(objects, the_hand, test, spec, folder=folder, workers=workers):
                 print_score(score)
@@ -80,7 +79,7 @@ def evaluate(
         summary = summarise(scores)
         print_summary(protocol, summary)
         asked = {"hand": hand, "hand_sha256": the_hand.source.sha256, **dataclasses.asdict(spec)}
-        asked |= {"protocol": dataclasses.asdict(test)}
+        asked["protocol"] = dataclasses.asdict(test)
         content = {"asked": asked, "summary": summary, "views": [dataclasses.asdict(score) for score in scores]}
         write_file(out / "evaluate.json", format_json(content))
         write_evaluation(out / "evaluate.html", f"Grasps of the {hand} hand under {protocol}", asked, scores)
@@ -88,7 +87,7 @@ def evaluate(
 
 
 def print_score(score: ViewScore) -> None:
-    """Print one line."""
+    """Print the line of a view."""
     failed = [attempt.status for attempt in score.attempts if attempt.status is not Status.OK]
     reasons = ", ".join(f"{failed.count(status)} {status.name.lower()}" for status in dict.fromkeys(failed))
     reasons = reasons if score.attempts else score.note or score.refusal.sentence
@@ -98,14 +97,13 @@ def print_score(score: ViewScore) -> None:
 
 def print_summary(protocol: str, summary: dict[str, Any]) -> None:
     """Print shares, failures by stage, and cost."""
-    print(f"\n{protocol}")
     rows = []
     for key, text in SHARE_NAMES.items():
         value, low, high, total = summary[key]
         rows.append((text, f"{value:.1%} [{low:.1%}, {high:.1%}] of {total}"))
     for stage, reasons in summary["failures"].items():
         rows.append((f"failed in {stage}", ", ".join(f"{n} {name.lower()}" for name, n in reasons.items())))
-    print(format_columns(rows, left={0, 1}))
+    print(f"\n{protocol}\n{format_columns(rows, left={0, 1})}")
     force, overlap, most = (_number(summary[key]) for key in ("force_n", "overlap_mm", "overlap_mm_max"))
     print(f"mean normal force of a finger {force} N, overlap at the grasp {overlap} mm (most {most} mm)")
     plan, trial = _number(summary["plan_cpu_s"]), _number(summary["trial_cpu_s"])

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from torchgrasp.base import check_whole
 from torchgrasp.cli.common import naming
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.export import format_grasps, format_keyframes
@@ -32,18 +33,15 @@ def export(
         most: how many grasps, the best first.
         force: normal force of the strongest finger [N] in the squeeze.
     """
-    with naming("GRASPS", "path"):
+    with naming(path="GRASPS"):
         planned = load_grasps(grasps)
-    with naming("--hand", "hand", "name"):
+    with naming(hand="--hand", name="--hand"):
         robot = load_hand(planned.meta.get("hand", "") if hand is None else hand)
     if planned.meta.get("hand_sha256") != robot.source.sha256:
         raise BadArgument("--hand", f"{robot.name}, whose files are not those that were planned with", "the same hand")
-    if most < 1:
-        raise BadArgument("--most", most, "at least 1")
+    check_whole("--most", most, 1, 1_000_000)
     best = planned[planned.status == Status.OK][:most]
-    with naming("--force", "force"):
-        text = (format_grasps if format == "json" else format_keyframes)(robot, best, force)
-    with naming("--out", "path"):
-        write_file(out, text)
+    with naming(force="--force", path="--out"):
+        write_file(out, (format_grasps if format == "json" else format_keyframes)(robot, best, force))
     print(f"{len(best)} grasps of the {robot.name} hand: {out}")
     return 0 if len(best) else 1

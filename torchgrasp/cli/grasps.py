@@ -6,15 +6,14 @@ import importlib.util
 import sys
 import time
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from tqdm import tqdm
 
-from torchgrasp.cli.common import check_folder, check_seed, check_table, naming, table_height
-from torchgrasp.cloud.io.read import read_cloud
+from torchgrasp.base import check_whole
+from torchgrasp.cli.common import check_folder, check_seed, naming, read_view, table_height
 from torchgrasp.columns import format_columns
 from torchgrasp.errors import BadArgument, MissingExtra
 from torchgrasp.evaluation.lift import close_hand
@@ -30,9 +29,6 @@ from torchgrasp.specs import ContactSpec, Simulator, TrialSpec
 
 if TYPE_CHECKING:
     import trimesh
-
-PLANNING = ("shape", "plan", "certify", "query", "refine")
-"""The stages that `plan_grasps` reports, in their order."""
 
 
 def objects() -> int:
@@ -75,64 +71,52 @@ def grasp(
         friction: coefficient of friction between fingertips and object.
         mode: contacts, pose and joints together, or contacts first and the learned model after, as in the paper.
     """
-    with naming("--out", "path"):
+    with naming(path="--out"):
         check_folder(out)
     if close and mesh is None:
         raise BadArgument("--close", "no --mesh", "--close together with --mesh")
     if close:
         import_simulator()
-    check_table(table, no_table)
-    if not 1 <= starts <= 1_000_000:
-        raise BadArgument("--starts", starts, "an integer in [1, 1000000]")
+    check_whole("--starts", starts, 1, 1_000_000)
     check_seed(seed)
-    with naming("--hand", "hand", "name"):
+    with naming(hand="--hand", name="--hand"):
         the_hand = load_hand(hand)
-    with naming("CLOUD", "path", "points", "normals"), naming("--viewpoint", "viewpoint"):
-        partial = read_cloud(cloud, viewpoint)
-    true_mesh, parts = None, None
-    if mesh is not None:
-        with naming("--mesh", "mesh"):
-            true_mesh, parts = read_true_mesh(mesh)
+    partial = read_view("CLOUD", cloud, viewpoint)
     height = table_height(partial, table, no_table)
-    with naming("--friction", "friction"), naming("--table", "table"):
+    with naming(mesh="--mesh", friction="--friction", table="--table"):
+        true_mesh, parts = (None, None) if mesh is None else read_true_mesh(mesh)
         spec = ContactSpec(friction=friction, table=height)
         trial = TrialSpec(friction=friction)
 
-    extra = ("closing",) * close
-    with _Progress((*PLANNING, *extra, "report")) as progress:
+    progress = _Progress("shape", "plan", "certify", "query", "refine", *["closing"] * close, "report")
+    with progress.bar:
         origin = "no table" if height is None else f"table at z = {height:.3f} m"
         origin += " (lowest point)" * (height is not None and table is None)
         camera = "camera known" if partial.viewpoint is not None else "camera estimated"
         progress.end("cloud", f"{len(partial)} points, {camera}, {origin}")
         grasps = plan_grasps(partial, the_hand, spec, starts, seed, mode=mode, observer=progress.end)
-        surface = extract_surface(progress.values["shape"])
+        surface, plan = extract_surface(progress.values["shape"]), progress.values["plan"]
         name = object_name(cloud if mesh is None else mesh)
-        plan = progress.values["plan"]
         run = Run(name, cloud, partial, the_hand, spec, surface, grasps, tuple(progress.stages), plan)
         if close and true_mesh is not None and len(run.executable):
             closure = close_hand(run.executable[0], the_hand, true_mesh, trial, seed=seed, parts=parts)
             progress.end("closing", f"{closure.time[-1]:.1f} s simulated, {closure.status.name.lower()}")
             run = dataclasses.replace(run, stages=tuple(progress.stages), mesh=true_mesh, closure=closure)
-        with naming("--out", "path"):
+        with naming(path="--out"):
             grasps.save(out / "grasps.safetensors")
             write_report(out / "report.html", run)
         progress.end("report", f"{out / 'grasps.safetensors'}, {out / 'report.html'}")
     if len(run.executable):
         print(f"\n{format_columns([GRASP_COLUMNS, *grasp_rows(run.executable, 5)])}\n")
     print(verdict(run))
-    done = bool(len(run.executable)) if not close else run.closure is not None and run.closure.held
+    done = run.closure is not None and run.closure.held if close else len(run.executable) > 0
     return 0 if done else 1
 
 
 def import_simulator(name: Simulator = "sapien") -> None:
-    """Import a simulator, before any work.
-
-    Raises:
-        MissingExtra: it is not installed.
-        BadArgument: it is installed and cannot be loaded.
-    """
+    """Import a simulator; refuse one that is not installed or cannot be loaded."""
     if importlib.util.find_spec(name) is None:
-        raise MissingExtra(name, {"sapien": "sim", "mujoco": "mujoco"}[name])
+        raise MissingExtra(name, "sim" if name == "sapien" else name)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a missing Vulkan does not concern physics
@@ -143,11 +127,7 @@ def import_simulator(name: Simulator = "sapien") -> None:
 
 
 def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] | None]":
-    """Read a closed mesh; an object of torchgrasp comes with its convex parts.
-
-    Raises:
-        MeshError: the mesh is missing, open, or without volume.
-    """
+    """Read a closed mesh; an object of torchgrasp comes with its convex parts."""
     mesh, digest = read_mesh(path), sha256(path)
     for name in list_objects():
         if sha256(DATA / name / "mesh.ply") == digest:
@@ -168,21 +148,13 @@ def object_name(path: Path) -> str:
 class _Progress:
     """A line for each stage that ended; on a terminal a bar names the stage under way."""
 
-    def __init__(self, names: Sequence[str]) -> None:
-        self.names = names
+    def __init__(self, *names: str) -> None:
+        self.next = dict(zip(names, (*names[1:], "done"), strict=True))
         self.stages: list[Stage] = []
         self.values: dict[str, Any] = {}
-
-    def __enter__(self) -> "_Progress":
-        """Start the clock and the bar."""
         self.began = time.perf_counter()
         # None: silent where stderr is no terminal.
-        self.bar = tqdm(total=len(self.names), desc=self.names[0], leave=False, delay=1, disable=None, unit="stage")
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        """Wipe the bar away."""
-        self.bar.close()
+        self.bar = tqdm(total=len(names), desc=names[0], leave=False, delay=1, disable=None, unit="stage")
 
     def end(self, name: str, message: str, value: Any = None) -> None:
         """Note the end of a stage."""
@@ -192,8 +164,6 @@ class _Progress:
         with self.bar.external_write_mode(sys.stdout):
             print(f"{name:8}{now - self.began:6.1f} s  {message}", flush=True)
         self.began = now
-        if name in self.names:
+        if name in self.next:
             self.bar.update()
-            following = self.names.index(name) + 1
-            if following < len(self.names):
-                self.bar.set_description(self.names[following])
+            self.bar.set_description(self.next[name])

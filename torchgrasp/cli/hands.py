@@ -19,9 +19,6 @@ from torchgrasp.posture_model.sample import OPPOSED_COSINE, SampleSpec, Sampling
 from torchgrasp.report.hands import draw_hand, opposed_posture
 from torchgrasp.testing import check_hand, find_faults, random_joints
 
-DESCRIBED_POSTURES = 5000
-"""Random postures from which a hand is described: shares vary by 1 %."""
-
 
 def new(
     urdf: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="URDF")],
@@ -43,7 +40,7 @@ def new(
     target = urdf.parent / "hand.toml"
     if target.exists():
         raise OutputError("URDF", f"{target}, which exists", "a folder without a hand.toml")
-    with naming("--tips", "tips"), naming("URDF", "urdf"):
+    with naming(tips="--tips", urdf="URDF"):
         text = draft_hand(urdf, tips, name, seed)
     write_file(target, text)
     print(f"written: {target}; look over the lines marked CHECK, then: torchgrasp hand check {target.parent}")
@@ -65,13 +62,12 @@ def check(
     """
     if out.suffix.lower() != ".png":
         raise BadArgument("--out", out, "a file ending in .png")
-    with naming("--fingers", "fingers"), naming("HAND", "hand"):
+    with naming(fingers="--fingers", hand="HAND", path="--out"):
         if _print_faults(hand, fingers):
             return 2
         sound = check_hand(hand, fingers)
-    with naming("--out", "path"):
         check_folder(out.parent)
-    joints = random_joints(sound, DESCRIBED_POSTURES)
+    joints = random_joints(sound, 5000)  # shares vary by 1 %
     print(describe(sound, joints))
     model = find_hand(hand) / "mixture.safetensors"
     print(f"learned model: {model if model.exists() else f'none; learn it by scripts/train.py posture-model {hand}'}")
@@ -129,10 +125,10 @@ def sample(
         seed: of every random draw.
     """
     check_seed(seed)
-    with naming("--hand", "hand"), naming("--fingers", "fingers"):
+    with naming(hand="--hand", fingers="--fingers"):
         robot = load_hand(hand, fingers)
     begin = time.perf_counter()
-    with naming("--out", "folder", "path"), naming("--n", "n"), naming("--workers", "workers"):
+    with naming(folder="--out", path="--out", n="--n", workers="--workers"):
         spec = SampleSpec(n, seed, sampling)
         with tqdm(total=n, unit="posture", unit_scale=True, disable=None, leave=False) as bar:
             write_samples(robot, spec, out, workers, bar.update)

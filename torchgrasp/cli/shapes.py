@@ -5,8 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from torchgrasp.cli.common import check_seed, check_table, naming, table_height
-from torchgrasp.cloud.io.read import read_cloud
+from torchgrasp.cli.common import check_seed, naming, read_view, table_height
 from torchgrasp.export import check_surface_path, largest_std, save_surface
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import extract_surface
@@ -36,18 +35,14 @@ def surface(
         seed: of every random draw.
     """
     check_seed(seed)
-    check_table(table, no_table)
-    with naming("--out", "path"):
+    with naming(path="--out"):
         check_surface_path(out)
-    with naming("CLOUD", "path", "points", "normals"), naming("--viewpoint", "viewpoint"):
-        points = read_cloud(cloud, viewpoint)
-        with naming("--table", "table"):
-            shape = fit_shape(points, support=support, seed=seed, table=table_height(points, table, no_table))
-    with naming("--resolution", "resolution"):
-        mesh = extract_surface(shape, resolution)
-    with naming("--out", "path"):
-        save_surface(mesh, out)
-    middle = float(mesh.std_m.median())
-    print(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces, {out}")
-    print(f"standard deviation: median {1e3 * middle:.1f} mm, {1e3 * largest_std(mesh):.1f} mm where it is yellow")
+    view = read_view("CLOUD", cloud, viewpoint)
+    with naming(points="CLOUD", normals="CLOUD", table="--table", resolution="--resolution", path="--out"):
+        shape = fit_shape(view, support=support, seed=seed, table=table_height(view, table, no_table))
+        estimate = extract_surface(shape, resolution)
+        save_surface(estimate, out)
+    middle, most = 1e3 * float(estimate.std_m.median()), 1e3 * largest_std(estimate)
+    print(f"{len(estimate.vertices)} vertices, {len(estimate.faces)} faces, {out}")
+    print(f"standard deviation: median {middle:.1f} mm, {most:.1f} mm where it is yellow")
     return 0

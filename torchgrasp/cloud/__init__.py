@@ -1,6 +1,6 @@
 """Point clouds: read, checked, merged, cleaned and prepared."""
 
-from torchgrasp.cloud.camera import look_at, partial_view, render_depth
+from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.check import check_cloud, remove_duplicates
 from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.cloud.diagnose import CloudReport, diagnose_cloud, format_report
@@ -29,7 +29,6 @@ __all__ = [
     "read_cloud",
     "remove_duplicates",
     "remove_outliers",
-    "render_depth",
     "save_cloud",
     "voxel_downsample",
 ]

@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.cloud.depth import check_intrinsics, check_rigid, cloud_from_depth
+from torchgrasp.base import check_number
+from torchgrasp.cloud.depth import check_rigid, cloud_from_depth
 from torchgrasp.errors import BadArgument, MeshError
 from torchgrasp.frames import apply, inverse, rigid, rotate
 from torchgrasp.values import PointCloud
@@ -21,14 +22,10 @@ WIDTH, HEIGHT = 640, 480
 """Pixels of the default camera, as of common stereo cameras."""
 FOCAL = 616.0
 """Focal length [px] of the default camera: a horizontal view of 55 degrees."""
+INTRINSICS = torch.tensor([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]], dtype=torch.float64)
+"""Intrinsics [px] of the default camera."""
 BASELINE = 0.055
 """Distance [m] between the eyes of the modelled stereo camera, as of common ones."""
-
-
-def default_intrinsics() -> Float[Tensor, "3 3"]:
-    """Return the intrinsics [px] of the default camera."""
-    rows = [[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]]
-    return torch.tensor(rows, dtype=torch.float64)
 
 
 def look_at(
@@ -40,9 +37,9 @@ def look_at(
     """Return obj_from_camera of an upright camera that looks at a target.
 
     Args:
-        azimuth: direction from the target to the camera, from x towards y [deg].
+        azimuth: direction of the camera, from x towards y [deg].
         elevation: above the horizontal [deg], in [-89.9, 89.9].
-        distance: from the target to the camera [m], in [0.01, 10].
+        distance: from the target [m], in [0.01, 10].
         target: point (3,) [m] in the middle of the image, or a mesh, for the centre of its box; None: the origin.
 
     Raises:
@@ -52,57 +49,26 @@ def look_at(
     >>> look_at(0.0, 0.0, 0.5)[:3, 3]
     tensor([0.5000, 0.0000, 0.0000], dtype=torch.float64)
     """
-    if not -89.9 <= elevation <= 89.9:
-        raise BadArgument("elevation", elevation, "a number of degrees in [-89.9, 89.9]")
+    check_number("elevation", elevation, -89.9, 89.9)
+    check_number("distance", distance, 0.01, 10.0)
     if not math.isfinite(azimuth):
         raise BadArgument("azimuth", azimuth, "a finite number of degrees")
-    if not 0.01 <= distance <= 10.0:
-        raise BadArgument("distance", distance, "metres in [0.01, 10]")
     a, e = math.radians(azimuth), math.radians(elevation)
     away = torch.tensor([math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)], dtype=torch.float64)
     right = torch.tensor([-math.sin(a), math.cos(a), 0.0], dtype=torch.float64)
     down = torch.linalg.cross(-away, right)
-    if target is not None and not isinstance(target, Tensor):
+    position = distance * away
+    if isinstance(target, Tensor):
+        position = target.double() + position
+    elif target is not None:
         if not len(target.faces):
             raise MeshError("target", "no faces", "a mesh with a surface")
-        target = torch.from_numpy(np.asarray(target.bounds).mean(0))
-    centre = torch.zeros(3, dtype=torch.float64) if target is None else target.double()
-    return rigid(torch.stack([right, down, -away], -1), centre + distance * away)
-
-
-def render_depth(
-    mesh: "trimesh.Trimesh",
-    camera_pose: Float[Tensor, "4 4"],
-    intrinsics: Float[Tensor, "3 3"] | None = None,
-    size: tuple[int, int] = (HEIGHT, WIDTH),
-) -> Float[Tensor, "h w"]:
-    """Return the exact depth image [m] of a mesh, 0 where nothing is.
-
-    Args:
-        mesh: in the object frame [m].
-        camera_pose: obj_from_camera (x right, y down, z forward).
-        intrinsics: of the pinhole camera [px]; None: `default_intrinsics()`.
-        size: height and width of the image [px].
-
-    Raises:
-        BadArgument: intrinsics of no pinhole camera; a pose that is not rigid; a size outside [1, 4096] pixels.
-        MeshError: the mesh has no faces.
-
-    >>> import trimesh
-    >>> ball = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
-    >>> round(float(render_depth(ball, look_at(0.0, 0.0, 0.5))[240, 320]), 3)
-    0.45
-    """
-    k = default_intrinsics() if intrinsics is None else check_intrinsics(intrinsics).double()
-    return _cast(mesh, check_rigid("camera_pose", camera_pose).double(), k, size)[0]
+        position = torch.from_numpy(np.asarray(target.bounds).mean(0)) + position
+    return rigid(torch.stack([right, down, -away], -1), position)
 
 
 def partial_view(
-    mesh: "trimesh.Trimesh",
-    camera_pose: Float[Tensor, "4 4"],
-    n: int = 1000,
-    noise: bool = True,
-    seed: int = 0,
+    mesh: "trimesh.Trimesh", camera_pose: Float[Tensor, "4 4"], n: int = 1000, noise: bool = True, seed: int = 0
 ) -> PointCloud:
     """Return n points [m] that the default camera sees of a mesh. They have a viewpoint and no normals.
 
@@ -114,8 +80,6 @@ def partial_view(
         mesh: in the object frame [m].
         camera_pose: obj_from_camera, see `look_at`.
         n: points drawn from the pixels; all pixels if there are fewer.
-        noise: whether the camera errs.
-        seed: of the noise and of the draw.
 
     Raises:
         BadArgument: fewer than 4 points; a pose that is not rigid.
@@ -129,29 +93,24 @@ def partial_view(
     """
     if n < 4:
         raise BadArgument("n", n, "at least 4 points")
-    pose, intrinsics = check_rigid("camera_pose", camera_pose).double(), default_intrinsics()
-    depth, cosine = _cast(mesh, pose, intrinsics, (HEIGHT, WIDTH))
+    pose = check_rigid("camera_pose", camera_pose).double()
+    depth, cosine = _cast(mesh, pose)
     generator = torch.Generator().manual_seed(seed)
     if noise:
         depth = _add_noise(depth, cosine, generator)
-    cloud = cloud_from_depth(depth, intrinsics, camera_pose=pose)
+    cloud = cloud_from_depth(depth, INTRINSICS, camera_pose=pose)
     rows = torch.randperm(len(cloud), generator=generator)[:n]
     return PointCloud(cloud.points[rows], None, cloud.viewpoint)
 
 
 def _cast(
-    mesh: "trimesh.Trimesh",
-    obj_from_camera: Float[Tensor, "4 4"],
-    intrinsics: Float[Tensor, "3 3"],
-    size: tuple[int, int],
+    mesh: "trimesh.Trimesh", obj_from_camera: Float[Tensor, "4 4"]
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
     """Return depth [m] and |cosine| of ray and face normal, both 0 where nothing is."""
-    if not all(1 <= pixels <= 4096 for pixels in size):
-        raise BadArgument("size", size, "height and width in [1, 4096] pixels")
     if not len(mesh.faces):
         raise MeshError("mesh", "no faces", "a mesh with a surface")
-    row, column = torch.meshgrid(*(torch.arange(pixels).double() for pixels in size), indexing="ij")
-    x, y = (column - intrinsics[0, 2]) / intrinsics[0, 0], (row - intrinsics[1, 2]) / intrinsics[1, 1]
+    row, column = torch.meshgrid(torch.arange(HEIGHT).double(), torch.arange(WIDTH).double(), indexing="ij")
+    x, y = (column - INTRINSICS[0, 2]) / FOCAL, (row - INTRINSICS[1, 2]) / FOCAL
     rays = torch.stack([x, y, torch.ones_like(x)], -1)
     inside = _in_image_box(mesh, obj_from_camera, x, y)
     direction = rotate(obj_from_camera, rays[inside]).numpy()
@@ -164,7 +123,7 @@ def _cast(
     z = ((corner - origin) * normal).sum(-1) / against
     cosine = np.abs(against) / np.linalg.norm(direction[hit], axis=-1)
     where = torch.nonzero(inside)[torch.from_numpy(hit)]
-    images = torch.zeros(2, *size, dtype=torch.float64)
+    images = torch.zeros(2, HEIGHT, WIDTH, dtype=torch.float64)
     images[:, where[:, 0], where[:, 1]] = torch.from_numpy(np.stack([z, cosine]))
     return images[0], images[1]
 
@@ -198,8 +157,7 @@ def _add_noise(
     far = torch.from_numpy(maximum_filter(torch.where(measured, depth, 100.0).numpy(), 5))
     near = torch.from_numpy(minimum_filter(torch.where(measured, depth, 100.0).numpy(), 5))
     rim = (far - depth > 0.010) | (depth - near > 0.010)
-    flying = rim & (uniform() < 0.25)
-    noisy = noisy + torch.where(flying, -0.008 * torch.log1p(-uniform()), 0.0)
+    noisy = noisy + torch.where(rim & (uniform() < 0.25), -0.008 * torch.log1p(-uniform()), 0.0)
     angle = torch.rad2deg(torch.arccos(cosine.clamp(0.0, 1.0)))
     lost = (rim & (uniform() < 0.35)) | (uniform() < 0.01) | (uniform() < (angle - 72.5) / (87.0 - 72.5))
     return torch.where(measured & ~lost, noisy, 0.0)

@@ -1,10 +1,12 @@
 """Refusals of clouds that no grasp can be planned on."""
 
+import dataclasses
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import check_tensor
+from torchgrasp.base import named_tensors
 from torchgrasp.errors import BadArgument, SuspiciousScale, TooFewPoints
 from torchgrasp.values import PointCloud
 
@@ -19,9 +21,7 @@ LINE_RATIO = 1e-6
 
 
 def check_cloud(cloud: PointCloud) -> PointCloud:
-    """Return the cloud itself, or raise what is wrong with it.
-
-    A flat cloud, as of one face, is accepted.
+    """Return the cloud itself, or raise what is wrong with it. A flat cloud, as of one face, is accepted.
 
     Raises:
         BadArgument: not a `PointCloud`; a non-finite number; a tensor that requires a gradient; points that all
@@ -49,23 +49,21 @@ def remove_duplicates(cloud: PointCloud) -> PointCloud:
     """
     if not isinstance(cloud, PointCloud):
         raise BadArgument("cloud", type(cloud).__name__, "a PointCloud")
-    for name in ("points", "normals", "viewpoint"):
-        if getattr(cloud, name) is not None and getattr(cloud, name).requires_grad:
+    for name, tensor in named_tensors(cloud).items():
+        if tensor.requires_grad:
             raise BadArgument(name, "a tensor that requires a gradient", f"a tensor without one: {name}.detach()")
-    points = check_tensor("points", cloud.points, (None, 3))
+    points = dataclasses.replace(cloud).points  # the value checks itself again: its numbers may be spoilt since
     extent = float((points.amax(0) - points.amin(0)).max())
     if extent == 0.0:
         raise BadArgument("points", f"{len(points)} points that all coincide", "points of a surface")
     if not MIN_EXTENT <= extent <= MAX_EXTENT:
-        raise SuspiciousScale(
-            "points", f"an extent of {extent:.4g} m", f"{MIN_EXTENT:g} m to {MAX_EXTENT:g} m; {_remedy(extent)}"
-        )
+        question = "normalised" if extent < MIN_EXTENT else f"in mm ({extent / 1000:.3g} m), or a whole scene"
+        allowed = f"{MIN_EXTENT:g} m to {MAX_EXTENT:g} m: lengths are metres; is this cloud {question}?"
+        raise SuspiciousScale("points", f"an extent of {extent:.4g} m", allowed)
     if cloud.normals is not None:
-        zero = torch.linalg.vector_norm(check_tensor("normals", cloud.normals, (len(points), 3)), dim=-1) == 0
-        if bool(zero.any()):
-            raise BadArgument("normals", f"{int(zero.sum())} normals of length zero", "normals with a direction")
-    if cloud.viewpoint is not None:
-        check_tensor("viewpoint", cloud.viewpoint, (3,) if cloud.viewpoint.ndim == 1 else (len(points), 3))
+        zero = int((torch.linalg.vector_norm(cloud.normals, dim=-1) == 0).sum())
+        if zero:
+            raise BadArgument("normals", f"{zero} normals of length zero", "normals with a direction")
     rows = _distinct_rows(points)
     if len(rows) < MIN_POINTS:
         raise TooFewPoints("points", f"{len(rows)} distinct points", f"at least {MIN_POINTS} distinct points")
@@ -95,10 +93,3 @@ def first_of_each(group: Int[Tensor, "n"]) -> Int[Tensor, "groups"]:
     """Return the first index of each group, for numbers of groups without gaps."""
     order = torch.arange(len(group), device=group.device)
     return torch.full_like(order, len(order)).scatter_reduce(0, group, order, "amin")[: int(group.max()) + 1]
-
-
-def _remedy(extent: float) -> str:
-    """Guess what is wrong with the unit."""
-    if extent < MIN_EXTENT:
-        return "lengths are metres: is this cloud normalised, or in another unit?"
-    return f"lengths are metres: is this cloud in mm (then its extent is {extent / 1000:.3g} m), or a whole scene?"

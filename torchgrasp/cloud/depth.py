@@ -37,25 +37,22 @@ def cloud_from_depth(
     >>> cloud_from_depth(torch.full((48, 64), 0.5), K).viewpoint
     tensor([0., 0., 0.])
     """
-    if not isinstance(depth, Tensor):
-        raise BadArgument("depth", type(depth).__name__, "a torch tensor of shape (h, w), floating, in metres")
-    if depth.ndim != 2 or depth.dtype not in (torch.float32, torch.float64):
-        raise BadArgument("depth", f"shape {tuple(depth.shape)} of {depth.dtype}", "shape (h, w), floating, in metres")
+    if not isinstance(depth, Tensor) or depth.ndim != 2 or depth.dtype not in (torch.float32, torch.float64):
+        raise BadArgument("depth", _describe(depth), "a torch tensor (h, w), floating, in metres")
     if bool((depth < 0).any()):
         raise BadArgument("depth", f"{float(depth[depth < 0].min()):.4g} m", "depths >= 0")
-    check_intrinsics(intrinsics)
+    k = check_tensor("intrinsics", intrinsics, (3, 3)).to(depth)
+    if not (k[0, 0] > 0 and k[1, 1] > 0) or k[0, 1] != 0 or k[1, 0] != 0 or k[2].tolist() != [0, 0, 1]:
+        raise BadArgument("intrinsics", k.tolist(), "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0")
     measured = torch.isfinite(depth) & (depth > 0)
     if mask is not None:
-        if not isinstance(mask, Tensor):
-            raise BadArgument("mask", type(mask).__name__, f"a torch tensor of bool of {tuple(depth.shape)}")
-        if mask.shape != depth.shape or mask.dtype != torch.bool:
-            raise BadArgument("mask", f"shape {tuple(mask.shape)} of {mask.dtype}", f"bool of {tuple(depth.shape)}")
+        if not isinstance(mask, Tensor) or mask.shape != depth.shape or mask.dtype != torch.bool:
+            raise BadArgument("mask", _describe(mask), f"a torch tensor of bool {tuple(depth.shape)}")
         measured = measured & mask
     if int(measured.sum()) < 4:
         raise TooFewPoints("depth", f"{int(measured.sum())} measured pixels", "at least 4 measured pixels in the mask")
     row, column = torch.nonzero(measured, as_tuple=True)
     z = depth[measured]
-    k = intrinsics.to(depth)
     points = torch.stack([z * (column - k[0, 2]) / k[0, 0], z * (row - k[1, 2]) / k[1, 1], z], -1)
     viewpoint = torch.zeros(3, dtype=points.dtype, device=points.device)
     if camera_pose is not None:
@@ -64,12 +61,10 @@ def cloud_from_depth(
     return check_cloud(PointCloud(points, None, viewpoint))
 
 
-def check_intrinsics(intrinsics: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-    """Return the intrinsics of a pinhole camera; refuse others."""
-    k = check_tensor("intrinsics", intrinsics, (3, 3))
-    if not (k[0, 0] > 0 and k[1, 1] > 0) or k[0, 1] != 0 or k[1, 0] != 0 or k[2].tolist() != [0, 0, 1]:
-        raise BadArgument("intrinsics", k.tolist(), "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0")
-    return k
+def _describe(value: object) -> str:
+    """Return the type of an image, its shape and its dtype."""
+    shape, dtype = getattr(value, "shape", ()), getattr(value, "dtype", "no dtype")
+    return f"{type(value).__name__} of shape {tuple(shape)}, {dtype}"
 
 
 def check_rigid(name: str, pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:

@@ -14,23 +14,6 @@ from torchgrasp.cloud.orientation import NormalCheck, compare_normals, share_fac
 from torchgrasp.cloud.prepare import FACING, MAX_POINTS, clean_cloud
 from torchgrasp.values import PointCloud
 
-DENSITY_NEIGHBOURS = 8
-"""Neighbours whose disc gives the density: a raster's eight."""
-MANY_OUTLIERS = 0.05
-"""Share of outliers above which the object was cut out badly: rims alone give fewer."""
-SPARSE = 0.1
-"""Spacing over the longest side above which a shape is mostly guessed: ten points a side."""
-LARGE = 0.4
-"""Longest side [m] above which a cloud is hardly one object for a hand."""
-NOISY = 0.003
-"""Noise [m] above which normals are poor: the radius of 25 neighbours at 1 mm spacing."""
-FLAT = 1e-3
-"""Thickness over length below which a cloud is one face: below any camera's noise."""
-FLIPPED = 0.03
-"""Share of flipped normals worth advice: a few at edges are no harm."""
-TABLE_HEIGHT, TABLE_SHARE = 0.004, 0.2
-"""A table is a level layer of 4 mm, a camera's noise, that holds a fifth of the points."""
-
 
 @dataclasses.dataclass(frozen=True)
 class CloudReport(Value):
@@ -61,7 +44,7 @@ def diagnose_cloud(cloud: PointCloud) -> CloudReport:
     """
     distinct = remove_duplicates(cloud)
     points = distinct.points.double()
-    distance, _ = nearest(points, DENSITY_NEIGHBOURS + 1)
+    distance, _ = nearest(points, 9)  # the point itself and a raster's eight neighbours
     area = math.pi * distance[:, -1] ** 2  # of the disc that holds the neighbours
     check = None if distinct.normals is None else compare_normals(points, distinct.normals.double())
     if check is not None and not check.oriented:
@@ -71,10 +54,10 @@ def diagnose_cloud(cloud: PointCloud) -> CloudReport:
     judged = clean if distinct.normals is None else distinct
     viewpoint = clean.viewpoint if judged.viewpoint is None else judged.viewpoint
     assert judged.normals is not None
-    side = (points.amax(0) - points.amin(0)).tolist()
+    x, y, z = (points.amax(0) - points.amin(0)).tolist()
     report = CloudReport(
         points=len(cloud),
-        size=(side[0], side[1], side[2]),
+        size=(x, y, z),
         spacing=float(distance[:, 1].median()),
         density=float(((distance.shape[1] - 1) / area).median()),
         noise=float(fit_planes(points)[1].median()),
@@ -131,23 +114,19 @@ def _advise(report: CloudReport, clean: PointCloud) -> list[str]:
     away = oriented and given and report.facing < 1 - FACING
     assert clean.normals is not None
     z = clean.points[:, 2]
-    layer = float(((z < float(z.min()) + TABLE_HEIGHT) & (clean.normals[:, 2] > 0.9)).double().mean())
-    table = layer >= TABLE_SHARE and float(z.max() - z.min()) >= 2 * TABLE_HEIGHT
+    layer = float(((z < float(z.min()) + 0.004) & (clean.normals[:, 2] > 0.9)).double().mean())  # a camera's noise
+    table = layer >= 0.2 and float(z.max() - z.min()) >= 0.008
     thin = f"{MAX_POINTS} points are enough: voxel_downsample(cloud, {voxel:.2g}) keeps about as many"
+    sparse = f"{1e3 * report.spacing:.0f} mm between points: the shape is mostly guessed"
+    noisy = f"{1e3 * report.noise:.1f} mm of noise blur the normals: come closer, or average images"
     rules = [
-        (longest > LARGE, f"{longest:.2f} m is large for a hand: is it a whole scene? Cut the object out"),
+        (longest > 0.4, f"{longest:.2f} m is large for a hand: is it a whole scene? Cut the object out"),
         (report.points > 2 * MAX_POINTS, thin),
-        (outliers > MANY_OUTLIERS, f"{outliers:.0%} of the points are outliers: cut the object out more closely"),
-        (
-            report.spacing > SPARSE * longest,
-            f"{1e3 * report.spacing:.0f} mm between points: the shape is mostly guessed",
-        ),
-        (
-            report.noise > NOISY,
-            f"{1e3 * report.noise:.1f} mm of noise blur the normals: come closer, or average images",
-        ),
-        (thickness < FLAT * length, "all points lie in one plane: the thickness is a guess; show two sides"),
-        (oriented and flipped > FLIPPED, f"{flipped:.0%} of the normals look flipped: leave them out to fit new ones"),
+        (outliers > 0.05, f"{outliers:.0%} of the points are outliers: cut the object out more closely"),
+        (report.spacing > 0.1 * longest, sparse),
+        (report.noise > 0.003, noisy),  # [m], the radius of 25 neighbours at 1 mm spacing
+        (thickness < 1e-3 * length, "all points lie in one plane: the thickness is a guess; show two sides"),
+        (oriented and flipped > 0.03, f"{flipped:.0%} of the normals look flipped: leave them out to fit new ones"),
         (away, "the normals point away from the camera: turn them round, or leave them out"),
         (report.normals is not None and not oriented, "the signs of the normals are random: leave them out"),
         (report.viewpoint is not None and not given, "the camera's position is a guess: give it with --viewpoint"),

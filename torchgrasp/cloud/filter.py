@@ -2,24 +2,18 @@
 
 import torch
 
+from torchgrasp.base import check_number
 from torchgrasp.cloud.check import MIN_POINTS, check_cloud, first_of_each, remove_duplicates
 from torchgrasp.cloud.neighbours import find_inliers
-from torchgrasp.errors import BadArgument, TooFewPoints
+from torchgrasp.errors import TooFewPoints
 from torchgrasp.values import PointCloud
-
-MIN_VOXEL, MAX_VOXEL = 1e-5, 1.0
-"""Sides [m] of a voxel: below a sensor's resolution nothing is merged, above 1 m no object is left."""
 
 
 def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
-    """Return one point a voxel, the nearest to its centre.
+    """Return one point a voxel, the nearest to its centre, for voxels of a side [m] in [1e-5, 1].
 
     The grid starts at the cloud's lowest corner and moves with it. Points are not averaged, as a mean may lie
     inside a thin wall. Their order is kept.
-
-    Args:
-        cloud: points [m].
-        voxel: side of a voxel [m], in [1e-5, 1].
 
     Raises:
         BadArgument, SuspiciousScale: see `check_cloud`; a voxel outside its range.
@@ -29,8 +23,7 @@ def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
     True
     """
     cloud = check_cloud(cloud)
-    if not MIN_VOXEL <= voxel <= MAX_VOXEL:  # also refuses NaN
-        raise BadArgument("voxel", voxel, f"a side in [{MIN_VOXEL:g}, {MAX_VOXEL:g}] m")
+    check_number("voxel", voxel, 1e-5, 1.0)  # [m], from a sensor's resolution to the size of an object
     points = cloud.points.double()
     place = (points - points.amin(0)) / voxel
     cell = torch.floor(place)
@@ -43,9 +36,7 @@ def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
 
 
 def remove_outliers(cloud: PointCloud) -> PointCloud:
-    """Return a cloud without copies and outliers, such as flying pixels.
-
-    Outliers have a mean distance to 8 neighbours above 2.5 times the median.
+    """Return a cloud without copies and outliers: points 2.5 median distances from their 8 neighbours.
 
     Raises:
         BadArgument, SuspiciousScale: see `check_cloud`.

@@ -20,16 +20,15 @@ def merge_clouds(
 ) -> PointCloud:
     """Return several views in one frame, with normals and the camera of each point.
 
-    `estimate_normals` gives normals to a view without them. `fit_shape` uses each camera's outline and free space. A view with normals but without viewpoint leaves the result without viewpoint.
-    Overlaps stay twice as dense; `voxel_downsample` evens them.
+    `estimate_normals` gives normals to a view without them. A view with normals but without viewpoint leaves the
+    result without viewpoint. Overlaps stay twice as dense; `voxel_downsample` evens them.
 
     Args:
         clouds: points [m] of the views, each in its own frame.
         poses: obj_from_cloud of each view, rigid.
 
     Raises:
-        BadArgument: no cloud; another number of poses; a pose that is not rigid; clouds of different dtype or on
-            different devices; see also `check_cloud`.
+        BadArgument: no cloud; another number of poses; a pose that is not rigid; clouds of several dtypes or devices.
         TooFewPoints, SuspiciousScale: see `check_cloud`, for the views and for the result.
 
     >>> view = PointCloud(0.1 * torch.rand(90, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))
@@ -40,9 +39,8 @@ def merge_clouds(
         raise BadArgument("clouds", "none", "at least one PointCloud")
     if len(poses) != len(clouds):
         raise BadArgument("poses", f"{len(poses)} for {len(clouds)} clouds", "one pose a cloud")
-    for cloud in clouds:
+    for i, (cloud, pose) in enumerate(zip(clouds, poses, strict=True)):
         check_cloud(cloud)
-    for i, pose in enumerate(poses):
         check_rigid(f"poses[{i}]", pose)
     types = {(str(c.points.dtype), str(c.points.device)) for c in clouds}
     if len(types) > 1:
@@ -62,7 +60,7 @@ def _view_in_frame(cloud: PointCloud, obj_from_cloud: Float[Tensor, "4 4"]) -> P
     assert cloud.normals is not None
     pose, dtype = obj_from_cloud.to(cloud.points).double(), cloud.points.dtype
     points, normals = apply(pose, cloud.points.double()), rotate(pose, unit(cloud.normals.double()))
-    viewpoint = None if cloud.viewpoint is None else apply(pose, cloud.viewpoint.double().reshape(-1, 3)).to(dtype)
-    if viewpoint is not None and len(viewpoint) == 1:
-        viewpoint = viewpoint[0]
+    viewpoint = cloud.viewpoint
+    if viewpoint is not None:
+        viewpoint = apply(pose, viewpoint.double().reshape(-1, 3)).reshape(viewpoint.shape).to(dtype)
     return PointCloud(points.to(dtype), normals.to(dtype), viewpoint)

@@ -35,25 +35,17 @@ def find_inliers(points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
     return spacing <= OUTLIER_RATIO * spacing.median()
 
 
-def fit_planes(
-    points: Float[Tensor, "n 3"],
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
-    """Return normals of local planes, of unknown sign, and weighted rms [m].
-
-    The weights of 25 neighbours are exp(-(d / 0.7 d_25)^2).
-    """
+def fit_planes(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+    """Return normals of local planes, of unknown sign, and weighted rms [m]."""
     near, weight = _neighbourhood(points, PLANE_NEIGHBOURS)
     mean_squares, axes = _principal_axes(near, weight)
     return axes[..., 0], mean_squares[:, 0].clamp_min(0).sqrt()
 
 
-def fit_quadrics(
-    points: Float[Tensor, "n 3"],
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+def fit_quadrics(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"]]:
     """Return feet on local quadrics, unit normals there, and weighted rms [m].
 
-    Weighted least squares fit the height over the plane of 30 neighbours. Planes would move points of a ball of
-    radius r inward by s^2 / 2r, where s is the neighbours' spread.
+    Planes would move points of a ball of radius r inward by s^2 / 2r, where s is the neighbours' spread.
     """
     near, weight = _neighbourhood(points, QUADRIC_NEIGHBOURS)
     _, axes = _principal_axes(near, weight)
@@ -72,7 +64,7 @@ def fit_quadrics(
 
 
 def _neighbourhood(points: Float[Tensor, "n 3"], k: int) -> tuple[Float[Tensor, "n k 3"], Float[Tensor, "n k"]]:
-    """Return the k nearest points and their normalised weights."""
+    """Return the k nearest points and their weights exp(-(d / 0.7 d_k)^2), normalised."""
     distance, index = nearest(points, k)
     weight = torch.exp(-((distance / (0.7 * distance[:, -1:])) ** 2))
     return points[index], weight / weight.sum(-1, keepdim=True)
@@ -83,6 +75,4 @@ def _principal_axes(
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     """Return mean squares along the principal axes, ascending, and the axes as columns."""
     difference = near - (weight[..., None] * near).sum(1)[:, None]
-    scatter = (weight[..., None] * difference).transpose(-1, -2) @ difference
-    mean_squares, axes = torch.linalg.eigh(scatter)
-    return mean_squares, axes
+    return torch.linalg.eigh((weight[..., None] * difference).transpose(-1, -2) @ difference)

@@ -14,39 +14,24 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import fibonacci_sphere, unit
 from torchgrasp.values import PointCloud
 
-N_NEIGHBOURS = 8
-"""Neighbours that a normal is compared with: enough for a majority."""
 MIN_COSINE = 0.7
 """Least |cosine| of normals that are compared, 45 degrees: across an edge signs say nothing."""
 MAX_HEIGHT = 0.3
 """Greatest height over the tangent plane, per distance: beyond may be the other side of a thin wall."""
 MAX_OPPOSED = 0.35
 """Share of opposite pairs that means random signs: these give .5, 10 % of flips .18."""
-MIN_PAIRS = 20
-"""Fewest pairs that can tell random signs: with fewer a share of .35 may be chance."""
-UNIT_TOLERANCE = 1e-3
-"""Deviation of a unit normal's length: text files round to three digits."""
-N_DIRECTIONS = 400
-"""Directions tried for an unknown viewpoint: about 10 degrees apart."""
 SOFTNESS = 0.3
 """Cosine over which a normal's vote changes sides: normals near the rim count little."""
 
 
 @dataclasses.dataclass(frozen=True)
 class NormalCheck(Value):
-    """What given normals are worth.
+    """What given normals are worth."""
 
-    Args:
-        flipped: which normals oppose most of their neighbours'.
-        opposed: share of opposite normals among pairs of neighbours.
-        oriented: whether the signs can be trusted.
-        scaled: number of normals that are not of unit length; their users normalise them.
-    """
-
-    flipped: Bool[Tensor, "n"]
-    opposed: float
-    oriented: bool
-    scaled: int
+    flipped: Bool[Tensor, "n"]  # which normals oppose most of their neighbours'
+    opposed: float  # share of opposite normals among pairs of neighbours
+    oriented: bool  # whether the signs can be trusted
+    scaled: int  # number of normals not of unit length; their users normalise them
 
 
 def check_normals(cloud: PointCloud) -> NormalCheck:
@@ -60,28 +45,24 @@ def check_normals(cloud: PointCloud) -> NormalCheck:
     >>> check_normals(PointCloud(0.05 * ball, ball)).oriented
     True
     """
-    cloud = check_cloud(cloud)
-    if cloud.normals is None:
+    if check_cloud(cloud).normals is None:
         raise BadArgument("cloud", "no normals", "a cloud with normals")
     return compare_normals(cloud.points.double(), cloud.normals.double())
 
 
 def compare_normals(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> NormalCheck:
     """Compare the normals of neighbouring points."""
-    distance, index = nearest(points, N_NEIGHBOURS + 1)
+    distance, index = nearest(points, 9)  # the point itself and eight neighbours: enough for a majority
     directions = unit(normals)
     cosine = (directions[:, None] * directions[index[:, 1:]]).sum(-1)
     height = ((points[index[:, 1:]] - points[:, None]) * directions[:, None]).sum(-1).abs()
     compared = (cosine.abs() > MIN_COSINE) & (height <= MAX_HEIGHT * distance[:, 1:])
     against = compared & (cosine < 0)
     pairs = int(compared.sum())
-    opposed = int(against.sum()) / pairs if pairs >= MIN_PAIRS else 0.0
-    return NormalCheck(
-        flipped=2 * against.sum(-1) > compared.sum(-1),
-        opposed=opposed,
-        oriented=opposed < MAX_OPPOSED,
-        scaled=int(((torch.linalg.vector_norm(normals, dim=-1) - 1).abs() > UNIT_TOLERANCE).sum()),
-    )
+    opposed = int(against.sum()) / pairs if pairs >= 20 else 0.0  # of fewer pairs any share may be chance
+    scaled = (torch.linalg.vector_norm(normals, dim=-1) - 1).abs() > 1e-3  # text files round to three digits
+    flipped = 2 * against.sum(-1) > compared.sum(-1)
+    return NormalCheck(flipped, opposed, oriented=opposed < MAX_OPPOSED, scaled=int(scaled.sum()))
 
 
 def estimate_viewpoint(cloud: PointCloud) -> Float[Tensor, "3"]:
@@ -89,10 +70,8 @@ def estimate_viewpoint(cloud: PointCloud) -> Float[Tensor, "3"]:
 
     Normals of a view face the camera, and objects bulge. The direction v maximises sum_i w_i tanh(n_i.v / 0.3),
     where w_i = n_i.(p_i - centre) makes the sign of n_i irrelevant. The centre is that of the principal box. The
-    camera is 4 radii away.
-
-    The origin is preferred if it scores 0.8 of the best and the cloud looks like one in its camera's frame. Such a
-    cloud lies within 45 degrees of z, more than 2 radii away.
+    camera is 4 radii away. The origin is preferred if it scores 0.8 of the best and the cloud looks like one in its
+    camera's frame: within 45 degrees of z, more than 2 radii away.
 
     The sides of a flat face or a bowl look alike: give a known viewpoint.
 
@@ -113,7 +92,7 @@ def guess_viewpoint(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"])
     centre = (along.amax(0) + along.amin(0)) / 2 @ axes
     radius = torch.linalg.vector_norm(points - centre, dim=-1).max()
     bulge = (normals * (points - centre)).sum(-1)
-    directions = fibonacci_sphere(N_DIRECTIONS).to(points)
+    directions = fibonacci_sphere(400).to(points)  # about 10 degrees apart
     away = torch.linalg.vector_norm(centre)
     origin = -centre / away.clamp_min(1e-300)
     pieces = torch.cat([directions, origin[None]]).split(64)  # bounds the memory for whole depth images

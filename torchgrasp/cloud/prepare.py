@@ -26,18 +26,12 @@ MAX_VIEWS, MIN_VIEW_POINTS = 16, 10
 
 @dataclasses.dataclass(frozen=True)
 class PreparedCloud(Value):
-    """A cloud that `prepare_cloud` has checked: later stages check nothing.
+    """A cloud that `prepare_cloud` has checked: later stages check nothing."""
 
-    Args:
-        cloud: distinct points [m] with outward normals, in the given dtype.
-        points, normals: at most 2000 of them, in float64 and of unit length.
-        viewpoint: the camera [m] of all `points`, or of each; None: unknown.
-    """
-
-    cloud: PointCloud
-    points: Float[Tensor, "n 3"]
-    normals: Float[Tensor, "n 3"]
-    viewpoint: Float[Tensor, "*views 3"] | None
+    cloud: PointCloud  # distinct points [m] with outward normals, in the given dtype
+    points: Float[Tensor, "n 3"]  # at most 2000 of them, in float64
+    normals: Float[Tensor, "n 3"]  # theirs, of unit length
+    viewpoint: Float[Tensor, "*views 3"] | None  # the camera [m] of all `points`, or of each; None: unknown
 
     @property
     def one_sided(self) -> bool:
@@ -88,8 +82,7 @@ def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = T
 def estimate_normals(cloud: PointCloud) -> PointCloud:
     """Return a cloud without copies, with outward normals of local quadrics.
 
-    Outward is towards the viewpoint, or else the side of given normals. A single view without both
-    gets the viewpoint of `estimate_viewpoint`.
+    Outward is towards the viewpoint (by default that of `estimate_viewpoint`), or else the side of given normals.
 
     Raises:
         BadArgument, TooFewPoints, SuspiciousScale: see `check_cloud`.
@@ -101,10 +94,9 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
 
 
 def clean_cloud(cloud: PointCloud) -> PointCloud:
-    """Return the inliers, on their local quadrics, with outward normals.
+    """Return the points without outliers, on their local quadrics, with outward normals.
 
-    Outliers are those of `remove_outliers`, and points over 4.5 median rms from their quadric. The noise of a
-    simulated camera falls from 0.94 to 0.65 mm rms.
+    Besides the outliers of `remove_outliers` go points over 4.5 median rms from their quadric.
 
     Raises:
         BadArgument, SuspiciousScale: see `check_cloud`.

@@ -32,7 +32,6 @@ def parse_pcd(data: bytes) -> dict[str, Any]:
         raise ValueError(f"{count} points, not up to {MAX_POINTS}")
     encoding = header["DATA"][0].lower()
     wanted = ("x", "y", "z", "normal_x", "normal_y", "normal_z")
-    columns: dict[str, np.ndarray] = {}
     if encoding == "ascii":
         table = read_table(body, count, sum(counts))
         starts = np.cumsum([0, *counts[:-1]])
@@ -42,8 +41,6 @@ def parse_pcd(data: bytes) -> dict[str, Any]:
         # Padding fields are all called "_": columns go by number.
         formats = [f"({c},)<{letters[k.upper()]}{int(s)}" for k, s, c in zip(kinds, sizes, counts, strict=True)]
         dtype = np.dtype({"names": [str(i) for i in range(len(names))], "formats": formats})
-        if count * dtype.itemsize > len(body):
-            raise ValueError(f"{len(body)} bytes, fewer than {count} points have")
         rows = np.frombuffer(body, dtype=dtype, count=count)
         columns = {name: rows[f"{i}"][:, 0].astype(np.float64) for i, name in enumerate(names) if name in wanted}
     else:

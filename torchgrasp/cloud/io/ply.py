@@ -95,8 +95,6 @@ def _read_columns(body: bytes, encoding: str, count: int, properties: list[tuple
         return {name: table[:, i] for i, name in enumerate(names)}
     order = "<" if encoding == "binary_little_endian" else ">"
     dtype = np.dtype([(name, order + kind) for name, kind in properties])
-    if count * dtype.itemsize > len(body):
-        raise ValueError(f"{len(body)} bytes, fewer than {count} vertices have")
     table = np.frombuffer(body, dtype=dtype, count=count)
     return {name: table[name] for name in names}
 

@@ -1,6 +1,7 @@
 """Point clouds from and to files. A malformed file is refused by name; none runs code."""
 
 import io
+import math
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgrasp.base import check_tensor
+from torchgrasp.base import check_tensor, named_tensors
 from torchgrasp.cloud.check import MIN_POINTS, check_cloud
 from torchgrasp.cloud.io.pcd import parse_pcd
 from torchgrasp.cloud.io.ply import format_ply, parse_ply
@@ -26,8 +27,8 @@ MAX_BYTES = 512 * 2**20
 def read_cloud(path: Path | str, viewpoint: Sequence[float | int] | Tensor | None = None) -> PointCloud:
     """Read the point cloud of one object, in metres and float64.
 
-    * `.ply`, ascii or binary: x y z, optionally nx ny nz; the viewpoint from a header line
-      `comment viewpoint x y z`. A mesh gives 2000 surface points, with normals if closed.
+    * `.ply`, ascii or binary: x y z, optionally nx ny nz; the viewpoint from a header line `comment viewpoint x y z`.
+      A mesh gives 2000 surface points, with normals if closed.
     * `.pcd`, ascii or binary: x y z, optionally normal_x normal_y normal_z; the viewpoint from VIEWPOINT, unless it
       is the default `0 0 0 1 0 0 0` and within the cloud's bounding box.
     * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3) and `viewpoint` (3,), or (n, 3) of several views.
@@ -47,7 +48,12 @@ def read_cloud(path: Path | str, viewpoint: Sequence[float | int] | Tensor | Non
     Traceback (most recent call last):
     torchgrasp.errors.CloudFileError: path: found scan.docx, allowed is a file ending in .ply, .pcd, .npz, .npy, .xyz
     """
-    position = None if viewpoint is None else _check_viewpoint(viewpoint)
+    try:
+        position = None if viewpoint is None else torch.as_tensor(viewpoint, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise BadArgument("viewpoint", repr(viewpoint), "three numbers [m]") from error
+    if position is not None:
+        check_tensor("viewpoint", position, (3,))
     path = Path(path)
     suffix = path.suffix.lower()
     parsers = {
@@ -87,8 +93,7 @@ def save_cloud(cloud: PointCloud, path: Path | str) -> Path:
     torchgrasp.errors.BadArgument: path: found cloud.txt, allowed is a file ending in .npz or .ply
     """
     path, buffer = Path(path), io.BytesIO()
-    fields = {"points": cloud.points, "normals": cloud.normals, "viewpoint": cloud.viewpoint}
-    arrays = {name: value.detach().cpu().numpy() for name, value in fields.items() if value is not None}
+    arrays = {name: tensor.detach().cpu().numpy() for name, tensor in named_tensors(cloud).items()}
     if path.suffix.lower() not in (".npz", ".ply"):
         raise BadArgument("path", path, "a file ending in .npz or .ply")
     if path.suffix.lower() == ".npz":
@@ -99,22 +104,12 @@ def save_cloud(cloud: PointCloud, path: Path | str) -> Path:
     return write_file(path, format_ply(**arrays))
 
 
-def _check_viewpoint(viewpoint: Any) -> Tensor:
-    """Return three finite numbers in float64; refuse others."""
-    try:
-        position = torch.as_tensor(viewpoint, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise BadArgument("viewpoint", repr(viewpoint), "three numbers [m]") from error
-    return check_tensor("viewpoint", position, (3,))
-
-
 def _check_array(path: Path, name: str, array: Any) -> Tensor:
     """Return an array as float64, or refuse its file."""
     array = np.asarray(array)
-    shape = (3,) if name == "viewpoint" and array.ndim == 1 else (None, 3)
     if array.dtype.kind not in "fiu":
         raise CloudFileError("path", f"{path}: {name} of type {array.dtype}", "real numbers")
-    if len(array.shape) != len(shape) or array.shape[-1] != 3:
+    if array.ndim not in ((1, 2) if name == "viewpoint" else (2,)) or array.shape[-1] != 3:
         raise CloudFileError("path", f"{path}: {name} of shape {array.shape}", "(n, 3), or (3,) for one viewpoint")
     if len(array) > MAX_POINTS:
         raise CloudFileError("path", f"{path} with {len(array)} points", f"at most {MAX_POINTS} points")
@@ -139,10 +134,7 @@ def _array_from_npy(data: bytes) -> np.ndarray:
         raise ValueError(f"version {version} of the npy format")
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = read(stream)
-    promised = dtype.itemsize
-    for side in shape:  # Python integers do not overflow
-        promised *= int(side)
-    if dtype.hasobject or promised > len(data):
+    if dtype.hasobject or dtype.itemsize * math.prod(shape) > len(data):
         raise ValueError(f"an array of shape {shape} and type {dtype}, which the file cannot hold")
     stream.seek(0)
     return np.lib.format.read_array(stream, allow_pickle=False)
