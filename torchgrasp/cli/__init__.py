@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 import torch
 import tyro
 
+from torchgrasp import __version__
 from torchgrasp.cli import clouds, grasps, hands, shapes
 from torchgrasp.cli.evaluate import evaluate
 from torchgrasp.cli.export import export
@@ -29,15 +30,12 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "hand sample": hands.sample,
     "shape surface": shapes.surface,
 }
-"""The commands by name."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return its exit code. Errors end as one sentence on stderr."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given == ["--version"]:
-        from torchgrasp import __version__
-
         print(f"torchgrasp {__version__}")
         return 0
     # The batches are small: a second thread costs more than it brings, and one gives the same bits on any machine.

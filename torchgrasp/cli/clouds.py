@@ -3,20 +3,17 @@
 from pathlib import Path
 from typing import Annotated
 
-import tyro
+from tyro.conf import Positional, arg
 
 from torchgrasp.cli.common import check_seed, naming, read_view
 from torchgrasp.cloud import diagnose_cloud, format_report, look_at, partial_view, save_cloud
-from torchgrasp.errors import BadArgument
 from torchgrasp.mesh import read_mesh
 
 
 def check(
-    cloud: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")],
-    /,
-    viewpoint: tuple[float, float, float] | None = None,
+    cloud: Annotated[Positional[Path], arg(metavar="FILE")], /, viewpoint: tuple[float, float, float] | None = None
 ) -> int:
-    """Report what a point cloud is like, and what would improve it.
+    """Report on a point cloud, with advice for a better one.
 
     Args:
         cloud: point cloud of one object in metres, z up (.ply, .pcd, .npy, .npz, .xyz).
@@ -28,7 +25,7 @@ def check(
 
 
 def render(
-    mesh: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MESH")],
+    mesh: Annotated[Positional[Path], arg(metavar="MESH")],
     /,
     out: Path,
     azimuth: float = 30.0,
@@ -51,8 +48,6 @@ def render(
         seed: of the noise and of the choice of points.
     """
     check_seed(seed)
-    if out.suffix.lower() not in (".npz", ".ply"):
-        raise BadArgument("--out", out, "a file ending in .npz or .ply")
     angles = {name: f"--{name}" for name in ("azimuth", "elevation", "distance")}
     with naming(**angles, n="--points", points="MESH", depth="MESH", mesh="MESH"):
         solid = read_mesh(mesh)

@@ -5,6 +5,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from torchgrasp.base import check_whole
 from torchgrasp.cloud.io.read import read_cloud
 from torchgrasp.errors import BadArgument, OutputError
 from torchgrasp.values import PointCloud
@@ -12,7 +13,7 @@ from torchgrasp.values import PointCloud
 
 @contextlib.contextmanager
 def naming(**options: str) -> Iterator[None]:
-    """Name the options in errors about the arguments."""
+    """Name options in errors, by the argument that each stands for."""
     try:
         yield
     except BadArgument as error:
@@ -28,7 +29,7 @@ def read_view(option: str, path: Path, viewpoint: tuple[float, float, float] | N
 
 
 def check_folder(path: Path) -> None:
-    """Refuse a folder that cannot be made or written, by a trial."""
+    """Refuse a folder that cannot be written, by a trial."""
     made: list[Path] = []
     try:
         for folder in reversed([path, *path.parents]):
@@ -46,8 +47,7 @@ def check_folder(path: Path) -> None:
 
 def check_seed(seed: int) -> None:
     """Refuse a seed that no generator takes."""
-    if not 0 <= seed < 2**63:
-        raise BadArgument("--seed", seed, "an integer in [0, 2^63)")
+    check_whole("--seed", seed, 0, 2**63 - 1)
 
 
 def table_height(cloud: PointCloud, table: float | None, no_table: bool) -> float | None:

@@ -104,12 +104,7 @@ def print_summary(protocol: str, summary: dict[str, Any]) -> None:
     for stage, reasons in summary["failures"].items():
         rows.append((f"failed in {stage}", ", ".join(f"{n} {name.lower()}" for name, n in reasons.items())))
     print(f"\n{protocol}\n{format_columns(rows, left={0, 1})}")
-    force, overlap, most = (_number(summary[key]) for key in ("force_n", "overlap_mm", "overlap_mm_max"))
+    means = [summary[key] for key in ("force_n", "overlap_mm", "overlap_mm_max", "plan_cpu_s", "trial_cpu_s", "cpu_s")]
+    force, overlap, most, plan, trial, total = ("-" if mean is None else f"{mean:.2f}" for mean in means)
     print(f"mean normal force of a finger {force} N, overlap at the grasp {overlap} mm (most {most} mm)")
-    plan, trial = _number(summary["plan_cpu_s"]), _number(summary["trial_cpu_s"])
-    print(f"CPU time {plan} s to plan on a view, {trial} s for an attempt, {_number(summary['cpu_s'])} s in all")
-
-
-def _number(value: float | None) -> str:
-    """Return a number with two decimals, or a dash for none."""
-    return "-" if value is None else f"{value:.2f}"
+    print(f"CPU time {plan} s to plan on a view, {trial} s for an attempt, {total} s in all")

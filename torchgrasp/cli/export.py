@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
+from tyro.conf import Positional, arg
 
 from torchgrasp.base import check_whole
 from torchgrasp.cli.common import naming
@@ -15,7 +15,7 @@ from torchgrasp.values import load_grasps
 
 
 def export(
-    grasps: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="GRASPS")],
+    grasps: Annotated[Positional[Path], arg(metavar="GRASPS")],
     /,
     out: Path,
     format: Literal["json", "mujoco"] = "json",

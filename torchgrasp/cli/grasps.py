@@ -9,8 +9,8 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
 from tqdm import tqdm
+from tyro.conf import Positional, arg
 
 from torchgrasp.base import check_whole
 from torchgrasp.cli.common import check_folder, check_seed, naming, read_view, table_height
@@ -32,14 +32,14 @@ if TYPE_CHECKING:
 
 
 def objects() -> int:
-    """List the objects that come with torchgrasp, with a noisy view and a true mesh."""
+    """List the shipped objects, each with a noisy view and a true mesh."""
     for name in list_objects():
         print(f"{name} ({MASSES[name]:g} kg)\n  view: {DATA / name / 'view.ply'}\n  mesh: {DATA / name / 'mesh.ply'}")
     return 0
 
 
 def grasp(
-    cloud: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CLOUD")],
+    cloud: Annotated[Positional[Path], arg(metavar="CLOUD")],
     /,
     hand: str,
     out: Path,
@@ -73,9 +73,9 @@ def grasp(
     """
     with naming(path="--out"):
         check_folder(out)
-    if close and mesh is None:
-        raise BadArgument("--close", "no --mesh", "--close together with --mesh")
     if close:
+        if mesh is None:
+            raise BadArgument("--close", "no --mesh", "--close together with --mesh")
         import_simulator()
     check_whole("--starts", starts, 1, 1_000_000)
     check_seed(seed)
@@ -114,7 +114,7 @@ def grasp(
 
 
 def import_simulator(name: Simulator = "sapien") -> None:
-    """Import a simulator; refuse one that is not installed or cannot be loaded."""
+    """Import a simulator; refuse one that cannot be loaded."""
     if importlib.util.find_spec(name) is None:
         raise MissingExtra(name, "sim" if name == "sapien" else name)
     try:
@@ -127,7 +127,7 @@ def import_simulator(name: Simulator = "sapien") -> None:
 
 
 def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] | None]":
-    """Read a closed mesh; an object of torchgrasp comes with its convex parts."""
+    """Read a closed mesh, with the convex parts of a shipped object."""
     mesh, digest = read_mesh(path), sha256(path)
     for name in list_objects():
         if sha256(DATA / name / "mesh.ply") == digest:

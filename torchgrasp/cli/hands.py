@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Annotated
 
 import torch
-import tyro
 from tqdm import tqdm
+from tyro.conf import Positional, arg
 
 from torchgrasp.cli.common import check_folder, check_seed, naming
 from torchgrasp.errors import BadArgument, GraspError, OutputError
@@ -21,7 +21,7 @@ from torchgrasp.testing import check_hand, find_faults, random_joints
 
 
 def new(
-    urdf: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="URDF")],
+    urdf: Annotated[Positional[Path], arg(metavar="URDF")],
     /,
     tips: tuple[str, ...] = (),
     name: str | None = None,
@@ -48,12 +48,9 @@ def new(
 
 
 def check(
-    hand: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="HAND")],
-    /,
-    fingers: str = "default",
-    out: Path = Path("hand.png"),
+    hand: Annotated[Positional[str], arg(metavar="HAND")], /, fingers: str = "default", out: Path = Path("hand.png")
 ) -> int:
-    """Name every fault of a hand; describe and draw a sound one.
+    """Name every fault of a hand; draw a sound one.
 
     Args:
         hand: name of a shipped hand, or the folder of another.
@@ -78,7 +75,7 @@ def check(
 
 def describe(hand: Hand, joints: torch.Tensor) -> str:
     """Describe a hand: its joints, its fingers, and its random postures `joints` (n, h) [rad]."""
-    actuated, tips = hand.actuated, hand.tips
+    tips = hand.tips
     lines = [f"{hand.name}, option {hand.source.option}: {hand.dof} actuated of {len(hand.tree.joint_names)} joints"]
     for name, low, high in zip(hand.joint_names, hand.lower.rad2deg(), hand.upper.rad2deg(), strict=True):
         lines.append(f"  {name:24} {low:7.1f} to {high:6.1f} degrees")
@@ -86,9 +83,8 @@ def describe(hand: Hand, joints: torch.Tensor) -> str:
         radius = float(tips.radius[k])
         tip = f"a sphere of {1e3 * radius:.1f} mm" if radius else "a point"
         contact, normal = (", ".join(f"{x:.4g}" for x in v[k].tolist()) for v in (tips.contact, tips.normal))
-        lines.append(f"finger {finger}: {tip} on {tips.links[k]}")
-        lines.append(f"  contact [{contact}] m, normal [{normal}]")
-    for name, row, offset in zip(hand.tree.joint_names, actuated.coupling, actuated.offset, strict=True):
+        lines += [f"finger {finger}: {tip} on {tips.links[k]}", f"  contact [{contact}] m, normal [{normal}]"]
+    for name, row, offset in zip(hand.tree.joint_names, hand.actuated.coupling, hand.actuated.offset, strict=True):
         source = int(row.abs().argmax())
         if not row[source]:
             lines.append(f"joint {name} is parked at {offset:.4g}")
@@ -107,7 +103,7 @@ def describe(hand: Hand, joints: torch.Tensor) -> str:
 def sample(
     hand: str,
     out: Path,
-    n: int = 1_000_000,
+    n: int = 10**6,
     fingers: str = "default",
     sampling: Sampling = "uniform",
     workers: int = 1,
@@ -137,7 +133,7 @@ def sample(
 
 
 def _print_faults(hand: str | Path, fingers: str) -> int:
-    """Print every fault of a hand's files; return the exit code, 0 or 2."""
+    """Print every fault of a hand; return the exit code."""
     try:
         faults: list[GraspError] = list(find_faults(hand, fingers))
     except BadArgument as error:

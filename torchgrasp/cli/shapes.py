@@ -3,22 +3,24 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
+from tyro.conf import Positional, arg
 
 from torchgrasp.cli.common import check_seed, naming, read_view, table_height
 from torchgrasp.export import check_surface_path, largest_std, save_surface
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import extract_surface
 
+Support = Literal["camera", "paper"]
+
 
 def surface(
-    cloud: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CLOUD")],
+    cloud: Annotated[Positional[Path], arg(metavar="CLOUD")],
     /,
     out: Path,
     viewpoint: tuple[float, float, float] | None = None,
     table: float | None = None,
     no_table: bool = False,
-    support: Literal["camera", "paper"] = "camera",
+    support: Support = "camera",
     resolution: int = 64,
     seed: int = 0,
 ) -> int:

@@ -24,8 +24,6 @@ FOCAL = 616.0
 """Focal length [px] of the default camera: a horizontal view of 55 degrees."""
 INTRINSICS = torch.tensor([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]], dtype=torch.float64)
 """Intrinsics [px] of the default camera."""
-BASELINE = 0.055
-"""Distance [m] between the eyes of the modelled stereo camera, as of common ones."""
 
 
 def look_at(
@@ -149,8 +147,9 @@ def _add_noise(
     normal = partial(torch.randn, depth.shape, generator=generator, dtype=torch.float64)
     uniform = partial(torch.rand, depth.shape, generator=generator, dtype=torch.float64)
     measured = depth > 0
-    disparity = FOCAL * BASELINE / torch.where(measured, depth, 1.0) + 0.12 * normal()
-    noisy = FOCAL * BASELINE / (torch.round(32 * disparity) / 32).clamp_min(1 / 32)
+    scale = FOCAL * 0.055  # [px m], of a stereo camera whose eyes are 55 mm apart
+    disparity = scale / torch.where(measured, depth, 1.0) + 0.12 * normal()
+    noisy = scale / (torch.round(32 * disparity) / 32).clamp_min(1 / 32)
     smooth = torch.from_numpy(gaussian_filter(normal().numpy(), 12.0))
     noisy = noisy + 0.0008 * smooth / smooth.std()
     # A rim pixel has, within two pixels, background or a surface more than 10 mm away.

@@ -14,10 +14,6 @@ MIN_EXTENT, MAX_EXTENT = 0.005, 2.0
 """Longest side [m] of an object's bounding box: smaller is no object for a hand, larger is a scene or not in metres."""
 MIN_POINTS = 4
 """Fewest distinct points: a quadric or a posterior of fewer says nothing."""
-SAME_POINT = 1e-9
-"""Distance of coincident points, as a share of the extent: above rounding, below any sensor's resolution."""
-LINE_RATIO = 1e-6
-"""Ratio of the second to the first singular value below which the points lie on a line and have no normals."""
 
 
 def check_cloud(cloud: PointCloud) -> PointCloud:
@@ -68,7 +64,7 @@ def remove_duplicates(cloud: PointCloud) -> PointCloud:
     if len(rows) < MIN_POINTS:
         raise TooFewPoints("points", f"{len(rows)} distinct points", f"at least {MIN_POINTS} distinct points")
     spread = torch.linalg.svdvals((points - points.mean(0)).double())
-    if float(spread[1]) < LINE_RATIO * float(spread[0]):
+    if float(spread[1]) < 1e-6 * float(spread[0]):
         raise BadArgument("points", f"{len(points)} points on one line", "points of a surface")
     return cloud if len(rows) == len(cloud) else cloud.select(rows)
 
@@ -79,7 +75,7 @@ def _distinct_rows(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:
 
     points = points.detach().double()
     low = points.amin(0)
-    tolerance = SAME_POINT * float((points.amax(0) - low).max())
+    tolerance = 1e-9 * float((points.amax(0) - low).max())  # above rounding, below any sensor's resolution
     # Points that share a cell of half the tolerance coincide: one point a cell leaves few pairs among many copies.
     _, group = torch.unique(torch.floor((points - low) / (tolerance / 2)), dim=0, return_inverse=True)
     rows = first_of_each(group).sort().values

@@ -36,7 +36,9 @@ def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
 
 
 def remove_outliers(cloud: PointCloud) -> PointCloud:
-    """Return a cloud without copies and outliers: points 2.5 median distances from their 8 neighbours.
+    """Return a cloud without copies and outliers, such as flying pixels.
+
+    Outliers have a mean distance to 8 neighbours above 2.5 times the median.
 
     Raises:
         BadArgument, SuspiciousScale: see `check_cloud`.

@@ -7,17 +7,6 @@ from torch import Tensor
 
 from torchgrasp.linalg import unit
 
-OUTLIER_NEIGHBOURS = 8
-"""Neighbours whose mean distance marks an outlier: more than the few pixels that fly off a rim together."""
-OUTLIER_RATIO = 2.5
-"""Ratio of that distance to the median one: real views, whose spacing varies with depth and slope, stay below."""
-PLANE_NEIGHBOURS = 25
-"""Neighbours, the point itself included, that fix a local plane: about eight for each of its three unknowns."""
-QUADRIC_NEIGHBOURS = 30
-"""Neighbours that fix a local quadric: five for each of its six unknowns."""
-FLATNESS = 1e-3
-"""Weight of a flat quadric against the points, whose spread counts as 1: it decides only where points are few."""
-
 
 def nearest(points: Float[Tensor, "n 3"], k: int) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
     """Return distances and indices of the k nearest points, itself first. A small cloud has fewer."""
@@ -30,14 +19,14 @@ def nearest(points: Float[Tensor, "n 3"], k: int) -> tuple[Float[Tensor, "n k"],
 
 def find_inliers(points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
     """Tell which points are no outliers; see `remove_outliers`."""
-    distance, _ = nearest(points, OUTLIER_NEIGHBOURS + 1)
+    distance, _ = nearest(points, 9)  # itself and eight, more than the few pixels that fly off a rim together
     spacing = distance[:, 1:].mean(-1)
-    return spacing <= OUTLIER_RATIO * spacing.median()
+    return spacing <= 2.5 * spacing.median()  # real views, whose spacing varies with depth and slope, stay below
 
 
 def fit_planes(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
     """Return normals of local planes, of unknown sign, and weighted rms [m]."""
-    near, weight = _neighbourhood(points, PLANE_NEIGHBOURS)
+    near, weight = _neighbourhood(points, 25)  # about eight for each of a plane's three unknowns
     mean_squares, axes = _principal_axes(near, weight)
     return axes[..., 0], mean_squares[:, 0].clamp_min(0).sqrt()
 
@@ -47,14 +36,14 @@ def fit_quadrics(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Fl
 
     Planes would move points of a ball of radius r inward by s^2 / 2r, where s is the neighbours' spread.
     """
-    near, weight = _neighbourhood(points, QUADRIC_NEIGHBOURS)
+    near, weight = _neighbourhood(points, 30)  # five for each of a quadric's six unknowns
     _, axes = _principal_axes(near, weight)
     height, u, v = ((near - points[:, None]) @ axes).unbind(-1)
     size = torch.stack([u, v], -1).norm(dim=-1).amax(-1, keepdim=True)
     u, v = u / size, v / size
     terms = torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v], -1)
     weighted = weight[..., None] * terms
-    flat = FLATNESS * torch.tensor([0.0, 1.0, 1.0, 1.0, 1.0, 1.0]).to(points)
+    flat = 1e-3 * torch.tensor([0.0, 1.0, 1.0, 1.0, 1.0, 1.0]).to(points)  # decides only where points are few
     moments = weighted.transpose(-1, -2) @ terms + torch.diag_embed(flat)
     quadric = torch.linalg.solve(moments, (weighted * height[..., None]).sum(-2))
     residual = height - (terms * quadric[:, None]).sum(-1)

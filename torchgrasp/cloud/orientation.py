@@ -14,14 +14,8 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import fibonacci_sphere, unit
 from torchgrasp.values import PointCloud
 
-MIN_COSINE = 0.7
-"""Least |cosine| of normals that are compared, 45 degrees: across an edge signs say nothing."""
-MAX_HEIGHT = 0.3
-"""Greatest height over the tangent plane, per distance: beyond may be the other side of a thin wall."""
 MAX_OPPOSED = 0.35
 """Share of opposite pairs that means random signs: these give .5, 10 % of flips .18."""
-SOFTNESS = 0.3
-"""Cosine over which a normal's vote changes sides: normals near the rim count little."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,9 +39,10 @@ def check_normals(cloud: PointCloud) -> NormalCheck:
     >>> check_normals(PointCloud(0.05 * ball, ball)).oriented
     True
     """
-    if check_cloud(cloud).normals is None:
+    normals = check_cloud(cloud).normals
+    if normals is None:
         raise BadArgument("cloud", "no normals", "a cloud with normals")
-    return compare_normals(cloud.points.double(), cloud.normals.double())
+    return compare_normals(cloud.points.double(), normals.double())
 
 
 def compare_normals(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> NormalCheck:
@@ -56,7 +51,8 @@ def compare_normals(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"])
     directions = unit(normals)
     cosine = (directions[:, None] * directions[index[:, 1:]]).sum(-1)
     height = ((points[index[:, 1:]] - points[:, None]) * directions[:, None]).sum(-1).abs()
-    compared = (cosine.abs() > MIN_COSINE) & (height <= MAX_HEIGHT * distance[:, 1:])
+    # Across an edge of 45 degrees signs say nothing; a point far over the tangent plane may be behind a thin wall.
+    compared = (cosine.abs() > 0.7) & (height <= 0.3 * distance[:, 1:])
     against = compared & (cosine < 0)
     pairs = int(compared.sum())
     opposed = int(against.sum()) / pairs if pairs >= 20 else 0.0  # of fewer pairs any share may be chance
@@ -96,7 +92,7 @@ def guess_viewpoint(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"])
     away = torch.linalg.vector_norm(centre)
     origin = -centre / away.clamp_min(1e-300)
     pieces = torch.cat([directions, origin[None]]).split(64)  # bounds the memory for whole depth images
-    score = torch.cat([(bulge[:, None] * torch.tanh(normals @ piece.T / SOFTNESS)).mean(0) for piece in pieces])
+    score = torch.cat([(bulge[:, None] * torch.tanh(normals @ piece.T / 0.3)).mean(0) for piece in pieces])
     best = score[:-1].argmax()
     in_camera_frame = (centre[2] > math.cos(math.pi / 4) * away) & (away > 2 * radius)
     if bool(in_camera_frame & (score[-1] >= 0.8 * score[best])):

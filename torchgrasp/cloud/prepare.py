@@ -14,8 +14,6 @@ from torchgrasp.errors import BadArgument, TooFewPoints
 from torchgrasp.linalg import unit
 from torchgrasp.values import PointCloud
 
-OFFSET_RATIO = 4.5
-"""Distance of an outlier from its quadric, in median rms of the quadrics: beyond Gaussian noise."""
 FACING = 0.9
 """Least share of a view's normals that face the camera: noise turns some at the rim."""
 MAX_POINTS = 2000
@@ -96,7 +94,7 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
 def clean_cloud(cloud: PointCloud) -> PointCloud:
     """Return the points without outliers, on their local quadrics, with outward normals.
 
-    Besides the outliers of `remove_outliers` go points over 4.5 median rms from their quadric.
+    Outliers are those of `remove_outliers`, and points over 4.5 median rms from their quadric.
 
     Raises:
         BadArgument, SuspiciousScale: see `check_cloud`.
@@ -116,7 +114,7 @@ def _fit_normals(cloud: PointCloud, clean: bool) -> PointCloud:
     feet, normals, rms = fit_quadrics(points.double())
     if clean:
         offset = torch.linalg.vector_norm(points.double() - feet, dim=-1)
-        keep = offset <= OFFSET_RATIO * rms.median() + 1e-12
+        keep = offset <= 4.5 * rms.median() + 1e-12  # beyond Gaussian noise
         cloud, points, normals = cloud.select(keep), feet.to(points.dtype)[keep], normals[keep]
     viewpoint = cloud.viewpoint
     if viewpoint is None and cloud.normals is not None:

@@ -17,9 +17,6 @@ from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.ik.approach import APPROACH_DISTANCE
 from torchgrasp.values import Grasps
 
-LAYOUT_VERSION = 2
-"""Readers compare it; version 1 had no approach."""
-
 CONVENTIONS = {
     "units": {"length": "m", "angle": "rad", "force": "N", "torque": "N m", "stiffness": "N m/rad", "time": "s"},
     "frames": {
@@ -78,7 +75,7 @@ def format_grasps(hand: Hand, grasps: Grasps, force: float = 4.0) -> str:
     ]
     content = {
         "format": "torchgrasp grasps",
-        "version": LAYOUT_VERSION,
+        "version": 2,  # version 1 had no approach
         **CONVENTIONS,
         "hand": {"name": hand.name, "urdf": path.name, "root": read_urdf(path).root, "sha256": hand.source.sha256},
         "actuated": list(hand.joint_names),

@@ -12,12 +12,6 @@ from torchgrasp.ik.approach import APPROACH_DISTANCE
 from torchgrasp.sim.mjcf import add_drive, add_links, format_numbers
 from torchgrasp.values import Grasps
 
-FREE_JOINT = "hand"
-"""Name of the free joint."""
-
-POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
-"""Numbers of the free joint: position [m] and quaternion."""
-
 
 def format_keyframes(hand: Hand, grasps: Grasps, force: float = 4.0) -> str:
     """Return MJCF of the hand with four keyframes for each grasp: grasp_0_approach, _pregrasp, _grasp, _squeeze.
@@ -36,11 +30,12 @@ def format_keyframes(hand: Hand, grasps: Grasps, force: float = 4.0) -> str:
     tags = "custom", "worldbody", "actuator", "keyframe"
     custom, world, actuator, keyframes = (ET.SubElement(root, tag) for tag in tags)
     palm = add_links(world, urdf, np.eye(4))
-    palm.insert(0, ET.Element("freejoint", name=FREE_JOINT))
+    palm.insert(0, ET.Element("freejoint", name="hand"))
     order = [joint.attrib["name"] for joint in palm.iter("joint")]  # bodies as they nest, as MuJoCo numbers them
     for name in order:
         add_drive(actuator, name, hand.actuators[name])
-    ET.SubElement(custom, "text", name="qpos", data=" ".join([*(f"{FREE_JOINT}/{axis}" for axis in POSE), *order]))
+    free = "hand/x hand/y hand/z hand/qw hand/qx hand/qy hand/qz".split()
+    ET.SubElement(custom, "text", name="qpos", data=" ".join([*free, *order]))
     ET.SubElement(custom, "text", name="ctrl", data=" ".join(order))
     opened, closed = hand.expand(grasps.pregrasp.double()), hand.expand(grasps.joints.double())
     keys = (

@@ -8,14 +8,9 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.files import write_file
 from torchgrasp.shape.surface import Surface
 
-SUFFIXES = (".ply", ".glb")
-"""The formats, by suffix."""
-
 
 def save_surface(surface: Surface, path: Path | str) -> Path:
-    """Write a surface as `.ply` or `.glb`. Colours show `std_m`, from 0 (violet) to `largest_std` (yellow).
-
-    A `.ply` file also holds `std_m` [m] of every vertex.
+    """Write a surface as `.ply`, with `std_m` [m] of each vertex, or `.glb`. Yellow marks `largest_std`, violet 0.
 
     Raises:
         BadArgument: another suffix.
@@ -54,6 +49,6 @@ def check_surface_path(path: Path | str) -> Path:
     '.glb'
     """
     path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise BadArgument("path", path, f"a file ending in {' or '.join(SUFFIXES)}")
+    if path.suffix.lower() not in (".ply", ".glb"):
+        raise BadArgument("path", path, "a file ending in .ply or .glb")
     return path

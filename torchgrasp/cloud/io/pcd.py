@@ -6,9 +6,6 @@ import numpy as np
 
 from torchgrasp.cloud.io.text import MAX_POINTS, read_table
 
-KEYWORDS = ("FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
-"""Header lines that are read; the format has VERSION besides."""
-
 
 def parse_pcd(data: bytes) -> dict[str, Any]:
     r"""Return points, normals and viewpoint of a PCD file, or None.
@@ -59,7 +56,7 @@ def _split_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
         if stop < 0 or stop > 65536:
             raise ValueError("no PCD header")
         words = data[start:stop].decode("ascii").split("#")[0].split()
-        if words and words[0].upper() in KEYWORDS:
+        if words:
             header[words[0].upper()] = words[1:]
         start = stop + 1
     return header, data[start:]
@@ -73,7 +70,5 @@ def _viewpoint(header: dict[str, list[str]], points: np.ndarray) -> np.ndarray |
     if len(numbers) != 7:
         raise ValueError(f"VIEWPOINT with {len(numbers)} numbers, not 7")
     finite = points[np.isfinite(points).all(1)]
-    default = np.array_equal(numbers, [0, 0, 0, 1, 0, 0, 0])
-    if default and len(finite) and bool(((finite.min(0) <= 0) & (finite.max(0) >= 0)).all()):
-        return None
-    return numbers[:3]
+    within = len(finite) and bool(((finite.min(0) <= 0) & (finite.max(0) >= 0)).all())
+    return None if within and np.array_equal(numbers, [0, 0, 0, 1, 0, 0, 0]) else numbers[:3]

@@ -54,8 +54,7 @@ def read_cloud(path: Path | str, viewpoint: Sequence[float | int] | Tensor | Non
         raise BadArgument("viewpoint", repr(viewpoint), "three numbers [m]") from error
     if position is not None:
         check_tensor("viewpoint", position, (3,))
-    path = Path(path)
-    suffix = path.suffix.lower()
+    path, suffix = Path(path), Path(path).suffix.lower()
     parsers = {
         ".ply": parse_ply,
         ".pcd": parse_pcd,
