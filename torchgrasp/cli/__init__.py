@@ -1,7 +1,4 @@
-"""The command line, one file for each group of commands.
-
-Exit codes: 0 done, 1 no executable grasp or object not held, 2 a bad input named on stderr, 130 interrupted.
-"""
+"""The command line. Exit codes: 0 done, 1 no executable grasp or object not held, 2 bad input, 130 interrupted."""
 
 import os
 import sys

@@ -72,8 +72,9 @@ def evaluate(
     scores = []
     with naming(folder="--out", path="--out"), hold_folder(out):
         with naming(objects="--objects", path="--objects", workers="--workers"):
-            folder = planned or out / "grasps"
-            for score in evaluate_views(objects, the_hand, test, spec, folder=folder, workers=workers):
+            for score in evaluate_views(
+                objects, the_hand, test, spec, folder=planned or out / "grasps", workers=workers
+            ):
                 print_score(score)
                 scores.append(score)
         summary = summarise(scores)
@@ -97,10 +98,7 @@ def print_score(score: ViewScore) -> None:
 
 def print_summary(protocol: str, summary: dict[str, Any]) -> None:
     """Print shares, failures by stage, and cost."""
-    rows = []
-    for key, text in SHARE_NAMES.items():
-        value, low, high, total = summary[key]
-        rows.append((text, f"{value:.1%} [{low:.1%}, {high:.1%}] of {total}"))
+    rows = [(text, "{:.1%} [{:.1%}, {:.1%}] of {}".format(*summary[key])) for key, text in SHARE_NAMES.items()]
     for stage, reasons in summary["failures"].items():
         rows.append((f"failed in {stage}", ", ".join(f"{n} {name.lower()}" for name, n in reasons.items())))
     print(f"\n{protocol}\n{format_columns(rows, left={0, 1})}")

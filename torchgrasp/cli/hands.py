@@ -103,7 +103,7 @@ def describe(hand: Hand, joints: torch.Tensor) -> str:
 def sample(
     hand: str,
     out: Path,
-    n: int = 10**6,
+    n: int = 1_000_000,
     fingers: str = "default",
     sampling: Sampling = "uniform",
     workers: int = 1,

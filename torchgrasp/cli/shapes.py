@@ -10,8 +10,6 @@ from torchgrasp.export import check_surface_path, largest_std, save_surface
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import extract_surface
 
-Support = Literal["camera", "paper"]
-
 
 def surface(
     cloud: Annotated[Positional[Path], arg(metavar="CLOUD")],
@@ -20,7 +18,7 @@ def surface(
     viewpoint: tuple[float, float, float] | None = None,
     table: float | None = None,
     no_table: bool = False,
-    support: Support = "camera",
+    support: Literal["camera", "paper"] = "camera",
     resolution: int = 64,
     seed: int = 0,
 ) -> int:

@@ -19,8 +19,7 @@ def nearest(points: Float[Tensor, "n 3"], k: int) -> tuple[Float[Tensor, "n k"],
 
 def find_inliers(points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
     """Tell which points are no outliers; see `remove_outliers`."""
-    distance, _ = nearest(points, 9)  # itself and eight, more than the few pixels that fly off a rim together
-    spacing = distance[:, 1:].mean(-1)
+    spacing = nearest(points, 9)[0][:, 1:].mean(-1)  # to eight: more than fly off a rim together
     return spacing <= 2.5 * spacing.median()  # real views, whose spacing varies with depth and slope, stay below
 
 
