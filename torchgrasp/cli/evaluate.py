@@ -72,7 +72,8 @@ def evaluate(
     scores = []
     with naming(folder="--out", path="--out"), hold_folder(out):
         with naming(objects="--objects", path="--objects", workers="--workers"):
-            for score in evaluate_views(
+            views = evaluate_views(objects, the_hand, test, spec, folder=planned or out / "grasps", workers=workers)
+            for score in views:
                 objects, the_hand, test, spec, folder=planned or out / "grasps", workers=workers
             ):
                 print_score(score)
