@@ -74,8 +74,6 @@ def evaluate(
         with naming(objects="--objects", path="--objects", workers="--workers"):
             views = evaluate_views(objects, the_hand, test, spec, folder=planned or out / "grasps", workers=workers)
             for score in views:
-                objects, the_hand, test, spec, folder=planned or out / "grasps", workers=workers
-            ):
                 print_score(score)
                 scores.append(score)
         summary = summarise(scores)
