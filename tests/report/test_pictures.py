@@ -12,9 +12,10 @@ from torchgrasp.report.pictures import (
     draw_surface,
     draw_tick,
     facing,
+    plot_forces,
+    plot_motion,
     view_of,
 )
-from torchgrasp.report.plots import plot_forces, plot_motion
 
 
 def decode(png):

@@ -43,16 +43,10 @@ Ranks = Literal["best", "spread"]
 
 @dataclasses.dataclass(frozen=True)
 class EvaluationSpec(Value):
-    """Which grasps of a folder of objects are evaluated.
+    """Which grasps of a folder of objects are evaluated: of each view at most `grasps`, by `ranks`.
 
-    Args:
-        grasps: the most of each view.
-        ranks: which of a view's grasps.
-        starts: of the contact planner.
-        complete: plan on whole clouds with normals: the value of a perfect shape.
-        only: names of objects; (): all.
-        planned: take the grasps that an earlier call left in its folder.
-        seed: of every random draw.
+    `complete` plans on whole clouds with normals, as if the shape were known. `only` names objects; (): all. `planned`
+    takes the grasps that an earlier call left in its folder. `starts` are those of the contact planner.
 
     Raises:
         BadArgument: no grasps, or unknown ranks.
@@ -87,7 +81,6 @@ def evaluate(
 
     Args:
         objects: a folder as in `torchgrasp.datasets`.
-        hand: the hand.
         protocol: itself, or its name in `PROTOCOLS`.
         spec: which grasps; None: `EvaluationSpec()`.
         folder: where the executable grasps of each view are kept, OBJECT_VIEW.safetensors; None: nowhere.
@@ -152,7 +145,7 @@ def run_protocol(trial: GraspTrial, protocol: Protocol, rank: int = 0, draw: int
 
 @dataclasses.dataclass(frozen=True)
 class _View:
-    """A view and a hand by their files; `shelf` is the folder of grasps, `file` holds those of this view."""
+    """A view and a hand by their files; `shelf` is the folder of grasps."""
 
     objects: Path
     object: str
@@ -183,16 +176,10 @@ def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
             return dataclasses.replace(score, executable=len(grasps))
         started = time.process_time()
         contacts = ContactSpec(friction=min(friction, MOST_FRICTION), table=0.0)
-        values: dict[str, Any] = {}
-        grasps = plan_grasps(
-            cloud,
-            hand,
-            contacts,
-            spec.starts,
-            spec.seed,
-            observer=lambda stage, _, value: values.update({stage: value}),
-        )
-        executable, starts = grasps[grasps.status == Status.OK], values["plan"].status
+        stages: list[tuple[str, str, Any]] = []
+        grasps = plan_grasps(cloud, hand, contacts, spec.starts, spec.seed, observer=lambda *x: stages.append(x))
+        executable = grasps[grasps.status == Status.OK]
+        starts = next(value.status for name, _, value in stages if name == "plan")
         executable.save(view.file)
         failed = count_status(grasps.status if len(grasps) else starts[starts != Status.OK])
         refusal = Status.OK if len(executable) else next(iter(failed), Status.OUT_OF_REACH)

@@ -32,7 +32,7 @@ APPROACH_SPEED = 0.2
 
 @dataclasses.dataclass(frozen=True)
 class GraspTrial:
-    """One grasp to be tried on the true object, as in `close_hand`."""
+    """A grasp and the true object, as in `close_hand`."""
 
     hand: Hand
     grasp: Grasps
@@ -88,7 +88,7 @@ class TrialDriver:
         return TrialRun(self)
 
     def grasp_overlap(self) -> float:
-        """Return the depth [m] of the hand's grasp pose in the object."""
+        """Return the overlap [m] of hand and object at the grasp."""
         joints = _by_name(self.reference.hand, self.reference.joints)
         scene_spec = dataclasses.replace(self.scene_spec, joints=joints, approach=(0.0, 0.0, 0.0), table=False)
         return open_scene(scene_spec, self.spec.simulator).penetration()

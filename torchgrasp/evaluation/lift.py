@@ -62,8 +62,9 @@ def close_hand(
         parts: convex bodies that stand for the mesh; None: its own decomposition (`convex_parts`).
 
     Raises:
-        BadArgument: not exactly one row, joints of another hand, a pre-grasp outside the limits, an approach that is no
-            unit vector, an error that is no finite (4, 4), or a belief for a closing without the law of Eq. (25).
+        BadArgument: not exactly one row, joints of another hand, or a pre-grasp outside the joint limits.
+        BadArgument: an approach that is no unit vector, or an error that is no finite (4, 4).
+        BadArgument: a belief for a closing that does not follow the law (Eq. 25).
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
     """
@@ -139,7 +140,7 @@ class _Lift:
         return height + self.spec.shake * math.sin(phase), self.spec.shake * frequency * math.cos(phase)
 
     def _record(self) -> None:
-        """Append a tick; raise if the simulation diverged or the object is gone."""
+        """Append a tick; raise if the object diverged or is gone."""
         robot, scene = self.run.robot, self.run.scene
         now, touching, pose = robot.steps * self.spec.timestep, int(robot.finger.sum()), scene.object_pose()
         centre = pose[:3, :3] @ scene.centre + pose[:3, 3]
@@ -156,7 +157,7 @@ class _Lift:
         return float(np.linalg.norm(self.ticks[-1].centre - self.ticks[0].centre))
 
     def _verdict(self) -> Status:
-        """Return the status of a finished trial: held, or the first failure."""
+        """Return whether the object is held, or the first failure."""
         rise = np.array([tick.centre[2] - self.ticks[0].centre[2] for tick in self.ticks])
         half = 0.5 * self.spec.lift_height
         gripped = np.array([tick.touching >= 2 for tick in self.ticks[-self.run.robot.ticks(JUDGED_TIME) :]])

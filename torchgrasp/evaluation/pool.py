@@ -1,4 +1,4 @@
-"""Tasks on worker processes: a simulator, which is C++ code, may hang or die, and costs its own task alone."""
+"""Tasks on worker processes: a simulator that hangs or dies costs its own task alone."""
 
 import math
 import multiprocessing
@@ -71,7 +71,7 @@ def _run(
 
 
 def _begin(function: Callable[..., Any]) -> None:
-    """Prepare a worker: one thread, and no life without the parent, however that ends."""
+    """Prepare a worker: one thread, and an end with the parent."""
     torch.set_num_threads(1)
     parent = multiprocessing.parent_process()
     assert parent is not None

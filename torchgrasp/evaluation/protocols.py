@@ -150,7 +150,7 @@ def error_from_object_pose(
 def draw_error(
     protocol: Protocol, grasp: Grasps, mesh: "trimesh.Trimesh", row: int, draw: int, seed: int
 ) -> Float[Tensor, "4 4"]:
-    """Draw the hand's error for a row of a view's grasps and a draw."""
+    """Draw the hand's error for a grasp and a draw."""
     noise = protocol.noise
     if protocol.pull is not None:
         return draw_hand_errors(noise, row + 1, seed)[row, draw]

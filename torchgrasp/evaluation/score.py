@@ -42,7 +42,7 @@ class ProtocolResult(Value):
 
 @dataclasses.dataclass(frozen=True)
 class ViewScore(Value):
-    """The outcome of a view, for which the planner offered `executable` grasps.
+    """The outcome of a view with `executable` planned grasps.
 
     Without any, `refusal` is the commonest reason; `note` may say more. `seconds` is the CPU time of planning.
     """

@@ -1,4 +1,4 @@
-"""Pages and pictures: of a run, of an evaluation, of a hand. No OpenGL, no display."""
+"""Pages and pictures of runs, evaluations and hands. No OpenGL, no display."""
 
 from torchgrasp.report.evaluation import write_evaluation
 from torchgrasp.report.page import draw_pictures, write_report

@@ -1,4 +1,4 @@
-"""A canvas for one still: it collects shapes, frames them, and returns a PNG."""
+"""Shapes to one still: a canvas frames and renders them."""
 
 import io
 

@@ -55,7 +55,7 @@ def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[
 
 
 def bar(share: Share) -> Markup:
-    """Draw a share as a mark and its interval as a line, from 0 to 1.
+    """Draw a share as a mark and its interval as a line.
 
     >>> bar((0.5, 0.25, 0.75, 8)).count("<line")
     2
@@ -92,7 +92,7 @@ def _objects(scores: Sequence[ViewScore], by_object: Mapping[str, Any]) -> str:
 
 
 def _failures(failures: Mapping[str, Mapping[str, int]]) -> str:
-    """Return the table of failures, each with its sentence and a bar."""
+    """Return the table of failures with meanings and bars."""
     most = max((n for reasons in failures.values() for n in reasons.values()), default=1)
     rows = []
     for stage, reasons in failures.items():

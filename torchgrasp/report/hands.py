@@ -66,7 +66,7 @@ def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
 
 
 def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> bytes:
-    """Draw the hand with its pads in the palm's frame, as a PNG."""
+    """Draw the hand in the palm's frame as a PNG."""
     solids = solids_from_hand(hand, hand.expand_joints(joints), hand.tree.joint_names, torch.eye(4).to(joints))
     points, normals = (x.cpu().numpy() for x in hand.fingertips(joints[None].double()))
     canvas = Canvas()
@@ -86,7 +86,11 @@ def _draw_limits(
     low, high = float(hand.lower.min()), float(hand.upper.max())
     left, right = 380, 2 * TILE[0] - 260
     pen.text((16, top), "joint [degrees], the posture as a mark", INK, font)
-    for k, (name, finger) in enumerate(zip(hand.joint_names, _fingers_of_joints(hand), strict=True)):
+    finger_of_link = finger_of_links(hand)
+    finger_of_joint = [finger_of_link[hand.tree.link_names[k]] for k in hand.tree.child.tolist()]
+    for k, (name, moves) in enumerate(zip(hand.joint_names, hand.actuated.coupling.T, strict=True)):
+        moved = {finger_of_joint[j] for j in torch.nonzero(moves)[:, 0].tolist()}
+        finger = moved.pop() if len(moved) == 1 else PARKED  # that of no finger moves several
         y, ends = top + BAR * (k + 1), [float(hand.lower[k]), float(hand.upper[k])]
         first, last, at = (left + (right - left) * (q - low) / (high - low) for q in (*ends, float(joints[k])))
         pen.text((16, y), name[:34], INK, font)
@@ -94,11 +98,3 @@ def _draw_limits(
         pen.rounded_rectangle([first, y + 6, last, y + 18], 5, HAND if finger == PARKED else FINGERS[finger])
         pen.line([(at, y), (at, y + 24)], INK, 3)
         pen.text((right + 20, y), " to ".join(f"{np.rad2deg(e):.0f}" for e in ends), INK, font)
-
-
-def _fingers_of_joints(hand: Hand) -> list[int]:
-    """Return the finger of each actuated joint; `PARKED` for one that moves several."""
-    fingers = finger_of_links(hand)
-    child = [fingers[hand.tree.link_names[k]] for k in hand.tree.child.tolist()]
-    moved = [{child[j] for j in torch.nonzero(column)[:, 0].tolist()} for column in hand.actuated.coupling.T]
-    return [owners.pop() if len(owners) == 1 else PARKED for owners in moved]

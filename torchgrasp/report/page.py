@@ -19,16 +19,17 @@ from torchgrasp.report.pictures import (
     draw_surface,
     draw_tick,
     facing,
+    plot_forces,
+    plot_motion,
     rotated,
     view_of,
 )
-from torchgrasp.report.plots import plot_forces, plot_motion
 from torchgrasp.report.run import Run, verdict
 from torchgrasp.values import Grasps
 
 
 def write_report(path: Path | str, run: Run) -> Path:
-    """Write pictures and tables of a run as one HTML file, atomically.
+    """Write a run with its pictures as one HTML file, atomically.
 
     Raises:
         OutputError: the file cannot be written.
@@ -117,7 +118,7 @@ def _statuses(status: Int[Tensor, "b"]) -> str:
 
 
 def _section(name: str, shots: Sequence[tuple[str, bytes]], run: Run) -> str:
-    """Return a section of pictures, with the fingers' colours where they show."""
+    """Return a section of pictures, with a legend of the fingers."""
     legend = "".join(
         f'<span class="dot" style="background:{color}"></span>{escape(finger)}'
         for finger, color in zip(run.hand.tips.names, FINGERS, strict=True)

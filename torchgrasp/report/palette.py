@@ -10,6 +10,7 @@ HAND = "#a9b0ba"
 """The palm and parked fingers."""
 
 OBJECT, TABLE = "#e9d7b3", "#eceae4"
+"""Sand and grey."""
 
 PAPER, INK, GRID = "#fcfcfa", "#22262b", "#dcdad3"
 """The background, lines with letters, and grid lines."""

@@ -71,7 +71,7 @@ def render(
 
 
 def _cast(triangles: Triangles, camera: Camera, width: int, height: int) -> _Hits:
-    """Cut triangles into rows of pixels, and keep the nearest at each pixel."""
+    """Return the nearest triangle at each pixel, found row by row."""
     local = (triangles.corners - camera.position) @ camera.frame.T
     away = np.maximum(-local[..., 2], 1e-6)  # the scene is framed in front of the camera
     focal = height / 2 / np.tan(camera.angle / 2)
@@ -120,7 +120,7 @@ def _cast(triangles: Triangles, camera: Camera, width: int, height: int) -> _Hit
 
 
 def _ranges(begin: np.ndarray, end: np.ndarray) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Return all integers of the ranges [begin, end), each with its range."""
+    """Return the integers of the ranges [begin, end) with their ranges."""
     counts = np.maximum(end - begin, 0)
     owner = np.repeat(np.arange(len(begin)), counts)
     start = np.cumsum(counts) - counts
@@ -128,7 +128,7 @@ def _ranges(begin: np.ndarray, end: np.ndarray) -> tuple[Int[np.ndarray, " k"], 
 
 
 def _shade(triangles: Triangles, hits: _Hits, camera: Camera) -> Float[np.ndarray, "k 3"]:
-    """Light both sides of the hits, by two lamps fixed to the camera."""
+    """Light both sides by two lamps fixed to the camera."""
     color = np.einsum("kci,kc->ki", triangles.colors[hits.triangle], hits.weights)
     normal = np.einsum("kci,kc->ki", triangles.normals[hits.triangle], hits.weights) @ camera.frame.T
     normal /= np.maximum(np.sqrt(np.einsum("ki,ki->k", normal, normal)), 1e-12)[:, None]

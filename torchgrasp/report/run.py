@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from torchgrasp.base import count_status
 from torchgrasp.errors import Status
@@ -16,9 +16,8 @@ if TYPE_CHECKING:
     import trimesh
 
 
-@dataclasses.dataclass(frozen=True)
-class Stage:
-    """A stage that ended: name, result in a line, wall time [s]."""
+class Stage(NamedTuple):
+    """A finished stage, its result and wall time [s]."""
 
     name: str
     message: str
@@ -51,8 +50,7 @@ def verdict(run: Run) -> str:
     """Say in one sentence what the run ended with."""
     if run.closure is not None:
         return closing_sentence(run.closure, run.hand.name, run.object_name)
-    count = len(run.executable)
-    if count:
+    if count := len(run.executable):
         return f"The {run.hand.name} hand has {count} executable grasp{'s' * (count > 1)} of the {run.object_name}."
     return refusal(run)
 

@@ -1,7 +1,6 @@
 """A hand as solids to draw: the collision shapes of its URDF, each with its finger."""
 
-import dataclasses
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -19,8 +18,7 @@ PARKED = -1
 """Finger of a link that no grasping finger owns, such as the palm."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Solid:
+class Solid(NamedTuple):
     """A triangle mesh in the picture's frame, of a grasping finger (0, 1, 2) or `PARKED`."""
 
     vertices: Float[np.ndarray, "v 3"]
@@ -54,8 +52,7 @@ def finger_of_links(hand: Hand) -> dict[str, int]:
     """Return each link's finger: all joints that move the link move this fingertip alone."""
     moves = hand.tree.moves.bool().cpu()
     finger_of = {}
-    for link, name in enumerate(hand.tree.link_names):
-        mine = moves[link]
+    for mine, name in zip(moves, hand.tree.link_names, strict=True):
         owners = [f for f in range(3) if bool(mine.any()) and bool(moves[hand.tips.index[f]][mine].all())]
         finger_of[name] = owners[0] if len(owners) == 1 else PARKED
     return finger_of
