@@ -68,7 +68,7 @@ SLIP, TILT = 0.01, math.radians(15)
 """Motion [m] and turn [rad] under the pull up to which a grasp counts as stable."""
 
 REGULARISATION = 0.05
-"""Variance that a fit adds to every number, relative to its variance over the trials: there are a few hundred of them."""
+"""Variance that a fit adds to every number, relative to its variance over the few hundred trials."""
 
 
 def body(name: str) -> tuple[trimesh.Trimesh, list[trimesh.Trimesh]]:

@@ -1,4 +1,4 @@
-"""The posterior on the fingers' lines against that of distance and normal; where fingers stop, against interpolation."""
+"""The posterior on the fingers' lines against that of distance and normal, and where fingers stop."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""Closing the hand beside its bars: simulators against statics and each other, the closing's parts, speed, stability."""
+"""Closing the hand beside its bars: both simulators, the parts of the closing, speed, stability."""
 
 from collections.abc import Callable
 from pathlib import Path

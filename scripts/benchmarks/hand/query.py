@@ -84,11 +84,8 @@ def _solved_row(hand: str, what: str, solution: IKSolution, seconds: float, bar:
     error = 1e3 * solution.tip_error.amax(1).nan_to_num(torch.inf)
     share, median = float(solved.double().mean()), float(error.median())
     right = float(ok.double().mean())
-    by_model = (
-        f", {float((ok & (solution.attempts <= LEARNED_ATTEMPTS)).double().mean()):.2%} by the learned model's starts alone"
-        if bar
-        else ""
-    )
+    learned = float((ok & (solution.attempts <= LEARNED_ATTEMPTS)).double().mean())
+    by_model = f", {learned:.2%} by the learned model's starts alone" if bar else ""
     wanted = "none"
     if bar is not None:
         wanted = f">= {bar:.0%} with all tips within 1 mm and free of self-collision, median <= {MEDIAN} mm"
