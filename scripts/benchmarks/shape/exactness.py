@@ -183,7 +183,7 @@ def bench_update(n: int = 70, seeds: int = 10) -> Row:
         before = condition(seen, Normalisation(origin, 1.0), cloud, PSI_SCALE)
         touch = partial(before.update, x[n:], normals[n:], noise=NOISE, normal_noise=NOISE)
         every = join([seen, observe(x[n:], normals[n:])])
-        refit = partial(condition, every, origin, 1.0, cloud, PSI_SCALE, kernel=before.kernel)
+        refit = partial(condition, every, Normalisation(origin, 1.0), cloud, PSI_SCALE, kernel=before.kernel)
         after, whole = touch(), refit()
         points = queries_in(before, 300)
         a, b = after.predict(points), whole.predict(points)

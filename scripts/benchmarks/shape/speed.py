@@ -114,7 +114,9 @@ def bench_growth(out: Path) -> Row:
     for n in GROWTH:
         x, normals = random_view(n, torch.Generator().manual_seed(0))
         seen, cloud = observe(x, normals), PointCloud(x, normals)
-        fit = least_seconds(partial(condition, seen, x.new_zeros(3), 1.0, cloud, PSI_SCALE), 2 if n > 300 else 5)
+        fit = least_seconds(
+            partial(condition, seen, Normalisation(x.new_zeros(3), 1.0), cloud, PSI_SCALE), 2 if n > 300 else 5
+        )
         shape = posterior(n)
         points = queries_in(shape, count)
         query = least_seconds(partial(shape.predict, points), 2 if n > 300 else 5)
