@@ -1,6 +1,8 @@
 """Value types: checks at construction, rows, devices and dtypes, statuses."""
 
 import dataclasses
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -171,3 +173,13 @@ def test_paper_spec_has_no_margins():
     spec = ContactSpec.paper()
     assert spec.planned_friction == spec.friction == 0.8
     assert spec.max_variance == 0.03 and spec.separation == 0 and spec.flatness is None and spec.table is None
+
+
+@pytest.mark.parametrize("kind", ["ContactSpec", "TrialSpec"])
+def test_none_is_refused_by_name_where_the_type_has_no_none(kind):
+    # in a process of its own, where no annotation is checked before the value is
+    lines = [f"from torchgrasp import {kind}, GraspError", "try:", f"    {kind}(friction=None)"]
+    code = "\n".join([*lines, "except GraspError as error:", "    print(error)"])
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("friction: found None")
+    assert ContactSpec(flatness=None).flatness is None and TrialSpec(kp=None).kp is None

@@ -181,10 +181,14 @@ class TrialSpec(Value):
 
 
 def _check_ranges(spec: Value, **ranges: tuple[float | int, float | int]) -> None:
-    """Raise `BadArgument` for the first field outside its range; None is allowed where it is a default."""
+    """Raise `BadArgument` for the first field outside its range; None is allowed where its type says so."""
+    types = {field.name: field.type for field in dataclasses.fields(spec)}  # pyright: ignore[reportArgumentType]
     for name, (low, high) in ranges.items():
-        if getattr(spec, name) is not None:
-            check_number(name, getattr(spec, name), low, high)
+        value = getattr(spec, name)
+        if value is None and type(None) not in get_args(types[name]):
+            raise BadArgument(name, value, f"a number in [{low:g}, {high:g}]")
+        if value is not None:
+            check_number(name, value, low, high)
 
 
 def check_simulator(simulator: str) -> None:

@@ -28,7 +28,7 @@ def test_free_space_is_free_and_its_least_distance_is_a_lower_bound(seen_cylinde
     assert len(above) < len(x)
 
 
-def test_a_shape_that_respects_free_space_has_no_trespasses_and_a_blown_up_one_has(seen_cylinder: PointCloud):
+def test_a_shape_that_respects_free_space_does_not_violate_it_and_a_blown_up_one_does(seen_cylinder: PointCloud):
     assert seen_cylinder.viewpoint is not None
     shape = fit_shape(seen_cylinder, table=0.0)
     x = shape.normalise(_ring(0.045))
