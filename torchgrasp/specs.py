@@ -5,6 +5,7 @@ from typing import Literal, get_args
 
 from torchgrasp.base import Value, check_number
 from torchgrasp.errors import BadArgument
+from torchgrasp.plane import Plane, as_plane
 
 Simulator = Literal["sapien", "mujoco"]
 """The simulators."""
@@ -28,10 +29,11 @@ class ContactSpec(Value):
         friction_margin: contacts are planned and certified with `friction * friction_margin`.
         separation: least distance between two contacts [m]; None: the width of the fingertips and 2 mm.
         flatness: largest angle [rad] between the normals of the surface within 8 mm of a contact; None: not checked.
-        table: height [m] of the table's plane, whose normal is the z axis of the cloud's frame; None: no table.
+        table: the table's `Plane` in the cloud's frame, or its height [m] along z; None: no table.
         contact_height: least height of a contact above the table [m].
         tip_radius: radius [m] of the fingertips, which must lie above the table; 0: points. None: the hand's.
         start_radius: normalised radius of the sphere from which starts are drawn (Sec. 6.2; the paper: 0.1).
+        contact_allowed: whether links may touch and push the target's neighbours; collisions then only cost success.
 
     Raises:
         BadArgument: a number outside its range.
@@ -46,10 +48,11 @@ class ContactSpec(Value):
     friction_margin: float = 0.5
     separation: float | None = None
     flatness: float | None = 0.44
-    table: float | None = None
+    table: Plane | float | None = None
     contact_height: float = 0.012
     tip_radius: float | None = None
     start_radius: float = 0.9
+    contact_allowed: bool = False
 
     def __post_init__(self) -> None:
         """Check every range once, where the value is made."""
@@ -61,11 +64,16 @@ class ContactSpec(Value):
             friction_margin=(1e-3, 1.0),
             separation=(0.0, 1.0),
             flatness=(1e-3, 3.1416),
-            table=(-1e6, 1e6),
             contact_height=(-1.0, 1.0),
             tip_radius=(0.0, 1.0),
             start_radius=(1e-6, 1.2),
         )
+        as_plane(self.table)
+
+    @property
+    def plane(self) -> Plane | None:
+        """The table as a plane."""
+        return as_plane(self.table)
 
     @property
     def planned_friction(self) -> float:
