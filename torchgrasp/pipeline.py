@@ -135,7 +135,7 @@ def plan_grasps(
     message = f"{len(contacts)} of {len(offered)} triples closed at friction {spec.planned_friction:g}"
     observer("certify", message, certificate)
 
-    world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), spec.table)
+    world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), spec.plane)
     problem = GraspProblem(hand, contacts, certificate, world, surface.vertices.mean(0))
     if mixture is None:
         seeds = nearest_postures(PostureLibrary.of(hand, seed=seed), contacts, world)

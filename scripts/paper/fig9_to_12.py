@@ -88,7 +88,7 @@ def take(name: str, starts: int, seed: int) -> tuple[Taken, Taken]:
     """Return the grasps of the Allegro and the Barrett hand on one object, from the learned models' seeds."""
     shape = fit_shape(load_object(name).view, seed=seed, table=SPEC.table)
     surface = extract_surface(shape)
-    world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), SPEC.table)
+    world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), SPEC.plane)
     plan = plan_contacts(shape, SPEC, starts, seed)
     contacts = plan.contacts[spread_rows(plan, TRIPLES)]
     certificate = certify(contacts, SPEC)

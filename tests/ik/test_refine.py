@@ -6,14 +6,16 @@ import pytest
 import torch
 
 from tests.reach import touched_contacts
-from torchgrasp.errors import Status
-from torchgrasp.frames import rigid, rotation_from_vector
+from torchgrasp.errors import BadArgument, Status
+from torchgrasp.frames import apply, rigid, rotate, rotation_from_vector
 from torchgrasp.hand.load import load_hand
+from torchgrasp.ik.approach import find_approach
 from torchgrasp.ik.checks import is_clear, measure_errors
-from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, clearance_hinges
+from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, clearance_hinges, link_clearance
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.ik.refine import grasp_residuals, open_hand, refine, tip_residuals, tip_targets
 from torchgrasp.ik.sdf import field_from_surface
+from torchgrasp.plane import Plane
 from torchgrasp.values import Contacts
 
 
@@ -174,3 +176,32 @@ def test_the_opened_hand_is_farther_and_clear(hand, ball):
     assert float(travel.median()) > 0.005
     assert bool((opened >= hand.lower).all())
     assert bool((opened <= hand.upper).all())
+
+
+def test_a_tilted_table_is_a_level_one_seen_from_another_frame(hand, ball):
+    """Residuals, openings, approaches and clearances turn with everything; a height is a level plane."""
+    posture = random_postures(hand, 6)
+    contacts = touched(hand, posture)
+    contacts = dataclasses.replace(contacts, std_m=torch.full_like(contacts.points[..., 0], 0.004))
+    turn = rigid(rotation_from_vector(torch.tensor([0.4, -0.9, 0.3]).double()), torch.tensor([0.2, 0.1, -0.3]).double())
+    moved = Configuration(posture.joints, turn @ posture.obj_from_hand)
+    turned = Contacts(apply(turn, contacts.points), rotate(turn, contacts.normals), std_m=contacts.std_m)
+    level, tilted = CollisionWorld(table=-0.05), CollisionWorld(table=Plane.horizontal(-0.05).moved(turn))
+
+    here, there = (SpatialJacobian.at(hand, p) for p in (posture, moved))
+    for tips_touch in (True, False):
+        for a, b in zip(
+            clearance_hinges(here, level, tips_touch), clearance_hinges(there, tilted, tips_touch), strict=True
+        ):
+            torch.testing.assert_close(a, b, atol=1e-9, rtol=1e-9)
+    torch.testing.assert_close(link_clearance(here, level, True)[2], link_clearance(there, tilted, True)[2])
+    torch.testing.assert_close(
+        open_hand(hand, posture, contacts, level), open_hand(hand, moved, turned, tilted), atol=1e-6, rtol=0
+    )
+    (direction, room), (other, same) = (find_approach(hand, p, w) for p, w in ((posture, level), (moved, tilted)))
+    torch.testing.assert_close(rotate(turn, direction[:, None])[:, 0], other)
+    torch.testing.assert_close(room, same)
+    plane = CollisionWorld(table=Plane.horizontal(-0.05))
+    assert all(map(torch.equal, clearance_hinges(here, level, True), clearance_hinges(here, plane, True)))
+    with pytest.raises(BadArgument, match="table"):
+        CollisionWorld(ball, float("nan"))

@@ -8,9 +8,10 @@ from torch import Tensor
 
 from torchgrasp.frames import rotate
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.clearance import CollisionWorld
+from torchgrasp.ik.clearance import CollisionWorld, along
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.linalg import unit
+from torchgrasp.plane import Plane
 
 APPROACH_DISTANCE = 0.1
 """Length [m] of the straight path: about a hand's depth."""
@@ -27,12 +28,13 @@ def find_approach(
 ) -> tuple[Float[Tensor, "g 3"], Float[Tensor, "g"]]:
     """Return a direction of approach for each pre-grasp, and the least clearance [m] of its path.
 
-    Candidates are the hand's approach axis, tilted directions and, above a table, straight down. The field's nearest
-    nodes rank their paths to 3 mm. The first path of non-negative interpolated clearance is taken, else the clearest.
+    Candidates are the hand's approach axis, tilted directions and, above a table, straight down on it. The field's
+    nearest nodes rank their paths to 3 mm. The first path of non-negative interpolated clearance is taken, else the
+    clearest.
     """
     spheres = hand.collision_spheres
     centres = SpatialJacobian.at(hand, opened).points(spheres.link_index, spheres.center)
-    radius, candidates = spheres.radius.to(centres), approach_directions(hand, opened, world.table)
+    radius, candidates = spheres.radius.to(centres), approach_directions(hand, opened, world.plane)
     coarse = torch.stack([_clearance(centres, radius, d, world, exact=False) for d in candidates.unbind(1)], 1)
     chosen, clearance = candidates[:, 0].clone(), torch.full_like(coarse[:, 0], -math.inf)
     for choice in torch.argsort(coarse, dim=1, descending=True, stable=True).unbind(1):
@@ -44,7 +46,7 @@ def find_approach(
     return chosen, clearance
 
 
-def approach_directions(hand: Hand, opened: Configuration, table: float | None) -> Float[Tensor, "g k 3"]:
+def approach_directions(hand: Hand, opened: Configuration, table: Plane | None) -> Float[Tensor, "g k 3"]:
     """Return the candidate directions in the object's frame."""
     pose = opened.obj_from_hand
     axis = unit(hand.approach.to(pose))
@@ -55,7 +57,7 @@ def approach_directions(hand: Hand, opened: Configuration, table: float | None) 
     directions = rotate(pose, torch.cat([axis[None], tilted]).expand(len(pose), -1, -1))
     if table is None:
         return directions
-    down = torch.tensor([0.0, 0.0, -1.0]).to(pose).expand(len(pose), 1, 3)
+    down = (0.0 - table.normal.to(pose)).expand(len(pose), 1, 3)  # minus alone would make negative zeros
     return torch.cat([directions, down], 1)
 
 
@@ -78,6 +80,6 @@ def _clearance(
             least = world.field.query(path[torch.arange(len(path), device=path.device), first])[0] - radius[first]
             row, sphere = torch.nonzero(coarse < least[:, None] + NODE_ERROR * world.field.spacing, as_tuple=True)
             least = least.scatter_reduce(0, row, world.field.query(path[row, sphere])[0] - radius[sphere], "amin")
-    if world.table is not None:
-        least = torch.minimum(least, (path[..., 2] - radius).amin(1) - world.table)
+    if world.plane is not None:
+        least = torch.minimum(least, (along(path, world.plane) - radius).amin(1) - world.plane.offset)
     return least

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
@@ -12,6 +13,7 @@ from torchgrasp.hand.collision_spheres import CollisionSpheres
 from torchgrasp.ik.configuration import SpatialJacobian, wrench_of
 from torchgrasp.ik.sdf import SignedDistanceField
 from torchgrasp.optim import Residuals
+from torchgrasp.plane import Plane, as_plane
 
 MILLIMETRE = 1e-3
 """Unit of all residuals [m]: it makes lengths as large as angles times their weights."""
@@ -25,10 +27,31 @@ HINGES = 8
 
 @dataclasses.dataclass(frozen=True)
 class CollisionWorld(Value):
-    """The object's signed distance field and the table's height [m], if any."""
+    """The object's signed distance field, and the table as a plane or a height [m] along z, if any.
+
+    Raises:
+        BadArgument: a table that is neither.
+    """
 
     field: SignedDistanceField | None = None
-    table: float | None = None
+    table: Plane | float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the table once, where the value is made."""
+        as_plane(self.table)
+
+    @cached_property
+    def plane(self) -> Plane | None:
+        """The table as a plane."""
+        return as_plane(self.table)
+
+
+def along(points: Float[Tensor, "*b 3"], plane: Plane) -> Float[Tensor, "*b"]:
+    """Return the coordinates [m] of points along a plane's normal."""
+    x, y, z = plane.normal.tolist()
+    if (x, y, z) == (0.0, 0.0, 1.0):  # the usual table costs nothing
+        return points[..., 2]
+    return points[..., 0] * x + points[..., 1] * y + points[..., 2] * z
 
 
 def hinge(clearance: Float[Tensor, "g k"], jacobian: Float[Tensor, "g k d"], margin: float) -> Residuals:
@@ -51,8 +74,8 @@ def collision_cost(
     if world.field is not None:
         deficit = (CLEARANCE + radius - world.field.nearest_node(centres)) * ~spheres.touching
         cost = cost + deficit.clamp_min(0).square().sum(-1)
-    if world.table is not None:
-        deficit = world.table + CLEARANCE * ~spheres.touching + radius - centres[..., 2]
+    if world.plane is not None:
+        deficit = world.plane.offset + CLEARANCE * ~spheres.touching + radius - along(centres, world.plane)
         cost = cost + deficit.clamp_min(0).square().sum(-1)
     return cost / MILLIMETRE**2
 
@@ -72,12 +95,12 @@ def clearance_hinges(spatial: SpatialJacobian, world: CollisionWorld, tips_touch
         clearance = distance - radius[index] + torch.where(torch.isinf(coarse[row, index]), 1.0, 0.0)
         jacobian = spatial.jacobian(wrench_of(nearest, gradient), spheres.link_index[index])
         hinges.append(hinge(clearance, jacobian, CLEARANCE))
-    if world.table is not None:
-        height = centres[..., 2] - radius - world.table
+    if world.plane is not None:
+        height = along(centres, world.plane) - radius - world.plane.offset
         if tips_touch:  # their contacts decide how low they are
             height = height + CLEARANCE * spheres.touching
         row, index = least(height)
-        up = torch.tensor([0.0, 0.0, 1.0]).to(centres).expand(*index.shape, 3)
+        up = world.plane.normal.to(centres).expand(*index.shape, 3)
         jacobian = spatial.jacobian(wrench_of(centres[row, index], up), spheres.link_index[index])
         hinges.append(hinge(height[row, index], jacobian, CLEARANCE))
     residuals, jacobians = zip(*hinges, strict=True)
@@ -109,6 +132,6 @@ def link_clearance(
         clearance = world.field.query(centres)[0] - radius
     tips = clearance[:, spheres.touching].amin(1)
     links = clearance[:, ~spheres.touching].amin(1) if tips_touch else clearance.amin(1)
-    if world.table is None:
+    if world.plane is None:
         return links, tips, torch.full_like(tips, math.inf)
-    return links, tips, (centres[..., 2] - radius).amin(1) - world.table
+    return links, tips, (along(centres, world.plane) - radius).amin(1) - world.plane.offset

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, clearance_hinges
+from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, along, clearance_hinges
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian, wrench_of
 from torchgrasp.optim import SOLVED, LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.values import Contacts
@@ -96,9 +96,10 @@ def open_hand(
     """
     normals, gap = contacts.normals, OPENING + OPENING_SIGMAS * contacts.require_std()
     target = tip_targets(hand, contacts) + gap[..., None] * normals
-    if world.table is not None:
-        lowest = world.table + CLEARANCE + hand.tips.radius.to(target)
-        target = torch.stack([*target.unbind(-1)[:2], torch.maximum(target[..., 2], lowest)], -1)
+    if world.plane is not None:
+        up, height = world.plane.normal.to(target), along(target, world.plane)[..., None]
+        lowest = (world.plane.offset + CLEARANCE + hand.tips.radius.to(target))[:, None]
+        target = target - height * up + torch.maximum(height, lowest) * up  # exact where the table is horizontal
 
     def evaluate(state: Configuration, rows: Int[Tensor, "a"]) -> Residuals:
         residual, jacobian = grasp_residuals(hand, state, target[rows], normals[rows], world, tips_touch=False)

@@ -46,7 +46,7 @@ def bench_executable(views: list[Any], starts: int, seed: int) -> list[Row]:
     for name, cloud in tqdm(first.items(), desc="executable", disable=None, leave=False):
         shape = fit_shape(cloud, seed=seed, table=SPEC.table)
         surface = extract_surface(shape)
-        world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), SPEC.table)
+        world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), SPEC.plane)
         began = time.process_time()
         plan = plan_contacts(shape, SPEC, starts, seed)
         certificate = certify(plan.contacts, SPEC)
@@ -77,9 +77,9 @@ def bench_executable(views: list[Any], starts: int, seed: int) -> list[Row]:
 def count_blockers(hand: Hand, grasps: Grasps, world: CollisionWorld) -> dict[str, float]:
     """Return the share of triples that each of `BLOCKERS` kept from a grasp, by the best failure of each triple."""
     spheres, centres = hand.collision_spheres, apply(grasps.obj_from_hand, hand.sphere_centres(grasps.joints))
-    assert world.field is not None and world.table is not None
+    assert world.field is not None and world.plane is not None
     clearance = world.field.query(centres)[0] - spheres.radius
-    height = (centres[..., 2] - spheres.radius - world.table).amin(1)
+    height = (world.plane.height(centres) - spheres.radius).amin(1)
     parts = (spheres.finger == -1, (spheres.finger != -1) & ~spheres.touching, spheres.touching)
     palm, links, tips = (torch.where(part, clearance, torch.inf).amin(1) for part in parts)
     lack = torch.stack(
