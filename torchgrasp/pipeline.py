@@ -118,7 +118,7 @@ def plan_grasps(
         path = mixture_path(hand.urdf_path.parent)
         mixture, mixture_sha256 = load_mixture(path), sha256(path)
     if shape is None:
-        shape = fit_shape(cloud, seed=seed, table=spec.table)
+        shape = fit_shape(cloud, seed=seed, table=spec.table)  # pyright: ignore[reportArgumentType]
     else:
         check_cloud(cloud)
     hand = hand.to(shape.device)

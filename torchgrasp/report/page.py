@@ -4,6 +4,7 @@ import base64
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from jaxtyping import Int
 from torch import Tensor
@@ -39,7 +40,8 @@ def write_report(path: Path | str, run: Run) -> Path:
 
 def draw_pictures(run: Run) -> dict[str, list[tuple[str, bytes]]]:
     """Draw every picture of a run: captions and PNGs by section."""
-    view, table, best = view_of(run.cloud), run.spec.table, run.executable
+    table: Any = run.spec.table  # pictures know heights only
+    view, best = view_of(run.cloud), run.executable
     sections = {
         "Seen and unseen": [
             ("The cloud from the camera's side, coloured by height.", draw_cloud(run.cloud, table)),
