@@ -273,6 +273,22 @@ class ObjectMotion(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
+class Disturbance(Value):
+    """What a trial did to all but its object.
+
+    The three columns are neighbours, table, and the object by links other than the fingers'. `first_touch` [s] is when
+    the hand first touched each, infinite if never. `impulse` [N s] is the sum of its normal impulses. `early` tells
+    whether it touched any of them before a fingertip touched the object. `neighbour_pose` is the motion of each of m
+    neighbours from its start.
+    """
+
+    first_touch: Float[Tensor, "3"]
+    impulse: Float[Tensor, "3"]
+    early: bool
+    neighbour_pose: Float[Tensor, "t m 4 4"]
+
+
+@dataclasses.dataclass(frozen=True)
 class ClosureResult(Value):
     """What happened when the hand closed on the true object.
 
@@ -280,7 +296,8 @@ class ClosureResult(Value):
     are the frames of object and hand in the world. `joints` has every joint of the URDF, in the order of `joint_names`.
     `contact_order` lists the fingers by their first touch. `object_motion` is the motion of the object in the hand
     from the pre-grasp to the end. `start_overlap` [m] is the depth of the opened hand in object or table at the start.
-    `held` tells whether the object is up with the hand at the end; `seconds` is wall time.
+    `held` tells whether the object is up with the hand at the end; `seconds` is wall time. Poses are in the frame of
+    the grasp.
     """
 
     held: bool
@@ -294,4 +311,5 @@ class ClosureResult(Value):
     contact_order: tuple[int, ...]
     object_motion: ObjectMotion
     start_overlap: float
+    disturbance: Disturbance
     seconds: float

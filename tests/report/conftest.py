@@ -12,7 +12,16 @@ from torchgrasp.hand.load import load_hand
 from torchgrasp.report.run import Run, Stage
 from torchgrasp.shape.surface import Surface
 from torchgrasp.specs import ContactSpec
-from torchgrasp.values import Certificate, ClosureResult, ContactPlan, Contacts, Grasps, ObjectMotion, PointCloud
+from torchgrasp.values import (
+    Certificate,
+    ClosureResult,
+    ContactPlan,
+    Contacts,
+    Disturbance,
+    Grasps,
+    ObjectMotion,
+    PointCloud,
+)
 
 F64 = torch.float64
 
@@ -67,6 +76,7 @@ def run() -> Run:
         contact_order=(0, 1, 2),
         object_motion=ObjectMotion(0.003, math.radians(2)),
         start_overlap=0.0,
+        disturbance=Disturbance(torch.full((3,), math.inf), torch.zeros(3), False, lifted[:, None]),
         seconds=1.0,
     )
     cloud = PointCloud(vertices[vertices[:, 0] > 0], None, torch.tensor([0.5, 0.1, 0.3], dtype=F64))

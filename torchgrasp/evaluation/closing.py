@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -13,13 +14,16 @@ from torchgrasp.control.controller import GraspController, check_modes
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.protocols import apply_error
+from torchgrasp.frames import inverse, rigid
 from torchgrasp.hand.hand import Hand
+from torchgrasp.linalg import unit
 from torchgrasp.mesh import read_mesh
+from torchgrasp.plane import GRID, Plane, to_upright
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.sim.convex_parts import check_parts, convex_parts
 from torchgrasp.sim.hand import SimulatedHand
 from torchgrasp.sim.open import open_scene
-from torchgrasp.sim.scene import SceneSpec
+from torchgrasp.sim.scene import Body, Neighbour, SceneSpec
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import Grasps
 
@@ -41,12 +45,16 @@ class GraspTrial:
     error: Float[Tensor, "4 4"] | None = None
     belief: ShapeGP | None = None
     parts: "Sequence[trimesh.Trimesh] | None" = None
+    table: Plane | None = None
+    neighbours: Sequence[Neighbour] = ()
 
 
 class TrialDriver:
     """A trial that was checked once, for any number of runs.
 
-    The hand follows `reference`; None: that of the trial's hand and grasp.
+    The hand follows `reference`; None: that of the trial's hand and grasp. `obj_from_world` is the simulator's frame in
+    that of the grasp: the same, or upright on the trial's table. There all is rounded, so that a trial moved as a whole
+    is the same to the last bit.
 
     Raises:
         BadArgument, MeshError: as in `close_hand`.
@@ -57,10 +65,17 @@ class TrialDriver:
         self.trial, self.spec = trial, spec
         hand, grasp = trial.hand.to("cpu", torch.float64), trial.grasp.to("cpu", torch.float64)
         self.reference = reference or ClosingReference.from_grasp(hand, grasp, spec.force, spec.kp)
+        self.obj_from_world = torch.eye(4, dtype=torch.float64)
+        if trial.table is not None:
+            self.obj_from_world = world_frame(trial.table, grasp.obj_from_hand[0])
+            grasp = _to_world(grasp, self.obj_from_world)
+            if reference is None:
+                upright = ClosingReference.from_grasp(hand, grasp, spec.force, spec.kp)
+                self.reference = dataclasses.replace(upright, obj_from_hand=self.reference.obj_from_hand)
         hand.check_joints(grasp.pregrasp)
         if spec.approach and not abs(float(torch.linalg.vector_norm(grasp.approach)) - 1) < 1e-4:
             raise BadArgument("grasp", f"an approach along {grasp.approach[0].tolist()}", "a unit vector")
-        mesh, drives = read_mesh(trial.mesh), hand.actuators
+        body, drives = self._body(Neighbour(read_mesh(trial.mesh), trial.parts)), hand.actuators
         if spec.kp is not None:
             drives = {name: drive._replace(kp=spec.kp) for name, drive in drives.items()}
         true_pose = apply_error(grasp.obj_from_hand[0], trial.error)
@@ -71,9 +86,9 @@ class TrialDriver:
             joints=_by_name(hand, grasp.pregrasp[0]),
             drives=drives,
             tip_links=tuple(hand.tips.links),
-            mesh=mesh,
-            parts=convex_parts(mesh) if trial.parts is None else check_parts(trial.parts),
-            mass=spec.mass if spec.density is None else spec.density * float(mesh.volume),
+            mesh=body.mesh,
+            parts=list(body.parts),
+            mass=body.mass,
             friction=spec.friction,
             gravity=spec.gravity,
             timestep=spec.timestep,
@@ -81,7 +96,19 @@ class TrialDriver:
             approach=tuple(approach.tolist()),
             table=spec.table,
             patch=spec.patch,
+            height=None if trial.table is None else 0.0,
+            neighbours=tuple(self._body(neighbour) for neighbour in trial.neighbours),
         )
+
+    def _body(self, given: Neighbour) -> Body:
+        """Return a body in the simulator's frame, with parts and mass; parts are cut in the frame that was given."""
+        mesh, mass = read_mesh(given.mesh), given.mass
+        parts = convex_parts(mesh) if given.parts is None else check_parts(given.parts)
+        if mass is None:
+            mass = self.spec.mass if self.spec.density is None else self.spec.density * float(mesh.volume)
+        if self.trial.table is not None:
+            mesh, *parts = (_moved(x, self.obj_from_world) for x in (mesh, *parts))
+        return Body(mesh, parts, mass)
 
     def open(self) -> "TrialRun":
         """Return a run in a fresh scene; raises `MissingExtra` without the simulator."""
@@ -90,7 +117,8 @@ class TrialDriver:
     def grasp_overlap(self) -> float:
         """Return the overlap [m] of hand and object at the grasp."""
         joints = _by_name(self.reference.hand, self.reference.joints)
-        scene_spec = dataclasses.replace(self.scene_spec, joints=joints, approach=(0.0, 0.0, 0.0), table=False)
+        alone = {"approach": (0.0, 0.0, 0.0), "table": False, "neighbours": ()}
+        scene_spec = dataclasses.replace(self.scene_spec, joints=joints, **alone)
         return open_scene(scene_spec, self.spec.simulator).penetration()
 
 
@@ -99,7 +127,7 @@ class TrialRun:
 
     def __init__(self, driver: TrialDriver) -> None:
         spec, trial = driver.spec, driver.trial
-        self.spec, self.mass = spec, driver.scene_spec.mass
+        self.spec, self.mass, self.obj_from_world = spec, driver.scene_spec.mass, driver.obj_from_world
         self.scene = open_scene(driver.scene_spec, spec.simulator)
         generator = torch.Generator().manual_seed(trial.seed) if spec.noise else None
         self.robot = SimulatedHand(self.scene, driver.reference, spec.control_rate, generator)
@@ -147,6 +175,46 @@ def smooth_step(time: float) -> tuple[float, float]:
     (0.5, 1.5)
     """
     return time * time * (3 - 2 * time), 6 * time * (1 - time)
+
+
+def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+    """Return `obj_from_world`: z up from a table at z = 0, the hand above the origin, x along the hand's x axis.
+
+    A hand whose x axis is steeper than 60 degrees gives its y axis.
+    """
+    z, origin = unit(table.normal.double()), obj_from_hand[:3, 3]
+    level = [axis - (axis @ z) * z for axis in obj_from_hand[:3, :2].unbind(-1)]
+    x = unit(level[0] if torch.linalg.vector_norm(level[0]) > 0.5 else level[1])
+    return rigid(torch.stack([x, torch.linalg.cross(z, x), z], -1), origin - table.height(origin) * z)
+
+
+def _to_world(grasp: Grasps, obj_from_world: Float[Tensor, "4 4"]) -> Grasps:
+    """Return a grasp in the simulator's frame, rounded: lengths to `GRID`, directions finer."""
+    world_from_obj = inverse(obj_from_world)
+
+    def turn(vectors: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+        return _rounded(vectors @ world_from_obj[:3, :3].T)
+
+    contacts = dataclasses.replace(
+        grasp.contacts,
+        points=to_upright(grasp.contacts.points, obj_from_world),
+        normals=turn(grasp.contacts.normals),
+    )
+    pose = _rounded(world_from_obj @ grasp.obj_from_hand)
+    return dataclasses.replace(grasp, contacts=contacts, obj_from_hand=pose, approach=turn(grasp.approach))
+
+
+def _rounded(numbers: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+    """Round numbers of about 1 to a billionth."""
+    return torch.round(numbers / GRID**1.5) * GRID**1.5
+
+
+def _moved(mesh: "trimesh.Trimesh", obj_from_world: Float[Tensor, "4 4"]) -> "trimesh.Trimesh":
+    """Return a mesh in the simulator's frame, its vertices rounded to `GRID`."""
+    import trimesh
+
+    vertices = to_upright(torch.from_numpy(np.array(mesh.vertices, dtype=np.float64)), obj_from_world)
+    return trimesh.Trimesh(vertices.numpy(), mesh.faces, process=False)
 
 
 def _by_name(hand: Hand, joints: Float[Tensor, " h"]) -> dict[str, float]:

@@ -15,9 +15,11 @@ from torchgrasp.errors import Status
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun, smooth_step
 from torchgrasp.frames import apply, inverse, rotation_angle
 from torchgrasp.hand.hand import Hand
+from torchgrasp.plane import Plane
 from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.sim.scene import Neighbour
 from torchgrasp.specs import TrialSpec
-from torchgrasp.values import ClosureResult, Grasps, ObjectMotion
+from torchgrasp.values import ClosureResult, Disturbance, Grasps, ObjectMotion
 
 if TYPE_CHECKING:
     import trimesh
@@ -44,10 +46,12 @@ def close_hand(
     error: Float[Tensor, "4 4"] | None = None,
     belief: ShapeGP | None = None,
     parts: "Sequence[trimesh.Trimesh] | None" = None,
+    table: Plane | None = None,
+    neighbours: Sequence[Neighbour] = (),
 ) -> ClosureResult:
     """Close a hand on the true object, lift it and hold it, in simulation.
 
-    The object stands on a table at its mesh's lowest point. The opened hand moves straight to its pre-grasp, closes and
+    The opened hand moves straight to its pre-grasp, closes and
     presses (`GraspController`), rises and holds. The object is **held** if at the end its centre is up by half the
     lift, and two fingers touched it in most of the last `JUDGED_TIME`. Equal arguments give equal bits.
 
@@ -60,6 +64,8 @@ def close_hand(
         error: true pose of the hand in its planned frame, unknown to the hand; None: the planned pose.
         belief: the shape that the grasp was planned on, revised by touches while the hand closes; None: no revision.
         parts: convex bodies that stand for the mesh; None: its own decomposition (`convex_parts`).
+        table: what the object stands on, in the frame of the grasp; None: level, at the mesh's lowest point.
+        neighbours: further bodies on the table, which the hand may push.
 
     Raises:
         BadArgument: not exactly one row, joints of another hand, or a pre-grasp outside the joint limits.
@@ -68,7 +74,7 @@ def close_hand(
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
     """
-    return lift_grasp(GraspTrial(hand, grasp, mesh, seed, error, belief, parts), spec)
+    return lift_grasp(GraspTrial(hand, grasp, mesh, seed, error, belief, parts, table, neighbours), spec)
 
 
 def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResult:
@@ -92,6 +98,7 @@ class _Tick(NamedTuple):
     forces: np.ndarray
     object_pose: np.ndarray
     hand_pose: np.ndarray
+    neighbour_pose: np.ndarray
     joints: np.ndarray
     touching: int
     centre: np.ndarray
@@ -144,9 +151,12 @@ class _Lift:
         robot, scene = self.run.robot, self.run.scene
         now, touching, pose = robot.steps * self.spec.timestep, int(robot.finger.sum()), scene.object_pose()
         centre = pose[:3, :3] @ scene.centre + pose[:3, 3]
-        self.ticks.append(_Tick(now, robot.force, pose, scene.hand_pose(), scene.joints(), touching, centre))
+        tick = _Tick(
+            now, robot.force, pose, scene.hand_pose(), scene.neighbour_poses(), scene.joints(), touching, centre
+        )
+        self.ticks.append(tick)
         moved = self._moved()
-        if not np.isfinite(self.ticks[-1].joints).all() or not np.isfinite(moved):
+        if not np.isfinite(tick.joints).all() or not np.isfinite(moved):
             raise FloatingPointError
         if moved > LOST_DISTANCE + self.spec.lift_height:
             self.pushed = self.pushed or moved
@@ -173,16 +183,21 @@ class _Lift:
 
     def result(self, status: Status, seconds: float) -> ClosureResult:
         """Return the record as a value."""
-        time, forces, object_pose, hand_pose, joints, *_ = (
+        time, forces, object_pose, hand_pose, neighbour_pose, joints, *_ = (
             torch.from_numpy(np.stack(column)) for column in zip(*self.ticks, strict=True)
         )
-        first_touch = self.run.robot.first_touch
+        robot, obj_from_world = self.run.robot, self.run.obj_from_world
+        first_touch, first_stray = robot.first_touch, torch.from_numpy(robot.first_stray)
         touched = [finger for finger in range(3) if np.isfinite(first_touch[finger])]
         hand_from_object = inverse(hand_pose) @ object_pose
         start, end = hand_from_object[self.arrived], hand_from_object[-1]
         centres = apply(torch.stack([start, end]), torch.from_numpy(self.run.scene.centre).expand(2, 1, 3))[:, 0]
         distance = float(torch.linalg.vector_norm(centres[1] - centres[0]))
         angle = float(rotation_angle(start[:3, :3].T @ end[:3, :3]))
+        if not torch.equal(obj_from_world, torch.eye(4, dtype=torch.float64)):
+            world_from_obj = inverse(obj_from_world)
+            object_pose, neighbour_pose = (obj_from_world @ x @ world_from_obj for x in (object_pose, neighbour_pose))
+            hand_pose = obj_from_world @ hand_pose
         return ClosureResult(
             held=status is Status.OK,
             status=status,
@@ -195,5 +210,11 @@ class _Lift:
             contact_order=tuple(sorted(touched, key=lambda finger: first_touch[finger])),
             object_motion=ObjectMotion(distance, angle),
             start_overlap=self.run.overlap,
+            disturbance=Disturbance(
+                first_touch=first_stray * self.spec.timestep,
+                impulse=torch.from_numpy(robot.stray),
+                early=bool(first_stray.min() < min(first_touch)),
+                neighbour_pose=neighbour_pose,
+            ),
             seconds=seconds,
         )

@@ -13,7 +13,8 @@ class SimulatedHand:
     """The hand of a scene, with tactile fingertips.
 
     `force` (3,) are the true normal forces [N], averaged over the last tick. `finger` flags contacts in its last step.
-    `steps` counts steps of the simulator. `first_touch` is the step of each fingertip's first contact, infinite before.
+    `steps` counts steps of the simulator. `first_touch` is the step of each fingertip's first contact, infinite before;
+    `first_stray` that of each kind in `StepContacts.stray`, whose impulses [N s] are summed in `stray`.
 
     Args:
         scene: at its start.
@@ -29,6 +30,7 @@ class SimulatedHand:
         self.substeps = max(1, round(1 / (control_rate * scene.timestep)))
         self.period = self.substeps * scene.timestep
         self.steps, self.first_touch = 0, [float("inf")] * 3
+        self.first_stray, self.stray = np.full(3, np.inf), np.zeros(3)
         self.force, self.finger, self.tactile = np.zeros(3), np.zeros(3, dtype=bool), no_contact()
         names, centres = reference.hand.tree.joint_names, reference.hand.tips.center.double()
         self._centres = torch.cat([centres, torch.ones(3, 1, dtype=torch.float64)], dim=-1).numpy()
@@ -46,6 +48,8 @@ class SimulatedHand:
             self.finger = step.finger
             for i in np.flatnonzero(step.weight > 0):
                 self.first_touch[i] = min(self.first_touch[i], self.steps)
+            self.first_stray[(step.stray > 0) & np.isinf(self.first_stray)] = self.steps
+            self.stray += step.stray
         self.force = np.linalg.norm(contacts.impulse, axis=-1) / self.period
         return self._observe(contacts)
 

@@ -14,10 +14,10 @@ from torchgrasp.frames import rotation_from_rpy
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.urdf import Link, Urdf, read_urdf
 from torchgrasp.sim.mount import MOUNT_DRIVE, mount_slides
-from torchgrasp.sim.scene import ARMATURE, SceneSpec
+from torchgrasp.sim.scene import ARMATURE, Body, SceneSpec
 
-OBJECT, TABLE = "torchgrasp_object", "torchgrasp_table"
-"""Names of the object (its body and its free joint) and of the table."""
+OBJECT, TABLE, NEIGHBOUR = "torchgrasp_object", "torchgrasp_table", "torchgrasp_neighbour_{}"
+"""Names of the object (its body and its free joint), of the table, and of the neighbours by number."""
 
 HAND_BIT, OBJECT_BIT, TABLE_BIT = 1, 2, 4
 """Collision groups: any two of them collide, but not the hand with itself."""
@@ -54,9 +54,11 @@ def scene_mjcf(spec: SceneSpec) -> str:
     asset, world, actuator = (ET.SubElement(root, tag) for tag in ("asset", "worldbody", "actuator"))
     if spec.table:
         bits = _bits(TABLE_BIT, HAND_BIT)
-        height = format_numbers((0.0, 0.0, float(spec.mesh.bounds[0, 2])))
+        height = format_numbers((0.0, 0.0, spec.table_height))
         ET.SubElement(world, "geom", bits, name=TABLE, type="plane", size="1 1 0.1", pos=height)
-    _add_object(asset, world, spec)
+    _add_body(asset, world, OBJECT, spec.body, HAND_BIT | TABLE_BIT)
+    for k, body in enumerate(spec.neighbours):
+        _add_body(asset, world, NEIGHBOUR.format(k), body, HAND_BIT | TABLE_BIT | OBJECT_BIT)
     _add_hand(world, spec, urdf)
     for name in movable:
         add_drive(actuator, name, spec.drives[name])
@@ -65,15 +67,15 @@ def scene_mjcf(spec: SceneSpec) -> str:
     return ET.tostring(root, encoding="unicode")
 
 
-def _add_object(asset: ET.Element, world: ET.Element, spec: SceneSpec) -> None:
-    """Add the object with the mass centre and inertia of an even filling."""
-    body = ET.SubElement(world, "body", name=OBJECT)
-    ET.SubElement(body, "freejoint", name=OBJECT)
-    inertia = np.asarray(spec.mesh.moment_inertia) * (spec.mass / spec.mesh.volume)
-    _weigh(body, spec.mass, spec.mesh.center_mass, inertia[np.triu_indices(3)])
+def _add_body(asset: ET.Element, world: ET.Element, name: str, spec: Body, hits: int) -> None:
+    """Add a free body with the mass centre and inertia of an even filling, and the groups that it hits."""
+    body = ET.SubElement(world, "body", name=name)
+    ET.SubElement(body, "freejoint", name=name)
+    _weigh(body, spec.mass, spec.mesh.center_mass, spec.inertia[np.triu_indices(3)])
     for k, part in enumerate(spec.parts):
-        ET.SubElement(asset, "mesh", name=f"part_{k}", vertex=format_numbers(np.asarray(part.vertices, float).ravel()))
-        ET.SubElement(body, "geom", _bits(OBJECT_BIT, HAND_BIT | TABLE_BIT), type="mesh", mesh=f"part_{k}")
+        corners = format_numbers(np.asarray(part.vertices, float).ravel())
+        ET.SubElement(asset, "mesh", name=f"{name}_{k}", vertex=corners)
+        ET.SubElement(body, "geom", _bits(OBJECT_BIT, hits), type="mesh", mesh=f"{name}_{k}")
 
 
 def _add_hand(world: ET.Element, spec: SceneSpec, urdf: Urdf) -> None:

@@ -6,9 +6,9 @@ import numpy as np
 
 from torchgrasp.errors import HandFileError, MissingExtra
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.sim.mjcf import OBJECT, TABLE, scene_mjcf
+from torchgrasp.sim.mjcf import NEIGHBOUR, OBJECT, scene_mjcf
 from torchgrasp.sim.mount import MOUNT_DRIVE, mount_slides
-from torchgrasp.sim.scene import STILL, Scene, SceneSpec, StepContacts
+from torchgrasp.sim.scene import NEIGHBOURS, STILL, TABLETOP, TARGET, Scene, SceneSpec, StepContacts
 
 
 class MujocoScene(Scene):
@@ -35,7 +35,8 @@ class MujocoScene(Scene):
         self._motors = np.array([model.actuator(name).id for name in self.joint_names])
         self.root = model.body(urdf.root).id
         self.tips = [model.body(name).id for name in spec.tip_links]
-        self._map_contacts(spec.table)
+        self.neighbours = [model.body(NEIGHBOUR.format(k)).id for k in range(len(spec.neighbours))]
+        self._map_contacts()
         data.qpos[self._positions] = [spec.joints[name] for name in self.joint_names]
         self.drive(data.qpos[self._positions])
         for slide in mount_slides(spec):
@@ -43,11 +44,11 @@ class MujocoScene(Scene):
             self._move_mount(slide.name, slide.start, 0.0)
         mujoco.mj_step1(model, data)
 
-    def _map_contacts(self, table: bool) -> None:
-        """Map shapes to bodies, and tips and their parent bodies to fingers."""
+    def _map_contacts(self) -> None:
+        """Map shapes to bodies, tips and their parent bodies to fingers, and what is no link to its kind."""
         model = self.model
         self._body_of = model.geom_bodyid.tolist()
-        self._table = model.geom(TABLE).id if table else -1
+        self._kind_of = {0: TABLETOP, self.body: TARGET} | dict.fromkeys(self.neighbours, NEIGHBOURS)
         self._finger_of = {body: i for i, body in enumerate(self.tips)}
         for i, tip in enumerate(self.tips):
             if model.body_jntnum[tip] == 0:
@@ -62,14 +63,14 @@ class MujocoScene(Scene):
         wrench, found = np.zeros(6), self.data.contact
         for k, shapes in enumerate(found.geom.tolist()):
             first, second = (self._body_of[shape] for shape in shapes)
-            if self.body not in (first, second):
+            if (first in self._kind_of) == (second in self._kind_of):
                 continue
-            link, sign = (second, -1.0) if first == self.body else (first, 1.0)
-            finger = self._finger_of.get(link)
-            if finger is None:
-                continue
+            link, other, sign = (second, first, -1.0) if first in self._kind_of else (first, second, 1.0)
             self._mujoco.mj_contactForce(self.model, self.data, k, wrench)
-            if wrench[0] > 0.0:
+            finger = self._finger_of.get(link) if other == self.body else None
+            if finger is None:
+                contacts.stray[self._kind_of[other]] += max(float(wrench[0]), 0.0) * self.timestep
+            elif wrench[0] > 0.0:
                 contacts.finger[finger] = True
                 if link == self.tips[finger]:
                     axes = found.frame[k].reshape(3, 3)  # in rows; the first points from the first body to the second
@@ -99,10 +100,10 @@ class MujocoScene(Scene):
         return jacobian[:, :, self._velocities]
 
     def penetration(self) -> float:
-        """Return the depth [m] of the hand in object or table."""
+        """Return the depth [m] of the hand in anything."""
         deepest = 0.0
         for (first, second), distance in zip(self.data.contact.geom, self.data.contact.dist, strict=True):
-            if self._table not in (first, second) or self.body not in (self._body_of[first], self._body_of[second]):
+            if (self._body_of[first] in self._kind_of) != (self._body_of[second] in self._kind_of):
                 deepest = max(deepest, -float(distance))
         return deepest
 

@@ -20,16 +20,17 @@ import numpy as np
 
 from torchgrasp.errors import MissingExtra
 from torchgrasp.sim.mount import MOUNT_DRIVE, mount_slides, mounted_urdf
-from torchgrasp.sim.scene import ARMATURE, TABLE, SceneSpec
+from torchgrasp.sim.scene import ARMATURE, TABLE, Body, SceneSpec
 
 
 class Built(NamedTuple):
-    """SAPIEN's own objects: physics system, scene, the object's body, and the hand."""
+    """SAPIEN's own objects: physics system, scene, the object's body, the hand, and the neighbours' bodies."""
 
     system: Any
     scene: Any
     body: Any
     hand: Any
+    neighbours: list[Any]
 
 
 def build(spec: SceneSpec) -> Built:
@@ -39,22 +40,29 @@ def build(spec: SceneSpec) -> Built:
         BadArgument: a joint of the hand without a position or drive.
         MissingExtra: SAPIEN is not installed.
     """
-    sapien, physx = _import_sapien()
-    physx.set_scene_config(gravity=np.array([0, 0, -spec.gravity], np.float32), enable_tgs=True, enable_pcm=True)
+    sapien, physx = import_sapien()
+    system, scene = open_world(sapien, physx, spec.gravity, spec.timestep)
+    material = physx.PhysxMaterial(spec.friction, spec.friction, 0.0)
+    if spec.table:
+        place(sapien, scene, "table", table(physx, material), spec.table_height - TABLE[2] / 2)
+    bodies = [rigid_body(sapien, physx, material, body, spec.patch) for body in (spec.body, *spec.neighbours)]
+    for k, body in enumerate(bodies):
+        place(sapien, scene, "neighbour" if k else "object", body)
+    return Built(system, scene, bodies[0], _hand(scene, material, spec), bodies[1:])
+
+
+def open_world(sapien: Any, physx: Any, gravity: float, timestep: float) -> tuple[Any, Any]:
+    """Return an empty physics system and its scene; gravity [m/s^2], timestep [s]."""
+    physx.set_scene_config(gravity=np.array([0, 0, -gravity], np.float32), enable_tgs=True, enable_pcm=True)
     physx.set_shape_config(contact_offset=0.002, rest_offset=0.0)
     physx.set_body_config(solver_position_iterations=10, solver_velocity_iterations=1, sleep_threshold=0.0)
     system = physx.PhysxCpuSystem()
     scene = sapien.Scene([system])
-    scene.timestep = spec.timestep
-    material = physx.PhysxMaterial(spec.friction, spec.friction, 0.0)
-    if spec.table:
-        _place(sapien, scene, "table", _table(physx, material), float(spec.mesh.bounds[0, 2]) - TABLE[2] / 2)
-    body = _object(sapien, physx, material, spec)
-    _place(sapien, scene, "object", body, 0.0)
-    return Built(system, scene, body, _hand(scene, material, spec))
+    scene.timestep = timestep
+    return system, scene
 
 
-def _place(sapien: Any, scene: Any, name: str, body: Any, height: float) -> None:
+def place(sapien: Any, scene: Any, name: str, body: Any, height: float = 0.0) -> None:
     """Add an entity of one body to the scene, at a height [m]."""
     entity = sapien.Entity()
     entity.name = name
@@ -63,22 +71,22 @@ def _place(sapien: Any, scene: Any, name: str, body: Any, height: float) -> None
     scene.add_entity(entity)
 
 
-def _table(physx: Any, material: Any) -> Any:
+def table(physx: Any, material: Any) -> Any:
     """Return a box to put under the object."""
     body = physx.PhysxRigidStaticComponent()
     body.attach(physx.PhysxCollisionShapeBox(np.array(TABLE, np.float32) / 2, material))
     return body
 
 
-def _object(sapien: Any, physx: Any, material: Any, spec: SceneSpec) -> Any:
-    """Return the object with the mass centre and inertia of an even filling."""
+def rigid_body(sapien: Any, physx: Any, material: Any, spec: Body, patch: float) -> Any:
+    """Return a body with the mass centre and inertia of an even filling, and soft contacts of a radius [m]."""
     body = physx.PhysxRigidDynamicComponent()
     for part in spec.parts:
         vertices = np.asarray(part.vertices, np.float32)
         shape = physx.PhysxCollisionShapeConvexMesh(vertices, np.ones(3, np.float32), material)
-        shape.min_patch_radius = spec.patch
+        shape.min_patch_radius = patch
         body.attach(shape)
-    moments, axes = np.linalg.eigh(np.asarray(spec.mesh.moment_inertia) * (spec.mass / spec.mesh.volume))
+    moments, axes = np.linalg.eigh(spec.inertia)
     axes = axes * np.array([1.0, 1.0, np.sign(np.linalg.det(axes))])
     frame = np.eye(4)
     frame[:3, :3], frame[:3, 3] = axes, spec.mesh.center_mass
@@ -124,7 +132,7 @@ def _hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
     return hand
 
 
-def _import_sapien() -> tuple[Any, Any]:
+def import_sapien() -> tuple[Any, Any]:
     """Import SAPIEN, silencing its warning about a missing Vulkan: physics needs none."""
     try:
         with warnings.catch_warnings():

@@ -6,7 +6,19 @@ import numpy as np
 
 from torchgrasp.sim.mount import WRIST_JOINT
 from torchgrasp.sim.sapien_build import build
-from torchgrasp.sim.scene import APPROACH_JOINT, LIFT_JOINT, STILL, Scene, SceneSpec, StepContacts
+from torchgrasp.sim.scene import (
+    APPROACH_JOINT,
+    LIFT_JOINT,
+    NEIGHBOURS,
+    STILL,
+    TABLETOP,
+    TARGET,
+    Scene,
+    SceneSpec,
+    StepContacts,
+)
+
+_PLACES = {"neighbour": NEIGHBOURS, "table": TABLETOP, "object": TARGET}
 
 
 class SapienScene(Scene):
@@ -14,7 +26,7 @@ class SapienScene(Scene):
 
     def __init__(self, spec: SceneSpec) -> None:
         super().__init__(spec)
-        self.system, self.scene, self.body, self.hand = build(spec)
+        self.system, self.scene, self.body, self.hand, self.neighbours = build(spec)
         active = self.hand.active_joints
         self._mount = {j.name: j for j in active if j.name in (LIFT_JOINT, APPROACH_JOINT)}
         self._places = [k for k, j in enumerate(active) if j.name not in self._mount]
@@ -31,6 +43,7 @@ class SapienScene(Scene):
         """Map tips and their parent links to fingers."""
         self._tip_of = {link.name: i for i, link in enumerate(self.tips)}
         self._finger_of = dict(self._tip_of)
+        self._links = {link.name for link in self.hand.links}
         for i, tip in enumerate(self.tips):
             if tip.joint.dof == 0:
                 self._finger_of.setdefault(tip.parent.name, i)
@@ -58,11 +71,16 @@ class SapienScene(Scene):
         contacts = StepContacts.none()
         for contact in self.system.get_contacts():
             first, second = (b.entity.name for b in contact.bodies)
-            if "object" not in (first, second):
+            if first in self._links:
+                link, other, sign = first, second, -1.0
+            elif second in self._links:
+                link, other, sign = second, first, 1.0
+            else:
                 continue
-            link, sign = (second, 1.0) if first == "object" else (first, -1.0)
-            finger = self._finger_of.get(link)
+            finger = self._finger_of.get(link) if other == "object" else None
             if finger is None:
+                size = sum(float(np.linalg.norm(point.impulse)) for point in contact.points)
+                contacts.stray[_PLACES[other]] += size
                 continue
             for point in contact.points:
                 size = float(np.linalg.norm(point.impulse))
@@ -109,13 +127,16 @@ class SapienScene(Scene):
         return columns.transpose(0, 2, 1)
 
     def penetration(self) -> float:
-        """Return the depth [m] of the hand in object or table after a weightless step."""
-        self.body.disable_gravity = True
+        """Return the depth [m] of the hand in anything after a weightless step."""
+        bodies = [self.body, *self.neighbours]
+        for body in bodies:
+            body.disable_gravity = True
         self.scene.step()
-        self.body.disable_gravity = False
+        for body in bodies:
+            body.disable_gravity = False
         deepest = 0.0
         for contact in self.system.get_contacts():
-            if {b.entity.name for b in contact.bodies} != {"object", "table"}:
+            if not self._links.isdisjoint(b.entity.name for b in contact.bodies):
                 deepest = max([deepest, *(-p.separation for p in contact.points)])
         return float(deepest)
 

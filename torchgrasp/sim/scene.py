@@ -5,6 +5,7 @@ Every trial opens a fresh scene: only then do two runs give equal bits. The worl
 
 import abc
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,13 +24,46 @@ ARMATURE = 1e-3
 """Inertia [kg m^2] that each motor's rotor adds to its joint; PhysX's implicit drives need one (`sapien_build`)."""
 
 TABLE = (2.0, 2.0, 0.1)
-"""Size of the table [m]; its top is at the lowest point of the mesh."""
+"""Size of the table [m]."""
 
 LIFT_JOINT, APPROACH_JOINT = "torchgrasp_lift", "torchgrasp_approach"
 """Prismatic joints of the mount: along the world's z axis, and along the approach, 0 where the hand has arrived."""
 
 STILL = np.zeros(3)
 """No force, no torque."""
+
+
+NEIGHBOURS, TABLETOP, TARGET = range(3)
+"""What a hand may touch otherwise than with a finger on the object: the places in `StepContacts.stray`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Neighbour:
+    """A body that stands or lies beside the object.
+
+    Args:
+        mesh: closed [m], where it lies, in the frame of the grasp.
+        parts: convex bodies that make up its surface; None: its own decomposition (`convex_parts`).
+        mass: [kg]; None: as the object's, by `TrialSpec.mass` or `TrialSpec.density`.
+    """
+
+    mesh: "trimesh.Trimesh"
+    parts: "Sequence[trimesh.Trimesh] | None" = None
+    mass: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Body:
+    """A rigid body of the simulator: its mesh, convex parts that make up its surface, and its mass [kg]."""
+
+    mesh: "trimesh.Trimesh"
+    parts: "Sequence[trimesh.Trimesh]"
+    mass: float
+
+    @property
+    def inertia(self) -> np.ndarray:
+        """The inertia (3, 3) [kg m^2] of an even filling about the mass centre."""
+        return np.asarray(self.mesh.moment_inertia) * (self.mass / self.mesh.volume)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,6 +86,8 @@ class SceneSpec:
         approach: displacement [m] from the hand's start to its pose.
         table: whether there is one.
         patch: radius [m] of a fingertip's contact patch; torsional friction is friction x force x patch.
+        height: of the table [m]; None: the lowest point of the mesh.
+        neighbours: further bodies.
     """
 
     urdf_path: Path | str
@@ -69,6 +105,18 @@ class SceneSpec:
     approach: tuple[float, float, float] = (0.0, 0.0, 0.0)
     table: bool = True
     patch: float = PATCH_RADIUS
+    height: float | None = None
+    neighbours: tuple[Body, ...] = ()
+
+    @property
+    def body(self) -> Body:
+        """The object as a body."""
+        return Body(self.mesh, self.parts, self.mass)
+
+    @property
+    def table_height(self) -> float:
+        """The height [m] of the table."""
+        return float(self.mesh.bounds[0, 2]) if self.height is None else self.height
 
     def check_drives(self, names: list[str]) -> None:
         """Refuse joints without a start or a drive."""
@@ -87,6 +135,8 @@ class StepContacts:
         weight: sum of these sizes (3,) [N s]; `moment / weight` is the mean contact point.
         finger: which fingers touch (3,), by the tip or by the link that carries it.
         force: of each fingertip on the object (3, 3) [N], friction included.
+        stray: sums of normal impulses (3,) [N s] of the hand on neighbours, on the table, and of links other than the
+            fingers' on the object.
     """
 
     impulse: np.ndarray
@@ -94,11 +144,13 @@ class StepContacts:
     weight: np.ndarray
     finger: np.ndarray
     force: np.ndarray
+    stray: np.ndarray
 
     @classmethod
     def none(cls) -> "StepContacts":
         """Return sums to add contacts to."""
-        return cls(np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), np.zeros(3, dtype=bool), np.zeros((3, 3)))
+        fingers = np.zeros(3, dtype=bool)
+        return cls(np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), fingers, np.zeros((3, 3)), np.zeros(3))
 
     def add(self, finger: int, impulse: np.ndarray, size: float, point: np.ndarray) -> None:
         """Add a contact of a fingertip by impulse [N s], its size, and place [m]."""
@@ -125,6 +177,7 @@ class Scene(abc.ABC):
     body: Any
     root: Any
     tips: list[Any]
+    neighbours: list[Any]
 
     def __init__(self, spec: SceneSpec) -> None:
         self.timestep, self.centre = spec.timestep, np.asarray(spec.mesh.center_mass, float)
@@ -168,6 +221,10 @@ class Scene(abc.ABC):
     def approach(self, left: float, speed: float = 0.0) -> None:
         """Set the remaining length [m] of the approach, and its speed [m/s]."""
         self._move_mount(APPROACH_JOINT, -left, speed)
+
+    def neighbour_poses(self) -> np.ndarray:
+        """Return the poses (m, 4, 4) of the neighbours."""
+        return np.array([self._pose(body) for body in self.neighbours]).reshape(-1, 4, 4)
 
     def object_pose(self) -> np.ndarray:
         """Return the object's pose (4, 4)."""
