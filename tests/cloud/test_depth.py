@@ -1,7 +1,8 @@
+import numpy as np
 import pytest
 import torch
 
-from torchgrasp.cloud.depth import cloud_from_depth
+from torchgrasp.cloud.depth import cloud_from_depth, read_depth
 from torchgrasp.errors import BadArgument, SuspiciousScale, TooFewPoints
 from torchgrasp.frames import rigid, rotation_from_vector
 
@@ -39,20 +40,53 @@ def test_pixels_without_depth_or_outside_the_mask_are_left_out():
     assert cloud_from_depth(depth.float(), K.float(), mask).points.dtype == torch.float32
 
 
+@pytest.mark.parametrize("make", [np.asarray, torch.from_numpy])
+def test_arrays_and_tensors_of_any_kind_give_the_same_cloud(make):
+    depth = tilted_depth().numpy()
+    depth[3, 4] = 0.0
+    mm = np.round(1000 * depth).astype(np.uint16)
+    mask = np.arange(48 * 64).reshape(48, 64) % 3 == 0
+    exact = cloud_from_depth(torch.from_numpy(mm / 1000.0), K, torch.from_numpy(mask))
+    for kind in (bool, np.uint8):
+        for k in (make(K.numpy()), (600.0, 550.0, 30.0, 20.0), np.float32([600, 550, 30, 20])):
+            cloud = cloud_from_depth(make(mm), k, make(mask.astype(kind)), np.eye(4))
+            assert torch.equal(cloud.points, exact.points)
+    infinite = np.where(depth > 0, depth, np.inf).astype(np.float32)
+    assert torch.equal(read_depth(make(infinite), K)[0] > 0, torch.from_numpy(depth > 0))
+    assert float(read_depth(make(mm.astype(np.int32)), K)[0].max()) == mm.max() / 1000
+
+
+REFUSED = {
+    "depth in mm": (lambda d: ((1000 * d), K), "depth.*are these mm"),
+    "negative depth": (lambda d: (-d, K), "depth.*depths >= 0"),
+    "a colour image": (lambda d: (d.expand(3, -1, -1), K), "depth.*of shape"),
+    "8 bit depth": (lambda d: ((200 * d).to(torch.uint8), K), "depth.*uint16"),
+    "mask of another size": (lambda d: (d, K, torch.ones(24, 32, dtype=torch.bool)), r"mask.*\(48, 64\)"),
+    "empty mask": (lambda d: (d, K, np.zeros((48, 64), dtype=np.uint8)), "mask.*no pixel"),
+    "floating mask": (lambda d: (d, K, d), "mask.*bool or uint8"),
+    "intrinsics of twice the size": (lambda d: (d, (1200.0, 1100.0, 64.0, 48.0)), r"intrinsics.*\(64.0, 48.0\) px"),
+    "intrinsics of half the size": (lambda d: (d, (300.0, 275.0, 16.0, 12.0)), "intrinsics.*same resolution"),
+    "intrinsics of 848 x 480 for 640 x 480": (lambda d: (d, (600.0, 600.0, 42.4, 24.0)), "intrinsics.*same resolution"),
+    "transposed intrinsics": (lambda d: (d, K.T), "intrinsics.*fx, fy"),
+    "three intrinsics": (lambda d: (d, (600.0, 30.0, 20.0)), "intrinsics.*fx, fy, cx, cy"),
+    "intrinsics of words": (lambda d: (d, ["f", "f", "c", "c"]), "intrinsics"),
+    "NaN intrinsics": (lambda d: (d, (600.0, float("nan"), 30.0, 20.0)), "intrinsics.*nan"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_bad_image_is_refused_in_one_sentence(name):
+    make, words = REFUSED[name]
+    with pytest.raises((BadArgument, TypeError), match=words):  # TypeError: the annotations are checked in tests
+        read_depth(*make(tilted_depth()))
+
+
 def test_refusals():
     depth, eye = tilted_depth(), torch.eye(4, dtype=torch.float64)
-    with pytest.raises(SuspiciousScale, match="mm"):
-        cloud_from_depth(depth * 1000, K)
+    with pytest.raises(SuspiciousScale, match="scene"):
+        cloud_from_depth(depth * 80, K)
     with pytest.raises(TooFewPoints, match="3 measured"):
         cloud_from_depth(depth, K, torch.arange(48 * 64).reshape(48, 64) < 3)
-    with pytest.raises(BadArgument, match="depths >= 0"):
-        cloud_from_depth(-depth, K)
-    with pytest.raises((BadArgument, TypeError), match="depth"):  # TypeError: the annotations are checked in tests
-        cloud_from_depth(depth.tolist(), K)
-    with pytest.raises((BadArgument, TypeError), match="mask"):
-        cloud_from_depth(depth, K, (depth > 0).tolist())
-    with pytest.raises(BadArgument, match="intrinsics"):
-        cloud_from_depth(depth, K.T)
     for spoilt in (2 * eye, torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0])).double(), eye + torch.nan):
         with pytest.raises(BadArgument, match="camera_pose"):
             cloud_from_depth(depth, K, camera_pose=spoilt)

@@ -2,7 +2,7 @@
 
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.check import check_cloud, remove_duplicates
-from torchgrasp.cloud.depth import cloud_from_depth
+from torchgrasp.cloud.depth import cloud_from_depth, read_depth
 from torchgrasp.cloud.diagnose import CloudReport, diagnose_cloud, format_report
 from torchgrasp.cloud.filter import remove_outliers, voxel_downsample
 from torchgrasp.cloud.io.read import read_cloud, save_cloud
@@ -27,6 +27,7 @@ __all__ = [
     "partial_view",
     "prepare_cloud",
     "read_cloud",
+    "read_depth",
     "remove_duplicates",
     "remove_outliers",
     "save_cloud",

@@ -1,5 +1,8 @@
 """From depth images to point clouds."""
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -10,12 +13,19 @@ from torchgrasp.errors import BadArgument, TooFewPoints
 from torchgrasp.frames import apply
 from torchgrasp.values import PointCloud
 
+MAX_SHIFT = 0.15
+"""Farthest principal point from the image's middle, in sides: cameras have .03, another resolution's is .16 or more."""
+MAX_DEPTH = 50.0
+"""Largest median depth [m]: no depth camera sees so far, and 50 mm is nearer than any sees."""
+MIN_PIXELS = 4
+"""Fewest measured pixels: as many as the points of a cloud."""
+
 
 def cloud_from_depth(
-    depth: Float[Tensor, "h w"],
-    intrinsics: Float[Tensor, "3 3"],
-    mask: Bool[Tensor, "h w"] | None = None,
-    camera_pose: Float[Tensor, "4 4"] | None = None,
+    depth: Tensor | np.ndarray,
+    intrinsics: Tensor | np.ndarray | Sequence[float],
+    mask: Tensor | np.ndarray | None = None,
+    camera_pose: Tensor | np.ndarray | None = None,
 ) -> PointCloud:
     """Return the points of a pinhole camera's depth image.
 
@@ -23,42 +33,105 @@ def cloud_from_depth(
     right, y down and z forward. Depths of 0, NaN or infinity are not measured. The camera is the viewpoint.
 
     Args:
-        depth: distance along the optical axis [m]; integer images in mm need `depth.double() / 1000`.
-        intrinsics: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [pixels].
-        mask: pixels of the object; None: all measured pixels.
-        camera_pose: obj_from_camera, rigid; None: the result is in the camera's frame.
+        depth: (h, w), distance along the optical axis: floats in metres, or integers (such as uint16) in millimetres.
+        intrinsics: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] or (fx, fy, cx, cy) [pixels].
+        mask: (h, w), pixels of the object, bool or uint8 (0 is outside); None: all measured pixels.
+        camera_pose: obj_from_camera (4, 4), rigid; None: the result is in the camera's frame.
 
     Raises:
-        BadArgument: a wrong shape or type; negative depth; intrinsics of no pinhole camera; a pose that is not rigid.
+        BadArgument: what `read_depth` refuses; a pose that is not rigid.
         TooFewPoints: fewer than 4 measured pixels.
-        SuspiciousScale: an extent outside [5 mm, 2 m]: depth in mm, or a scene without a mask.
+        SuspiciousScale: an extent outside [5 mm, 2 m], as of a scene without a mask.
 
-    >>> K = torch.tensor([[600.0, 0, 32], [0, 600.0, 24], [0, 0, 1]])
-    >>> cloud_from_depth(torch.full((48, 64), 0.5), K).viewpoint
-    tensor([0., 0., 0.])
+    >>> cloud_from_depth(np.full((48, 64), 500, dtype=np.uint16), (600.0, 600.0, 32.0, 24.0)).viewpoint
+    tensor([0., 0., 0.], dtype=torch.float64)
     """
-    if not isinstance(depth, Tensor) or depth.ndim != 2 or depth.dtype not in (torch.float32, torch.float64):
-        raise BadArgument("depth", _describe(depth), "a torch tensor (h, w), floating, in metres")
-    if bool((depth < 0).any()):
-        raise BadArgument("depth", f"{float(depth[depth < 0].min()):.4g} m", "depths >= 0")
-    k = check_tensor("intrinsics", intrinsics, (3, 3)).to(depth)
-    if not (k[0, 0] > 0 and k[1, 1] > 0) or k[0, 1] != 0 or k[1, 0] != 0 or k[2].tolist() != [0, 0, 1]:
-        raise BadArgument("intrinsics", k.tolist(), "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0")
-    measured = torch.isfinite(depth) & (depth > 0)
-    if mask is not None:
-        if not isinstance(mask, Tensor) or mask.shape != depth.shape or mask.dtype != torch.bool:
-            raise BadArgument("mask", _describe(mask), f"a torch tensor of bool {tuple(depth.shape)}")
-        measured = measured & mask
-    if int(measured.sum()) < 4:
-        raise TooFewPoints("depth", f"{int(measured.sum())} measured pixels", "at least 4 measured pixels in the mask")
+    z, k, inside = read_depth(depth, intrinsics, mask)
+    measured = z > 0 if inside is None else (z > 0) & inside
+    if int(measured.sum()) < MIN_PIXELS:
+        allowed = f"at least {MIN_PIXELS} measured pixels in the mask"
+        raise TooFewPoints("depth", f"{int(measured.sum())} measured pixels", allowed)
     row, column = torch.nonzero(measured, as_tuple=True)
-    z = depth[measured]
+    z = z[measured]
     points = torch.stack([z * (column - k[0, 2]) / k[0, 0], z * (row - k[1, 2]) / k[1, 1], z], -1)
     viewpoint = torch.zeros(3, dtype=points.dtype, device=points.device)
     if camera_pose is not None:
-        pose = check_rigid("camera_pose", camera_pose).to(points)
+        pose = check_rigid("camera_pose", _as_tensor("camera_pose", camera_pose)).to(points)
         points, viewpoint = apply(pose, points), pose[:3, 3]
-    return check_cloud(PointCloud(points, None, viewpoint))
+    dtype = depth.dtype if isinstance(depth, Tensor) and depth.is_floating_point() else points.dtype
+    return check_cloud(PointCloud(points.to(dtype), None, viewpoint.to(dtype)))
+
+
+def read_depth(
+    depth: Tensor | np.ndarray,
+    intrinsics: Tensor | np.ndarray | Sequence[float],
+    mask: Tensor | np.ndarray | None = None,
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "3 3"], Bool[Tensor, "h w"] | None]:
+    """Check a depth image; return depth [m] (0: not measured), the matrix of intrinsics and the mask.
+
+    Args:
+        depth, intrinsics, mask: as `cloud_from_depth` takes them.
+
+    Raises:
+        BadArgument: a wrong shape or type; depth that is negative, or in millimetres though floating; intrinsics of
+            no pinhole camera or of another resolution; a mask of another size or without pixels.
+
+    >>> depth, k, mask = read_depth(np.full((48, 64), 500, dtype=np.uint16), (600.0, 600.0, 32.0, 24.0))
+    >>> float(depth[0, 0]), k[0].tolist(), mask
+    (0.5, [600.0, 0.0, 32.0], None)
+    """
+    image = _as_tensor("depth", depth)
+    if image.ndim != 2 or image.dtype in (torch.bool, torch.uint8, torch.int8) or image.is_complex():
+        allowed = "an image (h, w) of floats in metres, or of integers such as uint16 in millimetres"
+        raise BadArgument("depth", _describe(depth), allowed)
+    metres = image.double() if image.is_floating_point() else image.double() / 1000
+    metres = torch.where(torch.isfinite(metres), metres, 0.0)
+    if bool((metres < 0).any()):
+        raise BadArgument("depth", f"{float(metres.min()):.4g} m", "depths >= 0; 0 and NaN are not measured")
+    measured = metres[metres > 0]
+    if len(measured) and float(measured.median()) > MAX_DEPTH:
+        allowed = f"at most {MAX_DEPTH:g} m: floats are metres; are these mm? Divide them by 1000, or give uint16"
+        raise BadArgument("depth", f"a median of {float(measured.median()):.4g} m", allowed)
+    k = _read_intrinsics(intrinsics, image.shape).to(image.device)
+    if mask is None:
+        return metres, k, None
+    inside = _as_tensor("mask", mask)
+    if inside.shape != image.shape or inside.dtype not in (torch.bool, torch.uint8):
+        allowed = f"an image of bool or uint8 of the depth's size {tuple(image.shape)}"
+        raise BadArgument("mask", _describe(mask), allowed)
+    if not bool((inside != 0).any()):
+        raise BadArgument("mask", "no pixel inside", "a mask that is not 0 at the object's pixels")
+    return metres, k, (inside != 0).to(image.device)
+
+
+def _read_intrinsics(intrinsics: Tensor | np.ndarray | Sequence[float], size: Sequence[int]) -> Float[Tensor, "3 3"]:
+    """Return the matrix of intrinsics [px] of an image (h, w), or refuse it."""
+    k = _as_tensor("intrinsics", intrinsics).double()
+    if k.shape == (4,):
+        fx, fy, cx, cy = k.tolist()
+        k = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+    if k.shape != (3, 3):
+        raise BadArgument("intrinsics", f"shape {tuple(k.shape)}", "(fx, fy, cx, cy), or a matrix 3x3")
+    check_tensor("intrinsics", k, (3, 3))
+    if not (k[0, 0] > 0 and k[1, 1] > 0) or k[0, 1] != 0 or k[1, 0] != 0 or k[2].tolist() != [0, 0, 1]:
+        raise BadArgument("intrinsics", k.tolist(), "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0")
+    height, width = size
+    shift = [abs(float(k[0, 2]) / width - 0.5), abs(float(k[1, 2]) / height - 0.5)]
+    if max(shift) > MAX_SHIFT:
+        found = f"a principal point ({float(k[0, 2]):.1f}, {float(k[1, 2]):.1f}) px in an image of {width} x {height}"
+        raise BadArgument("intrinsics", found, "one near the image's middle: intrinsics of the same resolution")
+    return k
+
+
+def _as_tensor(name: str, value: Tensor | np.ndarray | Sequence[float]) -> Tensor:
+    """Return an array of any kind as a tensor, or refuse it."""
+    if isinstance(value, Tensor):
+        return value
+    try:
+        array = np.array(value)
+        return torch.from_numpy(array.astype(array.dtype.newbyteorder("=")))  # big-endian files keep theirs
+    except (TypeError, ValueError) as error:  # text, objects, rows of different length
+        raise BadArgument(name, _describe(value), "an array of numbers") from error
 
 
 def _describe(value: object) -> str:
