@@ -6,13 +6,14 @@ from collections.abc import Callable
 from typing import Any, Literal, get_args
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import count_status
-from torchgrasp.cloud.check import check_cloud
+from torchgrasp.cloud.check import remove_duplicates
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.files import sha256
+from torchgrasp.frames import inverse
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.clearance import CollisionWorld
@@ -26,7 +27,8 @@ from torchgrasp.linalg import farthest_points
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure_probability import closure_share
 from torchgrasp.plan.solve import plan_contacts
-from torchgrasp.posture_model.mixture import load_mixture, mixture_path
+from torchgrasp.plane import Plane, cloud_to_upright, move, upright_frame
+from torchgrasp.posture_model.mixture import GraspMixture, load_mixture, mixture_path
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
@@ -112,22 +114,60 @@ def plan_grasps(
         raise BadArgument("hand", type(hand).__name__, "a Hand from load_hand")
     if mode not in get_args(Mode):
         raise BadArgument("mode", repr(mode), "'joint' or 'contact_first'")
-    spec = spec.for_fingertips(float(hand.tips.radius.max()))
+    cloud, spec = remove_duplicates(cloud), spec.for_fingertips(float(hand.tips.radius.max()))
     mixture, mixture_sha256 = None, "none"
     if mode == "contact_first":
         path = mixture_path(hand.urdf_path.parent)
         mixture, mixture_sha256 = load_mixture(path), sha256(path)
+    obj_from_upright = upright_frame(cloud, spec.plane)
     if shape is None:
-        shape = fit_shape(cloud, seed=seed, table=spec.table)  # pyright: ignore[reportArgumentType]
+        level = None if spec.table is None else 0.0
+        shape = fit_shape(cloud_to_upright(cloud, obj_from_upright), seed=seed, table=level)
     else:
-        check_cloud(cloud)
-    hand = hand.to(shape.device)
+        shape = shape.moved(inverse(obj_from_upright))
+    task = _Task(
+        hand.to(shape.device),
+        shape,
+        dataclasses.replace(spec, table=None if spec.table is None else 0.0),
+        starts,
+        seed,
+        mixture,
+        lambda stage, message, value: observer(stage, message, _moved(value, obj_from_upright)),
+    )
+    grasps = _moved(_plan(task), obj_from_upright)
+    meta = {"mode": mode, "mixture_sha256": mixture_sha256, "starts": str(starts), "seed": str(seed)}
+    grasps = dataclasses.replace(grasps, meta=_metadata(cloud, hand, spec) | meta)
+    observer("refine", f"{len(grasps)} refined: {describe(count_status(grasps.status))}", grasps)
+    return grasps
+
+
+def _moved(value: Any, obj_from_upright: Float[Tensor, "4 4"]) -> Any:
+    """Return a result in the given frame."""
+    return value.moved(obj_from_upright) if isinstance(value, ShapeGP) else move(value, obj_from_upright)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Task:
+    """What grasps are planned from, in the upright frame."""
+
+    hand: Hand
+    shape: ShapeGP
+    spec: ContactSpec
+    starts: int
+    seed: int
+    mixture: GraspMixture | None
+    observer: Observer
+
+
+def _plan(task: _Task) -> Grasps:
+    """Plan in the upright frame."""
+    hand, shape, spec, seed, observer = task.hand, task.shape, task.spec, task.seed, task.observer
     surface = extract_surface(shape)
     certain = float((surface.std_m < 0.004).double().mean())
     observer("shape", f"{len(shape.x)} points, {certain:.0%} of the surface certain to 4 mm", shape)
 
-    plan = plan_contacts(shape, spec, starts, seed)
-    observer("plan", f"{starts} starts: {describe(count_status(plan.status))}", plan)
+    plan = plan_contacts(shape, spec, task.starts, seed)
+    observer("plan", f"{task.starts} starts: {describe(count_status(plan.status))}", plan)
 
     offered = plan.contacts[spread_rows(plan, TRIPLES)]
     certificate = certify(offered, spec)
@@ -137,21 +177,19 @@ def plan_grasps(
 
     world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), spec.plane)
     problem = GraspProblem(hand, contacts, certificate, world, surface.vertices.mean(0))
-    if mixture is None:
+    if task.mixture is None:
         seeds = nearest_postures(PostureLibrary.of(hand, seed=seed), contacts, world)
     else:
-        seeds = query_mixture(hand, contacts, mixture.to(shape.device))
+        seeds = query_mixture(hand, contacts, task.mixture.to(shape.device))
     observer("query", f"{len(seeds)} seeds for {len(torch.unique(seeds.row))} of {len(contacts)} triples", seeds)
 
-    grasps = solve_joint(problem, seeds, shape, spec) if mixture is None else solve_contact_first(problem, seeds)
-    good = grasps[grasps.status == Status.OK]
+    solved = (
+        solve_contact_first(problem, seeds) if task.mixture is not None else solve_joint(problem, seeds, shape, spec)
+    )
+    good = solved[solved.status == Status.OK]
     closure = closure_share(shape, good.contacts, spec.friction, SURFACE_DRAWS, seed)
     features = success_features(good.contacts, closure, good.normal_angle, problem.center, spec.friction)
-    grasps = rank_by_success(grasps, success_log_odds(features))
-    meta = {"mode": mode, "mixture_sha256": mixture_sha256, "starts": str(starts), "seed": str(seed)}
-    grasps = dataclasses.replace(grasps, meta=_metadata(cloud, hand, spec) | meta)
-    observer("refine", f"{len(grasps)} refined: {describe(count_status(grasps.status))}", grasps)
-    return grasps
+    return rank_by_success(solved, success_log_odds(features))
 
 
 def _metadata(cloud: PointCloud, hand: Hand, spec: ContactSpec) -> dict[str, str]:
@@ -166,5 +204,11 @@ def _metadata(cloud: PointCloud, hand: Hand, spec: ContactSpec) -> dict[str, str
         "units": "metre, radian",
         "friction": f"{spec.friction:g}",
         "planned_friction": f"{spec.planned_friction:g}",
-        "table": "none" if spec.table is None else f"{spec.table:g}",
+        "table": "none" if spec.plane is None else _describe_plane(spec.plane),
     }
+
+
+def _describe_plane(plane: Plane) -> str:
+    """Return the numbers of a plane as text."""
+    x, y, z = plane.normal.tolist()
+    return f"normal {x:.9g} {y:.9g} {z:.9g}, offset {plane.offset:.9g}"

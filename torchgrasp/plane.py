@@ -6,19 +6,29 @@ what they are given into a frame that only scene and camera determine, and their
 
 import dataclasses
 import math
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value, check_tensor
+from torchgrasp.base import SomeValue, Value, check_tensor, map_tensors
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import apply, inverse, rigid
+from torchgrasp.frames import apply, inverse, rigid, rotate
 from torchgrasp.linalg import unit
+from torchgrasp.values import PointCloud
 
 GRID = 2.0**-20
 """Spacing [m] to which points are rounded in an upright frame: a micrometre. Rounding errors of a transform, some
 1e-16 m, then leave no trace."""
+PHASE = 1 / math.pi
+"""Phase of the rounding: numbers from a file of float32 would often lie halfway between two multiples of `GRID`."""
+POINTS, DIRECTIONS, POSES = (
+    ("points", "viewpoint"),
+    ("normals", "approach", "witness"),
+    ("obj_from_hand", "obj_from_vf"),
+)
+"""Fields of values that change with the frame; the other fields do not."""
 LEAST_TILT = 0.05
 """Least sine of the angle between the vertical and the direction to the camera: steeper views have no azimuth."""
 
@@ -74,16 +84,14 @@ def as_plane(table: Plane | float | None) -> Plane | None:
     return Plane.horizontal(table)
 
 
-def upright_frame(
-    points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "*views 3"] | None, table: Plane | None
-) -> Float[Tensor, "4 4"]:
-    """Return `obj_from_upright`, a frame that moves with points [m], camera and table.
+def upright_frame(cloud: PointCloud, table: Plane | None = None) -> Float[Tensor, "4 4"]:
+    """Return `obj_from_upright`, a frame that moves with cloud, camera and table.
 
     Its z axis is the table's normal, else the direction to the camera, else the points' least principal axis. Its x
     axis points level towards the camera, else to the point farthest from the vertical through the points' centre,
     where the origin lies: on the table, if there is one.
     """
-    points = points.detach().cpu().double()
+    points, viewpoint = cloud.points.detach().cpu().double(), cloud.viewpoint
     centre = points.mean(0)
     offset = points - centre
     eye = None if viewpoint is None else viewpoint.detach().cpu().double().reshape(-1, 3).mean(0) - centre
@@ -107,5 +115,37 @@ def upright_frame(
 
 def to_upright(points: Float[Tensor, "*b 3"], obj_from_upright: Float[Tensor, "4 4"]) -> Float[Tensor, "*b 3"]:
     """Return points [m] in the upright frame, rounded to `GRID`."""
-    flat = apply(inverse(obj_from_upright).to(points.device), points.double().reshape(-1, 3))
-    return (torch.round(flat / GRID) * GRID).reshape(points.shape)
+    return _round(apply(inverse(obj_from_upright).to(points.device), points.double().reshape(-1, 3))).reshape_as(points)
+
+
+def _round(x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+    """Round to multiples of `GRID`; rounded numbers stay."""
+    return torch.round(x / GRID + PHASE) * GRID
+
+
+def cloud_to_upright(cloud: PointCloud, obj_from_upright: Float[Tensor, "4 4"]) -> PointCloud:
+    """Return a cloud in the upright frame, in float64 and rounded to `GRID`."""
+    return map_tensors(_round, move(cloud.to(torch.float64), inverse(obj_from_upright)))
+
+
+def move(value: SomeValue, b_from_a: Float[Tensor, "4 4"]) -> SomeValue:
+    """Return a value of `torchgrasp.values` in frame b [m]; it is given in frame a.
+
+    >>> up = torch.eye(4).index_put((torch.tensor(2), torch.tensor(3)), torch.tensor(1.0))
+    >>> move(PointCloud(torch.zeros(4, 3)), up).points[0]
+    tensor([0., 0., 1.])
+    """
+
+    def moved(name: str, x: Any) -> Any:
+        if isinstance(x, Value):
+            return move(x, b_from_a)
+        if not isinstance(x, Tensor) or name not in (*POINTS, *DIRECTIONS, *POSES):
+            return x
+        pose = b_from_a.to(x)
+        if name in POSES:
+            return pose @ x
+        vectors = x.reshape(-1, 3)  # a wrench is a force and a torque
+        return (apply if name in POINTS else rotate)(pose, vectors).reshape(x.shape)
+
+    names = [field.name for field in dataclasses.fields(value)]  # pyright: ignore[reportArgumentType]
+    return type(value)(**{name: moved(name, getattr(value, name)) for name in names})

@@ -31,12 +31,12 @@ def check_feasibility(shape: Shape, spec: ContactSpec, points: Triples) -> Conta
     closed &= rank_ratio(wrench) >= MIN_RANK_RATIO  # 0 / 0 of a row that is not finite is False
 
     apart = torch.linalg.vector_norm(metres - metres.roll(1, 1), dim=-1).amin(-1)
-    lowest = ContactProblem.of(shape, spec).least_height(normals)
+    room = ContactProblem.of(shape, spec).room(points, normals)
     good = {
         Status.OUT_OF_DOMAIN: (torch.linalg.vector_norm(points, dim=-1) <= shape.domain_radius).all(-1),
         Status.OFF_SURFACE: (jet.distance.abs() <= ON_SURFACE).all(-1),
         Status.TOO_UNCERTAIN: ((jet.variance >= 0) & (jet.variance < spec.max_variance)).all(-1),
-        Status.BELOW_TABLE: (points[..., 2] >= lowest).all(-1),
+        Status.BELOW_TABLE: (room >= 0).all(-1),
         Status.TOO_CLOSE: apart >= spec.least_separation,
         Status.DEGENERATE: ~degenerate(points),
     }

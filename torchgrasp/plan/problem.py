@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchgrasp.base import Batch, map_tensors
 from torchgrasp.plan.wrench import Triples
+from torchgrasp.plane import Plane
 from torchgrasp.shape.posterior import SurfaceJet
 from torchgrasp.specs import ContactSpec
 
@@ -94,24 +95,24 @@ def forces_from_tensions(points: Triples, tension: Float[Tensor, "b 3"]) -> tupl
 class ContactProblem:
     """Eqs. (10)-(14) and the margins of `ContactSpec`, in the normalised units of one shape.
 
-    `friction` is that of the round cone inside the cone with edges. `separation` is at least `LEAST_SIDE`. `table` is
-    the z coordinate of its plane, -inf without one.
+    `friction` is that of the round cone inside the cone with edges. `separation` is at least `LEAST_SIDE`.
     """
 
     friction: float
     max_variance: float
     domain_radius: float
     separation: float
-    table: float
+    table: Plane | None
     contact_height: float
     tip_radius: float
 
     @classmethod
     def of(cls, shape: Shape, spec: ContactSpec) -> "ContactProblem":
         """Return the problem of a shape and a specification."""
-        table, scale = -math.inf, float(shape.scale)
-        if spec.table is not None:
-            table = float(shape.normalise(torch.tensor([0.0, 0.0, spec.table], dtype=torch.float64))[2])
+        table, scale = spec.plane, float(shape.scale)
+        if table is not None:
+            foot = table.offset * table.normal
+            table = Plane(table.normal, float(shape.normalise(foot) @ table.normal))
         return cls(
             friction=spec.planned_friction * math.cos(math.pi / spec.edges),
             max_variance=spec.max_variance,
@@ -122,9 +123,12 @@ class ContactProblem:
             tip_radius=spec.fingertip_radius / scale,
         )
 
-    def least_height(self, normals: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the least z coordinate of contacts: a round fingertip then rests on the table."""
-        return self.table + (self.tip_radius * (1 - normals[..., 2])).clamp_min(self.contact_height)
+    def room(self, points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+        """Return how much higher contacts are than they must be: at 0 a round fingertip rests on the table."""
+        if self.table is None:
+            return torch.full_like(points[..., 0], math.inf)
+        slant = 1 - normals @ self.table.normal.to(normals)
+        return self.table.height(points) - (self.tip_radius * slant).clamp_min(self.contact_height)
 
     def constraints(self, points: Triples, tension: Float[Tensor, "b 3"], jet: SurfaceJet) -> Constraints:
         """Evaluate all constraints and their Jacobians; `jet` is the shape at the points."""
@@ -148,11 +152,11 @@ class ContactProblem:
             _by_own_point(points / ball),
             sides_by_x,
         ]
-        if self.table > -math.inf:
-            lowest = self.least_height(jet.normals)
-            values.append(lowest - points[..., 2] + (1 - INSIDE) * 0.1)
-            by_tip = self.tip_radius * (lowest > self.table + self.contact_height)[..., None]
-            jacobians.append(_by_own_point(-identity[2] - by_tip * jet.normal_jacobian[..., 2, :]))
+        if self.table is not None:
+            up = self.table.normal.to(points)
+            values.append((1 - INSIDE) * 0.1 - self.room(points, jet.normals))
+            by_tip = self.tip_radius * (self.tip_radius * (1 - jet.normals @ up) > self.contact_height)[..., None]
+            jacobians.append(_by_own_point(-up - by_tip * (up @ jet.normal_jacobian)))
         return Constraints(
             centre=points.mean(1),
             surface=jet.distance,

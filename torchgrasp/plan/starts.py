@@ -105,7 +105,7 @@ def candidate_contacts(
     jet = triple_jet(shape, points)
     good = (jet.distance.abs() < 1e-4) & (jet.variance >= 0) & (jet.variance < spec.max_variance)
     good &= torch.linalg.vector_norm(points, dim=-1) < problem.domain_radius
-    good &= points[..., 2] > problem.least_height(jet.normals)
+    good &= problem.room(points, jet.normals) > 0
     if spec.flatness is not None:
         good &= normal_variation(shape, points, jet.normals) < CANDIDATE_FLATNESS * spec.flatness
     if int(good.sum()) < 3:

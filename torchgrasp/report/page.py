@@ -4,7 +4,6 @@ import base64
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from jaxtyping import Int
 from torch import Tensor
@@ -40,7 +39,8 @@ def write_report(path: Path | str, run: Run) -> Path:
 
 def draw_pictures(run: Run) -> dict[str, list[tuple[str, bytes]]]:
     """Draw every picture of a run: captions and PNGs by section."""
-    table: Any = run.spec.table  # pictures know heights only
+    run = run.upright()
+    table = None if run.spec.table is None else 0.0
     view, best = view_of(run.cloud), run.executable
     sections = {
         "Seen and unseen": [

@@ -5,9 +5,13 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import torch
+
 from torchgrasp.base import count_status
 from torchgrasp.errors import Status
+from torchgrasp.frames import inverse
 from torchgrasp.hand.hand import Hand
+from torchgrasp.plane import move, upright_frame
 from torchgrasp.shape.surface import Surface
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ClosureResult, ContactPlan, Grasps, PointCloud
@@ -45,24 +49,47 @@ class Run:
         """The grasps that passed every check, best first."""
         return self.grasps[self.grasps.status == Status.OK]
 
+    def upright(self) -> "Run":
+        """Return the run in the upright frame of its cloud and table, where z is up."""
+        obj_from_upright = upright_frame(self.cloud, self.spec.plane)
+        upright_from_obj, mesh, closure = inverse(obj_from_upright), self.mesh, self.closure
+        if mesh is not None:
+            mesh = mesh.copy().apply_transform(upright_from_obj.numpy())
+        if closure is not None:
+            object_pose = upright_from_obj @ closure.object_pose.double() @ obj_from_upright
+            hand_pose = upright_from_obj @ closure.hand_pose.double()
+            closure = dataclasses.replace(closure, object_pose=object_pose, hand_pose=hand_pose)
+        return dataclasses.replace(
+            self,
+            cloud=move(self.cloud, upright_from_obj),
+            surface=move(self.surface, upright_from_obj),
+            grasps=move(self.grasps, upright_from_obj),
+            mesh=mesh,
+            closure=closure,
+        )
+
 
 def verdict(run: Run) -> str:
     """Say in one sentence what the run ended with."""
     if run.closure is not None:
-        return closing_sentence(run.closure, run.hand.name, run.object_name)
+        return closing_sentence(run)
     if count := len(run.executable):
         return f"The {run.hand.name} hand has {count} executable grasp{'s' * (count > 1)} of the {run.object_name}."
     return refusal(run)
 
 
-def closing_sentence(closure: ClosureResult, hand_name: str, object_name: str) -> str:
-    """Say whether the object was held, its rise and its motion in the hand."""
+def closing_sentence(run: Run) -> str:
+    """Say whether the object was held, the rise of its mass centre, and its motion in the hand."""
+    upright = run.upright()
+    closure, mesh = upright.closure, upright.mesh
+    assert closure is not None and mesh is not None
     if not closure.held:
-        return f"The {hand_name} hand did not hold the {object_name}: {closure.status.sentence}."
-    rise = float(closure.object_pose[-1, 2, 3] - closure.object_pose[0, 2, 3])
+        return f"The {run.hand.name} hand did not hold the {run.object_name}: {closure.status.sentence}."
+    centre = torch.tensor([*mesh.center_mass, 1.0], dtype=torch.float64)
+    rise = float((closure.object_pose[-1] - closure.object_pose[0])[2] @ centre)
     moved, angle = closure.object_motion
     return (
-        f"The {hand_name} hand held the {object_name}: lifted {rise:.2f} m, "
+        f"The {run.hand.name} hand held the {run.object_name}: lifted {rise:.2f} m, "
         f"moved {1e3 * moved:.0f} mm and {math.degrees(angle):.0f} deg in the hand."
     )
 

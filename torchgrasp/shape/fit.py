@@ -9,9 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import join
+from torchgrasp.cloud.check import remove_duplicates
 from torchgrasp.cloud.prepare import PreparedCloud, prepare_cloud
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import fibonacci_sphere, unit
+from torchgrasp.plane import Plane, as_plane, cloud_to_upright, upright_frame
 from torchgrasp.shape.completion.complete import LEAST_NOISE, PART, Completion, complete_cloud
 from torchgrasp.shape.completion.free_space import free_space, free_space_violations
 from torchgrasp.shape.condition import check_kernel, longest_distance
@@ -54,7 +56,7 @@ def fit_shape(
     support: Literal["camera", "paper"] = "camera",
     seed: int = 0,
     *,
-    table: float | None = None,
+    table: Plane | float | None = None,
     kernel: KernelName | Kernel = "thin_plate",
     criterion: Criterion = "variance",
 ) -> ShapeGP:
@@ -76,7 +78,7 @@ def fit_shape(
         psi_scale: psi over the longest distance of the observations; below 1.34 the covariance may be indefinite.
         support: "camera" or "paper".
         seed: of the random draws.
-        table: height [m] of the table, whose normal is z; only "camera" uses it.
+        table: the table's plane, or its height [m] along z; only "camera" uses it.
         kernel: "thin_plate", "matern52" or "rbf" with the length of psi (`kernel_by_name`); or a `Kernel` of
             normalised distances.
         criterion: what the most informative point has most of: "variance"; "error", the mean's distance from 0;
@@ -92,11 +94,14 @@ def fit_shape(
     >>> fit_shape(PointCloud(0.04 * ball, ball)).predict(torch.tensor([0.0, 0.0, 0.04])).distance.abs() < 0.02
     tensor(True)
     """
-    _check_numbers(noise, budget, psi_scale, seed, table)
+    _check_numbers(noise, budget, psi_scale, seed)
     _check_names(support, kernel, criterion)
-    generator = torch.Generator().manual_seed(seed)
-    seen = prepare_cloud(cloud, generator, clean=support == "camera")
-    beside = _paper_support(seen, noise, generator) if support == "paper" else _camera_support(seen, noise, table)
+    plane, generator = as_plane(table), torch.Generator().manual_seed(seed)
+    cloud = remove_duplicates(cloud)
+    obj_from_upright = upright_frame(cloud, plane)
+    seen = prepare_cloud(cloud_to_upright(cloud, obj_from_upright), generator, clean=support == "camera")
+    height = None if plane is None else 0.0  # of the table in the upright frame
+    beside = _paper_support(seen, noise, generator) if support == "paper" else _camera_support(seen, noise, height)
     x = beside.frame.normalise(seen.points)
     candidates = on_surface(x, seen.normals, torch.full_like(x[:, 0], noise), beside.normal_noise)
 
@@ -111,15 +116,14 @@ def fit_shape(
         posterior = append_observations(posterior, part, shared)
     check_kernel(posterior, every.least_noise)
     shape = ShapeGP.of(posterior, beside.frame, seen.cloud, psi, beside.std_factor)
-    if beside.free is None:
-        return shape
-    free, least = beside.free
-    for _ in range(FREE_ROUNDS):
-        rows = free_space_violations(shape, free, least)
-        if not len(rows):
-            break
-        shape = shape.append(off_surface(free[rows], least[rows], FREE_NOISE / shape.scale))
-    return shape
+    if beside.free is not None:
+        free, least = beside.free
+        for _ in range(FREE_ROUNDS):
+            rows = free_space_violations(shape, free, least)
+            if not len(rows):
+                break
+            shape = shape.append(off_surface(free[rows], least[rows], FREE_NOISE / shape.scale))
+    return shape.moved(obj_from_upright)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,9 +189,7 @@ def _observe_completion(completion: Completion, frame: Normalisation) -> tuple[t
     return (rim, None), (mirrored, completion.deviations.to(frame.center) / frame.scale)
 
 
-def _check_numbers(
-    noise: float, budget: int | Literal["sure"] | None, psi_scale: float, seed: int, table: float | None
-) -> None:
+def _check_numbers(noise: float, budget: int | Literal["sure"] | None, psi_scale: float, seed: int) -> None:
     """Refuse numbers out of range."""
     if not 0.0 < noise <= 1.0:  # also refuses NaN
         raise BadArgument("noise", noise, "a number in (0, 1], normalised")
@@ -198,8 +200,6 @@ def _check_numbers(
         raise BadArgument("psi_scale", psi_scale, "a number in [1, 100]; 1.34 and more are safe")
     if not isinstance(seed, int) or not 0 <= seed < 2**63:
         raise BadArgument("seed", seed, "an integer from 0")
-    if table is not None and not math.isfinite(table):
-        raise BadArgument("table", table, "a height in metres, or None")
 
 
 def _check_names(support: str, kernel: KernelName | Kernel, criterion: str) -> None:

@@ -9,7 +9,9 @@ from torch import Tensor
 
 from torchgrasp.base import Value, check_tensor, map_tensors
 from torchgrasp.errors import BadArgument
-from torchgrasp.linalg import unit
+from torchgrasp.frames import apply
+from torchgrasp.linalg import cholesky, unit
+from torchgrasp.plane import move
 from torchgrasp.shape.joint_posterior import JointEstimate, draw_samples, joint_estimate
 from torchgrasp.shape.observations import Observations, on_surface
 from torchgrasp.shape.posterior import Posterior
@@ -175,6 +177,27 @@ class ShapeGP(Posterior, Normalisation):
     def append(self, new: Observations) -> "ShapeGP":
         """Return the shape given further observations, normalised, with the same kernel and domain."""
         return dataclasses.replace(self, **_fields(append_observations(self, new), Posterior))
+
+    def moved(self, b_from_a: Float[Tensor, "4 4"]) -> "ShapeGP":
+        """Return the shape in frame b [m]; it is given in frame a. Its normalised frame turns along."""
+        rotation, n = b_from_a[:3, :3].to(self.x), len(self.x)
+
+        def turn(rows: Float[Tensor, "rows c"]) -> Float[Tensor, "rows c"]:
+            """Turn the rows of normals."""
+            normals = rows[n:].reshape(3, self.n_oriented * rows.shape[1])
+            return torch.cat([rows[:n], (rotation @ normals).reshape(rows[n:].shape)])
+
+        back = slice(None) if self.order is None else torch.argsort(self.order)
+        covariance = (self.factor @ self.factor.T)[back][:, back]
+        return dataclasses.replace(
+            self,
+            x=self.x @ rotation.T,
+            center=apply(b_from_a.to(self.center), self.center[None])[0],
+            weights=turn(self.weights[:, None])[:, 0],
+            factor=cholesky(turn(turn(covariance).T), "the covariance of the observations", self.kernel.remedy),
+            order=None,
+            cloud=move(self.cloud, b_from_a),
+        )
 
     def _queries(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "q 3"]:
         """Return normalised query points as a list; refuse points outside the domain."""
