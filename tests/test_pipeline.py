@@ -9,12 +9,15 @@ import torch
 from scipy.optimize import linprog
 
 from torchgrasp import ContactSpec, PointCloud, Status, load_grasps, load_hand, load_object, plan_grasps
+from torchgrasp.base import named_tensors
 from torchgrasp.errors import BadArgument, SuspiciousScale
+from torchgrasp.frames import apply, inverse, rigid, rotate, rotation_from_vector
 from torchgrasp.ik.ranking import FEATURES, MODEL, rank_by_success
 from torchgrasp.linalg import unit
 from torchgrasp.pipeline import describe, digest, spread_rows
 from torchgrasp.plan.closure_probability import closure_probability
 from torchgrasp.plan.internal_forces import least_friction_forces
+from torchgrasp.plane import Plane, move, upright_frame
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.values import ContactPlan, Contacts
 
@@ -95,10 +98,14 @@ def test_the_likelier_success_ranks_first_and_failures_stay_last(run):
 
 def test_success_is_what_the_model_says_of_the_surface_that_was_planned_on(run):
     _, grasps, stages = run
-    best = grasps[grasps.status == Status.OK][:5]
-    closed = closure_probability(stages["shape"], best.contacts, SPEC, n=600, seed=1).probability.clamp(1e-3, 1 - 1e-3)
+    upright_from_obj = inverse(upright_frame(load_object("cylinder").view, SPEC.plane))
+    best, shape = (
+        move(grasps[grasps.status == Status.OK][:5], upright_from_obj),
+        stages["shape"].moved(upright_from_obj),
+    )
+    closed = closure_probability(shape, best.contacts, SPEC, n=600, seed=1).probability.clamp(1e-3, 1 - 1e-3)
     points, normals = best.contacts.points, best.contacts.normals
-    offset = (points.mean(1) - extract_surface(stages["shape"]).vertices.mean(0)).norm(dim=-1) / 0.02
+    offset = (points.mean(1) - extract_surface(shape).vertices.mean(0)).norm(dim=-1) / 0.02
     angle = [
         torch.acos((-(unit(forces) * normals).sum(-1)).clamp(0, 1)).amax(1) / math.atan(SPEC.friction)
         for forces in (least_friction_forces(points, normals), points.mean(1, keepdim=True) - points)
@@ -107,6 +114,27 @@ def test_success_is_what_the_model_says_of_the_surface_that_was_planned_on(run):
     model = json.loads(MODEL.read_text())
     odds = sum(model["weights"][name] * x for name, x in zip(FEATURES, known, strict=True)) + model["bias"]
     torch.testing.assert_close(best.success, 1 / (1 + (-odds).exp()), rtol=1e-6, atol=1e-6)
+
+
+def test_grasps_do_not_depend_on_the_frame_of_cloud_camera_and_table(moved_by):
+    hand, view, shapes = load_hand("barrett"), load_object("cylinder").view.to(torch.float64), []
+    note = lambda stage, text, value: shapes.append(value) if stage == "shape" else None  # noqa: E731
+    here = plan_grasps(view, hand, SPEC, starts=30, observer=note)
+    table = Plane.horizontal(0.0).moved(moved_by)
+    there = plan_grasps(move(view, moved_by), hand, ContactSpec(table=table), starts=30, observer=note)
+    back = named_tensors(move(there, inverse(moved_by)))
+    for name, x in named_tensors(here).items():
+        torch.testing.assert_close(back[name], x, rtol=0, atol=1e-9, msg=name)
+    first, second = (s.predict(p) for s, p in zip(shapes, (view.points, apply(moved_by, view.points)), strict=True))
+    torch.testing.assert_close(first.distance, second.distance, rtol=0, atol=1e-6)
+    torch.testing.assert_close(first.std_m, second.std_m, rtol=0, atol=1e-6)
+    torch.testing.assert_close(rotate(moved_by, first.normal), second.normal, rtol=0, atol=1e-5)
+
+
+@pytest.fixture(params=[0, 1])
+def moved_by(request):
+    draw = torch.randn(2, 3, generator=torch.Generator().manual_seed(request.param), dtype=torch.float64)
+    return rigid(rotation_from_vector(3 * draw[0]), draw[1])
 
 
 def test_tips_limits_and_clearances_hold(run):
