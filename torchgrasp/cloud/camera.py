@@ -92,16 +92,16 @@ def partial_view(
     if n < 4:
         raise BadArgument("n", n, "at least 4 points")
     pose = check_rigid("camera_pose", camera_pose).double()
-    depth, cosine = _cast(mesh, pose)
+    depth, cosine = cast_mesh(mesh, pose)
     generator = torch.Generator().manual_seed(seed)
     if noise:
-        depth = _add_noise(depth, cosine, generator)
+        depth = add_noise(depth, cosine, generator)
     cloud = cloud_from_depth(depth, INTRINSICS, camera_pose=pose)
     rows = torch.randperm(len(cloud), generator=generator)[:n]
     return PointCloud(cloud.points[rows], None, cloud.viewpoint)
 
 
-def _cast(
+def cast_mesh(
     mesh: "trimesh.Trimesh", obj_from_camera: Float[Tensor, "4 4"]
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
     """Return depth [m] and |cosine| of ray and face normal, both 0 where nothing is."""
@@ -138,7 +138,7 @@ def _in_image_box(
     return (x >= u.min() - margin) & (x <= u.max() + margin) & (y >= v.min() - margin) & (y <= v.max() + margin)
 
 
-def _add_noise(
+def add_noise(
     depth: Float[Tensor, "h w"], cosine: Float[Tensor, "h w"], generator: torch.Generator
 ) -> Float[Tensor, "h w"]:
     """Add the noise that `partial_view` describes to a depth image [m]."""

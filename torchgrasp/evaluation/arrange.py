@@ -1,0 +1,91 @@
+"""Scenes of several objects on a table."""
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.base import check_number
+from torchgrasp.errors import BadArgument
+from torchgrasp.frames import apply, rigid, rotation_from_vector
+
+if TYPE_CHECKING:
+    import trimesh
+
+TRIES = 200
+"""Positions tried for one mesh before the whole arrangement begins again."""
+ARRANGEMENTS = 50
+"""Beginnings before the meshes are said not to fit."""
+
+
+def scatter(
+    meshes: "Sequence[trimesh.Trimesh]", generator: torch.Generator, radius: float, gap: float
+) -> Float[Tensor, "n 4 4"]:
+    """Return poses of meshes that stand apart on the table z = 0, each turned about z at random.
+
+    Positions are uniform. Their footprints, the convex hulls seen from above, lie within `radius` of the origin and
+    at least `gap` apart. There is no physics: each mesh stays upright, with its lowest point on the table.
+
+    Args:
+        meshes: each in its own frame [m].
+        generator: of every draw.
+        radius: of the circle that holds the footprints [m].
+        gap: least distance of two footprints [m].
+
+    Raises:
+        BadArgument: the meshes do not fit into the circle.
+
+    >>> import trimesh
+    >>> scatter([trimesh.creation.box([0.1, 0.1, 0.2])], torch.Generator().manual_seed(0), 0.2, 0.01)[0, 2, 3]
+    tensor(0.1000, dtype=torch.float64)
+    """
+    check_number("gap", gap, 0.0, radius)
+    for _ in range(ARRANGEMENTS):
+        poses, taken = [], []
+        for mesh in meshes:
+            for _ in range(TRIES):
+                pose = _random_pose(mesh, generator, radius)
+                hull = _footprint(mesh, pose)
+                inside = bool((torch.linalg.vector_norm(hull, dim=-1) <= radius).all())
+                if inside and all(_separation(hull, other) >= gap for other in taken):
+                    poses.append(pose)
+                    taken.append(hull)
+                    break
+            else:
+                break
+        if len(poses) == len(meshes):
+            return torch.stack(poses) if poses else torch.empty(0, 4, 4, dtype=torch.float64)
+    raise BadArgument("radius", f"{radius:g} m for {len(meshes)} meshes", "a circle that holds them, with their gaps")
+
+
+def _random_pose(mesh: "trimesh.Trimesh", generator: torch.Generator, radius: float) -> Float[Tensor, "4 4"]:
+    """Return an upright pose in the circle, on the table."""
+    turn, share, angle = torch.rand(3, generator=generator, dtype=torch.float64).tolist()
+    distance, angle = radius * math.sqrt(share), 2 * math.pi * angle
+    position = [distance * math.cos(angle), distance * math.sin(angle), -float(mesh.bounds[0, 2])]
+    rotation = rotation_from_vector(torch.tensor([0.0, 0.0, 2 * math.pi * turn], dtype=torch.float64))
+    return rigid(rotation, torch.tensor(position, dtype=torch.float64))
+
+
+def _footprint(mesh: "trimesh.Trimesh", pose: Float[Tensor, "4 4"]) -> Float[Tensor, "n 2"]:
+    """Return the corners of the convex hull of a placed mesh, seen from above, in order."""
+    from scipy.spatial import ConvexHull
+
+    flat = apply(pose, torch.from_numpy(np.array(mesh.vertices, dtype=np.float64)))[:, :2]
+    return flat[torch.from_numpy(ConvexHull(flat.numpy()).vertices.astype(np.int64))]
+
+
+def _separation(a: Float[Tensor, "n 2"], b: Float[Tensor, "m 2"]) -> float:
+    """Return a lower bound of the distance of two convex polygons: the widest strip along an edge between them."""
+    return max(_widest_strip(a, b), _widest_strip(b, a))
+
+
+def _widest_strip(a: Float[Tensor, "n 2"], b: Float[Tensor, "m 2"]) -> float:
+    """Return the greatest distance of b from an edge of a, outward; a's corners run counter-clockwise."""
+    edge = a.roll(-1, 0) - a
+    outward = torch.stack([edge[:, 1], -edge[:, 0]], -1) / torch.linalg.vector_norm(edge, dim=-1, keepdim=True)
+    return float(((b @ outward.T).amin(0) - (a * outward).sum(-1)).max())
