@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgrasp.base import check_number
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import apply, rigid, rotation_from_vector
+from torchgrasp.frames import rigid, rotation_from_vector
 
 if TYPE_CHECKING:
     import trimesh
@@ -37,46 +37,52 @@ def scatter(
         gap: least distance of two footprints [m].
 
     Raises:
-        BadArgument: the meshes do not fit into the circle.
+        BadArgument: no mesh, or the meshes do not fit into the circle.
 
     >>> import trimesh
     >>> scatter([trimesh.creation.box([0.1, 0.1, 0.2])], torch.Generator().manual_seed(0), 0.2, 0.01)[0, 2, 3]
     tensor(0.1000, dtype=torch.float64)
     """
     check_number("gap", gap, 0.0, radius)
+    if not meshes:
+        raise BadArgument("meshes", "none", "at least one mesh")
+    outlines = [_footprint(mesh) for mesh in meshes]
+    largest_first = sorted(
+        range(len(meshes)), key=lambda i: -float(torch.linalg.vector_norm(outlines[i], dim=-1).max())
+    )
     for _ in range(ARRANGEMENTS):
-        poses, taken = [], []
-        for mesh in meshes:
+        placed: dict[int, tuple[Float[Tensor, "4 4"], Float[Tensor, "k 2"]]] = {}
+        for i in largest_first:
+            taken = [outline for _, outline in placed.values()]
             for _ in range(TRIES):
-                pose = _random_pose(mesh, generator, radius)
-                hull = _footprint(mesh, pose)
-                inside = bool((torch.linalg.vector_norm(hull, dim=-1) <= radius).all())
-                if inside and all(_separation(hull, other) >= gap for other in taken):
-                    poses.append(pose)
-                    taken.append(hull)
+                pose = _random_pose(-float(meshes[i].bounds[0, 2]), generator, radius)
+                outline = outlines[i] @ pose[:2, :2].T + pose[:2, 3]
+                inside = float(torch.linalg.vector_norm(outline, dim=-1).max()) <= radius
+                if inside and all(_separation(outline, other) >= gap for other in taken):
+                    placed[i] = pose, outline
                     break
             else:
                 break
-        if len(poses) == len(meshes):
-            return torch.stack(poses) if poses else torch.empty(0, 4, 4, dtype=torch.float64)
+        if len(placed) == len(meshes):
+            return torch.stack([placed[i][0] for i in range(len(meshes))])
     raise BadArgument("radius", f"{radius:g} m for {len(meshes)} meshes", "a circle that holds them, with their gaps")
 
 
-def _random_pose(mesh: "trimesh.Trimesh", generator: torch.Generator, radius: float) -> Float[Tensor, "4 4"]:
-    """Return an upright pose in the circle, on the table."""
+def _random_pose(height: float, generator: torch.Generator, radius: float) -> Float[Tensor, "4 4"]:
+    """Return an upright pose at a random place in the circle, at a height [m]."""
     turn, share, angle = torch.rand(3, generator=generator, dtype=torch.float64).tolist()
     distance, angle = radius * math.sqrt(share), 2 * math.pi * angle
-    position = [distance * math.cos(angle), distance * math.sin(angle), -float(mesh.bounds[0, 2])]
+    position = [distance * math.cos(angle), distance * math.sin(angle), height]
     rotation = rotation_from_vector(torch.tensor([0.0, 0.0, 2 * math.pi * turn], dtype=torch.float64))
     return rigid(rotation, torch.tensor(position, dtype=torch.float64))
 
 
-def _footprint(mesh: "trimesh.Trimesh", pose: Float[Tensor, "4 4"]) -> Float[Tensor, "n 2"]:
-    """Return the corners of the convex hull of a placed mesh, seen from above, in order."""
+def _footprint(mesh: "trimesh.Trimesh") -> Float[Tensor, "n 2"]:
+    """Return the corners of the convex hull of a mesh, seen from above, in order."""
     from scipy.spatial import ConvexHull
 
-    flat = apply(pose, torch.from_numpy(np.array(mesh.vertices, dtype=np.float64)))[:, :2]
-    return flat[torch.from_numpy(ConvexHull(flat.numpy()).vertices.astype(np.int64))]
+    flat = np.array(mesh.vertices, dtype=np.float64)[:, :2]
+    return torch.from_numpy(flat[ConvexHull(flat).vertices])
 
 
 def _separation(a: Float[Tensor, "n 2"], b: Float[Tensor, "m 2"]) -> float:
