@@ -3,6 +3,7 @@
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
 from torchgrasp.evaluation.campaign import EvaluationSpec, evaluate, run_protocol
 from torchgrasp.evaluation.lift import close_hand, lift_grasp
+from torchgrasp.evaluation.placed import PlacedScene, drop
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.evaluation.protocols import PROTOCOLS, PoseNoise, Protocol, PullSpec, apply_error
 from torchgrasp.evaluation.protocols import draw_error, draw_hand_errors, draw_object_poses, find_protocol
@@ -13,6 +14,7 @@ __all__ = [
     "PROTOCOLS",
     "EvaluationSpec",
     "GraspTrial",
+    "PlacedScene",
     "PoseNoise",
     "Protocol",
     "ProtocolResult",
@@ -26,6 +28,7 @@ __all__ = [
     "draw_error",
     "draw_hand_errors",
     "draw_object_poses",
+    "drop",
     "evaluate",
     "find_protocol",
     "lift_grasp",
