@@ -36,7 +36,7 @@ def bad_inputs(folder):
     """Name each bad input: its arguments, and words that the sentence must hold."""
     np.save(folder / "two.npy", sphere(2))
     np.save(folder / "mm.npy", sphere(200, 40.0))
-    np.save(folder / "nan.npy", np.where(np.arange(600).reshape(200, 3) == 7, np.nan, sphere(200)))
+    np.save(folder / "nan.npy", np.where(np.arange(600).reshape(200, 3) < 592, np.nan, sphere(200)))
     (folder / "empty.xyz").write_text("")
     (folder / "empty.ply").write_bytes(b"")
     (folder / "cloud.docx").write_text("x")
@@ -52,7 +52,7 @@ def bad_inputs(folder):
         "other suffix": ([folder / "cloud.docx", *hand], ["CLOUD", ".ply"]),
         "two points": ([folder / "two.npy", *hand], ["CLOUD", "2 points", "at least 4"]),
         "millimetres": ([folder / "mm.npy", *hand], ["CLOUD", "m"]),
-        "nan": ([folder / "nan.npy", *hand], ["CLOUD", "NaN", "finite"]),
+        "nan": ([folder / "nan.npy", *hand], ["CLOUD", "NaN", "198 of 200", "at least 4"]),
         "unknown hand": ([VIEW, "--hand", "shadow"], ["--hand", "'shadow'", "allegro", "barrett"]),
         "open mesh": ([VIEW, *hand, "--mesh", folder / "open.ply", "--close"], ["--mesh", "open", "watertight"]),
         "missing mesh": ([VIEW, *hand, "--mesh", folder / "no.stl", "--close"], ["--mesh", "no file"]),

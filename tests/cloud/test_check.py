@@ -16,10 +16,25 @@ def test_a_good_cloud_passes_unchanged():
         assert check_cloud(value) is value
 
 
-@pytest.mark.parametrize("factor", [1e-6, 1e-3, 0.04, 25.0, 1e3, 1e6])
-def test_a_wrong_unit_is_named(factor):
-    with pytest.raises(SuspiciousScale, match="mm" if factor > 1 else "normalised"):
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [
+        *[(1e-6, "normalised"), (1e-3, "normalised"), (0.04, "normalised"), (25.0, "whole scene.*--unit cm")],
+        *[(110.0, "--unit cm"), (1e3, "--unit mm"), (1e6, "--unit mm")],
+    ],
+)
+def test_a_wrong_unit_is_named(factor, words):
+    with pytest.raises(SuspiciousScale, match=words):
         check_cloud(PointCloud(cloud() * factor))
+
+
+def test_of_a_large_cloud_too_few_distinct_points_are_found():
+    """A part of the rows holds too few; then all are looked at."""
+    points = cloud(2).repeat(30_000, 1)
+    with pytest.raises(TooFewPoints, match="2 distinct"):
+        check_cloud(PointCloud(points))
+    points[[1, 3]] = cloud(9)[5:7]
+    assert len(check_cloud(PointCloud(points))) == 60_000
 
 
 def test_coincident_few_and_collinear_points_are_refused():

@@ -12,6 +12,10 @@ from torchgrasp.values import PointCloud
 
 MIN_EXTENT, MAX_EXTENT = 0.005, 2.0
 """Longest side [m] of an object's bounding box: smaller is no object for a hand, larger is a scene or not in metres."""
+LEAST_MM = 45.0
+"""Extent from which a cloud is rather in mm than in cm: objects for a hand are 5 to 45 cm long."""
+MANY = 20_000
+"""Points of a cloud that are looked at for copies when only their presence matters."""
 MIN_POINTS = 4
 """Fewest distinct points: a quadric or a posterior of fewer says nothing."""
 
@@ -28,7 +32,9 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
     >>> check_cloud(PointCloud(torch.rand(50, 3))).viewpoint is None
     True
     """
-    remove_duplicates(cloud)
+    points = _check(cloud)
+    rows = _distinct_rows(points[:: max(1, len(points) // MANY)])
+    _check_distinct(points, rows if len(rows) >= MIN_POINTS else _distinct_rows(points))
     return cloud
 
 
@@ -43,6 +49,23 @@ def remove_duplicates(cloud: PointCloud) -> PointCloud:
     >>> len(remove_duplicates(PointCloud(torch.rand(10, 3).repeat(3, 1))))
     10
     """
+    points = _check(cloud)
+    rows = _distinct_rows(points)
+    _check_distinct(points, rows)
+    return cloud if len(rows) == len(cloud) else cloud.select(rows)
+
+
+def _check_distinct(points: Float[Tensor, "n 3"], rows: Int[Tensor, "m"]) -> None:
+    """Refuse too few distinct rows, and points on a line."""
+    if len(rows) < MIN_POINTS:
+        raise TooFewPoints("points", f"{len(rows)} distinct points", f"at least {MIN_POINTS} distinct points")
+    spread = torch.linalg.svdvals((points - points.mean(0)).double())
+    if float(spread[1]) < 1e-6 * float(spread[0]):
+        raise BadArgument("points", f"{len(points)} points on one line", "points of a surface")
+
+
+def _check(cloud: PointCloud) -> Float[Tensor, "n 3"]:
+    """Return the points, or raise what is wrong with the cloud, copies aside."""
     if not isinstance(cloud, PointCloud):
         raise BadArgument("cloud", type(cloud).__name__, "a PointCloud")
     for name, tensor in named_tensors(cloud).items():
@@ -53,20 +76,23 @@ def remove_duplicates(cloud: PointCloud) -> PointCloud:
     if extent == 0.0:
         raise BadArgument("points", f"{len(points)} points that all coincide", "points of a surface")
     if not MIN_EXTENT <= extent <= MAX_EXTENT:
-        question = "normalised" if extent < MIN_EXTENT else f"in mm ({extent / 1000:.3g} m), or a whole scene"
-        allowed = f"{MIN_EXTENT:g} m to {MAX_EXTENT:g} m: lengths are metres; is this cloud {question}?"
+        allowed = f"{MIN_EXTENT:g} m to {MAX_EXTENT:g} m: lengths are metres; is this cloud {_guess_unit(extent)}?"
         raise SuspiciousScale("points", f"an extent of {extent:.4g} m", allowed)
     if cloud.normals is not None:
         zero = int((torch.linalg.vector_norm(cloud.normals, dim=-1) == 0).sum())
         if zero:
             raise BadArgument("normals", f"{zero} normals of length zero", "normals with a direction")
-    rows = _distinct_rows(points)
-    if len(rows) < MIN_POINTS:
-        raise TooFewPoints("points", f"{len(rows)} distinct points", f"at least {MIN_POINTS} distinct points")
-    spread = torch.linalg.svdvals((points - points.mean(0)).double())
-    if float(spread[1]) < 1e-6 * float(spread[0]):
-        raise BadArgument("points", f"{len(points)} points on one line", "points of a surface")
-    return cloud if len(rows) == len(cloud) else cloud.select(rows)
+    return points
+
+
+def _guess_unit(extent: float) -> str:
+    """Name the unit in which an extent of no object in metres is one of an object."""
+    if extent < MIN_EXTENT:
+        return "normalised"
+    if extent < 10:
+        return f"a whole scene (torchgrasp cloud cut), or in cm ({extent / 100:.3g} m: --unit cm)"
+    unit, scale = ("cm", 100) if extent < LEAST_MM else ("mm", 1000)
+    return f"in {unit} ({extent / scale:.3g} m: --unit {unit})"
 
 
 def _distinct_rows(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:

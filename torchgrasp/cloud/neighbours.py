@@ -8,24 +8,39 @@ from torch import Tensor
 from torchgrasp.linalg import unit
 
 
-def nearest(points: Float[Tensor, "n 3"], k: int) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
-    """Return distances and indices of the k nearest points, itself first. A small cloud has fewer."""
+def draw_rows(count: int, most: int) -> Int[Tensor, "m"]:
+    """Return the indices of at most so many points, drawn with a fixed seed, ascending."""
+    if count <= most:
+        return torch.arange(count)
+    return torch.randperm(count, generator=torch.Generator().manual_seed(0))[:most].sort().values
+
+
+def nearest(
+    points: Float[Tensor, "n 3"], k: int, rows: Int[Tensor, "m"] | None = None
+) -> tuple[Float[Tensor, "m k"], Int[Tensor, "m k"]]:
+    """Return distances and indices of the k points nearest to some (None: to all), itself first.
+
+    A small cloud has fewer neighbours.
+    """
     from scipy.spatial import KDTree
 
     array = points.detach().cpu().numpy()
-    distance, index = KDTree(array).query(array, k=min(k, len(array)))
+    asked = array if rows is None else array[rows.cpu().numpy()]
+    distance, index = KDTree(array).query(asked, k=min(k, len(array)))
     return torch.from_numpy(distance).to(points), torch.from_numpy(np.asarray(index, dtype=np.int64)).to(points.device)
 
 
-def find_inliers(points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-    """Tell which points are no outliers; see `remove_outliers`."""
-    spacing = nearest(points, 9)[0][:, 1:].mean(-1)  # to eight: more than fly off a rim together
+def find_inliers(points: Float[Tensor, "n 3"], rows: Int[Tensor, "m"] | None = None) -> Bool[Tensor, "m"]:
+    """Tell which points, by default of all, are no outliers; see `remove_outliers`."""
+    spacing = nearest(points, 9, rows)[0][:, 1:].mean(-1)  # to eight: more than fly off a rim together
     return spacing <= 2.5 * spacing.median()  # real views, whose spacing varies with depth and slope, stay below
 
 
-def fit_planes(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
-    """Return normals of local planes, of unknown sign, and weighted rms [m]."""
-    near, weight = _neighbourhood(points, 25)  # about eight for each of a plane's three unknowns
+def fit_planes(
+    points: Float[Tensor, "n 3"], rows: Int[Tensor, "m"] | None = None
+) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
+    """Return normals of local planes about points, by default all, of unknown sign, and weighted rms [m]."""
+    near, weight = _neighbourhood(points, 25, rows)  # about eight for each of a plane's three unknowns
     mean_squares, axes = _principal_axes(near, weight)
     return axes[..., 0], mean_squares[:, 0].clamp_min(0).sqrt()
 
@@ -51,9 +66,11 @@ def fit_quadrics(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Fl
     return feet, unit((axes @ gradient[..., None])[..., 0]), (weight * residual**2).sum(-1).sqrt()
 
 
-def _neighbourhood(points: Float[Tensor, "n 3"], k: int) -> tuple[Float[Tensor, "n k 3"], Float[Tensor, "n k"]]:
+def _neighbourhood(
+    points: Float[Tensor, "n 3"], k: int, rows: Int[Tensor, "m"] | None = None
+) -> tuple[Float[Tensor, "m k 3"], Float[Tensor, "m k"]]:
     """Return the k nearest points and their weights exp(-(d / 0.7 d_k)^2), normalised."""
-    distance, index = nearest(points, k)
+    distance, index = nearest(points, k, rows)
     weight = torch.exp(-((distance / (0.7 * distance[:, -1:])) ** 2))
     return points[index], weight / weight.sum(-1, keepdim=True)
 

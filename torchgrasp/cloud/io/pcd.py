@@ -4,16 +4,20 @@ from typing import Any
 
 import numpy as np
 
+from torchgrasp.cloud.io.lzf import decompress
 from torchgrasp.cloud.io.text import MAX_POINTS, read_table
+
+MAX_UNPACKED = 512 * 2**20
+"""Most bytes of the unpacked rows: some 100 for each of `MAX_POINTS`."""
 
 
 def parse_pcd(data: bytes) -> dict[str, Any]:
-    r"""Return points, normals and viewpoint of a PCD file, or None.
+    r"""Return points, normals and viewpoint of a PCD file, or None, and whether the viewpoint is the default.
 
-    Many writers fill VIEWPOINT with the default `0 0 0 1 0 0 0`. It counts only outside the points' bounding box.
+    Many writers fill VIEWPOINT with the default `0 0 0 1 0 0 0`, wherever the camera was.
 
     Raises:
-        ValueError: no PCD file; compressed data; fewer bytes than the header promises.
+        ValueError: no PCD file; fewer bytes than the header promises; malformed compressed data.
 
     >>> parse_pcd(b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 1\nDATA ascii\n1 2 3\n")["points"]
     array([[1., 2., 3.]])
@@ -33,18 +37,25 @@ def parse_pcd(data: bytes) -> dict[str, Any]:
         table = read_table(body, count, sum(counts))
         starts = np.cumsum([0, *counts[:-1]])
         columns = {name: table[:, s] for name, s in zip(names, starts, strict=True) if name in wanted}
-    elif encoding == "binary":
+    elif encoding in ("binary", "binary_compressed"):
         letters = {"F": "f", "I": "i", "U": "u"}
-        # Padding fields are all called "_": columns go by number.
         formats = [f"({c},)<{letters[k.upper()]}{int(s)}" for k, s, c in zip(kinds, sizes, counts, strict=True)]
+        if encoding == "binary_compressed":
+            body = _decompress(body, [np.dtype(f) for f in formats], count)
+        # Padding fields are all called "_": columns go by number.
         dtype = np.dtype({"names": [str(i) for i in range(len(names))], "formats": formats})
         rows = np.frombuffer(body, dtype=dtype, count=count)
         columns = {name: rows[f"{i}"][:, 0].astype(np.float64) for i, name in enumerate(names) if name in wanted}
     else:
-        raise ValueError(f"DATA {encoding}; convert it to binary or ascii")
+        raise ValueError(f"DATA {encoding}, not ascii, binary or binary_compressed")
     points = np.stack([columns[name] for name in wanted[:3]], axis=-1)
     normals = np.stack([columns[name] for name in wanted[3:]], axis=-1) if wanted[3] in columns else None
-    return {"points": points, "normals": normals, "viewpoint": _viewpoint(header, points)}
+    viewpoint = np.array([float(x) for x in header["VIEWPOINT"]]) if "VIEWPOINT" in header else None
+    if viewpoint is not None and len(viewpoint) != 7:
+        raise ValueError(f"VIEWPOINT with {len(viewpoint)} numbers, not 7")
+    default = viewpoint is not None and np.array_equal(viewpoint, [0, 0, 0, 1, 0, 0, 0])
+    position = None if viewpoint is None else viewpoint[:3]
+    return {"points": points, "normals": normals, "viewpoint": position, "default": default}
 
 
 def _split_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
@@ -62,13 +73,16 @@ def _split_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
     return header, data[start:]
 
 
-def _viewpoint(header: dict[str, list[str]], points: np.ndarray) -> np.ndarray | None:
-    """Return the position in VIEWPOINT; None for the default within the cloud."""
-    if "VIEWPOINT" not in header:
-        return None
-    numbers = np.array([float(x) for x in header["VIEWPOINT"]])
-    if len(numbers) != 7:
-        raise ValueError(f"VIEWPOINT with {len(numbers)} numbers, not 7")
-    finite = points[np.isfinite(points).all(1)]
-    within = len(finite) and bool(((finite.min(0) <= 0) & (finite.max(0) >= 0)).all())
-    return None if within and np.array_equal(numbers, [0, 0, 0, 1, 0, 0, 0]) else numbers[:3]
+def _decompress(body: bytes, kinds: list[np.dtype[Any]], count: int) -> bytes:
+    """Return compressed rows as rows: the file holds one field after the other."""
+    packed, unpacked = (int(n) for n in np.frombuffer(body, dtype="<u4", count=2))
+    wanted = count * sum(kind.itemsize for kind in kinds)
+    if unpacked != wanted or wanted > MAX_UNPACKED or packed > len(body) - 8:
+        sizes = f"{packed} bytes for {unpacked}"
+        raise ValueError(
+            f"compressed data of {sizes}, not at most {len(body) - 8} for {wanted}, {MAX_UNPACKED} at most"
+        )
+    data = decompress(body[8 : 8 + packed], unpacked)
+    starts = np.cumsum([0, *(count * kind.itemsize for kind in kinds)])
+    fields = [np.frombuffer(data, np.uint8, count * k.itemsize, s) for k, s in zip(kinds, starts[:-1], strict=True)]
+    return np.concatenate([field.reshape(count, -1) for field in fields], axis=1).tobytes()

@@ -5,18 +5,19 @@ import math
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchgrasp.base import check_tensor, named_tensors
-from torchgrasp.cloud.check import MIN_POINTS, check_cloud
+from torchgrasp.cloud.check import check_cloud
 from torchgrasp.cloud.io.pcd import parse_pcd
 from torchgrasp.cloud.io.ply import format_ply, parse_ply
-from torchgrasp.cloud.io.text import MAX_POINTS, read_lines
-from torchgrasp.errors import BadArgument, CloudFileError, TooFewPoints
+from torchgrasp.cloud.io.rows import CloudFile, make_cloud
+from torchgrasp.cloud.io.text import read_lines
+from torchgrasp.errors import BadArgument, CloudFileError
 from torchgrasp.files import write_file
 from torchgrasp.values import PointCloud
 
@@ -24,30 +25,59 @@ MAX_BYTES = 512 * 2**20
 """Most bytes of a file, and of its unpacked content: some 100 for each of `MAX_POINTS`."""
 
 
-def read_cloud(path: Path | str, viewpoint: Sequence[float | int] | Tensor | None = None) -> PointCloud:
-    """Read the point cloud of one object, in metres and float64.
+SCALE: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+"""Metres in each unit of length."""
+
+
+def read_cloud(
+    path: Path | str, viewpoint: Sequence[float | int] | Tensor | None = None, unit: Literal["m", "cm", "mm"] = "m"
+) -> PointCloud:
+    """Read the point cloud of one object, in float64; `read_cloud_file` also tells what was left out.
 
     * `.ply`, ascii or binary: x y z, optionally nx ny nz; the viewpoint from a header line `comment viewpoint x y z`.
       A mesh gives 2000 surface points, with normals if closed.
-    * `.pcd`, ascii or binary: x y z, optionally normal_x normal_y normal_z; the viewpoint from VIEWPOINT, unless it
-      is the default `0 0 0 1 0 0 0` and within the cloud's bounding box.
+    * `.pcd`, ascii, binary or compressed: x y z, optionally normal_x normal_y normal_z; the viewpoint from VIEWPOINT.
+      Its default `0 0 0 1 0 0 0` counts only if the points look like those of a camera in the origin.
     * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3) and `viewpoint` (3,), or (n, 3) of several views.
-    * `.npy`, `.xyz` (text): an (n, 3) array, or (n, 6) with normals.
+    * `.npy`, `.xyz`, `.txt`, `.csv` (text): an (n, 3) array, or (n, 6) with normals; colours are left out.
+
+    Arrays (h, w, 3) of an image are taken, too. Rows with NaN, infinity or, more than once, (0, 0, 0) are left out.
 
     Args:
         path: the file.
         viewpoint: the camera's position (3,) [m] in the cloud's frame, instead of the file's.
+        unit: of the file's points and viewpoint.
 
     Raises:
         CloudFileError: no such file; an unknown suffix; malformed content; more than 512 MB or 5 million points.
-        BadArgument: a viewpoint other than three numbers; a non-finite number; points on one line.
+        BadArgument: a viewpoint other than three numbers; points on one line.
         TooFewPoints: fewer than 4 distinct points.
         SuspiciousScale: an extent outside [5 mm, 2 m].
 
     >>> read_cloud("scan.docx")
     Traceback (most recent call last):
-    torchgrasp.errors.CloudFileError: path: found scan.docx, allowed is a file ending in .ply, .pcd, .npz, .npy, .xyz
+    torchgrasp.errors.CloudFileError: path: found scan.docx, allowed is a file ending in .ply, .pcd, .npz, .npy or .xyz
     """
+    return check_cloud(read_cloud_file(path, viewpoint, unit).cloud)
+
+
+def read_cloud_file(
+    path: Path | str, viewpoint: Sequence[float | int] | Tensor | None = None, unit: Literal["m", "cm", "mm"] = "m"
+) -> CloudFile:
+    """Read a cloud of any size, such as a whole scene, with notes on what was left out.
+
+    Args:
+        path, viewpoint, unit: as of `read_cloud`.
+
+    Raises:
+        CloudFileError, BadArgument, TooFewPoints: see `read_cloud`.
+
+    >>> read_cloud_file("none.ply")
+    Traceback (most recent call last):
+    torchgrasp.errors.CloudFileError: path: found none.ply, which is no file, allowed is a .ply file
+    """
+    if unit not in SCALE:
+        raise BadArgument("unit", repr(unit), f"one of {list(SCALE)}")
     try:
         position = None if viewpoint is None else torch.as_tensor(viewpoint, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -59,11 +89,12 @@ def read_cloud(path: Path | str, viewpoint: Sequence[float | int] | Tensor | Non
         ".ply": parse_ply,
         ".pcd": parse_pcd,
         ".npz": _parse_npz,
-        ".npy": lambda data: _split_columns(_array_from_npy(data)),
-        ".xyz": lambda data: _split_columns(read_lines(data)),
+        ".npy": lambda data: {"table": _array_from_npy(data)},
+        **dict.fromkeys((".xyz", ".txt", ".csv"), lambda data: {"table": read_lines(data)}),
     }
     if suffix not in parsers:
-        raise CloudFileError("path", path, f"a file ending in {', '.join(parsers)}")
+        # Text may also be called .txt and .csv.
+        raise CloudFileError("path", path, "a file ending in .ply, .pcd, .npz, .npy or .xyz")
     if not path.is_file():
         raise CloudFileError("path", f"{path}, which is no file", f"a {suffix} file")
     if path.stat().st_size > MAX_BYTES:
@@ -72,12 +103,27 @@ def read_cloud(path: Path | str, viewpoint: Sequence[float | int] | Tensor | Non
         arrays = parsers[suffix](path.read_bytes())
     except Exception as error:  # zlib, zipfile, numpy and trimesh each raise their own
         raise CloudFileError("path", f"{path}: {error!r}", f"a well-formed {suffix} file") from error
-    arrays = {name: _check_array(path, name, array) for name, array in arrays.items() if array is not None}
-    points = arrays["points"]
-    if len(points) < MIN_POINTS:
-        raise TooFewPoints("path", f"{path} with {len(points)} points", f"at least {MIN_POINTS} points")
-    position = arrays.get("viewpoint") if position is None else position
-    return check_cloud(PointCloud(points, arrays.get("normals"), position))
+    return make_cloud(str(path), arrays, position, SCALE[unit])
+
+
+def cloud_from_array(
+    points: np.ndarray, normals: np.ndarray | None = None, viewpoint: np.ndarray | Sequence[float] | None = None
+) -> PointCloud:
+    """Return the cloud of NumPy arrays [m] by the rules of `read_cloud`: missing rows and colours are left out.
+
+    Args:
+        points: (n, 3), (h, w, 3) of an image, or with three more columns of normals.
+        normals: of the same shape as points, or None.
+        viewpoint: the camera (3,), or None.
+
+    Raises:
+        BadArgument, TooFewPoints, SuspiciousScale: see `read_cloud`.
+
+    >>> len(cloud_from_array(np.random.default_rng(0).random((6, 8, 3))))
+    48
+    """
+    arrays = {"table" if normals is None else "points": points, "normals": normals, "viewpoint": viewpoint}
+    return check_cloud(make_cloud("an array", arrays).cloud)
 
 
 def save_cloud(cloud: PointCloud, path: Path | str) -> Path:
@@ -103,28 +149,6 @@ def save_cloud(cloud: PointCloud, path: Path | str) -> Path:
     return write_file(path, format_ply(**arrays))
 
 
-def _check_array(path: Path, name: str, array: Any) -> Tensor:
-    """Return an array as float64, or refuse its file."""
-    array = np.asarray(array)
-    if array.dtype.kind not in "fiu":
-        raise CloudFileError("path", f"{path}: {name} of type {array.dtype}", "real numbers")
-    if array.ndim not in ((1, 2) if name == "viewpoint" else (2,)) or array.shape[-1] != 3:
-        raise CloudFileError("path", f"{path}: {name} of shape {array.shape}", "(n, 3), or (3,) for one viewpoint")
-    if len(array) > MAX_POINTS:
-        raise CloudFileError("path", f"{path} with {len(array)} points", f"at most {MAX_POINTS} points")
-    bad = int((~np.isfinite(array)).reshape(-1, 3).any(1).sum())
-    if bad:
-        raise BadArgument("path", f"{path}: {bad} rows of {name} with NaN or infinity", "finite numbers only")
-    return torch.from_numpy(np.array(array, dtype=np.float64, order="C"))  # a copy: owned, writable, native bytes
-
-
-def _split_columns(table: np.ndarray) -> dict[str, Any]:
-    """Split (n, 3) points or (n, 6) points and normals."""
-    if table.ndim != 2 or table.shape[1] not in (3, 6):
-        raise ValueError(f"an array of shape {table.shape}, not (n, 3) or (n, 6)")
-    return {"points": table[:, :3], "normals": table[:, 3:] if table.shape[1] == 6 else None}
-
-
 def _array_from_npy(data: bytes) -> np.ndarray:
     """Return the array of a .npy file, which must hold what its header promises."""
     stream = io.BytesIO(data)
@@ -145,7 +169,8 @@ def _parse_npz(data: bytes) -> dict[str, Any]:
         names = {f"{name}.npy": name for name in ("points", "normals", "viewpoint")}
         members = [info for info in archive.infolist() if info.filename in names]
         if "points.npy" not in [info.filename for info in members]:
-            raise ValueError("no array named 'points'")
+            found = [info.filename.removesuffix(".npy") for info in archive.infolist()][:8]
+            raise ValueError(f"no array named 'points', but {found}")
         if sum(info.file_size for info in members) > MAX_BYTES:
             raise ValueError(f"arrays of more than {MAX_BYTES} bytes")
         return {names[info.filename]: _array_from_npy(archive.read(info)) for info in members}

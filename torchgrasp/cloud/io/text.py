@@ -38,7 +38,9 @@ def read_table(data: bytes, rows: int, columns: int) -> Float[np.ndarray, "rows 
 
 
 def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
-    r"""Return lines of numbers, separated by blanks or commas. `#` starts a comment.
+    r"""Return lines of numbers, separated by blanks, commas or semicolons.
+
+    `#` starts a comment. A first line that begins with the words x y z names the columns.
 
     Raises:
         ValueError: no numbers; lines of different length; a line or file that is too long.
@@ -53,9 +55,11 @@ def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
         while line := stream.readline(MAX_LINE + 1):
             if len(line) > MAX_LINE:
                 raise ValueError(f"a line of more than {MAX_LINE} characters")
-            line = line.split("#")[0].replace(",", " ")
+            line = line.split("#")[0].replace(",", " ").replace(";", " ")
             if not line.isspace() and line:
                 count += 1
+                if count == 1 and line.lower().replace('"', "").split()[:3] == ["x", "y", "z"]:
+                    continue
                 if count > MAX_POINTS:
                     raise ValueError(f"more than {MAX_POINTS} lines of numbers")
                 yield line

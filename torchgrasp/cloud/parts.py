@@ -1,0 +1,181 @@
+"""The parts of a cloud: a piece of the support, and bodies that lie apart."""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchgrasp.cloud.check import MIN_POINTS, first_of_each
+from torchgrasp.cloud.neighbours import draw_rows, fit_planes
+from torchgrasp.errors import TooFewPoints
+from torchgrasp.plane import Plane
+from torchgrasp.values import PointCloud
+
+CANDIDATES = 200
+"""Planes that are tried, each through a point with its normal: a support of 15 % of the points is hit 30 times."""
+LAYER = 0.004
+"""Half thickness [m] of a support's layer: noise and bias of a depth camera at half a metre."""
+TURNED = math.cos(math.radians(25))
+"""Least cosine between a layer's normal and those of its points: noise turns them by 13 degrees."""
+LEVEL = math.cos(math.radians(15))
+"""Least cosine between the vertical and the normal of a level plane."""
+MIN_SUPPORT, MIN_ALOFT = 0.15, 0.02
+"""Least shares of the points in a support's layer, as less does little harm, and above it, as else all is flat."""
+MAX_BELOW = 0.02
+"""Largest share of points below a support: strays."""
+MIN_SPREAD = 1.3
+"""Least area of a support for that of what lies above it: the bottom of a bowl is less than its rim."""
+MIN_WIDTH = 0.05
+"""Least width [m] of a support: a pen's side is narrower."""
+GAP = 0.04
+"""Least distance [m] between bodies. A bent or hidden surface of one body leaves gaps, too."""
+AROUND = 0.5
+"""Distance [m] from a point on the thing within which its support is sought."""
+FEW = 5000
+"""Points that a support is sought in."""
+MIN_BODY, FOOT = 0.1, 0.015
+"""Least share of the points in a second body, and how near [m] its lowest points are to the cloud's: it stands, too."""
+
+
+def find_support(
+    points: Float[Tensor, "n 3"],
+    normals: Float[Tensor, "n 3"],
+    up: Float[Tensor, "3"],
+    viewpoint: Float[Tensor, "3"] | None,
+    spread: float = MIN_SPREAD,
+) -> tuple[Plane, float] | None:
+    """Return the largest plane on which all else seems to stand, and its share of the points; None: there is none.
+
+    Args:
+        points: of a view [m].
+        normals: of unit length and any sign.
+        up: the vertical, of unit length.
+        viewpoint: the camera [m], which sees the upper side; None: only level planes are found.
+        spread: least area of the support for that of what lies above it.
+    """
+    rows = torch.linspace(0, len(points) - 1, min(CANDIDATES, len(points))).long()
+    normal, foot = normals[rows], points[rows]
+    for _ in range(3):
+        side = up.expand_as(foot) if viewpoint is None else viewpoint - foot
+        normal = torch.where(((normal * side).sum(-1) < 0)[:, None], -normal, normal)
+        height = points @ normal.T - (normal * foot).sum(-1)
+        layer = (height.abs() < LAYER) & ((normals @ normal.T).abs() > TURNED)
+        share = layer.double().mean(0)
+        order = share.argsort(descending=True)[:40]
+        fitted = [_fit(points[layer[:, k]]) for k in order.tolist() if int(layer[:, k].sum()) >= 3]
+        if not fitted:
+            return None
+        found = (share >= MIN_SUPPORT) & ((height < -2 * LAYER).double().mean(0) <= MAX_BELOW)
+        found &= (height > 2 * LAYER).double().mean(0) >= MIN_ALOFT
+        if viewpoint is None:
+            found &= normal @ up > LEVEL
+        for k in order.tolist():
+            if bool(found[k]):
+                area, width = _measure(points[layer[:, k]], normal[k])
+                aloft, _ = _measure(points[height[:, k] > 2 * LAYER], normal[k])
+                if area > spread * aloft and width > MIN_WIDTH:
+                    return Plane(normal[k], float(normal[k] @ foot[k])), float(share[k])
+        foot, normal = torch.stack([f for f, _ in fitted]), torch.stack([n for _, n in fitted])
+    return None
+
+
+def _measure(points: Float[Tensor, "n 3"], normal: Float[Tensor, "3"]) -> tuple[float, float]:
+    """Return the area [m2] of the convex hull of points, seen along a normal, and its lesser width [m]."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    flat = points @ torch.linalg.svd(normal[None]).Vh[1:].T
+    try:
+        hull = ConvexHull(flat.numpy())
+    except (QhullError, ValueError):  # fewer than three points, or all on a line
+        return 0.0, 0.0
+    width = math.sqrt(12.0 * float(torch.linalg.eigvalsh(torch.cov(flat.T, correction=0))[0]))  # as of a rectangle
+    return float(hull.volume), width  # of two dimensions the area
+
+
+def _fit(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Return a point and the normal of the plane through points."""
+    centre = points.mean(0)
+    return centre, torch.linalg.eigh((points - centre).T @ (points - centre)).eigenvectors[:, 0]
+
+
+def label_bodies(points: Float[Tensor, "n 3"], gap: float = GAP) -> Int[Tensor, "n"]:
+    """Number the groups of points [m] that a gap [m] separates, the largest first.
+
+    >>> label_bodies(torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0.11, 0, 0]]).double()).tolist()
+    [1, 0, 0]
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    # One point of each cell of a quarter of the gap, so that dense clouds have few pairs.
+    cells = torch.floor((points - points.amin(0)) / (gap / 4)).long()
+    size = cells.amax(0) + 1
+    _, group = torch.unique((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2], return_inverse=True)
+    first = first_of_each(group)
+    pairs = KDTree(points[first].numpy()).query_pairs(gap, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(first), len(first)))
+    label = connected_components(links, directed=False)[1][group.numpy()]
+    order = np.argsort(np.argsort(-np.bincount(label), kind="stable"), kind="stable")
+    return torch.from_numpy(order[label])
+
+
+def find_second_body(points: Float[Tensor, "n 3"], up: Float[Tensor, "3"], spacing: float) -> Bool[Tensor, "n"] | None:
+    """Tell which points [m] stand apart from the largest body, on the same ground; None: there are none."""
+    label = label_bodies(points, max(GAP, 4 * spacing))
+    height = points @ up
+    for k in range(1, int(label.max()) + 1):
+        body = label == k
+        low = height[body].quantile(0.02) - height.min(), height[label == 0].quantile(0.02) - height.min()
+        if float(body.double().mean()) >= MIN_BODY and max(float(x) for x in low) < FOOT:
+            return body
+    return None
+
+
+def cut_object(
+    cloud: PointCloud,
+    up: Float[Tensor, "3"],
+    point: Float[Tensor, "3"] | None = None,
+    box: Float[Tensor, "2 3"] | None = None,
+    gap: float = GAP,
+) -> tuple[PointCloud, Plane | None]:
+    """Return the points of one thing that stands on a plane, and the plane; None: none was found.
+
+    Args:
+        cloud: points [m] of a scene.
+        up: the vertical, of unit length.
+        point: on or near the thing [m]; all farther than 0.5 m from it is left out. None: the largest thing.
+        box: two corners [m]; all outside is left out first.
+        gap: least distance [m] between things.
+
+    Raises:
+        TooFewPoints: fewer than 4 points in the box, near the point or of the thing.
+    """
+    points = cloud.points.double()
+    keep = torch.ones(len(points), dtype=torch.bool)
+    if box is not None:
+        keep &= ((points >= box.amin(0)) & (points <= box.amax(0))).all(1)
+    if point is not None:
+        keep &= torch.linalg.vector_norm(points - point, dim=-1) < AROUND
+    cloud = _select(cloud, keep, "points in the box and near the point")
+    points = cloud.points.double()
+    rows = draw_rows(len(points), FEW)
+    eye = cloud.viewpoint if cloud.viewpoint is None or cloud.viewpoint.ndim == 1 else cloud.viewpoint.mean(0)
+    some = points[rows]
+    support = find_support(some, fit_planes(some)[0], up, None if eye is None else eye.double(), spread=0.0)
+    plane = None if support is None else support[0]
+    if plane is not None:
+        cloud = _select(cloud, plane.height(points) > LAYER, "points above the plane")
+        points = cloud.points.double()
+    label = label_bodies(points, gap)
+    wanted = 0 if point is None else int(label[torch.linalg.vector_norm(points - point, dim=-1).argmin()])
+    return _select(cloud, label == wanted, "points of the thing"), plane
+
+
+def _select(cloud: PointCloud, keep: Bool[Tensor, "n"], what: str) -> PointCloud:
+    """Select points, or say what there is too little of."""
+    if int(keep.sum()) < MIN_POINTS:
+        raise TooFewPoints("cloud", f"{int(keep.sum())} {what}", f"at least {MIN_POINTS}")
+    return cloud.select(keep)
