@@ -59,3 +59,13 @@ def test_a_mesh_that_is_no_solid_is_refused():
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     with pytest.raises(MeshError, match="open surface"):
         convex_parts(trimesh.Trimesh(box.vertices, box.faces[:-1]))
+
+
+def test_a_cube_whose_faces_are_flat_but_for_rounding_errors_gives_a_closed_part(tmp_path):
+    """Its hull comes out of Qhull open, and would be refused as a part."""
+    cube = trimesh.creation.box([0.04, 0.04, 0.04]).subdivide().subdivide().subdivide()
+    noise = np.random.default_rng(0).uniform(-1e-10, 1e-10, cube.vertices.shape)
+    cube = trimesh.Trimesh(cube.vertices + noise, cube.faces, process=False)
+    assert cube.is_convex and not cube.convex_hull.is_watertight
+    (part,) = check_parts(convex_parts(cube, tmp_path))
+    assert part.volume == pytest.approx(0.04**3, rel=1e-4)

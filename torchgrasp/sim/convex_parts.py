@@ -47,7 +47,7 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
     """
     mesh = read_mesh(mesh)
     if mesh.is_convex:
-        return [mesh.convex_hull]
+        return [_hull(mesh.vertices)]
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     path = (home / "torchgrasp" if cache is None else Path(cache)) / f"{_fingerprint(mesh)}.safetensors"
     if path.is_file():
@@ -61,6 +61,14 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
     except OutputError as error:
         _log.warning("convex parts are not kept: %s", error)
     return _filled(parts)
+
+
+def _hull(corners: np.ndarray) -> "trimesh.Trimesh":
+    """Return the convex hull of corners; Qhull may leave one open whose faces are flat but for rounding errors."""
+    import trimesh
+
+    hull = trimesh.convex.convex_hull(corners)
+    return hull if hull.is_watertight else trimesh.convex.convex_hull(np.round(corners, 6))
 
 
 def _filled(parts: "list[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
@@ -125,12 +133,11 @@ def _save(parts: "list[trimesh.Trimesh]", path: Path) -> None:
 
 def _load(path: Path) -> "list[trimesh.Trimesh]":
     """Read parts that `_save` wrote, as hulls of their corners."""
-    import trimesh
     from scipy.spatial import QhullError
 
     tensors, _ = load_tensors(path, "parts", {"vertices", "counts"})
     try:
         corners = torch.split(tensors["vertices"], tensors["counts"].tolist())
-        return [trimesh.convex.convex_hull(c.numpy()) for c in corners]
+        return [_hull(c.numpy()) for c in corners]
     except (QhullError, RuntimeError) as error:
         raise ModelFileError("path", f"{path}: {error}", "corners of bodies with a volume") from error
