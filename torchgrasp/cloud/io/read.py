@@ -1,11 +1,9 @@
 """Point clouds from and to files. A malformed file is refused by name; none runs code."""
 
 import io
-import math
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -13,6 +11,7 @@ from torch import Tensor
 
 from torchgrasp.base import check_tensor, named_tensors
 from torchgrasp.cloud.check import check_cloud
+from torchgrasp.cloud.io.arrays import MAX_BYTES, parse_npy, parse_npz
 from torchgrasp.cloud.io.pcd import parse_pcd
 from torchgrasp.cloud.io.ply import format_ply, parse_ply
 from torchgrasp.cloud.io.rows import CloudFile, make_cloud
@@ -20,10 +19,6 @@ from torchgrasp.cloud.io.text import read_lines
 from torchgrasp.errors import BadArgument, CloudFileError
 from torchgrasp.files import write_file
 from torchgrasp.values import PointCloud
-
-MAX_BYTES = 512 * 2**20
-"""Most bytes of a file, and of its unpacked content: some 100 for each of `MAX_POINTS`."""
-
 
 SCALE: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Metres in each unit of length."""
@@ -88,8 +83,8 @@ def read_cloud_file(
     parsers = {
         ".ply": parse_ply,
         ".pcd": parse_pcd,
-        ".npz": _parse_npz,
-        ".npy": lambda data: {"table": _array_from_npy(data)},
+        ".npz": lambda data: parse_npz(data, ("points", "normals", "viewpoint"), "points"),
+        ".npy": lambda data: {"table": parse_npy(data)},
         **dict.fromkeys((".xyz", ".txt", ".csv"), lambda data: {"table": read_lines(data)}),
     }
     if suffix not in parsers:
@@ -147,30 +142,3 @@ def save_cloud(cloud: PointCloud, path: Path | str) -> Path:
     if cloud.viewpoint is not None and cloud.viewpoint.ndim == 2:
         raise BadArgument("path", path, "a file ending in .npz, for a cloud of several views")
     return write_file(path, format_ply(**arrays))
-
-
-def _array_from_npy(data: bytes) -> np.ndarray:
-    """Return the array of a .npy file, which must hold what its header promises."""
-    stream = io.BytesIO(data)
-    version = np.lib.format.read_magic(stream)
-    if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"version {version} of the npy format")
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(stream)
-    if dtype.hasobject or dtype.itemsize * math.prod(shape) > len(data):
-        raise ValueError(f"an array of shape {shape} and type {dtype}, which the file cannot hold")
-    stream.seek(0)
-    return np.lib.format.read_array(stream, allow_pickle=False)
-
-
-def _parse_npz(data: bytes) -> dict[str, Any]:
-    """Parse a .npz file after a check of its unpacked size."""
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        names = {f"{name}.npy": name for name in ("points", "normals", "viewpoint")}
-        members = [info for info in archive.infolist() if info.filename in names]
-        if "points.npy" not in [info.filename for info in members]:
-            found = [info.filename.removesuffix(".npy") for info in archive.infolist()][:8]
-            raise ValueError(f"no array named 'points', but {found}")
-        if sum(info.file_size for info in members) > MAX_BYTES:
-            raise ValueError(f"arrays of more than {MAX_BYTES} bytes")
-        return {names[info.filename]: _array_from_npy(archive.read(info)) for info in members}
