@@ -1,0 +1,1 @@
+"""Scenes of things on a table, beside their bars."""

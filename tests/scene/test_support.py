@@ -1,0 +1,105 @@
+import math
+
+import pytest
+import torch
+import trimesh
+
+from torchgrasp.cloud.camera import INTRINSICS, look_at
+from torchgrasp.cloud.depth import cloud_from_depth
+from torchgrasp.cloud.render import render_depth
+from torchgrasp.errors import BadArgument, NoSupport
+from torchgrasp.frames import apply, rigid, rotation_from_vector
+from torchgrasp.scene.support import fit_support
+
+POSE = look_at(30.0, 40.0, 0.6)
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def box(size, place):
+    return trimesh.creation.box(size).apply_translation(place)
+
+
+THINGS = [
+    box([0.1, 0.06, 0.12], [0.05, 0.05, 0.06]),
+    trimesh.creation.icosphere(radius=0.04).apply_translation([-0.08, 0.0, 0.04]),
+]
+
+
+def look(meshes, table=0.0, pose=POSE):
+    depth, _ = render_depth(meshes, pose, table=table)
+    kept = torch.zeros_like(depth)
+    kept[::3, ::3] = depth[::3, ::3]
+    cloud = cloud_from_depth(kept, INTRINSICS, camera_pose=pose)
+    return cloud.points, cloud.viewpoint
+
+
+@pytest.fixture(scope="module")
+def seen():
+    return look(THINGS)
+
+
+def test_a_noisy_table_is_found_in_place(seen):
+    points, viewpoint = seen
+    for eye in (viewpoint, None):
+        plane = fit_support(points, eye)
+        assert math.degrees(math.acos(min(1.0, float(plane.normal[2])))) < 0.3
+        assert abs(plane.offset) < 0.001
+
+
+def test_a_rigid_motion_moves_the_plane_alike(seen):
+    points, viewpoint = seen
+    plane = fit_support(points, viewpoint)
+    generator = torch.Generator().manual_seed(1)
+    for _ in range(5):
+        rotation = rotation_from_vector(2 * torch.randn(3, generator=generator, dtype=torch.float64))
+        motion = rigid(rotation, torch.randn(3, generator=generator, dtype=torch.float64))
+        moved = fit_support(apply(motion, points), apply(motion, viewpoint[None])[0])
+        expected = plane.moved(motion)
+        assert (moved.normal - expected.normal).abs().max() < 1e-9
+        assert abs(moved.offset - expected.offset) < 1e-9
+
+
+def test_gravity_is_used_and_must_agree(seen):
+    assert fit_support(*seen, torch.tensor([0.0, 0.3, 2.0]).double()).normal[2] > 0.999
+    with pytest.raises(NoSupport):
+        fit_support(*seen, torch.tensor([1.0, 0.0, 0.0]).double())
+    with pytest.raises(NoSupport, match="from above"):
+        fit_support(*seen, -UP)
+
+
+def test_a_wall_with_things_on_both_sides_is_no_table():
+    wall = [box([0.001, 0.2, 0.2], [0.0, 0.0, 0.0]), box([0.2, 0.4, 0.1], [-0.2, 0.0, 0.0])]
+    with pytest.raises(NoSupport):
+        fit_support(*look([*THINGS, *wall], table=None))
+
+
+@pytest.mark.parametrize("size", [[0.2, 0.15, 0.1], [0.16, 0.08, 0.008], [0.3, 0.3, 0.02]])
+def test_a_flat_face_of_a_lone_thing_is_no_table(size):
+    with pytest.raises(NoSupport):
+        fit_support(*look([trimesh.creation.box(size)], table=None))
+
+
+def test_things_that_float_have_no_table():
+    with pytest.raises(NoSupport):
+        fit_support(*look(THINGS, table=None))
+
+
+def test_a_table_before_a_wall_is_refused_without_gravity():
+    seen = look([*THINGS, box([0.01, 2.0, 2.0], [-0.35, 0.0, 0.5])], pose=look_at(0.0, 35.0, 0.7))
+    assert fit_support(*seen, UP).normal[2] > 0.9999
+    with pytest.raises(NoSupport, match="two planes"):
+        fit_support(*seen)
+
+
+def test_a_floor_deep_below_is_no_objection():
+    floor = box([3.0, 3.0, 0.01], [0.0, 0.0, -0.7])
+    assert abs(fit_support(*look([*THINGS, floor], pose=look_at(0.0, 35.0, 0.9))).offset) < 0.002
+
+
+def test_bad_arguments_are_named(seen):
+    with pytest.raises(BadArgument, match="points"):
+        fit_support(seen[0] * torch.nan)
+    with pytest.raises(BadArgument, match="viewpoint"):
+        fit_support(seen[0], torch.full((3,), torch.inf))
+    with pytest.raises(NoSupport, match="7 points"):
+        fit_support(seen[0][:7])
