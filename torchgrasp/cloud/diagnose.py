@@ -7,12 +7,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.cloud.check import remove_duplicates
-from torchgrasp.cloud.neighbours import find_inliers, fit_planes, nearest
+from torchgrasp.base import Value, check_tensor
+from torchgrasp.cloud.advice import Advice, judge_pixels, judge_view
+from torchgrasp.cloud.check import check_cloud, remove_duplicates
+from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_planes, nearest
 from torchgrasp.cloud.orientation import NormalCheck, compare_normals, share_facing
-from torchgrasp.cloud.prepare import FACING, MAX_POINTS, clean_cloud
+from torchgrasp.cloud.prepare import MAX_POINTS, clean_cloud
+from torchgrasp.errors import BadArgument
+from torchgrasp.linalg import unit
+from torchgrasp.plane import Plane
 from torchgrasp.values import PointCloud
+
+MEASURED = 50_000
+"""Most points that spacing, noise and outliers are measured at."""
+VIEWED = 5000
+"""Most points that tell about camera, vertical, table and bodies: twice as many change no share by more than .01."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,6 +29,7 @@ class CloudReport(Value):
     """What a cloud is like, and what could be better."""
 
     points: int
+    measured: int  # how many of them the figures are taken from
     size: tuple[float, float, float]  # sides of the box along the axes [m]
     spacing: float  # median distance to the nearest point [m]
     density: float  # median number of points per square metre
@@ -30,46 +40,65 @@ class CloudReport(Value):
     viewpoint: Float[Tensor, "*points 3"] | None  # [m]; None: a whole surface
     viewpoint_given: bool  # else it is estimated
     facing: float  # share of normals that face the viewpoint
-    advice: tuple[str, ...]
+    advice: tuple[Advice, ...]  # what forbids a grasp comes first
 
 
-def diagnose_cloud(cloud: PointCloud) -> CloudReport:
+def diagnose_cloud(cloud: PointCloud, up: Float[Tensor, "3"] | None = None, table: Plane | None = None) -> CloudReport:
     """Measure a cloud, and advise what would improve it.
 
+    Of large clouds 50 000 points are measured, and 5000 tell about camera, vertical, table and bodies.
+
+    Args:
+        cloud: points of one object [m].
+        up: the vertical, of any length; None: z.
+        table: None: at the lowest point.
+
     Raises:
-        BadArgument, TooFewPoints, SuspiciousScale: see `check_cloud`.
+        BadArgument, TooFewPoints, SuspiciousScale: see `check_cloud`; a vertical of length zero.
 
     >>> diagnose_cloud(PointCloud(0.1 * torch.rand(500, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))).copies
     0
     """
-    distinct = remove_duplicates(cloud)
-    points = distinct.points.double()
-    distance, _ = nearest(points, 9)  # the point itself and a raster's eight neighbours
+    vertical = torch.tensor([0.0, 0.0, 1.0]) if up is None else check_tensor("up", up, (3,))
+    if not bool(vertical.any()):
+        raise BadArgument("up", "a vector of length zero", "the direction that points up")
+    check_cloud(cloud)
+    rows = draw_rows(len(cloud), MEASURED)
+    distinct = remove_duplicates(cloud if len(cloud) <= MEASURED else cloud.select(rows))
+    points = (cloud if len(cloud) > MEASURED else distinct).points.double()
+    rows = rows[: len(points)]
+    distance, _ = nearest(points, 9, rows)  # the point itself and a raster's eight neighbours
     area = math.pi * distance[:, -1] ** 2  # of the disc that holds the neighbours
-    check = None if distinct.normals is None else compare_normals(points, distinct.normals.double())
+    twins = (distance[:, 1:] <= 1e-9 * float((points.amax(0) - points.amin(0)).max())).double().sum(1)
+    view = distinct.select(draw_rows(len(distinct), VIEWED))
+    check = None if view.normals is None else compare_normals(view.points.double(), view.normals.double())
     if check is not None and not check.oriented:
-        distinct = PointCloud(distinct.points, None, distinct.viewpoint)
-    clean = clean_cloud(distinct)
+        view = PointCloud(view.points, None, view.viewpoint)
+    clean = clean_cloud(view)
     # Clean normals face the viewpoint by construction; given ones tell a whole surface.
-    judged = clean if distinct.normals is None else distinct
+    judged = clean if view.normals is None else view
     viewpoint = clean.viewpoint if judged.viewpoint is None else judged.viewpoint
     assert judged.normals is not None
     x, y, z = (points.amax(0) - points.amin(0)).tolist()
     report = CloudReport(
         points=len(cloud),
+        measured=len(rows),
         size=(x, y, z),
         spacing=float(distance[:, 1].median()),
         density=float(((distance.shape[1] - 1) / area).median()),
-        noise=float(fit_planes(points)[1].median()),
-        copies=len(cloud) - len(distinct),
-        outliers=int((~find_inliers(points)).sum()),
+        noise=float(fit_planes(points, rows)[1].median()),
+        copies=len(cloud) - len(points) + round(len(points) * float((twins / (twins + 1)).mean())),
+        outliers=round(len(points) * float((~find_inliers(points, rows)).double().mean())),
         normals=check,
         viewpoint=clean.viewpoint,
         viewpoint_given=cloud.viewpoint is not None,
         facing=0.0 if viewpoint is None else share_facing(judged.points, judged.normals, viewpoint),
         advice=(),
     )
-    return dataclasses.replace(report, advice=tuple(_advise(report, clean)))
+    advice = judge_view(view, clean, unit(vertical.double()), table)
+    if clean.viewpoint is not None and clean.viewpoint.ndim == 1:
+        advice += judge_pixels(view, clean.viewpoint)
+    return dataclasses.replace(report, advice=(*advice, *_advise(report, clean)))
 
 
 def format_report(report: CloudReport) -> str:
@@ -79,6 +108,8 @@ def format_report(report: CloudReport) -> str:
     points      500
     """
     copies = f" ({report.copies} of them copies)" * bool(report.copies)
+    part = report.measured + report.copies < report.points
+    sample = f"; {report.measured} of them, drawn at random, are measured" * part
     sides = " x ".join(f"{1e3 * s:.0f}" for s in report.size)
     check, normals = report.normals, "none; planes are fitted"
     if check is not None and check.oriented:
@@ -93,7 +124,7 @@ def format_report(report: CloudReport) -> str:
         origin = "given" if report.viewpoint_given else "estimated"
         viewpoint = f"{origin}, {places} m; {report.facing:.0%} of the normals face it"
     lines = [
-        ("points", f"{report.points}{copies}"),
+        ("points", f"{report.points}{copies}{sample}"),
         ("size", f"{sides} mm, if the numbers are metres"),
         ("spacing", f"{1e3 * report.spacing:.2g} mm, {1e-4 * report.density:.3g} points per cm2"),
         ("noise", f"{1e3 * report.noise:.2g} mm about local planes"),
@@ -101,35 +132,29 @@ def format_report(report: CloudReport) -> str:
         ("normals", normals),
         ("viewpoint", viewpoint),
     ]
-    return "\n".join(f"{name:12}{text}" for name, text in [*lines, *(("advice", text) for text in report.advice)])
+    lines += [("refused" if advice.refused else "advice", str(advice)) for advice in report.advice]
+    return "\n".join(f"{name:12}{text}" for name, text in lines)
 
 
-def _advise(report: CloudReport, clean: PointCloud) -> list[str]:
+def _advise(report: CloudReport, clean: PointCloud) -> list[Advice]:
     """Return a sentence for each thing that could be better."""
     longest, outliers, given = max(report.size), report.outliers / report.points, report.viewpoint_given
     voxel = 1.0 / math.sqrt(max(report.density * MAX_POINTS / report.points, 1e-12))
     thickness, _, length = torch.linalg.svdvals((clean.points - clean.points.mean(0)).double()).sort().values.tolist()
-    oriented = report.normals is not None and report.normals.oriented
-    flipped = 0.0 if report.normals is None else float(report.normals.flipped.double().mean())
-    away = oriented and given and report.facing < 1 - FACING
-    assert clean.normals is not None
-    z = clean.points[:, 2]
-    layer = float(((z < float(z.min()) + 0.004) & (clean.normals[:, 2] > 0.9)).double().mean())  # a camera's noise
-    table = layer >= 0.2 and float(z.max() - z.min()) >= 0.008
-    thin = f"{MAX_POINTS} points are enough: voxel_downsample(cloud, {voxel:.2g}) keeps about as many"
-    sparse = f"{1e3 * report.spacing:.0f} mm between points: the shape is mostly guessed"
-    noisy = f"{1e3 * report.noise:.1f} mm of noise blur the normals: come closer, or average images"
+    check = report.normals
+    flipped = 0.0 if check is None else float(check.flipped.double().mean())
+    cut, thin = "torchgrasp cloud cut CLOUD --out FILE", f"torchgrasp cloud thin CLOUD --voxel {voxel:.2g} --out FILE"
+    many = f"{report.points} points, of which {MAX_POINTS} are used"
+    sparse = f"{1e3 * report.spacing:.0f} mm between points, so that the shape is mostly guessed"
     rules = [
-        (longest > 0.4, f"{longest:.2f} m is large for a hand: is it a whole scene? Cut the object out"),
-        (report.points > 2 * MAX_POINTS, thin),
-        (outliers > 0.05, f"{outliers:.0%} of the points are outliers: cut the object out more closely"),
-        (report.spacing > 0.1 * longest, sparse),
-        (report.noise > 0.003, noisy),  # [m], the radius of 25 neighbours at 1 mm spacing
-        (thickness < 1e-3 * length, "all points lie in one plane: the thickness is a guess; show two sides"),
-        (oriented and flipped > 0.03, f"{flipped:.0%} of the normals look flipped: leave them out to fit new ones"),
-        (away, "the normals point away from the camera: turn them round, or leave them out"),
-        (report.normals is not None and not oriented, "the signs of the normals are random: leave them out"),
-        (report.viewpoint is not None and not given, "the camera's position is a guess: give it with --viewpoint"),
-        (table, f"a level plane holds the lowest {layer:.0%} of the points: if it is a table, cut it away"),
+        (longest > 0.4, f"a length of {longest:.2f} m, large for a hand, as of a whole scene", f"one thing: {cut}"),
+        (report.points > 2 * MAX_POINTS, many, f"as many: {thin}"),
+        (outliers > 0.05, f"{outliers:.0%} of the points far from the others", f"none: {thin}"),
+        (report.spacing > 0.1 * longest, sparse, "a denser cloud"),
+        (report.noise > 0.003, f"{1e3 * report.noise:.1f} mm of noise, which blur the normals", "a nearer camera"),
+        (thickness < 1e-3 * length, "points all in one plane, so that the thickness is a guess", "a view of two sides"),
+        (bool(check and check.oriented) and flipped > 0.03, f"{flipped:.0%} flipped normals", "none: --no-normals"),
+        (bool(check and not check.oriented), "normals of random signs, which are ignored", "none: --no-normals"),
+        (report.viewpoint is not None and not given, "a camera whose position is a guess", "--viewpoint X Y Z"),
     ]
-    return [sentence for applies, sentence in rules if applies]
+    return [Advice(found, mend, False) for applies, found, mend in rules if applies]

@@ -1,0 +1,176 @@
+"""What is wrong with a cloud, what is right instead, and the command that mends it."""
+
+import dataclasses
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.base import Value
+from torchgrasp.cloud.neighbours import find_inliers, nearest
+from torchgrasp.cloud.orientation import share_facing
+from torchgrasp.cloud.parts import LEVEL, find_second_body, find_support
+from torchgrasp.cloud.prepare import FACING
+from torchgrasp.cloud.visibility import MAX_BEHIND, MAX_EDGE_ON, share_unseen
+from torchgrasp.linalg import unit
+from torchgrasp.plane import Plane
+from torchgrasp.values import PointCloud
+
+MAX_DOWN = 0.15
+"""Largest share of points whose normals point down: 222 views from above have .08 at most."""
+DOWN = -0.5
+"""A normal points down when it is more than 30 degrees below the horizontal."""
+MIN_FLYING = 0.02
+"""Share of flying pixels that is worth a word."""
+FEWEST = 50
+"""Fewest points of one of several views that tell whether its camera can be right."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Advice(Value):
+    """Something wrong with a cloud: what was found, what is right with its command, and whether it forbids a grasp."""
+
+    found: str
+    mend: str
+    refused: bool
+
+    def __str__(self) -> str:
+        """Return the advice as one sentence."""
+        return f"{self.found}: {self.mend}"
+
+
+def judge_view(cloud: PointCloud, clean: PointCloud, up: Float[Tensor, "3"], table: Plane | None) -> list[Advice]:
+    """Return what contradicts a cloud's viewpoint, vertical and table, the worst first.
+
+    Args:
+        cloud: distinct points [m], with the normals and the viewpoint that were given, if any.
+        clean: the same cloud cleaned, with outward normals and perhaps an estimated viewpoint.
+        up: the vertical, of unit length.
+        table: None: at the lowest point.
+    """
+    assert clean.normals is not None
+    points, normals = clean.points.double(), clean.normals.double()
+    advice: list[Advice] = []
+    given = cloud.viewpoint is not None
+    eye = None if clean.viewpoint is None else clean.viewpoint.double()
+    facing = 1.0
+    if given and cloud.normals is not None:
+        facing = share_facing(cloud.points, cloud.normals, cloud.viewpoint)  # pyright: ignore[reportArgumentType]
+    if facing < 1 - FACING:
+        found = f"normals of which {1 - facing:.0%} point away from the camera"
+        mend = "outward normals, or none (--no-normals), or the true --viewpoint X Y Z"
+        advice.append(Advice(found, mend, True))
+    elif facing < FACING:
+        found = f"a viewpoint that {facing:.0%} of the normals face: it is ignored, the cloud taken for a whole surface"
+        advice.append(Advice(found, "the true --viewpoint X Y Z of a single view, or --no-viewpoint", False))
+    elif eye is not None:
+        advice += _judge_camera(clean, given)
+    support = find_support(points, normals, up, _single(eye) if facing >= FACING else None)
+    if eye is not None and facing >= FACING:
+        advice += _judge_height(points, eye, given, up, table, support)
+        down = float((normals @ up < DOWN).double().mean())
+        if given and not any(a.refused for a in advice) and down > MAX_DOWN:
+            found = f"a vertical {_triple(up)} that {down:.0%} of the visible normals contradict: they point down"
+            advice.append(Advice(found, "the vertical of the cloud's frame: --up X Y Z", False))
+    if support is not None:
+        advice.append(_describe_support(*support, up))
+    spacing = float(nearest(points, 2)[0][:, -1].median())
+    body = find_second_body(points, up, spacing)
+    if body is not None:
+        found = f"two bodies that stand apart, the second of {float(body.double().mean()):.0%} of the points"
+        x, y, z = points[~body].mean(0).tolist()
+        mend = f"one thing: torchgrasp cloud cut CLOUD --point {x:.3f} {y:.3f} {z:.3f} --out FILE"
+        advice.append(Advice(found, mend, True))
+    return sorted(advice, key=lambda a: not a.refused)
+
+
+def _judge_camera(clean: PointCloud, given: bool) -> list[Advice]:
+    """Tell whether the camera of each view can have seen its points."""
+    worst = (0.0, 0.0)
+    for view in clean.split_views():
+        if view.viewpoint is not None and view.normals is not None and len(view) >= FEWEST:
+            shares = share_unseen(view.points.double(), view.normals.double(), view.viewpoint.double())
+            worst = max(worst, shares, key=lambda s: max(s[0] / MAX_EDGE_ON, s[1] / MAX_BEHIND))
+    edge_on, behind = worst
+    if edge_on <= MAX_EDGE_ON and behind <= MAX_BEHIND:
+        return []
+    what = (
+        f"sees {edge_on:.0%} of them edge-on"
+        if edge_on / MAX_EDGE_ON > behind / MAX_BEHIND
+        else (f"has {behind:.0%} of them behind others")
+    )
+    if given:
+        found = f"a viewpoint that the points contradict: a camera there {what}"
+        return [Advice(found, "the true camera, --viewpoint X Y Z, or an estimate, --no-viewpoint", True)]
+    found = f"an estimated camera that the points contradict: it {what}"
+    return [Advice(found, "a single view with its --viewpoint X Y Z, or outward normals", False)]
+
+
+def _judge_height(
+    points: Float[Tensor, "n 3"],
+    eye: Float[Tensor, "*views 3"],
+    given: bool,
+    up: Float[Tensor, "3"],
+    table: Plane | None,
+    support: tuple[Plane, float] | None,
+) -> list[Advice]:
+    """Tell whether the camera is above the table."""
+    lowest = float((points @ up).min()) if table is None else table.offset
+    normal = up if table is None else table.normal.double()
+    below = lowest - float((eye @ normal).min())
+    if below < 0:
+        return []
+    ground = "the lowest point" if table is None else "the table"
+    place = f"{below:.2f} m below {ground} along the vertical {_triple(normal)}"
+    centre = points.mean(0)
+    forward = bool((eye == 0).all()) and float(unit(centre)[2]) > 0.7 and float(up[2]) > 0.9
+    if forward:
+        axis = torch.tensor([0.0, -1.0, 0.0]) if support is None else support[0].normal
+        found = f"a cloud in its camera's frame, whose z axis points forward: the camera is {place}"
+        why = "the normal of the plane in it" if support is not None else "for a level camera"
+        mend = f"a vertical that points up: --up {_triple(axis, ' ')} ({why}), or --camera-pose FILE"
+        return [Advice(found, mend, True)]
+    if not given:
+        found = f"an estimated camera {place}"
+        return [Advice(found, "the true camera: --viewpoint X Y Z", False)]
+    mend = f"a camera above it: --viewpoint X Y Z; or, if {_triple(up)} points down, --up {_triple(-up, ' ')}"
+    return [Advice(f"a camera {place}", mend, True)]
+
+
+def _describe_support(plane: Plane, share: float, up: Float[Tensor, "3"]) -> Advice:
+    """Name the plane that was left in."""
+    axis = _triple(plane.normal, " ")
+    tilted = float(plane.normal @ up) < LEVEL
+    turn = f" --up {axis}, its normal," if tilted else ""
+    found = f"a plane under the object, a table left in, with {share:.0%} of the points"
+    return Advice(found, f"the object alone: torchgrasp cloud cut CLOUD{turn} --out FILE", True)
+
+
+def judge_pixels(cloud: PointCloud, viewpoint: Float[Tensor, "3"]) -> list[Advice]:
+    """Tell whether pixels fly off rims: outliers that lie behind or before others on their rays."""
+    points = cloud.points.double()
+    inlier = find_inliers(points)
+    if bool(inlier.all()) or int(inlier.sum()) < FEWEST:
+        return []
+    from scipy.spatial import KDTree
+
+    stray = points[~inlier]
+    _, index = KDTree(points[inlier].numpy()).query(stray.numpy())
+    away = stray - points[inlier][torch.from_numpy(index)]
+    along = (unit(away) * unit(stray - viewpoint.double())).sum(-1).abs()
+    flying = float((along > 0.8).double().sum()) / len(points)
+    if flying < MIN_FLYING:
+        return []
+    found = f"flying pixels at rims, {flying:.0%} of the points"
+    return [Advice(found, "none, for a sharper outline: torchgrasp cloud thin CLOUD --voxel 0.001 --out FILE", False)]
+
+
+def _single(eye: Float[Tensor, "*views 3"] | None) -> Float[Tensor, "3"] | None:
+    """Return the camera of a single view, or the mean of several."""
+    return None if eye is None else eye.reshape(-1, 3).mean(0)
+
+
+def _triple(vector: Tensor, between: str = ", ") -> str:
+    """Return three numbers for a sentence or for a command."""
+    numbers = between.join(f"{0.0 + round(x, 3):g}" for x in vector.tolist())
+    return numbers if between == " " else f"({numbers})"
