@@ -278,13 +278,13 @@ class Disturbance(Value):
 
     The three columns are neighbours, table, and the object by links other than the fingers'. `first_touch` [s] is when
     the hand first touched each, infinite if never. `impulse` [N s] is the sum of its normal impulses. `early` tells
-    whether it touched any of them before a fingertip touched the object. `neighbour_pose` is the motion of each of m
+    whether that was before a fingertip touched the object. `neighbour_pose` is the motion of each of m
     neighbours from its start.
     """
 
     first_touch: Float[Tensor, "3"]
     impulse: Float[Tensor, "3"]
-    early: bool
+    early: Bool[Tensor, "3"]
     neighbour_pose: Float[Tensor, "t m 4 4"]
 
 

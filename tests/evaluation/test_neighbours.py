@@ -33,7 +33,7 @@ def close_beside(simulator, *neighbours, mesh=None, **options):
 def test_a_neighbour_out_of_the_way_changes_nothing_and_stands_still(simulator):
     alone, beside = close_beside(simulator), close_beside(simulator, Neighbour(box((-0.3, 0.3))))
     assert torch.equal(alone.disturbance.neighbour_pose, torch.zeros(len(alone.time), 0, 4, 4, dtype=torch.float64))
-    assert beside.held and not beside.disturbance.early
+    assert beside.held and not beside.disturbance.early[0]
     assert float((beside.disturbance.neighbour_pose[:, 0] - torch.eye(4, dtype=torch.float64)).abs().max()) < 1e-4
     assert torch.isinf(beside.disturbance.first_touch[0]) and beside.disturbance.impulse[0] == 0
 
@@ -48,7 +48,7 @@ def test_a_neighbour_in_the_way_of_a_finger_is_pushed_before_the_object_is_touch
     result = close_beside(simulator, Neighbour(in_the_way, mass=0.02))
     disturbance = result.disturbance
     moved = disturbance.neighbour_pose[-1, 0] @ torch.tensor([*in_the_way.center_mass, 1.0]).double()
-    assert disturbance.early
+    assert bool(disturbance.early[0])
     assert float(disturbance.impulse[0]) > 0 and torch.isfinite(disturbance.first_touch[0])
     assert float((moved[:3] - torch.from_numpy(in_the_way.center_mass)).norm()) > 0.005
 

@@ -76,7 +76,9 @@ def run() -> Run:
         contact_order=(0, 1, 2),
         object_motion=ObjectMotion(0.003, math.radians(2)),
         start_overlap=0.0,
-        disturbance=Disturbance(torch.full((3,), math.inf), torch.zeros(3), False, lifted[:, None]),
+        disturbance=Disturbance(
+            torch.full((3,), math.inf), torch.zeros(3), torch.zeros(3, dtype=torch.bool), lifted[:, None]
+        ),
         seconds=1.0,
     )
     cloud = PointCloud(vertices[vertices[:, 0] > 0], None, torch.tensor([0.5, 0.1, 0.3], dtype=F64))

@@ -213,7 +213,7 @@ class _Lift:
             disturbance=Disturbance(
                 first_touch=first_stray * self.spec.timestep,
                 impulse=torch.from_numpy(robot.stray),
-                early=bool(first_stray.min() < min(first_touch)),
+                early=first_stray < min(first_touch),
                 neighbour_pose=neighbour_pose,
             ),
             seconds=seconds,

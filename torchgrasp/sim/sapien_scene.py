@@ -44,6 +44,8 @@ class SapienScene(Scene):
         self._tip_of = {link.name: i for i, link in enumerate(self.tips)}
         self._finger_of = dict(self._tip_of)
         self._links = {link.name for link in self.hand.links}
+        bodies = [self.body, *self.neighbours, *self.hand.links, *self.system.rigid_static_components]
+        self._name_of = {body: body.entity.name for body in bodies}  # to ask SAPIEN in every step costs much
         for i, tip in enumerate(self.tips):
             if tip.joint.dof == 0:
                 self._finger_of.setdefault(tip.parent.name, i)
@@ -70,7 +72,7 @@ class SapienScene(Scene):
         self.scene.step()
         contacts = StepContacts.none()
         for contact in self.system.get_contacts():
-            first, second = (b.entity.name for b in contact.bodies)
+            first, second = (self._name_of[body] for body in contact.bodies)
             if first in self._links:
                 link, other, sign = first, second, -1.0
             elif second in self._links:
@@ -136,7 +138,7 @@ class SapienScene(Scene):
             body.disable_gravity = False
         deepest = 0.0
         for contact in self.system.get_contacts():
-            if not self._links.isdisjoint(b.entity.name for b in contact.bodies):
+            if not self._links.isdisjoint(self._name_of[body] for body in contact.bodies):
                 deepest = max([deepest, *(-p.separation for p in contact.points)])
         return float(deepest)
 
