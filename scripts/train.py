@@ -5,6 +5,7 @@ python scripts/train.py posture-model hands/allegro               the mixture of
 python scripts/train.py posture-model mine/hand.urdf --tips a b c  the same from a URDF alone
 python scripts/train.py stability allegro --workers 2             which pulled grasps hold, for the impedance control
 python scripts/train.py success --objects DIR                     the predicted success that ranks grasps
+python scripts/train.py occupancy DIR                             how likely hidden places of a scene are full
 python scripts/train.py objects                                   meshes, convex parts and views of the own objects
 """
 
@@ -12,6 +13,7 @@ import sys
 
 import tyro
 from train.author_objects import objects
+from train.occupancy import occupancy
 from train.posture_model import posture_model
 from train.stability import stability
 from train.success import success
@@ -19,7 +21,13 @@ from train.success import success
 from torchgrasp.errors import GraspError
 
 if __name__ == "__main__":
-    commands = {"posture-model": posture_model, "stability": stability, "success": success, "objects": objects}
+    commands = {
+        "posture-model": posture_model,
+        "stability": stability,
+        "success": success,
+        "occupancy": occupancy,
+        "objects": objects,
+    }
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="train.py", description="Files that torchgrasp ships.")
     except GraspError as error:

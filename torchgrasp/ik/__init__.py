@@ -6,6 +6,8 @@ from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.contact_first import solve_contact_first
 from torchgrasp.ik.joint import solve_joint
+from torchgrasp.ik.motion import collision_probability, lift_clearance
+from torchgrasp.ik.obstacles import Obstacles
 from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
 from torchgrasp.ik.query import query_mixture
 from torchgrasp.ik.sdf import SignedDistanceField, field_from_surface
@@ -13,6 +15,7 @@ from torchgrasp.ik.solve import IKSolution, solve_ik
 
 __all__ = [
     "CollisionWorld", "Configuration", "GraspCandidates", "GraspErrors", "GraspProblem", "IKSolution",
-    "PostureLibrary", "SignedDistanceField", "check_candidates", "field_from_surface", "measure_errors",
-    "nearest_postures", "query_mixture", "solve_contact_first", "solve_ik", "solve_joint",
+    "Obstacles", "PostureLibrary", "SignedDistanceField", "check_candidates", "collision_probability",
+    "field_from_surface", "lift_clearance", "measure_errors", "nearest_postures", "query_mixture",
+    "solve_contact_first", "solve_ik", "solve_joint",
 ]  # fmt: skip

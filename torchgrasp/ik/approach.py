@@ -1,4 +1,4 @@
-"""The straight path of the opened hand to its pre-grasp, clear of object and table."""
+"""The straight path of the opened hand to its pre-grasp, clear of object, table and obstacles."""
 
 import math
 
@@ -73,13 +73,14 @@ def _clearance(
     back = torch.arange(1, steps + 1).to(centres) * (APPROACH_DISTANCE / steps)
     path = (centres[:, None] - back[:, None, None] * direction[:, None, None]).flatten(1, 2)
     radius, least = radius.repeat(steps), torch.full_like(path[:, 0, 0], math.inf)
-    if world.field is not None:
-        coarse = world.field.nearest_node(path) - radius
-        least, first = coarse.min(1)
+    for field in world.fields:
+        coarse = field.nearest_node(path) - radius
+        near, first = coarse.min(1)
         if exact:  # only spheres that may have the least clearance are interpolated
-            least = world.field.query(path[torch.arange(len(path), device=path.device), first])[0] - radius[first]
-            row, sphere = torch.nonzero(coarse < least[:, None] + NODE_ERROR * world.field.spacing, as_tuple=True)
-            least = least.scatter_reduce(0, row, world.field.query(path[row, sphere])[0] - radius[sphere], "amin")
+            near = field.query(path[torch.arange(len(path), device=path.device), first])[0] - radius[first]
+            row, sphere = torch.nonzero(coarse < near[:, None] + NODE_ERROR * field.spacing, as_tuple=True)
+            near = near.scatter_reduce(0, row, field.query(path[row, sphere])[0] - radius[sphere], "amin")
+        least = torch.minimum(least, near)
     if world.plane is not None:
         least = torch.minimum(least, (along(path, world.plane) - radius).amin(1) - world.plane.offset)
     return least

@@ -1,27 +1,34 @@
 """What grasp solvers are given, and how candidates become checked grasps."""
 
 import dataclasses
+from collections.abc import Callable
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value
-from torchgrasp.errors import Status
+from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.approach import find_approach
 from torchgrasp.ik.checks import is_clear, measure_errors
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration
+from torchgrasp.ik.motion import motion_clearance
 from torchgrasp.ik.ranking import score
 from torchgrasp.ik.refine import open_hand
-from torchgrasp.values import Certificate, Contacts, Grasps
+from torchgrasp.values import Certificate, Contacts, Grasps, IKSeeds
+
+Reachable = Callable[[Tensor], Tensor]
+"""Tells which poses obj_from_hand (k, 4, 4) an arm reaches, as booleans (k,)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class GraspProblem(Value):
     """A hand, certified contacts and the world; grasps around `center`, the object's centre [m], rank higher.
+
+    Poses that `reachable` refuses are no grasps; None: every pose is reached.
 
     Raises:
         BadArgument: contacts without `std_m`, by which the pre-grasp opens.
@@ -32,10 +39,32 @@ class GraspProblem(Value):
     certificate: Certificate
     world: CollisionWorld
     center: Float[Tensor, "3"]
+    reachable: Reachable | None = None
 
     def __post_init__(self) -> None:
         """Check the contacts once, before any work."""
         self.contacts.require_std()
+
+    def drop_unreachable(self, seeds: IKSeeds) -> IKSeeds:
+        """Return the seeds whose poses are reached."""
+        return seeds if self.reachable is None else seeds[ask_reachable(self.reachable, seeds.obj_from_hand)]
+
+
+def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor, "k"]:
+    """Return which poses a user's callable reaches.
+
+    Raises:
+        BadArgument: an answer of another kind than one boolean for each pose.
+    """
+    if not len(obj_from_hand):
+        return torch.zeros(0, dtype=torch.bool, device=obj_from_hand.device)
+    answer = reachable(obj_from_hand)
+    if not isinstance(answer, Tensor) or answer.dtype != torch.bool or answer.shape != obj_from_hand.shape[:1]:
+        found = (
+            f"{answer.dtype} of shape {tuple(answer.shape)}" if isinstance(answer, Tensor) else type(answer).__name__
+        )
+        raise BadArgument("reachable", f"an answer of {found}", f"a tensor of {len(obj_from_hand)} booleans")
+    return answer.to(obj_from_hand.device)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,6 +96,12 @@ def check_candidates(problem: GraspProblem, candidates: GraspCandidates) -> Gras
     ready = status == Status.OK
     approach[ready], clearance = find_approach(hand, opened[ready], world)
     status[ready] = torch.where(clearance >= 0, int(Status.OK), int(Status.NO_APPROACH))
+    if world.obstacles is not None:
+        _keep_clear(problem, configuration, opened, approach, status)
+    if problem.reachable is not None:
+        ready = torch.nonzero((status == Status.OK) & (planned == Status.OK))[:, 0]
+        refused = ~ask_reachable(problem.reachable, configuration.obj_from_hand[ready])
+        status[ready[refused]] = int(Status.UNREACHABLE)
     return Grasps(
         joints=configuration.joints,
         pregrasp=pregrasp,
@@ -81,3 +116,20 @@ def check_candidates(problem: GraspProblem, candidates: GraspCandidates) -> Gras
         score=score(contacts, errors.normal_angle, problem.center),
         status=torch.where(planned == Status.OK, status, planned),
     )
+
+
+def _keep_clear(
+    problem: GraspProblem, configuration: Configuration, opened: Configuration, approach: Tensor, status: Tensor
+) -> None:
+    """Name what obstacles prevent, in place; obstacles that may be touched only turn the approach where they can."""
+    hand, world = problem.hand, problem.world
+    crowded = torch.nonzero(status == Status.NO_APPROACH)[:, 0]
+    direction, clearance = find_approach(hand, opened[crowded], world.alone)
+    pushed = crowded[clearance >= 0]
+    if world.guarded:
+        status[pushed] = int(Status.NEIGHBOUR_COLLISION)
+        ready = torch.nonzero(status == Status.OK)[:, 0]
+        room = motion_clearance(hand, configuration[ready], opened.joints[ready], world)
+        status[ready[room < 0]] = int(Status.NEIGHBOUR_COLLISION)
+    else:
+        status[pushed], approach[pushed] = int(Status.OK), direction[clearance >= 0]

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchgrasp.base import Batch
 from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, link_clearance
+from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, link_clearance, obstacle_clearance
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.ik.refine import FLAT_PAD, ROUND_PAD, tip_targets
 from torchgrasp.plan.feasibility import first_violation
@@ -51,10 +51,14 @@ def measure_errors(hand: Hand, configuration: Configuration, contacts: Contacts,
         Status.OBJECT_COLLISION: (links >= 0) & (depth >= -TIP_PENETRATION),
         Status.TABLE_COLLISION: table >= 0,
     }
-    return GraspErrors(error, angle, torch.stack([links, table, between]).amin(0), first_violation(conditions))
+    clearances = [links, table, between]
+    if world.guarded:
+        clearances.append(obstacle_clearance(spatial, world))
+        conditions[Status.NEIGHBOUR_COLLISION] = clearances[-1] >= 0
+    return GraspErrors(error, angle, torch.stack(clearances).amin(0), first_violation(conditions))
 
 
 def is_clear(hand: Hand, configuration: Configuration, world: CollisionWorld) -> Bool[Tensor, "g"]:
-    """Tell which hands touch nothing, not even with their fingertips."""
+    """Tell which hands touch neither object nor table nor themselves, not even with their fingertips."""
     links, _, table = link_clearance(SpatialJacobian.at(hand, configuration), world, tips_touch=False)
     return (links >= 0) & (table >= 0) & (hand.self_clearance(configuration.joints) >= 0)

@@ -1,4 +1,4 @@
-"""Clearances of links from the object, the table and each other."""
+"""Clearances of links from the object, the table, obstacles and each other."""
 
 import dataclasses
 import math
@@ -11,6 +11,7 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.hand.collision_spheres import CollisionSpheres
 from torchgrasp.ik.configuration import SpatialJacobian, wrench_of
+from torchgrasp.ik.obstacles import Obstacles
 from torchgrasp.ik.sdf import SignedDistanceField
 from torchgrasp.optim import Residuals
 from torchgrasp.plane import Plane, as_plane
@@ -27,7 +28,7 @@ HINGES = 8
 
 @dataclasses.dataclass(frozen=True)
 class CollisionWorld(Value):
-    """The object's signed distance field, and the table as a plane or a height [m] along z, if any.
+    """The object's signed distance field, the table as a plane or a height [m] along z, and obstacles, if any.
 
     Raises:
         BadArgument: a table that is neither.
@@ -35,6 +36,7 @@ class CollisionWorld(Value):
 
     field: SignedDistanceField | None = None
     table: Plane | float | None = None
+    obstacles: Obstacles | None = None
 
     def __post_init__(self) -> None:
         """Check the table once, where the value is made."""
@@ -44,6 +46,21 @@ class CollisionWorld(Value):
     def plane(self) -> Plane | None:
         """The table as a plane."""
         return as_plane(self.table)
+
+    @property
+    def fields(self) -> tuple[SignedDistanceField, ...]:
+        """The distance fields of object and obstacles, if any."""
+        return tuple(x for x in (self.field, self.obstacles and self.obstacles.field) if x is not None)
+
+    @property
+    def alone(self) -> "CollisionWorld":
+        """The same world without obstacles."""
+        return dataclasses.replace(self, obstacles=None)
+
+    @property
+    def guarded(self) -> bool:
+        """Tell whether there are obstacles that links may not touch."""
+        return self.obstacles is not None and self.obstacles.hard
 
 
 def along(points: Float[Tensor, "*b 3"], plane: Plane) -> Float[Tensor, "*b"]:
@@ -74,6 +91,9 @@ def collision_cost(
     if world.field is not None:
         deficit = (CLEARANCE + radius - world.field.nearest_node(centres)) * ~spheres.touching
         cost = cost + deficit.clamp_min(0).square().sum(-1)
+    if world.obstacles is not None:
+        deficit = CLEARANCE + radius - world.obstacles.field.nearest_node(centres)
+        cost = cost + deficit.clamp_min(0).square().sum(-1)
     if world.plane is not None:
         deficit = world.plane.offset + CLEARANCE * ~spheres.touching + radius - along(centres, world.plane)
         cost = cost + deficit.clamp_min(0).square().sum(-1)
@@ -81,17 +101,17 @@ def collision_cost(
 
 
 def clearance_hinges(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> Residuals:
-    """Return hinges on the least clearances of the links from each other, the object and the table."""
+    """Return hinges on the least clearances of the links from each other, the object, obstacles and the table."""
     hinges, spheres = [self_hinges(spatial)], spatial.hand.collision_spheres
     centres = spatial.points(spheres.link_index, spheres.center)
     radius = spheres.radius.to(centres)
-    if world.field is not None:
-        coarse = world.field.nearest_node(centres) - radius
-        if tips_touch:
+    for field in world.fields:
+        coarse = field.nearest_node(centres) - radius
+        if tips_touch and field is world.field:
             coarse = torch.where(spheres.touching, math.inf, coarse)
         row, index = least(coarse)
         nearest = centres[row, index]
-        distance, gradient = world.field.query(nearest)
+        distance, gradient = field.query(nearest)
         clearance = distance - radius[index] + torch.where(torch.isinf(coarse[row, index]), 1.0, 0.0)
         jacobian = spatial.jacobian(wrench_of(nearest, gradient), spheres.link_index[index])
         hinges.append(hinge(clearance, jacobian, CLEARANCE))
@@ -135,3 +155,12 @@ def link_clearance(
     if world.plane is None:
         return links, tips, torch.full_like(tips, math.inf)
     return links, tips, (along(centres, world.plane) - radius).amin(1) - world.plane.offset
+
+
+def obstacle_clearance(spatial: SpatialJacobian, world: CollisionWorld) -> Float[Tensor, "g"]:
+    """Return the least clearance [m] of all links, fingertips too, from obstacles; infinite without any."""
+    spheres = spatial.hand.collision_spheres
+    centres = spatial.points(spheres.link_index, spheres.center)
+    if world.obstacles is None:
+        return torch.full_like(centres[:, 0, 0], math.inf)
+    return (world.obstacles.field.query(centres)[0] - spheres.radius.to(centres)).amin(1)

@@ -40,6 +40,7 @@ def refine_on_contacts(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
 
 def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
     """Return a checked grasp on fixed contacts for each triple that has seeds, best first."""
+    seeds = problem.drop_unreachable(seeds)
     attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
     attempts.refine(seeds, rank_seeds(problem, seeds), SEEDS_PER_ROUND, partial(refine_on_contacts, problem))
     return best_grasps(attempts)

@@ -136,6 +136,7 @@ def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: Conta
         candidates = GraspCandidates(state.configuration, plan.contacts, certificate, seeds.permutation, plan.status)
         return check_candidates(problem, candidates)
 
+    seeds = problem.drop_unreachable(seeds)
     attempts, rank = Attempts(torch.ones_like(problem.certificate.closed), executable), rank_in_group(seeds.row)
     attempts.refine(seeds, rank, FIXED_SEEDS, partial(refine_on_contacts, problem))
     attempts.refine(seeds, rank, SLIDING_SEEDS, refine_sliding)

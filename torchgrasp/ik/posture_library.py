@@ -13,6 +13,7 @@ from torch import Tensor
 from torchgrasp.base import Value, check_whole, join
 from torchgrasp.frames import apply, degenerate, inverse, rotate, virtual_frame
 from torchgrasp.hand.hand import Hand
+from torchgrasp.ik.candidates import Reachable, ask_reachable
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, collision_cost
 from torchgrasp.ik.query import COSINE_SLACK, LENGTH_SLACK
 from torchgrasp.ik.refine import TIP_WEIGHT
@@ -24,6 +25,8 @@ LIBRARY_SIZE = 5000
 """Random postures of a library; with 2000 or 20000 the share of triples with a grasp differs by 0.02."""
 CANDIDATES = 64
 """Nearest postures of a triple, over all assignments, whose clearances are measured; also the most seeds of it."""
+ASKED = 3
+"""Seeds whose poses an arm is asked for, to each that is kept: an arm refuses about half."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,11 +56,17 @@ def feature(centres: Float[Tensor, "*b 3 3"], pads: Float[Tensor, "*b 3 3"]) -> 
     return torch.cat([centres / LENGTH_SLACK, pads / COSINE_SLACK], -1).flatten(-2).float()
 
 
-def nearest_postures(library: PostureLibrary, contacts: Contacts, world: CollisionWorld, n_seeds: int = 8) -> IKSeeds:
+def nearest_postures(
+    library: PostureLibrary,
+    contacts: Contacts,
+    world: CollisionWorld,
+    n_seeds: int = 8,
+    reachable: Reachable | None = None,
+) -> IKSeeds:
     """Return the postures nearest to contacts, placed by Eq. (24) with the tips' centres for fingertips.
 
     Seeds come in the order of the contacts' rows, best first within a row. A degenerate row has none. `energy` is half
-    the squared distance of the features.
+    the squared distance of the features. Poses that `reachable` refuses make room for the next best ones.
 
     Raises:
         BadArgument: `n_seeds`, for each triple, is not in [1, 64].
@@ -79,8 +88,14 @@ def nearest_postures(library: PostureLibrary, contacts: Contacts, world: Collisi
         spheres = apply(obj_from_hand.float(), library.spheres[sample])
         tips = 2 * energy * (TIP_WEIGHT * LENGTH_SLACK / MILLIMETRE) ** 2  # squared millimetres, weighed as in `refine`
         cost = tips + collision_cost(spheres, library.hand.collision_spheres, world)
-        best = cost.topk(n_seeds, 1, largest=False).indices.flatten()
-        b = b.repeat_interleave(n_seeds)  # from here on one row a seed
+        if reachable is None:
+            best = cost.topk(n_seeds, 1, largest=False).indices.flatten()
+            b = b.repeat_interleave(n_seeds)  # from here on one row a seed
+        else:
+            best = cost.topk(min(ASKED * n_seeds, CANDIDATES), 1, largest=False).indices
+            reached = ask_reachable(reachable, obj_from_hand[b, best].flatten(0, 1)).reshape(best.shape)
+            kept = reached & (reached.cumsum(1) <= n_seeds)
+            b, best = b.expand_as(best)[kept], best[kept]
         order, sample = order[b, best], sample[b, best]
         gap = apply(obj_from_vf[b, order], library.centres[sample]) - centres[row[b], order]
         tip_error, energy = torch.linalg.vector_norm(gap, dim=-1), energy[b, best].double()

@@ -1,5 +1,6 @@
 """What one camera saw of a table: things, their support, free and hidden space."""
 
+from torchgrasp.scene.occupancy import Occupancy, estimate_occupancy
 from torchgrasp.scene.scene import DepthImage, Scene
 
-__all__ = ["DepthImage", "Scene"]
+__all__ = ["DepthImage", "Occupancy", "Scene", "estimate_occupancy"]

@@ -1,0 +1,211 @@
+"""What may be in the way: how likely each place around the target is full of something else.
+
+A camera sees the front of things. In front of what it measured, space is free. Behind, a thing goes on for about as
+far as it is wide, down to the table under what was seen of it. `scripts/train.py occupancy` fits how likely that is.
+"""
+
+import dataclasses
+import functools
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchgrasp.base import Value
+from torchgrasp.errors import BadArgument
+from torchgrasp.frames import apply, inverse
+from torchgrasp.linalg import unit
+from torchgrasp.scene.scene import DepthImage, Scene
+
+SPACING = 0.005
+"""Spacing [m] of the voxels: a third of a finger's width."""
+SIDEWAYS, ABOVE = 0.25, 0.04
+"""How far [m] voxels reach around the target's points and above everything: a hand's length, two fingertips."""
+NOISE = 0.004
+"""Depth [m] in front of a measured one at which space counts as free: three standard deviations of the noise."""
+FILLED = 8
+"""Pixels without a depth take that of the nearest pixel with one, up to this distance: rims and dropouts."""
+LOW = 0.01
+"""Height [m] above the table below which unlabelled pixels show the table."""
+RIM, RIM_DEPTH = 6, 0.02
+"""Unlabelled pixels this near to the target's, in pixels and metres of depth, are its own: masks are never exact."""
+LEAST_PIXELS = 20
+"""Fewer pixels without label are no thing: flying pixels."""
+LEAST_SIZE = 0.005
+"""Least size [m] of a thing, by which depths in its shadow are measured: a voxel."""
+LEAST = 0.002
+"""Least probability of a hidden place: the model has seen some thousand places of a kind, no more."""
+MODEL = Path(__file__).with_name("occupancy.json")
+"""Knots and weights of the model of occupancy, and what they were fitted on."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Occupancy(Value):
+    """How likely each voxel is full of something that is neither the target nor the table.
+
+    The centre of voxel (i, j, k) is at `origin` + (i, j, k) * `spacing` [m].
+    """
+
+    origin: Float[Tensor, "3"]
+    spacing: float
+    probability: Float[Tensor, "x y z"]
+
+    @property
+    def centres(self) -> Float[Tensor, "x y z 3"]:
+        """The centres [m] of the voxels."""
+        steps = [torch.arange(n, dtype=torch.float64) * self.spacing for n in self.probability.shape]
+        return torch.stack(torch.meshgrid(*steps, indexing="ij"), -1) + self.origin.double()
+
+
+@dataclasses.dataclass(frozen=True)
+class Shadows(Value):
+    """A depth image [m] without small gaps, and whose shadow begins at each pixel.
+
+    `owner` is 0 for the table, -1 where nothing was measured, a thing's label, or another negative number for each
+    thing without label. `points` [m] are the pixels' (not a number where nothing was measured).
+    """
+
+    image: DepthImage
+    depth: Float[Tensor, "h w"]
+    owner: Int[Tensor, "h w"]
+    points: Float[Tensor, "h w 3"]
+
+    def look(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
+        """Return how far [m] points lie behind what was measured, along the ray, and whose shadow that is."""
+        camera = apply(inverse(self.image.obj_from_camera.double()), points.double())
+        x, y, z = camera.unbind(-1)
+        (fx, _, cx), (_, fy, cy), _ = self.image.intrinsics.tolist()
+        ahead = z > 0
+        safe = torch.where(ahead, z, 1.0)
+        column, row = torch.round(fx * x / safe + cx).long(), torch.round(fy * y / safe + cy).long()
+        height, width = self.depth.shape
+        seen = ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        pixel = torch.where(seen, row * width + column, 0)
+        owner = torch.where(seen, self.owner.reshape(-1)[pixel], -1)
+        behind = (z - self.depth.reshape(-1)[pixel]) * torch.linalg.vector_norm(camera, dim=-1) / safe
+        return behind, owner
+
+
+def cast_shadows(scene: Scene, target: int) -> Shadows:
+    """Return whose shadow begins at each pixel; scene and target in the upright frame."""
+    from scipy.ndimage import label
+
+    image, (row, column) = scene.image, scene.pixels.unbind(-1)
+    depth, owner = image.depth.double(), torch.full(image.depth.shape, -1, dtype=torch.int64)
+    points = depth.new_full((*depth.shape, 3), torch.nan)
+    points[row, column] = scene.points.double()
+    owner[row, column] = scene.labels
+    own = owner == target
+    if scene.table is not None:
+        loose = (owner == 0) & (points[..., 2] > LOW)
+        gap, nearest = find_nearest(own)
+        rim = loose & (gap <= RIM) & ((depth - depth.reshape(-1)[nearest]).abs() <= RIM_DEPTH)
+        numbered: Any = label((loose & ~rim).numpy())
+        parts = torch.from_numpy(numbered[0]).long()
+        large = (torch.bincount(parts.reshape(-1)) >= LEAST_PIXELS)[parts]
+        owner = torch.where(rim, target, torch.where(loose, torch.where(large, -1 - parts, -1), owner))
+    gap, nearest = find_nearest(owner != -1)
+    depth, owner = (torch.where(gap <= FILLED, x.reshape(-1)[nearest], x) for x in (depth, owner))
+    return Shadows(image, depth, owner, points)
+
+
+def find_nearest(pixels: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Int[Tensor, "h w"]]:
+    """Return distance [px] and flat index of the nearest of some pixels."""
+    from scipy.ndimage import distance_transform_edt
+
+    found: Any = distance_transform_edt(~pixels.numpy(), return_indices=True)
+    row, column = torch.from_numpy(found[1]).long()
+    return torch.from_numpy(found[0]), row * pixels.shape[1] + column
+
+
+def shadow_features(shadows: Shadows, owner: int, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 6"]:
+    """Return what tells whether points [m] in the shadow of a thing are full.
+
+    The depth behind its surface over its width; the depth [m] under its seen points, those of a column; how deep [m]
+    the mirrored point lies behind what was measured there, for two guesses of the middle; the distance from its front
+    over its seen depth, and from its middle over its width.
+    """
+    from scipy.ndimage import maximum_filter
+
+    own = shadows.points[(shadows.owner == owner) & torch.isfinite(shadows.points[..., 2])]
+    toward = unit(shadows.image.obj_from_camera[:2, 3].double() - own[:, :2].mean(0))
+    axes = torch.stack([toward, torch.stack([-toward[1], toward[0]])], -1)
+    seen, level = own[:, :2] @ axes, points[:, :2].double() @ axes
+    low, high = torch.quantile(seen, seen.new_tensor([0.02, 0.98]), dim=0)
+    (deep, wide), front = (high - low + LEAST_SIZE).tolist(), high[0]
+
+    corner = torch.floor(own[:, :2].amin(0) / SPACING).long() - 1
+    count = torch.floor(own[:, :2].amax(0) / SPACING).long() - corner + 2
+
+    def column(xy: Float[Tensor, "n 2"]) -> Int[Tensor, "n"]:
+        cell = torch.minimum((torch.floor(xy / SPACING).long() - corner).clamp_min(0), count - 1)
+        return cell[:, 0] * count[1] + cell[:, 1]  # outside, a cell of the empty border
+
+    top = own.new_full((int(count[0] * count[1]),), -1.0)
+    top.scatter_reduce_(0, column(own[:, :2]), own[:, 2], "amax")
+    top = torch.from_numpy(maximum_filter(top.reshape(count.tolist()).numpy(), 3)).reshape(-1)
+
+    def mirrored(size: float) -> Float[Tensor, "n"]:
+        middle = axes @ torch.stack([front - size / 2, (low[1] + high[1]) / 2])
+        image = torch.cat([2 * middle - points[:, :2], points[:, 2:]], -1)
+        return shadows.look(image)[0]
+
+    behind, _ = shadows.look(points)
+    under = top[column(points[:, :2].double())] - points[:, 2]
+    across = (level[:, 1] - (low[1] + high[1]) / 2).abs() / wide
+    mirrors = mirrored(deep), mirrored(max(deep, wide))
+    return torch.stack([behind / wide, under, *mirrors, (front - level[:, 0]) / deep, across], -1)
+
+
+@functools.cache
+def load_model() -> dict[str, Any]:
+    """Return the knots and weights of each kind of hidden space."""
+    return json.loads(MODEL.read_text("utf-8"))
+
+
+def probability(kind: str, features: Float[Tensor, "n f"]) -> Float[Tensor, "n"]:
+    """Return the probability that places of a kind are full: their log-odds are a sum of piecewise linear functions."""
+    model, odds = load_model()[kind], torch.full_like(features[:, 0], load_model()[kind]["bias"])
+    for x, knots, values in zip(features.unbind(-1), model["knots"], model["values"], strict=True):
+        odds += torch.from_numpy(np.interp(x.numpy(), knots, values)).to(odds)
+    return torch.sigmoid(odds).clamp_min(LEAST)
+
+
+def estimate_occupancy(scene: Scene, target: int) -> Occupancy:
+    """Return how likely places around the target are full of something else; the scene is in its upright frame.
+
+    Free is what lies in front of a measured depth, and the table is no obstacle. In the shadow of a thing the model
+    tells how likely, in that of the target and outside the picture little is known.
+
+    Raises:
+        BadArgument: a target without points.
+    """
+    if not bool(scene.rows_of(target).any()):
+        raise BadArgument("target", target, f"one of the labels {scene.things}")
+    things = (scene.labels > 0) if scene.table is None else (scene.points[:, 2] > LOW) | scene.rows_of(target)
+    points, others = scene.points[scene.rows_of(target)].double(), scene.points[things].double()
+    low, high = points.amin(0) - SIDEWAYS, points.amax(0) + SIDEWAYS
+    near = ((others >= low) & (others <= high))[:, :2].all(1)
+    low[2] = 0.0 if scene.table is not None else float(others[near, 2].min())
+    high[2] = float(others[near, 2].max()) + ABOVE
+    origin = (torch.floor(low / SPACING) + 0.5) * SPACING
+    shape = torch.ceil((high - origin) / SPACING).long().tolist()
+    empty = Occupancy(origin, SPACING, torch.zeros(shape, dtype=torch.float64))
+    centres, shadows = empty.centres.reshape(-1, 3), cast_shadows(scene, target)
+    behind, owner = shadows.look(centres)
+    hidden = torch.nonzero((owner == -1) | ((owner != 0) & (behind > -NOISE)))[:, 0]
+    whose, full = owner[hidden], empty.probability.reshape(-1)
+    for thing in whose.unique().tolist():
+        rows = hidden[whose == thing]
+        where, depth = centres[rows], behind[rows]
+        if thing == -1:
+            full[rows] = probability("unseen", where[:, 2:])
+        elif thing == target:
+            full[rows] = probability("target", torch.stack([depth, where[:, 2]], -1))
+        else:
+            full[rows] = probability("thing", shadow_features(shadows, thing, where))
+    return empty
