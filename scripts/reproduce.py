@@ -105,7 +105,8 @@ def draw(
     canvas = Canvas()
     if isinstance(what, PointCloud):
         points = what.points.numpy()
-        canvas.add_points(points, points[:, 2], "cividis")
+        height = points[:, 2] - points[:, 2].min()
+        canvas.add_points(points, map_colors(height / max(float(height.max()), 1e-12), "cividis"))
     else:
         vertices, faces, normals = what.vertices.numpy(), what.faces.numpy(), what.normals.numpy()
         canvas.add_mesh(vertices, faces, map_colors(1e3 * what.std_m.numpy() / most, "viridis"), normals)

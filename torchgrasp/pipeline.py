@@ -1,4 +1,4 @@
-"""From a partial point cloud to ranked grasps, in one call."""
+"""From a partial point cloud, or a thing of a scene, to ranked grasps, in one call."""
 
 import dataclasses
 import hashlib
@@ -15,10 +15,11 @@ from torchgrasp.errors import BadArgument, Status
 from torchgrasp.files import sha256
 from torchgrasp.frames import inverse
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.candidates import GraspProblem
+from torchgrasp.ik.candidates import GraspProblem, Reachable
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.contact_first import solve_contact_first
 from torchgrasp.ik.joint import solve_joint
+from torchgrasp.ik.obstacles import Obstacles, collision_probability
 from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
 from torchgrasp.ik.query import query_mixture
 from torchgrasp.ik.ranking import rank_by_success, success_features, success_log_odds
@@ -29,6 +30,8 @@ from torchgrasp.plan.closure_probability import closure_share
 from torchgrasp.plan.solve import plan_contacts
 from torchgrasp.plane import Plane, cloud_to_upright, move, upright_frame
 from torchgrasp.posture_model.mixture import GraspMixture, load_mixture, mixture_path
+from torchgrasp.scene.occupancy import estimate_occupancy
+from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
@@ -45,6 +48,8 @@ Mode = Literal["joint", "contact_first"]
 """
 TRIPLES, SURFACE_DRAWS = 250, 600
 """Planned triples offered to the hand; surfaces drawn for the probability of closure, whose error is then 0.02."""
+TARGET_POINTS = 1000
+"""Points taken of a scene's target: local quadrics of as many span a centimetre, ten times a camera's noise."""
 
 
 def spread_rows(plan: ContactPlan, most: int) -> Int[Tensor, "k"]:
@@ -75,7 +80,7 @@ def digest(cloud: PointCloud) -> str:
 
 
 def plan_grasps(
-    cloud: PointCloud,
+    cloud: PointCloud | Scene,
     hand: Hand,
     spec: ContactSpec | None = None,
     starts: int = 1000,
@@ -84,11 +89,15 @@ def plan_grasps(
     mode: Mode = "joint",
     shape: ShapeGP | None = None,
     observer: Observer = lambda stage, message, value: None,
+    reachable: Reachable | None = None,
 ) -> Grasps:
-    """Plan grasps of a hand on the object of a partial point cloud.
+    """Plan grasps of a hand on the object of a partial point cloud, or on the target of a scene.
+
+    The result does not depend on the frame of cloud, camera and table. In a scene the hand keeps clear of the target's
+    neighbours and of space that may be full. The rest of that risk lowers `Grasps.success`.
 
     Args:
-        cloud: what the camera saw [m]; missing normals and viewpoint are estimated.
+        cloud: what the camera saw [m]; missing normals and viewpoint are estimated. A `Scene` has a target.
         hand: from `load_hand`.
         spec: the constraints on contacts; None: `ContactSpec()`.
         starts: random starts of the contact planner.
@@ -96,12 +105,14 @@ def plan_grasps(
         mode: see `Mode`. Only "contact_first" needs the hand's learned model.
         shape: the object's shape if more is known than the cloud shows, as after a touch (`ShapeGP.update`).
         observer: called after each stage, see `Observer`.
+        reachable: tells which poses `obj_from_hand` (k, 4, 4) an arm can reach, in the given frame; None: all.
 
     Returns:
         Grasps, those with `Status.OK` first, best first. There may be none.
 
     Raises:
-        BadArgument: an argument of the wrong type or range, or a cloud that no object of graspable size gives.
+        BadArgument: an argument of the wrong type or range; a cloud that no object of graspable size gives; a scene
+            without a target.
 
     >>> from torchgrasp import load_hand, load_object
     >>> view = load_object("cylinder").view
@@ -114,7 +125,11 @@ def plan_grasps(
         raise BadArgument("hand", type(hand).__name__, "a Hand from load_hand")
     if mode not in get_args(Mode):
         raise BadArgument("mode", repr(mode), "'joint' or 'contact_first'")
-    cloud, spec = remove_duplicates(cloud), spec.for_fingertips(float(hand.tips.radius.max()))
+    scene, spec = None, spec.for_fingertips(float(hand.tips.radius.max()))
+    if isinstance(cloud, Scene):
+        scene, cloud = cloud, take_target(cloud, seed)
+        spec = dataclasses.replace(spec, table=scene.table if spec.table is None else spec.table)
+    cloud = remove_duplicates(cloud)
     mixture, mixture_sha256 = None, "none"
     if mode == "contact_first":
         path = mixture_path(hand.urdf_path.parent)
@@ -132,6 +147,8 @@ def plan_grasps(
         starts,
         seed,
         mixture,
+        None if scene is None else scene.to_upright(obj_from_upright),
+        None if reachable is None else lambda poses: reachable(obj_from_upright.to(poses) @ poses),
         lambda stage, message, value: observer(stage, message, _moved(value, obj_from_upright)),
     )
     grasps = _moved(_plan(task), obj_from_upright)
@@ -156,6 +173,8 @@ class _Task:
     starts: int
     seed: int
     mixture: GraspMixture | None
+    scene: Scene | None
+    reachable: Reachable | None
     observer: Observer
 
 
@@ -175,8 +194,9 @@ def _plan(task: _Task) -> Grasps:
     message = f"{len(contacts)} of {len(offered)} triples closed at friction {spec.planned_friction:g}"
     observer("certify", message, certificate)
 
-    world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), spec.plane)
-    problem = GraspProblem(hand, contacts, certificate, world, surface.vertices.mean(0))
+    obstacles = _find_obstacles(task)
+    world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), spec.plane, obstacles)
+    problem = GraspProblem(hand, contacts, certificate, world, surface.vertices.mean(0), task.reachable)
     if task.mixture is None:
         seeds = nearest_postures(PostureLibrary.of(hand, seed=seed), contacts, world)
     else:
@@ -189,7 +209,33 @@ def _plan(task: _Task) -> Grasps:
     good = solved[solved.status == Status.OK]
     closure = closure_share(shape, good.contacts, spec.friction, SURFACE_DRAWS, seed)
     features = success_features(good.contacts, closure, good.normal_angle, problem.center, spec.friction)
-    return rank_by_success(solved, success_log_odds(features))
+    log_odds = success_log_odds(features)
+    if obstacles is not None:
+        free = 1 - collision_probability(hand, good, obstacles).to(log_odds)
+        log_odds = torch.logit(torch.sigmoid(log_odds) * free, eps=1e-6)
+    return rank_by_success(solved, log_odds)
+
+
+def _find_obstacles(task: _Task) -> Obstacles | None:
+    """Return what may stand in the way of the hand in a scene."""
+    if task.scene is None or task.scene.target is None:
+        return None
+    occupancy = estimate_occupancy(task.scene, task.scene.target)
+    return Obstacles.of(occupancy, hard=not task.spec.contact_allowed)
+
+
+def take_target(scene: Scene, seed: int) -> PointCloud:
+    """Return the cloud of a scene's target, random `TARGET_POINTS` of its points at most.
+
+    Raises:
+        BadArgument: no target, or a label that no thing has.
+        TooFewPoints: fewer than 4 points.
+    """
+    if scene.target not in scene.things:
+        raise BadArgument("target", scene.target, f"one of the labels {list(scene.things)}: scene.select(label)")
+    cloud, generator = scene.cloud(), torch.Generator().manual_seed(seed)
+    rows = torch.randperm(len(cloud), generator=generator)[:TARGET_POINTS].sort().values
+    return cloud.select(rows.to(cloud.points.device))
 
 
 def _metadata(cloud: PointCloud, hand: Hand, spec: ContactSpec) -> dict[str, str]:

@@ -42,16 +42,15 @@ class Canvas:
         shade = np.broadcast_to(rgb(color), corners.shape) if isinstance(color, str) else color[faces]
         (self.transparent if transparent else self.solid).append(_triangles(corners, bent, shade))
 
-    def add_points(self, points: Float[np.ndarray, "n 3"], values: Float[np.ndarray, " n"], colors: str) -> None:
-        """Add points as small balls, coloured by values."""
+    def add_points(self, points: Float[np.ndarray, "n 3"], colors: Float[np.ndarray, "n 3"]) -> None:
+        """Add points as small balls, each in its colour."""
         from trimesh import creation
 
         size = 0.006 * float(np.linalg.norm(np.ptp(points, axis=0)))
         ball = creation.icosphere(subdivisions=1, radius=1.0)
         corners = (points[:, None, None] + size * ball.vertices[ball.faces]).reshape(-1, 3, 3)
         normals = np.tile(ball.vertices[ball.faces], (len(points), 1, 1))
-        shade = map_colors((values - values.min()) / max(float(np.ptp(values)), 1e-12), colors)
-        shades = np.broadcast_to(np.repeat(shade, len(ball.faces), 0)[:, None], corners.shape)
+        shades = np.broadcast_to(np.repeat(colors, len(ball.faces), 0)[:, None], corners.shape)
         self.solid.append(_triangles(corners, normals, shades))
 
     def add_arrows(

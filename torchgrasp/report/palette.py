@@ -12,6 +12,9 @@ HAND = "#a9b0ba"
 OBJECT, TABLE = "#e9d7b3", "#eceae4"
 """Sand and grey."""
 
+THINGS = ("#d98f5c", "#6f9fd8", "#7fb77e", "#c77cba", "#d8c25a", "#6bbdb7", "#e08a8a", "#9a8fd1")
+"""The things of a scene, in the order of their labels, again from the first."""
+
 PAPER, INK, GRID = "#fcfcfa", "#22262b", "#dcdad3"
 """The background, lines with letters, and grid lines."""
 

@@ -25,31 +25,32 @@ ARROW = 0.045
 
 def draw_cloud(cloud: PointCloud, table: float | None = None) -> bytes:
     """Draw a cloud from its camera, coloured by height."""
-    points = _array(cloud.points)
+    points = to_array(cloud.points)
     points = points[:: -(-len(points) // 3000)]  # more would hide each other
     canvas = Canvas()
-    canvas.add_points(points, points[:, 2], "cividis")
+    height = points[:, 2] - points[:, 2].min()
+    canvas.add_points(points, map_colors(height / max(float(height.max()), 1e-12), "cividis"))
     canvas.add_table(points, table)
     return canvas.render_png(points, view_of(cloud))
 
 
 def draw_surface(surface: Surface, direction: Direction, table: float | None = None) -> bytes:
     """Draw the estimated surface, coloured by its standard deviation [mm]."""
-    vertices, std_mm = _array(surface.vertices), 1e3 * _array(surface.std_m)
+    vertices, std_mm = to_array(surface.vertices), 1e3 * to_array(surface.std_m)
     most = max(float(np.quantile(std_mm, 0.99)), 1e-3)
     canvas = Canvas()
     faces, colors = surface.faces.cpu().numpy(), map_colors(std_mm / most, "viridis")
-    canvas.add_mesh(vertices, faces, colors, _array(surface.normals))
+    canvas.add_mesh(vertices, faces, colors, to_array(surface.normals))
     canvas.add_table(vertices, table)
     return canvas.render_png(vertices, direction, bar=("standard deviation of the surface [mm]", most, "viridis"))
 
 
 def draw_contacts(surface: Surface, contacts: Contacts, direction: Direction, table: float | None = None) -> bytes:
     """Draw the first row's contacts with normals on the estimated surface."""
-    vertices = _array(surface.vertices)
+    vertices = to_array(surface.vertices)
     canvas = Canvas()
-    canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, _array(surface.normals), transparent=True)
-    canvas.add_arrows(_array(contacts.points[0]), _array(contacts.normals[0]), ARROW, FINGERS)
+    canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, to_array(surface.normals), transparent=True)
+    canvas.add_arrows(to_array(contacts.points[0]), to_array(contacts.normals[0]), ARROW, FINGERS)
     canvas.add_table(vertices, table)
     return canvas.render_png(vertices, direction)
 
@@ -58,10 +59,10 @@ def draw_grasp(surface: Surface, hand: Hand, grasp: Grasps, direction: Direction
     """Draw the first row's hand on the estimated surface."""
     joints = hand.expand_joints(grasp.joints[0].double())
     solids = solids_from_hand(hand, joints, hand.tree.joint_names, grasp.obj_from_hand[0])
-    vertices = _array(surface.vertices)
+    vertices = to_array(surface.vertices)
     canvas = Canvas()
-    canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, _array(surface.normals))
-    canvas.add_arrows(_array(grasp.contacts.points[0]), _array(grasp.contacts.normals[0]), ARROW, FINGERS)
+    canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, to_array(surface.normals))
+    canvas.add_arrows(to_array(grasp.contacts.points[0]), to_array(grasp.contacts.normals[0]), ARROW, FINGERS)
     for solid in solids:
         canvas.add_mesh(solid.vertices, solid.faces, solid.color)
     corners = np.concatenate([vertices, *(s.vertices for s in solids)])
@@ -171,6 +172,6 @@ def rotated(direction: Direction, degrees: float) -> Direction:
     return (float(c * x - s * y), float(s * x + c * y), z)
 
 
-def _array(value: Float[Tensor, "*b"]) -> np.ndarray:
+def to_array(value: Float[Tensor, "*b"]) -> np.ndarray:
     """Return a tensor as an array of doubles."""
     return value.detach().cpu().double().numpy()

@@ -1,0 +1,123 @@
+"""Which thing of a scene to take first: the things ranked by their best grasps, with reasons for those without."""
+
+import dataclasses
+
+import torch
+from torch import Tensor
+
+from torchgrasp.base import Value, check_number, count_status
+from torchgrasp.errors import BadArgument, GraspError, Status
+from torchgrasp.hand.hand import Hand
+from torchgrasp.ik.candidates import Reachable
+from torchgrasp.pipeline import plan_grasps
+from torchgrasp.scene.scene import Scene
+from torchgrasp.specs import ContactSpec
+from torchgrasp.values import Grasps
+
+ROOM, HEIGHT = 0.06, 0.08
+"""Gap [m] to the nearest neighbour and height [m] above the table beyond which more makes nothing easier: a finger's
+width on both sides, a finger's length."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ThingPlan(Value):
+    """The executable grasps of one thing, best first, or the reason why there are none.
+
+    `success` is the predicted one of the best grasp, 0 without.
+    """
+
+    label: int
+    success: float
+    grasps: Grasps | None = None
+    reason: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class ScenePlan(Value):
+    """The things of a scene, the likeliest success first; then those without a grasp, and those not tried."""
+
+    things: tuple[ThingPlan, ...]
+
+    @property
+    def best(self) -> ThingPlan | None:
+        """The thing to take first; None if no thing has a grasp."""
+        return next((thing for thing in self.things if thing.grasps is not None), None)
+
+
+def plan_scene(
+    scene: Scene,
+    hand: Hand,
+    spec: ContactSpec | None = None,
+    starts: int = 1000,
+    seed: int = 0,
+    *,
+    enough: float = 1.0,
+    reachable: Reachable | None = None,
+) -> ScenePlan:
+    """Plan grasps of the things of a scene, and rank the things by predicted success.
+
+    Things with room around them and height above the table are planned first.
+
+    Args:
+        scene: things on a table.
+        hand: from `load_hand`.
+        spec: the constraints on contacts; None: `ContactSpec()`.
+        starts: random starts of the contact planner for each thing.
+        seed: of every random draw.
+        enough: predicted success of a grasp from which on no further thing is planned; 1: all are.
+        reachable: see `plan_grasps`.
+
+    Raises:
+        BadArgument: a scene without things, or an argument of the wrong type or range.
+    """
+    check_number("enough", enough, 0.0, 1.0)
+    if not scene.things:
+        raise BadArgument("scene", "no thing on the table", "a scene with at least one thing")
+    plans: list[ThingPlan] = []
+    for label in order_by_ease(scene):
+        if any(plan.success >= enough for plan in plans):
+            plans.append(ThingPlan(label, 0.0, reason="not tried: another thing is easy enough"))
+            continue
+        plans.append(_plan_thing(dataclasses.replace(scene, target=label), hand, spec, starts, seed, reachable))
+    return ScenePlan(tuple(sorted(plans, key=lambda plan: -plan.success)))
+
+
+def _plan_thing(
+    scene: Scene, hand: Hand, spec: ContactSpec | None, starts: int, seed: int, reachable: Reachable | None
+) -> ThingPlan:
+    """Plan grasps of a scene's target."""
+    assert scene.target is not None
+    stages: dict[str, Tensor] = {}
+
+    def note(stage: str, message: str, value: object) -> None:
+        if stage == "plan":
+            stages[stage] = value.status  # pyright: ignore[reportAttributeAccessIssue]
+
+    try:
+        grasps = plan_grasps(scene, hand, spec, starts, seed, observer=note, reachable=reachable)
+    except GraspError as error:
+        return ThingPlan(scene.target, 0.0, reason=str(error))
+    good = grasps[grasps.status == Status.OK]
+    if len(good):
+        return ThingPlan(scene.target, float(good.success[0]), good)
+    failed = count_status(grasps.status if len(grasps) else stages["plan"])
+    first = next((status for status in failed if status is not Status.OK), Status.OUT_OF_REACH)
+    return ThingPlan(scene.target, 0.0, reason=first.sentence)
+
+
+def order_by_ease(scene: Scene) -> list[int]:
+    """Return the labels of a scene's things, those first that have room around them and stand high."""
+    from scipy.spatial import KDTree
+
+    ease = {}
+    for label in scene.things:
+        own, others = scene.rows_of(label), (scene.labels > 0) & ~scene.rows_of(label)
+        points = scene.points[own].cpu().numpy()
+        room = ROOM
+        if bool(others.any()):
+            room = float(KDTree(scene.points[others].cpu().numpy()).query(points)[0].min())
+        height = HEIGHT
+        if scene.table is not None:
+            height = float(torch.quantile(scene.table.height(scene.points[own]), 0.95))
+        ease[label] = min(room / ROOM, 1.0) + min(height / HEIGHT, 1.0)
+    return sorted(ease, key=lambda label: -ease[label])
