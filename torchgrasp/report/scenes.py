@@ -19,7 +19,7 @@ POINTS = 4000
 
 
 def draw_depth(scene: Scene) -> bytes:
-    """Draw the depth image, each thing in its colour and the target the brightest; near is light, unmeasured is white."""
+    """Draw the depth image, each thing in its colour; the target is the brightest, and unmeasured pixels are white."""
     from PIL import Image
 
     depth, labels = to_array(scene.image.depth), np.zeros(scene.image.depth.shape, dtype=int)
