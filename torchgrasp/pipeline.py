@@ -19,7 +19,8 @@ from torchgrasp.ik.candidates import GraspProblem, Reachable
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.contact_first import solve_contact_first
 from torchgrasp.ik.joint import solve_joint
-from torchgrasp.ik.obstacles import Obstacles, collision_probability
+from torchgrasp.ik.motion import collision_probability
+from torchgrasp.ik.obstacles import Obstacles
 from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
 from torchgrasp.ik.query import query_mixture
 from torchgrasp.ik.ranking import rank_by_success, success_features, success_log_odds
