@@ -122,6 +122,7 @@ class Status(enum.IntEnum):
     NO_APPROACH = 28, "the opened hand cannot come straight to this pose without touching something"
     NEIGHBOUR_COLLISION = 29, "a link of the hand would touch a neighbour of the object, or space that may be full"
     UNREACHABLE = 30, "the arm cannot bring the hand to this pose (`reachable` refuses it)"
+    BURIED = 31, "something lies on the object or leans over it"
     # closing
     START_OVERLAP = 40, "the hand overlaps the object or the table before closing starts"
     NO_CONTACT = 41, "a fingertip never touched the object"

@@ -19,7 +19,7 @@ from torchgrasp.ik.candidates import GraspProblem, Reachable
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.contact_first import solve_contact_first
 from torchgrasp.ik.joint import solve_joint
-from torchgrasp.ik.motion import collision_probability
+from torchgrasp.ik.motion import collision_probability, lift_clearance
 from torchgrasp.ik.obstacles import Obstacles
 from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
 from torchgrasp.ik.query import query_mixture
@@ -35,7 +35,7 @@ from torchgrasp.scene.occupancy import estimate_occupancy
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.surface import extract_surface
+from torchgrasp.shape.surface import Surface, extract_surface
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan, Grasps, PointCloud
 
@@ -49,6 +49,8 @@ Mode = Literal["joint", "contact_first"]
 """
 TRIPLES, SURFACE_DRAWS = 250, 600
 """Planned triples offered to the hand; surfaces drawn for the probability of closure, whose error is then 0.02."""
+BURIED_DEPTH = 0.003
+"""Depth [m] in obstacles, beyond that of neighbours that touch, at which something lies on a lifted surface."""
 TARGET_POINTS = 1000
 """Points taken of a scene's target: local quadrics of as many span a centimetre, ten times a camera's noise."""
 
@@ -211,6 +213,9 @@ def _plan(task: _Task) -> Grasps:
     closure = closure_share(shape, good.contacts, spec.friction, SURFACE_DRAWS, seed)
     features = success_features(good.contacts, closure, good.normal_angle, problem.center, spec.friction)
     log_odds = success_log_odds(features)
+    if obstacles is not None and obstacles.hard and _is_buried(surface, obstacles):
+        buried = torch.where(solved.status == Status.OK, int(Status.BURIED), solved.status)
+        return dataclasses.replace(solved, status=buried)
     if obstacles is not None:
         free = 1 - collision_probability(hand, good, obstacles).to(log_odds)
         log_odds = torch.logit(torch.sigmoid(log_odds) * free, eps=1e-6)
@@ -223,6 +228,12 @@ def _find_obstacles(task: _Task) -> Obstacles | None:
         return None
     occupancy = estimate_occupancy(task.scene, task.scene.target)
     return Obstacles.of(occupancy, hard=not task.spec.contact_allowed)
+
+
+def _is_buried(surface: Surface, obstacles: Obstacles) -> bool:
+    """Tell whether the lifted surface runs into obstacles, deeper than it touches them where it stands."""
+    standing = float(obstacles.field.query(surface.vertices)[0].min())
+    return lift_clearance(surface.vertices, obstacles) < min(standing, 0.0) - BURIED_DEPTH
 
 
 def take_target(scene: Scene, seed: int) -> PointCloud:
