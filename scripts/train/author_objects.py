@@ -6,19 +6,40 @@ Run it after a change of `train/object_shapes.py` or of the virtual camera; it n
 import numpy as np
 import trimesh
 
-from torchgrasp.cloud.camera import look_at, partial_view
+from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view
 from torchgrasp.cloud.io.read import save_cloud
+from torchgrasp.cloud.render import render_depth
 from torchgrasp.files import write_atomically, write_file
-from torchgrasp.objects import DATA, list_objects
+from torchgrasp.objects import DATA, SCENE, list_objects
 
 VIEWS = {"cylinder": (20.0, 30.0), "jug": (60.0, 35.0), "rabbit": (55.0, 30.0), "spray": (50.0, 25.0)}
 """Azimuth and elevation [deg] of the camera for each object."""
+SCENE_SEED = 1
+"""Of the scene: its things stand apart, one of them in front of another."""
 
 
 def objects() -> None:
     """Write mesh, convex parts and noisy view of every object of the library."""
     for name in list_objects():
         write_object(name)
+
+
+def scene() -> None:
+    """Write the depth image of a scene of the library's objects, with labels, camera and table."""
+    from torchgrasp.evaluation.placed import drop  # needs SAPIEN, which the other trainings do not
+
+    count = len(list_objects())
+    placed = drop(None, (count, count), SCENE_SEED)
+    depth, labels = render_depth(placed.meshes, placed.camera_pose, seed=SCENE_SEED)
+    arrays = {
+        "depth": np.round(1e3 * depth.numpy()).astype(np.uint16),
+        "intrinsics": INTRINSICS.numpy(),
+        "camera_pose": placed.camera_pose.numpy(),
+        "labels": labels.numpy().astype(np.uint8),
+        "table": np.array([0.0, 0.0, 1.0, 0.0]),
+    }
+    write_atomically(SCENE, lambda path: np.savez_compressed(path, **arrays))
+    print(f"{SCENE}: {', '.join(placed.names)}")
 
 
 def write_object(name: str) -> None:

@@ -8,15 +8,20 @@ import numpy as np
 
 from torchgrasp.cloud.io.read import read_cloud
 from torchgrasp.errors import BadArgument
+from torchgrasp.scene.file import read_scene
+from torchgrasp.scene.scene import Scene
 from torchgrasp.values import PointCloud
 
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["GraspObject", "list_objects", "load_object"]
+__all__ = ["GraspObject", "list_objects", "load_object", "load_scene"]
 
 DATA = Path(__file__).parent / "data"
 """Folder of the objects: `<name>/mesh.ply`, `<name>/parts.npz` and `<name>/view.ply`."""
+
+SCENE = DATA / "scene.npz"
+"""A depth image of the objects on a table, with labels, camera and table."""
 
 MASSES = {"cylinder": 0.15, "jug": 0.20, "rabbit": 0.10, "spray": 0.15}
 """Masses [kg]: a tin, a plastic jug, a plush rabbit, a bottle a third full."""
@@ -65,3 +70,12 @@ def load_object(name: str) -> GraspObject:
         corners = np.split(file["corners"].astype(np.float64), np.cumsum(file["counts"])[:-1])
     parts = [trimesh.convex.convex_hull(c) for c in corners]
     return GraspObject(name, mesh, parts, read_cloud(DATA / name / "view.ply"), MASSES[name])
+
+
+def load_scene() -> Scene:
+    """Return a rendered scene of the library's objects on a table, with noise and true labels; z is up.
+
+    >>> load_scene().things
+    (1, 2, 3, 4)
+    """
+    return read_scene(SCENE)

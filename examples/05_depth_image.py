@@ -1,0 +1,38 @@
+"""From one depth image of a table to joint commands: what the camera measured goes in, a trajectory comes out."""
+
+import numpy as np
+import torch
+
+from torchgrasp import Scene, Status, load_hand, load_scene, plan_grasps
+from torchgrasp.control import ClosingReference, squeeze
+
+shipped = load_scene()  # your own: depth (h, w) in metres or uint16 mm, intrinsics (fx, fy, cx, cy), pose of the camera
+depth, intrinsics, camera = (x.numpy() for x in (shipped.image.depth, shipped.image.intrinsics, shipped.viewpoint))
+scene = Scene.from_depth(
+    np.round(1e3 * depth).astype(np.uint16), intrinsics, shipped.image.obj_from_camera.numpy(), point=(344, 230)
+)
+print(f"things {scene.things}, target {scene.target}, table {scene.table}")
+for sentence in scene.advice:
+    print("note:", sentence)
+
+
+def reachable(obj_from_hand):
+    """Stand in for the inverse kinematics of your arm: the palm must be within 0.9 m of its base."""
+    return torch.linalg.vector_norm(obj_from_hand[:, :3, 3], dim=-1) < 0.9
+
+
+hand = load_hand("allegro")
+grasps = plan_grasps(scene, hand, starts=100, reachable=reachable)
+best = grasps[0]
+print(Status(int(best.status)).sentence, f"- predicted success {float(best.success):.0%}")
+
+pose, approach = best.obj_from_hand[0], best.approach[0]
+start = pose.clone()
+start[:3, 3] -= 0.1 * approach
+print("open, the palm to", start[:3, 3].numpy().round(3), "then straight to", pose[:3, 3].numpy().round(3))
+for name, joints in {
+    "pre-grasp": best.pregrasp[0],
+    "grasp": best.joints[0],
+    "squeeze": squeeze(hand, best, force=4.0).joints[0],
+}.items():
+    print(name, dict(zip(hand.joint_names, joints.numpy().round(3).tolist(), strict=True)))
