@@ -4,10 +4,10 @@ import numpy as np
 import torch
 
 from torchgrasp import Scene, Status, load_hand, load_scene, plan_grasps
-from torchgrasp.control import ClosingReference, squeeze
+from torchgrasp.control import squeeze
 
-shipped = load_scene()  # your own: depth (h, w) in metres or uint16 mm, intrinsics (fx, fy, cx, cy), pose of the camera
-depth, intrinsics, camera = (x.numpy() for x in (shipped.image.depth, shipped.image.intrinsics, shipped.viewpoint))
+shipped = load_scene()  # your own camera: depth in metres or uint16 mm, (fx, fy, cx, cy), its pose
+depth, intrinsics = shipped.image.depth.numpy(), shipped.image.intrinsics.numpy()
 scene = Scene.from_depth(
     np.round(1e3 * depth).astype(np.uint16), intrinsics, shipped.image.obj_from_camera.numpy(), point=(344, 230)
 )

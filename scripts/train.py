@@ -12,7 +12,7 @@ python scripts/train.py objects                                   meshes, convex
 import sys
 
 import tyro
-from train.author_objects import objects
+from train.author_objects import objects, scene
 from train.occupancy import occupancy
 from train.posture_model import posture_model
 from train.stability import stability
@@ -27,6 +27,7 @@ if __name__ == "__main__":
         "success": success,
         "occupancy": occupancy,
         "objects": objects,
+        "scene": scene,
     }
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="train.py", description="Files that torchgrasp ships.")

@@ -31,7 +31,9 @@ def measure_frames(count: int, trials: int, seed: int = 0) -> list[Row]:
             grasp_error = max(grasp_error, _difference(move(there, inverse(pose)), here))
             done += 1
             if k < trials // len(list_objects()):
-                mesh, parts = ([m.copy().apply_transform(pose.numpy()) for m in ms] for ms in ([known.mesh], known.parts))
+                mesh, parts = (
+                    [m.copy().apply_transform(pose.numpy()) for m in ms] for ms in ([known.mesh], known.parts)
+                )
                 closure = close_hand(there[0], hand, mesh[0], parts=parts, table=table.moved(pose))
                 motion = torch.tensor([closure.object_motion]) - torch.tensor([reference.object_motion])
                 forces = closure.forces[-1] - reference.forces[-1]
