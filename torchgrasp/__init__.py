@@ -4,6 +4,7 @@ The names below are the library, in the order of the data flow. Each subpackage 
 """
 
 from torchgrasp.errors import GraspError, Status
+from torchgrasp.plane import Plane
 from torchgrasp.specs import ContactSpec, TrialSpec
 from torchgrasp.values import (
     Certificate,
@@ -19,8 +20,9 @@ from torchgrasp.values import (
     ShapeEstimate,
     load_grasps,
 )
-from torchgrasp.objects import GraspObject, list_objects, load_object
 from torchgrasp.cloud import cloud_from_depth, merge_clouds, read_cloud
+from torchgrasp.scene import Scene, read_scene, save_scene
+from torchgrasp.objects import GraspObject, list_objects, load_object, load_scene
 from torchgrasp.shape import ShapeGP, fit_shape
 from torchgrasp.plan import ClosureProbability, certify, closure_probability, plan_contacts
 from torchgrasp.hand import Hand, load_hand
@@ -35,6 +37,7 @@ from torchgrasp.posture_model import (
 )
 from torchgrasp.ik import IKSolution, PostureLibrary, solve_ik
 from torchgrasp.pipeline import plan_grasps
+from torchgrasp.clutter import ScenePlan, ThingPlan, plan_scene
 from torchgrasp.control import ClosingReference, GraspController, closing_gains
 from torchgrasp.evaluation import close_hand
 
@@ -43,6 +46,7 @@ __version__ = "0.1.0"
 __all__ = [
     "GraspError",
     "Status",
+    "Plane",
     "ContactSpec",
     "TrialSpec",
     "Certificate",
@@ -57,12 +61,16 @@ __all__ = [
     "PointCloud",
     "ShapeEstimate",
     "load_grasps",
-    "GraspObject",
-    "list_objects",
-    "load_object",
     "cloud_from_depth",
     "merge_clouds",
     "read_cloud",
+    "Scene",
+    "read_scene",
+    "save_scene",
+    "GraspObject",
+    "list_objects",
+    "load_object",
+    "load_scene",
     "ShapeGP",
     "fit_shape",
     "ClosureProbability",
@@ -82,6 +90,9 @@ __all__ = [
     "PostureLibrary",
     "solve_ik",
     "plan_grasps",
+    "ScenePlan",
+    "ThingPlan",
+    "plan_scene",
     "ClosingReference",
     "GraspController",
     "closing_gains",
