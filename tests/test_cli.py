@@ -227,9 +227,9 @@ def test_cloud_check_names_what_to_mend(tmp_path, capsys):
     points = sphere(6000)
     points[:3] += 0.3
     np.save(tmp_path / "ball.npy", np.concatenate([points, points[:5]]))
-    assert cli.main(["cloud", "check", str(tmp_path / "ball.npy"), "--viewpoint", "0", "0", "1"]) == 0
+    assert cli.main(["cloud", "check", str(tmp_path / "ball.npy")]) == 0
     said = capsys.readouterr().out
-    assert "6005 (5 of them copies)" in said and "voxel_downsample" in said
+    assert "6005 (5 of them copies)" in said and "torchgrasp cloud thin" in said
     assert next(line for line in said.splitlines() if line.startswith("outliers")).split()[1] == "3"
 
 

@@ -1,26 +1,149 @@
-"""`torchgrasp cloud`: check a cloud, or render one from a mesh."""
+"""`torchgrasp cloud`: check, cut and thin a cloud, make one of a depth image, or render one from a mesh."""
 
 from pathlib import Path
 from typing import Annotated
 
+import torch
 from tyro.conf import Positional, arg
 
-from torchgrasp.cli.common import check_seed, naming, read_view
-from torchgrasp.cloud import diagnose_cloud, format_report, look_at, partial_view, save_cloud
+from torchgrasp.base import check_tensor
+from torchgrasp.cli.common import AS_IT_IS, ViewOptions, check_seed, naming, print_notes, read_view, table_plane
+from torchgrasp.cloud import (
+    cloud_from_depth,
+    cut_object,
+    diagnose_cloud,
+    format_report,
+    look_at,
+    partial_view,
+    remove_outliers,
+    save_cloud,
+    voxel_downsample,
+)
+from torchgrasp.cloud.io.image import read_image, read_pose
+from torchgrasp.errors import BadArgument
 from torchgrasp.mesh import read_mesh
+from torchgrasp.plane import as_plane
 
 
 def check(
-    cloud: Annotated[Positional[Path], arg(metavar="FILE")], /, viewpoint: tuple[float, float, float] | None = None
+    cloud: Annotated[Positional[Path], arg(metavar="FILE")],
+    /,
+    view: Annotated[ViewOptions, arg(name="")] = AS_IT_IS,
+    table: tuple[float, ...] | None = None,
+    no_table: bool = False,
 ) -> int:
-    """Report on a point cloud, with advice for a better one.
+    """Report on a point cloud, with advice for a better one. The exit code is 1 if `torchgrasp grasp` refuses it.
 
     Args:
-        cloud: point cloud of one object in metres, z up (.ply, .pcd, .npy, .npz, .xyz).
-        viewpoint: position of the camera in the frame of the cloud; by default the file's, else it is estimated.
+        cloud: point cloud of one object (.ply, .pcd, .npy, .npz, .xyz, .txt, .csv).
+        view: how the file is meant.
+        table: height of the table along the vertical, or four numbers nx ny nz d of the plane n . p = d, in metres; by
+            default the table is at the lowest point of the cloud.
+        no_table: there is no table.
     """
+    file = read_view("FILE", cloud, view, whole=True)
+    plane = as_plane(table_plane(file.cloud, view, table, no_table))
+    up = view.vertical if view.up is not None or plane is None else plane.normal
     with naming(points="FILE", normals="FILE"):
-        print(format_report(diagnose_cloud(read_view("FILE", cloud, viewpoint))))
+        report = diagnose_cloud(file.cloud, up, plane if table is not None else None, stands=not no_table)
+    print(format_report(report))
+    for note in file.notes:
+        print(f"{'note':12}{note}")
+    return int(any(advice.refused for advice in report.advice))
+
+
+def cut(
+    cloud: Annotated[Positional[Path], arg(metavar="CLOUD")],
+    /,
+    out: Path,
+    view: Annotated[ViewOptions, arg(name="")] = AS_IT_IS,
+    point: tuple[float, float, float] | None = None,
+    box: tuple[float, float, float, float, float, float] | None = None,
+    gap: float = 0.02,
+) -> int:
+    """Write the points of one thing of a scene, without the plane that it stands on.
+
+    Args:
+        cloud: point cloud of a scene of any size (.ply, .pcd, .npy, .npz, .xyz, .txt, .csv).
+        out: point cloud to write (.npz or .ply), in metres.
+        view: how the file is meant.
+        point: a point on or near the thing; all farther than 0.5 m away is left out. By default the largest thing.
+        box: two corners of a box; all outside is left out first.
+        gap: least distance between two things.
+    """
+    if not 0.001 <= gap <= 1.0:
+        raise BadArgument("--gap", gap, "a number of metres in [0.001, 1]")
+    file = read_view("CLOUD", cloud, view, whole=True)
+    near = None if point is None else check_tensor("--point", torch.tensor(point, dtype=torch.float64), (3,))
+    corners = None if box is None else check_tensor("--box", torch.tensor(box, dtype=torch.float64), (6,)).reshape(2, 3)
+    up = view.vertical
+    with naming(cloud="CLOUD", points="CLOUD", path="--out"):
+        thing, plane = cut_object(
+            file.cloud, torch.tensor([0.0, 0, 1]).double() if up is None else up, near, corners, gap
+        )
+        save_cloud(thing, out)
+    print_notes(file.notes, ())
+    if plane is None:
+        print("note    no plane was found under the thing")
+    else:
+        x, y, z = plane.normal.tolist()
+        print(f"plane   --table {x:.5f} {y:.5f} {z:.5f} {plane.offset:.5f}")
+    print(f"{len(thing)} of {len(file.cloud)} points, {out}")
+    return 0
+
+
+def depth(
+    depth: Annotated[Positional[Path], arg(metavar="DEPTH")],
+    /,
+    intrinsics: tuple[float, float, float, float],
+    out: Path,
+    mask: Path | None = None,
+    camera_pose: Path | None = None,
+) -> int:
+    """Write the point cloud of a depth image, with the camera as viewpoint.
+
+    Args:
+        depth: image along the optical axis (.png of 16 bit, .npy, or .npz with an array "depth"): integers are
+            millimetres, floats metres; 0 and NaN are not measured.
+        intrinsics: fx fy cx cy in pixels, of the image's own resolution.
+        out: point cloud to write (.npz or .ply), in metres.
+        mask: image of the depth's size that is not 0 at the object (.png, .npy, or .npz with an array "mask").
+        camera_pose: file with frame_from_camera, 4 x 4 (.npy, or .txt); by default the cloud is in the camera's frame.
+    """
+    options = {name: f"--{name.replace('_', '-')}" for name in ("intrinsics", "mask", "camera_pose")}
+    with naming(**options, depth="DEPTH", points="DEPTH", path="--out"):
+        image = read_image("depth", depth)
+        inside = None if mask is None else read_image("mask", mask)
+        pose = None if camera_pose is None else read_pose("camera_pose", camera_pose)
+        cloud = cloud_from_depth(image, intrinsics, inside, pose)
+        save_cloud(cloud, out)
+    frame = "the camera's frame: give its vertical with --up" if pose is None else "the frame of the pose"
+    print(f"{len(cloud)} points in {frame}, {out}")
+    return 0
+
+
+def thin(
+    cloud: Annotated[Positional[Path], arg(metavar="CLOUD")],
+    /,
+    out: Path,
+    voxel: float = 0.002,
+    view: Annotated[ViewOptions, arg(name="")] = AS_IT_IS,
+) -> int:
+    """Write one point a voxel, without the outliers, such as flying pixels.
+
+    Args:
+        cloud: point cloud (.ply, .pcd, .npy, .npz, .xyz, .txt, .csv).
+        out: point cloud to write (.npz or .ply), in metres.
+        voxel: side of a voxel in metres.
+        view: how the file is meant.
+    """
+    file = read_view("CLOUD", cloud, view, whole=True)
+    with naming(voxel="--voxel", points="CLOUD", path="--out"):
+        some = voxel_downsample(file.cloud, voxel)
+        less = remove_outliers(some)
+        save_cloud(less, out)
+    print_notes(file.notes, ())
+    print(f"{len(less)} of {len(file.cloud)} points, {len(some) - len(less)} outliers removed, {out}")
     return 0
 
 

@@ -1,14 +1,27 @@
 """Checks that the commands share, and errors that name the option."""
 
 import contextlib
+import dataclasses
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal
 
-from torchgrasp.base import check_whole
-from torchgrasp.cloud.io.read import read_cloud
+import torch
+from torch import Tensor
+
+from torchgrasp.base import check_tensor, check_whole
+from torchgrasp.cloud import Advice, CloudFile, check_cloud, diagnose_cloud, read_cloud_file
+from torchgrasp.cloud.io.image import read_pose
+from torchgrasp.cloud.neighbours import draw_rows
 from torchgrasp.errors import BadArgument, OutputError
+from torchgrasp.frames import apply, rotate
+from torchgrasp.linalg import unit
+from torchgrasp.plane import Plane, as_plane
 from torchgrasp.values import PointCloud
+
+MOST_POINTS = 100_000
+"""Most points of a file that are used: a shape is fitted to 2000 of them, after outliers are found among all."""
 
 
 @contextlib.contextmanager
@@ -22,10 +35,95 @@ def naming(**options: str) -> Iterator[None]:
         raise type(error)(options[error.argument], error.found, error.allowed) from error
 
 
-def read_view(option: str, path: Path, viewpoint: tuple[float, float, float] | None) -> PointCloud:
-    """Read the cloud of an option."""
+WIDEST = 1.5
+"""Tangent of half the widest angle of view: that of 113 degrees, more than depth cameras have."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewOptions:
+    """How the file of a cloud is meant.
+
+    Args:
+        viewpoint: position of the camera in metres in the frame of the cloud; by default the file's, else an estimate.
+        no_viewpoint: estimate the camera in place of the file's.
+        no_normals: fit normals in place of the file's.
+        unit: of the numbers in the file; all options and results are in metres.
+        up: the vertical in the frame of the cloud, of any length; by default z.
+        camera_pose: file with frame_from_camera, 4 x 4 (.npy, or .txt): the cloud is in the camera's frame (x right,
+            y down, z forward) and is moved into the pose's frame, in which results are; the camera is known then.
+    """
+
+    viewpoint: tuple[float, float, float] | None = None
+    no_viewpoint: bool = False
+    no_normals: bool = False
+    unit: Literal["m", "cm", "mm"] = "m"
+    up: tuple[float, float, float] | None = None
+    camera_pose: Path | None = None
+
+    @property
+    def vertical(self) -> Tensor | None:
+        """The vertical, of unit length; None: z."""
+        if self.up is None:
+            return None
+        vector = check_tensor("--up", torch.tensor(self.up, dtype=torch.float64), (3,))
+        if not bool(vector.any()):
+            raise BadArgument("--up", "a vector of length zero", "the direction that points up")
+        return unit(vector)
+
+
+AS_IT_IS = ViewOptions()
+"""A cloud as its file says: metres, z up, with the file's viewpoint and normals."""
+
+
+def read_view(option: str, path: Path, view: ViewOptions, whole: bool = False) -> CloudFile:
+    """Read the cloud of an option as it is meant; `whole` takes scenes of any size and all their points."""
+    if view.viewpoint is not None and (view.no_viewpoint or view.camera_pose is not None):
+        raise BadArgument("--viewpoint", "--no-viewpoint or --camera-pose beside it", "one of them")
     with naming(path=option, points=option, normals=option, viewpoint="--viewpoint"):
-        return read_cloud(path, viewpoint)
+        file = read_cloud_file(path, view.viewpoint, view.unit)
+        cloud, notes = file.cloud, file.notes
+        if view.no_viewpoint:
+            cloud = PointCloud(cloud.points, cloud.normals)
+        if view.no_normals:
+            cloud = PointCloud(cloud.points, None, cloud.viewpoint)
+        if view.camera_pose is not None:
+            cloud = _move(option, cloud, read_pose("--camera-pose", view.camera_pose))
+            notes = tuple(note for note in notes if "default viewpoint" not in note)
+        if not whole:
+            check_cloud(cloud)
+            if len(cloud) > MOST_POINTS:
+                notes = (*notes, f"{MOST_POINTS} of {len(cloud)} points, drawn at random, are used")
+                cloud = cloud.select(draw_rows(len(cloud), MOST_POINTS))
+    return CloudFile(cloud, notes)
+
+
+def _move(option: str, cloud: PointCloud, pose: Tensor) -> PointCloud:
+    """Move a cloud from its camera's frame."""
+    aside = cloud.points[:, :2].abs().amax(1)
+    unseen = float((aside >= WIDEST * cloud.points[:, 2]).double().mean())
+    if unseen > 0.01:
+        allowed = "a cloud in the camera's frame (z forward) for --camera-pose; in another frame, --viewpoint X Y Z"
+        raise BadArgument(option, f"{unseen:.0%} of the points out of a camera's sight", allowed)
+    normals = None if cloud.normals is None else rotate(pose, cloud.normals)
+    return PointCloud(apply(pose, cloud.points), normals, pose[:3, 3].clone())
+
+
+def judge_cloud(option: str, cloud: PointCloud, view: ViewOptions, table: Plane | float | None) -> tuple[Advice, ...]:
+    """Return advice on a cloud; refuse what no grasp should be planned on. A table of None: there is none."""
+    plane = as_plane(table)
+    up = view.vertical if view.up is not None or plane is None else plane.normal
+    with naming(points=option, normals=option):
+        advice = diagnose_cloud(cloud, up, plane, stands=plane is not None).advice
+    for bad in advice:
+        if bad.refused:
+            raise BadArgument(option, bad.found, bad.mend)
+    return advice
+
+
+def print_notes(notes: tuple[str, ...], advice: tuple[Advice, ...]) -> None:
+    """Print what was left out of a file, and advice."""
+    for name, sentence in [*(("note", n) for n in notes), *(("advice", str(a)) for a in advice)]:
+        print(f"{name:8}{sentence}")
 
 
 def check_folder(path: Path) -> None:
@@ -50,8 +148,37 @@ def check_seed(seed: int) -> None:
     check_whole("--seed", seed, 0, 2**63 - 1)
 
 
-def table_height(cloud: PointCloud, table: float | None, no_table: bool) -> float | None:
-    """Return the table's height [m], by default the cloud's lowest point."""
+def table_plane(
+    cloud: PointCloud, view: ViewOptions, table: tuple[float, ...] | None, no_table: bool
+) -> Plane | float | None:
+    """Return the table, by default at the cloud's lowest point: a plane, or its height [m] along z.
+
+    Args:
+        table: the height along the vertical, or a normal and the plane's distance from the origin along it.
+    """
     if table is not None and no_table:
-        raise BadArgument("--table", f"{table:g} and --no-table", "one of the two")
-    return None if no_table else float(cloud.points[:, 2].min()) if table is None else table
+        raise BadArgument("--table", f"{' '.join(f'{x:g}' for x in table)} and --no-table", "one of the two")
+    if no_table:
+        return None
+    if table is not None and len(table) not in (1, 4):
+        raise BadArgument("--table", f"{len(table)} numbers", "a height, or four: a normal and its distance")
+    numbers = (
+        None if table is None else check_tensor("--table", torch.tensor(table, dtype=torch.float64), (len(table),))
+    )
+    if numbers is not None and len(numbers) == 4:
+        length = torch.linalg.vector_norm(numbers[:3])
+        if not bool(length > 0):
+            raise BadArgument("--table", "a normal of length zero", "the direction that points up")
+        return Plane(numbers[:3] / length, float(numbers[3] / length))
+    up = view.vertical
+    if up is None:
+        return float(cloud.points[:, 2].min()) if numbers is None else float(numbers[0])
+    return Plane(up, float((cloud.points.double() @ up).min()) if numbers is None else float(numbers[0]))
+
+
+def describe_table(table: Plane | float) -> str:
+    """Say where the table is."""
+    if isinstance(table, Plane):
+        x, y, z = (0.0 + round(n, 3) for n in table.normal.tolist())
+        return f"table at {table.offset:.3f} m along ({x:g}, {y:g}, {z:g})"
+    return f"table at z = {table:.3f} m"

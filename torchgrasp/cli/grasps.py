@@ -13,7 +13,18 @@ from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from torchgrasp.base import check_whole
-from torchgrasp.cli.common import check_folder, check_seed, naming, read_view, table_height
+from torchgrasp.cli.common import (
+    AS_IT_IS,
+    ViewOptions,
+    check_folder,
+    check_seed,
+    describe_table,
+    judge_cloud,
+    naming,
+    print_notes,
+    read_view,
+    table_plane,
+)
 from torchgrasp.columns import format_columns
 from torchgrasp.errors import BadArgument, MissingExtra
 from torchgrasp.evaluation.lift import close_hand
@@ -47,26 +58,29 @@ def grasp(
     close: bool = False,
     seed: int = 0,
     starts: int = 1000,
-    viewpoint: tuple[float, float, float] | None = None,
-    table: float | None = None,
+    view: Annotated[ViewOptions, arg(name="")] = AS_IT_IS,
+    table: tuple[float, ...] | None = None,
     no_table: bool = False,
     friction: float = 0.8,
     mode: Mode = "joint",
 ) -> int:
     """Plan grasps of the object in a partial cloud, and close on it in simulation.
 
-    Writes grasps.safetensors and report.html into the output folder.
+    Writes grasps.safetensors and report.html into the output folder. The cloud is checked as by `cloud check`. Refused
+    are: a camera below the table or that the points contradict, a plane left in, two bodies, and another unit. Other
+    findings are printed as advice.
 
     Args:
-        cloud: point cloud of one object in metres, z up (.ply, .pcd, .npy, .npz, .xyz).
+        cloud: point cloud of one object (.ply, .pcd, .npy, .npz, .xyz, .txt, .csv).
         hand: allegro, allegro_biotac, barrett, or the folder of another hand.
         out: folder of the results; it is made where it does not exist.
         mesh: true mesh of the object [m] in the frame of the cloud; only the simulator sees it.
         close: close the best grasp on the mesh, lift it and hold it (needs the extra "sim").
         seed: of every random draw; the same seed gives the same grasps.
         starts: random starts of the contact planner.
-        viewpoint: position of the camera in the frame of the cloud; by default the file's, else it is estimated.
-        table: height of the table [m]; by default the lowest point of the cloud.
+        view: how the file of the cloud is meant.
+        table: height of the table along the vertical, or four numbers nx ny nz d of the plane n . p = d, in metres; by
+            default the table is at the lowest point of the cloud.
         no_table: there is no table.
         friction: coefficient of friction between fingertips and object.
         mode: contacts, pose and joints together, or contacts first and the learned model after, as in the paper.
@@ -81,17 +95,18 @@ def grasp(
     check_seed(seed)
     with naming(hand="--hand", name="--hand"):
         the_hand = load_hand(hand)
-    partial = read_view("CLOUD", cloud, viewpoint)
-    height = table_height(partial, table, no_table)
+    file = read_view("CLOUD", cloud, view)
+    partial, plane = file.cloud, table_plane(file.cloud, view, table, no_table)
     with naming(mesh="--mesh", friction="--friction", table="--table"):
         true_mesh, parts = (None, None) if mesh is None else read_true_mesh(mesh)
-        spec = ContactSpec(friction=friction, table=height)
+        spec = ContactSpec(friction=friction, table=plane)
         trial = TrialSpec(friction=friction)
+    print_notes(file.notes, judge_cloud("CLOUD", partial, view, plane))
 
     progress = _Progress("shape", "plan", "certify", "query", "refine", *["closing"] * close, "report")
     with progress.bar:
-        origin = "no table" if height is None else f"table at z = {height:.3f} m"
-        origin += " (lowest point)" * (height is not None and table is None)
+        origin = "no table" if plane is None else describe_table(plane)
+        origin += " (lowest point)" * (plane is not None and table is None)
         camera = "camera known" if partial.viewpoint is not None else "camera estimated"
         progress.end("cloud", f"{len(partial)} points, {camera}, {origin}")
         grasps = plan_grasps(partial, the_hand, spec, starts, seed, mode=mode, observer=progress.end)

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from torchgrasp.cli.common import check_seed, naming, read_view, table_height
+from torchgrasp.cli.common import AS_IT_IS, ViewOptions, check_seed, naming, print_notes, read_view, table_plane
 from torchgrasp.export import check_surface_path, largest_std, save_surface
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import extract_surface
@@ -15,8 +15,8 @@ def surface(
     cloud: Annotated[Positional[Path], arg(metavar="CLOUD")],
     /,
     out: Path,
-    viewpoint: tuple[float, float, float] | None = None,
-    table: float | None = None,
+    view: Annotated[ViewOptions, arg(name="")] = AS_IT_IS,
+    table: tuple[float, ...] | None = None,
     no_table: bool = False,
     support: Literal["camera", "paper"] = "camera",
     resolution: int = 64,
@@ -25,10 +25,11 @@ def surface(
     """Write the estimated surface of an object, coloured by its standard deviation.
 
     Args:
-        cloud: point cloud of one object in metres, z up (.ply, .pcd, .npy, .npz, .xyz).
+        cloud: point cloud of one object (.ply, .pcd, .npy, .npz, .xyz, .txt, .csv).
         out: mesh to write: .ply, with the standard deviation of each vertex as "std_m" in metres, or .glb.
-        viewpoint: position of the camera in the frame of the cloud; by default the file's, else it is estimated.
-        table: height of the table [m]; by default the lowest point of the cloud.
+        view: how the file of the cloud is meant.
+        table: height of the table along the vertical, or four numbers nx ny nz d of the plane n . p = d, in metres; by
+            default the table is at the lowest point of the cloud.
         no_table: there is no table.
         support: what is observed of the hidden side: outline, symmetry and free space, or the paper's points.
         resolution: cells along the diameter of the surface's domain, 8 to 256.
@@ -37,11 +38,12 @@ def surface(
     check_seed(seed)
     with naming(path="--out"):
         check_surface_path(out)
-    view = read_view("CLOUD", cloud, viewpoint)
+    file = read_view("CLOUD", cloud, view)
     with naming(points="CLOUD", normals="CLOUD", table="--table", resolution="--resolution", path="--out"):
-        shape = fit_shape(view, support=support, seed=seed, table=table_height(view, table, no_table))
+        shape = fit_shape(file.cloud, support=support, seed=seed, table=table_plane(file.cloud, view, table, no_table))
         estimate = extract_surface(shape, resolution)
         save_surface(estimate, out)
+    print_notes(file.notes, ())
     middle, most = 1e3 * float(estimate.std_m.median()), 1e3 * largest_std(estimate)
     print(f"{len(estimate.vertices)} vertices, {len(estimate.faces)} faces, {out}")
     print(f"standard deviation: median {middle:.1f} mm, {most:.1f} mm where it is yellow")

@@ -39,7 +39,9 @@ class Advice(Value):
         return f"{self.found}: {self.mend}"
 
 
-def judge_view(cloud: PointCloud, clean: PointCloud, up: Float[Tensor, "3"], table: Plane | None) -> list[Advice]:
+def judge_view(
+    cloud: PointCloud, clean: PointCloud, up: Float[Tensor, "3"], table: Plane | None, stands: bool = True
+) -> list[Advice]:
     """Return what contradicts a cloud's viewpoint, vertical and table, the worst first.
 
     Args:
@@ -47,6 +49,7 @@ def judge_view(cloud: PointCloud, clean: PointCloud, up: Float[Tensor, "3"], tab
         clean: the same cloud cleaned, with outward normals and perhaps an estimated viewpoint.
         up: the vertical, of unit length.
         table: None: at the lowest point.
+        stands: whether the object stands on a table.
     """
     assert clean.normals is not None
     points, normals = clean.points.double(), clean.normals.double()
@@ -65,8 +68,10 @@ def judge_view(cloud: PointCloud, clean: PointCloud, up: Float[Tensor, "3"], tab
         advice.append(Advice(found, "the true --viewpoint X Y Z of a single view, or --no-viewpoint", False))
     elif eye is not None:
         advice += _judge_camera(clean, given)
-    support = find_support(points, normals, up, _single(eye) if facing >= FACING else None)
-    if eye is not None and facing >= FACING:
+    # An estimate may be on the wrong side of a table; the origin of a camera's frame is none.
+    trusted = eye is not None and facing >= FACING and (given or not bool(eye.any()))
+    support = find_support(points, normals, up, eye.reshape(-1, 3).mean(0) if trusted and eye is not None else None)
+    if stands and eye is not None and facing >= FACING:
         advice += _judge_height(points, eye, given, up, table, support)
         down = float((normals @ up < DOWN).double().mean())
         if given and not any(a.refused for a in advice) and down > MAX_DOWN:
@@ -123,8 +128,9 @@ def _judge_height(
     ground = "the lowest point" if table is None else "the table"
     place = f"{below:.2f} m below {ground} along the vertical {_triple(normal)}"
     centre = points.mean(0)
-    forward = bool((eye == 0).all()) and float(unit(centre)[2]) > 0.7 and float(up[2]) > 0.9
-    if forward:
+    far = 2 * float(torch.linalg.vector_norm(points - centre, dim=-1).max())
+    forward = float(centre[2]) > max(far, 0.7 * float(torch.linalg.vector_norm(centre))) and float(up[2]) > 0.9
+    if forward and not bool(eye.any()):
         axis = torch.tensor([0.0, -1.0, 0.0]) if support is None else support[0].normal
         found = f"a cloud in its camera's frame, whose z axis points forward: the camera is {place}"
         why = "the normal of the plane in it" if support is not None else "for a level camera"
@@ -163,11 +169,6 @@ def judge_pixels(cloud: PointCloud, viewpoint: Float[Tensor, "3"]) -> list[Advic
         return []
     found = f"flying pixels at rims, {flying:.0%} of the points"
     return [Advice(found, "none, for a sharper outline: torchgrasp cloud thin CLOUD --voxel 0.001 --out FILE", False)]
-
-
-def _single(eye: Float[Tensor, "*views 3"] | None) -> Float[Tensor, "3"] | None:
-    """Return the camera of a single view, or the mean of several."""
-    return None if eye is None else eye.reshape(-1, 3).mean(0)
 
 
 def _triple(vector: Tensor, between: str = ", ") -> str:

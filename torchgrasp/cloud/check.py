@@ -111,6 +111,14 @@ def _distinct_rows(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:
     return rows[keep]
 
 
+def distinct_exactly(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:
+    """Return the ascending indices of the first of all rows with equal numbers, fast for millions of rows."""
+    bits = (points.detach().double() + 0.0).contiguous().view(torch.int64)  # + 0.0: -0 equals 0
+    # Of two million rows two different ones share a key once in 1e7 clouds.
+    key = (bits[:, 0] * 0x1E3779B97F4A7C15 + bits[:, 1]) * 0x3F58476D1CE4E5B9 + bits[:, 2]
+    return first_of_each(torch.unique(key, return_inverse=True)[1]).sort().values
+
+
 def first_of_each(group: Int[Tensor, "n"]) -> Int[Tensor, "groups"]:
     """Return the first index of each group, for numbers of groups without gaps."""
     order = torch.arange(len(group), device=group.device)

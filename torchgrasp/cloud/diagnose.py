@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchgrasp.base import Value, check_tensor
 from torchgrasp.cloud.advice import Advice, judge_pixels, judge_view
-from torchgrasp.cloud.check import check_cloud, remove_duplicates
+from torchgrasp.cloud.check import check_cloud, distinct_exactly, remove_duplicates
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_planes, nearest
 from torchgrasp.cloud.orientation import NormalCheck, compare_normals, share_facing
 from torchgrasp.cloud.prepare import MAX_POINTS, clean_cloud
@@ -43,7 +43,9 @@ class CloudReport(Value):
     advice: tuple[Advice, ...]  # what forbids a grasp comes first
 
 
-def diagnose_cloud(cloud: PointCloud, up: Float[Tensor, "3"] | None = None, table: Plane | None = None) -> CloudReport:
+def diagnose_cloud(
+    cloud: PointCloud, up: Float[Tensor, "3"] | None = None, table: Plane | None = None, stands: bool = True
+) -> CloudReport:
     """Measure a cloud, and advise what would improve it.
 
     Of large clouds 50 000 points are measured, and 5000 tell about camera, vertical, table and bodies.
@@ -52,6 +54,7 @@ def diagnose_cloud(cloud: PointCloud, up: Float[Tensor, "3"] | None = None, tabl
         cloud: points of one object [m].
         up: the vertical, of any length; None: z.
         table: None: at the lowest point.
+        stands: whether the object stands on a table; else the camera may be below it.
 
     Raises:
         BadArgument, TooFewPoints, SuspiciousScale: see `check_cloud`; a vertical of length zero.
@@ -63,13 +66,12 @@ def diagnose_cloud(cloud: PointCloud, up: Float[Tensor, "3"] | None = None, tabl
     if not bool(vertical.any()):
         raise BadArgument("up", "a vector of length zero", "the direction that points up")
     check_cloud(cloud)
-    rows = draw_rows(len(cloud), MEASURED)
-    distinct = remove_duplicates(cloud if len(cloud) <= MEASURED else cloud.select(rows))
-    points = (cloud if len(cloud) > MEASURED else distinct).points.double()
-    rows = rows[: len(points)]
+    # Of large clouds only exact copies are removed; in the part that tells about the view, all.
+    whole = remove_duplicates(cloud) if len(cloud) <= MEASURED else cloud.select(distinct_exactly(cloud.points))
+    points, rows = whole.points.double(), draw_rows(len(whole), MEASURED)
     distance, _ = nearest(points, 9, rows)  # the point itself and a raster's eight neighbours
     area = math.pi * distance[:, -1] ** 2  # of the disc that holds the neighbours
-    twins = (distance[:, 1:] <= 1e-9 * float((points.amax(0) - points.amin(0)).max())).double().sum(1)
+    distinct = remove_duplicates(whole.select(rows))
     view = distinct.select(draw_rows(len(distinct), VIEWED))
     check = None if view.normals is None else compare_normals(view.points.double(), view.normals.double())
     if check is not None and not check.oriented:
@@ -87,7 +89,7 @@ def diagnose_cloud(cloud: PointCloud, up: Float[Tensor, "3"] | None = None, tabl
         spacing=float(distance[:, 1].median()),
         density=float(((distance.shape[1] - 1) / area).median()),
         noise=float(fit_planes(points, rows)[1].median()),
-        copies=len(cloud) - len(points) + round(len(points) * float((twins / (twins + 1)).mean())),
+        copies=len(cloud) - len(whole),
         outliers=round(len(points) * float((~find_inliers(points, rows)).double().mean())),
         normals=check,
         viewpoint=clean.viewpoint,
@@ -95,7 +97,7 @@ def diagnose_cloud(cloud: PointCloud, up: Float[Tensor, "3"] | None = None, tabl
         facing=0.0 if viewpoint is None else share_facing(judged.points, judged.normals, viewpoint),
         advice=(),
     )
-    advice = judge_view(view, clean, unit(vertical.double()), table)
+    advice = judge_view(view, clean, unit(vertical.double()), table, stands)
     if clean.viewpoint is not None and clean.viewpoint.ndim == 1:
         advice += judge_pixels(view, clean.viewpoint)
     return dataclasses.replace(report, advice=(*advice, *_advise(report, clean)))

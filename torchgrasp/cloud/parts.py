@@ -164,7 +164,10 @@ def cut_object(
     rows = draw_rows(len(points), FEW)
     eye = cloud.viewpoint if cloud.viewpoint is None or cloud.viewpoint.ndim == 1 else cloud.viewpoint.mean(0)
     some = points[rows]
-    support = find_support(some, fit_planes(some)[0], up, None if eye is None else eye.double(), spread=0.0)
+    normals = fit_planes(some)[0]
+    support = find_support(some, normals, up, None, spread=0.0)
+    if support is None and eye is not None:
+        support = find_support(some, normals, up, eye.double(), spread=0.0)
     plane = None if support is None else support[0]
     if plane is not None:
         cloud = _select(cloud, plane.height(points) > LAYER, "points above the plane")
