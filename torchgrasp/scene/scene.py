@@ -1,32 +1,27 @@
 """What one camera saw: things on a table."""
 
 import dataclasses
+from collections.abc import Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.frames import inverse
-from torchgrasp.plane import GRID, Plane, to_upright
+from torchgrasp.cloud.depth import read_depth
+from torchgrasp.errors import BadArgument
+from torchgrasp.plane import Plane, to_upright
+from torchgrasp.scene.build import find_table, image_of_cloud, label_image, read_image, read_labels
+from torchgrasp.scene.image import DepthImage
 from torchgrasp.values import PointCloud
 
-
-@dataclasses.dataclass(frozen=True)
-class DepthImage(Value):
-    """A pinhole camera's depth image: `depth` [m] along the optical axis, 0 where nothing was measured.
-
-    `intrinsics` [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] are pixels. `obj_from_camera` is the camera's pose.
-    """
-
-    depth: Float[Tensor, "h w"]
-    intrinsics: Float[Tensor, "3 3"]
-    obj_from_camera: Float[Tensor, "4 4"]
-
-    def to_upright(self, obj_from_upright: Float[Tensor, "4 4"]) -> "DepthImage":
-        """Return the image with its camera in an upright frame, rounded."""
-        pose = inverse(obj_from_upright) @ self.obj_from_camera.double()
-        return dataclasses.replace(self, obj_from_camera=torch.round(pose / GRID**1.5) * GRID**1.5)
+CLICK_PIXELS, CLICK_METRES = 3.0, 0.01
+"""Farthest measured pixel, and point [m], that a click can mean: a hundredth of the pixels are missing."""
+HIDDEN = 0.01
+"""Depth [m] behind the nearest point of its pixel at which a point belongs to what is hidden there."""
+CUT_OFF = 5
+"""Pixels of a target at the image's border that say it is cut off: fewer are noise."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,6 +43,156 @@ class Scene(Value):
     pixels: Int[Tensor, "n 2"]
     table: Plane | None = None
     target: int | None = None
+
+    @classmethod
+    def from_depth(
+        cls,
+        depth: Tensor | np.ndarray,
+        intrinsics: Tensor | np.ndarray | Sequence[float],
+        camera_pose: Tensor | np.ndarray | None = None,
+        *,
+        mask: Tensor | np.ndarray | None = None,
+        labels: Tensor | np.ndarray | None = None,
+        point: Sequence[float] | Tensor | np.ndarray | None = None,
+        table: Plane | float | None = None,
+        up: Sequence[float] | Tensor | np.ndarray | None = None,
+    ) -> "Scene":
+        """Return the scene in a pinhole camera's depth image.
+
+        Pixels on the table and flying pixels at rims get the label 0. Without labels the things are the connected
+        components above the table.
+
+        Args:
+            depth: (h, w), as `cloud_from_depth` takes it: floats in metres, or integers in millimetres.
+            intrinsics: (3, 3) or (fx, fy, cx, cy) [pixels].
+            camera_pose: obj_from_camera (4, 4), rigid; None: results are in the camera's frame.
+            mask: (h, w) of bool or uint8, pixels of the target; it may be off by a few pixels.
+            labels: (h, w) of whole numbers; 0 is no thing.
+            point: of the target: a pixel (u, v), or a point (x, y, z) [m].
+            table: a plane, or its height z [m]; None: it is fitted.
+            up: (3,), against gravity, for the fit; None: any direction.
+
+        Raises:
+            BadArgument: what `read_depth` refuses; mask or labels of another size; a target that is the table; a
+                point where nothing was measured; a camera below the table.
+            NoSupport: no plane that things stand on.
+        """
+        if sum(given is not None for given in (mask, labels, point)) > 1 and mask is not None:
+            raise BadArgument("mask", "a mask beside labels or a point", "one of them")
+        image = read_image(depth, intrinsics, camera_pose)
+        inside = None if mask is None else read_depth(depth, intrinsics, mask)[2]
+        given = None if labels is None else read_labels(labels, tuple(image.depth.shape))
+        points, measured = image.points(), image.depth > 0
+        plane = find_table(points[measured], image.obj_from_camera[:3, 3], table, up)
+        found = label_image(image, plane, given, None if inside is None else inside.cpu())
+        scene = cls(
+            points[measured], found[measured], image, torch.nonzero(measured), plane, 1 if mask is not None else None
+        )
+        return scene if point is None else scene.select(point)
+
+    @classmethod
+    def from_cloud(
+        cls,
+        cloud: PointCloud,
+        *,
+        labels: Tensor | np.ndarray | None = None,
+        mask: Tensor | np.ndarray | None = None,
+        box: Tensor | np.ndarray | Sequence[Sequence[float]] | None = None,
+        point: Sequence[float] | Tensor | np.ndarray | None = None,
+        table: Plane | float | None = None,
+        up: Sequence[float] | Tensor | np.ndarray | None = None,
+    ) -> "Scene":
+        """Return the scene in a cloud of one view.
+
+        A pinhole image stands for the camera: the points are projected at the viewpoint, about two to a pixel. It
+        tells free space from hidden space, and things from each other.
+
+        Args:
+            cloud: everything that the camera saw [m], with its viewpoint.
+            labels: (n,) of whole numbers; 0 is no thing.
+            mask: (n,) of bool, points of the target.
+            box: two corners (2, 3) [m] of a box along the axes, which holds the target.
+            point: a point (x, y, z) [m] of the target.
+            table, up: as in `from_depth`.
+
+        Raises:
+            BadArgument: no viewpoint, or several; labels or mask of another size; and as `from_depth`.
+            NoSupport: no plane that things stand on.
+        """
+        if sum(given is not None for given in (mask, labels, box)) > 1:
+            raise BadArgument("mask", "several of mask, labels and box", "one of them")
+        if cloud.viewpoint is None or cloud.viewpoint.ndim != 1:
+            found = "none" if cloud.viewpoint is None else "one for each point"
+            raise BadArgument("viewpoint", found, "the position of the one camera")
+        points, viewpoint = cloud.points.detach().cpu().double(), cloud.viewpoint.detach().cpu().double()
+        given = None if labels is None else read_labels(labels, (len(points),))
+        inside = None if mask is None else read_labels(torch.as_tensor(mask).long(), (len(points),)) > 0
+        if box is not None:
+            corners = torch.as_tensor(np.asarray(box), dtype=torch.float64)
+            if corners.shape != (2, 3):
+                raise BadArgument("box", f"shape {tuple(corners.shape)}", "two corners (2, 3)")
+            inside = ((points >= corners.amin(0)) & (points <= corners.amax(0))).all(-1)
+        if inside is not None and not bool(inside.any()):
+            raise BadArgument("mask" if box is None else "box", "no point inside", "one that holds the target")
+        plane = find_table(points, viewpoint, table, up)
+        image, pixels = image_of_cloud(points, viewpoint, plane.normal.double())
+        row, column = pixels.unbind(-1)
+        depth = ((points - viewpoint) @ image.obj_from_camera[:3, 2]) - image.depth[row, column]
+        front = depth < HIDDEN
+
+        def to_image(values: Tensor) -> Tensor:
+            whole = torch.zeros(image.depth.shape, dtype=values.dtype)
+            whole[row[front], column[front]] = values[front]
+            return whole
+
+        found = label_image(
+            image, plane, None if given is None else to_image(given), None if inside is None else to_image(inside)
+        )
+        own = torch.where(front, found[row, column], 0)
+        scene = cls(points, own, image, pixels, plane, None if inside is None else 1)
+        return scene if point is None else scene.select(point)
+
+    def select(self, target: int | Sequence[float] | Tensor | np.ndarray) -> "Scene":
+        """Return the scene with another target.
+
+        Args:
+            target: a label, a pixel (u, v) of the image, or a point (x, y, z) [m].
+
+        Raises:
+            BadArgument: no such label; nothing measured at the pixel or point; a place on the table.
+        """
+        if isinstance(target, int) and not isinstance(target, bool):
+            if target not in self.things:
+                raise BadArgument("target", target, f"a label of a thing: {list(self.things)}")
+            return dataclasses.replace(self, target=target)
+        place = torch.as_tensor(np.asarray(target), dtype=torch.float64)
+        if place.shape not in ((2,), (3,)) or not bool(torch.isfinite(place).all()):
+            raise BadArgument("point", repr(target), "a pixel (u, v) or a point (x, y, z)")
+        if len(place) == 2:
+            distance = torch.linalg.vector_norm(self.pixels.double() - place.flip(0), dim=-1)
+            text, reach = f"pixel ({place[0]:g}, {place[1]:g})", CLICK_PIXELS
+        else:
+            distance = torch.linalg.vector_norm(self.points.double() - place, dim=-1)
+            text, reach = f"point ({', '.join(f'{x:.3f}' for x in place.tolist())}) m", CLICK_METRES
+        nearest = int(distance.argmin())
+        if float(distance[nearest]) > reach:
+            raise BadArgument("point", f"nothing measured at {text}", "a place on a thing")
+        label = int(self.labels[nearest])
+        if label == 0:
+            raise BadArgument("point", f"{text} on the table, or on no thing", "a place on a thing")
+        return dataclasses.replace(self, target=label)
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """What speaks against the picture, a sentence each: a target that the border of the image cuts off."""
+        if self.target is None:
+            return ()
+        pixels = self.pixels[self.rows_of()]
+        last = torch.tensor(self.image.depth.shape) - 1
+        cut = int(((pixels <= 1) | (pixels >= last - 1)).any(-1).sum())
+        if cut < CUT_OFF:
+            return ()
+        return ("the target is cut off at the border of the image: its other part is unknown; turn the camera to it",)
 
     @property
     def viewpoint(self) -> Float[Tensor, "3"]:

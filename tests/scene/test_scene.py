@@ -1,0 +1,180 @@
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from torchgrasp.cloud.camera import INTRINSICS, look_at
+from torchgrasp.cloud.render import render_depth
+from torchgrasp.errors import BadArgument, NoSupport
+from torchgrasp.frames import apply, rigid, rotation_from_vector
+from torchgrasp.plane import Plane
+from torchgrasp.scene import Scene
+from torchgrasp.values import PointCloud
+
+POSE = look_at(20.0, 45.0, 0.6)
+K = INTRINSICS
+
+
+def things():
+    places = ([0.1, 0.0, 0.04], [0.0, 0.12, 0.05], [-0.1, -0.05, 0.03])
+    meshes = (
+        trimesh.creation.box([0.06, 0.06, 0.08]),
+        trimesh.creation.cylinder(0.03, 0.10),
+        trimesh.creation.icosphere(radius=0.03),
+    )
+    return [mesh.apply_translation(place) for mesh, place in zip(meshes, places, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def picture():
+    return render_depth(things(), POSE)
+
+
+@pytest.fixture(scope="module")
+def scene(picture):
+    return Scene.from_depth(picture[0], K, POSE)
+
+
+def middle(labels, k):
+    """Return the pixel (u, v) in the middle of a thing."""
+    row, column = torch.nonzero(labels == k).double().mean(0).tolist()
+    return column, row
+
+
+def agreement(scene, picture, k):
+    """Return the share of a thing's measured pixels that the target has, and of the target's that are others'."""
+    depth, labels = picture
+    target = torch.zeros_like(labels, dtype=torch.bool)
+    row, column = scene.pixels[scene.rows_of()].unbind(-1)
+    target[row, column] = True
+    true = (labels == k) & (depth > 0)
+    return float((target & true).sum() / true.sum()), float((target & ~true).sum() / target.sum())
+
+
+def test_a_clicked_thing_is_found_whole_and_alone(scene, picture):
+    assert len(scene.things) == 3
+    for k in (1, 2, 3):
+        for clicked in (middle(picture[1], k), apply(POSE, torch.zeros(1, 3).double())):
+            if isinstance(clicked, tuple):
+                found = scene.select(clicked)
+            else:  # the same by a point in space
+                u, v = middle(picture[1], k)
+                row = (scene.pixels.double() - torch.tensor([v, u])).norm(dim=-1).argmin()
+                found = scene.select(scene.points[row].tolist())
+            share, others = agreement(found, picture, k)
+            assert share > 0.95 and others < 0.02
+
+
+def test_labels_are_the_same_wherever_the_camera_stands(scene, picture):
+    motion = rigid(
+        rotation_from_vector(torch.tensor([1.0, 2.0, -0.5]).double()), torch.tensor([3.0, -1.0, 2.0]).double()
+    )
+    moved = Scene.from_depth(picture[0], K, motion @ POSE)
+    assert torch.equal(moved.labels, scene.labels)
+    torch.testing.assert_close(moved.points, apply(motion, scene.points), atol=1e-9, rtol=0)
+    expected = scene.table.moved(motion)
+    torch.testing.assert_close(moved.table.normal, expected.normal, atol=1e-9, rtol=0)
+    own = Scene.from_depth(picture[0], K)
+    assert torch.equal(own.labels, scene.labels)
+    assert not own.viewpoint.any()
+
+
+def test_other_types_give_the_same_scene(scene, picture):
+    millimetres = (1000 * picture[0]).round().numpy().astype(np.uint16)
+    found = Scene.from_depth(millimetres, (616.0, 616.0, 319.5, 239.5), POSE.numpy(), point=middle(picture[1], 1))
+    assert agreement(found, picture, 1)[0] > 0.95
+    missing = torch.where(picture[0] > 0, picture[0], torch.nan)
+    assert torch.equal(Scene.from_depth(missing, K, POSE).labels, scene.labels)
+
+
+def test_masks_off_by_three_pixels_lose_table_and_neighbours(picture):
+    from scipy.ndimage import binary_dilation, binary_erosion
+
+    depth, labels = picture
+    true = (labels == 2).numpy()
+    for mask in (true, binary_dilation(true, iterations=3), binary_erosion(true, iterations=3).astype(np.uint8)):
+        scene = Scene.from_depth(depth, K, POSE, mask=mask)
+        share, others = agreement(scene, picture, 2)
+        assert scene.target == 1 and len(scene.things) == 3
+        assert share > (0.95 if mask.sum() >= true.sum() else 0.7) and others < 0.02
+        # no sliver of the target is a neighbour
+        rows = scene.labels > 1
+        row, column = scene.pixels[rows].unbind(-1)
+        assert (labels[row, column] == 2).double().mean() < 0.005
+
+
+def test_given_labels_and_tables_are_kept(picture):
+    depth, labels = picture
+    scene = Scene.from_depth(depth, K, POSE, labels=labels.numpy().astype(np.uint8), table=0.0)
+    assert scene.things == (1, 2, 3) and scene.table.offset == 0.0
+    assert agreement(scene.select(3), picture, 3)[0] > 0.95
+    again = Scene.from_depth(depth, K, POSE, labels=_image(scene), table=Plane.horizontal(0.0))
+    assert torch.equal(again.labels, scene.labels)
+
+
+def _image(scene):
+    labels = torch.zeros(scene.image.depth.shape, dtype=torch.int64)
+    labels[scene.pixels[:, 0], scene.pixels[:, 1]] = scene.labels
+    return labels
+
+
+def test_a_cloud_gives_the_scene_of_its_picture(scene, picture):
+    shuffle = torch.randperm(len(scene.points), generator=torch.Generator().manual_seed(0))
+    cloud = PointCloud(scene.points[shuffle], None, scene.viewpoint)
+    inside = scene.select(middle(picture[1], 1)).cloud().points
+    box = torch.stack([inside.amin(0) - 0.01, inside.amax(0) + 0.01])
+    true = picture[1][scene.pixels[:, 0], scene.pixels[:, 1]][shuffle]
+    for given in ({"point": inside[len(inside) // 2]}, {"box": box.numpy()}, {"mask": true == 1}):
+        found = Scene.from_cloud(cloud, **given)
+        mine = found.rows_of()
+        assert (mine & (true == 1)).sum() / (true == 1).sum() > 0.93
+        assert (mine & (true != 1)).sum() / mine.sum() < 0.02
+        # its picture sees what the points are
+        seen = found.image.points()[found.pixels[:, 0], found.pixels[:, 1]]
+        assert (seen - found.points).norm(dim=-1).median() < 0.002
+
+
+def test_a_target_cut_off_at_the_border_is_told(picture):
+    depth, labels = picture
+    assert Scene.from_depth(depth, K, POSE, mask=labels == 1).advice == ()
+    row = int(torch.nonzero(labels == 1)[:, 0].double().mean())
+    cut, k = depth[:row], K.clone()
+    k[1, 2] = min(float(K[1, 2]), 0.6 * row)
+    mask = (labels == 1)[:row]
+    (sentence,) = Scene.from_depth(cut, k, mask=mask, table=None).advice
+    assert "border" in sentence
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"mask": np.zeros((480, 640), bool)}, "mask: found no pixel inside"),
+        ({"mask": np.ones((48, 64), bool)}, "mask: found .*size"),
+        ({"mask": "table"}, "mask: found .*this target is the table"),
+        ({"point": (5.0, 470.0)}, "point: found pixel .* on the table"),
+        ({"point": (5.0, 2.0)}, "point: found nothing measured"),
+        ({"point": (0.0, 0.0, 1.0)}, "point: found nothing measured"),
+        ({"point": (1.0,)}, "point: found"),
+        ({"labels": np.zeros((480, 640), int)}, "labels: found none"),
+        ({"labels": np.zeros((4, 6), int)}, "labels: found shape"),
+        ({"table": 2.0}, "table: found the camera .* below it"),
+        ({"up": (0.0, 0.0, -1.0)}, "table: found .* above"),
+        ({"intrinsics": (308.0, 308.0, 159.5, 119.5)}, "intrinsics: found a principal point"),
+        ({"scale": 1000.0}, "depth: found a median"),
+    ],
+)
+def test_bad_input_is_one_sentence(picture, given, message):
+    depth, labels = picture
+    given = dict(given)
+    if isinstance(given.get("mask"), str):
+        given["mask"] = (labels == 0) & (torch.arange(480)[:, None] > 400)
+    with pytest.raises(BadArgument, match=message) as refused:
+        Scene.from_depth(depth * given.pop("scale", 1.0), given.pop("intrinsics", K), POSE, **given)
+    assert "\n" not in str(refused.value)
+
+
+def test_no_table_and_no_camera_are_refused(picture):
+    with pytest.raises(NoSupport):
+        Scene.from_depth(render_depth(things(), POSE, table=None)[0], K, POSE)
+    with pytest.raises(BadArgument, match="viewpoint"):
+        Scene.from_cloud(PointCloud(torch.rand(100, 3)))

@@ -1,0 +1,36 @@
+"""What a pinhole depth camera measured."""
+
+import dataclasses
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.base import Value
+from torchgrasp.frames import apply, inverse
+from torchgrasp.plane import GRID
+
+
+@dataclasses.dataclass(frozen=True)
+class DepthImage(Value):
+    """A pinhole camera's depth image: `depth` [m] along the optical axis, 0 where nothing was measured.
+
+    `intrinsics` [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] are pixels. `obj_from_camera` is the camera's pose.
+    """
+
+    depth: Float[Tensor, "h w"]
+    intrinsics: Float[Tensor, "3 3"]
+    obj_from_camera: Float[Tensor, "4 4"]
+
+    def to_upright(self, obj_from_upright: Float[Tensor, "4 4"]) -> "DepthImage":
+        """Return the image with its camera in an upright frame, rounded."""
+        pose = inverse(obj_from_upright) @ self.obj_from_camera.double()
+        return dataclasses.replace(self, obj_from_camera=torch.round(pose / GRID**1.5) * GRID**1.5)
+
+    def points(self) -> Float[Tensor, "h w 3"]:
+        """Return the point [m] of every pixel; the camera's position where nothing was measured."""
+        z, k = self.depth.double(), self.intrinsics.double()
+        row = torch.arange(z.shape[0], dtype=z.dtype, device=z.device)[:, None]
+        column = torch.arange(z.shape[1], dtype=z.dtype, device=z.device)
+        camera = torch.stack([z * (column - k[0, 2]) / k[0, 0], z * (row - k[1, 2]) / k[1, 1], z], -1)
+        return apply(self.obj_from_camera.double(), camera.reshape(-1, 3)).reshape(*z.shape, 3)
