@@ -4,24 +4,27 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
+from torchgrasp.base import check_whole
 from torchgrasp.cli.common import check_seed, naming
 from torchgrasp.cli.grasps import import_simulator
+from torchgrasp.cli.scenes import evaluate_clutter
 from torchgrasp.columns import format_columns, format_line
-from torchgrasp.errors import Status
+from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.campaign import EvaluationSpec, Ranks
 from torchgrasp.evaluation.campaign import evaluate as evaluate_views
 from torchgrasp.evaluation.protocols import find_protocol
+from torchgrasp.evaluation.scenes import ClutterSpec
 from torchgrasp.evaluation.score import ViewScore, summarise
 from torchgrasp.files import format_json, hold_folder, write_file
 from torchgrasp.hand.load import load_hand
 from torchgrasp.report.evaluation import SHARE_NAMES, write_evaluation
-from torchgrasp.specs import ClosingMode, HoldingMode, Simulator
+from torchgrasp.specs import ClosingMode, HoldingMode, Simulator, TrialSpec
 
 
 def evaluate(
-    objects: Path,
     hand: str,
     out: Path,
+    objects: Path | None = None,
     protocol: Literal[
         "multidex", "dexgraspbench", "dexgraspbench-hard", "pose-noise", "paper", "tabletop"
     ] = "dexgraspbench",
@@ -37,14 +40,21 @@ def evaluate(
     planned: Path | None = None,
     workers: int = 1,
     seed: int = 0,
+    scenes: int = 0,
+    count: tuple[int, int] = (5, 8),
+    mask_error: int = 0,
+    clear: bool = False,
+    enough: float = 0.9,
 ) -> int:
     """Plan on each noisy view of a folder's objects and test the best grasps in simulation.
 
     Prints a line for each view, then shares with 95 % Wilson intervals. Writes evaluate.json, evaluate.html, and a
-    folder of grasps.
+    folder of grasps. With --scenes objects are dropped on a table, and the easiest one is lifted among its neighbours
+    after one look: the trial of protocol "paper". Then only evaluate.json is written.
 
     Args:
-        objects: folder with manifest.json, and for each object mesh.ply and noisy views.
+        objects: folder with manifest.json, and for each object mesh.ply and noisy views. Scenes need mesh.ply only, and
+            take the library's own objects by default.
         hand: allegro, allegro_biotac, barrett, or the folder of another hand.
         out: folder of the results; it is made where it does not exist, and no other run may use it meanwhile.
         protocol: which test; see torchgrasp.evaluation.protocols.
@@ -60,14 +70,27 @@ def evaluate(
         planned: folder "grasps" of an earlier run, whose grasps are tested.
         workers: processes; the results do not depend on their number.
         seed: of every random draw.
+        scenes: number of scenes in clutter; 0: single objects.
+        count: least and largest number of objects of a scene.
+        mask_error: pixels by which every object's mask is grown, or shrunk if negative.
+        clear: go on until the table is clear, with a new look after each try, at most two for an object.
+        enough: predicted success from which on no further object of a scene is planned.
     """
     check_seed(seed)
+    check_whole("--scenes", scenes, 0, 1_000_000)
     import_simulator(simulator)
     with naming(hand="--hand", name="--hand"):
         the_hand = load_hand(hand)
-    changes = {"closing": closing, "force": force, "holding": holding, "simulator": simulator}
+    changes: dict[str, Any] = {"closing": closing, "force": force, "holding": holding, "simulator": simulator}
+    changes = {name: x for name, x in changes.items() if x is not None}
+    if scenes:
+        with naming(force="--force", count="--count", mask_error="--mask-error", enough="--enough"):
+            spec = ClutterSpec(count, mask_error, clear, starts, enough, TrialSpec(**changes), seed)
+        return evaluate_clutter(objects, the_hand, out, scenes, spec, workers)
+    if objects is None:
+        raise BadArgument("--objects", "none", "a folder of objects, or --scenes")
     with naming(force="--force", grasps="--grasps"):
-        test = find_protocol(protocol).with_trial(**{name: x for name, x in changes.items() if x is not None})
+        test = find_protocol(protocol).with_trial(**changes)
         spec = EvaluationSpec(grasps, ranks, starts, complete, only, planned is not None, seed)
     scores = []
     with naming(folder="--out", path="--out"), hold_folder(out):
