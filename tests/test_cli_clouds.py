@@ -94,7 +94,7 @@ def neighbours():
 
 
 def towards_inside():
-    away = jug().points - jug().viewpoint
+    away = jug().points - POSE[:3, 3]
     return PointCloud(jug().points, away / away.norm(dim=1, keepdim=True), jug().viewpoint)
 
 
