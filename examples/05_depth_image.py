@@ -9,7 +9,7 @@ from torchgrasp.control import squeeze
 shipped = load_scene()  # your own camera: depth in metres or uint16 mm, (fx, fy, cx, cy), its pose
 depth, intrinsics = shipped.image.depth.numpy(), shipped.image.intrinsics.numpy()
 scene = Scene.from_depth(
-    np.round(1e3 * depth).astype(np.uint16), intrinsics, shipped.image.obj_from_camera.numpy(), point=(344, 230)
+    np.round(1e3 * depth).astype(np.uint16), intrinsics, shipped.image.obj_from_camera.numpy(), point=(394, 312)
 )
 print(f"things {scene.things}, target {scene.target}, table {scene.table}")
 for sentence in scene.advice:

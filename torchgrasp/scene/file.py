@@ -39,7 +39,7 @@ def read_scene(path: Path | str) -> Scene:
         raise
     except Exception as error:  # zlib, zipfile and numpy each raise their own
         raise CloudFileError("path", f"{path}: {error!r}", "a .npz file with depth and intrinsics") from error
-    return Scene.from_depth(depth, intrinsics, arrays.pop("camera_pose", None), **arrays, table=plane)  # pyright: ignore
+    return Scene.from_depth(depth, intrinsics, arrays.pop("camera_pose", None), **arrays, table=plane)
 
 
 def is_scene(path: Path) -> bool:
