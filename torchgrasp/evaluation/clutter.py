@@ -20,8 +20,7 @@ from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.placed import PlacedScene, aim, settle
 from torchgrasp.hand.hand import Hand
 from torchgrasp.plane import Plane
-from torchgrasp.scene.scene import DepthImage, Scene
-from torchgrasp.scene.support import fit_support
+from torchgrasp.scene.scene import Scene
 from torchgrasp.sim.scene import NEIGHBOURS, Neighbour
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import Grasps
@@ -34,9 +33,6 @@ TOUCHED = ("neighbour", "table", "target")
 """The columns of a `Disturbance`."""
 TRIES = 2
 """Tries for each object before it is left."""
-
-UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-"""Against gravity, in the world frame."""
 
 Planner = Callable[[Scene, int], ScenePlan]
 """Plans on a picture, with a seed."""
@@ -86,7 +82,7 @@ class ClearResult(Value):
 def look(placed: PlacedScene, seed: int = 0, mask_error: int = 0) -> Scene:
     """Return what the virtual depth camera, with its noise, sees of a scene; object k has label k + 1.
 
-    The table is fitted to the points; only the direction of gravity is known.
+    The table is fitted to the points; of the world only the direction of gravity is known.
 
     Args:
         seed: of the noise.
@@ -94,13 +90,7 @@ def look(placed: PlacedScene, seed: int = 0, mask_error: int = 0) -> Scene:
     """
     depth, labels = render_depth(placed.meshes, placed.camera_pose, seed=seed)
     labels = change_masks(labels, mask_error)
-    pixels = torch.nonzero(depth > 0)
-    z, rows = depth[depth > 0], pixels.double()
-    x, y = (rows[:, 1] - INTRINSICS[0, 2]) / INTRINSICS[0, 0], (rows[:, 0] - INTRINSICS[1, 2]) / INTRINSICS[1, 1]
-    points = torch.stack([z * x, z * y, z], -1) @ placed.camera_pose[:3, :3].T + placed.camera_pose[:3, 3]
-    image = DepthImage(depth, INTRINSICS, placed.camera_pose)
-    table = fit_support(points, placed.camera_pose[:3, 3], UP, seed=seed)
-    return Scene(points, labels[depth > 0], image, pixels, table)
+    return Scene.from_depth(depth, INTRINSICS, placed.camera_pose, labels=labels, up=(0.0, 0.0, 1.0))
 
 
 def change_masks(labels: Int[Tensor, "h w"], pixels: int) -> Int[Tensor, "h w"]:
