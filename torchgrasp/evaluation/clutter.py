@@ -14,7 +14,7 @@ from torchgrasp.base import Value, check_whole
 from torchgrasp.cloud.camera import INTRINSICS
 from torchgrasp.cloud.render import render_depth
 from torchgrasp.clutter import ScenePlan
-from torchgrasp.errors import Status
+from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.placed import PlacedScene, aim, settle
@@ -183,10 +183,15 @@ def clear_scene(
     generator = torch.Generator().manual_seed(seed)
     most = TRIES * len(placed) if most is None else most
     while left and len(tries) < most:
-        scene, started = look(placed, seed + len(tries), mask_error), time.process_time()
-        plan = planner(scene, seed + len(tries))
-        seconds = time.process_time() - started
-        spent += seconds
+        started = time.process_time()
+        try:
+            plan = planner(look(placed, seed + len(tries), mask_error), seed + len(tries))
+        except BadArgument as error:  # nothing is seen any more, or no table is found around a flat thing
+            reason = str(error)
+            break
+        finally:
+            seconds = time.process_time() - started
+            spent += seconds
         ready = [
             (thing.label, thing.grasps)
             for thing in plan.things
