@@ -1,9 +1,9 @@
 """Which thing of a scene to take first: the things ranked by their best grasps, with reasons for those without."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
-from torch import Tensor
 
 from torchgrasp.base import Value, check_number, count_status
 from torchgrasp.errors import BadArgument, GraspError, Status
@@ -12,6 +12,7 @@ from torchgrasp.ik.candidates import Reachable
 from torchgrasp.pipeline import plan_grasps
 from torchgrasp.plane import upright_frame
 from torchgrasp.scene.scene import Scene
+from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Grasps, PointCloud
 
@@ -27,13 +28,14 @@ at all is left."""
 class ThingPlan(Value):
     """The executable grasps of one thing, best first, or the reason why there are none.
 
-    `success` is the predicted one of the best grasp, 0 without.
+    `success` is the predicted one of the best grasp, 0 without. `shape` is the estimated one, if it was planned on.
     """
 
     label: int
     success: float
     grasps: Grasps | None = None
     reason: str = ""
+    shape: ShapeGP | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,11 +93,10 @@ def _plan_thing(
 ) -> ThingPlan:
     """Plan grasps of a scene's target."""
     assert scene.target is not None
-    stages: dict[str, Tensor] = {}
+    stages: dict[str, Any] = {}
 
     def note(stage: str, message: str, value: object) -> None:
-        if stage == "plan":
-            stages[stage] = value.status  # pyright: ignore[reportAttributeAccessIssue]
+        stages[stage] = value
 
     try:
         grasps = plan_grasps(scene, hand, spec, starts, seed, observer=note, reachable=reachable)
@@ -103,8 +104,8 @@ def _plan_thing(
         return ThingPlan(scene.target, 0.0, reason=str(error))
     good = grasps[grasps.status == Status.OK]
     if len(good):
-        return ThingPlan(scene.target, float(good.success[0]), good)
-    failed = count_status(grasps.status if len(grasps) else stages["plan"])
+        return ThingPlan(scene.target, float(good.success[0]), good, shape=stages["shape"])
+    failed = count_status(grasps.status if len(grasps) else stages["plan"].status)
     first = next((status for status in failed if status is not Status.OK), Status.OUT_OF_REACH)
     return ThingPlan(scene.target, 0.0, reason=first.sentence)
 

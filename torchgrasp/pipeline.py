@@ -203,7 +203,8 @@ def _plan(task: _Task) -> Grasps:
     world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), spec.plane, obstacles)
     problem = GraspProblem(hand, contacts, certificate, world, surface.vertices.mean(0), task.reachable)
     if task.mixture is None:
-        seeds = nearest_postures(PostureLibrary.of(hand, seed=seed), contacts, world)
+        library = PostureLibrary.of(hand, seed=seed)
+        seeds = nearest_postures(library, contacts, world, reachable=task.reachable)
     else:
         seeds = query_mixture(hand, contacts, task.mixture.to(shape.device))
     observer("query", f"{len(seeds)} seeds for {len(torch.unique(seeds.row))} of {len(contacts)} triples", seeds)

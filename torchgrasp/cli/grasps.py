@@ -3,13 +3,10 @@
 import dataclasses
 import importlib
 import importlib.util
-import sys
-import time
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
-from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from torchgrasp.base import check_whole
@@ -25,6 +22,8 @@ from torchgrasp.cli.common import (
     read_view,
     table_plane,
 )
+from torchgrasp.cli.progress import Progress
+from torchgrasp.cli.scene_grasps import grasp_scene
 from torchgrasp.columns import format_columns
 from torchgrasp.errors import BadArgument, MissingExtra
 from torchgrasp.evaluation.lift import close_hand
@@ -34,7 +33,8 @@ from torchgrasp.mesh import read_mesh
 from torchgrasp.objects import DATA, MASSES, list_objects, load_object
 from torchgrasp.pipeline import Mode, plan_grasps
 from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows, write_report
-from torchgrasp.report.run import Run, Stage, verdict
+from torchgrasp.report.run import Run, verdict
+from torchgrasp.scene.file import is_scene
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ContactSpec, Simulator, TrialSpec
 
@@ -63,15 +63,18 @@ def grasp(
     no_table: bool = False,
     friction: float = 0.8,
     mode: Mode = "joint",
+    label: int | None = None,
+    point: tuple[float, float] | None = None,
 ) -> int:
-    """Plan grasps of the object in a partial cloud, and close on it in simulation.
+    """Plan grasps of the object in a partial cloud, and close on it in simulation; or of a thing in a scene.
 
     Writes grasps.safetensors and report.html into the output folder. The cloud is checked as by `cloud check`. Refused
     are: a camera below the table or that the points contradict, a plane left in, two bodies, and another unit. Other
     findings are printed as advice.
 
     Args:
-        cloud: point cloud of one object (.ply, .pcd, .npy, .npz, .xyz, .txt, .csv).
+        cloud: point cloud of one object (.ply, .pcd, .npy, .npz, .xyz, .txt, .csv), or a scene (.npz with depth and
+            intrinsics; see docs/scenes.md).
         hand: allegro, allegro_biotac, barrett, or the folder of another hand.
         out: folder of the results; it is made where it does not exist.
         mesh: true mesh of the object [m] in the frame of the cloud; only the simulator sees it.
@@ -84,9 +87,22 @@ def grasp(
         no_table: there is no table.
         friction: coefficient of friction between fingertips and object.
         mode: contacts, pose and joints together, or contacts first and the learned model after, as in the paper.
+        label: of the thing to grasp in a scene; by default the easiest.
+        point: column and row of a pixel on the thing to grasp in a scene.
     """
     with naming(path="--out"):
         check_folder(out)
+    if is_scene(cloud):
+        if mesh is not None or view != AS_IT_IS or table is not None or no_table or mode != "joint":
+            found = "an option of clouds beside a scene"
+            raise BadArgument("CLOUD", found, "--label or --point, --hand, --out, --seed, --starts and --friction")
+        with naming(hand="--hand", name="--hand", friction="--friction"):
+            the_hand, spec = load_hand(hand), ContactSpec(friction=friction)
+        check_whole("--starts", starts, 1, 1_000_000)
+        check_seed(seed)
+        return grasp_scene(cloud, the_hand, spec, (starts, seed), label, point, out)
+    if label is not None or point is not None:
+        raise BadArgument("--label, --point", f"{cloud}, which is no scene", "a .npz file with depth and intrinsics")
     if close:
         if mesh is None:
             raise BadArgument("--close", "no --mesh", "--close together with --mesh")
@@ -103,7 +119,7 @@ def grasp(
         trial = TrialSpec(friction=friction)
     print_notes(file.notes, judge_cloud("CLOUD", partial, view, plane))
 
-    progress = _Progress("shape", "plan", "certify", "query", "refine", *["closing"] * close, "report")
+    progress = Progress("shape", "plan", "certify", "query", "refine", *["closing"] * close, "report")
     with progress.bar:
         origin = "no table" if plane is None else describe_table(plane)
         origin += " (lowest point)" * (plane is not None and table is None)
@@ -158,27 +174,3 @@ def object_name(path: Path) -> str:
     """
     generic = path.stem.rstrip("0123456789") in ("mesh", "view", "cloud", "model", "points")
     return path.resolve().parent.name or "object" if generic else path.stem
-
-
-class _Progress:
-    """A line for each stage that ended; on a terminal a bar names the stage under way."""
-
-    def __init__(self, *names: str) -> None:
-        self.next = dict(zip(names, (*names[1:], "done"), strict=True))
-        self.stages: list[Stage] = []
-        self.values: dict[str, Any] = {}
-        self.began = time.perf_counter()
-        # None: silent where stderr is no terminal.
-        self.bar = tqdm(total=len(names), desc=names[0], leave=False, delay=1, disable=None, unit="stage")
-
-    def end(self, name: str, message: str, value: Any = None) -> None:
-        """Note the end of a stage."""
-        now = time.perf_counter()
-        self.stages.append(Stage(name, message, now - self.began))
-        self.values[name] = value
-        with self.bar.external_write_mode(sys.stdout):
-            print(f"{name:8}{now - self.began:6.1f} s  {message}", flush=True)
-        self.began = now
-        if name in self.next:
-            self.bar.update()
-            self.bar.set_description(self.next[name])

@@ -25,6 +25,7 @@ from torchgrasp.report.pictures import (
     view_of,
 )
 from torchgrasp.report.run import Run, verdict
+from torchgrasp.report.scenes import draw_among, draw_depth
 from torchgrasp.values import Grasps
 
 
@@ -49,6 +50,12 @@ def draw_pictures(run: Run) -> dict[str, list[tuple[str, bytes]]]:
             ("The same from behind, where nothing was seen.", draw_surface(run.surface, rotated(view, 180.0), table)),
         ]
     }
+    if run.scene is not None:
+        seen = [("The depth image: the target in full colour, the other things pale.", draw_depth(run.scene))]
+        if len(best):
+            among = draw_among(run.scene, run.surface, run.hand, best[0], facing(best))
+            seen.append(("The best grasp among the measured points of the other things.", among))
+        sections = {"The scene": seen, **sections}
     if len(best):
         front = facing(best)
         sections["The best grasp"] = [

@@ -12,6 +12,7 @@ from torchgrasp.errors import Status
 from torchgrasp.frames import inverse
 from torchgrasp.hand.hand import Hand
 from torchgrasp.plane import move, upright_frame
+from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.surface import Surface
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ClosureResult, ContactPlan, Grasps, PointCloud
@@ -30,7 +31,10 @@ class Stage(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """Everything that a report shows; `closure` is that on the true `mesh`, or both are None."""
+    """Everything that a report shows; `closure` is that on the true `mesh`, or both are None.
+
+    The cloud is that of the target of `scene`, if there is one.
+    """
 
     object_name: str
     source: Path
@@ -43,6 +47,7 @@ class Run:
     plan: ContactPlan | None = None
     mesh: "trimesh.Trimesh | None" = None
     closure: ClosureResult | None = None
+    scene: Scene | None = None
 
     @property
     def executable(self) -> Grasps:
@@ -66,6 +71,7 @@ class Run:
             grasps=move(self.grasps, upright_from_obj),
             mesh=mesh,
             closure=closure,
+            scene=None if self.scene is None else self.scene.to_upright(obj_from_upright),
         )
 
 

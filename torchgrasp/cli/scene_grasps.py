@@ -1,0 +1,81 @@
+"""`torchgrasp grasp` on a scene: the thing that was asked for, or the easiest."""
+
+import dataclasses
+from pathlib import Path
+
+from torchgrasp.cli.common import naming
+from torchgrasp.cli.progress import Progress
+from torchgrasp.clutter import ThingPlan, plan_scene
+from torchgrasp.columns import format_columns, format_line
+from torchgrasp.hand.hand import Hand
+from torchgrasp.pipeline import plan_grasps, take_target
+from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows, write_report
+from torchgrasp.report.run import Run, verdict
+from torchgrasp.scene.file import read_scene
+from torchgrasp.shape.surface import extract_surface
+from torchgrasp.specs import ContactSpec
+from torchgrasp.values import Grasps
+
+ENOUGH = 0.9
+"""Predicted success from which on a thing is easy enough: the others are not tried."""
+
+
+def grasp_scene(
+    path: Path,
+    hand: Hand,
+    spec: ContactSpec,
+    numbers: tuple[int, int],
+    label: int | None,
+    point: tuple[float, float] | None,
+    out: Path,
+) -> int:
+    """Plan grasps of a thing of a scene, and write them with a report.
+
+    Args:
+        numbers: starts, and the seed.
+        label, point: of the thing, at most one of the two; None: the easiest thing.
+    """
+    starts, seed = numbers
+    names = {name: f"CLOUD: {name}" for name in ("depth", "intrinsics", "mask", "labels", "camera_pose", "table")}
+    with naming(path="CLOUD", points="CLOUD", target="--label", point="--point", **names):
+        scene = read_scene(path)
+        chosen = point if label is None else label
+        scene = scene if chosen is None else scene.select(chosen)
+    progress = Progress("scene", "shape", "plan", "certify", "query", "refine", "report")
+    with progress.bar:
+        progress.end("scene", f"{len(scene.things)} things, labels {', '.join(map(str, scene.things))}")
+        for sentence in scene.advice:
+            print(f"advice  {sentence}")
+        if scene.target is None:
+            plan = plan_scene(scene, hand, spec, starts, seed, enough=ENOUGH)
+            print_things(plan.things)
+            progress.end("things", f"{sum(thing.grasps is not None for thing in plan.things)} with a grasp")
+            if plan.best is None or plan.best.grasps is None or plan.best.shape is None:
+                print(f"The {hand.name} hand has no executable grasp of any thing of the scene.")
+                return 1
+            scene = dataclasses.replace(scene, target=plan.best.label)
+            grasps, shape = plan.best.grasps, plan.best.shape
+        else:
+            grasps: Grasps = plan_grasps(scene, hand, spec, starts, seed, observer=progress.end)
+            shape = progress.values["shape"]
+        spec = dataclasses.replace(spec, table=scene.table)
+        cloud, name = take_target(scene, seed), f"thing {scene.target}"
+        run = Run(
+            name, path, cloud, hand, spec, extract_surface(shape), grasps, tuple(progress.stages),
+            progress.values.get("plan"), scene=scene,
+        )  # fmt: skip
+        with naming(path="--out"):
+            grasps.save(out / "grasps.safetensors")
+            write_report(out / "report.html", run)
+        progress.end("report", f"{out / 'grasps.safetensors'}, {out / 'report.html'}")
+    if len(run.executable):
+        print(f"\n{format_columns([GRASP_COLUMNS, *grasp_rows(run.executable, 5)])}\n")
+    print(verdict(run))
+    return 0 if len(run.executable) else 1
+
+
+def print_things(things: tuple[ThingPlan, ...]) -> None:
+    """Print a line for each thing: its label, the predicted success of its best grasp, or why there is none."""
+    for thing in things:
+        text = thing.reason or f"{0 if thing.grasps is None else len(thing.grasps)} executable grasps"
+        print(format_line((f"thing {thing.label}", f"{thing.success:.0%}", text), (-10, 5, -1)), flush=True)
