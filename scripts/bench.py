@@ -6,6 +6,7 @@ python scripts/bench.py grasp --objects DIR    cloud to held object, for every o
 python scripts/bench.py hand                   the hands: kinematics, collision, the learned model, contacts to postures
 python scripts/bench.py plan --objects DIR     the contact planner against IPOPT, on the true surface, and as it grows
 python scripts/bench.py proof --objects DIR    certificates and the probability of closure, against exact references
+python scripts/bench.py scene --objects DIR    one depth image to its table, and to the thing at a clicked pixel
 python scripts/bench.py shape --objects DIR    exactness, speed, memory and calibration of the shape, beside its bars
 
 Times on two threads are for a quiet machine. Beside other work set OMP_WAIT_POLICY=PASSIVE: threads then sleep where
@@ -18,8 +19,17 @@ from benchmarks.grasp.suite import grasp
 from benchmarks.hand.suite import hand
 from benchmarks.plan.suite import plan
 from benchmarks.proof.suite import proof
+from benchmarks.scene.suite import scene
 from benchmarks.shape.suite import shape
 
 if __name__ == "__main__":
-    subjects = {"close": close, "grasp": grasp, "hand": hand, "plan": plan, "proof": proof, "shape": shape}
+    subjects = {
+        "close": close,
+        "grasp": grasp,
+        "hand": hand,
+        "plan": plan,
+        "proof": proof,
+        "scene": scene,
+        "shape": shape,
+    }
     tyro.extras.subcommand_cli_from_dict(subjects)

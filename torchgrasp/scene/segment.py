@@ -9,10 +9,11 @@ from torch import Tensor
 
 from torchgrasp.plane import Plane
 from torchgrasp.scene.image import DepthImage
+from torchgrasp.scene.merge import merge_pieces
 
 BAND = 0.010
 """Heights [m] below this, of either sign, measure the noise of the table."""
-SIGMAS, LEAST_HEIGHT = 3.0, 0.0015
+SIGMAS, LEAST_HEIGHT = 2.5, 0.002
 """A thing's pixels rise this many deviations of the smoothed table, and this much [m], above it."""
 SMOOTHING = 5
 """Side [px] of the square whose mean height tells a foot from the table."""
@@ -22,10 +23,12 @@ RIM = 1
 """Pixels about a jump that are no surface for certain: a camera's rim pixels fly."""
 NEAR, PASSES = 0.005, 12
 """Distance [m] within which a rim's pixel belongs to a thing, and passes of this: thin parts are rim throughout."""
-TOUCH, GAP = 6, 0.009
-"""Pixels of a piece within this distance [m] of another that make both one thing."""
+FEW = 6
+"""Pixels of a piece that are too few to say anything."""
+OWN = 0.6
+"""Share of that height that a pixel itself has: the mean is raised beside a thing, too."""
 LEAST_TOP, LEAST_FLOOR = 0.0035, 0.001
-"""Smoothed height [m] that a tenth of a thing's pixels reach: the table's waves do not. Median height [m] of pixels
+"""Smoothed height [m] that a tenth of a thing's pixels have: waves of the table do not. Median height [m] of pixels
 within a thing that are its floor, such as a pan's."""
 SPECK = 40
 """Least pixels of a thing: 6 mm x 6 mm at 0.6 m."""
@@ -47,51 +50,52 @@ def segment(image: DepthImage, table: Plane) -> Int[Tensor, "h w"]:
     >>> segment(DepthImage(depth, k, torch.eye(4).double()), Plane(torch.tensor([0, 0, -1.0]), -0.5)).unique()
     tensor([0, 1])
     """
-    measured, height, mean, risen = _above(image, table)
-    core, smooth, jump = _core(image, risen)
-    pieces = _grown(image.points(), _components(core, smooth, jump), risen)
-    thin = _components(risen & (pieces == 0), smooth, jump)
+    measured, smooth = image.depth > 0, dataclasses.replace(image, depth=torch.from_numpy(_median(image.depth.numpy())))
+    mean, threshold = _smoothed(image, table)
+    risen = _risen(smooth, table, mean, threshold)
+    core, jump = _core(smooth, risen)
+    pieces = _grown(image.points(), _components(core, smooth.depth, jump), risen)
+    thin = _components(risen & (pieces == 0), smooth.depth, jump)
     pieces = torch.where((pieces == 0) & (thin > 0), pieces.max() + thin, pieces)
     sure = core | (thin > 0)
-    things = _merged(dataclasses.replace(image, depth=smooth).points(), _without(pieces, _counts(pieces) < TOUCH), sure)
-    top = _counts(torch.where(mean > LEAST_TOP, things, 0), len(_counts(things))) >= 0.1 * _counts(things)
-    return _numbered(_filled(_without(things, ~top), measured, height))
+    high = _counts(torch.where(mean > LEAST_TOP, pieces, 0), len(_counts(pieces))) >= 0.1 * _counts(pieces)
+    few = _counts(torch.where(sure, pieces, 0), len(high)) < FEW
+    pieces = _without(pieces, few | ~high)
+    group = merge_pieces(smooth, torch.where(sure, pieces, 0), table, jump)
+    return _numbered(_filled(group[pieces], measured, table.height(image.points())))
 
 
 def on_surface(image: DepthImage, table: Plane) -> Bool[Tensor, "h w"]:
     """Tell which pixels rise above the table and lie on a surface; flying pixels do not."""
-    measured, _, _, risen = _above(image, table)
-    core, _, _ = _core(image, risen)
-    return measured & (_grown(image.points(), core.long(), risen) > 0)
+    smooth = dataclasses.replace(image, depth=torch.from_numpy(_median(image.depth.numpy())))
+    risen = _risen(smooth, table, *_smoothed(image, table))
+    return _grown(image.points(), _core(smooth, risen)[0].long(), risen) > 0
 
 
-def _above(image: DepthImage, table: Plane) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return which pixels are measured, heights, smoothed heights, and which pixels rise above the table."""
-    measured = image.depth > 0
-    height = torch.where(measured, table.height(image.points()), 0.0)
-    mean, threshold = _smoothed(height, measured, image.depth)
-    return measured, height, mean, measured & (mean > threshold) & (height > -threshold)
-
-
-def _core(image: DepthImage, risen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the risen pixels away from jumps, the smoothed depth, and the depth difference that is a jump."""
-    smooth = torch.from_numpy(_median(image.depth.double().numpy()))
-    jump = JUMP + JUMP_SPACINGS * smooth / float(image.intrinsics[0, 0])
-    return risen & ~_at_jump(smooth, jump), smooth, jump
-
-
-def _smoothed(height: Tensor, measured: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the mean height about each pixel, and the table's noise in it, which grows with the squared depth."""
+def _smoothed(image: DepthImage, table: Plane) -> tuple[Tensor, Tensor]:
+    """Return the mean height about each pixel, and the least that is no noise, which grows with the squared depth."""
     from scipy.ndimage import uniform_filter
 
+    measured, height = image.depth > 0, table.height(image.points())
     near = measured & (height.abs() < 3 * BAND)  # a foot has distant neighbours, too
     share = torch.from_numpy(uniform_filter(near.double().numpy(), SMOOTHING))
     total = torch.from_numpy(uniform_filter(torch.where(near, height, 0.0).numpy(), SMOOTHING))
     mean = torch.where(near, total / share.clamp_min(1e-9), height)
-    squared = depth.double().square()
+    squared = image.depth.square()
     flat = measured & (mean.abs() < BAND)
     noise = 1.4826 * float((mean.abs() / squared)[flat].median()) if bool(flat.any()) else 0.0
     return mean, (SIGMAS * noise * squared).clamp_min(LEAST_HEIGHT)
+
+
+def _risen(smooth: DepthImage, table: Plane, mean: Tensor, threshold: Tensor) -> Bool[Tensor, "h w"]:
+    """Tell which pixels rise above the table, with their neighbours and by themselves."""
+    return (smooth.depth > 0) & (mean > threshold) & (table.height(smooth.points()) > OWN * threshold)
+
+
+def _core(smooth: DepthImage, risen: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the risen pixels away from jumps, and the difference of depth [m] that is a jump."""
+    jump = JUMP + JUMP_SPACINGS * smooth.depth / float(smooth.intrinsics[0, 0])
+    return risen & ~_at_jump(smooth.depth, jump), jump
 
 
 def _median(depth: np.ndarray) -> np.ndarray:
@@ -137,7 +141,7 @@ def _grown(points: Tensor, labels: Tensor, risen: Tensor) -> Int[Tensor, "h w"]:
     """Give risen pixels without a label, pass by pass, that of the nearest labelled point within `NEAR`."""
     from scipy.spatial import KDTree
 
-    labels = _without(labels, _counts(labels) < TOUCH).reshape(-1).clone()
+    labels = _without(labels, _counts(labels) < FEW).reshape(-1).clone()
     place, loose = points.reshape(-1, 3).numpy(), torch.nonzero(risen.reshape(-1) & (labels == 0))[:, 0]
     new = torch.nonzero(labels)[:, 0]
     for _ in range(PASSES):
@@ -148,37 +152,6 @@ def _grown(points: Tensor, labels: Tensor, risen: Tensor) -> Int[Tensor, "h w"]:
         labels[loose[found]] = labels[new[torch.from_numpy(index)[found]]]
         new, loose = loose[found], loose[~found]
     return labels.reshape(risen.shape)
-
-
-def _merged(points: Tensor, labels: Tensor, sure: Tensor) -> Int[Tensor, "h w"]:
-    """Return labels in which pieces that touch are one."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import KDTree
-
-    rows = (labels > 0) & sure
-    if not bool(rows.any()):
-        return labels
-    names, number = labels[rows].unique(return_inverse=True)
-    if len(names) == 1:
-        return labels
-    number, place, joined = number.numpy(), points[rows].numpy(), []
-    trees = [KDTree(place[number == k]) for k in range(len(names))]
-    low = np.stack([tree.mins for tree in trees]) - GAP
-    high = np.stack([tree.maxes for tree in trees])
-    for a in range(len(names)):
-        for b in range(a):
-            if (low[a] < high[b]).all() and (low[b] < high[a]).all():
-                small, large = (a, b) if trees[a].n < trees[b].n else (b, a)
-                touching = np.isfinite(trees[large].query(trees[small].data, distance_upper_bound=GAP)[0])
-                if touching.sum() >= TOUCH:
-                    joined.append((a, b))
-    i, j = np.array(joined, dtype=int).reshape(-1, 2).T
-    graph = coo_matrix((np.ones(len(i), dtype=bool), (i, j)), shape=(len(names), len(names)))
-    group = torch.from_numpy(connected_components(graph, directed=False)[1].astype(np.int64))
-    new = torch.zeros(int(labels.max()) + 1, dtype=torch.long)
-    new[names] = group + 1
-    return new[labels]
 
 
 def _filled(labels: Tensor, measured: Tensor, height: Tensor) -> Int[Tensor, "h w"]:
@@ -192,7 +165,7 @@ def _filled(labels: Tensor, measured: Tensor, height: Tensor) -> Int[Tensor, "h 
     for number, box in enumerate(boxes, start=1):
         row, column = (slice(max(0, side.start - 1), side.stop + 1) for side in box)
         hole = torch.from_numpy(holes[row, column] == number)
-        if int(hole.sum()) < TOUCH:
+        if int(hole.sum()) < FEW:
             continue
         around = labels[row, column][~hole]
         names = around[around > 0].unique()

@@ -1,0 +1,160 @@
+"""From a depth image to its table and to a clicked thing, beside the bars."""
+
+import math
+import time
+from pathlib import Path
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+from tqdm import tqdm
+
+from benchmarks.common import Row, measure
+from benchmarks.scene.scenes import Picture, read_meshes, take_picture
+from torchgrasp.cloud.camera import INTRINSICS
+from torchgrasp.errors import BadArgument, NoSupport
+from torchgrasp.plane import Plane
+from torchgrasp.scene import Scene
+
+SUBJECTS = ("plane", "clicked point")
+TABLES = ("apart", "apart", "crowded", "boxes", "close")
+"""Kinds of scenes with a table, in turn."""
+EMPTY = ("lone", "lone", "apart", "boxes")
+"""Kinds of scenes without a table, in turn."""
+LEAST_SEEN = 500
+"""Measured pixels of an object that can be clicked: smaller ones are hidden, or too far to be grasped."""
+
+
+def scene(
+    objects: Path,
+    only: tuple[str, ...] = SUBJECTS,
+    scenes: int = 300,
+    seed: int = 0,
+    out: Path = Path("out/bench_scene.json"),
+) -> None:
+    """Measure how scenes are read from one depth image: the table's plane, and the thing at a clicked pixel.
+
+    Args:
+        objects: folder with manifest.json and a folder for each object.
+        only: subjects to measure: plane, clicked point.
+        scenes: rendered scenes of each subject. As many without a table as a third of these are refused.
+        seed: of the scenes.
+        out: where the numbers are written as JSON.
+    """
+    torch.set_num_threads(1)
+    meshes = read_meshes(objects)
+    subjects = {
+        "plane": lambda: bench_plane(meshes, scenes, seed),
+        "clicked point": lambda: bench_click(meshes, scenes, seed),
+    }
+    measure("scene", subjects, only, {"scenes": scenes, "seed": seed, "objects": len(meshes)}, out)
+
+
+def read_plane(picture: Picture) -> Plane | None:
+    """Return the plane in the world frame that is fitted in the camera's frame; None where it is refused."""
+    try:
+        table = Scene.from_depth(picture.depth, INTRINSICS).table
+    except NoSupport:
+        return None
+    return None if table is None else table.moved(picture.camera_pose)
+
+
+def bench_plane(meshes: list, scenes: int, seed: int) -> list[Row]:
+    """Measure the plane of scenes with a table, and how often one is found without."""
+    errors: list[tuple[float, float]] = []
+    refused = 0
+    for i in tqdm(range(scenes), desc="plane", disable=None, leave=False):
+        plane = read_plane(take_picture(meshes, seed + i, TABLES[i % len(TABLES)]))
+        if plane is None:
+            refused += 1
+            continue
+        tilt = math.degrees(math.acos(min(1.0, float(plane.normal[2]))))
+        errors.append((tilt, 1e3 * abs(plane.offset)))
+    good = sum(tilt < 1 and offset < 2 for tilt, offset in errors)
+    tilts, offsets = (sorted(column) for column in zip(*errors, strict=True))
+    empty = max(1, scenes // 3)
+    accepted = [
+        i
+        for i in tqdm(range(empty), desc="no table", disable=None, leave=False)
+        if read_plane(take_picture(meshes, seed + i, EMPTY[i % len(EMPTY)], table=False)) is not None
+    ]
+    wrong = len(errors) - good + len(accepted)
+    return [
+        Row(
+            f"plane of the table, {scenes} rendered scenes: apart, crowded, with big boxes, from nearby",
+            "normal within 1 degree and offset within 2 mm, all",
+            f"{good} of {scenes}, {refused} refused; largest {tilts[-1]:.2f} degrees, {offsets[-1]:.2f} mm",
+            good == scenes,
+            {"degrees": tilts, "mm": offsets, "refused": refused},
+        ),
+        Row(
+            f"wrong planes accepted, the same scenes and {empty} without a table",
+            "0",
+            f"{wrong} ({len(accepted)} without a table)",
+            wrong == 0,
+            {"accepted": accepted},
+        ),
+    ]
+
+
+def choose_pixel(picture: Picture, generator: torch.Generator) -> tuple[int, tuple[int, int]] | None:
+    """Return a random object that is seen whole in the picture, and a random pixel (u, v) within it; None: none is."""
+    from scipy.ndimage import binary_erosion
+
+    measured = picture.depth > 0
+    choices: list[tuple[int, Int[Tensor, "k 2"]]] = []
+    for k in picture.labels.unique().tolist():
+        mine = picture.labels == k
+        cut = mine[0].any() | mine[-1].any() | mine[:, 0].any() | mine[:, -1].any()
+        inner = torch.nonzero(torch.from_numpy(binary_erosion(mine.numpy(), iterations=2)) & measured)
+        if k and not cut and int((mine & measured).sum()) >= LEAST_SEEN and len(inner):
+            choices.append((k, inner))
+    if not choices:
+        return None
+    k, inner = choices[int(torch.randint(len(choices), (1,), generator=generator))]
+    row, column = inner[int(torch.randint(len(inner), (1,), generator=generator))].tolist()
+    return k, (column, row)
+
+
+def bench_click(meshes: list, scenes: int, seed: int) -> list[Row]:
+    """Measure the clicked thing's points: the share that is found, and the share of others among them."""
+    generator = torch.Generator().manual_seed(seed)
+    rows, seconds, i = [], [], 0
+    progress = tqdm(total=scenes, desc="click", disable=None, leave=False)
+    while len(rows) < scenes:
+        i += 1
+        picture = take_picture(meshes, seed + i, "apart")
+        chosen = choose_pixel(picture, generator)
+        if chosen is None:
+            continue
+        began = time.process_time()
+        try:
+            found = Scene.from_depth(picture.depth, INTRINSICS, picture.camera_pose, point=chosen[1])
+            pixels = found.pixels[found.rows_of()]
+        except BadArgument:
+            pixels = torch.empty(0, 2, dtype=torch.long)
+        seconds.append(time.process_time() - began)
+        own = picture.labels[pixels[:, 0], pixels[:, 1]] == chosen[0]
+        true = int(((picture.labels == chosen[0]) & (picture.depth > 0)).sum())
+        rows.append((seed + i, chosen[0], int(own.sum()) / true, int((~own).sum()) / max(1, len(own))))
+        progress.update()
+    progress.close()
+    share, others = ([row[k] for row in rows] for k in (2, 3))
+    mean_share, mean_others = sum(share) / scenes, sum(others) / scenes
+    both = sum(s >= 0.95 and o <= 0.02 for s, o in zip(share, others, strict=True)) / scenes
+    return [
+        Row(
+            f"thing at a clicked pixel, {scenes} scenes of 3 to 8 objects at least 10 mm apart, mean",
+            "the right thing's points >= 95 %, of others <= 2 %",
+            f"{mean_share:.1%}, {mean_others:.1%}; both in {both:.0%} of the scenes",
+            mean_share >= 0.95 and mean_others <= 0.02,
+            {"scenes": rows},
+        ),
+        Row(
+            "depth image of 640 x 480 to labelled scene, one thread",
+            "< 1.5 s",
+            f"median {sorted(seconds)[scenes // 2]:.2f} s, largest {max(seconds):.2f} s",
+            max(seconds) < 1.5,
+            {"seconds": seconds},
+        ),
+    ]

@@ -1,0 +1,69 @@
+import pytest
+import torch
+import trimesh
+
+from torchgrasp.cloud.camera import INTRINSICS, look_at
+from torchgrasp.cloud.render import render_depth
+from torchgrasp.plane import Plane
+from torchgrasp.scene.image import DepthImage
+from torchgrasp.scene.segment import on_surface, segment
+
+TABLE = Plane.horizontal(0.0)
+
+
+def box(size, place):
+    return trimesh.creation.box(size).apply_translation(place)
+
+
+def cup():
+    outer = trimesh.creation.annulus(0.037, 0.04, 0.08)
+    return trimesh.util.concatenate([outer.apply_translation([0, 0, 0.04]), trimesh.creation.cylinder(0.037, 0.01)])
+
+
+def look(meshes, elevation=40.0, noise=True):
+    pose = look_at(0.0, elevation, 0.6)
+    depth, labels = render_depth(meshes, pose, noise=noise)
+    return DepthImage(depth, INTRINSICS, pose), labels
+
+
+@pytest.mark.parametrize("elevation", [30.0, 45.0, 60.0])
+@pytest.mark.parametrize(
+    "meshes",
+    [
+        [
+            box([0.04, 0.1, 0.03], [0.06, 0, 0.015]),
+            box([0.04, 0.1, 0.12], [-0.01, 0, 0.06]),
+        ],  # one hides another's foot
+        [cup()],  # its inside is seen over its rim
+        [trimesh.util.concatenate(box([0.06, 0.06, 0.05], [0, 0, 0.025]), box([0.02, 0.12, 0.01], [0, 0.08, 0.045]))],
+        [box([0.15, 0.07, 0.008], [0, 0, 0.004])],
+    ],
+    ids=["behind", "cup", "overhang", "flat"],
+)
+def test_each_thing_has_one_label(meshes, elevation):
+    image, labels = look(meshes, elevation)
+    found = segment(image, TABLE)
+    assert found.max() == len(meshes)
+    for k in range(1, len(meshes) + 1):
+        mine = (labels == k) & (image.depth > 0)
+        label = int(found[mine].mode().values)
+        assert ((found == label) & mine).sum() > 0.93 * mine.sum()
+        assert ((found == label) & ~mine & (image.depth > 0)).sum() < 0.02 * mine.sum()
+
+
+def test_an_empty_table_has_no_things():
+    image, _ = look([box([0.01, 0.01, 0.01], [0.0, 0.0, -0.1])])
+    assert not segment(image, TABLE).any()
+
+
+def test_flying_pixels_belong_to_nothing():
+    image, labels = look([box([0.06, 0.06, 0.1], [0, 0, 0.05])], noise=False)
+    row, column = torch.nonzero(labels == 1)[:, 0].min(), 320
+    exact = on_surface(image, TABLE)
+    assert (exact & (labels == 1)).sum() > 0.96 * (labels == 1).sum()
+    flying = image.depth.clone()
+    away = 0.015 + 0.06 * torch.rand(2, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    flying[row - 2 : row, column - 20 : column + 20] = image.depth[row + 3, column] + away
+    moved = DepthImage(flying, image.intrinsics, image.obj_from_camera)
+    assert not on_surface(moved, TABLE)[row - 2 : row, column - 20 : column + 20].any()
+    assert segment(moved, TABLE).max() == 1
