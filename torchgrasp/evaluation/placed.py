@@ -17,10 +17,12 @@ from torchgrasp.cloud.camera import FOCAL, HEIGHT, WIDTH, look_at
 from torchgrasp.datasets import read_object_mesh
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, inverse, rigid, rotation_from_vector
+from torchgrasp.linalg import farthest_points
 from torchgrasp.mesh import read_mesh
 from torchgrasp.objects import list_objects, load_object
-from torchgrasp.sim.convex_parts import convex_parts
+from torchgrasp.sim.convex_parts import convex_parts, hull
 from torchgrasp.sim.scene import Body
+from torchgrasp.specs import TrialSpec
 
 if TYPE_CHECKING:
     import trimesh
@@ -37,12 +39,15 @@ FALL = 0.005
 """Gap [m] between a dropped object and what is below it."""
 DROP_TIME, REST_TIME = 1.0, 3.0
 """Longest times [s] until the next object is dropped, and until all must be still."""
-WATCH_TIME, WATCH_SHIFT = 2.0, 0.001
+WATCH_TIME, WATCH_SHIFT = 2.0, 0.004
 """Time [s] that a scene is watched, and the motion [m] of a vertex in it that shows an unsteady balance."""
 DROPS, BEGINNINGS = 3, 50
 """Drops for each object, on average, before a scene begins again; beginnings before it is given up."""
 ELEVATION, DISTANCE = (40.0, 60.0), (0.6, 0.75)
 """Of the camera [deg, m], uniform; the azimuth is any."""
+CORNERS = 120
+"""Most corners of a part. PhysX keeps 255 faces: of more it makes other bodies in other frames, and balls that rest on
+a face in one roll in the next."""
 BORDER = 8
 """Least distance of an object from the border of the image [px]."""
 VIEWS = 20
@@ -115,10 +120,11 @@ def drop(objects: Path | None, count: tuple[int, int], seed: int) -> PlacedScene
         names = tuple(known[i] for i in order[:n])
         bodies = [_read_body(objects, name) for name in names]
         poses = _fall(bodies, generator)
-        if poses is not None and _steady(bodies, poses):
-            scene = aim(_moved(names, bodies, poses, torch.eye(4, dtype=torch.float64)), generator)
-            if scene is not None:
-                return scene
+        if poses is None:
+            continue
+        scene = aim(_moved(names, bodies, poses, torch.eye(4, dtype=torch.float64)), generator)
+        if scene is not None and _steady(scene):
+            return scene
     raise BadArgument("objects", f"{objects}: none of {BEGINNINGS} scenes came to rest in view", "smaller objects")
 
 
@@ -158,17 +164,20 @@ def _between(ends: tuple[float, float], share: float) -> float:
     return ends[0] + share * (ends[1] - ends[0])
 
 
-def _steady(bodies: list[Body], poses: np.ndarray) -> bool:
-    """Tell whether bodies stay where they are, without damping, as in a trial."""
+def _steady(placed: PlacedScene) -> bool:
+    """Tell whether objects stay where they are in a trial: in another frame, with its timestep and no damping."""
     from torchgrasp.sim.settle import SettlingTable
 
-    table = SettlingTable(damping=0.0)
-    for body, pose in zip(bodies, poses, strict=True):
-        table.add(body, pose)
+    turn = rigid(rotation_from_vector(torch.tensor([0.0, 0.0, 1.0])).double(), torch.zeros(3).double()).numpy()
+    bodies = [Body(mesh, parts, MASS) for mesh, parts in zip(placed.meshes, placed.parts, strict=True)]
+    turned = _moved(placed.names, bodies, np.repeat(turn[None], len(bodies), 0), placed.camera_pose)
+    table = SettlingTable(damping=0.0, timestep=TrialSpec().timestep)
+    for mesh, parts in zip(turned.meshes, turned.parts, strict=True):
+        table.add(Body(mesh, parts, MASS), np.eye(4))
     table.wait(WATCH_TIME)
-    for body, start, end in zip(bodies, poses, table.poses(), strict=True):
-        change = np.asarray(body.mesh.vertices) @ (end - start)[:3, :3].T + (end - start)[:3, 3]
-        if np.abs(change).max() > WATCH_SHIFT:
+    for mesh, pose in zip(turned.meshes, table.poses(), strict=True):
+        moved = np.asarray(mesh.vertices) @ (pose[:3, :3] - np.eye(3)).T + pose[:3, 3]
+        if np.abs(moved).max() > WATCH_SHIFT:
             return False
     return True
 
@@ -234,7 +243,15 @@ def _read_body(objects: Path | None, name: str) -> Body:
     """Return an object, kept for the next scene."""
     if objects is None:
         known = load_object(name)
-        return Body(known.mesh, known.parts, MASS)
+        return Body(known.mesh, [_coarse(part) for part in known.parts], MASS)
     scaled = (Path(objects) / "manifest.json").is_file()
     mesh = read_object_mesh(objects, name) if scaled else read_mesh(Path(objects) / name / "mesh.ply")
-    return Body(mesh, convex_parts(mesh), MASS)
+    return Body(mesh, [_coarse(part) for part in convex_parts(mesh)], MASS)
+
+
+def _coarse(part: "trimesh.Trimesh") -> "trimesh.Trimesh":
+    """Return a convex part of at most `CORNERS` corners, the farthest from each other."""
+    if len(part.vertices) <= CORNERS:
+        return part
+    corners = torch.from_numpy(np.array(part.vertices, dtype=np.float64))
+    return hull(corners[farthest_points(corners, CORNERS)].numpy())

@@ -47,7 +47,7 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
     """
     mesh = read_mesh(mesh)
     if mesh.is_convex:
-        return [_hull(mesh.vertices)]
+        return [hull(mesh.vertices)]
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     path = (home / "torchgrasp" if cache is None else Path(cache)) / f"{_fingerprint(mesh)}.safetensors"
     if path.is_file():
@@ -63,12 +63,12 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
     return _filled(parts)
 
 
-def _hull(corners: np.ndarray) -> "trimesh.Trimesh":
+def hull(corners: np.ndarray) -> "trimesh.Trimesh":
     """Return the convex hull of corners; Qhull may leave one open whose faces are flat but for rounding errors."""
     import trimesh
 
-    hull = trimesh.convex.convex_hull(corners)
-    return hull if hull.is_watertight else trimesh.convex.convex_hull(np.round(corners, 6))
+    body = trimesh.convex.convex_hull(corners)
+    return body if body.is_watertight else trimesh.convex.convex_hull(np.round(corners, 6))
 
 
 def _filled(parts: "list[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
@@ -138,6 +138,6 @@ def _load(path: Path) -> "list[trimesh.Trimesh]":
     tensors, _ = load_tensors(path, "parts", {"vertices", "counts"})
     try:
         corners = torch.split(tensors["vertices"], tensors["counts"].tolist())
-        return [_hull(c.numpy()) for c in corners]
+        return [hull(c.numpy()) for c in corners]
     except (QhullError, RuntimeError) as error:
         raise ModelFileError("path", f"{path}: {error}", "corners of bodies with a volume") from error

@@ -11,8 +11,8 @@ TIMESTEP = 1 / 240
 """Timestep [s]: bodies that fall need no finer one."""
 ROLLING_DAMPING = 2.0
 """Damping of rotation [1/s]: it stands for the rolling resistance that rigid balls lack."""
-PAUSE = 24
-"""Steps between two looks at the bodies: 0.1 s."""
+PAUSE = 0.1
+"""Time [s] between two looks at the bodies."""
 STILL_SHIFT, STILL_TURN = 5e-4, 0.01
 """Motion [m] and change of a rotation matrix in that time below which a body is still; a ball on facets trembles less,
 though its speed of the moment does not tell."""
@@ -24,17 +24,18 @@ class SettlingTable:
     Args:
         friction: of every contact.
         damping: of rotation [1/s].
+        timestep: [s].
 
     Raises:
         MissingExtra: SAPIEN is not installed.
     """
 
-    def __init__(self, friction: float = 0.8, damping: float = ROLLING_DAMPING) -> None:
+    def __init__(self, friction: float = 0.8, damping: float = ROLLING_DAMPING, timestep: float = TIMESTEP) -> None:
         self._sapien, self._physx = import_sapien()
-        self._system, self._scene = open_world(self._sapien, self._physx, 9.81, TIMESTEP)
+        self._system, self._scene = open_world(self._sapien, self._physx, 9.81, timestep)
         self._material = self._physx.PhysxMaterial(friction, friction, 0.0)
         place(self._sapien, self._scene, "table", table(self._physx, self._material), -TABLE[2] / 2)
-        self._damping = damping
+        self._damping, self._timestep = damping, timestep
         self._bodies: list[Any] = []
 
     def add(self, body: Body, pose: np.ndarray) -> None:
@@ -56,14 +57,14 @@ class SettlingTable:
 
     def wait(self, seconds: float) -> None:
         """Let time pass."""
-        for _ in range(round(seconds / TIMESTEP)):
+        for _ in range(round(seconds / self._timestep)):
             self._scene.step()
 
     def settle(self, seconds: float) -> bool:
         """Wait until all bodies are still, at most some seconds; return whether they are."""
         before = self.poses()
-        for _ in range(round(seconds / TIMESTEP / PAUSE)):
-            self.wait(PAUSE * TIMESTEP)
+        for _ in range(round(seconds / PAUSE)):
+            self.wait(PAUSE)
             poses = self.poses()
             change, before = np.abs(poses - before), poses
             if change[:, :3, 3].max() < STILL_SHIFT and change[:, :3, :3].max() < STILL_TURN:
