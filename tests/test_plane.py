@@ -5,7 +5,9 @@ import torch
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, inverse, rigid, rotation_from_vector
+from torchgrasp.linalg import unit
 from torchgrasp.plane import GRID, Plane, as_plane, cloud_to_upright, move, upright_frame
+from torchgrasp.shape.surface import Surface
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import PointCloud
 
@@ -71,3 +73,13 @@ def test_a_table_is_a_plane_a_height_or_nothing(table):
 def test_a_normal_has_unit_length():
     with pytest.raises(BadArgument, match="normal"):
         Plane(torch.tensor([0.0, 0, 2.0]), 0.0)
+
+
+def test_every_place_and_direction_of_a_surface_moves():
+    pose, points = random_pose(2), random_cloud(False).points
+    faces = torch.arange(48).view(-1, 3)
+    surface = Surface(points, faces, unit(points), points[:, 0])
+    there = move(surface, pose)
+    torch.testing.assert_close(there.vertices, apply(pose, points))
+    torch.testing.assert_close(there.normals, surface.normals @ pose[:3, :3].T)
+    assert torch.equal(there.std_m, surface.std_m) and torch.equal(there.faces, faces)

@@ -24,7 +24,7 @@ GRID = 2.0**-20
 PHASE = 1 / math.pi
 """Phase of the rounding: numbers from a file of float32 would often lie halfway between two multiples of `GRID`."""
 POINTS, DIRECTIONS, POSES = (
-    ("points", "viewpoint"),
+    ("points", "viewpoint", "vertices"),
     ("normals", "approach", "witness"),
     ("obj_from_hand", "obj_from_vf"),
 )

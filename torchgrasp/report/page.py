@@ -53,7 +53,7 @@ def draw_pictures(run: Run) -> dict[str, list[tuple[str, bytes]]]:
     if run.scene is not None:
         seen = [("The depth image: the target in full colour, the other things pale.", draw_depth(run.scene))]
         if len(best):
-            among = draw_among(run.scene, run.surface, run.hand, best[0], facing(best))
+            among = draw_among(run.scene, run.surface, run.hand, best[0], view)
             seen.append(("The best grasp among the measured points of the other things.", among))
         sections = {"The scene": seen, **sections}
     if len(best):

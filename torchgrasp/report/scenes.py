@@ -31,7 +31,7 @@ def draw_depth(scene: Scene) -> bytes:
     pixels = light[..., None] * _colors(labels)
     if scene.target is not None:
         others = (labels != scene.target)[..., None]
-        pixels = np.where(others, 0.55 * pixels + 0.4, pixels)
+        pixels = np.where(others, 0.4 * pixels + 0.55, pixels)
     pixels[~seen] = 1.0
     buffer = io.BytesIO()
     Image.fromarray(np.uint8(255 * np.clip(pixels, 0.0, 1.0))).save(buffer, format="PNG")
