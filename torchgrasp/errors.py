@@ -36,9 +36,6 @@ class SuspiciousScale(BadArgument):
 class NoSupport(BadArgument):
     """A scene shows no plane that things stand on, or more than one."""
 
-    def __init__(self, found: str):
-        super().__init__("table", found, "one plane with things on it and nothing below it, or a table that is given")
-
 
 class CloudFileError(BadArgument):
     """A point-cloud file is missing, empty, or of another format than its suffix."""

@@ -42,6 +42,8 @@ LOW, LEAST_OVER = 0.06, 0.05
 pan stands about its floor; a wall behind a table has most of its points higher up."""
 RIVAL = 0.15
 """A second plane with this share of the points of the first, at more than 15 degrees from it, makes both doubtful."""
+SUPPORT = "one plane with things on it and nothing below it, or a table that is given"
+"""What a scene must show."""
 
 
 def fit_support(
@@ -78,7 +80,7 @@ def fit_support(
     eye = None if viewpoint is None else check_tensor("viewpoint", viewpoint, (3,)).detach().cpu().double()
     sky = None if up is None else unit(check_tensor("up", up, (3,)).detach().cpu().double())
     if len(points) < 50:
-        raise NoSupport(f"{len(points)} points")
+        raise NoSupport("table", f"{len(points)} points", SUPPORT)
     generator = torch.Generator().manual_seed(seed)
     points = points[torch.randperm(len(points), generator=generator)[:SAMPLE]]
     centre = points.mean(0)
@@ -105,11 +107,11 @@ def fit_support(
         rest = (points[:SCORED] @ fit.normal - fit.offset).abs() > 3 * noise[:SCORED]
         held = held & rest & ~held[i]
     if not good:
-        raise NoSupport(reasons[0] if reasons else "no plane with enough points")
+        raise NoSupport("table", reasons[0] if reasons else "no plane with enough points", SUPPORT)
     first = max(good, key=lambda fit: fit.count)
     rivals = [fit for fit in good if fit.count > RIVAL * first.count and float(fit.normal @ first.normal) < 0.966]
     if rivals:
-        raise NoSupport("two planes that could be the table, and no `up` that tells which")
+        raise NoSupport("table", "two planes that could be the table, and no `up` that tells which", SUPPORT)
     return Plane(first.normal, first.offset + float(first.normal @ centre))
 
 

@@ -1,0 +1,43 @@
+"""Scenes from and to files."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchgrasp import load_scene, read_scene, save_scene
+from torchgrasp.base import named_tensors
+from torchgrasp.errors import BadArgument, CloudFileError
+from torchgrasp.scene.file import is_scene
+
+
+def test_a_saved_scene_comes_back(tmp_path):
+    scene = load_scene()
+    again = read_scene(save_scene(scene, tmp_path / "scene.npz"))
+    for name, tensor in named_tensors(scene).items():
+        torch.testing.assert_close(named_tensors(again)[name], tensor, rtol=0, atol=1e-6, msg=name)
+    assert is_scene(tmp_path / "scene.npz")
+
+
+def test_the_shipped_scene_stands_on_its_table():
+    scene = load_scene()
+    assert scene.things == (1, 2, 3, 4) and scene.advice == ()
+    heights = scene.table.height(scene.points)
+    assert float(heights[scene.labels == 0].abs().quantile(0.9)) < 0.005
+    for label in scene.things:
+        assert 0.05 < float(heights[scene.rows_of(label)].max()) < 0.3
+
+
+def test_other_files_are_refused(tmp_path):
+    np.savez(tmp_path / "cloud.npz", points=np.zeros((5, 3)))
+    assert not is_scene(tmp_path / "cloud.npz")
+    for name in ("cloud.npz", "none.npz", "scene.ply"):
+        with pytest.raises(CloudFileError, match="depth and intrinsics"):
+            read_scene(tmp_path / name)
+    with pytest.raises(BadArgument, match="npz"):
+        save_scene(load_scene(), tmp_path / "scene.ply")
+
+
+def test_pickled_arrays_are_refused(tmp_path):
+    np.savez(tmp_path / "scene.npz", depth=np.array([{}], dtype=object), intrinsics=np.eye(3))
+    with pytest.raises(CloudFileError):
+        read_scene(tmp_path / "scene.npz")
