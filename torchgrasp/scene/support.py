@@ -17,23 +17,26 @@ TRIPLES = 4000
 """Triples of points that propose planes: of a table with 10 % of the points, four lie wholly on it."""
 SCORED = 2000
 """Points that score each proposal: enough to tell 5 % from 4 %."""
-NOISE = 0.0015
-"""Noise [m] of a depth camera that is assumed until it is measured, at the points' median distance."""
+NOISE, NOISE_GROWTH = 0.001, 0.0035
+"""Noise [m] of a depth camera that is assumed until it is measured, and its growth with the squared distance [1/m]:
+0.12 px of a stereo camera's disparity."""
+FAR = 0.7
+"""Distance [m] from the camera that is assumed where it is unknown."""
 LEAST_SHARE = 0.05
 """Least share of the points on the plane."""
 MOST_BELOW = 0.06
 """Greatest number of points below, over the number on the plane: flying pixels at rims are fewer."""
 LEAST_STANDING = 0.001
 """Least share of the points that stand on the plane, over its own part of the picture: a table carries something."""
-LEAST_WIDTH = 0.03
-"""Least spread [m] of the points on the plane, as a standard deviation along its narrower side: a patch 0.1 m wide."""
+LEAST_WIDTH = 0.04
+"""Least spread [m] of the points on the plane, as a standard deviation along its narrower side: a patch 0.14 m wide."""
 REACH = 0.30
 """Height [m] of things, above or below a plane: a floor lies deeper below a table than this, and a wall goes on."""
 MOST_TILT = 30.0
 """Greatest angle [deg] between the normal and `up`."""
 LEAST_TILT = 5.0
 """Least angle [deg] between the plane and the line of sight of the middle of its points: flatter ones are grazed."""
-ROUGH = 1.5
+ROUGH = 0.9
 """Greatest noise about the plane, over the assumed one: points that are no plane spread farther."""
 PLANES = 8
 """Planes that are looked at, those with the most points first."""
@@ -127,10 +130,8 @@ class _Fit:
 
 def _noise(points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None) -> Float[Tensor, "n"]:
     """Return the assumed noise [m] of each point, that of a stereo camera."""
-    if eye is None:
-        return torch.full((len(points),), NOISE, dtype=points.dtype)
-    squared = (points - eye).square().sum(-1)
-    return NOISE * squared / squared.median()
+    squared = torch.full((len(points),), FAR**2, dtype=points.dtype) if eye is None else (points - eye).square().sum(-1)
+    return NOISE + NOISE_GROWTH * squared
 
 
 def _propose(
