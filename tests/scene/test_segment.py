@@ -67,3 +67,13 @@ def test_flying_pixels_belong_to_nothing():
     moved = DepthImage(flying, image.intrinsics, image.obj_from_camera)
     assert not on_surface(moved, TABLE)[row - 2 : row, column - 20 : column + 20].any()
     assert segment(moved, TABLE).max() == 1
+
+
+def test_the_floor_of_a_pan_belongs_to_it_and_the_table_in_a_ring_does_not():
+    rim = trimesh.creation.annulus(0.09, 0.1, 0.04).apply_translation([0, 0, 0.02])
+    floor = trimesh.creation.cylinder(0.095, 0.002).apply_translation([0, 0, 0.001])
+    pan, labels = look([trimesh.util.concatenate([rim, floor])], 60.0)
+    ring, _ = look([rim], 60.0)
+    inside = (pan.points()[..., :2].norm(dim=-1) < 0.07) & (labels == 1)
+    assert (segment(pan, TABLE)[inside & (pan.depth > 0)] == 1).double().mean() > 0.95
+    assert (segment(ring, TABLE)[inside & (ring.depth > 0)] == 0).double().mean() > 0.95

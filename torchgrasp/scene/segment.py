@@ -156,18 +156,18 @@ def _grown(points: Tensor, labels: Tensor, risen: Tensor) -> Int[Tensor, "h w"]:
 
 def _filled(labels: Tensor, measured: Tensor, height: Tensor) -> Int[Tensor, "h w"]:
     """Give the floor within a thing, enclosed and a little above the table, the label of the thing."""
-    from scipy.ndimage import find_objects, label
+    from scipy.ndimage import binary_dilation, find_objects, label
 
     holes = np.empty(labels.shape, dtype=np.int32)
     label((measured & (labels == 0)).numpy(), output=holes)
     whole = labels.clone()
     boxes: list[tuple[slice, slice]] = find_objects(holes)
     for number, box in enumerate(boxes, start=1):
-        row, column = (slice(max(0, side.start - 1), side.stop + 1) for side in box)
+        row, column = (slice(max(0, side.start - 2), side.stop + 2) for side in box)
         hole = torch.from_numpy(holes[row, column] == number)
         if int(hole.sum()) < FEW:
             continue
-        around = labels[row, column][~hole]
+        around = labels[row, column][torch.from_numpy(binary_dilation(hole.numpy(), iterations=2)) & ~hole]
         names = around[around > 0].unique()
         edge = bool(hole[0].any() | hole[-1].any() | hole[:, 0].any() | hole[:, -1].any())
         if len(names) == 1 and not edge and float(height[row, column][hole].median()) > LEAST_FLOOR:
