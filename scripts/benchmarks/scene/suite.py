@@ -10,13 +10,14 @@ from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks.common import Row, measure
+from benchmarks.scene.frames import measure_frames
 from benchmarks.scene.scenes import Picture, read_meshes, take_picture
 from torchgrasp.cloud.camera import INTRINSICS
 from torchgrasp.errors import BadArgument, NoSupport
 from torchgrasp.plane import Plane
 from torchgrasp.scene import Scene
 
-SUBJECTS = ("plane", "clicked point")
+SUBJECTS = ("plane", "clicked point", "frames")
 TABLES = ("apart", "apart", "crowded", "boxes", "close")
 """Kinds of scenes with a table, in turn."""
 EMPTY = ("lone", "lone", "apart", "boxes")
@@ -29,23 +30,28 @@ def scene(
     objects: Path,
     only: tuple[str, ...] = SUBJECTS,
     scenes: int = 300,
+    frames: int = 200,
+    trials: int = 20,
     seed: int = 0,
     out: Path = Path("out/bench_scene.json"),
 ) -> None:
-    """Measure how scenes are read from one depth image: the table's plane, and the thing at a clicked pixel.
+    """Measure how scenes are read from one depth image, and that results do not depend on the frame.
 
     Args:
         objects: folder with manifest.json and a folder for each object.
-        only: subjects to measure: plane, clicked point.
-        scenes: rendered scenes of each subject. As many without a table as a third of these are refused.
+        only: subjects to measure: plane, clicked point, frames.
+        scenes: rendered scenes of the first two subjects. As many without a table as a third of these are refused.
+        frames: random frames in which grasps are planned.
+        trials: of these, frames in which the best grasp is closed in simulation.
         seed: of the scenes.
         out: where the numbers are written as JSON.
     """
     torch.set_num_threads(1)
-    meshes = read_meshes(objects)
+    meshes = read_meshes(objects) if set(only) - {"frames"} else []
     subjects = {
         "plane": lambda: bench_plane(meshes, scenes, seed),
         "clicked point": lambda: bench_click(meshes, scenes, seed),
+        "frames": lambda: measure_frames(frames, trials, seed),
     }
     measure("scene", subjects, only, {"scenes": scenes, "seed": seed, "objects": len(meshes)}, out)
 
