@@ -40,6 +40,7 @@ from torchgrasp.ik import IKSolution, PostureLibrary, solve_ik
 from torchgrasp.pipeline import plan_grasps
 from torchgrasp.clutter import ScenePlan, ThingPlan, plan_scene
 from torchgrasp.control import ClosingReference, GraspController, closing_gains
+from torchgrasp.sim import Neighbour
 from torchgrasp.evaluation import close_hand
 
 __version__ = "0.1.0"
@@ -98,5 +99,6 @@ __all__ = [
     "ClosingReference",
     "GraspController",
     "closing_gains",
+    "Neighbour",
     "close_hand",
 ]
