@@ -4,11 +4,11 @@ import dataclasses
 
 import torch
 
+from torchgrasp.closing import ClosingGains
 from torchgrasp.control import ClosingReference, Observation, no_contact
 from torchgrasp.control.closing_law import surface_covariance
 from torchgrasp.hand.joints import ActuatedJoints
 from torchgrasp.hand.load import load_hand
-from torchgrasp.values import ClosingGains
 
 PERIOD = 0.01
 FREE, TOUCHING = torch.zeros(3, dtype=torch.bool), torch.ones(3, dtype=torch.bool)

@@ -8,19 +8,16 @@ from torchgrasp.plane import Plane
 from torchgrasp.specs import ContactSpec, TrialSpec
 from torchgrasp.values import (
     Certificate,
-    ClosingGains,
-    ClosureResult,
     ContactCode,
     ContactPlan,
     Contacts,
-    Disturbance,
     Grasps,
     IKSeeds,
-    ObjectMotion,
     PointCloud,
     ShapeEstimate,
     load_grasps,
 )
+from torchgrasp.closing import ClosingGains, ClosureResult, Disturbance, ObjectMotion
 from torchgrasp.cloud import cloud_from_depth, merge_clouds, read_cloud
 from torchgrasp.scene import Scene, read_scene, save_scene
 from torchgrasp.objects import GraspObject, list_objects, load_object, load_scene

@@ -7,21 +7,13 @@ import pytest
 import torch
 import trimesh
 
+from torchgrasp.closing import ClosureResult, Disturbance, ObjectMotion
 from torchgrasp.errors import Status
 from torchgrasp.hand.load import load_hand
 from torchgrasp.report.run import Run, Stage
 from torchgrasp.shape.surface import Surface
 from torchgrasp.specs import ContactSpec
-from torchgrasp.values import (
-    Certificate,
-    ClosureResult,
-    ContactPlan,
-    Contacts,
-    Disturbance,
-    Grasps,
-    ObjectMotion,
-    PointCloud,
-)
+from torchgrasp.values import Certificate, ContactPlan, Contacts, Grasps, PointCloud
 
 F64 = torch.float64
 

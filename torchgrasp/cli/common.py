@@ -49,8 +49,8 @@ class ViewOptions:
         no_normals: fit normals in place of the file's.
         unit: of the numbers in the file; all options and results are in metres.
         up: the vertical in the frame of the cloud, of any length; by default z.
-        camera_pose: file with frame_from_camera, 4 x 4 (.npy, or .txt): the cloud is in the camera's frame (x right,
-            y down, z forward) and is moved into the pose's frame, in which results are; the camera is known then.
+        camera_pose: file with frame_from_camera, 4 x 4 (.npy, or .txt), for a cloud in the camera's frame (x right,
+            y down, z forward). The cloud is moved into the pose's frame. Results are there, and the camera is known.
     """
 
     viewpoint: tuple[float, float, float] | None = None

@@ -93,6 +93,8 @@ def grasp(
     with naming(path="--out"):
         check_folder(out)
     if is_scene(cloud):
+        if label is not None and point is not None:
+            raise BadArgument("--point", "--label beside it", "one of the two")
         if mesh is not None or view != AS_IT_IS or table is not None or no_table or mode != "joint":
             found = "an option of clouds beside a scene"
             raise BadArgument("CLOUD", found, "--label or --point, --hand, --out, --seed, --starts and --friction")
@@ -100,7 +102,7 @@ def grasp(
             the_hand, spec = load_hand(hand), ContactSpec(friction=friction)
         check_whole("--starts", starts, 1, 1_000_000)
         check_seed(seed)
-        return grasp_scene(cloud, the_hand, spec, (starts, seed), label, point, out)
+        return grasp_scene(cloud, the_hand, spec, (starts, seed), point if label is None else label, out)
     if label is not None or point is not None:
         raise BadArgument("--label, --point", f"{cloud}, which is no scene", "a .npz file with depth and intrinsics")
     if close:

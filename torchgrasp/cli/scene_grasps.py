@@ -25,22 +25,20 @@ def grasp_scene(
     hand: Hand,
     spec: ContactSpec,
     numbers: tuple[int, int],
-    label: int | None,
-    point: tuple[float, float] | None,
+    choice: int | tuple[float, float] | None,
     out: Path,
 ) -> int:
     """Plan grasps of a thing of a scene, and write them with a report.
 
     Args:
         numbers: starts, and the seed.
-        label, point: of the thing, at most one of the two; None: the easiest thing.
+        choice: label of the thing, or column and row of a pixel on it; None: the easiest thing.
     """
     starts, seed = numbers
     names = {name: f"CLOUD: {name}" for name in ("depth", "intrinsics", "mask", "labels", "camera_pose", "table")}
     with naming(path="CLOUD", points="CLOUD", target="--label", point="--point", **names):
         scene = read_scene(path)
-        chosen = point if label is None else label
-        scene = scene if chosen is None else scene.select(chosen)
+        scene = scene if choice is None else scene.select(choice)
     progress = Progress("scene", "shape", "plan", "certify", "query", "refine", "report")
     with progress.bar:
         progress.end("scene", f"{len(scene.things)} things, labels {', '.join(map(str, scene.things))}")

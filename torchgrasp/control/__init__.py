@@ -5,7 +5,7 @@ from torchgrasp.control.forces import Squeeze, squeeze
 from torchgrasp.control.observation import Observation, observe
 from torchgrasp.control.reference import ClosingReference, closing_gains
 from torchgrasp.control.tactile import TactileState, TipContact, measure, no_contact
-from torchgrasp.values import ClosingGains
+from torchgrasp.closing import ClosingGains
 
 __all__ = [
     "ClosingGains",

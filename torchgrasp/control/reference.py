@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value, check_tensor
+from torchgrasp.closing import ClosingGains
 from torchgrasp.control.closing_law import (
     FORCE_BANDWIDTH,
     FORCE_FLOOR,
@@ -20,7 +21,7 @@ from torchgrasp.control.forces import check_squeeze, contacts_in_hand, desired_f
 from torchgrasp.control.stiffness import drive_stiffness, joint_stiffness, tip_compliance
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand import Hand
-from torchgrasp.values import ClosingGains, Grasps
+from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
     from torchgrasp.control.adaptive.stability import StabilityModel

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.closing import ClosureResult, Disturbance, ObjectMotion
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun, smooth_step
 from torchgrasp.frames import apply, inverse, rotation_angle
@@ -19,7 +20,7 @@ from torchgrasp.plane import Plane
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.sim.scene import Neighbour
 from torchgrasp.specs import TrialSpec
-from torchgrasp.values import ClosureResult, Disturbance, Grasps, ObjectMotion
+from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
     import trimesh

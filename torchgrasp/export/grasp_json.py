@@ -14,7 +14,7 @@ from torchgrasp.files import format_json
 from torchgrasp.frames import rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.ik.approach import APPROACH_DISTANCE
+from torchgrasp.ik.motion import APPROACH_DISTANCE
 from torchgrasp.values import Grasps
 
 CONVENTIONS = {

@@ -8,7 +8,7 @@ from torchgrasp.control.forces import squeeze
 from torchgrasp.export.grasp_json import quaternion
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.ik.approach import APPROACH_DISTANCE
+from torchgrasp.ik.motion import APPROACH_DISTANCE
 from torchgrasp.sim.mjcf import add_drive, add_links, format_numbers
 from torchgrasp.values import Grasps
 

@@ -11,11 +11,10 @@ from torchgrasp.base import Batch, Value
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import rotate
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.approach import find_approach
 from torchgrasp.ik.checks import is_clear, measure_errors
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration
-from torchgrasp.ik.motion import motion_clearance
+from torchgrasp.ik.motion import find_approach, motion_clearance
 from torchgrasp.ik.ranking import score
 from torchgrasp.ik.refine import open_hand
 from torchgrasp.values import Certificate, Contacts, Grasps, IKSeeds

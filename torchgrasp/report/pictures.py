@@ -8,13 +8,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.closing import ClosureResult
 from torchgrasp.frames import apply, inverse, rotation_angle
 from torchgrasp.hand.hand import Hand
 from torchgrasp.report.canvas import Canvas, Direction, map_colors
 from torchgrasp.report.palette import FINGERS, GRID, INK, OBJECT, PAPER
 from torchgrasp.report.solids import solids_from_hand
 from torchgrasp.shape.surface import Surface
-from torchgrasp.values import ClosureResult, Contacts, Grasps, PointCloud
+from torchgrasp.values import Contacts, Grasps, PointCloud
 
 if TYPE_CHECKING:
     import trimesh

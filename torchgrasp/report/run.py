@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 
 from torchgrasp.base import count_status
+from torchgrasp.closing import ClosureResult
 from torchgrasp.errors import Status
 from torchgrasp.frames import inverse
 from torchgrasp.hand.hand import Hand
@@ -15,7 +16,7 @@ from torchgrasp.plane import move, upright_frame
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.surface import Surface
 from torchgrasp.specs import ContactSpec
-from torchgrasp.values import ClosureResult, ContactPlan, Grasps, PointCloud
+from torchgrasp.values import ContactPlan, Grasps, PointCloud
 
 if TYPE_CHECKING:
     import trimesh

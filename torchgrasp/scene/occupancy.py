@@ -125,9 +125,12 @@ def find_nearest(pixels: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Int
 def shadow_features(shadows: Shadows, owner: int, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 6"]:
     """Return what tells whether points [m] in the shadow of a thing are full.
 
-    The depth behind its surface over its width; the depth [m] under its seen points, those of a column; how deep [m]
-    the mirrored point lies behind what was measured there, for two guesses of the middle; the distance from its front
-    over its seen depth, and from its middle over its width.
+    These are, in order:
+
+    * the depth behind its surface over its width,
+    * the depth [m] under its seen points in the same column,
+    * how deep [m] the mirrored point lies behind what was measured, for two guesses of the middle,
+    * the distance from its front over its seen depth, and from its middle over its width.
     """
     from scipy.ndimage import maximum_filter
 

@@ -19,6 +19,7 @@ from torchgrasp.sim.scene import (
 )
 
 _PLACES = {"neighbour": NEIGHBOURS, "table": TABLETOP, "object": TARGET}
+"""Column of `Disturbance` for the bodies of each name."""
 
 
 class SapienScene(Scene):
