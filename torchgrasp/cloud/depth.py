@@ -23,7 +23,7 @@ MIN_PIXELS = 4
 
 def cloud_from_depth(
     depth: Tensor | np.ndarray,
-    intrinsics: Tensor | np.ndarray | Sequence[float],
+    intrinsics: Tensor | np.ndarray | Sequence[float | int],
     mask: Tensor | np.ndarray | None = None,
     camera_pose: Tensor | np.ndarray | None = None,
 ) -> PointCloud:
@@ -64,7 +64,7 @@ def cloud_from_depth(
 
 def read_depth(
     depth: Tensor | np.ndarray,
-    intrinsics: Tensor | np.ndarray | Sequence[float],
+    intrinsics: Tensor | np.ndarray | Sequence[float | int],
     mask: Tensor | np.ndarray | None = None,
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "3 3"], Bool[Tensor, "h w"] | None]:
     """Check a depth image; return depth [m] (0: not measured), the matrix of intrinsics and the mask.
@@ -104,7 +104,9 @@ def read_depth(
     return metres, k, (inside != 0).to(image.device)
 
 
-def _read_intrinsics(intrinsics: Tensor | np.ndarray | Sequence[float], size: Sequence[int]) -> Float[Tensor, "3 3"]:
+def _read_intrinsics(
+    intrinsics: Tensor | np.ndarray | Sequence[float | int], size: Sequence[int]
+) -> Float[Tensor, "3 3"]:
     """Return the matrix of intrinsics [px] of an image (h, w), or refuse it."""
     k = _as_tensor("intrinsics", intrinsics).double()
     if k.shape == (4,):
@@ -123,7 +125,7 @@ def _read_intrinsics(intrinsics: Tensor | np.ndarray | Sequence[float], size: Se
     return k
 
 
-def _as_tensor(name: str, value: Tensor | np.ndarray | Sequence[float]) -> Tensor:
+def _as_tensor(name: str, value: Tensor | np.ndarray | Sequence[float | int]) -> Tensor:
     """Return an array of any kind as a tensor, or refuse it."""
     if isinstance(value, Tensor):
         return value

@@ -1,5 +1,6 @@
 """Tasks on worker processes: a simulator that hangs or dies costs its own task alone."""
 
+import contextlib
 import math
 import multiprocessing
 import os
@@ -14,6 +15,9 @@ from torchgrasp.base import check_number, check_whole
 from torchgrasp.errors import MissingExtra, Status
 
 Result = TypeVar("Result")
+
+JOIN_TIME = 10.0
+"""Longest time [s] for stopped workers to end: they are killed, which takes milliseconds."""
 
 
 def run_tasks(
@@ -67,7 +71,8 @@ def _run(
             yield result
     finally:
         pool.stop()
-        pool.join()
+        with contextlib.suppress(TimeoutError):  # a signal can leave pebble's threads waiting for each other
+            pool.join(JOIN_TIME)
 
 
 def _begin(function: Callable[..., Any]) -> None:

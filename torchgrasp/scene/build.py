@@ -33,7 +33,7 @@ WIDEST = 75.0
 
 def read_image(
     depth: Tensor | np.ndarray,
-    intrinsics: Tensor | np.ndarray | Sequence[float],
+    intrinsics: Tensor | np.ndarray | Sequence[float | int],
     camera_pose: Tensor | np.ndarray | None,
 ) -> DepthImage:
     """Return a checked depth image in float64 [m]; a missing pose is the camera's own frame."""

@@ -48,14 +48,14 @@ class Scene(Value):
     def from_depth(
         cls,
         depth: Tensor | np.ndarray,
-        intrinsics: Tensor | np.ndarray | Sequence[float],
+        intrinsics: Tensor | np.ndarray | Sequence[float | int],
         camera_pose: Tensor | np.ndarray | None = None,
         *,
         mask: Tensor | np.ndarray | None = None,
         labels: Tensor | np.ndarray | None = None,
-        point: Sequence[float] | Tensor | np.ndarray | None = None,
+        point: Sequence[float | int] | Tensor | np.ndarray | None = None,
         table: Plane | float | None = None,
-        up: Sequence[float] | Tensor | np.ndarray | None = None,
+        up: Sequence[float | int] | Tensor | np.ndarray | None = None,
     ) -> "Scene":
         """Return the scene in a pinhole camera's depth image.
 
@@ -97,10 +97,10 @@ class Scene(Value):
         *,
         labels: Tensor | np.ndarray | None = None,
         mask: Tensor | np.ndarray | None = None,
-        box: Tensor | np.ndarray | Sequence[Sequence[float]] | None = None,
-        point: Sequence[float] | Tensor | np.ndarray | None = None,
+        box: Tensor | np.ndarray | Sequence[Sequence[float | int]] | None = None,
+        point: Sequence[float | int] | Tensor | np.ndarray | None = None,
         table: Plane | float | None = None,
-        up: Sequence[float] | Tensor | np.ndarray | None = None,
+        up: Sequence[float | int] | Tensor | np.ndarray | None = None,
     ) -> "Scene":
         """Return the scene in a cloud of one view.
 
@@ -152,7 +152,7 @@ class Scene(Value):
         scene = cls(points, own, image, pixels, plane, None if inside is None else 1)
         return scene if point is None else scene.select(point)
 
-    def select(self, target: int | Sequence[float] | Tensor | np.ndarray) -> "Scene":
+    def select(self, target: int | Sequence[float | int] | Tensor | np.ndarray) -> "Scene":
         """Return the scene with another target.
 
         Args:

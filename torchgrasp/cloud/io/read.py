@@ -102,7 +102,7 @@ def read_cloud_file(
 
 
 def cloud_from_array(
-    points: np.ndarray, normals: np.ndarray | None = None, viewpoint: np.ndarray | Sequence[float] | None = None
+    points: np.ndarray, normals: np.ndarray | None = None, viewpoint: np.ndarray | Sequence[float | int] | None = None
 ) -> PointCloud:
     """Return the cloud of NumPy arrays [m] by the rules of `read_cloud`: missing rows and colours are left out.
 
