@@ -10,7 +10,7 @@ import trimesh
 
 from torchgrasp import PointCloud
 from torchgrasp.cloud.io.read import save_cloud
-from torchgrasp.datasets import list_views, read_object_mesh, read_view
+from torchgrasp.datasets import list_views, read_family, read_group, read_object_mesh, read_view
 from torchgrasp.errors import BadArgument, MeshError
 
 
@@ -29,7 +29,10 @@ def folder(tmp_path: Path) -> Path:
     pose = np.eye(4)
     pose[:3, 3] = [0.0, 0.0, 2.0]
     views = {view: {"T_object_camera": pose.tolist()} for view in ("view1", "view0")}
-    entries = {"torn": {"views": {}}, "box": {"suggested_scale": 0.5, "views": views}}
+    entries = {
+        "torn": {"views": {}},
+        "box": {"suggested_scale": 0.5, "family": "cuboid", "group": "solid", "views": views},
+    }
     (tmp_path / "manifest.json").write_text(json.dumps({"objects": entries}))
     return tmp_path
 
@@ -38,6 +41,11 @@ def test_views_are_listed_in_order(folder: Path):
     assert list_views(folder) == [("box", "view0"), ("box", "view1")]
     assert list_views(folder, whole=True) == [("box", "whole"), ("torn", "whole")]
     assert list_views(folder, only=["torn"]) == []
+
+
+def test_an_object_without_family_is_one_of_its_own(folder: Path):
+    assert (read_family(folder, "box"), read_group(folder, "box")) == ("cuboid", "solid")
+    assert (read_family(folder, "torn"), read_group(folder, "torn")) == ("torn", "")
 
 
 def test_views_and_meshes_come_at_the_suggested_scale(folder: Path):

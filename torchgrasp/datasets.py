@@ -2,7 +2,8 @@
 
 `manifest.json` holds "objects" by name. An object has "views" by name, each with "T_object_camera" (4x4). Its folder
 has `mesh.ply` and `<view>_noisy.ply` [m], resting at z = 0. All readers apply the object's "suggested_scale"
-(default 1), at which a hand can grasp it.
+(default 1), at which a hand can grasp it. Optional are the "family" of look-alikes that it belongs to, and its "group",
+such as "solid".
 """
 
 import json
@@ -48,6 +49,16 @@ def read_view(objects: Path, name: str, view: str, camera: bool = True) -> Point
 def read_object_mesh(objects: Path, name: str) -> "trimesh.Trimesh":
     """Return the true mesh of an object; raises as `read_mesh`."""
     return read_mesh(Path(objects) / name / "mesh.ply").apply_scale(_scale(_read_manifest(objects, [name])[name]))
+
+
+def read_family(objects: Path, name: str) -> str:
+    """Return the family of look-alikes of an object: its own name if the manifest has none."""
+    return str(_read_manifest(objects, [name])[name].get("family", name))
+
+
+def read_group(objects: Path, name: str) -> str:
+    """Return the group of an object, such as "solid", "thin" or "shell": "" if the manifest has none."""
+    return str(_read_manifest(objects, [name])[name].get("group", ""))
 
 
 def _scale(entry: dict[str, Any]) -> float:

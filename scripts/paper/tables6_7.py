@@ -11,7 +11,7 @@ import numpy as np
 from paper.closing_trials import PAPER, THRESHOLDS, Cell, TableSpec, closing_cells, threshold_cells
 from torchgrasp.columns import format_line
 from torchgrasp.errors import Status
-from torchgrasp.evaluation import share
+from torchgrasp.evaluation import Share, share_over
 from torchgrasp.files import format_json, write_file
 
 PUBLISHED = {
@@ -94,7 +94,7 @@ def gather(cells: Iterator[tuple[Cell, ...]]) -> list[list[Cell]]:
             row.append(cell)
     print()
     for row in rows:
-        value, low, high, total = pooled(row)
+        value, low, high, total, _ = pooled(row)
         reasons = Counter(s.name.lower() for cell in row for s in cell.statuses if s.name != "OK")
         told = f"{value:6.1%} [{low:.1%}, {high:.1%}] of {total}; the paper: {PUBLISHED.get(row[0].row, '-')} %"
         print(
@@ -105,9 +105,9 @@ def gather(cells: Iterator[tuple[Cell, ...]]) -> list[list[Cell]]:
     return rows
 
 
-def pooled(row: list[Cell]) -> tuple[float, float, float, int]:
-    """Return the share of a row's trials that held, its 95 % Wilson interval, and their number."""
-    return share(sum(cell.held for cell in row), sum(len(cell.statuses) for cell in row))
+def pooled(row: list[Cell]) -> Share:
+    """Return the share of a row's trials that held, with its interval over objects."""
+    return share_over({cell.object: _of(row, cell.object) for cell in row})
 
 
 def in_points(value: tuple[float, float, float]) -> str:

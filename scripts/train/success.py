@@ -35,7 +35,7 @@ def success(
     trials = read_trials(objects, hands, grasps, workers, folder)
     unseen, base = leave_one_out(trials)
     print(*judge(unseen, base, trials), sep="\n")
-    draw_reliability(folder / "reliability.png", unseen, trials.passed)
+    draw_reliability(folder / "reliability.png", unseen, trials)
     weights, bias = fit(trials)
     bodies, share = len(set(trials.object)), trials.passed.mean()
     content = {

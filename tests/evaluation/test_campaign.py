@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +15,14 @@ from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.campaign import EvaluationSpec, choose_rows, evaluate, run_protocol
 from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.protocols import PROTOCOLS, Protocol
-from torchgrasp.evaluation.score import STAGES, share, summarise
+from torchgrasp.evaluation.score import STAGES, summarise
 from torchgrasp.files import hold_folder
 from torchgrasp.hand.load import load_hand
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import load_grasps
+
+FAMILIES = ((0, "round", "solid"), (1, "round", "solid"), (2, "round", "thin"), (3, "wire", "thin"))
+"""Row of `SCORES`, family and group."""
 
 
 def test_shares_count_every_view_and_failures_their_stage():
@@ -40,11 +42,12 @@ def test_shares_count_every_view_and_failures_their_stage():
     assert summarise(noisy)["top1"][::3] == (1 / 4, 4)  # two draws each, of the refused view too
 
 
-def test_wilson_intervals():
-    low, high = share(8, 10)[1:3]  # Wilson (1927) by hand
-    z2 = 1.959963985**2
-    middle, half = (0.8 + z2 / 20) / (1 + z2 / 10), 1.959963985 * math.sqrt(0.16 / 10 + z2 / 400) / (1 + z2 / 10)
-    assert (low, high) == (pytest.approx(middle - half), pytest.approx(middle + half))
+def test_groups_and_families_come_from_the_scores():
+    scores = [dataclasses.replace(SCORES[k], family=family, group=group) for k, family, group in FAMILIES]
+    found = summarise(scores)
+    assert found["by_group"].keys() == {"solid", "thin"}
+    assert found["by_group"]["solid"]["top1"][::3] == (1 / 2, 2)
+    assert found["objects"].units == 2 and found["gsr"].units == 1
 
 
 def test_every_status_of_an_attempt_has_one_stage():

@@ -5,27 +5,43 @@ import math
 import pytest
 import torch
 
+from tests.pinch import cylinder, pinch
 from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.protocols import (
+    PROTOCOLS,
     PoseNoise,
     apply_error,
+    draw_error,
     draw_hand_errors,
     draw_object_poses,
     error_from_object_pose,
+    seed_of,
 )
 from torchgrasp.frames import apply, inverse, rigid, rotation_angle, rotation_from_vector
 
 
 def test_errors_of_the_pose_stay_within_the_protocol_s():
-    noise = PoseNoise(0.005, math.radians(5), 200)
-    errors = draw_hand_errors(noise, 3, seed=1)
-    assert errors.shape == (3, 200, 4, 4)
+    noise = PoseNoise(0.005, math.radians(5))
+    errors = draw_hand_errors(noise, 600, seed=1)
+    assert errors.shape == (600, 4, 4)
     assert 0.0048 < float(errors[..., :3, 3].abs().max()) <= 0.005
     angle = rotation_angle(errors[..., :3, :3])
     assert math.radians(5) < float(angle.max()) <= math.radians(5) * 3**0.5
-    assert torch.equal(errors, draw_hand_errors(noise, 3, seed=1))
+    assert torch.equal(errors, draw_hand_errors(noise, 600, seed=1))
     still = draw_hand_errors(PoseNoise(), 2, seed=0)
-    assert torch.equal(still, torch.eye(4, dtype=torch.float64).expand(2, 1, 4, 4))
+    assert torch.equal(still, torch.eye(4, dtype=torch.float64).expand(2, 4, 4))
+
+
+def test_every_object_view_row_and_draw_has_an_error_of_its_own_that_others_do_not_change():
+    names = [(o, v, r, d) for o in ("tin", "cup") for v in ("view0", "view1") for r in range(3) for d in range(3)]
+    seeds = {seed_of(seed, *name) for seed in (0, 1) for name in names}
+    assert len(seeds) == 2 * len(names) and all(0 <= seed < 2**63 for seed in seeds)
+    assert seed_of(0, "a", "b") != seed_of(0, "ab") and seed_of(0, "1") != seed_of(0, 1)
+    mesh, (_, grasp) = cylinder(), pinch("allegro")
+    for name in ("paper", "pose-noise"):
+        errors = torch.stack([draw_error(PROTOCOLS[name], grasp, mesh, seed_of(0, *row)) for row in names])
+        assert len(errors[:, :3, 3].unique(dim=0)) == len(names)
+        assert torch.equal(draw_error(PROTOCOLS[name], grasp, mesh, seed_of(0, *names[-1])), errors[-1])
 
 
 def test_an_object_is_moved_on_its_table_and_turned_about_the_vertical() -> None:

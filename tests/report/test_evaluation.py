@@ -5,7 +5,7 @@ import re
 import pytest
 
 from tests.scores import SCORES
-from torchgrasp.evaluation.score import share
+from torchgrasp.evaluation.intervals import share_over
 from torchgrasp.report.evaluation import WIDTH, bar, format_evaluation, write_evaluation
 
 
@@ -19,7 +19,7 @@ def test_page_shows_shares_objects_and_reasons(tmp_path):
 
 
 def test_a_bar_ends_where_the_interval_does():
-    found = share(3, 10)
+    found = share_over({"tin": (1, 4), "cup": (2, 6)})
     ends = [float(x) for x in re.findall(r'x[12]="([\d.]+)"', bar(found))[2:]]
     at = float(re.findall(r'cx="([\d.]+)"', bar(found))[0])
     for drawn, value in zip((*ends, at), (found[1], found[2], found[0]), strict=True):

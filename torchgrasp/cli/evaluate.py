@@ -12,6 +12,7 @@ from torchgrasp.columns import format_columns, format_line
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.campaign import EvaluationSpec, Ranks
 from torchgrasp.evaluation.campaign import evaluate as evaluate_views
+from torchgrasp.evaluation.intervals import format_share
 from torchgrasp.evaluation.protocols import find_protocol
 from torchgrasp.evaluation.scenes import ClutterSpec
 from torchgrasp.evaluation.score import ViewScore, summarise
@@ -48,9 +49,9 @@ def evaluate(
 ) -> int:
     """Plan on each noisy view of a folder's objects and test the best grasps in simulation.
 
-    Prints a line for each view, then shares with 95 % Wilson intervals. Writes evaluate.json, evaluate.html, and a
-    folder of grasps. With --scenes objects are dropped on a table, and the easiest one is lifted among its neighbours
-    after one look: the trial of protocol "paper". Then only evaluate.json is written.
+    Prints a line for each view, then shares with 95 % intervals over families of objects. Writes evaluate.json,
+    evaluate.html, and a folder of grasps. With --scenes objects are dropped on a table, and the easiest one is lifted
+    among its neighbours after one look: the trial of protocol "paper". Then only evaluate.json is written.
 
     Args:
         objects: folder with manifest.json, and for each object mesh.ply and noisy views. Scenes need mesh.ply only, and
@@ -100,8 +101,8 @@ def evaluate(
                 print_score(score)
                 scores.append(score)
         summary = summarise(scores)
-        print_summary(protocol, summary)
-        asked = {"hand": hand, "hand_sha256": the_hand.source.sha256, **dataclasses.asdict(spec)}
+        print_summary(protocol, spec.tried, summary)
+        asked = {"hand": hand, "tried": spec.tried, "hand_sha256": the_hand.source.sha256, **dataclasses.asdict(spec)}
         asked["protocol"] = dataclasses.asdict(test)
         content = {"asked": asked, "summary": summary, "views": [dataclasses.asdict(score) for score in scores]}
         write_file(out / "evaluate.json", format_json(content))
@@ -118,12 +119,18 @@ def print_score(score: ViewScore) -> None:
     print(format_line((score.object, score.view, score.executable, passed, reasons), (-12, -6, 5, 7, -1)), flush=True)
 
 
-def print_summary(protocol: str, summary: dict[str, Any]) -> None:
-    """Print shares, failures by stage, and cost."""
-    rows = [(text, "{:.1%} [{:.1%}, {:.1%}] of {}".format(*summary[key])) for key, text in SHARE_NAMES.items()]
+def print_summary(protocol: str, tried: str, summary: dict[str, Any]) -> None:
+    """Print shares, those of each group of objects, failures by stage, and cost."""
+    rows = [(text, format_share(summary[key])) for key, text in SHARE_NAMES.items()]
+    for name, group in summary["by_group"].items():
+        rows += [(f"{name}: {text}", format_share(group[key])) for key, text in SHARE_NAMES.items()]
+    if summary["refused"]:
+        rows.append(
+            ("views without a grasp", f"{summary['refused']}: a failure of the best one, not in the grasps tried")
+        )
     for stage, reasons in summary["failures"].items():
         rows.append((f"failed in {stage}", ", ".join(f"{n} {name.lower()}" for name, n in reasons.items())))
-    print(f"\n{protocol}\n{format_columns(rows, left={0, 1})}")
+    print(f"\n{protocol}, {tried}\n{format_columns(rows, left={0, 1})}")
     means = [summary[key] for key in ("force_n", "overlap_mm", "overlap_mm_max", "plan_cpu_s", "trial_cpu_s", "cpu_s")]
     force, overlap, most, plan, trial, total = ("-" if mean is None else f"{mean:.2f}" for mean in means)
     print(f"mean normal force of a finger {force} N, overlap at the grasp {overlap} mm (most {most} mm)")

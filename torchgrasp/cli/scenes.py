@@ -6,6 +6,7 @@ from typing import Any
 
 from torchgrasp.cli.common import naming
 from torchgrasp.columns import format_columns, format_line
+from torchgrasp.evaluation.intervals import format_share
 from torchgrasp.evaluation.scenes import ClutterSpec, SceneScore, evaluate_scenes, scene_record, summarise_scenes
 from torchgrasp.files import format_json, hold_folder, write_file
 from torchgrasp.hand.hand import Hand
@@ -51,7 +52,7 @@ def print_scene(score: SceneScore) -> None:
 def print_clutter(summary: dict[str, Any], clear: bool) -> None:
     """Print shares, failures, and cost."""
     names = {key: text for key, text in SHARES.items() if clear or "cleared" not in key}
-    rows = [(text, "{:.1%} [{:.1%}, {:.1%}] of {}".format(*summary[key])) for key, text in names.items()]
+    rows = [(text, format_share(summary[key], "scenes")) for key, text in names.items()]
     if clear and summary["tries_per_object"] is not None:
         rows.append(("tries for each object taken", f"{summary['tries_per_object']:.2f}"))
     failed = ", ".join(f"{n} {name.lower()}" for name, n in summary["failures"].items())

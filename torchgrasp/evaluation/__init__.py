@@ -2,13 +2,14 @@
 
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
 from torchgrasp.evaluation.campaign import EvaluationSpec, evaluate, run_protocol
+from torchgrasp.evaluation.intervals import Share, contrast_over, count_by, difference_over, format_share, share_over
 from torchgrasp.evaluation.lift import close_hand, lift_grasp
 from torchgrasp.evaluation.placed import PlacedScene, drop
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.evaluation.protocols import PROTOCOLS, PoseNoise, Protocol, PullSpec, apply_error
-from torchgrasp.evaluation.protocols import draw_error, draw_hand_errors, draw_object_poses, find_protocol
+from torchgrasp.evaluation.protocols import draw_error, draw_hand_errors, draw_object_poses, find_protocol, seed_of
 from torchgrasp.evaluation.pull import PullResult, pull_grasp
-from torchgrasp.evaluation.score import ProtocolResult, ViewScore, share, summarise
+from torchgrasp.evaluation.score import ProtocolResult, ViewScore, summarise
 
 __all__ = [
     "PROTOCOLS",
@@ -20,21 +21,27 @@ __all__ = [
     "ProtocolResult",
     "PullResult",
     "PullSpec",
+    "Share",
     "TrialDriver",
     "TrialRun",
     "ViewScore",
     "apply_error",
     "close_hand",
+    "contrast_over",
+    "count_by",
+    "difference_over",
     "draw_error",
     "draw_hand_errors",
     "draw_object_poses",
     "drop",
     "evaluate",
     "find_protocol",
+    "format_share",
     "lift_grasp",
     "pull_grasp",
     "run_protocol",
     "run_tasks",
-    "share",
+    "seed_of",
+    "share_over",
     "summarise",
 ]

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import torch
 
 from torchgrasp.base import Value, check_whole, count_status
-from torchgrasp.datasets import list_views, read_object_mesh, read_view
+from torchgrasp.datasets import list_views, read_family, read_group, read_object_mesh, read_view
 from torchgrasp.errors import BadArgument, GraspError, MissingExtra, Status
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.pool import run_tasks
-from torchgrasp.evaluation.protocols import Protocol, draw_error, find_protocol
+from torchgrasp.evaluation.protocols import Protocol, draw_error, find_protocol, seed_of
 from torchgrasp.evaluation.pull import pull_grasp
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore
 from torchgrasp.hand.hand import Hand, HandSource
@@ -65,6 +65,17 @@ class EvaluationSpec(Value):
         if self.ranks not in get_args(Ranks):
             raise BadArgument("ranks", repr(self.ranks), f"one of {', '.join(get_args(Ranks))}")
 
+    @property
+    def tried(self) -> str:
+        """Return in words which grasps are tried.
+
+        >>> EvaluationSpec(20).tried, EvaluationSpec(6, "spread").tried
+        ('the 20 best of each view', 'up to 6 of each view, spread over all ranks')
+        """
+        if self.ranks == "spread":
+            return f"up to {self.grasps} of each view, spread over all ranks"
+        return f"the {self.grasps} best of each view" if self.grasps > 1 else "the best of each view"
+
 
 def evaluate(
     objects: Path,
@@ -103,7 +114,7 @@ def _evaluate(
         views = [dataclasses.replace(view, shelf=Path(folder or temporary)) for view in views]
         plans = run_tasks(_plan, [(view, protocol.trial.friction, spec) for view in views], workers, PLAN_LIMIT)
         scores = [
-            ViewScore(view.object, view.view, 0, math.nan, refusal=plan) if isinstance(plan, Status) else plan
+            dataclasses.replace(view.score, seconds=math.nan, refusal=plan) if isinstance(plan, Status) else plan
             for view, plan in zip(views, plans, strict=True)
         ]
         rows = [choose_rows(score.executable, spec.grasps, spec.ranks) for score in scores]
@@ -157,6 +168,11 @@ class _View:
     def file(self) -> Path:
         return self.shelf / f"{self.object}_{self.view}.safetensors"
 
+    @property
+    def score(self) -> ViewScore:
+        family, group = read_family(self.objects, self.object), read_group(self.objects, self.object)
+        return ViewScore(self.object, self.view, 0, 0.0, family=family, group=group)
+
     def load_hand(self) -> Hand:
         return load_hand(self.hand.urdf_path.parent, self.hand.option)
 
@@ -164,7 +180,7 @@ class _View:
 def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
     """Plan on a view, or count the grasps of an earlier call; without any, name the commonest failure."""
     torch.set_num_threads(1)
-    hand, score = view.load_hand(), ViewScore(view.object, view.view, 0, 0.0)
+    hand, score = view.load_hand(), view.score
     started = time.process_time()
     try:
         _read_solid(view.objects, view.object)  # a bad mesh is refused before any work; its parts are cached
@@ -195,7 +211,8 @@ def _try(view: _View, protocol: Protocol, seed: int, row: int, draw: int) -> Pro
     """Try one grasp with one drawn error of pose."""
     hand, grasp = view.load_hand(), load_grasps(view.file)[row]
     mesh, parts = _read_solid(view.objects, view.object)
-    error = draw_error(protocol, grasp, mesh, row, draw, seed)
+    seed = seed_of(seed, view.object, view.view, row, draw)
+    error = draw_error(protocol, grasp, mesh, seed)
     return run_protocol(GraspTrial(hand, grasp, mesh, seed, error, parts=parts), protocol, row, draw)
 
 

@@ -1,6 +1,8 @@
 """Tests of a grasp: lifts, and published pulls at the object's mass centre, without table and gravity."""
 
 import dataclasses
+import hashlib
+import json
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -122,11 +124,23 @@ def apply_error(obj_from_hand: Float[Tensor, "4 4"], error: Float[Tensor, "4 4"]
     return planned if error is None else planned @ check_tensor("error", error, (4, 4)).to("cpu", torch.float64)
 
 
-def draw_hand_errors(noise: PoseNoise, grasps: int, seed: int) -> Float[Tensor, "g n 4 4"]:
+def seed_of(seed: int, *names: str | int) -> int:
+    """Return the seed of one draw: a hash of the campaign's seed and of what the draw is for.
+
+    Draws for another object, view, row or repetition are independent, whatever else is drawn and in which order.
+
+    >>> seed_of(0, "jug", "view0", 3, 0) == seed_of(0, "jug", "view0", 3, 0) != seed_of(0, "cup", "view0", 3, 0)
+    True
+    """
+    digest = hashlib.sha256(json.dumps([seed, *names]).encode()).digest()
+    return int.from_bytes(digest[:8], "big") >> 1
+
+
+def draw_hand_errors(noise: PoseNoise, count: int, seed: int) -> Float[Tensor, "n 4 4"]:
     """Draw errors of the hand in its planned frame."""
     generator = torch.Generator().manual_seed(seed)
     largest = torch.tensor([noise.rotation] * 3 + [noise.translation] * 3, dtype=torch.float64)
-    drawn = 2 * torch.rand(grasps, noise.draws, 6, generator=generator, dtype=torch.float64) - 1
+    drawn = 2 * torch.rand(count, 6, generator=generator, dtype=torch.float64) - 1
     rotations, translations = (largest * drawn).split(3, -1)
     return rigid(rotation_from_vector(rotations), translations)
 
@@ -147,13 +161,10 @@ def error_from_object_pose(
     return inverse(obj_from_hand) @ inverse(object_pose) @ obj_from_hand
 
 
-def draw_error(
-    protocol: Protocol, grasp: Grasps, mesh: "trimesh.Trimesh", row: int, draw: int, seed: int
-) -> Float[Tensor, "4 4"]:
-    """Draw the hand's error for a grasp and a draw."""
-    noise = protocol.noise
+def draw_error(protocol: Protocol, grasp: Grasps, mesh: "trimesh.Trimesh", seed: int) -> Float[Tensor, "4 4"]:
+    """Draw the hand's error for one trial of a grasp, by a seed of its own (`seed_of`)."""
     if protocol.pull is not None:
-        return draw_hand_errors(noise, row + 1, seed)[row, draw]
+        return draw_hand_errors(protocol.noise, 1, seed)[0]
     pivot = torch.tensor(mesh.center_mass.tolist(), dtype=torch.float64)
-    poses = draw_object_poses(noise, pivot, (row + 1) * noise.draws, seed)
-    return error_from_object_pose(grasp.obj_from_hand[0].double(), poses[row * noise.draws + draw])
+    pose = draw_object_poses(protocol.noise, pivot, 1, seed)[0]
+    return error_from_object_pose(grasp.obj_from_hand[0].double(), pose)

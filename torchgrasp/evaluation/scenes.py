@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections import Counter
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,9 @@ from torchgrasp.base import Value, check_number, check_whole
 from torchgrasp.clutter import ScenePlan, plan_scene
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.clutter import MOVED, ClutterResult, clear_scene
+from torchgrasp.evaluation.intervals import Share, count_by, share_over
 from torchgrasp.evaluation.placed import drop, object_names
 from torchgrasp.evaluation.pool import run_tasks
-from torchgrasp.evaluation.score import share
 from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.load import load_hand
 from torchgrasp.scene.scene import Scene
@@ -114,27 +114,37 @@ def summarise_scenes(scores: Sequence[SceneScore]) -> dict[str, Any]:
     "planned" is the share of scenes with a grasp. "moved" (a neighbour by more than 20 mm), "toppled" and "early" (the
     hand touched a neighbour or the table before a finger the target) are shares of all tries. "cleared" is the share of
     all objects that were taken, "tries_per_object" the tries for each. "failures" counts statuses of the tries. Times
-    are mean CPU seconds, of a scene's plans and of a trial.
+    are mean CPU seconds, of a scene's plans and of a trial. Intervals are over scenes.
     """
     tries = [one for score in scores for one in score.tries]
-    first = [score.tries[0] for score in scores if score.tries]
-    taken, objects = sum(one.lifted for one in tries), sum(len(score.names) for score in scores)
+    taken = sum(one.lifted for one in tries)
     failures = Counter(one.status.name for one in tries if not one.lifted)
     failures.update(score.failure.name for score in scores if score.failure is not Status.OK)
     failures["NO_GRASP"] += sum(not score.tries and score.failure is Status.OK for score in scores)
     return {
-        "lifted": share(sum(one.lifted for one in first), len(scores)),
-        "planned": share(len(first), len(scores)),
-        "moved": share(sum(one.moved > MOVED for one in tries), len(tries)),
-        "toppled": share(sum(one.toppled > 0 for one in tries), len(tries)),
-        "early": share(sum(bool({"neighbour", "table"} & {*one.early}) for one in tries), len(tries)),
-        "cleared": share(taken, objects),
-        "tables_cleared": share(sum(bool(score.names) and not score.left for score in scores), len(scores)),
+        "lifted": _share(scores, lambda score: [bool(score.tries) and score.tries[0].lifted]),
+        "planned": _share(scores, lambda score: [bool(score.tries)]),
+        "moved": _share(scores, lambda score: [one.moved > MOVED for one in score.tries]),
+        "toppled": _share(scores, lambda score: [one.toppled > 0 for one in score.tries]),
+        "early": _share(scores, lambda score: [bool({"neighbour", "table"} & {*one.early}) for one in score.tries]),
+        "cleared": _share(scores, _taken),
+        "tables_cleared": _share(scores, lambda score: [bool(score.names) and not score.left]),
         "tries_per_object": len(tries) / taken if taken else None,
         "failures": {name: n for name, n in failures.most_common() if n},
         "plan_cpu_s": sum(score.plan_seconds for score in scores) / max(len(scores), 1),
         "trial_cpu_s": sum(one.trial_seconds for one in tries) / max(len(tries), 1),
     }
+
+
+def _share(scores: Sequence[SceneScore], outcomes: Callable[[SceneScore], list[bool]]) -> Share:
+    """Return the share of true outcomes, with its interval over scenes."""
+    return share_over(count_by((str(score.index), outcome) for score in scores for outcome in outcomes(score)))
+
+
+def _taken(score: SceneScore) -> list[bool]:
+    """Tell as many times as objects were taken that one was, and for the others that it was not."""
+    taken = sum(one.lifted for one in score.tries)
+    return [k < taken for k in range(len(score.names))]
 
 
 def scene_record(score: SceneScore) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import Any
 
 from torchgrasp.base import Value
 from torchgrasp.errors import Status
+from torchgrasp.evaluation.intervals import Share, count_by, share_over
 
 STAGES: dict[str, tuple[Status, ...]] = {
     "start": (Status.START_OVERLAP,),
@@ -16,9 +17,6 @@ STAGES: dict[str, tuple[Status, ...]] = {
     "simulation": (Status.UNSTABLE, Status.TIMED_OUT, Status.WORKER_DIED),
 }
 """The stages at which an attempt can fail, in order, with their statuses."""
-
-Share = tuple[float, float, float, int]
-"""A share, the ends of its 95 % Wilson interval, and the total."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +42,8 @@ class ProtocolResult(Value):
 class ViewScore(Value):
     """The outcome of a view with `executable` planned grasps.
 
-    Without any, `refusal` is the commonest reason; `note` may say more. `seconds` is the CPU time of planning.
+    Without any, `refusal` is the commonest reason; `note` may say more. `seconds` is the CPU time of planning. `family`
+    and `group` are the object's (`torchgrasp.datasets`), "" where unknown.
     """
 
     object: str
@@ -54,26 +53,34 @@ class ViewScore(Value):
     attempts: tuple[ProtocolResult, ...] = ()
     refusal: Status = Status.OK
     note: str = ""
+    family: str = ""
+    group: str = ""
+
+    @property
+    def unit(self) -> str:
+        """Return what is resampled for intervals: the family, or the object without one."""
+        return self.family or self.object
 
 
 def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     """Return the numbers of an evaluation by name.
 
-    "gsr" is the share of attempts that passed, "top1" that of the best-ranked grasps; a view without grasps fails in
-    every draw. "objects" is the share of objects with a success. "refused" counts views without a grasp, "failures" the
-    reasons of each stage. "force_n", "overlap_mm", "plan_cpu_s" (of a view) and "trial_cpu_s" are means.
+    "gsr" is the share of attempts that passed; views without a grasp are not in it. "top1" is that of the best-ranked
+    grasps: a view without grasps fails in every draw. "objects" is the share of objects with a success. Their intervals
+    are over families (`share_over`). "by_object" and "by_group" have the same of parts. "refused" counts views without
+    a grasp, "failures" the reasons of each stage. "force_n", "overlap_mm", "plan_cpu_s" (of a view) and "trial_cpu_s"
+    are means.
     """
     attempts = [attempt for score in scores for attempt in score.attempts]
     spent = [*(score.seconds for score in scores), *(a.seconds for a in attempts)]
     names = sorted({score.object for score in scores})
     by_object = {name: _shares([score for score in scores if score.object == name]) for name in names}
-    passed = sum(row["gsr"][0] > 0 for row in by_object.values())
+    groups = sorted({score.group for score in scores if score.group})
     reasons_of = {"planning": Counter(s.refusal.name for s in scores if not s.attempts)}
     for stage, reasons in STAGES.items():
         reasons_of[stage] = Counter(a.status.name for a in attempts if not a.passed and a.status in reasons)
     return {
         **_shares(scores),
-        "objects": share(passed, len(names)),
         "failures": {stage: dict(counts.most_common()) for stage, counts in reasons_of.items() if counts},
         "force_n": _mean(a.force for a in attempts),
         "overlap_mm": _mean(1e3 * a.overlap for a in attempts),
@@ -82,33 +89,23 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
         "trial_cpu_s": _mean(a.seconds for a in attempts),
         "cpu_s": sum(x for x in spent if not math.isnan(x)),
         "by_object": by_object,
+        "by_group": {name: _shares([score for score in scores if score.group == name]) for name in groups},
     }
 
 
-def share(count: int, total: int) -> Share:
-    """Return a count as a share of a total.
-
-    >>> [round(x, 2) for x in share(9, 10)]
-    [0.9, 0.6, 0.98, 10]
-    """
-    from scipy.stats import binomtest
-
-    if not total:
-        return 0.0, 0.0, 1.0, 0
-    interval = binomtest(count, total).proportion_ci(method="wilson")
-    return count / total, float(interval.low), float(interval.high), total
-
-
-def _shares(scores: Sequence[ViewScore]) -> dict[str, Any]:
+def _shares(scores: Sequence[ViewScore]) -> dict[str, Share | int]:
     """Return shares and counts of some views."""
-    attempts = [attempt for score in scores for attempt in score.attempts]
-    best = [attempt for attempt in attempts if attempt.rank == 0]
-    draws = 1 + max((attempt.draw for attempt in attempts), default=0)
-    refused = sum(not score.attempts for score in scores)
+    draws = 1 + max((attempt.draw for score in scores for attempt in score.attempts), default=0)
+    tried = [(score.unit, attempt) for score in scores for attempt in score.attempts]
+    best = [(unit, attempt.passed) for unit, attempt in tried if attempt.rank == 0]
+    refused = [(score.unit, False) for score in scores if not score.attempts]
+    unit_of = {score.object: score.unit for score in scores}
+    lifted = {score.object for score in scores if any(attempt.passed for attempt in score.attempts)}
     return {
-        "gsr": share(sum(a.passed for a in attempts), len(attempts)),
-        "top1": share(sum(a.passed for a in best), len(best) + refused * draws),
-        "refused": refused,
+        "gsr": share_over(count_by((unit, attempt.passed) for unit, attempt in tried)),
+        "top1": share_over(count_by(best + refused * draws)),
+        "objects": share_over(count_by((unit, name in lifted) for name, unit in unit_of.items())),
+        "refused": len(refused),
         "executable": sum(score.executable for score in scores),
     }
 

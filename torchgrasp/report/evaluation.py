@@ -1,11 +1,13 @@
 """The page of an evaluation: shares with intervals, and failures."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from torchgrasp.errors import Status
-from torchgrasp.evaluation.score import Share, ViewScore, summarise
+from torchgrasp.evaluation.intervals import Share, format_share
+from torchgrasp.evaluation.score import ViewScore, summarise
 from torchgrasp.files import write_file
 from torchgrasp.report.document import Markup, escape, format_document, format_html_table
 
@@ -13,8 +15,8 @@ WIDTH, HEIGHT = 180, 16
 """Size of a bar [pixels]."""
 
 SHARE_NAMES = {
-    "gsr": "grasps that pass",
-    "top1": "best-ranked grasps that pass",
+    "gsr": "grasps tried that pass",
+    "top1": "best-ranked grasps that pass, of all views",
     "objects": "objects with a grasp that passes",
 }
 """The shares of a summary in words."""
@@ -32,13 +34,14 @@ def write_evaluation(path: Path | str, title: str, asked: Mapping[str, object], 
 def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[ViewScore]) -> str:
     """Return the page of an evaluation as text."""
     summary = summarise(scores)
-    value, low, high, total = summary["gsr"]
-    verdict = f"{value:.0%} of {total} attempts passed (95 % interval {low:.0%} to {high:.0%})."
+    verdict = f"Passed: {format_share(summary['gsr'])}, with the 95 % interval over families."
     heads = ("what", "share", "with its 95 % interval, 0 to 100 %", "interval", "of")
     shares = [(name, *_share_cells(summary[key], 1)) for key, name in SHARE_NAMES.items()]
+    for group, some in summary["by_group"].items():
+        shares += [(f"{group}: {name}", *_share_cells(some[key], 1)) for key, name in SHARE_NAMES.items()]
     notes = [(score.object, score.view, score.note) for score in scores if score.note]
     body = [
-        f'<p class="verdict{"" if value else " bad"}">{escape(verdict)}</p>',
+        f'<p class="verdict{"" if summary["gsr"].value > 0 else " bad"}">{escape(verdict)}</p>',
         "<h2>Shares</h2>",
         format_html_table(heads, shares, numbers={1, 3, 4}),
         "<h2>By object and view</h2>",
@@ -55,25 +58,24 @@ def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[
 
 
 def bar(share: Share) -> Markup:
-    """Draw a share as a mark and its interval as a line.
+    """Draw a share as a mark and its interval, if it has one, as a line.
 
-    >>> bar((0.5, 0.25, 0.75, 8)).count("<line")
-    2
+    >>> bar(Share(0.5, 0.25, 0.75, 8, 4)).count("<line"), bar(Share(0.5, math.nan, math.nan, 8, 1)).count("<line")
+    (2, 1)
     """
-    value, low, high, _ = (x * (WIDTH - 8) + 4 for x in share)
+    value, low, high = (x * (WIDTH - 8) + 4 for x in share[:3])
     middle = HEIGHT / 2
-    return Markup(
-        f'<svg class="bar" viewBox="0 0 {WIDTH} {HEIGHT}" role="img">'
-        f'<line x1="4" x2="{WIDTH - 4}" y1="{middle}" y2="{middle}" stroke="#e7e5de" stroke-width="8"/>'
-        f'<line x1="{low:.1f}" x2="{high:.1f}" y1="{middle}" y2="{middle}" stroke="#8fc8bb" stroke-width="8"/>'
-        f'<circle cx="{value:.1f}" cy="{middle}" r="4" fill="#23967f"/></svg>'
-    )
+    scale = f'<line x1="4" x2="{WIDTH - 4}" y1="{middle}" y2="{middle}" stroke="#e7e5de" stroke-width="8"/>'
+    ends = f'<line x1="{low:.1f}" x2="{high:.1f}" y1="{middle}" y2="{middle}" stroke="#8fc8bb" stroke-width="8"/>'
+    mark = f'<circle cx="{value:.1f}" cy="{middle}" r="4" fill="#23967f"/>'
+    drawn = scale + ("" if math.isnan(low) else ends) + ("" if math.isnan(value) else mark)
+    return Markup(f'<svg class="bar" viewBox="0 0 {WIDTH} {HEIGHT}" role="img">{drawn}</svg>')
 
 
 def _share_cells(share: Share, digits: int) -> tuple[str, ...]:
     """Return a share in numbers and drawn."""
-    value, low, high = (f"{x:.{digits}%}" for x in share[:3])
-    return value, bar(share), f"{low} to {high}", str(share[3])
+    value, low, high = ("-" if math.isnan(x) else f"{x:.{digits}%}" for x in share[:3])
+    return value, bar(share), f"{low} to {high}" if share.units > 1 else "-", str(share.total)
 
 
 def _objects(scores: Sequence[ViewScore], by_object: Mapping[str, Any]) -> str:
@@ -86,7 +88,14 @@ def _objects(scores: Sequence[ViewScore], by_object: Mapping[str, Any]) -> str:
     rows = []
     for name, row in by_object.items():
         cells = [outcome.get((name, view), "") for view in views]
-        rows.append((name, *_share_cells(row["gsr"], 0), f"{row['top1'][0]:.0%}", *cells))
+        rows.append(
+            (
+                name,
+                *_share_cells(row["gsr"], 0),
+                "-" if math.isnan(row["top1"].value) else f"{row['top1'].value:.0%}",
+                *cells,
+            )
+        )
     heads = ("object", "pass", "with its 95 % interval", "interval", "of", "best-ranked", *views)
     return format_html_table(heads, rows, numbers={1, 3, 4, 5, *range(6, 6 + len(views))})
 

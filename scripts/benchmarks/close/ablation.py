@@ -6,8 +6,8 @@ from pathlib import Path
 
 from benchmarks.common import Row
 from torchgrasp import Status, TrialSpec, close_hand, fit_shape, load_hand, plan_grasps
-from torchgrasp.datasets import list_views, read_object_mesh, read_view
-from torchgrasp.evaluation import PROTOCOLS, draw_error, run_tasks, share
+from torchgrasp.datasets import list_views, read_family, read_object_mesh, read_view
+from torchgrasp.evaluation import PROTOCOLS, count_by, draw_error, format_share, run_tasks, seed_of, share_over
 from torchgrasp.evaluation.campaign import choose_rows
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ContactSpec
@@ -40,18 +40,18 @@ def bench_ablation(objects: Path, tries: int, starts: int, seed: int, workers: i
     for task, outcome in zip(tasks, run_tasks(_close_view, tasks, workers, LIMIT), strict=True):
         if isinstance(outcome, Status):
             raise SystemExit(f"{task[1]} {task[2]} {task[3]}: {outcome.sentence}")
-        cases += [(task[3], *case) for case in outcome]
+        cases += [(task[3], *case, read_family(objects, task[1])) for case in outcome]
     return [_row(part, [case for case in cases if case[1] == part]) for part in PARTS]
 
 
-def _row(part: str, cases: list[tuple[str, str, str, float, float]]) -> Row:
+def _row(part: str, cases: list[tuple[str, str, str, float, float, str]]) -> Row:
     """Return the share that held, of all and of each hand, how far the object moved, and the CPU time."""
     groups = {"all": cases} | {hand: [c for c in cases if c[0] == hand] for hand in ("allegro", "barrett")}
-    shares = {name: share(sum(c[2] == "OK" for c in group), len(group)) for name, group in groups.items()}
+    shares = {name: share_over(count_by((c[5], c[2] == "OK") for c in group)) for name, group in groups.items()}
     moved = sorted(case[3] for case in cases if case[2] == "OK")
     middle = moved[len(moved) // 2] if moved else float("nan")
     lost = {status: sum(c[2] == status for c in cases) for status in sorted({c[2] for c in cases} - {"OK"})}
-    words = "; ".join(f"{n} {s[0]:.1%} [{s[1]:.1%}, {s[2]:.1%}] of {s[3]}" for n, s in shares.items())
+    words = "; ".join(f"{n} {format_share(s)}" for n, s in shares.items())
     seconds = sum(case[4] for case in cases) / max(len(cases), 1)
     measured = f"{words}; moved {1e3 * middle:.1f} mm (median of the held); {seconds:.2f} CPU s; lost {lost}"
     numbers = {"shares": shares, "moved_mm": 1e3 * middle, "lost": lost, "seconds": seconds}
@@ -70,7 +70,7 @@ def _close_view(
     close = functools.partial(close_hand, hand=hand, mesh=mesh, parts=convex_parts(mesh))
     cases = []
     for row in choose_rows(len(grasps), tries, "spread"):
-        error = draw_error(PAPER, grasps[row], mesh, row, 0, seed)
+        error = draw_error(PAPER, grasps[row], mesh, seed_of(seed, name, view, row, 0))
         for part, (spec, revises) in PARTS.items():
             belief = shape if revises else None
             began = time.process_time()

@@ -7,8 +7,8 @@ from pathlib import Path
 from benchmarks.common import Row
 from torchgrasp import load_hand
 from torchgrasp.evaluation.campaign import EvaluationSpec, evaluate
+from torchgrasp.evaluation.intervals import count_by, difference_over, format_share, share_over
 from torchgrasp.evaluation.protocols import PROTOCOLS
-from torchgrasp.evaluation.score import share
 
 MOST_LOST = 0.10
 """Largest loss of the share that passes without errors: the project's own bar."""
@@ -24,7 +24,7 @@ def bench_noise(objects: Path, hands: tuple[str, ...], draws: int, spec: Evaluat
         with tempfile.TemporaryDirectory() as folder:
             planned = False
             for closing, bar in (("uncertainty", MOST_LOST), ("open_loop", None)):
-                shares = {}
+                counts = {}
                 for key, test in tests.items():
                     scores = evaluate(
                         objects,
@@ -34,18 +34,18 @@ def bench_noise(objects: Path, hands: tuple[str, ...], draws: int, spec: Evaluat
                         folder=Path(folder),
                         workers=workers,
                     )
-                    attempts = [attempt for score in scores for attempt in score.attempts]
-                    shares[key] = share(sum(attempt.passed for attempt in attempts), len(attempts))
+                    counts[key] = count_by((score.unit, a.passed) for score in scores for a in score.attempts)
                     planned = True
-                lost = shares["still"][0] - shares["noisy"][0]
-                words = [f"{key} {x[0]:.1%} [{x[1]:.1%}, {x[2]:.1%}] of {x[3]}" for key, x in shares.items()]
+                lost = difference_over(counts["still"], counts["noisy"])
+                shares = {key: share_over(x) for key, x in counts.items()}
+                words = [f"{key} {format_share(x)}" for key, x in shares.items()]
                 rows.append(
                     Row(
                         f"{name}, {closing}: loss by 5 mm and 5 degrees",
                         "none" if bar is None else f"at most {bar:.0%}",
-                        f"{lost:+.1%}: {', '.join(words)}",
-                        None if bar is None else lost <= bar,
-                        shares,
+                        f"{format_share(lost)}: {', '.join(words)}",
+                        None if bar is None else lost.value <= bar,
+                        {**shares, "lost": lost},
                     )
                 )
     return rows

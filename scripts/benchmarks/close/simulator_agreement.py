@@ -11,8 +11,9 @@ from sklearn.metrics import cohen_kappa_score, confusion_matrix
 from benchmarks.common import Row
 from torchgrasp import load_hand
 from torchgrasp.evaluation.campaign import EvaluationSpec, evaluate
+from torchgrasp.evaluation.intervals import count_by, format_share, share_over
 from torchgrasp.evaluation.protocols import PROTOCOLS
-from torchgrasp.evaluation.score import ProtocolResult, ViewScore, share
+from torchgrasp.evaluation.score import ProtocolResult, ViewScore
 
 TESTS = ("dexgraspbench", "dexgraspbench-hard", "pose-noise", "paper")
 """Three that pull and one that lifts, the last two with an error of where hand or object stand."""
@@ -61,14 +62,14 @@ def agreement_row(test: str, cases: list[Case]) -> Row:
     verdicts = [[case.sapien.passed for case in cases], [case.mujoco.passed for case in cases]]
     labels = [True, False]
     table, kappa = confusion_matrix(*verdicts, labels=labels), float(cohen_kappa_score(*verdicts, labels=labels))
-    found, low, high, count = share(int(np.trace(table)), int(table.sum()))
+    found = share_over(count_by((case.view.unit, case.sapien.passed == case.mujoco.passed) for case in cases))
     measured = (
-        f"{found:.1%} of {count} [{low:.1%}, {high:.1%}], kappa {kappa:.2f}; both pass {table[0, 0]}, "
+        f"{format_share(found)}, kappa {kappa:.2f}; both pass {table[0, 0]}, "
         f"both fail {table[1, 1]}, SAPIEN alone passes {table[0, 1]}, MuJoCo alone {table[1, 0]}"
     )
-    numbers = {"share": found, "low": low, "high": high, "count": count, "table": table.tolist(), "kappa": kappa}
+    numbers = {"share": found, "table": table.tolist(), "kappa": kappa}
     numbers["unequal"] = [_unequal(case) for case in cases if case.sapien.passed != case.mujoco.passed]
-    return Row(f"agreement of SAPIEN and MuJoCo, {test}", f">= {BAR:.0%}", measured, found >= BAR, numbers)
+    return Row(f"agreement of SAPIEN and MuJoCo, {test}", f">= {BAR:.0%}", measured, found.value >= BAR, numbers)
 
 
 def _unequal(case: Case) -> dict[str, Any]:

@@ -21,9 +21,9 @@ from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.io.read import save_cloud
 from torchgrasp.datasets import list_views, read_view
 from torchgrasp.evaluation.campaign import EvaluationSpec, evaluate
+from torchgrasp.evaluation.intervals import count_by, share_over
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.evaluation.protocols import PROTOCOLS
-from torchgrasp.evaluation.score import share
 from torchgrasp.files import format_json, write_atomically, write_file
 from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.ranking import success_features
@@ -63,11 +63,11 @@ def bench_success(objects: Path, hands: tuple[str, ...], grasps: int, workers: i
     """Fit on all objects but one and judge on that one, for each in turn."""
     trials = read_trials([objects], hands, grasps, workers, folder)
     unseen, base = leave_one_out(trials)
-    draw_reliability(folder / "reliability.png", unseen, trials.passed)
+    draw_reliability(folder / "reliability.png", unseen, trials)
     print(*judge(unseen, base, trials), sep="\n")
     mine, theirs = brier(unseen, trials.passed), brier(base, trials.passed)
     numbers = {"trials": len(trials.passed), "brier": mine, "base": theirs}
-    bins = [x for x in reliability(unseen, trials.passed) if x[2] >= ENOUGH]
+    bins = [x for x in reliability(unseen, trials) if x[2] >= ENOUGH]
     off = max(abs(mean - found[0]) for *_, mean, found in bins)
     return [
         Row("Brier score on objects not fitted on", f"below {theirs:.3f}", f"{mine:.3f}", mine < theirs, numbers),
@@ -214,19 +214,20 @@ def judge(predicted: np.ndarray, base: np.ndarray, trials: Trials) -> list[str]:
         rates = f"predicted {predicted[mine].mean():.2f}, passed {y[mine].mean():.2f} of {mine.sum()}"
         lines.append(f"{name}: {scores}, {auc}, {rates}")
     for name, mine in kinds[: 1 + len(np.unique(trials.closing))]:
-        for low, high, count, mean, (value, least, most) in reliability(predicted[mine], y[mine]):
+        for low, high, count, mean, (value, least, most) in reliability(predicted[mine], trials.select(mine)):
             found = f"predicted {mean:.2f}, passed {value:.2f} [{least:.2f}, {most:.2f}] of {count}"
             lines.append(f"{name}, {low:.1f} to {high:.1f}: {found}")
     return lines
 
 
-def reliability(predicted: np.ndarray, y: np.ndarray) -> list[tuple[float, float, int, float, tuple[float, ...]]]:
-    """Return for each bin its ends, count, mean prediction, and the share that passed with its Wilson interval."""
+def reliability(predicted: np.ndarray, trials: Trials) -> list[tuple[float, float, int, float, tuple[float, ...]]]:
+    """Return for each bin its ends, count, mean prediction, and the share that passed with its interval over bodies."""
     bins = []
     for low, high in itertools.pairwise(EDGES):
         mine = (predicted >= low) & ((predicted < high) | (high == EDGES[-1]))
         if mine.any():
-            found = share(int(y[mine].sum()), int(mine.sum()))[:3]
+            outcomes = zip(trials.object[mine].tolist(), trials.passed[mine].tolist(), strict=True)
+            found = share_over(count_by(outcomes))[:3]
             bins.append((float(low), float(high), int(mine.sum()), float(predicted[mine].mean()), found))
     return bins
 
@@ -236,7 +237,7 @@ def brier(predicted: np.ndarray, y: np.ndarray) -> float:
     return float(((predicted - y) ** 2).mean())
 
 
-def draw_reliability(path: Path, predicted: np.ndarray, y: np.ndarray) -> None:
+def draw_reliability(path: Path, predicted: np.ndarray, trials: Trials) -> None:
     """Draw the share that passed over the prediction, with intervals and counts."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -246,8 +247,8 @@ def draw_reliability(path: Path, predicted: np.ndarray, y: np.ndarray) -> None:
     axes = figure.add_subplot(xlabel="predicted success", ylabel="share that passed", xlim=(0, 1), ylim=(0, 1))
     axes.plot([0, 1], [0, 1], color="#7c8591", linewidth=1)
     axes.fill_between([0, 1], [-0.1, 0.9], [0.1, 1.1], color="#e7e5de", zorder=0)
-    for _, _, count, mean, (value, low, high) in reliability(predicted, y):
+    for _, _, count, mean, (value, low, high) in reliability(predicted, trials):
         axes.errorbar([mean], [value], [[value - low], [high - value]], fmt="o", color="#23967f", capsize=3)
         axes.annotate(f"{count}", (mean, value), (6, -12), textcoords="offset points", color="#4b525b")
-    axes.set_title(f"{len(y)} trials on objects not fitted on")
+    axes.set_title(f"{len(predicted)} trials on objects not fitted on")
     write_atomically(path, lambda temporary: figure.savefig(temporary, format="png"))

@@ -1,0 +1,119 @@
+"""Shares and their 95 % intervals, by a bootstrap over families of objects.
+
+The trials of one object are alike, and so are objects of one family. So whole families are drawn anew, never trials:
+10 000 times, as many as there are, with replacement. The interval lies between the 2.5 % and 97.5 % quantiles.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+RESAMPLES = 10_000
+"""Draws behind an interval: its ends are then known to a tenth of a point."""
+ONE_SIDED = 0.05
+"""Chance that a share lies beyond the bound that is given where every trial ended alike."""
+
+Counts = Mapping[str, tuple[int, int]]
+"""How many trials passed, and of how many, for each unit that is resampled: a family, or an object without one."""
+
+
+class Share(NamedTuple):
+    """A share or a difference of shares, its 95 % interval, and how many trials and units stand behind it.
+
+    A single unit has no interval: its ends are NaN. Nothing measured is NaN altogether.
+    """
+
+    value: float
+    low: float
+    high: float
+    total: int
+    units: int
+
+
+def count_by(outcomes: Iterable[tuple[str, bool]]) -> dict[str, tuple[int, int]]:
+    """Return the counts of outcomes that carry the name of their unit.
+
+    >>> count_by([("tin", True), ("cup", False), ("tin", False)])
+    {'tin': (1, 2), 'cup': (0, 1)}
+    """
+    counts: dict[str, tuple[int, int]] = {}
+    for name, passed in outcomes:
+        before = counts.get(name, (0, 0))
+        counts[name] = (before[0] + passed, before[1] + 1)
+    return counts
+
+
+def share_over(counts: Counts, seed: int = 0) -> Share:
+    """Return the share of all trials that passed, with its interval over the units.
+
+    Where all of n units passed in every trial, or in none, resampling tells nothing. The interval is then the one-sided
+    95 % bound of n independent trials that ended alike: 0.05 ** (1 / n) is its lower end, near 1 - 3 / n.
+
+    >>> share_over({"tin": (9, 10), "cup": (5, 10), "jug": (8, 10)})[::3]
+    (0.7333333333333333, 30)
+    >>> round(share_over({"tin": (2, 2), "cup": (3, 3)}).low, 2)
+    0.22
+    """
+    found = contrast_over([counts], [1.0], seed)
+    if found.units > 1 and found.value in (0.0, 1.0):
+        bound = ONE_SIDED ** (1 / found.units)
+        return found._replace(low=bound) if found.value else found._replace(high=1 - bound)
+    return found
+
+
+def difference_over(first: Counts, second: Counts, seed: int = 0) -> Share:
+    """Return by how much the first share is above the second; the units are paired.
+
+    An interval without width says that the units agree, not that the difference is known.
+
+    >>> difference_over({"tin": (4, 4), "cup": (4, 4)}, {"tin": (2, 4), "cup": (1, 4)})
+    Share(value=0.625, low=0.5, high=0.75, total=8, units=2)
+    """
+    return contrast_over([first, second], [1.0, -1.0], seed)
+
+
+def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: int = 0) -> Share:
+    """Return a weighted sum of shares, each a ratio of sums over the same resampled units.
+
+    The order of the units does not matter. `total` counts the trials of the first column. Resamples in which a column
+    has no trial are left out.
+    """
+    names = sorted({name for counts in columns for name, (_, total) in counts.items() if total})
+    total = sum(total for _, total in columns[0].values())
+    if not names:
+        return Share(math.nan, math.nan, math.nan, 0, 0)
+    table = torch.tensor([[counts.get(name, (0, 0)) for counts in columns] for name in names], dtype=torch.float64)
+    value = float(_combine(table.sum(0), weights))
+    if len(names) == 1:
+        return Share(value, math.nan, math.nan, total, 1)
+    drawn = torch.randint(len(names), (RESAMPLES, len(names)), generator=torch.Generator().manual_seed(seed))
+    times = torch.zeros(RESAMPLES, len(names), dtype=torch.float64)
+    times.scatter_add_(1, drawn, torch.ones_like(drawn, dtype=torch.float64))
+    values = _combine(torch.einsum("ru,uck->rck", times, table), weights)
+    low, high = values.nanquantile(torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()
+    return Share(value, low, high, total, len(names))
+
+
+def _combine(sums: Float[Tensor, "*r c 2"], weights: Sequence[float]) -> Float[Tensor, "*r"]:
+    """Return the weighted sum of the columns' shares; NaN where a column has no trial."""
+    return (sums[..., 0] / sums[..., 1]) @ sums.new_tensor(weights)
+
+
+def format_share(share: Share, unit: str = "families") -> str:
+    """Return a share in words.
+
+    >>> format_share(Share(0.938, 0.888, 0.965, 480, 8))
+    '93.8 % [88.8, 96.5] of 480, 8 families'
+    >>> format_share(Share(0.5, math.nan, math.nan, 4, 1))
+    '50.0 % of 4, one of the families: no interval'
+    """
+    if math.isnan(share.value):
+        return "nothing measured"
+    value = f"{100 * share.value:.1f} %"
+    if math.isnan(share.low):
+        return f"{value} of {share.total}, one of the {unit}: no interval"
+    return f"{value} [{100 * share.low:.1f}, {100 * share.high:.1f}] of {share.total}, {share.units} {unit}"
