@@ -134,6 +134,7 @@ class TrialSpec(Value):
         kp: stiffness of all joint drives [N m/rad]; None: the hand's own.
         overlap: largest overlap [m] at the start, because convex parts bulge a little.
         table: whether the object stands on a table.
+        self_collision: whether links of the hand collide with each other, in the pairs that the hand names.
 
     Raises:
         BadArgument: a number outside its range, an unknown closing, holding or simulator, or a control period below
@@ -159,6 +160,7 @@ class TrialSpec(Value):
     kp: float | None = None
     overlap: float = 1e-3
     table: bool = True
+    self_collision: bool = True
 
     def __post_init__(self) -> None:
         """Check every range once, where the value is made."""

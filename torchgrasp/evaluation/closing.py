@@ -98,6 +98,7 @@ class TrialDriver:
             patch=spec.patch,
             height=None if trial.table is None else 0.0,
             neighbours=tuple(self._body(neighbour) for neighbour in trial.neighbours),
+            self_pairs=hand.self_pairs if spec.self_collision else (),
         )
 
     def _body(self, given: Neighbour) -> Body:
@@ -117,7 +118,7 @@ class TrialDriver:
     def grasp_overlap(self) -> float:
         """Return the overlap [m] of hand and object at the grasp."""
         joints = _by_name(self.reference.hand, self.reference.joints)
-        alone = {"approach": (0.0, 0.0, 0.0), "table": False, "neighbours": ()}
+        alone = {"approach": (0.0, 0.0, 0.0), "table": False, "neighbours": (), "self_pairs": ()}
         scene_spec = dataclasses.replace(self.scene_spec, joints=joints, **alone)
         return open_scene(scene_spec, self.spec.simulator).penetration()
 

@@ -160,6 +160,12 @@ class Hand(Value):
         frames = (self.tree.frames(self._columns(part)) for part in rows.split(chunk))
         return torch.cat([self.self_collision.clearance(x, below) for x in frames]).reshape(joints.shape[:-1])
 
+    @property
+    def self_pairs(self) -> tuple[tuple[str, str], ...]:
+        """Names of the pairs of links that can meet, as `self_clearance` tests them."""
+        names = self.tree.link_names
+        return tuple((names[one], names[two]) for one, two in self.self_collision.link_pairs())
+
     def _columns(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "j n"]:
         """Return every movable joint of the URDF, with the postures last."""
         values = self.expand_joints(joints)

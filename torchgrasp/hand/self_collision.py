@@ -76,6 +76,11 @@ class SelfCollision(Value):
             twist = axes.new_zeros(6, len(pair), requires_grad=True)
             return torch.autograd.grad(self._separations((axes, center), pair, row, twist).sum(), twist)[0]
 
+    def link_pairs(self) -> list[tuple[int, int]]:
+        """Return the pairs of links that are tested, by their indices."""
+        links = torch.unique(self.link[self.pairs].sort(1).values, dim=0)
+        return [(int(one), int(two)) for one, two in links]
+
     def _place(self, frames: Float[Tensor, "3 4 l n"]) -> Placed:
         """Return the shapes' axes and centres in the palm's frame."""
         links, rotation = frames.index_select(2, self.link), self.rotation.to(frames)[..., None]

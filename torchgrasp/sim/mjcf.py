@@ -1,26 +1,27 @@
 """A scene as MJCF, MuJoCo's format, with the solver settings of published protocols.
 
 Joints have the same armature, drives and friction as in SAPIEN. Torsional friction is a length in MuJoCo: friction
-times patch radius. The hand feels neither gravity nor itself. The table is a plane: a flat bottom gets several
-contacts. Automatic reset is off, which would return a lost object.
+times patch radius. The hand feels no gravity, and itself only in the pairs that the scene names. The table is a plane:
+a flat bottom gets several contacts. Automatic reset is off, which would return a lost object.
 """
 
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
 from torchgrasp.frames import rotation_from_rpy
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.urdf import Link, Urdf, read_urdf
+from torchgrasp.sim.collision_masks import pair_masks
 from torchgrasp.sim.mount import MOUNT_DRIVE, mount_slides
 from torchgrasp.sim.scene import ARMATURE, Body, SceneSpec
 
 OBJECT, TABLE, NEIGHBOUR = "torchgrasp_object", "torchgrasp_table", "torchgrasp_neighbour_{}"
 """Names of the object (its body and its free joint), of the table, and of the neighbours by number."""
 
-HAND_BIT, OBJECT_BIT, TABLE_BIT = 1, 2, 4
-"""Collision groups: any two of them collide, but not the hand with itself."""
+HAND_BIT, OBJECT_BIT, TABLE_BIT, FREE_BIT = 1, 2, 4, 3
+"""Collision groups: any two of them collide, but not the hand with itself. The number of the first bit after them."""
 
 OPTION = {"integrator": "implicitfast", "cone": "elliptic", "impratio": "10", "noslip_iterations": "2"}
 """Of the solver, from DexGraspBench (arXiv 2412.16490)."""
@@ -86,18 +87,21 @@ def _add_hand(world: ET.Element, spec: SceneSpec, urdf: Urdf) -> None:
         _weigh(mount, 1.0, np.zeros(3), (0.01, 0.0, 0.0, 0.01, 0.0, 0.01))
         limits = {"axis": format_numbers(slide.axis), "range": format_numbers((slide.lower, slide.upper))}
         ET.SubElement(mount, "joint", limits, name=slide.name, type="slide")
-    add_links(mount, urdf, spec.world_from_hand)
+    add_links(mount, urdf, spec.world_from_hand, pair_masks(spec.self_pairs, FREE_BIT))
 
 
-def add_links(parent: ET.Element, urdf: Urdf, parent_from_root: np.ndarray) -> ET.Element:
-    """Add the links of a hand to a body; return the root's body."""
+def add_links(
+    parent: ET.Element, urdf: Urdf, parent_from_root: np.ndarray, masks: Mapping[str, tuple[int, int]] | None = None
+) -> ET.Element:
+    """Add the links of a hand to a body; return the root's body. `masks` are those of `pair_masks`."""
+    masks = masks or {}
     links = {link.name: link for link in urdf.links}
-    root = _add_link(parent, links[urdf.root], parent_from_root[:3, 3], parent_from_root[:3, :3])
+    root = _add_link(parent, links[urdf.root], parent_from_root[:3, 3], parent_from_root[:3, :3], masks)
     bodies = {urdf.root: root}
     while len(bodies) < len(links):
         for joint in urdf.joints:
             if joint.parent in bodies and joint.child not in bodies:
-                body = _add_link(bodies[joint.parent], links[joint.child], joint.xyz, _rotation(joint.rpy))
+                body = _add_link(bodies[joint.parent], links[joint.child], joint.xyz, _rotation(joint.rpy), masks)
                 bodies[joint.child] = body
                 if joint.kind != "fixed":
                     kind = "slide" if joint.kind == "prismatic" else "hinge"
@@ -106,16 +110,19 @@ def add_links(parent: ET.Element, urdf: Urdf, parent_from_root: np.ndarray) -> E
     return root
 
 
-def _add_link(parent: ET.Element, link: Link, place: Iterable[float], rotation: np.ndarray) -> ET.Element:
+def _add_link(
+    parent: ET.Element, link: Link, place: Iterable[float], rotation: np.ndarray, masks: Mapping[str, tuple[int, int]]
+) -> ET.Element:
     """Add a link of the hand with its shapes."""
     body = ET.SubElement(parent, "body", _frame(place, rotation), name=link.name, gravcomp="1")
     if link.mass > 0:
         _weigh(body, link.mass, link.com, link.inertia)
+    kind, hits = masks.get(link.name, (0, 0))
     for shape in link.shapes:
         halves = {"box": (0.5, 0.5, 0.5), "sphere": (1.0,), "cylinder": (1.0, 0.5)}[shape.kind]
         size = format_numbers(np.multiply(shape.size, halves))
         frame = _frame(shape.xyz, _rotation(shape.rpy))
-        ET.SubElement(body, "geom", _bits(HAND_BIT, 0) | frame, type=shape.kind, size=size)
+        ET.SubElement(body, "geom", _bits(HAND_BIT | kind, hits) | frame, type=shape.kind, size=size)
     return body
 
 

@@ -103,7 +103,7 @@ class MujocoScene(Scene):
         """Return the depth [m] of the hand in anything."""
         deepest = 0.0
         for (first, second), distance in zip(self.data.contact.geom, self.data.contact.dist, strict=True):
-            if (self._body_of[first] in self._kind_of) != (self._body_of[second] in self._kind_of):
+            if self._body_of[first] not in self._kind_of or self._body_of[second] not in self._kind_of:
                 deepest = max(deepest, -float(distance))
         return deepest
 

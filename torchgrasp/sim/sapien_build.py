@@ -3,7 +3,7 @@
 Settings that differ from SAPIEN's defaults each have a measured reason:
 
 * Joints get an armature: without it the implicit drives lose a third of their torque in a contact.
-* The hand's links feel neither gravity nor each other.
+* The hand's links feel no gravity, and each other only in the pairs that the scene names.
 * Sleeping is off, because a sleeping body keeps stale contacts.
 * The object's inertia is set with its mass.
 * Penetrations are resolved at 1 m/s at most.
@@ -19,8 +19,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from torchgrasp.errors import MissingExtra
+from torchgrasp.sim.collision_masks import pair_masks
 from torchgrasp.sim.mount import MOUNT_DRIVE, mount_slides, mounted_urdf
 from torchgrasp.sim.scene import ARMATURE, TABLE, Body, SceneSpec
+
+EVERYTHING_ELSE, FREE_BIT = 1, 1
+"""Collision group of what is no hand, as SAPIEN sets it, and the number of the first bit after it."""
 
 
 class Built(NamedTuple):
@@ -121,12 +125,12 @@ def _hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
         joint.set_drive_target(position)
         start.append(position)
     hand.set_qpos(np.array(start, np.float32))
+    masks = pair_masks(spec.self_pairs, FREE_BIT)
     for link in hand.links:
         link.disable_gravity = True
         for shape in link.collision_shapes:
-            groups = shape.get_collision_groups()
-            groups[2] |= 1  # shapes that share such a bit do not collide: the hand with itself
-            shape.set_collision_groups(groups)
+            kind, hits = masks.get(link.name, (0, 0))
+            shape.set_collision_groups([kind, EVERYTHING_ELSE | hits, 0, 0])
             if link.name in spec.tip_links:
                 shape.min_patch_radius = spec.patch
     return hand

@@ -74,6 +74,8 @@ class SapienScene(Scene):
         contacts = StepContacts.none()
         for contact in self.system.get_contacts():
             first, second = (self._name_of[body] for body in contact.bodies)
+            if first in self._links and second in self._links:
+                continue
             if first in self._links:
                 link, other, sign = first, second, -1.0
             elif second in self._links:

@@ -88,6 +88,7 @@ class SceneSpec:
         patch: radius [m] of a fingertip's contact patch; torsional friction is friction x force x patch.
         height: of the table [m]; None: the lowest point of the mesh.
         neighbours: further bodies.
+        self_pairs: names of the links of the hand that collide with each other.
     """
 
     urdf_path: Path | str
@@ -107,6 +108,7 @@ class SceneSpec:
     patch: float = PATCH_RADIUS
     height: float | None = None
     neighbours: tuple[Body, ...] = ()
+    self_pairs: tuple[tuple[str, str], ...] = ()
 
     @property
     def body(self) -> Body:
@@ -204,7 +206,7 @@ class Scene(abc.ABC):
 
     @abc.abstractmethod
     def penetration(self) -> float:
-        """Return the initial depth [m] of the hand in object or table."""
+        """Return the initial depth [m] of the hand in anything, itself included."""
 
     @abc.abstractmethod
     def _pose(self, body: Any) -> np.ndarray:
