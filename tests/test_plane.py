@@ -7,6 +7,7 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, inverse, rigid, rotation_from_vector
 from torchgrasp.linalg import unit
 from torchgrasp.plane import GRID, Plane, as_plane, cloud_to_upright, move, upright_frame
+from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import Surface
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import PointCloud
@@ -83,3 +84,12 @@ def test_every_place_and_direction_of_a_surface_moves():
     torch.testing.assert_close(there.vertices, apply(pose, points))
     torch.testing.assert_close(there.normals, surface.normals @ pose[:3, :3].T)
     assert torch.equal(there.std_m, surface.std_m) and torch.equal(there.faces, faces)
+
+
+def test_a_table_above_the_object_is_refused_before_any_work():
+    cloud = random_cloud(viewpoint=True)
+    above = 0.2 - cloud.points[:, 2].sort().values[24]
+    with pytest.raises(BadArgument, match=rf"^table: found a plane {above:.3g} m above the middle of the cloud"):
+        fit_shape(cloud, table=0.2)
+    tilted = Plane(unit(torch.tensor([0.02, 0.0, 1.0], dtype=F64)), 0.003)
+    assert upright_frame(cloud, tilted).isfinite().all()

@@ -1,6 +1,7 @@
 """Value types: checks at construction, rows, devices and dtypes, statuses."""
 
 import dataclasses
+import math
 import subprocess
 import sys
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchgrasp.base import count_status, join, pick, put
+from torchgrasp.base import check_number, check_whole, count_status, join, pick, put
 from torchgrasp.errors import BadArgument, FailedRows, GraspError, Status, TooFewPoints
 from torchgrasp.specs import ContactSpec, TrialSpec
 from torchgrasp.values import Certificate, ContactPlan, Contacts, PointCloud
@@ -108,6 +109,18 @@ def test_to_returns_a_new_value_and_keeps_integers():
         torch.float64
     )
     assert certificate.closed.dtype == torch.bool
+
+
+@pytest.mark.parametrize("value", [8.5, "8", True, None, math.nan, 2], ids=repr)
+def test_what_is_no_whole_number_of_the_range_is_a_bad_argument(value):
+    with pytest.raises(BadArgument, match=r"^edges: found "):
+        check_whole("edges", value, 3, 1024)
+
+
+@pytest.mark.parametrize("value", ["0.8", False, None, math.inf], ids=repr)
+def test_what_is_no_number_of_the_range_is_a_bad_argument(value):
+    with pytest.raises(BadArgument, match=r"^friction: found "):
+        check_number("friction", value, 0.0, 10.0)
 
 
 def test_values_are_frozen():

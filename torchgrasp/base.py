@@ -1,6 +1,7 @@
 """What every value is made of: frozen dataclasses of tensors, batches with rows, checks and counts."""
 
 import dataclasses
+import numbers
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
@@ -136,13 +137,18 @@ def check_tensor(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor
     return value
 
 
-def check_whole(name: str, value: int, low: int, high: int) -> None:
+def check_whole(name: str, value: Any, low: int, high: int) -> None:
     """Refuse a number that is not whole or is out of range; raise `BadArgument`."""
-    if not low <= value <= high or value != int(value):
-        raise BadArgument(name, value, f"a whole number in [{low}, {high}]")
+    if not _is_number(value) or not low <= value <= high or value != int(value):
+        raise BadArgument(name, value if _is_number(value) else repr(value), f"a whole number in [{low}, {high}]")
 
 
-def check_number(name: str, value: int | float, low: int | float, high: int | float) -> None:
+def check_number(name: str, value: Any, low: int | float, high: int | float) -> None:
     """Refuse a number that is out of range or NaN; raise `BadArgument`."""
-    if not low <= value <= high:
-        raise BadArgument(name, value, f"a number in [{low:g}, {high:g}]")
+    if not _is_number(value) or not low <= value <= high:
+        raise BadArgument(name, value if _is_number(value) else repr(value), f"a number in [{low:g}, {high:g}]")
+
+
+def _is_number(value: Any) -> bool:
+    """Tell whether a value is a real number; True and False are none."""
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from filelock import FileLock, Timeout
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
@@ -37,32 +38,33 @@ def hold_folder(folder: Path) -> Iterator[None]:
     Raises:
         OutputError: another run holds the lock, or the folder cannot be written.
     """
-    import fcntl
-
     path, made = folder / LOCK, [x for x in (folder, *folder.parents) if not x.exists()]
+    lock = FileLock(path, timeout=0)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        lock.acquire()
+    except Timeout as error:
+        raise OutputError("folder", f"{folder}, in use by {_holder(path)}", "a folder that no run writes") from error
     except OSError as error:
         raise OutputError("folder", f"{folder} ({error.strerror or error})", "a folder that can be written") from error
-    with os.fdopen(handle, "r+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if not os.path.samestat(os.fstat(handle), os.stat(path)):
-                raise FileNotFoundError(path)  # a run that just ended took the file away that was opened here
-        except OSError as error:
-            holder = file.read(200).strip() or "another run"
-            raise OutputError("folder", f"{folder}, in use by {holder}", "a folder that no run writes") from error
-        try:
-            file.truncate(0)
-            file.write(f"process {os.getpid()} on {socket.gethostname()}")
-            file.flush()
-            yield
-        finally:
+    try:
+        with contextlib.suppress(OSError):  # some systems let nobody write a locked file
+            path.write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
+        yield
+    finally:
+        lock.release()
+        with contextlib.suppress(OSError):
             path.unlink(missing_ok=True)
-            with contextlib.suppress(OSError):  # not empty
-                for empty in made:
-                    empty.rmdir()
+            for empty in made:
+                empty.rmdir()
+
+
+def _holder(path: Path) -> str:
+    """Return which run holds a lock, as far as its file tells."""
+    try:
+        return path.read_text(encoding="utf-8")[:200].strip() or "another run"
+    except (OSError, UnicodeDecodeError):
+        return "another run"
 
 
 def write_atomically(path: Path | str, write: Callable[[Path], object]) -> Path:

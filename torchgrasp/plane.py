@@ -29,6 +29,8 @@ POINTS, DIRECTIONS, POSES = (
     ("obj_from_hand", "obj_from_vf"),
 )
 """Fields of values that change with the frame; the other fields do not."""
+DEPTH = 0.01
+"""Depth [m] under the table at which a cloud's middle point contradicts the table: several errors of calibration."""
 LEAST_TILT = 0.05
 """Least sine of the angle between the vertical and the direction to the camera: steeper views have no azimuth."""
 
@@ -90,12 +92,18 @@ def upright_frame(cloud: PointCloud, table: Plane | None = None) -> Float[Tensor
     Its z axis is the table's normal, else the direction to the camera, else the points' least principal axis. Its x
     axis points level towards the camera, else to the point farthest from the vertical through the points' centre,
     where the origin lies: on the table, if there is one.
+
+    Raises:
+        BadArgument: a table with most points more than `DEPTH` under it.
     """
     points, viewpoint = cloud.points.detach().cpu().double(), cloud.viewpoint
     centre = points.mean(0)
     offset = points - centre
     eye = None if viewpoint is None else viewpoint.detach().cpu().double().reshape(-1, 3).mean(0) - centre
     if table is not None:
+        middle = float(table.height(points).median())
+        if middle < -DEPTH:
+            raise BadArgument("table", f"a plane {-middle:.3g} m above the middle of the cloud", "one under the object")
         z = unit(table.normal.detach().cpu().double())
         centre = centre - table.height(centre) * z
     elif eye is not None and bool(eye.any()):

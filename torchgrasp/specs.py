@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Literal, get_args
 
-from torchgrasp.base import Value, check_number
+from torchgrasp.base import Value, check_number, check_whole
 from torchgrasp.errors import BadArgument
 from torchgrasp.plane import Plane, as_plane
 
@@ -59,7 +59,6 @@ class ContactSpec(Value):
         _check_ranges(
             self,
             friction=(0.0, 10.0),
-            edges=(3, 1024),
             max_variance=(1e-12, 1e6),
             friction_margin=(1e-3, 1.0),
             separation=(0.0, 1.0),
@@ -68,6 +67,7 @@ class ContactSpec(Value):
             tip_radius=(0.0, 1.0),
             start_radius=(1e-6, 1.2),
         )
+        check_whole("edges", self.edges, 3, 1024)
         as_plane(self.table)
 
     @property
