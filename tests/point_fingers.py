@@ -37,6 +37,7 @@ def reference(coupling: torch.Tensor | None = None) -> ClosingReference:
     hand = load_hand("barrett")
     hand = dataclasses.replace(
         hand,
+        actuators=dict.fromkeys(names, next(iter(hand.actuators.values()))),
         actuated=ActuatedJoints(names[:h], -ones, ones, coupling, torch.zeros(9).double()),
         tree=dataclasses.replace(hand.tree, joint_names=names),
         tips=dataclasses.replace(hand.tips, radius=real([0.01, 0.01, 0.01])),

@@ -101,11 +101,14 @@ class ContactSpec(Value):
         return cls(friction, edges, max_variance, friction_margin=1.0, separation=0.0, flatness=None, start_radius=0.1)
 
 
-ClosingMode = Literal["open_loop", "position", "fixed", "uncertainty"]
+ClosingMode = Literal["open_loop", "position", "paper_position", "fixed", "paper", "uncertainty"]
 """How a hand closes, see `TrialSpec`."""
 
-HoldingMode = Literal["force", "impedance", "position"]
+HoldingMode = Literal["force", "impedance", "position", "law"]
 """How a closed hand presses, see `TrialSpec`."""
+
+ClosingPart = Literal["wait", "pace", "switch"]
+"""What the closing law has beyond the paper's, see `torchgrasp.control.closing.LawClosing`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,10 +116,13 @@ class TrialSpec(Value):
     """One simulated trial: close on the true mesh, lift it off the table, hold it.
 
     Args:
-        closing: how the hand closes: "uncertainty" (Eqs. 25-28), "fixed" (Eq. 25 with constant gains), "position"
-            (PI control until 0.5 N, the paper's baseline) or "open_loop" (pre-grasp, grasp, squeeze).
-        holding: how the closed hand presses: "force" (balanced forces), "impedance" (the grasp is a spring in the hand)
-            or "position" (joints stay at their targets). In open loop the squeeze stays.
+        closing: how the hand closes. "paper": Eqs. 25-28 as written, with forces of the hand's stability model.
+            "uncertainty": the same law with three further parts. "fixed": the same with constant gains.
+            "paper_position": PI control to the contacts until 0.5 N, the paper's baseline. "position": the same, aimed
+            behind the contacts. "open_loop": pre-grasp, grasp, squeeze.
+        holding: how the closed hand presses: "force" (balanced forces), "impedance" (the grasp is a spring in the
+            hand), "position" (joints stay at their targets) or "law" (Eq. 25 goes on). In open loop the squeeze stays.
+        without: parts that "uncertainty" or "fixed" leaves out.
         mass: mass of the object [kg].
         friction: coefficient of friction of every contact.
         gravity: [m/s^2].
@@ -137,8 +143,8 @@ class TrialSpec(Value):
         self_collision: whether links of the hand collide with each other, in the pairs that the hand names.
 
     Raises:
-        BadArgument: a number outside its range, an unknown closing, holding or simulator, or a control period below
-            one timestep.
+        BadArgument: a number outside its range, an unknown closing, holding, part or simulator, parts of a closing
+            that has none, or a control period below one timestep.
     """
 
     closing: ClosingMode = "uncertainty"
@@ -161,6 +167,7 @@ class TrialSpec(Value):
     overlap: float = 1e-3
     table: bool = True
     self_collision: bool = True
+    without: tuple[ClosingPart, ...] = ()
 
     def __post_init__(self) -> None:
         """Check every range once, where the value is made."""
@@ -168,6 +175,7 @@ class TrialSpec(Value):
         for name in ("closing", "holding", "simulator"):
             if getattr(self, name) not in get_args(fields[name]):
                 raise BadArgument(name, repr(getattr(self, name)), f"one of {', '.join(get_args(fields[name]))}")
+        check_closing_parts(self.closing, self.without)
         _check_ranges(
             self,
             mass=(1e-3, 10.0),
@@ -199,6 +207,13 @@ def _check_ranges(spec: Value, **ranges: tuple[float | int, float | int]) -> Non
             raise BadArgument(name, value, f"a number in [{low:g}, {high:g}]")
         if value is not None:
             check_number(name, value, low, high)
+
+
+def check_closing_parts(closing: str, without: tuple[str, ...]) -> None:
+    """Raise `BadArgument` for unknown parts, or parts of a closing that has none."""
+    known = get_args(ClosingPart) if closing in ("uncertainty", "fixed") else ()
+    if not set(without) <= set(known):
+        raise BadArgument("without", f"{without} of {closing!r}", f"some of {known}")
 
 
 def check_simulator(simulator: str) -> None:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.control.closing import UncertaintyClosing
+from torchgrasp.control.closing import LawClosing
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
@@ -124,7 +124,7 @@ def _pull(run: TrialRun, holding: Holding, pull: RisingPull) -> list[tuple[Tenso
 def _close(run: TrialRun, holding: Holding) -> tuple[Observation, Step]:
     """Close under the law, and return the last observation and what holds from then on."""
     robot, targets = run.robot, run.controller.targets
-    observation, closing = robot.tick(targets), UncertaintyClosing(robot.reference)
+    observation, closing = robot.tick(targets), LawClosing(robot.reference)
     for _ in range(robot.ticks(CLOSING_TIME)):
         targets = closing(observation, robot.period)
         observation = robot.tick(targets)

@@ -14,8 +14,8 @@ from torchgrasp.control.closing import (
     SETTLED,
     STOP_FORCE,
     FixedGainClosing,
+    LawClosing,
     PositionClosing,
-    UncertaintyClosing,
 )
 from torchgrasp.control.closing_law import MAX_SPEED, POSITION_FLOOR, POSITION_RATE
 from torchgrasp.control.controller import CLOSING_TIME, PRESSING_TIME, GraspController
@@ -25,7 +25,7 @@ from torchgrasp.errors import BadArgument
 
 
 def test_eq25_free_fingers_approach_their_contacts():
-    step = UncertaintyClosing(reference())(observation(), PERIOD).reshape(3, 3)
+    step = LawClosing(reference())(observation(), PERIOD).reshape(3, 3)
     assert ((step * NORMALS).sum(-1) < 0).all()
     assert step.norm(dim=-1).max() <= MAX_SPEED * PERIOD + 1e-12
     assert step[:, 1:].abs().max() < 1e-9
@@ -34,27 +34,27 @@ def test_eq25_free_fingers_approach_their_contacts():
 def test_a_touching_finger_keeps_the_waiting_force_whatever_its_position_error():
     one = torch.tensor([True, False, False])
     for reading, sign in ((0.0, -1), (1.0, 1)):
-        step = UncertaintyClosing(reference())(observation(0.02, (reading, 0, 0), one), PERIOD).reshape(3, 3)
+        step = LawClosing(reference())(observation(0.02, (reading, 0, 0), one), PERIOD).reshape(3, 3)
         assert float((step[0] * NORMALS[0]).sum()) * sign > 0
 
 
 def test_closing_ends_when_all_touch_or_patience_is_over():
-    controller = UncertaintyClosing(reference())
+    controller = LawClosing(reference())
     for contact, wait in ((TOUCHING, SETTLED), (torch.tensor([True, False, False]), PATIENCE)):
-        controller = UncertaintyClosing(reference())
+        controller = LawClosing(reference())
         ticks = 0
         while not controller.done:
             controller(observation(contact=contact), PERIOD)
             ticks += 1
         assert ticks * PERIOD == pytest.approx(wait, abs=1.5 * PERIOD)
-    controller = UncertaintyClosing(reference())
+    controller = LawClosing(reference())
     for _ in range(300):
         controller(observation(), PERIOD)
     assert not controller.done
 
 
 def test_targets_stay_within_limits_and_near_the_joints():
-    controller = UncertaintyClosing(reference())
+    controller = LawClosing(reference())
     for _ in range(500):
         targets = controller(observation(0.5), PERIOD)
     assert targets.abs().max() == pytest.approx(LEAD)
@@ -153,7 +153,7 @@ def test_fixed_gains_know_nothing_of_the_surface():
 def test_fingers_in_the_air_arrive_together():
     seen = observation(0.2)
     near = dataclasses.replace(seen, tips=TARGET + 0.01 * NORMALS + real([[0.2], [0.1], [0.2]]) * NORMALS)
-    step = UncertaintyClosing(reference())(near, PERIOD).reshape(3, 3)
+    step = LawClosing(reference())(near, PERIOD).reshape(3, 3)
     speed = -(step * NORMALS).sum(-1)
     assert float(speed[1] / speed[0]) == pytest.approx((0.1 + POSITION_FLOOR) / (0.2 + POSITION_FLOOR), rel=1e-3)
     assert float(speed[2]) == pytest.approx(float(speed[0]))
@@ -162,7 +162,7 @@ def test_fingers_in_the_air_arrive_together():
 def test_a_late_finger_searches_on_beyond_its_planned_contact_and_presses_harder():
     two = torch.tensor([True, True, False])
     seen = observation(-0.03, (0.3, 0.3, 0.0), two)
-    controller = UncertaintyClosing(reference())
+    controller = LawClosing(reference())
     first = controller(seen, PERIOD).reshape(3, 3)
     assert float(first[2] @ NORMALS[2]) < -0.5 * MAX_SPEED * PERIOD
     for _ in range(250):

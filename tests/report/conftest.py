@@ -67,6 +67,8 @@ def run() -> Run:
         joint_names=hand.tree.joint_names,
         contact_order=(0, 1, 2),
         object_motion=ObjectMotion(0.003, math.radians(2)),
+        pushed=ObjectMotion(0.002, 0.0),
+        slip=ObjectMotion(0.001, 0.0),
         start_overlap=0.0,
         disturbance=Disturbance(
             torch.full((3,), math.inf), torch.zeros(3), torch.zeros(3, dtype=torch.bool), lifted[:, None]

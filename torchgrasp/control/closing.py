@@ -4,12 +4,14 @@ import dataclasses
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.control.closing_law import POSITION_FLOOR, POSITION_RATE, blend, joint_step, tip_velocity
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.tactile import NOISE
+from torchgrasp.specs import ClosingPart
 
 Revision = Callable[[Observation, ClosingReference], ClosingReference]
 """Revises the reference by what the fingers feel (`Belief.revise`)."""
@@ -22,8 +24,11 @@ WAITING_FORCE, SETTLED, PATIENCE = 0.3, 0.1, 1.5
 once all have touched for ten samples [s], or after a time [s] in which a fingertip travels 60 mm."""
 
 LEAD, IMPATIENCE = 0.04, 0.25
-"""Largest lead [rad] of a target over its joint: it bounds the force of a link that is stopped unfelt. While the others
-wait for a finger, the lead grows by itself in each such time [s]."""
+"""Largest lead [rad] of a waiting finger's target over its joint: it bounds the force of a link that is stopped unfelt.
+While the others wait for a finger, the lead grows by itself in each such time [s]."""
+
+ARRIVED = 0.5
+"""Blend (Eq. 26) of a fingertip that is at its desired position: the force counts as much as the position."""
 
 STOP_FORCE, STOP_DISTANCE, AIM_DEPTH, INTEGRAL_RATE = 0.5, 1e-3, 0.02, 2.0
 """The position baseline: force [N] (Sec. 6.5) and distance to its target [m] at which a finger stops. The depth
@@ -35,6 +40,7 @@ class OpenLoopClosing:
 
     def __init__(self, reference: ClosingReference) -> None:
         poses = (reference.pregrasp, reference.joints, reference.squeeze)
+        self.reference = reference
         self.poses = torch.stack([reference.expand(pose) for pose in poses])
         self.time, self.done = 0.0, False
 
@@ -47,20 +53,36 @@ class OpenLoopClosing:
         return torch.lerp(self.poses[first], self.poses[first + 1], progress - first)
 
 
-class UncertaintyClosing:
-    """The uncertainty-aware controller (Eqs. 25-28), with fingers that wait for each other.
+class LawClosing:
+    """The closing law (Eqs. 25-28), and three parts that the paper does not have. `without` leaves some of them out.
 
-    A finger in the air searches along its contact's normal, even beyond the contact. Before the first
-    touch the fingers keep pace. A finger that touches is force-controlled whatever its position error: where the shape
-    is wrong, Eq. (26) would press on. It waits with `WAITING_FORCE` for the others. The holding then raises the full
-    forces: three separate loops would push the object (docs/closing.md).
+    * `switch`: touch decides. A finger in the air searches along its contact's normal, even beyond the contact. One
+      that touches is force-controlled whatever its position error: where the shape is wrong, Eq. (26) would press on.
+    * `wait`: a finger that touches presses with `WAITING_FORCE` until all do. The holding then raises the full forces:
+      three separate loops would push the object (docs/closing.md).
+    * `pace`: before the first touch all fingers keep pace. Without it they share one limit of speed, so that
+      Eq. (27) decides which is the first.
+
+    Without all three it is the paper's law. That needs four mends: `joint_step` for its J^-1, `POSITION_FLOOR`,
+    `MAX_SPEED`, and a target that leads its joint by no more than the drive can exert. It ends when all
+    fingers touch, each blend is at least `ARRIVED`, and the forces have been steady for a time `SETTLED`.
     """
 
-    def __init__(self, reference: ClosingReference, revise: Revision | None = None) -> None:
+    def __init__(
+        self, reference: ClosingReference, revise: Revision | None = None, without: tuple[ClosingPart, ...] = ()
+    ) -> None:
         self.reference, self.revise = reference, revise
+        self.switch, self.waits, self.paces = (part not in without for part in ("switch", "wait", "pace"))
+        self.strongest = _strongest_lead(reference)
         self.target = reference.pregrasp
         self.waiting = self.settled = 0.0
+        self.steady = torch.zeros(3, dtype=torch.float64)
         self.done = False
+
+    def press(self) -> "LawClosing":
+        """Let fingers that waited press with their desired forces."""
+        self.waits = False
+        return self
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets of all joints for the next tick."""
@@ -68,36 +90,56 @@ class UncertaintyClosing:
             self.reference = self.revise(observation, self.reference)
         reference, gains, coupling = self.reference, self.reference.gains, self.reference.hand.actuated.coupling
         normals, contact = reference.normals, observation.tactile.contact
-        self.waiting = self.waiting + period if bool(contact.any()) else 0.0
-        self.settled = self.settled + period if bool(contact.all()) else 0.0
-        self.done = self.settled >= SETTLED or self.waiting >= PATIENCE
-        desired = torch.where(contact, WAITING_FORCE, -(gains.desired_force * normals).sum(-1))
         error = gains.target - reference.contact_points(observation.tips)
         ahead = -(error * normals).sum(-1)  # how far the planned contact still lies ahead of each fingertip
-        error = error + ahead.clamp_max(0.0)[:, None] * normals
-        share = torch.where(contact, 1.0, blend(error, gains.covariance))
+        if self.switch:
+            error = error + ahead.clamp_max(0.0)[:, None] * normals
+        share = blend(error, gains.covariance)
+        if self.switch:
+            share = torch.where(contact, 1.0, share)
+        desired = -(gains.desired_force * normals).sum(-1)
+        if self.waits:
+            desired = torch.where(contact, WAITING_FORCE, desired)
+        self._judge(observation, share, period)
         force_error = -(desired - observation.tactile.reading)[:, None] * normals
-        velocity = tip_velocity(error, force_error, share, gains.position_gain, gains.force_gain)
-        velocity = velocity * self._pace(ahead, contact)[:, None]
+        velocity = tip_velocity(error, force_error, share, gains.position_gain, gains.force_gain, not self.paces)
+        if self.paces and not bool(contact.any()):
+            left = ahead.clamp_min(0.0) + POSITION_FLOOR
+            velocity = velocity * (left / left.max())[:, None]
         step = joint_step(observation.jacobian @ coupling, velocity, period, reference.joints - self.target)
         actuated = reference.pick(observation.joints)
-        lead = LEAD * (1 + self.waiting / IMPATIENCE)
+        lead = LEAD * (1 + self.waiting / IMPATIENCE) if self.waits else self.strongest
         target = torch.minimum(torch.maximum(self.target + step, actuated - lead), actuated + lead)
         self.target = reference.clamp(target)
         return reference.expand(self.target)
 
-    def _pace(self, ahead: Float[Tensor, "3"], contact: Bool[Tensor, "3"]) -> Float[Tensor, "3"]:
-        """Return each finger's share of its speed with which all arrive together."""
-        if bool(contact.any()):
-            return torch.ones_like(ahead)
-        left = ahead.clamp_min(0.0) + POSITION_FLOOR
-        return left / left.max()
+    def _judge(self, observation: Observation, share: Float[Tensor, "3"], period: float) -> None:
+        """Count the time since the first touch, and the time for which the fingers have settled."""
+        contact, average = observation.tactile.contact, observation.tactile.average
+        self.waiting = self.waiting + period if bool(contact.any()) else 0.0
+        settled = bool(contact.all())
+        if not self.waits:
+            settled = settled and bool((share >= ARRIVED).all() & ((average - self.steady).abs() < NOISE).all())
+        self.settled = self.settled + period if settled else 0.0
+        if not settled:
+            self.steady = average
+        self.done = self.settled >= SETTLED or (self.waits and self.waiting >= PATIENCE)
 
 
-class FixedGainClosing(UncertaintyClosing):
-    """`UncertaintyClosing` with equal gains for every contact and direction."""
+def _strongest_lead(reference: ClosingReference) -> Float[Tensor, " h"]:
+    """Return the lead [rad] of each actuated joint's target at which a drive is at its largest torque."""
+    hand = reference.hand
+    effort = torch.tensor([hand.actuators[name].effort for name in hand.tree.joint_names], dtype=torch.float64)
+    leads = (effort / reference.kp)[:, None] / hand.actuated.coupling.abs()  # infinite where nothing is driven
+    return leads.amin(0)
 
-    def __init__(self, reference: ClosingReference, revise: Revision | None = None) -> None:
+
+class FixedGainClosing(LawClosing):
+    """`LawClosing` with equal gains for every contact and direction."""
+
+    def __init__(
+        self, reference: ClosingReference, revise: Revision | None = None, without: tuple[ClosingPart, ...] = ()
+    ) -> None:
         gains = reference.gains
         isotropic = dataclasses.replace(
             gains,
@@ -105,15 +147,18 @@ class FixedGainClosing(UncertaintyClosing):
             position_gain=torch.full_like(gains.position_gain, POSITION_RATE),
             force_gain=gains.force_gain.amax(-1, keepdim=True).expand(3, 3),
         )
-        super().__init__(dataclasses.replace(reference, gains=isotropic), revise)
+        super().__init__(dataclasses.replace(reference, gains=isotropic), revise, without)
 
 
 class PositionClosing:
-    """The paper's baseline (Table 7): an isotropic PI position controller per fingertip that stops at `STOP_FORCE`."""
+    """The paper's baseline (Table 7): an isotropic PI position controller per fingertip that stops at `STOP_FORCE`.
 
-    def __init__(self, reference: ClosingReference) -> None:
+    It aims at a `depth` [m] behind the contacts. The paper's is 0, with which a finger may stop before it touches.
+    """
+
+    def __init__(self, reference: ClosingReference, depth: float = AIM_DEPTH) -> None:
         self.reference = reference
-        self.aim = reference.gains.target - AIM_DEPTH * reference.normals
+        self.aim = reference.gains.target - depth * reference.normals
         self.target = reference.pregrasp
         self.integral = torch.zeros_like(self.aim)
         self.stopped = torch.zeros(3, dtype=torch.bool)

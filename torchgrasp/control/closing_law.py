@@ -90,11 +90,18 @@ def tip_velocity(
     blend: Float[Tensor, "*b"],
     position_gain: Float[Tensor, "*b 3"],
     force_gain: Float[Tensor, "*b 3"],
+    together: bool = False,
 ) -> Float[Tensor, "*b 3"]:
-    """Return the bracket of Eq. (25) [m/s] for each fingertip, shortened to `MAX_SPEED`."""
+    """Return the bracket of Eq. (25) [m/s] for each fingertip, shortened to `MAX_SPEED`.
+
+    `together` shortens all fingers (the last axis of `blend`) by one factor: their gains still tell who is faster.
+    """
     share = blend[..., None]
     velocity = (1 - share) * position_gain * position_error + share * force_gain * force_error
-    return limit_norm(velocity, MAX_SPEED)
+    if not together:
+        return limit_norm(velocity, MAX_SPEED)
+    fastest = torch.linalg.vector_norm(velocity, dim=-1).amax(-1)
+    return velocity * (MAX_SPEED / fastest.clamp_min(MAX_SPEED))[..., None, None]
 
 
 def joint_step(

@@ -7,13 +7,13 @@ from typing import get_args
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.control.closing import FixedGainClosing, OpenLoopClosing, PositionClosing, Revision, UncertaintyClosing
+from torchgrasp.control.closing import FixedGainClosing, LawClosing, OpenLoopClosing, PositionClosing, Revision
 from torchgrasp.control.holding import ForceHold, PositionHold
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.errors import BadArgument
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.specs import ClosingMode, HoldingMode
+from torchgrasp.specs import ClosingMode, ClosingPart, HoldingMode, check_closing_parts
 
 Step = Callable[[Observation, float], Float[Tensor, " j"]]
 """Turns what is known, and the time to the next tick [s], into the targets of all joints [rad]."""
@@ -25,13 +25,16 @@ PRESSING_TIME = 0.5
 """Time [s] from the end of closing until the hand counts as closed: the forces have risen (`RAMP`)."""
 
 
-def check_modes(closing: str, holding: str, belief: object = None) -> None:
-    """Refuse an unknown closing or holding, and a belief for a closing that does not follow the law (Eq. 25)."""
+def check_modes(closing: str, holding: str, belief: object = None, without: tuple[str, ...] = ()) -> None:
+    """Refuse unknown names, and what a closing has not: parts, a law (Eq. 25) to hold with or to revise."""
     for name, value, mode in (("closing", closing, ClosingMode), ("holding", holding, HoldingMode)):
         if value not in get_args(mode):
             raise BadArgument(name, repr(value), f"one of {', '.join(get_args(mode))}")
     if belief is not None and closing not in ("fixed", "uncertainty"):
         raise BadArgument("belief", f"one for {closing!r}", "None, or a closing under the law")
+    if holding == "law" and closing not in ("fixed", "uncertainty", "paper"):
+        raise BadArgument("holding", f"'law' after {closing!r}", "another, or a closing under the law")
+    check_closing_parts(closing, without)
 
 
 class GraspController:
@@ -44,9 +47,10 @@ class GraspController:
         reference: what the hand follows.
         closing, holding: as in `TrialSpec`.
         belief: the shape that the grasp was planned on, which touches revise under the law (Eq. 25); None: they do not.
+        without: parts that the closing leaves out, as in `TrialSpec`.
 
     Raises:
-        BadArgument: an unknown closing or holding, or a belief for a closing that does not follow the law.
+        BadArgument: unknown names; a belief, parts or "law" for a closing that has none.
 
     A hand that is driven at 200 Hz; here joints follow at once and the object yields by 1 mm for 2 N:
 
@@ -73,11 +77,12 @@ class GraspController:
         closing: ClosingMode = "uncertainty",
         holding: HoldingMode = "force",
         belief: ShapeGP | None = None,
+        without: tuple[ClosingPart, ...] = (),
     ) -> None:
-        check_modes(closing, holding, belief)
+        check_modes(closing, holding, belief, without)
         self.reference = reference
-        self.closing = _closing(reference, closing, belief)
-        self._hold, self.hold = _holding(reference, holding), None
+        self.closing = _closing(reference, closing, belief, without)
+        self._hold, self.hold = _holding(self.closing, holding), None
         self.targets = reference.expand(reference.pregrasp)
         self.time, self.pressed = 0.0, 0.0
 
@@ -102,29 +107,38 @@ class GraspController:
         return self.targets
 
 
+Closing = OpenLoopClosing | PositionClosing | LawClosing
+
+
 def _closing(
-    reference: ClosingReference, mode: ClosingMode, belief: ShapeGP | None
-) -> OpenLoopClosing | PositionClosing | UncertaintyClosing:
+    reference: ClosingReference, mode: ClosingMode, belief: ShapeGP | None, without: tuple[ClosingPart, ...]
+) -> Closing:
     """Return the closing of a mode."""
     if mode == "open_loop":
         return OpenLoopClosing(reference)
     if mode == "position":
         return PositionClosing(reference)
+    if mode == "paper_position":
+        return PositionClosing(reference, depth=0.0)
+    if mode == "paper":
+        return LawClosing(reference, without=get_args(ClosingPart))
     revise: Revision | None = None
     if belief is not None:
         from torchgrasp.control.adaptive.belief import Belief
 
         revise = Belief(belief, reference.obj_from_hand).revise
-    return (FixedGainClosing if mode == "fixed" else UncertaintyClosing)(reference, revise)
+    return (FixedGainClosing if mode == "fixed" else LawClosing)(reference, revise, without)
 
 
 def _holding(
-    reference: ClosingReference, mode: HoldingMode
+    closing: Closing, mode: HoldingMode
 ) -> Callable[[ClosingReference, Observation, Float[Tensor, " j"]], Step]:
     """Return the maker of a holding; only the impedance reads the stability model."""
     if mode == "impedance":
         from torchgrasp.control.adaptive.impedance import Impedance
         from torchgrasp.control.adaptive.stability import load_stability
 
-        return functools.partial(Impedance, stability=load_stability(reference.hand))
+        return functools.partial(Impedance, stability=load_stability(closing.reference.hand))
+    if mode == "law" and isinstance(closing, LawClosing):
+        return lambda *_: closing.press()
     return ForceHold if mode == "force" else PositionHold

@@ -61,16 +61,16 @@ class TrialDriver:
     """
 
     def __init__(self, trial: GraspTrial, spec: TrialSpec, reference: ClosingReference | None = None) -> None:
-        check_modes(spec.closing, spec.holding, trial.belief)
+        check_modes(spec.closing, spec.holding, trial.belief, spec.without)
         self.trial, self.spec = trial, spec
         hand, grasp = trial.hand.to("cpu", torch.float64), trial.grasp.to("cpu", torch.float64)
-        self.reference = reference or ClosingReference.from_grasp(hand, grasp, spec.force, spec.kp)
+        self.reference = reference or derive_reference(hand, grasp, spec)
         self.obj_from_world = torch.eye(4, dtype=torch.float64)
         if trial.table is not None:
             self.obj_from_world = world_frame(trial.table, grasp.obj_from_hand[0])
             grasp = _to_world(grasp, self.obj_from_world)
             if reference is None:
-                upright = ClosingReference.from_grasp(hand, grasp, spec.force, spec.kp)
+                upright = derive_reference(hand, grasp, spec)
                 self.reference = dataclasses.replace(upright, obj_from_hand=self.reference.obj_from_hand)
         hand.check_joints(grasp.pregrasp)
         if spec.approach and not abs(float(torch.linalg.vector_norm(grasp.approach)) - 1) < 1e-4:
@@ -123,6 +123,19 @@ class TrialDriver:
         return open_scene(scene_spec, self.spec.simulator).penetration()
 
 
+def derive_reference(hand: Hand, grasp: Grasps, spec: TrialSpec) -> ClosingReference:
+    """Return what a trial's hand follows; closing "paper" takes its forces from the stability model [6].
+
+    A hand without such a model presses with analytic forces (`ClosingReference.gains.force_source`).
+    """
+    stability = None
+    if spec.closing == "paper":
+        from torchgrasp.control.adaptive.stability import load_stability
+
+        stability = load_stability(hand)
+    return ClosingReference.from_grasp(hand, grasp, spec.force, spec.kp, stability)
+
+
 class TrialRun:
     """One run of a trial in a fresh scene; its phases yield after every control tick."""
 
@@ -132,7 +145,7 @@ class TrialRun:
         self.scene = open_scene(driver.scene_spec, spec.simulator)
         generator = torch.Generator().manual_seed(trial.seed) if spec.noise else None
         self.robot = SimulatedHand(self.scene, driver.reference, spec.control_rate, generator)
-        self.controller = GraspController(self.robot.reference, spec.closing, spec.holding, trial.belief)
+        self.controller = GraspController(self.robot.reference, spec.closing, spec.holding, trial.belief, spec.without)
         self.overlap = self.scene.penetration()
 
     @property

@@ -35,6 +35,8 @@ PUSHED_DISTANCE = 0.05
 """Motion [m] of the object's centre while the hand closes that counts as pushed out: about a hand's opening."""
 LOST_DISTANCE = 0.5
 """Distance [m], beyond the lift, at which the object is gone and the trial over: out of the hand's reach."""
+SLIP_DISTANCE, SLIP_ANGLE = 0.02, math.radians(30)
+"""Motion [m, rad] of the object in the hand since it pressed that counts as slipped: a planned next step would fail."""
 
 
 def close_hand(
@@ -54,7 +56,8 @@ def close_hand(
 
     The opened hand moves straight to its pre-grasp, closes and
     presses (`GraspController`), rises and holds. The object is **held** if at the end its centre is up by half the
-    lift, and two fingers touched it in most of the last `JUDGED_TIME`. Equal arguments give equal bits.
+    lift, two fingers touched it in most of the last `JUDGED_TIME`, and it slipped by less than 20 mm and 30 degrees
+    since the hand pressed. Equal arguments give equal bits.
 
     Args:
         grasp: one row.
@@ -71,7 +74,7 @@ def close_hand(
     Raises:
         BadArgument: not exactly one row, joints of another hand, or a pre-grasp outside the joint limits.
         BadArgument: an approach that is no unit vector, or an error that is no finite (4, 4).
-        BadArgument: a belief for a closing that does not follow the law (Eq. 25).
+        BadArgument: a belief or the holding "law" for a closing that does not follow the law (Eq. 25).
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
     """
@@ -112,6 +115,8 @@ class _Lift:
         self.run, self.spec = run, run.spec
         self.ticks: list[_Tick] = []
         self.arrived, self.pushed, self.strained = 0, 0.0, False
+        self.touched: int | None = None
+        self.pressed: int | None = None
 
     def perform(self) -> Status:
         """Approach, close, press, lift and hold; return the status of the trial."""
@@ -125,6 +130,10 @@ class _Lift:
             self.arrived = len(self.ticks) - 1
             for _ in run.close():
                 self._record()
+                if self.touched is None and self._all_touched():
+                    self.touched = len(self.ticks) - 1
+            self.pressed = len(self.ticks) - 1
+            self.touched = self.pressed if self.touched is None else self.touched
             self.pushed, self.strained = self._moved(), run.strained()
             rising = run.robot.ticks(LIFT_TIME)
             for k in range(rising + run.robot.ticks(self.spec.hold_time)):
@@ -167,13 +176,18 @@ class _Lift:
         """Return the distance [m] of the object's centre from its start."""
         return float(np.linalg.norm(self.ticks[-1].centre - self.ticks[0].centre))
 
+    def _all_touched(self) -> bool:
+        """Return whether all fingers have touched, or the closing is over."""
+        return self.run.controller.hold is not None or bool(np.isfinite(self.run.robot.first_touch).all())
+
     def _verdict(self) -> Status:
         """Return whether the object is held, or the first failure."""
         rise = np.array([tick.centre[2] - self.ticks[0].centre[2] for tick in self.ticks])
         half = 0.5 * self.spec.lift_height
         gripped = np.array([tick.touching >= 2 for tick in self.ticks[-self.run.robot.ticks(JUDGED_TIME) :]])
         if rise[-1] >= half and gripped.mean() > 0.5:
-            return Status.OK
+            slip = self._motion(self.pressed, -1)
+            return Status.OK if slip.distance < SLIP_DISTANCE and slip.angle < SLIP_ANGLE else Status.SLIPPED
         if not np.isfinite(self.run.robot.first_touch).all():
             return Status.NO_CONTACT
         if self.pushed > PUSHED_DISTANCE:
@@ -181,6 +195,16 @@ class _Lift:
         if self.strained:
             return Status.TOO_WEAK
         return Status.DROPPED if rise.max() >= half else Status.NOT_LIFTED
+
+    def _motion(self, first: int | None, last: int | None) -> ObjectMotion:
+        """Return the motion of the object in the hand between two ticks; None: a tick that was not reached."""
+        if first is None or last is None:
+            return ObjectMotion(math.nan, math.nan)
+        ends = [self.ticks[first], self.ticks[last]]
+        start, end = (inverse(torch.from_numpy(t.hand_pose)) @ torch.from_numpy(t.object_pose) for t in ends)
+        centres = apply(torch.stack([start, end]), torch.from_numpy(self.run.scene.centre).expand(2, 1, 3))[:, 0]
+        distance = float(torch.linalg.vector_norm(centres[1] - centres[0]))
+        return ObjectMotion(distance, float(rotation_angle(start[:3, :3].T @ end[:3, :3])))
 
     def result(self, status: Status, seconds: float) -> ClosureResult:
         """Return the record as a value."""
@@ -190,11 +214,6 @@ class _Lift:
         robot, obj_from_world = self.run.robot, self.run.obj_from_world
         first_touch, first_stray = robot.first_touch, torch.from_numpy(robot.first_stray)
         touched = [finger for finger in range(3) if np.isfinite(first_touch[finger])]
-        hand_from_object = inverse(hand_pose) @ object_pose
-        start, end = hand_from_object[self.arrived], hand_from_object[-1]
-        centres = apply(torch.stack([start, end]), torch.from_numpy(self.run.scene.centre).expand(2, 1, 3))[:, 0]
-        distance = float(torch.linalg.vector_norm(centres[1] - centres[0]))
-        angle = float(rotation_angle(start[:3, :3].T @ end[:3, :3]))
         if not torch.equal(obj_from_world, torch.eye(4, dtype=torch.float64)):
             world_from_obj = inverse(obj_from_world)
             object_pose, neighbour_pose = (obj_from_world @ x @ world_from_obj for x in (object_pose, neighbour_pose))
@@ -209,7 +228,9 @@ class _Lift:
             joints=joints,
             joint_names=self.run.scene.joint_names,
             contact_order=tuple(sorted(touched, key=lambda finger: first_touch[finger])),
-            object_motion=ObjectMotion(distance, angle),
+            object_motion=self._motion(self.arrived, -1),
+            pushed=self._motion(self.arrived, self.touched),
+            slip=self._motion(self.pressed, -1),
             start_overlap=self.run.overlap,
             disturbance=Disturbance(
                 first_touch=first_stray * self.spec.timestep,

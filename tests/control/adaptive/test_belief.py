@@ -8,7 +8,7 @@ import torch
 from tests.point_fingers import GAINS, PERIOD, observation, real, reference
 from torchgrasp import fit_shape
 from torchgrasp.control.adaptive.belief import FARTHEST, Belief
-from torchgrasp.control.closing import UncertaintyClosing
+from torchgrasp.control.closing import LawClosing
 from torchgrasp.control.controller import GraspController
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import rigid, rotation_from_vector
@@ -98,6 +98,6 @@ def test_the_closing_follows_the_belief_and_others_refuse_it(shape):
     planned = at(0.03)
     controller = GraspController(planned, belief=shape)
     controller.step(felt(surface_point(shape, NORMALS[0]) + 0.01 * NORMALS[0], NORMALS[0]), PERIOD)
-    assert isinstance(controller.closing, UncertaintyClosing) and controller.closing.reference is not planned
+    assert isinstance(controller.closing, LawClosing) and controller.closing.reference is not planned
     with pytest.raises(BadArgument, match="belief"):
         GraspController(planned, "position", belief=shape)
