@@ -4,7 +4,7 @@
 python scripts/train.py posture-model hands/allegro               the mixture of a hand that has a hand.toml
 python scripts/train.py posture-model mine/hand.urdf --tips a b c  the same from a URDF alone
 python scripts/train.py stability allegro --workers 2             which pulled grasps hold, for the impedance control
-python scripts/train.py success --objects DIR                     the predicted success that ranks grasps
+python scripts/train.py success                                   the predicted success that ranks grasps
 python scripts/train.py occupancy DIR                             how likely hidden places of a scene are full
 python scripts/train.py objects                                   meshes, convex parts and views of the own objects
 """

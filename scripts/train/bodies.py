@@ -1,0 +1,98 @@
+"""Bodies of known shape that are authored here: nothing fitted on them has seen a scanned object.
+
+They are the library's own objects and random simple ones: boxes, rods that stand or lie, eggs, bottles, tubs, and two
+solids that are joined. Sizes suit one hand. Each is seen from one side by the library's own camera, with its noise.
+"""
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from torchgrasp.cloud.camera import look_at, partial_view
+from torchgrasp.cloud.io.read import save_cloud
+from torchgrasp.files import write_file
+from torchgrasp.objects import list_objects, load_object
+
+COUNTS = {"box": 7, "rod": 5, "lying": 2, "egg": 4, "bottle": 5, "tub": 3, "joined": 4}
+"""Random bodies of each kind: thirty, most of them of the shapes that packages have."""
+
+GOLDEN_ANGLE = 137.5
+"""Between the cameras of two bodies [deg], so that no side is seen twice."""
+
+
+def author_folder(folder: Path) -> None:
+    """Write the bodies as a folder of objects with one noisy view each (`torchgrasp.datasets`)."""
+    solids = {name: load_object(name).mesh for name in list_objects()}
+    for kind, count in COUNTS.items():
+        for k in range(count):
+            solids[f"{kind}_{k}"] = author_body(kind, k)
+    entries = {}
+    for k, (name, mesh) in enumerate(solids.items()):
+        mesh.apply_translation([0.0, 0.0, -mesh.bounds[0, 2]])
+        cloud = partial_view(mesh, look_at(GOLDEN_ANGLE * k % 360, 20.0 + 10.0 * (k % 4), target=mesh), seed=k)
+        pose = np.eye(4)
+        pose[:3, 3] = cloud.viewpoint.numpy()  # pyright: ignore[reportOptionalMemberAccess]
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        write_file(folder / name / "mesh.ply", mesh.export(file_type="ply"))
+        save_cloud(cloud, folder / name / "view0_noisy.ply")
+        entries[name] = {"views": {"view0": {"T_object_camera": pose.tolist()}}}
+    write_file(folder / "manifest.json", json.dumps({"objects": entries}))
+
+
+def author_body(kind: str, k: int) -> trimesh.Trimesh:
+    """Return the k-th body of a kind, always the same.
+
+    >>> author_body("bottle", 0).is_volume
+    True
+    """
+    makers: dict[str, Callable[[np.random.Generator], trimesh.Trimesh]] = {
+        "box": lambda draw: trimesh.creation.box((draw.uniform(0.03, 0.085), *draw.uniform(0.035, 0.14, 2))),
+        "rod": lambda draw: _rod(draw.uniform(0.018, 0.043), draw.uniform(0.06, 0.2)),
+        "lying": lambda draw: _rod(draw.uniform(0.02, 0.035), draw.uniform(0.08, 0.18)).apply_transform(
+            trimesh.transformations.rotation_matrix(math.pi / 2, [1, 0, 0])
+        ),
+        "egg": lambda draw: trimesh.creation.icosphere(subdivisions=3).apply_scale(draw.uniform(0.024, 0.05, 3)),
+        "bottle": _bottle,
+        "tub": _tub,
+        "joined": _joined,
+    }
+    return makers[kind](np.random.default_rng([list(COUNTS).index(kind), k]))
+
+
+def _rod(radius: float, height: float) -> trimesh.Trimesh:
+    """Return an upright cylinder [m]."""
+    return trimesh.creation.cylinder(radius, height, sections=64)
+
+
+def _revolve(profile: list[tuple[float, float]]) -> trimesh.Trimesh:
+    """Return the solid of revolution of (radius, height) [m]."""
+    ends = [(0.0, profile[0][1]), *profile, (0.0, profile[-1][1])]
+    return trimesh.creation.revolve(np.array(ends), sections=64)
+
+
+def _bottle(draw: np.random.Generator) -> trimesh.Trimesh:
+    """Return a bottle, round or oval: a body, a shoulder and a neck."""
+    wide, height, shoulder = draw.uniform(0.024, 0.042), draw.uniform(0.12, 0.22), draw.uniform(0.45, 0.75)
+    neck = wide * draw.uniform(0.35, 0.6)
+    top = min(shoulder + 0.2, 0.9) * height
+    body = _revolve([(0.9 * wide, 0.0), (wide, 0.006), (wide, shoulder * height), (neck, top), (neck, height)])
+    return body.apply_scale((1.0, draw.uniform(0.65, 1.0), 1.0))
+
+
+def _tub(draw: np.random.Generator) -> trimesh.Trimesh:
+    """Return a tub that is filled to its rim and wider there than at its foot."""
+    wide, height = draw.uniform(0.03, 0.047), draw.uniform(0.05, 0.11)
+    return _revolve([(wide * draw.uniform(0.6, 0.85), 0.0), (wide, 0.9 * height), (wide, height)])
+
+
+def _joined(draw: np.random.Generator) -> trimesh.Trimesh:
+    """Return a box with a smaller box or a bar at its side: no convex body."""
+    size = draw.uniform((0.035, 0.04, 0.05), (0.06, 0.08, 0.13))
+    other = size * draw.uniform(0.3, 0.7, 3)
+    arm = trimesh.creation.box(other) if draw.random() < 0.5 else _rod(other[0] / 2, other[2])
+    arm.apply_translation([0.0, (size[1] + other[1]) / 2 - 0.008, draw.uniform(-0.5, 0.5) * (size[2] - other[2])])
+    return trimesh.boolean.union([trimesh.creation.box(size), arm], engine="manifold")
