@@ -7,7 +7,8 @@ python scripts/reproduce.py fig5 --out DIR    planned contacts on the objects
 python scripts/reproduce.py table5 --out DIR  errors of the Barrett hand's learned model; fig7: four of them drawn
 python scripts/reproduce.py fig8 --out DIR    errors of the Allegro hand's learned model
 python scripts/reproduce.py grasps --out DIR  Figs. 9-12: one contact triple by two postures and by two hands; grasps
-python scripts/reproduce.py table6 --out DIR  how often ever riskier grasps hold; table7: under the law and the baseline
+python scripts/reproduce.py table6 --out DIR  how often ever riskier grasps hold; table7: under five closings
+python scripts/reproduce.py ladder --out DIR  from the paper's chain to the library's, one stage exchanged at a time
 """
 
 import io
@@ -18,6 +19,7 @@ import torch
 import trimesh
 import tyro
 from paper.fig9_to_12 import grasps
+from paper.ladder import ladder
 from paper.table4_fig5 import fig5, table4
 from paper.table5_fig7_fig8 import fig7, fig8, table5
 from paper.tables6_7 import table6, table7
@@ -123,5 +125,5 @@ def draw(
 if __name__ == "__main__":
     commands = {"fig4": fig4, "table4": table4, "fig5": fig5}
     commands |= {"table5": table5, "fig7": fig7, "fig8": fig8, "grasps": grasps}
-    commands |= {"table6": table6, "table7": table7}
+    commands |= {"table6": table6, "table7": table7, "ladder": ladder}
     tyro.extras.subcommand_cli_from_dict(commands, prog="reproduce.py", description="Figures and tables of the paper.")
