@@ -73,8 +73,9 @@ def table7(spec: Asked) -> None:
     numbers, held = report(rows), {row[0].row: count_held(row) for row in rows}
     alike = [f"{closing}, force" for closing in OWN]
     own = [f"{closing}, {holding}" for closing, holding in OWN.items()]
-    pairs = [(names[k], name) for names in (alike, own) for k in (0, 2) for name in names if name != names[k]]
-    gains = {f"{a} over {b}": difference_over(held[a], held[b]) for a, b in dict.fromkeys(pairs)}
+    pairs = [(names[0], name) for names in (alike, own) for name in names[1:]]
+    pairs += [(names[2], name) for names in (alike, own) for name in names[3:]]  # the paper's law over the baselines
+    gains = {f"{a} over {b}": difference_over(held[a], held[b]) for a, b in pairs}
     for name, gain in gains.items():
         print(f"{name}: {format_points(gain)}")
     write(spec.out / "table7.json", spec, rows, {"rows": numbers, "gains": gains})
