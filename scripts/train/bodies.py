@@ -17,8 +17,8 @@ from torchgrasp.cloud.io.read import save_cloud
 from torchgrasp.files import write_file
 from torchgrasp.objects import list_objects, load_object
 
-COUNTS = {"box": 7, "rod": 5, "lying": 2, "egg": 4, "bottle": 5, "tub": 3, "joined": 4}
-"""Random bodies of each kind: thirty, most of them of the shapes that packages have."""
+COUNTS = {"box": 5, "rod": 3, "lying": 2, "egg": 3, "bottle": 4, "tub": 2, "joined": 3}
+"""Random bodies of each kind, most of them of the shapes that packages have."""
 
 GOLDEN_ANGLE = 137.5
 """Between the cameras of two bodies [deg], so that no side is seen twice."""

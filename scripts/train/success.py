@@ -17,7 +17,7 @@ from train.bodies import author_folder
 
 def success(
     hands: tuple[str, ...] = ("allegro",),
-    grasps: int = 8,
+    grasps: int = 5,
     workers: int = 1,
     folder: Path = Path("out/success"),
     model: Path = MODEL,
