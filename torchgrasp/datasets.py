@@ -2,8 +2,8 @@
 
 `manifest.json` holds "objects" by name. An object has "views" by name, each with "T_object_camera" (4x4). Its folder
 has `mesh.ply` and `<view>_noisy.ply` [m], resting at z = 0. All readers apply the object's "suggested_scale"
-(default 1), at which a hand can grasp it. Optional are the "family" of look-alikes that it belongs to, and its "group",
-such as "solid".
+(default 1), at which a hand can grasp it. Optional are "mass_kg", the "family" of look-alikes that it belongs to, and
+its "group", such as "solid".
 """
 
 import json
@@ -59,6 +59,12 @@ def read_family(objects: Path, name: str) -> str:
 def read_group(objects: Path, name: str) -> str:
     """Return the group of an object, such as "solid", "thin" or "shell": "" if the manifest has none."""
     return str(_read_manifest(objects, [name])[name].get("group", ""))
+
+
+def read_mass(objects: Path, name: str) -> float | None:
+    """Return the mass [kg] of an object, of the real one whatever its scale; None: the manifest has none."""
+    mass = _read_manifest(objects, [name])[name].get("mass_kg")
+    return None if mass is None else float(mass)
 
 
 def _scale(entry: dict[str, Any]) -> float:

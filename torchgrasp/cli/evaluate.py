@@ -27,7 +27,7 @@ def evaluate(
     out: Path,
     objects: Path | None = None,
     protocol: Literal[
-        "multidex", "dexgraspbench", "dexgraspbench-hard", "pose-noise", "paper", "tabletop"
+        "multidex", "dexgraspbench", "dexgraspbench-hard", "pose-noise", "paper", "tabletop", "household"
     ] = "dexgraspbench",
     closing: ClosingMode | None = None,
     holding: HoldingMode = "force",
@@ -39,6 +39,7 @@ def evaluate(
     complete: bool = False,
     only: tuple[str, ...] = (),
     planned: Path | None = None,
+    perturb: Literal["none", "mass", "friction", "table", "up", "camera", "mask", "depth", "pose", "all"] = "none",
     workers: int = 1,
     seed: int = 0,
     scenes: int = 0,
@@ -69,6 +70,7 @@ def evaluate(
         complete: plan on the whole cloud instead of each view.
         only: names of objects to keep; by default all.
         planned: folder "grasps" of an earlier run, whose grasps are tested.
+        perturb: what the robot does not know before a lift; see torchgrasp.evaluation.perturb.
         workers: processes; the results do not depend on their number.
         seed: of every random draw.
         scenes: number of scenes in clutter; 0: single objects.
@@ -90,12 +92,12 @@ def evaluate(
         return evaluate_clutter(objects, the_hand, out, scenes, spec, workers)
     if objects is None:
         raise BadArgument("--objects", "none", "a folder of objects, or --scenes")
-    with naming(force="--force", grasps="--grasps"):
+    with naming(force="--force", grasps="--grasps", perturb="--perturb"):
         test = find_protocol(protocol).with_trial(**changes)
-        spec = EvaluationSpec(grasps, ranks, starts, complete, only, planned is not None, seed)
+        spec = EvaluationSpec(grasps, ranks, starts, complete, only, planned is not None, seed, perturb)
     scores = []
     with naming(folder="--out", path="--out"), hold_folder(out):
-        with naming(objects="--objects", path="--objects", workers="--workers"):
+        with naming(objects="--objects", path="--objects", workers="--workers", perturb="--perturb"):
             views = evaluate_views(objects, the_hand, test, spec, folder=planned or out / "grasps", workers=workers)
             for score in views:
                 print_score(score)
@@ -133,5 +135,9 @@ def print_summary(protocol: str, tried: str, summary: dict[str, Any]) -> None:
     print(f"\n{protocol}, {tried}\n{format_columns(rows, left={0, 1})}")
     means = [summary[key] for key in ("force_n", "overlap_mm", "overlap_mm_max", "plan_cpu_s", "trial_cpu_s", "cpu_s")]
     force, overlap, most, plan, trial, total = ("-" if mean is None else f"{mean:.2f}" for mean in means)
+    if summary["slip_mm"]:
+        (slip, farthest), (turn, widest) = summary["slip_mm"], summary["slip_deg"]
+        held = f"median {slip:.1f} mm and {turn:.1f} deg, 95 % below {farthest:.1f} mm and {widest:.1f} deg"
+        print(f"slip of what held: {held}")
     print(f"mean normal force of a finger {force} N, overlap at the grasp {overlap} mm (most {most} mm)")
     print(f"CPU time {plan} s to plan on a view, {trial} s for an attempt, {total} s in all")

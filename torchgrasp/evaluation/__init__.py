@@ -4,6 +4,8 @@ from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
 from torchgrasp.evaluation.campaign import EvaluationSpec, evaluate, run_protocol
 from torchgrasp.evaluation.intervals import Share, contrast_over, count_by, difference_over, format_share, share_over
 from torchgrasp.evaluation.lift import close_hand, lift_grasp
+from torchgrasp.evaluation.perturb import PERTURBATIONS, Perturbation, find_perturbation, household_mass
+from torchgrasp.evaluation.perturb import perturb_trial, perturb_view
 from torchgrasp.evaluation.placed import PlacedScene, drop
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.evaluation.protocols import PROTOCOLS, PoseNoise, Protocol, PullSpec, apply_error
@@ -12,9 +14,11 @@ from torchgrasp.evaluation.pull import PullResult, pull_grasp
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore, summarise
 
 __all__ = [
+    "PERTURBATIONS",
     "PROTOCOLS",
     "EvaluationSpec",
     "GraspTrial",
+    "Perturbation",
     "PlacedScene",
     "PoseNoise",
     "Protocol",
@@ -35,9 +39,13 @@ __all__ = [
     "draw_object_poses",
     "drop",
     "evaluate",
+    "find_perturbation",
     "find_protocol",
     "format_share",
+    "household_mass",
     "lift_grasp",
+    "perturb_trial",
+    "perturb_view",
     "pull_grasp",
     "run_protocol",
     "run_tasks",

@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import torch
 
 from torchgrasp.base import Value, check_whole, count_status
-from torchgrasp.datasets import list_views, read_family, read_group, read_object_mesh, read_view
+from torchgrasp.closing import ObjectMotion
+from torchgrasp.datasets import list_views, read_family, read_group, read_mass, read_object_mesh, read_view
 from torchgrasp.errors import BadArgument, GraspError, MissingExtra, Status
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver
 from torchgrasp.evaluation.lift import lift_grasp
+from torchgrasp.evaluation.perturb import find_perturbation, household_mass, perturb_trial, perturb_view
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.evaluation.protocols import Protocol, draw_error, find_protocol, seed_of
 from torchgrasp.evaluation.pull import pull_grasp
@@ -46,10 +48,11 @@ class EvaluationSpec(Value):
     """Which grasps of a folder of objects are evaluated: of each view at most `grasps`, by `ranks`.
 
     `complete` plans on whole clouds with normals, as if the shape were known. `only` names objects; (): all. `planned`
-    takes the grasps that an earlier call left in its folder. `starts` are those of the contact planner.
+    takes the grasps that an earlier call left in its folder. `starts` are those of the contact planner. `perturb` names
+    what the robot does not know (`PERTURBATIONS`).
 
     Raises:
-        BadArgument: no grasps, or unknown ranks.
+        BadArgument: no grasps, unknown ranks, or an unknown perturbation.
     """
 
     grasps: int = 20
@@ -59,8 +62,10 @@ class EvaluationSpec(Value):
     only: tuple[str, ...] = ()
     planned: bool = False
     seed: int = 0
+    perturb: str = "none"
 
     def __post_init__(self) -> None:
+        find_perturbation(self.perturb)
         check_whole("grasps", self.grasps, 1, 1_000_000)
         if self.ranks not in get_args(Ranks):
             raise BadArgument("ranks", repr(self.ranks), f"one of {', '.join(get_args(Ranks))}")
@@ -98,10 +103,12 @@ def evaluate(
         workers: processes (`run_tasks`); the scores do not depend on their number.
 
     Raises:
-        BadArgument: an unknown protocol, or no objects.
+        BadArgument: an unknown protocol, no objects, or a perturbation of a protocol that pulls.
         MissingExtra: the simulator, or pebble for workers, is not installed.
     """
     protocol, spec = find_protocol(protocol), EvaluationSpec() if spec is None else spec
+    if spec.perturb != "none" and protocol.pull is not None:
+        raise BadArgument("perturb", f"{spec.perturb!r} with {protocol.name!r}", "a protocol that lifts")
     names = list_views(objects, spec.complete, spec.only)
     return _evaluate([_View(Path(objects), *name, hand.source) for name in names], protocol, spec, folder, workers)
 
@@ -119,7 +126,7 @@ def _evaluate(
         ]
         rows = [choose_rows(score.executable, spec.grasps, spec.ranks) for score in scores]
         places = [list(itertools.product(chosen, range(protocol.noise.draws))) for chosen in rows]
-        tasks = [(view, protocol, spec.seed, *at) for view, some in zip(views, places, strict=True) for at in some]
+        tasks = [(view, protocol, spec, *at) for view, some in zip(views, places, strict=True) for at in some]
         with contextlib.closing(run_tasks(_try, tasks, workers, TRIAL_LIMIT)) as results:
             for score, some in zip(scores, places, strict=True):
                 tried = [(at, next(results)) for at in some]
@@ -146,12 +153,13 @@ def run_protocol(trial: GraspTrial, protocol: Protocol, rank: int = 0, draw: int
     if protocol.pull is not None:
         pull = pull_grasp(trial, protocol)
         status, moved, turned, force = pull.status, pull.moved, pull.turned, pull.force
+        slip = ObjectMotion(math.nan, math.nan)
     else:
         lift = lift_grasp(trial, protocol.trial)
-        status, (moved, turned) = lift.status, lift.object_motion
+        status, (moved, turned), slip = lift.status, lift.object_motion, lift.slip
         force = math.nan if status is Status.START_OVERLAP else float(lift.forces[-1].mean())
     spent = time.process_time() - started
-    return ProtocolResult(rank, draw, status is Status.OK, status, moved, turned, force, overlap, spent)
+    return ProtocolResult(rank, draw, status is Status.OK, status, moved, turned, force, overlap, spent, *slip)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,14 +192,18 @@ def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
     started = time.process_time()
     try:
         _read_solid(view.objects, view.object)  # a bad mesh is refused before any work; its parts are cached
-        cloud = read_view(view.objects, view.object, view.view)
+        cloud, table = perturb_view(
+            read_view(view.objects, view.object, view.view),
+            find_perturbation(spec.perturb),
+            seed_of(spec.seed, view.object, view.view),
+        )
         if spec.planned:
             grasps = load_grasps(view.file)
             if (grasps.meta.get("cloud_sha256"), grasps.meta.get("hand_sha256")) != (digest(cloud), hand.source.sha256):
                 raise BadArgument("folder", f"{view.file} of another cloud or hand", "grasps of this view")
             return dataclasses.replace(score, executable=len(grasps))
         started = time.process_time()
-        contacts = ContactSpec(friction=min(friction, MOST_FRICTION), table=0.0)
+        contacts = ContactSpec(friction=min(friction, MOST_FRICTION), table=table)
         stages: list[tuple[str, str, Any]] = []
         grasps = plan_grasps(cloud, hand, contacts, spec.starts, spec.seed, observer=lambda *x: stages.append(x))
         executable = grasps[grasps.status == Status.OK]
@@ -207,11 +219,16 @@ def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
     return dataclasses.replace(score, seconds=time.process_time() - started)
 
 
-def _try(view: _View, protocol: Protocol, seed: int, row: int, draw: int) -> ProtocolResult:
-    """Try one grasp with one drawn error of pose."""
+def _try(view: _View, protocol: Protocol, spec: EvaluationSpec, row: int, draw: int) -> ProtocolResult:
+    """Try one grasp with one draw of what the robot does not know."""
     hand, grasp = view.load_hand(), load_grasps(view.file)[row]
     mesh, parts = _read_solid(view.objects, view.object)
-    seed = seed_of(seed, view.object, view.view, row, draw)
+    seed = seed_of(spec.seed, view.object, view.view, row, draw)
+    perturbation = find_perturbation(spec.perturb)
+    mass = household_mass(float(mesh.volume), read_mass(view.objects, view.object))
+    trial = perturb_trial(protocol.trial, perturbation, mass, seed)
+    noise = protocol.noise if spec.perturb == "none" else perturbation.pose
+    protocol = dataclasses.replace(protocol, trial=trial, noise=noise)
     error = draw_error(protocol, grasp, mesh, seed)
     return run_protocol(GraspTrial(hand, grasp, mesh, seed, error, parts=parts), protocol, row, draw)
 

@@ -69,7 +69,7 @@ _FLOATING = TrialSpec(
 _PULL = PullSpec(10.0, 2.0, 0.05, math.radians(15))
 """DexGraspBench's."""
 
-_POSE_NOISE = PoseNoise(0.005, math.radians(5))
+POSE_NOISE = PoseNoise(0.005, math.radians(5))
 """As large as in Get a Grip (CoRL 2024)."""
 
 PROTOCOLS = {
@@ -82,9 +82,10 @@ PROTOCOLS = {
         ),
         Protocol("dexgraspbench", _FLOATING, _PULL),
         Protocol("dexgraspbench-hard", dataclasses.replace(_FLOATING, friction=0.3, patch=0.002 / 0.3), _PULL),
-        Protocol("pose-noise", _FLOATING, _PULL, dataclasses.replace(_POSE_NOISE, draws=20)),
-        Protocol("paper", TrialSpec(), noise=_POSE_NOISE),
+        Protocol("pose-noise", _FLOATING, _PULL, dataclasses.replace(POSE_NOISE, draws=20)),
+        Protocol("paper", TrialSpec(), noise=POSE_NOISE),
         Protocol("tabletop", TrialSpec(friction=0.6, shake=0.003)),
+        Protocol("household", TrialSpec(shake=0.003)),
     )
 }
 """By name.
@@ -95,6 +96,8 @@ PROTOCOLS = {
 * pose-noise: the same with errors of the hand's pose.
 * paper: the paper's lift (Sec. 6.5) at friction 0.8; errors of the object's pose stand for a real robot's chance.
 * tabletop: a lift by 0.1 m at friction 0.6, held for 2 s while the hand shakes.
+* household: the same at friction 0.8: the test in which `torchgrasp.evaluation.perturb` withholds what a robot does not
+  know.
 """
 
 

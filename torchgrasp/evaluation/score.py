@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+import torch
+
 from torchgrasp.base import Value
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.intervals import Share, count_by, share_over
@@ -24,7 +26,8 @@ class ProtocolResult(Value):
     """The outcome of the grasp of a `rank` under a `draw` of pose errors; NaN: not measured.
 
     The object moved by `moved` [m] and `turned` [rad], in a lift relative to the hand. `force` [N] is the fingers' mean
-    normal force, `overlap` [m] the depth of the grasp pose in the object, `seconds` CPU time.
+    normal force, `overlap` [m] the depth of the grasp pose in the object, `seconds` CPU time. In a lift the object
+    slipped by `slip` [m] and `slip_angle` [rad] since the hand pressed.
     """
 
     rank: int
@@ -36,6 +39,8 @@ class ProtocolResult(Value):
     force: float = math.nan
     overlap: float = math.nan
     seconds: float = math.nan
+    slip: float = math.nan
+    slip_angle: float = math.nan
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +74,7 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     grasps: a view without grasps fails in every draw. "objects" is the share of objects with a success. Their intervals
     are over families (`share_over`). "by_object" and "by_group" have the same of parts. "refused" counts views without
     a grasp, "failures" the reasons of each stage. "force_n", "overlap_mm", "plan_cpu_s" (of a view) and "trial_cpu_s"
-    are means.
+    are means. "slip_mm" and "slip_deg" are the median and the 95 % quantile over the grasps that held.
     """
     attempts = [attempt for score in scores for attempt in score.attempts]
     spent = [*(score.seconds for score in scores), *(a.seconds for a in attempts)]
@@ -85,6 +90,8 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
         "force_n": _mean(a.force for a in attempts),
         "overlap_mm": _mean(1e3 * a.overlap for a in attempts),
         "overlap_mm_max": max((1e3 * a.overlap for a in attempts if not math.isnan(a.overlap)), default=None),
+        "slip_mm": _quantiles(1e3 * a.slip for a in attempts if a.passed),
+        "slip_deg": _quantiles(math.degrees(a.slip_angle) for a in attempts if a.passed),
         "plan_cpu_s": _mean(score.seconds for score in scores),
         "trial_cpu_s": _mean(a.seconds for a in attempts),
         "cpu_s": sum(x for x in spent if not math.isnan(x)),
@@ -108,6 +115,15 @@ def _shares(scores: Sequence[ViewScore]) -> dict[str, Share | int]:
         "refused": len(refused),
         "executable": sum(score.executable for score in scores),
     }
+
+
+def _quantiles(values: Iterable[float]) -> tuple[float, float] | None:
+    """Return the median and the 95 % quantile of the known values, or None."""
+    known = torch.tensor([value for value in values if not math.isnan(value)], dtype=torch.float64)
+    if not len(known):
+        return None
+    median, most = known.quantile(torch.tensor([0.5, 0.95], dtype=torch.float64)).tolist()
+    return median, most
 
 
 def _mean(values: Iterable[float]) -> float | None:
