@@ -206,7 +206,9 @@ def test_bad_arguments_are_refused_before_any_work():
     with pytest.raises((BadArgument, TypeError), match="starts"):
         plan_grasps(view, hand, starts=0)
     with pytest.raises((BadArgument, TypeError), match="mode"):
-        plan_grasps(view, hand, mode="paper")  # pyright: ignore[reportArgumentType]
+        plan_grasps(view, hand, mode="best")  # pyright: ignore[reportArgumentType]
+    with pytest.raises((BadArgument, TypeError), match="ranking"):
+        plan_grasps(view, hand, ranking="best")  # pyright: ignore[reportArgumentType]
 
 
 def test_no_triples_is_an_answer():

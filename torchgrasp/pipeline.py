@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 from collections.abc import Callable
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import torch
 from jaxtyping import Float, Int
@@ -17,36 +17,31 @@ from torchgrasp.frames import inverse
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import GraspProblem, Reachable
 from torchgrasp.ik.clearance import CollisionWorld
+from torchgrasp.ik.cobyla import solve_as_paper
 from torchgrasp.ik.contact_first import solve_contact_first
 from torchgrasp.ik.joint import solve_joint
 from torchgrasp.ik.motion import collision_probability, lift_clearance
 from torchgrasp.ik.obstacles import Obstacles
 from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
 from torchgrasp.ik.query import query_mixture
-from torchgrasp.ik.ranking import rank_by_success, success_features, success_log_odds
+from torchgrasp.ik.ranking import rank_by_success, rank_by_variance, success_features, success_log_odds
 from torchgrasp.ik.sdf import field_from_surface
 from torchgrasp.linalg import farthest_points
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure_probability import closure_share
 from torchgrasp.plan.solve import plan_contacts
-from torchgrasp.plane import Plane, cloud_to_upright, move, upright_frame
-from torchgrasp.posture_model.mixture import GraspMixture, load_mixture, mixture_path
+from torchgrasp.plane import cloud_to_upright, move, upright_frame
+from torchgrasp.posture_model.mixture import PAPER_ENERGY, GraspMixture, load_mixture, mixture_path
 from torchgrasp.scene.occupancy import estimate_occupancy
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import Surface, extract_surface
-from torchgrasp.specs import ContactSpec
+from torchgrasp.specs import ContactSpec, Mode, Ranking
 from torchgrasp.values import ContactPlan, Grasps, PointCloud
 
 Observer = Callable[[str, str, Any], None]
 """Called after each stage with its name, one line about it, and its value."""
-Mode = Literal["joint", "contact_first"]
-"""How planned contacts become grasps.
-
-* "joint": seeds are random postures near each triple; where none succeeds, the contacts slide with the hand.
-* "contact_first": as in the paper, the learned model's seeds move onto fixed contacts.
-"""
 TRIPLES, SURFACE_DRAWS = 250, 600
 """Planned triples offered to the hand; surfaces drawn for the probability of closure, whose error is then 0.02."""
 SCENE_TRIPLES = 160
@@ -92,6 +87,7 @@ def plan_grasps(
     seed: int = 0,
     *,
     mode: Mode = "joint",
+    ranking: Ranking | None = None,
     shape: ShapeGP | None = None,
     observer: Observer = lambda stage, message, value: None,
     reachable: Reachable | None = None,
@@ -104,10 +100,11 @@ def plan_grasps(
     Args:
         cloud: what the camera saw [m]; missing normals and viewpoint are estimated. A `Scene` has a target.
         hand: from `load_hand`.
-        spec: the constraints on contacts; None: `ContactSpec()`.
+        spec: the constraints on contacts; None: `ContactSpec()`, in mode "paper" `ContactSpec.paper()`.
         starts: random starts of the contact planner.
         seed: of every random draw; the same seed gives bitwise the same grasps.
-        mode: see `Mode`. Only "contact_first" needs the hand's learned model.
+        mode: see `Mode`. All but "joint" need the hand's learned model.
+        ranking: see `Ranking`; None: "success", in mode "paper" "variance".
         shape: the object's shape if more is known than the cloud shows, as after a touch (`ShapeGP.update`).
         observer: called after each stage, see `Observer`.
         reachable: tells which poses `obj_from_hand` (k, 4, 4) an arm can reach, in the given frame; None: all.
@@ -125,24 +122,26 @@ def plan_grasps(
     >>> grasps.joints.shape[1]
     4
     """
-    spec = ContactSpec() if spec is None else spec
     if not isinstance(hand, Hand):
         raise BadArgument("hand", type(hand).__name__, "a Hand from load_hand")
-    if mode not in get_args(Mode):
-        raise BadArgument("mode", repr(mode), "'joint' or 'contact_first'")
+    _check_names(mode, ranking)
+    as_paper = mode == "paper"
+    spec = (ContactSpec.paper() if as_paper else ContactSpec()) if spec is None else spec
+    ranking = ranking or ("variance" if as_paper else "success")
     scene, spec = None, spec.for_fingertips(float(hand.tips.radius.max()))
     if isinstance(cloud, Scene):
         scene, cloud = cloud, take_target(cloud, seed)
         spec = dataclasses.replace(spec, table=scene.table if spec.table is None else spec.table)
     cloud = remove_duplicates(cloud)
     mixture, mixture_sha256 = None, "none"
-    if mode == "contact_first":
+    if mode != "joint":
         path = mixture_path(hand.urdf_path.parent)
         mixture, mixture_sha256 = load_mixture(path), sha256(path)
     obj_from_upright = upright_frame(cloud, spec.plane)
     if shape is None:
         level = None if spec.table is None else 0.0
-        shape = fit_shape(cloud_to_upright(cloud, obj_from_upright), seed=seed, table=level)
+        support = "paper" if as_paper else "camera"
+        shape = fit_shape(cloud_to_upright(cloud, obj_from_upright), support=support, seed=seed, table=level)
     else:
         shape = shape.moved(inverse(obj_from_upright))
     task = _Task(
@@ -151,16 +150,32 @@ def plan_grasps(
         dataclasses.replace(spec, table=None if spec.table is None else 0.0),
         starts,
         seed,
+        mode,
+        ranking,
         mixture,
         None if scene is None else scene.to_upright(obj_from_upright),
         None if reachable is None else lambda poses: reachable(obj_from_upright.to(poses) @ poses),
         lambda stage, message, value: observer(stage, message, _moved(value, obj_from_upright)),
     )
     grasps = _moved(_plan(task), obj_from_upright)
-    meta = {"mode": mode, "mixture_sha256": mixture_sha256, "starts": str(starts), "seed": str(seed)}
+    meta = {
+        "mode": mode,
+        "ranking": ranking,
+        "mixture_sha256": mixture_sha256,
+        "starts": str(starts),
+        "seed": str(seed),
+    }
     grasps = dataclasses.replace(grasps, meta=_metadata(cloud, hand, spec) | meta)
     observer("refine", f"{len(grasps)} refined: {describe(count_status(grasps.status))}", grasps)
     return grasps
+
+
+def _check_names(mode: str, ranking: str | None) -> None:
+    """Refuse an unknown mode or ranking."""
+    if mode not in get_args(Mode):
+        raise BadArgument("mode", repr(mode), f"one of {', '.join(map(repr, get_args(Mode)))}")
+    if ranking is not None and ranking not in get_args(Ranking):
+        raise BadArgument("ranking", repr(ranking), "'success', 'variance' or None")
 
 
 def _moved(value: Any, obj_from_upright: Float[Tensor, "4 4"]) -> Any:
@@ -177,6 +192,8 @@ class _Task:
     spec: ContactSpec
     starts: int
     seed: int
+    mode: Mode
+    ranking: Ranking
     mixture: GraspMixture | None
     scene: Scene | None
     reachable: Reachable | None
@@ -193,7 +210,7 @@ def _plan(task: _Task) -> Grasps:
     plan = plan_contacts(shape, spec, task.starts, seed)
     observer("plan", f"{task.starts} starts: {describe(count_status(plan.status))}", plan)
 
-    offered = plan.contacts[spread_rows(plan, TRIPLES if task.scene is None else SCENE_TRIPLES)]
+    offered = plan.contacts[_offered_rows(task, plan)]
     certificate = certify(offered, spec)
     contacts, certificate = offered[certificate.closed], certificate[certificate.closed]
     message = f"{len(contacts)} of {len(offered)} triples closed at friction {spec.planned_friction:g}"
@@ -205,13 +222,16 @@ def _plan(task: _Task) -> Grasps:
     if task.mixture is None:
         library = PostureLibrary.of(hand, seed=seed)
         seeds = nearest_postures(library, contacts, world, reachable=task.reachable)
+    elif task.mode == "paper":
+        seeds = query_mixture(hand, contacts, task.mixture.to(shape.device), n_seeds=1, max_energy=PAPER_ENERGY)
     else:
         seeds = query_mixture(hand, contacts, task.mixture.to(shape.device))
     observer("query", f"{len(seeds)} seeds for {len(torch.unique(seeds.row))} of {len(contacts)} triples", seeds)
 
-    solved = (
-        solve_contact_first(problem, seeds) if task.mixture is not None else solve_joint(problem, seeds, shape, spec)
-    )
+    if task.mode == "joint":
+        solved = solve_joint(problem, seeds, shape, spec)
+    else:
+        solved = (solve_as_paper if task.mode == "paper" else solve_contact_first)(problem, seeds)
     good = solved[solved.status == Status.OK]
     closure = closure_share(shape, good.contacts, spec.friction, SURFACE_DRAWS, seed)
     features = success_features(good.contacts, closure, good.normal_angle, problem.center, spec.friction)
@@ -222,7 +242,17 @@ def _plan(task: _Task) -> Grasps:
     if obstacles is not None:
         free = 1 - collision_probability(hand, good, obstacles).to(log_odds)
         log_odds = torch.logit(torch.sigmoid(log_odds) * free, eps=1e-6)
-    return rank_by_success(solved, log_odds)
+    ranked = rank_by_success(solved, log_odds)
+    return ranked if task.ranking == "success" else rank_by_variance(ranked)
+
+
+def _offered_rows(task: _Task, plan: ContactPlan) -> Int[Tensor, "k"]:
+    """Return the successful rows that the hand tries: far apart, or in the paper all, the most certain first."""
+    if task.mode != "paper" or task.ranking != "variance":
+        return spread_rows(plan, TRIPLES if task.scene is None else SCENE_TRIPLES)
+    rows, variance = torch.nonzero(plan.status == Status.OK)[:, 0], plan.contacts.variance
+    assert variance is not None
+    return rows[torch.argsort(variance[rows].sum(1), stable=True)]
 
 
 def _find_obstacles(task: _Task) -> Obstacles | None:
@@ -265,11 +295,5 @@ def _metadata(cloud: PointCloud, hand: Hand, spec: ContactSpec) -> dict[str, str
         "units": "metre, radian",
         "friction": f"{spec.friction:g}",
         "planned_friction": f"{spec.planned_friction:g}",
-        "table": "none" if spec.plane is None else _describe_plane(spec.plane),
+        "table": "none" if spec.plane is None else spec.plane.describe(),
     }
-
-
-def _describe_plane(plane: Plane) -> str:
-    """Return the numbers of a plane as text."""
-    x, y, z = plane.normal.tolist()
-    return f"normal {x:.9g} {y:.9g} {z:.9g}, offset {plane.offset:.9g}"

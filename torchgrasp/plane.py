@@ -76,6 +76,15 @@ class Plane(Value):
         normal = b_from_a[:3, :3].double() @ self.normal.double()
         return Plane(unit(normal), self.offset + float(normal @ b_from_a[:3, 3].double()))
 
+    def describe(self) -> str:
+        """Return the numbers as text.
+
+        >>> Plane.horizontal(0.1).describe()
+        'normal 0 0 1, offset 0.1'
+        """
+        x, y, z = self.normal.tolist()
+        return f"normal {x:.9g} {y:.9g} {z:.9g}, offset {self.offset:.9g}"
+
 
 def as_plane(table: Plane | float | None) -> Plane | None:
     """Return the plane of a table that is given as a plane, as a height [m] along z, or not at all."""

@@ -96,10 +96,24 @@ class ContactSpec(Value):
         return self if self.tip_radius is not None else dataclasses.replace(self, tip_radius=max(radius, TIP_RADIUS))
 
     @classmethod
-    def paper(cls, friction: float = 0.8, edges: int = 8, max_variance: float = 0.03) -> "ContactSpec":
-        """Return the paper's own problem: full friction, no separation, flatness or table."""
-        return cls(friction, edges, max_variance, friction_margin=1.0, separation=0.0, flatness=None, start_radius=0.1)
+    def paper(
+        cls, friction: float = 0.8, edges: int = 8, max_variance: float = 0.03, table: Plane | float | None = None
+    ) -> "ContactSpec":
+        """Return the paper's own problem: full friction, no separation or flatness; contacts lie above the table."""
+        spec = cls(friction, edges, max_variance, friction_margin=1.0, flatness=None, table=table, start_radius=0.1)
+        return dataclasses.replace(spec, separation=0.0, contact_height=0.0, tip_radius=0.0)
 
+
+Mode = Literal["joint", "contact_first", "paper"]
+"""How planned contacts become grasps.
+
+* "joint": seeds are random postures near each triple; where none succeeds, the contacts slide with the hand.
+* "contact_first": the learned model's seeds move onto fixed contacts.
+* "paper": the paper's chain as written (docs/paper.md): the model's seeds by Eqs. 21-24, moved by COBYLA. Shape,
+  contacts and ranking are the paper's too, unless given.
+"""
+Ranking = Literal["success", "variance"]
+"""Which executable grasp comes first: the likeliest success, or the least sum of variances as in the paper."""
 
 ClosingMode = Literal["open_loop", "position", "paper_position", "fixed", "paper", "uncertainty"]
 """How a hand closes, see `TrialSpec`."""

@@ -195,7 +195,8 @@ class Grasps(Batch):
     Finger i touches contact i. `pregrasp` is the joints of the opened hand at the same pose; `approach` is the unit
     direction of its straight path there. `clearance` [m] is the least distance of the links from the estimated
     surface, from each other and from the table; fingertips may touch the surface. `normal_angle` [rad] is the angle
-    between pad axis and contact direction. `score` ranks the grasps; `plan_grasps` makes it the log-odds of `success`.
+    between pad axis and contact direction. `score` ranks the grasps, or says what ranking them by success would be:
+    `plan_grasps` makes it the log-odds of `success`.
     `meta` holds names, units, hashes and the seed as text.
     """
 

@@ -59,13 +59,12 @@ def test_the_frame_of_the_contacts_does_not_matter(scene):
     torch.testing.assert_close(move @ here.obj_from_hand, there.obj_from_hand, atol=1e-6, rtol=0)
 
 
-def test_cobyla_lowers_the_tip_distances_with_the_pose_of_eq24():
+def test_cobyla_moves_pose_and_joints_until_the_contact_points_meet():
     hand = load_hand("barrett")
     true = torch.tensor([[0.3, 0.9, 1.0, 0.8], [0.1, 1.2, 0.6, 1.0]], dtype=torch.float64)
     points, normals = hand.fingertips(true)
-    contacts, start = Contacts(points, -normals), true + 0.05
-    nowhere = torch.eye(4, dtype=torch.float64).expand(2, 4, 4)
-    solution = refine_by_cobyla(hand, Configuration(start, nowhere), contacts, CollisionWorld())
+    contacts, nowhere = Contacts(points, -normals), torch.eye(4, dtype=torch.float64).expand(2, 4, 4)
+    solution = refine_by_cobyla(hand, Configuration(true + 0.05, nowhere), contacts, CollisionWorld())
     tips = hand.fingertips(solution.joints)[0]
     assert float((apply(solution.obj_from_hand, tips) - points).norm(dim=-1).max()) < 1e-4
     torch.testing.assert_close(solution.obj_from_hand @ virtual_frame(tips), virtual_frame(points), atol=1e-9, rtol=0)

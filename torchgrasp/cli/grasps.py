@@ -31,12 +31,12 @@ from torchgrasp.files import sha256
 from torchgrasp.hand.load import load_hand
 from torchgrasp.mesh import read_mesh
 from torchgrasp.objects import DATA, MASSES, list_objects, load_object
-from torchgrasp.pipeline import Mode, plan_grasps
+from torchgrasp.pipeline import plan_grasps
 from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows, write_report
 from torchgrasp.report.run import Run, verdict
 from torchgrasp.scene.file import is_scene
 from torchgrasp.shape.surface import extract_surface
-from torchgrasp.specs import ContactSpec, Simulator, TrialSpec
+from torchgrasp.specs import ContactSpec, Mode, Simulator, TrialSpec
 
 if TYPE_CHECKING:
     import trimesh
@@ -86,7 +86,7 @@ def grasp(
             default the table is at the lowest point of the cloud.
         no_table: there is no table.
         friction: coefficient of friction between fingertips and object.
-        mode: contacts, pose and joints together, or contacts first and the learned model after, as in the paper.
+        mode: contacts, pose and joints together; contacts first and the learned model after; or the paper as written.
         label: of the thing to grasp in a scene; by default the easiest.
         point: column and row of a pixel on the thing to grasp in a scene.
     """
@@ -117,7 +117,7 @@ def grasp(
     partial, plane = file.cloud, table_plane(file.cloud, view, table, no_table)
     with naming(mesh="--mesh", friction="--friction", table="--table"):
         true_mesh, parts = (None, None) if mesh is None else read_true_mesh(mesh)
-        spec = ContactSpec(friction=friction, table=plane)
+        spec = (ContactSpec.paper if mode == "paper" else ContactSpec)(friction=friction, table=plane)
         trial = TrialSpec(friction=friction)
     print_notes(file.notes, judge_cloud("CLOUD", partial, view, plane))
 

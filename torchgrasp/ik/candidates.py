@@ -77,13 +77,13 @@ class GraspCandidates(Batch):
     status: Int[Tensor, "g"]
 
 
-def check_candidates(problem: GraspProblem, candidates: GraspCandidates) -> Grasps:
-    """Return checked grasps; those right so far get pre-grasp and approach."""
+def check_candidates(problem: GraspProblem, candidates: GraspCandidates, rolling: bool = True) -> Grasps:
+    """Return checked grasps (`measure_errors`); those right so far get pre-grasp and approach."""
     hand, world = problem.hand, problem.world
     configuration, contacts, certificate = candidates.configuration, candidates.contacts, candidates.certificate
     unproven = (candidates.status == Status.OK) & ~certificate.closed
     planned = torch.where(unproven, int(Status.NOT_CLOSED), candidates.status)
-    errors = measure_errors(hand, configuration, contacts, world)
+    errors = measure_errors(hand, configuration, contacts, world, rolling)
 
     pregrasp, touching = configuration.joints.clone(), (planned == Status.OK) & (errors.status == Status.OK)
     pregrasp[touching] = open_hand(hand, configuration[touching], contacts[touching], world)

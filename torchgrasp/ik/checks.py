@@ -32,11 +32,19 @@ class GraspErrors(Batch):
     status: Int[Tensor, "g"]
 
 
-def measure_errors(hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld) -> GraspErrors:
-    """Measure grasps; `status` names the first error out of tolerance, as NaN is."""
+def measure_errors(
+    hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld, rolling: bool = True
+) -> GraspErrors:
+    """Measure grasps; `status` names the first error out of tolerance, as NaN is.
+
+    Round fingertips may roll on their contacts within the pads' cones. If not `rolling`, the pads' contact points
+    count, in any direction, as in the paper.
+    """
     spatial = SpatialJacobian.at(hand, configuration)
-    tips = spatial.points(hand.tips.index, hand.tips.center)
-    error = torch.linalg.vector_norm(tips - tip_targets(hand, contacts), dim=-1)
+    touching, target = (
+        (hand.tips.center, tip_targets(hand, contacts)) if rolling else (hand.tips.contact, contacts.points)
+    )
+    error = torch.linalg.vector_norm(spatial.points(hand.tips.index, touching) - target, dim=-1)
     pads = spatial.directions(hand.tips.index, hand.tips.normal)
     angle = torch.acos((-(pads * contacts.normals).sum(-1)).clamp(-1.0, 1.0))  # from the inward normal
     links, depth, table = link_clearance(spatial, world, tips_touch=True)
@@ -45,7 +53,7 @@ def measure_errors(hand: Hand, configuration: Configuration, contacts: Contacts,
     cone = torch.where(hand.tips.radius.to(error) > 0, ROUND_PAD, FLAT_PAD) + ANGLE_TOLERANCE
     conditions = {
         Status.TIP_ERROR: (error <= TIP_TOLERANCE).all(1),
-        Status.NORMAL_ANGLE: (angle <= cone).all(1),
+        Status.NORMAL_ANGLE: (angle <= cone).all(1) | (not rolling),
         Status.JOINT_LIMITS: ((configuration.joints >= lower - 1e-9) & (configuration.joints <= upper + 1e-9)).all(1),
         Status.SELF_COLLISION: between >= 0,
         Status.OBJECT_COLLISION: (links >= 0) & (depth >= -TIP_PENETRATION),

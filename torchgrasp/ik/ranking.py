@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.errors import Status
+from torchgrasp.errors import BadArgument, Status
 from torchgrasp.linalg import unit
 from torchgrasp.plan.internal_forces import least_friction_forces, tangential_ratio
 from torchgrasp.values import Contacts, Grasps
@@ -102,3 +102,14 @@ def rank_by_success(grasps: Grasps, log_odds: Float[Tensor, "k"]) -> Grasps:
     failed, scores = grasps.status != Status.OK, grasps.score.clone()
     scores[~failed] = log_odds.to(scores)
     return dataclasses.replace(grasps, score=scores)[lexical_order(failed.int(), -scores)]
+
+
+def rank_by_variance(grasps: Grasps) -> Grasps:
+    """Return executable grasps first, the least sum of the contacts' variances first (Sec. 6.5); scores stay.
+
+    Raises:
+        BadArgument: contacts without `variance`.
+    """
+    if grasps.contacts.variance is None:
+        raise BadArgument("grasps.contacts.variance", "None", "the variance of the surface at each contact")
+    return grasps[lexical_order((grasps.status != Status.OK).int(), grasps.contacts.variance.sum(1))]

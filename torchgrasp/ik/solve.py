@@ -68,7 +68,7 @@ def solve_ik(
         contacts: b triples; `std_m` and `variance` are not used.
         mixture: the hand's learned model; None: only the library gives seeds.
         world: what the links must not touch; None: only each other.
-        method: "cobyla" is the paper's (Sec. 6.3), which sees the tips alone.
+        method: "cobyla" is the paper's (Sec. 6.3), whose tips touch with their contact points in any direction.
         library: the hand's random postures; None: drawn when they are needed, in about a second.
 
     Returns:
@@ -98,7 +98,7 @@ def solve_ik(
         for part in (seeds[k : k + 512] for k in range(0, max(len(seeds), 1), 512)):  # temporaries stay in the cache
             taken = assign(contacts, part)
             configuration = move(hand, Configuration(part.joints, part.obj_from_hand), taken, world)
-            errors = measure_errors(hand, configuration, taken, world)
+            errors = measure_errors(hand, configuration, taken, world, rolling=method != "cobyla")
             placed = configuration.joints, configuration.obj_from_hand, part.permutation
             measured = errors.tip_error, errors.normal_angle, errors.clearance
             parts.append(IKSolution(*placed, *measured, torch.ones_like(errors.status), errors.status))

@@ -7,8 +7,9 @@ no link in another; the share that touches inside the pads' cones as well is pri
 
 import time
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -105,18 +106,18 @@ def _cobyla_row(hand: Hand, mixture: GraspMixture, contacts: Contacts, ours: IKS
     seeds, asked = timed(lambda: query_mixture(hand, contacts, mixture, n_seeds=SEEDS_PER_ASSIGNMENT))
     seeds = seeds[rank_in_group(seeds.row) == 0]
     taken, start = assign(contacts, seeds), Configuration(seeds.joints, seeds.obj_from_hand)
-    spent, place = [0.0], cobyla.place
+    spent, evaluate = [0.0], cobyla.CobylaRun.evaluate
 
-    def counted(*arguments: Any) -> tuple[Tensor, Tensor]:
-        placed, used = timed(lambda: place(*arguments))
+    def counted(self: cobyla.CobylaRun, x: np.ndarray) -> tuple[float, np.ndarray]:
+        values, used = timed(lambda: evaluate(self, x))
         spent[0] += used
-        return placed
+        return values
 
-    cobyla.place = counted
+    cobyla.CobylaRun.evaluate = counted
     try:
         refined, used = timed(lambda: cobyla.refine_by_cobyla(hand, start, taken, CollisionWorld()))
     finally:
-        cobyla.place = place
+        cobyla.CobylaRun.evaluate = evaluate
     points = SpatialJacobian.at(hand, refined).points(hand.tips.index, hand.tips.contact)
     error = 1e3 * torch.linalg.vector_norm(points - taken.points, dim=-1).amax(1)
     clear = hand.self_clearance(refined.joints) >= 0
