@@ -1,6 +1,6 @@
 """Views of objects with their true meshes; samples and nearest points of a mesh."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,9 +20,13 @@ SEARCH_SAMPLES, SEARCH_TRIANGLES = 20_000, 8
 """Samples of a surface, and how many of them give the triangles among which its nearest point is sought."""
 
 
-def read_views(objects: Path, camera: bool = True) -> Iterator[tuple[str, str, PointCloud, "trimesh.Trimesh"]]:
-    """Yield object, view, noisy cloud and true mesh of every view."""
+def read_views(
+    objects: Path, camera: bool = True, views: Sequence[str] = ()
+) -> Iterator[tuple[str, str, PointCloud, "trimesh.Trimesh"]]:
+    """Yield object, view, noisy cloud and true mesh of every view, or of those with a name in `views`."""
     for name, view in list_views(objects):
+        if views and view not in views:
+            continue
         yield name, view, read_view(objects, name, view, camera), read_object_mesh(objects, name)
 
 

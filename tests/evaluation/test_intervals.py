@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from torchgrasp.evaluation.intervals import contrast_over, difference_over, share_over
+from torchgrasp.evaluation.intervals import contrast_over, difference_over, mean_over, share_over
 
 COUNTS = {"tin": (9, 10), "cup": (3, 12), "jug": (7, 7), "box": (1, 6), "egg": (5, 9), "rod": (20, 30), "can": (4, 4)}
 OTHERS = {"tin": (4, 10), "cup": (3, 11), "jug": (6, 7), "box": (3, 6), "egg": (0, 9), "rod": (10, 30), "can": (4, 4)}
@@ -63,3 +63,10 @@ def test_one_unit_has_no_interval_and_nothing_measured_no_share() -> None:
     assert all(math.isnan(x) for x in share_over({})[:3])
     lacking = difference_over(COUNTS, {"tin": (1, 2)})  # resamples without the tin say nothing of the second
     assert lacking.low < lacking.value < lacking.high
+
+
+def test_a_mean_of_zeros_and_ones_is_a_share_and_numbers_that_were_not_measured_count_nowhere() -> None:
+    values = [(name, float(k < passed)) for name, (passed, total) in COUNTS.items() for k in range(total)]
+    assert mean_over(values) == contrast_over([COUNTS], [1.0])
+    assert mean_over([*values, ("tin", math.nan)]) == mean_over(values)
+    assert math.isnan(mean_over([("tin", math.nan)]).value)

@@ -2,7 +2,8 @@
 
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
 from torchgrasp.evaluation.campaign import EvaluationSpec, evaluate, run_protocol
-from torchgrasp.evaluation.intervals import Share, contrast_over, count_by, difference_over, format_share, share_over
+from torchgrasp.evaluation.intervals import Share, contrast_over, count_by, difference_over, format_share, mean_over
+from torchgrasp.evaluation.intervals import share_over
 from torchgrasp.evaluation.lift import close_hand, lift_grasp
 from torchgrasp.evaluation.perturb import PERTURBATIONS, Perturbation, find_perturbation, household_mass
 from torchgrasp.evaluation.perturb import perturb_trial, perturb_view
@@ -44,6 +45,7 @@ __all__ = [
     "format_share",
     "household_mass",
     "lift_grasp",
+    "mean_over",
     "perturb_trial",
     "perturb_view",
     "pull_grasp",

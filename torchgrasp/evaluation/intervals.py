@@ -17,8 +17,9 @@ RESAMPLES = 10_000
 ONE_SIDED = 0.05
 """Chance that a share lies beyond the bound that is given where every trial ended alike."""
 
-Counts = Mapping[str, tuple[int, int]]
-"""How many trials passed, and of how many, for each unit that is resampled: a family, or an object without one."""
+Counts = Mapping[str, tuple[int | float, int]]
+"""How many trials passed, and of how many, for each unit that is resampled: a family, or an object without one. For a
+mean it is the sum of what was measured instead."""
 
 
 class Share(NamedTuple):
@@ -63,6 +64,20 @@ def share_over(counts: Counts, seed: int = 0) -> Share:
         bound = ONE_SIDED ** (1 / found.units)
         return found._replace(low=bound) if found.value else found._replace(high=1 - bound)
     return found
+
+
+def mean_over(values: Iterable[tuple[str, float]], seed: int = 0) -> Share:
+    """Return the mean of numbers that carry the name of their unit, with its interval; NaN is left out.
+
+    >>> mean_over([("tin", 1.0), ("cup", 3.0), ("tin", 2.0)])[::3]
+    (2.0, 3)
+    """
+    sums: dict[str, tuple[float, int]] = {}
+    for name, value in values:
+        if not math.isnan(value):
+            before = sums.get(name, (0.0, 0))
+            sums[name] = (before[0] + value, before[1] + 1)
+    return contrast_over([sums], [1.0], seed)
 
 
 def difference_over(first: Counts, second: Counts, seed: int = 0) -> Share:

@@ -37,7 +37,7 @@ RIM_NORMAL_NOISE = 0.5
 MIRROR_NORMAL_NOISE = 0.25
 """Standard deviation of a mirrored normal: 14 degrees, the median error of the hidden side."""
 CAMERA_STD_FACTOR = 0.5
-"""Real deviations over the posterior's: with it 96 % of the hidden sides of 24 noisy views lie within two std_m."""
+"""Real deviations over the posterior's, on eight objects; too small on others (docs/shape.md)."""
 FREE_NOISE = 0.003
 """Standard deviation [m] of the least distance observed in free space, which is a bound, not a measurement."""
 FREE_ROUNDS = 3

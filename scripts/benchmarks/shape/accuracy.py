@@ -11,6 +11,7 @@ from torch import Tensor
 
 from benchmarks.ground_truth import nearest_on_mesh, read_views, sample_mesh
 from torchgrasp.columns import format_columns
+from torchgrasp.evaluation.intervals import mean_over
 from torchgrasp.linalg import unit
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
@@ -137,6 +138,28 @@ def format_table(rows: Sequence[Row]) -> str:
     least = min(r["hidden_within_2"] for r in rows)
     text = format_columns(table, left=range(len(table[0])))
     return f"{text}\nleast share of a view's hidden surface within 2 std_m: {least:.2f}"
+
+
+def format_groups(rows: Sequence[Row]) -> str:
+    """Return the mean of each group of objects, with its interval over families, as a table."""
+    columns = {
+        "hidden median mm": ("hidden_median_mm", 1),
+        "90 % mm": ("hidden_p90_mm", 1),
+        "normals deg": ("hidden_normal_deg", 0),
+        "within 1 sd %": ("hidden_within_1", 0),
+        "2 sd %": ("hidden_within_2", 0),
+    }
+    groups = sorted({str(row["group"]) for row in rows})
+    table: list[tuple[str, ...]] = [("group", "views", *columns)]
+    for group in (*groups, *(["all"] if len(groups) > 1 else [])):
+        mine = [row for row in rows if group in (row["group"], "all")]
+        cells = []
+        for key, digits in columns.values():
+            scale = 100 if "within" in key else 1
+            found = mean_over((str(row["family"]), scale * row[key]) for row in mine)
+            cells.append(f"{found.value:.{digits}f} [{found.low:.{digits}f}, {found.high:.{digits}f}]")
+        table.append((group or "-", str(len(mine)), *cells))
+    return format_columns(table, left=(0,))
 
 
 def mean_row(rows: Sequence[Row]) -> Row:

@@ -1,7 +1,7 @@
 """The shape beside its bars: exactness, speed and memory on random views, truth on the hidden side of real objects."""
 
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -13,10 +13,11 @@ from benchmarks.common import Row, least_seconds, measure
 from benchmarks.ground_truth import read_views
 from benchmarks.plan.closure_survival import closure_survival
 from benchmarks.shape.accuracy import Row as View
-from benchmarks.shape.accuracy import format_table, mean_row, measure_shape
+from benchmarks.shape.accuracy import format_groups, format_table, mean_row, measure_shape
 from benchmarks.shape.exactness import bench_cholesky, bench_laws, bench_refusals, bench_selection, bench_update
 from benchmarks.shape.input_ablation import bench_inputs
 from benchmarks.shape.speed import bench_growth, bench_memory, bench_queries, bench_raw
+from torchgrasp.datasets import read_family, read_group
 from torchgrasp.shape.fit import fit_shape
 
 SUBJECTS = (
@@ -37,6 +38,7 @@ SUBJECTS = (
 def shape(
     objects: Path | None = None,
     only: tuple[str, ...] = SUBJECTS,
+    views: tuple[str, ...] = (),
     clouds: int = 10_000,
     queries: int = 100_000,
     threads: int = 2,
@@ -50,6 +52,7 @@ def shape(
         objects: folder with manifest.json and a folder for each object; without it the hidden side is not measured.
         only: subjects to measure: refusals, selection, laws, update, queries, memory, raw, growth, objects, inputs,
             cholesky.
+        views: names of the views of each object, such as view0; by default all.
         clouds: random partial clouds whose covariance is factored; 10^4 take about ten minutes.
         queries: points at which the shape is asked; ten times as many for the memory.
         threads: of torch, for the library and its peers alike. Times are the least of some
@@ -69,7 +72,7 @@ def shape(
         "memory": lambda: [bench_memory(10 * queries, threads)],
         "raw": lambda: [bench_raw(queries)],
         "growth": lambda: [bench_growth(out.with_name("bench_shape_growth.png"))],
-        "objects": lambda: bench_objects(objects) if objects else [],
+        "objects": lambda: bench_objects(objects, views) if objects else [],
         "inputs": lambda: bench_inputs(objects) if objects else [],
         "cholesky": lambda: [bench_cholesky(clouds, seed)],
     }
@@ -85,10 +88,11 @@ def shape(
     measure("shape", subjects, only, settings, out)
 
 
-def bench_objects(objects: Path) -> list[Row]:
-    """Measure surface, coverage, closure and time of the fit on every noisy view of a folder, the table given."""
-    views, papers, seconds = _measure(objects, "camera"), _measure(objects, "paper"), _time_fits(objects)
-    print(format_table(views))
+def bench_objects(objects: Path, only: Sequence[str]) -> list[Row]:
+    """Measure surface, coverage, closure and time of the fit on noisy views of a folder, the table given."""
+    views, papers = _measure(objects, only, "camera"), _measure(objects, only, "paper")
+    seconds = _time_fits(objects, only)
+    print(format_table(views), format_groups(views), sep="\n")
     ours, paper = mean_row(views), mean_row(papers)
     middle, least = statistics.median(seconds), min(view["hidden_within_2"] for view in views)
     one, two = ours["hidden_within_1"], ours["hidden_within_2"]
@@ -121,21 +125,23 @@ def bench_objects(objects: Path) -> list[Row]:
     ]
 
 
-def _measure(objects: Path, support: Literal["camera", "paper"]) -> list[View]:
-    """Return errors, coverage and survival of closure of every view."""
+def _measure(objects: Path, only: Sequence[str], support: Literal["camera", "paper"]) -> list[View]:
+    """Return errors, coverage and survival of closure of every view, with its object's family and group."""
     views = []
-    for name, view, cloud, mesh in tqdm(list(read_views(objects)), desc=support, disable=None, leave=False):
+    for name, view, cloud, mesh in tqdm(list(read_views(objects, views=only)), desc=support, disable=None, leave=False):
         found = fit_shape(cloud, support=support, table=0.0)
-        views.append({"object": name, "view": view} | measure_shape(found, mesh, cloud) | closure_survival(found, mesh))
+        told = {"object": name, "view": view, "family": read_family(objects, name), "group": read_group(objects, name)}
+        views.append(told | measure_shape(found, mesh, cloud) | closure_survival(found, mesh))
     return views
 
 
-def _time_fits(objects: Path) -> list[float]:
+def _time_fits(objects: Path, only: Sequence[str]) -> list[float]:
     """Return the time [s] of the whole fit of every view, on one thread."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        return [least_seconds(partial(fit_shape, cloud, table=0.0), 2) for _, _, cloud, _ in read_views(objects)]
+        clouds = [cloud for _, _, cloud, _ in read_views(objects, views=only)]
+        return [least_seconds(partial(fit_shape, cloud, table=0.0), 2) for cloud in clouds]
     finally:
         torch.set_num_threads(threads)
 
