@@ -4,9 +4,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from paper.trials import TableSpec
 
 from benchmarks.close.ablation import bench_ablation
+from benchmarks.close.household import bench_grip, bench_household
 from benchmarks.close.pose_noise import bench_noise
+from benchmarks.close.real_scans import bench_scans
 from benchmarks.close.simulator_agreement import bench_agreement
 from benchmarks.close.speed import bench_closing_speed
 from benchmarks.close.stability import bench_stability
@@ -15,15 +18,19 @@ from benchmarks.close.success import bench_success
 from benchmarks.common import Row, measure
 from torchgrasp.evaluation.campaign import EvaluationSpec
 
-SUBJECTS = ("statics", "speed", "ablation", "agreement", "stability", "noise", "success")
+SUBJECTS = (
+    "statics", "speed", "ablation", "agreement", "stability", "noise", "success", "perturb", "grip", "scans",
+)  # fmt: skip
 
 
 def close(
-    objects: Path | None = None,
+    objects: tuple[Path, ...] = (),
     only: tuple[str, ...] = SUBJECTS,
     hands: tuple[str, ...] = ("allegro",),
     tries: int = 4,
     draws: int = 5,
+    grasps: int = 1,
+    names: tuple[str, ...] = (),
     starts: int = 1000,
     workers: int = 1,
     threads: int = 1,
@@ -33,11 +40,15 @@ def close(
     """Measure closing, lifting and pulling in simulation.
 
     Args:
-        objects: folder with manifest.json and a folder for each object; without it what needs grasps is left out.
-        only: subjects to measure: statics, speed, ablation, agreement, stability, noise, success.
-        hands: of noise and success; agreement takes both.
+        objects: folders with manifest.json and a folder for each object; without one what needs grasps is left out.
+            Only perturb, grip and scans take more than the first.
+        only: subjects to measure. statics, speed, ablation, agreement, stability, noise and success are of the closing;
+            perturb, grip and scans lift what a robot would meet, one object of each family.
+        hands: of all but ablation and agreement, which take both.
         tries: grasps of each view: the best for noise, else spread over all ranks.
         draws: errors of the hand's pose for each grasp.
+        grasps: the best of each view that perturb and grip lift.
+        names: of the objects that perturb and grip keep; by default all.
         starts: of the contact planner.
         workers: processes that share the trials.
         threads: of torch.
@@ -46,14 +57,19 @@ def close(
     """
     torch.set_num_threads(threads)
     spec = EvaluationSpec(tries, starts=starts, seed=seed)
+    folder = objects[0] if objects else None
+    household = TableSpec(out.parent, objects, hands, names, False, True, 1, grasps, 1, starts, workers, seed)
     subjects: dict[str, Callable[[], list[Row]]] = {
         "statics": bench_statics,
         "speed": bench_closing_speed,
-        "ablation": lambda: bench_ablation(objects, tries, starts, seed, workers) if objects else [],
-        "agreement": lambda: bench_agreement(objects, spec, workers) if objects else [],
-        "stability": lambda: bench_stability(objects, tries, starts, seed) if objects else [],
-        "noise": lambda: bench_noise(objects, hands, draws, spec, workers) if objects else [],
-        "success": lambda: bench_success(objects, hands, tries, workers, out.parent / "success") if objects else [],
+        "ablation": lambda: bench_ablation(folder, tries, starts, seed, workers) if folder else [],
+        "agreement": lambda: bench_agreement(folder, spec, workers) if folder else [],
+        "stability": lambda: bench_stability(folder, tries, starts, seed) if folder else [],
+        "noise": lambda: bench_noise(folder, hands, draws, spec, workers) if folder else [],
+        "perturb": lambda: bench_household(household) if folder else [],
+        "grip": lambda: bench_grip(household) if folder else [],
+        "scans": lambda: bench_scans(objects, hands, tries, starts, seed) if folder else [],
+        "success": lambda: bench_success(folder, hands, tries, workers, out.parent / "success") if folder else [],
     }
     settings = {"tries": tries, "starts": starts, "threads": threads, "seed": seed, "torch": torch.__version__}
     measure("close", subjects, only, settings, out)

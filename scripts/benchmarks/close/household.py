@@ -1,0 +1,217 @@
+"""Lifts that a robot would recognise: what each thing that it does not know costs, one at a time and all together.
+
+The best grasps of one view of each object are lifted under protocol "household". An object without a grasp fails.
+Plans and lifts are kept as files: a campaign that was stopped goes on where it was.
+"""
+
+import dataclasses
+import functools
+import json
+import math
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from paper.trials import CELL_SECONDS, Subject, TableSpec, subjects
+
+from benchmarks.common import Row
+from torchgrasp.datasets import list_views, read_mass, read_object_mesh, read_view
+from torchgrasp.errors import GraspError, Status
+from torchgrasp.evaluation import (
+    PERTURBATIONS,
+    PROTOCOLS,
+    PoseNoise,
+    close_hand,
+    count_by,
+    difference_over,
+    draw_error,
+    format_share,
+    household_mass,
+    perturb_trial,
+    perturb_view,
+    run_tasks,
+    seed_of,
+    share_over,
+)
+from torchgrasp.files import format_json, write_file
+from torchgrasp.hand.load import load_hand
+from torchgrasp.pipeline import plan_grasps
+from torchgrasp.sim.convex_parts import convex_parts
+from torchgrasp.specs import ContactSpec
+from torchgrasp.values import Grasps, load_grasps
+
+HOUSEHOLD = PROTOCOLS["household"]
+
+LEAST_HELD = 0.85
+"""Share of the best grasps that must hold with everything unknown together: the project's own bar."""
+
+FORCES = (4.0, 6.0, 8.0, 10.0)
+"""Grips [N] that are compared: a light squeeze, up to what the drives of a small hand can do."""
+
+
+Case = tuple[str, float]
+"""A perturbation by name, and a grip [N]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Lift:
+    """A lift of the grasp of a `rank`, of an object of a `family`; rank -1: there was none.
+
+    `slip` [m, rad] is the object's motion in the hand, `mass` [kg] and `friction` are the true ones.
+    """
+
+    object: str
+    family: str
+    rank: int
+    status: str
+    slip: tuple[float | None, float | None]
+    mass: float
+    friction: float
+    seconds: float
+
+    @property
+    def held(self) -> bool:
+        """Tell whether it held."""
+        return self.status == Status.OK.name
+
+
+def bench_household(spec: TableSpec) -> list[Row]:
+    """Lift with nothing unknown, with each factor alone, and with all of them."""
+    cases = [(name, HOUSEHOLD.trial.force) for name in PERTURBATIONS]
+    return [
+        _row(f"{hand}, {name}", found[name, force], found[cases[0]], name == "all")
+        for hand, found in _run(spec, cases)
+        for name, force in cases
+    ]
+
+
+def bench_grip(spec: TableSpec) -> list[Row]:
+    """Lift with everything unknown by several grips."""
+    cases = [("all", force) for force in FORCES]
+    return [
+        _row(f"{hand}, {force:g} N", found[name, force], found[cases[0]], False)
+        for hand, found in _run(spec, cases)
+        for name, force in cases
+    ]
+
+
+def _run(spec: TableSpec, cases: Sequence[Case]) -> Iterator[tuple[str, dict[Case, list[Lift]]]]:
+    """Yield for each hand the lifts of all objects by case."""
+    for hand in spec.hands:
+        tasks = [(spec, subject, hand, tuple(cases)) for subject in subjects(spec)]
+        lifts: dict[Case, list[Lift]] = {case: [] for case in cases}
+        for task, found in zip(tasks, run_tasks(lift_object, tasks, spec.workers, CELL_SECONDS), strict=True):
+            if isinstance(found, Status):
+                raise SystemExit(f"{task[1].name} {hand}: {found.sentence}")
+            for case, some in zip(cases, found, strict=True):
+                lifts[case] += [Lift(**lift) for lift in some]
+        yield hand, lifts
+
+
+def _row(what: str, lifts: Sequence[Lift], base: Sequence[Lift], judged: bool) -> Row:
+    """Return the share that held, of the best grasps and of all, the loss, the slip, and what lost the rest."""
+    best, first = (_counts(x for x in some if x.rank <= 0) for some in (lifts, base))
+    held = [x for x in lifts if x.held]
+    lost = dict(Counter(x.status for x in lifts if not x.held).most_common())
+    slips = [_quantiles([x.slip[k] for x in held], scale) for k, scale in ((0, 1e3), (1, math.degrees(1)))]
+    numbers: dict[str, Any] = {"best": share_over(best), "change": difference_over(best, first)}
+    numbers |= {"all": share_over(_counts(lifts)), "lost": lost, "slip": slips}
+    numbers["seconds"] = sum(x.seconds for x in lifts) / max(len({x.object for x in lifts}), 1)
+    numbers["objects"] = {x.object: x.status for x in lifts if x.rank <= 0}
+    change = numbers["change"]
+    words = [f"best one {format_share(numbers['best'])}"]
+    words.append(f"change {100 * change.value:+.1f} [{100 * change.low:+.1f}, {100 * change.high:+.1f}]")
+    if any(x.rank > 0 for x in lifts):
+        words.append(f"all ranks tried {format_share(numbers['all'])}")
+    (slip, far), (turn, wide) = slips
+    words.append(f"slip {slip:.1f} mm, {turn:.1f} deg; 95 % below {far:.1f} mm, {wide:.1f} deg; lost {lost}")
+    met = numbers["best"].value >= LEAST_HELD if judged else None
+    return Row(f"held, {what}", f">= {LEAST_HELD:.0%}" if judged else "-", "; ".join(words), met, numbers)
+
+
+def _counts(lifts: Iterable[Lift]) -> dict[str, tuple[int, int]]:
+    """Return the counts of what held by family."""
+    return count_by((lift.family, lift.held) for lift in lifts)
+
+
+def _quantiles(values: Sequence[float | None], scale: float) -> tuple[float, float]:
+    """Return median and 95 % quantile."""
+    known = torch.tensor([scale * x for x in values if x is not None], dtype=torch.float64)
+    if not len(known):
+        return math.nan, math.nan
+    median, most = known.quantile(torch.tensor([0.5, 0.95], dtype=torch.float64)).tolist()
+    return median, most
+
+
+def lift_object(spec: TableSpec, subject: Subject, hand: str, cases: Sequence[Case]) -> list[list[dict[str, Any]]]:
+    """Return the lifts of an object in every case, kept or run."""
+    torch.set_num_threads(1)
+    found = []
+    for name, force in cases:
+        what = f"{hand}_{subject.label}", name, force, spec.grasps, spec.draws
+        path = spec.kept("household", *what).with_suffix(".json")
+        if not path.is_file():
+            lifts = [dataclasses.asdict(lift) for lift in _lift(spec, subject, hand, name, force)]
+            write_file(path, format_json(lifts))
+        found.append(json.loads(path.read_text("utf-8")))
+    return found
+
+
+def _lift(spec: TableSpec, subject: Subject, hand: str, name: str, force: float) -> Iterator[Lift]:
+    """Lift the best grasps of one view under one perturbation."""
+    folder, perturbation = subject.folder, PERTURBATIONS[name]
+    assert folder is not None
+    began = time.process_time()
+    mesh, parts = _read_solid(folder, subject.name)
+    view = list_views(folder, only=[subject.name])[0][1]
+    mass = household_mass(float(mesh.volume), read_mass(folder, subject.name))
+    try:
+        grasps = _best(_plan(spec, subject, hand, view, name), spec.grasps)
+    except GraspError as error:
+        print(f"{subject.name}, {hand}, {name}: {error}", flush=True)
+        grasps = []
+    spent = time.process_time() - began
+    if not grasps:
+        yield Lift(subject.label, subject.family, -1, "NO_GRASP", (None, None), mass, math.nan, spent)
+    for rank, grasp in enumerate(grasps):
+        for draw in range(spec.draws):
+            began = time.process_time()
+            seed = seed_of(spec.seed, subject.label, view, rank, draw)
+            trial = perturb_trial(dataclasses.replace(HOUSEHOLD.trial, force=force), perturbation, mass, seed)
+            error = draw_error(dataclasses.replace(HOUSEHOLD, noise=perturbation.pose), grasp, mesh, seed)
+            done = close_hand(grasp, load_hand(hand), mesh, trial, seed, error=error, parts=parts)
+            spent += time.process_time() - began
+            slip = done.slip.distance, done.slip.angle
+            told = subject.label, subject.family, rank, done.status.name, slip, trial.mass, trial.friction
+            yield Lift(*told, spent)
+            spent = 0.0
+
+
+def _best(grasps: Grasps, most: int) -> list[Grasps]:
+    """Return the best grasps, one by one."""
+    return [grasps[row] for row in range(min(len(grasps), most))]
+
+
+def _plan(spec: TableSpec, subject: Subject, hand: str, view: str, name: str) -> Grasps:
+    """Return the executable grasps of a view, kept or planned; what only the lift meets shares one plan."""
+    assert subject.folder is not None
+    perturbation = PERTURBATIONS[name]
+    seen = dataclasses.replace(perturbation, mass=False, friction=None, pose=PoseNoise())
+    path = spec.kept("household", f"{hand}_{subject.label}_{view}", "plan", seen).with_suffix(".safetensors")
+    if not path.is_file():
+        cloud, seed = read_view(subject.folder, subject.name, view), seed_of(spec.seed, subject.label, view)
+        cloud, table = perturb_view(cloud, perturbation, seed)
+        contacts = ContactSpec(friction=HOUSEHOLD.trial.friction, table=table)
+        grasps = plan_grasps(cloud, load_hand(hand), contacts, spec.starts, spec.seed)
+        grasps[grasps.status == Status.OK].save(path)
+    return load_grasps(path)
+
+
+@functools.lru_cache(maxsize=2)
+def _read_solid(folder: Path, name: str) -> tuple[Any, Any]:
+    """Return mesh and convex parts."""
+    mesh = read_object_mesh(folder, name)
+    return mesh, convex_parts(mesh)
