@@ -310,7 +310,8 @@ class _Bench:
         seed = seed_of(self.spec.seed, self.subject.label, view, rank, draw)
         trial = dataclasses.replace(PAPER.trial, closing=row.closing, holding=row.holding, mass=mass)
         error = draw_error(PAPER, grasp, mesh, seed)
-        found = close_hand(grasp, self.hand, mesh, trial, seed, parts=parts, error=error)
+        touch = seed_of(seed, "touch")
+        found = close_hand(grasp, self.hand, mesh, trial, touch, parts=parts, error=error)
         certain = found.contact_order[0] == int(grasp.contacts.std_m[0].argmin()) if found.contact_order else None
         return Lift(view, rank, draw, found.status, found.pushed.distance, found.slip.distance, certain)
 

@@ -230,7 +230,8 @@ def _try(view: _View, protocol: Protocol, spec: EvaluationSpec, row: int, draw: 
     noise = protocol.noise if spec.perturb == "none" else perturbation.pose
     protocol = dataclasses.replace(protocol, trial=trial, noise=noise)
     error = draw_error(protocol, grasp, mesh, seed)
-    return run_protocol(GraspTrial(hand, grasp, mesh, seed, error, parts=parts), protocol, row, draw)
+    attempt = GraspTrial(hand, grasp, mesh, seed_of(seed, "touch"), error, parts=parts)
+    return run_protocol(attempt, protocol, row, draw)
 
 
 @functools.lru_cache(maxsize=2)

@@ -41,7 +41,7 @@ def bench_noise(objects: Path, hands: tuple[str, ...], draws: int, spec: Evaluat
                 words = [f"{key} {format_share(x)}" for key, x in shares.items()]
                 rows.append(
                     Row(
-                        f"{name}, {closing}: loss by 5 mm and 5 degrees",
+                        f"{name}, {closing}, {spec.tried}: loss by 5 mm and 5 degrees",
                         "none" if bar is None else f"at most {bar:.0%}",
                         f"{format_share(lost)}: {', '.join(words)}",
                         None if bar is None else lost.value <= bar,

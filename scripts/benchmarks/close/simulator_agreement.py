@@ -54,7 +54,7 @@ def bench_agreement(objects: Path, spec: EvaluationSpec, workers: int) -> list[R
                     pairs = zip(there.attempts, here.attempts, strict=True)
                     cases += [Case(test, hand.name, there, *pair) for pair in pairs]
     rows = [agreement_row(test, [case for case in cases if case.test == test]) for test in TESTS]
-    return [*rows, agreement_row("all tests", cases), speed_row(cases)]
+    return [*rows, agreement_row(f"all tests, {spec.tried}", cases), speed_row(cases)]
 
 
 def agreement_row(test: str, cases: list[Case]) -> Row:
