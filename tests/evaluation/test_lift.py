@@ -8,10 +8,12 @@ import pytest
 import torch
 import trimesh
 
-from tests.pinch import QUICK, close, cylinder, digest, digest_elsewhere, pinch
+from tests.pinch import HEIGHT, QUICK, close, cylinder, digest, digest_elsewhere, pinch
 from torchgrasp.control import observe
 from torchgrasp.errors import BadArgument, MeshError, Status
-from torchgrasp.evaluation import GraspTrial, TrialDriver, close_hand
+from torchgrasp.evaluation import GraspTrial, TrialDriver, close_hand, most_certain_first
+from torchgrasp.evaluation.lift import LIFT_TIME
+from torchgrasp.frames import inverse
 from torchgrasp.hand.load import load_hand
 from torchgrasp.specs import TrialSpec
 
@@ -41,13 +43,47 @@ def test_same_seed_same_bits_here_and_in_another_process():
     assert digest_elsewhere("allegro", "sapien", 3) == digest(first)
 
 
-def test_closings_differ_and_waiting_keeps_the_object_still():
+@pytest.mark.parametrize(("name", "aside"), [("allegro", -0.008), ("barrett", 0.008)])
+def test_waiting_keeps_the_object_still(name, aside):
     """The object stands 8 mm off: the finger that meets it first must not push it away before the others touch."""
-    mesh = cylinder((0.0, 0.008))
-    aware = close("allegro", mesh, dataclasses.replace(QUICK, noise=False))
-    position = close("allegro", mesh, dataclasses.replace(QUICK, noise=False, closing="position"))
-    assert not torch.equal(aware.joints[:50], position.joints[:50])
-    assert aware.held
+    mesh, still = cylinder((0.0, aside)), dataclasses.replace(QUICK, noise=False)
+    waiting, pressing = (close(name, mesh, dataclasses.replace(still, without=part)) for part in ((), ("wait",)))
+    assert waiting.held and pressing.held
+    assert waiting.pushed.distance < 0.5 * pressing.pushed.distance
+
+
+@pytest.mark.parametrize("closing", ["paper", "paper_position"])
+def test_the_papers_closings_lift_what_stands_where_it_was_seen(closing):
+    result = close("allegro", spec=dataclasses.replace(QUICK, closing=closing))
+    assert result.held
+    assert not torch.equal(result.joints[:50], close("allegro", spec=QUICK).joints[:50])
+
+
+def test_pushes_and_slips_are_parts_of_the_motion():
+    spec = dataclasses.replace(QUICK, hold_time=0.5)
+    result = close("allegro", cylinder((0.0, 0.008)), spec)
+    centre = torch.tensor([0.0, 0.008, HEIGHT / 2]).double()
+    centres = (inverse(result.hand_pose) @ result.object_pose)[:, :3] @ torch.cat([centre, torch.ones(1).double()])
+    touched = int((result.forces.cummax(0).values > 0).all(-1).int().argmax())
+    pressed = len(result.time) - 1 - round((LIFT_TIME + spec.hold_time) * spec.control_rate)
+    away = (result.hand_pose[: pressed + 1, :3, 3] - result.hand_pose[pressed, :3, 3]).norm(dim=-1)
+    arrived = int((away < 5e-4).int().argmax())
+    ends = [(centres[arrived], centres[touched]), (centres[pressed], centres[-1]), (centres[arrived], centres[-1])]
+    for motion, (start, end), tolerance in zip(
+        (result.pushed, result.slip, result.object_motion), ends, (3e-4, 1e-9, 1e-4), strict=True
+    ):
+        assert motion.distance == pytest.approx(float((end - start).norm()), abs=tolerance)
+    assert result.pushed.distance > 0.001
+
+
+def test_an_object_that_slips_in_the_hand_is_not_held(monkeypatch):
+    slipped = close("allegro", cylinder((0.0, 0.008)), QUICK).slip
+    for name, limit in (("SLIP_DISTANCE", slipped.distance), ("SLIP_ANGLE", slipped.angle)):
+        with monkeypatch.context() as patched:
+            patched.setattr(f"torchgrasp.evaluation.lift.{name}", 0.99 * limit)
+            result = close("allegro", cylinder((0.0, 0.008)), QUICK)
+        assert result.status is Status.SLIPPED
+        assert not result.held
 
 
 def test_the_hand_may_be_beside_its_planned_pose_and_may_be_shaken():
@@ -113,6 +149,17 @@ def test_too_little_friction_leaves_the_object_behind():
     result = close("allegro", spec=dataclasses.replace(QUICK, friction=0.02))
     assert not result.held
     assert result.status in (Status.NOT_LIFTED, Status.EJECTED, Status.DROPPED)
+
+
+def test_the_most_certain_finger_is_told():
+    _, grasp = pinch("allegro")
+    uneven = torch.tensor([[0.004, 0.002, 0.003]]).double()
+    grasp = dataclasses.replace(grasp, contacts=dataclasses.replace(grasp.contacts, std_m=uneven))
+    assert most_certain_first((1, 0, 2), grasp)
+    assert not most_certain_first((0, 1, 2), grasp)
+    assert not most_certain_first((), grasp)
+    with pytest.raises(BadArgument, match="exactly one"):
+        most_certain_first((0,), grasp[:0])
 
 
 def test_bad_arguments_are_refused():

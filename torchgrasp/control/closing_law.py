@@ -17,8 +17,8 @@ POSITION_RATE = 4.0
 """Position gain [1/s] of a contact without uncertainty, the largest: alpha_p = POSITION_RATE * POSITION_FLOOR**2."""
 
 FORCE_BANDWIDTH = 15.0
-"""Bandwidth [rad/s] of the force loop without uncertainty: alpha_f is this times the fingertip's compliance times
-FORCE_FLOOR**2. The sensor's 20 Hz filter leaves 15 rad/s stable."""
+"""Bandwidth [rad/s] of the most certain force loop: alpha_f is this times the fingertip's compliance times the least
+variance, FORCE_FLOOR**2 without a model. The sensor's 20 Hz filter leaves 15 rad/s stable."""
 
 FORCE_FLOOR = 0.3
 """Isotropic standard deviation [N] of Sigma_fd: the tactile sensor's accuracy along the surface."""

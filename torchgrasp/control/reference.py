@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from typing import TYPE_CHECKING
 
 import torch
@@ -67,8 +68,8 @@ class ClosingReference(Value):
             grasp: one row, planned for it.
             force: normal force of the strongest finger [N].
             kp: stiffness of every joint's drive [N m/rad]; None: the hand's own.
-            stability: chooses among balanced forces of nearly equal friction, and gives their covariance; None: it is
-                proportional to the force.
+            stability: chooses among balanced forces of nearly equal friction, and gives their covariance; the force
+                loop of the most certain finger is then the fastest. None: the covariance grows with the force.
 
         Raises:
             BadArgument: not exactly one row, joints of another hand, a force or stiffness that is not positive, or
@@ -86,12 +87,15 @@ class ClosingReference(Value):
         hand, grasp = hand.to(torch.float64), grasp.to(torch.float64)
         points, normals = contacts_in_hand(grasp)
         preferred = deviation = None
+        sure = FORCE_FLOOR
         if stability is not None:
-            preferred = stability.preferred_forces(points[0] + hand.tips.radius[:, None] * normals[0], force)
-            deviation = preferred.covariance.diagonal()[None].sqrt()
+            tips = points[0] + hand.tips.radius[:, None] * normals[0]
+            preferred = stability.preferred_forces(tips, force)
+            deviation = stability.preferred_forces(tips).covariance.diagonal()[None].sqrt()  # a given force has none
+            sure = math.hypot(FORCE_FLOOR, float(deviation.min()))
         forces = desired_forces(points, normals, force, None if preferred is None else preferred.forces[None])
         covariance, jacobian = surface_covariance(normals, std_m), hand.jacobian(grasp.joints)
-        alpha_f = FORCE_BANDWIDTH * FORCE_FLOOR**2 * tip_compliance(jacobian, normals, joint_stiffness(hand))
+        alpha_f = FORCE_BANDWIDTH * sure**2 * tip_compliance(jacobian, normals, joint_stiffness(hand))
         gains = ClosingGains(
             target=points[0],
             covariance=covariance[0],

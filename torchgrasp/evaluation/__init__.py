@@ -4,7 +4,7 @@ from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
 from torchgrasp.evaluation.campaign import EvaluationSpec, evaluate, run_protocol
 from torchgrasp.evaluation.intervals import Share, contrast_over, count_by, difference_over, format_share, mean_over
 from torchgrasp.evaluation.intervals import share_over
-from torchgrasp.evaluation.lift import close_hand, lift_grasp
+from torchgrasp.evaluation.lift import close_hand, lift_grasp, most_certain_first
 from torchgrasp.evaluation.perturb import PERTURBATIONS, Perturbation, find_perturbation, household_mass
 from torchgrasp.evaluation.perturb import perturb_trial, perturb_view
 from torchgrasp.evaluation.placed import PlacedScene, drop
@@ -46,6 +46,7 @@ __all__ = [
     "household_mass",
     "lift_grasp",
     "mean_over",
+    "most_certain_first",
     "perturb_trial",
     "perturb_view",
     "pull_grasp",

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.closing import ClosureResult, Disturbance, ObjectMotion
-from torchgrasp.errors import Status
+from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun, smooth_step
 from torchgrasp.frames import apply, inverse, rotation_angle
 from torchgrasp.hand.hand import Hand
@@ -89,6 +89,22 @@ def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResul
     lift = _Lift(run)
     status = lift.perform()
     return lift.result(status, time.perf_counter() - started)
+
+
+def most_certain_first(contact_order: Sequence[int], grasp: Grasps) -> bool:
+    """Return whether the finger on the most certain contact was the first to touch, as Sec. 5 expects of Eq. (27).
+
+    Args:
+        contact_order: fingers by their first touch (`ClosureResult`); without any the answer is no.
+        grasp: one row; of equally certain fingers any may be the first.
+
+    Raises:
+        BadArgument: not exactly one row, or contacts without `std_m`.
+    """
+    if len(grasp) != 1:
+        raise BadArgument("grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]")
+    std_m = grasp.contacts.require_std()[0]
+    return len(contact_order) > 0 and bool(std_m[contact_order[0]] == std_m.min())
 
 
 class _ObjectLost(Exception):
