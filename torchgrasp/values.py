@@ -86,7 +86,7 @@ class ShapeEstimate(Value):
 
     `distance`, `variance` and `covariance` are in the normalised units of the paper: one unit is `shape.scale` metres.
     So `max_variance=0.03` means what it means in the paper. `normal` is the unit gradient of the mean. `std_m` is the
-    calibrated standard deviation of the surface position [m].
+    calibrated standard deviation of the surface position [m]: that of the distance over the slope of the mean.
     """
 
     distance: Float[Tensor, "*b"]

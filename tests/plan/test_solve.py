@@ -32,7 +32,7 @@ def test_eq10_to_eq13_hold_for_every_row_that_is_ok(ellipsoid, name):
     gradient = x / torch.tensor(ellipsoid.axes, dtype=torch.float64) ** 2
     torch.testing.assert_close(good.contacts.normals, unit(gradient))  # Eq. (11)
     torch.testing.assert_close(good.contacts.variance, ellipsoid.doubt_at(x))
-    torch.testing.assert_close(good.contacts.std_m, 0.65 * 0.06 * ellipsoid.doubt_at(x).sqrt())
+    torch.testing.assert_close(good.contacts.std_m, 0.65 * 0.06 * ellipsoid.doubt_at(x).sqrt() / gradient.norm(dim=-1))
     assert float(good.contacts.variance.max()) < spec.max_variance  # Eq. (12)
     assert bool(certify(good.contacts, spec).closed.all())  # Eq. (13)
     w = wrenches(good.contacts.points, good.contacts.normals, spec.planned_friction, spec.edges)

@@ -10,9 +10,11 @@ from tests.covariance import covariance
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.linalg import unit
 from torchgrasp.shape.condition import condition, longest_distance
+from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import Normalisation, ShapeGP
 from torchgrasp.shape.kernel import thin_plate
 from torchgrasp.shape.observations import Observations
+from torchgrasp.shape.surface import extract_surface
 from torchgrasp.values import PointCloud
 
 NOISE = 0.01
@@ -98,7 +100,19 @@ def test_eq9_zero_level_is_the_sphere_where_it_was_seen(half_ball: ShapeGP):
 
 def test_std_m_is_the_calibrated_deviation_in_metres(half_ball: ShapeGP):
     found = half_ball.predict(half_ball.metres(_queries(half_ball, 5)))
-    torch.testing.assert_close(found.std_m, 0.65 * 0.05 * found.variance.sqrt())
+    slope = half_ball.differentiate(half_ball.metres(_queries(half_ball, 5))).distance.norm(dim=-1) * 0.05
+    torch.testing.assert_close(found.std_m, 0.65 * 0.05 * found.variance.sqrt() / slope)
+
+
+def test_std_m_is_divided_by_the_slope_where_the_mean_is_steep(seen_cylinder):
+    shape, step = fit_shape(seen_cylinder, support="paper"), 1e-6
+    surface = extract_surface(shape, 16)
+    found = shape.predict(surface.vertices)
+    up, down = (shape.predict(surface.vertices + k * step * surface.normals).distance for k in (1, -1))
+    slope = (up - down) / (2 * step)  # per metre
+    assert float((slope * shape.scale).quantile(0.9)) > 1.2  # the paper's means are steep
+    torch.testing.assert_close(found.std_m, found.variance.sqrt() / slope, rtol=1e-4, atol=0)
+    torch.testing.assert_close(surface.std_m, found.std_m, rtol=1e-4, atol=0)
 
 
 def test_jet_equals_predict_and_its_gradients_equal_finite_differences(half_ball: ShapeGP):

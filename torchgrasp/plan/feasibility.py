@@ -10,6 +10,7 @@ from torchgrasp.plan.closure_lp import solve_closure_lp
 from torchgrasp.plan.flatness import normal_variation
 from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet
 from torchgrasp.plan.wrench import BALANCED, MIN_MARGIN, MIN_RANK_RATIO, Triples, rank_ratio, wrenches
+from torchgrasp.shape.posterior import surface_deviation
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan, Contacts
 
@@ -46,8 +47,9 @@ def check_feasibility(shape: Shape, spec: ContactSpec, points: Triples) -> Conta
         flat_rows = normal_variation(shape, points[rows], normals[rows]).amax(-1) <= spec.flatness
         good[Status.NOT_FLAT] = torch.ones_like(closed).index_put((rows,), flat_rows)
     good[Status.NOT_CLOSED] = closed
+    std_m = shape.std_factor * shape.scale * surface_deviation(jet.variance, jet.gradient)
     return ContactPlan(
-        Contacts(metres, normals, jet.variance, shape.std_factor * shape.scale * jet.variance.sqrt()),
+        Contacts(metres, normals, jet.variance, std_m),
         coefficients.unflatten(1, wrench.shape[1:3]),
         torch.linalg.vector_norm(points.mean(1), dim=-1) * shape.scale,
         first_violation(good),

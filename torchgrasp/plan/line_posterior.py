@@ -24,6 +24,7 @@ from torchgrasp.plan.certify import check_unit
 from torchgrasp.plan.wrench import Triples, tangents
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.joint_posterior import distance_covariance, symmetric_root
+from torchgrasp.shape.posterior import surface_deviation
 from torchgrasp.values import Contacts
 
 FOOTPRINT = 0.012
@@ -43,7 +44,7 @@ class LinePosterior(Batch):
     Args:
         points: planned contacts x.
         normals: outward unit normals n.
-        deviation: standard deviation of d at the contact, the unit of nodes and grid.
+        deviation: standard deviation of the surface at the contact, the unit of nodes and grid.
         distance: mean of d on the grid.
         slope: mean of w at the nodes.
         root: symmetric root of the covariance of (d, w) at the nodes, line by line, node by node.
@@ -100,7 +101,8 @@ def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
     normals = check_unit(contacts.normals.detach().double().to(shape.device))
     if not bool(well_inside(shape, contacts).all()):
         raise BadArgument("contacts.points", "a contact at the edge of the domain", "contacts further inside")
-    deviation = shape.std_factor * shape.jet(points.flatten(0, 1)).variance.sqrt().reshape(points.shape[:2])
+    jet = shape.jet(points.flatten(0, 1))
+    deviation = shape.std_factor * surface_deviation(jet.variance, jet.gradient).reshape(points.shape[:2])
     nodes = deviation[..., None] * torch.tensor(NODES).to(deviation)
     covariance = points.new_empty(len(points), 12 * len(NODES), 12 * len(NODES))
     for rows in torch.arange(len(points), device=points.device).split(TRIPLES_PER_CHUNK):

@@ -14,7 +14,7 @@ from torchgrasp.linalg import cholesky, unit
 from torchgrasp.plane import move
 from torchgrasp.shape.joint_posterior import JointEstimate, draw_samples, joint_estimate
 from torchgrasp.shape.observations import Observations, on_surface
-from torchgrasp.shape.posterior import Posterior
+from torchgrasp.shape.posterior import Posterior, surface_deviation
 from torchgrasp.shape.update import append_observations
 from torchgrasp.values import PointCloud, ShapeEstimate
 
@@ -56,7 +56,7 @@ class ShapeGP(Posterior, Normalisation):
     Args:
         psi: length of the kernel, normalised: the thin plate's parameter.
         domain_radius: radius, normalised, of the ball in which the posterior is valid.
-        std_factor: ratio of the surface's real deviations to sqrt(variance), from hidden sides of known objects.
+        std_factor: ratio of the surface's real deviations to the posterior's, from hidden sides of known objects.
         cloud: what the camera saw, after cleaning.
     """
 
@@ -105,7 +105,7 @@ class ShapeGP(Posterior, Normalisation):
         """
         mean, covariance = self.estimate(self._queries(points))
         variance = covariance[:, 0, 0]
-        std_m = self.std_factor * self.scale * torch.sqrt(variance)
+        std_m = self.std_factor * self.scale * surface_deviation(variance, mean[:, 1:])
         return _reshape(ShapeEstimate(mean[:, 0], unit(mean[:, 1:]), variance, covariance, std_m), points)
 
     def differentiate(self, points: Float[Tensor, "*b 3"]) -> ShapeDerivatives:

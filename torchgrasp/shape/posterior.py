@@ -44,6 +44,17 @@ class SurfaceJet(Batch):
         return (self.hessian - n[..., :, None] * (n[..., None, :] @ self.hessian)) / steep
 
 
+def surface_deviation(variance: Float[Tensor, "*b"], gradient: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+    """Return the standard deviation of the zero level across itself, to first order in that of the distance.
+
+    A level moves by the error of the distance over the slope of the mean, which is steeper than 1 on the paper's data.
+
+    >>> surface_deviation(torch.tensor([0.04]), torch.tensor([[0.0, 0.0, 2.0]]))
+    tensor([0.1000])
+    """
+    return variance.sqrt() / torch.linalg.vector_norm(gradient, dim=-1)
+
+
 @dataclasses.dataclass(frozen=True)
 class Posterior(Value):
     """A Gaussian process given observations of distances and normals; normalised, in float64.

@@ -12,6 +12,7 @@ from torchgrasp.base import Value
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import limit_norm, unit
 from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.posterior import surface_deviation
 
 if TYPE_CHECKING:
     import trimesh
@@ -84,7 +85,7 @@ def extract_surface(shape: ShapeGP, resolution: int = 48) -> Surface:
         vertices=shape.metres(x),
         faces=faces if bool(outward) else faces.flip(1),
         normals=unit(jet.gradient),
-        std_m=shape.std_factor * shape.scale * torch.sqrt(jet.variance),
+        std_m=shape.std_factor * shape.scale * surface_deviation(jet.variance, jet.gradient),
     )
 
 
