@@ -2,6 +2,7 @@
 """Reproduce figures and tables of the paper with the objects of torchgrasp.
 
 python scripts/reproduce.py fig4 --out DIR    whole and partial clouds, and the shapes that follow from them
+python scripts/reproduce.py table3 --out DIR  how many points the filter keeps, and how long a shape takes
 python scripts/reproduce.py table4 --out DIR  how many of 1000 starts end in a grasp, how fast and how near the centre
 python scripts/reproduce.py fig5 --out DIR    planned contacts on the objects
 python scripts/reproduce.py table5 --out DIR  errors of the Barrett hand's learned model; fig7: four of them drawn
@@ -15,11 +16,10 @@ import io
 from pathlib import Path
 
 import numpy as np
-import torch
-import trimesh
 import tyro
 from paper.fig9_to_12 import grasps
 from paper.ladder import ladder
+from paper.table3 import sample_whole, table3
 from paper.table4_fig5 import fig5, table4
 from paper.table5_fig7_fig8 import fig7, fig8, table5
 from paper.tables6_7 import table6, table7
@@ -34,11 +34,9 @@ from torchgrasp.shape.surface import Surface, extract_surface
 
 TILE = (340, 360)
 """Width and height of one picture of a figure [pixels]."""
-POINTS = 1000
-"""Points of a whole cloud, as in the paper."""
 BUDGET = 200
 """Observations of a whole cloud; a partial one has some 160, with those that complete it."""
-ROWS = ("whole cloud", "shape from the whole cloud", "partial cloud", "shape from the partial cloud")
+ROWS = ("whole cloud", "shape from the whole cloud", "partial cloud", "the paper's shape from it", "the default shape")
 ARROW = 0.07
 """Length of the observed normals over the object's diagonal."""
 TURN = 70.0
@@ -48,7 +46,8 @@ TURN = 70.0
 def fig4(out: Path, seed: int = 0) -> None:
     """Draw Fig. 4: four objects as whole and partial clouds, and their shapes coloured by standard deviation.
 
-    Arrows are the points that a shape observes on the surface, of the cloud and of its completion, with its normals.
+    Two shapes are of the partial cloud: with the paper's observations, and with torchgrasp's own. Arrows are the points
+    that a shape observes on the surface, of the cloud and of its completion, with its normals.
 
     Args:
         out: folder of fig4.png; it is made where it does not exist.
@@ -60,10 +59,11 @@ def fig4(out: Path, seed: int = 0) -> None:
         clouds = (sample_whole(thing.mesh, seed), thing.view)
         # Exact normals are observed as they are: new ones would mix the two sides of thin walls, 6 mm between points.
         whole = fit_shape(clouds[0], budget=BUDGET, support="paper", seed=seed)
-        shapes = [whole, fit_shape(clouds[1], seed=seed, table=0.0)]
+        paper, default = fit_shape(clouds[1], support="paper", seed=seed), fit_shape(clouds[1], seed=seed, table=0.0)
+        shapes = [whole, paper, default]
         surfaces = [extract_surface(shape, 64) for shape in shapes]
         arrows = [observed_normals(shape) for shape in shapes]
-        for kind, surface in zip(("whole", "partial"), surfaces, strict=True):
+        for kind, surface in zip(("whole", "paper", "default"), surfaces, strict=True):
             std = 1e3 * surface.std_m
             print(f"{name:10}{kind:9} std [mm]: median {std.median():.1f}, 99 % {std.quantile(0.99):.1f}")
         scenes.append((thing, clouds, surfaces, arrows))
@@ -73,7 +73,8 @@ def fig4(out: Path, seed: int = 0) -> None:
     for column, (thing, clouds, surfaces, arrows) in enumerate(scenes):
         eye = rotated(view_of(thing.view), TURN)
         corners = np.asarray(thing.mesh.vertices)
-        rows = ((clouds[0], None), (surfaces[0], arrows[0]), (clouds[1], None), (surfaces[1], arrows[1]))
+        drawn = list(zip(surfaces, arrows, strict=True))
+        rows = ((clouds[0], None), drawn[0], (clouds[1], None), *drawn[1:])
         for row, (what, normals) in enumerate(rows):
             sheet.paste(draw(what, normals, most, corners, eye), (column * TILE[0], row * TILE[1] + 30))
     pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(22)
@@ -82,12 +83,6 @@ def fig4(out: Path, seed: int = 0) -> None:
     draw_bar(sheet, "standard deviation of the surface [mm]", most, "viridis")
     write_atomically(out / "fig4.png", lambda path: sheet.save(path, format="PNG"))
     print(out / "fig4.png")
-
-
-def sample_whole(mesh: trimesh.Trimesh, seed: int) -> PointCloud:
-    """Return points of the whole surface [m] with outward normals."""
-    points, faces = trimesh.sample.sample_surface(mesh, POINTS, seed=seed)[:2]
-    return PointCloud(torch.from_numpy(np.array(points)), torch.from_numpy(np.array(mesh.face_normals[faces])))
 
 
 def observed_normals(shape: ShapeGP) -> tuple[np.ndarray, np.ndarray]:
@@ -123,7 +118,7 @@ def draw(
 
 
 if __name__ == "__main__":
-    commands = {"fig4": fig4, "table4": table4, "fig5": fig5}
+    commands = {"table3": table3, "fig4": fig4, "table4": table4, "fig5": fig5}
     commands |= {"table5": table5, "fig7": fig7, "fig8": fig8, "grasps": grasps}
     commands |= {"table6": table6, "table7": table7, "ladder": ladder}
     tyro.extras.subcommand_cli_from_dict(commands, prog="reproduce.py", description="Figures and tables of the paper.")

@@ -27,14 +27,14 @@ ANGLE = 0.01
 """Unit of the variables [rad]: a fingertip moves by a millimetre or less, the unit of distances."""
 FIRST_RADIUS, LAST_RADIUS = 10.0, 0.05
 """Radius of the trust region in these units: at the start the error of a seed, at the end 0.05 mm at a fingertip."""
-EVALUATIONS = 600
-"""Most evaluations of one run; runs that reach their contacts need 100 to 400."""
+EVALUATIONS = 400
+"""Most evaluations of one run; runs that reach their contacts need 100 to 350."""
 ROOM, FAR = 0.5, 20.0
 """Clearance [mm] that the constraints ask for, since they are kept roughly; clearance above which none is told apart.
 The room left for a pre-grasp is no constraint, as in the paper."""
 WRONG = 1e3
 """Distance [mm] of fingertips in a line, which have no virtual frame."""
-ENOUGH, RUNS, AT_ONCE, EACH = 10, 40, 5, 2
+ENOUGH, RUNS, AT_ONCE, EACH = 10, 30, 5, 2
 """Executable triples after which no more are tried; most runs, each a second with SciPy's COBYLA; triples tried at a
 time; runs for each triple, those whose seeds collide least."""
 
