@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 from typing import Any
 
+from paper.rows import Cell, Plan, Row, TableSpec
 from paper.tables6_7 import Asked, count_held, format_points, gather, median, write
-from paper.trials import Cell, Plan, Row, TableSpec, run_cells
+from paper.trials import run_cells
 from torchgrasp.columns import format_columns
 from torchgrasp.evaluation import count_by, difference_over, format_share, share_over
 

@@ -10,7 +10,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from paper.trials import PAPER, Cell, Plan, Row, TableSpec, run_cells
+from paper.rows import Cell, Plan, Row, TableSpec
+from paper.trials import PAPER, run_cells
 from torchgrasp.columns import format_columns
 from torchgrasp.evaluation import Share, contrast_over, count_by, difference_over, format_share, share_over
 from torchgrasp.files import format_json, write_file
@@ -95,6 +96,8 @@ def gather(cells: Iterator[tuple[Cell, ...]]) -> list[list[Cell]]:
         print(f"{found[0].object:28}{found[0].hand:9}{counts} {note}".rstrip(), flush=True)
         for row, cell in zip(rows, found, strict=True):
             row.append(cell)
+    if not rows:
+        raise SystemExit("no object is finished")
     return rows
 
 

@@ -12,23 +12,23 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import torch
 
-from torchgrasp.base import Value, check_whole
+from paper.rows import Cell, Lift, Order, Plan, Row, Subject, Support, TableSpec
 from torchgrasp.datasets import list_views, read_family, read_group, read_object_mesh, read_view
 from torchgrasp.errors import GraspError, Status
 from torchgrasp.evaluation import PROTOCOLS, close_hand, draw_error, run_tasks, seed_of
 from torchgrasp.files import format_json, write_file
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
+from torchgrasp.ik.ranking import rank_by_variance
 from torchgrasp.objects import list_objects, load_object
-from torchgrasp.pipeline import Mode, plan_grasps
+from torchgrasp.pipeline import plan_grasps
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.sim.convex_parts import convex_parts
-from torchgrasp.specs import ClosingMode, ContactSpec, HoldingMode
 from torchgrasp.values import Grasps, PointCloud, load_grasps
 
 if TYPE_CHECKING:
@@ -42,143 +42,6 @@ MASS = 0.1
 CELL_SECONDS = 3600.0
 """Wall time [s] after which an object is given up: many times the usual."""
 
-Support = Literal["camera", "paper"]
-Order = Literal["success", "certain", "risky"]
-"""Which executable grasp comes first: the likeliest success, or the least or greatest sum of variances (Sec. 6.5)."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Plan(Value):
-    """How grasps are planned: `mode` of `plan_grasps`, support of the shape, and the problem of the contacts.
-
-    `margins` are the library's (`ContactSpec`); without them the problem is the paper's. `variance` is S_thresh; None:
-    that of the problem.
-    """
-
-    mode: Mode = "joint"
-    support: Support = "camera"
-    margins: bool = True
-    variance: float | None = None
-
-    def contacts(self) -> ContactSpec:
-        """Return the problem, for an object that stands on a table at z = 0."""
-        spec = dataclasses.replace(ContactSpec() if self.margins else ContactSpec.paper(), table=0.0)
-        return spec if self.variance is None else dataclasses.replace(spec, max_variance=self.variance)
-
-
-@dataclasses.dataclass(frozen=True)
-class Row(Value):
-    """A row of a table: its name, how grasps are planned, which come first, and how the hand closes and holds."""
-
-    name: str
-    plan: Plan
-    first: Order
-    closing: ClosingMode
-    holding: HoldingMode
-
-
-@dataclasses.dataclass(frozen=True)
-class TableSpec(Value):
-    """What a table is made of. A campaign that is stopped goes on where it was, if it is called again alike.
-
-    Args:
-        out: folder of the results, and of the plans and cells that are kept. After a change of the code, take another.
-        objects: folders of objects with noisy views, besides the library's own.
-        hands: by name.
-        only: names of objects to keep; by default all.
-        own: whether the library's own objects take part.
-        representatives: take one object of each family, the first by name.
-        views: views of each object.
-        grasps: grasps of each view.
-        draws: lifts of each grasp, with an error of the pose each.
-        starts: of the contact planner.
-        workers: processes; the results do not depend on their number.
-        seed: of every random draw.
-    """
-
-    out: Path
-    objects: tuple[Path, ...] = ()
-    hands: tuple[str, ...] = ("allegro", "barrett")
-    only: tuple[str, ...] = ()
-    own: bool = True
-    representatives: bool = False
-    views: int = 1
-    grasps: int = 2
-    draws: int = 1
-    starts: int = 1000
-    workers: int = 1
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("views", "grasps", "draws", "starts"):
-            check_whole(name, getattr(self, name), 1, 1_000_000)
-
-    def kept(self, kind: str, *what: object) -> Path:
-        """Return the file, without its ending, in which something of this campaign is kept."""
-        key = seed_of(self.seed, repr((self.starts, *what[1:])))
-        return self.out / kind / f"{what[0]}_{key:016x}"
-
-
-class Subject(NamedTuple):
-    """An object: its folder, None for the library's own, its name, family and group."""
-
-    folder: Path | None
-    name: str
-    family: str
-    group: str
-
-    @property
-    def label(self) -> str:
-        """Return a name that no other object has."""
-        return f"own {self.name}" if self.folder is None else self.name
-
-
-@dataclasses.dataclass(frozen=True)
-class Lift(Value):
-    """One lift, of the grasp at a `rank`, under one `draw` of the object's pose.
-
-    `pushed` [m] is how far the object moved until all fingers touched, `slip` [m] in the hand from then on. `certain`
-    tells whether the finger on the most certain contact touched first. NaN, None: never measured.
-    """
-
-    view: str
-    rank: int
-    draw: int
-    status: Status
-    pushed: float = math.nan
-    slip: float = math.nan
-    certain: bool | None = None
-
-    @property
-    def held(self) -> bool:
-        """Tell whether the object was held."""
-        return self.status is Status.OK
-
-
-@dataclasses.dataclass(frozen=True)
-class Cell(Value):
-    """The lifts of one object with one hand in one row.
-
-    `refused` views had no executable grasp; `note` may say why. `std_m` [m] is that of a grasp's least certain contact,
-    a mean over the grasps. `seconds` is the mean CPU time of planning on a view.
-    """
-
-    object: str
-    family: str
-    group: str
-    hand: str
-    row: str
-    lifts: tuple[Lift, ...]
-    refused: int
-    std_m: float
-    seconds: float
-    note: str = ""
-
-    @property
-    def held(self) -> int:
-        """Count the lifts that held."""
-        return sum(lift.held for lift in self.lifts)
-
 
 def run_cells(spec: TableSpec, rows: Sequence[Row]) -> Iterator[tuple[Cell, ...]]:
     """Yield for each hand and object the cells of the rows.
@@ -189,6 +52,8 @@ def run_cells(spec: TableSpec, rows: Sequence[Row]) -> Iterator[tuple[Cell, ...]
     for hand in spec.hands:
         load_hand(hand)
     tasks = [(spec, tuple(rows), subject, hand) for hand in spec.hands for subject in subjects(spec)]
+    if spec.finished:
+        tasks = [task for task in tasks if all(cell_path(spec, row, *task[2:]).is_file() for row in rows)]
     for (_, _, subject, hand), cells in zip(tasks, run_tasks(fill, tasks, spec.workers, CELL_SECONDS), strict=True):
         if isinstance(cells, Status):
             lost = Cell(
@@ -199,12 +64,26 @@ def run_cells(spec: TableSpec, rows: Sequence[Row]) -> Iterator[tuple[Cell, ...]
 
 
 def subjects(spec: TableSpec) -> list[Subject]:
-    """Return the objects of a campaign, by family and name."""
-    own = [Subject(None, name, f"own {name}", "") for name in list_objects() if spec.own]
-    names = [(folder, name) for folder in spec.objects for name in dict.fromkeys(n for n, _ in list_views(folder))]
-    found = own + [Subject(folder, name, read_family(folder, name), read_group(folder, name)) for folder, name in names]
-    found = sorted((s for s in found if not spec.only or s.name in spec.only), key=lambda s: (s.family, s.label))
-    return list({s.family: s for s in reversed(found)}.values())[::-1] if spec.representatives else found
+    """Return the objects of a campaign: first one of each family, the families in random order.
+
+    So the objects that are finished when a campaign is stopped are a fair sample of all.
+    """
+    found = [Subject(None, name, f"own {name}", "") for name in list_objects() if spec.own]
+    for folder in spec.objects:
+        names = dict.fromkeys(name for name, _ in list_views(folder))
+        found += [Subject(folder, name, read_family(folder, name), read_group(folder, name)) for name in names]
+    families: dict[str, list[Subject]] = {}
+    for subject in sorted((s for s in found if not spec.only or s.name in spec.only), key=lambda s: s.label):
+        families.setdefault(subject.family, []).append(subject)
+    ranked = [(k, subject) for some in families.values() for k, subject in enumerate(some)]
+    ranked.sort(key=lambda x: (x[0], seed_of(spec.seed, x[1].label)))
+    return [subject for k, subject in ranked if not (spec.representatives and k)]
+
+
+def cell_path(spec: TableSpec, row: Row, subject: Subject, hand: str) -> Path:
+    """Return the file in which a cell is kept; rows that differ in their names alone share it."""
+    asked = dataclasses.replace(row, name=""), spec.views, spec.grasps, spec.draws
+    return spec.kept("cells", f"{hand}_{subject.label}", *asked).with_suffix(".json")
 
 
 def fill(spec: TableSpec, rows: tuple[Row, ...], subject: Subject, hand_name: str) -> tuple[Cell, ...]:
@@ -212,8 +91,7 @@ def fill(spec: TableSpec, rows: tuple[Row, ...], subject: Subject, hand_name: st
     torch.set_num_threads(1)
     bench, cells = _Bench(spec, subject, hand_name), []
     for row in rows:
-        asked = dataclasses.replace(row, name=""), spec.views, spec.grasps, spec.draws
-        path = spec.kept("cells", f"{hand_name}_{subject.label}", *asked).with_suffix(".json")
+        path = cell_path(spec, row, subject, hand_name)
         if not path.is_file():
             write_file(path, format_json(dataclasses.asdict(bench.fill(row))))
         cells.append(dataclasses.replace(_read_cell(path), row=row.name))
@@ -317,11 +195,11 @@ class _Bench:
 
 
 def in_order(grasps: Grasps, first: Order) -> Grasps:
-    """Return grasps in an order; planned ones are by success already."""
+    """Return executable grasps in an order; planned ones are by success already."""
     if first == "success":
         return grasps
-    variance = grasps.contacts.std_m.square().sum(1)
-    return grasps[torch.argsort(variance, descending=first == "risky", stable=True)]
+    ranked = rank_by_variance(grasps)
+    return ranked if first == "certain" else ranked[torch.arange(len(ranked)).flip(0)]
 
 
 @functools.lru_cache(maxsize=4)

@@ -12,8 +12,9 @@ import torch
 import trimesh
 from paper import trials
 from paper.ladder import RUNGS, count_all, judge
+from paper.rows import Cell, Lift, Plan, Row, TableSpec
 from paper.tables6_7 import THRESHOLDS, count_held, line_weights
-from paper.trials import Cell, Lift, Plan, Row, TableSpec, fill, in_order, run_cells, subjects
+from paper.trials import fill, in_order, run_cells, subjects
 
 from tests.pinch import pinch
 from torchgrasp.base import join
@@ -31,10 +32,11 @@ ROWS = (
 def grasps():
     """Return three executable grasps, ever less certain, and one that is not executable."""
     _, grasp = pinch("allegro")
-    rows = [
-        dataclasses.replace(grasp, contacts=dataclasses.replace(grasp.contacts, std_m=torch.full((1, 3), 1e-3 * k)))
-        for k in (1, 2, 3, 4)
-    ]
+    rows = []
+    for k in (1, 2, 3, 4):
+        std = torch.full((1, 3), 1e-3 * k)
+        contacts = dataclasses.replace(grasp.contacts, std_m=std, variance=std**2)
+        rows.append(dataclasses.replace(grasp, contacts=contacts))
     lost = dataclasses.replace(rows.pop(), status=torch.full_like(grasp.status, int(Status.TIP_ERROR)))
     return join([*rows, lost])
 
@@ -63,9 +65,8 @@ def bench(monkeypatch):
 def test_rows_share_plans_and_errors_and_a_campaign_goes_on_where_it_stopped(bench, tmp_path):
     spec = TableSpec(tmp_path, hands=("allegro",), only=("cylinder", "jug"), draws=2, workers=0)
     first = list(run_cells(spec, ROWS))
-    assert [x[0].object for x in first] == ["own cylinder", "own jug"] and len(
-        bench.plans
-    ) == 4  # two plans, two objects
+    assert {x[0].object for x in first} == {"own cylinder", "own jug"}
+    assert len(bench.plans) == 4  # two plans, two objects
     assert [p[1:] for p in bench.plans[:2]] == [(0.03, "joint"), (0.06, "joint")]
     # two grasps, two draws: rows meet the same errors, ranks, draws and objects other ones
     assert len(bench.lifts) == 2 * 3 * 4
@@ -75,7 +76,7 @@ def test_rows_share_plans_and_errors_and_a_campaign_goes_on_where_it_stopped(ben
     assert stds[:8:2] == pytest.approx([0.001, 0.002, 0.003, 0.002])  # the likeliest, then the riskiest two
     assert [x[0].closing for x in bench.lifts[:8:4]] == ["uncertainty", "position"]
     cell = first[0][0]
-    assert (cell.held, len(cell.lifts), cell.refused, cell.row, cell.family) == (4, 4, 0, "one", "own cylinder")
+    assert (cell.held, len(cell.lifts), cell.refused, cell.row, cell.family) == (4, 4, 0, "one", cell.object)
     assert cell.std_m == pytest.approx(0.0015) and cell.lifts[0].certain is False  # finger 0 is the most certain
     asked = len(bench.plans), len(bench.lifts)
     assert list(run_cells(spec, ROWS)) == first and asked == (len(bench.plans), len(bench.lifts))
@@ -83,8 +84,9 @@ def test_rows_share_plans_and_errors_and_a_campaign_goes_on_where_it_stopped(ben
     assert [x[:3] for x in run_cells(spec, more)] == first
     assert len(bench.plans) == asked[0] and len(bench.lifts) == asked[1] + 8  # only the new row's
     other = dataclasses.replace(spec, seed=1)
-    assert [x[0].object for x in run_cells(other, ROWS[:1])] == ["own cylinder", "own jug"]
-    assert len(bench.plans) == asked[0] + 2  # another seed shares nothing
+    assert not list(run_cells(dataclasses.replace(other, finished=True), ROWS))
+    assert len(list(run_cells(other, ROWS[:1]))) == 2 and len(bench.plans) == asked[0] + 2  # a seed shares nothing
+    assert len(list(run_cells(dataclasses.replace(other, finished=True, only=()), ROWS[:1]))) == 2
 
 
 def test_a_view_without_a_grasp_is_refused_and_kept(bench, monkeypatch, tmp_path):
@@ -108,15 +110,6 @@ def test_families_come_from_the_folders_and_one_object_may_stand_for_each(tmp_pa
         entry["views"] = {"view0": {"T_object_camera": np.eye(4).tolist()}}
     (tmp_path / "manifest.json").write_text(json.dumps({"objects": entries}))
     spec = TableSpec(tmp_path, (tmp_path,))
-    assert [s.family for s in subjects(spec)] == [
-        "a",
-        "own cylinder",
-        "own jug",
-        "own rabbit",
-        "own spray",
-        "tin",
-        "tin",
-    ]
     few = dataclasses.replace(spec, own=False, representatives=True)
     assert [(s.label, s.family, s.group) for s in subjects(few)] == [("a", "a", ""), ("b", "tin", "solid")]
 
