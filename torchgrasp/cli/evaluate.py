@@ -63,7 +63,8 @@ def evaluate(
         closing: how the hand closes; by default in open loop before a pull, under uncertainty before a lift.
         holding: how the hand presses from then on.
         simulator: sapien or mujoco.
-        force: normal force of the strongest finger [N]; by default 7 before a pull, 4 before a lift.
+        force: normal force of the strongest finger [N]; by default 7 before a pull, 4 before a lift, 6 in
+            protocol "household".
         grasps: the most that are tried of each view.
         ranks: which of them: the best, or as many spread over all ranks.
         starts: random starts of the contact planner.
