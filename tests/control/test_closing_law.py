@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 import torch
 
+from torchgrasp.control.adaptive.stability import load_stability
 from torchgrasp.control.closing_law import (
     DAMPING,
+    FORCE_BANDWIDTH,
+    FORCE_FLOOR,
     MAX_SPEED,
     MAX_STEP,
     POSITION_FLOOR,
@@ -21,7 +24,7 @@ from torchgrasp.control.closing_law import (
     surface_covariance,
     tip_velocity,
 )
-from torchgrasp.control.reference import closing_gains
+from torchgrasp.control.reference import ClosingReference, closing_gains
 from torchgrasp.control.stiffness import joint_stiffness, tip_compliance
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.frames import apply, inverse, rigid, rotate, rotation_from_vector
@@ -184,6 +187,21 @@ def test_contacts_without_balance_are_pressed_along_their_normals():
     gains = closing_gains(grasp, hand, 5.0)
     assert torch.allclose(gains.desired_force, -5.0 * rotate(inverse(grasp.obj_from_hand), same)[0])
     assert torch.isfinite(gains.force_gain).all()
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett"])
+def test_eq28_the_learned_variance_tells_which_force_loop_is_the_fastest(name):
+    """Along its normal a loop has the bandwidth C_F over the compliance; no finger's force is known exactly."""
+    hand, model = load_hand(name), load_stability(load_hand(name))
+    grasp = grasp_of(hand)
+    gains = ClosingReference.from_grasp(hand, grasp, 4.0, stability=model).gains
+    centres, (_, pads) = hand.tip_centres(grasp.joints)[0], hand.fingertips(grasp.joints)
+    variance = model.preferred_forces(centres).covariance.diagonal()
+    sigma = variance[:, None] * pads[0] ** 2 + FORCE_FLOOR**2
+    compliance = tip_compliance(hand.jacobian(grasp.joints), pads, joint_stiffness(hand))[0]
+    expected = FORCE_BANDWIDTH * compliance[:, None] * (variance.min() + FORCE_FLOOR**2) / sigma
+    assert torch.allclose(gains.force_gain, expected, rtol=1e-6)
+    assert gains.force_source == "stability"
 
 
 def test_compliance_is_what_the_drives_yield():

@@ -12,6 +12,7 @@ from tests.pinch import HEIGHT, QUICK, close, cylinder, digest, digest_elsewhere
 from torchgrasp.control import observe
 from torchgrasp.errors import BadArgument, MeshError, Status
 from torchgrasp.evaluation import GraspTrial, TrialDriver, close_hand, most_certain_first
+from torchgrasp.evaluation.closing import derive_reference
 from torchgrasp.evaluation.lift import LIFT_TIME
 from torchgrasp.frames import inverse
 from torchgrasp.hand.load import load_hand
@@ -57,6 +58,12 @@ def test_the_papers_closings_lift_what_stands_where_it_was_seen(closing):
     result = close("allegro", spec=dataclasses.replace(QUICK, closing=closing))
     assert result.held
     assert not torch.equal(result.joints[:50], close("allegro", spec=QUICK).joints[:50])
+
+
+def test_the_papers_forces_are_those_of_the_stability_model():
+    hand, grasp = pinch("barrett")
+    sources = {c: derive_reference(hand, grasp, TrialSpec(closing=c)).gains.force_source for c in ("paper", "fixed")}
+    assert sources == {"paper": "stability", "fixed": "analytic"}
 
 
 def test_pushes_and_slips_are_parts_of_the_motion():

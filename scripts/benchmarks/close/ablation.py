@@ -124,14 +124,16 @@ def _row(part: str, cases: list[Case]) -> Row:
     held |= {hand: share_over(_held([c for c in mine if c.hand == hand])) for hand in ("allegro", "barrett")}
     against = difference_over(_held(mine), _held(default))
     first = share_over(count_by((c.family, c.first) for c in mine))
-    pushed, slip = (median_over([(c.family, getattr(c, name)) for c in mine]) for name in ("pushed", "slip"))
+    pushed = median_over([(c.family, c.pushed) for c in mine])
+    slip = median_over([(c.family, c.slip) for c in mine if c.held])
     lost = {status: sum(c.status == status for c in mine) for status in sorted({c.status for c in mine} - {"OK"})}
     seconds = sum(case.seconds for case in mine) / max(len(mine), 1)
     words = [f"{name} {format_share(s)}" for name, s in held.items()]
     words += [
         f"{100 * against.value:+.1f} points [{100 * against.low:.1f}, {100 * against.high:.1f}] against {DEFAULT}",
         f"most certain finger first {format_share(first)}",
-        *(f"{name} {x[0]:.1f} mm [{x[1]:.1f}, {x[2]:.1f}]" for name, x in (("pushed", pushed), ("slip", slip))),
+        "pushed {:.1f} mm [{:.1f}, {:.1f}]".format(*pushed),
+        "slip of the held {:.1f} mm [{:.1f}, {:.1f}]".format(*slip),
         f"{seconds:.2f} CPU s; lost {lost}",
     ]
     numbers = {"held": held, "against": against, "first": first, "pushed_mm": pushed, "slip_mm": slip, "lost": lost}
@@ -166,7 +168,7 @@ def _close_view(objects: Path, name: str, view: str, hand_name: str, tries: int,
             grasp, belief = grasps[row], shape if revises else None
             followed = swap_deviations(grasp) if swapped else grasp
             began = time.process_time()
-            result = close(followed, spec=spec, seed=drawn, error=error, belief=belief)
+            result = close(followed, spec=spec, seed=seed_of(drawn, "touch"), error=error, belief=belief)
             spent = time.process_time() - began
             first = most_certain_first(result.contact_order, grasp)
             moved = (1e3 * result.pushed.distance, 1e3 * result.slip.distance)
