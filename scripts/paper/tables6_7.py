@@ -112,7 +112,7 @@ def report(rows: Sequence[Sequence[Cell]]) -> dict[str, Any]:
         parts = {"all": numbers[name]} | {hand: _numbers([c for c in row if c.hand == hand]) for hand in hands}
         for hand, found in parts.items() if len(hands) > 1 else [(next(iter(hands)), numbers[name])]:
             held, certain = (format_share(found[key]) for key in ("held", "certain_first"))
-            moved = [f"{found[key]:.1f} mm" for key in ("pushed_mm", "slip_mm")]
+            moved = ["-" if math.isnan(x) else f"{x:.1f} mm" for x in (found["pushed_mm"], found["slip_mm"])]
             graspable = f"{found['graspable']} of {found['objects']}"
             lines.append((name, hand, held, graspable, *moved, certain, PUBLISHED.get(name, "-")))
     print(f"\n{format_columns(lines, left={0, 1, 2, 6})}")
