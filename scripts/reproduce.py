@@ -6,6 +6,7 @@ python scripts/reproduce.py table3 --out DIR  how many points the filter keeps, 
 python scripts/reproduce.py table4 --out DIR  how many of 1000 starts end in a grasp, how fast and how near the centre
 python scripts/reproduce.py fig5 --out DIR    planned contacts on the objects
 python scripts/reproduce.py table5 --out DIR  errors of the Barrett hand's learned model; fig7: four of them drawn
+python scripts/reproduce.py fig6 --out DIR    the number of Gaussians by BIC and by cross-validation
 python scripts/reproduce.py fig8 --out DIR    errors of the Allegro hand's learned model
 python scripts/reproduce.py grasps --out DIR  Figs. 9-12: one contact triple by two postures and by two hands; grasps
 python scripts/reproduce.py table6 --out DIR  how often ever riskier grasps hold; table7: under five closings
@@ -17,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+from paper.fig6 import fig6
 from paper.fig9_to_12 import grasps
 from paper.ladder import ladder
 from paper.table3 import sample_whole, table3
@@ -119,6 +121,6 @@ def draw(
 
 if __name__ == "__main__":
     commands = {"table3": table3, "fig4": fig4, "table4": table4, "fig5": fig5}
-    commands |= {"table5": table5, "fig7": fig7, "fig8": fig8, "grasps": grasps}
+    commands |= {"table5": table5, "fig6": fig6, "fig7": fig7, "fig8": fig8, "grasps": grasps}
     commands |= {"table6": table6, "table7": table7, "ladder": ladder}
     tyro.extras.subcommand_cli_from_dict(commands, prog="reproduce.py", description="Figures and tables of the paper.")

@@ -12,19 +12,23 @@ from tqdm import tqdm
 from torchgrasp.errors import BadArgument
 from torchgrasp.files import write_file
 from torchgrasp.hand.draft import draft_hand
+from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model import Progress, fit_mixture, sample_configurations
 from torchgrasp.posture_model.mixture import mixture_path
 from torchgrasp.testing import check_hand
 from train.mixture_score import evaluate_mixture
+from train.model_selection import bic_curve
 
-PAPER_COMPONENTS = {"allegro": 41, "barrett": 36}
-"""The paper's numbers of Gaussians (Sec. 6.3)."""
+CANDIDATES = tuple(range(5, 61, 5))
+"""Numbers of Gaussians to choose from: the range of Fig. 6."""
+SELECTION = 40_000
+"""Postures of their own on which the number is chosen."""
 
 
 def posture_model(
     hand: Annotated[str, tyro.conf.Positional],
     tips: tuple[str, ...] = (),
-    n: int = 400_000,
+    n: int = 200_000,
     components: int | None = None,
     seed: int = 0,
     starts: int = 5,
@@ -39,8 +43,8 @@ def posture_model(
     Args:
         hand: name of a shipped hand, the folder of another, or a URDF.
         tips: links of the fingertips as for `torchgrasp hand new`, for a URDF without a hand.toml beside it.
-        n: free postures to learn from; the default is the paper's number.
-        components: Gaussians; default: the paper's number for its hands, 40 for others.
+        n: postures to learn from, which can hold something where their tips have rolled.
+        components: Gaussians; default: the number of least BIC among `CANDIDATES`.
         seed: of postures and first start.
         starts: k-means starts of the fit, of which the likeliest continues.
         tolerance: of the mean log-likelihood [nats] at which the fit stops.
@@ -56,10 +60,10 @@ def posture_model(
     robot = check_hand(folder)
     begin = time.perf_counter()
     with tqdm(desc="postures", total=n + held_out, unit_scale=True, disable=None) as bar:
-        samples = sample_configurations(robot, n + held_out, seed, workers, observer=bar.update)
-    print(f"{robot.name}: {len(samples)} free postures in {time.perf_counter() - begin:.0f} s")
+        samples = sample_configurations(robot, n + held_out, seed, workers, "grasping", bar.update)
+    print(f"{robot.name}: {len(samples)} postures in {time.perf_counter() - begin:.0f} s")
     begin = time.perf_counter()
-    m = PAPER_COMPONENTS.get(robot.name, 40) if components is None else components
+    m = choose(robot, seed, workers) if components is None else components
     with tqdm(desc="EM", unit=" steps", disable=None) as bar:
 
         def show(progress: Progress) -> None:
@@ -80,6 +84,15 @@ def posture_model(
     print(score)
     mixture = dataclasses.replace(mixture, meta=meta | score.meta())
     print(f"written: {mixture.save(out or mixture_path(folder))}")
+
+
+def choose(hand: Hand, seed: int, workers: int) -> int:
+    """Return the number of Gaussians of least BIC on other postures, and print the curve."""
+    apart = sample_configurations(hand, SELECTION, seed + 1, workers, "grasping")
+    with tqdm(desc="components", total=len(CANDIDATES), disable=None) as bar:
+        curve = bic_curve(apart, CANDIDATES, observer=lambda m, mixture: bar.update() and None, iterations=100)
+    print(curve)
+    return int(curve.components[curve.bic.argmin()])
 
 
 def prepare_folder(hand: str, tips: tuple[str, ...]) -> str:

@@ -93,3 +93,11 @@ def test_degenerate_triples_have_no_seeds_and_same_seed_same_bits(library, poses
     assert len(nearest_postures(library, mixed[:0], CollisionWorld(NOTHING))) == 0
     with pytest.raises(BadArgument, match="n_seeds"):
         nearest_postures(library, mixed, CollisionWorld(NOTHING), n_seeds=0)
+
+
+def test_a_small_library_gives_no_more_seeds_than_it_has(poses):
+    library = PostureLibrary.of(load_hand("barrett"), 2, seed=3)
+    contacts = touched(library, poses[:2])
+    assert len(nearest_postures(library, contacts, CollisionWorld(NOTHING), n_seeds=12)) == 24
+    with pytest.raises(BadArgument, match=r"n_seeds: found 13, allowed is a whole number in \[1, 12\]"):
+        nearest_postures(library, contacts, CollisionWorld(NOTHING), n_seeds=13)

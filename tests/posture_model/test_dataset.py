@@ -32,7 +32,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-@pytest.mark.parametrize("sampling", ["uniform", "opposed"])
+@pytest.mark.parametrize("sampling", ["uniform", "grasping"])
 def test_a_folder_holds_what_sample_configurations_returns_for_any_number_of_workers(tmp_path, small, sampling):
     hand = load_hand("barrett")
     spec = SampleSpec(1700, 3, sampling)
@@ -139,7 +139,7 @@ def test_a_full_disk_leaves_nothing_half_written_and_the_run_goes_on_later(tmp_p
 def test_a_folder_of_other_samples_or_files_is_refused(tmp_path, small):
     hand = load_hand("barrett")
     write_samples(hand, SampleSpec(600), tmp_path / "a")
-    for other in (SampleSpec(601), SampleSpec(600, 1), SampleSpec(600, 0, "opposed")):
+    for other in (SampleSpec(601), SampleSpec(600, 1), SampleSpec(600, 0, "grasping")):
         with pytest.raises(OutputError, match="holds other samples"):
             write_samples(hand, other, tmp_path / "a")
     (tmp_path / "b").mkdir()
@@ -178,9 +178,9 @@ def test_what_is_no_manifest_is_refused(tmp_path, data):
 
 
 def test_command(tmp_path, small, capsys):
-    arguments = ["hand", "sample", "--hand", "barrett", "--n", "700", "--sampling", "opposed"]
+    arguments = ["hand", "sample", "--hand", "barrett", "--n", "700", "--sampling", "grasping"]
     assert main([*arguments, "--out", str(tmp_path / "a")]) == 0
-    assert "700 opposed postures of barrett" in capsys.readouterr().out
+    assert "700 grasping postures of barrett" in capsys.readouterr().out
     assert len(load_samples(tmp_path / "a")) == 700
     for wrong, named in [(["--hand", "shadow"], "--hand"), (["--n", "0"], "--n"), (["--seed", "-1"], "--seed"),
                          (["--fingers", "toes"], "--fingers"), (["--seed", "1"], "--out")]:  # fmt: skip

@@ -1,6 +1,5 @@
 """The mixture against torch.distributions, brute-force Bayes and Monte Carlo; its file against abuse."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -48,13 +47,13 @@ def test_eq21_eq22_energy_is_half_the_least_squared_mahalanobis_distance(generat
 
 
 def test_eq21_thresholds_accept_what_their_names_say():
-    assert math.isclose(2 * DEFAULT_ENERGY, chi2.ppf(0.99, 6), abs_tol=1e-7)
+    assert math.isclose(2 * DEFAULT_ENERGY, chi2.ppf(0.95, 6), abs_tol=1e-7)
     n = 1_000_000
     mixture = random_mixture(1)
     factor = torch.linalg.cholesky(mixture.covariances[0, 2:, 2:])
     noise = torch.from_numpy(np.random.default_rng(0).normal(size=(n, 6)))
     energy = mixture.energy(mixture.means[0, 2:] + noise @ factor.T)
-    for threshold, probability in ((PAPER_ENERGY, chi2.cdf(4.0, 6)), (DEFAULT_ENERGY, 0.99)):
+    for threshold, probability in ((PAPER_ENERGY, chi2.cdf(4.0, 6)), (DEFAULT_ENERGY, 0.95)):
         accepted = float((energy < threshold).double().mean())
         assert abs(accepted - probability) < 3 * math.sqrt(probability * (1 - probability) / n)
     assert abs(chi2.cdf(2 * PAPER_ENERGY, 6) - 0.323) < 5e-4
@@ -170,29 +169,3 @@ def test_bad_mixtures_do_not_exist():
         GraspMixture(good.weights, good.means, good.covariances, tuple("abcdefgh"))
     with pytest.raises(BadArgument, match="x: found shape"):
         good.log_prob(torch.zeros(3, 5))
-
-
-def test_a_mixture_with_observation_noise_is_that_of_noisy_codes(generator):
-    """Adding noise to samples of the mixture gives samples of the noisy one."""
-    mixture = load_mixture("barrett").with_observation_noise(0.0, 0.0)
-    assert torch.equal(mixture.covariances, load_mixture("barrett").covariances)
-    noisy = mixture.with_observation_noise(0.01, 0.5)
-    added = torch.linalg.eigvalsh(noisy.covariances - mixture.covariances)
-    assert float(added.min()) >= -1e-12
-    q = mixture.means[:, -6:]
-    assert bool((noisy.energy(q + 0.01) <= mixture.energy(q + 0.01)).all())
-    # one component: the posterior of the joints is the regression on a noisy observation
-    noise = torch.diag(torch.tensor([0.01**2] * 3 + [0.5**2] * 3, dtype=torch.float64))
-    joint, code = slice(None, -6), slice(-6, None)
-    sigma, mean = mixture.covariances[0], mixture.means[0]
-    single = dataclasses.replace(
-        mixture, weights=torch.ones(1, dtype=torch.float64), means=mean[None], covariances=sigma[None]
-    ).with_observation_noise(0.01, 0.5)
-    expected = mean[joint] + sigma[joint, code] @ torch.linalg.solve(sigma[code, code] + noise, q[1] - mean[code])
-    torch.testing.assert_close(single.joints(q[1]), expected)
-
-
-@pytest.mark.parametrize("given", [(-0.001, 0.0), (0.0, -0.1), (math.nan, 0.0)])
-def test_observation_noise_is_a_deviation(given):
-    with pytest.raises(BadArgument):
-        load_mixture("barrett").with_observation_noise(*given)

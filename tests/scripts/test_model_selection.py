@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 import torch
-from benchmarks.hand.model_selection import bic_curve, cross_validate
 from train.mixture_score import evaluate_mixture
+from train.model_selection import bic_curve, cross_validate
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.posture_model.fit import fit_mixture

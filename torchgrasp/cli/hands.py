@@ -15,7 +15,8 @@ from torchgrasp.hand.draft import draft_hand
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import find_hand, load_hand
 from torchgrasp.posture_model.dataset import write_samples
-from torchgrasp.posture_model.sample import OPPOSED_COSINE, SampleSpec, Sampling
+from torchgrasp.posture_model.sample import SampleSpec, Sampling
+from torchgrasp.posture_model.touch import can_close
 from torchgrasp.report.hands import draw_hand, opposed_posture
 from torchgrasp.testing import check_hand, find_faults, random_joints
 
@@ -93,9 +94,9 @@ def describe(hand: Hand, joints: torch.Tensor) -> str:
     points, normals = hand.fingertips(joints)
     free = hand.self_clearance(joints) > 0
     sides = 1e3 * torch.linalg.vector_norm(points - points.roll(1, 1), dim=-1)[free]
-    opposed = ((normals * normals.roll(1, 1)).sum(-1)[free] < OPPOSED_COSINE).any(1).double().mean()
+    closing = can_close(points[free], normals[free]).double().mean()
     lines.append(f"{1 - free.double().mean():.1%} of {len(joints)} random postures collide with themselves")
-    lines.append(f"{opposed:.1%} of the free ones have two pads face to face (an angle above 120 degrees)")
+    lines.append(f"{closing:.1%} of the free ones can hold something between the middles of their pads (friction 0.8)")
     lines.append(f"fingertips are {sides.quantile(0.01):.0f} to {sides.quantile(0.99):.0f} mm apart")
     return "\n".join(lines)
 
@@ -116,7 +117,7 @@ def sample(
         out: folder to write.
         n: how many postures; the paper has 1,000,000.
         fingers: which fingers grasp, one of the hand's options.
-        sampling: uniform as in the paper, or opposed: only postures in which two pads face each other.
+        sampling: uniform as in the paper, or grasping: only postures that can hold something.
         workers: threads that draw at the same time.
         seed: of every random draw.
     """

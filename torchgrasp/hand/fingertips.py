@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 
 import torch
 from jaxtyping import Float, Int
@@ -11,6 +12,9 @@ from torchgrasp.base import Value
 from torchgrasp.hand.hand_toml import HandSpec
 from torchgrasp.hand.kinematics import KinematicTree, map_directions, map_points, pose_in_carrier, tree_from_urdf
 from torchgrasp.hand.urdf import Urdf
+
+ROUND_PAD, FLAT_PAD = math.radians(60), math.radians(40)
+"""Half angles [rad] of the cone about the pad's axis in which a round and a flat fingertip may touch: choices."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +35,11 @@ class Fingertips(Value):
     chains: KinematicTree
     carrier: Int[Tensor, "3"]
     carrier_from_tip: Float[Tensor, "3 4 3 1"]
+
+    @property
+    def cone(self) -> Float[Tensor, "3"]:
+        """Half angle [rad] of the cone about each pad's axis in which the tip may touch."""
+        return torch.where(self.radius > 0, ROUND_PAD, FLAT_PAD).to(self.radius)
 
     @functools.cached_property
     def in_carriers(self) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3 3"], Float[Tensor, "3 3"]]:

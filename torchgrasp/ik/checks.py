@@ -12,7 +12,7 @@ from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, link_clearance, obstacle_clearance
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
-from torchgrasp.ik.refine import FLAT_PAD, ROUND_PAD, tip_targets
+from torchgrasp.ik.refine import tip_targets
 from torchgrasp.plan.feasibility import first_violation
 from torchgrasp.values import Contacts
 
@@ -50,7 +50,7 @@ def measure_errors(
     links, depth, table = link_clearance(spatial, world, tips_touch=True)
     between = hand.self_clearance(configuration.joints)
     lower, upper = hand.lower.to(error), hand.upper.to(error)
-    cone = torch.where(hand.tips.radius.to(error) > 0, ROUND_PAD, FLAT_PAD) + ANGLE_TOLERANCE
+    cone = hand.tips.cone.to(error) + ANGLE_TOLERANCE
     conditions = {
         Status.TIP_ERROR: (error <= TIP_TOLERANCE).all(1),
         Status.NORMAL_ANGLE: (angle <= cone).all(1) | (not rolling),

@@ -15,7 +15,6 @@ from torchgrasp.frames import apply, degenerate, inverse, rotate, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import Reachable, ask_reachable
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, collision_cost
-from torchgrasp.ik.query import COSINE_SLACK, LENGTH_SLACK
 from torchgrasp.ik.refine import TIP_WEIGHT
 from torchgrasp.posture_model.encoding import PERMUTATIONS
 from torchgrasp.posture_model.sample import sample_configurations
@@ -23,6 +22,8 @@ from torchgrasp.values import Contacts, IKSeeds
 
 LIBRARY_SIZE = 5000
 """Random postures of a library; with 2000 or 20000 the share of triples with a grasp differs by 0.02."""
+LENGTH_SCALE, COSINE_SCALE = 0.01, 0.5
+"""Distances of tip centres [m] and of pad axes that count the same: tips roll, and a solver turns them."""
 CANDIDATES = 64
 """Nearest postures of a triple, over all assignments, whose clearances are measured; also the most seeds of it."""
 ASKED = 3
@@ -52,8 +53,8 @@ class PostureLibrary(Value):
 
 
 def feature(centres: Float[Tensor, "*b 3 3"], pads: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 18"]:
-    """Return tip centres and pad axes in units of their slack."""
-    return torch.cat([centres / LENGTH_SLACK, pads / COSINE_SLACK], -1).flatten(-2).float()
+    """Return tip centres and pad axes in units of their scales."""
+    return torch.cat([centres / LENGTH_SCALE, pads / COSINE_SCALE], -1).flatten(-2).float()
 
 
 def nearest_postures(
@@ -69,10 +70,11 @@ def nearest_postures(
     the squared distance of the features. Poses that `reachable` refuses make room for the next best ones.
 
     Raises:
-        BadArgument: `n_seeds`, for each triple, is not in [1, 64].
+        BadArgument: `n_seeds`, for each triple, is not in [1, 64], or above six times the number of postures.
     """
-    check_whole("n_seeds", n_seeds, 1, CANDIDATES)
     permutations, given = torch.tensor(PERMUTATIONS, device=contacts.points.device), library.feature
+    candidates = min(CANDIDATES, len(permutations) * len(given))
+    check_whole("n_seeds", n_seeds, 1, candidates)
     radius, inward = library.hand.tips.radius.double(), -contacts.normals.double()[:, permutations]
     centres = contacts.points.double()[:, permutations] - radius[:, None] * inward  # (n, 6, 3, 3)
     parts = []
@@ -81,18 +83,18 @@ def nearest_postures(
         vf_from_obj = inverse(obj_from_vf)
         wanted = feature(apply(vf_from_obj, centres[row]), rotate(vf_from_obj, inward[row]))
         energy = wanted.square().sum(-1)[..., None] / 2 + given.square().sum(-1) / 2 - wanted @ given.T
-        energy, index = energy.flatten(1).topk(CANDIDATES, 1, largest=False)
+        energy, index = energy.flatten(1).topk(candidates, 1, largest=False)
         order, sample = index // len(given), index % len(given)
         b = torch.arange(len(row), device=row.device)[:, None]
         obj_from_hand = obj_from_vf[b, order] @ library.vf_from_hand[sample]
         spheres = apply(obj_from_hand.float(), library.spheres[sample])
-        tips = 2 * energy * (TIP_WEIGHT * LENGTH_SLACK / MILLIMETRE) ** 2  # squared millimetres, weighed as in `refine`
+        tips = 2 * energy * (TIP_WEIGHT * LENGTH_SCALE / MILLIMETRE) ** 2  # squared millimetres, weighed as in `refine`
         cost = tips + collision_cost(spheres, library.hand.collision_spheres, world)
         if reachable is None:
             best = cost.topk(n_seeds, 1, largest=False).indices.flatten()
             b = b.repeat_interleave(n_seeds)  # from here on one row a seed
         else:
-            best = cost.topk(min(ASKED * n_seeds, CANDIDATES), 1, largest=False).indices
+            best = cost.topk(min(ASKED * n_seeds, candidates), 1, largest=False).indices
             reached = ask_reachable(reachable, obj_from_hand[b, best].flatten(0, 1)).reshape(best.shape)
             kept = reached & (reached.cumsum(1) <= n_seeds)
             b, best = b.expand_as(best)[kept], best[kept]

@@ -16,8 +16,6 @@ from torchgrasp.values import Contacts, IKSeeds
 
 WRONG_SIDE = 0.3
 """Mean cosine of tips' and contacts' outward normals above which a seed touches from inside: codes have no side."""
-LENGTH_SLACK, COSINE_SLACK = 0.01, 0.5
-"""Noise of a planned code in L [m] and N: tips roll. Without it the Barrett reaches 1 % of a can's triples, not 99."""
 
 
 def query_mixture(
@@ -48,9 +46,8 @@ def query_mixture(
     check_whole("n_seeds", n_seeds, 1, len(mixture.weights) + 1)
     if not max_energy > 0:
         raise BadArgument("max_energy", max_energy, "a positive number")
-    noisy = mixture.with_observation_noise(LENGTH_SLACK, COSINE_SLACK)
     firsts = range(0, max(len(contacts), 1), 256)  # their configurations stay in the cache
-    parts = [_query(hand, contacts[k : k + 256], noisy, n_seeds, max_energy) for k in firsts]
+    parts = [_query(hand, contacts[k : k + 256], mixture, n_seeds, max_energy) for k in firsts]
     rows = torch.cat([part.row + k for part, k in zip(parts, firsts, strict=True)])
     return dataclasses.replace(join(parts), row=rows)
 

@@ -4,8 +4,6 @@ A round fingertip's centre comes to one radius off its contact, so the tip may r
 contact point. The contact direction stays inside a cone about the pad's axis.
 """
 
-import math
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -16,8 +14,6 @@ from torchgrasp.ik.configuration import Configuration, SpatialJacobian, wrench_o
 from torchgrasp.optim import SOLVED, LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.values import Contacts
 
-ROUND_PAD, FLAT_PAD = math.radians(60), math.radians(40)
-"""Half angles [rad] of the cone about the pad's axis in which a round and a flat fingertip may touch: choices."""
 TIP_WEIGHT, PAD_WEIGHT = 2.0, 80.0
 """Weights of a tip's millimetre and of a cosine outside the cone. A millimetre of clearance weighs 1: contact wins."""
 ITERATIONS = 40
@@ -36,14 +32,12 @@ def tip_residuals(
 ) -> Residuals:
     """Return the residuals of the tips' centres and of the contact directions."""
     hand = spatial.hand
-    radius = hand.tips.radius.to(normals)
     tips = spatial.points(hand.tips.index, hand.tips.center)
     finger = torch.arange(3, device=tips.device)
     coordinate = finger.repeat_interleave(3)
     axes = torch.eye(3).to(tips).repeat(3, 1).expand(len(tips), 9, 3)
     pads = spatial.directions(hand.tips.index, hand.tips.normal)
-    cone = torch.where(radius > 0, math.cos(ROUND_PAD), math.cos(FLAT_PAD))
-    outside = cone + (pads * normals).sum(-1)  # the contact direction is the inward normal
+    outside = hand.tips.cone.cos().to(pads) + (pads * normals).sum(-1)  # the contact direction is the inward normal
     torques = torch.cat([torch.zeros_like(pads), torch.linalg.cross(pads, normals)], -1)
     wrenches = torch.cat([wrench_of(tips[:, coordinate], axes), torques], 1)
     jacobian = spatial.jacobian(wrenches, hand.tips.index[torch.cat([coordinate, finger])])

@@ -2,14 +2,13 @@
 
 import dataclasses
 import functools
-import math
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import check_number, check_whole
+from torchgrasp.base import check_whole
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.hand.load import find_hand
@@ -19,8 +18,8 @@ from torchgrasp.values import ContactCode
 
 PAPER_ENERGY = 2.0
 """The paper's threshold on f_i of Eq. (21). It accepts 32 % of the codes of a single component (chi-square_6 < 4)."""
-DEFAULT_ENERGY = 8.405946915
-"""Half the 99 % quantile of chi-square_6: it accepts 99 % of the codes of a single component."""
+DEFAULT_ENERGY = 6.295793622
+"""Half the 95 % quantile of chi-square_6: in `bench.py hand --only reach` it accepts 95 % of planned grasps or more."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,19 +96,6 @@ class GraspMixture(GaussianMixture):
         modes = map_rows(take, _codes(q))
         return modes[..., :-1], modes[..., -1]
 
-    def with_observation_noise(self, lengths: float, cosines: float) -> "GraspMixture":
-        """Return the mixture of codes observed with independent Gaussian noise, whose variances are added to Sigma_q.
-
-        `lengths` [m] and `cosines` are standard deviations. A round fingertip rolls, so its contact differs from the
-        middle of its pad by some millimetres. The Barrett hand's codes fill a thin manifold of four dimensions. Without
-        noise, Eq. (21) would then refuse almost every contact triple within reach.
-        """
-        check_number("lengths", lengths, 0.0, math.inf)
-        check_number("cosines", cosines, 0.0, math.inf)
-        noise = torch.zeros(len(self.names)).to(self.covariances)
-        noise[-6:-3], noise[-3:] = lengths**2, cosines**2
-        return dataclasses.replace(self, covariances=self.covariances + torch.diag(noise))
-
     def _log_responsibility(self, q: Float[Tensor, "n 6"]) -> Float[Tensor, "n m"]:
         """Return log h_i of Eq. (23); the logarithm does not underflow far from every component."""
         return torch.log_softmax(self._code.log_joint(q), dim=-1)
@@ -135,7 +121,7 @@ def load_mixture(name_or_path: Path | str) -> GraspMixture:
     An unknown hand raises `HandFileError`, a missing or malformed file `ModelFileError`.
 
     >>> load_mixture("allegro").means.shape
-    torch.Size([41, 18])
+    torch.Size([40, 18])
     """
     path = mixture_path(name_or_path)
     tensors, meta = load_tensors(path, "mixture", {"weights", "means", "covariances"})

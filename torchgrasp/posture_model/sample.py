@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value, check_whole
@@ -15,6 +15,7 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.compatibility import describe_compatibility
 from torchgrasp.posture_model.encoding import encode_fingertips
+from torchgrasp.posture_model.touch import can_close, roll_contacts
 
 CHUNK_POSTURES = 10_000
 """Free postures from one generator. It is no argument, because another number gives a seed other postures."""
@@ -22,10 +23,15 @@ BLOCK_POSTURES = 2_000
 """Postures that a generator draws at a time; fixed for the same reason."""
 MAX_SAMPLES = 10**8
 """Most postures of one set: a hundred times the paper's million (Sec. 6.3)."""
-OPPOSED_COSINE = -0.5
-"""Largest cosine of the normals of two opposed pads: they are at most 60 degrees from opposite."""
+LEAST_KEPT = 1e-3
+"""Least share of postures that are kept, after ten blocks: another hand would draw for hours."""
 
-Sampling = Literal["uniform", "opposed"]
+Sampling = Literal["uniform", "grasping"]
+"""Which free postures are taken.
+
+* "uniform": all, as in the paper; they touch with the middle of their pads.
+* "grasping": those that can hold something where their tips have rolled, as what is planned for them does.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +50,7 @@ class HandSamples(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class SampleSpec(Value):
-    """Which n free postures are drawn: "uniform" as in the paper, or "opposed", with two pads face to face.
+    """Which n free postures are drawn, see `Sampling`.
 
     Chunk i comes from (seed, i) alone, so fewer samples are a prefix of more. Other values raise `BadArgument`.
     """
@@ -104,7 +110,7 @@ def draw_chunk(hand: Hand, spec: SampleSpec, i: int) -> tuple[Float[Tensor, "n h
     while kept < count:
         parts.append(next(blocks))
         kept, drawn = kept + len(parts[-1][0]), BLOCK_POSTURES * len(parts)
-        if kept < 1e-3 * drawn and len(parts) >= 10:  # such a hand would draw for hours
+        if kept < LEAST_KEPT * drawn and len(parts) >= 10:
             raise BadArgument("hand", f"{kept} kept of {drawn} postures", "a hand that can move freely")
     joints, q = (torch.cat(tensors)[:count] for tensors in zip(*parts, strict=True))
     return joints, q, BLOCK_POSTURES * len(parts)
@@ -119,18 +125,9 @@ def _draw_blocks(
         uniform = torch.from_numpy(generator.random((BLOCK_POSTURES, hand.dof))).to(lower.device)
         joints = torch.lerp(lower, upper, uniform)
         joints = joints[hand.self_clearance(joints, below=0.0) > 0]
-        points, normals = hand.fingertips(joints)
-        if sampling == "opposed":
-            facing = opposed(points, normals)
-            joints, points, normals = joints[facing], points[facing], normals[facing]
-        yield joints, encode_fingertips(points, normals)
-
-
-def opposed(points: Float[Tensor, "n 3 3"], normals: Float[Tensor, "n 3 3"]) -> Bool[Tensor, " n"]:
-    """Tell where two pads face each other: normals nearly opposite, each towards the other pad."""
-    facing = torch.zeros(len(points), dtype=torch.bool, device=points.device)
-    for i, j in ((0, 1), (0, 2), (1, 2)):
-        line = points[:, j] - points[:, i]
-        ahead, back = (normals[:, i] * line).sum(-1) > 0, (normals[:, j] * line).sum(-1) < 0
-        facing |= ahead & back & ((normals[:, i] * normals[:, j]).sum(-1) < OPPOSED_COSINE)
-    return facing
+        if sampling == "uniform":
+            yield joints, encode_fingertips(*hand.fingertips(joints))
+        else:
+            points, normals = roll_contacts(hand, joints, generator)
+            closed = can_close(points, normals)
+            yield joints[closed], encode_fingertips(points[closed], normals[closed])

@@ -6,13 +6,14 @@ from pathlib import Path
 import torch
 
 from benchmarks.common import Row, measure
-from benchmarks.hand.bic_figure import bench_bic
 from benchmarks.hand.kinematics import bench_collision, bench_fk, bench_samples
 from benchmarks.hand.mixture import bench_em, bench_mae, bench_queries
 from benchmarks.hand.query import bench_codes
+from benchmarks.hand.reach import bench_reach
+from benchmarks.hand.seeds import bench_seeds
 from benchmarks.plan.executable import bench_planned
 
-SUBJECTS = ("fk", "collision", "samples", "codes", "em", "mae", "queries", "bic", "planned")
+SUBJECTS = ("fk", "collision", "samples", "codes", "em", "mae", "queries", "reach", "seeds", "planned")
 
 
 def hand(
@@ -31,8 +32,8 @@ def hand(
     """Measure the hands against their bars and against peers, in one run and on the same threads.
 
     Args:
-        objects: folder with manifest.json and a folder for each object; planned contacts need it.
-        only: subjects to measure: fk, collision, samples, codes, em, mae, queries, bic, planned.
+        objects: folder with manifest.json and a folder for each object; planned contacts need it; seeds use it too.
+        only: subjects to measure: fk, collision, samples, codes, em, mae, queries, reach, seeds, planned.
         codes: held-out codes of each hand.
         samples: free postures of each hand; the first four tenths are fitted.
         queries: contact triples, in all six assignments.
@@ -41,7 +42,7 @@ def hand(
         threads: of torch, for the library and its peers.
         seed: of every draw.
         quick: a tenth of everything.
-        out: JSON file of the numbers; the picture of the model selection lies beside it.
+        out: JSON file of the numbers.
     """
     torch.set_num_threads(threads)
     if quick:
@@ -54,7 +55,8 @@ def hand(
         "em": lambda: bench_em(2 * samples // 5),
         "mae": lambda: bench_mae(samples),
         "queries": lambda: bench_queries(queries),
-        "bic": lambda: bench_bic(samples // 5, 2 if quick else 10, out.with_name("bench_hand_components.png")),
+        "reach": lambda: bench_reach(samples // 50),
+        "seeds": lambda: bench_seeds(objects, starts, seed),
         "planned": lambda: bench_planned(objects, starts, seed) if objects else [],
     }
     settings = {"threads": threads, "codes": codes, "peers": peers, "samples": samples, "queries": queries}
