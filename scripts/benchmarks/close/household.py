@@ -64,7 +64,7 @@ Case = tuple[str, float]
 class Lift:
     """A lift of the grasp of a `rank`, of an object of a `family`; rank -1: there was none.
 
-    `slip` [m, rad] is the object's motion in the hand, `mass` [kg] and `friction` are the true ones.
+    `slip` [m, rad] is the object's motion in the hand, `mass` [kg] and `friction` are the true ones. None: no lift.
     """
 
     object: str
@@ -73,7 +73,7 @@ class Lift:
     status: str
     slip: tuple[float | None, float | None]
     mass: float
-    friction: float
+    friction: float | None
     seconds: float
 
     @property
@@ -178,7 +178,7 @@ def _lift(spec: TableSpec, subject: Subject, hand: str, name: str, force: float)
         grasps = []
     spent = time.process_time() - began
     if not grasps:
-        yield Lift(subject.label, subject.family, -1, "NO_GRASP", (None, None), mass, math.nan, spent)
+        yield Lift(subject.label, subject.family, -1, "NO_GRASP", (None, None), mass, None, spent)
     for rank, grasp in enumerate(grasps):
         for draw in range(spec.draws):
             began = time.process_time()
