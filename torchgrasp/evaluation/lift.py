@@ -54,10 +54,10 @@ def close_hand(
 ) -> ClosureResult:
     """Close a hand on the true object, lift it and hold it, in simulation.
 
-    The opened hand moves straight to its pre-grasp, closes and
-    presses (`GraspController`), rises and holds. The object is **held** if at the end its centre is up by half the
-    lift, two fingers touched it in most of the last `JUDGED_TIME`, and it slipped by less than 20 mm and 30 degrees
-    since the hand pressed. Equal arguments give equal bits.
+    The opened hand moves straight to its pre-grasp, closes and presses (`GraspController`), rises and holds. The object
+    is **held** if at the end its centre is up by half the lift, and two fingers touched it in most of the last
+    `JUDGED_TIME`. It must also have slipped by less than 20 mm and 30 degrees since the hand pressed. Equal arguments
+    give equal bits.
 
     Args:
         grasp: one row.
