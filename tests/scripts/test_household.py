@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from benchmarks.close import household
+from benchmarks.close import household, suite
 from paper.trials import TableSpec
 
 from tests.pinch import pinch
@@ -88,3 +88,14 @@ def test_what_is_kept_is_not_run_again_and_a_refusal_fails(folder, seen, tmp_pat
     monkeypatch.setattr(household, "plan_grasps", lambda *_: (_ for _ in ()).throw(TooFewPoints("a", "b", "c")))
     lost = household.bench_grip(spec(folder, tmp_path / "none"))
     assert all(row.numbers["best"].value == 0.0 and row.numbers["lost"] == {"NO_GRASP": 2} for row in lost)
+
+
+def test_the_bench_asks_for_what_its_command_says(folder, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(suite, "bench_household", lambda spec: asked.append(spec) or [])
+    out = tmp_path / "bench.json"
+    suite.close((folder,), ("perturb",), ("barrett",), grasps=2, names=("ball",), starts=50, workers=3, seed=4, out=out)
+    (found,) = asked
+    assert (found.objects, found.hands, found.only, found.out) == ((folder,), ("barrett",), ("ball",), tmp_path)
+    assert (found.grasps, found.starts, found.workers, found.seed) == (2, 50, 3, 4)
+    assert found.representatives and not found.own and found.views == found.draws == 1

@@ -58,7 +58,10 @@ def close(
     torch.set_num_threads(threads)
     spec = EvaluationSpec(tries, starts=starts, seed=seed)
     folder = objects[0] if objects else None
-    household = TableSpec(out.parent, objects, hands, names, False, True, 1, grasps, 1, starts, workers, seed)
+    household = TableSpec(
+        out.parent, objects, hands=hands, only=names, own=False, representatives=True, grasps=grasps, starts=starts,
+        workers=workers, seed=seed,
+    )  # fmt: skip
     subjects: dict[str, Callable[[], list[Row]]] = {
         "statics": bench_statics,
         "speed": bench_closing_speed,
