@@ -5,6 +5,7 @@ import torch
 
 from torchgrasp import ContactSpec, Status, load_hand, load_mixture, load_object, plan_grasps
 from torchgrasp.frames import apply, virtual_frame
+from torchgrasp.ik.checks import PAPER_TOLERANCE
 from torchgrasp.ik.ranking import rank_by_variance
 from torchgrasp.posture_model.encoding import encode
 from torchgrasp.posture_model.mixture import PAPER_ENERGY
@@ -17,9 +18,9 @@ SPEC = ContactSpec.paper(table=0.0)
 @pytest.fixture(scope="module")
 def run():
     stages = {}
-    hand, view = load_hand("allegro"), load_object("cylinder").view
+    hand, view = load_hand("allegro"), load_object("jug").view
     note = lambda stage, text, value: stages.update({stage: value})  # noqa: E731
-    return hand, plan_grasps(view, hand, SPEC, starts=120, mode="paper", observer=note), stages
+    return hand, plan_grasps(view, hand, SPEC, starts=300, mode="paper", observer=note), stages
 
 
 def test_shape_contacts_and_ranking_are_the_papers(run):
@@ -47,7 +48,7 @@ def test_eq24_contact_points_meet_the_contacts_and_the_hand_is_clear(run):
     good = grasps[grasps.status == Status.OK]
     tips = hand.fingertips(good.joints)[0]
     placed = apply(good.obj_from_hand, tips)
-    assert float((placed - good.contacts.points).norm(dim=-1).max()) <= 1e-3
+    assert float((placed - good.contacts.points).norm(dim=-1).max()) <= PAPER_TOLERANCE
     torch.testing.assert_close(
         good.obj_from_hand @ virtual_frame(tips), virtual_frame(good.contacts.points), rtol=0, atol=1e-6
     )
@@ -80,7 +81,7 @@ def test_variance_ranks_and_scores_stay(run):
 
 def test_stages_can_be_exchanged_one_at_a_time(run):
     hand, _, stages = run
-    view, said = load_object("cylinder").view, {}
+    view, said = load_object("jug").view, {}
     grasps = plan_grasps(
         view,
         hand,

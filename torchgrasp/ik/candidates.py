@@ -11,7 +11,7 @@ from torchgrasp.base import Batch, Value
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import rotate
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.checks import is_clear, measure_errors
+from torchgrasp.ik.checks import TIP_TOLERANCE, is_clear, measure_errors
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.motion import find_approach, motion_clearance
@@ -77,13 +77,15 @@ class GraspCandidates(Batch):
     status: Int[Tensor, "g"]
 
 
-def check_candidates(problem: GraspProblem, candidates: GraspCandidates, rolling: bool = True) -> Grasps:
+def check_candidates(
+    problem: GraspProblem, candidates: GraspCandidates, rolling: bool = True, tolerance: float = TIP_TOLERANCE
+) -> Grasps:
     """Return checked grasps (`measure_errors`); those right so far get pre-grasp and approach."""
     hand, world = problem.hand, problem.world
     configuration, contacts, certificate = candidates.configuration, candidates.contacts, candidates.certificate
     unproven = (candidates.status == Status.OK) & ~certificate.closed
     planned = torch.where(unproven, int(Status.NOT_CLOSED), candidates.status)
-    errors = measure_errors(hand, configuration, contacts, world, rolling)
+    errors = measure_errors(hand, configuration, contacts, world, rolling, tolerance)
 
     pregrasp, touching = configuration.joints.clone(), (planned == Status.OK) & (errors.status == Status.OK)
     pregrasp[touching] = open_hand(hand, configuration[touching], contacts[touching], world)

@@ -16,6 +16,8 @@ from torchgrasp.ik.refine import tip_targets
 from torchgrasp.plan.feasibility import first_violation
 from torchgrasp.values import Contacts
 
+PAPER_TOLERANCE = 10 * MILLIMETRE
+"""Largest distance [m] of a tip from its contact in the paper's chain, about a tip's radius; closing takes it up."""
 TIP_TOLERANCE, TIP_PENETRATION = 1 * MILLIMETRE, 2 * MILLIMETRE
 """Largest distance [m] of a tip from its contact, a tenth of its radius or so, and depth in the estimated surface."""
 ANGLE_TOLERANCE = math.radians(2)
@@ -33,12 +35,17 @@ class GraspErrors(Batch):
 
 
 def measure_errors(
-    hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld, rolling: bool = True
+    hand: Hand,
+    configuration: Configuration,
+    contacts: Contacts,
+    world: CollisionWorld,
+    rolling: bool = True,
+    tolerance: float = TIP_TOLERANCE,
 ) -> GraspErrors:
     """Measure grasps; `status` names the first error out of tolerance, as NaN is.
 
     Round fingertips may roll on their contacts within the pads' cones. If not `rolling`, the pads' contact points
-    count, in any direction, as in the paper.
+    count, in any direction, as in the paper. `tolerance` [m] is that of tips.
     """
     spatial = SpatialJacobian.at(hand, configuration)
     touching, target = (
@@ -52,7 +59,7 @@ def measure_errors(
     lower, upper = hand.lower.to(error), hand.upper.to(error)
     cone = hand.tips.cone.to(error) + ANGLE_TOLERANCE
     conditions = {
-        Status.TIP_ERROR: (error <= TIP_TOLERANCE).all(1),
+        Status.TIP_ERROR: (error <= tolerance).all(1),
         Status.NORMAL_ANGLE: (angle <= cone).all(1) | (not rolling),
         Status.JOINT_LIMITS: ((configuration.joints >= lower - 1e-9) & (configuration.joints <= upper + 1e-9)).all(1),
         Status.SELF_COLLISION: between >= 0,

@@ -16,7 +16,7 @@ from torchgrasp.frames import apply, degenerate, inverse, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import map_points
 from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates
-from torchgrasp.ik.checks import TIP_PENETRATION
+from torchgrasp.ik.checks import PAPER_TOLERANCE, TIP_PENETRATION
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, along
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.ranking import rank_in_group
@@ -129,7 +129,7 @@ def solve_as_paper(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
         configuration = refine_by_cobyla(problem.hand, start, contacts, problem.world)
         certificate, status = problem.certificate[seeds.row], torch.full_like(seeds.row, Status.OK)
         candidates = GraspCandidates(configuration, contacts, certificate, seeds.permutation, status)
-        return check_candidates(problem, candidates, rolling=False)
+        return check_candidates(problem, candidates, rolling=False, tolerance=PAPER_TOLERANCE)
 
     for some in rows.split(AT_ONCE):  # one empty part without rows
         chosen = seeds[torch.isin(seeds.row, some)]

@@ -10,13 +10,14 @@ from benchmarks.common import Row, least_seconds, measure
 from benchmarks.ground_truth import read_views
 from benchmarks.plan.executable import bench_executable
 from benchmarks.plan.ipopt_comparison import POINTS, bench_peers
+from benchmarks.plan.sampler import bench_sampler
 from benchmarks.plan.scaling import bench_anytime, bench_growth, bench_memory
 from benchmarks.plan.true_surface import bench_fields, bench_objectives, bench_truth
 from torchgrasp import ContactSpec, Status, certify, fit_shape, plan_contacts
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.values import PointCloud
 
-SUBJECTS = ("call", "peers", "truth", "fields", "objectives", "executable", "growth", "memory", "anytime")
+SUBJECTS = ("call", "peers", "truth", "fields", "objectives", "executable", "sampler", "growth", "memory", "anytime")
 
 
 def plan(
@@ -33,7 +34,8 @@ def plan(
 
     Args:
         objects: folder with manifest.json and a folder for each object.
-        only: subjects to measure, of call, peers, truth, fields, objectives, executable, growth, memory, anytime.
+        only: subjects to measure, of call, peers, truth, fields, objectives, executable, sampler, growth, memory and
+            anytime.
         starts: of the planner, for each view and radius.
         tries: the first of them that IPOPT gets, for each view and radius.
         threads: of torch. IPOPT with MUMPS, as casadi brings it, has one; on two it is counted as two processes that
@@ -52,6 +54,7 @@ def plan(
         "fields": lambda: [bench_fields(views, max(starts // 5, 1), seed)],
         "objectives": lambda: [bench_objectives(views, max(starts // 40, 4), seed)],
         "executable": lambda: bench_executable(views, starts, seed),
+        "sampler": lambda: [bench_sampler(views, max(starts // 2, 1), seed)],
         "growth": lambda: [bench_growth(4 if quick else 5, out.with_name("bench_plan_growth.png"))],
         "memory": lambda: [bench_memory(10 * starts if quick else 100 * starts, threads)],
         "anytime": lambda: [bench_anytime(2.0 if quick else 10.0, out.with_name("bench_plan_anytime.png"))],
