@@ -39,6 +39,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_views_are_listed_in_order(folder: Path):
     assert list_views(folder) == [("box", "view0"), ("box", "view1")]
+    assert list_views(folder, most=1) == [("box", "view0")]
     assert list_views(folder, whole=True) == [("box", "whole"), ("torn", "whole")]
     assert list_views(folder, only=["torn"]) == []
 

@@ -25,14 +25,18 @@ WHOLE = "whole"
 """Name of the view that shows an object from all sides, with normals: `full_normals.ply`."""
 
 
-def list_views(objects: Path, whole: bool = False, only: Sequence[str] = ()) -> list[tuple[str, str]]:
-    """Return sorted pairs of object and view. `only` selects objects; with `whole` each has one view, `WHOLE`.
+def list_views(
+    objects: Path, whole: bool = False, only: Sequence[str] = (), most: int | None = None
+) -> list[tuple[str, str]]:
+    """Return sorted pairs of object and view, at most so many of an object; None: all.
+
+    `only` selects objects; with `whole` each has one view, `WHOLE`.
 
     Raises:
         BadArgument: no manifest, or none of the objects in it.
     """
     entries = _read_manifest(objects, only)
-    return [(name, view) for name in entries for view in ([WHOLE] if whole else sorted(entries[name]["views"]))]
+    return [(name, view) for name in entries for view in ([WHOLE] if whole else sorted(entries[name]["views"]))[:most]]
 
 
 def read_view(objects: Path, name: str, view: str, camera: bool = True) -> PointCloud:

@@ -38,6 +38,7 @@ def evaluate(
     starts: int = 1000,
     complete: bool = False,
     only: tuple[str, ...] = (),
+    views: int | None = None,
     planned: Path | None = None,
     perturb: Literal["none", "mass", "friction", "table", "up", "camera", "mask", "depth", "pose", "all"] = "none",
     workers: int = 1,
@@ -70,6 +71,7 @@ def evaluate(
         starts: random starts of the contact planner.
         complete: plan on the whole cloud instead of each view.
         only: names of objects to keep; by default all.
+        views: the most of each object; by default all.
         planned: folder "grasps" of an earlier run, whose grasps are tested.
         perturb: what the robot does not know before a lift; see torchgrasp.evaluation.perturb.
         workers: processes; the results do not depend on their number.
@@ -93,14 +95,14 @@ def evaluate(
         return evaluate_clutter(objects, the_hand, out, scenes, spec, workers)
     if objects is None:
         raise BadArgument("--objects", "none", "a folder of objects, or --scenes")
-    with naming(force="--force", grasps="--grasps", perturb="--perturb"):
+    with naming(force="--force", grasps="--grasps", perturb="--perturb", views="--views"):
         test = find_protocol(protocol).with_trial(**changes)
-        spec = EvaluationSpec(grasps, ranks, starts, complete, only, planned is not None, seed, perturb)
+        spec = EvaluationSpec(grasps, ranks, starts, complete, only, planned is not None, seed, perturb, views)
     scores = []
     with naming(folder="--out", path="--out"), hold_folder(out):
         with naming(objects="--objects", path="--objects", workers="--workers", perturb="--perturb"):
-            views = evaluate_views(objects, the_hand, test, spec, folder=planned or out / "grasps", workers=workers)
-            for score in views:
+            found = evaluate_views(objects, the_hand, test, spec, folder=planned or out / "grasps", workers=workers)
+            for score in found:
                 print_score(score)
                 scores.append(score)
         summary = summarise(scores)

@@ -49,7 +49,7 @@ class EvaluationSpec(Value):
 
     `complete` plans on whole clouds with normals, as if the shape were known. `only` names objects; (): all. `planned`
     takes the grasps that an earlier call left in its folder. `starts` are those of the contact planner. `perturb` names
-    what the robot does not know (`PERTURBATIONS`).
+    what the robot does not know (`PERTURBATIONS`). At most `views` of each object are taken; None: all.
 
     Raises:
         BadArgument: no grasps, unknown ranks, or an unknown perturbation.
@@ -63,10 +63,13 @@ class EvaluationSpec(Value):
     planned: bool = False
     seed: int = 0
     perturb: str = "none"
+    views: int | None = None
 
     def __post_init__(self) -> None:
         find_perturbation(self.perturb)
         check_whole("grasps", self.grasps, 1, 1_000_000)
+        if self.views is not None:
+            check_whole("views", self.views, 1, 1_000_000)
         if self.ranks not in get_args(Ranks):
             raise BadArgument("ranks", repr(self.ranks), f"one of {', '.join(get_args(Ranks))}")
 
@@ -109,7 +112,7 @@ def evaluate(
     protocol, spec = find_protocol(protocol), EvaluationSpec() if spec is None else spec
     if spec.perturb != "none" and protocol.pull is not None:
         raise BadArgument("perturb", f"{spec.perturb!r} with {protocol.name!r}", "a protocol that lifts")
-    names = list_views(objects, spec.complete, spec.only)
+    names = list_views(objects, spec.complete, spec.only, spec.views)
     return _evaluate([_View(Path(objects), *name, hand.source) for name in names], protocol, spec, folder, workers)
 
 
