@@ -64,7 +64,7 @@ def test_bad_arguments_are_named_at_once():
 
 
 SCRIPT = """
-import os, sys, time
+import os, signal, sys, time
 from pathlib import Path
 from torchgrasp.evaluation.pool import run_tasks
 
@@ -74,6 +74,7 @@ def tell_and_sleep(path):
     time.sleep(3600)
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background processes ignore it
     list(run_tasks(tell_and_sleep, [(path,) for path in sys.argv[1:]], workers=2, limit=3600))
 """
 

@@ -61,7 +61,11 @@ def test_central_untilted_grasps_rank_first():
 def test_every_feature_counts_the_way_it_should(name):
     changed = GOOD.clone()
     changed[0, FEATURES.index(name)] += -2.0 if name == "log-odds of closure" else 0.5
-    assert float(success_log_odds(changed)) < float(success_log_odds(GOOD))
+    gain = float(success_log_odds(changed) - success_log_odds(GOOD))
+    if name == "mean angle of the pads":  # decides nothing on the bodies of the fit, whose surface is known well
+        assert abs(gain) < 0.05
+    else:
+        assert gain < -0.1
 
 
 def ring(lift=0.0, shift=0.0):
