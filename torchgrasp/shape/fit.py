@@ -66,7 +66,7 @@ def fit_shape(
     observations. It pushes the shape out of free space and out of the table.
 
     "paper" observes the cloud's centre at d = -1 and 20 random points around it at d = +1. Its `std_m` is wide: it
-    holds 83 % of the hidden surface.
+    holds 81 % of the hidden surface.
 
     Args:
         cloud: points [m] of one object, of one view or of several (`merge_clouds`), prepared by `prepare_cloud`. Given

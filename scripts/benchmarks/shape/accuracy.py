@@ -92,7 +92,8 @@ def measure_shape(shape: ShapeGP, mesh: "trimesh.Trimesh", cloud: PointCloud, se
     inside = shape.contains(points)
     estimate = shape.predict(points[inside])
     ratio = torch.full_like(error, torch.inf)
-    ratio[inside] = estimate.distance.abs() * shape.scale / estimate.std_m
+    # Distance and std_m in metres are both divided by the slope there, which cancels.
+    ratio[inside] = estimate.distance.abs() / (shape.std_factor * estimate.variance.sqrt())
     row: Row = {}
     for name, where in (("seen", ~far), ("hidden", far)):
         row |= {
