@@ -23,6 +23,7 @@ from torchgrasp import (
     load_mixture,
     load_object,
     plan_contacts,
+    plan_grasps,
 )
 from torchgrasp.files import write_atomically
 from torchgrasp.frames import virtual_frame
@@ -51,8 +52,9 @@ NORMAL, FRAME = 0.035, 0.03
 
 @dataclasses.dataclass(frozen=True)
 class Taken:
-    """Grasps of one hand on one object that passed every check, and the contact triple of each."""
+    """Grasps of one hand on one object that passed every check, the contact triple of each, and who planned them."""
 
+    chain: str
     hand: Hand
     surface: Surface
     grasps: Grasps
@@ -63,7 +65,8 @@ def grasps(out: Path, starts: int = 300, seed: int = 0) -> None:
     """Draw Figs. 9 to 12 with the project's objects: the hands on the shapes that one side of each object gives.
 
     fig9.png: one contact triple by two postures of the same hand. fig10.png: one triple by both hands. fig11.png and
-    fig12.png: grasps of the Barrett and of the Allegro hand. Every grasp drawn has passed every check.
+    fig12.png: grasps of the Barrett and of the Allegro hand, those of the paper's own chain first where it has any.
+    Every grasp drawn has passed every check.
 
     Args:
         out: folder of the pictures; it is made where it does not exist.
@@ -80,8 +83,19 @@ def grasps(out: Path, starts: int = 300, seed: int = 0) -> None:
     save([[(t, one), (t, two)] for t, one, two, _ in widest], out / "fig9.png")
     save([found for hands in taken.values() if (found := shared_triple(*hands))][:2], out / "fig10.png")
     for k, number in ((1, 11), (0, 12)):
-        best = [[(hands[k], int(hands[k].grasps.score.argmax()))] for hands in taken.values() if len(hands[k].grasps)]
-        save(best, out / f"fig{number}.png")
+        papers = [take_as_paper(name, hands[k].hand, starts, seed) for name, hands in taken.items()]
+        shown = [t for t in (*papers, *(hands[k] for hands in taken.values())) if len(t.grasps)]
+        print(f"fig{number}: the paper's chain has {', '.join(str(len(t.grasps)) for t in papers)} grasps")
+        save([[(t, 0 if t.chain else int(t.grasps.score.argmax()))] for t in shown], out / f"fig{number}.png")
+
+
+def take_as_paper(name: str, hand: Hand, starts: int, seed: int) -> Taken:
+    """Return the grasps of the paper's chain, those of least variance first."""
+    view, spec = load_object(name).view, ContactSpec.paper(table=SPEC.table)
+    shape = fit_shape(view, support="paper", seed=seed)
+    planned = plan_grasps(view, hand, spec, starts, seed, mode="paper", shape=shape)
+    good = planned[planned.status == Status.OK]
+    return Taken("the paper's chain, ", hand, extract_surface(shape), good, torch.arange(len(good)))
 
 
 def take(name: str, starts: int, seed: int) -> tuple[Taken, Taken]:
@@ -100,7 +114,7 @@ def take(name: str, starts: int, seed: int) -> tuple[Taken, Taken]:
         seeds = seeds[rank_seeds(problem, seeds) < TRIED]
         refined = refine_on_contacts(problem, seeds)
         good = refined.status == Status.OK
-        found.append(Taken(hand, surface, refined[good], seeds.row[good]))
+        found.append(Taken("", hand, surface, refined[good], seeds.row[good]))
     return found[0], found[1]
 
 
@@ -136,7 +150,9 @@ def save(rows: list[list[tuple[Taken, int]]], path: Path) -> None:
         corner = (k % 2 * TILE[0], k // 2 * TILE[1])
         sheet.paste(draw(taken, index, eye).resize(TILE, Image.Resampling.LANCZOS), corner)
         worst = 1e3 * float(taken.grasps.tip_error[index].max())
-        pen.text((corner[0] + 10, corner[1] + 8), f"{taken.hand.name}, tips within {worst:.2f} mm", INK, font)
+        pen.text(
+            (corner[0] + 10, corner[1] + 8), f"{taken.chain}{taken.hand.name}, tips within {worst:.2f} mm", INK, font
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda temporary: sheet.save(temporary, format="PNG"))
     print(path)
