@@ -69,8 +69,8 @@ def fig4(out: Path, seed: int = 0) -> None:
             std = 1e3 * surface.std_m
             print(f"{name:10}{kind:9} std [mm]: median {std.median():.1f}, 99 % {std.quantile(0.99):.1f}")
         scenes.append((thing, clouds, surfaces, arrows))
-    # One scale for all: the whole clouds' surfaces are sure, and it shows.
-    most = 1e3 * max(float(surface.std_m.quantile(0.99)) for _, _, surfaces, _ in scenes for surface in surfaces)
+    # One scale for all, the most certain 80 % of each: the least certain bulges would leave all else in one colour.
+    most = 1e3 * max(float(surface.std_m.quantile(0.8)) for _, _, surfaces, _ in scenes for surface in surfaces)
     sheet = Image.new("RGB", (TILE[0] * len(scenes), TILE[1] * len(ROWS) + 110), PAPER)
     for column, (thing, clouds, surfaces, arrows) in enumerate(scenes):
         eye = rotated(view_of(thing.view), TURN)
