@@ -81,7 +81,7 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     names = sorted({score.object for score in scores})
     by_object = {name: _shares([score for score in scores if score.object == name]) for name in names}
     groups = sorted({score.group for score in scores if score.group})
-    reasons_of = {"planning": Counter(s.refusal.name for s in scores if not s.attempts)}
+    reasons_of = {"planning": Counter(s.refusal.name for s in scores if s.refusal is not Status.OK)}
     for stage, reasons in STAGES.items():
         reasons_of[stage] = Counter(a.status.name for a in attempts if not a.passed and a.status in reasons)
     return {
