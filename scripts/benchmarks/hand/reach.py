@@ -49,21 +49,22 @@ def _bench_hand(name: str, n: int) -> list[Row]:
     hand, mixture = load_hand(name), load_mixture(name)
     held_out = sample_configurations(hand, n, HELD_OUT_SEED, sampling="grasping")
     rows = [_row(name, "codes of held-out postures whose tips have rolled", mixture, held_out.q, ">= 95 %", None)]
-    rows.append(_row(name, "codes of planned executable grasps", mixture, planned_codes(hand), ">= 95 %", None))
+    rows.append(_row(name, "codes of planned executable grasps", mixture, planned_postures(hand).q, ">= 95 %", None))
     for what, q in spoilt_codes(held_out.q, HELD_OUT_SEED).items():
         met = search(hand, held_out, q[:SEARCHED])
         rows.append(_row(name, what, mixture, q, "<= 10 % of those that no posture has", met))
     return rows
 
 
-def planned_codes(hand: Hand) -> Float[Tensor, "k 6"]:
-    """Return the codes of the executable grasps on the library's own objects."""
-    codes = []
+def planned_postures(hand: Hand) -> HandSamples:
+    """Return postures and codes of the executable grasps on the library's own objects."""
+    joints, codes = [], []
     for thing in map(load_object, list_objects()):
         grasps = plan_grasps(thing.view, hand)
-        contacts = grasps.contacts[grasps.status == Status.OK]
-        codes.append(encode_fingertips(contacts.points.double(), contacts.normals.double()))
-    return torch.cat(codes)
+        good = grasps[grasps.status == Status.OK]
+        joints.append(good.joints)
+        codes.append(encode_fingertips(good.contacts.points.double(), good.contacts.normals.double()))
+    return HandSamples(torch.cat(joints), torch.cat(codes), hand.joint_names)
 
 
 def spoilt_codes(q: Float[Tensor, "n 6"], seed: int) -> dict[str, Float[Tensor, "n 6"]]:
