@@ -17,6 +17,7 @@ from benchmarks.shape.accuracy import format_groups, format_table, mean_row, mea
 from benchmarks.shape.exactness import bench_cholesky, bench_laws, bench_refusals, bench_selection, bench_update
 from benchmarks.shape.input_ablation import bench_inputs
 from benchmarks.shape.speed import bench_growth, bench_memory, bench_queries, bench_raw
+from benchmarks.shape.weaker_inputs import bench_weaker
 from torchgrasp.datasets import read_family, read_group
 from torchgrasp.shape.fit import fit_shape
 
@@ -31,6 +32,7 @@ SUBJECTS = (
     "growth",
     "objects",
     "inputs",
+    "weaker",
     "cholesky",
 )
 
@@ -51,13 +53,13 @@ def shape(
     Args:
         objects: folder with manifest.json and a folder for each object; without it the hidden side is not measured.
         only: subjects to measure: refusals, selection, laws, update, queries, memory, raw, growth, objects, inputs,
-            cholesky.
+            weaker, cholesky.
         views: names of the views of each object, such as view0; by default all.
         clouds: random partial clouds whose covariance is factored; 10^4 take about ten minutes.
         queries: points at which the shape is asked; ten times as many for the memory.
         threads: of torch, for the library and its peers alike. Times are the least of some
             calls: of the processor on one thread, which other load does not touch, of the wall on several.
-        seed: of the random clouds.
+        seed: of the random clouds, and of what is wrong in weaker inputs.
         quick: a hundredth of the clouds and a tenth of the queries.
         out: where the numbers are written as JSON, and beside it the growth as a picture.
     """
@@ -74,6 +76,7 @@ def shape(
         "growth": lambda: [bench_growth(out.with_name("bench_shape_growth.png"))],
         "objects": lambda: bench_objects(objects, views) if objects else [],
         "inputs": lambda: bench_inputs(objects) if objects else [],
+        "weaker": lambda: bench_weaker(objects, views, seed) if objects else [],
         "cholesky": lambda: [bench_cholesky(clouds, seed)],
     }
     clock = "processor" if threads == 1 else "wall"
