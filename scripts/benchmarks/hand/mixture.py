@@ -164,8 +164,8 @@ def _fit_theirs(samples: HandSamples, m: int) -> None:
 def bench_mae(n: int) -> list[Row]:
     """Evaluate the shipped models on n / 10 postures, touching where tips roll to and with the middles of their pads.
 
-    The third row has the codes that grasps really query. Beside them is the paper's own test: a model of uniform postures, on 6 n / 10 others. Learned postures bound any
-    function of the code.
+    The third row has the codes that grasps really query. Beside them is the paper's own test: a model of uniform
+    postures, on 6 n / 10 others. Learned postures bound any function of the code.
     """
     rows = []
     for name, m in COMPONENTS.items():

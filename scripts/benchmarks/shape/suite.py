@@ -18,6 +18,7 @@ from benchmarks.shape.exactness import bench_cholesky, bench_laws, bench_refusal
 from benchmarks.shape.input_ablation import bench_inputs
 from benchmarks.shape.speed import bench_growth, bench_memory, bench_queries, bench_raw
 from benchmarks.shape.weaker_inputs import bench_weaker
+from benchmarks.shape.worst_views import bench_worst
 from torchgrasp.datasets import read_family, read_group
 from torchgrasp.shape.fit import fit_shape
 
@@ -33,6 +34,7 @@ SUBJECTS = (
     "objects",
     "inputs",
     "weaker",
+    "worst",
     "cholesky",
 )
 
@@ -53,7 +55,7 @@ def shape(
     Args:
         objects: folder with manifest.json and a folder for each object; without it the hidden side is not measured.
         only: subjects to measure: refusals, selection, laws, update, queries, memory, raw, growth, objects, inputs,
-            weaker, cholesky.
+            weaker, worst, cholesky.
         views: names of the views of each object, such as view0; by default all.
         clouds: random partial clouds whose covariance is factored; 10^4 take about ten minutes.
         queries: points at which the shape is asked; ten times as many for the memory.
@@ -77,6 +79,7 @@ def shape(
         "objects": lambda: bench_objects(objects, views) if objects else [],
         "inputs": lambda: bench_inputs(objects) if objects else [],
         "weaker": lambda: bench_weaker(objects, views, seed) if objects else [],
+        "worst": lambda: bench_worst(objects, views, out.parent) if objects else [],
         "cholesky": lambda: [bench_cholesky(clouds, seed)],
     }
     clock = "processor" if threads == 1 else "wall"
