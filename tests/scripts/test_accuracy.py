@@ -9,12 +9,16 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from benchmarks.shape import weaker_inputs
 from benchmarks.shape.accuracy import (
     format_table,
     mean_row,
     measure_accuracy,
     measure_shape,
 )
+from benchmarks.shape.weaker_inputs import bench_weaker
+from benchmarks.shape.worst_views import bench_worst
+from PIL import Image
 
 from torchgrasp.shape.condition import condition
 from torchgrasp.shape.gp import Normalisation, ShapeGP
@@ -82,24 +86,47 @@ def _sphere_part() -> torch.Tensor:
     return RADIUS * n[n[:, 0] > 0]
 
 
-def test_a_folder_of_objects_becomes_rows_and_a_table(tmp_path: Path):
+@pytest.fixture
+def tin(tmp_path: Path) -> Path:
+    """A folder of one object: a standing cylinder, seen from one side."""
     (tmp_path / "tin").mkdir()
-    tin = trimesh.creation.cylinder(radius=0.06, height=0.24, sections=64)
-    tin.apply_translation([0, 0, 0.12])
-    tin.export(tmp_path / "tin" / "mesh.ply")
+    mesh = trimesh.creation.cylinder(radius=0.06, height=0.24, sections=64)
+    mesh.apply_translation([0, 0, 0.12])
+    mesh.export(tmp_path / "tin" / "mesh.ply")
     rng = np.random.default_rng(0)
     angle, height = (rng.random(700) - 0.5) * 2.9, 0.24 * rng.random(700)
     seen = np.stack([0.06 * np.cos(angle), 0.06 * np.sin(angle), height], -1)
     trimesh.PointCloud(seen).export(tmp_path / "tin" / "view0_noisy.ply")
     pose = np.eye(4)
     pose[:3, 3] = [0.9, 0.0, 0.3]
-    entry = {"suggested_scale": 0.5, "views": {"view0": {"T_object_camera": pose.tolist()}}}
+    entry = {"suggested_scale": 0.5, "group": "solid", "views": {"view0": {"T_object_camera": pose.tolist()}}}
     (tmp_path / "manifest.json").write_text(json.dumps({"objects": {"tin": entry}}))
-    rows = measure_accuracy(tmp_path)
+    return tmp_path
+
+
+def test_a_folder_of_objects_becomes_rows_and_a_table(tin: Path):
+    rows = measure_accuracy(tin)
     assert [(r["object"], r["view"]) for r in rows] == [("tin", "view0")]
     assert rows[0]["seen_median_mm"] < 1 and rows[0]["hidden_median_mm"] < 6
     text = format_table(rows)
     assert len(text.splitlines()) == 5 and "tin" in text and "2 std_m" in text
+
+
+def test_errors_of_the_camera_stay_errors_of_the_surface(tin: Path, monkeypatch):
+    monkeypatch.setattr(weaker_inputs, "FACTORS", ("none", "camera"))
+    none, camera = bench_weaker(tin, (), 0)
+    assert none.numbers["hidden_median_mm"]["change"][0] == 0
+    change = camera.numbers["hidden_median_mm"]["change"][0]
+    expected = camera.numbers["hidden_median_mm"]["mean"] - none.numbers["hidden_median_mm"]["mean"]
+    assert change == pytest.approx(expected) and abs(change) > 0.3
+
+
+def test_the_worst_views_are_drawn_on_a_page_of_their_group(tin: Path):
+    (row,) = bench_worst(tin, (), tin / "out")
+    assert "tin view0" in row.measured
+    with Image.open(tin / "out" / "worst_solid.jpg") as page:
+        colors = page.convert("RGB").getcolors(1 << 24)
+    assert page.width == 5 * 270 and len(colors) > 1000
 
 
 def test_a_mean_leaves_out_what_was_not_measured():
