@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchgrasp.base import Batch, Value, join
 from torchgrasp.linalg import farthest_points
+from torchgrasp.shape.completion.ellipsoid import Ellipsoid, find_ellipsoid
 from torchgrasp.shape.completion.revolution import find_revolution
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 from torchgrasp.shape.completion.symmetry import (
@@ -93,6 +94,9 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
     True
     """
     scorer = SymmetryScorer.of(cloud.to("cpu", torch.float64), table)
+    ball = find_ellipsoid(scorer.points, scorer.normals, scorer.outline, table)
+    if ball is not None:
+        return _hidden_side(scorer, ball, budget)
     parts = _split(scorer)
     planes, scores = torch.cat([part.planes for part in parts]), torch.cat([part.scores for part in parts])
     images = _mirror(parts)
@@ -101,6 +105,16 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
     chosen = merged[farthest_points(merged.points, budget, tie=TIE)]
     shared, asymmetry = chosen.shared.flatten(1), chosen.variance.sqrt()
     return Completion(chosen.points, chosen.normals, shared, asymmetry, planes, scores, scorer.outline)
+
+
+def _hidden_side(scorer: SymmetryScorer, ball: Ellipsoid, budget: int) -> Completion:
+    """Return the hidden side of an ellipsoid. What the seen side misses it by, the hidden side may miss it by."""
+    distance, _ = scorer.nearest(ball.points)
+    rows = torch.nonzero((distance > NEW) & _allowed(scorer, ball.points))[:, 0]
+    rows = rows[farthest_points(ball.points[rows], budget, tie=TIE)]
+    points, misfit = ball.points[rows], torch.full_like(ball.points[rows, 0], ball.misfit)
+    none = points.new_zeros(0, 4)
+    return Completion(points, ball.normals[rows], ball.deviations[rows], misfit, none, none[:, 0], scorer.outline)
 
 
 @dataclasses.dataclass(frozen=True)
