@@ -175,9 +175,9 @@ def test_contacts_satisfy_the_spec(run):
     torch.testing.assert_close(estimate.normal, contacts.normals, atol=1e-6, rtol=0)
     # the planner's variance is k0 - k A k, the estimate's k0 - |L^-1 k|^2: they part at the last digits of k0
     torch.testing.assert_close(estimate.std_m, contacts.std_m, atol=1e-7, rtol=0)
-    sides = (contacts.points - contacts.points.roll(1, 1)).norm(dim=-1)
-    assert float(sides.min()) >= SPEC.least_separation - 1e-6
-    assert float(contacts.points[..., 2].min()) >= SPEC.contact_height - 1e-6
+    centres = contacts.points + 0.012 * contacts.normals  # of fingertips that lie apart, on the table or above
+    assert float((centres - centres.roll(1, 1)).norm(dim=-1).min()) >= SPEC.least_separation - 1e-6
+    assert float(centres[..., 2].min()) >= 0.012 - 1e-6
 
 
 def test_the_file_names_everything(run, tmp_path):

@@ -103,9 +103,9 @@ class Status(enum.IntEnum):
     OFF_SURFACE = 11, "a contact is not on the estimated surface"
     TOO_UNCERTAIN = 12, "the shape at a contact is less certain than max_variance allows"
     NOT_CLOSED = 13, "the contacts do not resist every wrench at the planned friction (no frictional form closure)"
-    TOO_CLOSE = 14, "two contacts are closer than a fingertip is wide"
+    TOO_CLOSE = 14, "two fingertips on their contacts would overlap"
     NOT_FLAT = 15, "the surface around a contact bends too sharply for a fingertip"
-    BELOW_TABLE = 16, "a contact lies too near the table"
+    BELOW_TABLE = 16, "a fingertip on its contact would be below the table"
     DEGENERATE = 17, "the contacts lie on a line or in a point: they span no virtual frame"
     # hand configuration
     OUT_OF_REACH = 20, "no posture of this hand spans the contacts"

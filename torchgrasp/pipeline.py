@@ -30,6 +30,7 @@ from torchgrasp.linalg import farthest_points
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure_probability import closure_share
 from torchgrasp.plan.solve import plan_contacts
+from torchgrasp.plan.starts import settle_flatness
 from torchgrasp.plane import cloud_to_upright, move, upright_frame
 from torchgrasp.posture_model.mixture import PAPER_ENERGY, GraspMixture, load_mixture, mixture_path
 from torchgrasp.scene.occupancy import estimate_occupancy
@@ -202,19 +203,18 @@ class _Task:
 
 def _plan(task: _Task) -> Grasps:
     """Plan in the upright frame."""
-    hand, shape, spec, seed, observer = task.hand, task.shape, task.spec, task.seed, task.observer
+    hand, shape, seed, observer = task.hand, task.shape, task.seed, task.observer
+    spec = settle_flatness(shape, task.spec, seed)
     surface = extract_surface(shape)
     certain = float((surface.std_m < 0.004).double().mean())
     observer("shape", f"{len(shape.x)} points, {certain:.0%} of the surface certain to 4 mm", shape)
-
     plan = plan_contacts(shape, spec, task.starts, seed)
     observer("plan", f"{task.starts} starts: {describe(count_status(plan.status))}", plan)
 
     offered = plan.contacts[_offered_rows(task, plan)]
     certificate = certify(offered, spec)
     contacts, certificate = offered[certificate.closed], certificate[certificate.closed]
-    message = f"{len(contacts)} of {len(offered)} triples closed at friction {spec.planned_friction:g}"
-    observer("certify", message, certificate)
+    observer("certify", f"{len(contacts)} of {len(offered)} closed at friction {spec.planned_friction:g}", certificate)
 
     obstacles = _find_obstacles(task)
     world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), spec.plane, obstacles)

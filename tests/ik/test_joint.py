@@ -17,7 +17,6 @@ from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
 from torchgrasp.ik.rounds import assign
 from torchgrasp.ik.sdf import field_from_surface
 from torchgrasp.plan.flatness import flatness_constraint
-from torchgrasp.plan.problem import ContactProblem
 from torchgrasp.plan.solver import normalise_tensions
 from torchgrasp.shape.surface import extract_surface
 
@@ -51,8 +50,8 @@ def test_jacobian_of_the_joint_problem_against_finite_differences(scene, generat
     points = shape.normalise(assign(given.contacts, seeds).points)
     points = points + 0.1 * torch.randn(points.shape, generator=generator, dtype=torch.float64)
     tension = normalise_tensions(points, torch.rand(24, 3, generator=generator, dtype=torch.float64))
-    problem = JointProblem(hand, shape, ContactProblem.of(shape, spec), given.world, 0.2)
-    flat = flatness_constraint(shape, points, 0.2)
+    problem = JointProblem(hand, shape, spec, given.world)
+    flat = flatness_constraint(shape, points, 0.2, spec.ring_radius)
 
     def rows(state: JointState):
         residual, jacobian = problem.residuals(state, flat)
@@ -81,8 +80,8 @@ def test_grasps_satisfy_every_constraint(scene, grasps):
     assert float(seen.variance.max()) <= spec.max_variance + 1e-6
     torch.testing.assert_close(good.contacts.normals, seen.normal, atol=1e-6, rtol=0)
     assert bool(certify(good.contacts, spec).closed.all()) and bool(good.certificate.closed.all())
-    sides = torch.linalg.vector_norm(good.contacts.points - good.contacts.points.roll(1, 1), dim=-1)
-    assert float(sides.min()) >= spec.least_separation
+    tips = good.contacts.points + spec.fingertip_radius * good.contacts.normals
+    assert float(torch.linalg.vector_norm(tips - tips.roll(1, 1), dim=-1).min()) >= spec.least_separation
     centres = apply(good.obj_from_hand, hand.tip_centres(good.joints))
     gap = centres - good.contacts.points - hand.tips.radius[:, None] * good.contacts.normals
     assert float(torch.linalg.vector_norm(gap, dim=-1).max()) <= 1e-3

@@ -7,10 +7,12 @@ import torch
 from torch import Tensor
 
 from torchgrasp.linalg import unit
-from torchgrasp.plan.flatness import GUIDING_POINTS, INSIDE, RING_RADIUS, flatness_constraint, normal_variation
+from torchgrasp.plan.flatness import GUIDING_POINTS, INSIDE, flatness_constraint, normal_variation
 from torchgrasp.plan.problem import triple_jet
 from torchgrasp.plan.solver import project
 from torchgrasp.plan.wrench import tangents
+
+RING_RADIUS = 0.008
 
 
 def on_surface(ellipsoid, generator, count: int) -> Tensor:
@@ -20,7 +22,7 @@ def on_surface(ellipsoid, generator, count: int) -> Tensor:
 def test_variation_on_a_sphere_is_the_angle_under_which_the_ring_is_seen_from_its_centre(ellipsoid, generator):
     sphere = dataclasses.replace(ellipsoid, axes=(0.5, 0.5, 0.5))
     points = 0.5 * unit(torch.randn(5, 3, 3, generator=generator, dtype=torch.float64))
-    found = normal_variation(sphere, points, triple_jet(sphere, points).normals)
+    found = normal_variation(sphere, points, triple_jet(sphere, points).normals, RING_RADIUS)
     expected = math.atan(RING_RADIUS / (0.5 * sphere.scale))
     torch.testing.assert_close(found, torch.full_like(found, expected))
 
@@ -28,9 +30,9 @@ def test_variation_on_a_sphere_is_the_angle_under_which_the_ring_is_seen_from_it
 def test_values_on_a_sphere_change_sign_at_the_angle_under_which_the_ring_is_seen(ellipsoid, generator):
     sphere = dataclasses.replace(ellipsoid, axes=(0.5, 0.5, 0.5))
     points = 0.5 * unit(torch.randn(5, 3, 3, generator=generator, dtype=torch.float64))
-    angle = float(normal_variation(sphere, points, triple_jet(sphere, points).normals).mean())
+    angle = float(normal_variation(sphere, points, triple_jet(sphere, points).normals, RING_RADIUS).mean())
     for limit, sign in ((0.99 * angle / INSIDE, 1), (1.01 * angle / INSIDE, -1)):
-        value = flatness_constraint(sphere, points, limit).value
+        value = flatness_constraint(sphere, points, limit, RING_RADIUS).value
         assert value.shape == (5, 3 * GUIDING_POINTS)
         assert bool((sign * value > 0).all())
 
@@ -38,7 +40,7 @@ def test_values_on_a_sphere_change_sign_at_the_angle_under_which_the_ring_is_see
 def test_slope_against_automatic_differentiation(ellipsoid, generator):
     """The ring's tangents are carried along without spin, as t - n (n . t) does to first order."""
     points, limit = on_surface(ellipsoid, generator, 4), 0.3
-    constraint = flatness_constraint(ellipsoid, points, limit)
+    constraint = flatness_constraint(ellipsoid, points, limit, RING_RADIUS)
     normals = triple_jet(ellipsoid, points).normals
     first = tangents(points, normals)
     second = torch.linalg.cross(normals, first)

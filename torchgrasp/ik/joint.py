@@ -5,7 +5,7 @@ problem. Its unknowns are pose, joints, contacts and tensions.
 """
 
 import dataclasses
-from functools import partial
+from functools import cached_property, partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -54,13 +54,17 @@ class JointState(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class JointProblem:
-    """A hand and its object; `flatness` is the largest variation of the normal [rad] around a contact; None: any."""
+    """A hand and its object, with contacts that satisfy `spec`."""
 
     hand: Hand
     shape: Shape
-    contact_problem: ContactProblem
+    spec: ContactSpec
     world: CollisionWorld
-    flatness: float | None
+
+    @cached_property
+    def contact_problem(self) -> ContactProblem:
+        """The problem of the contacts alone."""
+        return ContactProblem.of(self.shape, self.spec)
 
     def residuals(self, state: JointState, flat: FlatnessConstraint | None) -> Residuals:
         """Return the residuals [mm], and their Jacobian by all unknowns."""
@@ -107,8 +111,9 @@ class JointProblem:
 
     def solve(self, state: JointState) -> JointState:
         """Return hands and contacts that satisfy all constraints, as far as each row allows."""
+        largest, radius = self.spec.flatness, self.spec.ring_radius
         for _ in range(STAGES):
-            flat = None if self.flatness is None else flatness_constraint(self.shape, state.points, self.flatness)
+            flat = None if largest is None else flatness_constraint(self.shape, state.points, largest, radius)
             sliding = LeastSquares(
                 lambda x, rows, flat=flat: self.residuals(x, None if flat is None else flat[rows]),
                 lambda x, step: x.integrate(self.hand, step),
@@ -122,7 +127,7 @@ def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: Conta
 
     Seeds are tried in their order. Slid contacts are certified anew; their failures have a planning `Status`.
     """
-    joint_problem = JointProblem(problem.hand, shape, ContactProblem.of(shape, spec), problem.world, spec.flatness)
+    joint_problem = JointProblem(problem.hand, shape, spec, problem.world)
 
     def refine_sliding(seeds: IKSeeds) -> Grasps:
         """Return a checked grasp for each seed, with sliding contacts."""

@@ -31,8 +31,9 @@ def check_feasibility(shape: Shape, spec: ContactSpec, points: Triples) -> Conta
     closed = finite & (residual <= BALANCED) & (coefficients.amin(-1) >= MIN_MARGIN)
     closed &= rank_ratio(wrench) >= MIN_RANK_RATIO  # 0 / 0 of a row that is not finite is False
 
-    apart = torch.linalg.vector_norm(metres - metres.roll(1, 1), dim=-1).amin(-1)
-    room = ContactProblem.of(shape, spec).room(points, normals)
+    problem = ContactProblem.of(shape, spec)
+    apart = torch.linalg.vector_norm(problem.sides(points, normals), dim=-1).amin(-1) * shape.scale
+    room = problem.room(points, normals)
     good = {
         Status.OUT_OF_DOMAIN: (torch.linalg.vector_norm(points, dim=-1) <= shape.domain_radius).all(-1),
         Status.OFF_SURFACE: (jet.distance.abs() <= ON_SURFACE).all(-1),
@@ -44,7 +45,7 @@ def check_feasibility(shape: Shape, spec: ContactSpec, points: Triples) -> Conta
     if spec.flatness is not None:
         # A ring costs eight evaluations a contact, so it is measured only where nothing has failed before.
         rows = torch.nonzero(torch.stack(list(good.values())).all(0))[:, 0]
-        flat_rows = normal_variation(shape, points[rows], normals[rows]).amax(-1) <= spec.flatness
+        flat_rows = normal_variation(shape, points[rows], normals[rows], spec.ring_radius).amax(-1) <= spec.flatness
         good[Status.NOT_FLAT] = torch.ones_like(closed).index_put((rows,), flat_rows)
     good[Status.NOT_CLOSED] = closed
     std_m = shape.std_factor * shape.scale * surface_deviation(jet.variance, jet.gradient)

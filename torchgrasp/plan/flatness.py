@@ -1,4 +1,4 @@
-"""Flatness of the surface around contacts: how the normal varies on a ring of a fingertip's size.
+"""Flatness of the surface around contacts: how the normal varies on a small ring.
 
 `normal_variation` judges a plan. `flatness_constraint` keeps sliding contacts on flat surface.
 """
@@ -16,8 +16,6 @@ from torchgrasp.plan.problem import Shape, triple_jet
 from torchgrasp.plan.solver import project
 from torchgrasp.plan.wrench import Triples, cone_edges, tangents
 
-RING_RADIUS = 0.008
-"""Radius [m] of the ring around a contact: within a fingertip, whose radius is 12 mm."""
 JUDGED_POINTS, GUIDING_POINTS = 8, 4
 """Points of the ring on which a plan is judged, and fewer that guide a solver."""
 INSIDE = 0.95
@@ -29,10 +27,10 @@ def ring_directions(normals: Triples, points: Triples, n: int) -> Float[Tensor, 
     return cone_edges(normals, tangents(points, normals), 1.0, n) + normals[:, :, None]
 
 
-def normal_variation(shape: Shape, points: Triples, normals: Triples) -> Float[Tensor, "b 3"]:
-    """Return the largest angle [rad] between the normals at a contact and on its ring."""
+def normal_variation(shape: Shape, points: Triples, normals: Triples, radius: float) -> Float[Tensor, "b 3"]:
+    """Return the largest angle [rad] between the normals at a contact and on its ring of a radius [m]."""
     around = ring_directions(normals, points, JUDGED_POINTS)
-    ring = points[:, :, None] + RING_RADIUS / float(shape.scale) * around
+    ring = points[:, :, None] + radius / float(shape.scale) * around
     _, gradient = shape.mean_and_gradient(project(shape, ring.flatten(1, 2), steps=1).flatten(0, 1))
     there = unit(gradient).unflatten(0, ring.shape[:3])
     here = normals[:, :, None].expand_as(there)
@@ -56,12 +54,12 @@ class FlatnessConstraint(Batch):
         return self.value + (self.by_points @ (points - self.at).flatten(1)[..., None])[..., 0]
 
 
-def flatness_constraint(shape: Shape, points: Triples, flatness: float) -> FlatnessConstraint:
+def flatness_constraint(shape: Shape, points: Triples, flatness: float, radius: float) -> FlatnessConstraint:
     """Evaluate |n - n_k| for the normals at a contact and on its ring, less the chord of `flatness` [rad].
 
-    Values are lengths: chords times the ring's radius.
+    Values are lengths: chords times the ring's `radius` [m], normalised.
     """
-    jet, radius = triple_jet(shape, points), RING_RADIUS / float(shape.scale)
+    jet, radius = triple_jet(shape, points), radius / float(shape.scale)
     identity = torch.eye(3, dtype=points.dtype, device=points.device)
     around = ring_directions(jet.normals, points, GUIDING_POINTS).transpose(1, 2)
     normal, normal_jacobian = jet.normals[:, None], jet.normal_jacobian[:, None]

@@ -27,7 +27,7 @@ INSIDE = 0.99
 CONE_MARGIN = 0.02
 """The cosine between force and inward normal exceeds that of the cone by this much: strictly inside, as phi > 0."""
 LEAST_SIDE = 0.05
-"""Least distance of two contacts, normalised: coincident ones balance, but their wrenches lack rank."""
+"""Least distance of two tip centres, normalised: coincident ones balance, but their wrenches lack rank."""
 
 
 @runtime_checkable
@@ -103,7 +103,6 @@ class ContactProblem:
     domain_radius: float
     separation: float
     table: Plane | None
-    contact_height: float
     tip_radius: float
 
     @classmethod
@@ -119,7 +118,6 @@ class ContactProblem:
             domain_radius=float(shape.domain_radius),
             separation=max(spec.least_separation / scale, LEAST_SIDE),
             table=table,
-            contact_height=spec.contact_height / scale,
             tip_radius=spec.fingertip_radius / scale,
         )
 
@@ -128,14 +126,19 @@ class ContactProblem:
         if self.table is None:
             return torch.full_like(points[..., 0], math.inf)
         slant = 1 - normals @ self.table.normal.to(normals)
-        return self.table.height(points) - (self.tip_radius * slant).clamp_min(self.contact_height)
+        return self.table.height(points) - self.tip_radius * slant
+
+    def sides(self, points: Float[Tensor, "*b 3 3"], normals: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:
+        """Return the sides of the triangle of the tips' centres, from each to the next."""
+        centres = points + self.tip_radius * normals
+        return centres.roll(-1, -2) - centres
 
     def constraints(self, points: Triples, tension: Float[Tensor, "b 3"], jet: SurfaceJet) -> Constraints:
         """Evaluate all constraints and their Jacobians; `jet` is the shape at the points."""
         b, identity = len(points), torch.eye(3, dtype=points.dtype, device=points.device)
         threshold, ball = self.max_variance * INSIDE, self.domain_radius * INSIDE
         half_slope = 2 * threshold**0.5  # slope of the variance at the threshold, for a linear standard deviation
-        sides = points.roll(-1, 1) - points
+        sides = self.sides(points, jet.normals)
         length = torch.linalg.vector_norm(sides, dim=-1)
         cones, cones_by_x = self._cones(points, tension, jet)
         values = [
@@ -144,8 +147,12 @@ class ContactProblem:
             ((points * points).sum(-1) - ball**2) / (2 * ball),
             self.separation / INSIDE - length,
         ]
-        sides_by_x = _by_own_point(sides / length[..., None])
-        sides_by_x = sides_by_x - sides_by_x.unflatten(2, (4, 3))[:, :, [2, 0, 1, 3]].flatten(2)  # a side's other end
+        along, centre_by_point = (
+            (sides / length[..., None])[..., None, :],
+            identity + self.tip_radius * jet.normal_jacobian,
+        )
+        one, other = (_by_own_point((along @ x)[..., 0, :]) for x in (centre_by_point, centre_by_point.roll(-1, 1)))
+        sides_by_x = one - other.unflatten(2, (4, 3))[:, :, [2, 0, 1, 3]].flatten(2)  # a side's other end
         jacobians = [
             cones_by_x,
             _by_own_point(jet.variance_gradient / half_slope),
@@ -155,8 +162,7 @@ class ContactProblem:
         if self.table is not None:
             up = self.table.normal.to(points)
             values.append((1 - INSIDE) * 0.1 - self.room(points, jet.normals))
-            by_tip = self.tip_radius * (self.tip_radius * (1 - jet.normals @ up) > self.contact_height)[..., None]
-            jacobians.append(_by_own_point(-up - by_tip * (up @ jet.normal_jacobian)))
+            jacobians.append(_by_own_point(-(up @ centre_by_point)))
         return Constraints(
             centre=points.mean(1),
             surface=jet.distance,

@@ -13,7 +13,7 @@ from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.objectives import Improvement, Objective, improvement
 from torchgrasp.plan.problem import ContactProblem, Shape
 from torchgrasp.plan.solver import FINISH, Stage, descend, project, start_state
-from torchgrasp.plan.starts import check_starts, drawn_starts, given_starts
+from torchgrasp.plan.starts import check_starts, drawn_starts, given_starts, settle_flatness
 from torchgrasp.plan.wrench import Triples
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan
@@ -73,6 +73,7 @@ def plan_contacts(
     """
     spec = ContactSpec() if spec is None else spec
     check_starts(shape, spec, starts, seed)
+    spec = settle_flatness(shape, spec, seed)
     if time_budget is not None and not time_budget > 0:  # also refuses NaN
         raise BadArgument("time_budget", time_budget, "a positive number of seconds, or None")
     improve = improvement(objective, shape, spec, seed)

@@ -1,9 +1,10 @@
 """Starts of the planner: on the paper's sphere, from candidate contacts, or given."""
 
+import dataclasses
 from collections.abc import Iterator
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import check_tensor
@@ -13,7 +14,7 @@ from torchgrasp.plan.flatness import normal_variation
 from torchgrasp.plan.problem import ContactProblem, Shape, device_of, triple_jet
 from torchgrasp.plan.solver import project
 from torchgrasp.plan.wrench import Triples, closed_exact
-from torchgrasp.specs import ContactSpec
+from torchgrasp.specs import FLAT_RADII, ContactSpec
 
 CANDIDATE_TRIPLES = 700
 """Triples of surface points among which candidates are found: 2100 points are 4 mm apart on a hand-sized object."""
@@ -25,6 +26,9 @@ NEAR_CENTRE = 0.1
 """Normalised distance from the centre to which such a start is drawn in: the paper's radius of starts."""
 TRIPLES_PER_START, ROUNDS = 20, 8
 """Triples drawn for each start in one round, and most rounds: 2 to 10 % of the candidates' triples are closed."""
+ENOUGH_CLOSED, SURVEYED = 0.1, 250
+"""Share of starts, and of how many, that are closed from the draw on where contacts can be as flat as is asked: the
+hand then gets a hundred triples of a thousand starts."""
 STARTS_PER_CHUNK = 500
 """Starts planned at once: memory is bounded, and a plan from fewer starts begins one from more."""
 
@@ -64,20 +68,42 @@ def drawn_starts(shape: Shape, spec: ContactSpec, starts: int, seed: int) -> Ite
     object's, where the paper's starts rarely end.
     """
     generator = torch.Generator().manual_seed(seed)
-
-    def draw(count: int) -> Float[Tensor, "_ 3 3"]:
-        points = unit(torch.randn(count, 3, 3, generator=generator, dtype=torch.float64))
-        return (spec.start_radius * points).to(device_of(shape))
-
     candidates = None
     if spec.flatness is not None:
-        candidates = candidate_contacts(shape, spec, project(shape, draw(CANDIDATE_TRIPLES), steps=6))
+        candidates = candidate_contacts(shape, spec, survey(shape, spec, generator))
     for begin in range(0, starts, STARTS_PER_CHUNK):
         count = min(STARTS_PER_CHUNK, starts - begin)
         if candidates is None:
-            yield project(shape, draw_in(shape, draw(count)), steps=6)
+            yield project(shape, draw_in(shape, draw(shape, spec, count, generator)), steps=6)
         else:
-            yield candidate_triples(ContactProblem.of(shape, spec), *candidates, count, generator)
+            yield candidate_triples(ContactProblem.of(shape, spec), *candidates, count, generator)[0]
+
+
+def settle_flatness(shape: Shape, spec: ContactSpec, seed: int) -> ContactSpec:
+    """Return the spec with its `flat_radius`, or the widest of `FLAT_RADII` at which enough starts are closed."""
+    if spec.flatness is None or spec.flat_radius is not None:
+        return spec
+    problem, points = ContactProblem.of(shape, spec), survey(shape, spec, torch.Generator().manual_seed(seed))
+    for radius in FLAT_RADII[:-1]:
+        settled = dataclasses.replace(spec, flat_radius=radius)
+        good, normals = qualify(shape, settled, points)
+        if int(good.sum()) >= 3:
+            generator = torch.Generator().manual_seed(seed)
+            _, closed = candidate_triples(problem, points[good], normals[good], SURVEYED, generator)
+            if closed >= ENOUGH_CLOSED * SURVEYED:
+                return settled
+    return dataclasses.replace(spec, flat_radius=FLAT_RADII[-1])
+
+
+def draw(shape: Shape, spec: ContactSpec, count: int, generator: torch.Generator) -> Float[Tensor, "_ 3 3"]:
+    """Return triples of points on the sphere of `spec.start_radius`."""
+    points = unit(torch.randn(count, 3, 3, generator=generator, dtype=torch.float64))
+    return (spec.start_radius * points).to(device_of(shape))
+
+
+def survey(shape: Shape, spec: ContactSpec, generator: torch.Generator) -> Float[Tensor, "_ 3 3"]:
+    """Return points all over the surface, among which candidates are found."""
+    return project(shape, draw(shape, spec, CANDIDATE_TRIPLES, generator), steps=6)
 
 
 def draw_in(shape: Shape, points: Triples) -> Triples:
@@ -97,20 +123,24 @@ def draw_in(shape: Shape, points: Triples) -> Triples:
 def candidate_contacts(
     shape: Shape, spec: ContactSpec, points: Triples
 ) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]]:
-    """Return the surface points that are certain, flat, inside and above the table, with normals.
+    """Return the surface points that qualify as contacts, with normals; all where fewer than three qualify."""
+    good, normals = qualify(shape, spec, points)
+    if int(good.sum()) < 3:
+        good = torch.ones_like(good)
+    return points[good], normals[good]
 
-    Where fewer than three qualify, all are returned.
-    """
+
+def qualify(shape: Shape, spec: ContactSpec, points: Triples) -> tuple[Bool[Tensor, "b 3"], Triples]:
+    """Tell which surface points are certain, flat, inside and above the table; return the normals of all."""
     problem = ContactProblem.of(shape, spec)
     jet = triple_jet(shape, points)
     good = (jet.distance.abs() < 1e-4) & (jet.variance >= 0) & (jet.variance < spec.max_variance)
     good &= torch.linalg.vector_norm(points, dim=-1) < problem.domain_radius
     good &= problem.room(points, jet.normals) > 0
     if spec.flatness is not None:
-        good &= normal_variation(shape, points, jet.normals) < CANDIDATE_FLATNESS * spec.flatness
-    if int(good.sum()) < 3:
-        good = torch.ones_like(good)
-    return points[good], jet.normals[good]
+        variation = normal_variation(shape, points, jet.normals, spec.ring_radius)
+        good &= variation < CANDIDATE_FLATNESS * spec.flatness
+    return good, jet.normals
 
 
 def candidate_triples(
@@ -119,17 +149,17 @@ def candidate_triples(
     normals: Float[Tensor, "p 3"],
     starts: int,
     generator: torch.Generator,
-) -> Triples:
-    """Return random triples of candidates, closed and separate as far as there are enough."""
+) -> tuple[Triples, int]:
+    """Return random triples of candidates, closed and separate as far as there are enough; and how many are."""
     triples, missing = [], starts
     for _ in range(ROUNDS):
         choice = torch.randint(len(points), (TRIPLES_PER_START * starts, 3), generator=generator).to(points.device)
-        corners = points[choice]
-        choice = choice[torch.linalg.vector_norm(corners - corners.roll(1, 1), dim=-1).amin(-1) > problem.separation]
+        apart = torch.linalg.vector_norm(problem.sides(points[choice], normals[choice]), dim=-1).amin(-1)
+        choice = choice[apart > problem.separation]
         closed = choice[closed_exact(points[choice], normals[choice], problem.friction)][:missing]
         triples.append(points[closed])
         missing -= len(closed)
         if missing == 0:
             break
     triples.append(points[torch.randint(len(points), (missing, 3), generator=generator).to(points.device)])
-    return torch.cat(triples)
+    return torch.cat(triples), starts - missing
