@@ -37,13 +37,14 @@ class Disturbance(Value):
     """What a trial did to all but its object.
 
     The three columns are neighbours, table, and the object by links other than the fingers'. `first_touch` [s] is when
-    the hand first touched each, infinite if never. `impulse` [N s] is the sum of its normal impulses. `early` tells
-    whether that was before a fingertip touched the object. `neighbour_pose` is the motion of each of m
-    neighbours from its start.
+    the hand first touched each, infinite if never. `impulse` [N s] is the sum of its normal impulses, `force` [N] the
+    largest mean normal force of a control tick. `early` tells whether that was before a fingertip touched the object.
+    `neighbour_pose` is the motion of each of m neighbours from its start.
     """
 
     first_touch: Float[Tensor, "3"]
     impulse: Float[Tensor, "3"]
+    force: Float[Tensor, "3"]
     early: Bool[Tensor, "3"]
     neighbour_pose: Float[Tensor, "t m 4 4"]
 

@@ -102,6 +102,11 @@ class ContactSpec(Value):
         wider = 2 * max(self.fingertip_radius - TIP_RADIUS, 0.0)
         return SEPARATION + wider if self.separation is None else self.separation
 
+    @property
+    def least_height(self) -> float:
+        """The height [m] that an upright wall needs between fingertips on the table: their radius and a flat ring."""
+        return self.fingertip_radius + (FLAT_RADII[-1] if self.flat_radius is None else self.flat_radius)
+
     def for_fingertips(self, radius: float) -> "ContactSpec":
         """Return the spec with the fingertip radius [m] of a hand, at least `TIP_RADIUS`; a given radius stays."""
         return self if self.tip_radius is not None else dataclasses.replace(self, tip_radius=max(radius, TIP_RADIUS))

@@ -13,6 +13,7 @@ from torchgrasp.control.closing import STOP_DISTANCE, LawClosing, PositionClosin
 from torchgrasp.control.closing_law import MAX_SPEED, position_gain, surface_covariance
 from torchgrasp.control.observation import Observation
 from torchgrasp.errors import BadArgument
+from torchgrasp.plane import Plane
 from torchgrasp.specs import ClosingPart, TrialSpec
 
 ALL = get_args(ClosingPart)
@@ -60,6 +61,25 @@ def test_eqs_25_to_28_as_written_are_the_law_without_its_parts():
     assert all(torch.equal(a, b) for (_, a), (_, b) in zip(paper, bare, strict=True))
     whole = press(GraspController(uncertain(2, 4, 6)), 1.0)
     assert not torch.equal(paper[-1][1], whole[-1][1])
+
+
+@pytest.mark.parametrize("up", [1.0, -1.0])
+def test_fingers_that_search_in_vain_do_not_sink_below_the_table_but_move_freely_along_and_off_it(up):
+    """The fingers search along x, beyond their contacts; the table is across x, 5 mm behind those above it."""
+    above = NORMALS[:, 0] == up
+    table = Plane(real([up, 0, 0]), float(up * TARGET[above, 0].mean()) - 0.005)
+    low, free = (dataclasses.replace(reference(), table=t) for t in (table, None))
+    tips = {}
+    for name, known in (("low", low), ("free", free)):
+        law, joints = LawClosing(known), torch.zeros(9).double()
+        for _ in range(400):
+            at = TARGET + 0.02 * NORMALS + joints.reshape(3, 3)
+            joints = law(dataclasses.replace(observation(joints=joints), tips=at), PERIOD)
+        tips[name] = at[:, 0] * up
+    height = tips["low"] - table.offset - 0.01
+    assert float(height[above].min()) >= 0 and float(height[above].max()) < 1e-3
+    assert float(tips["free"][above].max()) < table.offset
+    assert float(tips["low"][~above].min()) > float(-0.03 + 0.01)
 
 
 @pytest.mark.parametrize("contact", [False, True])

@@ -71,7 +71,7 @@ def run() -> Run:
         slip=ObjectMotion(0.001, 0.0),
         start_overlap=0.0,
         disturbance=Disturbance(
-            torch.full((3,), math.inf), torch.zeros(3), torch.zeros(3, dtype=torch.bool), lifted[:, None]
+            torch.full((3,), math.inf), *torch.zeros(2, 3), torch.zeros(3, dtype=torch.bool), lifted[:, None]
         ),
         seconds=1.0,
     )

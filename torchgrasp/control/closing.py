@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.control.closing_law import POSITION_FLOOR, POSITION_RATE, blend, joint_step, tip_velocity
+from torchgrasp.control.closing_law import POSITION_FLOOR, POSITION_RATE, blend, joint_step, stay_above, tip_velocity
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import NOISE
@@ -58,6 +58,7 @@ class LawClosing:
 
     * `switch`: touch decides. A finger in the air searches along its contact's normal, even beyond the contact. One
       that touches is force-controlled whatever its position error: where the shape is wrong, Eq. (26) would press on.
+      No finger searches below the table, if the reference knows one: it slides along.
     * `wait`: a finger that touches presses with `WAITING_FORCE` until all do. The holding then raises the full forces:
       three separate loops would push the object (docs/closing.md).
     * `pace`: before the first touch all fingers keep pace. Without it they share one limit of speed, so that
@@ -106,6 +107,9 @@ class LawClosing:
         if self.paces and not bool(contact.any()):
             left = ahead.clamp_min(0.0) + POSITION_FLOOR
             velocity = velocity * (left / left.max())[:, None]
+        if self.switch and reference.table is not None:
+            height = reference.table.height(observation.tips) - reference.hand.tips.radius
+            velocity = stay_above(velocity, height, reference.table.normal)
         step = joint_step(observation.jacobian @ coupling, velocity, period, reference.joints - self.target)
         actuated = reference.pick(observation.joints)
         lead = LEAD * (1 + self.waiting / IMPATIENCE) if self.waits else self.strongest

@@ -104,6 +104,18 @@ def tip_velocity(
     return velocity * (MAX_SPEED / fastest.clamp_min(MAX_SPEED))[..., None, None]
 
 
+def stay_above(
+    velocity: Float[Tensor, "*b 3"], height: Float[Tensor, "*b"], up: Float[Tensor, "3"]
+) -> Float[Tensor, "*b 3"]:
+    """Return velocities [m/s] of fingertips at a height [m] above a table: they sink ever slower, and not below it.
+
+    >>> stay_above(torch.tensor([0.01, 0.0, -0.02]), torch.tensor(0.0), torch.tensor([0.0, 0.0, 1.0]))
+    tensor([0.0100, 0.0000, 0.0000])
+    """
+    lacking = -POSITION_RATE * height.clamp_min(0.0) - velocity @ up
+    return velocity + lacking.clamp_min(0.0)[..., None] * up
+
+
 def joint_step(
     jacobian: Float[Tensor, "*b 3 3 h"],
     velocity: Float[Tensor, "*b 3 3"],

@@ -22,6 +22,7 @@ from torchgrasp.control.forces import check_squeeze, contacts_in_hand, desired_f
 from torchgrasp.control.stiffness import drive_stiffness, joint_stiffness, tip_compliance
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand import Hand
+from torchgrasp.plane import Plane
 from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
@@ -41,6 +42,7 @@ class ClosingReference(Value):
         squeeze: joint targets that press in open loop (`squeeze`).
         normals: outward normals of the planned contacts.
         gains: targets, gains and desired forces (Eqs. 26-28).
+        table: into which no fingertip presses while it searches; None: none is known.
     """
 
     hand: Hand
@@ -51,6 +53,7 @@ class ClosingReference(Value):
     squeeze: Float[Tensor, " h"]
     normals: Float[Tensor, "3 3"]
     gains: ClosingGains
+    table: Plane | None = None
 
     @classmethod
     def from_grasp(

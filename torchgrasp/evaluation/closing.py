@@ -76,6 +76,10 @@ class TrialDriver:
         if spec.approach and not abs(float(torch.linalg.vector_norm(grasp.approach)) - 1) < 1e-4:
             raise BadArgument("grasp", f"an approach along {grasp.approach[0].tolist()}", "a unit vector")
         body, drives = self._body(Neighbour(read_mesh(trial.mesh), trial.parts)), hand.actuators
+        if reference is None and spec.table:
+            table = Plane.horizontal(float(body.mesh.bounds[0, 2]) if trial.table is None else 0.0)
+            known = table.moved(inverse(grasp.obj_from_hand[0]))  # the hand's true pose may be another
+            self.reference = dataclasses.replace(self.reference, table=known)
         if spec.kp is not None:
             drives = {name: drive._replace(kp=spec.kp) for name, drive in drives.items()}
         true_pose = apply_error(grasp.obj_from_hand[0], trial.error)

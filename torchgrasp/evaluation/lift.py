@@ -251,6 +251,7 @@ class _Lift:
             disturbance=Disturbance(
                 first_touch=first_stray * self.spec.timestep,
                 impulse=torch.from_numpy(robot.stray),
+                force=torch.from_numpy(robot.most_stray),
                 early=first_stray < min(first_touch),
                 neighbour_pose=neighbour_pose,
             ),

@@ -111,4 +111,13 @@ def refusal(run: Run) -> str:
     else:
         return f"{head}: {Status.OUT_OF_REACH.sentence}."
     reasons = "; ".join(f"{n} of {total}: {status.sentence}" for status, n in count_status(failed).items())
-    return f"{head} ({reasons})."
+    return f"{head} ({reasons}){too_low(run)}."
+
+
+def too_low(run: Run) -> str:
+    """Say how high an object must be for the hand's fingertips on its table, if it is lower."""
+    spec = run.spec.for_fingertips(float(run.hand.tips.radius.max()))
+    if spec.plane is None or not len(run.surface.vertices):
+        return ""
+    height, needed = float(spec.plane.height(run.surface.vertices).max()), spec.least_height
+    return f": it is {1e3 * height:.0f} mm high, and this hand needs {1e3 * needed:.0f} mm" * (height < needed)

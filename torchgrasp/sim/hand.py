@@ -14,7 +14,8 @@ class SimulatedHand:
 
     `force` (3,) are the true normal forces [N], averaged over the last tick. `finger` flags contacts in its last step.
     `steps` counts steps of the simulator. `first_touch` is the step of each fingertip's first contact, infinite before;
-    `first_stray` that of each kind in `StepContacts.stray`, whose impulses [N s] are summed in `stray`.
+    `first_stray` that of each kind in `StepContacts.stray`, whose impulses [N s] are summed in `stray`;
+    `most_stray` [N] is its largest force over a tick.
 
     Args:
         scene: at its start.
@@ -30,7 +31,7 @@ class SimulatedHand:
         self.substeps = max(1, round(1 / (control_rate * scene.timestep)))
         self.period = self.substeps * scene.timestep
         self.steps, self.first_touch = 0, [float("inf")] * 3
-        self.first_stray, self.stray = np.full(3, np.inf), np.zeros(3)
+        self.first_stray, self.stray, self.most_stray = np.full(3, np.inf), np.zeros(3), np.zeros(3)
         self.force, self.finger, self.tactile = np.zeros(3), np.zeros(3, dtype=bool), no_contact()
         names, centres = reference.hand.tree.joint_names, reference.hand.tips.center.double()
         self._centres = torch.cat([centres, torch.ones(3, 1, dtype=torch.float64)], dim=-1).numpy()
@@ -40,7 +41,7 @@ class SimulatedHand:
     def tick(self, targets: Float[Tensor, " j"]) -> Observation:
         """Drive the joints for one control period; return what the robot knows."""
         self.scene.drive(targets[self._to_scene].numpy())
-        contacts = StepContacts.none()
+        contacts, before = StepContacts.none(), self.stray.copy()
         for _ in range(self.substeps):
             step = self.scene.step()
             self.steps += 1
@@ -50,6 +51,7 @@ class SimulatedHand:
                 self.first_touch[i] = min(self.first_touch[i], self.steps)
             self.first_stray[(step.stray > 0) & np.isinf(self.first_stray)] = self.steps
             self.stray += step.stray
+        self.most_stray = np.maximum(self.most_stray, (self.stray - before) / self.period)
         self.force = np.linalg.norm(contacts.impulse, axis=-1) / self.period
         return self._observe(contacts)
 
