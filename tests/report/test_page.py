@@ -8,6 +8,7 @@ import pytest
 from torchgrasp.errors import OutputError, Status
 from torchgrasp.report.page import format_page, grasp_rows, write_report
 from torchgrasp.report.run import closing_sentence, refusal, verdict
+from torchgrasp.specs import ContactSpec
 
 PNG = base64.b64decode("iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAQAAAC1HAwCAAAAC0lEQVR42mNkYAAAAAYAAjCB0C8AAAAASUVORK5CYII=")
 
@@ -81,6 +82,9 @@ def test_verdicts(run):
     assert f"1 of 1 postures: {Status.TIP_ERROR.sentence}" in verdict(none)
     unplanned = dataclasses.replace(none, grasps=run.grasps[:0])
     assert f"2 of 2 starts: {Status.NOT_CLOSED.sentence}" in refusal(unplanned)
+    top = float(run.surface.vertices[:, 2].max())
+    flat, high = (dataclasses.replace(unplanned, spec=ContactSpec(table=top - h)) for h in (0.0101, 0.016))
+    assert refusal(flat).endswith("it is 10 mm high, and this hand needs 15 mm.") and "high" not in refusal(high)
     assert Status.OUT_OF_REACH.sentence in refusal(dataclasses.replace(unplanned, plan=None))
     _, words = read(format_page(none, {}))
     assert "Best grasps" not in words
