@@ -6,6 +6,7 @@ python scripts/train.py posture-model mine/hand.urdf --tips a b c  the same from
 python scripts/train.py stability allegro --workers 2             which pulled grasps hold, for the impedance control
 python scripts/train.py success                                   the predicted success that ranks grasps
 python scripts/train.py occupancy DIR                             how likely hidden places of a scene are full
+python scripts/train.py bands DIR                                 how far off hidden sides are, by what they follow from
 python scripts/train.py objects                                   meshes, convex parts and views of the own objects
 """
 
@@ -13,6 +14,7 @@ import sys
 
 import tyro
 from train.author_objects import objects, scene
+from train.bands import bands
 from train.occupancy import occupancy
 from train.posture_model import posture_model
 from train.stability import stability
@@ -26,6 +28,7 @@ if __name__ == "__main__":
         "stability": stability,
         "success": success,
         "occupancy": occupancy,
+        "bands": bands,
         "objects": objects,
         "scene": scene,
     }

@@ -76,3 +76,12 @@ def test_cylinders_bowls_and_long_things_are_none(seen_cylinder: PointCloud):
     ball = _fruit((0.03, 0.03, 0.03))
     assert ball.normals is not None
     assert _find(PointCloud(ball.points, -ball.normals, CAMERA), 0.0) is None
+
+
+def test_the_domain_holds_the_whole_ball_and_the_band_the_error():
+    cloud = _fruit((0.03, 0.03, 0.03))
+    shape = fit_shape(PointCloud(cloud.points, viewpoint=CAMERA), table=0.0)
+    points = torch.tensor([0.01, -0.02, 0.03], dtype=torch.float64) + 0.03 * fibonacci_sphere(400)
+    assert bool(shape.contains(points).all())
+    estimate = shape.predict(points)
+    assert (shape.scale * estimate.distance.abs() < 2 * estimate.std_m).double().mean() > 0.9

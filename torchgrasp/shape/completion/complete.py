@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,7 +11,7 @@ from torch import Tensor
 from torchgrasp.base import Batch, Value, join
 from torchgrasp.linalg import farthest_points
 from torchgrasp.shape.completion.ellipsoid import Ellipsoid, find_ellipsoid
-from torchgrasp.shape.completion.revolution import find_revolution
+from torchgrasp.shape.completion.revolution import Revolution, find_revolution
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 from torchgrasp.shape.completion.symmetry import (
     SymmetryScorer,
@@ -43,6 +44,10 @@ PENALTY = 0.05
 """Score that an image of an image loses: of two equal points the one mirrored once is kept."""
 
 
+Kind = Literal["ball", "revolution", "mirrored", "guess"]
+"""What a hidden side follows from: an ellipsoid, an upright axis, mirror planes, or nothing but the outline."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Completion(Value):
     """Points of the hidden side. Their errors across the surface are correlated and do not average out.
@@ -55,6 +60,7 @@ class Completion(Value):
         asymmetry: standard deviation [m] of the smooth field.
         planes: the planes n.x = o that were used, as (n, o), the best of each part first.
         scores: of the planes: 1 if the mirror image lies on the cloud, below .15 for no support.
+        kind: what the points follow from, by which the bands are calibrated.
     """
 
     points: Float[Tensor, "m 3"]
@@ -64,6 +70,7 @@ class Completion(Value):
     planes: Float[Tensor, "p 4"]
     scores: Float[Tensor, "p"]
     outline: Outlines
+    kind: Kind
 
     @property
     def deviations(self) -> Float[Tensor, "m k"]:
@@ -97,14 +104,16 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
     ball = find_ellipsoid(scorer.points, scorer.normals, scorer.outline, table)
     if ball is not None:
         return _hidden_side(scorer, ball, budget)
-    parts = _split(scorer)
+    round_body = None if table is None else find_revolution(scorer.points, scorer.normals)
+    parts = _split(scorer, round_body)
     planes, scores = torch.cat([part.planes for part in parts]), torch.cat([part.scores for part in parts])
     images = _mirror(parts)
     images.sort(key=lambda image: -image.score)
     merged = _merge(scorer, _Image.of(scorer, torch.arange(0), len(planes)), images)
     chosen = merged[farthest_points(merged.points, budget, tie=TIE)]
     shared, asymmetry = chosen.shared.flatten(1), chosen.variance.sqrt()
-    return Completion(chosen.points, chosen.normals, shared, asymmetry, planes, scores, scorer.outline)
+    kind: Kind = "guess" if not len(planes) else "mirrored" if round_body is None else "revolution"
+    return Completion(chosen.points, chosen.normals, shared, asymmetry, planes, scores, scorer.outline, kind)
 
 
 def _hidden_side(scorer: SymmetryScorer, ball: Ellipsoid, budget: int) -> Completion:
@@ -114,7 +123,9 @@ def _hidden_side(scorer: SymmetryScorer, ball: Ellipsoid, budget: int) -> Comple
     rows = rows[farthest_points(ball.points[rows], budget, tie=TIE)]
     points, misfit = ball.points[rows], torch.full_like(ball.points[rows, 0], ball.misfit)
     none = points.new_zeros(0, 4)
-    return Completion(points, ball.normals[rows], ball.deviations[rows], misfit, none, none[:, 0], scorer.outline)
+    return Completion(
+        points, ball.normals[rows], ball.deviations[rows], misfit, none, none[:, 0], scorer.outline, "ball"
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,10 +189,9 @@ class _Mirror:
         return _Image(points, normals, score, variance, shared)
 
 
-def _split(scorer: SymmetryScorer) -> list[_Part]:
+def _split(scorer: SymmetryScorer, revolution: Revolution | None) -> list[_Part]:
     """Split the cloud into a body of revolution and its attached part, if it is one."""
     every = torch.arange(len(scorer.points))
-    revolution = None if scorer.table is None else find_revolution(scorer.points, scorer.normals)
     if revolution is None:
         return [_Part(scorer, every, *find_planes(scorer))]
     rows, rest = every[revolution.body], every[~revolution.body]
