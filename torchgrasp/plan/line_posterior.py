@@ -101,8 +101,33 @@ def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
     normals = check_unit(contacts.normals.detach().double().to(shape.device))
     if not bool(well_inside(shape, contacts).all()):
         raise BadArgument("contacts.points", "a contact at the edge of the domain", "contacts further inside")
+    owner = shape.wall_at(points.flatten(0, 1)).unflatten(0, points.shape[:2])
+    deviation, distance, slope, covariance = _along_lines(shape.walls[0], shape.std_factor, points, normals)
+    if len(shape.walls) > 1:  # a finger meets the wall of its contact; errors of different walls are independent
+        covariance = covariance * _on_same(owner[..., 0])
+    for number, wall in enumerate(shape.walls[1:], start=1):
+        parts, own = _along_lines(wall, shape.std_factor, points, normals), owner[..., number]
+        deviation = torch.where(own, parts[0], deviation)
+        distance = torch.where(own[..., None], parts[1], distance)
+        slope = torch.where(own[..., None, None], parts[2], slope)
+        covariance = covariance + parts[3] * _on_same(own)
+    prior = float(shape.prior_block()[0, 0])
+    root = symmetric_root(shape.std_factor**2 * covariance, prior, "contacts within the domain")
+    return LinePosterior(points, normals, deviation, distance, slope, root)
+
+
+def _on_same(own: Bool[Tensor, "b 3"]) -> Bool[Tensor, "b 60 60"]:
+    """Tell which entries of the nodes' covariance belong to two contacts of a wall."""
+    own = own.repeat_interleave(4 * len(NODES), 1)
+    return own[:, :, None] & own[:, None]
+
+
+def _along_lines(
+    shape: ShapeGP, factor: float, points: Triples, normals: Triples
+) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 3 23"], Float[Tensor, "b 3 5 3"], Float[Tensor, "b 60 60"]]:
+    """Return deviation, distance on the grid, slope and covariance at the nodes for a single surface."""
     jet = shape.jet(points.flatten(0, 1))
-    deviation = shape.std_factor * surface_deviation(jet.variance, jet.gradient).reshape(points.shape[:2])
+    deviation = factor * surface_deviation(jet.variance, jet.gradient).reshape(points.shape[:2])
     nodes = deviation[..., None] * torch.tensor(NODES).to(deviation)
     covariance = points.new_empty(len(points), 12 * len(NODES), 12 * len(NODES))
     for rows in torch.arange(len(points), device=points.device).split(TRIPLES_PER_CHUNK):
@@ -110,9 +135,7 @@ def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
     slope = shape.mean_and_gradient((points[:, :, None] + nodes[..., None] * normals[:, :, None]).reshape(-1, 3))[1]
     t = deviation[..., None] * grid().to(deviation)
     distance = shape.mean((points[:, :, None] + t[..., None] * normals[:, :, None]).reshape(-1, 3))
-    prior = float(shape.prior_block()[0, 0])
-    root = symmetric_root(shape.std_factor**2 * covariance, prior, "contacts within the domain")
-    return LinePosterior(points, normals, deviation, distance.reshape(t.shape), slope.reshape(*nodes.shape, 3), root)
+    return deviation, distance.reshape(t.shape), slope.reshape(*nodes.shape, 3), covariance
 
 
 def node_covariance(

@@ -3,6 +3,7 @@
 from torchgrasp.shape.condition import condition
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import Normalisation, ShapeDerivatives, ShapeGP
+from torchgrasp.shape.hollow import HollowShape
 from torchgrasp.shape.joint_posterior import JointEstimate
 from torchgrasp.shape.kernel import Kernel, kernel_by_name, matern52_kernel, rbf_kernel, thin_plate_kernel
 from torchgrasp.shape.observations import Observations
@@ -10,6 +11,7 @@ from torchgrasp.shape.posterior import SurfaceJet
 from torchgrasp.shape.surface import Surface, extract_surface
 
 __all__ = [
+    "HollowShape",
     "JointEstimate",
     "Kernel",
     "Normalisation",

@@ -90,6 +90,15 @@ class ShapeGP(Posterior, Normalisation):
         """Device of the shape; planners put their points there."""
         return self.x.device
 
+    @property
+    def walls(self) -> "tuple[ShapeGP, ...]":
+        """The surfaces that enclose the material, each with a posterior of its own."""
+        return (self,)
+
+    def wall_at(self, x: Float[Tensor, "q 3"]) -> Bool[Tensor, "q walls"]:
+        """Tell which wall is the surface at normalised points."""
+        return torch.ones(len(x), 1, dtype=torch.bool, device=x.device)
+
     def contains(self, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
         """Tell which points [m] lie in the domain."""
         return torch.linalg.vector_norm(self.normalise(points), dim=-1) <= self.domain_radius
@@ -126,7 +135,11 @@ class ShapeGP(Posterior, Normalisation):
         x = self._queries(check_tensor("points", points, (None, 3)))
         if len(x) > MAX_JOINT:
             raise BadArgument("points", f"{len(x)} points", f"at most {MAX_JOINT} points at once")
-        return joint_estimate(self, x).to(points.dtype)
+        return self.joint_at(x).to(points.dtype)
+
+    def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
+        """Return the joint posterior of (d, w) at normalised points; no check."""
+        return joint_estimate(self, x)
 
     def sample(self, points: Float[Tensor, "k 3"], n: int, seed: int = 0) -> Float[Tensor, "n k 4"]:
         """Draw (d, w) jointly at up to 1000 points [m], n times, normalised. Raises as `predict`."""

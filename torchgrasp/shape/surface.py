@@ -1,6 +1,7 @@
 """The zero level of the shape, Eq. (9): a triangle mesh of it, and Newton steps onto it."""
 
 import dataclasses
+import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -8,9 +9,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value
+from torchgrasp.base import Value, map_tensors
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import limit_norm, unit
+from torchgrasp.shape.clip import clip_mesh
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.posterior import surface_deviation
 
@@ -52,11 +54,20 @@ def extract_surface(shape: ShapeGP, resolution: int = 48) -> Surface:
     Raises:
         BadArgument: a resolution outside [8, 256], or a mean without zero level.
     """
-    from skimage.measure import marching_cubes
-
     if not 8 <= resolution <= 256:
         raise BadArgument("resolution", resolution, "an integer in [8, 256]")
-    radius, device = shape.domain_radius, shape.x.device
+    walls = [_extract_wall(shape, i, resolution) for i in range(len(shape.walls))]
+    before = [0, *itertools.accumulate(len(wall.vertices) for wall in walls)]
+    walls = [dataclasses.replace(w, faces=w.faces + n) for w, n in zip(walls, before, strict=False)]
+    return map_tensors(lambda *parts: torch.cat(parts), *walls)
+
+
+def _extract_wall(whole: ShapeGP, number: int, resolution: int) -> Surface:
+    """Return one wall of a shape, cut off where it leaves the material."""
+    from skimage.measure import marching_cubes
+
+    shape, others = whole.walls[number], [wall for i, wall in enumerate(whole.walls) if i != number]
+    radius, device = whole.domain_radius, shape.x.device
     axis = torch.linspace(-radius, radius, resolution + 1, dtype=torch.float64, device=device)
     grid = torch.cartesian_prod(axis, axis, axis)
     inside = torch.linalg.vector_norm(grid, dim=-1) <= radius
@@ -77,6 +88,10 @@ def extract_surface(shape: ShapeGP, resolution: int = 48) -> Surface:
         jet = shape.jet(x)
         move = newton_step(jet.distance, jet.gradient, jet.gradient, LEAST_SLOPE)[:, None] * jet.gradient
         x = x + limit_norm(move, step)
+    if others:
+        value = torch.stack([wall.mean(x) for wall in others]).amax(0)
+        vertices, triangles, _ = clip_mesh(x.cpu().numpy(), faces.cpu().numpy(), value.cpu().numpy())
+        x, faces = torch.from_numpy(vertices).to(x), torch.from_numpy(triangles).to(faces)
     jet = shape.jet(x)
     a, b, c = x[faces].unbind(1)
     across = torch.linalg.cross(b - a, c - a)
@@ -85,7 +100,7 @@ def extract_surface(shape: ShapeGP, resolution: int = 48) -> Surface:
         vertices=shape.metres(x),
         faces=faces if bool(outward) else faces.flip(1),
         normals=unit(jet.gradient),
-        std_m=shape.std_factor * shape.scale * surface_deviation(jet.variance, jet.gradient),
+        std_m=whole.std_factor * shape.scale * surface_deviation(jet.variance, jet.gradient),
     )
 
 

@@ -43,16 +43,9 @@ def find_revolution(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"])
     tensor([0.1000, 0.2000], dtype=torch.float64)
     """
     slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
-    steep = slope > STEEP
-    level = torch.where(steep[:, None], normals[:, :2] / slope[:, None], 0.0)
-    across = torch.stack([-level[:, 1], level[:, 0]], 1)  # a line along the normal: across . x = offset
-    offset = (across * points[:, :2]).sum(1)
-    miss = torch.zeros_like(offset)
-    center = points[:, :2].mean(0)
-    for _ in range(ITERATIONS):
-        weight = slope / (1.0 + (miss / HALF_WEIGHT) ** 2)
-        center = torch.linalg.lstsq(weight[:, None].sqrt() * across, (weight.sqrt() * offset)[:, None]).solution[:, 0]
-        miss = offset - across @ center
+    steep, level, across, offset = _lines(points, normals, slope)
+    center = fit_axis(points, normals)
+    miss = offset - across @ center
 
     radius = torch.linalg.vector_norm(points[:, :2] - center, dim=1)
     relative_miss = miss.abs() / radius.clamp_min(LEAST_RADIUS)
@@ -64,3 +57,26 @@ def find_revolution(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"])
     spread, one_way = relative_miss[side].square().mean().sqrt(), torch.linalg.vector_norm(level[side].mean(0))
     fits = bool((body.double().mean() > BODY_SHARE) & (spread < MAX_SPREAD) & (one_way < ONE_WAY))
     return Revolution(center, body) if fits else None
+
+
+def fit_axis(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, "2"]:
+    """Return the vertical axis [m] that most lines along the normals meet."""
+    slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
+    _, _, across, offset = _lines(points, normals, slope)
+    miss = torch.zeros_like(offset)
+    center = points[:, :2].mean(0)
+    for _ in range(ITERATIONS):
+        weight = slope / (1.0 + (miss / HALF_WEIGHT) ** 2)
+        center = torch.linalg.lstsq(weight[:, None].sqrt() * across, (weight.sqrt() * offset)[:, None]).solution[:, 0]
+        miss = offset - across @ center
+    return center
+
+
+def _lines(
+    points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], slope: Float[Tensor, "n"]
+) -> tuple[Bool[Tensor, "n"], Float[Tensor, "n 2"], Float[Tensor, "n 2"], Float[Tensor, "n"]]:
+    """Return which normals are steep, their level unit parts, and the lines across . x = offset along them."""
+    steep = slope > STEEP
+    level = torch.where(steep[:, None], normals[:, :2] / slope[:, None], 0.0)
+    across = torch.stack([-level[:, 1], level[:, 0]], 1)
+    return steep, level, across, (across * points[:, :2]).sum(1)

@@ -1,0 +1,133 @@
+"""A vessel's two walls: the field against a known cup, and its laws against those of each wall."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.cups import HEIGHT, RADIUS, cup, cup_view, ring
+from torchgrasp.linalg import unit
+from torchgrasp.mesh import closest_on_triangles
+from torchgrasp.plan.line_posterior import line_posterior
+from torchgrasp.shape.fit import fit_shape
+from torchgrasp.shape.hollow import HollowShape
+from torchgrasp.shape.surface import extract_surface
+from torchgrasp.values import Contacts
+
+WALL = 0.003
+
+
+@pytest.fixture(scope="module")
+def vessel() -> HollowShape:
+    shape = fit_shape(cup_view(WALL), table=0.0)
+    assert isinstance(shape, HollowShape)
+    return shape
+
+
+def _both_walls() -> tuple[Tensor, Tensor]:
+    """Points of the cup's walls all around, off the rim and the floor, with outward normals."""
+    (outer, out), (inner, into) = ring(RADIUS, 0.012, HEIGHT - 0.01), ring(RADIUS - WALL, 0.012, HEIGHT - 0.01)
+    return torch.cat([outer, inner]), torch.cat([out, -into])
+
+
+def test_both_walls_are_surfaces_seen_and_hidden(vessel: HollowShape):
+    points, normals = _both_walls()
+    found = vessel.predict(points)
+    off = found.distance.abs() * vessel.scale
+    assert off.median() < 0.0015 and off.quantile(0.9) < 0.003
+    assert torch.rad2deg(torch.arccos((found.normal * normals).sum(-1))).median() < 8
+    assert (off < 2 * found.std_m).double().mean() > 0.8
+
+
+def test_the_material_is_the_wall_and_the_inside_is_empty(vessel: HollowShape):
+    middle, _ = ring(RADIUS - WALL / 2, 0.012, HEIGHT - 0.012)
+    assert (vessel.predict(middle).distance < 0).double().mean() > 0.8
+    empty = torch.cat([ring(r, 0.02, HEIGHT + 0.01)[0] for r in (0.001, 0.012, 0.024)])
+    assert (vessel.predict(empty).distance > 0).all()
+    around, _ = ring(RADIUS + 0.008, 0.012, HEIGHT)
+    assert (vessel.predict(around).distance > 0).all()
+
+
+def test_without_a_table_and_of_a_closed_body_there_is_one_surface(seen_cylinder):
+    assert not isinstance(fit_shape(cup_view(WALL)), HollowShape)
+    solid = fit_shape(seen_cylinder, table=0.0)
+    assert not isinstance(solid, HollowShape) and solid.walls == (solid,)
+
+
+def test_the_greater_distance_counts_with_its_own_normal_and_covariance(vessel: HollowShape, generator):
+    x = 0.8 * unit(torch.randn(60, 3, generator=generator, dtype=torch.float64))
+    outer, lining = vessel.walls
+    a, b = outer.estimate(x), lining.estimate(x)
+    inner = b[0][:, 0] > a[0][:, 0]
+    assert 5 < int(inner.sum()) < 55
+    mean, covariance = vessel.estimate(x)
+    torch.testing.assert_close(mean, torch.where(inner[:, None], b[0], a[0]))
+    torch.testing.assert_close(covariance, torch.where(inner[:, None, None], b[1], a[1]))
+    torch.testing.assert_close(vessel.mean(x), mean[:, 0])
+    torch.testing.assert_close(vessel.mean_and_gradient(x)[1], mean[:, 1:])
+    jet = vessel.jet(x)
+    torch.testing.assert_close(jet.gradient, mean[:, 1:])
+    torch.testing.assert_close(jet.variance, covariance[:, 0, 0])
+    assert vessel.jet(x[:0]).hessian.shape == (0, 3, 3)
+
+
+def test_samples_of_a_wall_vary_together_and_of_two_walls_alone(vessel: HollowShape):
+    outside, inside = ring(RADIUS, 0.03, 0.05)[0][:6], ring(RADIUS - WALL, 0.03, 0.05)[0][:6]
+    points = torch.cat([outside, inside])
+    joint = vessel.joint(points)
+    blocks = joint.covariance.reshape(12, 4, 12, 4)
+    assert (blocks[:6, :, 6:] == 0).all() and (blocks[0, 0, 1, 0] != 0).all()
+    torch.testing.assert_close(joint.covariance, joint.covariance.mT)
+    drawn = vessel.sample(points, 4000, seed=1)[..., 0]
+    expected = torch.diagonal(joint.covariance)[::4]
+    torch.testing.assert_close(drawn.var(0), expected, rtol=0.15, atol=1e-9)
+
+
+def test_a_moved_vessel_moves_its_estimate(vessel: HollowShape, motion: Tensor):
+    points, _ = _both_walls()
+    there = points @ motion[:3, :3].T + motion[:3, 3]
+    found, moved = vessel.predict(points), vessel.moved(motion).predict(there)
+    torch.testing.assert_close(moved.distance, found.distance, rtol=0, atol=1e-9)
+    torch.testing.assert_close(moved.normal, found.normal @ motion[:3, :3].T, rtol=0, atol=1e-8)
+
+
+def test_a_touch_moves_the_wall_that_it_meets(vessel: HollowShape):
+    point, normal = torch.tensor([[-RADIUS - 0.002, 0.0, 0.04]]).double(), torch.tensor([[-1.0, 0.0, 0.0]]).double()
+    touched = vessel.update(point, normal)
+    assert isinstance(touched, HollowShape)
+    assert touched.predict(point).distance.abs() * vessel.scale < 0.001
+    inside = vessel.normalise(ring(RADIUS - WALL, 0.03, 0.05)[0])
+    torch.testing.assert_close(touched.lining.mean(inside), vessel.lining.mean(inside))
+
+
+def test_the_mesh_has_both_walls_and_the_volume_of_the_material(vessel: HollowShape):
+    import trimesh
+
+    surface = extract_surface(vessel, 48)
+    true = cup(WALL)
+    inner = (surface.normals[:, :2] * surface.vertices[:, :2]).sum(1) < 0
+    assert 0.2 < float(inner.double().mean()) < 0.6
+    mesh = surface.mesh()
+    assert isinstance(mesh, trimesh.Trimesh)
+    assert abs(mesh.volume / true.volume - 1) < 0.5  # 1 mm of 3 mm; filled it would be six times as much
+    corners = torch.from_numpy(true.triangles.copy())
+    points = surface.vertices[surface.vertices[:, 2] > 0.01][::7].numpy()
+    gaps = []
+    for point in points:
+        feet, _ = closest_on_triangles(point[None].repeat(len(corners), 0), corners.numpy())
+        gaps.append(((feet - point) ** 2).sum(1).min() ** 0.5)
+    assert torch.tensor(gaps).quantile(0.9) < 0.0035
+
+
+def test_a_fingers_line_meets_the_wall_of_its_contact(vessel: HollowShape):
+    angle = torch.arange(3, dtype=torch.float64) * (2 * torch.pi / 3)
+    out = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], 1)
+    points = torch.stack([RADIUS * out[0], (RADIUS - WALL) * out[1], RADIUS * out[2]]) + torch.tensor([0, 0, 0.05])
+    normals = torch.stack([out[0], -out[1], out[2]])
+    lines = line_posterior(vessel, Contacts(points[None], normals[None]))
+    covariance = (lines.root @ lines.root).reshape(3, 20, 3, 20)
+    assert covariance[0, :, 1].abs().max() < 1e-9 and covariance[2, :, 1].abs().max() < 1e-9
+    outer, lining = vessel.walls
+    alone = [line_posterior(wall, Contacts(points[None], normals[None])) for wall in (outer, lining)]
+    for k, whole in ((0, alone[0]), (1, alone[1]), (2, alone[0])):
+        torch.testing.assert_close(lines.distance[0, k], whole.distance[0, k])
+        torch.testing.assert_close(lines.slope[0, k], whole.slope[0, k])
