@@ -50,7 +50,8 @@ def test_jacobian_of_the_joint_problem_against_finite_differences(scene, generat
     points = shape.normalise(assign(given.contacts, seeds).points)
     points = points + 0.1 * torch.randn(points.shape, generator=generator, dtype=torch.float64)
     tension = normalise_tensions(points, torch.rand(24, 3, generator=generator, dtype=torch.float64))
-    problem = JointProblem(hand, shape, spec, given.world)
+    strict = dataclasses.replace(spec, max_variance=0.01)  # so that some points are too uncertain
+    problem = JointProblem(hand, shape, strict, given.world)
     flat = flatness_constraint(shape, points, 0.2, spec.ring_radius)
 
     def rows(state: JointState):
@@ -65,9 +66,12 @@ def test_jacobian_of_the_joint_problem_against_finite_differences(scene, generat
     assert int((jacobian != 0).any(2).any(0).sum()) >= 12 + 3 + 6 + 12  # all but ball, sides and table
     for k in range(jacobian.shape[2]):
         step = torch.zeros(24, jacobian.shape[2], dtype=torch.float64)
-        step[:, k] = 1e-5
-        slope = (rows(state.integrate(hand, step))[0] - rows(state.integrate(hand, -step))[0]) / 2e-5
-        torch.testing.assert_close(jacobian[..., k], slope, rtol=1e-4, atol=0.1)  # digits of the variance
+        step[:, k] = 3e-5
+        above, below = (rows(state.integrate(hand, sign * step))[0] for sign in (1, -1))
+        smooth = (above == 0) == (below == 0)  # no hinge opens in between
+        slope = (above - below) / 6e-5
+        # the variance has the fewest digits
+        torch.testing.assert_close(jacobian[..., k][smooth], slope[smooth], rtol=1e-4, atol=0.2)
 
 
 def test_grasps_satisfy_every_constraint(scene, grasps):
