@@ -59,15 +59,15 @@ def bench_worst(objects: Path, views: Sequence[str], out: Path) -> list[Row]:
 
 def _draw_page(worst: Sequence[tuple[Any, ...]], path: Path) -> None:
     """Draw the views side by side and write the picture."""
-    lines, size = -(-len(worst) // COLUMNS), 2 * TILE[1] + 34
+    lines, size = -(-len(worst) // COLUMNS), 2 * TILE[1] + 40
     sheet = Image.new("RGB", (COLUMNS * TILE[0], lines * size + 80), PAPER)
-    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(17)
+    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(13)
     for k, (_, error, name, view, cloud, mesh) in enumerate(worst):
         left, top = k % COLUMNS * TILE[0], k // COLUMNS * size
-        pen.text((left + 8, top + 6), f"{name} {view}: {error:.1f} mm", INK, font)
+        pen.text((left + 8, top + 2), f"{name}\n{view}: {error:.1f} mm", INK, font)
         surface = extract_surface(fit_shape(cloud, table=0.0), RESOLUTION)
         for row, tile in enumerate(_draw_view(surface, mesh, cloud)):
-            sheet.paste(tile, (left, top + 30 + row * TILE[1]))
+            sheet.paste(tile, (left, top + 36 + row * TILE[1]))
     draw_bar(sheet, "above: error of the true surface; below: std_m of the estimated one [mm]", MOST, "viridis")
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda temporary: sheet.save(temporary, format="JPEG", quality=82))
