@@ -13,9 +13,9 @@ class SimulatedHand:
     """The hand of a scene, with tactile fingertips.
 
     `force` (3,) are the true normal forces [N], averaged over the last tick. `finger` flags contacts in its last step.
-    `steps` counts steps of the simulator. `first_touch` is the step of each fingertip's first contact, infinite before;
-    `first_stray` that of each kind in `StepContacts.stray`, whose impulses [N s] are summed in `stray`;
-    `most_stray` [N] is its largest force over a tick.
+    `steps` counts steps of the simulator. `first_touch` is the step of each fingertip's first contact, infinite before.
+    `first_stray` is that of each kind in `StepContacts.stray`, whose impulses [N s] are summed in `stray`. `most_stray`
+    [N] is its largest force over a tick.
 
     Args:
         scene: at its start.
