@@ -25,20 +25,20 @@ from torchgrasp.shape.kernel import Kernel, KernelName, kernel_by_name
 from torchgrasp.shape.observations import Observations, off_surface, on_surface
 from torchgrasp.shape.select import Criterion, select_points
 from torchgrasp.shape.update import append_observations
-from torchgrasp.shape.wall_observations import WallObservations, observe_walls
+from torchgrasp.shape.wall_observations import (
+    OUTER_POINTS,
+    OUTER_RADIUS,
+    RIM_NOISE,
+    WallObservations,
+    observe_walls,
+)
 from torchgrasp.values import PointCloud
 
-OUTER_POINTS = 20
-"""Points outside (Sec. 3.1)."""
-OUTER_RADIUS = 1.2
-"""Radius, normalised, of the sphere of the points outside (Sec. 3.1)."""
 OUTER_NOISE = 0.3
 """Standard deviation, normalised, of a distance outside: the nearest of sparse points is too far, most of all on the
 hidden side. With .01 as with .1 the hidden side of a ball lies 3 mm inside, with .3 to 1 it does not."""
 NORMAL_NOISE = 0.05
 """Standard deviation of a seen normal: 3 degrees."""
-RIM_NOISE = 0.002
-"""Standard deviation [m] of a rim point: 2.5 pixels of a camera at 0.5 m."""
 RIM_NORMAL_NOISE = 0.5
 """Standard deviation of a rim normal; a smaller one bends the seen side."""
 MIRROR_NORMAL_NOISE = 0.25

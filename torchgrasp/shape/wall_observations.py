@@ -22,7 +22,7 @@ HIDDEN_NORMAL_NOISE = 0.25
 RIM_NOISE = 0.002
 """Standard deviation [m] of a rim point: 2.5 pixels of a camera at 0.5 m."""
 OUTER_POINTS, OUTER_RADIUS = 20, 1.2
-"""Points around a shape, and their distance from its centre, normalised (Sec. 3.1)."""
+"""Points outside, and the radius, normalised, of the sphere on which they lie (Sec. 3.1)."""
 OVER = 0.5
 """Height over the rim, in radii of the mouth, at which the inner wall still surrounds free space: it has no lid."""
 

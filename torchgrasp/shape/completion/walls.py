@@ -9,16 +9,13 @@ from torch import Tensor
 
 from torchgrasp.base import Batch, Value, join
 from torchgrasp.linalg import farthest_points
+from torchgrasp.shape.completion.complete import FRONT_MARGIN, HULL_MARGIN, NEW, SPACING
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 from torchgrasp.shape.completion.vessel import RIM, Vessel
 from torchgrasp.values import PointCloud
 
-HULL_MARGIN, FRONT_MARGIN = 0.001, 0.002
-"""A hidden point may lie this far [m] outside the hull and in front of the visible surface."""
 TURNS, TURNED = 24, 80
 """Angles by which a wall is turned about the axis, and points of it that are turned: a point each 5 to 10 mm."""
-NEW, SPACING = 0.006, 0.004
-"""Least distance [m] of a hidden point from the seen part of its wall, and from another one."""
 BUDGET = 50
 """Hidden points of a wall: as many as a solid's mirrored ones."""
 CENTER_ERROR, THICKNESS_ERROR = 0.0006, 0.0012
