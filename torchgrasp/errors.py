@@ -81,6 +81,22 @@ class FailedRows(GraspError):
     """Some rows of a batch failed; raised by `raise_for_status`."""
 
 
+class CloudWarning(UserWarning):
+    """A view whose shape is a guess in part; the message says where and why."""
+
+
+class CutOff(CloudWarning):
+    """The border of the image cuts the object off."""
+
+
+class Gap(CloudWarning):
+    """Within the outline nothing was measured: a hole, or a patch that mirrors."""
+
+
+class TwoBodies(CloudWarning):
+    """The cloud shows two bodies that stand apart."""
+
+
 class Status(enum.IntEnum):
     """The outcome of one row of a batch; `sentence` explains it to the user.
 

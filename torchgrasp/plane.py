@@ -25,7 +25,7 @@ PHASE = 1 / math.pi
 """Phase of the rounding: numbers from a file of float32 would often lie halfway between two multiples of `GRID`."""
 POINTS, DIRECTIONS, POSES = (
     ("points", "viewpoint", "vertices"),
-    ("normals", "approach", "witness"),
+    ("normals", "approach", "witness", "frustum"),
     ("obj_from_hand", "obj_from_vf"),
 )
 """Fields of values that change with the frame; the other fields do not."""

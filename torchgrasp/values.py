@@ -29,6 +29,8 @@ class PointCloud(Value):
         points: surface points [m], at least 4.
         normals: outward normals, or None. Functions that use them normalise them.
         viewpoint: position of the camera [m]; (n, 3) gives one camera for each point; None: unknown.
+        frustum: inward unit normals of the four sides of the camera's view, or of each point's; None: unknown. What
+            reaches a side goes on beyond it.
 
     Raises:
         BadArgument: wrong shape, dtype or non-finite numbers.
@@ -42,6 +44,7 @@ class PointCloud(Value):
     points: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"] | None = None
     viewpoint: Float[Tensor, "3"] | Float[Tensor, "n 3"] | None = None
+    frustum: Float[Tensor, "4 3"] | Float[Tensor, "n 4 3"] | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and numbers once, where the value is made."""
@@ -53,6 +56,9 @@ class PointCloud(Value):
         if self.viewpoint is not None:
             each = isinstance(self.viewpoint, Tensor) and self.viewpoint.ndim == 2
             check_tensor("viewpoint", self.viewpoint, (len(self.points), 3) if each else (3,))
+        if self.frustum is not None:
+            each = isinstance(self.frustum, Tensor) and self.frustum.ndim == 3
+            check_tensor("frustum", self.frustum, (len(self.points), 4, 3) if each else (4, 3))
 
     def __len__(self) -> int:
         """Count the points."""
@@ -64,11 +70,12 @@ class PointCloud(Value):
         Args:
             rows: a mask, or indices in the order wanted.
         """
-        normals, eye = self.normals, self.viewpoint
+        normals, eye, frustum = self.normals, self.viewpoint, self.frustum
         return PointCloud(
             points=self.points[rows],
             normals=None if normals is None else normals[rows],
             viewpoint=eye if eye is None or eye.ndim == 1 else eye[rows],
+            frustum=frustum if frustum is None or frustum.ndim == 2 else frustum[rows],
         )
 
     def split_views(self) -> "list[PointCloud]":
@@ -77,7 +84,12 @@ class PointCloud(Value):
             return [self]
         _, view = self.viewpoint.unique(dim=0, return_inverse=True)
         parts = [self.select(view == k) for k in dict.fromkeys(view.tolist())]
-        return [PointCloud(p.points, p.normals, p.viewpoint[0]) for p in parts if p.viewpoint is not None]
+        views = []
+        for part in parts:
+            assert part.viewpoint is not None
+            sides = part.frustum if part.frustum is None else part.frustum.reshape(-1, 4, 3)[0]
+            views.append(PointCloud(part.points, part.normals, part.viewpoint[0], sides))
+        return views
 
 
 @dataclasses.dataclass(frozen=True)

@@ -31,6 +31,15 @@ def test_the_pose_moves_points_and_viewpoint_alike():
     torch.testing.assert_close(moved.viewpoint, pose[:3, 3])
 
 
+def test_the_frustum_goes_through_the_outermost_pixels():
+    pose = rigid(rotation_from_vector(torch.tensor([0.3, -1.0, 2.0]).double()), torch.tensor([0.1, 0.2, -0.3]).double())
+    cloud = cloud_from_depth(tilted_depth(), K, camera_pose=pose)
+    height = ((cloud.points - cloud.viewpoint) @ cloud.frustum.T).reshape(48, 64, 4)
+    assert float(height.min()) > -1e-12
+    for border, side in ((height[:, 0], 0), (height[:, -1], 1), (height[0], 2), (height[-1], 3)):
+        torch.testing.assert_close(border[:, side], torch.zeros(len(border)).double(), atol=1e-12, rtol=0)
+
+
 def test_pixels_without_depth_or_outside_the_mask_are_left_out():
     depth, mask = tilted_depth(), torch.zeros(48, 64, dtype=torch.bool)
     depth[0, 0], depth[0, 1], depth[0, 2] = 0.0, float("nan"), float("inf")

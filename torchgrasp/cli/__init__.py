@@ -2,6 +2,7 @@
 
 import os
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 
 import torch
@@ -41,13 +42,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # The batches are small: a second thread costs more than it brings, and one gives the same bits on any machine.
     torch.set_num_threads(1)
     try:
-        return tyro.extras.subcommand_cli_from_dict(
-            COMMANDS,
-            prog="torchgrasp",
-            description="Dexterous fingertip grasps from a partial point cloud.",
-            args=_join_group(given),
-            config=(tyro.conf.FlagCreatePairsOff,),
-        )
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            return tyro.extras.subcommand_cli_from_dict(
+                COMMANDS,
+                prog="torchgrasp",
+                description="Dexterous fingertip grasps from a partial point cloud.",
+                args=_join_group(given),
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
     except GraspError as error:
         print(f"torchgrasp: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -57,6 +60,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of stdout went away; nobody is left to be told
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *_: object) -> None:
+    """Print a warning as one sentence on stderr, like an error."""
+    print(f"{category.__name__}: {' '.join(str(message).split())}", file=sys.stderr)
 
 
 def _join_group(given: list[str]) -> list[str]:

@@ -85,7 +85,7 @@ def read_view(option: str, path: Path, view: ViewOptions, whole: bool = False) -
         if view.no_viewpoint:
             cloud = PointCloud(cloud.points, cloud.normals)
         if view.no_normals:
-            cloud = PointCloud(cloud.points, None, cloud.viewpoint)
+            cloud = PointCloud(cloud.points, None, cloud.viewpoint, cloud.frustum)
         if view.camera_pose is not None:
             cloud = _move(option, cloud, read_pose("--camera-pose", view.camera_pose))
             notes = tuple(note for note in notes if "default viewpoint" not in note)
@@ -105,7 +105,8 @@ def _move(option: str, cloud: PointCloud, pose: Tensor) -> PointCloud:
         allowed = "a cloud in the camera's frame (z forward) for --camera-pose; in another frame, --viewpoint X Y Z"
         raise BadArgument(option, f"{unseen:.0%} of the points out of a camera's sight", allowed)
     normals = None if cloud.normals is None else rotate(pose, cloud.normals)
-    return PointCloud(apply(pose, cloud.points), normals, pose[:3, 3].clone())
+    frustum = None if cloud.frustum is None else rotate(pose, cloud.frustum)
+    return PointCloud(apply(pose, cloud.points), normals, pose[:3, 3].clone(), frustum)
 
 
 def judge_cloud(option: str, cloud: PointCloud, view: ViewOptions, table: Plane | float | None) -> tuple[Advice, ...]:

@@ -98,7 +98,7 @@ def partial_view(
         depth = add_noise(depth, cosine, generator)
     cloud = cloud_from_depth(depth, INTRINSICS, camera_pose=pose)
     rows = torch.randperm(len(cloud), generator=generator)[:n]
-    return PointCloud(cloud.points[rows], None, cloud.viewpoint)
+    return cloud.select(rows)
 
 
 def cast_mesh(

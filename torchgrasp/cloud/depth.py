@@ -10,7 +10,8 @@ from torch import Tensor
 from torchgrasp.base import check_tensor
 from torchgrasp.cloud.check import check_cloud
 from torchgrasp.errors import BadArgument, TooFewPoints
-from torchgrasp.frames import apply
+from torchgrasp.frames import apply, rotate
+from torchgrasp.linalg import unit
 from torchgrasp.values import PointCloud
 
 MAX_SHIFT = 0.15
@@ -30,7 +31,8 @@ def cloud_from_depth(
     """Return the points of a pinhole camera's depth image.
 
     A pixel (row v, column u) of depth z is the point z ((u - cx) / fx, (v - cy) / fy, 1). The camera's frame has x
-    right, y down and z forward. Depths of 0, NaN or infinity are not measured. The camera is the viewpoint.
+    right, y down and z forward. Depths of 0, NaN or infinity are not measured. The camera is the viewpoint, and the
+    cloud knows where its image ends.
 
     Args:
         depth: (h, w), distance along the optical axis: floats in metres, or integers (such as uint16) in millimetres.
@@ -46,20 +48,36 @@ def cloud_from_depth(
     >>> cloud_from_depth(np.full((48, 64), 500, dtype=np.uint16), (600.0, 600.0, 32.0, 24.0)).viewpoint
     tensor([0., 0., 0.], dtype=torch.float64)
     """
-    z, k, inside = read_depth(depth, intrinsics, mask)
-    measured = z > 0 if inside is None else (z > 0) & inside
+    z_image, k, inside = read_depth(depth, intrinsics, mask)
+    measured = z_image > 0 if inside is None else (z_image > 0) & inside
     if int(measured.sum()) < MIN_PIXELS:
         allowed = f"at least {MIN_PIXELS} measured pixels in the mask"
         raise TooFewPoints("depth", f"{int(measured.sum())} measured pixels", allowed)
     row, column = torch.nonzero(measured, as_tuple=True)
-    z = z[measured]
+    z = z_image[measured]
     points = torch.stack([z * (column - k[0, 2]) / k[0, 0], z * (row - k[1, 2]) / k[1, 1], z], -1)
     viewpoint = torch.zeros(3, dtype=points.dtype, device=points.device)
+    frustum = frustum_of_image(k, z_image.shape).to(points)
     if camera_pose is not None:
         pose = check_rigid("camera_pose", _as_tensor("camera_pose", camera_pose)).to(points)
-        points, viewpoint = apply(pose, points), pose[:3, 3]
+        points, viewpoint, frustum = apply(pose, points), pose[:3, 3], rotate(pose, frustum)
     dtype = depth.dtype if isinstance(depth, Tensor) and depth.is_floating_point() else points.dtype
-    return check_cloud(PointCloud(points.to(dtype), None, viewpoint.to(dtype)))
+    return check_cloud(PointCloud(points.to(dtype), None, viewpoint.to(dtype), frustum.to(dtype)))
+
+
+def frustum_of_image(intrinsics: Float[Tensor, "3 3"], size: Sequence[int]) -> Float[Tensor, "4 3"]:
+    """Return the inward unit normals of the sides of a camera's view, in its frame.
+
+    The sides go through the outermost pixels: left, right, top, bottom. `size` is (h, w).
+
+    >>> k = torch.tensor([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
+    >>> frustum_of_image(k, (101, 101))[0] * 2 ** 0.5 * torch.tensor([1.0, 1, 2])  # half a field of 53 degrees
+    tensor([1.2649, 0.0000, 1.2649])
+    """
+    (fx, _, cx), (_, fy, cy) = intrinsics[0].tolist(), intrinsics[1].tolist()
+    height, width = size
+    sides = [[fx, 0.0, cx], [-fx, 0.0, width - 1 - cx], [0.0, fy, cy], [0.0, -fy, height - 1 - cy]]
+    return unit(torch.tensor(sides, dtype=intrinsics.dtype))
 
 
 def read_depth(

@@ -51,7 +51,9 @@ def merge_clouds(
     normals = [v.normals for v in views if v.normals is not None]
     viewpoints = [v.viewpoint.expand(len(v), 3) for v in views if v.viewpoint is not None]
     viewpoint = torch.cat(viewpoints) if len(viewpoints) == len(views) else None
-    return check_cloud(PointCloud(torch.cat([v.points for v in views]), torch.cat(normals), viewpoint))
+    frustums = [v.frustum.expand(len(v), 4, 3) for v in views if v.frustum is not None]
+    frustum = torch.cat(frustums) if len(frustums) == len(views) else None
+    return check_cloud(PointCloud(torch.cat([v.points for v in views]), torch.cat(normals), viewpoint, frustum))
 
 
 def _view_in_frame(cloud: PointCloud, obj_from_cloud: Float[Tensor, "4 4"]) -> PointCloud:
@@ -60,7 +62,9 @@ def _view_in_frame(cloud: PointCloud, obj_from_cloud: Float[Tensor, "4 4"]) -> P
     assert cloud.normals is not None
     pose, dtype = obj_from_cloud.to(cloud.points).double(), cloud.points.dtype
     points, normals = apply(pose, cloud.points.double()), rotate(pose, unit(cloud.normals.double()))
-    viewpoint = cloud.viewpoint
+    viewpoint, frustum = cloud.viewpoint, cloud.frustum
     if viewpoint is not None:
         viewpoint = apply(pose, viewpoint.double().reshape(-1, 3)).reshape(viewpoint.shape).to(dtype)
-    return PointCloud(points.to(dtype), normals.to(dtype), viewpoint)
+    if frustum is not None:
+        frustum = rotate(pose, frustum.double().reshape(-1, 3)).reshape(frustum.shape).to(dtype)
+    return PointCloud(points.to(dtype), normals.to(dtype), viewpoint, frustum)

@@ -30,6 +30,7 @@ class PreparedCloud(Value):
     points: Float[Tensor, "n 3"]  # at most 2000 of them, in float64
     normals: Float[Tensor, "n 3"]  # theirs, of unit length
     viewpoint: Float[Tensor, "*views 3"] | None  # the camera [m] of all `points`, or of each; None: unknown
+    frustum: Float[Tensor, "*views 4 3"] | None  # normals of the sides of its view; None: unknown
 
     @property
     def one_sided(self) -> bool:
@@ -64,17 +65,17 @@ def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = T
         normals = None
     if clean and normals is not None and viewpoint is not None and share_facing(points, normals, viewpoint) < FACING:
         viewpoint = None
-    cloud = PointCloud(points, normals, viewpoint)
+    cloud = dataclasses.replace(cloud, normals=normals, viewpoint=viewpoint)
     if clean or normals is None:
         cloud = _fit_normals(cloud, clean)
     precise = cloud.to(torch.float64)
     if clean and precise.viewpoint is None:
         guess = guess_viewpoint(precise.points, fit_planes(precise.points)[0]).to(points.dtype)
-        precise = PointCloud(precise.points, precise.normals, guess.double())
+        precise = dataclasses.replace(precise, viewpoint=guess.double())
     if len(precise) > MAX_POINTS:
         precise = precise.select(torch.randperm(len(precise), generator=generator)[:MAX_POINTS].to(points.device))
     assert precise.normals is not None
-    return PreparedCloud(cloud, precise.points, unit(precise.normals), precise.viewpoint)
+    return PreparedCloud(cloud, precise.points, unit(precise.normals), precise.viewpoint, precise.frustum)
 
 
 def estimate_normals(cloud: PointCloud) -> PointCloud:
@@ -123,4 +124,5 @@ def _fit_normals(cloud: PointCloud, clean: bool) -> PointCloud:
         if viewpoint is None:
             viewpoint = guess_viewpoint(points.double(), normals).to(points.dtype)
         outward = viewpoint.double() - points.double()
-    return PointCloud(points, orient_normals(normals, outward).to(points.dtype), viewpoint)
+    normals = orient_normals(normals, outward).to(points.dtype)
+    return dataclasses.replace(cloud, points=points, normals=normals, viewpoint=viewpoint)

@@ -160,7 +160,7 @@ def perturb_view(cloud: PointCloud, perturbation: Perturbation, seed: int) -> tu
     if perturbation.depth:
         noise = torch.randn(len(points), 1, generator=_generator(seed, "depth"), dtype=torch.float64)
         points = points + perturbation.depth * noise * unit(points - viewpoint)
-    seen = PointCloud(points.to(cloud.points), None, cloud.viewpoint)
+    seen = PointCloud(points.to(cloud.points), None, cloud.viewpoint, cloud.frustum)
     return move(seen, _camera_error(viewpoint, perturbation.camera, seed)), table
 
 

@@ -151,4 +151,5 @@ def image_of_cloud(
     pixels = torch.stack([row.clamp(0, height - 1), column.clamp(0, width - 1)], -1)
     depth = torch.full((height * width,), torch.inf, dtype=torch.float64)
     depth.scatter_reduce_(0, pixels[:, 0] * width + pixels[:, 1], camera[:, 2], "amin")
-    return DepthImage(torch.where(torch.isfinite(depth), depth, 0.0).reshape(height, width), k, pose), pixels
+    depth = torch.where(torch.isfinite(depth), depth, 0.0).reshape(height, width)
+    return DepthImage(depth, k, pose, bounded=False), pixels

@@ -7,7 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.frames import apply, inverse
+from torchgrasp.cloud.depth import frustum_of_image
+from torchgrasp.frames import apply, inverse, rotate
 from torchgrasp.plane import GRID
 
 
@@ -21,6 +22,14 @@ class DepthImage(Value):
     depth: Float[Tensor, "h w"]
     intrinsics: Float[Tensor, "3 3"]
     obj_from_camera: Float[Tensor, "4 4"]
+    bounded: bool = True  # whether its border is the camera's; an image made of a cloud has none
+
+    @property
+    def frustum(self) -> Float[Tensor, "4 3"] | None:
+        """Inward normals of the sides of the camera's view, in the frame of `obj`; None: it has no border."""
+        if not self.bounded:
+            return None
+        return rotate(self.obj_from_camera.double(), frustum_of_image(self.intrinsics.double(), self.depth.shape))
 
     def to_upright(self, obj_from_upright: Float[Tensor, "4 4"]) -> "DepthImage":
         """Return the image with its camera in an upright frame, rounded."""

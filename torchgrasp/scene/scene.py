@@ -210,7 +210,9 @@ class Scene(Value):
 
     def cloud(self, label: int | None = None) -> PointCloud:
         """Return the points of a thing, by default the target, with the camera as viewpoint."""
-        return PointCloud(self.points[self.rows_of(label)], None, self.viewpoint.to(self.points))
+        frustum = self.image.frustum
+        sides = None if frustum is None else frustum.to(self.points)
+        return PointCloud(self.points[self.rows_of(label)], None, self.viewpoint.to(self.points), sides)
 
     def to_upright(self, obj_from_upright: Float[Tensor, "4 4"]) -> "Scene":
         """Return the scene in the `upright_frame` of its target and table, all rounded."""

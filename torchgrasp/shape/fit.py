@@ -15,6 +15,7 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import fibonacci_sphere, unit
 from torchgrasp.plane import Plane, as_plane, cloud_to_upright, upright_frame
 from torchgrasp.shape.completion.complete import LEAST_NOISE, PART, Completion, Kind, complete_cloud
+from torchgrasp.shape.completion.doubt import warn_of_doubts
 from torchgrasp.shape.completion.free_space import free_space, free_space_violations
 from torchgrasp.shape.completion.silhouette import silhouettes
 from torchgrasp.shape.completion.vessel import Vessel, find_vessel
@@ -51,9 +52,12 @@ STD_FACTORS: dict[tuple[Kind, bool], float] = {
     ("mirrored", False): 0.66,
     ("guess", True): 1.0,
     ("guess", False): 1.0,
+    ("cut off", True): 2.0,
+    ("cut off", False): 2.0,
 }
 """Real deviations over the posterior's, by what the hidden side follows from and whether the table is known.
-`scripts/train.py bands DIR` fits them and tries each on families left out; a guess keeps the posterior's own."""
+`scripts/train.py bands DIR` fits them and tries each on families left out; a guess keeps the posterior's own.
+What lies beyond an image's border is farther from all that was seen: a half cylinder is within 2 of twice its own."""
 WHOLE_STD_FACTOR, VESSEL_STD_FACTOR = 0.5, 0.5
 """The same where all sides were seen; of a vessel, whose hidden walls lie to 73, 91 and 100 % within 1, 2 and 3."""
 FREE_NOISE = 0.003
@@ -210,11 +214,12 @@ def _camera_supports(seen: PreparedCloud, noise: float, table: float | None) -> 
     """Return metric distances; of a view also outline, mirrored points and free space. A vessel has two surfaces."""
     completion, surface = None, seen.points
     if seen.one_sided:
-        cloud = PointCloud(seen.points, seen.normals, seen.viewpoint)
+        cloud = PointCloud(seen.points, seen.normals, seen.viewpoint, seen.frustum)
         vessel = None if table is None else find_vessel(seen.points.cpu(), seen.normals.cpu())
         if vessel is not None and table is not None:
             return _vessel_supports(cloud, vessel, table, noise)
         completion = complete_cloud(cloud, table)
+        warn_of_doubts(cloud, completion.outline, table is not None)
         surface = torch.cat([surface, completion.points.to(surface)])
     # The domain holds the whole of a ball. Of others the hidden side is not sure enough to set the scale.
     extent = surface if completion is not None and completion.kind == "ball" else seen.points

@@ -24,10 +24,11 @@ def unit_rows(n):
     return v / np.linalg.norm(v, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize("fields", ["points", "points normals", "points viewpoint", "points normals viewpoint"])
+@pytest.mark.parametrize("fields", ["points", "points normals", "points viewpoint", "points normals viewpoint frustum"])
 @pytest.mark.parametrize(("suffix", "tolerance"), [(".npz", 0.0), (".ply", 1e-8)])
 def test_a_saved_cloud_reads_back(tmp_path, points, fields, suffix, tolerance):
     arrays = {"points": points, "normals": unit_rows(60), "viewpoint": np.array([0.1, -0.2, 0.7])}
+    arrays["frustum"] = unit_rows(4)
     cloud = PointCloud(**{name: torch.from_numpy(arrays[name]) for name in fields.split()})
     back = read_cloud(save_cloud(cloud, tmp_path / f"cloud{suffix}"))
     for name in arrays:
@@ -243,6 +244,13 @@ def test_units_scale_points_and_the_viewpoint_of_the_file_alone(tmp_path, points
     np.testing.assert_allclose(cloud.points.numpy(), points, atol=1e-12)
     assert cloud.viewpoint.tolist() == [0, 0, 0.5]
     assert read_cloud(tmp_path / "a.npz", [0.0, 0.0, 0.4], "mm").viewpoint.tolist() == [0, 0, 0.4]
+
+
+def test_a_frustum_of_another_shape_is_refused(tmp_path, points):
+    np.savez(tmp_path / "a.npz", points=points, viewpoint=np.zeros(3), frustum=np.ones((3, 3)))
+    with pytest.raises(CloudFileError, match=r"a frustum of shape \(3, 3\)"):
+        read_cloud(tmp_path / "a.npz")
+    assert read_cloud(tmp_path / "a.npz", viewpoint=[0.0, 0.0, 1.0]).frustum is None
 
 
 def test_the_arrays_of_another_npz_are_listed(tmp_path, points):

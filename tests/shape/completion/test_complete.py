@@ -137,7 +137,7 @@ def test_silhouette_of_a_ball_is_its_circle():
     p = torch.randn(4000, 3, dtype=torch.float64, generator=rng)
     p = 0.04 * p / torch.linalg.vector_norm(p, dim=-1, keepdim=True)
     camera = torch.tensor([0.0, 0.5, 0.0], dtype=torch.float64)
-    outline = silhouette(p[((camera - p) * p).sum(-1) > 0], camera)
+    outline = silhouette(PointCloud(p[((camera - p) * p).sum(-1) > 0], None, camera))
     # The tangent cone touches the ball on a circle of radius r sqrt(1 - (r/d)^2) at distance d - r^2/d.
     ring = 0.04 * math.sqrt(1 - 0.08**2)
     assert len(outline.rim) == 16

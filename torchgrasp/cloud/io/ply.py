@@ -20,7 +20,7 @@ TYPES = {
 
 
 def parse_ply(data: bytes) -> dict[str, Any]:
-    """Return points, normals and viewpoint of a PLY file, or None.
+    """Return points, normals, viewpoint and frustum of a PLY file, or None.
 
     Raises:
         ValueError: no PLY file; fewer bytes than the header promises.
@@ -29,7 +29,7 @@ def parse_ply(data: bytes) -> dict[str, Any]:
     [0.0, 0.0, 0.0]
     """
     header, body = _split_header(data)
-    encoding, viewpoint = "", None
+    encoding, viewpoint, frustum = "", None, None
     elements: list[tuple[str, int, list[tuple[str, str]]]] = []
     for line in header:
         match line.split():
@@ -37,6 +37,8 @@ def parse_ply(data: bytes) -> dict[str, Any]:
                 encoding = kind
             case ["comment", "viewpoint", x, y, z]:
                 viewpoint = np.array([float(x), float(y), float(z)])
+            case ["comment", "frustum", *numbers] if len(numbers) == 12:
+                frustum = np.array([float(x) for x in numbers]).reshape(4, 3)
             case ["element", name, count]:
                 elements.append((name, int(count), []))
             case ["property", "list", _, _, name] if elements:
@@ -61,14 +63,20 @@ def parse_ply(data: bytes) -> dict[str, Any]:
     columns = _read_columns(body, encoding, count, properties)
     points = np.stack([columns[name] for name in "xyz"], axis=-1)
     normals = np.stack([columns[f"n{axis}"] for axis in "xyz"], axis=-1) if "nx" in columns else None
-    return {"points": points, "normals": normals, "viewpoint": viewpoint}
+    return {"points": points, "normals": normals, "viewpoint": viewpoint, "frustum": frustum}
 
 
-def format_ply(points: np.ndarray, normals: np.ndarray | None = None, viewpoint: np.ndarray | None = None) -> bytes:
-    """Return a binary PLY file. A comment line holds the viewpoint."""
+def format_ply(
+    points: np.ndarray,
+    normals: np.ndarray | None = None,
+    viewpoint: np.ndarray | None = None,
+    frustum: np.ndarray | None = None,
+) -> bytes:
+    """Return a binary PLY file. A comment line holds the viewpoint, another the sides of its view."""
     lines = ["ply", "format binary_little_endian 1.0"]
-    if viewpoint is not None:
-        lines.append("comment viewpoint " + " ".join(repr(float(x)) for x in viewpoint))
+    for name, numbers in (("viewpoint", viewpoint), ("frustum", frustum)):
+        if numbers is not None:
+            lines.append(f"comment {name} " + " ".join(repr(float(x)) for x in numbers.flat))
     lines.append(f"element vertex {len(points)}")
     names = ["x", "y", "z"] + (["nx", "ny", "nz"] if normals is not None else [])
     lines += [f"property float {name}" for name in names]

@@ -29,11 +29,13 @@ def read_cloud(
 ) -> PointCloud:
     """Read the point cloud of one object, in float64; `read_cloud_file` also tells what was left out.
 
-    * `.ply`, ascii or binary: x y z, optionally nx ny nz; the viewpoint from a header line `comment viewpoint x y z`.
+    * `.ply`, ascii or binary: x y z, optionally nx ny nz; header lines `comment viewpoint x y z` and
+      `comment frustum` with 12 numbers give the camera.
       A mesh gives 2000 surface points, with normals if closed.
     * `.pcd`, ascii, binary or compressed: x y z, optionally normal_x normal_y normal_z; the viewpoint from VIEWPOINT.
       Its default `0 0 0 1 0 0 0` counts only if the points look like those of a camera in the origin.
-    * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3) and `viewpoint` (3,), or (n, 3) of several views.
+    * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,) and `frustum` (4, 3);
+      of several views `viewpoint` (n, 3) and `frustum` (n, 4, 3).
     * `.npy`, `.xyz`, `.txt`, `.csv` (text): an (n, 3) array, or (n, 6) with normals; colours are left out.
 
     Arrays (h, w, 3) of an image are taken, too. Rows with NaN, infinity or, more than once, (0, 0, 0) are left out.
@@ -83,7 +85,7 @@ def read_cloud_file(
     parsers = {
         ".ply": parse_ply,
         ".pcd": parse_pcd,
-        ".npz": lambda data: parse_npz(data, ("points", "normals", "viewpoint"), "points"),
+        ".npz": lambda data: parse_npz(data, ("points", "normals", "viewpoint", "frustum"), "points"),
         ".npy": lambda data: {"table": parse_npy(data)},
         **dict.fromkeys((".xyz", ".txt", ".csv"), lambda data: {"table": read_lines(data)}),
     }

@@ -38,7 +38,8 @@ def make_cloud(source: str, arrays: dict[str, Any], viewpoint: Tensor | None = N
 
     Args:
         source: what errors name.
-        arrays: "points" (n, 3) or (h, w, 3), or "table" with 3 or 6 columns; optionally "normals" and "viewpoint".
+        arrays: "points" (n, 3) or (h, w, 3), or "table" with 3 or 6 columns; optionally "normals", "viewpoint" and
+            its "frustum".
         viewpoint: the camera [m], instead of the arrays'.
         scale: metres in a unit of points and of the arrays' viewpoint.
 
@@ -53,6 +54,7 @@ def make_cloud(source: str, arrays: dict[str, Any], viewpoint: Tensor | None = N
     points = scale * _as_rows(source, "points", arrays["points"])
     normals = None if arrays.get("normals") is None else _as_rows(source, "normals", arrays["normals"])
     default = bool(arrays.get("default")) and viewpoint is None
+    frustum = None if viewpoint is not None else arrays.get("frustum")  # that of another camera says nothing
     if viewpoint is None and arrays.get("viewpoint") is not None:
         viewpoint = scale * _as_rows(source, "viewpoint", arrays["viewpoint"])
         if not bool(torch.isfinite(viewpoint).all()):
@@ -68,10 +70,21 @@ def make_cloud(source: str, arrays: dict[str, Any], viewpoint: Tensor | None = N
         raise TooFewPoints("path", found, f"at least {MIN_POINTS} points")
     if viewpoint is not None and viewpoint.ndim == 2:
         viewpoint = viewpoint[keep]
-    cloud = PointCloud(points[keep], None if normals is None else normals[keep], viewpoint)
+    if frustum is not None:
+        frustum = _as_sides(source, frustum, len(points))
+        frustum = frustum if frustum.ndim == 2 else frustum[keep]
+    cloud = PointCloud(points[keep], None if normals is None else normals[keep], viewpoint, frustum)
     if default:
         cloud = _judge_default(cloud, notes)
     return CloudFile(cloud, tuple(notes))
+
+
+def _as_sides(source: str, array: Any, n: int) -> Tensor:
+    """Return a frustum's normals, or refuse its file."""
+    array = np.asarray(array)
+    if array.dtype.kind not in "fiu" or array.shape not in ((4, 3), (n, 4, 3)) or not np.isfinite(array).all():
+        raise CloudFileError("path", f"{source}: a frustum of shape {array.shape}", "finite numbers of shape (4, 3)")
+    return torch.from_numpy(array.astype(np.float64))
 
 
 def _as_rows(source: str, name: str, array: Any) -> Tensor:

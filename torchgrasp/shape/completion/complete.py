@@ -44,7 +44,7 @@ PENALTY = 0.05
 """Score that an image of an image loses: of two equal points the one mirrored once is kept."""
 
 
-Kind = Literal["ball", "revolution", "mirrored", "guess"]
+Kind = Literal["ball", "revolution", "mirrored", "guess", "cut off"]
 """What a hidden side follows from: an ellipsoid, an upright axis, mirror planes, or nothing but the outline."""
 
 
@@ -101,6 +101,8 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
     True
     """
     scorer = SymmetryScorer.of(cloud.to("cpu", torch.float64), table)
+    if scorer.outline.cut:  # an image's border is no outline, and half a thing is not symmetric
+        return _nothing(scorer)
     ball = find_ellipsoid(scorer.points, scorer.normals, scorer.outline, table)
     if ball is not None:
         return _hidden_side(scorer, ball, budget)
@@ -114,6 +116,12 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
     shared, asymmetry = chosen.shared.flatten(1), chosen.variance.sqrt()
     kind: Kind = "guess" if not len(planes) else "mirrored" if round_body is None else "revolution"
     return Completion(chosen.points, chosen.normals, shared, asymmetry, planes, scores, scorer.outline, kind)
+
+
+def _nothing(scorer: SymmetryScorer) -> Completion:
+    """Return no hidden side: the posterior alone guesses it."""
+    none, planes = scorer.points[:0], scorer.points.new_zeros(0, 4)
+    return Completion(none, none, none[:, :0], none[:, 0], planes, planes[:, 0], scorer.outline, "cut off")
 
 
 def _hidden_side(scorer: SymmetryScorer, ball: Ellipsoid, budget: int) -> Completion:

@@ -64,7 +64,7 @@ def free_space_violations(shape: ShapeGP, x: Float[Tensor, "n 3"], least: Float[
 
 def _points_beside(outline: Silhouette, origin: Float[Tensor, "3"], scale: float) -> Float[Tensor, "n 3"]:
     """Return points [m] on rays beside an outline, over the object's depth."""
-    depth = float(outline.depth.median())
+    depth = float(outline.depth[outline.depth > 0].median())  # 0 beyond the image
     rays = [_rays_beside(outline, offset / depth) for offset in OFFSETS]
     middle = float((origin - outline.viewpoint) @ outline.axes[2])
     depths = middle + scale * torch.linspace(-1.0, 1.0, DEPTHS, dtype=torch.float64)

@@ -41,6 +41,8 @@ class Silhouette(Value):
         depth: depth [m] of the nearest visible pixel.
         rim: points of the outline [m] at the visible depth.
         rim_normals: normals there of the cone that the camera and the outline span.
+        cut: whether the object reaches the border of the image. Beyond it nothing is outside the outline.
+        gap: greatest width [m] of a part within the outline where nothing was measured; 0: none. It may be a hole.
     """
 
     viewpoint: Float[Tensor, "3"]
@@ -51,6 +53,8 @@ class Silhouette(Value):
     depth: Float[Tensor, "h w"]
     rim: Float[Tensor, "k 3"]
     rim_normals: Float[Tensor, "k 3"]
+    cut: bool
+    gap: float
 
     def hull_distance(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return the signed distance [m] to the visual hull, positive outside."""
@@ -91,6 +95,16 @@ class Outlines(Value):
         """Normals there."""
         return torch.cat([view.rim_normals for view in self.views])
 
+    @property
+    def cut(self) -> bool:
+        """Whether the border of an image cuts the object off in every view."""
+        return all(view.cut for view in self.views)
+
+    @property
+    def gap(self) -> float:
+        """Greatest width [m] within an outline where the view measured nothing."""
+        return max(view.gap for view in self.views)
+
     def hull_distance(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return the signed distance [m] to the visual hull of all views."""
         return torch.stack([view.hull_distance(points) for view in self.views]).amax(0)
@@ -110,19 +124,23 @@ def silhouettes(cloud: PointCloud) -> Outlines:
     >>> len(silhouettes(PointCloud(cap, viewpoint=torch.tensor([0.0, 0.0, 9.0]).double())).views)
     1
     """
-    views = [(view.points, view.viewpoint) for view in cloud.split_views()]
-    for points, viewpoint in views:
-        assert viewpoint is not None
-        _check_view(points, viewpoint)
-    return Outlines(tuple(silhouette(points, viewpoint) for points, viewpoint in views if viewpoint is not None))
+    views = cloud.split_views()
+    for view in views:
+        assert view.viewpoint is not None
+        _check_view(view.points, view.viewpoint)
+    return Outlines(tuple(silhouette(view) for view in views))
 
 
-def silhouette(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> Silhouette:
-    """Return the silhouette of the points [m] of one view, all in front of the camera."""
-    from scipy.ndimage import distance_transform_edt
+def silhouette(view: PointCloud) -> Silhouette:
+    """Return the silhouette of one view, all in front of its camera.
+
+    A gap within the outline is no free space: a mirror-like patch is not measured either.
+    """
+    from scipy.ndimage import binary_fill_holes, distance_transform_edt
     from scipy.spatial import KDTree
 
-    axes, pixels, depths = (t.numpy() for t in _project(points, viewpoint))
+    assert view.viewpoint is not None
+    axes, pixels, depths = (t.numpy() for t in _project(view.points, view.viewpoint))
     distance, _ = KDTree(pixels).query(pixels, k=min(5, len(pixels)))
     spacing = float(np.median(distance[:, -1]))
     low, high = pixels.min(0), pixels.max(0)
@@ -136,22 +154,46 @@ def silhouette(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> S
     raster = np.zeros(shape)
     raster[row[order], column[order]] = depths[order]
     nearest = np.asarray(distance_transform_edt(raster == 0, return_distances=False, return_indices=True))
-    grown = _fill_pores(_distance(raster == 0) * cell <= GROW * spacing, spacing / cell)
+    measured = _distance(raster == 0) * cell <= GROW * spacing
+    grown = np.asarray(binary_fill_holes(measured))
+    gaps = grown & ~measured
+    gap = 2 * (float(_distance(gaps).max()) * cell + GROW * spacing) * bool(gaps.any())
     inside = _distance(grown) * cell > SHRINK * spacing
+    unseen = _beyond_image(view.frustum, axes, corner, cell, grown, GROW * spacing)
+    inside |= unseen
     outside = (_distance(~inside) - _distance(inside)) * cell
     outside += np.where(inside, 0.5, -0.5) * cell  # the outline runs between two cells
-    rim, rim_normals = _rim(outside, corner, cell, pixels, depths)
-    origin, axes = viewpoint.double().cpu(), torch.from_numpy(axes)
+    seen = ~unseen if not unseen.any() else _distance(~unseen) * cell > GROW * spacing
+    rim, rim_normals = _rim(outside, seen, corner, cell, pixels, depths)
+    origin, axes = view.viewpoint.double().cpu(), torch.from_numpy(axes)
     return Silhouette(
         viewpoint=origin,
         axes=axes,
         corner=torch.from_numpy(corner),
         cell=cell,
         outside=torch.from_numpy(outside),
-        depth=torch.from_numpy(raster[tuple(nearest)]),
+        depth=torch.from_numpy(np.where(unseen, 0.0, raster[tuple(nearest)])),  # nothing there is in front of it
         rim=torch.from_numpy(rim) @ axes + origin,
         rim_normals=torch.from_numpy(rim_normals) @ axes,
+        cut=bool(unseen.any()),
+        gap=gap * float(np.median(depths)),
     )
+
+
+def _beyond_image(
+    frustum: Tensor | None, axes: np.ndarray, corner: np.ndarray, cell: float, mask: np.ndarray, margin: float
+) -> np.ndarray:
+    """Tell which cells lie beyond a side of the image, or nearer to it than `margin`, that the mask reaches."""
+    beyond = np.zeros(mask.shape, dtype=bool)
+    if frustum is None:
+        return beyond
+    row, column = np.indices(mask.shape)
+    rays = np.stack([corner[0] + cell * column, corner[1] + cell * row, np.ones(mask.shape)], -1)
+    for side in frustum.double().cpu().numpy() @ axes.T:
+        past = rays @ side < margin * np.linalg.norm(side[:2])
+        if (past & mask).sum() * cell**2 > margin**2:  # more than a stray pixel
+            beyond |= past
+    return beyond
 
 
 def _check_view(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> None:
@@ -193,18 +235,6 @@ def _camera_axes(forward: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     return torch.stack([right, torch.linalg.cross(forward, right), forward])
 
 
-def _fill_pores(mask: np.ndarray, radius: float) -> np.ndarray:
-    """Fill holes of a mask in which no disc of the radius fits: gaps between samples."""
-    from scipy.ndimage import label
-
-    holes = np.zeros(mask.shape, dtype=np.int64)
-    label(~mask, output=holes)
-    widest = np.zeros(holes.max() + 1)
-    np.maximum.at(widest, holes, _distance(~mask))
-    widest[holes[0, 0]] = np.inf  # the surroundings
-    return mask | (widest[holes] < radius)
-
-
 def _distance(mask: np.ndarray) -> np.ndarray:
     """Return the distance [cells] of each cell to the nearest cell outside the mask."""
     from scipy.ndimage import distance_transform_edt
@@ -213,13 +243,13 @@ def _distance(mask: np.ndarray) -> np.ndarray:
 
 
 def _rim(
-    outside: np.ndarray, corner: np.ndarray, cell: float, pixels: np.ndarray, depths: np.ndarray
+    outside: np.ndarray, seen: np.ndarray, corner: np.ndarray, cell: float, pixels: np.ndarray, depths: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return 16 evenly spread points of the outline at the depth of nearby pixels, and their normals."""
     from scipy.ndimage import gaussian_filter
     from scipy.spatial import KDTree
 
-    row, column = np.nonzero(np.abs(outside) <= 0.75 * cell)
+    row, column = np.nonzero(seen & (np.abs(outside) <= 0.75 * cell))
     smooth = gaussian_filter(outside, 3.0)
     slope = np.stack([np.gradient(smooth, axis=axis)[row, column] for axis in (1, 0)], -1)
     slope /= np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-12)

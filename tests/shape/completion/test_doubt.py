@@ -1,0 +1,103 @@
+"""What a view does not tell: where it is cut off, has a gap, or shows two bodies, it warns and the band is wide."""
+
+import dataclasses
+import math
+import warnings
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from torchgrasp.cloud import look_at, partial_view
+from torchgrasp.cloud.depth import cloud_from_depth
+from torchgrasp.errors import CutOff, Gap, TwoBodies
+from torchgrasp.shape.fit import fit_shape
+
+
+def on_table(mesh):
+    return mesh.apply_translation([0.0, 0.0, -mesh.bounds[0, 2]])
+
+
+def surface(mesh, n=2000):
+    return torch.from_numpy(np.asarray(trimesh.sample.sample_surface(mesh, n, seed=0)[0]))
+
+
+BOX = on_table(trimesh.creation.box([0.08, 0.06, 0.12]))
+CAN = on_table(trimesh.creation.cylinder(0.04, 0.14))
+
+
+def cut_view(mesh, beyond):
+    """A view of which the image ends at a plane through the camera and x = y = 0 there, `beyond` m to the side."""
+    whole = partial_view(mesh, look_at(0.0, 20.0, target=mesh), n=1000, noise=False)
+    ray = torch.tensor([0.0, beyond, 0.07], dtype=torch.float64) - whole.viewpoint
+    side = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+    side = side - (side @ ray) / (ray @ ray) * ray
+    sides = torch.stack([side, ray, ray, ray])
+    inside = (whole.points - whole.viewpoint) @ side > 0
+    return dataclasses.replace(whole.select(inside), frustum=sides / sides.norm(dim=1, keepdim=True))
+
+
+def test_beyond_the_border_of_the_image_the_shape_is_told_to_be_a_guess():
+    cloud, truth = cut_view(CAN, 0.01), surface(CAN)
+    with pytest.warns(CutOff, match="cuts the object off"):
+        told = fit_shape(cloud, table=0.0)
+    untold = fit_shape(dataclasses.replace(cloud, frustum=None), table=0.0)
+    shares = []
+    for shape in (told, untold):
+        estimate = shape.predict(truth[truth[:, 1] > 0.013])
+        shares.append(float(((estimate.distance * shape.scale).abs() < 2 * estimate.std_m).double().mean()))
+    assert shares[0] > 0.8 > 0.5 > shares[1]
+    seen = told.predict(cloud.points)
+    assert float((seen.distance * told.scale).abs().median()) < 0.001
+
+
+def test_a_whole_object_far_from_the_border_is_not_cut_off():
+    pose = look_at(30.0, 25.0, target=BOX)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        whole = partial_view(BOX, pose, n=600)
+        shape = fit_shape(whole, table=0.0)
+    assert whole.frustum is not None and shape.std_factor < 1.0
+
+
+def test_a_depth_image_that_ends_on_the_object_cuts_it_off():
+    size, focal = 120, 300.0
+    v, u = torch.meshgrid(torch.arange(size).double(), torch.arange(size).double(), indexing="ij")
+    ball = 0.5 + 0.0 * u
+    radius = torch.hypot(u - 20, v - 60) / focal * 0.5
+    mask = radius < 0.06
+    depth = torch.where(mask, ball - torch.sqrt((0.06**2 - radius**2).clamp_min(0)), 0.0)
+    cloud = cloud_from_depth(depth, (focal, focal, size / 2, size / 2))
+    with pytest.warns(CutOff):
+        fit_shape(cloud.select(torch.arange(0, len(cloud), 8)))
+
+
+def test_a_gap_in_a_face_is_neither_a_hole_nor_a_sure_surface():
+    view = partial_view(BOX, look_at(30.0, 25.0, target=BOX), n=1000)
+    face = torch.tensor([0.04, 0.0, 0.06], dtype=torch.float64)
+    away = torch.linalg.vector_norm(view.points - face, dim=1)
+    with pytest.warns(Gap, match="a gap of 3. mm"):
+        shape = fit_shape(view.select(away > 0.02), table=0.0)
+    angle = torch.linspace(0, 2 * math.pi, 9).double()[:-1]
+    ring = face + 0.012 * torch.stack([torch.zeros_like(angle), angle.cos(), angle.sin()], -1)
+    inside = shape.predict(torch.cat([face[None], ring]))
+    assert bool(((inside.distance * shape.scale).abs() < inside.std_m).all())
+    sure = shape.predict(view.points[away > 0.03])
+    assert float(inside.std_m.median()) > 1.5 * float(sure.std_m.median())
+
+
+def test_a_hole_that_is_seen_through_is_no_surface():
+    ring = on_table(trimesh.creation.torus(0.04, 0.012))
+    with pytest.warns(Gap):
+        shape = fit_shape(partial_view(ring, look_at(30.0, 60.0, target=ring), n=1000), table=0.0)
+    middle = shape.predict(torch.tensor([[0.0, 0.0, 0.012], [0.01, 0.0, 0.012]], dtype=torch.float64))
+    assert bool((middle.distance * shape.scale > 0.01).all())
+
+
+def test_two_bodies_are_told():
+    other = trimesh.creation.box([0.05, 0.05, 0.06])
+    other.apply_translation([0.0, 0.13, 0.03])
+    both = trimesh.util.concatenate([BOX, other])
+    with pytest.warns(TwoBodies, match="two bodies that stand apart"):
+        fit_shape(partial_view(both, look_at(30.0, 40.0, target=both), n=1000), table=0.0)
