@@ -37,9 +37,9 @@ def closure_survival(shape: ShapeGP, mesh: "trimesh.Trimesh", seed: int = 0) -> 
 
     Random triples of the zero level with variance < 0.03, 10 mm above the ground and 15 to 110 mm apart, that have
     frictional form closure with the estimated normals: "sure_" at friction 0.6; "flat_" at 0.4 and on flat surface
-    alone. Each contact is moved to the nearest point of the true mesh, with its normal, and judged at friction 0.6
-    and 0.8: "sure_0.6", "sure_0.8", "flat_0.6", "flat_0.8"; "sure_yield" and "flat_yield" are the shares of the
-    triples that were closed on the estimate.
+    alone. Each contact is moved to the nearest point of the true mesh on the finger's side, with its normal, and
+    judged at friction 0.6 and 0.8: "sure_0.6", "sure_0.8", "flat_0.6", "flat_0.8"; "sure_yield" and "flat_yield" are
+    the shares of the triples that were closed on the estimate.
 
     Args:
         shape: the posterior [m].
@@ -53,7 +53,7 @@ def closure_survival(shape: ShapeGP, mesh: "trimesh.Trimesh", seed: int = 0) -> 
     normals = unit(jet.gradient)
     flat = _flat(points, normals)
     use = (jet.variance < SURE_VARIANCE) & (points[:, 2] > float(mesh.bounds[0, 2]) + LEAST_HEIGHT)
-    true_points, true_normals = nearest_on_mesh(mesh, points)
+    true_points, true_normals = nearest_on_mesh(mesh, points, normals)
 
     shares: dict[str, float] = {}
     for name, rows, friction in (("sure", use, 0.6), ("flat", use & flat, 0.4)):

@@ -128,6 +128,10 @@ def survive(shape: ShapeGP, spec: ContactSpec, mesh: Any, starts: int, seed: int
 
 
 def closed_on_mesh(contacts: Contacts, mesh: Any) -> Tensor:
-    """Tell which contacts are closed at the nearest points of the true surface, with its normals there."""
-    points, normals = nearest_on_mesh(mesh, contacts.points.flatten(0, 1))
-    return closed_exact(points.view_as(contacts.points), normals.view_as(contacts.points), FRICTION)
+    """Tell which contacts are closed at the nearest points of the true surface, with its normals there.
+
+    The nearest points are those on the fingers' side: on a wall thinner than the error the other side may be nearer.
+    """
+    points, facing = (part.flatten(0, 1).double() for part in (contacts.points, contacts.normals))
+    points, normals = nearest_on_mesh(mesh, points, facing)
+    return closed_exact(points.unflatten(0, (-1, 3)), normals.unflatten(0, (-1, 3)), FRICTION)

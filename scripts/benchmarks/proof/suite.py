@@ -11,7 +11,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks.common import Row, least_seconds, measure
-from benchmarks.ground_truth import nearest_on_mesh, read_views
+from benchmarks.ground_truth import read_views
+from benchmarks.plan.true_surface import closed_on_mesh
 from benchmarks.proof.closure_reference import redrawn_closure
 from benchmarks.proof.exact_lp import exact_margin, proves_margin_above, proves_margin_below, wrench_matrix
 from torchgrasp.errors import Status
@@ -21,7 +22,7 @@ from torchgrasp.plan.certify import certify, solve_by_highs
 from torchgrasp.plan.closure_lp import solve_closure_lp
 from torchgrasp.plan.closure_probability import closure_probability
 from torchgrasp.plan.solve import plan_contacts
-from torchgrasp.plan.wrench import MIN_MARGIN, closed_exact, wrenches
+from torchgrasp.plan.wrench import MIN_MARGIN, wrenches
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec
@@ -241,8 +242,7 @@ def bench_objects(objects: Path, starts: int, seed: int) -> list[Row]:
             if not len(contacts):
                 continue
             closure = closure_probability(shape, contacts, ContactSpec(friction=0.6), seed=seed)
-            points, normals = nearest_on_mesh(mesh, contacts.points.flatten(0, 1))
-            true = closed_exact(points.reshape(-1, 3, 3), normals.reshape(-1, 3, 3), 0.6)
+            true = closed_on_mesh(contacts, mesh)
             asked[name].append(
                 {
                     "probability": closure.probability,
