@@ -1,4 +1,4 @@
-"""Fit the factors of `std_m` by kind of completion, and try each on families of objects left out.
+"""Fit the factors of `std_m` and of the deviation of normals, and try them on families of objects left out.
 
 The posterior's own deviations are too wide where much is known, and too narrow where a wrong plane looks right. The
 factor of a kind is the one with which 1, 2 and 3 `std_m` hold what they say, in the mean over views.
@@ -11,15 +11,13 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
-from benchmarks.ground_truth import sample_mesh
+from benchmarks.ground_truth import read_views, sample_mesh
 
-from torchgrasp.cloud.prepare import prepare_cloud
 from torchgrasp.columns import format_columns
-from torchgrasp.datasets import list_views, read_family, read_object_mesh, read_view
+from torchgrasp.datasets import read_family
 from torchgrasp.evaluation.intervals import mean_over
-from torchgrasp.shape.completion.complete import complete_cloud
-from torchgrasp.shape.fit import STD_FACTORS, fit_shape
-from torchgrasp.values import PointCloud
+from torchgrasp.shape.fit import STD_FACTORS, VESSEL_STD_FACTOR, WHOLE_STD_FACTOR, fit_shape
+from train.normal_bands import measure_normals, report_normals
 
 NORMAL_SHARES = (0.683, 0.954, 0.997)
 """What a normal distribution holds within 1, 2 and 3 deviations."""
@@ -30,28 +28,34 @@ FACTORS = np.arange(0.2, 1.5, 0.01)
 HIDDEN, TABLE_FACE, SAMPLES = 0.006, 0.002, 1500
 """Distance [m] of hidden surface from the cloud; height [m] of the face on the table, which is left out; points."""
 
+SHIPPED = {**STD_FACTORS, ("vessel", True): VESSEL_STD_FACTOR, ("whole", True): WHOLE_STD_FACTOR}
+"""The factors in use, of each kind of hidden side."""
+
 Row = dict[str, Any]
-"""The family, the kind of completion with whether there was a table, and errors over the posterior's deviations."""
+"""The family, the kind of hidden side with whether there was a table, errors over the posterior's deviations, and with
+a table the errors of normals (`normal_bands.Row`)."""
 
 
-def bands(objects: tyro.conf.Positional[Path], beside: Path | None = None) -> None:
-    """Print the factors for `torchgrasp/shape/fit.py`, and what bands hold on families that did not choose them.
+def bands(objects: tyro.conf.Positional[Path], beside: Path | None = None, views: tuple[str, ...] = ()) -> None:
+    """Print the factors for `torchgrasp/shape/fit.py` and `normal_band.py`, and what bands hold on families left out.
 
     Args:
-        objects: a folder of objects as `torchgrasp.datasets` reads it; every view counts.
+        objects: a folder of objects as `torchgrasp.datasets` reads it.
         beside: a second folder, which chooses nothing and is only measured.
+        views: names of the views of each object, such as view0; by default all.
     """
-    rows = measure_ratios(objects)
+    rows = measure_ratios(objects, views)
     kinds = sorted({row["kind"] for row in rows}, key=str)
     factors = {kind: fit_factor([row["ratio"] for row in rows if row["kind"] == kind]) for kind in kinds}
     for row in rows:
         others = [r["ratio"] for r in rows if r["kind"] == row["kind"] and r["family"] != row["family"]]
-        row["factor"] = fit_factor(others) if others else STD_FACTORS[row["kind"]]
+        row["factor"] = fit_factor(others) if others else SHIPPED[row["kind"]]
     print(f"STD_FACTORS = {factors}\nfamilies left out\n{format_shares(rows)}")
+    print(report_normals([row for row in rows if "error" in row], fit_factor))
     if beside is not None:
-        rows = measure_ratios(beside)
+        rows = measure_ratios(beside, views)
         for row in rows:
-            row["factor"] = factors.get(row["kind"], STD_FACTORS[row["kind"]])
+            row["factor"] = factors.get(row["kind"], SHIPPED[row["kind"]])
         print(f"{beside.name}, which chose nothing\n{format_shares(rows)}")
 
 
@@ -91,13 +95,12 @@ def format_shares(rows: Sequence[Row]) -> str:
     return format_columns(table, left=(0, 1))
 
 
-def measure_ratios(objects: Path) -> list[Row]:
-    """Return family, kind and the ratios of the hidden surface of every view, with and without the table."""
+def measure_ratios(objects: Path, views: Sequence[str] = ()) -> list[Row]:
+    """Return `Row`s of every view, or of those with a name in `views`, with and without the table."""
     from scipy.spatial import KDTree
 
     rows = []
-    for name, view in list_views(objects):
-        cloud, mesh = read_view(objects, name, view), read_object_mesh(objects, name)
+    for name, _, cloud, mesh in read_views(objects, views=views):
         points, normals = sample_mesh(mesh, SAMPLES, np.random.default_rng(0))
         face = (points[:, 2] < float(mesh.bounds[0, 2]) + TABLE_FACE) & (normals[:, 2] < -0.7)
         far = torch.from_numpy(KDTree(cloud.points.numpy()).query(points.numpy())[0]) > HIDDEN
@@ -110,7 +113,6 @@ def measure_ratios(objects: Path) -> list[Row]:
             estimate = shape.predict(hidden[inside])
             ratio = np.full(len(hidden), np.inf)
             ratio[inside.numpy()] = (estimate.distance.abs() / estimate.variance.sqrt()).numpy()
-            seen = prepare_cloud(cloud, torch.Generator().manual_seed(0))
-            kind = complete_cloud(PointCloud(seen.points, seen.normals, seen.viewpoint), table).kind
-            rows.append({"family": read_family(objects, name), "ratio": ratio, "kind": (kind, table is not None)})
+            row = {"family": read_family(objects, name), "ratio": ratio, "kind": (shape.kind, table is not None)}
+            rows.append(row if table is None else row | measure_normals(shape, mesh, cloud))
     return rows

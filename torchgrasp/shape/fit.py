@@ -168,6 +168,7 @@ def _fit_surface(seen: PreparedCloud, beside: "_Support", options: _Options) -> 
         posterior = append_observations(posterior, part, shared)
     check_kernel(posterior, every.least_noise)
     shape = ShapeGP.of(posterior, beside.frame, cloud, psi, beside.std_factor)
+    shape = dataclasses.replace(shape, kind=beside.kind)
     if beside.free is None:
         return shape
     free, least = beside.free
@@ -185,7 +186,7 @@ class _Support:
 
     `anchors` are points inside and outside; `normal_noise` is the cloud's. `parts` are rim and mirrored
     points, with the errors that their distances share. `free` holds points of free space and least distances there.
-    `rows` are the points of the cloud that lie on this surface; None: all.
+    `rows` are the points of the cloud that lie on this surface; None: all. `kind` is the shape's.
     """
 
     frame: Normalisation
@@ -195,6 +196,7 @@ class _Support:
     parts: tuple[tuple[Observations, Tensor | None], ...] = ()
     free: tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]] | None = None
     rows: Bool[Tensor, "rows"] | None = None
+    kind: str = "guess"
 
 
 def _paper_support(seen: PreparedCloud, noise: float, generator: torch.Generator) -> _Support:
@@ -225,9 +227,10 @@ def _camera_supports(seen: PreparedCloud, noise: float, table: float | None) -> 
     extent = surface if completion is not None and completion.kind == "ball" else seen.points
     center = (extent.amin(0) + extent.amax(0)) / 2
     frame = Normalisation(center, float(torch.linalg.vector_norm(extent - center, dim=-1).max()))
-    inside, parts, free, factor = True, (), None, WHOLE_STD_FACTOR
+    inside, parts, free, factor, kind = True, (), None, WHOLE_STD_FACTOR, "whole"
     if completion is not None:
-        parts, factor = _observe_completion(completion, frame), STD_FACTORS[completion.kind, table is not None]
+        parts, kind = _observe_completion(completion, frame), completion.kind
+        factor = STD_FACTORS[completion.kind, table is not None]
         free = free_space(completion.outline, frame, table)
         inside = float(completion.outline.violation(center.cpu())) == 0.0  # not so for an arch or a bowl
     sphere = OUTER_RADIUS * fibonacci_sphere(OUTER_POINTS).to(center)
@@ -238,7 +241,7 @@ def _camera_supports(seen: PreparedCloud, noise: float, table: float | None) -> 
     anchors = join(
         [off_surface(x[:outer], distance[:outer], noise), off_surface(x[outer:], distance[outer:], OUTER_NOISE)]
     )
-    return (_Support(frame, anchors, NORMAL_NOISE, factor, parts, free),)
+    return (_Support(frame, anchors, NORMAL_NOISE, factor, parts, free, kind=kind),)
 
 
 def _vessel_supports(cloud: PointCloud, vessel: Vessel, table: float, noise: float) -> tuple[_Support, ...]:
@@ -253,7 +256,7 @@ def _vessel_supports(cloud: PointCloud, vessel: Vessel, table: float, noise: flo
         device = frame.center.device
         parts = tuple((part.to(device), None if shared is None else shared.to(device)) for part, shared in wall.parts)
         anchors, rows = wall.anchors.to(device), wall.rows.to(device)
-        return _Support(frame, anchors, NORMAL_NOISE, VESSEL_STD_FACTOR, parts, free, rows)
+        return _Support(frame, anchors, NORMAL_NOISE, VESSEL_STD_FACTOR, parts, free, rows, "vessel")
 
     return support(outer, free_space(outline, frame, table)), support(inner, None)
 

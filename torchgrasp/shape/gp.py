@@ -13,6 +13,7 @@ from torchgrasp.frames import apply
 from torchgrasp.linalg import cholesky, unit
 from torchgrasp.plane import move
 from torchgrasp.shape.joint_posterior import JointEstimate, draw_samples, joint_estimate
+from torchgrasp.shape.normal_band import normal_parts
 from torchgrasp.shape.observations import Observations, on_surface
 from torchgrasp.shape.posterior import Posterior, surface_deviation
 from torchgrasp.shape.update import append_observations
@@ -58,12 +59,15 @@ class ShapeGP(Posterior, Normalisation):
         domain_radius: radius, normalised, of the ball in which the posterior is valid.
         std_factor: ratio of the surface's real deviations to the posterior's, from hidden sides of known objects.
         cloud: what the camera saw, after cleaning.
+        kind: what the hidden side follows from: "ball", "revolution", "mirrored", "vessel", "guess" (the outline
+            alone), or "whole" without a hidden side.
     """
 
     psi: float
     domain_radius: float
     std_factor: float
     cloud: PointCloud
+    kind: str = dataclasses.field(default="guess", kw_only=True)
 
     @classmethod
     def of(
@@ -116,6 +120,24 @@ class ShapeGP(Posterior, Normalisation):
         variance = covariance[:, 0, 0]
         std_m = self.std_factor * self.scale * surface_deviation(variance, mean[:, 1:])
         return _reshape(ShapeEstimate(mean[:, 0], unit(mean[:, 1:]), variance, covariance, std_m), points)
+
+    def normal_std(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+        """Return the calibrated standard deviation [rad] of the normal about one axis, at points [m] of the surface.
+
+        It grows at edges, which the kernel rounds, and where a wrong place has another normal. It is of the slope over
+        a fingertip's width (`torchgrasp.shape.normal_band`). Raises as `predict`.
+
+        >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
+        >>> from torchgrasp import fit_shape
+        >>> fit_shape(PointCloud(0.04 * ball, ball)).normal_std(torch.tensor([0.0, 0.0, 0.04])) < 0.2
+        tensor(True)
+        """
+        x = self._queries(points)
+        std = torch.empty_like(x[:, 0])
+        for wall, own in zip(self.walls, self.wall_at(x).T, strict=True):
+            parts = normal_parts(wall, x[own], self.scale, self.std_factor)
+            std[own] = parts.variance().mean(-1).sqrt()
+        return std.to(points).reshape(points.shape[:-1])
 
     def differentiate(self, points: Float[Tensor, "*b 3"]) -> ShapeDerivatives:
         """Return distance, normal and variance differentiated by the query points [m]. Raises as `predict`."""
