@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from benchmarks.ground_truth import sample_mesh
 from benchmarks.shape import weaker_inputs
 from benchmarks.shape.accuracy import (
+    find_edges,
     format_table,
     mean_row,
     measure_accuracy,
@@ -131,3 +133,11 @@ def test_the_worst_views_are_drawn_on_a_page_of_their_group(tin: Path):
 
 def test_a_mean_leaves_out_what_was_not_measured():
     assert mean_row([{"a": 1.0, "b": math.nan, "view": "x"}, {"a": 3.0, "b": 5.0, "view": "y"}]) == {"a": 2.0, "b": 5.0}
+
+
+def test_edges_are_where_faces_meet_and_the_other_side_of_a_wall_is_none():
+    points, normals = sample_mesh(trimesh.creation.box([0.1, 0.1, 0.004]), 3000, np.random.default_rng(0))
+    edge = find_edges(points, normals)
+    inside = points[:, :2].abs().amax(1) < 0.041
+    assert not bool(edge[inside].any())
+    assert float(edge[points[:, :2].abs().amax(1) > 0.046].double().mean()) > 0.95

@@ -1,5 +1,6 @@
 """Errors of a shape against the true mesh, and coverage of its std_m."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,6 +30,8 @@ RESOLUTION = 56
 """Cells of the grid of the estimated surface along the domain's diameter."""
 SAMPLES = 3000
 """Points on the true and on the estimated surface."""
+EDGE_RADIUS, EDGE_ANGLES = 0.008, (25.0, 120.0)
+"""At an edge normals within 8 mm differ by 25 to 120 degrees; by more they are of two sides of a wall."""
 TABLE_FACE = 0.002
 """Height [m] over the lowest point within which downward surface is the face on the table."""
 
@@ -66,6 +69,7 @@ def measure_shape(shape: ShapeGP, mesh: "trimesh.Trimesh", cloud: PointCloud, se
 
     * "median_mm", "p90_mm": distance between true and estimated surface.
     * "normal_deg": median angle between their normals.
+    * "flat_deg", "edge_deg": the same off and at edges, where true normals within 8 mm differ by over 25 degrees.
     * "within_1", "_2", "_3": share of the true surface within k std_m. Surface outside the domain is missed.
     * "raw_1", "_2", "_3": the same with the paper's own deviation, sqrt(variance).
     * "share": share of the estimated surface that is sure.
@@ -84,6 +88,7 @@ def measure_shape(shape: ShapeGP, mesh: "trimesh.Trimesh", cloud: PointCloud, se
     points, normals = points[~face_on_table], normals[~face_on_table]
     far = torch.from_numpy(KDTree(cloud.points.numpy()).query(points.numpy())[0]) > HIDDEN
 
+    edge = find_edges(points, normals)
     surface = extract_surface(shape, RESOLUTION).mesh()
     feet, _ = nearest_on_mesh(surface, points)
     error = torch.linalg.vector_norm(feet - points, dim=-1)
@@ -100,6 +105,8 @@ def measure_shape(shape: ShapeGP, mesh: "trimesh.Trimesh", cloud: PointCloud, se
             f"{name}_median_mm": 1e3 * _quantile(error[where], 0.5),
             f"{name}_p90_mm": 1e3 * _quantile(error[where], 0.9),
             f"{name}_normal_deg": _quantile(angle[where], 0.5),
+            f"{name}_flat_deg": _quantile(angle[where & ~edge], 0.5),
+            f"{name}_edge_deg": _quantile(angle[where & edge], 0.5),
         }
         row |= {f"{name}_within_{k}": _share(ratio[where] <= k) for k in (1, 2, 3)}
         row |= {f"{name}_raw_{k}": _share(shape.std_factor * ratio[where] <= k) for k in (1, 2, 3)}
@@ -144,6 +151,9 @@ def format_table(rows: Sequence[Row]) -> str:
 def format_groups(rows: Sequence[Row]) -> str:
     """Return the mean of each group of objects, with its interval over families, as a table."""
     columns = {
+        "seen median mm": ("seen_median_mm", 2),
+        "flat deg": ("seen_flat_deg", 1),
+        "edge deg": ("seen_edge_deg", 1),
         "hidden median mm": ("hidden_median_mm", 1),
         "90 % mm": ("hidden_p90_mm", 1),
         "normals deg": ("hidden_normal_deg", 0),
@@ -168,6 +178,13 @@ def mean_row(rows: Sequence[Row]) -> Row:
     numbers = [key for key, value in rows[0].items() if isinstance(value, float)]
     table = {key: np.array([row[key] for row in rows]) for key in numbers}
     return {key: float(v[np.isfinite(v)].mean()) if np.isfinite(v).any() else float("nan") for key, v in table.items()}
+
+
+def find_edges(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+    """Tell at which samples of a surface others nearby are turned away, but not to the other side of a wall."""
+    close, angle = torch.cdist(points, points) < EDGE_RADIUS, normals @ normals.T
+    low, high = (math.cos(math.radians(degrees)) for degrees in EDGE_ANGLES)
+    return (close & (angle < low) & (angle > high)).any(-1)
 
 
 def _angle(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
