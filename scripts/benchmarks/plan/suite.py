@@ -10,6 +10,7 @@ from benchmarks.common import Row, least_seconds, measure
 from benchmarks.ground_truth import read_views
 from benchmarks.plan.executable import bench_executable
 from benchmarks.plan.ipopt_comparison import POINTS, bench_peers
+from benchmarks.plan.probability import bench_probability
 from benchmarks.plan.sampler import bench_sampler
 from benchmarks.plan.scaling import bench_anytime, bench_growth, bench_memory
 from benchmarks.plan.true_surface import bench_fields, bench_objectives, bench_truth
@@ -17,12 +18,25 @@ from torchgrasp import ContactSpec, Status, certify, fit_shape, plan_contacts
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.values import PointCloud
 
-SUBJECTS = ("call", "peers", "truth", "fields", "objectives", "executable", "sampler", "growth", "memory", "anytime")
+SUBJECTS = (
+    "call",
+    "peers",
+    "truth",
+    "fields",
+    "objectives",
+    "probability",
+    "executable",
+    "sampler",
+    "growth",
+    "memory",
+    "anytime",
+)
 
 
 def plan(
     objects: Path,
     only: tuple[str, ...] = SUBJECTS,
+    names: tuple[str, ...] = (),
     starts: int = 1000,
     tries: int = 20,
     threads: int = 1,
@@ -34,8 +48,9 @@ def plan(
 
     Args:
         objects: folder with manifest.json and a folder for each object.
-        only: subjects to measure, of call, peers, truth, fields, objectives, executable, sampler, growth, memory and
-            anytime.
+        only: subjects to measure, of call, peers, truth, fields, objectives, probability, executable, sampler,
+            growth, memory and anytime.
+        names: of the views of each object that are measured, such as view0; by default all.
         starts: of the planner, for each view and radius.
         tries: the first of them that IPOPT gets, for each view and radius.
         threads: of torch. IPOPT with MUMPS, as casadi brings it, has one; on two it is counted as two processes that
@@ -46,13 +61,14 @@ def plan(
     """
     torch.set_num_threads(threads)
     starts, tries = (starts // 10, tries // 10) if quick else (starts, tries)
-    views = [(name, view, cloud, mesh) for name, view, cloud, mesh in read_views(objects)]
+    views = [(name, view, cloud, mesh) for name, view, cloud, mesh in read_views(objects, views=names)]
     subjects: dict[str, Callable[[], list[Row]]] = {
         "call": lambda: bench_call(views[0][2], starts),
         "peers": lambda: bench_peers(views, starts, tries, seed, threads),
         "truth": lambda: [bench_truth(views, starts, seed)],
         "fields": lambda: [bench_fields(views, max(starts // 5, 1), seed)],
         "objectives": lambda: [bench_objectives(views, max(starts // 40, 4), seed)],
+        "probability": lambda: bench_probability(objects, names, max(starts // 5, 1), seed),
         "executable": lambda: bench_executable(views, starts, seed),
         "sampler": lambda: [bench_sampler(views, max(starts // 2, 1), seed)],
         "growth": lambda: [bench_growth(4 if quick else 5, out.with_name("bench_plan_growth.png"))],
