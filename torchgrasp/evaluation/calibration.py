@@ -32,7 +32,7 @@ def reliability(predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"], units:
     """
     at, bins = (predicted * BINS).long().clamp(0, BINS - 1), []
     for k in at.unique().tolist():
-        rows = torch.nonzero(at == k)[:, 0].tolist()
+        rows: list[int] = torch.nonzero(at == k)[:, 0].tolist()
         counts = count_by((units[row], bool(passed[row])) for row in rows)
         bins.append(Bin(k / BINS, (k + 1) / BINS, float(predicted[rows].mean()), share_over(counts)))
     return bins
