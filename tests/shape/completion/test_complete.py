@@ -149,3 +149,39 @@ def test_silhouette_of_a_ball_is_its_circle():
     violation = outline.violation(probe)
     assert violation[0] == 0 and violation[2] == 0
     assert violation[1] == hull[1] and violation[3].item() == pytest.approx(0.03 - 0.002, abs=0.002)
+
+
+@pytest.mark.parametrize("turn", [45.0, 60.0])
+def test_the_back_of_a_box_follows_from_a_plane_at_right_angles(turn: float):
+    """Its own score is small: the images of the broad side are hidden, and only the narrow side and the top match."""
+    camera = 0.6 * torch.tensor([math.cos(math.radians(turn)), math.sin(math.radians(turn)), 0.4], dtype=torch.float64)
+    half = (0.025, 0.05, 0.07)
+    found = complete_cloud(_seen_box(half, camera), table=0.0)
+    upright = found.planes[found.planes[:, 2].abs() < 0.5]
+    assert (upright[:, :3] @ upright[:, :3].T).abs().min() < math.cos(math.radians(85.0))
+    back = (found.normals[:, 0] < -0.9) & (found.points[:, 1].abs() < 0.04)
+    assert back.sum() >= 5
+    assert (found.points[back, 0] + half[0]).abs().max() < 0.004  # the far side, 50 mm behind the broad one
+
+
+def test_the_underside_of_a_lying_rod_is_mirrored_from_its_top():
+    rng = torch.Generator().manual_seed(3)
+    angle = 2 * math.pi * torch.rand(6000, generator=rng, dtype=torch.float64)
+    along = 0.15 * (torch.rand(6000, generator=rng, dtype=torch.float64) - 0.5)
+    normals = torch.stack([angle.cos(), torch.zeros_like(angle), angle.sin()], 1)
+    axis, radius = torch.tensor([0.0, 0.0, 0.02], dtype=torch.float64), 0.02
+    points = radius * normals + axis + along[:, None] * torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    camera = torch.tensor([0.5, 0.0, 0.3], dtype=torch.float64)
+    seen = ((camera - points) * normals).sum(1) > 0.1 * torch.linalg.vector_norm(camera - points, dim=1)
+    found = complete_cloud(PointCloud(points[seen], normals[seen], camera), table=0.0)
+    under = found.normals[:, 2] < -0.5
+    assert under.sum() >= 5
+    off = torch.linalg.vector_norm((found.points - axis)[under][:, [0, 2]], dim=1) - radius
+    assert off.abs().median() < 0.002
+
+
+def test_no_point_is_spent_on_the_face_on_the_table():
+    camera = torch.tensor([0.5, 0.2, 0.3], dtype=torch.float64)
+    found = complete_cloud(_seen_box((0.03, 0.03, 0.03), camera), table=0.0)
+    assert (found.planes[:, 2].abs() > 0.9).any()  # the level plane images the top onto the table
+    assert not ((found.points[:, 2] < 0.003) & (found.normals[:, 2] < -0.9)).any()

@@ -28,6 +28,8 @@ HULL_MARGIN, FRONT_MARGIN, TABLE_MARGIN = 0.001, 0.002, 0.002
 """A mirrored point may lie this far [m] outside the hull, in front of the visible surface, below the table."""
 NEW, SPACING = 0.006, 0.004
 """Least distance [m] of a mirrored point from the cloud and from another one."""
+FACE, DOWN = 0.004, 0.7
+"""Height [m] over the table of its face, and how far down its normals point: such points took the place of others."""
 LEAST_NOISE = 0.003
 """Standard deviation [m] of a mirrored point of an object that is symmetric about that very plane."""
 SYMMETRIC, ASYMMETRY = 0.45, 0.060
@@ -168,6 +170,12 @@ class _Image(Batch):
         shared = points.new_zeros(len(rows), n_planes, near)
         return cls(points, scorer.normals[rows], math.inf, torch.zeros_like(points[:, 0]), shared)
 
+    def with_rim(self, outline: Outlines) -> "_Image":
+        """Return the points and those of the outline. Their images are edges of the far side: flat sides bulge less."""
+        rim = outline.rim
+        shared = rim.new_zeros(len(rim), *self.shared.shape[1:])
+        return join([self, _Image(rim, outline.rim_normals, math.inf, torch.zeros_like(rim[:, 0]), shared)])
+
 
 @dataclasses.dataclass(frozen=True)
 class _Mirror:
@@ -204,7 +212,7 @@ def _split(scorer: SymmetryScorer, revolution: Revolution | None) -> list[_Part]
         return [_Part(scorer, every, *find_planes(scorer))]
     rows, rest = every[revolution.body], every[~revolution.body]
     body, attached = scorer.for_part(rows), scorer.for_part(rest)
-    parts = [_Part(body, rows, *find_planes(body))]
+    parts = [_Part(body, rows, *find_planes(body, turned=True))]
     if len(rest) >= MIN_ATTACHED:
         plane = find_plane_through_axis(attached, revolution.center, scorer.points[rest])
         parts.append(_Part(attached, rest, *plane))
@@ -216,6 +224,8 @@ def _mirror(parts: list[_Part]) -> list[_Image]:
     total, images, before = sum(len(part.planes) for part in parts), [], 0
     for part in parts:
         original = _Image.of(part.scorer, part.rows, total)
+        if len(part.rows) == len(part.scorer.points):  # of a part the outline says nothing
+            original = original.with_rim(part.scorer.outline)
         mirrors = [
             _Mirror.of(part.scorer, before + i, plane, score)
             for i, (plane, score) in enumerate(zip(part.planes, part.scores, strict=True))
@@ -233,7 +243,7 @@ def _merge(scorer: SymmetryScorer, merged: _Image, images: list[_Image]) -> _Ima
 
     for image in images:
         distance, _ = scorer.nearest(image.points)
-        new = image[(distance > NEW) & _allowed(scorer, image.points)]
+        new = image[(distance > NEW) & _allowed(scorer, image.points) & ~_on_table(scorer, image)]
         if len(merged) and len(new):
             distance, _ = KDTree(merged.points.numpy()).query(new.points.numpy())
             new = new[torch.from_numpy(distance) > SPACING]
@@ -246,6 +256,13 @@ def _allowed(scorer: SymmetryScorer, points: Float[Tensor, "n 3"]) -> Bool[Tenso
     outline = scorer.outline
     allowed = (outline.hull_distance(points) < HULL_MARGIN) & (outline.violation(points) < FRONT_MARGIN)
     return allowed if scorer.table is None else allowed & (points[:, 2] > scorer.table - TABLE_MARGIN)
+
+
+def _on_table(scorer: SymmetryScorer, image: _Image) -> Bool[Tensor, "n"]:
+    """Tell which points lie on the face on the table, which needs none: free space holds it."""
+    if scorer.table is None:
+        return torch.zeros(len(image), dtype=torch.bool)
+    return (image.points[:, 2] < scorer.table + FACE) & (image.normals[:, 2] < -DOWN)
 
 
 def _thin(points: Float[Tensor, "n 3"]) -> Tensor:
