@@ -30,8 +30,10 @@ from torchgrasp.shape.wall_observations import (
     OUTER_POINTS,
     OUTER_RADIUS,
     RIM_NOISE,
+    Middle,
     WallObservations,
     observe_walls,
+    tie_walls,
 )
 from torchgrasp.values import PointCloud
 
@@ -131,7 +133,8 @@ def fit_shape(
     most, stop = (MAX_BUDGET, noise) if budget == "sure" else (budget or BUDGETS[support], -math.inf)
     options = _Options(noise, psi_scale, kernel, criterion, most, stop)
     walls = [_fit_surface(seen, beside, options) for beside in supports]
-    shape = walls[0] if len(walls) == 1 else HollowShape.join(walls[0], walls[1], seen.cloud)
+    middle = supports[-1].middle
+    shape = walls[0] if middle is None else tie_walls(HollowShape.join(walls[0], walls[1], seen.cloud), middle)
     return shape.moved(obj_from_upright)
 
 
@@ -186,7 +189,8 @@ class _Support:
 
     `anchors` are points inside and outside; `normal_noise` is the cloud's. `parts` are rim and mirrored
     points, with the errors that their distances share. `free` holds points of free space and least distances there.
-    `rows` are the points of the cloud that lie on this surface; None: all. `kind` is the shape's.
+    `rows` are the points of the cloud that lie on this surface; None: all. `kind` is the shape's. `middle` is a
+    vessel's wall.
     """
 
     frame: Normalisation
@@ -197,6 +201,7 @@ class _Support:
     free: tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]] | None = None
     rows: Bool[Tensor, "rows"] | None = None
     kind: str = "guess"
+    middle: Middle | None = None
 
 
 def _paper_support(seen: PreparedCloud, noise: float, generator: torch.Generator) -> _Support:
@@ -250,15 +255,15 @@ def _vessel_supports(cloud: PointCloud, vessel: Vessel, table: float, noise: flo
     frame = Normalisation(center, float(torch.linalg.vector_norm(cloud.points - center, dim=-1).max()))
     cloud = cloud.to("cpu")
     outline = silhouettes(cloud)
-    outer, inner = observe_walls(cloud, vessel, outline, frame.to("cpu"), table, noise)
+    outer, inner, middle = observe_walls(cloud, vessel, outline, frame.to("cpu"), table, noise)
 
-    def support(wall: WallObservations, free: tuple[Tensor, Tensor] | None) -> _Support:
+    def support(wall: WallObservations, free: tuple[Tensor, Tensor] | None, middle: Middle | None = None) -> _Support:
         device = frame.center.device
         parts = tuple((part.to(device), None if shared is None else shared.to(device)) for part, shared in wall.parts)
         anchors, rows = wall.anchors.to(device), wall.rows.to(device)
-        return _Support(frame, anchors, NORMAL_NOISE, VESSEL_STD_FACTOR, parts, free, rows, "vessel")
+        return _Support(frame, anchors, NORMAL_NOISE, VESSEL_STD_FACTOR, parts, free, rows, "vessel", middle)
 
-    return support(outer, free_space(outline, frame, table)), support(inner, None)
+    return support(outer, free_space(outline, frame, table)), support(inner, None, middle.to(frame.center.device))
 
 
 def _observe_completion(completion: Completion, frame: Normalisation) -> tuple[tuple[Observations, Tensor | None], ...]:

@@ -7,12 +7,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value, join
-from torchgrasp.linalg import fibonacci_sphere
+from torchgrasp.linalg import farthest_points, fibonacci_sphere
 from torchgrasp.shape.completion.complete import LEAST_NOISE, PART
-from torchgrasp.shape.completion.silhouette import Outlines
-from torchgrasp.shape.completion.vessel import Vessel
-from torchgrasp.shape.completion.walls import FORM_ERROR, HiddenWall, complete_walls, lid
+from torchgrasp.shape.completion.silhouette import TIE, Outlines
+from torchgrasp.shape.completion.vessel import RIM, Vessel
+from torchgrasp.shape.completion.walls import FORM_ERROR, HiddenWall, Wall, complete_walls, lid
 from torchgrasp.shape.gp import Normalisation
+from torchgrasp.shape.hollow import HollowShape
 from torchgrasp.shape.joint_posterior import symmetric_root
 from torchgrasp.shape.observations import Observations, off_surface, on_surface
 from torchgrasp.values import PointCloud
@@ -25,9 +26,30 @@ OUTER_POINTS, OUTER_RADIUS = 20, 1.2
 """Points outside, and the radius, normalised, of the sphere on which they lie (Sec. 3.1)."""
 OVER = 0.5
 """Height over the rim, in radii of the mouth, at which the inner wall still surrounds free space: it has no lid."""
+SIDE = 0.8
+"""Upward part of a normal below which a wall is as thick as the rest; floors may be thicker, not thinner."""
+PROBES, ROUNDS, MOST = 150, 3, 24
+"""Places at which a wall's thickness is looked at, times it is, and places that are observed each time."""
+TOLERANCE, TIE_NOISE = 0.0005, 0.0007
+"""The wall may be off its thickness by this much [m]; standard deviation [m] with which it then is observed."""
 
 Part = tuple[Observations, Tensor | None]
 """Observations, and the errors that their distances share."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Middle(Value):
+    """Places amid the material of a vessel, normalised, and its thickness there.
+
+    Args:
+        x: the places.
+        side: which are as thick as `thickness`; others are at least as thick.
+        thickness: of the wall, normalised.
+    """
+
+    x: Float[Tensor, "n 3"]
+    side: Bool[Tensor, "n"]
+    thickness: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,8 +63,8 @@ class WallObservations(Value):
 
 def observe_walls(
     cloud: PointCloud, vessel: Vessel, outline: Outlines, frame: Normalisation, table: float, noise: float
-) -> tuple[WallObservations, WallObservations]:
-    """Return what is observed of the outer and of the inner wall of a vessel.
+) -> tuple[WallObservations, WallObservations, Middle]:
+    """Return what is observed of the outer and of the inner wall of a vessel, and where the material between them is.
 
     Distances are negative in the material. So the inner wall's are positive around the axis, and negative all around.
 
@@ -79,7 +101,51 @@ def observe_walls(
     return (
         WallObservations(outer.seen, body, parts),
         WallObservations(inner.seen, space, (_hidden(frame, inner.hidden),)),
+        _middle(cloud, vessel, (outer, inner), frame),
     )
+
+
+def tie_walls(shape: HollowShape, middle: Middle) -> HollowShape:
+    """Return the vessel with its wall as thick as it is known to be.
+
+    Two posteriors that know nothing of each other let walls touch, which tears holes. Amid the material both distances
+    sum to less than nothing, the thickness. Where they do not, the surer wall tells the other one where it is.
+    """
+    x, thickness, noise = middle.x, middle.thickness, TIE_NOISE / shape.scale
+    for _ in range(ROUNDS):
+        distance = torch.stack([wall.mean(x) for wall in shape.walls])
+        short = distance.sum(0) + thickness
+        off = torch.where(middle.side, short.abs(), short)
+        rows = torch.nonzero(off > TOLERANCE / shape.scale)[:, 0]
+        if not len(rows):
+            break
+        rows = rows[torch.argsort(off[rows], descending=True, stable=True)]
+        rows = rows[farthest_points(x[rows], MOST, tie=TIE)]
+        variance = torch.stack([wall.estimate(x[rows])[1][:, 0, 0] for wall in shape.walls])
+        walls = []
+        for number, wall in enumerate(shape.walls):
+            own, other = variance[number], variance[1 - number]
+            told = off_surface(x[rows], -thickness - distance[1 - number, rows], noise)
+            spread = torch.sqrt(shape.std_factor**2 * other + noise**2)
+            told = dataclasses.replace(told, distance_noise=spread)[own >= other]
+            walls.append(wall.append(told) if len(told.x) else wall)
+        shape = HollowShape.join(walls[0], walls[1], shape.cloud)
+    return shape
+
+
+def _middle(cloud: PointCloud, vessel: Vessel, walls: tuple[Wall, Wall], frame: Normalisation) -> Middle:
+    """Return places half a thickness behind both walls, without ears, handles and rim."""
+    assert cloud.normals is not None
+    points, normals = [], []
+    for wall, seen in zip(walls, (vessel.body & ~vessel.inner, vessel.inner), strict=True):
+        points += [cloud.points[seen], wall.hidden.points]
+        normals += [cloud.normals[seen], wall.hidden.normals]
+    at, out = torch.cat(points), torch.cat(normals)
+    below = at[:, 2] < vessel.rim - RIM
+    at, out = at[below], out[below]
+    rows = farthest_points(at, PROBES, tie=TIE)
+    x = frame.normalise(at[rows] - 0.5 * vessel.thickness * out[rows])
+    return Middle(x, out[rows, 2].abs() < SIDE, vessel.thickness / frame.scale)
 
 
 def _anchors(

@@ -42,9 +42,9 @@ def find_revolution(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"])
     >>> find_revolution(0.03 * level + torch.tensor([0.1, 0.2, 0.0]).double(), level).center
     tensor([0.1000, 0.2000], dtype=torch.float64)
     """
-    slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
-    steep, level, across, offset = _lines(points, normals, slope)
-    center = fit_axis(points, normals)
+    lines = _lines(points, normals)
+    center = _fit_to_lines(points, lines)
+    steep, level, across, offset = lines.steep, lines.level, lines.across, lines.offset
     miss = offset - across @ center
 
     radius = torch.linalg.vector_norm(points[:, :2] - center, dim=1)
@@ -61,22 +61,35 @@ def find_revolution(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"])
 
 def fit_axis(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, "2"]:
     """Return the vertical axis [m] that most lines along the normals meet."""
+    return _fit_to_lines(points, _lines(points, normals))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Lines:
+    """The lines across . x = offset along normals: their level part `slope` is steep, and of unit length `level`."""
+
+    slope: Float[Tensor, "n"]
+    steep: Bool[Tensor, "n"]
+    level: Float[Tensor, "n 2"]
+    across: Float[Tensor, "n 2"]
+    offset: Float[Tensor, "n"]
+
+
+def _lines(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> _Lines:
+    """Return the lines along the normals, seen from above."""
     slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
-    _, _, across, offset = _lines(points, normals, slope)
-    miss = torch.zeros_like(offset)
-    center = points[:, :2].mean(0)
-    for _ in range(ITERATIONS):
-        weight = slope / (1.0 + (miss / HALF_WEIGHT) ** 2)
-        center = torch.linalg.lstsq(weight[:, None].sqrt() * across, (weight.sqrt() * offset)[:, None]).solution[:, 0]
-        miss = offset - across @ center
-    return center
-
-
-def _lines(
-    points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], slope: Float[Tensor, "n"]
-) -> tuple[Bool[Tensor, "n"], Float[Tensor, "n 2"], Float[Tensor, "n 2"], Float[Tensor, "n"]]:
-    """Return which normals are steep, their level unit parts, and the lines across . x = offset along them."""
     steep = slope > STEEP
     level = torch.where(steep[:, None], normals[:, :2] / slope[:, None], 0.0)
     across = torch.stack([-level[:, 1], level[:, 0]], 1)
-    return steep, level, across, (across * points[:, :2]).sum(1)
+    return _Lines(slope, steep, level, across, (across * points[:, :2]).sum(1))
+
+
+def _fit_to_lines(points: Float[Tensor, "n 3"], lines: _Lines) -> Float[Tensor, "2"]:
+    """Return the point that most lines meet; reweighted least squares (Cauchy)."""
+    miss, center = torch.zeros_like(lines.offset), points[:, :2].mean(0)
+    for _ in range(ITERATIONS):
+        weight = lines.slope / (1.0 + (miss / HALF_WEIGHT) ** 2)
+        system, known = weight[:, None].sqrt() * lines.across, (weight.sqrt() * lines.offset)[:, None]
+        center = torch.linalg.lstsq(system, known).solution[:, 0]
+        miss = lines.offset - lines.across @ center
+    return center

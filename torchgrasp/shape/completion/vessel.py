@@ -30,6 +30,9 @@ DEPTH = 0.012
 """Depth [m] below the rim to which the inside must be seen: the recess of a lid is no cavity."""
 MIN_THICKNESS, MAX_THICKNESS = 0.0003, 0.012
 """Thickness [m] of a wall: beyond it a body with a hollow needs no two surfaces."""
+USUAL, SPREAD, THICKNESS_ERROR = 0.0035, 0.0015, 0.0012
+"""Thickness [m] of household vessels, 2 to 5 mm, and its standard deviation; that of one fit, rms on 40 noisy views of
+authored cups. A wall is the mean of both by their weights: thin fits tear holes, and thick ones fill the cavity."""
 RIM_QUANTILE = 0.98
 """Share of the body below its rim: noise lifts some points over it."""
 RIM, EDGE = 0.003, 0.002
@@ -45,7 +48,7 @@ class Vessel(Value):
 
     Args:
         center: of the axis.
-        thickness: of the wall, across it.
+        thickness: of the wall, across it; what was seen, weighted with what is usual.
         radius: outer radius of the mouth.
         rim: height of the mouth.
         inner: points seen through the mouth.
@@ -71,7 +74,7 @@ def find_vessel(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> 
     >>> sign = torch.where(torch.arange(900) % 2 == 0, 1.0, -1.0).double()[:, None]
     >>> points = (0.035 + 0.002 * sign) * level + height[:, None] * torch.tensor([0.0, 0.0, 0.07]).double()
     >>> round(find_vessel(points, sign * level).thickness, 4)
-    0.004
+    0.0038
     """
     slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
     level = normals[:, :2] / slope[:, None].clamp_min(1e-9)
@@ -108,4 +111,6 @@ def find_vessel(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> 
     enough = all(float(s) > least for s, least in zip(shares, (INNER_SHARE, OUTER_SHARE, BODY_SHARE), strict=True))
     if not enough or not math.isfinite(mouth) or float(rim - points[inner, 2].min()) < DEPTH:
         return None
+    usual = 1.0 / (1.0 + (SPREAD / THICKNESS_ERROR) ** 2)
+    thickness = usual * USUAL + (1.0 - usual) * thickness
     return Vessel(center, thickness, mouth, rim, inner, body & (points[:, 2] < rim - RIM))
