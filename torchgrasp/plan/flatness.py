@@ -7,12 +7,12 @@ import dataclasses
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Batch
 from torchgrasp.linalg import unit
-from torchgrasp.plan.problem import Shape, triple_jet
+from torchgrasp.plan.problem import Shape, triple_jet, walls_of
 from torchgrasp.plan.solver import project
 from torchgrasp.plan.wrench import Triples, cone_edges, tangents
 
@@ -28,7 +28,24 @@ def ring_directions(normals: Triples, points: Triples, n: int) -> Float[Tensor, 
 
 
 def normal_variation(shape: Shape, points: Triples, normals: Triples, radius: float) -> Float[Tensor, "b 3"]:
-    """Return the largest angle [rad] between the normals at a contact and on its ring of a radius [m]."""
+    """Return the largest angle [rad] between the normals at a contact and on its ring of a radius [m].
+
+    The ring of a contact on a thin wall is on that side of it, though it may lie nearer to the other.
+    """
+    variation, *others = (_wall_variation(wall, points, normals, radius) for wall in walls_of(shape))
+    for number, other in enumerate(others, start=1):
+        variation = torch.where(_owned(shape, points, number), other, variation)
+    return variation
+
+
+def _owned(shape: Shape, points: Triples, number: int) -> Bool[Tensor, "b 3"]:
+    """Tell which contacts are on one wall of a shape of several."""
+    owner = getattr(shape, "wall_at")(points.flatten(0, 1))  # noqa: B009 a shape of one wall need not tell
+    return owner[:, number].unflatten(0, points.shape[:2])
+
+
+def _wall_variation(shape: Shape, points: Triples, normals: Triples, radius: float) -> Float[Tensor, "b 3"]:
+    """Return the same of one surface."""
     around = ring_directions(normals, points, JUDGED_POINTS)
     ring = points[:, :, None] + radius / float(shape.scale) * around
     _, gradient = shape.mean_and_gradient(project(shape, ring.flatten(1, 2), steps=1).flatten(0, 1))
@@ -59,6 +76,16 @@ def flatness_constraint(shape: Shape, points: Triples, flatness: float, radius: 
 
     Values are lengths: chords times the ring's `radius` [m], normalised.
     """
+    found, *others = (_wall_constraint(wall, points, flatness, radius) for wall in walls_of(shape))
+    for number, other in enumerate(others, start=1):
+        own = _owned(shape, points, number)[:, None].expand(-1, GUIDING_POINTS, -1).flatten(1)
+        value, slope = torch.where(own, other.value, found.value), torch.where(own[..., None], other.by_points, found.by_points)
+        found = FlatnessConstraint(value, slope, points)
+    return found
+
+
+def _wall_constraint(shape: Shape, points: Triples, flatness: float, radius: float) -> FlatnessConstraint:
+    """Return the same of one surface."""
     jet, radius = triple_jet(shape, points), radius / float(shape.scale)
     identity = torch.eye(3, dtype=points.dtype, device=points.device)
     around = ring_directions(jet.normals, points, GUIDING_POINTS).transpose(1, 2)

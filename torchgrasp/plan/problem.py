@@ -51,6 +51,11 @@ def device_of(shape: Shape) -> torch.device:
     return getattr(shape, "device", torch.device("cpu"))
 
 
+def walls_of(shape: Shape) -> tuple[Shape, ...]:
+    """Return the surfaces of a shape, each as a shape: two of an open vessel, else the shape itself."""
+    return getattr(shape, "walls", (shape,))
+
+
 def triple_jet(shape: Shape, points: Triples) -> SurfaceJet:
     """Evaluate the shape at all points of all triples."""
     return map_tensors(lambda x: x.unflatten(0, points.shape[:2]), shape.jet(points.flatten(0, 1)))

@@ -11,7 +11,7 @@ from torchgrasp.base import check_tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
 from torchgrasp.plan.flatness import normal_variation
-from torchgrasp.plan.problem import ContactProblem, Shape, device_of, triple_jet
+from torchgrasp.plan.problem import ContactProblem, Shape, device_of, triple_jet, walls_of
 from torchgrasp.plan.solver import project
 from torchgrasp.plan.wrench import Triples, closed_exact
 from torchgrasp.specs import FLAT_RADII, ContactSpec
@@ -102,8 +102,10 @@ def draw(shape: Shape, spec: ContactSpec, count: int, generator: torch.Generator
 
 
 def survey(shape: Shape, spec: ContactSpec, generator: torch.Generator) -> Float[Tensor, "_ 3 3"]:
-    """Return points all over the surface, among which candidates are found."""
-    return project(shape, draw(shape, spec, CANDIDATE_TRIPLES, generator), steps=6)
+    """Return points all over the surface, among which candidates are found; of a vessel as many on either wall."""
+    walls = walls_of(shape)
+    drawn = draw(shape, spec, CANDIDATE_TRIPLES, generator).tensor_split(len(walls))
+    return torch.cat([project(wall, points, steps=6) for wall, points in zip(walls, drawn, strict=True)])
 
 
 def draw_in(shape: Shape, points: Triples) -> Triples:
