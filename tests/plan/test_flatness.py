@@ -3,14 +3,18 @@
 import dataclasses
 import math
 
+import pytest
 import torch
 from torch import Tensor
 
+from tests.cups import RADIUS, cup_view, ring
 from torchgrasp.linalg import unit
 from torchgrasp.plan.flatness import GUIDING_POINTS, INSIDE, flatness_constraint, normal_variation
 from torchgrasp.plan.problem import triple_jet
 from torchgrasp.plan.solver import project
 from torchgrasp.plan.wrench import tangents
+from torchgrasp.shape.fit import fit_shape
+from torchgrasp.shape.hollow import HollowShape
 
 RING_RADIUS = 0.008
 
@@ -63,3 +67,22 @@ def test_slope_against_automatic_differentiation(ellipsoid, generator):
     step = 1e-3 * torch.randn(points.shape, generator=generator, dtype=torch.float64)
     linear = constraint.value + (constraint.by_points @ step.flatten(1)[..., None])[..., 0]
     torch.testing.assert_close(constraint.values(points + step), linear)
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_a_thin_wall_is_as_flat_as_its_own_side(inside: bool):
+    """The ring of a contact inside a cup runs through the wall, nearer to its outside."""
+    vessel = fit_shape(cup_view(0.002), table=0.0)
+    assert isinstance(vessel, HollowShape)
+    points, out = ring(RADIUS - (0.002 if inside else 0.0), 0.03, 0.055)
+    wall = vessel.walls[int(inside)]
+    triples = project(wall, vessel.normalise(points).reshape(-1, 3, 3), steps=6)
+    triples = triples[vessel.wall_at(triples.flatten(0, 1))[:, int(inside)].reshape(-1, 3).all(1)]
+    assert len(triples) > 15
+    normals = triple_jet(vessel, triples).normals
+    assert bool(((out[:1] * normals[0, :1]).sum() > 0) != inside)
+    angle = normal_variation(vessel, triples, normals, RING_RADIUS)
+    assert angle.median() < 2 * math.atan(RING_RADIUS / RADIUS)  # that of the cylinder, and as much for the camera
+    torch.testing.assert_close(angle, normal_variation(wall, triples, normals, RING_RADIUS))
+    limit = float(angle.max()) / INSIDE
+    assert bool((flatness_constraint(vessel, triples, limit, RING_RADIUS).value < 1e-3).all())

@@ -11,6 +11,7 @@ from torchgrasp.plan.line_posterior import line_posterior
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.hollow import HollowShape
 from torchgrasp.shape.surface import extract_surface
+from torchgrasp.shape.wall_observations import Middle, tie_walls
 from torchgrasp.values import Contacts
 
 WALL = 0.003
@@ -131,3 +132,27 @@ def test_a_fingers_line_meets_the_wall_of_its_contact(vessel: HollowShape):
     for k, whole in ((0, alone[0]), (1, alone[1]), (2, alone[0])):
         torch.testing.assert_close(lines.distance[0, k], whole.distance[0, k])
         torch.testing.assert_close(lines.slope[0, k], whole.slope[0, k])
+
+
+def test_walls_are_tied_at_their_thickness_and_floors_only_where_they_are_thinner(vessel: HollowShape):
+    places = vessel.normalise(ring(RADIUS - WALL / 2, 0.02, HEIGHT - 0.02)[0])
+    every, thickness = torch.ones(len(places), dtype=torch.bool), 0.005 / vessel.scale
+
+    def sum_of(shape: HollowShape) -> Tensor:
+        return shape.outer.mean(places) + shape.lining.mean(places)
+
+    tied = tie_walls(vessel, Middle(places, every, thickness))
+    assert (sum_of(vessel) + thickness).abs().median() * vessel.scale > 0.001
+    assert (sum_of(tied) + thickness).abs().median() * vessel.scale < 0.0006
+    thin = tie_walls(vessel, Middle(places, ~every, 0.0005 / vessel.scale))
+    assert len(thin.lining.x) == len(vessel.lining.x) and len(thin.x) == len(vessel.x)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_thin_wall_has_no_holes(seed: int):
+    shape = fit_shape(cup_view(0.002, seed=seed), table=0.0)
+    middle, _ = ring(RADIUS - 0.001, 0.015, HEIGHT - 0.012)
+    out = middle * torch.tensor([1.0, 1.0, 0.0]) / torch.linalg.vector_norm(middle[:, :2], dim=1)[:, None]
+    across = torch.stack([middle + s * out for s in torch.linspace(-0.004, 0.004, 17, dtype=torch.float64)], 1)
+    material = (shape.predict(across).distance < 0).any(1)
+    assert material.double().mean() > 0.96

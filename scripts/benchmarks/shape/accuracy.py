@@ -174,9 +174,9 @@ def format_groups(rows: Sequence[Row]) -> str:
 
 
 def mean_row(rows: Sequence[Row]) -> Row:
-    """Return the mean of every number over the rows that measured it."""
+    """Return the mean of every number of the first row over the rows that measured it."""
     numbers = [key for key, value in rows[0].items() if isinstance(value, float)]
-    table = {key: np.array([row[key] for row in rows]) for key in numbers}
+    table = {key: np.array([row.get(key, np.nan) for row in rows]) for key in numbers}
     return {key: float(v[np.isfinite(v)].mean()) if np.isfinite(v).any() else float("nan") for key, v in table.items()}
 
 

@@ -74,7 +74,7 @@ def true_wall(
     points, normals = sample_mesh(mesh, n, np.random.default_rng(seed))
     side = normals[:, 2].abs() < LEVEL
     points, normals = points[side], normals[side]
-    corners = torch.from_numpy(np.asarray(mesh.triangles, dtype=np.float64))
+    corners = torch.from_numpy(np.array(mesh.triangles, dtype=np.float64))
     a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     across = torch.linalg.cross(ab, ac)
     depth = torch.full_like(points[:, 0], torch.inf)
@@ -114,7 +114,7 @@ def estimated_thickness(
 
 def _rim_seen(mesh: "trimesh.Trimesh", cloud: PointCloud, points: Float[Tensor, "k 3"]) -> Tensor:
     """Tell over which points the cloud holds the rim: the highest part of the mesh in their sector."""
-    vertices = torch.from_numpy(np.asarray(mesh.vertices, dtype=np.float64))
+    vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
     middle = (vertices.amin(0) + vertices.amax(0)) / 2
 
     def sector(p: Tensor) -> Tensor:
