@@ -79,7 +79,10 @@ def flatness_constraint(shape: Shape, points: Triples, flatness: float, radius: 
     found, *others = (_wall_constraint(wall, points, flatness, radius) for wall in walls_of(shape))
     for number, other in enumerate(others, start=1):
         own = _owned(shape, points, number)[:, None].expand(-1, GUIDING_POINTS, -1).flatten(1)
-        value, slope = torch.where(own, other.value, found.value), torch.where(own[..., None], other.by_points, found.by_points)
+        value, slope = (
+            torch.where(own, other.value, found.value),
+            torch.where(own[..., None], other.by_points, found.by_points),
+        )
         found = FlatnessConstraint(value, slope, points)
     return found
 
