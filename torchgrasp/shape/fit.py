@@ -61,12 +61,9 @@ STD_FACTORS: dict[tuple[Kind, bool], float] = {
 `scripts/train.py bands DIR` fits them and tries each on families left out; a guess keeps the posterior's own.
 What lies beyond an image's border is farther from all that was seen: a half cylinder is within 2 of twice its own."""
 WHOLE_STD_FACTOR, VESSEL_STD_FACTOR = 0.5, 0.58
-"""The same where all sides were seen; of a vessel, whose hidden walls then lie to 76, 94 and 100 % within 1, 2 and 3 on
-families left out."""
-FREE_NOISE = 0.003
-"""Standard deviation [m] of the least distance observed in free space, which is a bound, not a measurement."""
-FREE_ROUNDS = 3
-"""Times that a shape is pushed out of free space; a push may bulge it elsewhere."""
+"""The same where all sides were seen; of a vessel: families left out lie to 76, 94 and 100 % within 1, 2 and 3."""
+FREE_NOISE, FREE_ROUNDS = 0.003, 3
+"""Standard deviation [m] of a least distance in free space, a bound; times that a shape is pushed out of it."""
 BUDGETS = {"camera": 85, "paper": 70}
 """Points observed by default: fewer lose accuracy on the seen side, more cost planning time."""
 MAX_BUDGET = 1000
@@ -134,8 +131,8 @@ def fit_shape(
     most, stop = (MAX_BUDGET, noise) if budget == "sure" else (budget or BUDGETS[support], -math.inf)
     options = _Options(noise, psi_scale, kernel, criterion, most, stop)
     walls = [_fit_surface(seen, beside, options) for beside in supports]
-    middle = supports[-1].middle
-    shape = walls[0] if middle is None else tie_walls(HollowShape.join(walls[0], walls[1], seen.cloud), middle)
+    shape, middle = walls[0], supports[0].middle
+    shape = shape if middle is None else tie_walls(HollowShape.join(*walls, seen.cloud), middle)
     return shape.moved(obj_from_upright)
 
 
@@ -190,8 +187,7 @@ class _Support:
 
     `anchors` are points inside and outside; `normal_noise` is the cloud's. `parts` are rim and mirrored
     points, with the errors that their distances share. `free` holds points of free space and least distances there.
-    `rows` are the points of the cloud that lie on this surface; None: all. `kind` is the shape's. `middle` is a
-    vessel's wall.
+    `rows` are the points of the cloud that lie on this surface; None: all. `kind` is the shape's, `middle` a wall.
     """
 
     frame: Normalisation
@@ -254,17 +250,16 @@ def _vessel_supports(cloud: PointCloud, vessel: Vessel, table: float, noise: flo
     """Return the supports of an open vessel's outer body and of its inner wall."""
     center = (cloud.points.amin(0) + cloud.points.amax(0)) / 2
     frame = Normalisation(center, float(torch.linalg.vector_norm(cloud.points - center, dim=-1).max()))
-    cloud = cloud.to("cpu")
+    cloud, device = cloud.to("cpu"), frame.center.device
     outline = silhouettes(cloud)
     outer, inner, middle = observe_walls(cloud, vessel, outline, frame.to("cpu"), table, noise)
 
-    def support(wall: WallObservations, free: tuple[Tensor, Tensor] | None, middle: Middle | None = None) -> _Support:
-        device = frame.center.device
+    def support(wall: WallObservations, free: tuple[Tensor, Tensor] | None) -> _Support:
         parts = tuple((part.to(device), None if shared is None else shared.to(device)) for part, shared in wall.parts)
-        anchors, rows = wall.anchors.to(device), wall.rows.to(device)
-        return _Support(frame, anchors, NORMAL_NOISE, VESSEL_STD_FACTOR, parts, free, rows, "vessel", middle)
+        anchors, rows, amid = wall.anchors.to(device), wall.rows.to(device), middle.to(device)
+        return _Support(frame, anchors, NORMAL_NOISE, VESSEL_STD_FACTOR, parts, free, rows, "vessel", amid)
 
-    return support(outer, free_space(outline, frame, table)), support(inner, None, middle.to(frame.center.device))
+    return support(outer, free_space(outline, frame, table)), support(inner, None)
 
 
 def _observe_completion(completion: Completion, frame: Normalisation) -> tuple[tuple[Observations, Tensor | None], ...]:
