@@ -132,7 +132,7 @@ def fit_shape(
     options = _Options(noise, psi_scale, kernel, criterion, most, stop)
     walls = [_fit_surface(seen, beside, options) for beside in supports]
     shape, middle = walls[0], supports[0].middle
-    shape = shape if middle is None else tie_walls(HollowShape.join(*walls, seen.cloud), middle)
+    shape = shape if middle is None else tie_walls(HollowShape.join(shape, walls[1], seen.cloud), middle)
     return shape.moved(obj_from_upright)
 
 
