@@ -68,6 +68,8 @@ class Batch(Value):
                 raise BadArgument("rows", repr(rows), "an index, a slice, a mask of all rows or a tensor of indices")
             row = range(len(self))[rows]
             rows = slice(row, row + 1)
+        elif isinstance(rows, Tensor) and rows.dtype == torch.bool and rows.shape == (len(self),):
+            rows = torch.nonzero(rows)[:, 0]  # once for all tensors: on a GPU the host waits for the number of rows
         return map_tensors(lambda x: x[rows], self)
 
     def __iter__(self: SomeBatch) -> Iterator[SomeBatch]:
@@ -108,6 +110,17 @@ def named_tensors(value: Value, prefix: str = "") -> dict[str, Tensor]:
         elif isinstance(inner, Value):
             tensors |= named_tensors(inner, f"{prefix}{field.name}.")
     return tensors
+
+
+def settle(value: SomeValue, device: torch.device) -> SomeValue:
+    """Return a value on a device: itself, with all that it has cached, where it is there already."""
+    return value if all(x.device == device for x in named_tensors(value).values()) else value.to(device)
+
+
+def check_device(name: str, found: torch.device, beside: str, wanted: torch.device) -> None:
+    """Refuse an argument on another device than the one `beside` it; raise `BadArgument`."""
+    if found != wanted:
+        raise BadArgument(name, f"tensors on {found}", f"tensors on {wanted}, as {beside}: `.to` moves them")
 
 
 def count_status(status: Int[Tensor, "*b"]) -> dict[Status, int]:

@@ -25,7 +25,7 @@ def rigid(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"])
     tensor([1., 1., 1.])
     """
     top = torch.cat([rotation, translation[..., None]], dim=-1)
-    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=top.dtype, device=top.device)
+    bottom = torch.eye(4, dtype=top.dtype, device=top.device)[3]
     return torch.cat([top, bottom.expand(*top.shape[:-2], 1, 4)], dim=-2)
 
 
@@ -59,7 +59,10 @@ def rotation_from_vector(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     >>> torch.allclose(rotation_from_vector(torch.zeros(3)), torch.eye(3))
     True
     """
-    return torch.linalg.matrix_exp(skew(v))
+    angle = torch.linalg.vector_norm(v, dim=-1)[..., None, None]
+    turn, half = skew(v), torch.sinc(angle / (2 * math.pi))  # Rodrigues: sin x / x, and (1 - cos x) / x^2 = half^2 / 2
+    identity = torch.eye(3, dtype=v.dtype, device=v.device)
+    return identity + torch.sinc(angle / math.pi) * turn + half * half / 2 * (turn @ turn)
 
 
 def rotation_from_rpy(rpy: tuple[float, float, float]) -> Float[Tensor, "3 3"]:

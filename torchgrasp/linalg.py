@@ -56,7 +56,7 @@ def cholesky(matrix: Float[Tensor, "*b n n"], what: str, remedy: str) -> Float[T
             [0., 1.]])
     """
     factor, info = torch.linalg.cholesky_ex(matrix)
-    if bool((info != 0).any()) or not bool(torch.isfinite(factor).all()):
+    if not bool((info == 0).all() & torch.isfinite(factor).all()):  # one wait for the device
         finite = bool(torch.isfinite(matrix).all())
         smallest = float(torch.linalg.eigvalsh(matrix).min()) if finite else float("nan")
         raise IndefiniteCovariance(what, smallest, remedy)
@@ -93,9 +93,9 @@ def farthest_points(
     >>> farthest_points(torch.tensor([[0.0], [1.0], [9.0]]), 2)
     tensor([0, 2])
     """
-    picks = [first] if len(points) else []
+    picks = torch.full((min(count, len(points)),), first, dtype=torch.long, device=points.device)
     nearest = torch.full((len(points),), torch.inf, dtype=points.dtype, device=points.device)
-    while len(picks) < min(count, len(points)):
-        nearest = torch.minimum(nearest, distance(points, points[picks[-1]]))
-        picks.append(int(torch.nonzero(nearest >= (1.0 - tie) * nearest.max())[0]))
-    return torch.tensor(picks, dtype=torch.long, device=points.device)
+    for k in range(1, len(picks)):
+        nearest = torch.minimum(nearest, distance(points, points.index_select(0, picks[k - 1 : k])[0]))
+        picks[k] = (nearest >= (1.0 - tie) * nearest.max()).int().argmax()  # the first of the largest
+    return picks

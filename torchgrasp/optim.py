@@ -74,11 +74,12 @@ def levenberg_marquardt(problem: Problem[State, Model], state: State, steps: int
     rows, damping = rows.to(model.cost.device), torch.full_like(model.cost, problem.first_damping)
     for _ in range(steps):
         x, taken = problem.step(model, damping)
-        if not bool(taken.all()):
+        left = torch.nonzero(taken)[:, 0]  # the only wait for the device in a step
+        if len(left) < len(taken):
             whole = put(whole, rows, state)
-            if not bool(taken.any()):
+            if not len(left):
                 return whole
-            rows, state, model, x, damping = rows[taken], state[taken], model[taken], x[taken], damping[taken]
+            rows, state, model, x, damping = rows[left], state[left], model[left], x[left], damping[left]
         trial_state = problem.move(state, x)
         trial = problem.linearise(trial_state, rows)
         accepted, damping = problem.judge(model, trial, x, damping)

@@ -5,6 +5,7 @@ what they are given into a frame that only scene and camera determine, and their
 """
 
 import dataclasses
+import functools
 import math
 from typing import Any
 
@@ -66,6 +67,12 @@ class Plane(Value):
     def horizontal(cls, height: float) -> "Plane":
         """Return the plane z = height [m]."""
         return cls(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), float(height))
+
+    @functools.cached_property
+    def components(self) -> tuple[float, float, float]:
+        """The normal as numbers, read from its device once."""
+        x, y, z = self.normal.tolist()
+        return x, y, z
 
     def height(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return the heights [m] of points above the plane."""

@@ -4,9 +4,11 @@ import functools
 from collections.abc import Callable
 from typing import get_args
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import check_device, settle
 from torchgrasp.control.closing import FixedGainClosing, LawClosing, OpenLoopClosing, PositionClosing, Revision
 from torchgrasp.control.holding import ForceHold, PositionHold
 from torchgrasp.control.observation import Observation
@@ -38,7 +40,7 @@ def check_modes(closing: str, holding: str, belief: object = None, without: tupl
 
 
 class GraspController:
-    """Close a hand and hold the object: observations in, joint targets out.
+    """Close a hand and hold the object: observations in, joint targets out, all on the CPU.
 
     A closing brings the fingers to the object, then a holding presses. `closed` turns true `PRESSING_TIME` later:
     then the hand may be lifted, with further steps. The open loop keeps its squeeze.
@@ -80,7 +82,7 @@ class GraspController:
         without: tuple[ClosingPart, ...] = (),
     ) -> None:
         check_modes(closing, holding, belief, without)
-        self.reference = reference
+        self.reference = reference = settle(reference, torch.device("cpu"))
         self.closing = _closing(reference, closing, belief, without)
         self._hold, self.hold = _holding(self.closing, holding), None
         self.targets = reference.expand(reference.pregrasp)
@@ -94,7 +96,12 @@ class GraspController:
         return self.pressed >= PRESSING_TIME - 1e-9
 
     def step(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
-        """Return the targets of all joints [rad] for the next tick, a period [s] later."""
+        """Return the targets of all joints [rad] for the next tick, a period [s] later.
+
+        Raises:
+            BadArgument: an observation on another device than the CPU.
+        """
+        check_device("observation", observation.joints.device, "the controller", self.targets.device)
         over = self.closing.done or self.time >= CLOSING_TIME
         if self.hold is None and over and not isinstance(self.closing, OpenLoopClosing):
             self.hold = self._hold(self.reference, observation, self.targets)

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import settle
 from torchgrasp.control.stiffness import joint_stiffness
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, inverse, rotate
@@ -64,7 +65,7 @@ def squeeze(hand: Hand, grasps: Grasps, force: float = 4.0, kp: float | None = N
     The targets solve J^T f = kp (target - q) for the `desired_forces` f; they may exceed a joint's limits.
 
     Args:
-        hand: the hand.
+        hand: the hand; it follows the grasps to their device.
         grasps: g rows, planned for it.
         force: normal force of the strongest finger [N].
         kp: stiffness of every joint's drive [N m/rad]; None: the hand's own.
@@ -79,7 +80,7 @@ def squeeze(hand: Hand, grasps: Grasps, force: float = 4.0, kp: float | None = N
     True
     """
     check_squeeze(hand, grasps, force, kp)
-    hand, joints = hand.to(torch.float64), grasps.joints.double()
+    hand, joints = settle(hand.to(torch.float64), grasps.joints.device), grasps.joints.double()
     forces = desired_forces(*contacts_in_hand(grasps), force)
     return press(joints, hand.jacobian(joints), forces, joint_stiffness(hand, kp))
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value
+from torchgrasp.base import Value, check_device
 from torchgrasp.control.tactile import TactileState
 from torchgrasp.hand.hand import Hand
 
@@ -29,7 +29,12 @@ class Observation(Value):
 
 
 def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> Observation:
-    """Return the observation of a robot with actuated joints [rad] and fingertips as read."""
+    """Return the observation of a robot with actuated joints [rad] and fingertips as read.
+
+    Raises:
+        BadArgument: joints or fingertips on another device than the hand.
+    """
+    check_device("tactile", tactile.lagged.device, "the hand", hand.lower.device)
     joints = joints.double()
     tips = hand.tip_centres(joints)
     axes, origins = hand.tree.joint_axes(hand.link_poses(joints))

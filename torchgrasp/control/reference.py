@@ -64,7 +64,7 @@ class ClosingReference(Value):
         kp: float | None = None,
         stability: "StabilityModel | None" = None,
     ) -> "ClosingReference":
-        """Derive the reference of one grasp.
+        """Derive the reference of one grasp, on the CPU: a tick has too little work for a GPU.
 
         Args:
             hand: the hand.
@@ -86,8 +86,8 @@ class ClosingReference(Value):
         check_tensor("grasp.obj_from_hand", grasp.obj_from_hand, (1, 4, 4))
         check_tensor("grasp.contacts.points", contacts.points, (1, 3, 3))
         check_tensor("grasp.contacts.normals", contacts.normals, (1, 3, 3))
-        std_m = check_tensor("grasp.contacts.std_m", contacts.std_m, (1, 3)).double()
-        hand, grasp = hand.to(torch.float64), grasp.to(torch.float64)
+        std_m = check_tensor("grasp.contacts.std_m", contacts.std_m, (1, 3)).to("cpu", torch.float64)
+        hand, grasp = hand.to("cpu", torch.float64), grasp.to("cpu", torch.float64)
         points, normals = contacts_in_hand(grasp)
         preferred = deviation = None
         sure = FORCE_FLOOR

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Value
+from torchgrasp.base import Value, check_device
 from torchgrasp.linalg import unit
 
 SAMPLING_RATE = 100.0
@@ -92,7 +92,11 @@ def measure(
         radius: of the tips [m]; 0: not round (`FLAT_RADIUS`).
         period: of the tick [s].
         generator: draws the noise; None: no noise.
+
+    Raises:
+        BadArgument: true contacts on another device than the state.
     """
+    check_device("truth", truth.forces.device, "the tactile state", tactile.lagged.device)
     force = torch.cat([truth.normal_force[..., None], truth.forces], dim=-1)
     lagged = tactile.lagged + low_pass(CUTOFF, period) * (force - tactile.lagged)
     age, interval = tactile.age + period, 1 / SAMPLING_RATE

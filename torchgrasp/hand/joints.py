@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value
+from torchgrasp.base import Value, check_device
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand_toml import HandSpec
 from torchgrasp.hand.urdf import Mimic, Urdf
@@ -28,15 +28,20 @@ class ActuatedJoints(Value):
     def expand(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
         """Return every movable joint of the URDF."""
         self.check(joints)
+        return self.couple(joints)
+
+    def couple(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
+        """Return every movable joint without a check, for which the host would wait for a GPU."""
         return joints @ self.coupling.to(joints).T + self.offset.to(joints)
 
     def check(self, joints: Tensor) -> None:
-        """Refuse joints of a wrong count or dtype, NaN and infinity."""
+        """Refuse joints of a wrong count, dtype or device, NaN and infinity."""
         if joints.ndim < 1 or joints.shape[-1] != len(self.names):
             wanted = f"{len(self.names)} joints last: {self.names}"
             raise BadArgument("joints", f"shape {tuple(joints.shape)}", wanted)
         if joints.dtype not in (torch.float32, torch.float64):
             raise BadArgument("joints", str(joints.dtype), "torch.float32 or torch.float64")
+        check_device("joints", joints.device, "the hand", self.lower.device)
         finite = torch.isfinite(joints)
         if not bool(finite.all()):
             value, k = _first(joints, ~finite)

@@ -64,7 +64,7 @@ class KinematicTree(Value):
     def poses(self, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
         """Return `root_from_link` of every link for joints [rad or m]."""
         frames = self.frames(values.T.contiguous())
-        last = frames.new_tensor([0.0, 0.0, 0.0, 1.0])[:, None, None].expand(1, 4, *frames.shape[2:])
+        last = torch.eye(4, dtype=frames.dtype, device=frames.device)[3, :, None, None].expand(1, 4, *frames.shape[2:])
         return torch.cat([frames, last]).permute(3, 2, 0, 1)
 
     def joint_axes(self, poses: Float[Tensor, "*b l 4 4"]) -> tuple[Float[Tensor, "*b j 3"], Float[Tensor, "*b j 3"]]:

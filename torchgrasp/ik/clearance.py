@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value
+from torchgrasp.base import Value, settle
 from torchgrasp.hand.collision_spheres import CollisionSpheres
 from torchgrasp.ik.configuration import SpatialJacobian, wrench_of
 from torchgrasp.ik.obstacles import Obstacles
@@ -44,8 +44,9 @@ class CollisionWorld(Value):
 
     @cached_property
     def plane(self) -> Plane | None:
-        """The table as a plane."""
-        return as_plane(self.table)
+        """The table as a plane, on the device of the fields."""
+        plane = as_plane(self.table)
+        return plane if plane is None or not self.fields else settle(plane, self.fields[0].origin.device)
 
     @property
     def fields(self) -> tuple[SignedDistanceField, ...]:
@@ -65,7 +66,7 @@ class CollisionWorld(Value):
 
 def along(points: Float[Tensor, "*b 3"], plane: Plane) -> Float[Tensor, "*b"]:
     """Return the coordinates [m] of points along a plane's normal."""
-    x, y, z = plane.normal.tolist()
+    x, y, z = plane.components
     if (x, y, z) == (0.0, 0.0, 1.0):  # the usual table costs nothing
         return points[..., 2]
     return points[..., 0] * x + points[..., 1] * y + points[..., 2] * z
@@ -133,9 +134,9 @@ def self_hinges(spatial: SpatialJacobian) -> Residuals:
     separation = pairs.separations(frames, SELF_CLEARANCE).T
     row, index = least(separation)
     separation = separation[row, index]
-    close = separation < SELF_CLEARANCE  # the hinges of the others are flat
+    close = torch.nonzero(separation < SELF_CLEARANCE, as_tuple=True)  # the hinges of the others are flat
     wrench = separation.new_zeros(*index.shape, 6)
-    wrench[close] = pairs.wrenches(frames, index[close], row.expand_as(index)[close]).T
+    wrench[close] = pairs.wrenches(frames, index[close], close[0]).T
     first, second = pairs.link[pairs.pairs[index]].unbind(-1)
     return hinge(separation, spatial.jacobian(wrench, second) - spatial.jacobian(wrench, first), SELF_CLEARANCE)
 

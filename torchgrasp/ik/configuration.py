@@ -42,7 +42,7 @@ class SpatialJacobian(Value):
     @classmethod
     def at(cls, hand: Hand, configuration: Configuration) -> "SpatialJacobian":
         """Evaluate the forward kinematics once."""
-        links, pose = hand.link_poses(configuration.joints), configuration.obj_from_hand
+        links, pose = hand.tree.poses(hand.actuated.couple(configuration.joints)), configuration.obj_from_hand
         axes, origins = hand.tree.joint_axes(links)
         axes, origins = rotate(pose, axes), apply(pose, origins)
         slide = hand.tree.prismatic.to(axes)[:, None]
@@ -56,8 +56,7 @@ class SpatialJacobian(Value):
         # One product with a sparse matrix is many times faster than a product for each point.
         k = torch.arange(len(links), device=links.device)
         selection = frames.new_zeros(len(links), count, 4)
-        selection[k, links, :3] = local.to(frames)
-        selection[k, links, 3] = 1.0
+        selection[k, links] = torch.cat([local.to(frames), frames.new_ones(len(links), 1)], 1)
         return (selection.flatten(1) @ frames).unflatten(1, (3, g)).permute(2, 0, 1)
 
     def directions(self, links: Int[Tensor, "k"], local: Float[Tensor, "k 3"]) -> Float[Tensor, "g k 3"]:

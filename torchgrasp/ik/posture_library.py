@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value, check_whole, join
+from torchgrasp.base import Value, check_device, check_whole, join
 from torchgrasp.frames import apply, degenerate, inverse, rotate, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import Reachable, ask_reachable
@@ -70,11 +70,13 @@ def nearest_postures(
     the squared distance of the features. Poses that `reachable` refuses make room for the next best ones.
 
     Raises:
-        BadArgument: `n_seeds`, for each triple, is not in [1, 64], or above six times the number of postures.
+        BadArgument: `n_seeds`, for each triple, is not in [1, 64], or above six times the number of postures;
+            contacts on another device than the library.
     """
     permutations, given = torch.tensor(PERMUTATIONS, device=contacts.points.device), library.feature
     candidates = min(CANDIDATES, len(permutations) * len(given))
     check_whole("n_seeds", n_seeds, 1, candidates)
+    check_device("contacts", contacts.points.device, "the library", given.device)
     radius, inward = library.hand.tips.radius.double(), -contacts.normals.double()[:, permutations]
     centres = contacts.points.double()[:, permutations] - radius[:, None] * inward  # (n, 6, 3, 3)
     parts = []

@@ -4,7 +4,7 @@ import dataclasses
 
 import torch
 
-from torchgrasp.base import check_whole, join
+from torchgrasp.base import check_whole, join, settle
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, degenerate, inverse, rotate, virtual_frame
 from torchgrasp.hand.hand import Hand
@@ -29,7 +29,7 @@ def query_mixture(
     smaller tip error. An unreachable row has none.
 
     Args:
-        contacts: triples on the object.
+        contacts: triples on the object; hand and mixture follow them to their device.
         mixture: the hand's learned model.
         n_seeds: for each assignment, at most one more than the mixture has components.
         max_energy: threshold on the least f_i of Eq. (21); `PAPER_ENERGY` is the paper's.
@@ -46,6 +46,7 @@ def query_mixture(
     check_whole("n_seeds", n_seeds, 1, len(mixture.weights) + 1)
     if not max_energy > 0:
         raise BadArgument("max_energy", max_energy, "a positive number")
+    hand, mixture = (settle(value, contacts.points.device) for value in (hand, mixture))
     firsts = range(0, max(len(contacts), 1), 256)  # their configurations stay in the cache
     parts = [_query(hand, contacts[k : k + 256], mixture, n_seeds, max_energy) for k in firsts]
     rows = torch.cat([part.row + k for part, k in zip(parts, firsts, strict=True)])

@@ -1,6 +1,7 @@
 """A signed distance field of an object's surface, for collision."""
 
 import dataclasses
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -25,23 +26,28 @@ class SignedDistanceField(Value):
     spacing: float
     values: Float[Tensor, "x y z"]
 
+    @cached_property
+    def _last_node(self) -> Int[Tensor, "3"]:
+        """Index of the last node along each axis."""
+        return torch.tensor(self.values.shape, device=self.values.device) - 1
+
     def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return the value [m] at the nearest node, at most 0.87 spacings off; outside the grid it is too small."""
         flat = 0
-        for x, low, count in zip(points.unbind(-1), self.origin.tolist(), self.values.shape, strict=True):
+        for x, low, count in zip(points.unbind(-1), self.origin.to(points), self.values.shape, strict=True):
             node = torch.round((x - low) / self.spacing).clamp_(0, count - 1)
             flat = node.long() if isinstance(flat, int) else flat * count + node.long()
         return self.values.reshape(-1)[flat].to(points)
 
     def query(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
         """Return the trilinear signed distance [m] and its gradient; beyond the grid the distance to it is added."""
-        shape = torch.tensor(self.values.shape, device=points.device)
+        _, ny, nz = self.values.shape
         position = (points - self.origin.to(points)) / self.spacing
-        inside = torch.minimum(position.clamp_min(0), (shape - 1).to(points))
-        cell = torch.minimum(inside.detach().long(), shape - 2)
+        inside = torch.minimum(position.clamp_min(0), self._last_node.to(points))
+        cell = torch.minimum(inside.detach().long(), self._last_node - 1)
         fx, fy, fz = (inside - cell).unbind(-1)
-        flat = (cell[..., 0] * shape[1] + cell[..., 1]) * shape[2] + cell[..., 2]
-        table, dx, dy = self.values.reshape(-1), int(shape[1] * shape[2]), int(shape[2])
+        flat = (cell[..., 0] * ny + cell[..., 1]) * nz + cell[..., 2]
+        table, dx, dy = self.values.reshape(-1), ny * nz, nz
         corner = [table[flat + i * dx + j * dy + k].to(points) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
         z = [torch.lerp(corner[2 * i], corner[2 * i + 1], fz) for i in range(4)]
         y = [torch.lerp(z[0], z[1], fy), torch.lerp(z[2], z[3], fy)]

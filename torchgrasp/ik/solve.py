@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch, check_tensor, join, pick
+from torchgrasp.base import Batch, check_tensor, join, pick, settle
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import degenerate
 from torchgrasp.hand.hand import Hand
@@ -67,7 +67,7 @@ def solve_ik(
     Args:
         contacts: b triples; `std_m` and `variance` are not used.
         mixture: the hand's learned model; None: only the library gives seeds.
-        world: what the links must not touch; None: only each other.
+        world: what the links must not touch; None: only each other. All arguments follow the contacts' device.
         method: "cobyla" is the paper's (Sec. 6.3), whose tips touch with their contact points in any direction.
         library: the hand's random postures; None: drawn when they are needed, in about a second.
 
@@ -90,7 +90,9 @@ def solve_ik(
     check_tensor("contacts.normals", contacts.normals, (len(contacts), 3, 3))
     if method not in get_args(Method):
         raise BadArgument("method", repr(method), f"one of {get_args(Method)}")
-    world = CollisionWorld() if world is None else world
+    device = contacts.points.device
+    hand, world = settle(hand, device), settle(CollisionWorld() if world is None else world, device)
+    library = None if library is None else settle(library, device)
     move = refine_by_cobyla if method == "cobyla" else refine_exactly
 
     def refine_seeds(seeds: IKSeeds) -> IKSolution:

@@ -116,7 +116,7 @@ class ContactProblem:
         table, scale = spec.plane, float(shape.scale)
         if table is not None:
             foot = table.offset * table.normal
-            table = Plane(table.normal, float(shape.normalise(foot) @ table.normal))
+            table = Plane(table.normal, float(shape.normalise(foot) @ table.normal)).to(device_of(shape))
         return cls(
             friction=spec.planned_friction * math.cos(math.pi / spec.edges),
             max_variance=spec.max_variance,
@@ -157,7 +157,8 @@ class ContactProblem:
             identity + self.tip_radius * jet.normal_jacobian,
         )
         one, other = (_by_own_point((along @ x)[..., 0, :]) for x in (centre_by_point, centre_by_point.roll(-1, 1)))
-        sides_by_x = one - other.unflatten(2, (4, 3))[:, :, [2, 0, 1, 3]].flatten(2)  # a side's other end
+        points_part, tension_part = other.split([9, 3], 2)
+        sides_by_x = one - torch.cat([points_part.roll(3, 2), tension_part], 2)  # a side's other end
         jacobians = [
             cones_by_x,
             _by_own_point(jet.variance_gradient / half_slope),

@@ -109,7 +109,8 @@ class Descent(Problem[State, LinearConstraints]):
     def step(self, model: LinearConstraints, damping: Damping) -> Steps:
         """Return the damped step, no point farther than `LONGEST_STEP`. Rows without a factor rest."""
         jacobian = model.weighted_jacobian
-        scale = torch.tensor([1.0] * 9 + [TENSION_DAMPING] * 3, dtype=jacobian.dtype, device=jacobian.device)
+        scale = jacobian.new_ones(12)
+        scale[9:] = TENSION_DAMPING
         normal = jacobian.mT @ jacobian + torch.diag_embed(damping[:, None] * scale)
         factor, failed = torch.linalg.cholesky_ex(normal)
         descent = -(jacobian.mT @ model.residual[..., None])

@@ -77,8 +77,7 @@ def expectation_maximisation(
         if converged or len(history) > iterations:
             return Fit(state.components, state.reseeded, history, state.jumped, converged)
         components, reseeded = maximisation(sums, n, regularisation, state.reseeded)
-        jumped = not torch.equal(reseeded, state.reseeded)
-        state = Progress(components, reseeded, history, jumped)
+        state = Progress(components, reseeded, history, reseeded is not state.reseeded)
         observer(state)
 
 
@@ -132,13 +131,15 @@ def maximisation(
 
     A component collapses if its covariance is singular or its responsibilities sum to less than d + 1 rows. Half of the
     heaviest component, split across its longest axis, then replaces it. If every component collapses, or one more than
-    `MAX_RESEEDS` times, `IndefiniteCovariance` is raised.
+    `MAX_RESEEDS` times, `IndefiniteCovariance` is raised. Where none collapses, `reseeded` is returned itself.
     """
     components = components_from_sums(sums, n, regularisation)
     weights, means, covariances = components.weights.clone(), components.means.clone(), components.covariances.clone()
     factor, info = torch.linalg.cholesky_ex(covariances)
     regular = (info == 0) & (factor.diagonal(dim1=-2, dim2=-1) ** 2 > SINGULAR_VARIANCE).all(-1)
     collapsed = (sums[:, 0] < means.shape[1] + 1) | ~regular
+    if not bool(collapsed.any()):
+        return Components(weights / weights.sum(), means, covariances), reseeded
     reseeded = reseeded + collapsed
     if bool(collapsed.all()) or int(reseeded.max()) > MAX_RESEEDS:
         k = int(reseeded.argmax())

@@ -74,14 +74,15 @@ def select_points(
         with_picks = with_all[:, :, picks[:count]].permute(2, 1, 0).reshape(4 * count, 4)
         cross = torch.cat([with_known[:, p].squeeze(1).T, with_picks])
         before = torch.linalg.solve_triangular(factor[:end, :end], cross, upper=False)
-        own = prior + torch.diag(noise[p[0]])
+        own = prior + torch.diag(noise[p][0])
         corner = cholesky(own - before.T @ before, "the covariance of a picked point", kernel.remedy)
         left = torch.cat([with_all[:, 0], values[p].T], 1).addmm_(before.T, whitened[:end], alpha=-1.0)
         factor[new, :end], factor[new, new] = before.T, corner
         whitened[new] = torch.linalg.solve_triangular(corner, left, upper=False)
         variance -= (whitened[new, :n] ** 2).sum(0)
         error += whitened[new, n] @ whitened[new, :n]
-        picks[count], free[p] = p[0], -math.inf
+        picks[count] = p[0]
+        free.index_fill_(0, p, -math.inf)
         count += 1
     picks, rows = picks[:count], old + 4 * count
     by_pick = torch.arange(4 * count, device=x.device).reshape(4, count).T.flatten()

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.base import settle
 from torchgrasp.control.closing_law import position_gain, surface_covariance
 from torchgrasp.control.forces import desired_forces
 from torchgrasp.control.observation import Observation
@@ -34,7 +35,8 @@ class Belief:
     """A shape, the planned pose of the hand, and which fingers have touched."""
 
     def __init__(self, shape: ShapeGP, obj_from_hand: Float[Tensor, "4 4"]) -> None:
-        self.shape, self.obj_from_hand = shape, obj_from_hand.double()
+        self.obj_from_hand = obj_from_hand.double()
+        self.shape = settle(shape, obj_from_hand.device)
         self.hand_from_obj = inverse(self.obj_from_hand)
         self.touched = torch.zeros(3, dtype=torch.bool)
 
