@@ -20,6 +20,8 @@ from torchgrasp.values import Contacts
 
 DRAWS_PER_CHUNK = 8192
 """Drawn triples that are judged at a time: their tensors take about 20 MB."""
+GPU_DRAWS = 2**18
+"""The same on a GPU, which fewer leave idle: about 700 MB (`scripts/bench.py gpu`)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,10 +84,10 @@ def closed_share(lines: LinePosterior, friction: float, n: int, seed: int) -> Fl
     """Return the share of n drawn surfaces on which the fingers' triples are closed."""
     generator = torch.Generator().manual_seed(seed)
     count = lines.points.new_zeros(len(lines))
-    at_once = min(n, DRAWS_PER_CHUNK)
+    at_once, judged = min(n, DRAWS_PER_CHUNK), DRAWS_PER_CHUNK if count.device.type == "cpu" else GPU_DRAWS
     for start in range(0, n, at_once):
         standard = torch.randn(min(at_once, n - start), lines.root.shape[-1], dtype=torch.float64, generator=generator)
-        for rows in torch.arange(len(lines), device=count.device).split(max(DRAWS_PER_CHUNK // len(standard), 1)):
+        for rows in torch.arange(len(lines), device=count.device).split(max(judged // len(standard), 1)):
             points, normals = first_contact(lines[rows], standard.to(count) @ lines.root[rows])
             closed = closed_exact(points.flatten(0, 1), normals.flatten(0, 1), friction)
             count[rows] += closed.unflatten(0, points.shape[:2]).sum(1)

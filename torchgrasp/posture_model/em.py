@@ -20,6 +20,8 @@ from torchgrasp.posture_model.shard import Shard
 
 CACHED_ROWS = 2048
 """Rows of one pass: their features and responsibilities stay in the cache."""
+GPU_ROWS = 2**17
+"""Rows of one pass on a GPU, which smaller passes leave idle; features take 200 MB (`scripts/bench.py gpu`)."""
 SINGULAR_VARIANCE = 1e-12
 """A conditional variance of this size is rounding, beside the data's variance of 1."""
 MAX_RESEEDS = 3
@@ -85,10 +87,10 @@ def expectation(shard: Shard, components: Components) -> tuple[Float[Tensor, "m 
     """Return the responsibility-weighted sums of the features, and the log-likelihood of all data, Eq. (19)."""
     x, coefficients = shard.rows, coefficients_from_components(components)
     sums, log_likelihood = torch.zeros_like(coefficients), x.new_zeros(())
-    features = x.new_empty(coefficients.shape[1], min(CACHED_ROWS, len(x)))  # reused by every pass
-    joint = x.new_empty(len(coefficients), min(CACHED_ROWS, len(x)))
+    at_once = min(CACHED_ROWS if x.device.type == "cpu" else GPU_ROWS, len(x))
+    features, joint = x.new_empty(coefficients.shape[1], at_once), x.new_empty(len(coefficients), at_once)  # reused
     floor = math.log(torch.finfo(x.dtype).tiny) / 2  # far below rounding; denormal numbers are slow
-    for rows in x.split(CACHED_ROWS):
+    for rows in x.split(at_once):
         phi = features_from_data(rows, features[:, : len(rows)])
         # log joint density (m, rows), then log-sum-exp written out: its exponentials are the responsibilities
         responsibility = torch.mm(coefficients, phi, out=joint[:, : len(rows)])
