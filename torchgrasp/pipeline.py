@@ -100,10 +100,10 @@ def plan_grasps(
 
     Args:
         cloud: what the camera saw [m]; missing normals and viewpoint are estimated. A `Scene` has a target.
-        hand: from `load_hand`.
+        hand: from `load_hand`; it follows the shape, which is where the cloud is, to its device.
         spec: the constraints on contacts; None: `ContactSpec()`, in mode "paper" `ContactSpec.paper()`.
         starts: random starts of the contact planner.
-        seed: of every random draw; the same seed gives bitwise the same grasps.
+        seed: of every random draw; on the CPU the same seed gives bitwise the same grasps.
         mode: see `Mode`. All but "joint" need the hand's learned model.
         ranking: see `Ranking`; None: "success", in mode "paper" "variance".
         shape: the object's shape if more is known than the cloud shows, as after a touch (`ShapeGP.update`).

@@ -88,7 +88,7 @@ class JointProblem:
     ) -> Float[Tensor, "g 12 9"]:
         """Return the derivative of the tip residuals by the contacts; pads count `outside` their cones."""
         hand, normals, normal_jacobian = self.hand, jet.normals, jet.normal_jacobian
-        identity = torch.eye(3).to(normals)
+        identity = torch.eye(3, dtype=normals.dtype, device=normals.device)
         target = float(self.shape.scale) * identity + hand.tips.radius.to(normals)[:, None, None] * normal_jacobian
         pads = spatial.directions(hand.tips.index, hand.tips.normal)
         tilt = (pads[..., None, :] @ normal_jacobian)[..., 0, :] * outside[..., None]

@@ -76,7 +76,7 @@ def _clearance(
 ) -> Float[Tensor, "g"]:
     """Return the least clearance [m] of spheres along a path to the pre-grasp, interpolated or by the nearest nodes."""
     steps = FINE_STEPS if exact else COARSE_STEPS
-    back = torch.arange(1, steps + 1).to(centres) * (APPROACH_DISTANCE / steps)
+    back = torch.arange(1, steps + 1, dtype=centres.dtype, device=centres.device) * (APPROACH_DISTANCE / steps)
     path = (centres[:, None] - back[:, None, None] * direction[:, None, None]).flatten(1, 2)
     radius, least = radius.repeat(steps), torch.full_like(path[:, 0, 0], math.inf)
     for field in world.fields:

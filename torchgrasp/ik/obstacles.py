@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Value, check_number
+from torchgrasp.base import Value, check_number, settle
 from torchgrasp.ik.sdf import SignedDistanceField
 from torchgrasp.scene.occupancy import Occupancy
 
@@ -41,13 +41,14 @@ class Obstacles(Value):
             BadArgument: `full` outside [0.01, 1].
         """
         check_number("full", full, 0.01, 1.0)
+        device, occupancy = occupancy.origin.device, settle(occupancy, torch.device("cpu"))  # SciPy's distances
         probability, levels = occupancy.probability, sorted({*LEVELS, full})
         if not bool((probability >= levels[0]).any()):
             return None
         distances = torch.stack([distance_to(probability >= level, occupancy.spacing) for level in levels])
         outside, inside = distances[levels.index(full)], depth_in(probability >= full, occupancy.spacing)
         field = SignedDistanceField(occupancy.origin.double(), occupancy.spacing, outside - inside)
-        return cls(field, distances.float(), torch.tensor(levels, dtype=torch.float64), hard)
+        return cls(field, distances.float(), torch.tensor(levels, dtype=torch.float64), hard).to(device)
 
     def likelihood(self, centres: Float[Tensor, "*b s 3"], radius: Float[Tensor, "s"]) -> Float[Tensor, "*b"]:
         """Return the largest probability of a voxel that spheres [m] meet: the middle between two levels."""

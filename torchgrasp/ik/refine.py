@@ -35,7 +35,7 @@ def tip_residuals(
     tips = spatial.points(hand.tips.index, hand.tips.center)
     finger = torch.arange(3, device=tips.device)
     coordinate = finger.repeat_interleave(3)
-    axes = torch.eye(3).to(tips).repeat(3, 1).expand(len(tips), 9, 3)
+    axes = torch.eye(3, dtype=tips.dtype, device=tips.device).repeat(3, 1).expand(len(tips), 9, 3)
     pads = spatial.directions(hand.tips.index, hand.tips.normal)
     outside = hand.tips.cone.cos().to(pads) + (pads * normals).sum(-1)  # the contact direction is the inward normal
     torques = torch.cat([torch.zeros_like(pads), torch.linalg.cross(pads, normals)], -1)

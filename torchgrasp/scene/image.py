@@ -33,7 +33,7 @@ class DepthImage(Value):
 
     def to_upright(self, obj_from_upright: Float[Tensor, "4 4"]) -> "DepthImage":
         """Return the image with its camera in an upright frame, rounded."""
-        pose = inverse(obj_from_upright) @ self.obj_from_camera.double()
+        pose = inverse(obj_from_upright).to(self.obj_from_camera.device) @ self.obj_from_camera.double()
         return dataclasses.replace(self, obj_from_camera=torch.round(pose / GRID**1.5) * GRID**1.5)
 
     def points(self) -> Float[Tensor, "h w 3"]:

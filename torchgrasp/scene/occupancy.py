@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value
+from torchgrasp.base import Value, settle
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, inverse
 from torchgrasp.linalg import unit
@@ -182,11 +182,12 @@ def estimate_occupancy(scene: Scene, target: int) -> Occupancy:
     """Return how likely places around the target are full of something else; the scene is in its upright frame.
 
     Free is what lies in front of a measured depth, and the table is no obstacle. In the shadow of a thing the model
-    tells how likely, in that of the target and outside the picture little is known.
+    tells how likely, in that of the target and outside the picture little is known. It is computed on the CPU.
 
     Raises:
         BadArgument: a target without points.
     """
+    device, scene = scene.points.device, settle(scene, torch.device("cpu"))
     if not bool(scene.rows_of(target).any()):
         raise BadArgument("target", target, f"one of the labels {scene.things}")
     things = (scene.labels > 0) if scene.table is None else (scene.points[:, 2] > LOW) | scene.rows_of(target)
@@ -211,4 +212,4 @@ def estimate_occupancy(scene: Scene, target: int) -> Occupancy:
             full[rows] = probability("target", torch.stack([depth, where[:, 2]], -1))
         else:
             full[rows] = probability("thing", shadow_features(shadows, thing, where))
-    return empty
+    return settle(empty, device)
