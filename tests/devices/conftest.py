@@ -1,0 +1,82 @@
+"""What the tests of devices share: the pretended device, and one planned object."""
+
+from concurrent.futures import Future
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.devices.elsewhere import DEVICE, Elsewhere, pretend
+from torchgrasp import ContactSpec, Grasps, Hand, ShapeGP, fit_shape, load_hand, load_object, plan_grasps
+from torchgrasp.base import Value, named_tensors
+
+
+class SerialPool:
+    """A pool of one thread, the caller's: the pretended device is known there alone."""
+
+    def __init__(self, *arguments: Any) -> None: ...
+    def __enter__(self) -> "SerialPool":
+        return self
+
+    def __exit__(self, *error: Any) -> None: ...
+    def map(self, function: Any, *values: Any) -> Any:
+        return map(function, *values)
+
+    def submit(self, function: Any, *values: Any) -> Future:
+        future: Future = Future()
+        future.set_result(function(*values))
+        return future
+
+
+@pytest.fixture
+def device(monkeypatch):
+    """The pretended device, and a count of the waits for it."""
+    monkeypatch.setattr("torchgrasp.posture_model.sample.ThreadPoolExecutor", SerialPool)
+    with pretend() as waits:
+        yield waits
+
+
+def sent(value: Any) -> Any:
+    """Return a value, or parts of one, on the pretended device."""
+    if isinstance(value, Value | Tensor):
+        return value.to(DEVICE)
+    return type(value)(map(sent, value)) if isinstance(value, tuple | list) else value
+
+
+def tensors_of(value: Any) -> list[Tensor]:
+    """Return every tensor of a result."""
+    if isinstance(value, Tensor):
+        return [value]
+    if isinstance(value, Value):
+        return list(named_tensors(value).values())
+    return [x for part in value for x in tensors_of(part)] if isinstance(value, tuple | list) else []
+
+
+def same(there: Any, here: Any, device: torch.device = DEVICE) -> None:
+    """Assert that a result is on a device, and has the numbers and types of the CPU's."""
+    one, other = tensors_of(there), tensors_of(here)
+    assert len(one) == len(other) > 0
+    for a, b in zip(one, other, strict=True):
+        assert a.device == device and a.dtype == b.dtype
+        torch.testing.assert_close(a.as_subclass(Tensor), b, rtol=1e-6, atol=1e-8, equal_nan=True)
+
+
+@pytest.fixture(scope="session")
+def shape() -> ShapeGP:
+    return fit_shape(load_object("jug").view, table=0.0)
+
+
+@pytest.fixture(scope="session")
+def hand() -> Hand:
+    return load_hand("barrett")
+
+
+@pytest.fixture(scope="session")
+def grasps(hand: Hand) -> Grasps:
+    found = plan_grasps(load_object("jug").view, hand, ContactSpec(table=0.0), starts=25)
+    assert len(found[found.status == 0]) > 1
+    return found[found.status == 0][:2]
+
+
+__all__ = ["DEVICE", "Elsewhere", "same", "sent"]

@@ -1,0 +1,226 @@
+"""A second device for tests: CPU tensors that say they are elsewhere, and break or wait where a GPU's would.
+
+`Elsewhere` behaves like a tensor of `DEVICE`. An operation on tensors of both devices is an error, as is
+`numpy()`, a draw there by a generator of the CPU, or an index from there into a tensor of the CPU. `pretend` makes
+`device=DEVICE` work, and lists where the host would wait for the device.
+"""
+
+import contextlib
+import traceback
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+
+DEVICE = torch.device("cuda:0")
+MAKERS = {
+    getattr(torch, name)
+    for name in "tensor as_tensor zeros ones full empty eye arange linspace rand randn randint randperm".split()
+} | {torch.triu_indices, torch.tril_indices}
+"""Functions that make tensors where they are told to."""
+READERS = {"item", "tolist", "__bool__", "__float__", "__int__", "__index__", "nonzero", "masked_select", "equal"}
+READERS |= {"unique", "allclose", "bincount", "svdvals", "svd", "eigh", "eigvalsh", "matrix_exp"}
+"""Functions whose result depends on numbers that the host must read first."""
+DATA = {"item", "tolist", "__bool__", "__float__", "__int__", "__index__", "__repr__", "__format__", "__len__"}
+DATA |= {"dim", "size", "stride", "numel", "is_contiguous", "is_floating_point", "data_ptr", "backward"}
+"""Functions that return no tensor."""
+INTO = {"__getitem__", "__setitem__", "index_put", "index_put_"}
+"""Functions that take indices of the CPU, too."""
+
+
+def elsewhere(value: Tensor) -> Tensor:
+    """Return a copy on the pretended device."""
+    return value.detach().clone().as_subclass(Elsewhere)
+
+
+def _home(value: Any) -> Any:
+    """Return a device argument as the CPU's, if it names the pretended device."""
+    text = str(value) if isinstance(value, torch.device | str) else ""
+    return torch.device("cpu") if text.split(":")[0] == DEVICE.type else value
+
+
+def _plain(value: Any) -> Any:
+    """Return a tensor as one of the CPU, whatever it says."""
+    return value.as_subclass(Tensor) if isinstance(value, Elsewhere) else value
+
+
+def _moved(value: Any) -> Any:
+    """Return every plain tensor of a result as one of the pretended device."""
+    if type(value) is Tensor:
+        return value.as_subclass(Elsewhere)
+    if isinstance(value, list):
+        return [_moved(x) for x in value]
+    if isinstance(value, tuple):
+        parts = [_moved(x) for x in value]
+        return tuple(parts) if type(value) is tuple else type(value)(parts)
+    return value
+
+
+def _tensors(value: Any) -> Iterator[Tensor]:
+    """Yield all tensors of arguments."""
+    if isinstance(value, Tensor):
+        yield value
+    elif isinstance(value, list | tuple):
+        for part in value:
+            yield from _tensors(part)
+    elif isinstance(value, dict):
+        yield from _tensors(list(value.values()))
+
+
+def _device(value: Tensor) -> torch.device:
+    """Return where a tensor says it is."""
+    return DEVICE if isinstance(value, Elsewhere) else torch.device("cpu")
+
+
+def _target(arguments: list[Any]) -> torch.device | None:
+    """Return the device that `Tensor.to` is asked for."""
+    for value in arguments:
+        if isinstance(value, torch.device | str):
+            return torch.device(value)
+        if isinstance(value, Tensor):
+            return _device(value)
+    return None
+
+
+def _is_mask(value: Any) -> bool:
+    """Tell whether an index has a mask on the device, or numbers that must be brought there."""
+    parts = value if isinstance(value, tuple) else (value,)
+    return any(
+        (isinstance(x, Tensor) and (x.dtype == torch.bool or (x.dim() == 0 and isinstance(x, Elsewhere))))
+        or (isinstance(x, Tensor) and not isinstance(x, Elsewhere))
+        or isinstance(x, list)
+        for x in parts
+    )
+
+
+class Waits:
+    """Where the host waited for the device, by file and line in the package."""
+
+    def __init__(self) -> None:
+        self.places: Counter[str] = Counter()
+
+    def note(self) -> None:
+        """Count a wait at the innermost line of the package."""
+        for frame in reversed(traceback.extract_stack()):
+            if "/torchgrasp/" in frame.filename:
+                self.places[f"{frame.filename.rsplit('/torchgrasp/', 1)[1]}:{frame.line}"] += 1
+                return
+
+
+_ACTIVE: list[Waits] = []
+
+
+def _wait() -> None:
+    for waits in _ACTIVE:
+        waits.note()
+
+
+class Elsewhere(Tensor):
+    """A tensor that says it is on `DEVICE`."""
+
+    @classmethod
+    def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Run a function of tensors as the device would."""
+        kwargs, name = dict(kwargs or {}), getattr(func, "__name__", "")
+        with torch._C.DisableTorchFunctionSubclass():
+            if func == Tensor.device.__get__:
+                return DEVICE
+            if func == Tensor.is_cuda.__get__:
+                return True
+            if name == "__get__" or name == "__set__":
+                return _moved(func(*args, **kwargs))
+            if name in READERS:
+                _wait()
+            if name in DATA:
+                return func(*args, **kwargs)
+            if func in (Tensor.numpy, Tensor.__array__):
+                raise TypeError(f"can't convert {DEVICE} device type tensor to numpy")
+            if func is Tensor.cpu:
+                _wait()
+                return _plain(args[0]).clone()
+            if func is Tensor.to:
+                return _to(args, kwargs)
+            _refuse_mixes(func, name, args, kwargs)
+            result = func(
+                *(_home(_plain(x)) if not isinstance(x, list | tuple) else x for x in args), **_all_home(kwargs)
+            )
+        stays = kwargs.get("device") is not None and torch.device(kwargs["device"]).type == "cpu"
+        return result if stays else _moved(result)
+
+
+def _all_home(kwargs: dict[str, Any]) -> dict[str, Any]:
+    return {key: _home(value) for key, value in kwargs.items()}
+
+
+def _to(args: Any, kwargs: dict[str, Any]) -> Tensor:
+    """Run `Tensor.to`; a move between the devices waits."""
+    target = _target([*args[1:], *kwargs.values()]) or _device(args[0])
+    rest = [_home(_plain(x)) for x in args[1:]]
+    result = Tensor.to(_plain(args[0]), *rest, **{key: _home(_plain(value)) for key, value in kwargs.items()})
+    if target.type != _device(args[0]).type:
+        _wait()
+        result = result.clone() if result is _plain(args[0]) else result
+    elif args[0].dtype == result.dtype:
+        return args[0]
+    return result.as_subclass(Elsewhere if target.type == DEVICE.type else Tensor)
+
+
+def _refuse_mixes(func: Any, name: str, args: Any, kwargs: dict[str, Any]) -> None:
+    """Raise what a GPU raises for tensors of both devices, except where it takes them."""
+    tensors = list(_tensors([*args, kwargs]))
+    there = [x for x in tensors if isinstance(x, Elsewhere)]
+    here = [x for x in tensors if not isinstance(x, Elsewhere) and x.dim() > 0]
+    generator = kwargs.get("generator")
+    if generator is not None and there and generator.device.type == "cpu":
+        raise RuntimeError(f"Expected a '{DEVICE.type}' device type for generator but found 'cpu'")
+    if name in ("__getitem__", "__setitem__"):
+        if _is_mask(args[1]) and isinstance(args[0], Elsewhere):
+            _wait()
+        if name == "__setitem__" and isinstance(args[0], Elsewhere) and not isinstance(args[2], Elsewhere):
+            if any(isinstance(x, Tensor | list) for x in (args[1] if isinstance(args[1], tuple) else (args[1],))):
+                _wait()  # a number that is put at indices is brought there first
+    if not there or not here:
+        return
+    if name == "copy_":
+        _wait()
+    elif name in INTO and isinstance(args[0], Elsewhere):
+        values = list(_tensors(args[2:3]))
+        if any(not isinstance(x, Elsewhere) and x.dim() > 0 for x in values):
+            raise RuntimeError(f"{name}: expected all tensors to be on the same device")
+    else:
+        raise RuntimeError(f"{name}: expected all tensors to be on the same device, but found {DEVICE} and cpu")
+
+
+class _Makers(TorchFunctionMode):
+    """Lets functions that make tensors make them on the pretended device."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Run a function that makes or moves a tensor."""
+        kwargs = dict(kwargs or {})
+        if func in MAKERS and kwargs.get("device") is not None and torch.device(kwargs["device"]).type == DEVICE.type:
+            if kwargs.get("generator") is not None:
+                raise RuntimeError(f"Expected a '{DEVICE.type}' device type for generator but found 'cpu'")
+            if func in (torch.tensor, torch.as_tensor):
+                _wait()
+            return _moved(func(*args, **_all_home(kwargs)))
+        if func is Tensor.to and type(args[0]) is Tensor:
+            target = _target([*args[1:], *kwargs.values()])
+            if target is not None and target.type == DEVICE.type:
+                with torch._C.DisableTorchFunctionSubclass():
+                    return _to(args, kwargs)
+        return func(*args, **kwargs)
+
+
+@contextlib.contextmanager
+def pretend() -> Iterator[Waits]:
+    """Make the pretended device known; the value counts where the host waits for it."""
+    waits = Waits()
+    _ACTIVE.append(waits)
+    try:
+        with _Makers():
+            yield waits
+    finally:
+        _ACTIVE.remove(waits)

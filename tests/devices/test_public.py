@@ -1,0 +1,217 @@
+"""Every public function with every tensor on another device: the CPU's result there, or an error that names it."""
+
+import pytest
+import torch
+
+from tests.devices.conftest import same, sent
+from tests.devices.elsewhere import DEVICE
+from torchgrasp import (
+    ContactSpec,
+    IKSolution,
+    PointCloud,
+    certify,
+    closing_gains,
+    closure_probability,
+    encode,
+    fit_mixture,
+    fit_shape,
+    load_mixture,
+    load_object,
+    load_scene,
+    merge_clouds,
+    plan_contacts,
+    plan_grasps,
+    sample_configurations,
+    solve_ik,
+)  # fmt: skip
+from torchgrasp.cloud import (
+    clean_cloud,
+    estimate_normals,
+    estimate_viewpoint,
+    remove_outliers,
+    voxel_downsample,
+)
+from torchgrasp.control import ClosingReference, GraspController, measure, no_contact, observe, squeeze
+from torchgrasp.control.tactile import TipContact
+from torchgrasp.errors import BadArgument
+from torchgrasp.ik import CollisionWorld, PostureLibrary, nearest_postures, query_mixture
+from torchgrasp.plan import least_friction_forces
+from torchgrasp.scene import estimate_occupancy
+from torchgrasp.shape import extract_surface
+from torchgrasp.testing import random_joints
+
+SPEC, CPU = ContactSpec(table=0.0), torch.device("cpu")
+VIEW = load_object("jug").view
+
+CLOUDS = {
+    "fit_shape": lambda cloud: fit_shape(cloud, table=0.0),
+    "fit_shape, paper": lambda cloud: fit_shape(cloud, support="paper"),
+    "fit_shape, a kernel": lambda cloud: fit_shape(cloud, kernel="matern52", budget=30),
+    "fit_shape, no camera": lambda cloud: fit_shape(PointCloud(cloud.points), budget=30),
+    "merge_clouds": lambda cloud: merge_clouds([cloud, cloud], torch.eye(4).to(cloud.points).expand(2, 4, 4)),
+    "clean_cloud": clean_cloud,
+    "remove_outliers": remove_outliers,
+    "voxel_downsample": lambda cloud: voxel_downsample(cloud, 0.005),
+    "estimate_normals": estimate_normals,
+    "estimate_viewpoint": estimate_viewpoint,
+    "PointCloud.select": lambda cloud: cloud.select(torch.arange(5)),
+}
+SHAPES = {
+    "predict": lambda shape, x: shape.predict(x),
+    "differentiate": lambda shape, x: shape.differentiate(x),
+    "joint": lambda shape, x: shape.joint(x),
+    "sample": lambda shape, x: shape.sample(x, 4, seed=0),
+    "update": lambda shape, x: shape.update(x[:1], noise=0.001),
+    "contains": lambda shape, x: shape.contains(x),
+    "extract_surface": lambda shape, x: extract_surface(shape, 24),
+    "plan_contacts": lambda shape, x: plan_contacts(shape, SPEC, 6),
+    "plan_contacts, paper": lambda shape, x: plan_contacts(shape, ContactSpec.paper(), 2),
+    "plan_contacts, given starts": lambda shape, x: plan_contacts(shape, SPEC, x[:12].reshape(4, 3, 3)),
+    "plan_contacts, epsilon": lambda shape, x: plan_contacts(shape, SPEC, 3, objective="epsilon"),
+    "plan_contacts, min_weight": lambda shape, x: plan_contacts(shape, SPEC, 3, objective="min_weight"),
+    "plan_contacts, probability": lambda shape, x: plan_contacts(shape, SPEC, 3, objective="probability"),
+}
+CONTACTS = {
+    "certify": lambda contacts, shape: certify(contacts, SPEC),
+    "closure_probability": lambda contacts, shape: closure_probability(shape, contacts, SPEC, 200),
+    "encode": lambda contacts, shape: encode(contacts),
+    "least_friction_forces": lambda contacts, shape: least_friction_forces(contacts.points, contacts.normals),
+}
+HANDS = {
+    "fingertips": lambda hand, joints: hand.fingertips(joints),
+    "tip_centres": lambda hand, joints: hand.tip_centres(joints),
+    "jacobian": lambda hand, joints: hand.jacobian(joints),
+    "link_poses": lambda hand, joints: hand.link_poses(joints),
+    "sphere_centres": lambda hand, joints: hand.sphere_centres(joints),
+    "self_clearance": lambda hand, joints: hand.self_clearance(joints),
+    "expand_joints": lambda hand, joints: hand.expand_joints(joints),
+    "check_joints": lambda hand, joints: hand.check_joints(joints),
+    "sample_configurations": lambda hand, joints: sample_configurations(hand, 50),
+}
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_clouds(device, name):
+    same(CLOUDS[name](sent(VIEW)), CLOUDS[name](VIEW))
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_shapes(device, shape, name):
+    x = VIEW.points[:36].double()
+    same(SHAPES[name](sent(shape), sent(x)), SHAPES[name](shape, x))
+
+
+@pytest.mark.parametrize("name", CONTACTS)
+def test_contacts(device, shape, grasps, name):
+    contacts = grasps.contacts
+    same(CONTACTS[name](sent(contacts), sent(shape)), CONTACTS[name](contacts, shape))
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_hands(device, hand, name):
+    joints = random_joints(hand, 7, 0)
+    same(HANDS[name](sent(hand), sent(joints)), HANDS[name](hand, joints))
+
+
+def test_joints_of_another_device_than_the_hand_are_refused(device, hand):
+    joints = random_joints(hand, 7, 0)
+    for name in set(HANDS) - {"sample_configurations"}:
+        for one, other in ((sent(hand), joints), (hand, sent(joints))):
+            with pytest.raises(BadArgument, match="joints"):
+                HANDS[name](one, other)
+
+
+@pytest.mark.parametrize("method", ["levenberg_marquardt", "cobyla"])
+def test_hand_and_model_follow_the_contacts(device, hand, grasps, method):
+    contacts, mixture, library = grasps.contacts[:1], load_mixture("barrett"), PostureLibrary.of(hand, 300)
+
+    def solve(contacts) -> IKSolution:
+        return solve_ik(hand, contacts, mixture, CollisionWorld(table=0.0), method, library)
+
+    same(solve(sent(contacts)), solve(contacts))
+    same(query_mixture(hand, sent(contacts), mixture), query_mixture(hand, contacts, mixture))
+
+
+def test_a_library_of_another_device_is_refused(device, hand, grasps):
+    library = PostureLibrary.of(hand, 300)
+    with pytest.raises(BadArgument, match="contacts"):
+        nearest_postures(library, sent(grasps.contacts), CollisionWorld())
+    found = nearest_postures(sent(library), sent(grasps.contacts), CollisionWorld(table=0.0))
+    same(found, nearest_postures(library, grasps.contacts, CollisionWorld(table=0.0)))
+
+
+@pytest.mark.parametrize("mode", ["joint", "contact_first"])
+def test_grasps_are_where_the_cloud_is(device, hand, mode):
+    same(plan_grasps(sent(VIEW), hand, SPEC, 8, mode=mode), plan_grasps(VIEW, hand, SPEC, 8, mode=mode))
+
+
+def test_a_given_shape_decides_where_grasps_are(device, hand, shape):
+    found = plan_grasps(VIEW, hand, SPEC, 8, shape=sent(shape))
+    same(found, plan_grasps(VIEW, hand, SPEC, 8, shape=shape))
+    assert plan_grasps(sent(VIEW), hand, SPEC, 8, shape=shape).joints.device == CPU
+
+
+def test_single_precision_goes_in_and_double_comes_out(device, hand):
+    cloud = sent(VIEW.to(torch.float32))
+    found = plan_grasps(cloud, hand, SPEC, 8)
+    assert found.joints.dtype == torch.float64 and found.joints.device == DEVICE
+    assert fit_shape(cloud).predict(cloud.points[:3]).distance.dtype == torch.float32
+
+
+def test_a_scene_is_planned_where_it_is(device, hand):
+    scene = load_scene()
+    there = sent(scene)
+    occupancy = estimate_occupancy(scene, 1)
+    same(estimate_occupancy(there, 1), occupancy)
+    same(Obstacles.of(sent(occupancy)), Obstacles.of(occupancy))
+    assert plan_grasps(there.select(1), hand, starts=2).joints.device == DEVICE
+
+
+def test_a_mixture_is_fitted_where_its_samples_are(device, hand):
+    samples = sample_configurations(hand, 300)
+    same(fit_mixture(sent(samples), 3, iterations=4), fit_mixture(samples, 3, iterations=4))
+
+
+@pytest.mark.parametrize("name", ["energy", "joints", "modes"])
+def test_a_mixture_answers_where_it_is(device, grasps, name):
+    mixture, code = load_mixture("barrett"), encode(grasps.contacts)
+    if name == "energy":
+        return same(sent(mixture).energy(sent(code)), mixture.energy(code))
+    query = {"joints": lambda m, q: m.joints(q), "modes": lambda m, q: m.modes(q, 2)}[name]
+    return same(query(sent(mixture), sent(code.q[0])), query(mixture, code.q[0]))
+
+
+def test_closing_is_on_the_cpu_whatever_is_given(device, hand, grasps):
+    expected = closing_gains(grasps[0], hand)
+    for grasp, its_hand in ((sent(grasps[0]), hand), (grasps[0], sent(hand)), (sent(grasps[0]), sent(hand))):
+        same(closing_gains(grasp, its_hand), expected, CPU)
+
+
+def test_the_squeeze_follows_the_grasps(device, hand, grasps):
+    same(squeeze(hand, sent(grasps)), squeeze(hand, grasps))
+
+
+@pytest.mark.parametrize("closing", ["uncertainty", "fixed", "paper", "position", "open_loop"])
+def test_a_controller_runs_on_the_cpu(device, hand, grasps, shape, closing):
+    reference = sent(ClosingReference.from_grasp(hand, grasps[0]))
+    belief = sent(shape) if closing in ("uncertainty", "fixed") else None
+    controller = GraspController(reference, closing=closing, belief=belief)
+    reference, tactile = controller.reference, no_contact()
+    point = reference.gains.target
+    truth = TipContact(torch.ones(3).double(), -reference.normals, point, reference.normals)
+    tactile = measure(tactile, truth, reference.normals, hand.tips.radius.double(), 0.02)
+    observation = observe(hand, reference.pregrasp, tactile)
+    assert controller.step(observation, 0.02).device == CPU
+    with pytest.raises(BadArgument, match="observation"):
+        controller.step(sent(observation), 0.02)
+    with pytest.raises(BadArgument, match="truth"):
+        measure(tactile, sent(truth), reference.normals, hand.tips.radius.double(), 0.02)
+    with pytest.raises(BadArgument, match="tactile"):
+        observe(hand, reference.pregrasp, sent(tactile))
+
+
+def test_saved_grasps_come_back_on_the_cpu(device, grasps, tmp_path):
+    from torchgrasp import load_grasps
+
+    sent(grasps).save(tmp_path / "grasps.safetensors")
+    same(load_grasps(tmp_path / "grasps.safetensors"), grasps, CPU)
