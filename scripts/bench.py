@@ -3,6 +3,7 @@
 
 python scripts/bench.py close --objects DIR    closing the hand: the simulators against statics and against each other
 python scripts/bench.py grasp --objects DIR    cloud to held object, for every object of a folder and both hands
+python scripts/bench.py gpu                    every kernel on a GPU beside the CPU, where there is a GPU
 python scripts/bench.py hand                   the hands: kinematics, collision, the learned model, contacts to postures
 python scripts/bench.py plan --objects DIR     the contact planner against IPOPT, on the true surface, and as it grows
 python scripts/bench.py proof --objects DIR    certificates and the probability of closure, against exact references
@@ -15,6 +16,7 @@ they would spin, which takes a plan twice as long on a quiet one.
 
 import tyro
 from benchmarks.close.suite import close
+from benchmarks.gpu.suite import gpu
 from benchmarks.grasp.suite import grasp
 from benchmarks.hand.suite import hand
 from benchmarks.plan.suite import plan
@@ -25,6 +27,7 @@ from benchmarks.shape.suite import shape
 if __name__ == "__main__":
     subjects = {
         "close": close,
+        "gpu": gpu,
         "grasp": grasp,
         "hand": hand,
         "plan": plan,
