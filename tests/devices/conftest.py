@@ -64,7 +64,7 @@ def same(there: Any, here: Any, device: torch.device = DEVICE) -> None:
 
 @pytest.fixture(scope="session")
 def shape() -> ShapeGP:
-    return fit_shape(load_object("jug").view, table=0.0)
+    return fit_shape(load_object("cylinder").view, table=0.0)
 
 
 @pytest.fixture(scope="session")
@@ -74,7 +74,7 @@ def hand() -> Hand:
 
 @pytest.fixture(scope="session")
 def grasps(hand: Hand) -> Grasps:
-    found = plan_grasps(load_object("jug").view, hand, ContactSpec(table=0.0), starts=25)
+    found = plan_grasps(load_object("cylinder").view, hand, ContactSpec(table=0.0), starts=25)
     assert len(found[found.status == 0]) > 1
     return found[found.status == 0][:2]
 

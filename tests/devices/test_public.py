@@ -34,14 +34,14 @@ from torchgrasp.cloud import (
 from torchgrasp.control import ClosingReference, GraspController, measure, no_contact, observe, squeeze
 from torchgrasp.control.tactile import TipContact
 from torchgrasp.errors import BadArgument
-from torchgrasp.ik import CollisionWorld, PostureLibrary, nearest_postures, query_mixture
+from torchgrasp.ik import CollisionWorld, Obstacles, PostureLibrary, nearest_postures, query_mixture
 from torchgrasp.plan import least_friction_forces
 from torchgrasp.scene import estimate_occupancy
 from torchgrasp.shape import extract_surface
 from torchgrasp.testing import random_joints
 
 SPEC, CPU = ContactSpec(table=0.0), torch.device("cpu")
-VIEW = load_object("jug").view
+VIEW = load_object("cylinder").view
 
 CLOUDS = {
     "fit_shape": lambda cloud: fit_shape(cloud, table=0.0),
@@ -121,12 +121,11 @@ def test_joints_of_another_device_than_the_hand_are_refused(device, hand):
                 HANDS[name](one, other)
 
 
-@pytest.mark.parametrize("method", ["levenberg_marquardt", "cobyla"])
-def test_hand_and_model_follow_the_contacts(device, hand, grasps, method):
+def test_hand_and_model_follow_the_contacts(device, hand, grasps):
     contacts, mixture, library = grasps.contacts[:1], load_mixture("barrett"), PostureLibrary.of(hand, 300)
 
     def solve(contacts) -> IKSolution:
-        return solve_ik(hand, contacts, mixture, CollisionWorld(table=0.0), method, library)
+        return solve_ik(hand, contacts, mixture, CollisionWorld(table=0.0), library=library)
 
     same(solve(sent(contacts)), solve(contacts))
     same(query_mixture(hand, sent(contacts), mixture), query_mixture(hand, contacts, mixture))
@@ -140,20 +139,18 @@ def test_a_library_of_another_device_is_refused(device, hand, grasps):
     same(found, nearest_postures(library, grasps.contacts, CollisionWorld(table=0.0)))
 
 
-@pytest.mark.parametrize("mode", ["joint", "contact_first"])
-def test_grasps_are_where_the_cloud_is(device, hand, mode):
-    same(plan_grasps(sent(VIEW), hand, SPEC, 8, mode=mode), plan_grasps(VIEW, hand, SPEC, 8, mode=mode))
+def test_grasps_are_where_the_cloud_is(device, hand):
+    same(plan_grasps(sent(VIEW), hand, SPEC, 3), plan_grasps(VIEW, hand, SPEC, 3))
 
 
 def test_a_given_shape_decides_where_grasps_are(device, hand, shape):
-    found = plan_grasps(VIEW, hand, SPEC, 8, shape=sent(shape))
-    same(found, plan_grasps(VIEW, hand, SPEC, 8, shape=shape))
-    assert plan_grasps(sent(VIEW), hand, SPEC, 8, shape=shape).joints.device == CPU
+    assert plan_grasps(VIEW, hand, SPEC, 2, shape=sent(shape)).joints.device == DEVICE
+    assert plan_grasps(sent(VIEW), hand, SPEC, 2, shape=shape).joints.device == CPU
 
 
 def test_single_precision_goes_in_and_double_comes_out(device, hand):
     cloud = sent(VIEW.to(torch.float32))
-    found = plan_grasps(cloud, hand, SPEC, 8)
+    found = plan_grasps(cloud, hand, SPEC, 2)
     assert found.joints.dtype == torch.float64 and found.joints.device == DEVICE
     assert fit_shape(cloud).predict(cloud.points[:3]).distance.dtype == torch.float32
 

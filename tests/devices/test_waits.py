@@ -71,7 +71,7 @@ def test_refinement_waits_for_the_pairs_of_links_too(device, monkeypatch, shape,
 
 
 def test_a_pick_of_the_selection_waits_once(device):
-    view = load_object("jug").view
+    view = load_object("cylinder").view
     x = elsewhere(view.points[:60].double() * 8)
     noise = torch.full_like(x[:, 0], 0.01)
     seen = on_surface(x, torch.nn.functional.normalize(x, dim=-1), noise, 0.05)
