@@ -77,7 +77,7 @@ def frustum_of_image(intrinsics: Float[Tensor, "3 3"], size: Sequence[int]) -> F
     (fx, _, cx), (_, fy, cy) = intrinsics[0].tolist(), intrinsics[1].tolist()
     height, width = size
     sides = [[fx, 0.0, cx], [-fx, 0.0, width - 1 - cx], [0.0, fy, cy], [0.0, -fy, height - 1 - cy]]
-    return unit(torch.tensor(sides, dtype=intrinsics.dtype))
+    return unit(torch.tensor(sides, dtype=intrinsics.dtype, device=intrinsics.device))
 
 
 def read_depth(
