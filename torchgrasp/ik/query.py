@@ -46,7 +46,7 @@ def query_mixture(
     check_whole("n_seeds", n_seeds, 1, len(mixture.weights) + 1)
     if not max_energy > 0:
         raise BadArgument("max_energy", max_energy, "a positive number")
-    hand, mixture = (settle(value, contacts.points.device) for value in (hand, mixture))
+    hand, mixture = settle(hand, contacts.points.device), settle(mixture, contacts.points.device)
     firsts = range(0, max(len(contacts), 1), 256)  # their configurations stay in the cache
     parts = [_query(hand, contacts[k : k + 256], mixture, n_seeds, max_energy) for k in firsts]
     rows = torch.cat([part.row + k for part, k in zip(parts, firsts, strict=True)])
