@@ -4,9 +4,10 @@ import pytest
 import torch
 from benchmarks.shape.walls import estimated_thickness, measure_walls, true_wall
 
-from tests.cups import HEIGHT, RADIUS, cup, cup_view, ring
+from tests.cups import RADIUS, cup, cup_view
+from torchgrasp.linalg import unit
 from torchgrasp.shape.fit import fit_shape
-from torchgrasp.shape.hollow import HollowShape
+from torchgrasp.values import PointCloud
 
 
 @pytest.mark.parametrize("wall", [0.002, 0.005])
@@ -19,12 +20,13 @@ def test_true_walls_are_as_thick_as_the_cup_is_made(wall: float):
     assert torch.equal(outside, radius > RADIUS - wall / 2)
 
 
-def test_a_filled_cup_has_no_thin_wall_and_empty_space_has_none():
-    middle, out = ring(RADIUS - 0.001, 0.02, HEIGHT - 0.02)
-    solid = fit_shape(cup_view(0.002))
-    assert not isinstance(solid, HollowShape)
-    assert estimated_thickness(solid, middle, out).median() > 0.008
-    assert (estimated_thickness(solid, 2 * middle, out) == 0).all()
+def test_a_ball_is_thick_and_empty_space_has_no_wall():
+    """Along a radius 5 mm below the surface, 5 mm are material outward and all 15 mm inward."""
+    out = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
+    ball = fit_shape(PointCloud(0.04 * out, out))
+    found = estimated_thickness(ball, 0.035 * out[:50], out[:50])
+    torch.testing.assert_close(found, torch.full_like(found, 0.020), rtol=0, atol=0.001)
+    assert (estimated_thickness(ball, 0.056 * out[:50], out[:50]) == 0).all()
 
 
 def test_two_walls_are_measured_and_below_a_seen_rim():
