@@ -28,7 +28,6 @@ from torchgrasp.ik.ranking import rank_by_success, rank_by_variance, success_fea
 from torchgrasp.ik.sdf import field_from_surface
 from torchgrasp.linalg import farthest_points
 from torchgrasp.plan.certify import certify
-from torchgrasp.plan.closure_probability import closure_share
 from torchgrasp.plan.solve import plan_contacts
 from torchgrasp.plan.starts import settle_flatness
 from torchgrasp.plane import cloud_to_upright, move, upright_frame
@@ -43,8 +42,8 @@ from torchgrasp.values import ContactPlan, Grasps, PointCloud
 
 Observer = Callable[[str, str, Any], None]
 """Called after each stage with its name, one line about it, and its value."""
-TRIPLES, SURFACE_DRAWS = 250, 600
-"""Planned triples offered to the hand; surfaces drawn for the probability of closure, whose error is then 0.02."""
+TRIPLES = 250
+"""Planned triples offered to the hand."""
 SCENE_TRIPLES = 160
 """Triples offered in a scene, where more postures of each are tried: first grasps come in 1.5 times as long."""
 BURIED_DEPTH = 0.003
@@ -233,9 +232,8 @@ def _plan(task: _Task) -> Grasps:
     else:
         solved = (solve_as_paper if task.mode == "paper" else solve_contact_first)(problem, seeds)
     good = solved[solved.status == Status.OK]
-    closure = closure_share(shape, good.contacts, spec.friction, SURFACE_DRAWS, seed)
-    features = success_features(good.contacts, closure, good.normal_angle, problem.center, spec.friction)
-    log_odds = success_log_odds(features)
+    features = success_features(shape, good.contacts, problem.center, spec.friction, seed)
+    log_odds = success_log_odds(features, hand.name)
     if obstacles is not None and obstacles.hard and _is_buried(surface, obstacles):
         buried = torch.where(solved.status == Status.OK, int(Status.BURIED), solved.status)
         return dataclasses.replace(solved, status=buried)

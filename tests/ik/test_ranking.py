@@ -2,23 +2,29 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
+from torchgrasp.frames import apply, rigid, rotation_from_vector
 from torchgrasp.ik.ranking import (
     FEATURES,
     centred_friction,
+    load_arm,
     rank_in_group,
     score,
     success_features,
     success_log_odds,
 )
-from torchgrasp.values import Contacts
+from torchgrasp.linalg import unit
+from torchgrasp.plan.closure_probability import closure_probability
+from torchgrasp.shape.fit import fit_shape
+from torchgrasp.specs import ContactSpec
+from torchgrasp.values import Contacts, PointCloud
 
-CENTER = torch.tensor([0.0, 0.03, 0.0], dtype=torch.float64)
 PADS = torch.tensor([[0.1, 0.3, 0.2]], dtype=torch.float64)
-CLOSED = torch.tensor([0.9], dtype=torch.float64)
-GOOD = torch.tensor([[4.0, 0.3, 0.3, 0.5, 0.6]])
+GOOD = torch.tensor([[4.0, 0.3, -1.0]])
+RADIUS = 0.04
 
 
 def test_rank_in_group_against_brute_force(generator):
@@ -58,52 +64,83 @@ def test_central_untilted_grasps_rank_first():
 
 
 @pytest.mark.parametrize("name", FEATURES)
-def test_every_feature_counts_the_way_it_should(name):
+@pytest.mark.parametrize("hand", ["allegro", "barrett"])
+def test_every_feature_counts_the_way_it_should(name, hand):
     changed = GOOD.clone()
     changed[0, FEATURES.index(name)] += -2.0 if name == "log-odds of closure" else 0.5
-    gain = float(success_log_odds(changed) - success_log_odds(GOOD))
-    if name == "mean angle of the pads":  # decides nothing on the bodies of the fit, whose surface is known well
-        assert abs(gain) < 0.05
-    else:
-        assert gain < -0.1
+    assert float(success_log_odds(changed, hand) - success_log_odds(GOOD, hand)) < -0.1
 
 
-def ring(lift=0.0, shift=0.0):
-    """Contacts around z with normals tilted up by `lift` [rad]; forces meet `shift` beside their centre."""
-    real = {"dtype": torch.float64}
-    around = torch.tensor([0.0, 2.0, 4.0], **real) * math.pi / 3
-    out = torch.stack([around.cos(), around.sin(), 0 * around], -1)
-    inner = 0.03 * out - torch.tensor([shift, 0.0, 0.0], **real)
-    inner = inner / inner.norm(dim=-1, keepdim=True)
-    normals = inner * math.cos(lift) + torch.tensor([0.0, 0.0, math.sin(lift)], **real)
-    return Contacts(0.03 * out[None], normals[None])
+def test_a_hand_that_the_model_does_not_know_gets_the_least_chance():
+    known = [success_log_odds(GOOD, hand) for hand in ("allegro", "barrett")]
+    assert float(success_log_odds(GOOD, "mine")) == min(map(float, known))
 
 
-def test_features_of_a_triangle_by_hand():
+@pytest.fixture(scope="module")
+def ball():
+    """The posterior of a whole ball of 80 mm."""
+    draw = torch.randn(600, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return fit_shape(PointCloud(RADIUS * unit(draw), unit(draw)))
+
+
+def around(height=0.0):
+    """Contacts around z at a height [m] on the ball."""
+    angle = torch.tensor([0.3, 2.4, 4.6], dtype=torch.float64)
+    level = math.sqrt(RADIUS**2 - height**2) * torch.stack([angle.cos(), angle.sin(), 0 * angle], -1)
+    points = level + torch.tensor([0.0, 0.0, height], dtype=torch.float64)
+    return Contacts(points[None], unit(points)[None])
+
+
+def test_features_of_a_ball_by_hand(ball):
+    contacts, center = around(0.01), torch.tensor([0.0, 0.0, -0.02], dtype=torch.float64)
+    closure, least, arm = success_features(ball, contacts, center, 0.5, seed=3)[0].tolist()
     cone = math.atan(0.5)
-    features = success_features(ring(lift=0.2), CLOSED, PADS, CENTER, 0.5)[0]
-    torch.testing.assert_close(
-        features, torch.tensor([math.log(9), 1.5, 0.2 / cone, 0.2 / cone, 0.2], dtype=torch.float64), atol=1e-3, rtol=0
-    )
-    # Forces that meet where the normals do need no friction; those to the centre, half a radius aside, do.
-    _, offset, least, lean, _ = success_features(ring(shift=0.01), CLOSED, PADS, CENTER, 0.5)[0]
-    aside = math.pi / 3 - math.atan2(math.sqrt(3) / 2, 5 / 6)
-    assert float(least) < 0.02 and float(lean) * cone == pytest.approx(aside, abs=1e-6)
-    assert float(offset) == pytest.approx(1.5)
+    closed = closure_probability(ball, contacts, ContactSpec(friction=0.5), n=600, seed=3).probability
+    assert closure == pytest.approx(float(torch.logit(closed, eps=1e-3)))
+    assert least * cone == pytest.approx(math.asin(0.25), abs=0.01)  # forces within the plane of the contacts
+    p = contacts.points[0].numpy()
+    gaps = [np.linalg.norm(np.cross(p[2] - p[1], x - p[1])) for x in (center.numpy(), p[0])]
+    gaps = [gap / np.linalg.norm(p[2] - p[1]) for gap in gaps]
+    assert arm == pytest.approx(math.log(gaps[0] / (gaps[1] + 0.01) + 0.1))
 
 
-def test_features_do_not_depend_on_the_frame_and_are_finite_where_nothing_balances():
-    contacts = ring(lift=0.1, shift=0.01)
-    turned = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64))[0]
-    turned = turned * torch.linalg.det(turned)
-    points, normals = contacts.points @ turned.T + 1.0, contacts.normals @ turned.T
-    moved = Contacts(points, normals)
-    again = success_features(moved, CLOSED, PADS, CENTER @ turned.T + 1.0, 0.5)
-    torch.testing.assert_close(again, success_features(contacts, CLOSED, PADS, CENTER, 0.5), atol=1e-3, rtol=0)
-    certain = success_features(contacts, torch.ones_like(CLOSED), PADS, CENTER, 0.5)
-    assert bool(torch.isfinite(certain).all())
-    alike = Contacts(points, normals[:, :1].expand(1, 3, 3).contiguous())
-    assert float(success_features(alike, CLOSED, PADS, CENTER, 0.5)[0, 2]) == pytest.approx(
-        math.pi / 2 / math.atan(0.5)
-    )
-    assert success_features(contacts[:0], CLOSED[:0], PADS[:0], CENTER, 0.5).shape == (0, 5)
+def test_the_arm_of_a_load_is_about_the_longest_side_and_no_frame_or_order_matters(generator):
+    points = 0.05 * torch.randn(30, 3, 3, generator=generator, dtype=torch.float64)
+    center = torch.tensor([0.01, -0.02, 0.015], dtype=torch.float64)
+    found = load_arm(points, center)
+    for row in range(10):
+        p = points[row].numpy()
+        first, second, third = max(((0, 1, 2), (1, 2, 0), (2, 0, 1)), key=lambda s: np.linalg.norm(p[s[0]] - p[s[1]]))
+        side = p[second] - p[first]
+        gaps = [np.linalg.norm(np.cross(side, x - p[first])) / np.linalg.norm(side) for x in (center.numpy(), p[third])]
+        assert float(found[row]) == pytest.approx(gaps[0] / (gaps[1] + 0.01))
+    turn = rotation_from_vector(torch.tensor([0.3, -1.0, 2.0], dtype=torch.float64))
+    torch.testing.assert_close(load_arm(points[:, [2, 0, 1]] @ turn.T + 1.0, turn @ center + 1.0), found)
+    assert load_arm(points[:0], center).shape == (0,)
+
+
+def test_features_do_not_depend_on_the_frame_and_rows_do_not_on_each_other(ball):
+    turn = rotation_from_vector(torch.tensor([0.5, 1.0, -2.0], dtype=torch.float64))
+    moved_from_obj = rigid(turn, torch.tensor([0.3, -0.1, 0.2], dtype=torch.float64))
+    center = torch.tensor([0.0, 0.01, 0.0], dtype=torch.float64)
+    both = Contacts(*(torch.cat([x, y]) for x, y in zip(tensors(around(0.01)), tensors(around(-0.02)), strict=True)))
+    here = success_features(ball, both, center, 0.6)
+    there = Contacts(apply(moved_from_obj, both.points), both.normals @ turn.T)
+    again = success_features(ball.moved(moved_from_obj), there, apply(moved_from_obj, center[None])[0], 0.6)
+    torch.testing.assert_close(again[:, 1:], here[:, 1:], atol=1e-3, rtol=0)
+    torch.testing.assert_close(torch.sigmoid(again[:, 0]), torch.sigmoid(here[:, 0]), atol=0.06, rtol=0)  # other draws
+    torch.testing.assert_close(success_features(ball, both[1:], center, 0.6), here[1:], atol=1e-9, rtol=0)
+    assert success_features(ball, both[:0], center, 0.6).shape == (0, len(FEATURES))
+
+
+def test_contacts_that_nothing_balances_have_finite_features(ball):
+    one_side = around(0.01)
+    alike = Contacts(one_side.points, one_side.normals[:, :1].expand(1, 3, 3).contiguous())
+    features = success_features(ball, alike, torch.zeros(3, dtype=torch.float64), 0.5)
+    assert bool(torch.isfinite(features).all())
+    assert float(features[0, 1]) == pytest.approx(math.pi / 2 / math.atan(0.5))
+
+
+def tensors(contacts):
+    """Return points and normals."""
+    return contacts.points, contacts.normals

@@ -234,7 +234,7 @@ def _try(view: _View, protocol: Protocol, spec: EvaluationSpec, row: int, draw: 
     protocol = dataclasses.replace(protocol, trial=trial, noise=noise)
     error = draw_error(protocol, grasp, mesh, seed)
     attempt = GraspTrial(hand, grasp, mesh, seed_of(seed, "touch"), error, parts=parts)
-    return run_protocol(attempt, protocol, row, draw)
+    return dataclasses.replace(run_protocol(attempt, protocol, row, draw), predicted=float(grasp.success[0]))
 
 
 @functools.lru_cache(maxsize=2)

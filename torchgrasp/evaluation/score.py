@@ -10,6 +10,7 @@ import torch
 
 from torchgrasp.base import Value
 from torchgrasp.errors import Status
+from torchgrasp.evaluation.calibration import judge
 from torchgrasp.evaluation.intervals import Share, count_by, share_over
 
 STAGES: dict[str, tuple[Status, ...]] = {
@@ -27,7 +28,7 @@ class ProtocolResult(Value):
 
     The object moved by `moved` [m] and `turned` [rad], in a lift relative to the hand. `force` [N] is the fingers' mean
     normal force, `overlap` [m] the depth of the grasp pose in the object, `seconds` CPU time. In a lift the object
-    slipped by `slip` [m] and `slip_angle` [rad] since the hand pressed.
+    slipped by `slip` [m] and `slip_angle` [rad] since the hand pressed. `predicted` is the grasp's predicted success.
     """
 
     rank: int
@@ -41,6 +42,7 @@ class ProtocolResult(Value):
     seconds: float = math.nan
     slip: float = math.nan
     slip_angle: float = math.nan
+    predicted: float = math.nan
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +76,8 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     grasps: a view without grasps fails in every draw. "objects" is the share of objects with a success. Their intervals
     are over families (`share_over`). "by_object" and "by_group" have the same of parts. "refused" counts views without
     a grasp, "failures" the reasons of each stage. "force_n", "overlap_mm", "plan_cpu_s" (of a view) and "trial_cpu_s"
-    are means. "slip_mm" and "slip_deg" are the median and the 95 % quantile over the grasps that held.
+    are means. "slip_mm" and "slip_deg" are the median and the 95 % quantile over the grasps that held. "success" judges
+    the predictions (`torchgrasp.evaluation.calibration.judge`); None without any.
     """
     attempts = [attempt for score in scores for attempt in score.attempts]
     spent = [*(score.seconds for score in scores), *(a.seconds for a in attempts)]
@@ -95,6 +98,7 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
         "plan_cpu_s": _mean(score.seconds for score in scores),
         "trial_cpu_s": _mean(a.seconds for a in attempts),
         "cpu_s": sum(x for x in spent if not math.isnan(x)),
+        "success": _judge_predictions(scores),
         "by_object": by_object,
         "by_group": {name: _shares([score for score in scores if score.group == name]) for name in groups},
     }
@@ -115,6 +119,15 @@ def _shares(scores: Sequence[ViewScore]) -> dict[str, Share | int]:
         "refused": len(refused),
         "executable": sum(score.executable for score in scores),
     }
+
+
+def _judge_predictions(scores: Sequence[ViewScore]) -> dict[str, Any] | None:
+    """Return how true predicted success was, or None where nothing was predicted."""
+    known = [(score.unit, a) for score in scores for a in score.attempts if not math.isnan(a.predicted)]
+    if not known:
+        return None
+    predicted = torch.tensor([attempt.predicted for _, attempt in known], dtype=torch.float64)
+    return judge(predicted, torch.tensor([attempt.passed for _, attempt in known]), [unit for unit, _ in known])
 
 
 def _quantiles(values: Iterable[float]) -> tuple[float, float] | None:

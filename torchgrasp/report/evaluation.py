@@ -51,6 +51,7 @@ def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[
         *(["<h3>Refused</h3>", format_html_table(("object", "view", "why"), notes)] if notes else []),
         "<h2>Forces, overlap and time</h2>",
         format_html_table(("what", "value"), _figures(summary), numbers={1}),
+        *_predictions(summary["success"]),
         "<h2>What was asked</h2>",
         format_html_table(("what", "value"), [(k.replace("_", " "), str(v)) for k, v in asked.items()], code={1}),
     ]
@@ -109,6 +110,20 @@ def _failures(failures: Mapping[str, Mapping[str, int]]) -> str:
             swatch = Markup(f'<span class="swatch" style="width:{160 * n / most:.0f}px"></span>')
             rows.append((stage, name.lower(), str(n), swatch, Status[name].sentence))
     return format_html_table(("stage", "reason", "count", "", "meaning"), rows, numbers={2})
+
+
+def _predictions(found: Mapping[str, Any] | None) -> list[Markup | str]:
+    """Return how true predicted success was, bin by bin; nothing without predictions."""
+    if found is None:
+        return []
+    said = (
+        f"Predicted {found['predicted']:.0%}, passed {found['passed']:.0%}; expected calibration error "
+        f"{found['error']:.2f}, Brier skill {found['skill']:.2f}, area under the curve {found['auc']:.2f}."
+    )
+    rows = [(f"{x.low:.0%} to {x.high:.0%}", f"{x.predicted:.0%}", *_share_cells(x.passed, 0)) for x in found["bins"]]
+    heads = ("predicted", "mean", "passed", "with its 95 % interval", "interval", "of")
+    table = format_html_table(heads, rows, numbers={1, 2, 4, 5})
+    return ["<h2>Predicted success, and what passed</h2>", f"<p>{escape(said)}</p>", table]
 
 
 def _figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
