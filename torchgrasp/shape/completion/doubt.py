@@ -10,8 +10,8 @@ from torchgrasp.errors import CutOff, Gap, TwoBodies
 from torchgrasp.shape.completion.silhouette import Outlines
 from torchgrasp.values import PointCloud
 
-LEAST_GAP = 0.02
-"""Least width [m] of a gap that is told: a fingertip would rest on the rim of a narrower one."""
+LEAST_GAP = 0.025
+"""Least width [m] of a gap that is told: a fingertip rests on the rim of a narrower one, as of a handle."""
 CALLER = 5
 """Frames between a warning and the caller of `fit_shape`, to whom it is shown."""
 
