@@ -12,7 +12,7 @@ from torch import Tensor
 from torchgrasp.base import Value, map_tensors
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import limit_norm, unit
-from torchgrasp.shape.clip import clip_mesh
+from torchgrasp.mesh import clip_mesh
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.posterior import surface_deviation
 
