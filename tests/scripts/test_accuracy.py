@@ -65,7 +65,7 @@ def test_a_whole_ball_is_all_seen_and_nearly_exact(shape: ShapeGP, cloud: PointC
 def test_a_larger_true_ball_is_off_by_the_difference_of_the_radii(shape: ShapeGP, cloud: PointCloud):
     row = measure_shape(shape, _ball(RADIUS + 0.003), cloud)
     assert row["seen_median_mm"] == pytest.approx(3.0, abs=0.2)
-    assert row["sure_median_mm"] == pytest.approx(3.0, abs=0.2)
+    assert row["sure_median_mm"] == pytest.approx(3.0, abs=0.2) and row["chamfer_mm"] == pytest.approx(3.0, abs=0.2)
     assert row["seen_normal_deg"] < 4
 
 
@@ -79,7 +79,7 @@ def test_a_wide_band_covers_and_a_narrow_one_does_not(shape: ShapeGP, cloud: Poi
 def test_what_the_cloud_never_saw_is_hidden(shape: ShapeGP):
     seen = PointCloud(_sphere_part())
     row = measure_shape(shape, _ball(), seen)
-    assert row["hidden_median_mm"] < 0.3 and row["seen_median_mm"] < 0.3
+    assert row["hidden_median_mm"] < 0.3 and row["seen_median_mm"] < 0.3 and row["chamfer_mm"] < 0.3
 
 
 def _sphere_part() -> torch.Tensor:
