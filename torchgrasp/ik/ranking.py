@@ -110,7 +110,9 @@ def success_features(
     center = center.to(points)
     closure = torch.logit(closure_share(shape, contacts, friction, SURFACE_DRAWS, seed).to(points), eps=1e-3)
     forces = least_friction_forces(points, normals, strongest=1.0)
-    least = torch.atan(tangential_ratio(forces, normals).amax(-1)).nan_to_num(math.pi / 2)
+    least = torch.atan(tangential_ratio(forces, normals).amax(-1)).nan_to_num(
+        math.pi / 2
+    )  # no balance: at any friction
     arm = torch.log(load_arm(points, center) + LEAST_ARM)
     return torch.stack([closure, least / math.atan(friction), arm], dim=-1)
 

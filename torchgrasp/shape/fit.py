@@ -57,9 +57,8 @@ STD_FACTORS: dict[tuple[Kind, bool], float] = {
     ("cut off", True): 2.0,
     ("cut off", False): 2.0,
 }
-"""Real deviations over the posterior's, by what the hidden side follows from and whether the table is known.
-`scripts/train.py bands DIR` fits them and tries each on families left out; a guess keeps the posterior's own.
-What lies beyond an image's border is farther from all that was seen: a half cylinder is within 2 of twice its own."""
+"""Real deviations over the posterior's, by what the hidden side follows from and whether the table is known: fitted by
+`scripts/train.py bands DIR`, tried on families left out. A guess keeps the posterior's own; half a can needs twice."""
 WHOLE_STD_FACTOR, VESSEL_STD_FACTOR = 0.5, 0.58
 """The same where all sides were seen; of a vessel: families left out lie to 76, 94 and 100 % within 1, 2 and 3."""
 FREE_NOISE, FREE_ROUNDS = 0.003, 3
@@ -252,6 +251,7 @@ def _vessel_supports(cloud: PointCloud, vessel: Vessel, table: float, noise: flo
     frame = Normalisation(center, float(torch.linalg.vector_norm(cloud.points - center, dim=-1).max()))
     cloud, device = cloud.to("cpu"), frame.center.device
     outline = silhouettes(cloud)
+    warn_of_doubts(cloud, outline, on_table=True)
     outer, inner, middle = observe_walls(cloud, vessel, outline, frame.to("cpu"), table, noise)
 
     def support(wall: WallObservations, free: tuple[Tensor, Tensor] | None) -> _Support:

@@ -60,7 +60,7 @@ class ShapeGP(Posterior, Normalisation):
         std_factor: ratio of the surface's real deviations to the posterior's, from hidden sides of known objects.
         cloud: what the camera saw, after cleaning.
         kind: what the hidden side follows from: "ball", "revolution", "mirrored", "vessel", "guess" (the outline
-            alone), or "whole" without a hidden side.
+            alone), "cut off" by the image's border, or "whole" without a hidden side.
     """
 
     psi: float
