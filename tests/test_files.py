@@ -7,12 +7,13 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from torchgrasp.base import named_tensors
 from torchgrasp.errors import ModelFileError, OutputError
 from torchgrasp.files import LOCK, hold_folder, load_tensors, save_tensors, sha256, write_atomically
 from torchgrasp.values import Certificate, Contacts, Grasps, load_grasps
 
 
-def some_grasps(g: int = 2, h: int = 4) -> Grasps:
+def some_grasps(g: int = 2, h: int = 4, f: int = 3) -> Grasps:
     def rand(*shape: int) -> torch.Tensor:
         return torch.rand(*shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
 
@@ -21,11 +22,11 @@ def some_grasps(g: int = 2, h: int = 4) -> Grasps:
         pregrasp=rand(g, h),
         approach=rand(g, 3),
         obj_from_hand=rand(g, 4, 4),
-        contacts=Contacts(rand(g, 3, 3), rand(g, 3, 3), rand(g, 3), rand(g, 3)),
-        permutation=torch.tensor([[0, 1, 2]] * g),
-        tip_error=rand(g, 3),
+        contacts=Contacts(rand(g, f, 3), rand(g, f, 3), rand(g, f), rand(g, f)),
+        permutation=torch.arange(f).repeat(g, 1),
+        tip_error=rand(g, f),
         clearance=rand(g),
-        normal_angle=rand(g, 3),
+        normal_angle=rand(g, f),
         certificate=Certificate(rand(g), rand(g), rand(g), torch.ones(g, dtype=torch.bool), rand(g, 6)),
         score=rand(g),
         status=torch.zeros(g, dtype=torch.int64),
@@ -33,8 +34,9 @@ def some_grasps(g: int = 2, h: int = 4) -> Grasps:
     )
 
 
-def test_grasps_survive_the_round_trip(tmp_path):
-    before = some_grasps()
+@pytest.mark.parametrize("fingertips", [3, 4, 5])
+def test_grasps_survive_the_round_trip(tmp_path, fingertips):
+    before = some_grasps(f=fingertips)
     before.save(tmp_path / "deep" / "grasps.safetensors")
     after = load_grasps(tmp_path / "deep" / "grasps.safetensors")
     assert after.meta == before.meta
@@ -58,6 +60,14 @@ def test_optional_tensors_may_be_absent_and_others_may_not(tmp_path):
     for names, optional in (({"a"}, {"c"}), ({"a", "c"}, {"b"})):
         with pytest.raises(ModelFileError, match="tensors"):
             load_tensors(tmp_path / "some", "toy", names, optional)
+
+
+def test_grasps_of_other_numbers_of_fingertips_or_of_several_are_refused(tmp_path):
+    four, three = some_grasps(f=4), some_grasps(f=3)
+    for wrong in (some_grasps(f=2), some_grasps(f=6), dataclasses.replace(four, contacts=three.contacts)):
+        save_tensors(tmp_path / "grasps", "grasps", named_tensors(wrong), {})
+        with pytest.raises(ModelFileError, match="three to five fingertips"):
+            load_grasps(tmp_path / "grasps")
 
 
 def test_the_same_grasps_give_the_same_bytes(tmp_path):

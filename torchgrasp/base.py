@@ -11,6 +11,10 @@ from torch import Tensor
 
 from torchgrasp.errors import BadArgument, FailedRows, Status
 
+FINGERTIPS = (3, 5)
+"""Fewest and most fingertips on an object: two points do not hold it against turning about their line, and hands have
+at most five fingers."""
+
 SomeValue = TypeVar("SomeValue", bound="Value")
 SomeBatch = TypeVar("SomeBatch", bound="Batch")
 

@@ -3,7 +3,8 @@
 A value is a frozen dataclass of tensors: it never changes, and `.to()` returns a new one. Lengths are metres.
 Positions are in the frame of the cloud ("obj") unless said otherwise. `a_from_b` maps coordinates of frame b into a.
 
-Letters in shapes: n points, b batch rows, g grasps, e friction-cone edges, h actuated joints, t time steps.
+Letters in shapes: n points, b batch rows, g grasps, f fingertips (three to five), e friction-cone edges, h actuated
+joints, t time steps.
 """
 
 import dataclasses
@@ -14,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch, Value, check_tensor, named_tensors
+from torchgrasp.base import FINGERTIPS, Batch, Value, check_tensor, named_tensors
 from torchgrasp.errors import BadArgument, ModelFileError, Status, TooFewPoints
 from torchgrasp.files import load_tensors, save_tensors
 
@@ -113,18 +114,23 @@ class ShapeEstimate(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Contacts(Batch):
-    """Three contacts a row: `points` [m] and outward unit `normals`.
+    """Three to five contacts a row, one for each fingertip: `points` [m] and outward unit `normals`.
 
     `variance` (Eq. 12, normalised units) and `std_m` [m] say how uncertain the surface is there. They are None where
     nobody knows, as for contacts of another planner.
     """
 
-    points: Float[Tensor, "b 3 3"]
-    normals: Float[Tensor, "b 3 3"]
-    variance: Float[Tensor, "b 3"] | None = None
-    std_m: Float[Tensor, "b 3"] | None = None
+    points: Float[Tensor, "b f 3"]
+    normals: Float[Tensor, "b f 3"]
+    variance: Float[Tensor, "b f"] | None = None
+    std_m: Float[Tensor, "b f"] | None = None
 
-    def require_std(self) -> Float[Tensor, "b 3"]:
+    @property
+    def fingertips(self) -> int:
+        """The number f of contacts in a row."""
+        return self.points.shape[-2]
+
+    def require_std(self) -> Float[Tensor, "b f"]:
         """Return `std_m`.
 
         Raises:
@@ -144,7 +150,7 @@ class ContactPlan(Batch):
     """
 
     contacts: Contacts
-    coefficients: Float[Tensor, "b 3 e"]
+    coefficients: Float[Tensor, "b f e"]
     quality: Float[Tensor, "b"]
     status: Int[Tensor, "b"]
 
@@ -195,9 +201,9 @@ class IKSeeds(Batch):
     joints: Float[Tensor, "g h"]
     obj_from_hand: Float[Tensor, "g 4 4"]
     row: Int[Tensor, "g"]
-    permutation: Int[Tensor, "g 3"]
+    permutation: Int[Tensor, "g f"]
     energy: Float[Tensor, "g"]
-    tip_error: Float[Tensor, "g 3"]
+    tip_error: Float[Tensor, "g f"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -217,10 +223,10 @@ class Grasps(Batch):
     approach: Float[Tensor, "g 3"]
     obj_from_hand: Float[Tensor, "g 4 4"]
     contacts: Contacts
-    permutation: Int[Tensor, "g 3"]
-    tip_error: Float[Tensor, "g 3"]
+    permutation: Int[Tensor, "g f"]
+    tip_error: Float[Tensor, "g f"]
     clearance: Float[Tensor, "g"]
-    normal_angle: Float[Tensor, "g 3"]
+    normal_angle: Float[Tensor, "g f"]
     certificate: Certificate
     score: Float[Tensor, "g"]
     status: Int[Tensor, "g"]
@@ -240,6 +246,10 @@ class Grasps(Batch):
         save_tensors(path, "grasps", named_tensors(self), self.meta)
 
 
+OF_FINGERTIPS = ("permutation", "tip_error", "normal_angle")
+"""Fields of `Grasps` with a column for each fingertip."""
+
+
 def load_grasps(path: Path | str) -> Grasps:
     """Read grasps that `Grasps.save` wrote.
 
@@ -254,6 +264,15 @@ def load_grasps(path: Path | str) -> Grasps:
     rows = {name: len(t) for name, t in tensors.items()}
     if len(set(rows.values())) != 1:
         raise ModelFileError("path", f"{path}: rows {rows}", "as many rows in every tensor")
+    tips = {
+        name: tuple(t.shape[1:2])
+        for name, t in tensors.items()
+        if name.startswith("contacts.") or name in OF_FINGERTIPS
+    }
+    if len(set(tips.values())) != 1 or tips["contacts.points"] not in [
+        (f,) for f in range(FINGERTIPS[0], FINGERTIPS[1] + 1)
+    ]:
+        raise ModelFileError("path", f"{path}: fingertips {tips}", "three to five fingertips, as many in every tensor")
     values: dict[str, Any] = {name: tensors[name] for name in plain}
     for name, kind in nested.items():
         values[name] = kind(**{f.name: tensors.get(f"{name}.{f.name}") for f in dataclasses.fields(kind)})
