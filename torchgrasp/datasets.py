@@ -4,17 +4,21 @@
 has `mesh.ply` and `<view>_noisy.ply` [m], resting at z = 0. All readers apply the object's "suggested_scale"
 (default 1), at which a hand can grasp it. Optional are "mass_kg", the "family" of look-alikes that it belongs to, and
 its "group", such as "solid".
+
+The folder of a stranger may hold anything. A name of an object or a view is one part of a path, and no file outside
+the folder is read.
 """
 
-import json
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
 from torchgrasp.cloud.io.read import read_cloud
-from torchgrasp.errors import BadArgument
+from torchgrasp.errors import DatasetError
+from torchgrasp.json_fields import Field, read_json
 from torchgrasp.mesh import read_mesh
 from torchgrasp.values import PointCloud
 
@@ -23,6 +27,77 @@ if TYPE_CHECKING:
 
 WHOLE = "whole"
 """Name of the view that shows an object from all sides, with normals: `full_normals.ply`."""
+MOST_SCALE, MOST_METRES, MOST_MASS = 1e4, 1e4, 1e4
+"""Largest scale, its inverse being the least, largest coordinate [m] of a camera, and largest mass [kg]."""
+LONGEST_NAME = 100
+"""Most letters of a name: file names have 255 bytes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjectEntry:
+    """What the manifest says of an object.
+
+    Args:
+        views: the camera's position [m] of each view, by name, at scale 1.
+        scale: factor of mesh and clouds.
+        family: look-alikes that it belongs to; its own name if the manifest has none.
+        group: such as "solid", "thin" or "shell"; "" if the manifest has none.
+        mass: of the real object [kg], whatever its scale; None: the manifest has none.
+    """
+
+    views: dict[str, tuple[float, ...]]
+    scale: float
+    family: str
+    group: str
+    mass: float | None
+
+
+def list_objects(objects: Path, only: Sequence[str] = ()) -> list[str]:
+    """Return the names of the objects of a folder, sorted; `only` selects some. Their entries may be bad.
+
+    Raises:
+        DatasetError: no manifest, or none of the objects in it.
+    """
+    return sorted(_read_fields(objects, only))
+
+
+def read_entry(objects: Path, name: str) -> ObjectEntry:
+    """Return what the manifest says of an object.
+
+    Raises:
+        DatasetError: no such object, a field that is missing or of a wrong type or range, or a name that is no name of
+            a folder.
+    """
+    field = _read_fields(objects, [name])[name]
+    check_name(field, name)
+    fields, views = field.entries(), {}
+    if "views" not in fields:
+        raise field.wrong('an object with "views"')
+    for view, of_view in fields["views"].entries().items():
+        check_name(of_view, view)
+        pose = of_view.entries().get("T_object_camera")
+        if pose is None:
+            raise of_view.wrong('an object with "T_object_camera"')
+        rows = [[x.number(-MOST_METRES, MOST_METRES) for x in row.items(4)] for row in pose.items(4)]
+        if [len(row) for row in rows] != [4, 4, 4, 4]:
+            raise pose.wrong("4 rows of 4 numbers")
+        views[view] = tuple(row[3] for row in rows[:3])
+    scale, mass, family, group = (fields.get(key) for key in ("suggested_scale", "mass_kg", "family", "group"))
+    return ObjectEntry(
+        views,
+        1.0 if scale is None else scale.number(1 / MOST_SCALE, MOST_SCALE),
+        name if family is None else family.text(),
+        "" if group is None else group.text(),
+        None if mass is None or mass.value is None else mass.number(1e-6, MOST_MASS),
+    )
+
+
+def check_name(field: Field, name: str) -> None:
+    """Refuse a name that is more than one part of a path, or that a terminal would not print."""
+    plain = name.isprintable() and not set(name) & set("/\\:") and name == name.strip(" .")
+    if not plain or not 0 < len(name.encode("utf-8", "surrogatepass")) <= LONGEST_NAME:
+        allowed = f"a printable name of 1 to {LONGEST_NAME} bytes without / \\ : or a dot or space at its ends"
+        raise field.refuse(f"{field.path}: the name {name[:LONGEST_NAME]!r}", allowed)
 
 
 def list_views(
@@ -33,56 +108,69 @@ def list_views(
     `only` selects objects; with `whole` each has one view, `WHOLE`.
 
     Raises:
-        BadArgument: no manifest, or none of the objects in it.
+        DatasetError: no manifest, none of the objects in it, or a bad entry.
     """
-    entries = _read_manifest(objects, only)
-    return [(name, view) for name in entries for view in ([WHOLE] if whole else sorted(entries[name]["views"]))[:most]]
+    entries = {name: read_entry(objects, name) for name in list_objects(objects, only)}
+    return [(name, view) for name, x in entries.items() for view in ([WHOLE] if whole else sorted(x.views))[:most]]
 
 
 def read_view(objects: Path, name: str, view: str, camera: bool = True) -> PointCloud:
-    """Return a noisy view without normals, with its viewpoint if `camera`."""
-    entry, folder = _read_manifest(objects, [name])[name], Path(objects) / name
+    """Return a noisy view without normals, with its viewpoint if `camera`.
+
+    Raises:
+        DatasetError: as `read_entry`, or no such view.
+        CloudFileError: a bad file.
+    """
+    entry = read_entry(objects, name)
     if view == WHOLE:
-        cloud = read_cloud(folder / "full_normals.ply")
-        return PointCloud(cloud.points * _scale(entry), cloud.normals)
-    cloud = read_cloud(folder / f"{view}_noisy.ply")
-    viewpoint = torch.tensor(entry["views"][view]["T_object_camera"], dtype=torch.float64)[:3, 3]
-    return PointCloud(cloud.points * _scale(entry), None, viewpoint * _scale(entry) if camera else None)
+        cloud = read_cloud(_file(objects, name, "full_normals.ply"))
+        return PointCloud(cloud.points * entry.scale, cloud.normals)
+    if view not in entry.views:
+        raise DatasetError("objects", f"{objects}: view {view!r} of {name!r}", f"one of {sorted(entry.views)}")
+    cloud = read_cloud(_file(objects, name, f"{view}_noisy.ply"))
+    viewpoint = torch.tensor(entry.views[view], dtype=torch.float64)
+    return PointCloud(cloud.points * entry.scale, None, viewpoint * entry.scale if camera else None)
 
 
 def read_object_mesh(objects: Path, name: str) -> "trimesh.Trimesh":
-    """Return the true mesh of an object; raises as `read_mesh`."""
-    return read_mesh(Path(objects) / name / "mesh.ply").apply_scale(_scale(_read_manifest(objects, [name])[name]))
+    """Return the true mesh of an object; raises as `read_entry` and `read_mesh`."""
+    scale = read_entry(objects, name).scale
+    return read_mesh(_file(objects, name, "mesh.ply")).apply_scale(scale)
 
 
 def read_family(objects: Path, name: str) -> str:
-    """Return the family of look-alikes of an object: its own name if the manifest has none."""
-    return str(_read_manifest(objects, [name])[name].get("family", name))
+    """Return the family of look-alikes of an object, see `ObjectEntry`."""
+    return read_entry(objects, name).family
 
 
 def read_group(objects: Path, name: str) -> str:
-    """Return the group of an object, such as "solid", "thin" or "shell": "" if the manifest has none."""
-    return str(_read_manifest(objects, [name])[name].get("group", ""))
+    """Return the group of an object, see `ObjectEntry`."""
+    return read_entry(objects, name).group
 
 
 def read_mass(objects: Path, name: str) -> float | None:
-    """Return the mass [kg] of an object, of the real one whatever its scale; None: the manifest has none."""
-    mass = _read_manifest(objects, [name])[name].get("mass_kg")
-    return None if mass is None else float(mass)
+    """Return the mass [kg] of an object, see `ObjectEntry`."""
+    return read_entry(objects, name).mass
 
 
-def _scale(entry: dict[str, Any]) -> float:
-    """Return the factor of an object's mesh and clouds."""
-    return float(entry.get("suggested_scale", 1.0))
+def _file(objects: Path, name: str, file: str) -> Path:
+    """Return the path of an object's file, which may not be linked to one outside the folder."""
+    path, folder = Path(objects) / name / file, Path(objects).resolve()
+    if not path.resolve().is_relative_to(folder):
+        raise DatasetError("objects", f"{path}, which is {path.resolve()}", f"files within {folder}")
+    return path
 
 
-def _read_manifest(objects: Path, only: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return the entries of the objects asked for, sorted; all of them if `only` is empty."""
-    manifest = Path(objects) / "manifest.json"
-    if not manifest.is_file():
-        raise BadArgument("objects", str(objects), "a folder with a manifest.json")
-    entries = json.loads(manifest.read_text()).get("objects", {})
-    chosen = {name: entries[name] for name in sorted(entries) if not only or name in only}
+def _read_fields(objects: Path, only: Sequence[str]) -> dict[str, Field]:
+    """Return the entries of the objects asked for, all of them if `only` is empty."""
+
+    def refuse(found: str, allowed: str) -> DatasetError:
+        return DatasetError("objects", found, allowed)
+
+    path = Path(objects) / "manifest.json"
+    top = read_json(path, refuse, "a folder with a manifest.json in UTF-8").entries()
+    entries = top["objects"].entries() if "objects" in top else {}
+    chosen = {name: entries[name] for name in entries if not only or name in only}
     if not chosen:
-        raise BadArgument("objects", f"{manifest} with {sorted(entries)}", "a manifest with the objects asked for")
+        raise refuse(f"{path} with {sorted(entries)[:100]}", "a manifest with the objects asked for")
     return chosen

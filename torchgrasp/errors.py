@@ -53,6 +53,10 @@ class ModelFileError(BadArgument):
     """A safetensors file is missing or truncated, or holds other tensors than its kind requires."""
 
 
+class DatasetError(BadArgument):
+    """A folder of objects has a bad manifest, or one that names files outside the folder."""
+
+
 class OutputError(BadArgument):
     """An output folder or file cannot be written."""
 

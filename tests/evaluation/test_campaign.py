@@ -113,7 +113,7 @@ def test_any_number_of_workers_gives_the_same_bits_and_a_bad_object_is_refused(f
     tin, torn = one
     assert [(a.rank, a.draw) for a in tin.attempts] == [(r, d) for r in (0, tin.executable - 1) for d in (0, 1)]
     assert (torn.executable, torn.refusal, torn.attempts) == (0, Status.BAD_OBJECT, ()) and "open surface" in torn.note
-    assert len(load_grasps(tmp_path / "tin_view0.safetensors")) == tin.executable
+    assert len(load_grasps(tmp_path / "tin" / "view0.safetensors")) == tin.executable
     planned = dataclasses.replace(spec, planned=True)
     again = list(evaluate(folder, hand, quick, planned, folder=tmp_path))
     assert without_times(again) == without_times(one)
@@ -146,7 +146,7 @@ def test_a_robot_plans_on_what_it_believes_and_lifts_what_is(folder, tmp_path):
     for name in ("none", "friction", "table"):
         asked = dataclasses.replace(spec, perturb=name)
         (score,) = evaluate(folder, hand, quick, asked, folder=tmp_path / name)
-        grasps = load_grasps(tmp_path / name / "tin_view0.safetensors")
+        grasps = load_grasps(tmp_path / name / "tin" / "view0.safetensors")
         found[name] = grasps.obj_from_hand, score.attempts[0]
     assert torch.equal(found["none"][0], found["friction"][0]) and found["none"][1] != found["friction"][1]
     assert not torch.equal(found["none"][0][0], found["table"][0][0])

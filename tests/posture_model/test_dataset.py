@@ -136,6 +136,17 @@ def test_a_full_disk_leaves_nothing_half_written_and_the_run_goes_on_later(tmp_p
         write_samples(hand, SampleSpec(1100), tmp_path / "full")
 
 
+@pytest.mark.parametrize("half", [".samples.json.abc123.json", ".chunk-000000.safetensors.abc123.safetensors"])
+def test_a_run_killed_between_a_temporary_file_and_its_name_is_continued(tmp_path, small, half):
+    (tmp_path / half).write_text("{")
+    write_samples(load_hand("barrett"), SampleSpec(600), tmp_path)
+    assert sorted(x.name for x in tmp_path.iterdir()) == [
+        "chunk-000000.safetensors",
+        "chunk-000001.safetensors",
+        "samples.json",
+    ]
+
+
 def test_a_folder_of_other_samples_or_files_is_refused(tmp_path, small):
     hand = load_hand("barrett")
     write_samples(hand, SampleSpec(600), tmp_path / "a")
@@ -173,7 +184,7 @@ def test_what_is_no_manifest_is_refused(tmp_path, data):
     (tmp_path / "samples.json").write_bytes(data)
     with pytest.raises(ModelFileError, match=r"samples\.json"):
         load_samples(tmp_path)
-    with pytest.raises(ModelFileError, match=r"without samples\.json"):
+    with pytest.raises(ModelFileError, match=r"samples\.json, which is no file"):
         load_samples(tmp_path / "nowhere")
 
 

@@ -15,8 +15,8 @@ import torch
 
 from torchgrasp.base import Value, check_whole, count_status
 from torchgrasp.closing import ObjectMotion
-from torchgrasp.datasets import list_views, read_family, read_group, read_mass, read_object_mesh, read_view
-from torchgrasp.errors import BadArgument, GraspError, MissingExtra, Status
+from torchgrasp.datasets import list_objects, list_views, read_entry, read_object_mesh, read_view
+from torchgrasp.errors import BadArgument, DatasetError, GraspError, MissingExtra, Status
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.perturb import find_perturbation, household_mass, perturb_trial, perturb_view
@@ -96,13 +96,13 @@ def evaluate(
 ) -> Generator[ViewScore, None, None]:
     """Plan on every view of a folder of objects, and yield each view's score.
 
-    Only the simulator knows the true mesh. An object with bad files is refused and the others go on.
+    Only the simulator knows the true mesh. An object with bad files or a bad entry is refused; the others go on.
 
     Args:
         objects: a folder as in `torchgrasp.datasets`.
         protocol: itself, or its name in `PROTOCOLS`.
         spec: which grasps; None: `EvaluationSpec()`.
-        folder: where the executable grasps of each view are kept, OBJECT_VIEW.safetensors; None: nowhere.
+        folder: where the executable grasps of each view are kept, OBJECT/VIEW.safetensors; None: nowhere.
         workers: processes (`run_tasks`); the scores do not depend on their number.
 
     Raises:
@@ -112,14 +112,28 @@ def evaluate(
     protocol, spec = find_protocol(protocol), EvaluationSpec() if spec is None else spec
     if spec.perturb != "none" and protocol.pull is not None:
         raise BadArgument("perturb", f"{spec.perturb!r} with {protocol.name!r}", "a protocol that lifts")
-    names = list_views(objects, spec.complete, spec.only, spec.views)
-    return _evaluate([_View(Path(objects), *name, hand.source) for name in names], protocol, spec, folder, workers)
+    views, refused = [], []
+    for name in list_objects(objects, spec.only):
+        try:
+            found = list_views(objects, spec.complete, [name], spec.views)
+        except DatasetError as error:
+            note = " ".join(str(error).split())
+            refused.append(ViewScore(ascii(name), "", 0, math.nan, refusal=Status.BAD_OBJECT, note=note))
+        else:
+            views += [_View(Path(objects), *x, hand.source) for x in found]
+    return _evaluate(views, refused, protocol, spec, folder, workers)
 
 
 def _evaluate(
-    views: "list[_View]", protocol: Protocol, spec: EvaluationSpec, folder: Path | None, workers: int
+    views: "list[_View]",
+    refused: list[ViewScore],
+    protocol: Protocol,
+    spec: EvaluationSpec,
+    folder: Path | None,
+    workers: int,
 ) -> Generator[ViewScore, None, None]:
     """Yield the scores, lazily; `evaluate` checks at once."""
+    yield from refused
     with tempfile.TemporaryDirectory() as temporary:
         views = [dataclasses.replace(view, shelf=Path(folder or temporary)) for view in views]
         plans = run_tasks(_plan, [(view, protocol.trial.friction, spec) for view in views], workers, PLAN_LIMIT)
@@ -177,12 +191,12 @@ class _View:
 
     @property
     def file(self) -> Path:
-        return self.shelf / f"{self.object}_{self.view}.safetensors"
+        return self.shelf / self.object / f"{self.view}.safetensors"
 
     @property
     def score(self) -> ViewScore:
-        family, group = read_family(self.objects, self.object), read_group(self.objects, self.object)
-        return ViewScore(self.object, self.view, 0, 0.0, family=family, group=group)
+        entry = read_entry(self.objects, self.object)
+        return ViewScore(self.object, self.view, 0, 0.0, family=entry.family, group=entry.group)
 
     def load_hand(self) -> Hand:
         return load_hand(self.hand.urdf_path.parent, self.hand.option)
@@ -228,7 +242,7 @@ def _try(view: _View, protocol: Protocol, spec: EvaluationSpec, row: int, draw: 
     mesh, parts = _read_solid(view.objects, view.object)
     seed = seed_of(spec.seed, view.object, view.view, row, draw)
     perturbation = find_perturbation(spec.perturb)
-    mass = household_mass(float(mesh.volume), read_mass(view.objects, view.object))
+    mass = household_mass(float(mesh.volume), read_entry(view.objects, view.object).mass)
     trial = perturb_trial(protocol.trial, perturbation, mass, seed)
     noise = protocol.noise if spec.perturb == "none" else perturbation.pose
     protocol = dataclasses.replace(protocol, trial=trial, noise=noise)

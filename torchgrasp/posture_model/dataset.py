@@ -6,13 +6,20 @@ import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 from torchgrasp.base import check_whole, join
 from torchgrasp.errors import ModelFileError, OutputError
 from torchgrasp.files import LOCK, hold_folder, load_tensors, save_tensors, write_file
 from torchgrasp.hand.hand import Hand
-from torchgrasp.posture_model.sample import CHUNK_POSTURES, HandSamples, SampleSpec, chunk_sizes, draw_chunk
+from torchgrasp.json_fields import Field, read_json
+from torchgrasp.posture_model.sample import (
+    CHUNK_POSTURES,
+    MAX_SAMPLES,
+    HandSamples,
+    SampleSpec,
+    chunk_sizes,
+    draw_chunk,
+)
 
 MANIFEST = "samples.json"
 """File that describes the samples of a folder."""
@@ -126,15 +133,12 @@ def load_samples(folder: Path | str) -> SampleFolder:
     torch.Size([50, 4])
     """
     folder = Path(folder)
-    path, allowed = folder / MANIFEST, "a folder written by write_samples"
-    if not path.is_file():
-        raise ModelFileError("folder", f"{folder} without {MANIFEST}", allowed)
-    try:
-        if path.stat().st_size > MAX_MANIFEST:
-            raise ValueError("larger than 1 MiB")
-        samples = _parse_manifest(folder, json.loads(path.read_text("utf-8")))
-    except (OSError, ValueError, RecursionError) as error:
-        raise ModelFileError("folder", f"{path}: {error}", allowed) from error
+
+    def refuse(found: str, allowed: str) -> ModelFileError:
+        return ModelFileError("folder", found, allowed)
+
+    manifest = read_json(folder / MANIFEST, refuse, "a folder written by write_samples", MAX_MANIFEST)
+    samples = _parse_manifest(folder, manifest)
     chunks = len(chunk_sizes(samples.n))
     if missing := sum(not samples.path(i).is_file() for i in range(chunks)):
         allowed = "a finished folder: run the command that began it again"
@@ -142,24 +146,27 @@ def load_samples(folder: Path | str) -> SampleFolder:
     return samples
 
 
-def _parse_manifest(folder: Path, manifest: Any) -> SampleFolder:
-    """Return the samples that a manifest describes; raise `ValueError` for anything but a manifest."""
+def _parse_manifest(folder: Path, manifest: Field) -> SampleFolder:
+    """Return the samples that a manifest describes."""
     fixed = {"torchgrasp": "samples", "version": 1, "chunk": CHUNK_POSTURES}
-    if not isinstance(manifest, dict) or any(manifest.get(key) != value for key, value in fixed.items()):
-        raise ValueError("another kind of file, or of another version")
-    n: Any = manifest.get("n")
-    names: Any = manifest.get("joint_names")
-    meta: dict[str, Any] = {key: manifest.get(key) for key in META_KEYS}
-    counted = isinstance(n, int) and not isinstance(n, bool)
-    named = isinstance(names, list) and 0 < len(names) <= 1000
-    if not (counted and named and all(isinstance(x, str) for x in (*names, *meta.values()))):
-        raise ValueError("damaged")
-    return SampleFolder(folder, SampleSpec(n).n, tuple(names), meta)
+    fields = manifest.entries()
+    if any(key not in fields or fields[key].value != value for key, value in fixed.items()):
+        raise manifest.wrong(f"a file with {fixed}")
+    missing = {"n", "joint_names", *META_KEYS} - set(fields)
+    if missing:
+        raise manifest.wrong(f"a file with {min(missing)!r}")
+    names = tuple(name.text() for name in fields["joint_names"].items())
+    if not names:
+        raise fields["joint_names"].wrong("the name of a joint")
+    meta = {key: fields[key].text() for key in META_KEYS}
+    return SampleFolder(folder, fields["n"].whole(1, MAX_SAMPLES), names, meta)
 
 
 def _begin(folder: Path, manifest: str) -> None:
     """Write the manifest or check that it is the same; delete the half-written files of a killed run."""
     path = folder / MANIFEST
+    for half in (*folder.glob(".chunk-*.safetensors"), *folder.glob(f".{MANIFEST}.*.json")):
+        half.unlink()
     if path.exists():
         if path.read_text("utf-8", errors="replace") != manifest:
             raise OutputError("folder", f"{folder}, which holds other samples", "an empty folder, or the same samples")
@@ -167,5 +174,3 @@ def _begin(folder: Path, manifest: str) -> None:
         raise OutputError("folder", f"{folder}, which holds other files", "an empty folder")
     else:
         write_file(path, manifest)
-    for half in folder.glob(".*.safetensors"):
-        half.unlink()

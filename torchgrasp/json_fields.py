@@ -1,0 +1,94 @@
+"""JSON files of strangers: bounded in size, and read field by field, each with its type.
+
+An error names the file and the field, such as `objects.cup.views.front`, what was found, and what is allowed.
+"""
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from torchgrasp.errors import BadArgument
+
+Refuse = Callable[[str, str], BadArgument]
+"""Makes the error of a reader of what was found and what is allowed."""
+
+MOST_BYTES = 32 * 1024 * 1024
+"""Largest file [bytes]: a manifest of 100,000 objects with three views each is smaller."""
+MOST_LETTERS = 200
+"""Longest text: file names may have 255 bytes, and some of them are ours."""
+SHOWN = 60
+"""Letters of a wrong value that an error shows."""
+
+
+class Field(NamedTuple):
+    """A value of a JSON file with its place; `refuse` makes the error that is raised for it."""
+
+    path: Path
+    place: str
+    value: Any
+    refuse: Refuse
+
+    def wrong(self, allowed: str) -> BadArgument:
+        """Return the error of this field."""
+        text = repr(self.value)[: SHOWN + 1]
+        shown = text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
+        return self.refuse(f"{self.path}: {self.place or 'the file'} = {shown}", allowed)
+
+    def entries(self) -> "dict[str, Field]":
+        """Return the fields of an object by name."""
+        if not isinstance(self.value, dict):
+            raise self.wrong("an object { }")
+        within = f"{self.place}." if self.place else ""
+        return {key: Field(self.path, f"{within}{key}", value, self.refuse) for key, value in self.value.items()}
+
+    def items(self, most: int = 1000) -> "list[Field]":
+        """Return the fields of a list of at most so many."""
+        if not isinstance(self.value, list) or len(self.value) > most:
+            raise self.wrong(f"a list of at most {most}")
+        return [Field(self.path, f"{self.place}[{i}]", x, self.refuse) for i, x in enumerate(self.value)]
+
+    def text(self) -> str:
+        """Return a text of at most `MOST_LETTERS`."""
+        if not isinstance(self.value, str) or len(self.value) > MOST_LETTERS:
+            raise self.wrong(f"a text of at most {MOST_LETTERS} letters")
+        return self.value
+
+    def number(self, low: float, high: float) -> float:
+        """Return a number in [low, high]."""
+        allowed = f"a number in [{low:g}, {high:g}]"
+        if isinstance(self.value, bool) or not isinstance(self.value, int | float):
+            raise self.wrong(allowed)
+        if not low <= self.value <= high or not math.isfinite(self.value):  # compares integers of any length
+            raise self.wrong(allowed)
+        return float(self.value)
+
+    def whole(self, low: int, high: int) -> int:
+        """Return a whole number in [low, high]."""
+        if isinstance(self.value, bool) or not isinstance(self.value, int) or not low <= self.value <= high:
+            raise self.wrong(f"a whole number in [{low}, {high}]")
+        return self.value
+
+
+def read_json(path: Path, refuse: Refuse, allowed: str, most: int = MOST_BYTES) -> Field:
+    """Read a JSON file in UTF-8 of at most so many bytes; raise the error of `refuse` for any other file.
+
+    NaN and Infinity are no JSON, and no number of more than 4300 digits is read.
+    """
+    if not path.is_file():  # a pipe or a device would block, or never end
+        raise refuse(f"{path}, which is no file", allowed)
+    try:
+        with path.open("rb") as file:
+            data = file.read(most + 1)
+        if len(data) > most:
+            raise ValueError(f"more than {most} bytes")
+        value = json.loads(data.decode("utf-8"), parse_constant=_refuse_constant)
+    except (OSError, ValueError, RecursionError) as error:
+        raise refuse(f"{path}: {error}", allowed) from error
+    return Field(path, "", value, refuse)
+
+
+def _refuse_constant(name: str) -> float:
+    """Refuse NaN and Infinity, which Python would read."""
+    raise ValueError(f"{name}, which is no JSON")
