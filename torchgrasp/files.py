@@ -25,6 +25,9 @@ from torchgrasp.errors import ModelFileError, OutputError, Status
 VERSION = "1"
 """Version of the file layout; readers refuse any other."""
 
+DTYPES = (torch.float32, torch.float64, torch.int64, torch.bool)
+"""Types of numbers in our files. Of others, such as float8, torch cannot even tell which are finite."""
+
 LOCK = ".lock"
 """Name of the lock file in a folder; the file names the run that holds the lock."""
 
@@ -57,6 +60,14 @@ def hold_folder(folder: Path) -> Iterator[None]:
             path.unlink(missing_ok=True)
             for empty in made:
                 empty.rmdir()
+
+
+def is_file(path: Path | str) -> bool:
+    """Tell whether a path is that of a regular file; a path of a wrong type or length is not."""
+    try:
+        return Path(path).is_file()
+    except (OSError, TypeError, ValueError):  # a name of more than 255 letters, a number, a NUL
+        return False
 
 
 def _holder(path: Path) -> str:
@@ -139,24 +150,26 @@ def load_tensors(
         ModelFileError: the file is missing or malformed, has another kind, version or tensors, or a number is not
             finite.
     """
-    path, allowed = Path(path), names.union(optional)
-    if not path.is_file():
+    allowed = names.union(optional)
+    if not is_file(path):
         raise ModelFileError("path", f"{path}, which is no file", f"a safetensors file of kind {kind!r}")
     try:
         with safe_open(path, framework="pt") as file:
             meta = json.loads((file.metadata() or {}).get("torchgrasp", "{}"))
             found = set(file.keys())
             tensors = {name: file.get_tensor(name) for name in found & allowed}  # nothing else is worth its memory
-    except (SafetensorError, OSError, ValueError, KeyError) as error:
+    except (SafetensorError, OSError, ValueError, KeyError, RecursionError) as error:
         raise ModelFileError("path", f"{path}: {error}", f"a safetensors file of kind {kind!r}") from error
-    if not isinstance(meta, dict):
-        meta = {}
+    if not isinstance(meta, dict) or not all(isinstance(x, str) for x in meta.values()):
+        raise ModelFileError("path", f"{path}: metadata that is no object of texts", f"kind {kind!r}")
     if meta.get("kind") != kind or meta.get("version") != VERSION:
         other = f"kind {meta.get('kind')!r}, version {meta.get('version')!r}"
         raise ModelFileError("path", f"{path}: {other}", f"kind {kind!r}, version {VERSION!r}")
     if not names <= found <= allowed:
         raise ModelFileError("path", f"{path}: tensors {sorted(found)}", f"tensors {sorted(names)}")
     for name, t in tensors.items():
+        if t.dtype not in DTYPES:
+            raise ModelFileError("path", f"{path}: {name} of {t.dtype}", f"one of {', '.join(map(str, DTYPES))}")
         if t.is_floating_point() and not bool(torch.isfinite(t).all()):
             raise ModelFileError("path", f"{path}: a non-finite number in {name}", "finite numbers")
     return tensors, meta

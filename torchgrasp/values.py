@@ -9,7 +9,6 @@ joints, t time steps.
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,7 +16,8 @@ from torch import Tensor
 
 from torchgrasp.base import FINGERTIPS, Batch, Value, check_tensor, named_tensors
 from torchgrasp.errors import BadArgument, ModelFileError, Status, TooFewPoints
-from torchgrasp.files import load_tensors, save_tensors
+from torchgrasp.files import save_tensors
+from torchgrasp.value_files import read_value
 
 # ---------------------------------------------------------------------------------------------- what was seen
 
@@ -246,34 +246,29 @@ class Grasps(Batch):
         save_tensors(path, "grasps", named_tensors(self), self.meta)
 
 
-OF_FINGERTIPS = ("permutation", "tip_error", "normal_angle")
-"""Fields of `Grasps` with a column for each fingertip."""
+RIGID = 1e-4
+"""Largest error of a rotation matrix in a file, that of float32 and of rounding in a text."""
 
 
 def load_grasps(path: Path | str) -> Grasps:
     """Read grasps that `Grasps.save` wrote.
 
     Raises:
-        ModelFileError: the file is missing or malformed.
+        ModelFileError: the file is missing or malformed; a pose that is not rigid, an unknown status, contacts that are
+            not each under one finger, or not three to five of them.
     """
-    nested = {"contacts": Contacts, "certificate": Certificate}
-    plain = [f.name for f in dataclasses.fields(Grasps) if f.name not in (*nested, "meta")]
-    inner = {f"{name}.{f.name}": f for name, kind in nested.items() for f in dataclasses.fields(kind)}
-    optional = {name for name, f in inner.items() if f.default is None}
-    tensors, meta = load_tensors(path, "grasps", {*plain, *inner} - optional, optional)
-    rows = {name: len(t) for name, t in tensors.items()}
-    if len(set(rows.values())) != 1:
-        raise ModelFileError("path", f"{path}: rows {rows}", "as many rows in every tensor")
-    tips = {
-        name: tuple(t.shape[1:2])
-        for name, t in tensors.items()
-        if name.startswith("contacts.") or name in OF_FINGERTIPS
+    grasps, meta = read_value(path, "grasps", Grasps, meta={})
+    rotation, last = grasps.obj_from_hand[:, :3, :3].double(), grasps.obj_from_hand[:, 3]
+    error = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().amax((1, 2))
+    mirrored, sheared = torch.linalg.det(rotation) < 0, (last != torch.eye(4).to(last)[3]).any(1)
+    f, order = grasps.contacts.fingertips, grasps.permutation.sort(1).values
+    wrong = {
+        f"{f} fingertips, not three to five": torch.tensor([not FINGERTIPS[0] <= f <= FINGERTIPS[1]]),
+        "obj_from_hand that is not rigid": ~(error <= RIGID) | mirrored | sheared,
+        "an unknown status": ~torch.isin(grasps.status, torch.tensor([int(status) for status in Status])),
+        "a permutation that is none": (order != torch.arange(f)).any(1),
     }
-    if len(set(tips.values())) != 1 or tips["contacts.points"] not in [
-        (f,) for f in range(FINGERTIPS[0], FINGERTIPS[1] + 1)
-    ]:
-        raise ModelFileError("path", f"{path}: fingertips {tips}", "three to five fingertips, as many in every tensor")
-    values: dict[str, Any] = {name: tensors[name] for name in plain}
-    for name, kind in nested.items():
-        values[name] = kind(**{f.name: tensors.get(f"{name}.{f.name}") for f in dataclasses.fields(kind)})
-    return Grasps(**values, meta={k: v for k, v in meta.items() if k not in ("kind", "version")})
+    for found, rows in wrong.items():
+        if bool(rows.any()):
+            raise ModelFileError("path", f"{path}: {found}", "grasps that Grasps.save wrote")
+    return dataclasses.replace(grasps, meta=meta)
