@@ -67,7 +67,7 @@ def test_grasps_of_other_numbers_of_fingertips_or_of_several_are_refused(tmp_pat
     four, three = some_grasps(f=4), some_grasps(f=3)
     for wrong in (some_grasps(f=2), some_grasps(f=6), dataclasses.replace(four, contacts=three.contacts)):
         save_tensors(tmp_path / "grasps", "grasps", named_tensors(wrong), {})
-        with pytest.raises(ModelFileError, match="three to five|one size for each letter"):
+        with pytest.raises(ModelFileError, match=r"three to five|one size for each letter"):
             load_grasps(tmp_path / "grasps")
 
 
