@@ -1,8 +1,8 @@
 """The public law for hands: what torchgrasp needs of a hand of your own."""
 
+import io
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,13 +13,14 @@ from torchgrasp.errors import HandFileError
 from torchgrasp.frames import rotation_from_rpy
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import HandSpec, read_hand_toml
+from torchgrasp.hand.kinematics import chain_from_urdf
 from torchgrasp.hand.load import find_hand, load_hand
 from torchgrasp.hand.urdf import Shape, Urdf, read_urdf
 
 FK_POSTURES = 50
 """Random postures in which kinematics are compared, a millisecond each."""
-FK_TOLERANCE = 1e-6
-"""Largest difference [m, and entries of rotations] between two readers of the same URDF: a micrometre."""
+FK_TOLERANCE = 1e-8
+"""Largest difference [m, and entries of rotations] from other libraries' poses; rounding leaves 1e-15."""
 
 
 def check_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
@@ -117,23 +118,20 @@ def largest_fk_error(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[float, s
     """Return the largest difference of a pose from yourdfpy's and pytorch-kinematics', and its link."""
     import yourdfpy
 
-    robot = yourdfpy.URDF.load(str(hand.urdf_path), load_meshes=False, load_collision_meshes=False)
-    chain = reference_poses(read_urdf(hand.urdf_path), hand.expand_joints(joints)).double()
-    others = torch.stack([chain, torch.zeros_like(chain)])
+    urdf, poses = read_urdf(hand.urdf_path), hand.link_poses(joints).double()
+    robot = yourdfpy.URDF.load(io.BytesIO(urdf.xml), load_meshes=False)
+    others = torch.stack([reference_poses(urdf, hand.expand_joints(joints).double()), torch.zeros_like(poses)])
     for row in range(len(joints)):
         values = {name: float(value) for name, value in hand.expand(joints[row]).items()}
         robot.update_cfg([values[name] for name in robot.actuated_joint_names])
         others[1, row] = torch.from_numpy(np.stack([robot.get_transform(link) for link in hand.tree.link_names]))
-    error = (others - hand.link_poses(joints).double()).abs().amax((0, 1, 3, 4))
+    error = (others - poses).abs().amax((0, 1, 3, 4))
     return float(error.max()), hand.tree.link_names[int(error.argmax())]
 
 
 def reference_poses(urdf: Urdf, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
-    """Return `root_from_link` of every link by pytorch-kinematics, accurate to 1e-8 m."""
-    import pytorch_kinematics
-
-    chain: Any = pytorch_kinematics.build_chain_from_urdf(urdf.kinematic_xml())
-    chain = chain.to(dtype=values.dtype, device=values.device)
+    """Return `root_from_link` of every link by pytorch-kinematics, in the dtype of `values`."""
+    chain = chain_from_urdf(urdf, values.dtype)
     names = [j.name for j in urdf.movable]
     order = [names.index(name) for name in chain.get_joint_parameter_names()]
     poses = chain.forward_kinematics_tensor(values[:, order], analytical_grad=False)

@@ -39,8 +39,15 @@ def chain(n: int, close: bool = False) -> str:
 
 
 END = "</robot>"
-VISUAL = '<link name="v"><visual><geometry><mesh filename="{}"/></geometry></visual></link>'
-VISUAL += '<joint name="w" type="fixed"><parent link="base"/><child link="v"/></joint>'
+MESH = '<link name="v"><{0}><geometry><mesh filename="{1}"/></geometry></{0}></link>'
+MESH += '<joint name="w" type="fixed"><parent link="base"/><child link="v"/></joint>'
+
+NAMES = (
+    "../secret.stl", "../../../../etc/secret.stl", "/etc/secret.stl", "/dev/zero", "file:///etc/secret.stl",
+    "FILE:x.stl", "http://localhost/x.stl", "package://claw/../../x.stl", "a\\..\\x.stl", "x" * 5000 + ".stl",
+    "", "x.dae", "x.stl/../../../x.stl", "link.stl", "pipe.stl", "folder.stl", "huge.stl", "&#0;.stl",
+)  # fmt: skip
+"""Files of meshes. A visual one is never opened, so its name does no harm."""
 
 
 def urdf_corpus(good: str) -> dict[str, str | bytes]:
@@ -95,12 +102,9 @@ def urdf_corpus(good: str) -> dict[str, str | bytes]:
         "negative radius": good.replace('radius="0.011"', 'radius="-0.011"'),
         "collision mesh": good.replace('<sphere radius="0.011"/>', '<mesh filename="tip.stl"/>', 1),
     }  # fmt: skip
-    for name in (
-        "../secret.stl", "../../../../etc/secret.stl", "/etc/secret.stl", "/dev/zero", "file:///etc/secret.stl",
-        "FILE:x.stl", "http://localhost/x.stl", "package://claw/../../x.stl", "a\\..\\x.stl", "x" * 5000 + ".stl",
-        "", "x.dae", "x.stl/../../../x.stl", "link.stl", "pipe.stl", "folder.stl", "huge.stl", "&#0;.stl",
-    ):  # fmt: skip
-        corpus[f"mesh {name[:30]!r}"] = body + VISUAL.format(name) + END
+    for name in NAMES:
+        corpus[f"mesh {name[:30]!r}"] = body + MESH.format("collision", name) + END
+        corpus[f"seen {name[:30]!r}"] = body + MESH.format("visual", name) + END
     return corpus
 
 
@@ -201,7 +205,8 @@ def test_hostile_hands_are_refused_and_open_nothing(claw, tmp_path):
     assert done.returncode == 0, done.stderr[-2000:]
     said = json.loads(done.stdout.splitlines()[-1])
     assert len(said["outcomes"]) >= 75
-    assert {name: what for name, what in said["outcomes"].items() if what != "refused"} == {}
+    harmless = {f"claw.urdf: seen {name[:30]!r}" for name in NAMES}
+    assert {name for name, what in said["outcomes"].items() if what != "refused"} <= harmless
     assert said["seen"] == []
 
 

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 import torch
+from pytorch_kinematics import SerialChain, build_chain_from_urdf
 
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.testing import random_joints, reference_poses
+from torchgrasp.testing import largest_fk_error, random_joints, reference_poses
 
 BRANCHED = """<robot name="branched">
   <link name="tip"/><link name="base"/><link name="slider"/><link name="arm"/><link name="side"/><link name="bolt"/>
@@ -39,9 +40,26 @@ def assert_same_poses(found: torch.Tensor, truth: torch.Tensor) -> None:
     assert float((turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 3).abs().max()) < 1e-6
 
 
-def test_fk_equals_pytorch_kinematics(hand):
-    joints = random_joints(hand, 1000)
-    assert_same_poses(hand.link_poses(joints), reference_poses(read_urdf(hand.urdf_path), hand.expand_joints(joints)))
+def test_fk_equals_pytorch_kinematics_and_yourdfpy(hand):
+    assert largest_fk_error(hand, random_joints(hand, 1000))[0] < 1e-8
+
+
+def test_fk_equals_pytorch_kinematics_reading_the_file_itself(hand):
+    """Its own reader keeps seven digits of an angle."""
+    joints, chain = random_joints(hand, 1000), build_chain_from_urdf(hand.urdf_path.read_bytes()).to(torch.float64)
+    poses = chain.forward_kinematics(hand.expand(joints))
+    assert_same_poses(hand.link_poses(joints), torch.stack([poses[n].get_matrix() for n in hand.tree.link_names], 1))
+
+
+def test_the_chain_is_pytorch_kinematics_own_and_goes_where_the_hand_goes(hand):
+    joints = random_joints(hand, 3).requires_grad_()
+    tip = hand.tips.links[0]
+    found = hand.chain.forward_kinematics(hand.expand(joints))[tip].get_matrix()
+    torch.testing.assert_close(found, hand.link_poses(joints)[:, hand.tree.link_names.index(tip)], atol=1e-8, rtol=0)
+    assert torch.autograd.grad(found.sum(), joints)[0].abs().max() > 0
+    serial = SerialChain(hand.chain, tip, dtype=torch.float64)
+    assert serial.jacobian(torch.zeros(2, serial.n_joints, dtype=torch.float64)).shape == (2, 6, serial.n_joints)
+    assert hand.to(torch.float32).chain.dtype == torch.float32
 
 
 def test_fk_and_jacobian_equal_pinocchios_by_joint_name(hand):
@@ -89,7 +107,7 @@ def test_a_tree_of_every_kind_of_joint_is_that_of_pytorch_kinematics(tmp_path, g
     tree = tree_from_urdf(urdf)
     assert tree.joint_names == ("end", "turn", "slide", "away")
     values = torch.randn(50, 4, generator=generator, dtype=torch.float64)
-    assert_same_poses(tree.poses(values), reference_poses(urdf, values))
+    assert float((tree.poses(values) - reference_poses(urdf, values)).abs().max()) < 1e-8
     assert torch.autograd.gradgradcheck(tree.poses, values[:1].requires_grad_())
 
 

@@ -17,8 +17,8 @@ MEETING_DISTANCE = 0.002
 """Links that come nearer than this [m] in some posture are a pair to test."""
 ALWAYS = 0.98
 """Links that overlap in a larger share of the postures overlap by construction, and are no pair to test."""
-ROWS_PER_CHUNK = 1000
-"""Postures tested at a time, which bounds the memory."""
+ROWS_PER_CHUNK, NUMBERS_PER_CHUNK = 1000, 4_000_000
+"""Most postures tested at a time, and most separations: 32 MB."""
 
 
 def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, seed: int = 0) -> list[tuple[str, str]]:
@@ -38,7 +38,8 @@ def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, 
         return []
     links, owner = torch.unique(shapes.link[shapes.pairs].sort(1).values, dim=0, return_inverse=True)
     met, near = torch.zeros(2, len(links))
-    for values in draw_postures(urdf, coupling, n, seed).split(ROWS_PER_CHUNK, 1):
+    rows = max(1, min(ROWS_PER_CHUNK, NUMBERS_PER_CHUNK // len(shapes.pairs)))
+    for values in draw_postures(urdf, coupling, n, seed).split(rows, 1):
         apart = shapes.separations(tree.frames(values), MEETING_DISTANCE)
         least = apart.new_full((len(links), apart.shape[1]), torch.inf)
         least.scatter_reduce_(0, owner[:, None].expand_as(apart), apart, "amin")

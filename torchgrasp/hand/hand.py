@@ -1,9 +1,10 @@
 """A robot hand as a value: joints, kinematic tree, fingertips, and how they move."""
 
 import dataclasses
+import functools
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -13,8 +14,12 @@ from torchgrasp.base import Value
 from torchgrasp.hand.collision_spheres import CollisionSpheres
 from torchgrasp.hand.fingertips import Fingertips
 from torchgrasp.hand.joints import ActuatedJoints
-from torchgrasp.hand.kinematics import KinematicTree, map_directions, map_points
+from torchgrasp.hand.kinematics import KinematicTree, chain_from_urdf, map_directions, map_points
 from torchgrasp.hand.self_collision import SelfCollision
+from torchgrasp.hand.urdf import read_urdf
+
+if TYPE_CHECKING:
+    from pytorch_kinematics import Chain
 
 
 class Actuator(NamedTuple):
@@ -56,6 +61,19 @@ class Hand(Value):
     def urdf_path(self) -> Path:
         """The URDF."""
         return self.source.urdf_path
+
+    @functools.cached_property
+    def chain(self) -> "Chain":
+        """The hand's tree as pytorch-kinematics' chain, for use with that library; every movable joint is free in it.
+
+        >>> from torchgrasp.hand.load import load_hand
+        >>> hand, joints = load_hand("barrett"), torch.zeros(1, 4, dtype=torch.float64)
+        >>> pose = hand.chain.forward_kinematics(hand.expand(joints))["f3_tip"].get_matrix()
+        >>> torch.allclose(pose[0], hand.link_poses(joints)[0, hand.tree.link_names.index("f3_tip")])
+        True
+        """
+        chain = chain_from_urdf(read_urdf(self.urdf_path))
+        return chain.to(dtype=self.lower.dtype, device=self.lower.device)
 
     @property
     def joint_names(self) -> tuple[str, ...]:

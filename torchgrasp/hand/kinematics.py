@@ -5,6 +5,7 @@ The child's frame in its parent is `constant + sine sin q + cosine cos q + slide
 
 import dataclasses
 from collections.abc import Collection
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float, Int
@@ -13,6 +14,9 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.frames import rotation_from_rpy, skew
 from torchgrasp.hand.urdf import Joint, Urdf
+
+if TYPE_CHECKING:
+    from pytorch_kinematics import Chain
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -114,6 +118,29 @@ def tree_from_urdf(urdf: Urdf, ends: Collection[str] | None = None) -> Kinematic
         places=tuple(next((k, level.index(n)) for k, level in enumerate(levels) if n in level) for n in links),
         slides=any(j.kind == "prismatic" and j.child in part for j in joints),
     )
+
+
+def chain_from_urdf(urdf: Urdf, dtype: torch.dtype = torch.float64) -> "Chain":
+    """Return the tree of a URDF as pytorch-kinematics' chain; `<mimic>` joints are free in it.
+
+    It is built from the values of the URDF: that library's own reader keeps seven digits of an angle.
+    """
+    from pytorch_kinematics.chain import Chain
+    from pytorch_kinematics.frame import Frame, Link
+    from pytorch_kinematics.frame import Joint as Mover
+    from pytorch_kinematics.transforms import Transform3d
+
+    frames = {urdf.root: Frame(urdf.root, Link(urdf.root), Mover(dtype=dtype))}
+    for j in urdf.joints:
+        offset = Transform3d(
+            dtype=dtype, rot=rotation_from_rpy(j.rpy).to(dtype), pos=torch.tensor([j.xyz], dtype=dtype)
+        )
+        limits, speeds, efforts = (j.lower, j.upper), (-j.velocity, j.velocity), (-j.effort, j.effort)
+        mover = Mover(j.name, offset, j.kind, j.axis, dtype, "cpu", limits, speeds, efforts)
+        frames[j.child] = Frame(j.child, Link(j.child), mover)
+    for j in urdf.joints:
+        frames[j.parent].add_child(frames[j.child])
+    return Chain(frames[urdf.root], dtype)
 
 
 def pose_in_carrier(urdf: Urdf, link: str) -> tuple[str, Float[Tensor, "3 4"]]:

@@ -1,5 +1,9 @@
-"""Safe parsing of a URDF's XML: bounded, without declarations, without meshes outside the folder."""
+"""The gate in front of every reader of a URDF: bounded XML, without declarations, of known words and finite numbers.
 
+What passes is written anew from the elements below, so that no reader sees anything else. It opens no other file.
+"""
+
+import math
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -11,10 +15,51 @@ MAX_DEPTH = 64
 """Deepest nesting of elements; a URDF needs six."""
 MAX_ELEMENTS = 50_000
 """Most elements: about 100 for each of 512 links."""
-MAX_MESH = 50 * 1024 * 1024
-"""Largest mesh that a URDF may name [bytes]."""
-IGNORED = {"material", "transmission", "gazebo"}
+IGNORED = {"material", "transmission", "gazebo", "ros2_control", "mujoco", "sensor"}
 """Elements of a robot, besides links and joints, that a hand can do without."""
+NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
+"""A decimal number. Python alone also reads 1_0, digits other than ASCII's, and nan."""
+MAX_WORD = 200
+"""Longest name [letters]."""
+SHAPES = ("box", "cylinder", "sphere", "mesh")
+"""Collision shapes of a URDF."""
+PARTS = {
+    "robot": ("link", "joint"),
+    "link": ("inertial", "collision"),
+    "inertial": ("origin", "mass", "inertia"),
+    "collision": ("origin", "geometry"),
+    "geometry": SHAPES,
+    "joint": ("origin", "parent", "child", "axis", "limit", "mimic"),
+}
+"""The elements that are read, by the element around them. `<visual>` is not: nobody opens its mesh."""
+NEEDED = {
+    "inertial": ("mass", "inertia"),
+    "collision": ("geometry",),
+    "joint": ("parent", "child"),
+}
+"""Elements that another cannot do without."""
+WORDS = {
+    "link": ("name",),
+    "joint": ("name", "type"),
+    "parent": ("link",),
+    "child": ("link",),
+    "mimic": ("joint",),
+    "mesh": ("filename",),
+}
+"""Attributes that are names; an element with one needs it."""
+NUMBERS: dict[str, dict[str, tuple[int, str | None]]] = {
+    "origin": {"xyz": (3, "0 0 0"), "rpy": (3, "0 0 0")},
+    "mass": {"value": (1, None)},
+    "inertia": {key: (1, None) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")},
+    "box": {"size": (3, None)},
+    "cylinder": {"radius": (1, None), "length": (1, None)},
+    "sphere": {"radius": (1, None)},
+    "mesh": {"scale": (3, "1 1 1")},
+    "axis": {"xyz": (3, None)},
+    "limit": {"lower": (1, ""), "upper": (1, ""), "effort": (1, "0"), "velocity": (1, "0")},
+    "mimic": {"multiplier": (1, "1"), "offset": (1, "0")},
+}
+"""Attributes that are numbers: how many, and what stands for a missing one; None: it is needed, "": it stays away."""
 
 
 def read_bounded(source: str, path: Path, wanted: str, most: int) -> bytes:
@@ -45,7 +90,7 @@ class _BoundedBuilder(ET.TreeBuilder):
 
 
 def parse_urdf(path: Path, data: bytes) -> ET.Element:
-    """Parse a URDF's bytes; refuse XML that reaches other files or explodes, unknown elements, meshes elsewhere."""
+    """Parse a URDF's bytes; return links and joints alone, with each number checked. Raises `HandFileError`."""
     # anywhere, comments included: what looks like a comment may be hidden in a processing instruction
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
         raise HandFileError("urdf", f"{path}: a DOCTYPE or ENTITY declaration", "no declarations")
@@ -67,21 +112,37 @@ def parse_urdf(path: Path, data: bytes) -> ET.Element:
     for element in robot:
         if element.tag not in {"link", "joint"} | IGNORED:
             raise HandFileError("urdf", f"{path}: <{element.tag}>", f"<link>, <joint> or one of {sorted(IGNORED)}")
-    for mesh in robot.iter("mesh"):
-        _check_mesh_name(path, mesh.get("filename", ""))
-    return robot
+    clean = _clean(path, "", robot)
+    clean.set("name", robot.get("name") or "hand")
+    return clean
 
 
-def _check_mesh_name(path: Path, name: str) -> None:
-    """Refuse a mesh outside the hand's folder or not a regular file, without opening it."""
-    allowed = "a relative .stl or .obj of at most 50 MiB inside the hand's folder"
-    refusal = HandFileError("urdf", f"{path}: mesh {name[:80]!r}", allowed)
-    if not 0 < len(name) <= 255 or ":" in name or "\\" in name or Path(name).suffix.lower() not in (".stl", ".obj"):
-        raise refusal
-    mesh = path.parent.resolve() / name
-    try:
-        inside = mesh.resolve().is_relative_to(path.parent.resolve())
-    except (OSError, RuntimeError):  # a loop of symbolic links, a name that the file system does not take
-        inside = False
-    if not inside or (mesh.exists() and not (mesh.is_file() and mesh.stat().st_size <= MAX_MESH)):
-        raise refusal
+def _clean(path: Path, where: str, element: ET.Element) -> ET.Element:
+    """Copy what is known of an element; refuse it where something is missing or no number."""
+    tag = str(element.tag)
+    clean = ET.Element(tag)
+    where = "" if tag == "robot" else f"{where} {tag} {(element.get('name') or '')[:MAX_WORD]}".strip()
+    for key in WORDS.get(tag, ()):
+        word = element.get(key, "")
+        if not 0 < len(word) <= MAX_WORD:
+            found = "without one" if not word else f"of {len(word)} letters"
+            raise HandFileError("urdf", f"{path}: {where}: a {key} {found}", f"a {key} of 1 to {MAX_WORD} letters")
+        clean.set(key, word)
+    for key, (count, default) in NUMBERS.get(tag, {}).items():
+        text = element.get(key, default)
+        words = (text or "").split()
+        right = len(words) == count and all(NUMBER.fullmatch(w) and math.isfinite(float(w)) for w in words)
+        if right:
+            clean.set(key, " ".join(words))
+        elif text != "" or key in element.attrib:
+            found = f"{where} {key} {(text or 'nothing')[:80]!r}"
+            raise HandFileError("urdf", f"{path}: {found}", f"{count} finite number(s)")
+    if tag == "geometry" and (len(element) != 1 or element[0].tag not in SHAPES):
+        found = f"{where} <{element[0].tag}>" if len(element) == 1 else f"{where} without one shape"
+        raise HandFileError("urdf", f"{path}: {found}", "box, cylinder or sphere")
+    kept = PARTS.get(tag, ())
+    for need in NEEDED.get(tag, ()):
+        if element.find(need) is None:
+            raise HandFileError("urdf", f"{path}: {where} without <{need}>", f"a <{need}> in every <{tag}>")
+    clean.extend([_clean(path, where, part) for part in element if part.tag in kept])
+    return clean

@@ -1,13 +1,15 @@
-"""A URDF as values: links, joints and collision shapes of a checked tree. No other file is opened."""
+"""A URDF as values: links, joints and collision shapes of a checked tree. yourdfpy reads it; no mesh is opened."""
 
 import dataclasses
 import functools
+import io
 import math
-import re
 import xml.etree.ElementTree as ET
 from collections import Counter
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from torchgrasp.errors import HandFileError
 from torchgrasp.hand.safe_xml import parse_urdf, read_bounded
@@ -16,8 +18,12 @@ MAX_BYTES = 4 * 1024 * 1024
 """Largest URDF; those of the shipped hands have about 12 kB."""
 MAX_LINKS = 512
 """Most links: the pairs of them are tested for collisions."""
-NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
-"""A decimal number. Python alone also reads 1_0, digits other than ASCII's, and nan."""
+MAX_SHAPES = 1000
+"""Most collision shapes, for the same reason; a hand has up to 100."""
+MAX_SIZE = 2.0
+"""Largest collision shape [m]: a hand is smaller, and its cover of spheres grows with the surface."""
+MEND = "torchgrasp hand new writes a clean copy"
+"""What helps against what a published URDF may hold, and a clean one may not."""
 
 Triple = tuple[float, float, float]
 
@@ -32,12 +38,16 @@ class Mimic(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Shape:
-    """A collision shape: `size` is (x, y, z) of a box, (radius,) of a sphere, (radius, length) of a cylinder [m]."""
+    """A collision shape, box, sphere, cylinder or mesh.
+
+    `size` is (x, y, z) of a box, (radius,) of a sphere, (radius, length) of a cylinder [m]; the scale of a mesh.
+    """
 
     kind: str
     size: tuple[float, ...]
     xyz: Triple
     rpy: Triple
+    file: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +63,7 @@ class Link:
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """A joint of the tree; a fixed one has limits of 0."""
+    """A joint of the tree; a fixed one has limits of 0, one without limits infinite ones."""
 
     name: str
     kind: str
@@ -71,7 +81,10 @@ class Joint:
 
 @dataclasses.dataclass(frozen=True)
 class Urdf:
-    """A checked URDF: one tree of links, finite numbers throughout."""
+    """A checked URDF: one tree of links, finite numbers throughout.
+
+    `data` are the bytes of the file, `xml` those of its links and joints alone.
+    """
 
     path: Path
     name: str
@@ -79,6 +92,7 @@ class Urdf:
     links: tuple[Link, ...]
     joints: tuple[Joint, ...]
     data: bytes
+    xml: bytes
 
     def wrong(self, found: str, allowed: str) -> HandFileError:
         """Make the error for a broken rule."""
@@ -101,161 +115,175 @@ class Urdf:
         """Return the movable joints above a link."""
         return tuple(j for j in self.joints_above(link) if j.kind != "fixed")
 
-    def kinematic_xml(self) -> bytes:
-        """Write links and joints alone, as bytes without an encoding declaration."""
-        robot = ET.Element("robot", name=self.name)
-        for link in self.links:
-            ET.SubElement(robot, "link", name=link.name)
-        for j in self.joints:
-            joint = ET.SubElement(robot, "joint", name=j.name, type=j.kind)
-            ET.SubElement(joint, "origin", xyz=" ".join(map(repr, j.xyz)), rpy=" ".join(map(repr, j.rpy)))
-            ET.SubElement(joint, "parent", link=j.parent)
-            ET.SubElement(joint, "child", link=j.child)
-            if j.kind != "fixed":
-                ET.SubElement(joint, "axis", xyz=" ".join(map(repr, j.axis)))
-                limits = {"lower": j.lower, "upper": j.upper, "effort": j.effort, "velocity": j.velocity}
-                ET.SubElement(joint, "limit", {k: repr(v) for k, v in limits.items()})
-        return ET.tostring(robot)
-
 
 def read_urdf(path: Path | str) -> Urdf:
-    """Read and check a URDF file of at most 4 MiB, without opening meshes; raises `HandFileError`."""
+    """Read and check a URDF file of at most 4 MiB; raises `HandFileError`.
+
+    It has to be a clean one: no meshes as collision shapes, no joint without limits, none that follows a follower.
+    """
+    urdf = read_published(path)
+    for link in urdf.links:
+        if any(shape.kind == "mesh" for shape in link.shapes):
+            raise urdf.wrong(f"link {link.name} collision <mesh>", f"box, cylinder or sphere; {MEND}")
+    for j in urdf.movable:
+        if math.isinf(j.upper - j.lower):
+            raise urdf.wrong(f"joint {j.name} without a limit", f"lower and upper; {MEND}")
+        if j.mimic and any(other.mimic for other in urdf.movable if other.name == j.mimic.source):
+            raise urdf.wrong(f"joint {j.name} mimics a coupled joint", f"an independent joint; {MEND}")
+    return urdf
+
+
+def read_published(path: Path | str) -> Urdf:
+    """Read a URDF as it is published: with meshes, without limits, with joints that follow a follower.
+
+    Raises:
+        HandFileError: the file is missing, too large or hostile, or no tree of bodies.
+    """
     path = Path(path)
     data = read_bounded("urdf", path, "a URDF file", MAX_BYTES)
-    robot, reader = parse_urdf(path, data), _Reader(path)
-    links = tuple(reader.link(e) for e in robot if e.tag == "link")
-    joints = tuple(reader.joint(e) for e in robot if e.tag == "joint")
-    return Urdf(path, robot.get("name", ""), reader.check_tree(links, joints), links, joints, data)
+    return urdf_from_xml(path, data, ET.tostring(parse_urdf(path, data)))
 
 
-class _Reader:
-    """Reads the elements of one URDF; every complaint names the file."""
+def urdf_from_xml(path: Path, data: bytes, xml: bytes) -> Urdf:
+    """Read the XML that passed the gate of `safe_xml`."""
+    import yourdfpy  # takes half a second
 
-    def __init__(self, path: Path):
-        self.path = path
+    robot = yourdfpy.URDF.load(io.BytesIO(xml), build_scene_graph=False, load_meshes=False).robot
+    links, joints = tuple(map(_link, robot.links)), tuple(map(_joint, robot.joints))
+    urdf = Urdf(path, robot.name, "", links, joints, data, xml)
+    _check_names(urdf)
+    _check_shapes(urdf)
+    _check_joints(urdf)
+    return dataclasses.replace(urdf, root=_check_tree(urdf))
 
-    def refuse(self, found: str, allowed: str) -> NoReturn:
-        raise HandFileError("urdf", f"{self.path}: {found}", allowed)
 
-    def numbers(
-        self, where: str, element: ET.Element | None, key: str, n: int, default: float | None = None
-    ) -> tuple[float, ...]:
-        """Read n finite numbers from an attribute."""
-        text = None if element is None else element.get(key)
-        if text is None and default is not None:
-            return (default,) * n
-        words = (text or "").split()
-        values = tuple(float(word) for word in words if NUMBER.fullmatch(word))
-        if len(words) != n or len(values) != n or not all(map(math.isfinite, values)):
-            self.refuse(f"{where} {key} {(text or 'nothing')[:80]!r}", f"{n} finite number(s)")
-        return values
+def _floats(values: Any) -> tuple[float, ...]:
+    return tuple(float(x) + 0.0 for x in values)
 
-    def number(self, where: str, element: ET.Element | None, key: str, default: float | None = None) -> float:
-        return self.numbers(where, element, key, 1, default)[0]
 
-    def triple(self, where: str, element: ET.Element | None, key: str, default: float | None = None) -> Triple:
-        x, y, z = self.numbers(where, element, key, 3, default)
-        return x, y, z
+def _pose(origin: Any) -> tuple[Triple, Triple]:
+    """Return translation and fixed-axis angles of a 4 x 4 pose."""
+    from trimesh.transformations import euler_from_matrix
 
-    def name(self, element: ET.Element | None, key: str, where: str) -> str:
-        name = "" if element is None else element.get(key, "")
-        if not 0 < len(name) <= 200:
-            self.refuse(f"{where} without a name", f"a {key} of 1 to 200 letters")
-        return name
+    if origin is None:
+        return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    # of the two triples the smaller one, to the digits that a rotation keeps: so the numbers of the file come back
+    one = _floats(euler_from_matrix(origin))
+    two = [math.copysign(math.pi, angle) - angle for angle in one]
+    angles = min((one, (-two[0], two[1], -two[2])), key=lambda triple: sum(map(abs, triple)))
+    x, y, z, roll, pitch, yaw = _floats([*origin[:3, 3], *(round(angle, 15) for angle in angles)])
+    return (x, y, z), (roll, pitch, yaw)
 
-    def origin(self, where: str, element: ET.Element) -> tuple[Triple, Triple]:
-        origin, where = element.find("origin"), f"{where} origin"
-        return self.triple(where, origin, "xyz", 0.0), self.triple(where, origin, "rpy", 0.0)
 
-    def link(self, element: ET.Element) -> Link:
-        """Read a link with its inertia and its collision shapes."""
-        name = self.name(element, "name", "a link")
-        mass, com, inertia = 0.0, (0.0, 0.0, 0.0), (0.0,) * 6
-        inertial = element.find("inertial")
-        if inertial is not None:
-            where = f"link {name} inertial"
-            com, rpy = self.origin(where, inertial)
-            if any(rpy):
-                self.refuse(f"{where} rpy {rpy}", "an inertia in the axes of the link")
-            mass = self.number(f"{where} mass", inertial.find("mass"), "value")
-            keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-            inertia = tuple(self.number(where, inertial.find("inertia"), key) for key in keys)
-        return Link(name, mass, com, inertia, tuple(self.shape(name, c) for c in element.findall("collision")))
+def _link(link: Any) -> Link:
+    """Read a link; its inertia is turned into the link's axes."""
+    mass, com, inertia = 0.0, (0.0, 0.0, 0.0), np.zeros((3, 3))
+    if link.inertial is not None:
+        mass, inertia = link.inertial.mass, link.inertial.inertia
+        com, rpy = _pose(link.inertial.origin)
+        if any(rpy):
+            turn = link.inertial.origin[:3, :3]
+            inertia = turn @ inertia @ turn.T
+    return Link(link.name, float(mass), com, _floats(inertia[np.triu_indices(3)]), tuple(map(_shape, link.collisions)))
 
-    def shape(self, link: str, collision: ET.Element) -> Shape:
-        """Read a collision shape; planner and simulator see no mesh."""
-        where = f"link {link} collision"
-        xyz, rpy = self.origin(where, collision)
-        geometry = collision.find("geometry")
-        if geometry is None or len(geometry) != 1:
-            self.refuse(f"{where} without one geometry", "box, cylinder or sphere")
-        g = geometry[0]
-        if g.tag == "box":
-            size = self.triple(where, g, "size")
-        elif g.tag == "sphere":
-            size = (self.number(where, g, "radius"),)
-        elif g.tag == "cylinder":
-            size = (self.number(where, g, "radius"), self.number(where, g, "length"))
-        else:
-            self.refuse(f"{where} <{g.tag}>", "box, cylinder or sphere")
-        if min(size) <= 0:
-            self.refuse(f"{where} of size {size}", "positive lengths")
-        return Shape(g.tag, size, xyz, rpy)
 
-    def joint(self, element: ET.Element) -> Joint:
-        name = self.name(element, "name", "a joint")
-        where, kind = f"joint {name}", element.get("type", "")
-        if kind not in ("revolute", "prismatic", "fixed"):
-            self.refuse(f"{where} of type {kind!r}", "revolute, prismatic or fixed")
-        parent = self.name(element.find("parent"), "link", f"{where}: a parent")
-        child = self.name(element.find("child"), "link", f"{where}: a child")
-        xyz, rpy = self.origin(where, element)
-        if kind == "fixed":
-            return Joint(name, kind, parent, child, xyz, rpy)
-        axis = element.find("axis")
-        x, y, z = (1.0, 0.0, 0.0) if axis is None else self.triple(f"{where} axis", axis, "xyz")
-        length = math.sqrt(sum(a * a for a in (x, y, z)))
-        if not 0.999 < length < 1.001:  # a longer axis has been used to hide a ratio, which readers then lose
-            self.refuse(f"{where} axis of length {length:g}", "a unit axis")
-        limit, follow, mimic = element.find("limit"), element.find("mimic"), None
-        lower, upper = self.number(f"{where} limit", limit, "lower"), self.number(f"{where} limit", limit, "upper")
-        if not lower < upper:
-            self.refuse(f"{where} limits {lower}, {upper}", "lower < upper")
-        effort, velocity = self.number(where, limit, "effort", 0.0), self.number(where, limit, "velocity", 0.0)
-        if follow is not None:
-            source = self.name(follow, "joint", f"{where}: a mimic")
-            ratio, offset = self.number(where, follow, "multiplier", 1.0), self.number(where, follow, "offset", 0.0)
-            mimic = Mimic(source, ratio, offset)
-        unit = (x / length, y / length, z / length)
-        return Joint(name, kind, parent, child, xyz, rpy, unit, lower, upper, effort, velocity, mimic)
+def _shape(collision: Any) -> Shape:
+    xyz, rpy = _pose(collision.origin)
+    box, sphere, cylinder, mesh = (getattr(collision.geometry, k) for k in ("box", "sphere", "cylinder", "mesh"))
+    if mesh is not None:
+        return Shape("mesh", _floats(mesh.scale), xyz, rpy, mesh.filename)
+    if box is not None:
+        return Shape("box", _floats(box.size), xyz, rpy)
+    if sphere is not None:
+        return Shape("sphere", (sphere.radius,), xyz, rpy)
+    return Shape("cylinder", (cylinder.radius, cylinder.length), xyz, rpy)
 
-    def check_tree(self, links: tuple[Link, ...], joints: tuple[Joint, ...]) -> str:
-        """Check that a tree reaches every link once; return its root."""
-        names = [x.name for x in links]
-        known = set(names)
-        if not 0 < len(links) <= MAX_LINKS:
-            self.refuse(f"{len(links)} links", f"1 to {MAX_LINKS} links")
-        lists = {"link": names, "joint": [j.name for j in joints], "child": [j.child for j in joints]}
-        for what, listed in lists.items():
-            twice = sorted(n for n, times in Counter(listed).items() if times > 1)
-            if twice:
-                self.refuse(f"{what} {twice[0]!r} twice", f"every {what} once")
-        for name, link in ((j.name, link) for j in joints for link in (j.parent, j.child)):
-            if link not in known:
-                self.refuse(f"joint {name} names link {link!r}", "a link of the file")
-        roots = sorted(known - {j.child for j in joints})
-        if len(roots) != 1:
-            self.refuse(f"roots {roots}" if roots else "a cycle and no root", "exactly one root link")
-        reached, front = {roots[0]}, [roots[0]]
-        while front:
-            front = [j.child for j in joints if j.parent in front]
-            reached |= set(front)
-        if len(reached) < len(names):
-            self.refuse(f"a cycle around {sorted(known - reached)[0]!r}", "a tree")
-        movable = {j.name: j for j in joints if j.kind != "fixed"}
-        for j, source in ((j, j.mimic.source) for j in joints if j.mimic):
-            if source not in movable:
-                self.refuse(f"joint {j.name} mimics {source!r}", "a movable joint of the file")
-            if movable[source].mimic:
-                self.refuse(f"joint {j.name} mimics a coupled joint", "an independent joint")
-        return roots[0]
+
+def _joint(joint: Any) -> Joint:
+    xyz, rpy = _pose(joint.origin)
+    if joint.type == "fixed":
+        return Joint(joint.name, joint.type, joint.parent, joint.child, xyz, rpy)
+    x, y, z = _floats(joint.axis)
+    length = math.sqrt(x * x + y * y + z * z)
+    length = length if _is_unit(length) else 1.0  # refused later
+    limit, mimic = joint.limit, joint.mimic
+    lower, upper = (None, None) if limit is None or joint.type == "continuous" else (limit.lower, limit.upper)
+    return Joint(
+        joint.name,
+        joint.type,
+        joint.parent,
+        joint.child,
+        xyz,
+        rpy,
+        (x / length, y / length, z / length),
+        -math.inf if lower is None else lower,
+        math.inf if upper is None else upper,
+        0.0 if limit is None else limit.effort,
+        0.0 if limit is None else limit.velocity,
+        None if mimic is None else Mimic(mimic.joint, mimic.multiplier, mimic.offset),
+    )
+
+
+def _is_unit(length: float) -> bool:
+    """Tell whether an axis has length 1; a longer one has been used to hide a ratio, which readers then lose."""
+    return 0.999 < length < 1.001
+
+
+def _check_names(urdf: Urdf) -> None:
+    """Refuse too many links, names and children that come twice, and joints of unknown links."""
+    if not 0 < len(urdf.links) <= MAX_LINKS:
+        raise urdf.wrong(f"{len(urdf.links)} links", f"1 to {MAX_LINKS} links")
+    names = [x.name for x in urdf.links]
+    lists = {"link": names, "joint": [j.name for j in urdf.joints], "child": [j.child for j in urdf.joints]}
+    for what, listed in lists.items():
+        twice = sorted(n for n, times in Counter(listed).items() if times > 1)
+        if twice:
+            raise urdf.wrong(f"{what} {twice[0]!r} twice", f"every {what} once")
+    for j in urdf.joints:
+        for link in {j.parent, j.child} - set(names):
+            raise urdf.wrong(f"joint {j.name} names link {link!r}", "a link of the file")
+
+
+def _check_shapes(urdf: Urdf) -> None:
+    """Refuse too many shapes, and sizes that are not positive or no hand's."""
+    count = sum(len(link.shapes) for link in urdf.links)
+    if count > MAX_SHAPES:
+        raise urdf.wrong(f"{count} collision shapes", f"at most {MAX_SHAPES}")
+    for link, shape in ((x, shape) for x in urdf.links for shape in x.shapes):
+        if shape.kind != "mesh" and not 0 < min(shape.size) <= max(shape.size) <= MAX_SIZE:
+            found = f"link {link.name} collision of size {shape.size}"
+            raise urdf.wrong(found, f"positive lengths, at most {MAX_SIZE:g} m")
+
+
+def _check_joints(urdf: Urdf) -> None:
+    """Refuse unknown kinds of joints, axes and limits that are none, and mimics in a circle."""
+    movable = {j.name: j for j in urdf.movable}
+    for j in urdf.movable:
+        if j.kind not in ("revolute", "prismatic", "continuous"):
+            raise urdf.wrong(f"joint {j.name} of type {j.kind!r}", "revolute, prismatic, continuous or fixed")
+        if not _is_unit(math.hypot(*j.axis)):
+            raise urdf.wrong(f"joint {j.name} axis of length {math.hypot(*j.axis):g}", "a unit axis")
+        if not j.lower < j.upper:
+            raise urdf.wrong(f"joint {j.name} limits {j.lower}, {j.upper}", "lower < upper")
+        passed = [j.name]
+        while mimic := movable[passed[-1]].mimic:
+            if mimic.source not in movable:
+                raise urdf.wrong(f"joint {passed[-1]} mimics {mimic.source!r}", "a movable joint of the file")
+            if mimic.source in passed:
+                raise urdf.wrong(f"joint {passed[-1]} mimics a coupled joint in a circle", "an independent joint")
+            passed.append(mimic.source)
+
+
+def _check_tree(urdf: Urdf) -> str:
+    """Check that a tree reaches every link; return its root."""
+    known = {x.name for x in urdf.links}
+    roots = sorted(known - {j.child for j in urdf.joints})
+    if len(roots) != 1:
+        raise urdf.wrong(f"roots {roots}" if roots else "a cycle and no root", "exactly one root link")
+    reached, front = {roots[0]}, [roots[0]]
+    while front:
+        front = [j.child for j in urdf.joints if j.parent in front]
+        reached |= set(front)
+    if len(reached) < len(known):
+        raise urdf.wrong(f"a cycle around {sorted(known - reached)[0]!r}", "a tree")
+    return roots[0]

@@ -45,18 +45,17 @@ def mount_slides(spec: SceneSpec) -> list[Slide]:
 def mounted_urdf(spec: SceneSpec) -> str:
     """Return the URDF of the hand on its mount.
 
-    `<visual>` and `<material>` are left out: they need a render device. So are `<mimic>`, `<transmission>` and
-    `<gazebo>`: SAPIEN's mimic joints transmit wrong forces. Coupled joints get targets of their own.
+    Only links and joints are in it, without `<visual>`, which needs a render device. `<mimic>` is left out: SAPIEN's
+    mimic joints transmit wrong forces. Coupled joints get targets of their own.
 
     Raises:
         HandFileError: the file is no sound URDF (`read_urdf`).
     """
     urdf = read_urdf(spec.urdf_path)
-    robot = ET.fromstring(urdf.data)
-    for parent in list(robot.iter()):
-        for child in list(parent):
-            if child.tag in ("visual", "mimic", "transmission", "gazebo", "material"):
-                parent.remove(child)
+    robot = ET.fromstring(urdf.xml)
+    for joint in robot.iter("joint"):
+        for mimic in joint.findall("mimic"):
+            joint.remove(mimic)
     roll, pitch, yaw = euler_from_rotation(spec.world_from_hand[:3, :3])
     x, y, z = spec.world_from_hand[:3, 3]
     mount, parent = ['<link name="torchgrasp_world"/>'], "torchgrasp_world"

@@ -24,6 +24,7 @@ from benchmarks.common import Row
 from benchmarks.hand.coal_reference import exact_clearance
 from torchgrasp import load_hand
 from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.kinematics import chain_from_urdf
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.posture_model.dataset import load_samples
 from torchgrasp.testing import random_joints, reference_poses
@@ -92,10 +93,9 @@ def _speed(name: str, hand: Hand, n: int, threads: int, dtype: torch.dtype) -> l
     The peer's Jacobian always has the three rows of rotation, too.
     """
     joints, some = random_joints(hand, n, 3).to(dtype), n // 10  # the peer's time is as long for each row
-    xml = read_urdf(hand.urdf_path).kinematic_xml()
-    chain: Any = pytorch_kinematics.build_chain_from_urdf(xml).to(dtype=dtype)
-    make: Any = pytorch_kinematics.build_serial_chain_from_urdf
-    fingers = [make(xml, link).to(dtype=dtype) for link in hand.tips.links]
+    chain: Any = chain_from_urdf(read_urdf(hand.urdf_path), dtype)
+    make: Any = pytorch_kinematics.SerialChain
+    fingers = [make(chain, link, dtype=dtype) for link in hand.tips.links]
     order = [hand.tree.joint_names.index(x) for x in chain.get_joint_parameter_names()]
     orders = [[hand.tree.joint_names.index(x) for x in f.get_joint_parameter_names()] for f in fingers]
     coupling, contact = hand.actuated.coupling.to(dtype), hand.tips.contact.to(dtype)
