@@ -3,7 +3,7 @@
 import torch
 
 from torchgrasp.linalg import unit
-from torchgrasp.plan.wrench import closed_exact
+from torchgrasp.plan.round_cones import closed_exact
 from torchgrasp.shape.condition import condition
 from torchgrasp.shape.gp import Normalisation, ShapeGP
 from torchgrasp.shape.observations import Observations

@@ -1,21 +1,22 @@
-"""Rigid transforms and the virtual frame of three contacts (Eqs. 15-17).
+"""Rigid transforms, and the virtual frame of three contacts (Eqs. 15-17).
 
 A transform `a_from_b` maps coordinates of frame b into frame a. So chains read by adjacency:
 `obj_from_hand = obj_from_vf @ vf_from_hand` (Eq. 24).
 """
 
+import itertools
 import math
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.errors import DegenerateContacts
 from torchgrasp.linalg import unit
 
 MIN_HEIGHT_RATIO = 1e-3
-"""Least height of a contact triangle over its longest side. At a height of 1e-4 m, noise of 1e-6 m turns the virtual
-frame by 0.01 rad."""
+"""Least height of the largest contact triangle over its longest side. At a height of 1e-4 m, noise of 1e-6 m turns the
+virtual frame by 0.01 rad."""
 
 
 def rigid(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
@@ -94,11 +95,21 @@ def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
     return torch.atan2(torch.linalg.vector_norm(axis, dim=-1), trace - 1)
 
 
-def degenerate(points: Float[Tensor, "*b 3 3"]) -> Bool[Tensor, "*b"]:
-    """Tell which triangles are too flat for a virtual frame; see `MIN_HEIGHT_RATIO`."""
-    sides = points - points.roll(1, dims=-2)
-    longest = torch.linalg.vector_norm(sides, dim=-1).amax(-1)
-    doubled_area = torch.linalg.vector_norm(torch.linalg.cross(sides[..., 0, :], sides[..., 1, :]), dim=-1)
+def subsets(count: int, size: int, device: torch.device) -> Int[Tensor, "k s"]:
+    """Return all choices of `size` of the numbers below `count`, in their order.
+
+    >>> subsets(3, 2, torch.device("cpu")).tolist()
+    [[0, 1], [0, 2], [1, 2]]
+    """
+    return torch.tensor(list(itertools.combinations(range(count), size)), device=device)
+
+
+def degenerate(points: Float[Tensor, "*b f 3"]) -> Bool[Tensor, "*b"]:
+    """Tell which contacts lie too near to a line: their largest triangle is too flat, see `MIN_HEIGHT_RATIO`."""
+    corners = points[..., subsets(points.shape[-2], 3, points.device), :]  # (*b, k, 3, 3)
+    sides = corners - corners.roll(1, dims=-2)
+    longest = torch.linalg.vector_norm(sides, dim=-1).amax((-1, -2))
+    doubled_area = torch.linalg.vector_norm(torch.linalg.cross(sides[..., 0, :], sides[..., 1, :]), dim=-1).amax(-1)
     return ~(doubled_area > MIN_HEIGHT_RATIO * longest**2)
 
 

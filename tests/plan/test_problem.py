@@ -15,7 +15,7 @@ from torchgrasp.plan.problem import (
     forces_from_tensions,
     triple_jet,
 )
-from torchgrasp.plan.wrench import closed_exact
+from torchgrasp.plan.round_cones import closed_exact
 from torchgrasp.specs import ContactSpec
 
 SPEC = ContactSpec(table=0.47, tip_radius=0.03, separation=0.03)

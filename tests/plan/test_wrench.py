@@ -10,9 +10,9 @@ from torch import Tensor
 from torchgrasp.frames import apply, rotate
 from torchgrasp.linalg import unit
 from torchgrasp.plan.certify import certify
+from torchgrasp.plan.round_cones import closed_exact
 from torchgrasp.plan.wrench import (
     centre_and_radius,
-    closed_exact,
     cone_edges,
     rank_ratio,
     tangents,

@@ -8,7 +8,7 @@ import trimesh
 from benchmarks.plan.probability import HARD, draw_triples, format_reliability, judge_triples, planned_closed
 
 from tests.half_ball import RADIUS, ball
-from torchgrasp.plan.wrench import closed_exact
+from torchgrasp.plan.round_cones import closed_exact
 
 
 def _asked(power: float, n: int = 4000) -> list[dict]:

@@ -1,4 +1,4 @@
-"""Certificates of frictional form closure, Eq. (13): a verdict for every triple, with its proof.
+"""Certificates of frictional form closure, Eq. (13): a verdict for every row of contacts, with its proof.
 
 The proof of closure is a balance phi. The proof against it is a witness: a wrench that no contact opposes. Either is
 checked, whoever found it: phi bounds the margin from below, the witness from above. A batched simplex (`closure_lp`)
@@ -10,10 +10,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import FINGERTIPS
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import degenerate
 from torchgrasp.plan.closure_lp import solve_closure_lp
-from torchgrasp.plan.wrench import MIN_MARGIN, MIN_RANK_RATIO, Triples, rank_ratio, wrenches
+from torchgrasp.plan.wrench import MIN_MARGIN, MIN_RANK_RATIO, Vectors, rank_ratio, wrenches
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Certificate, Contacts
 
@@ -30,7 +31,7 @@ UNIT_TOLERANCE = 1e-3
 
 
 def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
-    """Prove in float64 that each triple has frictional form closure, Eq. (13), or that it has not.
+    """Prove in float64 that the contacts of a row have frictional form closure, Eq. (13), or that they have not.
 
     The margin is max s: W phi = 0, sum phi = 1, phi >= s. The cones have `spec.edges` edges at `spec.planned_friction`.
     The margin is -inf where no phi balances. Closed rows have a margin of at least 1e-6 and full rank.
@@ -40,7 +41,7 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     and hold NaN.
 
     Args:
-        contacts: triples of any planner, with outward unit normals; other fields are not read.
+        contacts: three to five a row, of any planner, with outward unit normals; other fields are not read.
         spec: friction and edges; `ContactSpec()` by default.
 
     Raises:
@@ -125,7 +126,7 @@ def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None]
     return float(solution.x[m]), float(np.abs(phi @ wrench).max()), -dual / np.linalg.norm(dual)
 
 
-def check_unit(normals: Triples) -> Triples:
+def check_unit(normals: Vectors) -> Vectors:
     """Return the contacts' normals; raise `BadArgument` for a length other than 1. NaN passes."""
     length = torch.linalg.vector_norm(normals, dim=-1)
     wrong = torch.nonzero((length - 1).abs() > UNIT_TOLERANCE)
@@ -136,12 +137,22 @@ def check_unit(normals: Triples) -> Triples:
     return normals
 
 
-def _checked(contacts: Contacts) -> tuple[Triples, Triples]:
-    """Return checked points and normals in float64 on the CPU."""
+def check_contacts(contacts: Contacts) -> Contacts:
+    """Return contacts of good shapes; raise `BadArgument` for others, and for a number of contacts beyond 3 to 5."""
     if not isinstance(contacts, Contacts):
         raise BadArgument("contacts", type(contacts).__name__, "Contacts")
-    for name, value in (("points", contacts.points), ("normals", contacts.normals)):
-        if value.shape != (*contacts.points.shape[:1], 3, 3) or not value.is_floating_point():
+    points = contacts.points
+    for name, value in (("points", points), ("normals", contacts.normals)):
+        if value.shape != (*points.shape[:2], 3) or not value.is_floating_point():
             found = f"shape {tuple(value.shape)} of {value.dtype}"
-            raise BadArgument(f"contacts.{name}", found, "floating numbers of shape b x 3 x 3, as many of each")
-    return contacts.points.detach().double().cpu(), check_unit(contacts.normals.detach().double().cpu())
+            raise BadArgument(f"contacts.{name}", found, "floating numbers of shape b x f x 3, as many of each")
+    if not FINGERTIPS[0] <= points.shape[1] <= FINGERTIPS[1]:
+        allowed = f"{FINGERTIPS[0]} to {FINGERTIPS[1]}, one for each fingertip"
+        raise BadArgument("contacts.points", f"{points.shape[1]} contacts a row", allowed)
+    return contacts
+
+
+def _checked(contacts: Contacts) -> tuple[Vectors, Vectors]:
+    """Return checked points and normals in float64 on the CPU."""
+    points = check_contacts(contacts).points
+    return points.detach().double().cpu(), check_unit(contacts.normals.detach().double().cpu())

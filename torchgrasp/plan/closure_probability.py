@@ -13,7 +13,7 @@ from torch import Tensor
 from torchgrasp.base import Batch
 from torchgrasp.errors import BadArgument
 from torchgrasp.plan.line_posterior import LinePosterior, first_contact, line_posterior, well_inside
-from torchgrasp.plan.wrench import closed_exact
+from torchgrasp.plan.round_cones import closed_exact
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts

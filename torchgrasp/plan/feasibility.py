@@ -9,7 +9,7 @@ from torchgrasp.frames import degenerate
 from torchgrasp.plan.closure_lp import solve_closure_lp
 from torchgrasp.plan.flatness import normal_variation
 from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet
-from torchgrasp.plan.wrench import BALANCED, MIN_MARGIN, MIN_RANK_RATIO, Triples, rank_ratio, wrenches
+from torchgrasp.plan.wrench import BALANCED, MIN_MARGIN, MIN_RANK_RATIO, Vectors, rank_ratio, wrenches
 from torchgrasp.shape.posterior import surface_deviation
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan, Contacts
@@ -18,7 +18,7 @@ ON_SURFACE = 1e-6
 """Largest |f_d| of a contact on the surface, normalised: 0.1 um on a hand-sized object, far above rounding."""
 
 
-def check_feasibility(shape: Shape, spec: ContactSpec, points: Triples) -> ContactPlan:
+def check_feasibility(shape: Shape, spec: ContactSpec, points: Vectors) -> ContactPlan:
     """Evaluate triples at normalised `points` against every constraint."""
     jet = triple_jet(shape, points)
     normals, metres = jet.normals, shape.metres(points)

@@ -14,7 +14,7 @@ from torchgrasp.base import Batch
 from torchgrasp.linalg import unit
 from torchgrasp.plan.problem import Shape, triple_jet, walls_of
 from torchgrasp.plan.solver import project
-from torchgrasp.plan.wrench import Triples, cone_edges, tangents
+from torchgrasp.plan.wrench import Vectors, cone_edges, tangents
 
 JUDGED_POINTS, GUIDING_POINTS = 8, 4
 """Points of the ring on which a plan is judged, and fewer that guide a solver."""
@@ -22,12 +22,12 @@ INSIDE = 0.95
 """Share of the largest variation that guiding points allow: the judged points lie between them."""
 
 
-def ring_directions(normals: Triples, points: Triples, n: int) -> Float[Tensor, "b 3 n 3"]:
+def ring_directions(normals: Vectors, points: Vectors, n: int) -> Float[Tensor, "b 3 n 3"]:
     """Return n unit tangents around each contact: a cone of friction 1 without its axis."""
     return cone_edges(normals, tangents(points, normals), 1.0, n) + normals[:, :, None]
 
 
-def normal_variation(shape: Shape, points: Triples, normals: Triples, radius: float) -> Float[Tensor, "b 3"]:
+def normal_variation(shape: Shape, points: Vectors, normals: Vectors, radius: float) -> Float[Tensor, "b 3"]:
     """Return the largest angle [rad] between the normals at a contact and on its ring of a radius [m].
 
     The ring of a contact on a thin wall is on that side of it, though it may lie nearer to the other.
@@ -38,13 +38,13 @@ def normal_variation(shape: Shape, points: Triples, normals: Triples, radius: fl
     return variation
 
 
-def _owned(shape: Shape, points: Triples, number: int) -> Bool[Tensor, "b 3"]:
+def _owned(shape: Shape, points: Vectors, number: int) -> Bool[Tensor, "b 3"]:
     """Tell which contacts are on one wall of a shape of several."""
     owner = getattr(shape, "wall_at")(points.flatten(0, 1))  # noqa: B009 a shape of one wall need not tell
     return owner[:, number].unflatten(0, points.shape[:2])
 
 
-def _wall_variation(shape: Shape, points: Triples, normals: Triples, radius: float) -> Float[Tensor, "b 3"]:
+def _wall_variation(shape: Shape, points: Vectors, normals: Vectors, radius: float) -> Float[Tensor, "b 3"]:
     """Return the same of one surface."""
     around = ring_directions(normals, points, JUDGED_POINTS)
     ring = points[:, :, None] + radius / float(shape.scale) * around
@@ -64,14 +64,14 @@ class FlatnessConstraint(Batch):
 
     value: Float[Tensor, "b k"]
     by_points: Float[Tensor, "b k 9"]
-    at: Triples
+    at: Vectors
 
-    def values(self, points: Triples) -> Float[Tensor, "b k"]:
+    def values(self, points: Vectors) -> Float[Tensor, "b k"]:
         """Return the values at points nearby."""
         return self.value + (self.by_points @ (points - self.at).flatten(1)[..., None])[..., 0]
 
 
-def flatness_constraint(shape: Shape, points: Triples, flatness: float, radius: float) -> FlatnessConstraint:
+def flatness_constraint(shape: Shape, points: Vectors, flatness: float, radius: float) -> FlatnessConstraint:
     """Evaluate |n - n_k| for the normals at a contact and on its ring, less the chord of `flatness` [rad].
 
     Values are lengths: chords times the ring's `radius` [m], normalised.
@@ -87,7 +87,7 @@ def flatness_constraint(shape: Shape, points: Triples, flatness: float, radius: 
     return found
 
 
-def _wall_constraint(shape: Shape, points: Triples, flatness: float, radius: float) -> FlatnessConstraint:
+def _wall_constraint(shape: Shape, points: Vectors, flatness: float, radius: float) -> FlatnessConstraint:
     """Return the same of one surface."""
     jet, radius = triple_jet(shape, points), radius / float(shape.scale)
     identity = torch.eye(3, dtype=points.dtype, device=points.device)

@@ -21,7 +21,7 @@ from torchgrasp.base import Batch, check_tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
 from torchgrasp.plan.certify import check_unit
-from torchgrasp.plan.wrench import Triples, tangents
+from torchgrasp.plan.wrench import Vectors, tangents
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.joint_posterior import distance_covariance, symmetric_root
 from torchgrasp.shape.normal_band import FOOTPRINT
@@ -33,7 +33,7 @@ NODES = (4.0, 1.5, 0.0, -1.5, -4.0)
 OUTER_GRID = (12.0, 9.0, 6.5, 4.0, 3.375, 2.75, 2.125, 1.5, 1.125, 0.75, 0.375, 0.0)
 """Outer half of the grid, in the same unit; it holds all nodes."""
 TRIPLES_PER_CHUNK = 32
-"""Triples whose joint posterior is made at a time: 105 x 105 distances each, which stay in the cache."""
+"""Vectors whose joint posterior is made at a time: 105 x 105 distances each, which stay in the cache."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,8 +49,8 @@ class LinePosterior(Batch):
         root: symmetric root of the covariance of (d, w) at the nodes, line by line, node by node.
     """
 
-    points: Triples
-    normals: Triples
+    points: Vectors
+    normals: Vectors
     deviation: Float[Tensor, "b 3"]
     distance: Float[Tensor, "b 3 23"]
     slope: Float[Tensor, "b 3 5 3"]
@@ -122,7 +122,7 @@ def _on_same(own: Bool[Tensor, "b 3"]) -> Bool[Tensor, "b 60 60"]:
 
 
 def _along_lines(
-    shape: ShapeGP, factor: float, points: Triples, normals: Triples
+    shape: ShapeGP, factor: float, points: Vectors, normals: Vectors
 ) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 3 23"], Float[Tensor, "b 3 5 3"], Float[Tensor, "b 60 60"]]:
     """Return deviation, distance on the grid, slope and covariance at the nodes for a single surface."""
     jet = shape.jet(points.flatten(0, 1))
@@ -138,7 +138,7 @@ def _along_lines(
 
 
 def node_covariance(
-    shape: ShapeGP, points: Triples, normals: Triples, nodes: Float[Tensor, "b 3 5"]
+    shape: ShapeGP, points: Vectors, normals: Vectors, nodes: Float[Tensor, "b 3 5"]
 ) -> Float[Tensor, "b 60 60"]:
     """Return the posterior covariance of (d, w) at the nodes, w by difference quotients of d.
 

@@ -18,7 +18,7 @@ from torchgrasp.plan.closure_probability import closure_share
 from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.problem import ContactProblem, Shape, device_of
 from torchgrasp.plan.solver import FINISH, Stage, State, descend, project, start_state
-from torchgrasp.plan.wrench import Triples, wrenches
+from torchgrasp.plan.wrench import Vectors, wrenches
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan
@@ -109,7 +109,7 @@ def raise_probability(
     return put(dataclasses.replace(plan, quality=torch.zeros_like(plan.quality)), good, best)
 
 
-def min_weight_cost(spec: ContactSpec, points: Triples, normals: Triples) -> Float[Tensor, "b"]:
+def min_weight_cost(spec: ContactSpec, points: Vectors, normals: Vectors) -> Float[Tensor, "b"]:
     """Return minus the margin s of the certificate, with its derivative.
 
     By duality ds = -v . sum phi_k da_k (see `closure_lp`).
@@ -124,7 +124,7 @@ def min_weight_cost(spec: ContactSpec, points: Triples, normals: Triples) -> Flo
     return (dual * change).sum(-1) - margin
 
 
-def epsilon_cost(spec: ContactSpec, points: Triples, normals: Triples) -> Float[Tensor, "b"]:
+def epsilon_cost(spec: ContactSpec, points: Vectors, normals: Vectors) -> Float[Tensor, "b"]:
     """Return minus Ferrari and Canny's epsilon: the radius of the largest ball in the hull of the wrenches.
 
     It is the least offset u . sum lambda_k w_k of a facet with unit normal u and corners w_k, at the foot of the
@@ -149,7 +149,7 @@ def epsilon_cost(spec: ContactSpec, points: Triples, normals: Triples) -> Float[
     return torch.stack(costs) if costs else points.new_zeros(0)
 
 
-def evaluate_cost(cost: Cost, points: Triples, normals: Triples) -> Float[Tensor, "b"]:
+def evaluate_cost(cost: Cost, points: Vectors, normals: Vectors) -> Float[Tensor, "b"]:
     """Return the cost of contacts [m]; raise `BadArgument` without one number a row."""
     value = cost(points, normals)
     if not isinstance(value, Tensor) or value.shape != points.shape[:1]:
@@ -158,7 +158,7 @@ def evaluate_cost(cost: Cost, points: Triples, normals: Triples) -> Float[Tensor
     return value
 
 
-def cost_gradients(cost: Cost, points: Triples, normals: Triples) -> tuple[Float[Tensor, "b"], Triples, Triples]:
+def cost_gradients(cost: Cost, points: Vectors, normals: Vectors) -> tuple[Float[Tensor, "b"], Vectors, Vectors]:
     """Return the cost of contacts [m] and its gradients by points and normals."""
     with torch.enable_grad():
         leaves = points.detach().requires_grad_(), normals.detach().requires_grad_()

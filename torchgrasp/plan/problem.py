@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Batch, map_tensors
-from torchgrasp.plan.wrench import Triples
+from torchgrasp.plan.wrench import Vectors
 from torchgrasp.plane import Plane
 from torchgrasp.shape.posterior import SurfaceJet
 from torchgrasp.specs import ContactSpec
@@ -56,7 +56,7 @@ def walls_of(shape: Shape) -> tuple[Shape, ...]:
     return getattr(shape, "walls", (shape,))
 
 
-def triple_jet(shape: Shape, points: Triples) -> SurfaceJet:
+def triple_jet(shape: Shape, points: Vectors) -> SurfaceJet:
     """Evaluate the shape at all points of all triples."""
     return map_tensors(lambda x: x.unflatten(0, points.shape[:2]), shape.jet(points.flatten(0, 1)))
 
@@ -86,7 +86,7 @@ class Constraints(Batch):
         return torch.cat([self.centre_by_x, self.surface_by_x, self.bounds_by_x], 1)
 
 
-def forces_from_tensions(points: Triples, tension: Float[Tensor, "b 3"]) -> tuple[Triples, Triples]:
+def forces_from_tensions(points: Vectors, tension: Float[Tensor, "b 3"]) -> tuple[Vectors, Vectors]:
     """Return the forces on the object at the contacts, and the sides from each contact to the next.
 
     A tension pulls the ends of its side together, in proportion to its length.
@@ -138,7 +138,7 @@ class ContactProblem:
         centres = points + self.tip_radius * normals
         return centres.roll(-1, -2) - centres
 
-    def constraints(self, points: Triples, tension: Float[Tensor, "b 3"], jet: SurfaceJet) -> Constraints:
+    def constraints(self, points: Vectors, tension: Float[Tensor, "b 3"], jet: SurfaceJet) -> Constraints:
         """Evaluate all constraints and their Jacobians; `jet` is the shape at the points."""
         b, identity = len(points), torch.eye(3, dtype=points.dtype, device=points.device)
         threshold, ball = self.max_variance * INSIDE, self.domain_radius * INSIDE
@@ -179,7 +179,7 @@ class ContactProblem:
         )
 
     def _cones(
-        self, points: Triples, tension: Float[Tensor, "b 3"], jet: SurfaceJet
+        self, points: Vectors, tension: Float[Tensor, "b 3"], jet: SurfaceJet
     ) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 3 12"]]:
         """Return by how much each force leaves its cone, as a cosine.
 
@@ -208,7 +208,7 @@ class ContactProblem:
         return outward[..., 0] + cosine + CONE_MARGIN, blocks.flatten(2)
 
 
-def _by_own_point(slope: Triples) -> Float[Tensor, "b 3 12"]:
+def _by_own_point(slope: Vectors) -> Float[Tensor, "b 3 12"]:
     """Return the Jacobian of three values, each of its own point alone."""
     jacobian = slope.new_zeros(len(slope), 3, 12)
     for i in range(3):

@@ -14,7 +14,7 @@ from torchgrasp.plan.objectives import Improvement, Objective, improvement
 from torchgrasp.plan.problem import ContactProblem, Shape
 from torchgrasp.plan.solver import FINISH, Stage, descend, project, start_state
 from torchgrasp.plan.starts import check_starts, drawn_starts, given_starts, settle_flatness
-from torchgrasp.plan.wrench import Triples
+from torchgrasp.plan.wrench import Vectors
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan
 
@@ -83,7 +83,7 @@ def plan_contacts(
     return join([plan_chunk(shape, spec, first, stages, improve) for first, stages in chunks])
 
 
-def _chunks(shape: Shape, spec: ContactSpec, starts: int | Triples, seed: int) -> Iterator[Chunk]:
+def _chunks(shape: Shape, spec: ContactSpec, starts: int | Vectors, seed: int) -> Iterator[Chunk]:
     """Yield starts and stages, chunk by chunk."""
     if isinstance(starts, Tensor):
         return ((first, SEARCH) for first in given_starts(shape, starts))
@@ -108,7 +108,7 @@ def _within(seconds: float, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
 def plan_chunk(
     shape: Shape,
     spec: ContactSpec,
-    first: Triples,
+    first: Vectors,
     stages: tuple[Stage, ...],
     improve: Improvement | None = None,
 ) -> ContactPlan:

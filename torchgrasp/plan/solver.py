@@ -15,7 +15,7 @@ from torchgrasp.base import Batch
 from torchgrasp.linalg import limit_norm
 from torchgrasp.optim import Damping, Linearisation, Problem, Steps, Verdict, levenberg_marquardt
 from torchgrasp.plan.problem import ContactProblem, Shape, SurfaceJet, forces_from_tensions, triple_jet
-from torchgrasp.plan.wrench import Triples
+from torchgrasp.plan.wrench import Vectors
 from torchgrasp.shape.surface import newton_step
 
 LONGEST_STEP = 0.3
@@ -49,9 +49,9 @@ FINISH = Stage(centre=0.0, cones=3.0, steps=30, settled=1e-8)
 
 @dataclasses.dataclass(frozen=True)
 class State(Batch):
-    """Triples with the tensions of their sides, and the shape at their normalised points."""
+    """Vectors with the tensions of their sides, and the shape at their normalised points."""
 
-    points: Triples
+    points: Vectors
     tension: Float[Tensor, "b 3"]
     jet: SurfaceJet
 
@@ -171,13 +171,13 @@ def project(shape: Shape, points: Float[Tensor, "b k 3"], steps: int) -> Float[T
     return x.view_as(points)
 
 
-def start_state(shape: Shape, points: Triples) -> State:
+def start_state(shape: Shape, points: Vectors) -> State:
     """Return the state of triples with equal tensions: forces point to the contacts' centre."""
     tension = normalise_tensions(points, points.new_ones(len(points), 3))
     return State(points, tension, triple_jet(shape, points))
 
 
-def normalise_tensions(points: Triples, tension: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
+def normalise_tensions(points: Vectors, tension: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
     """Return the tensions for which the mean size of the forces is 1."""
     force, _ = forces_from_tensions(points, tension)
     return tension / torch.linalg.vector_norm(force, dim=-1).mean(-1, keepdim=True)

@@ -12,8 +12,9 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
 from torchgrasp.plan.flatness import normal_variation
 from torchgrasp.plan.problem import ContactProblem, Shape, device_of, triple_jet, walls_of
+from torchgrasp.plan.round_cones import closed_exact
 from torchgrasp.plan.solver import project
-from torchgrasp.plan.wrench import Triples, closed_exact
+from torchgrasp.plan.wrench import Vectors
 from torchgrasp.specs import FLAT_RADII, ContactSpec
 
 CANDIDATE_TRIPLES = 700
@@ -54,7 +55,7 @@ def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor, seed: in
         raise BadArgument("spec.start_radius", spec.start_radius, f"at most {float(shape.domain_radius):.4g}")
 
 
-def given_starts(shape: Shape, starts: Triples) -> Iterator[Float[Tensor, "_ 3 3"]]:
+def given_starts(shape: Shape, starts: Vectors) -> Iterator[Float[Tensor, "_ 3 3"]]:
     """Yield normalised starts on the surface from given points [m]."""
     for points in starts.detach().to(device_of(shape), torch.float64).split(STARTS_PER_CHUNK):
         yield project(shape, draw_in(shape, shape.normalise(points)), steps=6)
@@ -108,7 +109,7 @@ def survey(shape: Shape, spec: ContactSpec, generator: torch.Generator) -> Float
     return torch.cat([project(wall, points, steps=6) for wall, points in zip(walls, drawn, strict=True)])
 
 
-def draw_in(shape: Shape, points: Triples) -> Triples:
+def draw_in(shape: Shape, points: Vectors) -> Vectors:
     """Return normalised starts, those off the surface drawn in around the centre.
 
     A point off the surface is only a direction. From far away it ends on the nearest surface, uncertain or not. From
@@ -123,7 +124,7 @@ def draw_in(shape: Shape, points: Triples) -> Triples:
 
 
 def candidate_contacts(
-    shape: Shape, spec: ContactSpec, points: Triples
+    shape: Shape, spec: ContactSpec, points: Vectors
 ) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]]:
     """Return the surface points that qualify as contacts, with normals; all where fewer than three qualify."""
     good, normals = qualify(shape, spec, points)
@@ -132,7 +133,7 @@ def candidate_contacts(
     return points[good], normals[good]
 
 
-def qualify(shape: Shape, spec: ContactSpec, points: Triples) -> tuple[Bool[Tensor, "b 3"], Triples]:
+def qualify(shape: Shape, spec: ContactSpec, points: Vectors) -> tuple[Bool[Tensor, "b 3"], Vectors]:
     """Tell which surface points are certain, flat, inside and above the table; return the normals of all."""
     problem = ContactProblem.of(shape, spec)
     jet = triple_jet(shape, points)
@@ -151,7 +152,7 @@ def candidate_triples(
     normals: Float[Tensor, "p 3"],
     starts: int,
     generator: torch.Generator,
-) -> tuple[Triples, int]:
+) -> tuple[Vectors, int]:
     """Return random triples of candidates, closed and separate as far as there are enough; and how many are."""
     triples, missing = [], starts
     for _ in range(ROUNDS):

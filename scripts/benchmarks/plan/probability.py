@@ -20,7 +20,7 @@ from torchgrasp.datasets import read_family, read_group
 from torchgrasp.evaluation.calibration import BINS, judge
 from torchgrasp.evaluation.intervals import count_by, format_share, share_over
 from torchgrasp.plan.line_posterior import well_inside
-from torchgrasp.plan.wrench import closed_exact
+from torchgrasp.plan.round_cones import closed_exact
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.values import Contacts

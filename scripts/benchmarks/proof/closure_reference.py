@@ -10,7 +10,8 @@ from torch import Tensor
 
 from torchgrasp.linalg import unit
 from torchgrasp.plan.line_posterior import FOOTPRINT
-from torchgrasp.plan.wrench import closed_exact, tangents
+from torchgrasp.plan.round_cones import closed_exact
+from torchgrasp.plan.wrench import tangents
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.joint_posterior import distance_covariance
 from torchgrasp.values import Contacts
