@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Literal, get_args
 
-from torchgrasp.base import Value, check_number, check_whole
+from torchgrasp.base import FINGERTIPS, Value, check_number, check_whole
 from torchgrasp.errors import BadArgument
 from torchgrasp.plane import Plane, as_plane
 
@@ -21,7 +21,7 @@ fewer is closed on the true surface, but balls of 40 mm and things 25 mm high ha
 
 @dataclasses.dataclass(frozen=True)
 class ContactSpec(Value):
-    """What three contacts must satisfy (Eqs. 10-14). `ContactSpec.paper()` is the paper's own.
+    """What three to five contacts must satisfy (Eqs. 10-14). `ContactSpec.paper()` is the paper's own.
 
     The estimated surface differs from the true one, so contacts keep margins beyond the paper: less friction, flat
     surface, a distance of a fingertip. `docs/planning.md` has their measured worth.
@@ -39,6 +39,7 @@ class ContactSpec(Value):
         table: the table's `Plane` in the cloud's frame, or its height [m] along z; None: no table.
         tip_radius: radius [m] of the fingertips, which may rest on the table; 0: points. None: the hand's.
         start_radius: normalised radius of the sphere from which starts are drawn (Sec. 6.2; the paper: 0.1).
+        fingertips: number of contacts in a row, one for each fingertip: 3, 4 or 5.
         contact_allowed: whether links may touch and push the target's neighbours; collisions then only cost success.
 
     Raises:
@@ -58,6 +59,7 @@ class ContactSpec(Value):
     table: Plane | float | None = None
     tip_radius: float | None = None
     start_radius: float = 0.9
+    fingertips: int = 3
     contact_allowed: bool = False
 
     def __post_init__(self) -> None:
@@ -74,6 +76,7 @@ class ContactSpec(Value):
             start_radius=(1e-6, 1.2),
         )
         check_whole("edges", self.edges, 3, 1024)
+        check_whole("fingertips", self.fingertips, *FINGERTIPS)
         as_plane(self.table)
 
     @property

@@ -19,7 +19,7 @@ ON_SURFACE = 1e-6
 
 
 def check_feasibility(shape: Shape, spec: ContactSpec, points: Vectors) -> ContactPlan:
-    """Evaluate triples at normalised `points` against every constraint."""
+    """Evaluate contacts at normalised `points` against every constraint."""
     jet = triple_jet(shape, points)
     normals, metres = jet.normals, shape.metres(points)
     wrench = wrenches(points, normals, spec.planned_friction, spec.edges)

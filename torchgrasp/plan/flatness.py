@@ -22,12 +22,12 @@ INSIDE = 0.95
 """Share of the largest variation that guiding points allow: the judged points lie between them."""
 
 
-def ring_directions(normals: Vectors, points: Vectors, n: int) -> Float[Tensor, "b 3 n 3"]:
+def ring_directions(normals: Vectors, points: Vectors, n: int) -> Float[Tensor, "b f n 3"]:
     """Return n unit tangents around each contact: a cone of friction 1 without its axis."""
     return cone_edges(normals, tangents(points, normals), 1.0, n) + normals[:, :, None]
 
 
-def normal_variation(shape: Shape, points: Vectors, normals: Vectors, radius: float) -> Float[Tensor, "b 3"]:
+def normal_variation(shape: Shape, points: Vectors, normals: Vectors, radius: float) -> Float[Tensor, "b f"]:
     """Return the largest angle [rad] between the normals at a contact and on its ring of a radius [m].
 
     The ring of a contact on a thin wall is on that side of it, though it may lie nearer to the other.
@@ -38,13 +38,13 @@ def normal_variation(shape: Shape, points: Vectors, normals: Vectors, radius: fl
     return variation
 
 
-def _owned(shape: Shape, points: Vectors, number: int) -> Bool[Tensor, "b 3"]:
+def _owned(shape: Shape, points: Vectors, number: int) -> Bool[Tensor, "b f"]:
     """Tell which contacts are on one wall of a shape of several."""
     owner = getattr(shape, "wall_at")(points.flatten(0, 1))  # noqa: B009 a shape of one wall need not tell
     return owner[:, number].unflatten(0, points.shape[:2])
 
 
-def _wall_variation(shape: Shape, points: Vectors, normals: Vectors, radius: float) -> Float[Tensor, "b 3"]:
+def _wall_variation(shape: Shape, points: Vectors, normals: Vectors, radius: float) -> Float[Tensor, "b f"]:
     """Return the same of one surface."""
     around = ring_directions(normals, points, JUDGED_POINTS)
     ring = points[:, :, None] + radius / float(shape.scale) * around
@@ -57,13 +57,13 @@ def _wall_variation(shape: Shape, points: Vectors, normals: Vectors, radius: flo
 
 @dataclasses.dataclass(frozen=True)
 class FlatnessConstraint(Batch):
-    """Values <= 0 on flat surface, linear about the points `at` of their evaluation.
+    """Values <= 0 on flat surface, linear about the points `at` of their evaluation, by their 3 f coordinates.
 
     A ring costs as much as several steps of a solver: evaluate it rarely.
     """
 
     value: Float[Tensor, "b k"]
-    by_points: Float[Tensor, "b k 9"]
+    by_points: Float[Tensor, "b k x"]
     at: Vectors
 
     def values(self, points: Vectors) -> Float[Tensor, "b k"]:
@@ -93,7 +93,7 @@ def _wall_constraint(shape: Shape, points: Vectors, flatness: float, radius: flo
     identity = torch.eye(3, dtype=points.dtype, device=points.device)
     around = ring_directions(jet.normals, points, GUIDING_POINTS).transpose(1, 2)
     normal, normal_jacobian = jet.normals[:, None], jet.normal_jacobian[:, None]
-    ring = points[:, None] + radius * around  # (b, k, 3, 3)
+    ring = points[:, None] + radius * around  # (b, k, f, 3)
     # The ring turns with the normal at its centre.
     ring_by_point = identity - radius * normal[..., :, None] * (around[..., None, :] @ normal_jacobian)
     there = triple_jet(shape, ring.flatten(0, 1))
@@ -102,6 +102,7 @@ def _wall_constraint(shape: Shape, points: Vectors, flatness: float, radius: flo
     direction = difference / torch.where(chord == 0, 1.0, chord)[..., None]
     change = there.normal_jacobian.view(*ring.shape, 3) @ ring_by_point - normal_jacobian
     slope = (direction[..., None, :] @ change)[..., 0, :]
-    by_points = torch.einsum("bkij,il->bkilj", radius * slope, identity).flatten(3).flatten(1, 2)
+    own = torch.eye(points.shape[1], dtype=points.dtype, device=points.device)
+    by_points = torch.einsum("bkij,il->bkilj", radius * slope, own).flatten(3).flatten(1, 2)
     value = radius * (chord - 2 * math.sin(INSIDE * flatness / 2)).flatten(1)
     return FlatnessConstraint(value, by_points, points)

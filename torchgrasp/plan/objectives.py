@@ -24,11 +24,11 @@ from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan
 
 Cost = Callable[[Tensor, Tensor], Tensor]
-"""Contacts (b, 3, 3) [m] and outward unit normals (b, 3, 3) in, a cost (b,) out, differentiable by autograd."""
+"""Contacts (b, f, 3) [m] and outward unit normals (b, f, 3) in, a cost (b,) out, differentiable by autograd."""
 Objective = Literal["center", "epsilon", "min_weight", "probability"] | Cost
 """What a plan minimises."""
-Improvement = Callable[[ContactPlan, Float[Tensor, "b 3"]], ContactPlan]
-"""A plan and the tensions of its triangles in, the improved plan out. `quality` then holds the cost."""
+Improvement = Callable[[ContactPlan, Float[Tensor, "b p"]], ContactPlan]
+"""A plan and the tensions of its pairs in, the improved plan out. `quality` then holds the cost."""
 DOWN = Stage(centre=0.0, cones=3.0, steps=15)
 """The stage down a cost; feasibility alone is beside it."""
 ON_FACET = 1e-9
@@ -41,7 +41,7 @@ SURFACE_DRAWS = 400
 
 
 def improvement(objective: Objective, shape: Shape, spec: ContactSpec, seed: int) -> Improvement | None:
-    """Return what improves a plan; None for "center". A user's cost is tried on two triples first.
+    """Return what improves a plan; None for "center". A user's cost is tried on two rows first.
 
     Raises:
         BadArgument: an unknown name, a cost without a number for each row or without a gradient, or "probability"
@@ -59,14 +59,14 @@ def improvement(objective: Objective, shape: Shape, spec: ContactSpec, seed: int
         expected = "'center', 'epsilon', 'min_weight', 'probability' or a cost of contacts"
         raise BadArgument("objective", repr(objective), expected)
     if cost is objective:
-        outward = torch.tensor([[1.0, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0]], dtype=torch.float64)
-        outward = outward.to(device_of(shape)).repeat(2, 1, 1)
+        corners = [[1.0, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0], [0, 0.6, 0.8], [0, 0.6, -0.8]]
+        outward = torch.tensor(corners[: spec.fingertips], dtype=torch.float64).to(device_of(shape)).repeat(2, 1, 1)
         cost_gradients(cost, shape.metres(outward), outward)
     return partial(lower_cost, shape, spec, cost)
 
 
 def lower_cost(
-    shape: Shape, spec: ContactSpec, cost: Cost, plan: ContactPlan, tension: Float[Tensor, "b 3"]
+    shape: Shape, spec: ContactSpec, cost: Cost, plan: ContactPlan, tension: Float[Tensor, "b p"]
 ) -> ContactPlan:
     """Return the plan with a lower cost in its OK rows."""
     problem, good = ContactProblem.of(shape, spec), torch.nonzero(plan.status == Status.OK)[:, 0]
@@ -84,7 +84,7 @@ def lower_cost(
 
 
 def raise_probability(
-    shape: ShapeGP, spec: ContactSpec, seed: int, plan: ContactPlan, tension: Float[Tensor, "b 3"]
+    shape: ShapeGP, spec: ContactSpec, seed: int, plan: ContactPlan, tension: Float[Tensor, "b p"]
 ) -> ContactPlan:
     """Return the plan with a more probable closure in its OK rows.
 
@@ -100,7 +100,7 @@ def raise_probability(
     good = torch.nonzero(plan.status == Status.OK)[:, 0]
     best = with_probability(plan[good])
     for k in range(MOVES):
-        drawn = torch.randn(3, 3, generator=generator, dtype=torch.float64).to(tension.device)
+        drawn = torch.randn(spec.fingertips, 3, generator=generator, dtype=torch.float64).to(tension.device)
         normals = best.contacts.normals
         along = drawn - (drawn * normals).sum(-1, keepdim=True) * normals
         points = shape.normalise(best.contacts.points + FIRST_MOVE * SHRINK**k * unit(along))
@@ -169,11 +169,11 @@ def cost_gradients(cost: Cost, points: Vectors, normals: Vectors) -> tuple[Float
     return value.detach(), by_point, by_normal
 
 
-def differentiate_cost(cost: Cost, shape: Shape, state: State) -> tuple[Float[Tensor, "b"], Float[Tensor, "b 12"]]:
-    """Return the cost of triples and its gradient by normalised points and (zero) tensions."""
+def differentiate_cost(cost: Cost, shape: Shape, state: State) -> tuple[Float[Tensor, "b"], Float[Tensor, "b u"]]:
+    """Return the cost of contacts and its gradient by normalised points and (zero) tensions."""
     jet, normals = state.jet, state.jet.normals  # dn = (1 - n n^T) H dx / |g|
     value, by_point, by_normal = cost_gradients(cost, shape.metres(state.points), normals)
     across = by_normal - (by_normal * normals).sum(-1, keepdim=True) * normals
     steep = torch.linalg.vector_norm(jet.gradient, dim=-1, keepdim=True)
     gradient = float(shape.scale) * by_point + (jet.hessian @ (across / steep)[..., None])[..., 0]
-    return value, torch.cat([gradient.flatten(1), torch.zeros_like(gradient[:, 0])], 1)
+    return value, torch.cat([gradient.flatten(1), torch.zeros_like(state.tension)], 1)

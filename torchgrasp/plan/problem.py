@@ -1,19 +1,21 @@
-"""The contact planning problem, Eqs. (10)-(14), for a batch of triples.
+"""The contact planning problem, Eqs. (10)-(14), for a batch of contacts.
 
-Unknowns x of a triple are its normalised points (3, 3) and the tensions (3) of its triangle's sides. Eq. (11) defines
+Unknowns x of a row are its f normalised points (f, 3) and a tension for each of the p pairs of points. Eq. (11) defines
 the normals. Eq. (13) asks for balanced forces in the friction cones. Three forces balance if and only if each is the
-sum of the pulls along the two sides at its contact [1]. So W phi = 0 holds whatever the tensions; one inequality for
+sum of the pulls along the two sides at its contact [1]. Pulls between all pairs balance at more contacts, too, and
+give every balance unless the contacts lie in one plane. So W phi = 0 holds whatever the tensions; one inequality for
 each cone is left. Every inequality is a bound <= 0.
 
 [1] Yoshikawa and Nagai, IEEE Trans. Robotics and Automation 7, 1991.
 """
 
 import dataclasses
+import functools
 import math
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch, map_tensors
@@ -57,23 +59,48 @@ def walls_of(shape: Shape) -> tuple[Shape, ...]:
 
 
 def triple_jet(shape: Shape, points: Vectors) -> SurfaceJet:
-    """Evaluate the shape at all points of all triples."""
+    """Evaluate the shape at all points of all rows."""
     return map_tensors(lambda x: x.unflatten(0, points.shape[:2]), shape.jet(points.flatten(0, 1)))
+
+
+@functools.cache
+def contact_pairs(fingertips: int, device: torch.device) -> Int[Tensor, "2 p"]:
+    """Return all pairs of contacts: each with the next, then each with the one after it.
+
+    >>> contact_pairs(3, torch.device("cpu")).tolist()
+    [[0, 1, 2], [1, 2, 0]]
+    """
+    order = [(i, (i + gap) % fingertips) for gap in range(1, fingertips // 2 + 1) for i in range(fingertips)]
+    return torch.tensor(order[: fingertips * (fingertips - 1) // 2], device=device).T
+
+
+@functools.cache
+def pull_signs(fingertips: int, device: torch.device) -> Float[Tensor, "f p"]:
+    """Return 1 where a contact is the first of a pair, -1 where it is the second: the sense of its pull along it."""
+    pairs = contact_pairs(fingertips, device)
+    at = torch.arange(fingertips, device=device)[:, None]
+    return (at == pairs[0]).double() - (at == pairs[1]).double()
+
+
+def split_unknowns(x: Float[Tensor, "b u"]) -> tuple[Vectors, Float[Tensor, "b p"]]:
+    """Return the part of the points and that of the tensions: u = 3 f + f (f - 1) / 2 unknowns have f points."""
+    fingertips = (math.isqrt(25 + 8 * x.shape[1]) - 5) // 2
+    return x[:, : 3 * fingertips].unflatten(1, (fingertips, 3)), x[:, 3 * fingertips :]
 
 
 @dataclasses.dataclass(frozen=True)
 class Constraints(Batch):
-    """Values of the constraints, and Jacobians by nine coordinates and three tensions.
+    """Values of the constraints, and Jacobians by u unknowns: coordinates, then tensions.
 
-    `bounds` are three each: cones, variances, domain, sides, and with a table heights.
+    `bounds` are f cones, f variances, f of the domain, p distances of pairs, and with a table f heights.
     """
 
     centre: Float[Tensor, "b 3"]
-    surface: Float[Tensor, "b 3"]
+    surface: Float[Tensor, "b f"]
     bounds: Float[Tensor, "b k"]
-    centre_by_x: Float[Tensor, "b 3 12"]
-    surface_by_x: Float[Tensor, "b 3 12"]
-    bounds_by_x: Float[Tensor, "b k 12"]
+    centre_by_x: Float[Tensor, "b 3 u"]
+    surface_by_x: Float[Tensor, "b f u"]
+    bounds_by_x: Float[Tensor, "b k u"]
 
     @property
     def values(self) -> Float[Tensor, "b r"]:
@@ -81,19 +108,19 @@ class Constraints(Batch):
         return torch.cat([self.centre, self.surface, self.bounds], 1)
 
     @property
-    def jacobian(self) -> Float[Tensor, "b r 12"]:
+    def jacobian(self) -> Float[Tensor, "b r u"]:
         """The derivatives of `values`."""
         return torch.cat([self.centre_by_x, self.surface_by_x, self.bounds_by_x], 1)
 
 
-def forces_from_tensions(points: Vectors, tension: Float[Tensor, "b 3"]) -> tuple[Vectors, Vectors]:
-    """Return the forces on the object at the contacts, and the sides from each contact to the next.
+def forces_from_tensions(points: Vectors, tension: Float[Tensor, "b p"]) -> tuple[Vectors, Float[Tensor, "b p 3"]]:
+    """Return the forces on the object at the contacts, and the sides from the first to the second of each pair.
 
     A tension pulls the ends of its side together, in proportion to its length.
     """
-    sides = points.roll(-1, 1) - points
-    pull = tension[..., None] * sides
-    return pull - pull.roll(1, 1), sides
+    first, second = contact_pairs(points.shape[1], points.device)
+    sides = points[:, second] - points[:, first]
+    return pull_signs(points.shape[1], points.device).to(points) @ (tension[..., None] * sides), sides
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,6 +130,7 @@ class ContactProblem:
     `friction` is that of the round cone inside the cone with edges. `separation` is at least `LEAST_SIDE`.
     """
 
+    fingertips: int
     friction: float
     max_variance: float
     domain_radius: float
@@ -118,6 +146,7 @@ class ContactProblem:
             foot = table.offset * table.normal
             table = Plane(table.normal, float(shape.normalise(foot) @ table.normal)).to(device_of(shape))
         return cls(
+            fingertips=spec.fingertips,
             friction=spec.planned_friction * math.cos(math.pi / spec.edges),
             max_variance=spec.max_variance,
             domain_radius=float(shape.domain_radius),
@@ -133,60 +162,68 @@ class ContactProblem:
         slant = 1 - normals @ self.table.normal.to(normals)
         return self.table.height(points) - self.tip_radius * slant
 
-    def sides(self, points: Float[Tensor, "*b 3 3"], normals: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:
-        """Return the sides of the triangle of the tips' centres, from each to the next."""
+    def sides(self, points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p 3"]:
+        """Return the sides between the tips' centres, from the first to the second of each pair."""
         centres = points + self.tip_radius * normals
-        return centres.roll(-1, -2) - centres
+        first, second = contact_pairs(points.shape[-2], points.device)
+        return centres[..., second, :] - centres[..., first, :]
 
-    def constraints(self, points: Vectors, tension: Float[Tensor, "b 3"], jet: SurfaceJet) -> Constraints:
+    def constraints(self, points: Vectors, tension: Float[Tensor, "b p"], jet: SurfaceJet) -> Constraints:
         """Evaluate all constraints and their Jacobians; `jet` is the shape at the points."""
-        b, identity = len(points), torch.eye(3, dtype=points.dtype, device=points.device)
+        b, f = points.shape[:2]
+        unknowns = 3 * f + tension.shape[1]
+        own = functools.partial(_by_own_point, unknowns=unknowns)
+        identity = torch.eye(3, dtype=points.dtype, device=points.device)
         threshold, ball = self.max_variance * INSIDE, self.domain_radius * INSIDE
         half_slope = 2 * threshold**0.5  # slope of the variance at the threshold, for a linear standard deviation
-        sides = self.sides(points, jet.normals)
-        length = torch.linalg.vector_norm(sides, dim=-1)
+        centre_by_point = identity + self.tip_radius * jet.normal_jacobian
         cones, cones_by_x = self._cones(points, tension, jet)
+        distances, distances_by_x = self._distances(points, jet.normals, centre_by_point)
         values = [
             cones,
             (jet.variance - threshold) / half_slope,
             ((points * points).sum(-1) - ball**2) / (2 * ball),
-            self.separation / INSIDE - length,
+            distances,
         ]
-        along, centre_by_point = (
-            (sides / length[..., None])[..., None, :],
-            identity + self.tip_radius * jet.normal_jacobian,
-        )
-        one, other = (_by_own_point((along @ x)[..., 0, :]) for x in (centre_by_point, centre_by_point.roll(-1, 1)))
-        points_part, tension_part = other.split([9, 3], 2)
-        sides_by_x = one - torch.cat([points_part.roll(3, 2), tension_part], 2)  # a side's other end
-        jacobians = [
-            cones_by_x,
-            _by_own_point(jet.variance_gradient / half_slope),
-            _by_own_point(points / ball),
-            sides_by_x,
-        ]
+        jacobians = [cones_by_x, own(jet.variance_gradient / half_slope), own(points / ball), distances_by_x]
         if self.table is not None:
             up = self.table.normal.to(points)
             values.append((1 - INSIDE) * 0.1 - self.room(points, jet.normals))
-            jacobians.append(_by_own_point(-(up @ centre_by_point)))
+            jacobians.append(own(-(up @ centre_by_point)))
+        by_tension = identity.new_zeros(3, tension.shape[1])
         return Constraints(
             centre=points.mean(1),
             surface=jet.distance,
             bounds=torch.cat(values, 1),
-            centre_by_x=torch.cat([identity.repeat(1, 3) / 3, torch.zeros_like(identity)], 1).expand(b, 3, 12),
-            surface_by_x=_by_own_point(jet.gradient),
+            centre_by_x=torch.cat([identity.repeat(1, f) / f, by_tension], 1).expand(b, 3, unknowns),
+            surface_by_x=own(jet.gradient),
             bounds_by_x=torch.cat(jacobians, 1),
         )
 
+    def _distances(
+        self, points: Vectors, normals: Vectors, centre_by_point: Float[Tensor, "b f 3 3"]
+    ) -> tuple[Float[Tensor, "b p"], Float[Tensor, "b p u"]]:
+        """Return by how much each pair of tip centres is too near, with derivatives."""
+        sides = self.sides(points, normals)
+        length = torch.linalg.vector_norm(sides, dim=-1)
+        along = (sides / length[..., None])[..., None, :]
+        first, second = contact_pairs(points.shape[1], points.device)
+        pair = torch.arange(len(first), device=points.device)
+        blocks = points.new_zeros(len(points), len(pair), points.shape[1], 3)
+        blocks[:, pair, first] = (along @ centre_by_point[:, first])[..., 0, :]
+        blocks[:, pair, second] = -(along @ centre_by_point[:, second])[..., 0, :]
+        by_tension = points.new_zeros(len(points), len(pair), len(pair))
+        return self.separation / INSIDE - length, torch.cat([blocks.flatten(2), by_tension], 2)
+
     def _cones(
-        self, points: Vectors, tension: Float[Tensor, "b 3"], jet: SurfaceJet
-    ) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 3 12"]]:
+        self, points: Vectors, tension: Float[Tensor, "b p"], jet: SurfaceJet
+    ) -> tuple[Float[Tensor, "b f"], Float[Tensor, "b f u"]]:
         """Return by how much each force leaves its cone, as a cosine.
 
         With u = f / |f| the bound is n.u + cosine. Its derivatives are (1 - u u^T) n / |f| by the force, and u by the
         normal, which turns with its point.
         """
-        normals = jet.normals
+        normals, at = jet.normals, torch.arange(points.shape[1], device=points.device)
         force, sides = forces_from_tensions(points, tension)
         size = torch.linalg.vector_norm(force, dim=-1, keepdim=True)
         direction = force / size
@@ -195,22 +232,20 @@ class ContactProblem:
         steep = torch.linalg.vector_norm(jet.gradient, dim=-1, keepdim=True)
         across = (direction - outward * normals) / steep  # (1 - n n^T) u / |g|, which the Hessian carries to the point
         by_point = (across[..., None, :] @ jet.hessian)[..., 0, :]
-        before = tension.roll(1, 1)
-        blocks = by_force.new_zeros(len(points), 3, 4, 3)
-        for i in range(3):
-            after, other = (i + 1) % 3, (i + 2) % 3
-            blocks[:, i, i] = by_point[:, i] - (tension[:, i] + before[:, i])[:, None] * by_force[:, i]
-            blocks[:, i, after] = tension[:, i, None] * by_force[:, i]
-            blocks[:, i, other] = before[:, i, None] * by_force[:, i]
-            blocks[:, i, 3, i] = (by_force[:, i] * sides[:, i]).sum(-1)
-            blocks[:, i, 3, other] = -(by_force[:, i] * sides[:, other]).sum(-1)
+        first, second = contact_pairs(len(at), points.device)
+        between = tension.new_zeros(len(points), len(at), len(at))  # the tension between two contacts
+        between[:, first, second] = between[:, second, first] = tension
+        blocks = between[..., None] * by_force[:, :, None]
+        blocks[:, at, at] = by_point - between.sum(2, keepdim=True) * by_force
+        along = (by_force[:, :, None] * sides[:, None]).sum(-1)
+        by_tension = along * pull_signs(len(at), points.device).to(points)
         cosine = 1 / math.sqrt(1 + self.friction**2)
-        return outward[..., 0] + cosine + CONE_MARGIN, blocks.flatten(2)
+        return outward[..., 0] + cosine + CONE_MARGIN, torch.cat([blocks.flatten(2), by_tension], 2)
 
 
-def _by_own_point(slope: Vectors) -> Float[Tensor, "b 3 12"]:
-    """Return the Jacobian of three values, each of its own point alone."""
-    jacobian = slope.new_zeros(len(slope), 3, 12)
-    for i in range(3):
-        jacobian[:, i, 3 * i : 3 * i + 3] = slope[:, i]
+def _by_own_point(slope: Vectors, unknowns: int) -> Float[Tensor, "b f u"]:
+    """Return the Jacobian of a value at each point by all unknowns: each depends on its own point alone."""
+    b, f = slope.shape[:2]
+    jacobian, at = slope.new_zeros(b, f, unknowns), torch.arange(f, device=slope.device)
+    jacobian[:, :, : 3 * f].unflatten(2, (f, 3))[:, at, at] = slope
     return jacobian

@@ -1,4 +1,4 @@
-"""From a shape with uncertainty to contact triples: Eqs. (10)-(14) solved from many starts at once."""
+"""From a shape with uncertainty to contacts: Eqs. (10)-(14) solved from many starts at once."""
 
 import time
 from collections.abc import Iterator
@@ -25,23 +25,23 @@ SEARCH = (Stage(centre=3.0, cones=0.3, steps=10), Stage(centre=1.0, cones=3.0, s
 """Stages from starts anywhere: centre and closure by turns, each of which leads out of places where the other is stuck.
 The last two give way where the centre cannot be reached."""
 TO_CENTRE = (Stage(centre=0.3, cones=3.0, steps=8),)
-"""The stage from triples of candidates, most of which are feasible but for rounding: towards the centre, Eq. (14)."""
+"""The stage from rows of candidates, most of which are feasible but for rounding: towards the centre, Eq. (14)."""
 LEAST_STARTS = 25
 """Fewest starts at a time under a time budget: with less, the overhead of each step outweighs them."""
-Chunk = tuple[Float[Tensor, "_ 3 3"], tuple[Stage, ...]]
+Chunk = tuple[Float[Tensor, "_ f 3"], tuple[Stage, ...]]
 """Normalised starts on the surface, and the stages from there."""
 
 
 def plan_contacts(
     shape: Shape,
     spec: ContactSpec | None = None,
-    starts: int | Float[Tensor, "b 3 3"] = 1000,
+    starts: int | Float[Tensor, "b f 3"] = 1000,
     seed: int = 0,
     *,
     objective: Objective = "center",
     time_budget: float | None = None,
 ) -> ContactPlan:
-    """Plan three contacts from each of many starts, Eqs. (10)-(14): one row a start, in the order of the starts.
+    """Plan `spec.fingertips` contacts from each of many starts, Eqs. (10)-(14): one row a start, in their order.
 
     A failed row carries the `Status` of the first constraint it violates. Where a descent fails, a feasible start is
     itself the plan. Without `time_budget` the result is deterministic. A plan from 500 or 1000 starts begins one from
@@ -58,7 +58,7 @@ def plan_contacts(
             * "min_weight": minus the greatest margin of the certificate.
             * "probability": minus the share of 400 surfaces drawn from a `ShapeGP` on which the contacts are closed
               at `spec.friction`; 0 in failed rows.
-            * a function of contacts (b, 3, 3) [m] and outward unit normals (b, 3, 3) that returns costs (b,), each of
+            * a function of contacts (b, f, 3) [m] and outward unit normals (b, f, 3) that returns costs (b,), each of
               its own row alone, differentiable by autograd, in any unit.
         time_budget: seconds of wall time for the call. As many starts are planned as will fit, at least 25. None: all.
 

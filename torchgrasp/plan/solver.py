@@ -14,7 +14,15 @@ from torch import Tensor
 from torchgrasp.base import Batch
 from torchgrasp.linalg import limit_norm
 from torchgrasp.optim import Damping, Linearisation, Problem, Steps, Verdict, levenberg_marquardt
-from torchgrasp.plan.problem import ContactProblem, Shape, SurfaceJet, forces_from_tensions, triple_jet
+from torchgrasp.plan.problem import (
+    ContactProblem,
+    Shape,
+    SurfaceJet,
+    contact_pairs,
+    forces_from_tensions,
+    split_unknowns,
+    triple_jet,
+)
 from torchgrasp.plan.wrench import Vectors
 from torchgrasp.shape.surface import newton_step
 
@@ -34,7 +42,7 @@ BOUNDS = 3.0
 class Stage:
     """At most so many steps with constant weights of centre (Eq. 14) and cones (Eq. 13).
 
-    A triple rests when its next step is shorter than `settled`.
+    A row rests when its next step is shorter than `settled`.
     """
 
     centre: float
@@ -52,12 +60,12 @@ class State(Batch):
     """Vectors with the tensions of their sides, and the shape at their normalised points."""
 
     points: Vectors
-    tension: Float[Tensor, "b 3"]
+    tension: Float[Tensor, "b p"]
     jet: SurfaceJet
 
 
-StateCost = Callable[[State], tuple[Float[Tensor, "b"], Float[Tensor, "b 12"]]]
-"""The cost of triples and its gradient by points and tensions."""
+StateCost = Callable[[State], tuple[Float[Tensor, "b"], Float[Tensor, "b u"]]]
+"""The cost of contacts and its gradient by points and tensions."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,12 +77,12 @@ class LinearConstraints(Linearisation):
 
     residual: Float[Tensor, "a r"]
     weight: Float[Tensor, "a r"]
-    jacobian: Float[Tensor, "a r 12"]
+    jacobian: Float[Tensor, "a r u"]
     inside: Bool[Tensor, "a"]
-    downhill: Float[Tensor, "a 12"] | None = None
+    downhill: Float[Tensor, "a u"] | None = None
 
     @property
-    def weighted_jacobian(self) -> Float[Tensor, "a r 12"]:
+    def weighted_jacobian(self) -> Float[Tensor, "a r u"]:
         """The Jacobian of the weighted residuals."""
         return self.weight[..., None] * self.jacobian
 
@@ -93,7 +101,7 @@ class Descent(Problem[State, LinearConstraints]):
         """Evaluate constraints and objective; bounds that hold weigh nothing."""
         constraints = self.problem.constraints(state.points, state.tension, state.jet)
         bounds = torch.full_like(constraints.bounds, BOUNDS)
-        bounds[:, :3] = self.stage.cones
+        bounds[:, : state.points.shape[1]] = self.stage.cones
         centre = torch.full_like(constraints.centre, self.stage.centre)
         surface = torch.full_like(constraints.surface, SURFACE)
         weight = torch.cat([centre, surface, bounds * (constraints.bounds > 0)], 1)
@@ -109,25 +117,26 @@ class Descent(Problem[State, LinearConstraints]):
     def step(self, model: LinearConstraints, damping: Damping) -> Steps:
         """Return the damped step, no point farther than `LONGEST_STEP`. Rows without a factor rest."""
         jacobian = model.weighted_jacobian
-        scale = jacobian.new_ones(12)
-        scale[9:] = TENSION_DAMPING
+        scale = jacobian.new_ones(1, jacobian.shape[2])
+        split_unknowns(scale)[1][:] = TENSION_DAMPING
         normal = jacobian.mT @ jacobian + torch.diag_embed(damping[:, None] * scale)
         factor, failed = torch.linalg.cholesky_ex(normal)
         descent = -(jacobian.mT @ model.residual[..., None])
         descent = descent if model.downhill is None else descent + model.downhill[..., None]
         x = torch.cholesky_solve(descent, factor)[..., 0]
         x = torch.where((failed == 0)[:, None], x, torch.nan)
-        length = torch.linalg.vector_norm(x[:, :9].unflatten(1, (3, 3)), dim=-1).amax(-1)
+        length = torch.linalg.vector_norm(split_unknowns(x)[0], dim=-1).amax(-1)
         shrink = (length / LONGEST_STEP).clamp(min=1.0)
         return x / shrink[:, None], length / shrink > self.stage.settled  # NaN is not longer
 
-    def move(self, state: State, x: Float[Tensor, "a 12"]) -> State:
-        """Return the triples moved along the surface."""
-        points = project(self.shape, state.points + x[:, :9].unflatten(1, (3, 3)), steps=1)
-        return State(points, normalise_tensions(points, state.tension + x[:, 9:]), triple_jet(self.shape, points))
+    def move(self, state: State, x: Float[Tensor, "a u"]) -> State:
+        """Return the contacts moved along the surface."""
+        by_points, by_tension = split_unknowns(x)
+        points = project(self.shape, state.points + by_points, steps=1)
+        return State(points, normalise_tensions(points, state.tension + by_tension), triple_jet(self.shape, points))
 
     def judge(
-        self, model: LinearConstraints, trial: LinearConstraints, x: Float[Tensor, "a 12"], damping: Damping
+        self, model: LinearConstraints, trial: LinearConstraints, x: Float[Tensor, "a u"], damping: Damping
     ) -> Verdict:
         """Accept a decrease inside the domain; damp by the kept share of its promise (Nielsen)."""
         kept = (model.cost - trial.cost) / promised_decrease(model, x)
@@ -144,7 +153,7 @@ class Descent(Problem[State, LinearConstraints]):
         return dataclasses.replace(model, jacobian=(model.jacobian + trial.jacobian) / 2)
 
 
-def promised_decrease(model: LinearConstraints, x: Float[Tensor, "a 12"]) -> Float[Tensor, "a"]:
+def promised_decrease(model: LinearConstraints, x: Float[Tensor, "a u"]) -> Float[Tensor, "a"]:
     """Return by how much a step lowers the model's cost."""
     linear = model.residual + (model.weighted_jacobian @ x[..., None])[..., 0]
     promised = (model.residual.square().sum(1) - linear.square().sum(1)) / 2
@@ -154,7 +163,7 @@ def promised_decrease(model: LinearConstraints, x: Float[Tensor, "a 12"]) -> Flo
 def descend(
     shape: Shape, problem: ContactProblem, state: State, stage: Stage, objective: StateCost | None = None
 ) -> State:
-    """Return the triples after a stage; an objective's first gradient is weighted to the length `PULL`."""
+    """Return the contacts after a stage; an objective's first gradient is weighted to the length `PULL`."""
     pull = None
     if objective is not None:
         length = torch.linalg.vector_norm(objective(state)[1], dim=-1)
@@ -172,12 +181,17 @@ def project(shape: Shape, points: Float[Tensor, "b k 3"], steps: int) -> Float[T
 
 
 def start_state(shape: Shape, points: Vectors) -> State:
-    """Return the state of triples with equal tensions: forces point to the contacts' centre."""
-    tension = normalise_tensions(points, points.new_ones(len(points), 3))
-    return State(points, tension, triple_jet(shape, points))
+    """Return the state of contacts with equal tensions."""
+    return State(points, equal_tensions(points), triple_jet(shape, points))
 
 
-def normalise_tensions(points: Vectors, tension: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
+def equal_tensions(points: Vectors) -> Float[Tensor, "b p"]:
+    """Return equal tensions of all pairs: the forces point to the contacts' centre."""
+    pairs = contact_pairs(points.shape[1], points.device).shape[1]
+    return normalise_tensions(points, points.new_ones(len(points), pairs))
+
+
+def normalise_tensions(points: Vectors, tension: Float[Tensor, "b p"]) -> Float[Tensor, "b p"]:
     """Return the tensions for which the mean size of the forces is 1."""
     force, _ = forces_from_tensions(points, tension)
     return tension / torch.linalg.vector_norm(force, dim=-1).mean(-1, keepdim=True)

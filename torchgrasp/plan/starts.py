@@ -25,8 +25,8 @@ FAR = 0.1
 """A start with a point farther than this from the surface (normalised signed distance) is no guess of contacts."""
 NEAR_CENTRE = 0.1
 """Normalised distance from the centre to which such a start is drawn in: the paper's radius of starts."""
-TRIPLES_PER_START, ROUNDS = 20, 8
-"""Triples drawn for each start in one round, and most rounds: 2 to 10 % of the candidates' triples are closed."""
+DRAWN_PER_START, ROUNDS = 20, 8
+"""Rows drawn for each start in one round, and most rounds: 2 to 10 % of the candidates' triples are closed."""
 ENOUGH_CLOSED, SURVEYED = 0.1, 250
 """Share of starts, and of how many, that are closed from the draw on where contacts can be as flat as is asked: the
 hand then gets a hundred triples of a thousand starts."""
@@ -43,29 +43,32 @@ def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor, seed: in
     if not isinstance(spec, ContactSpec):
         raise BadArgument("spec", type(spec).__name__, "a ContactSpec")
     if isinstance(starts, Tensor):
-        points = shape.normalise(check_tensor("starts", starts, (None, 3, 3)))
+        if starts.ndim == 3 and starts.shape[1] != spec.fingertips:
+            allowed = f"as many as spec.fingertips: {spec.fingertips}"
+            raise BadArgument("starts", f"{starts.shape[1]} contacts a row", allowed)
+        points = shape.normalise(check_tensor("starts", starts, (None, spec.fingertips, 3)))
         farthest = float(torch.linalg.vector_norm(points, dim=-1).max()) if len(points) else 0.0
         if farthest > shape.domain_radius:
             found = f"a point {farthest * float(shape.scale):.4g} m from the shape's centre"
             allowed = f"at most {float(shape.domain_radius) * float(shape.scale):.4g} m, where the shape is known"
             raise BadArgument("starts", found, allowed)
     elif isinstance(starts, bool) or not isinstance(starts, int) or starts < 1:
-        raise BadArgument("starts", repr(starts), "a positive number, or starting points of shape b x 3 x 3 [m]")
+        raise BadArgument("starts", repr(starts), "a positive number, or starting points of shape b x f x 3 [m]")
     elif spec.start_radius > shape.domain_radius:
         raise BadArgument("spec.start_radius", spec.start_radius, f"at most {float(shape.domain_radius):.4g}")
 
 
-def given_starts(shape: Shape, starts: Vectors) -> Iterator[Float[Tensor, "_ 3 3"]]:
+def given_starts(shape: Shape, starts: Vectors) -> Iterator[Float[Tensor, "_ f 3"]]:
     """Yield normalised starts on the surface from given points [m]."""
     for points in starts.detach().to(device_of(shape), torch.float64).split(STARTS_PER_CHUNK):
         yield project(shape, draw_in(shape, shape.normalise(points)), steps=6)
 
 
-def drawn_starts(shape: Shape, spec: ContactSpec, starts: int, seed: int) -> Iterator[Float[Tensor, "_ 3 3"]]:
+def drawn_starts(shape: Shape, spec: ContactSpec, starts: int, seed: int) -> Iterator[Float[Tensor, "_ f 3"]]:
     """Yield normalised starts on the surface.
 
     Without `spec.flatness` they are the paper's: points of the sphere of `spec.start_radius`, moved onto the surface
-    (Sec. 6.2). With it they are triples of `candidate_contacts`. The centre of a flat grasp may lie 30 mm from the
+    (Sec. 6.2). With it they are rows of `candidate_contacts`. The centre of a flat grasp may lie 30 mm from the
     object's, where the paper's starts rarely end.
     """
     generator = torch.Generator().manual_seed(seed)
@@ -75,9 +78,10 @@ def drawn_starts(shape: Shape, spec: ContactSpec, starts: int, seed: int) -> Ite
     for begin in range(0, starts, STARTS_PER_CHUNK):
         count = min(STARTS_PER_CHUNK, starts - begin)
         if candidates is None:
-            yield project(shape, draw_in(shape, draw(shape, spec, count, generator)), steps=6)
+            drawn = draw(shape, spec, (count, spec.fingertips), generator)
+            yield project(shape, draw_in(shape, drawn), steps=6)
         else:
-            yield candidate_triples(ContactProblem.of(shape, spec), *candidates, count, generator)[0]
+            yield candidate_rows(ContactProblem.of(shape, spec), *candidates, count, generator)[0]
 
 
 def settle_flatness(shape: Shape, spec: ContactSpec, seed: int) -> ContactSpec:
@@ -88,24 +92,24 @@ def settle_flatness(shape: Shape, spec: ContactSpec, seed: int) -> ContactSpec:
     for radius in FLAT_RADII[:-1]:
         settled = dataclasses.replace(spec, flat_radius=radius)
         good, normals = qualify(shape, settled, points)
-        if int(good.sum()) >= 3:
+        if int(good.sum()) >= spec.fingertips:
             generator = torch.Generator().manual_seed(seed)
-            _, closed = candidate_triples(problem, points[good], normals[good], SURVEYED, generator)
+            _, closed = candidate_rows(problem, points[good], normals[good], SURVEYED, generator)
             if closed >= ENOUGH_CLOSED * SURVEYED:
                 return settled
     return dataclasses.replace(spec, flat_radius=FLAT_RADII[-1])
 
 
-def draw(shape: Shape, spec: ContactSpec, count: int, generator: torch.Generator) -> Float[Tensor, "_ 3 3"]:
-    """Return triples of points on the sphere of `spec.start_radius`."""
-    points = unit(torch.randn(count, 3, 3, generator=generator, dtype=torch.float64))
+def draw(shape: Shape, spec: ContactSpec, size: tuple[int, int], generator: torch.Generator) -> Float[Tensor, "_ f 3"]:
+    """Return rows of points on the sphere of `spec.start_radius`."""
+    points = unit(torch.randn(*size, 3, generator=generator, dtype=torch.float64))
     return (spec.start_radius * points).to(device_of(shape))
 
 
-def survey(shape: Shape, spec: ContactSpec, generator: torch.Generator) -> Float[Tensor, "_ 3 3"]:
+def survey(shape: Shape, spec: ContactSpec, generator: torch.Generator) -> Float[Tensor, "_ f 3"]:
     """Return points all over the surface, among which candidates are found; of a vessel as many on either wall."""
     walls = walls_of(shape)
-    drawn = draw(shape, spec, CANDIDATE_TRIPLES, generator).tensor_split(len(walls))
+    drawn = draw(shape, spec, (CANDIDATE_TRIPLES, 3), generator).tensor_split(len(walls))
     return torch.cat([project(wall, points, steps=6) for wall, points in zip(walls, drawn, strict=True)])
 
 
@@ -113,7 +117,7 @@ def draw_in(shape: Shape, points: Vectors) -> Vectors:
     """Return normalised starts, those off the surface drawn in around the centre.
 
     A point off the surface is only a direction. From far away it ends on the nearest surface, uncertain or not. From
-    near the centre the three spread over the surface that faces them, centred as Eq. (14) wants.
+    near the centre they spread over the surface that faces them, centred as Eq. (14) wants.
     """
     distance, _ = shape.mean_and_gradient(points.flatten(0, 1))
     far = distance.view(points.shape[:2]).abs().amax(-1) > FAR
@@ -126,14 +130,14 @@ def draw_in(shape: Shape, points: Vectors) -> Vectors:
 def candidate_contacts(
     shape: Shape, spec: ContactSpec, points: Vectors
 ) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]]:
-    """Return the surface points that qualify as contacts, with normals; all where fewer than three qualify."""
+    """Return the surface points that qualify as contacts, with normals; all where too few qualify."""
     good, normals = qualify(shape, spec, points)
-    if int(good.sum()) < 3:
+    if int(good.sum()) < spec.fingertips:
         good = torch.ones_like(good)
     return points[good], normals[good]
 
 
-def qualify(shape: Shape, spec: ContactSpec, points: Vectors) -> tuple[Bool[Tensor, "b 3"], Vectors]:
+def qualify(shape: Shape, spec: ContactSpec, points: Vectors) -> tuple[Bool[Tensor, "b f"], Vectors]:
     """Tell which surface points are certain, flat, inside and above the table; return the normals of all."""
     problem = ContactProblem.of(shape, spec)
     jet = triple_jet(shape, points)
@@ -146,23 +150,23 @@ def qualify(shape: Shape, spec: ContactSpec, points: Vectors) -> tuple[Bool[Tens
     return good, jet.normals
 
 
-def candidate_triples(
+def candidate_rows(
     problem: ContactProblem,
     points: Float[Tensor, "p 3"],
     normals: Float[Tensor, "p 3"],
     starts: int,
     generator: torch.Generator,
 ) -> tuple[Vectors, int]:
-    """Return random triples of candidates, closed and separate as far as there are enough; and how many are."""
-    triples, missing = [], starts
+    """Return random rows of candidates, closed and separate as far as there are enough; and how many are."""
+    rows, missing, f = [], starts, problem.fingertips
     for _ in range(ROUNDS):
-        choice = torch.randint(len(points), (TRIPLES_PER_START * starts, 3), generator=generator).to(points.device)
+        choice = torch.randint(len(points), (DRAWN_PER_START * starts, f), generator=generator).to(points.device)
         apart = torch.linalg.vector_norm(problem.sides(points[choice], normals[choice]), dim=-1).amin(-1)
         choice = choice[apart > problem.separation]
         closed = choice[closed_exact(points[choice], normals[choice], problem.friction)][:missing]
-        triples.append(points[closed])
+        rows.append(points[closed])
         missing -= len(closed)
         if missing == 0:
             break
-    triples.append(points[torch.randint(len(points), (missing, 3), generator=generator).to(points.device)])
-    return torch.cat(triples), starts - missing
+    rows.append(points[torch.randint(len(points), (missing, f), generator=generator).to(points.device)])
+    return torch.cat(rows), starts - missing
