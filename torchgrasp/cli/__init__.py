@@ -1,9 +1,15 @@
-"""The command line. Exit codes: 0 done, 1 no executable grasp or object not held, 2 bad input, 130 interrupted."""
+"""The command line.
 
+Exit codes: 0 done, 1 no executable grasp or object not held, 2 bad input, 130 interrupted, 143 terminated.
+"""
+
+import contextlib
 import os
+import signal
 import sys
+import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 import tyro
@@ -42,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # The batches are small: a second thread costs more than it brings, and one gives the same bits on any machine.
     torch.set_num_threads(1)
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), _end_in_order():
             warnings.showwarning = _show_warning
             return tyro.extras.subcommand_cli_from_dict(
                 COMMANDS,
@@ -54,12 +60,36 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except GraspError as error:
         print(f"torchgrasp: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
+    except _Terminated:
+        print("torchgrasp: terminated", file=sys.stderr)
+        return 143
     except KeyboardInterrupt:
         print("torchgrasp: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of stdout went away; nobody is left to be told
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM, which ends a command as SIGINT does: workers are stopped, and nothing half-written stays."""
+
+
+@contextlib.contextmanager
+def _end_in_order() -> Iterator[None]:
+    """Raise `_Terminated` at SIGTERM within the context; only the main thread may say so."""
+
+    def end(*_: object) -> None:
+        raise _Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: object) -> None:
