@@ -99,3 +99,14 @@ def farthest_points(
         nearest = torch.minimum(nearest, distance(points, points.index_select(0, picks[k - 1 : k])[0]))
         picks[k] = (nearest >= (1.0 - tie) * nearest.max()).int().argmax()  # the first of the largest
     return picks
+
+
+def reflect(points: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]) -> Float[Tensor, "*d 3"]:
+    """Mirror points across the plane n.x = o."""
+    height = (points * plane[..., :3]).sum(-1, keepdim=True) - plane[..., 3:]
+    return points - 2.0 * height * plane[..., :3]
+
+
+def reflect_directions(directions: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]) -> Float[Tensor, "*d 3"]:
+    """Mirror directions across a plane."""
+    return directions - 2.0 * (directions * plane[..., :3]).sum(-1, keepdim=True) * plane[..., :3]

@@ -48,9 +48,10 @@ MIRROR_NORMAL_NOISE = 0.25
 """Standard deviation of a mirrored normal: 14 degrees, the median error of the hidden side."""
 STD_FACTORS: dict[tuple[Kind, bool], float] = {
     ("ball", True): 0.5,
-    ("revolution", True): 0.46,
+    ("revolution", True): 0.56,
     ("mirrored", True): 0.59,
     ("ball", False): 0.56,
+    ("revolution", False): 0.59,
     ("mirrored", False): 0.66,
     ("guess", True): 1.0,
     ("guess", False): 1.0,

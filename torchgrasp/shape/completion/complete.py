@@ -9,7 +9,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value, join
-from torchgrasp.linalg import farthest_points
+from torchgrasp.frames import apply, inverse, rotate
+from torchgrasp.linalg import farthest_points, reflect, reflect_directions
+from torchgrasp.shape.completion.axis import find_axis
 from torchgrasp.shape.completion.ellipsoid import Ellipsoid, find_ellipsoid
 from torchgrasp.shape.completion.revolution import Revolution, find_revolution
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
@@ -18,8 +20,6 @@ from torchgrasp.shape.completion.symmetry import (
     find_plane_through_axis,
     find_planes,
     planes_near,
-    reflect,
-    reflect_directions,
 )
 from torchgrasp.shape.joint_posterior import symmetric_root
 from torchgrasp.values import PointCloud
@@ -47,7 +47,7 @@ PENALTY = 0.05
 
 
 Kind = Literal["ball", "revolution", "mirrored", "guess", "cut off"]
-"""What a hidden side follows from: an ellipsoid, an upright axis, mirror planes, or nothing but the outline."""
+"""What a hidden side follows from: an ellipsoid, an axis, mirror planes, or nothing but the outline."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +74,14 @@ class Completion(Value):
     outline: Outlines
     kind: Kind
 
+    def moved(self, b_from_a: Float[Tensor, "4 4"]) -> "Completion":
+        """Return the completion in frame b; it is given in frame a."""
+        normals = rotate(b_from_a, self.planes[:, :3])
+        planes = torch.cat([normals, self.planes[:, 3:] + normals @ b_from_a[:3, 3:]], 1)
+        points, turned = apply(b_from_a, self.points), rotate(b_from_a, self.normals)
+        outline = self.outline.moved(b_from_a)
+        return dataclasses.replace(self, points=points, normals=turned, planes=planes, outline=outline)
+
     @property
     def deviations(self) -> Float[Tensor, "m k"]:
         """Correlated errors [m], a column for each independent cause.
@@ -91,8 +99,8 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
     The cloud is mirrored across its best planes and across pairs of them. Points of better planes come first. No view
     may exclude a point, and no other point may be near. Low scores mean large asymmetry.
 
-    On a table, a body of revolution and its attached part are mirrored separately. Any plane through the axis
-    explains the body. The part alone tells the plane of a handle.
+    A body of revolution and its attached part are mirrored separately, in the frame of the axis. Any plane through the
+    axis explains the body. The part alone tells the plane of a handle.
 
     The cloud is clean, with outward normals and viewpoints. The table has its height [m] and normal z.
 
@@ -109,6 +117,9 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
     if ball is not None:
         return _hidden_side(scorer, ball, budget)
     round_body = None if table is None else find_revolution(scorer.points, scorer.normals)
+    axis = find_axis(scorer) if round_body is None else None
+    if axis is not None:
+        scorer, round_body = scorer.about_axis(axis[0]), axis[1]
     parts = _split(scorer, round_body)
     planes, scores = torch.cat([part.planes for part in parts]), torch.cat([part.scores for part in parts])
     images = _mirror(parts)
@@ -117,7 +128,8 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 
     chosen = merged[farthest_points(merged.points, budget, tie=TIE)]
     shared, asymmetry = chosen.shared.flatten(1), chosen.variance.sqrt()
     kind: Kind = "guess" if not len(planes) else "mirrored" if round_body is None else "revolution"
-    return Completion(chosen.points, chosen.normals, shared, asymmetry, planes, scores, scorer.outline, kind)
+    found = Completion(chosen.points, chosen.normals, shared, asymmetry, planes, scores, scorer.outline, kind)
+    return found if axis is None else found.moved(inverse(axis[0]))
 
 
 def _nothing(scorer: SymmetryScorer) -> Completion:
@@ -166,7 +178,7 @@ class _Image(Batch):
     def of(cls, scorer: SymmetryScorer, rows: Tensor, n_planes: int) -> "_Image":
         """Return points of the cloud, without error."""
         points = scorer.points[rows]
-        near = NEARBY ** (2 if scorer.table is not None else 3)
+        near = NEARBY ** (2 if scorer.upright else 3)
         shared = points.new_zeros(len(rows), n_planes, near)
         return cls(points, scorer.normals[rows], math.inf, torch.zeros_like(points[:, 0]), shared)
 
@@ -255,14 +267,14 @@ def _allowed(scorer: SymmetryScorer, points: Float[Tensor, "n 3"]) -> Bool[Tenso
     """Tell which points neither a view nor the table excludes."""
     outline = scorer.outline
     allowed = (outline.hull_distance(points) < HULL_MARGIN) & (outline.violation(points) < FRONT_MARGIN)
-    return allowed if scorer.table is None else allowed & (points[:, 2] > scorer.table - TABLE_MARGIN)
+    return allowed if scorer.table is None else allowed & (scorer.table.height(points) > -TABLE_MARGIN)
 
 
 def _on_table(scorer: SymmetryScorer, image: _Image) -> Bool[Tensor, "n"]:
     """Tell which points lie on the face on the table, which needs none: free space holds it."""
     if scorer.table is None:
         return torch.zeros(len(image), dtype=torch.bool)
-    return (image.points[:, 2] < scorer.table + FACE) & (image.normals[:, 2] < -DOWN)
+    return (scorer.table.height(image.points) < FACE) & (image.normals @ scorer.table.normal < -DOWN)
 
 
 def _thin(points: Float[Tensor, "n 3"]) -> Tensor:

@@ -42,30 +42,21 @@ def find_revolution(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"])
     >>> find_revolution(0.03 * level + torch.tensor([0.1, 0.2, 0.0]).double(), level).center
     tensor([0.1000, 0.2000], dtype=torch.float64)
     """
-    lines = _lines(points, normals)
+    lines = lines_from_above(points, normals)
     center = _fit_to_lines(points, lines)
-    steep, level, across, offset = lines.steep, lines.level, lines.across, lines.offset
-    miss = offset - across @ center
-
-    radius = torch.linalg.vector_norm(points[:, :2] - center, dim=1)
-    relative_miss = miss.abs() / radius.clamp_min(LEAST_RADIUS)
-    meets = steep & (relative_miss < MISS)
-    slices = ((points[:, 2:] - points[:, 2]).abs() < SLICE) & meets
-    typical = torch.where(slices, radius, torch.nan).nanmedian(1).values
-    body = torch.where(steep, meets & ((radius - typical).abs() < THICKNESS), radius < typical + THICKNESS)
-    side = body & steep
-    spread, one_way = relative_miss[side].square().mean().sqrt(), torch.linalg.vector_norm(level[side].mean(0))
-    fits = bool((body.double().mean() > BODY_SHARE) & (spread < MAX_SPREAD) & (one_way < ONE_WAY))
-    return Revolution(center, body) if fits else None
+    body = split_body(points, lines, center)
+    spread = (body.miss / body.radius.clamp_min(LEAST_RADIUS))[body.side].square().mean().sqrt()
+    fits = bool((body.mask.double().mean() > BODY_SHARE) & (spread < MAX_SPREAD) & (body.one_way < ONE_WAY))
+    return Revolution(center, body.mask) if fits else None
 
 
 def fit_axis(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, "2"]:
     """Return the vertical axis [m] that most lines along the normals meet."""
-    return _fit_to_lines(points, _lines(points, normals))
+    return _fit_to_lines(points, lines_from_above(points, normals))
 
 
 @dataclasses.dataclass(frozen=True)
-class _Lines:
+class Lines:
     """The lines across . x = offset along normals: their level part `slope` is steep, and of unit length `level`."""
 
     slope: Float[Tensor, "n"]
@@ -75,16 +66,45 @@ class _Lines:
     offset: Float[Tensor, "n"]
 
 
-def _lines(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> _Lines:
+def lines_from_above(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Lines:
     """Return the lines along the normals, seen from above."""
     slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
     steep = slope > STEEP
     level = torch.where(steep[:, None], normals[:, :2] / slope[:, None], 0.0)
     across = torch.stack([-level[:, 1], level[:, 0]], 1)
-    return _Lines(slope, steep, level, across, (across * points[:, :2]).sum(1))
+    return Lines(slope, steep, level, across, (across * points[:, :2]).sum(1))
 
 
-def _fit_to_lines(points: Float[Tensor, "n 3"], lines: _Lines) -> Float[Tensor, "2"]:
+@dataclasses.dataclass(frozen=True)
+class Body:
+    """What a cloud has about a vertical axis: `mask` of all its points, `side` of those with steep normals.
+
+    Each point has the distance [m] by which its normal's line misses the axis, its radius, and that of its slice; mean
+    level normals of the side have the length `one_way`.
+    """
+
+    mask: Bool[Tensor, "n"]
+    side: Bool[Tensor, "n"]
+    miss: Float[Tensor, "n"]
+    radius: Float[Tensor, "n"]
+    typical: Float[Tensor, "n"]
+    one_way: Float[Tensor, ""]
+
+
+def split_body(points: Float[Tensor, "n 3"], lines: Lines, center: Float[Tensor, "2"]) -> Body:
+    """Return the points whose normals meet the vertical axis at `center`, and whose radius is that of their slice."""
+    miss = lines.offset - lines.across @ center
+    radius = torch.linalg.vector_norm(points[:, :2] - center, dim=1)
+    meets = lines.steep & (miss.abs() / radius.clamp_min(LEAST_RADIUS) < MISS)
+    slices = ((points[:, 2:] - points[:, 2]).abs() < SLICE) & meets
+    typical = torch.where(slices, radius, torch.nan).nanmedian(1).values
+    near = (radius - typical).abs() < THICKNESS
+    mask = torch.where(lines.steep, meets & near, radius < typical + THICKNESS)
+    side = mask & lines.steep
+    return Body(mask, side, miss, radius, typical, torch.linalg.vector_norm(lines.level[side].mean(0)))
+
+
+def _fit_to_lines(points: Float[Tensor, "n 3"], lines: Lines) -> Float[Tensor, "2"]:
     """Return the point that most lines meet; reweighted least squares (Cauchy)."""
     miss, center = torch.zeros_like(lines.offset), points[:, :2].mean(0)
     for _ in range(ITERATIONS):

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.errors import BadArgument
+from torchgrasp.frames import apply, rotate
 from torchgrasp.linalg import farthest_points, unit
 from torchgrasp.values import PointCloud
 
@@ -67,6 +68,12 @@ class Silhouette(Value):
         in_front = (visible - depth - FRONT_MARGIN).clamp_min(0)
         return torch.where(outside > 0, outside * depth, in_front)
 
+    def moved(self, b_from_a: Float[Tensor, "4 4"]) -> "Silhouette":
+        """Return the silhouette in frame b; it is given in frame a."""
+        viewpoint, rim = apply(b_from_a, self.viewpoint[None])[0], apply(b_from_a, self.rim)
+        axes, rim_normals = rotate(b_from_a, self.axes), rotate(b_from_a, self.rim_normals)
+        return dataclasses.replace(self, viewpoint=viewpoint, axes=axes, rim=rim, rim_normals=rim_normals)
+
     def _look_up(self, points: Float[Tensor, "*b 3"]) -> tuple[Tensor, Tensor, Tensor]:
         """Return the outline's distance, the visible depth and the own depth of points."""
         local = (points - self.viewpoint) @ self.axes.T
@@ -104,6 +111,10 @@ class Outlines(Value):
     def gap(self) -> float:
         """Greatest width [m] within an outline where the view measured nothing."""
         return max(view.gap for view in self.views)
+
+    def moved(self, b_from_a: Float[Tensor, "4 4"]) -> "Outlines":
+        """Return the outlines in frame b; they are given in frame a."""
+        return Outlines(tuple(view.moved(b_from_a) for view in self.views))
 
     def hull_distance(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return the signed distance [m] to the visual hull of all views."""

@@ -8,7 +8,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.linalg import farthest_points, fibonacci_sphere, unit
+from torchgrasp.frames import apply, rotate
+from torchgrasp.linalg import farthest_points, fibonacci_sphere, reflect, reflect_directions, unit
+from torchgrasp.plane import Plane
 from torchgrasp.shape.completion.silhouette import TIE, Outlines, silhouettes
 from torchgrasp.values import PointCloud
 
@@ -44,31 +46,48 @@ SLOPE = 0.15
 cans .1. With 0.1 the hidden side of cans was off by 2.3 mm, with 0.15 by 1.9 (docs/shape.md)."""
 COVERED = 0.42
 """Cosine of the angle, 65 degrees, within which another plane stands for the one at right angles to the best."""
+AXIS, END_SCORE = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), 0.4
+"""The axis of a body of revolution in its frame, and the least score of the plane that mirrors its ends."""
 LEVEL_SCORE = 0.0
 """Least score of the level plane: with .3 undersides gained half as much."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SymmetryScorer:
-    """Scores mirror planes: mirrored `probes` against the cloud, its outlines and the table."""
+    """Scores mirror planes: mirrored `probes` against the cloud, its outlines and the table.
+
+    `upright` tells that z is an axis which every plane keeps: the vertical, or the axis of a body of revolution.
+    """
 
     points: Tensor
     normals: Tensor
     tree: object
     outline: Outlines
-    table: float | None
+    table: Plane | None
+    upright: bool
     probes: Tensor
     probe_normals: Tensor
 
     @classmethod
     def of(cls, cloud: PointCloud, table: float | None) -> "SymmetryScorer":
-        """Return the scorer of a cloud with normals, all of it probed."""
+        """Return the scorer of a cloud with normals, all of it probed; the table has normal z."""
         from scipy.spatial import KDTree
 
         assert cloud.normals is not None
-        tree = KDTree(cloud.points.numpy())
-        whole = cls(cloud.points, cloud.normals, tree, silhouettes(cloud), table, cloud.points[:0], cloud.normals[:0])
+        points, normals, plane = cloud.points, cloud.normals, None if table is None else Plane.horizontal(table)
+        tree, upright = KDTree(points.numpy()), table is not None
+        whole = cls(points, normals, tree, silhouettes(cloud), plane, upright, points[:0], normals[:0])
         return whole.for_part(torch.arange(len(cloud)))
+
+    def about_axis(self, axis_from_cloud: Float[Tensor, "4 4"]) -> "SymmetryScorer":
+        """Return the scorer in the frame of an axis, which is its z."""
+        from scipy.spatial import KDTree
+
+        points, normals = apply(axis_from_cloud, self.points), rotate(axis_from_cloud, self.normals)
+        table = None if self.table is None else self.table.moved(axis_from_cloud)
+        probes, probe_normals = apply(axis_from_cloud, self.probes), rotate(axis_from_cloud, self.probe_normals)
+        outline, tree = self.outline.moved(axis_from_cloud), KDTree(points.numpy())
+        return SymmetryScorer(points, normals, tree, outline, table, True, probes, probe_normals)
 
     def for_part(self, rows: Int[Tensor, "k"]) -> "SymmetryScorer":
         """Return the scorer with probes from some points of the cloud."""
@@ -104,7 +123,7 @@ class SymmetryScorer:
         match = (torch.exp(-0.5 * (distance / MATCH_DISTANCE) ** 2) * agreement).mean(-1)
         depth = self.outline.violation(mirrored)
         if self.table is not None:
-            depth = depth + (self.table - mirrored[..., 2]).clamp_min(0)
+            depth = depth + (-self.table.height(mirrored)).clamp_min(0)
         violation = ((depth / MATCH_DISTANCE).clamp_max(3.0) ** 2 / 9.0).mean(-1)
         return match - 2.0 * violation, violation
 
@@ -117,7 +136,7 @@ def find_planes(scorer: SymmetryScorer, turned: bool = False) -> tuple[Float[Ten
     halfway up shows the underside. A body of revolution (`turned`) needs neither: all planes through its axis match.
     """
     view = torch.stack([unit(scorer.center - seen.viewpoint) for seen in scorer.outline.views]).mean(0)
-    if scorer.table is None:
+    if not scorer.upright:
         directions = fibonacci_sphere(2 * DIRECTIONS)[:DIRECTIONS]  # half a sphere: n and -n are one
     else:
         directions = _level_directions(ANGLES)
@@ -126,7 +145,7 @@ def find_planes(scorer: SymmetryScorer, turned: bool = False) -> tuple[Float[Ten
     across = unit(view) if float(torch.linalg.vector_norm(view)) > ONE_SIDED else None
     grid = _plane_grid(scorer, directions)
     scores = scorer.score(grid.reshape(-1, 4))[0].reshape(grid.shape[:2])
-    if scorer.table is None:
+    if not scorer.upright:
         rim = (scorer.outline.rim @ directions.T).median(0).values
         scores = scores - RIM_PRIOR * ((grid[..., 3] - rim[:, None]) / (0.25 * scorer.size)) ** 2
     strongest = int(scores.max(1).values.argmax())
@@ -135,6 +154,8 @@ def find_planes(scorer: SymmetryScorer, turned: bool = False) -> tuple[Float[Ten
     planes = [_refine(scorer, grid[i, k]) for i, k in _pick_planes(scores, directions, across)]
     if scorer.table is None or turned:
         planes += list(_across_plane(scorer, planes, grid, across))
+        if turned and scorer.table is None:
+            planes += list(_best_plane(scorer, _plane_grid(scorer, AXIS, FINE_OFFSETS)[0], END_SCORE))
     else:
         best = _refine(scorer, grid[strongest, int(scores[strongest].argmax())])
         planes = _without_slope(scorer, planes, best)
@@ -169,7 +190,7 @@ def planes_near(
 ) -> Float[Tensor, "p 4"]:
     """Return a plane rotated about its axes [rad] and shifted [m]. A table leaves the vertical axis."""
     normal = plane[:3]
-    if scorer.table is not None:
+    if scorer.upright:
         sideways = torch.stack([-normal[1], normal[0], torch.zeros_like(normal[0])])[None]
     else:
         sideways = torch.linalg.svd(normal[None], full_matrices=True).Vh[1:]
@@ -178,17 +199,6 @@ def planes_near(
     # Rotate about the cloud's centre: a frame's origin may be far away.
     offsets = plane[3] + (normals - normal) @ scorer.center
     return torch.cat([normals.repeat_interleave(len(shifts), 0), (offsets[:, None] + shifts).reshape(-1, 1)], 1)
-
-
-def reflect(points: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]) -> Float[Tensor, "*d 3"]:
-    """Mirror points across the plane n.x = o."""
-    height = (points * plane[..., :3]).sum(-1, keepdim=True) - plane[..., 3:]
-    return points - 2.0 * height * plane[..., :3]
-
-
-def reflect_directions(directions: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]) -> Float[Tensor, "*d 3"]:
-    """Mirror directions across a plane."""
-    return directions - 2.0 * (directions * plane[..., :3]).sum(-1, keepdim=True) * plane[..., :3]
 
 
 def _level_directions(n: int) -> Float[Tensor, "n 3"]:
@@ -264,9 +274,9 @@ def _square_plane(
     return _best_plane(scorer, _plane_grid(scorer, direction, FINE_OFFSETS)[0], -math.inf)
 
 
-def _level_plane(scorer: SymmetryScorer, table: float) -> Float[Tensor, "p 4"]:
+def _level_plane(scorer: SymmetryScorer, table: Plane) -> Float[Tensor, "p 4"]:
     """Return the level plane halfway up an object on a table; none if it matches nothing."""
-    half = (scorer.points[:, 2].max() + table) / 2
+    half = (scorer.points[:, 2].max() + table.offset) / 2
     return _best_plane(scorer, torch.stack([0 * half, 0 * half, 0 * half + 1, half])[None], LEVEL_SCORE)
 
 
