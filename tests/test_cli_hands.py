@@ -85,3 +85,37 @@ def test_a_posture_is_drawn_with_every_finger(barrett):
     for color in FINGERS:
         wanted = np.array(rgb(color)) / np.linalg.norm(rgb(color))
         assert (hue @ wanted > 0.99).sum() > 300
+
+
+def test_new_mends_a_published_urdf_and_leaves_it_as_it_is(claw, capsys, tmp_path):
+    """A mesh as a tip: the clean copy lies beside the URDF, under another name, or in a folder of its own."""
+    import trimesh
+
+    trimesh.creation.icosphere(3, 0.011).export(claw.parent / "tip.stl")
+    published = claw.parent / "hand.urdf"
+    text = claw.read_text().replace('<sphere radius="0.011"/>', '<mesh filename="tip.stl"/>')
+    published.write_text(text)
+    assert main(["hand", "new", str(published)]) == 0
+    said = capsys.readouterr().out
+    assert "mended: 3 collision meshes" in said and "hand_clean.urdf" in said
+    assert published.read_text() == text and "mesh" not in (claw.parent / "hand_clean.urdf").read_text()
+    out = tmp_path / "other"
+    assert main(["hand", "new", str(published), "--out", str(out), "--tips", "left_tip", "thumb_tip", "right_tip"]) == 0
+    assert sorted(file.name for file in out.iterdir()) == ["hand.toml", "hand.urdf"]
+    assert main(["hand", "check", str(out), "--out", str(out / "hand.png")]) == 0
+    assert "the hand can grasp" in capsys.readouterr().out
+
+
+def test_what_is_doubtful_is_named_with_its_mend(claw, capsys):
+    """A pad that faces away, and a link that is always in another's way."""
+    text = claw.read_text().replace('<box size="0.016 0.02 0.056"/>', '<box size="0.055 0.055 0.056"/>')
+    claw.write_text(text)
+    assert main(["hand", "new", str(claw)]) == 0
+    toml = claw.parent / "hand.toml"
+    pad = toml.read_text().split("[[finger]]")[1]
+    away = pad.replace("0.866025403784", "-0.866025403784").replace("0.009526279442", "-0.009526279442")
+    assert away != pad
+    toml.write_text(toml.read_text().replace(pad, away))
+    main(["hand", "check", str(claw.parent), "--out", str(claw.parent / "hand.png")])
+    said = capsys.readouterr().out
+    assert "doubtful: only" in said and "doubtful: the pad of left faces" in said

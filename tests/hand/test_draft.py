@@ -66,6 +66,29 @@ def test_a_tip_that_is_not_round_gets_a_pad_on_its_side(claw, tip):
     assert depth - 0.002 < float(reach) <= depth + 1e-9
 
 
+def two_fingers(claw):
+    """Cut off the thumb."""
+    text = claw.read_text()
+    first, last = text.index('<link name="thumb_root">'), text.index("</robot>")
+    (claw.parent / "two.urdf").write_text(text[:first] + text[last:])
+    return claw.parent / "two.urdf"
+
+
+def write_with_frame(claw):
+    """Hang the claw on a frame without mass."""
+    frame = '<link name="world"/><joint name="w" type="fixed"><parent link="world"/><child link="base"/></joint>'
+    (claw.parent / "framed.urdf").write_text(claw.read_text().replace("</robot>", frame + "</robot>"))
+    return claw.parent / "framed.urdf"
+
+
+def test_of_four_fingers_those_grasp_that_face_each_other(tmp_path):
+    """Allegro's thumb faces its fingers; three fingers beside each other practically never do."""
+    (tmp_path / "hand.urdf").write_bytes((hands_folder() / "allegro" / "hand.urdf").read_bytes())
+    (tmp_path / "hand.toml").write_text(draft_hand(tmp_path / "hand.urdf"))
+    hand = check_hand(tmp_path)
+    assert "thumb" in hand.finger_names and hand.dof == 12
+
+
 def test_what_cannot_be_guessed_is_asked_for(claw, tmp_path):
     with pytest.raises(BadArgument, match="left_tip"):
         draft_hand(claw, ("left_tip", "right_tip"))
@@ -73,8 +96,10 @@ def test_what_cannot_be_guessed_is_asked_for(claw, tmp_path):
         draft_hand(claw, ("left_tip", "right_tip", "nose"))
     with pytest.raises(BadArgument, match="base"):
         draft_hand(claw, ("left_tip", "right_tip", "base"))
-    with pytest.raises(BadArgument, match="ring_tip"):
-        draft_hand(hands_folder() / "allegro" / "hand.urdf")  # four branches
+    with pytest.raises(BadArgument, match="three to five"):
+        draft_hand(two_fingers(claw))
+    with pytest.raises(HandFileError, match="hand new"):
+        draft_hand(write_with_frame(claw))
     with pytest.raises(HandFileError, match="no file"):
         draft_hand(tmp_path / "none.urdf")
 

@@ -1,5 +1,6 @@
 """`torchgrasp hand`: draft a hand.toml, check a hand, sample its postures."""
 
+import tempfile
 import time
 from pathlib import Path
 from typing import Annotated
@@ -8,17 +9,25 @@ import torch
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
+from torchgrasp.base import count_status
 from torchgrasp.cli.common import check_folder, check_seed, naming
-from torchgrasp.errors import BadArgument, GraspError, OutputError
+from torchgrasp.errors import BadArgument, GraspError, OutputError, Status
 from torchgrasp.files import write_file
-from torchgrasp.hand.draft import draft_hand
+from torchgrasp.hand.draft import Wish, new_hand
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import find_hand, load_hand
+from torchgrasp.objects import load_object
+from torchgrasp.pipeline import plan_grasps
 from torchgrasp.posture_model.dataset import write_samples
 from torchgrasp.posture_model.sample import SampleSpec, Sampling
 from torchgrasp.posture_model.touch import can_close
 from torchgrasp.report.hands import draw_hand, opposed_posture
 from torchgrasp.testing import check_hand, find_faults, random_joints
+
+FREE, FACING, CLOSING = 0.2, 0.02, 0.001
+"""Shares of random postures below which a hand is doubtful; sound public hands have 0.27, 0.05 and 0.004."""
+TRIAL_STARTS = 100
+"""Starts of the planner with which a hand is tried on a shipped object: some seconds."""
 
 
 def new(
@@ -26,26 +35,51 @@ def new(
     /,
     tips: tuple[str, ...] = (),
     name: str | None = None,
+    root: str = "",
+    meshes: Path | None = None,
+    out: Path | None = None,
     seed: int = 0,
 ) -> int:
-    """Write a first hand.toml beside a URDF: fingers, pads, coupling, pairs of links.
+    """Write a first hand.toml for a URDF as it is published, and a clean copy of the URDF where it needs mending.
 
     Args:
-        urdf: the hand: boxes, cylinders and spheres as collision shapes, masses, limits, drives.
+        urdf: the hand, with or without meshes.
         tips: links of the three grasping fingertips in grasp order, then of fingers to park; by default the ends of the
-            tree's three branches.
+            tree's branches, first the three whose pads best face each other.
         name: of the hand; by default the robot's.
+        root: link from which on the URDF is the hand, where it hangs on an arm.
+        meshes: folder in which all meshes lie; by default the URDF's.
+        out: folder to write; by default the URDF's.
         seed: of the random postures from which pads and pairs are guessed.
     """
     check_seed(seed)
-    target = urdf.parent / "hand.toml"
-    if target.exists():
-        raise OutputError("URDF", f"{target}, which exists", "a folder without a hand.toml")
-    with naming(tips="--tips", urdf="URDF"):
-        text = draft_hand(urdf, tips, name, seed)
-    write_file(target, text)
-    print(f"written: {target}; look over the lines marked CHECK, then: torchgrasp hand check {target.parent}")
-    return _print_faults(target.parent, "default")
+    folder = urdf.parent if out is None else out
+    with naming(path="--out"):
+        check_folder(folder)
+    clean = "hand.urdf" if (folder / "hand.urdf").resolve() != urdf.resolve() else "hand_clean.urdf"
+    with naming(tips="--tips", root="--root", urdf="URDF"):
+        draft = new_hand(urdf, Wish(tips, name or "", root, meshes), seed, clean)
+    texts = {"hand.toml": draft.toml}
+    if draft.urdf or out is not None:
+        texts[clean if draft.urdf else urdf.name] = draft.urdf or urdf.read_text(encoding="utf-8")
+    for file in texts:
+        if (folder / file).exists():
+            raise OutputError("URDF", f"{folder / file}, which exists", "a folder without one, as by --out")
+    with tempfile.TemporaryDirectory() as trial:
+        for file, text in ({urdf.name: urdf.read_text(encoding="utf-8")} | texts).items():
+            write_file(Path(trial) / file, text)
+        if _print_faults(trial, "default"):
+            print(f"nothing is written; mend {urdf} and try again")
+            return 2
+        hand = check_hand(trial)
+    for sentence in draft.mended:
+        print(f"mended: {sentence}")
+    for file, text in texts.items():
+        write_file(folder / file, text)
+        print(f"written: {folder / file}")
+    print(f"grasping fingers: {', '.join(hand.finger_names)}; approach {[round(x) for x in hand.approach.tolist()]}")
+    print(f"look over the lines of hand.toml marked CHECK, then: torchgrasp hand check {folder}")
+    return 0
 
 
 def check(
@@ -68,10 +102,56 @@ def check(
     joints = random_joints(sound, 5000)  # shares vary by 1 %
     print(describe(sound, joints))
     model = find_hand(hand) / "mixture.safetensors"
-    print(f"learned model: {model if model.exists() else f'none; learn it by scripts/train.py posture-model {hand}'}")
+    print(f"learned model: {model if model.exists() else 'none, and none is needed but for the paper modes'}")
+    for doubt in find_doubts(sound, joints):
+        print(f"doubtful: {doubt}")
     write_file(out, draw_hand(sound, opposed_posture(sound, joints)))
     print(f"picture: {out}")
-    return 0
+    return _try_objects(sound)
+
+
+def find_doubts(hand: Hand, joints: torch.Tensor) -> list[str]:
+    """Say what of a sound hand is doubtful, judged by random postures `joints` (n, h) [rad], and how to mend it."""
+    doubts, free = [], hand.self_clearance(joints) > 0
+    share = float(free.double().mean())
+    if share < FREE:
+        met = hand.self_collision.separations(hand.tree.frames(hand.expand_joints(joints[:500]).T.contiguous()), 0.0)
+        links = hand.self_collision.link[hand.self_collision.pairs[int((met < 0).sum(1).argmax())]]
+        one, two = (hand.tree.link_names[int(k)] for k in links)
+        doubts.append(
+            f"only {share:.0%} of random postures are free, most often {one} meets {two}: if that cannot be, make "
+            "their collision shapes smaller, or take the pair out of [self_collision]"
+        )
+    points, normals = hand.fingertips(joints[free])
+    inward = points.mean(1, keepdim=True) - points
+    facing = ((normals * inward).sum(-1) / torch.linalg.vector_norm(inward, dim=-1) > 0.5).double().mean(0)
+    for name, seen in zip(hand.finger_names, facing.tolist(), strict=True):
+        if seen < FACING:
+            doubts.append(
+                f"the pad of {name} faces the others in {seen:.1%} of free postures: if its arrow in the picture "
+                "points the wrong way, turn contact and normal in hand.toml, or name other fingers in [options.default]"
+            )
+    closing = float(can_close(points, normals).double().mean()) if len(points) else 0.0
+    if closing < CLOSING:
+        doubts.append(
+            f"{closing:.2%} of free postures can hold something: give [options.default] the thumb and two fingers that "
+            "it faces"
+        )
+    return doubts
+
+
+def _try_objects(hand: Hand) -> int:
+    """Plan on shipped objects until one is graspable; return the exit code."""
+    for name in ("cylinder", "jug"):
+        grasps = plan_grasps(load_object(name).view, hand, starts=TRIAL_STARTS)
+        count = count_status(grasps.status)
+        good = count.get(Status.OK, 0)
+        if good:
+            print(f"on the shipped {name}: {good} of {len(grasps)} grasps executable; the hand can grasp")
+            return 0
+        lost = ", ".join(f"{number} {status.name.lower()}" for status, number in count.items())
+        print(f"on the shipped {name}: no executable grasp ({lost})")
+    return 1
 
 
 def describe(hand: Hand, joints: torch.Tensor) -> str:

@@ -1,54 +1,71 @@
-"""A first hand.toml for a URDF: fingers, pads, coupling, pairs of links.
+"""A first hand.toml for a URDF, and a clean copy of the URDF: fingers, pads, coupling, pairs of links.
 
-A URDF does not say where a finger's pad is. Here the pad faces where the finger's last joint bends. A joint bends to
-the side with most of its range; if both have as much, towards the other fingertips.
+What a published URDF says is mended (`mend`), its meshes become simple shapes (`fit_shapes`), its pads are guessed
+(`pads`). Every guess is marked.
 """
 
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import rigid, rotation_from_rpy
 from torchgrasp.hand.collision_pairs import collision_pairs, draw_postures
+from torchgrasp.hand.fit_shapes import replace_meshes, shape_points, split_tip
 from torchgrasp.hand.hand_toml import Pad
-from torchgrasp.hand.kinematics import map_points, tree_from_urdf
-from torchgrasp.hand.urdf import Joint, Shape, Triple, Urdf, read_urdf
+from torchgrasp.hand.kinematics import tree_from_urdf
+from torchgrasp.hand.mend import fix_wrist, keep_below, mend_bodies, mend_joints, merge_frames, urdf_text
+from torchgrasp.hand.pads import best_three, guess_pads, is_primitive
+from torchgrasp.hand.urdf import MEND, Mimic, Triple, Urdf, read_published
 
 DRAFT_POSTURES = 20_000
 """Random postures from which pads and approach are guessed."""
-MEETING_SHARE = 0.1
-"""Share of the postures that tells where the fingers meet: those with the nearest fingertips."""
-ONE_SIDED = 0.1
-"""A joint bends to one side if the middle of its range is farther off zero than this, over the range's length."""
-TILT = math.radians(30)
-"""A round tip touches this far from its direction of motion, towards its end: so the Allegro hand closes most often."""
-SHORT_ARM = 1e-3
-"""A joint whose axis passes a tip nearer than this [m] does not move it."""
 STIFFNESS, DAMPING = 4.0, 0.03
 """Drive [rad^-1] per N m of the weakest joint's effort, and its damping [s]: about those of the shipped hands."""
+MOST_STIFFNESS = 10.0
+"""Stiffest drive [N m/rad]: the Barrett's, which is the strongest of the shipped hands."""
+ROTOR = 1e-3
+"""Inertia [kg m2] that simulations add to every joint for its motor."""
 
-Vector = Float[np.ndarray, "3"]
+Chosen = dict[str, Pad]
+"""Pads by the links that touch: three that grasp, in grasp order, then those to park."""
+
+
+class Draft(NamedTuple):
+    """A first hand.toml, the clean URDF that it speaks of, and sentences on what was mended.
+
+    `urdf` is empty where the URDF is clean as it is.
+    """
+
+    toml: str
+    urdf: str
+    mended: tuple[str, ...]
+
+
+class Wish(NamedTuple):
+    """What a user may say of a hand: the links of its tips, its name, the root below an arm, the folder of meshes."""
+
+    tips: tuple[str, ...] = ()
+    name: str = ""
+    root: str = ""
+    meshes: Path | None = None
 
 
 def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = None, seed: int = 0) -> str:
-    """Write the text of a hand.toml for a URDF, to be looked over and checked by `check_hand`.
+    """Write the text of a hand.toml for a clean URDF, to be looked over and checked by `check_hand`.
 
     Args:
         path: of the URDF.
         tips: links of the three grasping fingertips in grasp order, then of the fingers to park; by default the ends of
-            the tree's branches, which must be three.
+            the tree's branches, first the three whose pads best face each other.
         name: of the hand; by default the robot's.
         seed: of the random postures.
 
     Raises:
-        HandFileError: the URDF is missing or malformed.
+        HandFileError: the URDF is missing or malformed, or needs mending: `new_hand` does that.
         BadArgument: fewer than three tips, or one without a collision shape or a joint that moves it.
 
     >>> from torchgrasp.hand.load import find_hand
@@ -56,49 +73,128 @@ def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = No
     >>> '"f1_distal" = { source = "f1_flex"' in text
     True
     """
-    urdf = read_urdf(path)
+    draft = new_hand(path, Wish(tuple(tips), name or ""), seed)
+    if draft.urdf:
+        raise read_published(path).wrong("; ".join(draft.mended)[:1000], f"a clean URDF; {MEND}")
+    return draft.toml
+
+
+def new_hand(path: Path | str, wish: Wish = Wish(), seed: int = 0, file: str = "hand.urdf") -> Draft:  # noqa: B008
+    """Mend a published URDF, and draft a hand.toml for the clean copy, which is to be called `file`.
+
+    Raises:
+        HandFileError: the URDF or a mesh of it is missing, malformed or hostile, or nothing can mend it.
+        BadArgument: fewer than three tips, or one without a collision shape or a joint that moves it.
+    """
+    published = read_published(path)
+    urdf, told = keep_below(published, wish.root or published.root)
+    urdf, more, taken = merge_frames(urdf)
+    told += more
+    urdf, more = fix_wrist(urdf, fingertip_links(urdf) or [urdf.root])
+    urdf, again, taken_again = merge_frames(urdf)
+    told += more + again
+    urdf, more = mend_joints(urdf)
+    told += more
+    points = shape_points(urdf, wish.meshes or published.path.parent)
+    surfaces = {name: np.concatenate(parts) for name, parts in points.items() if parts}
+    urdf, more = mend_bodies(urdf, surfaces)
+    told += more
+    tips = tuple(taken_again.get(x, x) for x in (taken.get(tip, tip) for tip in wish.tips))
+    tips = _checked_tips(urdf, tips)
+    frames = tree_from_urdf(urdf).frames(draw_postures(urdf, _coupling(urdf), DRAFT_POSTURES, seed))
+    guess = guess_pads(urdf, frames, tips, surfaces)
+    order = list(range(len(tips)))
+    if not wish.tips and len(tips) > 3:
+        at = [next(i for i, x in enumerate(urdf.links) if x.name == tip) for tip in tips]
+        best = best_three(frames[:, :, at], guess.pads)
+        order = [*best, *(k for k in order if k not in best)]
+    simple = {x.name for x in urdf.links if is_primitive(x)}
+    clean, more = replace_meshes(urdf, points)
+    told += more
+    chosen: Chosen = {}
+    balls = list[str]()
+    for k in order:
+        tip, pad = tips[k], guess.pads[k]
+        if tip not in simple:
+            balls.append(f"{tip} {1e3 * pad.radius:.1f} mm")
+            clean, tip, pad = split_tip(clean, tip, pad, guess.outward[k], surfaces[tip])
+        chosen[tip] = pad
+    told += [f"fingertips touch by a ball in their end, of radius: {', '.join(balls)}"] if balls else []
+    name, mended = wish.name or urdf.name, bool(told)
+    toml = _toml_text(clean, chosen, guess.approach, (name, file if mended else published.path.name), seed)
+    return Draft(toml, urdf_text(clean) if mended else "", tuple(told))
+
+
+def _checked_tips(urdf: Urdf, tips: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the links of the fingertips, given or found; refuse too few, and links that cannot touch."""
     ends = fingertip_links(urdf)
-    chosen = tuple(tips) or ends
-    if len(chosen) < 3 or (not tips and len(chosen) > 3) or len(set(chosen)) < len(chosen):
+    chosen = tips or ends
+    if not 3 <= len(chosen) or (not tips and len(chosen) > 5) or len(set(chosen)) < len(chosen):
         wanted = f"three links in grasp order, then those to park; the branches of {urdf.path} end in {list(ends)}"
-        raise BadArgument("tips", list(tips) or "none", wanted)
-    chains = {tip: tuple(j.name for j in urdf.movers(tip)[::-1]) for tip in chosen}
+        found = list(tips) or f"none, and {len(ends)} fingers"
+        raise BadArgument("tips", found, f"a hand of three to five fingertips: {wanted}")
     shaped = {x.name for x in urdf.links if x.shapes}
     for tip in chosen:
-        if tip not in shaped or not chains[tip]:
+        if tip not in shaped or not urdf.movers(tip):
             raise BadArgument("tips", tip, f"links with a collision shape that joints move, as {list(ends)}")
-    coupling = {j.name: j.mimic for j in urdf.movable if j.mimic is not None}
-    free = [j for j in urdf.movable if j.name not in coupling]
-    grasping = {joint for tip in chosen[:3] for joint in chains[tip]}
+    return chosen
+
+
+def _coupling(urdf: Urdf) -> dict[str, Mimic]:
+    return {j.name: j.mimic for j in urdf.movable if j.mimic is not None}
+
+
+def _gains(urdf: Urdf) -> tuple[float, float]:
+    """Return stiffness and damping of the drives: of the weakest joint's effort, and no less than critical damping."""
+    free = [j for j in urdf.movable if j.mimic is None]
+    kp = min(STIFFNESS * min(j.effort for j in free), MOST_STIFFNESS)
+    poses = tree_from_urdf(urdf).poses(torch.zeros(1, len(urdf.movable), dtype=torch.float64))[0].numpy()
+    names = [x.name for x in urdf.links]
+    centres = np.array([p[:3, :3] @ x.com + p[:3, 3] for p, x in zip(poses, urdf.links, strict=True)])
+    heaviest = 0.0
+    for j in free:
+        if j.kind == "prismatic":
+            continue
+        pose = poses[names.index(j.child)]
+        moved = [k for k, name in enumerate(names) if j in urdf.joints_above(name)]
+        arms = np.cross(pose[:3, :3] @ j.axis, centres[moved] - pose[:3, 3])
+        heaviest = max(heaviest, float(np.array([urdf.links[k].mass for k in moved]) @ (arms**2).sum(1)))
+    return kp, max(DAMPING * kp, 2 * np.sqrt(kp * (heaviest + ROTOR)))
+
+
+def _toml_text(urdf: Urdf, pads: Chosen, approach: Triple, names: tuple[str, str], seed: int) -> str:
+    """Write a hand.toml; `names` are those of the hand and of its URDF's file."""
+    coupling = _coupling(urdf)
+    free, tips = [j for j in urdf.movable if j.name not in coupling], list(pads)
+    chains = {tip: [j.name for j in urdf.movers(tip)[::-1]] for tip in tips}
+    grasping = {joint for tip in tips[:3] for joint in chains[tip]}
     moved = grasping | {coupling[j].source for j in grasping if j in coupling}
     parked = {j.name: min(max(0.0, j.lower), j.upper) for j in free if j.name not in moved}
-    frames = tree_from_urdf(urdf).frames(draw_postures(urdf, coupling, DRAFT_POSTURES, seed))
-    pads, approach = guess_pads(urdf, frames, chosen)
-    kp = STIFFNESS * min((j.effort for j in free if j.effort > 0), default=1.0)
-    names = {tip: tip.removesuffix("_tip") for tip in chosen}
+    kp, kd = _gains(urdf)
+    called = {tip: tip.removesuffix("_ball").removesuffix("_tip") for tip in tips}
     lines = [
         "# A draft. Lengths [m], angles [rad], in the link frames of the URDF. Look over what is marked CHECK.",
-        f"name = {_toml(name or urdf.name or 'hand')}",
-        f"urdf = {_toml(urdf.path.name)}",
+        f"name = {_toml(names[0])}",
+        f"urdf = {_toml(names[1])}",
         f"base_link = {_toml(urdf.root)}",
         f"approach = {_toml(approach)}  # CHECK: out of the palm",
         "limit_margin = 0.0  # taken off both ends of every joint's range",
         "",
         "[actuators]  # joint position control; effort [N m] and velocity [rad/s] are those of the URDF",
         f"kp = {kp:.3g}  # CHECK: [N m/rad]",
-        f"kd = {DAMPING * kp:.3g}  # [N m s/rad]",
+        f"kd = {kd:.3g}  # [N m s/rad]",
     ]
     if coupling:
         lines += ["", "# joint = ratio * source + offset", "[coupling]"]
     for joint, (source, ratio, offset) in coupling.items():
         lines.append(f"{_toml(joint)} = {{ source = {_toml(source)}, ratio = {ratio!r}, offset = {offset!r} }}")
     lines += ["", "# Which fingers grasp, in grasp order; every other joint is parked.", "[options.default]"]
-    lines.append(f"fingers = {_toml([names[tip] for tip in chosen[:3]])}")
+    lines.append(f"fingers = {_toml([called[tip] for tip in tips[:3]])}{'  # CHECK' if len(tips) > 3 else ''}")
     if parked:
         row = ", ".join(f"{_toml(joint)} = {value!r}" for joint, value in parked.items())
         lines.append(f"parked = {{ {row} }}  # CHECK: out of the way of the others")
-    for tip, pad in zip(chosen, pads, strict=True):
-        lines += ["", "[[finger]]", f"name = {_toml(names[tip])}"]
+    for tip, pad in pads.items():
+        lines += ["", "[[finger]]", f"name = {_toml(called[tip])}"]
         lines += [f"joints = {_toml(chains[tip])}", f"tip_link = {_toml(tip)}"]
         lines += [f"contact = {_toml(pad.contact)}  # CHECK: the middle of the pad", f"normal = {_toml(pad.normal)}"]
         sphere = ['tip = "sphere"', f"center = {_toml(pad.center)}", f"radius = {pad.radius!r}"]
@@ -115,89 +211,6 @@ def fingertip_links(urdf: Urdf) -> tuple[str, ...]:
     for link in (x.name for x in urdf.links if x.name not in parents):
         ends += [x for x in (link, *(j.parent for j in urdf.joints_above(link))) if x in shaped][:1]
     return tuple(e for e in dict.fromkeys(ends) if urdf.movers(e))
-
-
-def guess_pads(urdf: Urdf, frames: Float[Tensor, "3 4 l n"], tips: Sequence[str]) -> tuple[tuple[Pad, ...], Triple]:
-    """Guess the pads of the tips and the direction out of the palm, from the links' frames in random postures."""
-    links = {x.name: i for i, x in enumerate(urdf.links)}
-    index = torch.tensor([links[tip] for tip in tips])
-    # a tip's shape is the one that reaches farthest from its joint
-    shapes = [max(urdf.links[i].shapes, key=lambda s: math.dist(s.xyz, (0.0, 0.0, 0.0))) for i in index.tolist()]
-    cores = [_core(shape) for shape in shapes]
-    tip_frames = frames.index_select(2, index)
-    centres = map_points(tip_frames, torch.tensor(np.stack(cores)))  # 3 f n
-    middle = centres[:, :3].mean(1, keepdim=True)
-    spread = torch.linalg.vector_norm(centres[:, :3] - middle, dim=0).sum(0)
-    near = spread.topk(max(1, int(MEETING_SHARE * len(spread))), largest=False).indices
-    inward = (tip_frames[:, :3] * (middle - centres)[:, None])[..., near].sum(0).mean(-1).T.numpy()  # tips' frames
-    pads = []
-    for tip, shape, core, closing in zip(tips, shapes, cores, inward, strict=True):
-        joint, motion, outward = _motion(urdf, tip, core)
-        middle_of_range = (joint.lower + joint.upper) / 2
-        one_sided = abs(middle_of_range) > ONE_SIDED * (joint.upper - joint.lower)
-        bending = math.copysign(1.0, middle_of_range if one_sided else motion @ closing)
-        pads.append(_pad(shape, core, bending * motion, outward))
-    palm = next(x for x in urdf.links if x.name == urdf.root)
-    palm_centre = np.mean([s.xyz for s in palm.shapes], axis=0) if palm.shapes else np.zeros(3)
-    out = middle[:, 0, near].mean(1).numpy() - palm_centre
-    axis = int(np.abs(out).argmax())
-    return tuple(pads), _triple(np.sign(out[axis]) * np.eye(3)[axis])
-
-
-def _motion(urdf: Urdf, tip: str, core: Vector) -> tuple[Joint, Vector, Vector]:
-    """Return the last joint that moves a tip, and the directions of motion and of the arm in the tip's frame."""
-    tip_from_above = np.eye(4)
-    for joint in urdf.joints_above(tip):
-        if joint.kind != "fixed":
-            axis, arm = tip_from_above[:3, :3] @ np.array(joint.axis), core - tip_from_above[:3, 3]
-            motion = axis if joint.kind == "prismatic" else np.cross(axis, arm)
-            length = float(np.linalg.norm(motion))
-            if length > SHORT_ARM:
-                arm = arm - (arm @ axis) * axis
-                return joint, motion / length, arm / max(float(np.linalg.norm(arm)), SHORT_ARM)
-        above_from_link = rigid(rotation_from_rpy(joint.rpy), torch.tensor(joint.xyz, dtype=torch.float64))
-        tip_from_above = tip_from_above @ np.linalg.inv(above_from_link.numpy())
-    raise BadArgument("tips", tip, "links that a joint moves")
-
-
-def _half(shape: Shape) -> Vector:
-    """Return the half sizes of a shape's bounding box."""
-    if shape.kind == "box":
-        return np.array(shape.size) / 2
-    radius = shape.size[0]
-    return np.array([radius, radius, radius if shape.kind == "sphere" else shape.size[1] / 2])
-
-
-def _core(shape: Shape) -> Vector:
-    """Return the point one half thickness before the far end of a tip, in the link's frame."""
-    center, half = np.array(shape.xyz), _half(shape)
-    rotation, long = rotation_from_rpy(shape.rpy).numpy(), int(half.argmax())
-    inset = half[long] - np.delete(half, long).min()
-    return center + math.copysign(inset, rotation[:, long] @ center) * rotation[:, long]
-
-
-def _pad(shape: Shape, core: Vector, motion: Vector, outward: Vector) -> Pad:
-    """Return the pad of a tip that moves along `motion`; on a sphere it is tilted outward."""
-    if shape.kind == "sphere":
-        normal, radius = math.cos(TILT) * motion + math.sin(TILT) * outward, shape.size[0]
-        center, normal = np.array(shape.xyz), normal / np.linalg.norm(normal)
-        return Pad(_triple(center + radius * normal), _triple(normal), _triple(center), radius)
-    rotation, half = rotation_from_rpy(shape.rpy).numpy(), _half(shape)
-    side = rotation.T @ motion
-    side[int(half.argmax())] = 0.0  # along the tip's length there is no pad
-    if shape.kind == "box":
-        face = int(np.abs(side).argmax())
-        side, depth = np.sign(side[face]) * np.eye(3)[face], half[face]
-    else:
-        side, depth = side / np.linalg.norm(side), shape.size[0]
-    contact = core + depth * (rotation @ side)
-    return Pad(_triple(contact), _triple(rotation @ side), _triple(contact), 0.0)
-
-
-def _triple(x: Vector) -> Triple:
-    """Return an array as three numbers that print shortly."""
-    a, b, c = (round(float(v), 12) + 0.0 for v in x)
-    return a, b, c
 
 
 def _toml(x: object) -> str:

@@ -65,9 +65,14 @@ def _first(joints: Tensor, wrong: Tensor) -> tuple[float, int]:
 
 
 def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
-    """Return the joints of the grasping fingers; refuse joints without a range, and joints without a role."""
+    """Return the joints of the grasping fingers; refuse joints without a range, and joints without a role.
+
+    A joint of another finger is among them if one of theirs follows it.
+    """
     movable = {j.name: j for j in urdf.movable}
-    names = tuple(dict.fromkeys(j for f in spec.fingers for j in f.joints if j not in spec.coupling))
+    own = [j for f in spec.fingers for j in f.joints]
+    leaders = [spec.coupling[j].source for j in own if j in spec.coupling]
+    names = tuple(dict.fromkeys([*(j for j in own if j not in spec.coupling), *leaders]))
     limits = torch.tensor([[movable[n].lower, movable[n].upper] for n in names], dtype=torch.float64)
     limits = limits + torch.tensor([spec.limit_margin, -spec.limit_margin], dtype=torch.float64)
     for name, (low, high) in zip(names, limits.tolist(), strict=True):

@@ -161,8 +161,8 @@ def _floats(values: Any) -> tuple[float, ...]:
     return tuple(float(x) + 0.0 for x in values)
 
 
-def _pose(origin: Any) -> tuple[Triple, Triple]:
-    """Return translation and fixed-axis angles of a 4 x 4 pose."""
+def place(origin: Any) -> tuple[Triple, Triple]:
+    """Return translation [m] and fixed-axis angles [rad] of a 4 x 4 pose; None: zeros."""
     from trimesh.transformations import euler_from_matrix
 
     if origin is None:
@@ -180,7 +180,7 @@ def _link(link: Any) -> Link:
     mass, com, inertia = 0.0, (0.0, 0.0, 0.0), np.zeros((3, 3))
     if link.inertial is not None:
         mass, inertia = link.inertial.mass, link.inertial.inertia
-        com, rpy = _pose(link.inertial.origin)
+        com, rpy = place(link.inertial.origin)
         if any(rpy):
             turn = link.inertial.origin[:3, :3]
             inertia = turn @ inertia @ turn.T
@@ -188,7 +188,7 @@ def _link(link: Any) -> Link:
 
 
 def _shape(collision: Any) -> Shape:
-    xyz, rpy = _pose(collision.origin)
+    xyz, rpy = place(collision.origin)
     box, sphere, cylinder, mesh = (getattr(collision.geometry, k) for k in ("box", "sphere", "cylinder", "mesh"))
     if mesh is not None:
         return Shape("mesh", _floats(mesh.scale), xyz, rpy, mesh.filename)
@@ -200,7 +200,7 @@ def _shape(collision: Any) -> Shape:
 
 
 def _joint(joint: Any) -> Joint:
-    xyz, rpy = _pose(joint.origin)
+    xyz, rpy = place(joint.origin)
     if joint.type == "fixed":
         return Joint(joint.name, joint.type, joint.parent, joint.child, xyz, rpy)
     x, y, z = _floats(joint.axis)

@@ -1,0 +1,247 @@
+"""Mending of published URDFs: frames without mass, wrists, masses, limits, followers; and the clean copy's text.
+
+Every step returns the mended URDF and sentences that tell what it did.
+"""
+
+import dataclasses
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Collection, Mapping, Sequence
+
+import numpy as np
+
+from torchgrasp.errors import BadArgument
+from torchgrasp.hand.urdf import Joint, Link, Mimic, Shape, Urdf, place
+
+MANY = 3
+"""A hand has at most this many joints that move all its fingertips, a wrist; an arm has more."""
+EFFORT, VELOCITY = 1.0, 3.0
+"""Drive [N m, rad/s] of a joint for which the URDF declares none: between those of small hands' motors."""
+DENSITY = 1000.0
+"""Mass over the volume of the bounding box [kg/m3]: plastic and metal, half of it air."""
+LEAST_MASS, LEAST_SIZE = 1e-3, 5e-3
+"""Mass [kg] and edge [m] of a body for which there is nothing to go by: a gram, which no simulator trips over."""
+FAR_OUT = 2.0
+"""A mass centre or a radius of gyration farther out than this, in half diagonals of a body, is a slip of the pen."""
+
+Step = tuple[Urdf, list[str]]
+
+
+def pose_of(part: Joint | Shape) -> np.ndarray:
+    """Return the 4 x 4 pose of a joint or a shape in its parent."""
+    from trimesh.transformations import compose_matrix
+
+    return compose_matrix(angles=part.rpy, translate=part.xyz)
+
+
+def keep_below(urdf: Urdf, root: str) -> Step:
+    """Keep the links below a link, and that link: the hand on an arm."""
+    names = {x.name for x in urdf.links}
+    if root not in names:
+        raise BadArgument("root", repr(root), f"a link of {urdf.path}: {sorted(names)}")
+    if root == urdf.root:
+        return urdf, []
+    kept = {x for x in names if x == root or any(j.parent == root for j in urdf.joints_above(x))}
+    joints = tuple(j for j in urdf.joints if j.parent in kept)
+    inside = {j.name for j in joints}
+    for j in joints:
+        if j.mimic and j.mimic.source not in inside:
+            raise urdf.wrong(f"joint {j.name} follows {j.mimic.source!r} above {root!r}", "a root above both")
+    links = tuple(x for x in urdf.links if x.name in kept)
+    told = f"{len(names) - len(kept)} links that do not hang from {root} are left out"
+    return dataclasses.replace(urdf, root=root, links=links, joints=joints), [told]
+
+
+def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
+    """Merge frames without mass into the body they are fixed to; tell which link took which.
+
+    A root without mass takes the body that is fixed to it. An end with a shape stays: it may be a fingertip.
+    """
+    taken: dict[str, str] = {}
+    while True:
+        links, parents = {x.name: x for x in urdf.links}, {j.parent for j in urdf.joints}
+        for j in (j for j in urdf.joints if j.kind == "fixed"):
+            child, bare_root = links[j.child], j.parent == urdf.root and not _is_body(links[j.parent])
+            frame = not child.mass > 0 and (j.child in parents or not child.shapes)
+            if frame or bare_root:
+                break
+        else:
+            return urdf, [f"frames without mass are merged into others: {', '.join(taken)}"] if taken else [], taken
+        moved, parent = _moved(child, pose_of(j)), links[j.parent]
+        body = moved if bare_root else parent
+        merged = dataclasses.replace(body, name=parent.name, shapes=parent.shapes + moved.shapes)
+        below = tuple(_under(x, j) if x.parent == child.name else x for x in urdf.joints if x is not j)
+        kept = tuple(merged if x is parent else x for x in urdf.links if x is not child)
+        taken = {name: parent.name if to == child.name else to for name, to in taken.items()} | {
+            child.name: parent.name
+        }
+        urdf = dataclasses.replace(urdf, links=kept, joints=below)
+
+
+def _is_body(link: Link) -> bool:
+    return link.mass > 0 or bool(link.shapes)
+
+
+def _under(joint: Joint, above: Joint) -> Joint:
+    """Return a joint fixed to the parent of the frame that was its parent."""
+    xyz, rpy = place(pose_of(above) @ pose_of(joint))
+    return dataclasses.replace(joint, parent=above.parent, xyz=xyz, rpy=rpy)
+
+
+def _moved(link: Link, pose: np.ndarray) -> Link:
+    """Return a link's body and shapes in another frame."""
+    turn, shapes = pose[:3, :3], []
+    for shape in link.shapes:
+        xyz, rpy = place(pose @ pose_of(shape))
+        shapes.append(dataclasses.replace(shape, xyz=xyz, rpy=rpy))
+    x, y, z = (turn @ link.com + pose[:3, 3]).tolist()
+    inertia = _triangle(turn @ _matrix(link.inertia) @ turn.T)
+    return Link(link.name, link.mass, (x, y, z), inertia, tuple(shapes))
+
+
+def fix_wrist(urdf: Urdf, tips: Sequence[str]) -> Step:
+    """Fix the joints that move all fingertips, a wrist; cut off an arm. `tips` are the ends of all fingers."""
+    common = [j for j in urdf.movers(tips[0]) if all(j in urdf.movers(tip) for tip in tips)] if len(tips) > 2 else []
+    if len(common) > MANY:
+        urdf, told = keep_below(urdf, common[0].child)
+        return urdf, [f"{len(common)} joints above {urdf.root} move all fingertips, an arm: {told[0]}"]
+    if not common:
+        return urdf, []
+    at = {j.name: min(max(0.0, j.lower), j.upper) for j in common}
+    for j in urdf.movable:
+        if j.mimic and j.mimic.source in at:
+            at[j.name] = j.mimic.ratio * at[j.mimic.source] + j.mimic.offset
+    joints = tuple(_fixed(j, at[j.name]) if j.name in at else j for j in urdf.joints)
+    told = ", ".join(f"{name} at {value:.4g}" for name, value in at.items())
+    return dataclasses.replace(urdf, joints=joints), [f"joints that move all fingertips, a wrist, are fixed: {told}"]
+
+
+def _fixed(joint: Joint, value: float) -> Joint:
+    from trimesh.transformations import rotation_matrix, translation_matrix
+
+    move = translation_matrix(value * np.array(joint.axis))
+    if joint.kind != "prismatic":
+        move = rotation_matrix(value, joint.axis)
+    xyz, rpy = place(pose_of(joint) @ move)
+    return Joint(joint.name, "fixed", joint.parent, joint.child, xyz, rpy)
+
+
+def mend_joints(urdf: Urdf) -> Step:
+    """Give limits and drives where there are none; let followers follow a leader, within the limits of both."""
+    told, joints, idle = [], {j.name: j for j in urdf.joints}, list[str]()
+    for name, j in joints.items():
+        if j.kind == "fixed":
+            continue
+        if math.isinf(j.upper - j.lower):
+            if j.kind == "prismatic":
+                raise urdf.wrong(f"joint {name} without a limit", "lower and upper of a joint that slides")
+            j = dataclasses.replace(j, kind="revolute", lower=-math.pi, upper=math.pi)
+            told.append(f"joint {name} has no limits: it turns by up to half a turn either way")
+        drive = (j.effort if j.effort > 0 else EFFORT, j.velocity if j.velocity > 0 else VELOCITY)
+        if drive != (j.effort, j.velocity):
+            idle.append(name)
+            j = dataclasses.replace(j, effort=drive[0], velocity=drive[1])
+        joints[name] = j
+    if idle:
+        told.append(f"without effort or velocity are {', '.join(idle)}: taken {EFFORT:g} N m, {VELOCITY:g} rad/s")
+    for name, j in joints.items():
+        mimic = j.mimic
+        while mimic and (above := joints[mimic.source].mimic):
+            mimic = Mimic(above.source, mimic.ratio * above.ratio, mimic.ratio * above.offset + mimic.offset)
+        if mimic != j.mimic:
+            told.append(f"joint {name} follows a follower of {mimic and mimic.source}: it follows that directly")
+            joints[name] = dataclasses.replace(j, mimic=mimic)
+    for name, j in joints.items():
+        if j.mimic and not j.mimic.ratio:
+            raise urdf.wrong(f"joint {name} follows by a ratio of 0", "a fixed joint, or another ratio")
+        if j.mimic:
+            source = joints[j.mimic.source]
+            ends = sorted((end - j.mimic.offset) / j.mimic.ratio for end in (j.lower, j.upper))
+            low, high = max(source.lower, ends[0]), min(source.upper, ends[1])
+            if not low < high:
+                raise urdf.wrong(f"joint {name} follows {source.name} outside its own limits", "limits that overlap")
+            if (low, high) != (source.lower, source.upper):
+                joints[source.name] = dataclasses.replace(source, lower=low, upper=high)
+                told.append(
+                    f"joint {source.name} is limited to [{low:.6g}, {high:.6g}] instead of [{source.lower:.6g}, "
+                    f"{source.upper:.6g}]: {name}, which follows it, would leave its own limits"
+                )
+    return dataclasses.replace(urdf, joints=tuple(joints.values())), told
+
+
+def mend_bodies(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Step:
+    """Give masses and inertias where there are none, or none that a body can have; `surfaces` are points (n, 3)."""
+    links, weightless, absurd = [], list[str](), list[str]()
+    for link in urdf.links:
+        points = surfaces.get(link.name, np.zeros((1, 3)))
+        low, high = points.min(0), points.max(0)
+        size = np.maximum(high - low, LEAST_SIZE)
+        reach, middle, mass = float(np.linalg.norm(size)) / 2, (low + high) / 2, link.mass
+        if not mass > 0:
+            mass = max(LEAST_MASS, DENSITY / 2 * float(np.prod(high - low)))
+            weightless.append(f"{link.name} ({1e3 * mass:.3g} g)")
+        principal = np.linalg.eigvalsh(_matrix(link.inertia))
+        sound = principal[0] > 0 and principal[0] + principal[1] >= principal[2] * (1 - 1e-6)
+        known = link.name in surfaces
+        off = known and math.dist(link.com, middle) > FAR_OUT * reach
+        wide = known and principal[2] > mass * (FAR_OUT * reach) ** 2
+        if not link.mass > 0 or not sound or off or wide:
+            absurd += [link.name] if link.mass > 0 else []
+            x, y, z = middle.tolist() if off or not link.mass > 0 else link.com
+            inertia = mass / 12 * np.diag(size @ size - size**2)
+            link = Link(link.name, mass, (x, y, z), _triangle(inertia), link.shapes)
+        links.append(link)
+    told = [f"links without mass get that of half their bounding box: {', '.join(weightless)}"] if weightless else []
+    if absurd:
+        told.append(
+            f"no body of its size and mass has the inertia or mass centre of {', '.join(absurd)}: taken those of the "
+            "bounding box"
+        )
+    return dataclasses.replace(urdf, links=tuple(links)), told
+
+
+def _matrix(inertia: Collection[float]) -> np.ndarray:
+    xx, xy, xz, yy, yz, zz = inertia
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def _triangle(inertia: np.ndarray) -> tuple[float, ...]:
+    return tuple(inertia[np.triu_indices(3)].tolist())
+
+
+def urdf_text(urdf: Urdf) -> str:
+    """Write a URDF, its links, joints and shapes; `read_urdf` reads the same from it."""
+    robot = ET.Element("robot", name=urdf.name)
+    for link in urdf.links:
+        element = ET.SubElement(robot, "link", name=link.name)
+        inertial = ET.SubElement(element, "inertial")
+        ET.SubElement(inertial, "origin", xyz=_words(link.com))
+        ET.SubElement(inertial, "mass", value=_words([link.mass]))
+        keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        ET.SubElement(inertial, "inertia", {k: _words([v]) for k, v in zip(keys, link.inertia, strict=True)})
+        for shape in link.shapes:
+            collision = ET.SubElement(element, "collision")
+            ET.SubElement(collision, "origin", xyz=_words(shape.xyz), rpy=_words(shape.rpy))
+            keys = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length")}[shape.kind]
+            sizes = [shape.size] if shape.kind == "box" else [[x] for x in shape.size]
+            numbers = {k: _words(v) for k, v in zip(keys, sizes, strict=True)}
+            ET.SubElement(ET.SubElement(collision, "geometry"), shape.kind, numbers)
+    for j in urdf.joints:
+        joint = ET.SubElement(robot, "joint", name=j.name, type=j.kind)
+        ET.SubElement(joint, "origin", xyz=_words(j.xyz), rpy=_words(j.rpy))
+        ET.SubElement(joint, "parent", link=j.parent)
+        ET.SubElement(joint, "child", link=j.child)
+        if j.kind == "fixed":
+            continue
+        ET.SubElement(joint, "axis", xyz=_words(j.axis))
+        limits = {"lower": j.lower, "upper": j.upper, "effort": j.effort, "velocity": j.velocity}
+        ET.SubElement(joint, "limit", {k: _words([v]) for k, v in limits.items()})
+        if j.mimic:
+            ratio, offset = _words([j.mimic.ratio]), _words([j.mimic.offset])
+            ET.SubElement(joint, "mimic", joint=j.mimic.source, multiplier=ratio, offset=offset)
+    ET.indent(robot)
+    return ET.tostring(robot, encoding="unicode") + "\n"
+
+
+def _words(values: Collection[float]) -> str:
+    return " ".join(f"{float(x) + 0.0!r}" for x in values)
