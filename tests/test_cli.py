@@ -53,7 +53,7 @@ def bad_inputs(folder):
         "two points": ([folder / "two.npy", *hand], ["CLOUD", "2 points", "at least 4"]),
         "millimetres": ([folder / "mm.npy", *hand], ["CLOUD", "m"]),
         "nan": ([folder / "nan.npy", *hand], ["CLOUD", "NaN", "198 of 200", "at least 4"]),
-        "unknown hand": ([VIEW, "--hand", "shadow"], ["--hand", "'shadow'", "allegro", "barrett"]),
+        "unknown hand": ([VIEW, "--hand", "fist"], ["--hand", "'fist'", "allegro", "barrett"]),
         "open mesh": ([VIEW, *hand, "--mesh", folder / "open.ply", "--close"], ["--mesh", "open", "watertight"]),
         "missing mesh": ([VIEW, *hand, "--mesh", folder / "no.stl", "--close"], ["--mesh", "no file"]),
         "close without mesh": ([VIEW, *hand, "--close"], ["--close", "--mesh"]),

@@ -55,7 +55,7 @@ def test_check_names_every_fault(barrett, capsys):
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
-        (["check", "shadow"], "allegro"),
+        (["check", "fist"], "allegro"),
         (["check", "barrett", "--fingers", "five"], "--fingers"),
         (["check", "barrett", "--out", "hand.jpg"], "--out"),
         (["new", "none.urdf"], "none.urdf"),

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -75,6 +76,19 @@ def test_mujoco_loads_the_keyframes_and_places_the_tips(name):
     np.testing.assert_allclose(arrived[:3] - start[:3], 0.1 * grasp.approach[0].numpy(), atol=1e-12)
 
 
+def test_a_robot_of_half_the_stiffness_gets_twice_the_lead():
+    hand, grasp = pinch("allegro")
+    own, soft = (json.loads(format_grasps(hand, grasp, 5.0, kp)) for kp in (None, 1.5))
+    assert set(own["stiffness"].values()) == {3.0} and set(soft["stiffness"].values()) == {1.5}
+    first, second = (content["grasps"][0] for content in (own, soft))
+    assert second["torque"] == first["torque"] and second["contacts"] == first["contacts"]
+    for joint in own["actuated"]:
+        leads = [row["joints"]["squeeze"][joint] - row["joints"]["grasp"][joint] for row in (first, second)]
+        assert leads[1] == pytest.approx(2 * leads[0], abs=1e-12)
+    gains = re.findall(r'<position kp="([0-9.]+)"', format_keyframes(hand, grasp, 5.0, 1.5))
+    assert len(gains) == 16 and set(gains) == {"1.5"}
+
+
 def test_the_command_writes_both_and_names_what_is_wrong(tmp_path, capsys):
     hand, grasp = pinch("allegro")
     grasp = dataclasses.replace(grasp, meta={"hand": "allegro", "hand_sha256": hand.source.sha256})
@@ -82,7 +96,9 @@ def test_the_command_writes_both_and_names_what_is_wrong(tmp_path, capsys):
     words = ["export", str(tmp_path / "grasps.safetensors"), "--out", str(tmp_path / "out")]
     assert cli.main(words) == 0 and json.loads((tmp_path / "out").read_text())["grasps"][0]["status"] == "OK"
     assert cli.main([*words, "--format", "mujoco"]) == 0 and (tmp_path / "out").read_text().startswith("<mujoco")
-    for more, named in ((["--hand", "barrett"], "--hand"), (["--force", "-1"], "--force"), (["--most", "0"], "--most")):
+    wrong = {"--hand": "barrett", "--force": "-1", "--most": "0", "--kp": "0"}
+    for named, value in wrong.items():
+        more = [named, value]
         assert cli.main([*words, *more]) == 2
         assert named in capsys.readouterr().err
 

@@ -16,7 +16,7 @@ def test_a_hand_is_found_by_name_folder_and_file():
 
 def test_unknown_hand_and_option_are_named(tmp_path):
     with pytest.raises(HandFileError, match=r"allegro.*barrett"):
-        load_hand("shadow")
+        load_hand("fist")
     with pytest.raises(HandFileError, match=r"hand\.toml"):
         load_hand(tmp_path)
     with pytest.raises(BadArgument, match="paper_literal"):

@@ -193,7 +193,7 @@ def test_command(tmp_path, small, capsys):
     assert main([*arguments, "--out", str(tmp_path / "a")]) == 0
     assert "700 grasping postures of barrett" in capsys.readouterr().out
     assert len(load_samples(tmp_path / "a")) == 700
-    for wrong, named in [(["--hand", "shadow"], "--hand"), (["--n", "0"], "--n"), (["--seed", "-1"], "--seed"),
+    for wrong, named in [(["--hand", "fist"], "--hand"), (["--n", "0"], "--n"), (["--seed", "-1"], "--seed"),
                          (["--fingers", "toes"], "--fingers"), (["--seed", "1"], "--out")]:  # fmt: skip
         assert main([*arguments, "--out", str(tmp_path / "a"), *wrong]) == 2
         assert f"torchgrasp: {named}" in capsys.readouterr().err

@@ -22,6 +22,7 @@ def export(
     hand: str | None = None,
     most: int = 20,
     force: float = 4.0,
+    kp: float | None = None,
 ) -> int:
     """Write the best executable grasps of a file for replay, with joints by name.
 
@@ -32,6 +33,7 @@ def export(
         hand: name or folder of the hand; by default the name in the file.
         most: how many grasps, the best first.
         force: normal force of the strongest finger [N] in the squeeze.
+        kp: stiffness of the joints under the robot's own position control [N m/rad]; by default the hand's.
     """
     with naming(path="GRASPS"):
         planned = load_grasps(grasps)
@@ -41,7 +43,7 @@ def export(
         raise BadArgument("--hand", f"{robot.name}, whose files are not those that were planned with", "the same hand")
     check_whole("--most", most, 1, 1_000_000)
     best = planned[planned.status == Status.OK][:most]
-    with naming(force="--force", path="--out"):
-        write_file(out, (format_grasps if format == "json" else format_keyframes)(robot, best, force))
+    with naming(force="--force", kp="--kp", path="--out"):
+        write_file(out, (format_grasps if format == "json" else format_keyframes)(robot, best, force, kp))
     print(f"{len(best)} grasps of the {robot.name} hand: {out}")
     return 0 if len(best) else 1

@@ -32,17 +32,17 @@ CONVENTIONS = {
 """Meaning of the numbers; the file contains it."""
 
 
-def format_grasps(hand: Hand, grasps: Grasps, force: float = 4.0) -> str:
+def format_grasps(hand: Hand, grasps: Grasps, force: float = 4.0, kp: float | None = None) -> str:
     """Return grasps as JSON, with `CONVENTIONS`.
 
     The hand comes to "pose" along "approach" in its "pregrasp" posture. It closes to "grasp" in the time given.
     In the same time again it presses towards "squeeze". All joints move evenly. The strongest finger presses with a
-    normal force of `force` [N].
+    normal force of `force` [N]. `kp` is the stiffness of the robot's own position control [N m/rad]; None: the hand's.
 
     Raises:
-        BadArgument: joints of another hand, or a force that is not positive.
+        BadArgument: joints of another hand, or a force or stiffness that is not positive.
     """
-    squeezed, path = squeeze(hand, grasps, force), hand.urdf_path
+    squeezed, path = squeeze(hand, grasps, force, kp), hand.urdf_path
     forces = rotate(grasps.obj_from_hand.double(), squeezed.forces)
     postures = {"pregrasp": grasps.pregrasp.double(), "grasp": grasps.joints.double(), "squeeze": squeezed.joints}
     named = {name: hand.expand(joints) for name, joints in postures.items()}
@@ -79,7 +79,7 @@ def format_grasps(hand: Hand, grasps: Grasps, force: float = 4.0) -> str:
         **CONVENTIONS,
         "hand": {"name": hand.name, "urdf": path.name, "root": read_urdf(path).root, "sha256": hand.source.sha256},
         "actuated": list(hand.joint_names),
-        "stiffness": {name: drive.kp for name, drive in hand.actuators.items()},
+        "stiffness": {name: drive.kp if kp is None else kp for name, drive in hand.actuators.items()},
         "strongest_normal_force": force,
         "time": {"pregrasp": 0.0, "grasp": POSE_TIME, "squeeze": 2 * POSE_TIME},
         "provenance": grasps.meta,

@@ -13,18 +13,18 @@ from torchgrasp.sim.mjcf import add_drive, add_links, format_numbers
 from torchgrasp.values import Grasps
 
 
-def format_keyframes(hand: Hand, grasps: Grasps, force: float = 4.0) -> str:
+def format_keyframes(hand: Hand, grasps: Grasps, force: float = 4.0, kp: float | None = None) -> str:
     """Return MJCF of the hand with four keyframes for each grasp: grasp_0_approach, _pregrasp, _grasp, _squeeze.
 
     The world is the object's frame. `qpos` is the free joint, then the joints of the model; `ctrl` is the targets of
     the actuators. The text elements "qpos" and "ctrl" name their order. The approach has the joints of the pre-grasp.
     The squeeze has the joints of the grasp and targets that press. `force` [N] is the normal force of the strongest
-    finger.
+    finger. `kp` is the stiffness of every drive [N m/rad]; None: the hand's own.
 
     Raises:
-        BadArgument: joints of another hand, or a force that is not positive.
+        BadArgument: joints of another hand, or a force or stiffness that is not positive.
     """
-    squeezed, urdf = squeeze(hand, grasps, force), read_urdf(hand.urdf_path)
+    squeezed, urdf = squeeze(hand, grasps, force, kp), read_urdf(hand.urdf_path)
     root = ET.Element("mujoco", model=hand.name)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     tags = "custom", "worldbody", "actuator", "keyframe"
@@ -33,7 +33,8 @@ def format_keyframes(hand: Hand, grasps: Grasps, force: float = 4.0) -> str:
     palm.insert(0, ET.Element("freejoint", name="hand"))
     order = [joint.attrib["name"] for joint in palm.iter("joint")]  # bodies as they nest, as MuJoCo numbers them
     for name in order:
-        add_drive(actuator, name, hand.actuators[name])
+        drive = hand.actuators[name]
+        add_drive(actuator, name, drive if kp is None else drive._replace(kp=kp))
     free = "hand/x hand/y hand/z hand/qw hand/qx hand/qy hand/qz".split()
     ET.SubElement(custom, "text", name="qpos", data=" ".join([*free, *order]))
     ET.SubElement(custom, "text", name="ctrl", data=" ".join(order))

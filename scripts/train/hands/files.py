@@ -141,7 +141,9 @@ def format_toml(table: Table, pairs: list[tuple[str, str]]) -> str:
         lines += [f"normal = [{numbers(tip.normal, ', ', 16)}]", 'tip = "sphere"', "center = [0, 0, 0]"]
         lines += [f"radius = {tip.radius}", ""]
     lines += ["[self_collision]"]
-    lines += ["# The pairs of links that come within 2 mm in 20,000 uniform postures of all joints, but for neighbours."]
+    lines += [
+        "# The pairs of links that come within 2 mm in 20,000 uniform postures of all joints, but for neighbours."
+    ]
     return "\n".join([*lines, "pairs = [", *(f"  {quoted(pair)}," for pair in pairs), "]", ""])
 
 
@@ -164,7 +166,8 @@ def mass_properties(body: Body) -> tuple[Triple, tuple[float, ...]]:
     com = masses @ places / body.mass
     total = np.zeros((3, 3))
     for shape, mass, place in zip(body.shapes, masses, places, strict=True):
-        turn, arm = rotation_from_rpy(shape.rpy).numpy(), place - com
+        roll, pitch, yaw = (float(angle) for angle in shape.rpy)
+        turn, arm = rotation_from_rpy((roll, pitch, yaw)).numpy(), place - com
         total += turn @ np.diag(principal(shape, mass)) @ turn.T + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     x, y, z = (float(v) for v in com)
     return (x, y, z), tuple(float(total[i, j]) for i in range(3) for j in range(i, 3))

@@ -8,8 +8,8 @@ from typing import NamedTuple
 class Mirror(NamedTuple):
     """How a left hand differs from the mirror image of the right one.
 
-    `axis` is the coordinate (0, 1, 2) that changes its sign, in every link. `kept` are joints that the maker turns about
-    the same axis on both sides: there positive is not the mirrored direction.
+    `axis` is the coordinate (0, 1, 2) that changes its sign, in every link. `kept` are joints that the maker turns
+    about the same axis on both sides: there positive is not the mirrored direction.
     """
 
     names: tuple[str, str]

@@ -47,8 +47,10 @@ def shadow() -> Table:
         drive=(3.0, 0.1),
         bodies=tuple(bodies),
         joints=tuple(joints),
-        tips=tuple(Tip(f, f"{f}_tip", 0.007, NORMAL) for f in (*FINGERS, "little"))
-        + (Tip("thumb", "thumb_tip", 0.008, NORMAL),),
+        tips=(
+            *(Tip(f, f"{f}_tip", 0.007, NORMAL) for f in (*FINGERS, "little")),
+            Tip("thumb", "thumb_tip", 0.008, NORMAL),
+        ),
         options={"default": ("index", "middle", "thumb")},
         parked={**parked, "LFJ5": 0.0},
     )
@@ -80,11 +82,11 @@ def _palm() -> tuple[list[Body], list[Joint]]:
     return bodies, fixed
 
 
-def _finger(
-    finger: str, letters: str, mount: tuple[str, Triple, Triple], sign: int
-) -> tuple[list[Body], list[Joint]]:
+def _finger(finger: str, letters: str, mount: tuple[str, Triple, Triple], sign: int) -> tuple[list[Body], list[Joint]]:
     """Return links and joints of a finger."""
-    knuckle, proximal, middle, distal, tip = (f"{finger}_{x}" for x in ("knuckle", "proximal", "middle", "distal", "tip"))
+    knuckle, proximal, middle, distal, tip = (
+        f"{finger}_{x}" for x in ("knuckle", "proximal", "middle", "distal", "tip")
+    )
     bodies = [
         Body(knuckle, 0.008, (Shape((0.008,)),)),
         Body(proximal, 0.03, (Shape((0.008, 0.037), (0, 0, 0.0265)),)),
