@@ -58,7 +58,7 @@ def evaluate(
     Args:
         objects: folder with manifest.json, and for each object mesh.ply and noisy views. Scenes need mesh.ply only, and
             take the library's own objects by default.
-        hand: allegro, allegro_biotac, barrett, or the folder of another hand.
+        hand: name of a shipped hand, as allegro, barrett, leap or shadow, or the folder of another.
         out: folder of the results; it is made where it does not exist, and no other run may use it meanwhile.
         protocol: which test; see torchgrasp.evaluation.protocols.
         closing: how the hand closes; by default in open loop before a pull, under uncertainty before a lift.

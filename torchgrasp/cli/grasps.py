@@ -75,7 +75,7 @@ def grasp(
     Args:
         cloud: point cloud of one object (.ply, .pcd, .npy, .npz, .xyz, .txt, .csv), or a scene (.npz with depth and
             intrinsics; see docs/scenes.md).
-        hand: allegro, allegro_biotac, barrett, or the folder of another hand.
+        hand: name of a shipped hand, as allegro, barrett, leap or shadow, or the folder of another.
         out: folder of the results; it is made where it does not exist.
         mesh: true mesh of the object [m] in the frame of the cloud; only the simulator sees it.
         close: close the best grasp on the mesh, lift it and hold it (needs the extra "sim").

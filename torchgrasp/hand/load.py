@@ -40,7 +40,7 @@ def load_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
     """Load a hand from its hand.toml and URDF, with one of its finger options.
 
     Args:
-        name_or_path: a shipped hand ("allegro", "allegro_biotac", "barrett"), or the folder of another one.
+        name_or_path: a shipped hand, as "allegro", "barrett", "leap" or "shadow", or the folder of another one.
         fingers: "default", or for the Allegro "paper_literal" (index, middle and ring finger).
 
     Raises:
