@@ -1,4 +1,4 @@
-"""A half-seen ball whose surface is drawn, and triples on it."""
+"""A half-seen ball whose surface is drawn, and contacts on it."""
 
 import torch
 
@@ -32,13 +32,13 @@ def ball(seen_from: float, std_factor: float, noise: float = 0.02) -> ShapeGP:
     )
 
 
-def contacts_on(shape: ShapeGP, generator: torch.Generator, count: int) -> Contacts:
-    """Random triples on the mean surface whose normals are the mean's, closed there at friction 0.8."""
-    x = unit(torch.randn(20 * count, 3, 3, generator=generator, dtype=torch.float64))
+def contacts_on(shape: ShapeGP, generator: torch.Generator, count: int, fingertips: int = 3) -> Contacts:
+    """Random contacts on the mean surface whose normals are the mean's, closed there at friction 0.8."""
+    x = unit(torch.randn(20 * count, fingertips, 3, generator=generator, dtype=torch.float64))
     for _ in range(8):
-        distance, slope = (t.unflatten(0, (len(x), 3)) for t in shape.mean_and_gradient(x.flatten(0, 1)))
+        distance, slope = (t.unflatten(0, (len(x), -1)) for t in shape.mean_and_gradient(x.flatten(0, 1)))
         x = x - (distance / (slope * slope).sum(-1))[..., None] * slope
-    normals = unit(shape.mean_and_gradient(x.flatten(0, 1))[1]).unflatten(0, (len(x), 3))
+    normals = unit(shape.mean_and_gradient(x.flatten(0, 1))[1]).unflatten(0, (len(x), -1))
     good = closed_exact(x, normals, 0.8) & (torch.linalg.vector_norm(x - x.roll(1, 1), dim=-1).amin(-1) > 0.3)
     x, normals = x[good][:count], normals[good][:count]
     return Contacts(shape.metres(x), normals)

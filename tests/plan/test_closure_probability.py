@@ -33,16 +33,18 @@ def test_the_probability_is_a_share_with_a_bounded_error(doubtful, generator):
     assert 0.5 < float(found.probability.mean()) < 0.99
 
 
-def test_surfaces_drawn_anew_are_closed_as_often(doubtful, generator):
-    contacts = contacts_on(doubtful, generator, 6)
-    found = closure_probability(doubtful, contacts, ContactSpec(friction=0.6), n=600)
-    again = redrawn_closure(doubtful, contacts, 0.6, 600, seed=1)
+@pytest.mark.parametrize(("fingertips", "friction"), [(3, 0.6), (4, 0.3)])
+def test_surfaces_drawn_anew_are_closed_as_often(doubtful, generator, fingertips, friction):
+    contacts = contacts_on(doubtful, generator, 6, fingertips)
+    found = closure_probability(doubtful, contacts, ContactSpec(friction=friction), n=600)
+    again = redrawn_closure(doubtful, contacts, friction, 600, seed=1)
     assert bool(((again - found.probability).abs() <= 3 * 2**0.5 * found.standard_error).all())
     assert float(found.probability.min()) < 0.95
 
 
-def test_rows_do_not_depend_on_each_other_and_a_seed_fixes_every_bit(doubtful, generator):
-    contacts = contacts_on(doubtful, generator, 20)
+@pytest.mark.parametrize("fingertips", [3, 5])
+def test_rows_do_not_depend_on_each_other_and_a_seed_fixes_every_bit(doubtful, generator, fingertips):
+    contacts = contacts_on(doubtful, generator, 20, fingertips)
     every, again, other = (closure_probability(doubtful, contacts, n=300, seed=seed) for seed in (3, 3, 4))
     assert torch.equal(every.probability, again.probability)
     assert not torch.equal(every.probability, other.probability)
@@ -54,12 +56,14 @@ def test_rows_do_not_depend_on_each_other_and_a_seed_fixes_every_bit(doubtful, g
 def test_bad_arguments_name_what_was_found(doubtful, generator):
     contacts = contacts_on(doubtful, generator, 2)
     far = Contacts(contacts.points * 100, contacts.normals)
+    two = Contacts(contacts.points[:, :2], contacts.normals[:, :2])
     long = Contacts(contacts.points, 1.1 * contacts.normals)
     for action, match in (
         (lambda: closure_probability(doubtful, contacts, n=0), "integer from 1"),
         (lambda: closure_probability(doubtful, contacts, seed=-1), "integer from 0"),
         (lambda: closure_probability(doubtful, far), "domain"),
         (lambda: closure_probability(doubtful, long), "unit vectors"),
+        (lambda: closure_probability(doubtful, two), "found 2 contacts a row, allowed is 3 to 5"),
     ):
         with pytest.raises(BadArgument, match=match):
             action()

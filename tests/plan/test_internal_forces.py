@@ -3,11 +3,15 @@
 import math
 
 import numpy as np
+import pytest
 import torch
 from scipy.optimize import linprog
 
 from torchgrasp.frames import rotation_from_vector
+from torchgrasp.plan.cone_forces import forces_in_cones
 from torchgrasp.plan.internal_forces import internal_forces, least_friction_forces, tangential_ratio
+
+FINGERTIPS = pytest.mark.parametrize("fingertips", [3, 4, 5])
 
 
 def pinch(spread=0.02, half=0.03):
@@ -17,12 +21,12 @@ def pinch(spread=0.02, half=0.03):
     return points, normals
 
 
-def tripods(count, seed):
+def tripods(count, seed, fingertips=3):
     """Random contacts on a sphere, opened so that they can balance, with tilted normals."""
     generator = torch.Generator().manual_seed(seed)
-    noise = torch.randn(2, count, 3, 3, generator=generator, dtype=torch.float64)
-    angles = torch.tensor([0.0, 2 * math.pi / 3, 4 * math.pi / 3], dtype=torch.float64)
-    ring = torch.stack([angles.cos(), angles.sin(), torch.zeros(3, dtype=torch.float64)], -1)
+    noise = torch.randn(2, count, fingertips, 3, generator=generator, dtype=torch.float64)
+    angles = torch.arange(fingertips, dtype=torch.float64) * 2 * math.pi / fingertips
+    ring = torch.stack([angles.cos(), angles.sin(), torch.zeros_like(angles)], -1)
     points = ring + 0.25 * noise[0]
     points = 0.04 * points / points.norm(dim=-1, keepdim=True)
     outward = points / 0.04 + 0.25 * noise[1]
@@ -30,7 +34,7 @@ def tripods(count, seed):
 
 
 def least_ratio(points, normals):
-    """The least friction (tangent) that balances three contacts: bisection over LPs with a fine polygonal cone."""
+    """The least friction (tangent) that balances contacts: bisection over LPs with a fine polygonal cone."""
     angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
 
     def balances(friction):
@@ -40,11 +44,12 @@ def least_ratio(points, normals):
             rays = -n + friction * (np.cos(angles)[:, None] * t[0] + np.sin(angles)[:, None] * t[1])
             columns += [np.concatenate([r, np.cross(p, r)]) for r in rays]
         matrix = np.stack(columns, 1)
-        ones = np.kron(np.eye(3), np.ones(64))  # normal force of each contact
-        unit = np.concatenate([matrix / 0.04, np.ones((1, 192))])
+        f = len(points)
+        ones = np.kron(np.eye(f), np.ones(64))  # normal force of each contact
+        unit = np.concatenate([matrix / 0.04, np.ones((1, 64 * f))])
         least = -ones  # each contact presses with at least 2 % of the sum
         answer = linprog(
-            np.zeros(192), A_ub=least, b_ub=-0.02 * np.ones(3), A_eq=unit, b_eq=np.eye(7)[6], method="highs"
+            np.zeros(64 * f), A_ub=least, b_ub=-0.02 * np.ones(f), A_eq=unit, b_eq=np.eye(7)[6], method="highs"
         )
         return answer.status == 0
 
@@ -55,16 +60,20 @@ def least_ratio(points, normals):
     return high
 
 
-def test_internal_forces_balance():
-    points, _ = tripods(50, 0)
+@FINGERTIPS
+def test_internal_forces_balance(fingertips):
+    points, _ = tripods(50, 0, fingertips)
     forces = internal_forces(points)
+    assert forces.shape == (50, fingertips * (fingertips - 1) // 2, fingertips, 3)
+    assert bool((torch.linalg.matrix_rank(forces.flatten(2)) == 3 * fingertips - 6).all())
     torques = torch.linalg.cross(points[:, None].expand_as(forces), forces)
     assert forces.sum(-2).abs().max() < 1e-12
     assert torques.sum(-2).abs().max() < 1e-12
 
 
-def test_balanced_forces_are_in_equilibrium_and_scaled():
-    points, normals = tripods(64, 1)
+@FINGERTIPS
+def test_balanced_forces_are_in_equilibrium_and_scaled(fingertips):
+    points, normals = tripods(64, 1, fingertips)
     forces = least_friction_forces(points, normals, 5.0)
     good = torch.isfinite(forces).all(-1).all(-1)
     assert good.float().mean() > 0.8
@@ -73,11 +82,12 @@ def test_balanced_forces_are_in_equilibrium_and_scaled():
     assert torch.linalg.cross(points, forces).sum(-2).abs().max() < 1e-9
     push = -(forces * normals).sum(-1)
     assert torch.allclose(push.amax(-1), torch.tensor(5.0, dtype=torch.float64))
-    assert (push > 0).all()
+    assert (push > 0.05).all()
 
 
-def test_least_friction_against_linear_programmes():
-    points, normals = tripods(12, 2)
+@FINGERTIPS
+def test_least_friction_against_linear_programmes(fingertips):
+    points, normals = tripods(12, 2, fingertips)
     forces = least_friction_forces(points, normals, 1.0)
     ratios = tangential_ratio(forces, normals).amax(-1)
     for k in range(len(points)):
@@ -85,7 +95,7 @@ def test_least_friction_against_linear_programmes():
         if not torch.isfinite(ratios[k]):
             assert oracle > 2.0
         elif oracle < 2.0:
-            assert ratios[k] <= oracle + 0.05
+            assert oracle - 0.02 <= ratios[k] <= oracle + (0.05 if fingertips == 3 else 0.1)
 
 
 def test_thumb_is_the_sum_of_the_others_and_they_are_even():
@@ -107,3 +117,63 @@ def test_forces_turn_with_the_frame():
 def test_contacts_that_cannot_balance_are_nan():
     points, normals = pinch()
     assert torch.isnan(least_friction_forces(points, normals[:1].expand(3, 3).contiguous(), 4.0)).all()
+
+
+@FINGERTIPS
+def test_the_method_of_centres_finds_the_least_friction(fingertips):
+    points, normals = tripods(12, 4, fingertips)
+    forces = forces_in_cones(points, normals, points.new_ones(12, fingertips), 1e-3)
+    ratios = tangential_ratio(forces, normals).amax(-1)
+    compared = 0
+    for k in range(12):
+        oracle = least_ratio(points[k].numpy(), normals[k].numpy())
+        if oracle < 2.0:
+            assert ratios[k] == pytest.approx(oracle, abs=0.02)
+            compared += 1
+    assert compared >= 8
+
+
+def test_three_contacts_are_searched_and_centred_alike():
+    points, normals = tripods(40, 5)
+    searched = tangential_ratio(least_friction_forces(points, normals), normals).amax(-1)
+    centred = tangential_ratio(forces_in_cones(points, normals, points.new_ones(40, 3), 1e-3), normals).amax(-1)
+    good = searched < 2.0
+    assert int(good.sum()) > 25
+    assert float((centred - searched)[good].max()) < 0.01  # the search also weighs evenness
+    assert float((searched - centred)[good].median()) < 0.02
+
+
+def test_four_fingers_against_a_thumb_press_with_a_quarter_each_or_as_is_preferred():
+    corners = [[0.03, y, z] for y, z in ((-0.02, -0.02), (-0.02, 0.02), (0.02, -0.02), (0.02, 0.02))]
+    points = torch.tensor([*corners, [-0.03, 0.0, 0.0]], dtype=torch.float64)
+    normals = torch.tensor([[1.0, 0, 0]] * 4 + [[-1.0, 0, 0]], dtype=torch.float64)
+    forces = least_friction_forces(points, normals, 8.0)
+    push = -(forces * normals).sum(-1)
+    torch.testing.assert_close(push, torch.tensor([2.0, 2, 2, 2, 8], dtype=torch.float64), rtol=0, atol=0.01)
+    uneven = torch.tensor([0.1, 0.4, 0.4, 0.1, 1.0], dtype=torch.float64)
+    push = -(least_friction_forces(points, normals, 8.0, uneven) * normals).sum(-1)
+    assert float(push[1]) == pytest.approx(float(push[2]), abs=0.05)
+    assert float(push[1]) > 2 * float(push[0])
+
+
+@pytest.mark.parametrize("fingertips", [4, 5])
+def test_forces_of_more_contacts_turn_with_the_frame_and_know_no_row_beside(fingertips):
+    points, normals = tripods(20, 6, fingertips)
+    rotation = rotation_from_vector(torch.tensor([0.4, -0.9, 0.3], dtype=torch.float64))
+    here = least_friction_forces(points, normals, 4.0)
+    good = torch.isfinite(here).flatten(1).all(1)
+    assert int(good.sum()) > 15
+    there = least_friction_forces(points @ rotation.T, normals @ rotation.T, 4.0)
+    torch.testing.assert_close((here @ rotation.T)[good], there[good], rtol=0, atol=1e-6)
+    torch.testing.assert_close(least_friction_forces(points[7], normals[7], 4.0), here[7], rtol=0, atol=1e-9)
+
+
+def test_more_contacts_that_cannot_balance_are_nan_and_harm_no_other():
+    points, normals = tripods(3, 7, 4)
+    alone = least_friction_forces(points, normals)
+    assert bool(torch.isfinite(alone).all())
+    normals[0] = normals[0, :1]
+    points[2, 1] = torch.nan
+    forces = least_friction_forces(points, normals)
+    assert bool(torch.isnan(forces[[0, 2]]).all())
+    torch.testing.assert_close(forces[1], alone[1])

@@ -1,7 +1,10 @@
 """The rows of Eqs. (10)-(14) against their definitions, and their Jacobian against automatic differentiation."""
 
+import dataclasses
+import itertools
 import math
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -12,19 +15,29 @@ from torchgrasp.plan.problem import (
     LEAST_SIDE,
     Constraints,
     ContactProblem,
+    contact_pairs,
     forces_from_tensions,
+    split_unknowns,
     triple_jet,
 )
 from torchgrasp.plan.round_cones import closed_exact
 from torchgrasp.specs import ContactSpec
 
+CPU = torch.device("cpu")
 SPEC = ContactSpec(table=0.47, tip_radius=0.03, separation=0.03)
 
 
+FINGERTIPS = pytest.mark.parametrize("fingertips", [3, 4, 5])
+
+
+def with_fingertips(fingertips: int, spec: ContactSpec = SPEC) -> ContactSpec:
+    return dataclasses.replace(spec, fingertips=fingertips)
+
+
 def problem_and_state(ellipsoid, generator: torch.Generator, spec: ContactSpec = SPEC, count: int = 6):
-    problem = ContactProblem.of(ellipsoid, spec)
-    points = 0.8 * torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)
-    tension = 1 + 0.5 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    problem, f = ContactProblem.of(ellipsoid, spec), spec.fingertips
+    points = 0.8 * torch.randn(count, f, 3, generator=generator, dtype=torch.float64)
+    tension = 1 + 0.5 * torch.randn(count, f * (f - 1) // 2, generator=generator, dtype=torch.float64)
     return problem, points, tension, triple_jet(ellipsoid, points)
 
 
@@ -46,17 +59,20 @@ def test_eq12_variance_row_is_positive_exactly_where_the_variance_exceeds_the_th
     assert torch.equal(rows.bounds[:, 3:6] > 0, ellipsoid.doubt_at(points) > INSIDE * SPEC.max_variance)
 
 
-def test_eq13_forces_balance_whatever_the_tensions(ellipsoid, generator):
-    _, points, tension, _ = problem_and_state(ellipsoid, generator)
+@FINGERTIPS
+def test_eq13_forces_balance_whatever_the_tensions(ellipsoid, generator, fingertips):
+    _, points, tension, _ = problem_and_state(ellipsoid, generator, with_fingertips(fingertips))
     force, _ = forces_from_tensions(points, tension)
     zero = torch.zeros(6, 3, dtype=torch.float64)
     torch.testing.assert_close(force.sum(1), zero)
     torch.testing.assert_close(torch.linalg.cross(points, force).sum(1), zero)
 
 
-def test_eq13_cone_rows_are_the_cosines_of_the_forces_and_imply_closure(ellipsoid, generator):
-    problem, points, tension, jet = problem_and_state(ellipsoid, generator, ContactSpec.paper(), count=4000)
-    rows = problem.constraints(points, tension, jet).bounds[:, :3]
+@FINGERTIPS
+def test_eq13_cone_rows_are_the_cosines_of_the_forces_and_imply_closure(ellipsoid, generator, fingertips):
+    spec = with_fingertips(fingertips, ContactSpec.paper())
+    problem, points, tension, jet = problem_and_state(ellipsoid, generator, spec, count=4000)
+    rows = problem.constraints(points, tension, jet).bounds[:, :fingertips]
     force, _ = forces_from_tensions(points, tension)
     cosine = -(unit(force) * jet.normals).sum(-1)
     cone = math.cos(math.atan(0.8 * math.cos(math.pi / 8)))
@@ -71,16 +87,21 @@ def test_eq14_centre_rows_are_the_mean_of_the_contacts(ellipsoid, generator):
     torch.testing.assert_close(problem.constraints(points, tension, jet).centre, points.mean(1))
 
 
-def test_bounds_name_ball_separation_and_table(ellipsoid, generator):
-    problem, points, tension, jet = problem_and_state(ellipsoid, generator)
-    bounds = problem.constraints(points, tension, jet).bounds
-    assert bounds.shape == (6, 15)
-    assert torch.equal(bounds[:, 6:9] > 0, torch.linalg.vector_norm(points, dim=-1) > INSIDE * 1.35)
+@FINGERTIPS
+def test_bounds_name_ball_separation_and_table(ellipsoid, generator, fingertips):
+    problem, points, tension, jet = problem_and_state(ellipsoid, generator, with_fingertips(fingertips))
+    rows = problem.constraints(points, tension, jet).bounds
+    f, pairs = fingertips, tension.shape[1]
+    _, _, inside, distances, heights = rows.split([f, f, f, pairs, f], 1)
+    assert torch.equal(inside > 0, torch.linalg.vector_norm(points, dim=-1) > INSIDE * 1.35)
     centres = ellipsoid.metres(points) + 0.03 * jet.normals
-    apart = torch.linalg.vector_norm(centres - centres.roll(-1, 1), dim=-1)
-    assert torch.equal(bounds[:, 9:12] > 0, apart < SPEC.least_separation / INSIDE)
+    apart = torch.stack([(centres[:, i] - centres[:, j]).norm(dim=-1) for i, j in contact_pairs(f, CPU).T], 1)
+    assert torch.equal(distances > 0, apart < SPEC.least_separation / INSIDE)
+    assert {frozenset(pair) for pair in contact_pairs(f, CPU).T.tolist()} == set(
+        map(frozenset, itertools.combinations(range(f), 2))
+    )
     height = ellipsoid.metres(points)[..., 2]
-    above = bounds[:, 12:] <= 0
+    above = heights <= 0
     lowest = height + 0.03 * (jet.normals[..., 2] - 1)  # of a fingertip there
     assert bool((lowest[above] >= 0.47).all())
     assert bool(above[lowest > 0.47 + 1e-4].all()) and bool(((lowest < 0.47) & (height > 0.47)).any())
@@ -89,13 +110,14 @@ def test_bounds_name_ball_separation_and_table(ellipsoid, generator):
     assert paper.separation == LEAST_SIDE
 
 
-def test_jacobian_of_every_row_against_automatic_differentiation(ellipsoid, generator):
-    problem, points, tension, jet = problem_and_state(ellipsoid, generator)
+@FINGERTIPS
+def test_jacobian_of_every_row_against_automatic_differentiation(ellipsoid, generator, fingertips):
+    problem, points, tension, jet = problem_and_state(ellipsoid, generator, with_fingertips(fingertips))
     rows = problem.constraints(points, tension, jet)
 
     def values(x: Tensor) -> tuple[Tensor, ...]:
-        points = x[:, :9].unflatten(1, (3, 3))
-        r: Constraints = problem.constraints(points, x[:, 9:], triple_jet(ellipsoid, points))
+        points, tension = split_unknowns(x)
+        r: Constraints = problem.constraints(points, tension, triple_jet(ellipsoid, points))
         return r.surface.sum(0), r.centre.sum(0), r.bounds.sum(0)
 
     wanted = torch.autograd.functional.jacobian(values, torch.cat([points.flatten(1), tension], 1))

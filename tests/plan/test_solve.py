@@ -1,6 +1,7 @@
 """Plans on an analytic shape: every constraint re-checked from outside, statuses, seeds, given starts."""
 
 import dataclasses
+import itertools
 
 import pytest
 import torch
@@ -20,9 +21,10 @@ from torchgrasp.specs import ContactSpec
 SPECS = {"paper": ContactSpec.paper(), "table": ContactSpec(table=0.472, flatness=0.6, flat_radius=0.008)}
 
 
+@pytest.mark.parametrize("fingertips", [3, 4, 5])
 @pytest.mark.parametrize("name", list(SPECS))
-def test_eq10_to_eq13_hold_for_every_row_that_is_ok(ellipsoid, name):
-    spec = SPECS[name]
+def test_eq10_to_eq13_hold_for_every_row_that_is_ok(ellipsoid, name, fingertips):
+    spec = dataclasses.replace(SPECS[name], fingertips=fingertips)
     plan = plan_contacts(ellipsoid, spec, starts=60, seed=3)
     assert len(plan) == 60
     assert int((plan.status == Status.OK).sum()) >= 45
@@ -40,8 +42,8 @@ def test_eq10_to_eq13_hold_for_every_row_that_is_ok(ellipsoid, name):
     assert float(good.coefficients.min()) > 0
     torch.testing.assert_close(good.coefficients.sum((1, 2)), torch.ones(len(good), dtype=torch.float64))
     centres = good.contacts.points + spec.fingertip_radius * good.contacts.normals
-    apart = torch.linalg.vector_norm(centres - centres.roll(1, 1), dim=-1)
-    assert float(apart.min()) >= spec.least_separation
+    for one, other in itertools.combinations(centres.unbind(1), 2):
+        assert float(torch.linalg.vector_norm(one - other, dim=-1).min()) >= spec.least_separation
     assert not bool(degenerate(good.contacts.points).any())
     if spec.table is not None:
         height = good.contacts.points[..., 2]
@@ -227,5 +229,8 @@ def test_bad_starting_points_are_refused(ellipsoid):
         plan_contacts(ellipsoid, starts=far)
     with pytest.raises(BadArgument, match="finite"):
         plan_contacts(ellipsoid, starts=far * torch.nan)
+    four = torch.zeros(2, 4, 3, dtype=torch.float64)
+    with pytest.raises(BadArgument, match="starts: found 4 contacts a row, allowed is as many as spec"):
+        plan_contacts(ellipsoid, starts=four)
     with pytest.raises(BadArgument, match="start_radius"):
         plan_contacts(dataclasses.replace(ellipsoid, domain_radius=0.5))

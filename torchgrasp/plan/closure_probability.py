@@ -13,20 +13,20 @@ from torch import Tensor
 from torchgrasp.base import Batch
 from torchgrasp.errors import BadArgument
 from torchgrasp.plan.line_posterior import LinePosterior, first_contact, line_posterior, well_inside
-from torchgrasp.plan.round_cones import closed_exact
+from torchgrasp.plan.round_cones import closed_exact, first_balance
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts
 
 DRAWS_PER_CHUNK = 8192
-"""Drawn triples that are judged at a time: their tensors take about 20 MB."""
+"""Drawn rows that are judged at a time: their tensors take about 20 MB."""
 GPU_DRAWS = 2**18
 """The same on a GPU, which fewer leave idle: about 700 MB (`scripts/bench.py gpu`)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ClosureProbability(Batch):
-    """The `probability` that each triple is closed, with its `standard_error`."""
+    """The `probability` that the contacts of each row are closed, with its `standard_error`."""
 
     probability: Float[Tensor, "b"]
     standard_error: Float[Tensor, "b"]
@@ -41,8 +41,8 @@ def closure_probability(
 
     Args:
         shape: the posterior.
-        contacts: triples [m] of any planner with outward unit normals, inside the domain of the shape. A finger that
-            meets no surface within 12 standard deviations of its contact does not close.
+        contacts: three to five a row [m], of any planner, with outward unit normals, inside the domain of the shape. A
+            finger that meets no surface within 12 standard deviations of its contact does not close.
         spec: its `friction` counts, that of execution, not `planned_friction`.
         n: number of draws. The standard error is at most 1 / (2 sqrt(n)): 0.01 for 2500. It is that of
             (k + 1) / (n + 2) for k closed draws, and so never 0.
@@ -81,14 +81,16 @@ def closure_share(shape: ShapeGP, contacts: Contacts, friction: float, n: int, s
 
 
 def closed_share(lines: LinePosterior, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:
-    """Return the share of n drawn surfaces on which the fingers' triples are closed."""
+    """Return the share of n drawn surfaces on which the fingers' contacts are closed."""
     generator = torch.Generator().manual_seed(seed)
     count = lines.points.new_zeros(len(lines))
+    guess = None if lines.points.shape[1] == 3 else first_balance(lines.points, lines.normals, friction)
     at_once, judged = min(n, DRAWS_PER_CHUNK), DRAWS_PER_CHUNK if count.device.type == "cpu" else GPU_DRAWS
     for start in range(0, n, at_once):
         standard = torch.randn(min(at_once, n - start), lines.root.shape[-1], dtype=torch.float64, generator=generator)
         for rows in torch.arange(len(lines), device=count.device).split(max(judged // len(standard), 1)):
             points, normals = first_contact(lines[rows], standard.to(count) @ lines.root[rows])
-            closed = closed_exact(points.flatten(0, 1), normals.flatten(0, 1), friction)
+            balance = None if guess is None else guess[rows].repeat_interleave(len(standard), 0)
+            closed = closed_exact(points.flatten(0, 1), normals.flatten(0, 1), friction, balance)
             count[rows] += closed.unflatten(0, points.shape[:2]).sum(1)
     return count / n

@@ -1,4 +1,4 @@
-"""The uncertain surface along the lines of three fingers, and where fingers meet it.
+"""The uncertain surface along the lines of the fingers, and where fingers meet it.
 
 A finger comes along the planned normal n of its contact x. It stops at x + t n where the distance d turns negative: at
 the smallest |t|. The normal there is along the gradient w.
@@ -20,7 +20,7 @@ from torch import Tensor
 from torchgrasp.base import Batch, check_tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
-from torchgrasp.plan.certify import check_unit
+from torchgrasp.plan.certify import check_contacts, check_unit
 from torchgrasp.plan.wrench import Vectors, tangents
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.joint_posterior import distance_covariance, symmetric_root
@@ -32,8 +32,8 @@ NODES = (4.0, 1.5, 0.0, -1.5, -4.0)
 """Nodes of a line, in standard deviations of the surface at its contact: three err by 0.07, five by 0.02 at most."""
 OUTER_GRID = (12.0, 9.0, 6.5, 4.0, 3.375, 2.75, 2.125, 1.5, 1.125, 0.75, 0.375, 0.0)
 """Outer half of the grid, in the same unit; it holds all nodes."""
-TRIPLES_PER_CHUNK = 32
-"""Vectors whose joint posterior is made at a time: 105 x 105 distances each, which stay in the cache."""
+ROWS_PER_CHUNK = 32
+"""Rows whose joint posterior is made at a time: 105 x 105 distances of three contacts, which stay in the cache."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,15 +46,15 @@ class LinePosterior(Batch):
         deviation: standard deviation of the surface at the contact, the unit of nodes and grid.
         distance: mean of d on the grid.
         slope: mean of w at the nodes.
-        root: symmetric root of the covariance of (d, w) at the nodes, line by line, node by node.
+        root: symmetric root of the covariance of the z = 20 f values (d, w) at the nodes, line by line, node by node.
     """
 
     points: Vectors
     normals: Vectors
-    deviation: Float[Tensor, "b 3"]
-    distance: Float[Tensor, "b 3 23"]
-    slope: Float[Tensor, "b 3 5 3"]
-    root: Float[Tensor, "b 60 60"]
+    deviation: Float[Tensor, "b f"]
+    distance: Float[Tensor, "b f 23"]
+    slope: Float[Tensor, "b f 5 3"]
+    root: Float[Tensor, "b z z"]
 
 
 @functools.cache
@@ -82,7 +82,7 @@ def interpolation(at: Float[Tensor, "*b"], nodes: Float[Tensor, "k"]) -> Float[T
 
 
 def well_inside(shape: ShapeGP, contacts: Contacts) -> Bool[Tensor, "b"]:
-    """Tell which triples are a footprint or more inside the domain."""
+    """Tell which rows are a footprint or more inside the domain."""
     radius = torch.linalg.vector_norm(shape.normalise(contacts.points.detach().double().to(shape.device)), dim=-1)
     return (radius + FOOTPRINT / shape.scale <= shape.domain_radius).all(-1)
 
@@ -94,8 +94,9 @@ def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
         BadArgument: contacts of a wrong shape, not finite, within a footprint of the domain's edge, or without unit
             normals.
     """
+    f = check_contacts(contacts).fingertips
     for name, value in (("points", contacts.points), ("normals", contacts.normals)):
-        check_tensor(f"contacts.{name}", value, (len(contacts), 3, 3))
+        check_tensor(f"contacts.{name}", value, (len(contacts), f, 3))
     points = shape.normalise(contacts.points.detach().double().to(shape.device))
     normals = check_unit(contacts.normals.detach().double().to(shape.device))
     if not bool(well_inside(shape, contacts).all()):
@@ -115,7 +116,7 @@ def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
     return LinePosterior(points, normals, deviation, distance, slope, root)
 
 
-def _on_same(own: Bool[Tensor, "b 3"]) -> Bool[Tensor, "b 60 60"]:
+def _on_same(own: Bool[Tensor, "b f"]) -> Bool[Tensor, "b z z"]:
     """Tell which entries of the nodes' covariance belong to two contacts of a wall."""
     own = own.repeat_interleave(4 * len(NODES), 1)
     return own[:, :, None] & own[:, None]
@@ -123,13 +124,14 @@ def _on_same(own: Bool[Tensor, "b 3"]) -> Bool[Tensor, "b 60 60"]:
 
 def _along_lines(
     shape: ShapeGP, factor: float, points: Vectors, normals: Vectors
-) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 3 23"], Float[Tensor, "b 3 5 3"], Float[Tensor, "b 60 60"]]:
+) -> tuple[Float[Tensor, "b f"], Float[Tensor, "b f 23"], Float[Tensor, "b f 5 3"], Float[Tensor, "b z z"]]:
     """Return deviation, distance on the grid, slope and covariance at the nodes for a single surface."""
     jet = shape.jet(points.flatten(0, 1))
     deviation = factor * surface_deviation(jet.variance, jet.gradient).reshape(points.shape[:2])
     nodes = deviation[..., None] * torch.tensor(NODES).to(deviation)
-    covariance = points.new_empty(len(points), 12 * len(NODES), 12 * len(NODES))
-    for rows in torch.arange(len(points), device=points.device).split(TRIPLES_PER_CHUNK):
+    values = 4 * len(NODES) * points.shape[1]
+    covariance = points.new_empty(len(points), values, values)
+    for rows in torch.arange(len(points), device=points.device).split(ROWS_PER_CHUNK):
         covariance[rows] = node_covariance(shape, points[rows], normals[rows], nodes[rows])
     slope = shape.mean_and_gradient((points[:, :, None] + nodes[..., None] * normals[:, :, None]).reshape(-1, 3))[1]
     t = deviation[..., None] * grid().to(deviation)
@@ -138,13 +140,13 @@ def _along_lines(
 
 
 def node_covariance(
-    shape: ShapeGP, points: Vectors, normals: Vectors, nodes: Float[Tensor, "b 3 5"]
-) -> Float[Tensor, "b 60 60"]:
+    shape: ShapeGP, points: Vectors, normals: Vectors, nodes: Float[Tensor, "b f 5"]
+) -> Float[Tensor, "b z z"]:
     """Return the posterior covariance of (d, w) at the nodes, w by difference quotients of d.
 
     Nodes outside the domain take the covariance at its edge.
     """
-    width = FOOTPRINT / shape.scale
+    width, f = FOOTPRINT / shape.scale, points.shape[1]
     along = (points * normals).sum(-1)
     half_chord = (along**2 + (shape.domain_radius - width) ** 2 - (points**2).sum(-1)).sqrt()
     nodes = torch.maximum(torch.minimum(nodes, (half_chord - along)[..., None]), -(half_chord + along)[..., None])
@@ -156,16 +158,16 @@ def node_covariance(
     weights = points.new_zeros(*points.shape[:2], 4, 7)
     weights[..., 0, 0] = 1.0
     weights[..., 1:, 1:] = torch.cat([axes, -axes], 2).mT / (2 * width)
-    values = distance_covariance(shape, queries.flatten(1, 3)).unflatten(2, (3, -1, 7)).unflatten(1, (3, -1, 7))
+    values = distance_covariance(shape, queries.flatten(1, 3)).unflatten(2, (f, -1, 7)).unflatten(1, (f, -1, 7))
     half = torch.einsum("bimp,bikpjlq->bikmjlq", weights, values)
     return torch.einsum("bikmjlq,bjnq->bikmjln", half, weights).flatten(4).flatten(1, 3)
 
 
 def first_contact(
-    lines: LinePosterior, drawn: Float[Tensor, "b n 60"]
-) -> tuple[Float[Tensor, "b n 3 3"], Float[Tensor, "b n 3 3"]]:
+    lines: LinePosterior, drawn: Float[Tensor, "b n z"]
+) -> tuple[Float[Tensor, "b n f 3"], Float[Tensor, "b n f 3"]]:
     """Return where the fingers stop for drawn deviations, and the normals there; NaN without a surface."""
-    deviation = drawn.unflatten(-1, (3, len(NODES), 4))
+    deviation = drawn.unflatten(-1, (lines.points.shape[1], len(NODES), 4))
     distance = lines.distance[:, None] + deviation[..., 0] @ grid_weights().to(drawn).T
     crosses = (distance[..., :-1] > 0) & (distance[..., 1:] <= 0)
     t = grid().to(drawn)
@@ -174,7 +176,7 @@ def first_contact(
     high, low = distance.gather(-1, before), distance.gather(-1, before + 1)
     stop = torch.lerp(t[before], t[before + 1], high / (high - low))
     stop = torch.where(torch.isinf(nearest), torch.nan, stop)
-    weights = interpolation(stop, torch.tensor(NODES).to(stop))  # (b, n, 3, 1, k)
+    weights = interpolation(stop, torch.tensor(NODES).to(stop))  # (b, n, f, 1, k)
     slope = lines.slope[:, None] + deviation[..., 1:]
     motion = stop * lines.deviation[:, None, :, None]
     return lines.points[:, None] + motion * lines.normals[:, None], unit((weights @ slope)[..., 0, :])

@@ -25,13 +25,27 @@ ROUNDS = 12
 """Most programmes: the error of a cone falls to less than a quarter in each, so that 1e-7 of the friction is left."""
 
 
-def closed_exact(points: Vectors, normals: Vectors, friction: float) -> Bool[Tensor, "b"]:
+def closed_exact(
+    points: Vectors, normals: Vectors, friction: float, guess: Float[Tensor, "b m"] | None = None
+) -> Bool[Tensor, "b"]:
     """Tell which contacts have frictional form closure with round cones.
 
     Degenerate and non-finite rows are not closed, nor are those at the very border.
+
+    Args:
+        points: three to five a row.
+        normals: outward unit normals.
+        friction: coefficient of friction.
+        guess: the `first_balance` of contacts nearby, which most often decides four or five at once; None: unknown.
     """
-    test = _closed_in_plane if points.shape[1] == 3 else _closed_by_proof
-    return test(points, normals, friction) & ~degenerate(points)
+    if points.shape[1] == 3:
+        return _closed_in_plane(points, normals, friction) & ~degenerate(points)
+    return _closed_by_proof(points, normals, friction, guess) & ~degenerate(points)
+
+
+def first_balance(points: Vectors, normals: Vectors, friction: float) -> Float[Tensor, "b m"]:
+    """Return the balance of the greatest margin of the edges with which a proof begins; any where nothing balances."""
+    return solve_closure_lp(wrenches(points, normals, friction, FIRST_EDGES).flatten(1, 2))[0]
 
 
 def _closed_in_plane(points: Vectors, normals: Vectors, friction: float) -> Bool[Tensor, "b"]:
@@ -63,15 +77,22 @@ def _closed_in_plane(points: Vectors, normals: Vectors, friction: float) -> Bool
     return spanned & (projected > cone).all(-1)
 
 
-def _closed_by_proof(points: Vectors, normals: Vectors, friction: float) -> Bool[Tensor, "b"]:
+def _closed_by_proof(
+    points: Vectors, normals: Vectors, friction: float, guess: Float[Tensor, "b m"] | None
+) -> Bool[Tensor, "b"]:
     """Decide for more contacts, row by row until it is proven."""
     closed = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    if friction == 0:  # forces along normals may balance, but only seven or more span all wrenches
+        return closed
     rows = torch.nonzero((torch.isfinite(points) & torch.isfinite(normals)).flatten(1).all(1))[:, 0]
     wrench = wrenches(points[rows], normals[rows], friction, FIRST_EDGES).flatten(1, 2)
+    if guess is not None:
+        proven = _balances(wrench, _corrected(wrench, guess[rows]))
+        closed[rows[proven]] = True
+        rows, wrench = rows[~proven], wrench[~proven]
     for _ in range(ROUNDS):
         phi, witness = solve_closure_lp(wrench)
-        balanced = (phi[:, None] @ wrench)[:, 0].abs().amax(-1) <= BALANCED
-        proven = balanced & (phi.amin(-1) > BALANCED)
+        proven = _balances(wrench, phi)
         closed[rows[proven]] = True
         least, opposing = most_opposing(points[rows], normals[rows], friction, witness)
         left = torch.nonzero(~proven & (least.amin(-1) < -BALANCED))[:, 0]
@@ -79,6 +100,19 @@ def _closed_by_proof(points: Vectors, normals: Vectors, friction: float) -> Bool
             break
         rows, wrench = rows[left], torch.cat([wrench[left], opposing[left]], 1)
     return closed
+
+
+def _balances(wrench: Float[Tensor, "b m 6"], phi: Float[Tensor, "b m"]) -> Bool[Tensor, "b"]:
+    """Tell whether coefficients are positive and balance."""
+    return ((phi[:, None] @ wrench)[:, 0].abs().amax(-1) <= BALANCED) & (phi.amin(-1) > BALANCED)
+
+
+def _corrected(wrench: Float[Tensor, "b m 6"], phi: Float[Tensor, "b m"]) -> Float[Tensor, "b m"]:
+    """Return the balance with the least relative changes of given coefficients, of either sign."""
+    weighted = phi.square()[..., None] * wrench
+    factor, _ = torch.linalg.cholesky_ex(wrench.mT @ weighted)
+    dual = torch.cholesky_solve((phi[:, None] @ wrench).mT, factor)
+    return phi - (weighted @ dual)[..., 0]
 
 
 def most_opposing(

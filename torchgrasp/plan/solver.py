@@ -57,7 +57,7 @@ FINISH = Stage(centre=0.0, cones=3.0, steps=30, settled=1e-8)
 
 @dataclasses.dataclass(frozen=True)
 class State(Batch):
-    """Vectors with the tensions of their sides, and the shape at their normalised points."""
+    """Contacts with the tensions of their pairs, and the shape at their normalised points."""
 
     points: Vectors
     tension: Float[Tensor, "b p"]

@@ -43,11 +43,11 @@ def _closed_share(shape: ShapeGP, contacts: Contacts, friction: float, n: int, s
     eigenvalues, vectors = torch.linalg.eigh(values)
     root = (vectors * eigenvalues.clamp(min=0.0).sqrt()) @ vectors.T
     generator = torch.Generator().manual_seed(seed)
-    drawn = (torch.randn(n, len(root), dtype=torch.float64, generator=generator) @ root).reshape(n, 3, GRID_POINTS, 7)
+    drawn = (torch.randn(n, len(root), dtype=torch.float64, generator=generator) @ root).reshape(n, -1, GRID_POINTS, 7)
     mean, slope = shape.mean_and_gradient(places.reshape(-1, 3))
-    distance = mean.reshape(3, GRID_POINTS) + drawn[..., 0]
+    distance = mean.reshape(-1, GRID_POINTS) + drawn[..., 0]
     deviations = (drawn[..., 1:4] - drawn[..., 4:]) / (2 * width)
-    gradient = slope.reshape(3, GRID_POINTS, 3) + deviations @ axes
+    gradient = slope.reshape(-1, GRID_POINTS, 3) + deviations @ axes
 
     crosses = (distance[..., :-1] > 0) & (distance[..., 1:] <= 0)
     far = torch.where(crosses, grid[:-1].abs().expand_as(crosses), torch.inf)

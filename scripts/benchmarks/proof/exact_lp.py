@@ -17,17 +17,17 @@ NEAR_BASIS = 10
 
 
 def wrench_matrix(points: np.ndarray, normals: np.ndarray, friction: float, edges: int) -> np.ndarray:
-    """Return the m x 6 wrenches of three contacts with outward normals, from the definition, as integers.
+    """Return the m x 6 wrenches of contacts with outward normals, from the definition, as integers.
 
-    The first edge of each cone leans along the plane of the contacts, as the library's does. Torques are about the
-    centre, over the root-mean-square distance from it.
+    The first edge of each cone leans along the plane of three contacts that it leans most against, as the library's
+    does. Torques are about the centre, over the root-mean-square distance from it.
     """
     arm = points - points.mean(0)
-    arm = arm / np.sqrt((arm**2).sum() / 3)
-    plane = np.cross(points[1] - points[0], points[2] - points[0])
+    arm = arm / np.sqrt((arm**2).sum() / len(points))
+    planes = [np.cross(q - p, r - p) for p, q, r in combinations(points, 3)]
     rows = []
     for p, n in zip(arm, normals, strict=True):
-        along = np.cross(plane, n)
+        along = max((np.cross(plane, n) for plane in planes), key=np.linalg.norm)
         along = along / np.linalg.norm(along)
         across = np.cross(n, along)
         for k in range(edges):

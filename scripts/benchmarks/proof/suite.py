@@ -2,40 +2,34 @@
 
 import time
 from collections.abc import Callable
-from fractions import Fraction
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from benchmarks.common import Row, least_seconds, measure
+from benchmarks.common import Row, measure
 from benchmarks.ground_truth import read_views
 from benchmarks.plan.true_surface import closed_on_mesh
+from benchmarks.proof.certificates import bench_certificates
 from benchmarks.proof.closure_reference import redrawn_closure
-from benchmarks.proof.exact_lp import exact_margin, proves_margin_above, proves_margin_below, wrench_matrix
 from torchgrasp.errors import Status
-from torchgrasp.linalg import unit
 from torchgrasp.objects import list_objects, load_object
-from torchgrasp.plan.certify import certify, solve_by_highs
-from torchgrasp.plan.closure_lp import solve_closure_lp
+from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure_probability import closure_probability
 from torchgrasp.plan.solve import plan_contacts
-from torchgrasp.plan.wrench import MIN_MARGIN, wrenches
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts
 
 SUBJECTS = ("certificates", "probability", "objects")
-FRICTIONS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.5, 2.0)
-EDGES = (8, 8, 8, 8, 8, 3, 4, 5, 6, 12)
 
 
 def proof(
     objects: Path | None = None,
     only: tuple[str, ...] = SUBJECTS,
+    fingertips: tuple[int, ...] = (3, 4, 5),
     grasps: int = 100_000,
     starts: int = 300,
     seed: int = 0,
@@ -47,7 +41,8 @@ def proof(
     Args:
         objects: folder with manifest.json and a folder for each object: what the probability says of true surfaces.
         only: subjects to measure, of certificates, probability, objects.
-        grasps: certificates that are checked.
+        fingertips: numbers of contacts whose certificates are checked.
+        grasps: certificates that are checked of each number of contacts.
         starts: of the planner, for each view.
         seed: of every draw.
         quick: a hundredth of the grasps.
@@ -56,109 +51,12 @@ def proof(
     torch.set_num_threads(1)
     grasps = grasps // 100 if quick else grasps
     subjects: dict[str, Callable[[], list[Row]]] = {
-        "certificates": lambda: bench_certificates(grasps, seed),
+        "certificates": lambda: [row for f in fingertips for row in bench_certificates(f, grasps, seed)],
         "probability": lambda: bench_probability(starts, seed),
         "objects": lambda: bench_objects(objects, starts, seed) if objects else [],
     }
     settings = {"grasps": grasps, "starts": starts, "seed": seed, "threads": 1}
     measure("proof", subjects, only, settings, out)
-
-
-# ------------------------------------------------------------------------------------------------- certificates
-
-
-def bench_certificates(grasps: int, seed: int) -> list[Row]:
-    """Certify random triples, half of them at the border of closure, and prove every verdict in exact arithmetic."""
-    generator = torch.Generator().manual_seed(seed)
-    each = grasps // len(FRICTIONS)
-    counts = {"closed": 0, "open": 0, "degenerate": 0}
-    wrong, worst = 0, 0.0
-    bound, sampled, aside = Fraction(MIN_MARGIN), 0, 0
-    nearest: list[float] = []
-    for friction, edges in tqdm(list(zip(FRICTIONS, EDGES, strict=True)), desc="frictions", disable=None, leave=False):
-        spec = ContactSpec(friction=friction, edges=edges, friction_margin=1.0)
-        contacts = border_triples(each, spec, generator)
-        certificate = certify(contacts, spec)
-        phi, _ = solve_closure_lp(
-            wrenches(contacts.points, contacts.normals, spec.planned_friction, edges).flatten(1, 2)
-        )
-        nearest.append(float((certificate.margin - MIN_MARGIN).abs().median()))
-        for i in range(each):
-            points, normals = contacts.points[i].numpy(), contacts.normals[i].numpy()
-            if not certificate.closed[i] and certificate.margin[i] >= MIN_MARGIN:
-                counts["degenerate"] += 1
-                wrong += not has_low_rank(points, normals, friction, edges)
-                continue
-            matrix = wrench_matrix(points, normals, friction, edges)
-            if certificate.closed[i]:
-                counts["closed"] += 1
-                wrong += not proves_margin_above(matrix, phi[i].numpy(), bound)
-            else:
-                counts["open"] += 1
-                wrong += not proves_margin_below(matrix, certificate.witness[i].numpy(), bound)
-            if i % 50 == 0 and torch.isfinite(certificate.margin[i]):
-                try:
-                    exact = float(exact_margin(matrix))
-                except ArithmeticError:
-                    aside += 1
-                    continue
-                sampled += 1
-                worst = max(worst, abs(exact - float(certificate.margin[i])))
-    total = sum(counts.values())
-    spec = ContactSpec(friction=0.5, friction_margin=1.0)
-    contacts = random_contacts(10_000, generator)
-    fast = least_seconds(lambda: certify(contacts, spec)) / len(contacts)
-    matrices = wrenches(contacts.points[:100], contacts.normals[:100], 0.5, 8).flatten(1, 2).numpy()
-    slow = least_seconds(lambda: [solve_by_highs(m) for m in matrices], 3) / len(matrices)
-    return [
-        Row(
-            f"certificates: {total} triples at 10 frictions, half within 1e-3 of the border, in exact arithmetic",
-            "0 wrong",
-            f"{wrong} wrong ({counts['closed']} closed, {counts['open']} open, {counts['degenerate']} lack rank); "
-            f"margins of {sampled} against an exact programme: largest difference {worst:.1e}; {aside} more have "
-            "no feasible basis among the coefficients that HiGHS leaves",
-            wrong == 0 and worst < 1e-7,
-            {"wrong": wrong, "counts": counts, "worst": worst, "aside": aside, "median_from_border": nearest},
-        ),
-        Row(
-            "certificates per second, 10^4 at once, one thread, against one HiGHS programme after the other",
-            "-",
-            f"{1 / fast:.0f} against {1 / slow:.0f} per second: {slow / fast:.0f}x",
-            None,
-            {"seconds": fast, "highs_seconds": slow},
-        ),
-    ]
-
-
-def random_contacts(count: int, generator: torch.Generator, lean: float = 0.45) -> Contacts:
-    """Return random triples with normals that lean away from their centre; the smaller `lean`, the more are closed."""
-    points, noise = (torch.randn(count, 3, 3, generator=generator, dtype=torch.float64) for _ in range(2))
-    return Contacts(points, unit(unit(points - points.mean(1, keepdim=True)) + lean * noise))
-
-
-def border_triples(count: int, spec: ContactSpec, generator: torch.Generator) -> Contacts:
-    """Return random triples; the normals of every second one are turned to the border of closure and a little on."""
-    contacts = random_contacts(count, generator)
-    half = count // 2
-    points, far = contacts.points[:half], contacts.normals[:half]
-    near = unit(points - points.mean(1, keepdim=True))
-    low, high = torch.zeros(half, 1, 1, dtype=torch.float64), torch.full((half, 1, 1), 2.0, dtype=torch.float64)
-    for _ in range(45):
-        middle = (low + high) / 2
-        closed = certify(Contacts(points, unit(near + middle * (far - near))), spec).closed[:, None, None]
-        low, high = torch.where(closed, middle, low), torch.where(closed, high, middle)
-    step = 10 ** (-3 - 7 * torch.rand(half, 1, 1, generator=generator, dtype=torch.float64))
-    sign = torch.sign(torch.randn(half, 1, 1, generator=generator, dtype=torch.float64))
-    turned = unit(near + (low + sign * step) * (far - near))
-    return Contacts(contacts.points, torch.cat([turned, contacts.normals[half:]]))
-
-
-def has_low_rank(points: np.ndarray, normals: np.ndarray, friction: float, edges: int) -> bool:
-    """Tell whether wrenches written anew lack rank, or the triangle is flat, to the thresholds of the library."""
-    values = np.linalg.svd(wrench_matrix(points, normals, friction, edges).astype(float), compute_uv=False)
-    sides = points - np.roll(points, 1, 0)
-    area = np.linalg.norm(np.cross(sides[0], sides[1]))
-    return bool(values[-1] < 1.001e-3 * values[0] or area < 1.001e-3 * (sides**2).sum(1).max())
 
 
 # -------------------------------------------------------------------------------------------------- probability
