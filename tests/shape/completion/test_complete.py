@@ -7,8 +7,18 @@ import torch
 from torch import Tensor
 
 from torchgrasp.frames import apply, rotate
-from torchgrasp.shape.completion.complete import LEAST_NOISE, Completion, complete_cloud
+from torchgrasp.shape.completion.complete import (
+    LEAST_NOISE,
+    NEARBY,
+    NEARBY_ANGLE,
+    NEARBY_SHIFT,
+    TEMPERATURE,
+    Completion,
+    complete_cloud,
+)
 from torchgrasp.shape.completion.silhouette import silhouette
+from torchgrasp.shape.completion.symmetry import SymmetryScorer, planes_near, reflect
+from torchgrasp.shape.fit import fit_shape
 from torchgrasp.values import PointCloud
 
 CAMERA = torch.tensor([0.45, 0.0, 0.3], dtype=torch.float64)
@@ -108,6 +118,30 @@ def test_shared_errors_are_those_of_a_moved_plane(seen_cylinder: PointCloud, tab
     assert torch.linalg.vector_norm(found.shared, dim=1).min() > 0
 
 
+def test_shared_errors_are_the_second_moment_of_the_mixture_of_planes():
+    """Every plane near the chosen one moves a point; its probability follows from its score."""
+    cloud = _seen_box((0.025, 0.04, 0.06), torch.tensor([0.4, 0.2, 0.3], dtype=torch.float64))
+    found = complete_cloud(cloud, table=0.0)
+    scorer = SymmetryScorer.of(cloud, 0.0)
+    by_plane = found.shared.reshape(len(found.points), len(found.planes), -1)
+    checked = 0
+    for k, plane in enumerate(found.planes):
+        # Points of this plane alone, mirrored once, since an image of an image has errors of two planes.
+        mine = (by_plane[:, k].abs().sum(-1) > 0) & (by_plane.abs().sum((1, 2)) == by_plane[:, k].abs().sum(-1))
+        sources, normals = reflect(found.points[mine], plane), found.normals[mine]
+        steps = torch.linspace(-1, 1, NEARBY, dtype=torch.float64)
+        moment, total = torch.zeros(len(sources), len(sources), dtype=torch.float64), 0.0
+        for other in planes_near(scorer, plane, NEARBY_ANGLE * steps, NEARBY_SHIFT * scorer.size * steps):
+            chance = math.exp(float(scorer.score(other[None])[0]) / TEMPERATURE)
+            moved = ((reflect(sources, other) - found.points[mine]) * normals).sum(1)
+            moment, total = moment + chance * moved[:, None] * moved, total + chance
+        torch.testing.assert_close(
+            (found.shared @ found.shared.T)[mine][:, mine], moment / total, atol=1e-12, rtol=1e-9
+        )
+        checked += int(mine.sum())
+    assert checked > 10
+
+
 def _deviation(found: Completion) -> Tensor:
     """The standard deviation [m] of each point's whole error."""
     return torch.sqrt(LEAST_NOISE**2 + (found.deviations**2).sum(1))
@@ -178,6 +212,20 @@ def test_the_underside_of_a_lying_rod_is_mirrored_from_its_top():
     assert under.sum() >= 5
     off = torch.linalg.vector_norm((found.points - axis)[under][:, [0, 2]], dim=1) - radius
     assert off.abs().median() < 0.002
+
+
+@pytest.mark.parametrize("depth", [0.03, 0.05, 0.08])
+def test_a_box_that_shows_one_face_does_not_know_its_depth(depth: float):
+    """Mirror planes of any depth hide their images, so their scores are equal: the back lies anywhere behind."""
+    camera = torch.tensor([0.5, 0.0, 0.06], dtype=torch.float64)
+    cloud = _seen_box((depth / 2, 0.04, 0.06), camera)
+    assert cloud.normals is not None and (cloud.normals[:, 0] == 1).all()
+    shape = fit_shape(cloud, table=0.0)
+    y, z = torch.linspace(-0.03, 0.03, 7, dtype=torch.float64), torch.linspace(0.02, 0.1, 7, dtype=torch.float64)
+    back = torch.cartesian_prod(torch.tensor([-depth / 2], dtype=torch.float64), y, z)
+    found = shape.predict(back)
+    assert (found.distance.abs() <= 2 * shape.std_factor * found.variance.sqrt()).double().mean() > 0.9
+    assert found.std_m.median() > 0.01
 
 
 def test_no_point_is_spent_on_the_face_on_the_table():
