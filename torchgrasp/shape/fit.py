@@ -52,7 +52,7 @@ STD_FACTORS: dict[tuple[Kind, bool], float] = {
     ("mirrored", True): 0.59,
     ("ball", False): 0.56,
     ("revolution", False): 0.59,
-    ("mirrored", False): 0.66,
+    ("mirrored", False): 0.75,
     ("guess", True): 1.0,
     ("guess", False): 1.0,
     ("cut off", True): 2.0,
