@@ -14,7 +14,7 @@ import torch
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.collision_pairs import collision_pairs, draw_postures
-from torchgrasp.hand.fit_shapes import replace_meshes, shape_points, split_tip
+from torchgrasp.hand.fit_shapes import ball_tip, replace_meshes, shape_points
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.mend import fix_wrist, keep_below, mend_bodies, mend_joints, merge_frames, urdf_text
@@ -117,7 +117,7 @@ def new_hand(path: Path | str, wish: Wish = Wish(), seed: int = 0, file: str = "
         tip, pad = tips[k], guess.pads[k]
         if tip not in simple:
             balls.append(f"{tip} {1e3 * pad.radius:.1f} mm")
-            clean, tip, pad = split_tip(clean, tip, pad, guess.outward[k], surfaces[tip])
+            clean = ball_tip(clean, tip, pad, guess.outward[k], surfaces[tip])
         chosen[tip] = pad
     told += [f"fingertips touch by a ball in their end, of radius: {', '.join(balls)}"] if balls else []
     name, mended = wish.name or urdf.name, bool(told)
@@ -171,7 +171,7 @@ def _toml_text(urdf: Urdf, pads: Chosen, approach: Triple, names: tuple[str, str
     moved = grasping | {coupling[j].source for j in grasping if j in coupling}
     parked = {j.name: min(max(0.0, j.lower), j.upper) for j in free if j.name not in moved}
     kp, kd = _gains(urdf)
-    called = {tip: tip.removesuffix("_ball").removesuffix("_tip") for tip in tips}
+    called = {tip: tip.removesuffix("_tip") for tip in tips}
     lines = [
         "# A draft. Lengths [m], angles [rad], in the link frames of the URDF. Look over what is marked CHECK.",
         f"name = {_toml(names[0])}",

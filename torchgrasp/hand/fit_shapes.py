@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.mend import pose_of
 from torchgrasp.hand.safe_xml import read_bounded
-from torchgrasp.hand.urdf import MAX_SIZE, Joint, Link, Shape, Urdf, place
+from torchgrasp.hand.urdf import MAX_SIZE, Shape, Urdf, place
 
 if TYPE_CHECKING:
     import trimesh
@@ -41,11 +41,12 @@ TURNED = 0.85
 """A box is turned out of the link's axes if it then has less than this share of the volume."""
 WHOLE = 2.6
 """A tip shorter than this many radii is a ball and nothing else, as Allegro's: a hemisphere with a foot."""
-BALL_DENSITY, BALL_SHARE = 1000.0, 0.2
-"""Mass of a ball: of rubber [kg/m3], but at most this share of its tip's."""
+MOST_TIP, SAVING_TIP = 4, 0.04
+"""Boxes of a fingertip, and what a further one must save: a bent tip in one box would touch before its ball."""
 
 Points = Float[np.ndarray, "_ 3"]
 """Points, of any count in each use."""
+Corners = tuple[np.ndarray, np.ndarray]
 
 
 def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
@@ -111,43 +112,21 @@ def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tupl
     return dataclasses.replace(urdf, links=tuple(links)), told
 
 
-def split_tip(urdf: Urdf, tip: str, ball: Pad, outward: np.ndarray, points: Points) -> tuple[Urdf, str, Pad]:
-    """Give a tip a ball of its own, and boxes up to the ball's centre; return the link of the ball and its pad.
+def ball_tip(urdf: Urdf, tip: str, ball: Pad, outward: np.ndarray, points: Points) -> Urdf:
+    """Give a tip a ball, and boxes up to the ball's centre, close to its surface where it is bent.
 
-    What is part of the fingertip's link may touch the object. So the ball, which shall touch, becomes a link.
+    `outward` points to the finger's end, `points` lie on the tip. Ball and boxes may touch the object.
     """
-    link, place_of_ball = next(x for x in urdf.links if x.name == tip), np.array(ball.center)
-    reach = (points - place_of_ball) @ outward
-    sphere = Shape("sphere", (ball.radius,), ball.center, (0.0, 0.0, 0.0))
-    if np.ptp(reach) < WHOLE * ball.radius:
-        whole = dataclasses.replace(link, shapes=(sphere,))
-        return _with(urdf, whole), tip, ball
-    mass = min(BALL_DENSITY * 4 / 3 * math.pi * ball.radius**3, BALL_SHARE * link.mass)
-    left, round_inertia = 1 - mass / link.mass, 0.4 * mass * ball.radius**2
-    rest = dataclasses.replace(
-        link,
-        mass=link.mass * left,
-        inertia=tuple(left * x for x in link.inertia),
-        shapes=tuple(fit_shapes(points[reach < 0])),
-    )
-    zero, name = (0.0, 0.0, 0.0), f"{tip}_ball"
-    body = Link(
-        name,
-        mass,
-        zero,
-        (round_inertia, 0.0, 0.0, round_inertia, 0.0, round_inertia),
-        (dataclasses.replace(sphere, xyz=zero),),
-    )
-    joint = Joint(f"{name}_joint", "fixed", tip, name, ball.center, zero)
-    urdf = dataclasses.replace(_with(urdf, rest), joints=(*urdf.joints, joint))
-    urdf = dataclasses.replace(urdf, links=(*urdf.links, body))
-    x, y, z = (round(ball.radius * n, 12) for n in ball.normal)
-    return urdf, name, Pad((x, y, z), ball.normal, zero, ball.radius)
-
-
-def _with(urdf: Urdf, link: Link) -> Urdf:
-    """Return a URDF with one link replaced by another of its name."""
-    return dataclasses.replace(urdf, links=tuple(link if x.name == link.name else x for x in urdf.links))
+    link = next(x for x in urdf.links if x.name == tip)
+    reach = (points - np.array(ball.center)) @ outward
+    shapes = [Shape("sphere", (ball.radius,), ball.center, (0.0, 0.0, 0.0))]
+    if np.ptp(reach) > WHOLE * ball.radius:
+        motion = np.array(ball.normal) - ball.normal @ outward * outward
+        motion /= np.linalg.norm(motion)
+        axes = np.stack([motion, outward, np.cross(motion, outward)], 1)
+        shapes += _boxes(_cut(points[reach < 0] @ axes, MOST_TIP, SAVING_TIP), axes)
+    ended = dataclasses.replace(link, shapes=tuple(shapes))
+    return dataclasses.replace(urdf, links=tuple(ended if x is link else x for x in urdf.links))
 
 
 def _read_points(urdf: Urdf, name: str, folder: Path) -> Points:
@@ -213,7 +192,7 @@ def fit_shapes(points: Points) -> list[Shape]:
     """
     turn = _axes(points)
     local = points @ turn
-    boxes = _cut(local)
+    boxes = _cut(local, MOST_SMALL if float(np.ptp(local, axis=0).max()) < SMALL else MOST, SAVING)
     volume = sum(float(np.prod(high - low)) for low, high in boxes)
     low, high = local.min(0), local.max(0)
     middle, sides = (low + high) / 2, high - low
@@ -222,7 +201,7 @@ def fit_shapes(points: Points) -> list[Shape]:
         if math.pi * radius**2 * sides[axis] < ROUND * volume:
             along = np.roll(np.eye(3), -axis - 1, 0).T  # its third column is the axis
             return [_shape("cylinder", (radius, sides[axis]), turn @ along, turn @ middle)]
-    return [_shape("box", tuple(high - low), turn, turn @ (low + high) / 2) for low, high in boxes]
+    return _boxes(boxes, turn)
 
 
 def _axes(points: Points) -> Float[np.ndarray, "3 3"]:
@@ -237,15 +216,19 @@ def _axes(points: Points) -> Float[np.ndarray, "3 3"]:
     return turned[:3, :3].T if np.prod(sizes) < TURNED * straight else np.eye(3)
 
 
-def _cut(points: Points) -> list[tuple[np.ndarray, np.ndarray]]:
+def _boxes(corners: list[Corners], axes: np.ndarray) -> list[Shape]:
+    """Return boxes from their corners along axes, the columns."""
+    return [_shape("box", tuple(high - low), axes, axes @ (low + high) / 2) for low, high in corners]
+
+
+def _cut(points: Points, most: int, saving: float) -> list[Corners]:
     """Return the lower and upper corners of boxes around points."""
     cells = [(points.min(0), points.max(0), points)]
-    most = MOST_SMALL if float(np.ptp(points, axis=0).max()) < SMALL else MOST
     while len(cells) < most:
         total = sum(float(np.prod(high - low)) for low, high, _ in cells)
         cuts = [(gain, k, two) for k, cell in enumerate(cells) for gain, two in _halves(*cell)]
         gain, k, two = max(cuts, key=lambda cut: cut[0], default=(0.0, 0, ()))
-        if gain <= SAVING * total:
+        if gain <= saving * total:
             break
         cells[k : k + 1] = two
     return [(low, high) for low, high, _ in cells]
