@@ -1,8 +1,8 @@
 #!/usr/bin/env python
 """Make the files that torchgrasp ships: learned models, and the library's own objects.
 
-python scripts/train.py posture-model hands/allegro               the mixture of a hand that has a hand.toml
-python scripts/train.py posture-model mine/hand.urdf --tips a b c  the same from a URDF alone
+`torchgrasp hand train` learns the posture model of a hand.
+
 python scripts/train.py stability allegro --workers 2             which pulled grasps hold, for the impedance control
 python scripts/train.py success                                   the predicted success that ranks grasps
 python scripts/train.py occupancy DIR                             how likely hidden places of a scene are full
@@ -18,7 +18,6 @@ from train.author_objects import objects, scene
 from train.bands import bands
 from train.hands.author import hands
 from train.occupancy import occupancy
-from train.posture_model import posture_model
 from train.stability import stability
 from train.success import success
 
@@ -26,7 +25,6 @@ from torchgrasp.errors import GraspError
 
 if __name__ == "__main__":
     commands = {
-        "posture-model": posture_model,
         "stability": stability,
         "success": success,
         "occupancy": occupancy,

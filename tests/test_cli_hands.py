@@ -119,3 +119,15 @@ def test_what_is_doubtful_is_named_with_its_mend(claw, capsys):
     main(["hand", "check", str(claw.parent), "--out", str(claw.parent / "hand.png")])
     said = capsys.readouterr().out
     assert "doubtful: only" in said and "doubtful: the pad of left faces" in said
+
+
+def test_train_learns_a_mixture_that_the_paper_modes_take(claw, capsys):
+    from torchgrasp import load_hand, load_mixture
+
+    assert main(["hand", "new", str(claw)]) == 0
+    folder = str(claw.parent)
+    assert main(["hand", "train", folder, "--n", "3000", "--components", "4", "--held-out", "500"]) == 0
+    assert "4 components" in capsys.readouterr().out
+    assert load_mixture(folder).joint_names == load_hand(folder).joint_names
+    assert main(["hand", "train", folder, "--held-out", "1"]) == 2
+    assert main(["hand", "train", folder, "--out", "x.pt"]) == 2

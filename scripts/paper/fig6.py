@@ -6,11 +6,11 @@ from pathlib import Path
 import torch
 from matplotlib.figure import Figure
 from tqdm import tqdm
-from train.model_selection import BicCurve, CrossValidation, bic_curve, cross_validate
 
 from torchgrasp import load_hand
 from torchgrasp.files import write_atomically, write_file
 from torchgrasp.posture_model.sample import sample_configurations
+from torchgrasp.posture_model.selection import BicCurve, CrossValidation, bic_curve, cross_validate
 
 PUBLISHED = {"allegro": 41, "barrett": 36}
 """The paper's numbers of Gaussians."""

@@ -18,6 +18,7 @@ from torchgrasp import __version__
 from torchgrasp.cli import clouds, grasps, hands, shapes
 from torchgrasp.cli.evaluate import evaluate
 from torchgrasp.cli.export import export
+from torchgrasp.cli.hand_train import train
 from torchgrasp.errors import GraspError
 
 __all__ = ["COMMANDS", "main"]
@@ -35,6 +36,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "hand new": hands.new,
     "hand check": hands.check,
     "hand sample": hands.sample,
+    "hand train": train,
     "shape surface": shapes.surface,
 }
 

@@ -102,7 +102,8 @@ def check(
     joints = random_joints(sound, 5000)  # shares vary by 1 %
     print(describe(sound, joints))
     model = find_hand(hand) / "mixture.safetensors"
-    print(f"learned model: {model if model.exists() else 'none, and none is needed but for the paper modes'}")
+    missing = f"none; only the modes of the paper need one: torchgrasp hand train {hand}"
+    print(f"learned model: {model if model.exists() else missing}")
     for doubt in find_doubts(sound, joints):
         print(f"doubtful: {doubt}")
     write_file(out, draw_hand(sound, opposed_posture(sound, joints)))

@@ -14,7 +14,6 @@ import torch
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
-from train.mixture_score import MixtureScore, evaluate_mixture
 
 from benchmarks.common import Row, least_seconds, peak_mib
 from benchmarks.hand.query import touched
@@ -27,6 +26,7 @@ from torchgrasp.posture_model.fit import fit_mixture
 from torchgrasp.posture_model.kmeans import start_components
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY
 from torchgrasp.posture_model.sample import HandSamples, Sampling, sample_configurations
+from torchgrasp.posture_model.score import MixtureScore, evaluate_mixture
 from torchgrasp.posture_model.shard import Shard
 
 COMPONENTS = {"allegro": 41, "barrett": 36}

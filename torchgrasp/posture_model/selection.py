@@ -17,7 +17,7 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.posture_model.fit import fit_mixture
 from torchgrasp.posture_model.mixture import GraspMixture
 from torchgrasp.posture_model.sample import HandSamples
-from train.mixture_score import evaluate_mixture
+from torchgrasp.posture_model.score import evaluate_mixture
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,13 +5,13 @@ import math
 import numpy as np
 import pytest
 import torch
-from train.mixture_score import evaluate_mixture
-from train.model_selection import bic_curve, cross_validate
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.posture_model.fit import fit_mixture
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY
 from torchgrasp.posture_model.sample import HandSamples
+from torchgrasp.posture_model.score import evaluate_mixture
+from torchgrasp.posture_model.selection import bic_curve, cross_validate
 
 
 def islands(n: int = 1500, m: int = 4) -> HandSamples:
