@@ -19,8 +19,8 @@ from torchgrasp.shape.hollow import HollowShape
 RING_RADIUS = 0.008
 
 
-def on_surface(ellipsoid, generator, count: int) -> Tensor:
-    return project(ellipsoid, torch.randn(count, 3, 3, generator=generator, dtype=torch.float64), steps=8)
+def on_surface(ellipsoid, generator, count: int, fingertips: int) -> Tensor:
+    return project(ellipsoid, torch.randn(count, fingertips, 3, generator=generator, dtype=torch.float64), steps=8)
 
 
 def test_variation_on_a_sphere_is_the_angle_under_which_the_ring_is_seen_from_its_centre(ellipsoid, generator):
@@ -41,9 +41,10 @@ def test_values_on_a_sphere_change_sign_at_the_angle_under_which_the_ring_is_see
         assert bool((sign * value > 0).all())
 
 
-def test_slope_against_automatic_differentiation(ellipsoid, generator):
+@pytest.mark.parametrize("fingertips", [3, 5])
+def test_slope_against_automatic_differentiation(ellipsoid, generator, fingertips):
     """The ring's tangents are carried along without spin, as t - n (n . t) does to first order."""
-    points, limit = on_surface(ellipsoid, generator, 4), 0.3
+    points, limit = on_surface(ellipsoid, generator, 4, fingertips), 0.3
     constraint = flatness_constraint(ellipsoid, points, limit, RING_RADIUS)
     normals = triple_jet(ellipsoid, points).normals
     first = tangents(points, normals)

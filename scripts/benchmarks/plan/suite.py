@@ -9,6 +9,7 @@ import torch
 from benchmarks.common import Row, least_seconds, measure
 from benchmarks.ground_truth import read_views
 from benchmarks.plan.executable import bench_executable
+from benchmarks.plan.fingertips import bench_fingertips
 from benchmarks.plan.ipopt_comparison import POINTS, bench_peers
 from benchmarks.plan.probability import bench_probability
 from benchmarks.plan.sampler import bench_sampler
@@ -27,6 +28,7 @@ SUBJECTS = (
     "probability",
     "executable",
     "sampler",
+    "fingertips",
     "growth",
     "memory",
     "anytime",
@@ -49,7 +51,7 @@ def plan(
     Args:
         objects: folder with manifest.json and a folder for each object.
         only: subjects to measure, of call, peers, truth, fields, objectives, probability, executable, sampler,
-            growth, memory and anytime.
+            fingertips, growth, memory and anytime.
         names: of the views of each object that are measured, such as view0; by default all.
         starts: of the planner, for each view and radius.
         tries: the first of them that IPOPT gets, for each view and radius.
@@ -71,6 +73,7 @@ def plan(
         "probability": lambda: bench_probability(objects, names, max(starts // 5, 1), seed),
         "executable": lambda: bench_executable(views, starts, seed),
         "sampler": lambda: [bench_sampler(views, max(starts // 2, 1), seed)],
+        "fingertips": lambda: bench_fingertips(views, max(starts // 5, 1), seed),
         "growth": lambda: [bench_growth(4 if quick else 5, out.with_name("bench_plan_growth.png"))],
         "memory": lambda: [bench_memory(10 * starts if quick else 100 * starts, threads)],
         "anytime": lambda: [bench_anytime(2.0 if quick else 10.0, out.with_name("bench_plan_anytime.png"))],

@@ -133,5 +133,5 @@ def closed_on_mesh(contacts: Contacts, mesh: Any) -> Tensor:
     The nearest points are those on the fingers' side: on a wall thinner than the error the other side may be nearer.
     """
     points, facing = (part.flatten(0, 1).double() for part in (contacts.points, contacts.normals))
-    points, normals = nearest_on_mesh(mesh, points, facing)
-    return closed_exact(points.unflatten(0, (-1, 3)), normals.unflatten(0, (-1, 3)), FRICTION)
+    points, normals = (x.view(contacts.points.shape) for x in nearest_on_mesh(mesh, points, facing))
+    return closed_exact(points, normals, FRICTION)
