@@ -4,9 +4,10 @@ from pathlib import Path
 
 from torchgrasp.files import write_file
 from torchgrasp.hand.collision_pairs import collision_pairs
+from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.load import hands_folder
 from torchgrasp.hand.urdf import read_urdf
-from train.hands.files import Table, format_toml, format_urdf
+from train.hands.files import format_toml, format_urdf
 from train.hands.leap import leap
 from train.hands.mirror import Mirror
 from train.hands.shadow import shadow
@@ -28,10 +29,12 @@ MIRRORS = (
 def hands() -> None:
     """Write hand.urdf and hand.toml of every hand that comes from a table or a mirror."""
     for table in TABLES:
-        folder = hands_folder() / table.name
+        folder, urdf = hands_folder() / table.name, format_urdf(table)
         folder.mkdir(exist_ok=True)
-        write_file(folder / "hand.urdf", format_urdf(table))
-        write_file(folder / "hand.toml", format_toml(table, meeting_pairs(table, folder)))
+        same = (folder / "hand.toml").exists() and (folder / "hand.urdf").read_text("utf-8") == urdf
+        write_file(folder / "hand.urdf", urdf)
+        pairs = list(read_hand_toml(folder / "hand.toml").pairs or ()) if same else meeting_pairs(folder)
+        write_file(folder / "hand.toml", format_toml(table, pairs))
         print(folder)
     for image in MIRRORS:
         folder = hands_folder() / image.names[1]
@@ -41,8 +44,8 @@ def hands() -> None:
         print(folder)
 
 
-def meeting_pairs(table: Table, folder: Path) -> list[tuple[str, str]]:
-    """Return the pairs of links that can meet."""
+def meeting_pairs(folder: Path) -> list[tuple[str, str]]:
+    """Return the pairs of links that can meet, which takes half a minute."""
     urdf = read_urdf(folder / "hand.urdf")
     return collision_pairs(urdf, {j.name: j.mimic for j in urdf.movable if j.mimic is not None})
 

@@ -8,11 +8,10 @@ import math
 from train.hands.files import Body, Joint, Shape, Table, Tip
 
 SIDES = {
-    # name, root, x and z of the knuckles, y of each, base of the thumb, sign of y, limits of joints 12 and 13
     "right": ("leap", "palm_lower", (-0.007, -0.0071, -0.00709), -0.0187, (0.023, -0.0224, -0.0678)),
     "left": ("leap_left", "palm_lower_left", (-0.0825,) * 3, 0.0078, (-0.0857, -0.0403, 0.0051)),
 }
-"""Name and root of a side, and where its fingers are hinged: x of each, z of all, y of each [m]."""
+"""Names of hand and root, and where the fingers are hinged: x of each, z of all, y of each [m]."""
 THUMBS = {"right": ((-0.0693, -0.0012, -0.0216), 1), "left": ((-0.1448, -0.09, 0.0049), -1)}
 """Where the thumb is hinged [m], and the sign of y and of its first two joints."""
 QUARTER = 1.57079
@@ -20,6 +19,7 @@ QUARTER = 1.57079
 DRIVE = (0.95, 8.48)
 """Effort [N m] and velocity [rad/s] of every motor."""
 FINGERS = ("index", "middle", "ring")
+"""The three equal ones."""
 TIP_RADIUS, TIP_INSET = 0.0105, 0.0396
 """The ball that touches the pad's face and the end of the soft tip, and how far it lies from the last joint [m]."""
 TILT = math.radians(30)

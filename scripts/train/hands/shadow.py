@@ -11,12 +11,14 @@ FINGERS = {
 }
 """Letters of a finger's joints, where its knuckle is [m], and the sign of the knuckle's axis."""
 QUARTER = math.pi / 2
+"""A right angle."""
 FLEXION: Triple = (1, 0, 0)
 FINGER_DRIVE = (2.0, 2.0)
 """Effort [N m] and velocity [rad/s] of the fingers' joints."""
 TILT = math.radians(30)
 """Of the contact's normal from the palmar axis to the finger's end, as in the Allegro hand."""
 NORMAL = (0.0, -math.cos(TILT), math.sin(TILT))
+"""Of every contact, in its tip's link."""
 TIP_MASS = 0.003
 """Share of a distal link's mass [kg] that is the ball's: about its share of the volume."""
 FOREARM_RADIUS, FOREARM_PLACES = 0.072, (0.055, 0.09, 0.125)
