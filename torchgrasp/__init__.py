@@ -23,7 +23,7 @@ from torchgrasp.scene import Scene, read_scene, save_scene
 from torchgrasp.objects import GraspObject, list_objects, load_object, load_scene
 from torchgrasp.shape import ShapeGP, fit_shape
 from torchgrasp.plan import ClosureProbability, certify, closure_probability, plan_contacts
-from torchgrasp.hand import Hand, load_hand
+from torchgrasp.hand import Hand, hand_of, load_hand
 from torchgrasp.posture_model import (
     GraspMixture,
     HandSamples,
@@ -78,6 +78,7 @@ __all__ = [
     "closure_probability",
     "plan_contacts",
     "Hand",
+    "hand_of",
     "load_hand",
     "GraspMixture",
     "HandSamples",

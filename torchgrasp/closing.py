@@ -17,11 +17,11 @@ class ClosingGains(Value):
     `force_source` is "analytic", or "stability" if the stability model chose among the balanced forces.
     """
 
-    target: Float[Tensor, "3 3"]
-    covariance: Float[Tensor, "3 3 3"]
-    position_gain: Float[Tensor, "3 3"]
-    force_gain: Float[Tensor, "3 3"]
-    desired_force: Float[Tensor, "3 3"]
+    target: Float[Tensor, "f 3"]
+    covariance: Float[Tensor, "f 3 3"]
+    position_gain: Float[Tensor, "f 3"]
+    force_gain: Float[Tensor, "f 3"]
+    desired_force: Float[Tensor, "f 3"]
     force_source: str = "analytic"
 
 
@@ -65,7 +65,7 @@ class ClosureResult(Value):
     held: bool
     status: Status
     time: Float[Tensor, "t"]
-    forces: Float[Tensor, "t 3"]
+    forces: Float[Tensor, "t f"]
     object_pose: Float[Tensor, "t 4 4"]
     hand_pose: Float[Tensor, "t 4 4"]
     joints: Float[Tensor, "t j"]

@@ -1,8 +1,6 @@
 """From a partial point cloud, or a thing of a scene, to ranked grasps, in one call."""
 
 import dataclasses
-import hashlib
-from collections.abc import Callable
 from typing import Any, get_args
 
 import torch
@@ -13,8 +11,10 @@ from torchgrasp.base import count_status
 from torchgrasp.cloud.check import remove_duplicates
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.files import sha256
+from torchgrasp.finger_sets import Observer, finger_sets, plan_sets
 from torchgrasp.frames import inverse
 from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.ik.candidates import GraspProblem, Reachable
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.cobyla import solve_as_paper
@@ -22,7 +22,7 @@ from torchgrasp.ik.contact_first import solve_contact_first
 from torchgrasp.ik.joint import solve_joint
 from torchgrasp.ik.motion import collision_probability, lift_clearance
 from torchgrasp.ik.obstacles import Obstacles
-from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
+from torchgrasp.ik.posture_library import PostureLibrary, keep_nearest, nearest_postures
 from torchgrasp.ik.query import query_mixture
 from torchgrasp.ik.ranking import rank_by_success, rank_by_variance, success_features, success_log_odds
 from torchgrasp.ik.sdf import field_from_surface
@@ -32,6 +32,7 @@ from torchgrasp.plan.solve import plan_contacts
 from torchgrasp.plan.starts import settle_flatness
 from torchgrasp.plane import cloud_to_upright, move, upright_frame
 from torchgrasp.posture_model.mixture import PAPER_ENERGY, GraspMixture, load_mixture, mixture_path
+from torchgrasp.provenance import metadata
 from torchgrasp.scene.occupancy import estimate_occupancy
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.fit import fit_shape
@@ -40,12 +41,13 @@ from torchgrasp.shape.surface import Surface, extract_surface
 from torchgrasp.specs import ContactSpec, Mode, Ranking
 from torchgrasp.values import ContactPlan, Grasps, PointCloud
 
-Observer = Callable[[str, str, Any], None]
-"""Called after each stage with its name, one line about it, and its value."""
 TRIPLES = 250
 """Planned triples offered to the hand."""
 SCENE_TRIPLES = 160
 """Triples offered in a scene, where more postures of each are tried: first grasps come in 1.5 times as long."""
+OFFERED = 4
+"""Rows of four or five contacts offered for each that is tried: the nearest to postures of the hand. Few are in reach,
+and of the nearest twice as many (docs/fingers.md)."""
 BURIED_DEPTH = 0.003
 """Depth [m] in obstacles, beyond that of neighbours that touch, at which something lies on a lifted surface."""
 TARGET_POINTS = 1000
@@ -74,11 +76,6 @@ def describe(counts: dict[Status, int]) -> str:
     return ", ".join(f"{n} {s.name.lower()}" for s, n in ordered) or "none"
 
 
-def digest(cloud: PointCloud) -> str:
-    """Return the SHA-256 of the points, by which results name their input."""
-    return hashlib.sha256(cloud.points.detach().cpu().double().contiguous().numpy().tobytes()).hexdigest()
-
-
 def plan_grasps(
     cloud: PointCloud | Scene,
     hand: Hand,
@@ -86,6 +83,7 @@ def plan_grasps(
     starts: int = 1000,
     seed: int = 0,
     *,
+    fingers: Fingers | None = None,
     mode: Mode = "joint",
     ranking: Ranking | None = None,
     shape: ShapeGP | None = None,
@@ -100,10 +98,13 @@ def plan_grasps(
     Args:
         cloud: what the camera saw [m]; missing normals and viewpoint are estimated. A `Scene` has a target.
         hand: from `load_hand`; it follows the shape, which is where the cloud is, to its device.
-        spec: the constraints on contacts; None: `ContactSpec()`, in mode "paper" `ContactSpec.paper()`.
+        spec: the constraints on contacts, of which each finger gets one; None: `ContactSpec()`, in mode "paper"
+            `ContactSpec.paper()`.
         starts: random starts of the contact planner.
         seed: of every random draw; on the CPU the same seed gives bitwise the same grasps.
-        mode: see `Mode`. All but "joint" need the hand's learned model.
+        fingers: which grasp, as in `load_hand`; None: those of the hand. "auto": of the sets that the hand declares,
+            the one whose best grasps are likeliest to succeed. The result names them; `hand_of` loads their hand.
+        mode: see `Mode`. All but "joint" need the hand's learned model, and three fingers.
         ranking: see `Ranking`; None: "success", in mode "paper" "variance".
         shape: the object's shape if more is known than the cloud shows, as after a touch (`ShapeGP.update`).
         observer: called after each stage, see `Observer`.
@@ -128,7 +129,7 @@ def plan_grasps(
     as_paper = mode == "paper"
     spec = (ContactSpec.paper() if as_paper else ContactSpec()) if spec is None else spec
     ranking = ranking or ("variance" if as_paper else "success")
-    scene, spec = None, spec.for_fingertips(float(hand.tips.radius.max()))
+    hands, scene = finger_sets(hand, fingers, mode), None
     if isinstance(cloud, Scene):
         scene, cloud = cloud, take_target(cloud, seed)
         spec = dataclasses.replace(spec, table=scene.table if spec.table is None else spec.table)
@@ -145,7 +146,7 @@ def plan_grasps(
     else:
         shape = shape.moved(inverse(obj_from_upright))
     task = _Task(
-        hand.to(shape.device),
+        hand,
         shape,
         dataclasses.replace(spec, table=None if spec.table is None else 0.0),
         starts,
@@ -157,7 +158,8 @@ def plan_grasps(
         None if reachable is None else lambda poses: reachable(obj_from_upright.to(poses) @ poses),
         lambda stage, message, value: observer(stage, message, _moved(value, obj_from_upright)),
     )
-    grasps = _moved(_plan(task), obj_from_upright)
+    hand, grasps = plan_sets(hands, lambda one, observer: _plan(task.of(one, observer)), task.observer)
+    grasps = _moved(grasps, obj_from_upright)
     meta = {
         "mode": mode,
         "ranking": ranking,
@@ -165,7 +167,7 @@ def plan_grasps(
         "starts": str(starts),
         "seed": str(seed),
     }
-    grasps = dataclasses.replace(grasps, meta=_metadata(cloud, hand, spec) | meta)
+    grasps = dataclasses.replace(grasps, meta=metadata(cloud, hand, spec) | meta)
     observer("refine", f"{len(grasps)} refined: {describe(count_status(grasps.status))}", grasps)
     return grasps
 
@@ -199,6 +201,11 @@ class _Task:
     reachable: Reachable | None
     observer: Observer
 
+    def of(self, hand: Hand, observer: Observer) -> "_Task":
+        """Return the task of a hand with its fingertips."""
+        spec = dataclasses.replace(self.spec.for_fingertips(float(hand.tips.radius.max())), fingertips=len(hand.tips))
+        return dataclasses.replace(self, hand=hand.to(self.shape.device), spec=spec, observer=observer)
+
 
 def _plan(task: _Task) -> Grasps:
     """Plan in the upright frame."""
@@ -220,7 +227,7 @@ def _plan(task: _Task) -> Grasps:
     problem = GraspProblem(hand, contacts, certificate, world, surface.vertices.mean(0), task.reachable)
     if task.mixture is None:
         library = PostureLibrary.of(hand, seed=seed)
-        seeds = nearest_postures(library, contacts, world, reachable=task.reachable)
+        seeds = keep_nearest(nearest_postures(library, contacts, world, reachable=task.reachable), _tried(task))
     elif task.mode == "paper":
         seeds = query_mixture(hand, contacts, task.mixture.to(shape.device), n_seeds=1, max_energy=PAPER_ENERGY)
     else:
@@ -247,10 +254,15 @@ def _plan(task: _Task) -> Grasps:
 def _offered_rows(task: _Task, plan: ContactPlan) -> Int[Tensor, "k"]:
     """Return the successful rows that the hand tries: far apart, or in the paper all, the most certain first."""
     if task.mode != "paper" or task.ranking != "variance":
-        return spread_rows(plan, TRIPLES if task.scene is None else SCENE_TRIPLES)
+        return spread_rows(plan, _tried(task) * (1 if len(task.hand.tips) == 3 else OFFERED))
     rows, variance = torch.nonzero(plan.status == Status.OK)[:, 0], plan.contacts.variance
     assert variance is not None
     return rows[torch.argsort(variance[rows].sum(1), stable=True)]
+
+
+def _tried(task: _Task) -> int:
+    """Return how many rows of contacts the hand tries at most."""
+    return TRIPLES if task.scene is None else SCENE_TRIPLES
 
 
 def _find_obstacles(task: _Task) -> Obstacles | None:
@@ -279,19 +291,3 @@ def take_target(scene: Scene, seed: int) -> PointCloud:
     cloud, generator = scene.cloud(), torch.Generator().manual_seed(seed)
     rows = torch.randperm(len(cloud), generator=generator)[:TARGET_POINTS].sort().values
     return cloud.select(rows.to(cloud.points.device))
-
-
-def _metadata(cloud: PointCloud, hand: Hand, spec: ContactSpec) -> dict[str, str]:
-    """Return the origin and the units of grasps, for their file."""
-    return {
-        "hand": hand.name,
-        "hand_sha256": hand.source.sha256,
-        "cloud_sha256": digest(cloud),
-        "joint_names": ",".join(hand.joint_names),
-        "finger_names": ",".join(hand.tips.names),
-        "frames": "obj: the frame of the cloud; hand: the base link of the hand's URDF; a_from_b maps b into a",
-        "units": "metre, radian",
-        "friction": f"{spec.friction:g}",
-        "planned_friction": f"{spec.planned_friction:g}",
-        "table": "none" if spec.plane is None else spec.plane.describe(),
-    }

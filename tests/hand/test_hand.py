@@ -12,7 +12,7 @@ from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.testing import largest_fk_error, random_joints
 
-HANDS = [("allegro", "default"), ("allegro", "paper_literal"), ("barrett", "default")]
+HANDS = [("allegro", "default"), ("allegro", "paper_literal"), ("allegro", "four"), ("barrett", "default")]
 HANDS += [("leap", "default"), ("shadow", "default")]
 
 

@@ -17,9 +17,9 @@ NOTHING = SignedDistanceField(torch.zeros(3, dtype=torch.float64), 1.0, torch.on
 """The field of an object a metre away."""
 
 
-@pytest.fixture(scope="module", params=["allegro", "barrett"])
+@pytest.fixture(scope="module", params=[("allegro", 3), ("barrett", 3), ("allegro", 4)], ids=str)
 def library(request):
-    return PostureLibrary.of(load_hand(request.param), 400, seed=3)
+    return PostureLibrary.of(load_hand(*request.param), 400, seed=3)
 
 
 @pytest.fixture
@@ -39,18 +39,19 @@ def test_eq24_postures_of_the_library_are_found_and_placed(library, poses):
     best = seeds[torch.arange(0, 36, 3)]
     torch.testing.assert_close(best.joints, library.joints[:12])
     torch.testing.assert_close(best.obj_from_hand, poses)
-    assert best.permutation.tolist() == [[0, 1, 2]] * 12
+    assert best.permutation.tolist() == [list(range(len(library.hand.tips)))] * 12
     assert float(best.tip_error.max()) < 1e-9
     assert float(best.energy.max()) < 1e-3  # rounding of single precision
     assert bool((best.energy <= seeds.energy.view(12, 3).T).all())
 
 
 def test_the_order_of_the_contacts_does_not_matter(library, poses):
-    contacts, order = touched(library, poses), [2, 0, 1]
+    contacts = touched(library, poses)
+    order = torch.arange(contacts.fingertips).roll(1)
     turned = Contacts(contacts.points[:, order], contacts.normals[:, order])
     seeds = nearest_postures(library, turned, CollisionWorld(NOTHING), n_seeds=1)
     torch.testing.assert_close(seeds.joints, library.joints[:12])
-    assert seeds.permutation.tolist() == [[1, 2, 0]] * 12  # finger i takes the contact that was its own
+    assert seeds.permutation.tolist() == [order.argsort().tolist()] * 12  # finger i takes the contact that was its own
 
 
 def test_a_table_moves_clear_postures_to_the_front(library, poses):
@@ -80,8 +81,8 @@ def test_collision_cost_is_the_sum_of_squared_deficits(library, poses):
 
 def test_degenerate_triples_have_no_seeds_and_same_seed_same_bits(library, poses):
     contacts = touched(library, poses)
-    line = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]], dtype=torch.float64)
-    up = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand(3, 3)
+    line = torch.arange(contacts.fingertips)[:, None] * torch.tensor([0.1, 0, 0], dtype=torch.float64)
+    up = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand_as(line)
     points, normals = contacts.points.clone(), contacts.normals.clone()
     points[4], normals[4] = line, up
     mixed = Contacts(points, normals)
@@ -93,6 +94,9 @@ def test_degenerate_triples_have_no_seeds_and_same_seed_same_bits(library, poses
     assert len(nearest_postures(library, mixed[:0], CollisionWorld(NOTHING))) == 0
     with pytest.raises(BadArgument, match="n_seeds"):
         nearest_postures(library, mixed, CollisionWorld(NOTHING), n_seeds=0)
+    more = Contacts(*(torch.cat([x, x[:, :1]], 1) for x in (points, normals)))
+    with pytest.raises(BadArgument, match="one for each fingertip"):
+        nearest_postures(library, more, CollisionWorld(NOTHING))
 
 
 def test_a_small_library_gives_no_more_seeds_than_it_has(poses):

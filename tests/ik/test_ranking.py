@@ -1,5 +1,6 @@
 """Ranking: order within groups, the geometric score, and which way each feature of the model of success counts."""
 
+import itertools
 import math
 
 import numpy as np
@@ -54,6 +55,14 @@ def test_centred_friction_is_the_tangent_of_the_tilt():
     torch.testing.assert_close(
         centred_friction(triple(tilt=0.3)), torch.tensor([0.3], dtype=torch.float64).tan(), atol=1e-6, rtol=0
     )
+
+
+def test_more_contacts_carry_a_load_as_the_best_three_do(generator):
+    points = torch.randn(20, 5, 3, generator=generator, dtype=torch.float64)
+    center = torch.tensor([0.5, 0.1, -0.3], dtype=torch.float64)
+    threes = torch.stack([load_arm(points[:, list(k)], center) for k in itertools.combinations(range(5), 3)])
+    assert torch.equal(load_arm(points, center), threes.amin(0))
+    assert bool((load_arm(points, center) <= load_arm(points[:, :4], center)).all())
 
 
 def test_central_untilted_grasps_rank_first():

@@ -17,6 +17,30 @@ from torchgrasp.posture_model.sample import sample_configurations
 from torchgrasp.values import Contacts
 
 
+def four_fingers():
+    """The Allegro with all fingers, its postures, and contacts of other postures with their fingers mixed up."""
+    hand = load_hand("allegro", 4)
+    contacts = touched_contacts(hand, sample_configurations(hand, 30, seed=5).joints)
+    order = torch.stack([torch.randperm(4, generator=torch.Generator().manual_seed(k)) for k in range(30)])
+    at = torch.arange(30)[:, None]
+    return hand, PostureLibrary.of(hand, 2000), Contacts(contacts.points[at, order], contacts.normals[at, order])
+
+
+def test_contacts_of_four_fingers_are_solved_in_any_order():
+    hand, library, contacts = four_fingers()
+    solution = solve_ik(hand, contacts, library=library)
+    assert float((solution.status == Status.OK).double().mean()) >= 0.9
+    solved = solution.status == Status.OK
+    torch.testing.assert_close(solution.tip_error, miss(hand, solution, contacts), atol=1e-9, rtol=0)
+    assert float(solution.tip_error[solved].max()) < 1e-3
+    assert bool((solution.permutation.sort(1).values == torch.arange(4)).all())
+    for options, word in (({"method": "cobyla"}, "method"), ({"mixture": load_mixture("allegro")}, "mixture")):
+        with pytest.raises(BadArgument, match=f"{word}.*4 fingertips.*three"):
+            solve_ik(hand, contacts, library=library, **options)
+    with pytest.raises(BadArgument, match=r"contacts\.points"):
+        solve_ik(load_hand("allegro"), contacts)
+
+
 @pytest.fixture(scope="module", params=["allegro", "barrett"])
 def scene(request):
     """A hand, its model, its own postures, and contacts that 40 postures of another seed touch."""

@@ -26,6 +26,7 @@ def evaluate(
     hand: str,
     out: Path,
     objects: Path | None = None,
+    fingers: str = "default",
     protocol: Literal[
         "multidex", "dexgraspbench", "dexgraspbench-hard", "pose-noise", "paper", "tabletop", "household"
     ] = "dexgraspbench",
@@ -59,6 +60,7 @@ def evaluate(
         objects: folder with manifest.json, and for each object mesh.ply and noisy views. Scenes need mesh.ply only, and
             take the library's own objects by default.
         hand: name of a shipped hand, as allegro, barrett, leap or shadow, or the folder of another.
+        fingers: which grasp: an option of the hand, a number of fingers, or their names as in index,middle,thumb.
         out: folder of the results; it is made where it does not exist, and no other run may use it meanwhile.
         protocol: which test; see torchgrasp.evaluation.protocols.
         closing: how the hand closes; by default in open loop before a pull, under uncertainty before a lift.
@@ -85,8 +87,8 @@ def evaluate(
     check_seed(seed)
     check_whole("--scenes", scenes, 0, 1_000_000)
     import_simulator(simulator)
-    with naming(hand="--hand", name="--hand"):
-        the_hand = load_hand(hand)
+    with naming(hand="--hand", name="--hand", fingers="--fingers"):
+        the_hand = load_hand(hand, fingers)
     changes: dict[str, Any] = {"closing": closing, "force": force, "holding": holding, "simulator": simulator}
     changes = {name: x for name, x in changes.items() if x is not None}
     if scenes:
@@ -107,7 +109,13 @@ def evaluate(
                 scores.append(score)
         summary = summarise(scores)
         print_summary(protocol, spec.tried, summary)
-        asked = {"hand": hand, "tried": spec.tried, "hand_sha256": the_hand.source.sha256, **dataclasses.asdict(spec)}
+        asked = {
+            "hand": hand,
+            "fingers": the_hand.source.option,
+            "tried": spec.tried,
+            "hand_sha256": the_hand.source.sha256,
+            **dataclasses.asdict(spec),
+        }
         asked["protocol"] = dataclasses.asdict(test)
         content = {"asked": asked, "summary": summary, "views": [dataclasses.asdict(score) for score in scores]}
         write_file(out / "evaluate.json", format_json(content))

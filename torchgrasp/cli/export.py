@@ -10,7 +10,7 @@ from torchgrasp.cli.common import naming
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.export import format_grasps, format_keyframes
 from torchgrasp.files import write_file
-from torchgrasp.hand.load import load_hand
+from torchgrasp.hand.load import hand_of
 from torchgrasp.values import load_grasps
 
 
@@ -37,8 +37,8 @@ def export(
     """
     with naming(path="GRASPS"):
         planned = load_grasps(grasps)
-    with naming(hand="--hand", name="--hand"):
-        robot = load_hand(planned.meta.get("hand", "") if hand is None else hand)
+    with naming(hand="--hand", name="--hand", grasps="GRASPS", fingers="GRASPS"):
+        robot = hand_of(planned, hand)
     if planned.meta.get("hand_sha256") != robot.source.sha256:
         raise BadArgument("--hand", f"{robot.name}, whose files are not those that were planned with", "the same hand")
     check_whole("--most", most, 1, 1_000_000)

@@ -28,7 +28,7 @@ from torchgrasp.columns import format_columns
 from torchgrasp.errors import BadArgument, MissingExtra
 from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.files import sha256
-from torchgrasp.hand.load import load_hand
+from torchgrasp.hand.load import hand_of, load_hand
 from torchgrasp.mesh import read_mesh
 from torchgrasp.objects import DATA, MASSES, list_objects, load_object
 from torchgrasp.pipeline import plan_grasps
@@ -62,6 +62,7 @@ def grasp(
     table: tuple[float, ...] | None = None,
     no_table: bool = False,
     friction: float = 0.8,
+    fingers: str = "default",
     mode: Mode = "joint",
     label: int | None = None,
     point: tuple[float, float] | None = None,
@@ -86,6 +87,8 @@ def grasp(
             default the table is at the lowest point of the cloud.
         no_table: there is no table.
         friction: coefficient of friction between fingertips and object.
+        fingers: which grasp: an option of the hand, a number of fingers, or their names as in index,middle,thumb;
+            "auto" tries the options, and takes the one whose best grasps are likeliest to succeed.
         mode: contacts, pose and joints together; contacts first and the learned model after; or the paper as written.
         label: of the thing to grasp in a scene; by default the easiest.
         point: column and row of a pixel on the thing to grasp in a scene.
@@ -98,8 +101,8 @@ def grasp(
         if mesh is not None or view != AS_IT_IS or table is not None or no_table or mode != "joint":
             found = "an option of clouds beside a scene"
             raise BadArgument("CLOUD", found, "--label or --point, --hand, --out, --seed, --starts and --friction")
-        with naming(hand="--hand", name="--hand", friction="--friction"):
-            the_hand, spec = load_hand(hand), ContactSpec(friction=friction)
+        with naming(hand="--hand", name="--hand", fingers="--fingers", friction="--friction"):
+            the_hand, spec = load_hand(hand, fingers), ContactSpec(friction=friction)
         check_whole("--starts", starts, 1, 1_000_000)
         check_seed(seed)
         return grasp_scene(cloud, the_hand, spec, (starts, seed), point if label is None else label, out)
@@ -111,8 +114,8 @@ def grasp(
         import_simulator()
     check_whole("--starts", starts, 1, 1_000_000)
     check_seed(seed)
-    with naming(hand="--hand", name="--hand"):
-        the_hand = load_hand(hand)
+    with naming(hand="--hand", name="--hand", fingers="--fingers"):
+        the_hand = load_hand(hand, "default" if fingers == "auto" else fingers)
     file = read_view("CLOUD", cloud, view)
     partial, plane = file.cloud, table_plane(file.cloud, view, table, no_table)
     with naming(mesh="--mesh", friction="--friction", table="--table"):
@@ -121,13 +124,18 @@ def grasp(
         trial = TrialSpec(friction=friction)
     print_notes(file.notes, judge_cloud("CLOUD", partial, view, plane))
 
-    progress = Progress("shape", "plan", "certify", "query", "refine", *["closing"] * close, "report")
+    auto = fingers == "auto"
+    names = [*["fingers"] * auto, "shape", "plan", "certify", "query", "refine", *["closing"] * close, "report"]
+    progress = Progress(*names)
     with progress.bar:
         origin = "no table" if plane is None else describe_table(plane)
         origin += " (lowest point)" * (plane is not None and table is None)
         camera = "camera known" if partial.viewpoint is not None else "camera estimated"
         progress.end("cloud", f"{len(partial)} points, {camera}, {origin}")
-        grasps = plan_grasps(partial, the_hand, spec, starts, seed, mode=mode, observer=progress.end)
+        grasps = plan_grasps(
+            partial, the_hand, spec, starts, seed, fingers="auto" if auto else None, mode=mode, observer=progress.end
+        )
+        the_hand = hand_of(grasps, the_hand)
         surface, plan = extract_surface(progress.values["shape"]), progress.values["plan"]
         name = object_name(cloud if mesh is None else mesh)
         run = Run(name, cloud, partial, the_hand, spec, surface, grasps, tuple(progress.stages), plan)

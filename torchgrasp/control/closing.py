@@ -60,7 +60,7 @@ class LawClosing:
       that touches is force-controlled whatever its position error: where the shape is wrong, Eq. (26) would press on.
       No finger searches below the table, if the reference knows one: it slides along.
     * `wait`: a finger that touches presses with `WAITING_FORCE` until all do. The holding then raises the full forces:
-      three separate loops would push the object (docs/closing.md).
+      separate loops would push the object (docs/closing.md).
     * `pace`: before the first touch all fingers keep pace. Without it they share one limit of speed, so that
       Eq. (27) decides which is the first.
 
@@ -77,7 +77,7 @@ class LawClosing:
         self.strongest = _strongest_lead(reference)
         self.target = reference.pregrasp
         self.waiting = self.settled = 0.0
-        self.steady = torch.zeros(3, dtype=torch.float64)
+        self.steady = torch.zeros_like(reference.normals[:, 0])
         self.done = False
 
     def press(self) -> "LawClosing":
@@ -117,7 +117,7 @@ class LawClosing:
         self.target = reference.clamp(target)
         return reference.expand(self.target)
 
-    def _judge(self, observation: Observation, share: Float[Tensor, "3"], period: float) -> None:
+    def _judge(self, observation: Observation, share: Float[Tensor, "f"], period: float) -> None:
         """Count the time since the first touch, and the time for which the fingers have settled."""
         contact, average = observation.tactile.contact, observation.tactile.average
         self.waiting = self.waiting + period if bool(contact.any()) else 0.0
@@ -147,9 +147,9 @@ class FixedGainClosing(LawClosing):
         gains = reference.gains
         isotropic = dataclasses.replace(
             gains,
-            covariance=POSITION_FLOOR**2 * torch.eye(3, dtype=gains.covariance.dtype).expand(3, 3, 3),
+            covariance=POSITION_FLOOR**2 * torch.eye(3, dtype=gains.covariance.dtype).expand_as(gains.covariance),
             position_gain=torch.full_like(gains.position_gain, POSITION_RATE),
-            force_gain=gains.force_gain.amax(-1, keepdim=True).expand(3, 3),
+            force_gain=gains.force_gain.amax(-1, keepdim=True).expand_as(gains.force_gain),
         )
         super().__init__(dataclasses.replace(reference, gains=isotropic), revise, without)
 
@@ -165,7 +165,7 @@ class PositionClosing:
         self.aim = reference.gains.target - depth * reference.normals
         self.target = reference.pregrasp
         self.integral = torch.zeros_like(self.aim)
-        self.stopped = torch.zeros(3, dtype=torch.bool)
+        self.stopped = torch.zeros_like(self.aim[:, 0], dtype=torch.bool)
         self.done = False
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:

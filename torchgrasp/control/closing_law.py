@@ -117,20 +117,20 @@ def stay_above(
 
 
 def joint_step(
-    jacobian: Float[Tensor, "*b 3 3 h"],
-    velocity: Float[Tensor, "*b 3 3"],
+    jacobian: Float[Tensor, "*b f 3 h"],
+    velocity: Float[Tensor, "*b f 3"],
     period: float,
     posture_error: Float[Tensor, "*b h"] | None = None,
     damping: float = DAMPING,
 ) -> Float[Tensor, "*b h"]:
-    """Return the change of the joints [rad] in one tick, Eq. (25), by damped least squares over all three fingers.
+    """Return the change of the joints [rad] in one tick, Eq. (25), by damped least squares over all fingers.
 
     The paper's J^-1 does not exist for coupled fingers, nor for four joints. Joint motions that move no fingertip
     reduce `posture_error` at `POSITION_RATE`.
 
     Args:
-        jacobian: of the three fingertips [m/rad].
-        velocity: of the three fingertips [m/s] (`tip_velocity`).
+        jacobian: of the f fingertips [m/rad].
+        velocity: of the fingertips [m/s] (`tip_velocity`).
         period: of the controller [s].
         posture_error: planned minus present joints [rad]; None: ignored.
         damping: of the inverse [m^2].

@@ -52,7 +52,8 @@ class GraspController:
         without: parts that the closing leaves out, as in `TrialSpec`.
 
     Raises:
-        BadArgument: unknown names; a belief, parts or "law" for a closing that has none.
+        BadArgument: unknown names; a belief, parts or "law" for a closing that has none; "impedance" for more than
+            three fingertips.
 
     A hand that is driven at 200 Hz; here joints follow at once and the object yields by 1 mm for 2 N:
 
@@ -142,6 +143,7 @@ def _holding(
 ) -> Callable[[ClosingReference, Observation, Float[Tensor, " j"]], Step]:
     """Return the maker of a holding; only the impedance reads the stability model."""
     if mode == "impedance":
+        closing.reference.hand.require_three("holding", "'impedance', whose virtual frame is of three,")
         from torchgrasp.control.adaptive.impedance import Impedance
         from torchgrasp.control.adaptive.stability import load_stability
 

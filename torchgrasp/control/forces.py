@@ -19,11 +19,11 @@ FORCE_SPREAD = 0.1
 
 
 def desired_forces(
-    points: Float[Tensor, "*b 3 3"],
-    normals: Float[Tensor, "*b 3 3"],
+    points: Float[Tensor, "*b f 3"],
+    normals: Float[Tensor, "*b f 3"],
     strongest: float = 4.0,
-    preferred: Float[Tensor, "*#b 3"] | None = None,
-) -> Float[Tensor, "*b 3 3"]:
+    preferred: Float[Tensor, "*#b f"] | None = None,
+) -> Float[Tensor, "*b f 3"]:
     """Return `least_friction_forces`, or `strongest` along the normals where no balanced set presses everywhere."""
     balanced = least_friction_forces(points, normals, strongest, preferred)
     return torch.where(torch.isfinite(balanced), balanced, -strongest * normals)
@@ -44,7 +44,7 @@ def force_covariance(
     return along + floor**2 * torch.eye(3, dtype=forces.dtype, device=forces.device)
 
 
-def contacts_in_hand(grasps: Grasps) -> tuple[Float[Tensor, "g 3 3"], Float[Tensor, "g 3 3"]]:
+def contacts_in_hand(grasps: Grasps) -> tuple[Float[Tensor, "g f 3"], Float[Tensor, "g f 3"]]:
     """Return planned contact points [m] and normals in the hand's frame."""
     hand_from_obj = inverse(grasps.obj_from_hand.double())
     contacts = grasps.contacts
@@ -55,7 +55,7 @@ class Squeeze(NamedTuple):
     """The third pose of a grasp: joint targets [rad], forces on the object [N], torques [N m]."""
 
     joints: Float[Tensor, "g h"]
-    forces: Float[Tensor, "g 3 3"]
+    forces: Float[Tensor, "g f 3"]
     torques: Float[Tensor, "g h"]
 
 
@@ -71,7 +71,7 @@ def squeeze(hand: Hand, grasps: Grasps, force: float = 4.0, kp: float | None = N
         kp: stiffness of every joint's drive [N m/rad]; None: the hand's own.
 
     Raises:
-        BadArgument: joints of another hand, or a force or stiffness that is not positive.
+        BadArgument: joints or fingers of another hand, or a force or stiffness that is not positive.
 
     >>> from torchgrasp import load_hand, load_object, plan_grasps
     >>> hand = load_hand("allegro")
@@ -86,7 +86,8 @@ def squeeze(hand: Hand, grasps: Grasps, force: float = 4.0, kp: float | None = N
 
 
 def check_squeeze(hand: Hand, grasps: Grasps, force: float, kp: float | None) -> None:
-    """Refuse joints of another hand, and a force or stiffness that is not positive."""
+    """Refuse joints or fingers of another hand, and a force or stiffness that is not positive."""
+    check_fingers(hand, grasps)
     if grasps.joints.shape[-1] != hand.dof:
         raise BadArgument("grasps", f"{grasps.joints.shape[-1]} joints", f"the {hand.dof} of {hand.name}")
     if not 0.0 < force < 1e3:
@@ -95,10 +96,19 @@ def check_squeeze(hand: Hand, grasps: Grasps, force: float, kp: float | None) ->
         raise BadArgument("kp", kp, "a number in (0, 10^6) [N m/rad]")
 
 
+def check_fingers(hand: Hand, grasps: Grasps) -> None:
+    """Refuse grasps that were planned for other fingers of a hand; those that name none may be of any."""
+    names = grasps.meta.get("finger_names", ",".join(hand.finger_names)).split(",")
+    if tuple(names) != hand.finger_names or grasps.contacts.fingertips != len(names):
+        found = f"{grasps.contacts.fingertips} contacts a row, of the fingers {', '.join(names)}"
+        allowed = f"those of the hand: {', '.join(hand.finger_names)}; `hand_of(grasps)` loads the fingers of grasps"
+        raise BadArgument("grasps", found, allowed)
+
+
 def press(
     joints: Float[Tensor, "g h"],
-    jacobian: Float[Tensor, "g 3 3 h"],
-    forces: Float[Tensor, "g 3 3"],
+    jacobian: Float[Tensor, "g f 3 h"],
+    forces: Float[Tensor, "g f 3"],
     stiffness: Float[Tensor, " h"],
 ) -> Squeeze:
     """Return the `Squeeze` with which joints of a stiffness [N m/rad] exert forces [N]."""

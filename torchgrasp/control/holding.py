@@ -55,7 +55,7 @@ def regulate(factor: float, observation: Observation, strength: float, period: f
     return min(max(factor + period * lacking, 0.5), 1.5)
 
 
-def held_forces(reference: ClosingReference, observation: Observation) -> tuple[Float[Tensor, "3 3"], float]:
+def held_forces(reference: ClosingReference, observation: Observation) -> tuple[Float[Tensor, "f 3"], float]:
     """Return forces [N] that are balanced at the sensed contacts, and their normal sum.
 
     The planned forces stay where a finger is in the air or no balanced set presses.

@@ -23,8 +23,8 @@ class Observation(Value):
     """
 
     joints: Float[Tensor, " j"]
-    tips: Float[Tensor, "3 3"]
-    jacobian: Float[Tensor, "3 3 j"]
+    tips: Float[Tensor, "f 3"]
+    jacobian: Float[Tensor, "f 3 j"]
     tactile: TactileState
 
 
@@ -38,7 +38,7 @@ def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> O
     joints = joints.double()
     tips = hand.tip_centres(joints)
     axes, origins = hand.tree.joint_axes(hand.link_poses(joints))
-    turning = torch.linalg.cross(axes.expand(3, -1, 3), tips[:, None] - origins)
+    turning = torch.linalg.cross(axes.expand(len(tips), -1, 3), tips[:, None] - origins)
     columns = torch.where(hand.tree.prismatic[:, None] > 0, axes, turning)
     columns = columns * hand.tree.moves[hand.tips.index][:, :, None]
     return Observation(hand.expand_joints(joints), tips, columns.transpose(1, 2), tactile)

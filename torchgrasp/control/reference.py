@@ -51,7 +51,7 @@ class ClosingReference(Value):
     pregrasp: Float[Tensor, " h"]
     joints: Float[Tensor, " h"]
     squeeze: Float[Tensor, " h"]
-    normals: Float[Tensor, "3 3"]
+    normals: Float[Tensor, "f 3"]
     gains: ClosingGains
     table: Plane | None = None
 
@@ -75,8 +75,8 @@ class ClosingReference(Value):
                 loop of the most certain finger is then the fastest. None: the covariance grows with the force.
 
         Raises:
-            BadArgument: not exactly one row, joints of another hand, a force or stiffness that is not positive, or
-                numbers in the grasp that are not finite.
+            BadArgument: not exactly one row, joints or fingers of another hand, a force or stiffness that is not
+                positive, or numbers in the grasp that are not finite.
         """
         if len(grasp) != 1:
             raise BadArgument("grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]")
@@ -84,9 +84,11 @@ class ClosingReference(Value):
         contacts = grasp.contacts
         check_tensor("grasp.joints", grasp.joints, (1, hand.dof))
         check_tensor("grasp.obj_from_hand", grasp.obj_from_hand, (1, 4, 4))
-        check_tensor("grasp.contacts.points", contacts.points, (1, 3, 3))
-        check_tensor("grasp.contacts.normals", contacts.normals, (1, 3, 3))
-        std_m = check_tensor("grasp.contacts.std_m", contacts.std_m, (1, 3)).to("cpu", torch.float64)
+        check_tensor("grasp.contacts.points", contacts.points, (1, len(hand.tips), 3))
+        check_tensor("grasp.contacts.normals", contacts.normals, (1, len(hand.tips), 3))
+        std_m = check_tensor("grasp.contacts.std_m", contacts.std_m, (1, len(hand.tips))).to("cpu", torch.float64)
+        if stability is not None:
+            hand.require_three("stability", "a model of stability")
         hand, grasp = hand.to("cpu", torch.float64), grasp.to("cpu", torch.float64)
         points, normals = contacts_in_hand(grasp)
         preferred = deviation = None
@@ -135,7 +137,7 @@ class ClosingReference(Value):
         """Return joints within their limits."""
         return torch.minimum(torch.maximum(actuated, self.hand.lower), self.hand.upper)
 
-    def contact_points(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+    def contact_points(self, tips: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
         """Return the first points to touch [m] of fingertips with given centres [m]."""
         return tips - self.hand.tips.radius[:, None] * self.normals
 

@@ -29,8 +29,8 @@ def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
 
 
 def tip_compliance(
-    jacobian: Float[Tensor, "*b 3 3 h"], normals: Float[Tensor, "*b 3 3"], stiffness: Float[Tensor, "h"]
-) -> Float[Tensor, "*b 3"]:
+    jacobian: Float[Tensor, "*b f 3 h"], normals: Float[Tensor, "*b f 3"], stiffness: Float[Tensor, "h"]
+) -> Float[Tensor, "*b f"]:
     """Return the compliance [m/N] of each fingertip along its normal, by joint stiffness [N m/rad]."""
     along = torch.einsum("...cih,...ci->...ch", jacobian, normals)
     return (along**2 / stiffness).sum(-1)

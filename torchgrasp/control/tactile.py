@@ -33,43 +33,43 @@ TOUCH_ON, TOUCH_OFF = 0.2, 0.1
 
 @dataclasses.dataclass(frozen=True)
 class TipContact(Value):
-    """True contacts of three fingertips, averaged over a tick.
+    """True contacts of f fingertips, averaged over a tick.
 
     `forces` [N] act on the object, friction included. `points` [m] and outward `normals` are NaN without contact.
     """
 
-    normal_force: Float[Tensor, "*b 3"]
-    forces: Float[Tensor, "*b 3 3"]
-    points: Float[Tensor, "*b 3 3"]
-    normals: Float[Tensor, "*b 3 3"]
+    normal_force: Float[Tensor, "*b f"]
+    forces: Float[Tensor, "*b f 3"]
+    points: Float[Tensor, "*b f 3"]
+    normals: Float[Tensor, "*b f 3"]
 
 
 @dataclasses.dataclass(frozen=True)
 class TactileState(Value):
-    """What three fingertips report, and their memory.
+    """What f fingertips report, and their memory.
 
     `reading` [N] is the normal force, `forces` [N] the full one. `points` [m] and `normals` are NaN without contact.
     `lagged` [N] is normal force and full force behind the low-pass. `average` [N] is the slow mean of the readings.
     `age` [s] counts from the last sample.
     """
 
-    reading: Float[Tensor, "*b 3"]
-    forces: Float[Tensor, "*b 3 3"]
-    contact: Bool[Tensor, "*b 3"]
-    points: Float[Tensor, "*b 3 3"]
-    normals: Float[Tensor, "*b 3 3"]
-    lagged: Float[Tensor, "*b 3 4"]
-    average: Float[Tensor, "*b 3"]
+    reading: Float[Tensor, "*b f"]
+    forces: Float[Tensor, "*b f 3"]
+    contact: Bool[Tensor, "*b f"]
+    points: Float[Tensor, "*b f 3"]
+    normals: Float[Tensor, "*b f 3"]
+    lagged: Float[Tensor, "*b f 4"]
+    average: Float[Tensor, "*b f"]
     age: float
 
 
-def no_contact(*batch: int) -> TactileState:
-    """Return the state of three fingertips in the air, due to sample.
+def no_contact(*batch: int, fingers: int = 3) -> TactileState:
+    """Return the state of fingertips in the air, due to sample.
 
     >>> no_contact().contact
     tensor([False, False, False])
     """
-    lagged = torch.zeros(*batch, 3, 4, dtype=torch.float64)
+    lagged = torch.zeros(*batch, fingers, 4, dtype=torch.float64)
     zero, vectors = lagged[..., 0], lagged[..., 1:]
     nothing = torch.full_like(vectors, torch.nan)
     return TactileState(zero, vectors, zero > 0, nothing, nothing, lagged, zero, 1 / SAMPLING_RATE)
@@ -78,8 +78,8 @@ def no_contact(*batch: int) -> TactileState:
 def measure(
     tactile: TactileState,
     truth: TipContact,
-    pads: Float[Tensor, "*#b 3 3"],
-    radius: Float[Tensor, "3"],
+    pads: Float[Tensor, "*#b f 3"],
+    radius: Float[Tensor, "f"],
     period: float,
     generator: torch.Generator | None = None,
 ) -> TactileState:

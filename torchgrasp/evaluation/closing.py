@@ -136,6 +136,7 @@ def derive_reference(hand: Hand, grasp: Grasps, spec: TrialSpec) -> ClosingRefer
     if spec.closing == "paper":
         from torchgrasp.control.adaptive.stability import load_stability
 
+        hand.require_three("closing", "'paper', whose model of stability is of three,")
         stability = load_stability(hand)
     return ClosingReference.from_grasp(hand, grasp, spec.force, spec.kp, stability)
 

@@ -229,7 +229,7 @@ class _Lift:
         )
         robot, obj_from_world = self.run.robot, self.run.obj_from_world
         first_touch, first_stray = robot.first_touch, torch.from_numpy(robot.first_stray)
-        touched = [finger for finger in range(3) if np.isfinite(first_touch[finger])]
+        touched = [finger for finger, step in enumerate(first_touch) if np.isfinite(step)]
         if not torch.equal(obj_from_world, torch.eye(4, dtype=torch.float64)):
             world_from_obj = inverse(obj_from_world)
             object_pose, neighbour_pose = (obj_from_world @ x @ world_from_obj for x in (object_pose, neighbour_pose))

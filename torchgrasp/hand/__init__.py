@@ -7,7 +7,7 @@ from torchgrasp.hand.hand import Actuator, Hand, HandSource
 from torchgrasp.hand.joints import ActuatedJoints
 from torchgrasp.hand.kinematics import KinematicTree
 from torchgrasp.hand.self_collision import SelfCollision
-from torchgrasp.hand.load import find_hand, hands_folder, load_hand
+from torchgrasp.hand.load import find_hand, hand_of, hands_folder, load_hand, with_fingers
 from torchgrasp.hand.urdf import Joint, Link, Mimic, Shape, Urdf, read_urdf
 
 __all__ = [
@@ -26,7 +26,9 @@ __all__ = [
     "Urdf",
     "draft_hand",
     "find_hand",
+    "hand_of",
     "hands_folder",
     "load_hand",
     "read_urdf",
+    "with_fingers",
 ]

@@ -1,4 +1,4 @@
-"""The three fingertips of a hand: their pads, and the chains of links that move them."""
+"""The fingertips of a hand, three to five: their pads, and the chains of links that move them."""
 
 import dataclasses
 import functools
@@ -25,30 +25,34 @@ class Fingertips(Value):
     `chains` is the tree that leads to the carriers, `carrier` their index in it.
     """
 
-    names: tuple[str, str, str]
-    links: tuple[str, str, str]
-    index: Int[Tensor, "3"]
-    contact: Float[Tensor, "3 3"]
-    normal: Float[Tensor, "3 3"]
-    center: Float[Tensor, "3 3"]
-    radius: Float[Tensor, "3"]
+    names: tuple[str, ...]
+    links: tuple[str, ...]
+    index: Int[Tensor, "f"]
+    contact: Float[Tensor, "f 3"]
+    normal: Float[Tensor, "f 3"]
+    center: Float[Tensor, "f 3"]
+    radius: Float[Tensor, "f"]
     chains: KinematicTree
-    carrier: Int[Tensor, "3"]
-    carrier_from_tip: Float[Tensor, "3 4 3 1"]
+    carrier: Int[Tensor, "f"]
+    carrier_from_tip: Float[Tensor, "3 4 f 1"]
+
+    def __len__(self) -> int:
+        """Count the fingertips, f."""
+        return len(self.names)
 
     @property
-    def cone(self) -> Float[Tensor, "3"]:
+    def cone(self) -> Float[Tensor, "f"]:
         """Half angle [rad] of the cone about each pad's axis in which the tip may touch."""
         return torch.where(self.radius > 0, ROUND_PAD, FLAT_PAD).to(self.radius)
 
     @functools.cached_property
-    def in_carriers(self) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3 3"], Float[Tensor, "3 3"]]:
+    def in_carriers(self) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
         """`contact`, `normal` and `center` in the frames of the carriers."""
         pose = self.carrier_from_tip
         contact, center = (map_points(pose, x)[..., 0].T for x in (self.contact, self.center))
         return contact, map_directions(pose, self.normal)[..., 0].T, center
 
-    def frames(self, values: Float[Tensor, "j n"]) -> tuple[Float[Tensor, "3 4 l n"], Float[Tensor, "3 4 3 n"]]:
+    def frames(self, values: Float[Tensor, "j n"]) -> tuple[Float[Tensor, "3 4 l n"], Float[Tensor, "3 4 f n"]]:
         """Return the frames of all links of `chains` and of the carriers."""
         frames = self.chains.frames(values)
         return frames, frames.index_select(2, self.carrier)
@@ -57,13 +61,12 @@ class Fingertips(Value):
 def tips_from_files(spec: HandSpec, urdf: Urdf) -> Fingertips:
     """Return the fingertips of the chosen fingers."""
     links = [x.name for x in urdf.links]
-    one, two, three = spec.fingers
     contact, normal, center, radius = zip(*(f.pad for f in spec.fingers), strict=True)
     carriers, poses = zip(*(pose_in_carrier(urdf, f.tip_link) for f in spec.fingers), strict=True)
     chains = tree_from_urdf(urdf, carriers)
     return Fingertips(
-        names=(one.name, two.name, three.name),
-        links=(one.tip_link, two.tip_link, three.tip_link),
+        names=tuple(f.name for f in spec.fingers),
+        links=tuple(f.tip_link for f in spec.fingers),
         index=torch.tensor([links.index(f.tip_link) for f in spec.fingers]),
         contact=torch.tensor(contact, dtype=torch.float64),
         normal=torch.tensor(normal, dtype=torch.float64),

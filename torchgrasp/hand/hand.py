@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.errors import BadArgument
 from torchgrasp.hand.collision_spheres import CollisionSpheres
 from torchgrasp.hand.fingertips import Fingertips
 from torchgrasp.hand.joints import ActuatedJoints
@@ -32,16 +33,19 @@ class Actuator(NamedTuple):
 
 
 class HandSource(NamedTuple):
-    """Origin of a hand: finger option, URDF, SHA-256 of both files."""
+    """Origin of a hand: finger option or names of its fingers, URDF, SHA-256 of both files, all options."""
 
     option: str
     urdf_path: Path
     sha256: str
+    options: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
 class Hand(Value):
-    """A robot hand with three grasping fingers, in grasp order. Positions [m] are in the palm's frame, the URDF's root.
+    """A robot hand with three to five grasping fingers, in grasp order.
+
+    Positions [m] are in the palm's frame, the URDF's root.
 
     `joints` (.., h) are the actuated joints of the grasping fingers, in the order of `joint_names`. Every method raises
     `BadArgument` for joints of a wrong count or dtype, and for NaN or infinity. `approach` points out of the palm.
@@ -86,7 +90,7 @@ class Hand(Value):
         return self.tips.names
 
     @property
-    def tip_radius(self) -> Float[Tensor, "3"]:
+    def tip_radius(self) -> Float[Tensor, "f"]:
         """Radii of the fingertips [m]; 0: a flat or pointed tip."""
         return self.tips.radius
 
@@ -104,6 +108,12 @@ class Hand(Value):
     def upper(self) -> Float[Tensor, " h"]:
         """Upper limits of the actuated joints [rad]."""
         return self.actuated.upper
+
+    def require_three(self, argument: str, what: str) -> None:
+        """Refuse another number of fingertips than the three of the paper; raise `BadArgument` for an argument."""
+        if len(self.tips) != 3:
+            found = f"{what} for {len(self.tips)} fingertips"
+            raise BadArgument(argument, found, "that for three fingertips alone, as in the paper")
 
     def check_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b h"]:
         """Return `joints` if they are within the limits; raise `BadArgument` with the first other joint."""
@@ -124,7 +134,7 @@ class Hand(Value):
         poses = self.tree.poses(values.reshape(-1, values.shape[-1]))
         return poses.reshape(*joints.shape[:-1], *poses.shape[1:])
 
-    def fingertips(self, joints: Float[Tensor, "*b h"]) -> tuple[Float[Tensor, "*b 3 3"], Float[Tensor, "*b 3 3"]]:
+    def fingertips(self, joints: Float[Tensor, "*b h"]) -> tuple[Float[Tensor, "*b f 3"], Float[Tensor, "*b f 3"]]:
         """Return the pads' contact points [m] and outward unit normals.
 
         >>> from torchgrasp.hand.load import load_hand
@@ -136,12 +146,12 @@ class Hand(Value):
         contact, normal, _ = self.tips.in_carriers
         return _rows(map_points(carriers, contact), joints), _rows(map_directions(carriers, normal), joints)
 
-    def tip_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b 3 3"]:
+    def tip_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b f 3"]:
         """Return the centres [m] of the tips' spheres; the contact points where the radius is 0."""
         _, carriers = self.tips.frames(self._columns(joints))
         return _rows(map_points(carriers, self.tips.in_carriers[2]), joints)
 
-    def jacobian(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b 3 3 h"]:
+    def jacobian(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b f 3 h"]:
         """Return the derivative [m/rad] of the contact points (finger, coordinate) by the actuated joints."""
         chains = self.tips.chains
         frames, carriers = self.tips.frames(self._columns(joints))
@@ -156,8 +166,9 @@ class Hand(Value):
         column = torch.stack([ay * z - az * y, az * x - ax * z, ax * y - ay * x])
         if chains.slides:
             column = torch.where(self.tree.prismatic[joint][:, None] > 0, axes, column)
-        summed = contact.new_zeros(3, 3 * self.dof, contact.shape[2]).index_add(1, finger * self.dof + actuated, column)
-        return _rows(summed.unflatten(1, (3, self.dof)).movedim(2, 0), joints)
+        summed = contact.new_zeros(3, len(self.tips) * self.dof, contact.shape[2])
+        summed = summed.index_add(1, finger * self.dof + actuated, column)
+        return _rows(summed.unflatten(1, (len(self.tips), self.dof)).movedim(2, 0), joints)
 
     def sphere_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b s 3"]:
         """Return the centres [m] of `collision_spheres`."""

@@ -3,10 +3,11 @@
 import dataclasses
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from torchgrasp.base import FINGERTIPS
 from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.safe_xml import read_bounded
 from torchgrasp.hand.urdf import Mimic, Triple
@@ -15,6 +16,9 @@ if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
+
+SUPPORTED = "three to five different fingers"
+"""What a hand grasps with (`FINGERTIPS`): fewer tips cannot hold a thing, and no hand has more fingers."""
 
 MAX_BYTES = 1024 * 1024
 """Largest hand.toml; those of the shipped hands have about 5 kB."""
@@ -38,13 +42,30 @@ class Finger(NamedTuple):
     pad: Pad
 
 
-Grasping = tuple[Finger, Finger, Finger]
-"""The three grasping fingers, in grasp order."""
+Grasping = tuple[Finger, ...]
+"""The grasping fingers, three to five, in grasp order."""
+
+Fingers = str | int | tuple[str, ...]
+"""Which fingers grasp: an option of hand.toml, the first option with so many fingers, or fingers by name.
+
+Names may also stand in one text, as "index,middle,thumb".
+"""
+
+
+class Option(NamedTuple):
+    """Which fingers grasp, and where other joints are parked [rad]."""
+
+    fingers: Grasping
+    parked: dict[str, float]
 
 
 @dataclasses.dataclass(frozen=True)
 class HandSpec:
-    """A hand.toml with one of its finger options chosen."""
+    """A hand.toml with its grasping `fingers` chosen; `option` names them.
+
+    Fingers that were chosen by name may leave joints that no option parks. Those are parked at zero, which opens a hand
+    by convention, or at their limit next to it.
+    """
 
     path: Path
     name: str
@@ -56,6 +77,7 @@ class HandSpec:
     kd: float
     option: str
     fingers: Grasping
+    options: dict[str, Option]
     all_fingers: tuple[Finger, ...]
     parked: dict[str, float]
     coupling: dict[str, Mimic]
@@ -133,8 +155,8 @@ class _Table:
             raise self.wrong(unknown[0], f"one of {sorted(self.read)}")
 
 
-def read_hand_toml(path: Path | str, fingers: str = "default") -> HandSpec:
-    """Read and check a hand.toml with a finger option; raises `HandFileError`, or `BadArgument` for another option."""
+def read_hand_toml(path: Path | str, fingers: Fingers = "default") -> HandSpec:
+    """Read and check a hand.toml with its fingers; raises `HandFileError`, or `BadArgument` for others."""
     path = Path(path)
     data = read_bounded("hand.toml", path, "a hand.toml", MAX_BYTES)
     try:
@@ -151,12 +173,13 @@ def read_hand_toml(path: Path | str, fingers: str = "default") -> HandSpec:
     known = tuple(_finger(t) for t in top.tables("finger"))
     if len({f.name for f in known}) < len(known):
         raise HandFileError("hand.toml", f"{path}: fingers {[f.name for f in known]}", "every name once")
-    chosen, parked = _option(top, known, fingers)
-    coupling, pairs = _coupling(top), _pairs(top)
+    options, coupling, pairs = _options(top, known), _coupling(top), _pairs(top)
     top.done()
+    option, (chosen, parked) = _choose(options, {f.name: f for f in known}, coupling, fingers)
     return HandSpec(
-        path, name, urdf, base_link, approach, margin, kp, kd, fingers, chosen, known, parked, coupling, pairs, data
-    )
+        path, name, urdf, base_link, approach, margin, kp, kd, option, chosen, options, known, parked, coupling, pairs,
+        data,
+    )  # fmt: skip
 
 
 def _finger(table: _Table) -> Finger:
@@ -177,20 +200,43 @@ def _finger(table: _Table) -> Finger:
     return finger
 
 
-def _option(top: _Table, known: tuple[Finger, ...], name: str) -> tuple[Grasping, dict[str, float]]:
-    """Return the grasping fingers, and the parked joints with their values."""
-    options = top.inner("options")
-    if name not in options.table:
-        raise BadArgument("fingers", repr(name), f"one of {sorted(options.table)}")
-    option = options.inner(name)
-    names, by_name = option.texts("fingers"), {f.name: f for f in known}
-    if len(names) != 3 or len(set(names)) != 3 or not set(names) <= set(by_name):
-        raise option.wrong("fingers", f"three different fingers of {sorted(by_name)}")
-    park = option.inner("parked", optional=True)
-    parked = {joint: park.number(joint) for joint in park.table}
-    option.done()
-    one, two, three = (by_name[finger] for finger in names)
-    return (one, two, three), parked
+def _options(top: _Table, known: tuple[Finger, ...]) -> dict[str, Option]:
+    """Read the grasping fingers of every option, and the joints that it parks."""
+    table, by_name, options = top.inner("options"), {f.name: f for f in known}, dict[str, Option]()
+    for name in table.table:
+        option = table.inner(name)
+        names = option.texts("fingers")
+        if not _is_graspable(names, by_name):
+            raise option.wrong("fingers", f"{SUPPORTED} of {sorted(by_name)}")
+        park = option.inner("parked", optional=True)
+        options[name] = Option(tuple(by_name[x] for x in names), {joint: park.number(joint) for joint in park.table})
+        option.done()
+    return options
+
+
+def _is_graspable(names: tuple[str, ...], known: Collection[str]) -> bool:
+    """Tell whether fingers are known, different, and of a number that is supported."""
+    return FINGERTIPS[0] <= len(names) <= FINGERTIPS[1] and len(set(names)) == len(names) and set(names) <= set(known)
+
+
+def _choose(
+    options: dict[str, Option], known: dict[str, Finger], coupling: dict[str, Mimic], wanted: Fingers
+) -> tuple[str, Option]:
+    """Return the fingers that are wanted, and what names them: an option, or the fingers themselves."""
+    declared = f"one of the options {sorted(options)}, {SUPPORTED} of {sorted(known)}, or their number in an option"
+    if isinstance(wanted, str) and wanted in options:
+        return wanted, options[wanted]
+    names = tuple(wanted.split(",")) if isinstance(wanted, str) else wanted
+    for name, option in options.items():
+        if str(len(option.fingers)) == str(wanted) or tuple(f.name for f in option.fingers) == names:
+            return name, option
+    if not isinstance(names, tuple) or not _is_graspable(names, known):
+        raise BadArgument("fingers", repr(wanted), declared)
+    fingers = tuple(known[name] for name in names)
+    grasping = {joint for finger in fingers for joint in finger.joints}
+    moving = grasping | {coupling[joint].source for joint in grasping if joint in coupling} | set(coupling)
+    parked = {joint: value for option in reversed(options.values()) for joint, value in option.parked.items()}
+    return ",".join(names), Option(fingers, {joint: value for joint, value in parked.items() if joint not in moving})
 
 
 def _coupling(top: _Table) -> dict[str, Mimic]:

@@ -86,8 +86,9 @@ def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
         if source in names:
             coupling[row, names.index(source)] = ratio
             offset[row] = shift
-        elif source in spec.parked:
-            offset[row] = ratio * spec.parked[source] + shift
+        elif source in spec.parked or spec.option not in spec.options:
+            opened = min(max(0.0, movable[source].lower), movable[source].upper)
+            offset[row] = ratio * spec.parked.get(source, opened) + shift
         else:
             raise spec.wrong(f"joint {joint} neither grasps nor is parked", "either")
     return ActuatedJoints(names, limits[:, 0].clone(), limits[:, 1].clone(), coupling, offset)

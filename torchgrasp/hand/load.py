@@ -5,15 +5,16 @@ from pathlib import Path
 
 import torch
 
-from torchgrasp.errors import HandFileError
+from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.collision_spheres import spheres_from_urdf
 from torchgrasp.hand.fingertips import tips_from_files
 from torchgrasp.hand.hand import Actuator, Hand, HandSource
-from torchgrasp.hand.hand_toml import HandSpec, read_hand_toml
+from torchgrasp.hand.hand_toml import Fingers, HandSpec, read_hand_toml
 from torchgrasp.hand.joints import joints_from_files
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.self_collision import self_collision_from_urdf
 from torchgrasp.hand.urdf import Urdf, read_urdf
+from torchgrasp.values import Grasps
 
 
 def hands_folder() -> Path:
@@ -36,19 +37,23 @@ def find_hand(name_or_path: str | Path) -> Path:
     return folder
 
 
-def load_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
-    """Load a hand from its hand.toml and URDF, with one of its finger options.
+def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
+    """Load a hand from its hand.toml and URDF, with the fingers that grasp.
 
     Args:
         name_or_path: a shipped hand, as "allegro", "barrett", "leap" or "shadow", or the folder of another one.
-        fingers: "default", or for the Allegro "paper_literal" (index, middle and ring finger).
+        fingers: an option of hand.toml: "default", or for the Allegro "four" (all) or "paper_literal" (index, middle
+            and ring). Or a number, for the first option with so many; or three to five fingers by name, in grasp order.
+            Joints of the other fingers are parked where an option parks them, else at zero, or at the limit next to it.
 
     Raises:
         HandFileError: a file is missing or malformed, or the two do not fit each other.
-        BadArgument: the hand has no such option.
+        BadArgument: the hand has no such option or fingers.
 
     >>> load_hand("barrett").joint_names
     ('spread', 'f1_flex', 'f2_flex', 'f3_flex')
+    >>> load_hand("allegro", ("index", "ring", "thumb")).finger_names
+    ('index', 'ring', 'thumb')
     """
     spec = read_hand_toml(find_hand(name_or_path) / "hand.toml", fingers)
     urdf = read_urdf(spec.urdf)
@@ -56,7 +61,7 @@ def load_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
     _check_mimics_and_shapes(spec, urdf)
     return Hand(
         name=spec.name,
-        source=HandSource(spec.option, urdf.path, hashlib.sha256(spec.data + b"\0" + urdf.data).hexdigest()),
+        source=HandSource(spec.option, urdf.path, _digest(spec, urdf), tuple(spec.options)),
         actuated=joints_from_files(spec, urdf),
         tree=tree_from_urdf(urdf),
         tips=tips_from_files(spec, urdf),
@@ -65,6 +70,44 @@ def load_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
         collision_spheres=spheres_from_urdf(urdf, spec),
         self_collision=self_collision_from_urdf(urdf, spec.pairs),
     )
+
+
+def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
+    """Return the same hand, where it is, grasping with other fingers; see `load_hand`."""
+    other = load_hand(hand.urdf_path.parent, fingers)
+    return hand if other.finger_names == hand.finger_names else other.to(hand.lower)
+
+
+def hand_of(grasps: Grasps, hand: Hand | str | Path | None = None) -> Hand:
+    """Return the hand with the fingers that grasps were planned for, by which to close it or to export them.
+
+    Args:
+        grasps: of `plan_grasps`, or a file of them.
+        hand: the same hand with any fingers, its name or its folder; None: the shipped hand that the grasps name.
+
+    Raises:
+        BadArgument: grasps that name no hand, those of another hand, or fingers that it does not have.
+        HandFileError: as `load_hand`.
+
+    >>> from torchgrasp import load_object, plan_grasps
+    >>> grasps = plan_grasps(load_object("cylinder").view, load_hand("allegro", 4), starts=20)
+    >>> hand_of(grasps).finger_names
+    ('index', 'middle', 'ring', 'thumb')
+    """
+    name, names = grasps.meta.get("hand"), grasps.meta.get("finger_names")
+    if name is None:
+        raise BadArgument("grasps", "no name of a hand in `meta`", "grasps of plan_grasps")
+    fingers = "default" if names is None else tuple(names.split(","))
+    known = name if hand is None else hand
+    found = with_fingers(known, fingers) if isinstance(known, Hand) else load_hand(known, fingers)
+    if found.name != name:
+        raise BadArgument("hand", found.name, f"{name}, for which the grasps were planned")
+    return found
+
+
+def _digest(spec: HandSpec, urdf: Urdf) -> str:
+    """Return the SHA-256 of both files."""
+    return hashlib.sha256(spec.data + b"\0" + urdf.data).hexdigest()
 
 
 def _check_names(spec: HandSpec, urdf: Urdf) -> None:

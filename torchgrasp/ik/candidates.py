@@ -68,12 +68,12 @@ def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -
 
 @dataclasses.dataclass(frozen=True)
 class GraspCandidates(Batch):
-    """Configurations with finger i on contact i, the triple's `permutation[:, i]`; `status` is that of the contacts."""
+    """Configurations with finger i on contact i, a row's `permutation[:, i]`; `status` is that of the contacts."""
 
     configuration: Configuration
     contacts: Contacts
     certificate: Certificate
-    permutation: Int[Tensor, "g 3"]
+    permutation: Int[Tensor, "g f"]
     status: Int[Tensor, "g"]
 
 

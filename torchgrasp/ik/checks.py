@@ -28,8 +28,8 @@ ANGLE_TOLERANCE = math.radians(2)
 class GraspErrors(Batch):
     """Errors of grasps; `Grasps` explains the fields."""
 
-    tip_error: Float[Tensor, "g 3"]
-    normal_angle: Float[Tensor, "g 3"]
+    tip_error: Float[Tensor, "g f"]
+    normal_angle: Float[Tensor, "g f"]
     clearance: Float[Tensor, "g"]
     status: Int[Tensor, "g"]
 

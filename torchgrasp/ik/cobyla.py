@@ -50,7 +50,7 @@ def refine_by_cobyla(
 
 
 class CobylaRun:
-    """One run from `joints`. SciPy asks for distance and clearances one after the other: the last values are kept."""
+    """One run from `joints` onto three points. SciPy asks for distance, then clearances: values are kept."""
 
     def __init__(self, hand: Hand, joints: Float[Tensor, "h"], points: Float[Tensor, "3 3"], world: CollisionWorld):
         self.hand, self.world = hand, world

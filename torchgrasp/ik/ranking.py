@@ -1,10 +1,11 @@
 """Which grasp to try first: a geometric score of candidates, a predicted probability of success of grasps.
 
 `score` chooses among the candidates of a triple, a logistic model orders the executable grasps (docs/closing.md).
-`scripts/train.py success` fits it to trials of the Allegro and the Barrett hand.
+`scripts/train.py success` fits it to trials of three fingertips, of the Allegro and the Barrett hand.
 """
 
 import dataclasses
+import itertools
 import json
 import math
 from pathlib import Path
@@ -69,22 +70,25 @@ def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
     return (sine / cosine.clamp_min(1e-3)).amax(1)
 
 
-def score(contacts: Contacts, normal_angle: Float[Tensor, "g 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "g"]:
+def score(contacts: Contacts, normal_angle: Float[Tensor, "g f"], center: Float[Tensor, "3"]) -> Float[Tensor, "g"]:
     """Return scores: central contacts, little friction and central pads are better."""
     offset = torch.linalg.vector_norm(contacts.points.mean(1) - center, dim=-1)
     return -(offset / OFFSET + centred_friction(contacts) + normal_angle.amax(1) / PAD_ANGLE)
 
 
-def load_arm(points: Float[Tensor, "b 3 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "b"]:
+def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "b"]:
     """Return the arm of a load at `center` about the longest side of each triangle, over the triangle's height.
 
     The object turns most easily about that side: only the third contact and torsion resist, by a lever of the height
-    and `LEAST_LEVER`.
+    and `LEAST_LEVER`. More contacts hold as well as the best three of them, at least.
 
     >>> triangle = torch.tensor([[[-0.03, 0.0, 0.0], [0.03, 0.0, 0.0], [0.0, 0.02, 0.0]]])
     >>> load_arm(triangle, torch.tensor([0.0, 0.0, 0.06]))
     tensor([2.])
     """
+    if points.shape[1] > 3:
+        triples = torch.tensor(list(itertools.combinations(range(points.shape[1]), 3)), device=points.device)
+        return load_arm(points[:, triples].flatten(0, 1), center).unflatten(0, (len(points), len(triples))).amin(1)
     sides = points.roll(-1, dims=1) - points
     longest = torch.linalg.vector_norm(sides, dim=-1).argmax(1)[:, None, None].expand(-1, 1, 3)
     along, foot = unit(sides.gather(1, longest)[:, 0]), points.gather(1, longest)[:, 0]
@@ -101,7 +105,7 @@ def success_features(
 
     Args:
         shape: the posterior.
-        contacts: planned triples, on its surface.
+        contacts: planned ones, on its surface.
         center: of the object's mass, as far as known [m].
         friction: of fingertips and object.
         seed: of the surfaces that are drawn.

@@ -22,37 +22,39 @@ OPENING, OPENING_SIGMAS = 0.012, 3.0
 """Distance of the pre-grasp's tips from their contacts: metres, plus standard deviations of the surface there."""
 
 
-def tip_targets(hand: Hand, contacts: Contacts) -> Float[Tensor, "g 3 3"]:
+def tip_targets(hand: Hand, contacts: Contacts) -> Float[Tensor, "g f 3"]:
     """Return the centres [m] (`Hand.tip_centres`) of touching tips."""
     return contacts.points + hand.tips.radius.to(contacts.normals)[:, None] * contacts.normals
 
 
 def tip_residuals(
-    spatial: SpatialJacobian, target: Float[Tensor, "g 3 3"], normals: Float[Tensor, "g 3 3"]
+    spatial: SpatialJacobian, target: Float[Tensor, "g f 3"], normals: Float[Tensor, "g f 3"]
 ) -> Residuals:
     """Return the residuals of the tips' centres and of the contact directions."""
     hand = spatial.hand
     tips = spatial.points(hand.tips.index, hand.tips.center)
-    finger = torch.arange(3, device=tips.device)
+    count = len(hand.tips)
+    finger = torch.arange(count, device=tips.device)
     coordinate = finger.repeat_interleave(3)
-    axes = torch.eye(3, dtype=tips.dtype, device=tips.device).repeat(3, 1).expand(len(tips), 9, 3)
+    axes = torch.eye(3, dtype=tips.dtype, device=tips.device).repeat(count, 1).expand(len(tips), 3 * count, 3)
     pads = spatial.directions(hand.tips.index, hand.tips.normal)
     outside = hand.tips.cone.cos().to(pads) + (pads * normals).sum(-1)  # the contact direction is the inward normal
     torques = torch.cat([torch.zeros_like(pads), torch.linalg.cross(pads, normals)], -1)
     wrenches = torch.cat([wrench_of(tips[:, coordinate], axes), torques], 1)
     jacobian = spatial.jacobian(wrenches, hand.tips.index[torch.cat([coordinate, finger])])
+    by_tips, by_pads = jacobian.split([3 * count, count], 1)
     active = (outside > 0).to(tips)
     return (
         torch.cat([TIP_WEIGHT * (tips - target).flatten(1) / MILLIMETRE, PAD_WEIGHT * outside * active], 1),
-        torch.cat([TIP_WEIGHT * jacobian[:, :9] / MILLIMETRE, PAD_WEIGHT * active[..., None] * jacobian[:, 9:]], 1),
+        torch.cat([TIP_WEIGHT * by_tips / MILLIMETRE, PAD_WEIGHT * active[..., None] * by_pads], 1),
     )
 
 
 def grasp_residuals(
     hand: Hand,
     configuration: Configuration,
-    target: Float[Tensor, "g 3 3"],
-    normals: Float[Tensor, "g 3 3"],
+    target: Float[Tensor, "g f 3"],
+    normals: Float[Tensor, "g f 3"],
     world: CollisionWorld | None,
     tips_touch: bool,
 ) -> Residuals:

@@ -46,9 +46,9 @@ class IKSolution(Batch):
 
     joints: Float[Tensor, "b h"]
     obj_from_hand: Float[Tensor, "b 4 4"]
-    permutation: Int[Tensor, "b 3"]
-    tip_error: Float[Tensor, "b 3"]
-    normal_angle: Float[Tensor, "b 3"]
+    permutation: Int[Tensor, "b f"]
+    tip_error: Float[Tensor, "b f"]
+    normal_angle: Float[Tensor, "b f"]
     clearance: Float[Tensor, "b"]
     attempts: Int[Tensor, "b"]
     status: Int[Tensor, "b"]
@@ -65,7 +65,7 @@ def solve_ik(
     """Return configurations that touch the contacts in any assignment, without self-collision.
 
     Args:
-        contacts: b triples; `std_m` and `variance` are not used.
+        contacts: b rows, a contact for each fingertip; `std_m` and `variance` are not used.
         mixture: the hand's learned model; None: only the library gives seeds.
         world: what the links must not touch; None: only each other. All arguments follow the contacts' device.
         method: "cobyla" is the paper's (Sec. 6.3), whose tips touch with their contact points in any direction.
@@ -76,7 +76,8 @@ def solve_ik(
         cone, and every link is clear.
 
     Raises:
-        BadArgument: contacts that are no finite triples, a mixture of another hand, an unknown method.
+        BadArgument: contacts that are not finite, or not one for each fingertip; a mixture of another hand, an unknown
+            method; a mixture or COBYLA for more than three fingertips.
 
     >>> from torchgrasp.hand.load import load_hand
     >>> points = 0.05 * torch.eye(3)[None].double()
@@ -86,10 +87,14 @@ def solve_ik(
     """
     if not isinstance(hand, Hand):
         raise BadArgument("hand", type(hand).__name__, "a Hand from load_hand")
-    check_tensor("contacts.points", contacts.points, (None, 3, 3))
-    check_tensor("contacts.normals", contacts.normals, (len(contacts), 3, 3))
+    check_tensor("contacts.points", contacts.points, (None, len(hand.tips), 3))
+    check_tensor("contacts.normals", contacts.normals, (len(contacts), len(hand.tips), 3))
     if method not in get_args(Method):
         raise BadArgument("method", repr(method), f"one of {get_args(Method)}")
+    if method == "cobyla":
+        hand.require_three("method", "'cobyla'")
+    if mixture is not None:
+        hand.require_three("mixture", "a learned model")
     device = contacts.points.device
     hand, world = settle(hand, device), settle(CollisionWorld() if world is None else world, device)
     library = None if library is None else settle(library, device)
@@ -140,7 +145,7 @@ def refine_exactly(
 
 def _no_solution(hand: Hand, contacts: Contacts) -> IKSolution:
     """Return rows out of reach, or degenerate."""
-    b, nan = len(contacts), contacts.points.new_full((), torch.nan)
+    b, f, nan = len(contacts), contacts.fingertips, contacts.points.new_full((), torch.nan)
     status = torch.where(degenerate(contacts.points), int(Status.DEGENERATE), int(Status.OUT_OF_REACH))
-    placed = nan.expand(b, hand.dof), nan.expand(b, 4, 4), torch.arange(3, device=nan.device).expand(b, 3)
-    return IKSolution(*placed, nan.expand(b, 3), nan.expand(b, 3), nan.expand(b), torch.zeros_like(status), status)
+    placed = nan.expand(b, hand.dof), nan.expand(b, 4, 4), torch.arange(f, device=nan.device).expand(b, f)
+    return IKSolution(*placed, nan.expand(b, f), nan.expand(b, f), nan.expand(b), torch.zeros_like(status), status)

@@ -35,7 +35,7 @@ def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: H
         raise BadArgument("mixture", f"a model of {whose}", allowed)
 
 
-def _probe_codes(hand: Hand) -> Float[Tensor, "3 6"]:
+def _probe_codes(hand: Hand) -> Float[Tensor, "3 q"]:
     """Return the codes of three postures between the limits; they depend on limits, links and fingertips."""
     lower, upper = hand.lower.double(), hand.upper.double()
     share = torch.tensor([0.2, 0.5, 0.7], dtype=torch.float64, device=lower.device)

@@ -17,19 +17,19 @@ CODE_NAMES = ("L1", "L2", "L3", "N1", "N2", "N3")
 """The numbers of a code q = (L, N): three lengths [m], three cosines."""
 
 
-def encode_fingertips(points: Float[Tensor, "*b 3 3"], normals: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 6"]:
-    """Return the code q = (L, N) of three points with unit normals, Eq. (18).
+def encode_fingertips(points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b q"]:
+    """Return the code q = (L, N) of points with unit normals, Eq. (18): six numbers of three points, as in the paper.
 
-    L_i is the distance [m] of point i from the centre of the points; N is n1.n2, n1.n3 and n2.n3. Rigid motion does
-    not change the code. Negated normals do not change it either, so fingertips have the code of the contacts that they
-    touch. Nor do a mirror image or a rotation of the normals alone: every match has to be checked afterwards.
+    L_i is the distance [m] of point i from the centre of the points; N is n1.n2, n1.n3, n2.n3 and so on. Rigid
+    motion does not change the code. Negated normals do not change it either, so fingertips have the code of the
+    contacts that they touch. Nor do a mirror image or a rotation of the normals alone: every match has to be checked
+    afterwards.
 
     >>> encode_fingertips(torch.eye(3), torch.eye(3))[3:]
     tensor([0., 0., 0.])
     """
     lengths = torch.linalg.vector_norm(points - points.mean(-2, keepdim=True), dim=-1)
-    n1, n2, n3 = normals.unbind(-2)
-    cosines = torch.stack([(n1 * n2).sum(-1), (n1 * n3).sum(-1), (n2 * n3).sum(-1)], dim=-1)
+    cosines = torch.stack([(n * m).sum(-1) for n, m in itertools.combinations(normals.unbind(-2), 2)], dim=-1)
     return torch.cat([lengths, cosines], dim=-1)
 
 

@@ -60,6 +60,8 @@ def fit_mixture(
     >>> fit_mixture(HandSamples(numbers[:, :1], numbers[:, 1:], ("knuckle",)), components=2).joint_names
     ('knuckle',)
     """
+    if samples.q.shape[1] != len(CODE_NAMES):
+        raise BadArgument("samples", f"codes of {samples.q.shape[1]} numbers", "codes of three fingertips: six numbers")
     rows = samples.rows().double()  # a copy, which is standardised in place
     check_tensor("samples", rows, (len(samples), rows.shape[1]))
     shard = Shard.of(rows, distributed)

@@ -39,7 +39,7 @@ class HandSamples(Batch):
     """Postures `joints` [rad] of one hand and their codes `q` (Eq. 18); `meta` names the hand and the draw."""
 
     joints: Float[Tensor, "n h"]
-    q: Float[Tensor, "n 6"]
+    q: Float[Tensor, "n q"]
     joint_names: tuple[str, ...]
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
 
@@ -89,6 +89,8 @@ def sample_configurations(
     """
     spec = SampleSpec(n, seed, sampling)
     check_whole("workers", workers, 1, 1024)
+    if sampling == "grasping":
+        hand.require_three("sampling", "'grasping'")
     parts = []
     with ThreadPoolExecutor(workers) as pool:
         for part in pool.map(lambda i: draw_chunk(hand, spec, i), range(len(chunk_sizes(n)))):
@@ -103,7 +105,7 @@ def chunk_sizes(n: int) -> list[int]:
     return [min(CHUNK_POSTURES, n - first) for first in range(0, n, CHUNK_POSTURES)]
 
 
-def draw_chunk(hand: Hand, spec: SampleSpec, i: int) -> tuple[Float[Tensor, "n h"], Float[Tensor, "n 6"], int]:
+def draw_chunk(hand: Hand, spec: SampleSpec, i: int) -> tuple[Float[Tensor, "n h"], Float[Tensor, "n q"], int]:
     """Return the kept postures of chunk i, their codes, and the number of postures drawn for them."""
     count, parts, kept = chunk_sizes(spec.n)[i], [], 0
     blocks = _draw_blocks(hand, np.random.default_rng((spec.seed, i)), spec.sampling)
@@ -118,7 +120,7 @@ def draw_chunk(hand: Hand, spec: SampleSpec, i: int) -> tuple[Float[Tensor, "n h
 
 def _draw_blocks(
     hand: Hand, generator: np.random.Generator, sampling: Sampling
-) -> Iterator[tuple[Float[Tensor, "n h"], Float[Tensor, "n 6"]]]:
+) -> Iterator[tuple[Float[Tensor, "n h"], Float[Tensor, "n q"]]]:
     """Yield the kept postures of one block of draws after another, with their codes."""
     lower, upper = hand.lower.double(), hand.upper.double()
     while True:

@@ -72,7 +72,7 @@ def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> byte
     canvas = Canvas()
     for solid in solids:
         canvas.add_mesh(solid.vertices, solid.faces, solid.color)
-    canvas.add_arrows(points[0], normals[0], NORMAL, FINGERS)
+    canvas.add_arrows(points[0], normals[0], NORMAL, FINGERS[: len(hand.tips)])
     frame = FRAME * float(np.linalg.norm(np.ptp(solids[0].vertices, axis=0)))
     canvas.add_arrows(np.zeros((3, 3)), np.eye(3), frame, AXES)
     corners = [points[0], points[0] + NORMAL * normals[0], frame * np.eye(3), *(s.vertices for s in solids)]

@@ -130,7 +130,7 @@ def _section(name: str, shots: Sequence[tuple[str, bytes]], run: Run) -> str:
     """Return a section of pictures, with a legend of the fingers."""
     legend = "".join(
         f'<span class="dot" style="background:{color}"></span>{escape(finger)}'
-        for finger, color in zip(run.hand.tips.names, FINGERS, strict=True)
+        for finger, color in zip(run.hand.tips.names, FINGERS, strict=False)
     )
     figures = "\n".join(
         f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{base64.b64encode(png).decode("ascii")}">'

@@ -1,7 +1,7 @@
 """The colours that pictures, plots and pages share."""
 
-FINGERS = ("#2f6db5", "#23967f", "#e0762f")
-"""The three fingers, in grasp order."""
+FINGERS = ("#2f6db5", "#23967f", "#e0762f", "#8a4f9e", "#c23b55")
+"""The fingers, in grasp order; a hand has three to five."""
 
 AXES = ("#d62728", "#2ca02c", "#1f4fd8")
 """A frame's x, y and z."""

@@ -51,9 +51,15 @@ def draw_contacts(surface: Surface, contacts: Contacts, direction: Direction, ta
     vertices = to_array(surface.vertices)
     canvas = Canvas()
     canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, to_array(surface.normals), transparent=True)
-    canvas.add_arrows(to_array(contacts.points[0]), to_array(contacts.normals[0]), ARROW, FINGERS)
+    add_contacts(canvas, contacts)
     canvas.add_table(vertices, table)
     return canvas.render_png(vertices, direction)
+
+
+def add_contacts(canvas: Canvas, contacts: Contacts) -> None:
+    """Add an arrow along the normal of each of the first row's contacts, in the colour of its finger."""
+    points, normals = to_array(contacts.points[0]), to_array(contacts.normals[0])
+    canvas.add_arrows(points, normals, ARROW, FINGERS[: len(points)])
 
 
 def draw_grasp(surface: Surface, hand: Hand, grasp: Grasps, direction: Direction, table: float | None = None) -> bytes:
@@ -63,7 +69,7 @@ def draw_grasp(surface: Surface, hand: Hand, grasp: Grasps, direction: Direction
     vertices = to_array(surface.vertices)
     canvas = Canvas()
     canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, to_array(surface.normals))
-    canvas.add_arrows(to_array(grasp.contacts.points[0]), to_array(grasp.contacts.normals[0]), ARROW, FINGERS)
+    add_contacts(canvas, grasp.contacts)
     for solid in solids:
         canvas.add_mesh(solid.vertices, solid.faces, solid.color)
     corners = np.concatenate([vertices, *(s.vertices for s in solids)])
@@ -90,11 +96,11 @@ def plot_forces(closure: ClosureResult, finger_names: tuple[str, ...]) -> bytes:
     """Plot the normal force of each fingertip [N] over time [s]."""
     time = closure.time.cpu().numpy()
     figure, axes = _figure()
-    for forces, name, color in zip(closure.forces.T.cpu().numpy(), finger_names, FINGERS, strict=True):
+    for forces, name, color in zip(closure.forces.T.cpu().numpy(), finger_names, FINGERS, strict=False):
         axes.plot(time, forces, color=color, linewidth=1.6, label=name)
     axes.set_ylabel("normal force [N]")
     axes.set_ylim(0.0, max(1.0, 1.15 * float(closure.forces.max())))
-    axes.legend(frameon=False, ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2)
+    axes.legend(frameon=False, ncols=len(finger_names), loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2)
     return _png(figure)
 
 

@@ -7,8 +7,8 @@ from jaxtyping import Float
 
 from torchgrasp.hand.hand import Hand
 from torchgrasp.report.canvas import Canvas, Direction
-from torchgrasp.report.palette import FINGERS, OBJECT, TABLE, THINGS, rgb
-from torchgrasp.report.pictures import to_array
+from torchgrasp.report.palette import OBJECT, TABLE, THINGS, rgb
+from torchgrasp.report.pictures import add_contacts, to_array
 from torchgrasp.report.solids import solids_from_hand
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.surface import Surface
@@ -47,7 +47,7 @@ def draw_among(scene: Scene, surface: Surface, hand: Hand, grasp: Grasps, direct
     solids = solids_from_hand(hand, joints, hand.tree.joint_names, grasp.obj_from_hand[0])
     vertices, canvas = to_array(surface.vertices), Canvas()
     canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, to_array(surface.normals))
-    canvas.add_arrows(to_array(grasp.contacts.points[0]), to_array(grasp.contacts.normals[0]), 0.045, FINGERS)
+    add_contacts(canvas, grasp.contacts)
     for solid in solids:
         canvas.add_mesh(solid.vertices, solid.faces, solid.color)
     others = (scene.labels > 0) & ~scene.rows_of()

@@ -19,7 +19,7 @@ PARKED = -1
 
 
 class Solid(NamedTuple):
-    """A triangle mesh in the picture's frame, of a grasping finger (0, 1, 2) or `PARKED`."""
+    """A triangle mesh in the picture's frame, of a grasping finger (from 0) or `PARKED`."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: np.ndarray
@@ -53,7 +53,7 @@ def finger_of_links(hand: Hand) -> dict[str, int]:
     moves = hand.tree.moves.bool().cpu()
     finger_of = {}
     for mine, name in zip(moves, hand.tree.link_names, strict=True):
-        owners = [f for f in range(3) if bool(mine.any()) and bool(moves[hand.tips.index[f]][mine].all())]
+        owners = [f for f in range(len(hand.tips)) if bool(mine.any()) and bool(moves[hand.tips.index[f]][mine].all())]
         finger_of[name] = owners[0] if len(owners) == 1 else PARKED
     return finger_of
 

@@ -12,7 +12,7 @@ from torchgrasp.sim.scene import Scene, StepContacts
 class SimulatedHand:
     """The hand of a scene, with tactile fingertips.
 
-    `force` (3,) are the true normal forces [N], averaged over the last tick. `finger` flags contacts in its last step.
+    `force` (f,) are the true normal forces [N], averaged over the last tick. `finger` flags contacts in its last step.
     `steps` counts steps of the simulator. `first_touch` is the step of each fingertip's first contact, infinite before.
     `first_stray` is that of each kind in `StepContacts.stray`, whose impulses [N s] are summed in `stray`. `most_stray`
     [N] is its largest force over a tick.
@@ -30,18 +30,20 @@ class SimulatedHand:
         self.scene, self.reference, self.generator = scene, reference, generator
         self.substeps = max(1, round(1 / (control_rate * scene.timestep)))
         self.period = self.substeps * scene.timestep
-        self.steps, self.first_touch = 0, [float("inf")] * 3
+        fingers = len(reference.hand.tips)
+        self.steps, self.first_touch = 0, [float("inf")] * fingers
         self.first_stray, self.stray, self.most_stray = np.full(3, np.inf), np.zeros(3), np.zeros(3)
-        self.force, self.finger, self.tactile = np.zeros(3), np.zeros(3, dtype=bool), no_contact()
+        self.force, self.finger = np.zeros(fingers), np.zeros(fingers, dtype=bool)
+        self.tactile = no_contact(fingers=fingers)
         names, centres = reference.hand.tree.joint_names, reference.hand.tips.center.double()
-        self._centres = torch.cat([centres, torch.ones(3, 1, dtype=torch.float64)], dim=-1).numpy()
+        self._centres = torch.cat([centres, torch.ones(fingers, 1, dtype=torch.float64)], dim=-1).numpy()
         self._to_scene = [names.index(name) for name in scene.joint_names]
         self._from_scene = [scene.joint_names.index(name) for name in names]
 
     def tick(self, targets: Float[Tensor, " j"]) -> Observation:
         """Drive the joints for one control period; return what the robot knows."""
         self.scene.drive(targets[self._to_scene].numpy())
-        contacts, before = StepContacts.none(), self.stray.copy()
+        contacts, before = StepContacts.none(len(self.force)), self.stray.copy()
         for _ in range(self.substeps):
             step = self.scene.step()
             self.steps += 1
@@ -69,8 +71,9 @@ class SimulatedHand:
             normals = -contacts.impulse / np.linalg.norm(contacts.impulse, axis=-1, keepdims=True)
         vectors = torch.from_numpy(np.concatenate([contacts.force, normals]) @ rotation)
         places = torch.from_numpy((np.concatenate([points, centres]) - origin) @ rotation)
-        truth = TipContact(torch.from_numpy(self.force), vectors[:3], places[:3], vectors[3:])
+        f = len(self.force)
+        truth = TipContact(torch.from_numpy(self.force), vectors[:f], places[:f], vectors[f:])
         normals, radius = self.reference.normals, self.reference.hand.tips.radius
         self.tactile = measure(self.tactile, truth, normals, radius, self.period, self.generator)
         joints, jacobian = self.scene.joints()[self._from_scene], self.scene.jacobian(centres)[..., self._from_scene]
-        return Observation(torch.from_numpy(joints), places[3:], torch.from_numpy(rotation.T @ jacobian), self.tactile)
+        return Observation(torch.from_numpy(joints), places[f:], torch.from_numpy(rotation.T @ jacobian), self.tactile)

@@ -56,7 +56,7 @@ class MujocoScene(Scene):
 
     def step(self) -> StepContacts:
         """Advance by one timestep and report the contacts between fingertips and object."""
-        contacts = StepContacts.none()
+        contacts = StepContacts.none(len(self.tips))
         if self._diverged():
             return contacts
         self._mujoco.mj_step2(self.model, self.data)
@@ -93,8 +93,8 @@ class MujocoScene(Scene):
         return self.data.qpos[self._positions]
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return the geometric Jacobian (3, 3, j) of points on the fingertips."""
-        jacobian = np.zeros((3, 3, self.model.nv))
+        """Return the geometric Jacobian (f, 3, j) of points on the fingertips."""
+        jacobian = np.zeros((len(self.tips), 3, self.model.nv))
         for rows, point, tip in zip(jacobian, points, self.tips, strict=True):
             self._mujoco.mj_jac(self.model, self.data, rows, None, point, tip)
         return jacobian[:, :, self._velocities]

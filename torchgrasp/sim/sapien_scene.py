@@ -71,7 +71,7 @@ class SapienScene(Scene):
         if self._force.any() or self._torque.any():
             self.body.add_force_torque(self._force, self._torque)
         self.scene.step()
-        contacts = StepContacts.none()
+        contacts = StepContacts.none(len(self.tips))
         for contact in self.system.get_contacts():
             first, second = (self._name_of[body] for body in contact.bodies)
             if first in self._links and second in self._links:
@@ -123,7 +123,7 @@ class SapienScene(Scene):
         return np.asarray(self.hand.get_qpos(), float)[self._places]
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return the geometric Jacobian (3, 3, j) of points on the fingertips."""
+        """Return the geometric Jacobian (f, 3, j) of points on the fingertips."""
         links = [self._pose(j.child_link) for j in self._driven]
         frames = np.stack([link @ frame for link, frame in zip(links, self._frames, strict=True)])
         arms = points[:, None, :] - frames[None, :, :3, 3]

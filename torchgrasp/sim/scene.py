@@ -75,7 +75,7 @@ class SceneSpec:
         world_from_hand: pose of the hand (4, 4).
         joints: start position of every joint of the URDF by name [rad].
         drives: of every joint by name.
-        tip_links: the three fingertips' links, in grasp order.
+        tip_links: the f fingertips' links, in grasp order.
         mesh: the closed object, for its table height, mass centre and inertia.
         parts: convex bodies that make up its surface.
         mass: of the object [kg].
@@ -129,14 +129,14 @@ class SceneSpec:
 
 @dataclasses.dataclass(frozen=True)
 class StepContacts:
-    """True contacts of three fingers with the object, summed over a step.
+    """True contacts of f fingers with the object, summed over a step.
 
     Args:
-        impulse: normal impulse on the object (3, 3) [N s]; friction is not in it.
-        moment: contact points weighted by the size of their impulse (3, 3) [N s m].
-        weight: sum of these sizes (3,) [N s]; `moment / weight` is the mean contact point.
-        finger: which fingers touch (3,), by the tip or by the link that carries it.
-        force: of each fingertip on the object (3, 3) [N], friction included.
+        impulse: normal impulse on the object (f, 3) [N s]; friction is not in it.
+        moment: contact points weighted by the size of their impulse (f, 3) [N s m].
+        weight: sum of these sizes (f,) [N s]; `moment / weight` is the mean contact point.
+        finger: which fingers touch (f,), by the tip or by the link that carries it.
+        force: of each fingertip on the object (f, 3) [N], friction included.
         stray: sums of normal impulses (3,) [N s] of the hand on neighbours, on the table, and of links other than the
             fingers' on the object.
     """
@@ -149,10 +149,10 @@ class StepContacts:
     stray: np.ndarray
 
     @classmethod
-    def none(cls) -> "StepContacts":
+    def none(cls, fingers: int = 3) -> "StepContacts":
         """Return sums to add contacts to."""
-        fingers = np.zeros(3, dtype=bool)
-        return cls(np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), fingers, np.zeros((3, 3)), np.zeros(3))
+        impulse, moment, force = np.zeros((3, fingers, 3))
+        return cls(impulse, moment, np.zeros(fingers), np.zeros(fingers, dtype=bool), force, np.zeros(3))
 
     def add(self, finger: int, impulse: np.ndarray, size: float, point: np.ndarray) -> None:
         """Add a contact of a fingertip by impulse [N s], its size, and place [m]."""
@@ -202,7 +202,7 @@ class Scene(abc.ABC):
 
     @abc.abstractmethod
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return d points / d driven joints (3, 3, j) of points on the fingertips."""
+        """Return d points / d driven joints (f, 3, j) of points on the fingertips."""
 
     @abc.abstractmethod
     def penetration(self) -> float:
@@ -237,5 +237,5 @@ class Scene(abc.ABC):
         return self._pose(self.root)
 
     def tip_poses(self) -> np.ndarray:
-        """Return the poses (3, 4, 4) of the fingertips' links."""
+        """Return the poses (f, 4, 4) of the fingertips' links."""
         return np.stack([self._pose(tip) for tip in self.tips])

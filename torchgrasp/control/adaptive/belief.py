@@ -38,18 +38,19 @@ class Belief:
         self.obj_from_hand = obj_from_hand.double()
         self.shape = settle(shape, obj_from_hand.device)
         self.hand_from_obj = inverse(self.obj_from_hand)
-        self.touched = torch.zeros(3, dtype=torch.bool)
+        self.touched: Tensor | None = None
 
     def revise(self, observation: Observation, reference: ClosingReference) -> ClosingReference:
         """Return the reference, replanned for the fingers in the air after a surprising touch."""
+        touched = torch.zeros_like(observation.tactile.contact) if self.touched is None else self.touched
         fresh = (
             observation.tactile.contact
-            & ~self.touched
+            & ~touched
             & torch.isfinite(observation.tactile.points + observation.tactile.normals).all(-1)
         )
         if not bool(fresh.any()):
             return reference
-        self.touched = self.touched | fresh
+        self.touched = touched | fresh
         points = apply(self.obj_from_hand, observation.tactile.points[fresh])
         inside = self.shape.contains(points)
         points, normals = points[inside], rotate(self.obj_from_hand, observation.tactile.normals[fresh])[inside]
@@ -64,7 +65,7 @@ class Belief:
         self.shape = self.shape.update(points, normals, noise=PLACE_NOISE, normal_noise=PLACE_NOISE / FLAT_RADIUS)
         return self._replan(~observation.tactile.contact, reference)
 
-    def _replan(self, air: Bool[Tensor, "3"], reference: ClosingReference) -> ClosingReference:
+    def _replan(self, air: Bool[Tensor, "f"], reference: ClosingReference) -> ClosingReference:
         """Return the reference with the remaining contacts on the revised surface."""
         gains = reference.gains
         start, lines = apply(self.obj_from_hand, gains.target), rotate(self.obj_from_hand, reference.normals)
