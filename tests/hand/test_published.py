@@ -260,6 +260,12 @@ def test_a_broken_mesh_is_refused_by_name(claw, name):
         new_hand(claw)
 
 
+def test_too_many_bytes_of_meshes_are_refused(claw, monkeypatch):
+    monkeypatch.setattr(sys.modules["torchgrasp.hand.fit_shapes"], "MAX_MESHES", 1000)
+    with pytest.raises(HandFileError, match="in all"):
+        new_hand(mesh_claw(claw))
+
+
 def test_what_a_mesh_names_is_not_opened(claw, tmp_path):
     """Materials and textures of an .obj are files of anybody's choice."""
     tip = "mtllib ../../secret.mtl\nusemtl x\n" + trimesh.creation.icosphere(3, 0.011).export(file_type="obj")

@@ -23,8 +23,10 @@ if TYPE_CHECKING:
 
 MAX_MESH = 50 * 1024 * 1024
 """Largest mesh [bytes]."""
+MAX_MESHES = 4 * MAX_MESH
+"""Largest size of all meshes of a hand [bytes]."""
 MAX_FACES = 500_000
-"""Most triangles of a mesh, and of all meshes of a link; those of public hands have up to 13,000."""
+"""Most triangles of a mesh; those of public hands have up to 13,000."""
 MESH_KINDS = (".stl", ".obj", ".ply")
 """Formats of meshes: those that are geometry alone."""
 SAMPLES = 4000
@@ -80,13 +82,15 @@ def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
     Raises:
         HandFileError: a mesh is missing, outside the folder, too large or none.
     """
-    meshes: dict[str, Points] = {}
+    names = {shape.file for link in urdf.links for shape in link.shapes if shape.kind == "mesh"}
+    size = sum(mesh_file(urdf, name, folder).stat().st_size for name in names)
+    if size > MAX_MESHES:
+        raise urdf.wrong(f"meshes of {size} bytes", f"at most {MAX_MESHES >> 20} MiB in all")
+    meshes = {name: _read_points(urdf, name, folder) for name in sorted(names)}
     found = {}
     for link in urdf.links:
         parts = []
         for shape in link.shapes:
-            if shape.kind == "mesh" and shape.file not in meshes:
-                meshes[shape.file] = _read_points(urdf, shape.file, folder)
             local = meshes[shape.file] * shape.size if shape.kind == "mesh" else _primitive_points(shape)
             reach = float(np.abs(local).max())
             if not reach <= MAX_SIZE:
