@@ -129,7 +129,8 @@ def format_toml(table: Table, pairs: list[tuple[str, str]]) -> str:
     for option, fingers in table.options.items():
         grasping = {joint for finger in fingers for joint in moving[finger]}
         rest = ", ".join(f"{quoted(j)} = {v}" for j, v in table.parked.items() if j not in grasping)
-        lines += [f"[options.{option}]", f"fingers = {quoted(fingers)}", f"parked = {{ {rest} }}" if rest else "", ""]
+        lines += [f"[options.{option}]", f"fingers = {quoted(fingers)}"]
+        lines += [f"parked = {{ {rest} }}", ""] if rest else [""]
     if coupling:
         lines += ["# joint = ratio * source + offset", "[coupling]"]
         lines += [f"{j} = {{ source = {quoted(source)}, ratio = 1.0, offset = 0.0 }}" for j, source in coupling.items()]

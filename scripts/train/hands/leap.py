@@ -59,7 +59,7 @@ def leap(side: str) -> Table:
         bodies=(*bodies, *parts[0]),
         joints=(*joints, *parts[1]),
         tips=tuple(Tip(f, f"{f}_tip", TIP_RADIUS, normal) for f in (*FINGERS, "thumb")),
-        options={"default": ("index", "middle", "thumb")},
+        options={"default": ("index", "middle", "thumb"), "four": (*FINGERS, "thumb")},
         parked={"8": 0.0, "9": -0.314, "10": -0.2, "11": -0.366},
     )
 

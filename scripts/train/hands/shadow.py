@@ -53,7 +53,11 @@ def shadow() -> Table:
             *(Tip(f, f"{f}_tip", 0.007, NORMAL) for f in (*FINGERS, "little")),
             Tip("thumb", "thumb_tip", 0.008, NORMAL),
         ),
-        options={"default": ("index", "middle", "thumb")},
+        options={
+            "default": ("index", "middle", "thumb"),
+            "four": (*FINGERS, "thumb"),
+            "five": (*FINGERS, "little", "thumb"),
+        },
         parked={**parked, "LFJ5": 0.0},
     )
 
