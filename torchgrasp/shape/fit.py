@@ -38,8 +38,8 @@ from torchgrasp.shape.wall_observations import (
 from torchgrasp.values import PointCloud
 
 OUTER_NOISE = 0.3
-"""Standard deviation, normalised, of a distance outside: the nearest of sparse points is too far, most of all on the
-hidden side. With .01 as with .1 the hidden side of a ball lies 3 mm inside, with .3 to 1 it does not."""
+"""Standard deviation, normalised, of a distance outside: the nearest of sparse points is too far. The hidden side of a
+ball lies 3 mm inside with .01 as with .1, but not with .3 to 1."""
 NORMAL_NOISE = 0.05
 """Standard deviation of a seen normal: 3 degrees."""
 RIM_NORMAL_NOISE = 0.5
