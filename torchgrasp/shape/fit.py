@@ -124,10 +124,8 @@ def fit_shape(
     obj_from_upright = upright_frame(cloud, plane)
     seen = prepare_cloud(cloud_to_upright(cloud, obj_from_upright), generator, clean=support == "camera")
     height = None if plane is None else 0.0  # of the table in the upright frame
-    if support == "paper":
-        supports = (_paper_support(seen, noise, generator),)
-    else:
-        supports = _camera_supports(seen, noise, height)
+    as_paper = support == "paper"
+    supports = (_paper_support(seen, noise, generator),) if as_paper else _camera_supports(seen, noise, height)
     most, stop = (MAX_BUDGET, noise) if budget == "sure" else (budget or BUDGETS[support], -math.inf)
     options = _Options(noise, psi_scale, kernel, criterion, most, stop)
     walls = [_fit_surface(seen, beside, options) for beside in supports]
