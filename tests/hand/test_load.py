@@ -1,5 +1,7 @@
 """Loading a hand: which hands there are, and hand.toml files that are broken or do not fit their URDF."""
 
+import shutil
+
 import pytest
 import torch
 
@@ -12,6 +14,16 @@ def test_a_hand_is_found_by_name_folder_and_file():
     for given in ("barrett", folder, str(folder), folder / "hand.toml"):
         assert find_hand(given) == folder
     assert load_hand(folder).source.sha256 == load_hand("barrett").source.sha256
+
+
+def test_a_shipped_name_that_is_a_folder_here_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(find_hand("leap"), tmp_path / "leap")
+    with pytest.raises(HandFileError, match="a shipped hand and a folder here"):
+        find_hand("leap")
+    assert find_hand("./leap").resolve() == tmp_path / "leap" == find_hand(tmp_path / "leap")
+    monkeypatch.chdir(hands_folder())
+    assert find_hand("leap") == hands_folder() / "leap"
 
 
 def test_unknown_hand_and_option_are_named(tmp_path):

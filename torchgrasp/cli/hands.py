@@ -78,7 +78,8 @@ def new(
         write_file(folder / file, text)
         print(f"written: {folder / file}")
     print(f"grasping fingers: {', '.join(hand.finger_names)}; approach {[round(x) for x in hand.approach.tolist()]}")
-    print(f"look over the lines of hand.toml marked CHECK, then: torchgrasp hand check {folder}")
+    place = folder if folder.is_absolute() else f"./{folder}"  # a bare name may be that of a shipped hand
+    print(f"look over the lines of hand.toml marked CHECK, then: torchgrasp hand check {place}")
     return 0
 
 

@@ -25,10 +25,18 @@ def hands_folder() -> Path:
 
 
 def find_hand(name_or_path: str | Path) -> Path:
-    """Return the folder of a hand, given a shipped name, a folder or a hand.toml; raises `HandFileError`."""
+    """Return the folder of a hand, given a shipped name, a folder or a hand.toml.
+
+    Raises:
+        HandFileError: no such hand, or a shipped name that is a folder here, too.
+    """
     shipped = hands_folder()
     names = sorted(p.parent.name for p in shipped.glob("*/hand.toml"))
     if isinstance(name_or_path, str) and name_or_path in names:
+        here = Path(name_or_path)
+        if (here / "hand.toml").is_file() and here.resolve() != (shipped / name_or_path).resolve():
+            found = f"{name_or_path!r}, a shipped hand and a folder here"
+            raise HandFileError("hand", found, f"'./{name_or_path}' for the folder, or a folder of another name")
         return shipped / name_or_path
     path = Path(name_or_path)
     folder = path.parent if path.name == "hand.toml" else path
