@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchgrasp.errors import BadArgument
+from torchgrasp.files import is_file
 
 Refuse = Callable[[str, str], BadArgument]
 """Makes the error of a reader of what was found and what is allowed."""
@@ -76,7 +77,7 @@ def read_json(path: Path, refuse: Refuse, allowed: str, most: int = MOST_BYTES) 
 
     NaN and Infinity are no JSON, and no number of more than 4300 digits is read.
     """
-    if not path.is_file():  # a pipe or a device would block, or never end
+    if not is_file(path):  # a pipe or a device would block, or never end
         raise refuse(f"{path}, which is no file", allowed)
     try:
         with path.open("rb") as file:

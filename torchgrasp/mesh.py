@@ -7,6 +7,7 @@ import numpy as np
 
 from torchgrasp.cloud.check import MAX_EXTENT, MIN_EXTENT
 from torchgrasp.errors import MeshError, SuspiciousScale
+from torchgrasp.files import is_file
 
 if TYPE_CHECKING:
     import trimesh
@@ -32,7 +33,7 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
     name = "a mesh"
     if not isinstance(mesh, trimesh.Trimesh):
         path, name = Path(mesh), str(mesh)
-        if not path.is_file():
+        if not is_file(path):
             raise MeshError("mesh", f"{path}, which is no file", "a mesh file (ply, obj, stl, ...)")
         try:
             loaded = trimesh.load_mesh(path)

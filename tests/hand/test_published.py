@@ -130,6 +130,17 @@ def test_fitted_boxes_hold_all_points_and_little_else():
     np.testing.assert_allclose(found[0].size, (0.03, 0.02), rtol=0.02)
 
 
+@pytest.mark.parametrize("thickness", [0.0, 1e-8, 1e-6, 1e-4])
+def test_flat_bodies_in_any_pose_are_covered(thickness):
+    turn = trimesh.transformations.random_rotation_matrix(np.random.default_rng(1).random(3))[:3, :3]
+    points = np.random.default_rng(0).uniform(-1, 1, (2000, 3)) * [0.02, 0.03, thickness] @ turn.T
+    inside = np.zeros(len(points), dtype=bool)
+    for shape in fit_shapes(points):
+        pose = trimesh.transformations.compose_matrix(angles=shape.rpy, translate=shape.xyz)
+        inside |= (np.abs((points - pose[:3, 3]) @ pose[:3, :3]) <= np.array(shape.size) / 2 + 1e-5).all(1)
+    assert inside.all()
+
+
 def test_frames_wrist_and_masses(claw):
     """A frame above, one below, one in between, an inertia of no body, no mass: the same hand, in the root's frame."""
     limit = '<limit lower="-1" upper="1" effort="1" velocity="1"/>'

@@ -12,8 +12,11 @@ from safetensors.torch import save_file
 
 from torchgrasp import cli, load_grasps, load_object, plan_grasps
 from torchgrasp.base import named_tensors
-from torchgrasp.errors import ModelFileError
+from torchgrasp.cloud.io.read import read_cloud
+from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.hand.load import load_hand
+from torchgrasp.mesh import read_mesh
+from torchgrasp.scene.file import read_scene
 from torchgrasp.values import Grasps
 
 
@@ -104,6 +107,13 @@ def test_a_path_that_is_no_file_is_refused(tmp_path: Path):
     for path in (tmp_path / "pipe.safetensors", "a" * 5000, "a\0b", tmp_path):
         with pytest.raises(ModelFileError, match="no file"):
             load_grasps(path)
+
+
+@pytest.mark.parametrize("name", ["a" * 5000, "a\0b"])
+def test_a_path_that_no_file_can_have_is_refused_by_every_reader(name: str):
+    for read, suffix in ((read_cloud, ".ply"), (read_mesh, ".stl"), (read_scene, ".npz")):
+        with pytest.raises(BadArgument, match="allowed is"):
+            read(name + suffix)
 
 
 @pytest.mark.parametrize("format", ["json", "mujoco"])

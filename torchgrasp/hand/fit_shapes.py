@@ -41,6 +41,8 @@ ROUND = 0.9
 """A cylinder is taken where its volume is less than this share of the boxes': pi / 4 of one box's."""
 TURNED = 0.85
 """A box is turned out of the link's axes if it then has less than this share of the volume."""
+FLAT = 1e-7
+"""Points that spread by less [m], RMS, lie in a plane: far above what float32 rounds off 0.1 m, 6e-9."""
 WHOLE = 2.6
 """A tip shorter than this many radii is a ball and nothing else, as Allegro's: a hemisphere with a foot."""
 MOST_TIP, SAVING_TIP = 4, 0.04
@@ -209,13 +211,12 @@ def fit_shapes(points: Points) -> list[Shape]:
 
 
 def _axes(points: Points) -> Float[np.ndarray, "3 3"]:
-    """Return the axes of the boxes as columns: the link's, unless others fit much better."""
+    """Return the axes of the boxes as columns: the link's, unless the body is flat or others fit much better."""
     from trimesh.bounds import oriented_bounds
 
-    try:
-        turned, sizes = oriented_bounds(points)
-    except Exception:  # a flat body has no hull; which error says so depends on Qhull
+    if np.linalg.matrix_rank(points - points.mean(0), tol=FLAT * math.sqrt(len(points))) < 3:  # it has no hull
         return np.eye(3)
+    turned, sizes = oriented_bounds(points)
     straight = np.prod(np.ptp(points, axis=0))
     return turned[:3, :3].T if np.prod(sizes) < TURNED * straight else np.eye(3)
 

@@ -1,10 +1,11 @@
 """Balanced forces of any number of contacts with the least friction: a method of centres.
 
-Forces that balance are F = N z. The friction cones of a tangent tau have an analytic centre among them, the minimum of
+Forces that balance are F = N z, with normal parts a_i and tangential parts t_i. The friction cones of a tangent tau
+have an analytic centre among them. It is where this is least:
 
-    sum c_i a_i - sum log(tau^2 a_i^2 - |t_i|^2)
+    sum c_i a_i - sum log(tau^2 a_i^2 - |t_i|^2).
 
-for normal forces a_i and tangential ones t_i. Newton's steps go there while tau falls towards the ratio that the forces
+Newton's steps go there while tau falls towards the ratio that the forces
 need [1]. The c_i, of which 2 / c_i are preferred normal forces, also fix the scale.
 
 [1] Boyd and El Ghaoui, Linear Algebra and its Applications 188, 1993.

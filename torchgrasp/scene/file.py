@@ -8,7 +8,7 @@ import torch
 
 from torchgrasp.cloud.io.arrays import MAX_BYTES, parse_npz
 from torchgrasp.errors import BadArgument, CloudFileError
-from torchgrasp.files import write_file
+from torchgrasp.files import is_file, write_file
 from torchgrasp.plane import Plane
 from torchgrasp.scene.scene import Scene
 
@@ -27,7 +27,7 @@ def read_scene(path: Path | str) -> Scene:
         BadArgument: what `Scene.from_depth` refuses.
     """
     path = Path(path)
-    if path.suffix.lower() != ".npz" or not path.is_file():
+    if path.suffix.lower() != ".npz" or not is_file(path):
         raise CloudFileError("path", path, "a .npz file with depth and intrinsics")
     if path.stat().st_size > MAX_BYTES:
         raise CloudFileError("path", f"{path} of {path.stat().st_size} bytes", f"at most {MAX_BYTES} bytes")

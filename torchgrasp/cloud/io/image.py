@@ -11,6 +11,7 @@ from torchgrasp.cloud.depth import check_rigid
 from torchgrasp.cloud.io.arrays import MAX_BYTES, parse_npy, parse_npz
 from torchgrasp.cloud.io.text import read_lines
 from torchgrasp.errors import BadArgument
+from torchgrasp.files import is_file
 
 
 def read_image(name: str, path: Path | str) -> np.ndarray:
@@ -53,7 +54,7 @@ def read_pose(name: str, path: Path | str) -> Float[Tensor, "4 4"]:
 def _read_bytes(name: str, path: Path | str, suffixes: tuple[str, ...]) -> tuple[bytes, str]:
     """Return the content and the suffix of a file, or refuse it."""
     path, allowed = Path(path), f"a {', '.join(suffixes[:-1])} or {suffixes[-1]} file"
-    if not path.is_file():
+    if not is_file(path):
         raise BadArgument(name, f"{path}, which is no file", allowed)
     if path.suffix.lower() not in suffixes or path.stat().st_size > MAX_BYTES:
         raise BadArgument(name, f"{path} of {path.stat().st_size} bytes", f"{allowed} of at most {MAX_BYTES} bytes")

@@ -17,7 +17,7 @@ from torchgrasp.cloud.io.ply import format_ply, parse_ply
 from torchgrasp.cloud.io.rows import CloudFile, make_cloud
 from torchgrasp.cloud.io.text import read_lines
 from torchgrasp.errors import BadArgument, CloudFileError
-from torchgrasp.files import write_file
+from torchgrasp.files import is_file, write_file
 from torchgrasp.values import PointCloud
 
 SCALE: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -92,7 +92,7 @@ def read_cloud_file(
     if suffix not in parsers:
         # Text may also be called .txt and .csv.
         raise CloudFileError("path", path, "a file ending in .ply, .pcd, .npz, .npy or .xyz")
-    if not path.is_file():
+    if not is_file(path):
         raise CloudFileError("path", f"{path}, which is no file", f"a {suffix} file")
     if path.stat().st_size > MAX_BYTES:
         raise CloudFileError("path", f"{path} of {path.stat().st_size} bytes", f"at most {MAX_BYTES} bytes")
