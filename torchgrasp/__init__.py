@@ -34,8 +34,7 @@ from torchgrasp.posture_model import (
     sample_configurations,
 )
 from torchgrasp.ik import IKSolution, PostureLibrary, solve_ik
-from torchgrasp.pipeline import plan_grasps
-from torchgrasp.clutter import ScenePlan, ThingPlan, plan_scene
+from torchgrasp.pipeline import ScenePlan, ThingPlan, plan_grasps, plan_scene
 from torchgrasp.control import ClosingReference, GraspController, closing_gains
 from torchgrasp.sim import Neighbour
 from torchgrasp.evaluation import close_hand

@@ -8,8 +8,7 @@ from typing import Literal, NamedTuple
 from torchgrasp.base import Value, check_whole
 from torchgrasp.errors import Status
 from torchgrasp.evaluation import seed_of
-from torchgrasp.pipeline import Mode
-from torchgrasp.specs import ClosingMode, ContactSpec, HoldingMode
+from torchgrasp.specs import ClosingMode, ContactSpec, HoldingMode, Mode
 
 Support = Literal["camera", "paper"]
 Order = Literal["success", "certain", "risky"]

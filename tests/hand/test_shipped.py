@@ -13,7 +13,7 @@ from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.load import hands_folder, load_hand
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.objects import load_object
-from torchgrasp.pipeline import plan_grasps
+from torchgrasp.pipeline.grasps import plan_grasps
 from torchgrasp.specs import ContactSpec
 from torchgrasp.testing import check_hand, random_joints
 

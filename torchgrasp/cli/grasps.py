@@ -31,7 +31,7 @@ from torchgrasp.files import sha256
 from torchgrasp.hand.load import hand_of, load_hand
 from torchgrasp.mesh import read_mesh
 from torchgrasp.objects import DATA, MASSES, list_objects, load_object
-from torchgrasp.pipeline import plan_grasps
+from torchgrasp.pipeline.grasps import plan_grasps
 from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows, write_report
 from torchgrasp.report.run import Run, verdict
 from torchgrasp.scene.file import is_scene

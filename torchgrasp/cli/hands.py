@@ -17,7 +17,7 @@ from torchgrasp.hand.draft import Wish, new_hand
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import find_hand, load_hand
 from torchgrasp.objects import load_object
-from torchgrasp.pipeline import plan_grasps
+from torchgrasp.pipeline.grasps import plan_grasps
 from torchgrasp.posture_model.dataset import write_samples
 from torchgrasp.posture_model.sample import SampleSpec, Sampling
 from torchgrasp.posture_model.touch import can_close

@@ -5,10 +5,11 @@ from pathlib import Path
 
 from torchgrasp.cli.common import naming
 from torchgrasp.cli.progress import Progress
-from torchgrasp.clutter import ThingPlan, plan_scene
 from torchgrasp.columns import format_columns, format_line
 from torchgrasp.hand.hand import Hand
-from torchgrasp.pipeline import plan_grasps, take_target
+from torchgrasp.pipeline.grasps import plan_grasps
+from torchgrasp.pipeline.task import take_target
+from torchgrasp.pipeline.things import ThingPlan, plan_scene
 from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows, write_report
 from torchgrasp.report.run import Run, verdict
 from torchgrasp.scene.file import read_scene

@@ -26,8 +26,8 @@ from torchgrasp.evaluation.pull import pull_grasp
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore
 from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.load import load_hand
-from torchgrasp.pipeline import plan_grasps
-from torchgrasp.provenance import digest
+from torchgrasp.pipeline.grasps import plan_grasps
+from torchgrasp.pipeline.provenance import digest
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import load_grasps

@@ -13,12 +13,12 @@ from torch import Tensor
 from torchgrasp.base import Value, check_whole
 from torchgrasp.cloud.camera import INTRINSICS
 from torchgrasp.cloud.render import render_depth
-from torchgrasp.clutter import ScenePlan
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.placed import PlacedScene, aim, settle
 from torchgrasp.hand.hand import Hand
+from torchgrasp.pipeline.things import ScenePlan
 from torchgrasp.plane import Plane
 from torchgrasp.scene.scene import Scene
 from torchgrasp.sim.scene import NEIGHBOURS, Neighbour

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from torchgrasp.base import Value, check_number, check_whole
-from torchgrasp.clutter import ScenePlan, plan_scene
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.clutter import MOVED, ClutterResult, clear_scene
 from torchgrasp.evaluation.intervals import Share, count_by, share_over
@@ -19,6 +18,7 @@ from torchgrasp.evaluation.placed import drop, object_names
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.load import load_hand
+from torchgrasp.pipeline.things import ScenePlan, plan_scene
 from torchgrasp.scene.scene import Scene
 from torchgrasp.specs import ContactSpec, TrialSpec
 

@@ -9,7 +9,7 @@ from torchgrasp.base import Value, check_number, count_status
 from torchgrasp.errors import BadArgument, GraspError, Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import Reachable
-from torchgrasp.pipeline import plan_grasps
+from torchgrasp.pipeline.grasps import plan_grasps
 from torchgrasp.plane import upright_frame
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.gp import ShapeGP

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.test_pipeline import closure_margin
+from tests.pipeline.test_grasps import closure_margin
 from torchgrasp import (
     ContactSpec,
     Status,
@@ -24,9 +24,9 @@ from torchgrasp.base import named_tensors
 from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.lift import TrialSpec
 from torchgrasp.export import format_grasps
-from torchgrasp.finger_sets import expected_success, finger_sets
 from torchgrasp.frames import apply
 from torchgrasp.objects import DATA
+from torchgrasp.pipeline.fingers import expected_success, finger_sets
 
 SPEC = ContactSpec(table=0.0)
 ALL = ("index", "middle", "ring", "thumb")

@@ -14,8 +14,8 @@ from torchgrasp.errors import BadArgument, SuspiciousScale
 from torchgrasp.frames import apply, inverse, rigid, rotate, rotation_from_vector
 from torchgrasp.ik.ranking import FEATURES, MODEL, rank_by_success, success_features
 from torchgrasp.pipeline import describe, spread_rows
+from torchgrasp.pipeline.provenance import digest
 from torchgrasp.plane import Plane, move, upright_frame
-from torchgrasp.provenance import digest
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.values import ContactPlan, Contacts
 

@@ -9,11 +9,11 @@ import trimesh
 from torchgrasp import ContactSpec, Status, load_hand, load_scene, plan_grasps, plan_scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at
 from torchgrasp.cloud.render import render_depth
-from torchgrasp.clutter import order_by_ease
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, inverse, rigid, rotation_from_vector
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.pipeline import TARGET_POINTS, take_target
+from torchgrasp.pipeline.things import order_by_ease
 from torchgrasp.scene import Scene
 
 HAND = load_hand("barrett")

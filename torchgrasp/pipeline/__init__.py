@@ -1,0 +1,10 @@
+"""The whole chain: from a partial cloud, or a scene, to ranked grasps of a hand."""
+
+from torchgrasp.pipeline.grasps import describe, plan_grasps
+from torchgrasp.pipeline.stages import spread_rows
+from torchgrasp.pipeline.task import TARGET_POINTS, take_target
+from torchgrasp.pipeline.things import ScenePlan, ThingPlan, plan_scene
+
+__all__ = [
+    "TARGET_POINTS", "ScenePlan", "ThingPlan", "describe", "plan_grasps", "plan_scene", "spread_rows", "take_target",
+]  # fmt: skip
