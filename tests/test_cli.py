@@ -1,5 +1,6 @@
 """The command line: what a bad input ends with, and that nothing is left behind."""
 
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -213,7 +214,31 @@ def test_grasp_from_cloud_to_files(tmp_path, capsys):
 def test_groups_of_commands_have_help(words, capsys):
     with pytest.raises(SystemExit) as end:
         cli.main(words)
-    assert end.value.code == 0 and " ".join(words[:1]) in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert end.value.code == 0 and f"torchgrasp {' '.join(w for w in words if w[0] != '-')}" in said
+    assert "evaluate" not in said
+
+
+def test_the_bare_command_shows_where_to_begin(capsys):
+    assert cli.main([]) == 0
+    said = capsys.readouterr().out
+    shown = [line.strip() for line in said.splitlines() if line.startswith("  torchgrasp")]
+    named = {line.removeprefix("torchgrasp ") for line in shown}
+    assert len(named) == 3 and all(any(words.startswith(name) for name in cli.COMMANDS) for words in named)
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [(["clo"], {"cloud"}), (["cloud", ""], {"check", "cut", "depth", "thin", "render"}), (["hand", "tr"], {"train"})],
+)
+def test_the_shell_completes_commands_of_a_group(typed, offered, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["--tyro-print-completion", "bash"])
+    (tmp_path / "completion").write_text(capsys.readouterr().out)
+    words = " ".join(f"'{word}'" for word in ["torchgrasp", *typed])
+    ask = f"source completion; COMP_WORDS=({words}); COMP_CWORD={len(typed)}; _tyro_torchgrasp; echo ${{COMPREPLY[@]}}"
+    done = subprocess.run(["bash", "-c", ask], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert set(done.stdout.split()) - {"--help", "-h"} == offered
 
 
 def test_cloud_check_reports_a_view(capsys):

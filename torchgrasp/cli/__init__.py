@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import torch
 import tyro
+from tyro.extras import SubcommandApp
 
 from torchgrasp import __version__
 from torchgrasp.cli import clouds, grasps, hands, shapes
@@ -39,24 +40,38 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "hand train": train,
     "shape surface": shapes.surface,
 }
+GROUPS = {
+    "cloud": "Check, cut, thin and make point clouds.",
+    "hand": "Bring a hand of your own: draft, check, sample, train.",
+    "shape": "See the shape that was estimated.",
+}
+
+
+START = """torchgrasp: dexterous fingertip grasps from a partial point cloud
+
+  torchgrasp objects                                  shipped objects: files of a noisy view and of the true mesh
+  torchgrasp cloud check CLOUD                        is this cloud ready? what would make it better?
+  torchgrasp grasp CLOUD --hand allegro --out DIR     plan grasps of what the cloud shows, with a report
+
+All commands: torchgrasp --help. To read: README.md and docs/ of the repository."""
+"""What `torchgrasp` alone prints."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return its exit code. Errors end as one sentence on stderr."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    if given == ["--version"]:
-        print(f"torchgrasp {__version__}")
+    if given in ([], ["--version"]):
+        print(f"torchgrasp {__version__}" if given else START)
         return 0
     # The batches are small: a second thread costs more than it brings, and one gives the same bits on any machine.
     torch.set_num_threads(1)
     try:
         with warnings.catch_warnings(), _end_in_order():
             warnings.showwarning = _show_warning
-            return tyro.extras.subcommand_cli_from_dict(
-                COMMANDS,
+            return _application(COMMANDS).cli(
                 prog="torchgrasp",
                 description="Dexterous fingertip grasps from a partial point cloud.",
-                args=_join_group(given),
+                args=[*given, "--help"] if given[0] in GROUPS and len(given) == 1 else given,
                 config=(tyro.conf.FlagCreatePairsOff,),
             )
     except GraspError as error:
@@ -99,13 +114,13 @@ def _show_warning(message: Warning | str, category: type[Warning], *_: object) -
     print(f"{category.__name__}: {' '.join(str(message).split())}", file=sys.stderr)
 
 
-def _join_group(given: list[str]) -> list[str]:
-    """Join a group and its command into one word; a group alone asks for help.
-
-    >>> _join_group(["cloud", "check", "a.ply"]), _join_group(["cloud"])
-    (['cloud check', 'a.ply'], ['--help'])
-    """
-    groups = {name.split()[0] for name in COMMANDS if " " in name}
-    if given and given[0] in groups and given[1:] in ([], ["--help"], ["-h"]):
-        return ["--help"]
-    return [" ".join(given[:2]), *given[2:]] if " ".join(given[:2]) in COMMANDS else given
+def _application(commands: dict[str, Callable[..., int]]) -> SubcommandApp:
+    """Return the parser of commands; those of two words are grouped by the first."""
+    top, groups = SubcommandApp(), dict[str, SubcommandApp]()
+    for name, function in commands.items():
+        group, _, last = name.rpartition(" ")
+        if group and group not in groups:
+            groups[group] = SubcommandApp()
+            top.command(groups[group], name=group, help=GROUPS[group])
+        (groups[group] if group else top).command(name=last)(function)
+    return top

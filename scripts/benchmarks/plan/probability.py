@@ -1,8 +1,10 @@
-"""Whether the probability of closure is true: planned and random triples, judged on the true surface.
+"""Whether the probability of closure is true: planned and random contacts, judged on the true surface.
 
 Nothing of it was fitted to closures: every object is unseen. Bins, errors and intervals are over whole families.
 """
 
+import dataclasses
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -26,7 +28,7 @@ from torchgrasp.shape.surface import extract_surface
 from torchgrasp.values import Contacts
 
 TRIPLES, TRIED, SAMPLES = 24, 20_000, 3000
-"""Triples of each sort in a view; random triples that are tried for them, and points of the surface they are of."""
+"""Rows of contacts of each sort in a view; random ones that are tried for them, and points of the surface."""
 SIDES = (0.015, 0.110)
 """Least and greatest distance [m] between two random contacts."""
 LOW, SHARE_OF_HEIGHT = 0.010, 0.3
@@ -48,14 +50,14 @@ Asked = dict[str, Any]
 """Of a triple: its sort, object's family and group, the probability, and whether it is closed on the true surface."""
 
 
-def bench_probability(objects: Path, views: Sequence[str], starts: int, seed: int) -> list[Row]:
+def bench_probability(objects: Path, views: Sequence[str], starts: int, seed: int, fingertips: int = 3) -> list[Row]:
     """Compare the probability of closure with closure on the true surface, for every view of a folder."""
     asked: list[Asked] = []
     spec = ContactSpec(friction=FRICTION)
     for name, _, cloud, mesh in tqdm(list(read_views(objects, views=views)), desc="probability", disable=None):
         shape = fit_shape(cloud, table=0.0)
         told = {"family": read_family(objects, name), "group": read_group(objects, name)}
-        for sort, contacts in draw_triples(shape, mesh, starts, seed).items():
+        for sort, contacts in draw_contacts(shape, mesh, starts, seed, fingertips).items():
             contacts = contacts[well_inside(shape, contacts)]
             said = closure_probability(shape, contacts, spec, DRAWS, seed).probability.tolist()
             closed = closed_on_mesh(contacts, mesh).tolist()
@@ -65,9 +67,9 @@ def bench_probability(objects: Path, views: Sequence[str], starts: int, seed: in
     return [judge_triples(asked), *(planned_closed(asked, group) for group in groups)]
 
 
-def draw_triples(shape: ShapeGP, mesh: Any, starts: int, seed: int) -> dict[str, Contacts]:
-    """Return up to 24 triples of each of `SORTS`."""
-    plan = plan_contacts(shape, DEFAULT, starts, seed)
+def draw_contacts(shape: ShapeGP, mesh: Any, starts: int, seed: int, fingertips: int) -> dict[str, Contacts]:
+    """Return up to 24 rows of contacts of each of `SORTS`."""
+    plan = plan_contacts(shape, dataclasses.replace(DEFAULT, fingertips=fingertips), starts, seed)
     found = {"planned": plan[plan.status == Status.OK].contacts[:TRIPLES]}
     generator = np.random.default_rng(seed)
     points, _ = sample_mesh(extract_surface(shape).mesh(), SAMPLES, generator)
@@ -75,11 +77,12 @@ def draw_triples(shape: ShapeGP, mesh: Any, starts: int, seed: int) -> dict[str,
     normals = shape.predict(points).normal
     low, high = mesh.bounds[:, 2]
     rows = torch.nonzero(points[:, 2] > low + min(LOW, SHARE_OF_HEIGHT * (high - low)))[:, 0]
-    triples = rows[torch.from_numpy(generator.integers(max(len(rows), 1), size=(TRIED if len(rows) else 0, 3)))]
-    side = torch.linalg.vector_norm(points[triples] - points[triples].roll(1, 1), dim=-1)
-    triples = triples[(side.amin(-1) > SIDES[0]) & (side.amax(-1) < SIDES[1])]
-    hard = closed_exact(points[triples], normals[triples], HARD)
-    for sort, chosen in (("random", triples), ("hard", triples[hard])):
+    drawn = rows[torch.from_numpy(generator.integers(max(len(rows), 1), size=(TRIED if len(rows) else 0, fingertips)))]
+    first, second = torch.tensor(list(itertools.combinations(range(fingertips), 2))).T
+    side = torch.linalg.vector_norm(points[drawn[:, first]] - points[drawn[:, second]], dim=-1)
+    drawn = drawn[(side.amin(-1) > SIDES[0]) & (side.amax(-1) < SIDES[1])]
+    hard = closed_exact(points[drawn], normals[drawn], HARD)
+    for sort, chosen in (("random", drawn), ("hard", drawn[hard])):
         chosen = chosen[:TRIPLES]
         found[sort] = Contacts(points[chosen], normals[chosen])
     return found
@@ -93,7 +96,7 @@ def judge_triples(asked: Sequence[Asked]) -> Row:
     off = max((abs(b.predicted - b.passed.value) for b in bins if b.passed.total >= ENOUGH), default=float("nan"))
     error, skill, area = (float(found[name]) for name in ("error", "skill", "auc"))  # pyright: ignore[reportArgumentType]
     return Row(
-        f"probability of closure of {len(asked)} planned and random triples on the true surface at friction {FRICTION}",
+        f"probability of closure of {len(asked)} planned and random contacts, the truth at friction {FRICTION}",
         f"bins within {NEAR}, expected calibration error <= {ERROR}, Brier skill >= {SKILL}, area >= {AREA}",
         f"worst bin {off:.3f}, error {error:.3f}, skill {skill:.2f}, area {area:.3f}",
         off <= NEAR and error <= ERROR and skill >= SKILL and area >= AREA,

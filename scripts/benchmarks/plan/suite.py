@@ -43,6 +43,7 @@ def plan(
     tries: int = 20,
     threads: int = 1,
     seed: int = 0,
+    fingertips: int = 3,
     quick: bool = False,
     out: Path = Path("out/bench_plan.json"),
 ) -> None:
@@ -58,6 +59,7 @@ def plan(
         threads: of torch. IPOPT with MUMPS, as casadi brings it, has one; on two it is counted as two processes that
             do not hinder each other.
         seed: of the starts.
+        fingertips: of the contacts whose probability of closure is judged.
         quick: a tenth of starts and tries.
         out: where the numbers are written as JSON, and beside it growth and time budget as pictures.
     """
@@ -70,7 +72,7 @@ def plan(
         "truth": lambda: [bench_truth(views, starts, seed)],
         "fields": lambda: [bench_fields(views, max(starts // 5, 1), seed)],
         "objectives": lambda: [bench_objectives(views, max(starts // 40, 4), seed)],
-        "probability": lambda: bench_probability(objects, names, max(starts // 5, 1), seed),
+        "probability": lambda: bench_probability(objects, names, max(starts // 5, 1), seed, fingertips),
         "executable": lambda: bench_executable(views, starts, seed),
         "sampler": lambda: [bench_sampler(views, max(starts // 2, 1), seed)],
         "fingertips": lambda: bench_fingertips(views, max(starts // 5, 1), seed),
