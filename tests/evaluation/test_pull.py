@@ -39,7 +39,7 @@ def test_the_squeeze_presses_with_forces_that_cancel(name):
     # Forces at the planned contacts, from the torques alone: J^T f = torque, of all f the one that cancels.
     hand_from_obj = inverse(grasp.obj_from_hand)
     points = apply(hand_from_obj, grasp.contacts.points)[0]
-    jacobian = hand.jacobian(grasp.joints)[0].flatten(0, 1)
+    jacobian = hand.jacobian(grasp.joints, points[None])[0].flatten(0, 1)
     still = torch.cat([torch.eye(3).double().repeat(1, 3), torch.cat([cross(p) for p in points], 1)])
     system = torch.cat([jacobian.T, still])
     wished = torch.cat([torque, torch.zeros(6, dtype=torch.float64)])

@@ -45,6 +45,25 @@ def test_jacobian_equals_finite_differences(hand):
         torch.testing.assert_close(jacobian[..., j], difference, atol=1e-7, rtol=1e-6)
 
 
+def test_jacobian_of_given_points_equals_finite_differences_of_points_fixed_to_the_tips(hand):
+    joints, step = random_joints(hand, 20).reshape(4, 5, hand.dof), 1e-5
+    offset = torch.tensor([0.003, -0.006, 0.01], dtype=torch.float64)
+
+    def carried(joints):
+        return map_points_of_links(hand.link_poses(joints)[..., hand.tips.index, :, :], hand.tips.center + offset)
+
+    jacobian = hand.jacobian(joints, carried(joints))
+    for j in range(hand.dof):
+        shift = torch.zeros(hand.dof, dtype=torch.float64)
+        shift[j] = step
+        difference = (carried(joints + shift) - carried(joints - shift)) / (2 * step)
+        torch.testing.assert_close(jacobian[..., j], difference, atol=1e-7, rtol=1e-6)
+
+
+def map_points_of_links(poses, points):
+    return (poses[..., :3, :3] @ points[..., None])[..., 0] + poses[..., :3, 3]
+
+
 def test_joint_axes_and_origins_give_the_derivative_of_any_point_of_a_link(hand):
     joints, spheres = random_joints(hand, 1)[0], hand.collision_spheres
     axes, origins = hand.tree.joint_axes(hand.link_poses(joints))

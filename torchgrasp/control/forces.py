@@ -81,8 +81,9 @@ def squeeze(hand: Hand, grasps: Grasps, force: float = 4.0, kp: float | None = N
     """
     check_squeeze(hand, grasps, force, kp)
     hand, joints = settle(hand.to(torch.float64), grasps.joints.device), grasps.joints.double()
-    forces = desired_forces(*contacts_in_hand(grasps), force)
-    return press(joints, hand.jacobian(joints), forces, joint_stiffness(hand, kp))
+    points, normals = contacts_in_hand(grasps)
+    forces = desired_forces(points, normals, force)
+    return press(joints, hand.jacobian(joints, points), forces, joint_stiffness(hand, kp))
 
 
 def check_squeeze(hand: Hand, grasps: Grasps, force: float, kp: float | None) -> None:

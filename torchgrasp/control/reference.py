@@ -99,7 +99,7 @@ class ClosingReference(Value):
             deviation = stability.preferred_forces(tips).covariance.diagonal()[None].sqrt()  # a given force has none
             sure = math.hypot(FORCE_FLOOR, float(deviation.min()))
         forces = desired_forces(points, normals, force, None if preferred is None else preferred.forces[None])
-        covariance, jacobian = surface_covariance(normals, std_m), hand.jacobian(grasp.joints)
+        covariance, jacobian = surface_covariance(normals, std_m), hand.jacobian(grasp.joints, points)
         alpha_f = FORCE_BANDWIDTH * sure**2 * tip_compliance(jacobian, normals, joint_stiffness(hand))
         gains = ClosingGains(
             target=points[0],

@@ -151,11 +151,19 @@ class Hand(Value):
         _, carriers = self.tips.frames(self._columns(joints))
         return _rows(map_points(carriers, self.tips.in_carriers[2]), joints)
 
-    def jacobian(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b f 3 h"]:
-        """Return the derivative [m/rad] of the contact points (finger, coordinate) by the actuated joints."""
+    def jacobian(
+        self, joints: Float[Tensor, "*b h"], at: Float[Tensor, "*b f 3"] | None = None
+    ) -> Float[Tensor, "*b f 3 h"]:
+        """Return the derivative [m/rad] of the contact points (finger, coordinate) by the actuated joints.
+
+        `at` are the points [m] that the fingertips carry, such as where round ones touch; None: those of the pads.
+        """
         chains = self.tips.chains
         frames, carriers = self.tips.frames(self._columns(joints))
-        contact = map_points(carriers, self.tips.in_carriers[0])
+        if at is None:
+            contact = map_points(carriers, self.tips.in_carriers[0])
+        else:
+            contact = at.reshape(-1, len(self.tips), 3).permute(2, 1, 0)
         # a finger's contact moves with the joints above it, and they with the actuated joints
         moves = self.tree.moves[self.tips.index][:, :, None] * self.actuated.coupling
         finger, joint, actuated = torch.nonzero(moves, as_tuple=True)
