@@ -1,6 +1,7 @@
 """`torchgrasp hand`: a draft, every fault by name, a picture of a sound hand."""
 
 import io
+import re
 import shutil
 
 import numpy as np
@@ -28,6 +29,7 @@ def test_new_writes_a_draft_that_check_takes_and_draws(barrett, capsys):
     picture = barrett / "hand.png"
     assert main(["hand", "check", str(barrett), "--out", str(picture)]) == 0
     said = capsys.readouterr().out
+    assert re.search(r"sets of fingers:\ndefault +f1_distal, f2_distal, f3_distal\n", said)
     for words in ("mine, option default: 4 actuated of 8 joints", "spread", "f1_distal = 0.3333 f1_flex", "none"):
         assert words in said
     with Image.open(picture) as image:
@@ -118,7 +120,28 @@ def test_what_is_doubtful_is_named_with_its_mend(claw, capsys):
     toml.write_text(toml.read_text().replace(pad, away))
     main(["hand", "check", str(claw.parent), "--out", str(claw.parent / "hand.png")])
     said = capsys.readouterr().out
-    assert "doubtful: only" in said and "doubtful: the pad of left faces" in said
+    assert "doubtful: default: only" in said and "doubtful: default: the pad of left faces" in said
+
+
+def test_every_set_of_fingers_is_checked_and_tried(tmp_path, capsys, monkeypatch):
+    """A draft of the Allegro hand has two; a fault of a further one is named, and four fingers are described."""
+    monkeypatch.setattr("torchgrasp.cli.hand_check.TRIAL_STARTS", 15)
+    assert main(["hand", "new", str(hands_folder() / "allegro" / "hand.urdf"), "--out", str(tmp_path / "mine")]) == 0
+    assert re.search(r"default +[\w, ]*thumb\nfour +index, middle, ring, thumb\n", capsys.readouterr().out)
+    words = ["hand", "check", str(tmp_path / "mine"), "--out", str(tmp_path / "hand.png")]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "default on the shipped cylinder: " in said and "four on the shipped cylinder: " in said
+    monkeypatch.setattr("torchgrasp.cli.hand_check._try_objects", lambda hand: True)
+    assert main([*words, "--fingers", "4"]) == 0
+    said = capsys.readouterr().out
+    assert "option four: 16 actuated" in said and "16 actuated of 16" in said
+    toml = tmp_path / "mine" / "hand.toml"
+    other = '\n[options.other]\nfingers = ["index", "ring", "thumb"]\n'
+    parked = "parked = {joint_4 = 0, joint_5 = 9, joint_6 = 0, joint_7 = 0}\n"
+    toml.write_text(toml.read_text() + other + parked)
+    assert main(words) == 2
+    assert "wrong: " in (said := capsys.readouterr().out) and "joint_5 at 9" in said
 
 
 def test_train_learns_a_mixture_that_the_paper_modes_take(claw, capsys):

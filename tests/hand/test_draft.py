@@ -89,6 +89,46 @@ def test_of_four_fingers_those_grasp_that_face_each_other(tmp_path):
     assert "thumb" in hand.finger_names and hand.dof == 12
 
 
+def with_more_fingers(claw, *more):
+    """Give the claw further fingers like its left and right one, farther out."""
+    text, end = claw.read_text(), "</robot>"
+    for name, old, y in more:
+        start = text.index(f'<link name="{old}_root">')
+        finger = text[start : text.index(f'<link name="{ {"left": "right", "right": "thumb"}[old] }_root">')]
+        sign = "-" if old == "left" else ""
+        finger = finger.replace(f"{old}_", f"{name}_").replace(f'xyz="-0.045 {sign}0.03', f'xyz="-0.045 {y}')
+        text = text.replace(end, finger + end)
+    claw.write_text(text)
+    return claw
+
+
+@pytest.mark.parametrize("more", [(("ring", "left", -0.07),), (("ring", "left", -0.07), ("index", "right", 0.07))])
+def test_a_draft_declares_every_number_of_fingers(claw, more):
+    """Each set holds the smaller one, passes the law, and parks the joints of all other fingers."""
+    folder = drafted(with_more_fingers(claw, *more))
+    spec, before = read_hand_toml(folder / "hand.toml"), set[str]()
+    assert list(spec.options) == ["default", "four", "five"][: 1 + len(more)]
+    for count, name in enumerate(spec.options, 3):
+        hand, option = check_hand(folder, name), spec.options[name]
+        names = {finger.name for finger in option.fingers}
+        assert len(names) == count and before < names
+        idle = [finger for finger in spec.all_fingers if finger.name not in names]
+        assert set(option.parked) == {j for f in idle for j in f.joints if not j.endswith("follow")}
+        assert hand.dof == 2 * count and load_hand(folder, count).finger_names == hand.finger_names
+        assert hand.source.options == tuple(spec.options)
+        before = names
+    assert "thumb" in {finger.name for finger in spec.fingers}
+
+
+def test_named_tips_are_taken_in_their_order(claw):
+    tips = ("thumb_tip", "ring_tip", "left_tip", "right_tip")
+    spec = read_hand_toml(drafted(with_more_fingers(claw, ("ring", "left", -0.07)), *tips) / "hand.toml", "four")
+    assert [f.name for f in spec.options["default"].fingers] == ["thumb", "ring", "left"]
+    assert [f.name for f in spec.fingers] == ["thumb", "ring", "left", "right"]
+    with pytest.raises(BadArgument, match="three to five"):
+        draft_hand(claw, ("left_tip", "right_tip", "thumb_tip", "ring_tip", "left_far", "right_far"))
+
+
 def test_what_cannot_be_guessed_is_asked_for(claw, tmp_path):
     with pytest.raises(BadArgument, match="left_tip"):
         draft_hand(claw, ("left_tip", "right_tip"))

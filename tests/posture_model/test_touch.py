@@ -1,6 +1,7 @@
 """Rolled contacts stay on their tips and in their cones; closing triples are those of a linear program."""
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -76,3 +77,11 @@ def test_eq13_closing_triples_are_those_of_a_linear_program():
     margin = np.array([closes(points[k].numpy(), normals[k].numpy(), friction) for k in rows.tolist()])
     assert (margin[:40] > 0).all()  # what balances does close
     assert (margin[40:] > 0.02).mean() < 0.02  # and of the others only narrow ones do
+
+
+def test_eq13_more_contacts_close_if_three_of_them_do(generator):
+    points, normals = torch.randn(2, 300, 5, 3, generator=generator, dtype=torch.float64)
+    normals = normals / normals.norm(dim=-1, keepdim=True)
+    by_three = [can_close(points[:, k], normals[:, k]) for k in map(list, itertools.combinations(range(5), 3))]
+    assert torch.equal(can_close(points, normals), torch.stack(by_three).any(0))
+    assert 0 < int(can_close(points[:, :4], normals[:, :4]).sum()) < int(can_close(points, normals).sum()) < 300

@@ -19,6 +19,7 @@ from torchgrasp import __version__
 from torchgrasp.cli import clouds, grasps, hands, shapes
 from torchgrasp.cli.evaluate import evaluate
 from torchgrasp.cli.export import export
+from torchgrasp.cli.hand_check import check
 from torchgrasp.cli.hand_train import train
 from torchgrasp.errors import GraspError
 
@@ -35,7 +36,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "cloud thin": clouds.thin,
     "cloud render": clouds.render,
     "hand new": hands.new,
-    "hand check": hands.check,
+    "hand check": check,
     "hand sample": hands.sample,
     "hand train": train,
     "shape surface": shapes.surface,

@@ -12,13 +12,14 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from torchgrasp.base import FINGERTIPS
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.collision_pairs import collision_pairs, draw_postures
 from torchgrasp.hand.fit_shapes import ball_tip, replace_meshes, shape_points
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.mend import fix_wrist, keep_below, mend_bodies, mend_joints, merge_frames, urdf_text
-from torchgrasp.hand.pads import best_three, guess_pads, is_primitive
+from torchgrasp.hand.pads import guess_pads, is_primitive, order_by_facing
 from torchgrasp.hand.urdf import MEND, Mimic, Triple, Urdf, read_published
 
 DRAFT_POSTURES = 20_000
@@ -30,8 +31,13 @@ MOST_STIFFNESS = 10.0
 ROTOR = 1e-3
 """Inertia [kg m2] that simulations add to every joint for its motor."""
 
+OPTIONS = {"default": 3, "four": 4, "five": 5}
+"""Sets of fingers that a draft declares, as far as the hand has as many."""
+
 Chosen = dict[str, Pad]
-"""Pads by the links that touch: three that grasp, in grasp order, then those to park."""
+"""Pads by the links that touch."""
+Sets = dict[str, list[str]]
+"""Links that touch by the option of hand.toml in which their fingers grasp."""
 
 
 class Draft(NamedTuple):
@@ -59,14 +65,14 @@ def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = No
 
     Args:
         path: of the URDF.
-        tips: links of the three grasping fingertips in grasp order, then of the fingers to park; by default the ends of
-            the tree's branches, first the three whose pads best face each other.
+        tips: links of the fingertips in grasp order, first the three of option "default"; "four" and "five" add the
+            next. By default the ends of the tree's branches, in the order in which their pads best face each other.
         name: of the hand; by default the robot's.
         seed: of the random postures.
 
     Raises:
         HandFileError: the URDF is missing or malformed, or needs mending: `new_hand` does that.
-        BadArgument: fewer than three tips, or one without a collision shape or a joint that moves it.
+        BadArgument: fewer than three tips, more than five, or one without a collision shape or a joint that moves it.
 
     >>> from torchgrasp.hand.load import find_hand
     >>> text = draft_hand(find_hand("barrett") / "hand.urdf")
@@ -84,7 +90,7 @@ def new_hand(path: Path | str, wish: Wish = Wish(), seed: int = 0, file: str = "
 
     Raises:
         HandFileError: the URDF or a mesh of it is missing, malformed or hostile, or nothing can mend it.
-        BadArgument: fewer than three tips, or one without a collision shape or a joint that moves it.
+        BadArgument: fewer than three tips, more than five, or one without a collision shape or a joint that moves it.
     """
     published = read_published(path)
     urdf, told = keep_below(published, wish.root or published.root)
@@ -104,24 +110,23 @@ def new_hand(path: Path | str, wish: Wish = Wish(), seed: int = 0, file: str = "
     frames = tree_from_urdf(urdf).frames(draw_postures(urdf, _coupling(urdf), DRAFT_POSTURES, seed))
     guess = guess_pads(urdf, frames, tips, surfaces)
     order = list(range(len(tips)))
-    if not wish.tips and len(tips) > 3:
+    if not wish.tips:
         at = [next(i for i, x in enumerate(urdf.links) if x.name == tip) for tip in tips]
-        best = best_three(frames[:, :, at], guess.pads)
-        order = [*best, *(k for k in order if k not in best)]
+        order = order_by_facing(frames[:, :, at], guess.pads)
+    sets = {name: [tips[k] for k in sorted(order[:n])] for name, n in OPTIONS.items() if n <= len(tips)}
     simple = {x.name for x in urdf.links if is_primitive(x)}
     clean, more = replace_meshes(urdf, points)
     told += more
     chosen: Chosen = {}
     balls = list[str]()
-    for k in order:
-        tip, pad = tips[k], guess.pads[k]
+    for tip, pad, outward in zip(tips, guess.pads, guess.outward, strict=True):
         if tip not in simple:
             balls.append(f"{tip} {1e3 * pad.radius:.1f} mm")
-            clean = ball_tip(clean, tip, pad, guess.outward[k], surfaces[tip])
+            clean = ball_tip(clean, tip, pad, outward, surfaces[tip])
         chosen[tip] = pad
     told += [f"fingertips touch by a ball in their end, of radius: {', '.join(balls)}"] if balls else []
     name, mended = wish.name or urdf.name, bool(told)
-    toml = _toml_text(clean, chosen, guess.approach, (name, file if mended else published.path.name), seed)
+    toml = _toml_text(clean, chosen, sets, guess.approach, (name, file if mended else published.path.name), seed)
     return Draft(toml, urdf_text(clean) if mended else "", tuple(told))
 
 
@@ -129,10 +134,9 @@ def _checked_tips(urdf: Urdf, tips: tuple[str, ...]) -> tuple[str, ...]:
     """Return the links of the fingertips, given or found; refuse too few, and links that cannot touch."""
     ends = fingertip_links(urdf)
     chosen = tips or ends
-    if not 3 <= len(chosen) or (not tips and len(chosen) > 5) or len(set(chosen)) < len(chosen):
-        wanted = f"three links in grasp order, then those to park; the branches of {urdf.path} end in {list(ends)}"
-        found = list(tips) or f"none, and {len(ends)} fingers"
-        raise BadArgument("tips", found, f"a hand of three to five fingertips: {wanted}")
+    if not FINGERTIPS[0] <= len(chosen) <= FINGERTIPS[1] or len(set(chosen)) < len(chosen):
+        wanted = f"three to five different links in grasp order; the branches of {urdf.path} end in {list(ends)}"
+        raise BadArgument("tips", list(tips) or f"none, and {len(ends)} fingers", wanted)
     shaped = {x.name for x in urdf.links if x.shapes}
     for tip in chosen:
         if tip not in shaped or not urdf.movers(tip):
@@ -162,16 +166,12 @@ def _gains(urdf: Urdf) -> tuple[float, float]:
     return kp, max(DAMPING * kp, 2 * np.sqrt(kp * (heaviest + ROTOR)))
 
 
-def _toml_text(urdf: Urdf, pads: Chosen, approach: Triple, names: tuple[str, str], seed: int) -> str:
+def _toml_text(urdf: Urdf, pads: Chosen, sets: Sets, approach: Triple, names: tuple[str, str], seed: int) -> str:
     """Write a hand.toml; `names` are those of the hand and of its URDF's file."""
     coupling = _coupling(urdf)
-    free, tips = [j for j in urdf.movable if j.name not in coupling], list(pads)
-    chains = {tip: [j.name for j in urdf.movers(tip)[::-1]] for tip in tips}
-    grasping = {joint for tip in tips[:3] for joint in chains[tip]}
-    moved = grasping | {coupling[j].source for j in grasping if j in coupling}
-    parked = {j.name: min(max(0.0, j.lower), j.upper) for j in free if j.name not in moved}
+    chains = {tip: [j.name for j in urdf.movers(tip)[::-1]] for tip in pads}
     kp, kd = _gains(urdf)
-    called = {tip: tip.removesuffix("_tip") for tip in tips}
+    called = {tip: tip.removesuffix("_tip") for tip in pads}
     lines = [
         "# A draft. Lengths [m], angles [rad], in the link frames of the URDF. Look over what is marked CHECK.",
         f"name = {_toml(names[0])}",
@@ -188,20 +188,32 @@ def _toml_text(urdf: Urdf, pads: Chosen, approach: Triple, names: tuple[str, str
         lines += ["", "# joint = ratio * source + offset", "[coupling]"]
     for joint, (source, ratio, offset) in coupling.items():
         lines.append(f"{_toml(joint)} = {{ source = {_toml(source)}, ratio = {ratio!r}, offset = {offset!r} }}")
-    lines += ["", "# Which fingers grasp, in grasp order; every other joint is parked.", "[options.default]"]
-    lines.append(f"fingers = {_toml([called[tip] for tip in tips[:3]])}{'  # CHECK' if len(tips) > 3 else ''}")
-    if parked:
-        row = ", ".join(f"{_toml(joint)} = {value!r}" for joint, value in parked.items())
-        lines.append(f"parked = {{ {row} }}  # CHECK: out of the way of the others")
+    lines += ["", "# Which fingers grasp, in grasp order; every other joint is parked."]
+    for option, tips in sets.items():
+        guessed = "  # CHECK" if len(tips) < len(pads) else ""
+        lines += [f"[options.{option}]", f"fingers = {_toml([called[tip] for tip in tips])}{guessed}"]
+        parked = _parked(urdf, {joint for tip in tips for joint in chains[tip]})
+        if parked:
+            row = ", ".join(f"{_toml(joint)} = {value!r}" for joint, value in parked.items())
+            lines.append(f"parked = {{ {row} }}  # CHECK: out of the way of the others")
+        lines.append("")
     for tip, pad in pads.items():
-        lines += ["", "[[finger]]", f"name = {_toml(called[tip])}"]
+        lines += ["[[finger]]", f"name = {_toml(called[tip])}"]
         lines += [f"joints = {_toml(chains[tip])}", f"tip_link = {_toml(tip)}"]
         lines += [f"contact = {_toml(pad.contact)}  # CHECK: the middle of the pad", f"normal = {_toml(pad.normal)}"]
         sphere = ['tip = "sphere"', f"center = {_toml(pad.center)}", f"radius = {pad.radius!r}"]
-        lines += sphere if pad.radius else ['tip = "point"']
-    lines += ["", "[self_collision]", "# The pairs of links that meet in some random postures, but not in nearly all."]
+        lines += [*(sphere if pad.radius else ['tip = "point"']), ""]
+    lines += ["[self_collision]", "# The pairs of links that meet in some random postures, but not in nearly all."]
     lines += ["pairs = [", *(f"  {_toml(pair)}," for pair in collision_pairs(urdf, coupling, seed=seed)), "]", ""]
     return "\n".join(lines)
+
+
+def _parked(urdf: Urdf, grasping: set[str]) -> dict[str, float]:
+    """Return where the joints are that neither grasp nor lead nor follow another: at zero, or the limit next to it."""
+    coupling = _coupling(urdf)
+    moved = grasping | {coupling[j].source for j in grasping if j in coupling}
+    free = (j for j in urdf.movable if j.name not in coupling and j.name not in moved)
+    return {j.name: min(max(0.0, j.lower), j.upper) for j in free}
 
 
 def fingertip_links(urdf: Urdf) -> tuple[str, ...]:

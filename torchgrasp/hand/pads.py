@@ -88,22 +88,27 @@ def guess_pads(
     return Guess(tuple(pads), tuple(ends), _triple(np.sign(out[axis]) * np.eye(3)[axis]))
 
 
-def best_three(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> tuple[int, int, int]:
-    """Return the three tips whose pads most often face the middle of all three, from the tips' frames.
+def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> list[int]:
+    """Return the tips, first the three whose pads most often face their middle, then one by one those that face best.
 
-    A pad faces it within 45 degrees; in between lies something of a size that a hand holds.
+    A pad faces the middle within 45 degrees; in between lies something of a size that a hand holds. `frames` are the
+    tips' frames in random postures.
     """
     contacts, normals = (torch.tensor([getattr(p, k) for p in pads]).double() for k in ("contact", "normal"))
     points, directions = map_points(frames, contacts), map_directions(frames, normals)
-    shares = {}
-    for three in itertools.combinations(range(len(pads)), 3):
-        inward = points[:, three].mean(1, keepdim=True) - points[:, three]
+
+    def share(tips: tuple[int, ...]) -> float:
+        """Return the share of the postures in which all these pads face their middle."""
+        inward = points[:, tips].mean(1, keepdim=True) - points[:, tips]
         length = torch.linalg.vector_norm(inward, dim=0)
-        facing = (directions[:, three] * inward).sum(0) / length.clamp_min(1e-9)
+        facing = (directions[:, tips] * inward).sum(0) / length.clamp_min(1e-9)
         apart = (length > HELD[0]) & (length < HELD[1])
-        shares[three] = float(((facing > FACING) & apart).all(0).double().mean())
-    one, two, three = max(shares, key=lambda key: shares[key])
-    return one, two, three
+        return float(((facing > FACING) & apart).all(0).double().mean())
+
+    order = max(itertools.combinations(range(len(pads)), 3), key=share)
+    while len(order) < len(pads):
+        order = max(((*order, k) for k in range(len(pads)) if k not in order), key=share)
+    return list(order)
 
 
 def is_primitive(link: Link) -> bool:

@@ -1,5 +1,6 @@
 """How a free posture may touch: its round fingertips roll, and the contacts must be able to hold something."""
 
+import itertools
 import math
 
 import numpy as np
@@ -37,12 +38,21 @@ def roll_contacts(
     return points + radius[:, None] * (normals - axes), normals
 
 
-def can_close(points: Float[Tensor, "n 3 3"], normals: Float[Tensor, "n 3 3"]) -> Bool[Tensor, "n"]:
-    """Tell which triples balance forces inside the friction cones of `ContactSpec`, Eq. (13).
+def can_close(points: Float[Tensor, "n f 3"], normals: Float[Tensor, "n f 3"]) -> Bool[Tensor, "n"]:
+    """Tell which contacts balance forces inside the friction cones of `ContactSpec`, Eq. (13), with three of them.
 
     Balanced forces of three contacts run along the triangle's sides. A grid over them finds all but narrow closures.
     `normals` point out of the fingertips, into the object.
     """
+    closed = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    for three in itertools.combinations(range(points.shape[1]), 3):
+        rows = torch.nonzero(~closed)[:, 0]
+        closed[rows] = _close_triples(points[rows][:, three], normals[rows][:, three])
+    return closed
+
+
+def _close_triples(points: Float[Tensor, "n 3 3"], normals: Float[Tensor, "n 3 3"]) -> Bool[Tensor, "n"]:
+    """Tell which triples balance forces."""
     spread = 1 + ContactSpec().friction ** 2
     t12, t13, t23 = fibonacci_sphere(BALANCES).to(points).T
     e12, e13, e23 = (unit(points[:, j] - points[:, i]) for i, j in ((0, 1), (0, 2), (1, 2)))
