@@ -72,9 +72,16 @@ def test_a_thing_is_grasped_by_click_or_mask(seen, grasp, tmp_path, click):
 
 
 def test_without_a_choice_the_easiest_thing_is_taken_and_all_are_listed(seen, grasp, monkeypatch):
-    thing = ThingPlan(2, 0.5, reason="too heavy")
-    monkeypatch.setattr("torchgrasp.cli.scene_grasps.plan_scene", lambda *a, **k: ScenePlan((thing,)))
-    code, words = grasp(seen)
+    thing, asked = ThingPlan(2, 0.5, reason="too heavy"), []
+
+    def note(scene, hand, *_, fingers, enough):
+        asked.append((hand.finger_names, fingers))
+        return ScenePlan((thing,))
+
+    monkeypatch.setattr("torchgrasp.cli.scene_grasps.plan_scene", note)
+    for wanted, passed in (("default", None), ("f3,f1,f2", None), ("auto", "auto")):
+        code, words = grasp(seen, "--fingers", wanted)
+        assert asked.pop() == (("f3", "f1", "f2") if "," in wanted else ("f1", "f2", "f3"), passed)
     assert code == 1 and "thing 2" in words and "too heavy" in words and "no executable grasp of any thing" in words
 
 

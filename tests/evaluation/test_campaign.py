@@ -157,6 +157,23 @@ def test_a_robot_plans_on_what_it_believes_and_lifts_what_is(folder, tmp_path):
 
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
+def test_each_view_is_grasped_with_the_fingers_that_were_chosen_for_it(folder, tmp_path, monkeypatch):
+    """Here most fingers always win, which are others than the hand's own; later trials find them by the files."""
+    pytest.importorskip("sapien")
+    monkeypatch.setattr("torchgrasp.pipeline.fingers.expected_success", lambda grasps: grasps.contacts.points.shape[1])
+    test = PROTOCOLS["dexgraspbench"]
+    test = dataclasses.replace(test, pull=dataclasses.replace(test.pull, seconds=0.1))
+    spec = EvaluationSpec(1, starts=25, only=("tin",), fingers="auto")
+    (score,) = evaluate(folder, load_hand("allegro"), test, spec, folder=tmp_path)
+    assert score.fingers == "index,middle,ring,thumb" and len(score.attempts) == 1
+    assert score.attempts[0].force > 1.0 and score.attempts[0].status in (Status.OK, Status.MOVED)
+    assert summarise([score, SCORES[0]])["fingers"] == {score.fingers: 1, "": 1}
+    (again,) = evaluate(folder, load_hand("allegro"), test, dataclasses.replace(spec, planned=True), folder=tmp_path)
+    assert without_times([again]) == without_times([score])
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
 def test_a_pinched_cylinder_is_lifted():
     pytest.importorskip("sapien")
     hand, grasp = pinch("allegro")

@@ -18,7 +18,9 @@ from torchgrasp import (
     load_grasps,
     load_hand,
     load_object,
+    load_scene,
     plan_grasps,
+    plan_scene,
 )
 from torchgrasp.base import named_tensors
 from torchgrasp.errors import BadArgument
@@ -126,6 +128,23 @@ def test_the_command_grasps_with_the_fingers_asked_for(tmp_path, capsys):
     assert len(json.loads((tmp_path / "a.json").read_text())["grasps"][0]["contacts"]) == 4
     assert cli.main([*words, "--fingers", "index,thumb"]) == 2
     assert "--fingers" in capsys.readouterr().err
+
+
+def test_a_thing_of_a_scene_is_grasped_with_the_fingers_asked_for(monkeypatch):
+    scene, hand, asked = load_scene(), load_hand("allegro"), []
+    best = plan_scene(scene, hand, starts=10, fingers=4, enough=0.0).things[0]
+    assert best.grasps is not None, best.reason
+    assert hand_of(best.grasps, hand).finger_names == ALL and best.grasps.joints.shape[1] == 16
+    with pytest.raises(BadArgument, match="fingers"):
+        plan_scene(scene, hand, fingers=("index", "thumb"))
+
+    def note(cloud, fingers, **_):
+        asked.append((cloud.target, fingers))
+        raise BadArgument("cloud", "seen", "nothing")
+
+    monkeypatch.setattr("torchgrasp.pipeline.things.plan_grasps", note)
+    plan_scene(scene, hand, fingers="auto")
+    assert sorted(asked) == [(label, "auto") for label in scene.things]
 
 
 @pytest.mark.sim

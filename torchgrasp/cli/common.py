@@ -16,6 +16,8 @@ from torchgrasp.cloud.io.image import read_pose
 from torchgrasp.cloud.neighbours import draw_rows
 from torchgrasp.errors import BadArgument, OutputError
 from torchgrasp.frames import apply, rotate
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import load_hand
 from torchgrasp.linalg import unit
 from torchgrasp.plane import Plane, as_plane
 from torchgrasp.values import PointCloud
@@ -142,6 +144,12 @@ def check_folder(path: Path) -> None:
     finally:
         for folder in reversed(made):
             folder.rmdir()
+
+
+def load_fingers(hand: str, fingers: str) -> tuple[Hand, Literal["auto"] | None]:
+    """Load the hand of --hand with --fingers; return it, and "auto" where its sets of fingers are to be compared."""
+    with naming(hand="--hand", name="--hand", fingers="--fingers"):
+        return (load_hand(hand), "auto") if fingers == "auto" else (load_hand(hand, fingers), None)
 
 
 def check_seed(seed: int) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from torchgrasp.base import check_whole
-from torchgrasp.cli.common import check_seed, naming
+from torchgrasp.cli.common import check_seed, load_fingers, naming
 from torchgrasp.cli.grasps import import_simulator
 from torchgrasp.cli.scenes import evaluate_clutter
 from torchgrasp.columns import format_columns, format_line
@@ -17,7 +17,6 @@ from torchgrasp.evaluation.protocols import find_protocol
 from torchgrasp.evaluation.scenes import ClutterSpec
 from torchgrasp.evaluation.score import ViewScore, summarise
 from torchgrasp.files import format_json, hold_folder, write_file
-from torchgrasp.hand.load import load_hand
 from torchgrasp.report.evaluation import SHARE_NAMES, write_evaluation
 from torchgrasp.specs import ClosingMode, HoldingMode, Simulator, TrialSpec
 
@@ -60,7 +59,8 @@ def evaluate(
         objects: folder with manifest.json, and for each object mesh.ply and noisy views. Scenes need mesh.ply only, and
             take the library's own objects by default.
         hand: name of a shipped hand, as allegro, barrett, leap or shadow, or the folder of another.
-        fingers: which grasp: an option of the hand, a number of fingers, or their names as in index,middle,thumb.
+        fingers: which grasp: an option of the hand, a number of fingers, or their names as in index,middle,thumb;
+            "auto": for each view the option whose best grasps are likeliest to succeed.
         out: folder of the results; it is made where it does not exist, and no other run may use it meanwhile.
         protocol: which test; see torchgrasp.evaluation.protocols.
         closing: how the hand closes; by default in open loop before a pull, under uncertainty before a lift.
@@ -87,19 +87,18 @@ def evaluate(
     check_seed(seed)
     check_whole("--scenes", scenes, 0, 1_000_000)
     import_simulator(simulator)
-    with naming(hand="--hand", name="--hand", fingers="--fingers"):
-        the_hand = load_hand(hand, fingers)
+    the_hand, among = load_fingers(hand, fingers)
     changes: dict[str, Any] = {"closing": closing, "force": force, "holding": holding, "simulator": simulator}
     changes = {name: x for name, x in changes.items() if x is not None}
     if scenes:
         with naming(force="--force", count="--count", mask_error="--mask-error", enough="--enough"):
-            spec = ClutterSpec(count, mask_error, clear, starts, enough, TrialSpec(**changes), seed)
+            spec = ClutterSpec(count, mask_error, clear, starts, enough, TrialSpec(**changes), seed, among)
         return evaluate_clutter(objects, the_hand, out, scenes, spec, workers)
     if objects is None:
         raise BadArgument("--objects", "none", "a folder of objects, or --scenes")
     with naming(force="--force", grasps="--grasps", perturb="--perturb", views="--views"):
         test = find_protocol(protocol).with_trial(**changes)
-        spec = EvaluationSpec(grasps, ranks, starts, complete, only, planned is not None, seed, perturb, views)
+        spec = EvaluationSpec(grasps, ranks, starts, complete, only, planned is not None, seed, perturb, views, among)
     scores = []
     with naming(folder="--out", path="--out"), hold_folder(out):
         with naming(objects="--objects", path="--objects", workers="--workers", perturb="--perturb"):
@@ -109,13 +108,8 @@ def evaluate(
                 scores.append(score)
         summary = summarise(scores)
         print_summary(protocol, spec.tried, summary)
-        asked = {
-            "hand": hand,
-            "fingers": the_hand.source.option,
-            "tried": spec.tried,
-            "hand_sha256": the_hand.source.sha256,
-            **dataclasses.asdict(spec),
-        }
+        asked = {"hand": hand, "tried": spec.tried, "hand_sha256": the_hand.source.sha256, **dataclasses.asdict(spec)}
+        asked["fingers"] = among or the_hand.source.option
         asked["protocol"] = dataclasses.asdict(test)
         content = {"asked": asked, "summary": summary, "views": [dataclasses.asdict(score) for score in scores]}
         write_file(out / "evaluate.json", format_json(content))
@@ -141,6 +135,8 @@ def print_summary(protocol: str, tried: str, summary: dict[str, Any]) -> None:
         rows.append(
             ("views without a grasp", f"{summary['refused']}: a failure of the best one, not in the grasps tried")
         )
+    if len(summary["fingers"]) > 1:
+        rows.append(("views by fingers", "; ".join(f"{n} {names}" for names, n in summary["fingers"].items())))
     for stage, reasons in summary["failures"].items():
         rows.append((f"failed in {stage}", ", ".join(f"{n} {name.lower()}" for name, n in reasons.items())))
     print(f"\n{protocol}, {tried}\n{format_columns(rows, left={0, 1})}")

@@ -17,18 +17,19 @@ from torchgrasp.cli.common import (
     check_seed,
     describe_table,
     judge_cloud,
+    load_fingers,
     naming,
     print_notes,
     read_view,
     table_plane,
 )
 from torchgrasp.cli.progress import Progress
-from torchgrasp.cli.scene_grasps import grasp_scene
+from torchgrasp.cli.scene_grasps import Wanted, grasp_scene
 from torchgrasp.columns import format_columns
 from torchgrasp.errors import BadArgument, MissingExtra
 from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.files import sha256
-from torchgrasp.hand.load import hand_of, load_hand
+from torchgrasp.hand.load import hand_of
 from torchgrasp.mesh import read_mesh
 from torchgrasp.objects import DATA, MASSES, list_objects, load_object
 from torchgrasp.pipeline.grasps import plan_grasps
@@ -100,12 +101,16 @@ def grasp(
             raise BadArgument("--point", "--label beside it", "one of the two")
         if mesh is not None or view != AS_IT_IS or table is not None or no_table or mode != "joint":
             found = "an option of clouds beside a scene"
-            raise BadArgument("CLOUD", found, "--label or --point, --hand, --out, --seed, --starts and --friction")
-        with naming(hand="--hand", name="--hand", fingers="--fingers", friction="--friction"):
-            the_hand, spec = load_hand(hand, fingers), ContactSpec(friction=friction)
+            raise BadArgument(
+                "CLOUD", found, "--label or --point, --hand, --fingers, --out, --seed, --starts, --friction"
+            )
+        the_hand, among = load_fingers(hand, fingers)
+        with naming(friction="--friction"):
+            spec = ContactSpec(friction=friction)
         check_whole("--starts", starts, 1, 1_000_000)
         check_seed(seed)
-        return grasp_scene(cloud, the_hand, spec, (starts, seed), point if label is None else label, out)
+        wanted = Wanted(the_hand, spec, starts, seed, among)
+        return grasp_scene(cloud, wanted, point if label is None else label, out)
     if label is not None or point is not None:
         raise BadArgument("--label, --point", f"{cloud}, which is no scene", "a .npz file with depth and intrinsics")
     if close:
@@ -114,8 +119,7 @@ def grasp(
         import_simulator()
     check_whole("--starts", starts, 1, 1_000_000)
     check_seed(seed)
-    with naming(hand="--hand", name="--hand", fingers="--fingers"):
-        the_hand = load_hand(hand, "default" if fingers == "auto" else fingers)
+    the_hand, among = load_fingers(hand, fingers)
     file = read_view("CLOUD", cloud, view)
     partial, plane = file.cloud, table_plane(file.cloud, view, table, no_table)
     with naming(mesh="--mesh", friction="--friction", table="--table"):
@@ -124,17 +128,23 @@ def grasp(
         trial = TrialSpec(friction=friction)
     print_notes(file.notes, judge_cloud("CLOUD", partial, view, plane))
 
-    auto = fingers == "auto"
-    names = [*["fingers"] * auto, "shape", "plan", "certify", "query", "refine", *["closing"] * close, "report"]
+    names = [
+        *["fingers"] * (among is not None),
+        "shape",
+        "plan",
+        "certify",
+        "query",
+        "refine",
+        *["closing"] * close,
+        "report",
+    ]
     progress = Progress(*names)
     with progress.bar:
         origin = "no table" if plane is None else describe_table(plane)
         origin += " (lowest point)" * (plane is not None and table is None)
         camera = "camera known" if partial.viewpoint is not None else "camera estimated"
         progress.end("cloud", f"{len(partial)} points, {camera}, {origin}")
-        grasps = plan_grasps(
-            partial, the_hand, spec, starts, seed, fingers="auto" if auto else None, mode=mode, observer=progress.end
-        )
+        grasps = plan_grasps(partial, the_hand, spec, starts, seed, fingers=among, mode=mode, observer=progress.end)
         the_hand = hand_of(grasps, the_hand)
         surface, plan = extract_surface(progress.values["shape"]), progress.values["plan"]
         name = object_name(cloud if mesh is None else mesh)

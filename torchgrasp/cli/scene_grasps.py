@@ -2,11 +2,14 @@
 
 import dataclasses
 from pathlib import Path
+from typing import NamedTuple
 
 from torchgrasp.cli.common import naming
 from torchgrasp.cli.progress import Progress
 from torchgrasp.columns import format_columns, format_line
 from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.hand_toml import Fingers
+from torchgrasp.hand.load import hand_of
 from torchgrasp.pipeline.grasps import plan_grasps
 from torchgrasp.pipeline.task import take_target
 from torchgrasp.pipeline.things import ThingPlan, plan_scene
@@ -15,38 +18,44 @@ from torchgrasp.report.run import Run, verdict
 from torchgrasp.scene.file import read_scene
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ContactSpec
-from torchgrasp.values import Grasps
 
 ENOUGH = 0.9
 """Predicted success from which on a thing is easy enough: the others are not tried."""
 
 
-def grasp_scene(
-    path: Path,
-    hand: Hand,
-    spec: ContactSpec,
-    numbers: tuple[int, int],
-    choice: int | tuple[float, float] | None,
-    out: Path,
-) -> int:
+class Wanted(NamedTuple):
+    """What is planned for in a scene; see `plan_scene`."""
+
+    hand: Hand
+    spec: ContactSpec
+    starts: int
+    seed: int
+    fingers: Fingers | None
+
+
+def grasp_scene(path: Path, wanted: Wanted, choice: int | tuple[float, float] | None, out: Path) -> int:
     """Plan grasps of a thing of a scene, and write them with a report.
 
     Args:
-        numbers: starts, and the seed.
+        path: of the scene.
+        wanted: what is planned for.
         choice: label of the thing, or column and row of a pixel on it; None: the easiest thing.
+        out: folder to write.
     """
-    starts, seed = numbers
+    hand, spec, starts, seed, fingers = wanted
     names = {name: f"CLOUD: {name}" for name in ("depth", "intrinsics", "mask", "labels", "camera_pose", "table")}
     with naming(path="CLOUD", points="CLOUD", target="--label", point="--point", **names):
         scene = read_scene(path)
         scene = scene if choice is None else scene.select(choice)
-    progress = Progress("scene", "shape", "plan", "certify", "query", "refine", "report")
+    progress = Progress(
+        "scene", *["fingers"] * (fingers == "auto"), "shape", "plan", "certify", "query", "refine", "report"
+    )
     with progress.bar:
         progress.end("scene", f"{len(scene.things)} things, labels {', '.join(map(str, scene.things))}")
         for sentence in scene.advice:
             print(f"advice  {sentence}")
         if scene.target is None:
-            plan = plan_scene(scene, hand, spec, starts, seed, enough=ENOUGH)
+            plan = plan_scene(scene, hand, spec, starts, seed, fingers=fingers, enough=ENOUGH)
             print_things(plan.things)
             progress.end("things", f"{sum(thing.grasps is not None for thing in plan.things)} with a grasp")
             if plan.best is None or plan.best.grasps is None or plan.best.shape is None:
@@ -55,9 +64,9 @@ def grasp_scene(
             scene = dataclasses.replace(scene, target=plan.best.label)
             grasps, shape = plan.best.grasps, plan.best.shape
         else:
-            grasps: Grasps = plan_grasps(scene, hand, spec, starts, seed, observer=progress.end)
+            grasps = plan_grasps(scene, hand, spec, starts, seed, fingers=fingers, observer=progress.end)
             shape = progress.values["shape"]
-        spec = dataclasses.replace(spec, table=scene.table)
+        spec, hand = dataclasses.replace(spec, table=scene.table), hand_of(grasps, hand)
         cloud, name = take_target(scene, seed), f"thing {scene.target}"
         run = Run(
             name, path, cloud, hand, spec, extract_surface(shape), grasps, tuple(progress.stages),

@@ -34,6 +34,7 @@ def evaluate_clutter(objects: Path | None, hand: Hand, out: Path, scenes: int, s
         summary = summarise_scenes(scores)
         print_clutter(summary, spec.clear)
         asked = {"hand": hand.name, "hand_sha256": hand.source.sha256, "scenes": scenes, **dataclasses.asdict(spec)}
+        asked["fingers"] = spec.fingers or hand.source.option
         asked["objects"] = "the library's own" if objects is None else str(objects)
         content = {"asked": asked, "summary": summary, "scenes": [scene_record(score) for score in scores]}
         write_file(out / "evaluate.json", format_json(content))

@@ -25,7 +25,8 @@ from torchgrasp.evaluation.protocols import Protocol, draw_error, find_protocol,
 from torchgrasp.evaluation.pull import pull_grasp
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore
 from torchgrasp.hand.hand import Hand, HandSource
-from torchgrasp.hand.load import load_hand
+from torchgrasp.hand.hand_toml import Fingers
+from torchgrasp.hand.load import hand_of, load_hand
 from torchgrasp.pipeline.grasps import plan_grasps
 from torchgrasp.pipeline.provenance import digest
 from torchgrasp.sim.convex_parts import convex_parts
@@ -50,7 +51,8 @@ class EvaluationSpec(Value):
 
     `complete` plans on whole clouds with normals, as if the shape were known. `only` names objects; (): all. `planned`
     takes the grasps that an earlier call left in its folder. `starts` are those of the contact planner. `perturb` names
-    what the robot does not know (`PERTURBATIONS`). At most `views` of each object are taken; None: all.
+    what the robot does not know (`PERTURBATIONS`). At most `views` of each object are taken; None: all. `fingers` grasp
+    as in `plan_grasps`: "auto" takes the likeliest set for each view; None: the hand's own.
 
     Raises:
         BadArgument: no grasps, unknown ranks, or an unknown perturbation.
@@ -65,6 +67,7 @@ class EvaluationSpec(Value):
     seed: int = 0
     perturb: str = "none"
     views: int | None = None
+    fingers: Fingers | None = None
 
     def __post_init__(self) -> None:
         find_perturbation(self.perturb)
@@ -219,17 +222,21 @@ def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
             grasps = load_grasps(view.file)
             if (grasps.meta.get("cloud_sha256"), grasps.meta.get("hand_sha256")) != (digest(cloud), hand.source.sha256):
                 raise BadArgument("folder", f"{view.file} of another cloud or hand", "grasps of this view")
-            return dataclasses.replace(score, executable=len(grasps))
+            fingers = grasps.meta.get("finger_names", "")
+            return dataclasses.replace(score, executable=len(grasps), fingers=fingers)
         started = time.process_time()
         contacts = ContactSpec(friction=min(friction, MOST_FRICTION), table=table)
         stages: list[tuple[str, str, Any]] = []
-        grasps = plan_grasps(cloud, hand, contacts, spec.starts, spec.seed, observer=lambda *x: stages.append(x))
+        grasps = plan_grasps(
+            cloud, hand, contacts, spec.starts, spec.seed, fingers=spec.fingers, observer=lambda *x: stages.append(x)
+        )
         executable = grasps[grasps.status == Status.OK]
         starts = next(value.status for name, _, value in stages if name == "plan")
         executable.save(view.file)
         failed = count_status(grasps.status if len(grasps) else starts[starts != Status.OK])
         refusal = Status.OK if len(executable) else next(iter(failed), Status.OUT_OF_REACH)
-        score = dataclasses.replace(score, executable=len(executable), refusal=refusal)
+        fingers = grasps.meta["finger_names"]
+        score = dataclasses.replace(score, executable=len(executable), refusal=refusal, fingers=fingers)
     except MissingExtra:
         raise
     except GraspError as error:
@@ -239,7 +246,8 @@ def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
 
 def _try(view: _View, protocol: Protocol, spec: EvaluationSpec, row: int, draw: int) -> ProtocolResult:
     """Try one grasp with one draw of what the robot does not know."""
-    hand, grasp = view.load_hand(), load_grasps(view.file)[row]
+    grasp = load_grasps(view.file)[row]
+    hand = hand_of(grasp, view.load_hand())
     mesh, parts = _read_solid(view.objects, view.object)
     seed = seed_of(spec.seed, view.object, view.view, row, draw)
     perturbation = find_perturbation(spec.perturb)

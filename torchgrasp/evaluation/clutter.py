@@ -18,6 +18,7 @@ from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.placed import PlacedScene, aim, settle
 from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import hand_of
 from torchgrasp.pipeline.things import ScenePlan
 from torchgrasp.plane import Plane
 from torchgrasp.scene.scene import Scene
@@ -201,7 +202,8 @@ def clear_scene(
             reason = "; ".join(dict.fromkeys(thing.reason for thing in plan.things if thing.reason))
             break
         label, grasps = ready[0]
-        result = run_scene_trial(placed, label, grasps[0], hand, spec, seed + len(tries))
+        grasping = hand_of(grasps, hand) if grasps.meta else hand  # a planner of one's own may name no fingers
+        result = run_scene_trial(placed, label, grasps[0], grasping, spec, seed + len(tries))
         tries.append(dataclasses.replace(result, plan_seconds=seconds))
         keep = [i for i in range(len(placed)) if not (result.lifted and i == label - 1)]
         failed[left[label - 1]] += 1

@@ -17,6 +17,7 @@ from torchgrasp.evaluation.intervals import Share, count_by, share_over
 from torchgrasp.evaluation.placed import drop, object_names
 from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.hand.hand import Hand, HandSource
+from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.hand.load import load_hand
 from torchgrasp.pipeline.things import ScenePlan, plan_scene
 from torchgrasp.scene.scene import Scene
@@ -31,7 +32,8 @@ class ClutterSpec(Value):
     """What is asked in clutter: scenes of `count` objects, one grasp each, or as many as clear the table.
 
     `mask_error` grows every mask by pixels, or shrinks it if negative. `starts` are the contact planner's for each
-    object. `enough` is the predicted success from which on no further object is planned.
+    object. `enough` is the predicted success from which on no further object is planned. `fingers` is "auto" for the
+    likeliest set of fingers for each object; None: the hand's own.
     """
 
     count: tuple[int, int] = (5, 8)
@@ -41,6 +43,7 @@ class ClutterSpec(Value):
     enough: float = 0.9
     trial: TrialSpec = dataclasses.field(default_factory=TrialSpec)
     seed: int = 0
+    fingers: Fingers | None = None
 
     def __post_init__(self) -> None:
         check_whole("count", self.count[0], 1, 20)
@@ -104,7 +107,7 @@ def _try_scene(objects: Path | None, source: HandSource, spec: ClutterSpec, inde
 def _plan(scene: Scene, seed: int, hand: Hand, spec: ClutterSpec) -> ScenePlan:
     """Plan on a picture."""
     contacts = ContactSpec(friction=spec.trial.friction)
-    return plan_scene(scene, hand, contacts, spec.starts, seed, enough=spec.enough)
+    return plan_scene(scene, hand, contacts, spec.starts, seed, fingers=spec.fingers, enough=spec.enough)
 
 
 def summarise_scenes(scores: Sequence[SceneScore]) -> dict[str, Any]:

@@ -50,7 +50,7 @@ class ViewScore(Value):
     """The outcome of a view with `executable` planned grasps.
 
     Without any, `refusal` is the commonest reason; `note` may say more. `seconds` is the CPU time of planning. `family`
-    and `group` are the object's (`torchgrasp.datasets`), "" where unknown.
+    and `group` are the object's (`torchgrasp.datasets`), "" where unknown. `fingers` are those that grasp.
     """
 
     object: str
@@ -62,6 +62,7 @@ class ViewScore(Value):
     note: str = ""
     family: str = ""
     group: str = ""
+    fingers: str = ""
 
     @property
     def unit(self) -> str:
@@ -75,9 +76,10 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     "gsr" is the share of attempts that passed; views without a grasp are not in it. "top1" is that of the best-ranked
     grasps: a view without grasps fails in every draw. "objects" is the share of objects with a success. Their intervals
     are over families (`share_over`). "by_object" and "by_group" have the same of parts. "refused" counts views without
-    a grasp, "failures" the reasons of each stage. "force_n", "overlap_mm", "plan_cpu_s" (of a view) and "trial_cpu_s"
-    are means. "slip_mm" and "slip_deg" are the median and the 95 % quantile over the grasps that held. "success" judges
-    the predictions (`torchgrasp.evaluation.calibration.judge`); None without any.
+    a grasp, "failures" the reasons of each stage, "fingers" the views by the fingers that grasp. "force_n",
+    "overlap_mm", "plan_cpu_s" (of a view) and "trial_cpu_s" are means. "slip_mm" and "slip_deg" are the median and the
+    95 % quantile over the grasps that held. "success" judges the predictions
+    (`torchgrasp.evaluation.calibration.judge`); None without any.
     """
     attempts = [attempt for score in scores for attempt in score.attempts]
     spent = [*(score.seconds for score in scores), *(a.seconds for a in attempts)]
@@ -90,6 +92,7 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     return {
         **_shares(scores),
         "failures": {stage: dict(counts.most_common()) for stage, counts in reasons_of.items() if counts},
+        "fingers": dict(Counter(score.fingers for score in scores if score.executable).most_common()),
         "force_n": _mean(a.force for a in attempts),
         "overlap_mm": _mean(1e3 * a.overlap for a in attempts),
         "overlap_mm_max": max((1e3 * a.overlap for a in attempts if not math.isnan(a.overlap)), default=None),

@@ -1,6 +1,8 @@
 """Which thing of a scene to take first: the things ranked by their best grasps, with reasons for those without."""
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -8,7 +10,9 @@ import numpy as np
 from torchgrasp.base import Value, check_number, count_status
 from torchgrasp.errors import BadArgument, GraspError, Status
 from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.ik.candidates import Reachable
+from torchgrasp.pipeline.fingers import finger_sets
 from torchgrasp.pipeline.grasps import plan_grasps
 from torchgrasp.plane import upright_frame
 from torchgrasp.scene.scene import Scene
@@ -57,6 +61,7 @@ def plan_scene(
     starts: int = 1000,
     seed: int = 0,
     *,
+    fingers: Fingers | None = None,
     enough: float = 1.0,
     reachable: Reachable | None = None,
 ) -> ScenePlan:
@@ -70,6 +75,7 @@ def plan_scene(
         spec: the constraints on contacts; None: `ContactSpec()`.
         starts: random starts of the contact planner for each thing.
         seed: of every random draw.
+        fingers: see `plan_grasps`; with "auto" each thing has its own. `hand_of(grasps, hand)` has those of grasps.
         enough: predicted success of a grasp from which on no further thing is planned; 1: all are.
         reachable: see `plan_grasps`.
 
@@ -79,18 +85,20 @@ def plan_scene(
     check_number("enough", enough, 0.0, 1.0)
     if not scene.things:
         raise BadArgument("scene", "no thing on the table", "a scene with at least one thing")
+    finger_sets(hand, fingers)  # refuses unknown ones
+    plan = functools.partial(
+        plan_grasps, hand=hand, spec=spec, starts=starts, seed=seed, fingers=fingers, reachable=reachable
+    )
     plans: list[ThingPlan] = []
     for label in order_by_ease(scene):
-        if any(plan.success >= enough for plan in plans):
+        if any(thing.success >= enough for thing in plans):
             plans.append(ThingPlan(label, 0.0, reason="not tried: another thing is easy enough"))
             continue
-        plans.append(_plan_thing(dataclasses.replace(scene, target=label), hand, spec, starts, seed, reachable))
-    return ScenePlan(tuple(sorted(plans, key=lambda plan: -plan.success)))
+        plans.append(_plan_thing(dataclasses.replace(scene, target=label), plan))
+    return ScenePlan(tuple(sorted(plans, key=lambda thing: -thing.success)))
 
 
-def _plan_thing(
-    scene: Scene, hand: Hand, spec: ContactSpec | None, starts: int, seed: int, reachable: Reachable | None
-) -> ThingPlan:
+def _plan_thing(scene: Scene, plan: Callable[..., Grasps]) -> ThingPlan:
     """Plan grasps of a scene's target."""
     assert scene.target is not None
     stages: dict[str, Any] = {}
@@ -99,7 +107,7 @@ def _plan_thing(
         stages[stage] = value
 
     try:
-        grasps = plan_grasps(scene, hand, spec, starts, seed, observer=note, reachable=reachable)
+        grasps = plan(scene, observer=note)
     except GraspError as error:
         return ThingPlan(scene.target, 0.0, reason=str(error))
     good = grasps[grasps.status == Status.OK]
