@@ -1,5 +1,6 @@
 """Ranking: order within groups, the geometric score, and which way each feature of the model of success counts."""
 
+import dataclasses
 import itertools
 import math
 
@@ -7,10 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from torchgrasp.frames import apply, rigid, rotation_from_vector
+from tests.pinch import pinch
+from torchgrasp.frames import apply, inverse, rigid, rotate, rotation_from_vector
 from torchgrasp.ik.ranking import (
     FEATURES,
     centred_friction,
+    finger_levers,
     load_arm,
     rank_in_group,
     score,
@@ -24,7 +27,8 @@ from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts, PointCloud
 
 PADS = torch.tensor([[0.1, 0.3, 0.2]], dtype=torch.float64)
-GOOD = torch.tensor([[4.0, 0.3, -1.0]])
+GOOD = torch.tensor([[4.0, 0.3, -1.0, -0.2]])
+WORSE = {"log-odds of closure": -2.0, "log of the stiffest finger's lever over 70 mm, at most": -0.5}
 RADIUS = 0.04
 
 
@@ -76,7 +80,7 @@ def test_central_untilted_grasps_rank_first():
 @pytest.mark.parametrize("hand", ["allegro", "barrett"])
 def test_every_feature_counts_the_way_it_should(name, hand):
     changed = GOOD.clone()
-    changed[0, FEATURES.index(name)] += -2.0 if name == "log-odds of closure" else 0.5
+    changed[0, FEATURES.index(name)] += WORSE.get(name, 0.5)
     assert float(success_log_odds(changed, hand) - success_log_odds(GOOD, hand)) < -0.1
 
 
@@ -100,9 +104,42 @@ def around(height=0.0):
     return Contacts(points[None], unit(points)[None])
 
 
+def held(contacts, hand_from_obj=None):
+    """The Allegro hand's pinch of other contacts, as if it reached them, in another frame of the object."""
+    hand, grasp = pinch("allegro")
+    pose = grasp.obj_from_hand if hand_from_obj is None else hand_from_obj @ grasp.obj_from_hand
+    rows = grasp[torch.zeros(len(contacts), dtype=torch.int64)]
+    return hand, dataclasses.replace(rows, contacts=contacts, obj_from_hand=pose.expand(len(contacts), 4, 4))
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett"])
+def test_equal_springs_in_all_joints_yield_by_the_square_of_the_lever(name):
+    hand, grasp = pinch(name)
+    points = apply(inverse(grasp.obj_from_hand), grasp.contacts.points)[0]
+    normals = rotate(inverse(grasp.obj_from_hand), grasp.contacts.normals)[0]
+    levers, step = finger_levers(hand, grasp)[0], 1e-6
+    rest = hand.link_poses(grasp.joints)[0, hand.tips.index]
+    local = (rest[:, :3, :3].mT @ (points - rest[:, :3, 3])[..., None])[..., 0]
+
+    def pushed(joints):
+        """How far [m] the touching points of the tips are along the normals."""
+        poses = hand.link_poses(joints[None])[0, hand.tips.index]
+        return (((poses[:, :3, :3] @ local[..., None])[..., 0] + poses[:, :3, 3]) * normals).sum(-1)
+
+    moves = torch.stack(
+        [(pushed(grasp.joints[0] + d) - pushed(grasp.joints[0] - d)) / (2 * step) for d in step * torch.eye(hand.dof)],
+        1,
+    )
+    stiffness = hand.actuated.coupling.T @ hand.actuated.coupling  # of unit springs in every joint of the URDF
+    for finger, move in enumerate(moves):
+        yielding = torch.linalg.solve(stiffness, move)  # least energy: stiffness @ yielding = torque of a unit force
+        assert float(move @ yielding) == pytest.approx(float(levers[finger]) ** 2, rel=1e-6)
+
+
 def test_features_of_a_ball_by_hand(ball):
     contacts, center = around(0.01), torch.tensor([0.0, 0.0, -0.02], dtype=torch.float64)
-    closure, least, arm = success_features(ball, contacts, center, 0.5, seed=3)[0].tolist()
+    hand, grasp = held(contacts)
+    closure, least, arm, lever = success_features(hand, ball, grasp, center, 0.5, seed=3)[0].tolist()
     cone = math.atan(0.5)
     closed = closure_probability(ball, contacts, ContactSpec(friction=0.5), n=600, seed=3).probability
     assert closure == pytest.approx(float(torch.logit(closed, eps=1e-3)))
@@ -111,6 +148,7 @@ def test_features_of_a_ball_by_hand(ball):
     gaps = [np.linalg.norm(np.cross(p[2] - p[1], x - p[1])) for x in (center.numpy(), p[0])]
     gaps = [gap / np.linalg.norm(p[2] - p[1]) for gap in gaps]
     assert arm == pytest.approx(math.log(gaps[0] / (gaps[1] + 0.01) + 0.1))
+    assert lever == pytest.approx(math.log((min(float(finger_levers(hand, grasp).min()), 0.07) + 0.01) / 0.08))
 
 
 def test_the_arm_of_a_load_is_about_the_longest_side_and_no_frame_or_order_matters(generator):
@@ -133,19 +171,22 @@ def test_features_do_not_depend_on_the_frame_and_rows_do_not_on_each_other(ball)
     moved_from_obj = rigid(turn, torch.tensor([0.3, -0.1, 0.2], dtype=torch.float64))
     center = torch.tensor([0.0, 0.01, 0.0], dtype=torch.float64)
     both = Contacts(*(torch.cat([x, y]) for x, y in zip(tensors(around(0.01)), tensors(around(-0.02)), strict=True)))
-    here = success_features(ball, both, center, 0.6)
+    hand, grasps = held(both)
+    here = success_features(hand, ball, grasps, center, 0.6)
     there = Contacts(apply(moved_from_obj, both.points), both.normals @ turn.T)
-    again = success_features(ball.moved(moved_from_obj), there, apply(moved_from_obj, center[None])[0], 0.6)
+    moved, at = held(there, moved_from_obj)[1], apply(moved_from_obj, center[None])[0]
+    again = success_features(hand, ball.moved(moved_from_obj), moved, at, 0.6)
     torch.testing.assert_close(again[:, 1:], here[:, 1:], atol=1e-3, rtol=0)
     torch.testing.assert_close(torch.sigmoid(again[:, 0]), torch.sigmoid(here[:, 0]), atol=0.06, rtol=0)  # other draws
-    torch.testing.assert_close(success_features(ball, both[1:], center, 0.6), here[1:], atol=1e-9, rtol=0)
-    assert success_features(ball, both[:0], center, 0.6).shape == (0, len(FEATURES))
+    torch.testing.assert_close(success_features(hand, ball, grasps[1:], center, 0.6), here[1:], atol=1e-9, rtol=0)
+    assert success_features(hand, ball, grasps[:0], center, 0.6).shape == (0, len(FEATURES))
 
 
 def test_contacts_that_nothing_balances_have_finite_features(ball):
     one_side = around(0.01)
     alike = Contacts(one_side.points, one_side.normals[:, :1].expand(1, 3, 3).contiguous())
-    features = success_features(ball, alike, torch.zeros(3, dtype=torch.float64), 0.5)
+    hand, grasp = held(alike)
+    features = success_features(hand, ball, grasp, torch.zeros(3, dtype=torch.float64), 0.5)
     assert bool(torch.isfinite(features).all())
     assert float(features[0, 1]) == pytest.approx(math.pi / 2 / math.atan(0.5))
 

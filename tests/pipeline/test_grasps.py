@@ -100,7 +100,7 @@ def test_success_is_what_the_model_says_of_the_surface_that_was_planned_on(run):
     best = move(grasps[grasps.status == Status.OK][:5], upright_from_obj)
     shape = stages["shape"].moved(upright_from_obj)
     center = extract_surface(shape).vertices.mean(0)
-    features = success_features(shape, best.contacts, center, SPEC.friction, seed=1)
+    features = success_features(hand, shape, best, center, SPEC.friction, seed=1)
     model = json.loads(MODEL.read_text())
     odds = features @ torch.tensor([model["weights"][name] for name in FEATURES], dtype=features.dtype)
     torch.testing.assert_close(best.success, 1 / (1 + (-odds - model["bias"][hand.name]).exp()), rtol=1e-6, atol=1e-6)

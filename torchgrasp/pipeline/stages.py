@@ -143,7 +143,7 @@ class Bench:
         """Return grasps in the order of the task's ranking, scored by the log-odds of success."""
         task, good = self.task, solved[solved.status == Status.OK]
         center = self.surface.vertices.mean(0)
-        features = success_features(task.shape, good.contacts, center, self.spec.friction, task.seed)
+        features = success_features(task.hand, task.shape, good, center, self.spec.friction, task.seed)
         log_odds = success_log_odds(features, task.hand.name)
         if self.obstacles is not None:
             free = 1 - collision_probability(task.hand, good, self.obstacles).to(log_odds)

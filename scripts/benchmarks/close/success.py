@@ -171,12 +171,12 @@ def describe_trials(source: Path, name: str, hand: str, grasps: int, folder: Pat
         return []
     shape = fit_shape(read_view(source, name, rows[0]["view"]), table=0.0)
     center, family = extract_surface(shape).vertices.mean(0), read_family(source, name) or name
-    planned = load_grasps(grasps_at(source, name, hand, folder))
+    model, planned = load_hand(hand), load_grasps(grasps_at(source, name, hand, folder))
     frictions = [PROTOCOLS[TESTS[row["test"]][0]].trial.friction for row in rows]
     for friction in sorted(set(frictions)):
         mine = [row for row, own in zip(rows, frictions, strict=True) if own == friction]
-        contacts = planned.contacts[torch.tensor([row["rank"] for row in mine])]
-        features = success_features(shape, contacts, center, friction)
+        tried = planned[torch.tensor([row["rank"] for row in mine])]
+        features = success_features(model, shape, tried, center, friction)
         for row, known in zip(mine, features.tolist(), strict=True):
             row |= {"features": known, "family": family, "test": ", ".join(TESTS[row["test"]])}
     return rows
