@@ -210,6 +210,33 @@ def test_grasp_from_cloud_to_files(tmp_path, capsys):
     assert said.out.splitlines()[-1].startswith("The barrett hand has")
 
 
+def test_an_empty_result_names_what_would_help(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(grasps, "write_report", lambda path, run: path)
+    code = cli.main(
+        [
+            "grasp",
+            VIEW,
+            "--hand",
+            "barrett",
+            "--out",
+            str(tmp_path),
+            "--starts",
+            "10",
+            "--friction",
+            "0",
+            "--table",
+            "0",
+        ]
+    )
+    said = capsys.readouterr().out
+    assert code == 1
+    assert any(line.startswith("change") and "executable" in line for line in said.splitlines())
+    last = said.splitlines()[-1]
+    assert (
+        last.startswith("The barrett hand has no executable grasp") and "if the friction were 0.4 instead of 0" in last
+    )
+
+
 @pytest.mark.parametrize("words", [["cloud"], ["cloud", "--help"], ["shape", "-h"], ["cloud", "check", "--help"]])
 def test_groups_of_commands_have_help(words, capsys):
     with pytest.raises(SystemExit) as end:

@@ -6,6 +6,7 @@ from html.parser import HTMLParser
 import pytest
 
 from torchgrasp.errors import OutputError, Status
+from torchgrasp.pipeline import Explanation, Funnel, Losses, Trial
 from torchgrasp.report.page import format_page, grasp_rows, write_report
 from torchgrasp.report.run import closing_sentence, refusal, verdict
 from torchgrasp.specs import ContactSpec
@@ -88,3 +89,15 @@ def test_verdicts(run):
     assert Status.OUT_OF_REACH.sentence in refusal(dataclasses.replace(unplanned, plan=None))
     _, words = read(format_page(none, {}))
     assert "Best grasps" not in words
+
+
+def test_a_run_without_a_grasp_tells_what_would_help(run):
+    lost = Losses("contacts", "starts", 9, {Status.NOT_FLAT: 6, Status.TOO_CLOSE: 3})
+    trial = Trial("with <wider> limits", True, 4, 0.15, Funnel((dataclasses.replace(lost, lost={}),)))
+    explanation = Explanation(9, Funnel((lost,)), (trial,))
+    none = dataclasses.replace(run, closure=None, mesh=None, grasps=run.grasps[1], explanation=explanation)
+    assert verdict(none) == f"{refusal(none)} {explanation.advice}" and str(trial) in verdict(none)
+    tags, words = read(format_page(none, {}))
+    assert "wider" not in {tag for tag, _ in tags}
+    for text in ("0 of 9 starts", "6 not_flat, 3 too_close", "with <wider> limits", "15%"):
+        assert text in words

@@ -26,12 +26,13 @@ from torchgrasp.cli.common import (
 from torchgrasp.cli.progress import Progress
 from torchgrasp.cli.scene_grasps import Wanted, grasp_scene
 from torchgrasp.columns import format_columns
-from torchgrasp.errors import BadArgument, MissingExtra
+from torchgrasp.errors import BadArgument, MissingExtra, Status
 from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.files import sha256
 from torchgrasp.hand.load import hand_of
 from torchgrasp.mesh import read_mesh
 from torchgrasp.objects import DATA, MASSES, list_objects, load_object
+from torchgrasp.pipeline.explain import explain_empty
 from torchgrasp.pipeline.grasps import plan_grasps
 from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows, write_report
 from torchgrasp.report.run import Run, verdict
@@ -70,7 +71,8 @@ def grasp(
 ) -> int:
     """Plan grasps of the object in a partial cloud, and close on it in simulation; or of a thing in a scene.
 
-    Writes grasps.safetensors and report.html into the output folder. The cloud is checked as by `cloud check`. Refused
+    Writes grasps.safetensors and report.html into the output folder. Where no grasp is executable, single changes are
+    tried, and the one that helps most is named. The cloud is checked as by `cloud check`. Refused
     are: a camera below the table or that the points contradict, a plane left in, two bodies, and another unit. Other
     findings are printed as advice.
 
@@ -145,10 +147,15 @@ def grasp(
         camera = "camera known" if partial.viewpoint is not None else "camera estimated"
         progress.end("cloud", f"{len(partial)} points, {camera}, {origin}")
         grasps = plan_grasps(partial, the_hand, spec, starts, seed, fingers=among, mode=mode, observer=progress.end)
+        explanation = None
+        if not bool((grasps.status == Status.OK).any()):
+            options = {"fingers": among, "mode": mode, "observer": progress.end}
+            explanation = explain_empty(partial, the_hand, spec, starts, seed, **options)
         the_hand = hand_of(grasps, the_hand)
         surface, plan = extract_surface(progress.values["shape"]), progress.values["plan"]
         name = object_name(cloud if mesh is None else mesh)
-        run = Run(name, cloud, partial, the_hand, spec, surface, grasps, tuple(progress.stages), plan)
+        stages = tuple(progress.stages)
+        run = Run(name, cloud, partial, the_hand, spec, surface, grasps, stages, plan, explanation=explanation)
         if close and true_mesh is not None and len(run.executable):
             closure = close_hand(run.executable[0], the_hand, true_mesh, trial, seed=seed, parts=parts)
             progress.end("closing", f"{closure.time[-1]:.1f} s simulated, {closure.status.name.lower()}")

@@ -7,9 +7,11 @@ from typing import NamedTuple
 from torchgrasp.cli.common import naming
 from torchgrasp.cli.progress import Progress
 from torchgrasp.columns import format_columns, format_line
+from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.hand.load import hand_of
+from torchgrasp.pipeline.explain import explain_empty
 from torchgrasp.pipeline.grasps import plan_grasps
 from torchgrasp.pipeline.task import take_target
 from torchgrasp.pipeline.things import ThingPlan, plan_scene
@@ -47,6 +49,7 @@ def grasp_scene(path: Path, wanted: Wanted, choice: int | tuple[float, float] | 
     with naming(path="CLOUD", points="CLOUD", target="--label", point="--point", **names):
         scene = read_scene(path)
         scene = scene if choice is None else scene.select(choice)
+    explanation = None
     progress = Progress(
         "scene", *["fingers"] * (fingers == "auto"), "shape", "plan", "certify", "query", "refine", "report"
     )
@@ -60,17 +63,20 @@ def grasp_scene(path: Path, wanted: Wanted, choice: int | tuple[float, float] | 
             progress.end("things", f"{sum(thing.grasps is not None for thing in plan.things)} with a grasp")
             if plan.best is None or plan.best.grasps is None or plan.best.shape is None:
                 print(f"The {hand.name} hand has no executable grasp of any thing of the scene.")
+                print("With --label or --point, what would help most is tried for one of them.")
                 return 1
             scene = dataclasses.replace(scene, target=plan.best.label)
             grasps, shape = plan.best.grasps, plan.best.shape
         else:
             grasps = plan_grasps(scene, hand, spec, starts, seed, fingers=fingers, observer=progress.end)
             shape = progress.values["shape"]
+            if not bool((grasps.status == Status.OK).any()):
+                explanation = explain_empty(scene, hand, spec, starts, seed, fingers=fingers, observer=progress.end)
         spec, hand = dataclasses.replace(spec, table=scene.table), hand_of(grasps, hand)
         cloud, name = take_target(scene, seed), f"thing {scene.target}"
         run = Run(
             name, path, cloud, hand, spec, extract_surface(shape), grasps, tuple(progress.stages),
-            progress.values.get("plan"), scene=scene,
+            progress.values.get("plan"), scene=scene, explanation=explanation,
         )  # fmt: skip
         with naming(path="--out"):
             grasps.save(out / "grasps.safetensors")

@@ -1,10 +1,13 @@
 """The whole chain: from a partial cloud, or a scene, to ranked grasps of a hand."""
 
+from torchgrasp.pipeline.explain import Explanation, Trial, explain_empty
+from torchgrasp.pipeline.funnel import Funnel, Losses
 from torchgrasp.pipeline.grasps import describe, plan_grasps
 from torchgrasp.pipeline.stages import spread_rows
 from torchgrasp.pipeline.task import TARGET_POINTS, take_target
 from torchgrasp.pipeline.things import ScenePlan, ThingPlan, plan_scene
 
 __all__ = [
-    "TARGET_POINTS", "ScenePlan", "ThingPlan", "describe", "plan_grasps", "plan_scene", "spread_rows", "take_target",
+    "TARGET_POINTS", "Explanation", "Funnel", "Losses", "ScenePlan", "ThingPlan", "Trial", "describe", "explain_empty",
+    "plan_grasps", "plan_scene", "spread_rows", "take_target",
 ]  # fmt: skip

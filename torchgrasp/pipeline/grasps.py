@@ -65,7 +65,7 @@ def plan_grasps(
         reachable: tells which poses `obj_from_hand` (k, 4, 4) an arm can reach, in the given frame; None: all.
 
     Returns:
-        Grasps, those with `Status.OK` first, best first. There may be none.
+        Grasps, those with `Status.OK` first, best first. There may be none: `explain_empty` tells why.
 
     Raises:
         BadArgument: an argument of the wrong type or range; a cloud that no object of graspable size gives; a scene

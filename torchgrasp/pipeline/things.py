@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from torchgrasp.base import Value, check_number, count_status
+from torchgrasp.base import Value, check_number
 from torchgrasp.errors import BadArgument, GraspError, Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.ik.candidates import Reachable
 from torchgrasp.pipeline.fingers import finger_sets
+from torchgrasp.pipeline.funnel import Funnel
 from torchgrasp.pipeline.grasps import plan_grasps
 from torchgrasp.plane import upright_frame
 from torchgrasp.scene.scene import Scene
@@ -113,9 +114,7 @@ def _plan_thing(scene: Scene, plan: Callable[..., Grasps]) -> ThingPlan:
     good = grasps[grasps.status == Status.OK]
     if len(good):
         return ThingPlan(scene.target, float(good.success[0]), good, shape=stages["shape"])
-    failed = count_status(grasps.status if len(grasps) else stages["plan"].status)
-    first = next((status for status in failed if status is not Status.OK), Status.OUT_OF_REACH)
-    return ThingPlan(scene.target, 0.0, reason=first.sentence)
+    return ThingPlan(scene.target, 0.0, reason=Funnel.of(stages["plan"], stages["certify"], grasps).reason.sentence)
 
 
 def order_by_ease(scene: Scene) -> list[int]:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchgrasp.base import count_status
 from torchgrasp.files import write_file
+from torchgrasp.pipeline.explain import Explanation
 from torchgrasp.report.document import escape, format_document, format_html_table
 from torchgrasp.report.palette import FINGERS
 from torchgrasp.report.pictures import (
@@ -91,6 +92,8 @@ def format_page(run: Run, pictures: dict[str, list[tuple[str, bytes]]]) -> str:
         rows = grasp_rows(run.executable)
         body.append(f"<h2>Best grasps ({len(rows)} of {len(run.executable)})</h2>")
         body.append(format_html_table(GRASP_COLUMNS, rows, numbers=range(len(GRASP_COLUMNS))))
+    if run.explanation is not None:
+        body += _explanation(run.explanation)
     if run.plan is not None:
         body += ["<h2>What became of every start</h2>", _statuses(run.plan.status)]
     if len(run.grasps):
@@ -118,6 +121,18 @@ def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
 
 GRASP_COLUMNS = ("rank", "success", "tip error mm", "clearance mm", "pad angle deg", "closure margin", "surface std mm")
 """Heads of `grasp_rows`; errors, angles and deviations are of the worst finger."""
+
+
+def _explanation(explanation: Explanation) -> list[str]:
+    """Return where grasps were lost, and what each change gave."""
+    lost = [(x.stage, f"{x.kept} of {x.given} {x.things}", x.reasons) for x in explanation.funnel.stages if x.given]
+    tried = [(t.words, str(t.executable), f"{t.expected:.0%}") for t in explanation.trials]
+    return [
+        f"<h2>Where {explanation.starts} starts end</h2>",
+        format_html_table(("stage", "kept", "lost"), lost),
+        "<h2>What would help, by trial</h2>",
+        format_html_table(("change", "executable grasps", "expected success of the best"), tried, numbers={1, 2}),
+    ]
 
 
 def _statuses(status: Int[Tensor, "b"]) -> str:

@@ -12,6 +12,7 @@ from torchgrasp.closing import ClosureResult
 from torchgrasp.errors import Status
 from torchgrasp.frames import inverse
 from torchgrasp.hand.hand import Hand
+from torchgrasp.pipeline.explain import Explanation
 from torchgrasp.plane import move, upright_frame
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.surface import Surface
@@ -34,7 +35,7 @@ class Stage(NamedTuple):
 class Run:
     """Everything that a report shows; `closure` is that on the true `mesh`, or both are None.
 
-    The cloud is that of the target of `scene`, if there is one.
+    The cloud is that of the target of `scene`, if there is one. `explanation` tells why no grasp is executable.
     """
 
     object_name: str
@@ -49,6 +50,7 @@ class Run:
     mesh: "trimesh.Trimesh | None" = None
     closure: ClosureResult | None = None
     scene: Scene | None = None
+    explanation: Explanation | None = None
 
     @property
     def executable(self) -> Grasps:
@@ -82,7 +84,7 @@ def verdict(run: Run) -> str:
         return closing_sentence(run)
     if count := len(run.executable):
         return f"The {run.hand.name} hand has {count} executable grasp{'s' * (count > 1)} of the {run.object_name}."
-    return refusal(run)
+    return refusal(run) + ("" if run.explanation is None else f" {run.explanation.advice}")
 
 
 def closing_sentence(run: Run) -> str:
