@@ -1,8 +1,12 @@
 """What README, guides and examples show runs; commands exist and take their flags."""
 
+import json
+import os
 import re
 import runpy
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -20,6 +24,30 @@ def fenced(language, text=README):
 def test_python_of_the_readme_and_the_guides_runs(code, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "README.md", "exec"), {})
+
+
+@pytest.mark.slow
+@pytest.mark.sim
+def test_the_guide_to_hands_runs_as_it_stands(tmp_path):
+    """In a shell and an empty folder: a draft, its check, a mend by hand, a held object, a file for the robot."""
+    pytest.importorskip("sapien")
+    tools, guide = tmp_path / "tools", (ROOT / "docs" / "hands.md").read_text()
+    tools.mkdir()
+    command = '-c "import sys; from torchgrasp.cli import main; sys.exit(main())"'
+    for name, words in (("python", ""), ("torchgrasp", command)):
+        (tools / name).write_text(f'#!/bin/sh\nexec "{sys.executable}" {words} "$@"\n')
+        (tools / name).chmod(0o755)
+    places = {"PATH": f"{tools}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    lines, empty = "\n".join(fenced("bash", guide)), tmp_path / "empty"
+    empty.mkdir()
+    done = subprocess.run(
+        ["bash", "-euo", "pipefail"], input=lines, cwd=empty, env=os.environ | places, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("the hand can grasp") == 2 and "The leap hand held the cylinder" in done.stdout
+    assert "wrong:" not in done.stdout and "doubtful:" not in done.stdout
+    grasps = json.loads((empty / "grasps.json").read_text())["grasps"]
+    assert grasps and {contact["finger"] for contact in grasps[0]["contacts"]} == {"index", "ring", "thumb"}
 
 
 def test_first_example_is_short():

@@ -37,6 +37,7 @@ def copy_of(name: str, tmp_path: Path, file: str, old: str, new: str) -> Path:
         ("barrett", "hand.toml", "ratio = 0.3333333333333333", "ratio = 0.3443", "coupling"),
         ("allegro", "hand.toml", "[0.01039230485, 0, 0.006]", "[-0.01039230485, 0, -0.006]", "center"),
         ("barrett", "hand.toml", '["f3_flex", "f3_distal"]', '["f3_distal", "f3_flex"]', "in order"),
+        ("leap", "hand.toml", '"10" = -0.2', '"10" = -0.5', r"meet in all .* as ring_\w+ and ring_"),
     ],
 )
 def test_broken_hands_are_told_why(tmp_path, name, file, old, new, match):

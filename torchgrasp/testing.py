@@ -42,8 +42,11 @@ def check_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
         raise fault
     joints = random_joints(hand, FK_POSTURES)
     if not bool((hand.self_clearance(joints) > 0).any()):
-        found = f"{find_hand(name_or_path)}: links that meet in all of {FK_POSTURES} random postures"
-        raise HandFileError("hand.toml", found, "pairs of self_collision that can part")
+        one, two = most_met(hand, joints)
+        found = (
+            f"{find_hand(name_or_path)}: links that meet in all of {FK_POSTURES} random postures, as {one} and {two}"
+        )
+        raise HandFileError("hand.toml", found, "parked joints, shapes or pairs of self_collision by which they part")
     worst, link = largest_fk_error(hand, joints)
     if not worst < FK_TOLERANCE:
         raise AssertionError(f"{hand.name}: link {link} differs by {worst:.3g} from others' pose")
@@ -63,6 +66,14 @@ def random_joints(hand: Hand, n: int, seed: int = 0) -> Float[Tensor, "n h"]:
     """Draw postures uniformly within the limits [rad]."""
     share = torch.rand(n, hand.dof, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     return hand.lower + (hand.upper - hand.lower) * share
+
+
+def most_met(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[str, str]:
+    """Return the links that overlap in most of some postures."""
+    apart = hand.self_collision.separations(hand.tree.frames(hand.expand_joints(joints).T.contiguous()), 0.0)
+    links = hand.self_collision.link[hand.self_collision.pairs[int((apart < 0).sum(1).argmax())]]
+    one, two = (hand.tree.link_names[int(k)] for k in links)
+    return one, two
 
 
 def _wrong_bodies(urdf: Urdf) -> Iterator[HandFileError]:

@@ -19,7 +19,7 @@ from torchgrasp.pipeline.fingers import finger_sets
 from torchgrasp.pipeline.grasps import plan_grasps
 from torchgrasp.posture_model.touch import can_close
 from torchgrasp.report.hands import draw_hand, opposed_posture
-from torchgrasp.testing import check_hand, find_faults, random_joints
+from torchgrasp.testing import check_hand, find_faults, most_met, random_joints
 
 FREE, FACING, CLOSING = 0.2, 0.02, 0.001
 """Shares of random postures below which three fingers are doubtful; sound public hands have 0.27, 0.05 and 0.004. Of
@@ -89,9 +89,7 @@ def find_doubts(hand: Hand, joints: torch.Tensor) -> list[str]:
     doubts, free, named = [], hand.self_clearance(joints) > 0, f"[options.{hand.source.option}]"
     share = float(free.double().mean())
     if share < FREE ** (len(hand.tips) / 3):
-        met = hand.self_collision.separations(hand.tree.frames(hand.expand_joints(joints[:500]).T.contiguous()), 0.0)
-        links = hand.self_collision.link[hand.self_collision.pairs[int((met < 0).sum(1).argmax())]]
-        one, two = (hand.tree.link_names[int(k)] for k in links)
+        one, two = most_met(hand, joints[:500])
         doubts.append(
             f"only {share:.0%} of random postures are free, most often {one} meets {two}: if that cannot be, make "
             "their collision shapes smaller, or take the pair out of [self_collision]"

@@ -59,7 +59,10 @@ def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
     Raises:
         HandFileError: the name is that of no file in the folder, or of one that is no mesh or too large.
     """
-    base, allowed = folder.resolve(), f"a {', '.join(MESH_KINDS)} of at most {MAX_MESH >> 20} MiB inside {folder}"
+    base, allowed = (
+        folder.resolve(),
+        f"a {', '.join(MESH_KINDS)} (export others) of at most {MAX_MESH >> 20} MiB inside {folder}",
+    )
     refusal = urdf.wrong(f"mesh {name[:80]!r}", allowed)
     package = name.startswith("package://")
     path = PurePosixPath(name.removeprefix("package://"))
