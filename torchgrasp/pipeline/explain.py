@@ -21,8 +21,8 @@ TRIAL_STARTS = 100
 MOST_TRIALS = 8
 """Changes that are tried at most, those that prevent most losses first."""
 BESIDE, RELEVANT = 0.2, 0.25
-"""Weight of what a stage lost for other reasons than a change prevents, since a row is named by one of the constraints
-that it fails; and the share of the greatest sum of weights with which a change is tried."""
+"""Weight of what a stage lost for other reasons than a change prevents: a row names one of the constraints it fails.
+And the share of the greatest sum of weights from which on a change is tried."""
 SOLVED = 0.8
 """Expected success (`expected_success`) with which a change leaves little for others to add."""
 
@@ -90,10 +90,10 @@ def explain_empty(
 ) -> Explanation:
     """Tell why `plan_grasps` found no executable grasp, and which single change would give some.
 
-    Each change is planned with, at the same seed: other fingers of the hand, another shipped hand, wider limits of
-    contacts, higher friction, no table, no neighbours, a free arm; where none of them helps, more starts. Eight changes
-    are tried at most, with 100 starts each, those first that prevent most of what was lost. The rest is left out once
-    the 20 best grasps of a change that the user can choose are likely to succeed.
+    Single changes are planned with at the same seed: other fingers, another shipped hand, wider limits of contacts,
+    higher friction, no table, no neighbours, a free arm. Where none of them helps, more starts are. Eight changes are
+    tried at most, with 100 starts each, those first that prevent most of what was lost. The rest is left out once the
+    20 best grasps of a change that the user can choose are likely to succeed.
 
     Args:
         cloud, hand, spec, starts, seed: as of `plan_grasps`.
