@@ -8,7 +8,7 @@ import torch
 from tests.half_ball import RADIUS, contacts_on
 from torchgrasp.linalg import unit
 from torchgrasp.plan.line_posterior import FOOTPRINT, NODES, first_contact, grid, line_posterior
-from torchgrasp.shape.joint_posterior import distance_covariance
+from torchgrasp.shape.joint_posterior import combined_covariance, distance_covariance
 
 
 def test_a_finger_stops_where_the_drawn_distance_turns_negative_nearest_to_its_contact(doubtful, generator):
@@ -54,6 +54,14 @@ def test_the_posterior_on_the_lines_is_that_of_distance_and_normal(doubtful, gen
             torch.testing.assert_close(deviation[b, i, k, 0, i, k, 0], variance, rtol=1e-6, atol=1e-12)
             held += 1
     assert 20 < held < 45  # outside the domain deviations are those at its edge
+
+
+def test_the_covariance_of_sums_is_that_of_the_distances_between_their_weights(doubtful, generator):
+    x = unit(torch.randn(3, 2, 4, 3, generator=generator, dtype=torch.float64))
+    weights = torch.randn(3, 2, 2, 4, generator=generator, dtype=torch.float64)
+    whole = torch.stack([torch.block_diag(*blocks) for blocks in weights])
+    expected = whole @ distance_covariance(doubtful, x.flatten(1, 2)) @ whole.mT
+    torch.testing.assert_close(combined_covariance(doubtful, x, weights), expected, rtol=0, atol=1e-9)
 
 
 def test_covariances_of_distances_are_those_of_the_joint_posterior(doubtful, generator):

@@ -123,6 +123,7 @@ def test_mean_and_gradient_without_variances_equal_the_jet():
     jet = shape.jet(x)
     torch.testing.assert_close(distance, jet.distance, rtol=0, atol=1e-9)
     torch.testing.assert_close(gradient, jet.gradient, rtol=0, atol=1e-9)
+    torch.testing.assert_close(shape.mean_jet(x).hessian, jet.hessian, rtol=0, atol=1e-9)
     assert torch.isfinite(shape.mean_and_gradient(shape.x)[1]).all()
 
 

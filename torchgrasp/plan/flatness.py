@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchgrasp.base import Batch
 from torchgrasp.linalg import unit
-from torchgrasp.plan.problem import Shape, triple_jet, walls_of
+from torchgrasp.plan.problem import Shape, triple_mean_jet, walls_of
 from torchgrasp.plan.solver import project
 from torchgrasp.plan.wrench import Vectors, cone_edges, tangents
 
@@ -89,14 +89,14 @@ def flatness_constraint(shape: Shape, points: Vectors, flatness: float, radius: 
 
 def _wall_constraint(shape: Shape, points: Vectors, flatness: float, radius: float) -> FlatnessConstraint:
     """Return the same of one surface."""
-    jet, radius = triple_jet(shape, points), radius / float(shape.scale)
+    jet, radius = triple_mean_jet(shape, points), radius / float(shape.scale)
     identity = torch.eye(3, dtype=points.dtype, device=points.device)
     around = ring_directions(jet.normals, points, GUIDING_POINTS).transpose(1, 2)
     normal, normal_jacobian = jet.normals[:, None], jet.normal_jacobian[:, None]
     ring = points[:, None] + radius * around  # (b, k, f, 3)
     # The ring turns with the normal at its centre.
     ring_by_point = identity - radius * normal[..., :, None] * (around[..., None, :] @ normal_jacobian)
-    there = triple_jet(shape, ring.flatten(0, 1))
+    there = triple_mean_jet(shape, ring.flatten(0, 1))
     difference = there.normals.view_as(ring) - normal
     chord = torch.linalg.vector_norm(difference, dim=-1)
     direction = difference / torch.where(chord == 0, 1.0, chord)[..., None]

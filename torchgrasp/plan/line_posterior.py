@@ -23,7 +23,7 @@ from torchgrasp.linalg import unit
 from torchgrasp.plan.certify import check_contacts, check_unit
 from torchgrasp.plan.wrench import Vectors, tangents
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.joint_posterior import distance_covariance, symmetric_root
+from torchgrasp.shape.joint_posterior import combined_covariance, symmetric_root
 from torchgrasp.shape.normal_band import FOOTPRINT
 from torchgrasp.shape.posterior import surface_deviation
 from torchgrasp.values import Contacts
@@ -146,7 +146,7 @@ def node_covariance(
 
     Nodes outside the domain take the covariance at its edge.
     """
-    width, f = FOOTPRINT / shape.scale, points.shape[1]
+    width = FOOTPRINT / shape.scale
     along = (points * normals).sum(-1)
     half_chord = (along**2 + (shape.domain_radius - width) ** 2 - (points**2).sum(-1)).sqrt()
     nodes = torch.maximum(torch.minimum(nodes, (half_chord - along)[..., None]), -(half_chord + along)[..., None])
@@ -158,9 +158,7 @@ def node_covariance(
     weights = points.new_zeros(*points.shape[:2], 4, 7)
     weights[..., 0, 0] = 1.0
     weights[..., 1:, 1:] = torch.cat([axes, -axes], 2).mT / (2 * width)
-    values = distance_covariance(shape, queries.flatten(1, 3)).unflatten(2, (f, -1, 7)).unflatten(1, (f, -1, 7))
-    half = torch.einsum("bimp,bikpjlq->bikmjlq", weights, values)
-    return torch.einsum("bikmjlq,bjnq->bikmjln", half, weights).flatten(4).flatten(1, 3)
+    return combined_covariance(shape, queries.flatten(1, 2), weights.repeat_interleave(len(NODES), 1))
 
 
 def first_contact(

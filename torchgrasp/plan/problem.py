@@ -21,7 +21,7 @@ from torch import Tensor
 from torchgrasp.base import Batch, map_tensors
 from torchgrasp.plan.wrench import Vectors
 from torchgrasp.plane import Plane
-from torchgrasp.shape.posterior import SurfaceJet
+from torchgrasp.shape.posterior import MeanJet, SurfaceJet
 from torchgrasp.specs import ContactSpec
 
 INSIDE = 0.99
@@ -61,6 +61,17 @@ def walls_of(shape: Shape) -> tuple[Shape, ...]:
 def triple_jet(shape: Shape, points: Vectors) -> SurfaceJet:
     """Evaluate the shape at all points of all rows."""
     return map_tensors(lambda x: x.unflatten(0, points.shape[:2]), shape.jet(points.flatten(0, 1)))
+
+
+def triple_mean_jet(shape: Shape, points: Vectors) -> MeanJet:
+    """Evaluate the mean alone at all points of all rows, where the shape has a cheaper `mean_jet`."""
+    jet = getattr(shape, "mean_jet", shape.jet)(points.flatten(0, 1))
+    return MeanJet(*(x.unflatten(0, points.shape[:2]) for x in (jet.distance, jet.gradient, jet.hessian)))
+
+
+def with_variance(jet: MeanJet, variance: Float[Tensor, "b f"], gradient: Float[Tensor, "b f 3"]) -> SurfaceJet:
+    """Return the mean's derivatives with a variance that was found elsewhere."""
+    return SurfaceJet(jet.distance, jet.gradient, jet.hessian, variance, gradient)
 
 
 @functools.cache

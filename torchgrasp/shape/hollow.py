@@ -12,7 +12,7 @@ from torch import Tensor
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.joint_posterior import JointEstimate
 from torchgrasp.shape.observations import Observations
-from torchgrasp.shape.posterior import SurfaceJet
+from torchgrasp.shape.posterior import MeanJet, SurfaceJet
 from torchgrasp.values import PointCloud
 
 
@@ -66,13 +66,11 @@ class HollowShape(ShapeGP):
 
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
         """Return mean and variance with derivatives at normalised points."""
-        names = [f.name for f in dataclasses.fields(SurfaceJet)]
+        return SurfaceJet(*self._by_wall(x, lambda wall, own: _fields(wall.jet(own))))
 
-        def evaluate(wall: ShapeGP, own: Tensor) -> tuple[Tensor, ...]:
-            jet = wall.jet(own)
-            return tuple(getattr(jet, name) for name in names)
-
-        return SurfaceJet(*self._by_wall(x, evaluate))
+    def mean_jet(self, x: Float[Tensor, "q 3"]) -> MeanJet:
+        """Return the mean with its derivatives at normalised points."""
+        return MeanJet(*self._by_wall(x, lambda wall, own: _fields(wall.mean_jet(own))))
 
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
         """Return the joint posterior of (d, w) at normalised points."""
@@ -105,3 +103,8 @@ class HollowShape(ShapeGP):
             for whole, rows in zip(found, part, strict=True):
                 whole[own] = rows
         return found
+
+
+def _fields(jet: MeanJet) -> tuple[Tensor, ...]:
+    """Return the fields in their order."""
+    return tuple(getattr(jet, f.name) for f in dataclasses.fields(jet))

@@ -40,12 +40,21 @@ def joint_estimate(posterior: Posterior, x: Float[Tensor, "k 3"]) -> JointEstima
 
 def distance_covariance(posterior: Posterior, x: Float[Tensor, "b k 3"]) -> Float[Tensor, "b k k"]:
     """Return the covariance of the distances within sets of normalised points, Eq. (8)."""
-    b, k = x.shape[:2]
-    cross = posterior.cross(x.flatten(0, 1))[0]
-    whitened = torch.linalg.solve_triangular(posterior.factor, posterior.ordered(cross.T), upper=False)
-    whitened = whitened.T.reshape(b, k, len(posterior.factor))
-    prior = posterior.kernel.profile(torch.linalg.vector_norm(x[:, :, None] - x[:, None], dim=-1))
-    return prior - whitened @ whitened.mT
+    return combined_covariance(posterior, x[:, :, None], x.new_ones(1, 1, 1, 1))
+
+
+def combined_covariance(
+    posterior: Posterior, x: Float[Tensor, "b g p 3"], weights: Float[Tensor, "#b #g m p"]
+) -> Float[Tensor, "b v v"]:
+    """Return the covariance, within sets, of m weighted sums of the distances of each group of p points: v = g m."""
+    (b, g, p), rows = x.shape[:3], len(posterior.factor)
+    v, points = g * weights.shape[2], x.flatten(1, 2)
+    cross = posterior.distance_rows(points.flatten(0, 1)).view(b, g, p, rows)
+    whitened = posterior.whiten((weights @ cross).view(b * v, rows)).view(b, v, rows)  # the sums: they are fewer
+    prior = posterior.kernel.profile(torch.linalg.vector_norm(points[:, :, None] - points[:, None], dim=-1))
+    prior = weights @ prior.view(b, g, p, g * p)  # (b, g, m, g p)
+    prior = weights @ prior.view(b, v, g, p).permute(0, 2, 3, 1)  # (b, g, m, v)
+    return torch.baddbmm(prior.reshape(b, v, v), whitened, whitened.mT, alpha=-1.0)
 
 
 def symmetric_root(covariance: Float[Tensor, "*b k k"], prior: float, remedy: str) -> Float[Tensor, "*b k k"]:

@@ -85,9 +85,8 @@ def _extract_wall(whole: ShapeGP, number: int, resolution: int) -> Surface:
     x = torch.from_numpy(corners[used].astype(np.float64) - radius).to(device)
     faces = torch.from_numpy(faces.reshape(-1, 3).astype(np.int64)).to(device)
     for _ in range(NEWTON_STEPS):
-        jet = shape.jet(x)
-        move = newton_step(jet.distance, jet.gradient, jet.gradient, LEAST_SLOPE)[:, None] * jet.gradient
-        x = x + limit_norm(move, step)
+        value, gradient = shape.mean_and_gradient(x)
+        x = x + limit_norm(newton_step(value, gradient, gradient, LEAST_SLOPE)[:, None] * gradient, step)
     if others:
         value = torch.stack([wall.mean(x) for wall in others]).amax(0)
         vertices, triangles, _ = clip_mesh(x.cpu().numpy(), faces.cpu().numpy(), value.cpu().numpy())
