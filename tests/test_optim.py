@@ -26,7 +26,7 @@ def rosenbrock(state: Point, rows: Tensor) -> Residuals:
 
 def solve(start: Tensor, residuals=rosenbrock, steps: int = 200, solved: float = 1e-20) -> Tensor:
     problem = LeastSquares(residuals, lambda state, x: Point(state.x + x), solved)
-    return levenberg_marquardt(problem, Point(start), steps).x
+    return levenberg_marquardt(problem, Point(start), steps)[0].x
 
 
 def starts(generator: torch.Generator, count: int = 20) -> Tensor:

@@ -67,25 +67,26 @@ class Problem(abc.ABC, Generic[State, Model]):
         return model
 
 
-def levenberg_marquardt(problem: Problem[State, Model], state: State, steps: int) -> State:
-    """Lower the cost of every row by damped Gauss-Newton steps of one evaluation each."""
+def levenberg_marquardt(problem: Problem[State, Model], state: State, steps: int) -> tuple[State, Float[Tensor, "b"]]:
+    """Lower the cost of every row by damped Gauss-Newton steps of one evaluation each; return states and costs."""
     whole, rows = state, torch.arange(len(state))
     model = problem.linearise(state, rows)
+    costs = model.cost
     rows, damping = rows.to(model.cost.device), torch.full_like(model.cost, problem.first_damping)
     for _ in range(steps):
         x, taken = problem.step(model, damping)
         left = torch.nonzero(taken)[:, 0]  # the only wait for the device in a step
         if len(left) < len(taken):
-            whole = put(whole, rows, state)
+            whole, costs = put(whole, rows, state), costs.index_copy(0, rows, model.cost)
             if not len(left):
-                return whole
+                return whole, costs
             rows, state, model, x, damping = rows[left], state[left], model[left], x[left], damping[left]
         trial_state = problem.move(state, x)
         trial = problem.linearise(trial_state, rows)
         accepted, damping = problem.judge(model, trial, x, damping)
         state = pick(accepted, trial_state, state)
         model = pick(accepted, trial, problem.refuse(model, trial))
-    return put(whole, rows, state)
+    return put(whole, rows, state), costs.index_copy(0, rows, model.cost)
 
 
 Residuals = tuple[Float[Tensor, "g m"], Float[Tensor, "g m d"]]

@@ -17,6 +17,7 @@ from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
 from torchgrasp.ik.rounds import assign
 from torchgrasp.ik.sdf import field_from_surface
 from torchgrasp.plan.flatness import flatness_constraint
+from torchgrasp.plan.problem import triple_jet
 from torchgrasp.plan.solver import normalise_tensions
 from torchgrasp.shape.surface import extract_surface
 
@@ -65,7 +66,8 @@ def test_jacobian_of_the_joint_problem_against_finite_differences(scene, generat
         rest = [*range(4 * f), *range(links.stop, residual.shape[1])]
         return residual[:, rest], jacobian[:, rest]
 
-    state = JointState(posture, points, tension)
+    jet = triple_jet(shape, points)
+    state = JointState(posture, points, tension, jet.variance, jet.variance_gradient)
     jacobian = rows(state)[1]
     assert int((jacobian != 0).any(2).any(0).sum()) >= 4 * f + f + 2 * f + 4 * f  # all but ball, sides and table
     for k in range(jacobian.shape[2]):
@@ -76,6 +78,20 @@ def test_jacobian_of_the_joint_problem_against_finite_differences(scene, generat
         slope = (above - below) / 6e-5
         # the variance has the fewest digits
         torch.testing.assert_close(jacobian[..., k][smooth], slope[smooth], rtol=1e-4, atol=0.2)
+
+
+def test_hands_that_cannot_reach_are_given_up_and_the_others_named(scene):
+    given, seeds, shape, spec = scene
+    seeds = seeds[:16]
+    far = torch.arange(16) % 2 == 0
+    pose = seeds.obj_from_hand.clone()
+    pose[far, 0, 3] += 5.0  # steps are short: no hand comes back from there
+    start = Configuration(seeds.joints, pose)
+    points = shape.normalise(assign(given.contacts, seeds).points)
+    configuration, _, rows = JointProblem(given.hand, shape, spec, given.world).solve(start, points)
+    assert len(rows) > 0 and not bool(far[rows].any()) and len(configuration) == len(rows)
+    moved = torch.linalg.vector_norm(configuration.obj_from_hand[:, :3, 3] - pose[rows, :3, 3], dim=-1)
+    assert float(moved.max()) < 0.2
 
 
 def test_grasps_satisfy_every_constraint(scene, grasps):

@@ -34,13 +34,17 @@ class Attempts(Generic[Result]):
         self.rows.append(row)
         self.unsolved = self.unsolved.index_fill(0, row[self.solves(results)], False)
 
+    def choose(self, seeds: IKSeeds, rank: Int[Tensor, "g"], first: int, count: int) -> IKSeeds:
+        """Return `count` seeds of each unsolved triple, from the one of rank `first` on."""
+        return seeds[(rank >= first) & (rank < first + count) & self.unsolved[seeds.row]]
+
     def refine(
         self, seeds: IKSeeds, rank: Int[Tensor, "g"], counts: Sequence[int], refine: Callable[[IKSeeds], Result]
     ) -> None:
         """Refine the next `counts[k]` seeds of each unsolved triple in round k, in the order of `rank`."""
         first = 0
         for count in counts:
-            chosen = seeds[(rank >= first) & (rank < first + count) & self.unsolved[seeds.row]]
+            chosen = self.choose(seeds, rank, first, count)
             first += count
             if len(chosen) or not self.results:
                 self.add(refine(chosen), chosen.row)

@@ -17,7 +17,7 @@ from torchgrasp.plan.closure_lp import solve_closure_lp
 from torchgrasp.plan.closure_probability import closure_share
 from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.problem import ContactProblem, Shape, device_of
-from torchgrasp.plan.solver import FINISH, Stage, State, descend, project, start_state
+from torchgrasp.plan.solver import EXACT_FINISH, Stage, State, descend, project, start_state
 from torchgrasp.plan.wrench import Vectors, wrenches
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec
@@ -73,7 +73,7 @@ def lower_cost(
     state = start_state(shape, shape.normalise(plan.contacts.points[good]))
     state = dataclasses.replace(state, tension=tension[good])
     state = descend(shape, problem, state, DOWN, partial(differentiate_cost, cost, shape))
-    state = descend(shape, problem, state, FINISH)
+    state = descend(shape, problem, state, EXACT_FINISH)
     lower = check_feasibility(shape, spec, project(shape, state.points, steps=3))
     plan, lower = (
         dataclasses.replace(p, quality=evaluate_cost(cost, p.contacts.points, p.contacts.normals))

@@ -22,6 +22,8 @@ from torchgrasp.plan.problem import (
     forces_from_tensions,
     split_unknowns,
     triple_jet,
+    triple_mean_jet,
+    with_variance,
 )
 from torchgrasp.plan.wrench import Vectors
 from torchgrasp.shape.surface import newton_step
@@ -42,17 +44,21 @@ BOUNDS = 3.0
 class Stage:
     """At most so many steps with constant weights of centre (Eq. 14) and cones (Eq. 13).
 
-    A row rests when its next step is shorter than `settled`.
+    A row rests when its next step is shorter than `settled`. The variance, which costs more than all else, is evaluated
+    at every step, or if not `exact` extrapolated from the start.
     """
 
     centre: float
     cones: float
     steps: int
     settled: float = 1e-3
+    exact: bool = True
 
 
-FINISH = Stage(centre=0.0, cones=3.0, steps=30, settled=1e-8)
+FINISH = Stage(centre=0.0, cones=3.0, steps=30, settled=1e-8, exact=False)
 """The last stage, feasibility alone: without an objective every residual can vanish."""
+EXACT_FINISH = dataclasses.replace(FINISH, exact=True)
+"""The same from where an objective has led, which is often the largest variance that is allowed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,7 +139,12 @@ class Descent(Problem[State, LinearConstraints]):
         """Return the contacts moved along the surface."""
         by_points, by_tension = split_unknowns(x)
         points = project(self.shape, state.points + by_points, steps=1)
-        return State(points, normalise_tensions(points, state.tension + by_tension), triple_jet(self.shape, points))
+        tension = normalise_tensions(points, state.tension + by_tension)
+        if self.stage.exact:
+            return State(points, tension, triple_jet(self.shape, points))
+        slope = state.jet.variance_gradient
+        variance = state.jet.variance + (slope * (points - state.points)).sum(-1)
+        return State(points, tension, with_variance(triple_mean_jet(self.shape, points), variance, slope))
 
     def judge(
         self, model: LinearConstraints, trial: LinearConstraints, x: Float[Tensor, "a u"], damping: Damping
@@ -168,7 +179,7 @@ def descend(
     if objective is not None:
         length = torch.linalg.vector_norm(objective(state)[1], dim=-1)
         pull = PULL / torch.where(length > 0, length, 1.0)
-    return levenberg_marquardt(Descent(shape, problem, stage, objective, pull), state, stage.steps)
+    return levenberg_marquardt(Descent(shape, problem, stage, objective, pull), state, stage.steps)[0]
 
 
 def project(shape: Shape, points: Float[Tensor, "b k 3"], steps: int) -> Float[Tensor, "b k 3"]:

@@ -109,7 +109,7 @@ def search(hand: Hand, samples: HandSamples, q: Float[Tensor, "k 6"]) -> Bool[Te
         joints = (touch.joints + step[:, : hand.dof]).clamp(hand.lower, hand.upper)
         return Touch(joints, touch.tilt + step[:, hand.dof :])
 
-    found = levenberg_marquardt(LeastSquares(evaluate, integrate), start, STEPS)
+    found, _ = levenberg_marquardt(LeastSquares(evaluate, integrate), start, STEPS)
     points, normals, inside = touch_points(hand, found.joints, found.tilt)
     error = ((encode_fingertips(points, normals) - wanted) / (0.1 * scale)).abs().amax(1)
     good = (error < 1) & (inside > -0.02).all(1) & (hand.self_clearance(found.joints) > 0) & can_close(points, normals)
