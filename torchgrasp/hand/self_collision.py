@@ -69,12 +69,14 @@ class SelfCollision(Value):
         self, frames: Float[Tensor, "3 4 l n"], pair: Int[Tensor, " k"], row: Int[Tensor, " k"]
     ) -> Float[Tensor, "6 k"]:
         """Return the derivative of separations by a twist (translation, rotation) of the second shape."""
-        if not len(pair):
-            return frames.new_zeros(6, 0)
-        axes, center = (x.detach() for x in self._place(frames))
-        with torch.enable_grad():
-            twist = axes.new_zeros(6, len(pair), requires_grad=True)
-            return torch.autograd.grad(self._separations((axes, center), pair, row, twist).sum(), twist)[0]
+        wrench, shapes, low = frames.new_zeros(6, len(pair)), self._place(frames), 0
+        for kind, count in enumerate(self.kinds):
+            at = torch.nonzero((pair >= low) & (pair < low + count))[:, 0]
+            if len(at):
+                push, point = self._push(kind, shapes, pair[at], row[at])
+                wrench[:, at] = torch.cat([push, torch.linalg.cross(point, push, dim=0)])
+            low += count
+        return wrench
 
     def link_pairs(self) -> list[tuple[int, int]]:
         """Return the pairs of links that are tested, by their indices."""
@@ -100,40 +102,64 @@ class SelfCollision(Value):
         """Return the sums of radii over the pairs."""
         return radius[self.pairs].sum(1, keepdim=True).to(like)
 
-    def _separations(
-        self, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"], twist: Tensor | None = None
-    ) -> Float[Tensor, " k"]:
-        """Return the separation of chosen pairs in chosen rows, with a small twist of the second shapes."""
+    def _separations(self, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]) -> Float[Tensor, " k"]:
+        """Return the separation of chosen pairs in chosen rows."""
         separation, low = shapes[1].new_zeros(len(pair)), 0
         for kind, count in enumerate(self.kinds):
             at = torch.nonzero((pair >= low) & (pair < low + count))[:, 0]
             if len(at):
-                part = self._of_kind(kind, shapes, pair[at], row[at], None if twist is None else twist[:, at])
-                separation = separation.index_put((at,), part)
+                separation = separation.index_put((at,), self._of_kind(kind, shapes, pair[at], row[at]))
             low += count
         return separation
 
     def _of_kind(
-        self, kind: int, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"], twist: Tensor | None
+        self, kind: int, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]
     ) -> Float[Tensor, " k"]:
         """Return the separation of pairs of one kind."""
-        rotation, center, n = shapes[0].flatten(2), shapes[1].flatten(1), shapes[1].shape[2]
-        half, radius, bounding = (x.to(center) for x in (self.half.T, self.radius, self._bounding()))
-        first, second = self.pairs[pair].unbind(1)
-        one, two = first * n + row, second * n + row
-        place, axes = center.index_select(1, two), rotation.index_select(2, two)
-        if twist is not None:
-            place = place + twist[:3] + torch.linalg.cross(twist[3:], place, dim=0)
-            axes = axes + torch.linalg.cross(twist[3:, None].expand_as(axes), axes, dim=0)
-        gap = place - center.index_select(1, one)
+        (first, second), (one, two), _, gap = self._meet(shapes, pair, row)
+        half, radius, bounding = (x.to(gap) for x in (self.half.T, self.radius, self._bounding()))
         if kind == 1:
-            local = axes[0] * gap[0] + axes[1] * gap[1] + axes[2] * gap[2]
-            return box_distance(local.T, half[:, second].T) - radius[first]
+            return box_distance(_inside(two, gap).T, half[:, second].T) - radius[first]
         apart = _length(gap) - bounding[first] - bounding[second]
         if kind == 2:
             return apart
-        boxes = box_separation(rotation.index_select(2, one), axes, gap, half[:, first], half[:, second])
-        return torch.maximum(apart, boxes)
+        return torch.maximum(apart, box_separation(one, two, gap, half[:, first], half[:, second]))
+
+    def _push(
+        self, kind: int, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]
+    ) -> tuple[Float[Tensor, "3 k"], Float[Tensor, "3 k"]]:
+        """Return the direction in which the second shapes leave the first, and a point on which that push acts."""
+        (first, second), (one, two), place, gap = self._meet(shapes, pair, row)
+        half, bounding = (x.to(gap) for x in (self.half.T, self._bounding()))
+        if kind == 1:
+            local = _inside(two, gap)
+            out = local.abs() - half[:, second]
+            inside = torch.nn.functional.one_hot(out.argmax(0), 3).T.to(out)
+            slope = torch.where((out > 0).any(0), out.clamp_min(0), inside) * torch.where(local < 0, -1.0, 1.0)
+            return (two * (slope / _length(slope))).sum(1), place - gap  # any turn about the sphere's centre is free
+        direct = gap / _length(gap)
+        if kind == 2:
+            return direct, place
+        apart = _length(gap) - bounding[first] - bounding[second]
+        far = apart > box_separation(one, two, gap, half[:, first], half[:, second])
+        push, arm = box_push(one, two, gap, half[:, first], half[:, second])
+        return torch.where(far, direct, push), place + torch.where(far, 0.0, arm)
+
+    def _meet(
+        self, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]
+    ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor], Float[Tensor, "3 k"], Float[Tensor, "3 k"]]:
+        """Return the shapes of chosen pairs, their axes, the second ones' centres, and these from the first ones'."""
+        rotation, center, n = shapes[0].flatten(2), shapes[1].flatten(1), shapes[1].shape[2]
+        first, second = self.pairs[pair].unbind(1)
+        one, two = first * n + row, second * n + row
+        place = center.index_select(1, two)
+        axes = rotation.index_select(2, one), rotation.index_select(2, two)
+        return (first, second), axes, place, place - center.index_select(1, one)
+
+
+def _inside(axes: Float[Tensor, "3 3 k"], v: Float[Tensor, "3 k"]) -> Float[Tensor, "3 k"]:
+    """Return the components of vectors along the columns of `axes`."""
+    return axes[0] * v[0] + axes[1] * v[1] + axes[2] * v[2]
 
 
 def _length(v: Float[Tensor, "3 *b"]) -> Float[Tensor, "*b"]:
@@ -159,8 +185,45 @@ def box_separation(
     >>> box_separation(still, still, x, torch.ones(3, 1), torch.ones(3, 1))
     tensor([1.])
     """
+    by_a, by_b, by_edges = _along_axes(a, b, gap, half_a, half_b)
+    return torch.maximum(torch.maximum(by_a, by_b).amax(0), by_edges.amax((0, 1)))
+
+
+def box_push(
+    a: Float[Tensor, "3 3 k"],
+    b: Float[Tensor, "3 3 k"],
+    gap: Float[Tensor, "3 k"],
+    half_a: Float[Tensor, "3 k"],
+    half_b: Float[Tensor, "3 k"],
+) -> tuple[Float[Tensor, "3 k"], Float[Tensor, "3 k"]]:
+    """Return the axis of `box_separation`, towards the second box, and the contact point from that box's centre [m]."""
+    by_a, by_b, by_edges = _along_axes(a, b, gap, half_a, half_b)
+    best = torch.cat([by_a, by_b, by_edges.flatten(0, 1)]).argmax(0)[None]
+    edges, i = best >= 6, torch.where(best >= 6, (best - 6) // 3, best.clamp_max(2))
+    j = torch.where(edges, (best - 6) % 3, (best - 3).clamp(0, 2))
+    along_a, along_b = (x.gather(1, at.expand(3, 1, -1))[:, 0] for x, at in ((a, i), (b, j)))
+    push = torch.where(edges, torch.linalg.cross(along_a, along_b, dim=0), torch.where(best < 3, along_a, along_b))
+    push = push / _length(push) * torch.where((push * gap).sum(0) < 0, -1.0, 1.0)
+    reach_a, reach_b = _inside(a, push).sign() * half_a, _inside(b, push).sign() * half_b
+    reach_a = reach_a.scatter(0, i, torch.where(edges, 0.0, reach_a.gather(0, i)))  # an edge is met anywhere along it
+    reach_b = reach_b.scatter(0, j, torch.where(edges, 0.0, reach_b.gather(0, j)))
+    of_a, of_b = (a * reach_a).sum(1), -(b * reach_b).sum(1)
+    between, cosine = gap + of_b - of_a, (along_a * along_b).sum(0)
+    beyond = (between * along_b).sum(0) - cosine * (between * along_a).sum(0)
+    crossed = of_b - beyond / (1 - cosine * cosine) * along_b
+    return push, torch.where(edges, crossed, torch.where(best < 3, of_b, of_a - gap))
+
+
+def _along_axes(
+    a: Float[Tensor, "3 3 k"],
+    b: Float[Tensor, "3 3 k"],
+    gap: Float[Tensor, "3 k"],
+    half_a: Float[Tensor, "3 k"],
+    half_b: Float[Tensor, "3 k"],
+) -> tuple[Float[Tensor, "3 k"], Float[Tensor, "3 k"], Float[Tensor, "3 3 k"]]:
+    """Return the separations along the faces of both boxes, and along the crossings of their edges."""
     rotation = a[0, :, None] * b[0] + a[1, :, None] * b[1] + a[2, :, None] * b[2]  # b's axes in the frame of a
-    t, u = (x[0] * gap[0] + x[1] * gap[1] + x[2] * gap[2] for x in (a, b))
+    t, u = _inside(a, gap), _inside(b, gap)
     size, square = rotation.abs(), rotation * rotation
     by_a = t.abs() - half_a - (size[:, 0] * half_b[0] + size[:, 1] * half_b[1] + size[:, 2] * half_b[2])
     by_b = u.abs() - half_b - (size[0] * half_a[0, None] + size[1] * half_a[1, None] + size[2] * half_a[2, None])
@@ -172,8 +235,7 @@ def box_separation(
     sine = square.roll(-1, 1) + square.roll(1, 1)
     crossing = sine > PARALLEL
     by_edges = (along.abs() - reach) * torch.rsqrt(torch.where(crossing, sine, 1.0))
-    by_edges = torch.where(crossing, by_edges, -torch.inf)
-    return torch.maximum(torch.maximum(by_a, by_b).amax(0), by_edges.amax((0, 1)))
+    return by_a, by_b, torch.where(crossing, by_edges, -torch.inf)
 
 
 def box_distance(points: Float[Tensor, "*b 3"], half: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
