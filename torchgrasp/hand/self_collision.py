@@ -134,7 +134,7 @@ class SelfCollision(Value):
         if kind == 1:
             local = _inside(two, gap)
             out = local.abs() - half[:, second]
-            inside = torch.nn.functional.one_hot(out.argmax(0), 3).T.to(out)
+            inside = (torch.arange(3, device=out.device)[:, None] == out.argmax(0)).to(out)
             slope = torch.where((out > 0).any(0), out.clamp_min(0), inside) * torch.where(local < 0, -1.0, 1.0)
             return (two * (slope / _length(slope))).sum(1), place - gap  # any turn about the sphere's centre is free
         direct = gap / _length(gap)
