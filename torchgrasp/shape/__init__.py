@@ -7,13 +7,14 @@ from torchgrasp.shape.hollow import HollowShape
 from torchgrasp.shape.joint_posterior import JointEstimate
 from torchgrasp.shape.kernel import Kernel, kernel_by_name, matern52_kernel, rbf_kernel, thin_plate_kernel
 from torchgrasp.shape.observations import Observations
-from torchgrasp.shape.posterior import SurfaceJet
+from torchgrasp.shape.posterior import MeanJet, SurfaceJet
 from torchgrasp.shape.surface import Surface, extract_surface
 
 __all__ = [
     "HollowShape",
     "JointEstimate",
     "Kernel",
+    "MeanJet",
     "Normalisation",
     "Observations",
     "ShapeDerivatives",
