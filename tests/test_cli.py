@@ -169,8 +169,8 @@ def test_objects_lists_files_that_exist(capsys):
 def test_the_table_is_the_lowest_point_unless_it_is_given(tmp_path, monkeypatch):
     seen = []
 
-    def note(cloud, hand, spec, starts, seed, fingers, mode, observer):
-        assert mode == "joint" and fingers is None
+    def note(cloud, hand, spec, starts, seed, fingers, mode, observer, time_budget):
+        assert mode == "joint" and fingers is None and time_budget is None
         seen.append((spec.table, spec.friction, starts, seed, float(cloud.points[:, 2].min())))
         raise KeyboardInterrupt
 

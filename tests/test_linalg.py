@@ -67,3 +67,14 @@ def test_a_limited_norm_keeps_the_direction(generator):
     within = v.norm(dim=-1) <= 1.0
     assert torch.equal(short[within], v[within])
     torch.testing.assert_close(unit(short[:20]), unit(v[:20]))
+
+
+def test_farthest_points_keep_away_from_points_before(generator):
+    points, before = torch.rand(40, 2, generator=generator), torch.rand(7, 2, generator=generator)
+    picks, known = farthest_points(points, 12, before=before).tolist(), [*before]
+    for pick in picks:
+        gaps = torch.stack([torch.stack([(p - q).norm() for q in known]).min() for p in points])
+        assert float(gaps[pick]) >= float(gaps.max()) - 1e-7
+        known.append(points[pick])
+    assert len(set(picks)) == 12
+    assert torch.equal(farthest_points(points, 5, 3, before=points[:0]), farthest_points(points, 5, 3))

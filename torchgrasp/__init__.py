@@ -34,7 +34,7 @@ from torchgrasp.posture_model import (
     sample_configurations,
 )
 from torchgrasp.ik import IKSolution, PostureLibrary, solve_ik
-from torchgrasp.pipeline import ScenePlan, ThingPlan, explain_empty, plan_grasps, plan_scene
+from torchgrasp.pipeline import ScenePlan, ThingPlan, explain_empty, plan_grasps, plan_scene, stream_grasps
 from torchgrasp.control import ClosingReference, GraspController, closing_gains
 from torchgrasp.sim import Neighbour
 from torchgrasp.evaluation import close_hand
@@ -90,6 +90,7 @@ __all__ = [
     "PostureLibrary",
     "solve_ik",
     "plan_grasps",
+    "stream_grasps",
     "explain_empty",
     "ScenePlan",
     "ThingPlan",

@@ -80,6 +80,7 @@ def farthest_points(
     first: int = 0,
     tie: float = 0.0,
     distance: Callable[[Tensor, Tensor], Tensor] = squared_distance,
+    before: Float[Tensor, "m *d"] | None = None,
 ) -> Int[Tensor, "picks"]:
     """Return the indices of at most `count` points, each the farthest from all points before it.
 
@@ -89,14 +90,19 @@ def farthest_points(
         first: index of the point to begin with.
         tie: relative difference of distances that counts as none; of equally far points the first is taken.
         distance: the distance of each point from one of them.
+        before: points that come first, of which none is returned; with any, `first` is not used.
 
     >>> farthest_points(torch.tensor([[0.0], [1.0], [9.0]]), 2)
     tensor([0, 2])
     """
     picks = torch.full((min(count, len(points)),), first, dtype=torch.long, device=points.device)
     nearest = torch.full((len(points),), torch.inf, dtype=points.dtype, device=points.device)
-    for k in range(1, len(picks)):
-        nearest = torch.minimum(nearest, distance(points, points.index_select(0, picks[k - 1 : k])[0]))
+    known = points[:0] if before is None else before
+    for one in known:
+        nearest = torch.minimum(nearest, distance(points, one))
+    for k in range(0 if len(known) else 1, len(picks)):
+        if k:
+            nearest = torch.minimum(nearest, distance(points, points.index_select(0, picks[k - 1 : k])[0]))
         picks[k] = (nearest >= (1.0 - tie) * nearest.max()).int().argmax()  # the first of the largest
     return picks
 

@@ -34,10 +34,10 @@ from torchgrasp.control.adaptive.impedance import Impedance
 from torchgrasp.control.adaptive.stability import FILE, NAMES, StabilityModel, lengths_of, state_of
 from torchgrasp.errors import BadArgument, GraspError
 from torchgrasp.evaluation.closing import GraspTrial
-from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.frames import rigid, rotation_from_vector
 from torchgrasp.linalg import unit
+from torchgrasp.pipeline.pool import run_tasks
 from torchgrasp.posture_model.compatibility import describe_compatibility
 from torchgrasp.posture_model.em import expectation_maximisation
 from torchgrasp.posture_model.gaussian import GaussianMixture

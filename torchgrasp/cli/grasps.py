@@ -3,13 +3,14 @@
 import dataclasses
 import importlib
 import importlib.util
+import math
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from torchgrasp.base import check_whole
+from torchgrasp.base import check_number, check_whole
 from torchgrasp.cli.common import (
     AS_IT_IS,
     ViewOptions,
@@ -34,6 +35,7 @@ from torchgrasp.mesh import read_mesh
 from torchgrasp.objects import DATA, MASSES, list_objects, load_object
 from torchgrasp.pipeline.explain import explain_empty
 from torchgrasp.pipeline.grasps import plan_grasps
+from torchgrasp.pipeline.task import LEAST_BUDGET
 from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows, write_report
 from torchgrasp.report.run import Run, verdict
 from torchgrasp.scene.file import is_scene
@@ -60,6 +62,7 @@ def grasp(
     close: bool = False,
     seed: int = 0,
     starts: int = 1000,
+    time_budget: float | None = None,
     view: Annotated[ViewOptions, arg(name="")] = AS_IT_IS,
     table: tuple[float, ...] | None = None,
     no_table: bool = False,
@@ -85,6 +88,7 @@ def grasp(
         close: close the best grasp on the mesh, lift it and hold it (needs the extra "sim").
         seed: of every random draw; the same seed gives the same grasps.
         starts: random starts of the contact planner.
+        time_budget: seconds for planning; the wave of starts that ends after them is the last. By default all starts.
         view: how the file of the cloud is meant.
         table: height of the table along the vertical, or four numbers nx ny nz d of the plane n . p = d, in metres; by
             default the table is at the lowest point of the cloud.
@@ -101,7 +105,7 @@ def grasp(
     if is_scene(cloud):
         if label is not None and point is not None:
             raise BadArgument("--point", "--label beside it", "one of the two")
-        if mesh is not None or view != AS_IT_IS or table is not None or no_table or mode != "joint":
+        if mesh is not None or view != AS_IT_IS or table is not None or no_table or mode != "joint" or time_budget:
             found = "an option of clouds beside a scene"
             raise BadArgument(
                 "CLOUD", found, "--label or --point, --hand, --fingers, --out, --seed, --starts, --friction"
@@ -121,6 +125,8 @@ def grasp(
         import_simulator()
     check_whole("--starts", starts, 1, 1_000_000)
     check_seed(seed)
+    if time_budget is not None:
+        check_number("--time-budget", time_budget, LEAST_BUDGET, math.inf)
     the_hand, among = load_fingers(hand, fingers)
     file = read_view("CLOUD", cloud, view)
     partial, plane = file.cloud, table_plane(file.cloud, view, table, no_table)
@@ -146,7 +152,10 @@ def grasp(
         origin += " (lowest point)" * (plane is not None and table is None)
         camera = "camera known" if partial.viewpoint is not None else "camera estimated"
         progress.end("cloud", f"{len(partial)} points, {camera}, {origin}")
-        grasps = plan_grasps(partial, the_hand, spec, starts, seed, fingers=among, mode=mode, observer=progress.end)
+        grasps = plan_grasps(
+            partial, the_hand, spec, starts, seed, fingers=among, mode=mode, observer=progress.end,
+            time_budget=time_budget,
+        )  # fmt: skip
         explanation = None
         if not bool((grasps.status == Status.OK).any()):
             options = {"fingers": among, "mode": mode, "observer": progress.end}

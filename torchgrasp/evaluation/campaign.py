@@ -20,7 +20,6 @@ from torchgrasp.errors import BadArgument, DatasetError, GraspError, MissingExtr
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.perturb import find_perturbation, household_mass, perturb_trial, perturb_view
-from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.evaluation.protocols import Protocol, draw_error, find_protocol, seed_of
 from torchgrasp.evaluation.pull import pull_grasp
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore
@@ -28,6 +27,7 @@ from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.hand.load import hand_of, load_hand
 from torchgrasp.pipeline.grasps import plan_grasps
+from torchgrasp.pipeline.pool import run_tasks
 from torchgrasp.pipeline.provenance import digest
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ContactSpec

@@ -15,10 +15,10 @@ from torchgrasp.errors import Status
 from torchgrasp.evaluation.clutter import MOVED, ClutterResult, clear_scene
 from torchgrasp.evaluation.intervals import Share, count_by, share_over
 from torchgrasp.evaluation.placed import drop, object_names
-from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.hand.load import load_hand
+from torchgrasp.pipeline.pool import run_tasks
 from torchgrasp.pipeline.things import ScenePlan, plan_scene
 from torchgrasp.scene.scene import Scene
 from torchgrasp.specs import ContactSpec, TrialSpec

@@ -3,7 +3,7 @@
 from functools import partial
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.errors import Status
@@ -18,16 +18,21 @@ SEEDS_PER_ROUND = (2, 4)
 """Seeds refined of each unsolved triple in a round: few at first, because the best seed often succeeds."""
 
 
-def rank_seeds(problem: GraspProblem, seeds: IKSeeds) -> Int[Tensor, "g"]:
-    """Return each seed's rank within its triple, by its first residuals."""
-    costs = []
+def seed_costs(problem: GraspProblem, seeds: IKSeeds) -> Float[Tensor, "g"]:
+    """Return the sum of each seed's squared residuals [mm2], before any step."""
+    costs = [seeds.energy[:0]]
     for rows in torch.arange(len(seeds), device=seeds.row.device).split(256):  # their temporaries stay in the cache
         part = seeds[rows]
         start, contacts = Configuration(part.joints, part.obj_from_hand), assign(problem.contacts, part)
         target = tip_targets(problem.hand, contacts)
         residual, _ = grasp_residuals(problem.hand, start, target, contacts.normals, problem.world, tips_touch=True)
         costs.append(residual.square().sum(1))
-    return rank_in_group(seeds.row, torch.cat(costs))
+    return torch.cat(costs)
+
+
+def rank_seeds(problem: GraspProblem, seeds: IKSeeds) -> Int[Tensor, "g"]:
+    """Return each seed's rank within its triple, by its first residuals."""
+    return rank_in_group(seeds.row, seed_costs(problem, seeds))
 
 
 def refine_on_contacts(problem: GraspProblem, seeds: IKSeeds) -> Grasps:

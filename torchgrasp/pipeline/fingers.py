@@ -34,18 +34,17 @@ def finger_sets(hand: Hand, fingers: Fingers | None, mode: Mode = "joint") -> tu
 
 
 def plan_sets(
-    hands: tuple[Hand, ...], plan: Callable[[Hand, Observer], Grasps], observer: Observer
+    hands: tuple[Hand, ...], plan: Callable[[Hand, Observer, int], Grasps], observer: Observer
 ) -> tuple[Hand, Grasps]:
     """Plan with each set of fingers; return the one with the greatest `expected_success`, and its grasps.
 
-    A stage "fingers" tells of each set as it ends; then come the stages of the best.
+    `plan` is also told how many sets are left, with its own. A stage "fingers" tells of each set as it ends; then come
+    the stages of the best.
     """
-    if len(hands) == 1:
-        return hands[0], plan(hands[0], observer)
     best, notes = None, list[tuple[str, str, Any]]()
-    for hand in hands:
+    for left, hand in zip(range(len(hands), 0, -1), hands, strict=True):
         stages = list[tuple[str, str, Any]]()
-        grasps = plan(hand, lambda *stage: stages.append(stage))  # noqa: B023 called at once
+        grasps = plan(hand, lambda *stage: stages.append(stage), left)  # noqa: B023 called at once
         expected, count = expected_success(grasps), int((grasps.status == Status.OK).sum())
         observer("fingers", f"{', '.join(hand.finger_names)}: {count} executable, {expected:.0%} expected", grasps)
         if best is None or expected > best[0]:

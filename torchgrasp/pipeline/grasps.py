@@ -1,35 +1,21 @@
-"""From a partial point cloud, or a thing of a scene, to ranked grasps, in one call."""
+"""From a partial point cloud, or a thing of a scene, to ranked grasps: all at once, or wave by wave."""
 
-import torch
+from collections.abc import Iterator, Sequence
+from typing import overload
 
-from torchgrasp.base import count_status
-from torchgrasp.errors import Status
+from typing_extensions import Unpack
+
+from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.hand_toml import Fingers
-from torchgrasp.ik.candidates import Reachable
-from torchgrasp.pipeline.fingers import Observer, plan_sets
-from torchgrasp.pipeline.stages import Bench
-from torchgrasp.pipeline.task import Request, Task, Work
-from torchgrasp.plan.solve import plan_contacts
+from torchgrasp.pipeline.chain import plan_request, stream_request
+from torchgrasp.pipeline.many import plan_many
+from torchgrasp.pipeline.task import PlanOptions, Request
 from torchgrasp.scene.scene import Scene
-from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.specs import ContactSpec, Mode, Ranking
+from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Grasps, PointCloud
 
-CERTAIN = 0.004
-"""Standard deviation [m] of the surface below which the line of the stage "shape" calls it certain."""
 
-
-def describe(counts: dict[Status, int]) -> str:
-    """Return counts of statuses as one line, the successes first.
-
-    >>> describe({Status.NOT_CLOSED: 2, Status.OK: 1})
-    '1 ok, 2 not_closed'
-    """
-    ordered = sorted(counts.items(), key=lambda pair: pair[0] is not Status.OK)
-    return ", ".join(f"{n} {s.name.lower()}" for s, n in ordered) or "none"
-
-
+@overload
 def plan_grasps(
     cloud: PointCloud | Scene,
     hand: Hand,
@@ -37,25 +23,54 @@ def plan_grasps(
     starts: int = 1000,
     seed: int = 0,
     *,
-    fingers: Fingers | None = None,
-    mode: Mode = "joint",
-    ranking: Ranking | None = None,
-    shape: ShapeGP | None = None,
-    observer: Observer = lambda stage, message, value: None,
-    reachable: Reachable | None = None,
-) -> Grasps:
+    time_budget: float | None = None,
+    **options: Unpack[PlanOptions],
+) -> Grasps: ...
+
+
+@overload
+def plan_grasps(
+    cloud: Sequence[PointCloud],
+    hand: Hand,
+    spec: ContactSpec | None = None,
+    starts: int = 1000,
+    seed: int = 0,
+    *,
+    time_budget: float | None = None,
+    workers: int = 0,
+    **options: Unpack[PlanOptions],
+) -> list[Grasps]: ...
+
+
+def plan_grasps(
+    cloud: PointCloud | Scene | Sequence[PointCloud],
+    hand: Hand,
+    spec: ContactSpec | None = None,
+    starts: int = 1000,
+    seed: int = 0,
+    *,
+    time_budget: float | None = None,
+    workers: int = 0,
+    **options: Unpack[PlanOptions],
+) -> Grasps | list[Grasps]:
     """Plan grasps of a hand on the object of a partial point cloud, or on the target of a scene.
 
     The result does not depend on the frame of cloud, camera and table. In a scene the hand keeps clear of the target's
     neighbours and of space that may be full. The rest of that risk lowers `Grasps.success`.
 
+    The starts are planned and tried in waves, each larger than the one before; `stream_grasps` yields them one by one.
+
     Args:
-        cloud: what the camera saw [m]; missing normals and viewpoint are estimated. A `Scene` has a target.
+        cloud: what the camera saw [m]; missing normals and viewpoint are estimated. A `Scene` has a target. A sequence
+            of clouds gives a list of results, see `plan_many`.
         hand: from `load_hand`; it follows the shape, which is where the cloud is, to its device.
         spec: the constraints on contacts, of which each finger gets one; None: `ContactSpec()`, in mode "paper"
             `ContactSpec.paper()`.
         starts: random starts of the contact planner.
         seed: of every random draw; on the CPU the same seed gives bitwise the same grasps.
+        time_budget: seconds of wall time; the wave that ends after them is the last, so the result depends on the
+            machine. `meta` counts the starts that were planned. None: all.
+        workers: processes for a sequence of clouds; 0: this one.
         fingers: which grasp, as in `load_hand`; None: those of the hand. "auto": of the sets that the hand declares,
             the one whose best grasps are likeliest to succeed. The result names them; `hand_of` loads their hand.
         mode: see `Mode`. All but "joint" need the hand's learned model, and three fingers.
@@ -77,25 +92,40 @@ def plan_grasps(
     >>> grasps.joints.shape[1]
     4
     """
-    request = Request(cloud, hand, spec, starts, seed, fingers, mode, ranking, shape, observer, reachable)
-    work = Work.of(request)
-    hand, grasps = plan_sets(work.hands, lambda one, note: plan_one(work.task.of(one, note)), work.task.observer)
-    grasps = work.give_back(grasps, hand)
-    observer("refine", f"{len(grasps)} refined: {describe(count_status(grasps.status))}", grasps)
-    return grasps
+    given = {"hand": hand, "spec": spec, "starts": starts, "seed": seed, "time_budget": time_budget, **options}
+    if isinstance(cloud, Sequence):
+        return plan_many(cloud, workers, given)
+    if workers:
+        raise BadArgument("workers", workers, "0 beside a single cloud")
+    return plan_request(Request(cloud, **given))
 
 
-def plan_one(task: Task) -> Grasps:
-    """Plan with one set of fingers in the upright frame."""
-    bench, shape, observer = Bench(task), task.shape, task.observer
-    certain = float((bench.surface.std_m < CERTAIN).double().mean())
-    observer("shape", f"{len(shape.x)} points, {certain:.0%} of the surface certain to {1e3 * CERTAIN:g} mm", shape)
-    plan = plan_contacts(shape, bench.spec, task.starts, task.seed)
-    observer("plan", f"{task.starts} starts: {describe(count_status(plan.status))}", plan)
-    offered, certificate = bench.offer(plan)
-    contacts, certificate = offered[certificate.closed], certificate[certificate.closed]
-    friction = bench.spec.planned_friction
-    observer("certify", f"{len(contacts)} of {len(offered)} closed at friction {friction:g}", certificate)
-    seeds = bench.seeds(contacts)
-    observer("query", f"{len(seeds)} seeds for {len(torch.unique(seeds.row))} of {len(contacts)} triples", seeds)
-    return bench.rank(bench.solve(contacts, certificate, seeds))
+def stream_grasps(
+    cloud: PointCloud | Scene,
+    hand: Hand,
+    spec: ContactSpec | None = None,
+    starts: int = 1000,
+    seed: int = 0,
+    **options: Unpack[PlanOptions],
+) -> Iterator[Grasps]:
+    """Yield executable grasps as soon as they are there: of each wave of `plan_grasps`, best first.
+
+    Each is certified, checked and scored; none is withdrawn. All together, ranked, they are the executable ones of
+    `plan_grasps` with the same arguments. Whoever stops listening stops the work. In other modes than "joint", and with
+    "auto" fingers, there is one wave.
+
+    Args:
+        cloud: this and all others: see `plan_grasps`.
+
+    Returns:
+        An iterator over `Grasps` of at least one row each. A later wave may have a better best one.
+
+    Raises:
+        BadArgument: as `plan_grasps`; a wrong cloud when the first grasps are asked for.
+
+    >>> from torchgrasp import load_hand, load_object
+    >>> first = next(stream_grasps(load_object("cylinder").view, load_hand("barrett"), starts=40))
+    >>> bool((first.status == 0).all())
+    True
+    """
+    return stream_request(Request(cloud, hand, spec, starts, seed, **options))

@@ -4,22 +4,32 @@ import dataclasses
 from functools import cached_property
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.errors import Status
 from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.cobyla import solve_as_paper
-from torchgrasp.ik.contact_first import solve_contact_first
+from torchgrasp.ik.contact_first import seed_costs, solve_contact_first
 from torchgrasp.ik.joint import solve_joint
 from torchgrasp.ik.motion import collision_probability, lift_clearance
 from torchgrasp.ik.obstacles import Obstacles
-from torchgrasp.ik.posture_library import PostureLibrary, keep_nearest, nearest_postures
+from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
 from torchgrasp.ik.query import query_mixture
-from torchgrasp.ik.ranking import rank_by_success, rank_by_variance, success_features, success_log_odds
+from torchgrasp.ik.ranking import (
+    LEAST_ARM,
+    load_arm,
+    rank_by_success,
+    rank_by_variance,
+    rank_in_group,
+    success_features,
+    success_log_odds,
+)
 from torchgrasp.ik.sdf import field_from_surface
 from torchgrasp.linalg import farthest_points
+from torchgrasp.pipeline.choice import Offer, sorted_points
+from torchgrasp.pipeline.story import Story
 from torchgrasp.pipeline.task import Task
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.starts import settle_flatness
@@ -34,8 +44,11 @@ TRIPLES = 250
 SCENE_TRIPLES = 160
 """Triples offered in a scene, where more postures of each are tried: first grasps come in 1.5 times as long."""
 OFFERED = 4
-"""Rows of four or five contacts offered for each that is tried: the nearest to postures of the hand. Few are in reach,
-and of the nearest twice as many (docs/fingers.md)."""
+"""Rows of contacts offered for each that is tried. Those that postures of the hand nearly fit are tried: of them more
+are executable, of four or five contacts twice as many (docs/fingers.md)."""
+JUDGED_SEEDS, ARM_WEIGHT, NOTHING = 2, 0.3, 1e-3
+"""Seeds that judge a row of contacts; weight of the log of the load's arm beside the log of the least residual; least
+residual [mm2] that counts. Weights of 0.1 to 1 give as many executable grasps."""
 BURIED_DEPTH = 0.003
 """Depth [m] in obstacles, beyond that of neighbours that touch, at which something lies on a lifted surface."""
 
@@ -45,11 +58,8 @@ def spread_rows(plan: ContactPlan, most: int) -> Int[Tensor, "k"]:
     rows = torch.nonzero(plan.status == Status.OK)[:, 0]
     if len(rows) <= most:
         return rows
-    points = plan.contacts.points[rows]
-    order = torch.argsort(points[..., 2], dim=1, stable=True)  # contacts in another order are the same triple
-    points = points.gather(1, order[..., None].expand(-1, -1, 3)).flatten(1)
-    chosen = farthest_points(points, most, first=int(plan.quality[rows].argmin()))
-    return rows[chosen.sort().values]
+    first = int(plan.quality[rows].argmin())
+    return rows[farthest_points(sorted_points(plan.contacts[rows]), most, first=first).sort().values]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,50 +110,71 @@ class Bench:
         """How many rows of contacts the hand tries at most."""
         return TRIPLES if self.task.scene is None else SCENE_TRIPLES
 
-    def offer(self, plan: ContactPlan) -> tuple[Contacts, Certificate]:
-        """Return contacts for the hand to try and their certificates, closed or not.
+    @property
+    def center(self) -> Float[Tensor, "3"]:
+        """The centre [m] of the estimated surface."""
+        return self.surface.vertices.mean(0)
+
+    def find(self, plan: ContactPlan, most: int, story: Story) -> Offer:
+        """Return closed contacts of which the hand may try so many, with seeds.
 
         They are far apart; in the paper all, the most certain first.
         """
-        if self.task.mode != "paper" or self.task.ranking != "variance":
-            rows = spread_rows(plan, self.tried * (1 if len(self.task.hand.tips) == 3 else OFFERED))
+        task = self.task
+        story.note("plan", plan)
+        if task.mode != "paper" or task.ranking != "variance":
+            rows = spread_rows(plan, most * (OFFERED if task.mode == "joint" else 1))
         else:
             rows, variance = torch.nonzero(plan.status == Status.OK)[:, 0], plan.contacts.variance
             assert variance is not None
             rows = rows[torch.argsort(variance[rows].sum(1), stable=True)]
         contacts = plan.contacts[rows]
-        return contacts, certify(contacts, self.spec)
+        certificate = certify(contacts, self.spec)
+        contacts, certificate = contacts[certificate.closed], certificate[certificate.closed]
+        story.note("certify", certificate, len(rows))
+        offer = Offer(contacts, certificate, self.seeds(contacts))
+        story.note("query", offer.seeds)
+        return offer
+
+    def problem(self, contacts: Contacts, certificate: Certificate) -> GraspProblem:
+        """Return the problem of reaching closed contacts."""
+        return GraspProblem(self.task.hand, contacts, certificate, self.world, self.center, self.task.reachable)
 
     def seeds(self, contacts: Contacts) -> IKSeeds:
         """Return postures near closed contacts."""
         task = self.task
         if task.mixture is None:
-            near = nearest_postures(self.library, contacts, self.world, reachable=task.reachable)
-            return keep_nearest(near, self.tried)
+            return nearest_postures(self.library, contacts, self.world, reachable=task.reachable)
         mixture = task.mixture.to(task.shape.device)
         if task.mode == "paper":
             return query_mixture(task.hand, contacts, mixture, n_seeds=1, max_energy=PAPER_ENERGY)
         return query_mixture(task.hand, contacts, mixture)
 
-    def solve(self, contacts: Contacts, certificate: Certificate, seeds: IKSeeds) -> Grasps:
-        """Return checked grasps from seeds on closed contacts."""
-        task, center = self.task, self.surface.vertices.mean(0)
-        problem = GraspProblem(task.hand, contacts, certificate, self.world, center, task.reachable)
+    def costs(self, offer: Offer) -> Float[Tensor, "b"]:
+        """Return the costs of trying contacts: how far their best seeds are from a grasp, how far the load is."""
+        contacts, certificate, seeds = offer
+        first = seeds[rank_in_group(seeds.row) < JUDGED_SEEDS]
+        residual = seed_costs(self.problem(contacts, certificate), first)
+        least = torch.full((len(contacts),), torch.inf, dtype=residual.dtype, device=residual.device)
+        least = least.scatter_reduce(0, first.row, residual, "amin")
+        return least.clamp_min(NOTHING).log() + ARM_WEIGHT * (load_arm(contacts.points, self.center) + LEAST_ARM).log()
+
+    def solve(self, offer: Offer) -> Grasps:
+        """Return checked grasps, a row for each row of contacts that has seeds."""
+        task, problem = self.task, self.problem(offer.contacts, offer.certificate)
         if task.mode == "joint":
-            solved = solve_joint(problem, seeds, task.shape, self.spec)
+            solved = solve_joint(problem, offer.seeds, task.shape, self.spec)
         else:
-            solved = (solve_as_paper if task.mode == "paper" else solve_contact_first)(problem, seeds)
+            solved = (solve_as_paper if task.mode == "paper" else solve_contact_first)(problem, offer.seeds)
         if not self.buried:
             return solved
-        return dataclasses.replace(
-            solved, status=torch.where(solved.status == Status.OK, int(Status.BURIED), solved.status)
-        )
+        buried = torch.where(solved.status == Status.OK, int(Status.BURIED), solved.status)
+        return dataclasses.replace(solved, status=buried)
 
     def rank(self, solved: Grasps) -> Grasps:
         """Return grasps in the order of the task's ranking, scored by the log-odds of success."""
         task, good = self.task, solved[solved.status == Status.OK]
-        center = self.surface.vertices.mean(0)
-        features = success_features(task.hand, task.shape, good, center, self.spec.friction, task.seed)
+        features = success_features(task.hand, task.shape, good, self.center, self.spec.friction, task.seed)
         log_odds = success_log_odds(features, task.hand.name)
         if self.obstacles is not None:
             free = 1 - collision_probability(task.hand, good, self.obstacles).to(log_odds)

@@ -1,12 +1,15 @@
 """What grasps are planned from: the arguments as given, and all of them in the upright frame of table and camera."""
 
 import dataclasses
-from typing import Any, get_args
+import math
+import time
+from typing import Any, TypedDict, get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import check_number, check_whole
 from torchgrasp.cloud.check import remove_duplicates
 from torchgrasp.errors import BadArgument
 from torchgrasp.files import sha256
@@ -24,8 +27,21 @@ from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec, Mode, Ranking
 from torchgrasp.values import Grasps, PointCloud
 
+LEAST_BUDGET = 1e-3
+"""Least time budget [s]: the first wave takes hundreds of times as long anyway."""
 TARGET_POINTS = 1000
 """Points taken of a scene's target: local quadrics of as many span a centimetre, ten times a camera's noise."""
+
+
+class PlanOptions(TypedDict, total=False):
+    """The further arguments of `plan_grasps`, which explains them."""
+
+    fingers: Fingers | None
+    mode: Mode
+    ranking: Ranking | None
+    shape: ShapeGP | None
+    observer: Observer
+    reachable: Reachable | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +49,7 @@ class Request:
     """The arguments of `plan_grasps`, which explains them.
 
     Raises:
-        BadArgument: no hand, or an unknown mode or ranking.
+        BadArgument: no hand, no starts, a negative seed, an unknown mode or ranking, or a budget that is not positive.
     """
 
     cloud: PointCloud | Scene
@@ -47,15 +63,20 @@ class Request:
     shape: ShapeGP | None = None
     observer: Observer = lambda stage, message, value: None
     reachable: Reachable | None = None
+    time_budget: float | None = None
 
     def __post_init__(self) -> None:
-        """Check before any work what no stage checks."""
+        """Check before any work what the stages check too late, or not."""
         if not isinstance(self.hand, Hand):
             raise BadArgument("hand", type(self.hand).__name__, "a Hand from load_hand")
         if self.mode not in get_args(Mode):
             raise BadArgument("mode", repr(self.mode), f"one of {', '.join(map(repr, get_args(Mode)))}")
         if self.ranking is not None and self.ranking not in get_args(Ranking):
             raise BadArgument("ranking", repr(self.ranking), "'success', 'variance' or None")
+        check_whole("starts", self.starts, 1, 1_000_000)
+        check_whole("seed", self.seed, 0, 2**63 - 1)
+        if self.time_budget is not None:
+            check_number("time_budget", self.time_budget, LEAST_BUDGET, math.inf)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +105,8 @@ class Task:
 class Work:
     """A task, the `hands` that may do it, each a set of fingers, and the way back to the given frame.
 
-    `cloud` and `spec` are those of the given frame; `mixture_sha256` is "none" where no learned model is asked.
+    `cloud` and `spec` are those of the given frame; `mixture_sha256` is "none" where no learned model is asked. No wave
+    begins after `deadline`, of `time.monotonic`.
     """
 
     task: Task
@@ -93,10 +115,12 @@ class Work:
     spec: ContactSpec
     obj_from_upright: Float[Tensor, "4 4"]
     mixture_sha256: str
+    deadline: float
 
     @classmethod
     def of(cls, request: Request) -> "Work":
         """Prepare what a request asks for: the hands, the cloud in the upright frame, and its shape."""
+        deadline = math.inf if request.time_budget is None else time.monotonic() + request.time_budget
         as_paper = request.mode == "paper"
         spec = (ContactSpec.paper() if as_paper else ContactSpec()) if request.spec is None else request.spec
         hands, cloud, scene = finger_sets(request.hand, request.fingers, request.mode), request.cloud, None
@@ -128,7 +152,7 @@ class Work:
             None if reachable is None else lambda poses: reachable(frame.to(poses) @ poses),
             lambda stage, message, value: observer(stage, message, moved(value, frame)),
         )
-        return cls(task, hands, cloud, spec, frame, mixture_sha256)
+        return cls(task, hands, cloud, spec, frame, mixture_sha256, deadline)
 
     def give_back(self, grasps: Grasps, hand: Hand) -> Grasps:
         """Return grasps of a hand in the given frame, with their origin."""
@@ -136,10 +160,9 @@ class Work:
             "mode": self.task.mode,
             "ranking": self.task.ranking,
             "mixture_sha256": self.mixture_sha256,
-            "starts": str(self.task.starts),
             "seed": str(self.task.seed),
         }
-        meta = metadata(self.cloud, hand, self.spec) | meta
+        meta = grasps.meta | metadata(self.cloud, hand, self.spec) | meta
         return dataclasses.replace(moved(grasps, self.obj_from_upright), meta=meta)
 
 

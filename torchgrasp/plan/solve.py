@@ -1,7 +1,8 @@
 """From a shape with uncertainty to contacts: Eqs. (10)-(14) solved from many starts at once."""
 
+import itertools
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from jaxtyping import Float
@@ -13,7 +14,7 @@ from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.objectives import Improvement, Objective, improvement
 from torchgrasp.plan.problem import ContactProblem, Shape
 from torchgrasp.plan.solver import FINISH, Stage, descend, project, start_state
-from torchgrasp.plan.starts import check_starts, drawn_starts, given_starts, settle_flatness
+from torchgrasp.plan.starts import check_starts, chunk_sizes, drawn_starts, given_starts, settle_flatness
 from torchgrasp.plan.wrench import Vectors
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan
@@ -87,8 +88,20 @@ def _chunks(shape: Shape, spec: ContactSpec, starts: int | Vectors, seed: int) -
     """Yield starts and stages, chunk by chunk."""
     if isinstance(starts, Tensor):
         return ((first, SEARCH) for first in given_starts(shape, starts))
-    stages = SEARCH if spec.flatness is None else TO_CENTRE
-    return ((first, stages) for first in drawn_starts(shape, spec, starts, seed))
+    return ((first, _stages(spec)) for first in drawn_starts(shape, spec, chunk_sizes(starts), seed))
+
+
+def _stages(spec: ContactSpec) -> tuple[Stage, ...]:
+    """Return the stages from drawn starts."""
+    return SEARCH if spec.flatness is None else TO_CENTRE
+
+
+def plan_in_turn(shape: Shape, spec: ContactSpec, sizes: Sequence[int], seed: int) -> Iterator[ContactPlan]:
+    """Yield a plan from `sizes[k]` further starts each time that one is asked for; `spec` has its `flat_radius`."""
+    chunks = [chunk_sizes(size) for size in sizes]
+    starts = drawn_starts(shape, spec, itertools.chain(*chunks), seed)
+    for parts in chunks:
+        yield join([plan_chunk(shape, spec, next(starts), _stages(spec)) for _ in parts])
 
 
 def _within(seconds: float, chunks: Iterator[Chunk]) -> Iterator[Chunk]:

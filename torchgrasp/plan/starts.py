@@ -1,7 +1,7 @@
 """Starts of the planner: on the paper's sphere, from candidate contacts, or given."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import torch
 from jaxtyping import Bool, Float
@@ -64,8 +64,13 @@ def given_starts(shape: Shape, starts: Vectors) -> Iterator[Float[Tensor, "_ f 3
         yield project(shape, draw_in(shape, shape.normalise(points)), steps=6)
 
 
-def drawn_starts(shape: Shape, spec: ContactSpec, starts: int, seed: int) -> Iterator[Float[Tensor, "_ f 3"]]:
-    """Yield normalised starts on the surface.
+def chunk_sizes(starts: int) -> list[int]:
+    """Return the numbers of starts that are planned at once."""
+    return [min(STARTS_PER_CHUNK, starts - begin) for begin in range(0, starts, STARTS_PER_CHUNK)]
+
+
+def drawn_starts(shape: Shape, spec: ContactSpec, sizes: Iterable[int], seed: int) -> Iterator[Float[Tensor, "_ f 3"]]:
+    """Yield normalised starts on the surface, `sizes[k]` at a time.
 
     Without `spec.flatness` they are the paper's: points of the sphere of `spec.start_radius`, moved onto the surface
     (Sec. 6.2). With it they are rows of `candidate_contacts`. The centre of a flat grasp may lie 30 mm from the
@@ -75,8 +80,7 @@ def drawn_starts(shape: Shape, spec: ContactSpec, starts: int, seed: int) -> Ite
     candidates = None
     if spec.flatness is not None:
         candidates = candidate_contacts(shape, spec, survey(shape, spec, generator))
-    for begin in range(0, starts, STARTS_PER_CHUNK):
-        count = min(STARTS_PER_CHUNK, starts - begin)
+    for count in sizes:
         if candidates is None:
             drawn = draw(shape, spec, (count, spec.fingertips), generator)
             yield project(shape, draw_in(shape, drawn), steps=6)

@@ -8,8 +8,8 @@ from pathlib import Path
 from benchmarks.common import Row, least_seconds
 from torchgrasp import ContactSpec, TrialSpec, close_hand, load_grasps, load_hand, load_object, plan_grasps
 from torchgrasp.control import ClosingReference, GraspController, no_contact, observe
-from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.objects import GraspObject
+from torchgrasp.pipeline.pool import run_tasks
 
 SIMULATED = 5.0
 """Length of a trial [s]."""

@@ -18,12 +18,12 @@ from torchgrasp.errors import Status
 from torchgrasp.evaluation import calibration
 from torchgrasp.evaluation.campaign import choose_rows, run_protocol
 from torchgrasp.evaluation.closing import GraspTrial
-from torchgrasp.evaluation.pool import run_tasks
 from torchgrasp.evaluation.protocols import PROTOCOLS, draw_error, seed_of
 from torchgrasp.files import format_json, write_atomically, write_file
 from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.ranking import FEATURES, MODEL, success_features
 from torchgrasp.pipeline import plan_grasps
+from torchgrasp.pipeline.pool import run_tasks
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.sim.convex_parts import convex_parts

@@ -61,7 +61,7 @@ def sample(shape: ShapeGP, seconds: float, seed: int) -> ContactPlan:
     """Return random triples, checked, as many as fit into the processor's time."""
     began, parts = time.process_time(), []
     for draw in itertools.count(seed):
-        parts += [check_feasibility(shape, DEFAULT, x) for x in drawn_starts(shape, DEFAULT, STARTS_PER_CHUNK, draw)]
+        parts += [check_feasibility(shape, DEFAULT, x) for x in drawn_starts(shape, DEFAULT, [STARTS_PER_CHUNK], draw)]
         if time.process_time() - began >= seconds:
             break
     return join(parts)

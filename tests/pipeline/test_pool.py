@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.evaluation.pool import run_tasks
+from torchgrasp.pipeline.pool import run_tasks
 
 pytest.importorskip("pebble")
 
@@ -66,7 +66,7 @@ def test_bad_arguments_are_named_at_once():
 SCRIPT = """
 import os, signal, sys, time
 from pathlib import Path
-from torchgrasp.evaluation.pool import run_tasks
+from torchgrasp.pipeline.pool import run_tasks
 
 def tell_and_sleep(path):
     Path(path + ".part").write_text(str(os.getpid()))

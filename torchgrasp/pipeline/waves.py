@@ -1,0 +1,90 @@
+"""Waves: few starts are planned and tried at first, then ever more, so that the first grasps come early."""
+
+import dataclasses
+import time
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from torchgrasp.base import join
+from torchgrasp.errors import Status
+from torchgrasp.ik.ranking import lexical_order, rank_by_variance
+from torchgrasp.pipeline.choice import Untried
+from torchgrasp.pipeline.stages import OFFERED, Bench
+from torchgrasp.pipeline.story import Story
+from torchgrasp.pipeline.task import Task
+from torchgrasp.plan.solve import plan_in_turn
+from torchgrasp.plan.starts import check_starts
+from torchgrasp.specs import Ranking
+from torchgrasp.values import Grasps
+
+FIRST, GROWTH, LARGEST = 16, 3, 96
+"""Rows of contacts that the hand tries in the first wave, how many times as many in the next, and at most."""
+CERTAIN = 0.004
+"""Standard deviation [m] of the surface below which the line of the stage "shape" calls it certain."""
+
+
+class Wave(NamedTuple):
+    """Numbers of further starts, and of rows of contacts that the hand tries."""
+
+    starts: int
+    tried: int
+
+
+def schedule(starts: int, most: int) -> list[Wave]:
+    """Return the waves in which `starts` are planned and `most` rows tried; a rest below `FIRST` joins the last wave.
+
+    >>> [tuple(wave) for wave in schedule(1000, 250)]
+    [(64, 16), (192, 48), (384, 96), (360, 90)]
+    >>> [tuple(wave) for wave in schedule(100, 250)]
+    [(64, 16), (36, 48), (0, 36)]
+    """
+    waves, size, most = list[Wave](), FIRST, min(most, starts)
+    tried = planned = 0
+    while tried < most:
+        size = size if most - tried >= size + FIRST else most - tried
+        tried += size
+        further = min(starts, max(OFFERED * tried, starts * tried // most)) - planned
+        waves.append(Wave(further, size))
+        planned, size = planned + further, min(GROWTH * size, LARGEST)
+    return waves
+
+
+def plan_waves(task: Task, deadline: float) -> Iterator[Grasps]:
+    """Yield the grasps of each wave, the executable ones first, in the upright frame; `meta` counts the starts so far.
+
+    No wave begins after `deadline`, of `time.monotonic`.
+    """
+    check_starts(task.shape, task.spec, task.starts, task.seed)
+    bench, untried = Bench(task), Untried()
+    surface, shape = bench.surface, task.shape
+    certain = float((surface.std_m < CERTAIN).double().mean())
+    text = f"{len(shape.x)} points, {certain:.0%} of the surface certain to {1e3 * CERTAIN:g} mm"
+    task.observer("shape", text, shape)
+    waves = schedule(task.starts, bench.tried) if task.mode == "joint" else [Wave(task.starts, bench.tried)]
+    sizes = [wave.starts for wave in waves if wave.starts]
+    plans = plan_in_turn(shape, bench.spec, sizes, task.seed)
+    story, planned = Story(task.observer, len(waves), len(sizes), bench.spec.planned_friction), 0
+    for wave in waves:
+        offer = bench.find(next(plans), wave.tried, story) if wave.starts else None
+        planned += wave.starts
+        if task.mode == "joint":
+            if offer is not None:
+                untried.add(offer, bench.costs(offer))
+            offer = untried.take(wave.tried)
+        assert offer is not None
+        grasps = bench.rank(bench.solve(offer))
+        story.end_wave(grasps)
+        late = time.monotonic() >= deadline
+        if late:
+            story.stop()
+        yield dataclasses.replace(grasps, meta={"starts": str(planned)})
+        if late:
+            return
+
+
+def rank_together(waves: Sequence[Grasps], ranking: Ranking) -> Grasps:
+    """Return the grasps of all waves, the executable ones first, with the metadata of the last."""
+    grasps = join(waves)
+    ranked = grasps[lexical_order((grasps.status != Status.OK).int(), -grasps.score)]
+    ranked = ranked if ranking == "success" else rank_by_variance(ranked)
+    return dataclasses.replace(ranked, meta=waves[-1].meta)
