@@ -1,6 +1,7 @@
 #!/usr/bin/env python
 """Measure torchgrasp. Each command prints a table and writes the same numbers as JSON.
 
+python scripts/bench.py anytime --objects DIR  how soon grasps come, and what waiting for more is worth
 python scripts/bench.py close --objects DIR    closing the hand: the simulators against statics and against each other
 python scripts/bench.py grasp --objects DIR    cloud to held object, for every object of a folder and both hands
 python scripts/bench.py gpu                    every kernel on a GPU beside the CPU, where there is a GPU
@@ -15,6 +16,7 @@ they would spin, which takes a plan twice as long on a quiet one.
 """
 
 import tyro
+from benchmarks.anytime.suite import anytime
 from benchmarks.close.suite import close
 from benchmarks.gpu.suite import gpu
 from benchmarks.grasp.suite import grasp
@@ -26,6 +28,7 @@ from benchmarks.shape.suite import shape
 
 if __name__ == "__main__":
     subjects = {
+        "anytime": anytime,
         "close": close,
         "gpu": gpu,
         "grasp": grasp,
