@@ -139,16 +139,6 @@ def nearest_postures(
     return join(parts).to(contacts.points.dtype)
 
 
-def keep_nearest(seeds: IKSeeds, most: int) -> IKSeeds:
-    """Return the seeds of the rows, `most` at most, to which a posture is nearest."""
-    rows, index = seeds.row.unique(return_inverse=True)
-    if len(rows) <= most:
-        return seeds
-    least = torch.full((len(rows),), torch.inf, dtype=seeds.energy.dtype, device=seeds.energy.device)
-    least = least.scatter_reduce(0, index, seeds.energy, "amin")
-    return seeds[torch.isin(index, torch.argsort(least, stable=True)[:most])]
-
-
 def _describe(
     centres: Float[Tensor, "r p f 3"], inward: Float[Tensor, "r p f 3"], framed: Bool[Tensor, "r p"]
 ) -> tuple[Float[Tensor, "r p 4 4"], Float[Tensor, "r p d"]]:

@@ -63,7 +63,7 @@ def anytime(
         out: where the numbers are written as JSON.
     """
     torch.set_num_threads(1)
-    chosen = list_views(objects, only=names, views=views)
+    chosen = list_views(objects, only=names, most=views)
     model = load_hand(hand)
     watch(load_object("cylinder").view, model, SPEC, 40)  # the first call alone imports
     courses: dict[tuple[str, str], Course] = {}
