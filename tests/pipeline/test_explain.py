@@ -17,7 +17,7 @@ from torchgrasp.pipeline.explain import Explanation, Trial, order_changes
 from torchgrasp.pipeline.funnel import Funnel, Losses
 from torchgrasp.pipeline.task import Request
 from torchgrasp.scene import Scene
-from torchgrasp.values import Certificate, ContactPlan, Contacts, Grasps
+from torchgrasp.values import Certificate, ContactPlan, Contacts, Grasps, IKSeeds
 
 TABLE = ContactSpec(table=0.0)
 VIEW = load_object("cylinder").view
@@ -62,6 +62,7 @@ def told(plan: list[Status], tried: int, grasps: list[Status]) -> Funnel:
     return Funnel.of(
         ContactPlan(contacts, torch.zeros(len(plan), 3, 8), torch.zeros(len(plan)), torch.tensor(plan)),
         certificate,
+        IKSeeds(some, pose, torch.arange(k), torch.zeros(k, 3).long(), some[:, 0], some),
         Grasps(
             some, some, some, pose, contacts[:k], torch.zeros(k, 3).long(), some, some[:, 0], some, certificate[:k],
             some[:, 0], torch.tensor(grasps, dtype=torch.int64),
@@ -98,7 +99,7 @@ def test_the_stage_that_lost_all_gives_the_reason(plan, tried, grasps, stage, re
 def test_a_funnel_agrees_with_the_observed_run():
     seen = {}
     grasps = plan_grasps(VIEW, load_hand("barrett"), TABLE, 20, observer=lambda s, text, value: seen.update({s: value}))
-    funnel = Funnel.of(seen["plan"], seen["certify"], grasps)
+    funnel = Funnel.of(seen["plan"], seen["certify"], seen["query"], grasps)
     assert funnel.stages[0].given == 20 and funnel.stages[1].given == len(seen["certify"])
     assert funnel.stages[1].kept == len(grasps) and funnel.executable == int((grasps.status == Status.OK).sum()) > 0
 

@@ -156,4 +156,4 @@ def try_request(request: Request) -> tuple[Funnel, float, ShapeGP]:
     told = dict[str, Any]()
     quiet = dataclasses.replace(request, observer=lambda stage, message, value: told.update({stage: value}))
     grasps = plan_grasps(**vars(quiet))
-    return Funnel.of(told["plan"], told["certify"], grasps), expected_success(grasps), told["shape"]
+    return Funnel.of(told["plan"], told["certify"], told["query"], grasps), expected_success(grasps), told["shape"]

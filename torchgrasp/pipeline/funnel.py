@@ -6,7 +6,7 @@ import torch
 
 from torchgrasp.base import Value, count_status
 from torchgrasp.errors import Status
-from torchgrasp.values import Certificate, ContactPlan, Grasps
+from torchgrasp.values import Certificate, ContactPlan, Grasps, IKSeeds
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,27 +37,27 @@ class Losses(Value):
 class Funnel(Value):
     """The stages from random starts to executable grasps, in their order.
 
-    "contacts" are planned from starts. Contacts far apart are tried: some posture of the hand is near them, else they
-    are out of reach. "grasps" are the executable ones; each of the others counts by what its best posture lacks.
+    "contacts" are planned from starts. Those without a posture near them are out of reach; of the others the likeliest
+    are tried. "grasps" are the executable ones; each of the others counts by what its best posture lacks.
     """
 
     stages: tuple[Losses, ...]
 
     @classmethod
-    def of(cls, plan: ContactPlan, tried: Certificate, grasps: Grasps) -> "Funnel":
-        """Return the funnel of what the stages "plan", "certify" and "refine" of `plan_grasps` told its observer.
+    def of(cls, plan: ContactPlan, closed: Certificate, seeds: IKSeeds, grasps: Grasps) -> "Funnel":
+        """Return the funnel of what "plan", "certify", "query" and "refine" of `plan_grasps` told its observer.
 
         >>> from torchgrasp import ContactSpec, load_hand, load_object, plan_grasps
         >>> told, view = {}, load_object("cylinder").view
         >>> spec, note = ContactSpec(friction=0.0), lambda stage, text, value: told.update({stage: value})
         >>> grasps = plan_grasps(view, load_hand("barrett"), spec, starts=20, observer=note)
-        >>> Funnel.of(told["plan"], told["certify"], grasps).stages[0].kept
+        >>> Funnel.of(told["plan"], told["certify"], told["query"], grasps).stages[0].kept
         0
         """
-        far = len(tried) - len(grasps)
+        far = len(closed) - len(seeds.row.unique())
         stages = (
             Losses("contacts", "starts", len(plan), _failures(plan.status)),
-            Losses("postures", "contacts", len(tried), {Status.OUT_OF_REACH: far} if far else {}),
+            Losses("postures", "contacts", far + len(grasps), {Status.OUT_OF_REACH: far} if far else {}),
             Losses("grasps", "postures", len(grasps), _failures(grasps.status)),
         )
         return cls(stages)

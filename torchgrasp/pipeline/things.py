@@ -114,7 +114,8 @@ def _plan_thing(scene: Scene, plan: Callable[..., Grasps]) -> ThingPlan:
     good = grasps[grasps.status == Status.OK]
     if len(good):
         return ThingPlan(scene.target, float(good.success[0]), good, shape=stages["shape"])
-    return ThingPlan(scene.target, 0.0, reason=Funnel.of(stages["plan"], stages["certify"], grasps).reason.sentence)
+    funnel = Funnel.of(stages["plan"], stages["certify"], stages["query"], grasps)
+    return ThingPlan(scene.target, 0.0, reason=funnel.reason.sentence)
 
 
 def order_by_ease(scene: Scene) -> list[int]:
