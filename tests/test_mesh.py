@@ -5,7 +5,8 @@ import pytest
 import trimesh
 
 from torchgrasp.errors import MeshError, SuspiciousScale
-from torchgrasp.mesh import clip_mesh, closest_on_triangles, read_mesh
+from torchgrasp.mesh import MAX_BYTES, clip_mesh, closest_on_triangles, read_mesh
+from torchgrasp.sim.convex_parts import check_parts
 
 
 def open_box():
@@ -46,7 +47,7 @@ def not_finite():
         (not_finite, "non-finite"),
         (flat, "volume"),
         (one_face_turned, "volume"),
-        (lambda: trimesh.Trimesh(), "without faces"),
+        (lambda: trimesh.Trimesh(), "of 0 faces"),
     ],
 )
 def test_bad_meshes_are_refused(mesh, reason):
@@ -98,3 +99,19 @@ def test_nothing_and_all_of_a_mesh():
     vertices, faces, cut = clip_mesh(box.vertices, box.faces, -np.ones(8))
     assert len(faces) == 12 and len(vertices) == 8 and not cut.any()
     assert len(clip_mesh(box.vertices, box.faces, np.ones(8))[1]) == 0
+
+
+def test_a_mesh_beyond_the_limits_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    path = tmp_path / "big.ply"
+    with path.open("wb") as file:
+        file.truncate(MAX_BYTES + 1)
+    with pytest.raises(MeshError, match=f"at most {MAX_BYTES} bytes"):
+        read_mesh(path)
+    monkeypatch.setattr("torchgrasp.mesh.MAX_FACES", 11)
+    with pytest.raises(MeshError, match="of 12 faces"):
+        read_mesh(trimesh.creation.box((0.1, 0.1, 0.1)))
+
+
+def test_too_many_parts_are_refused_before_they_are_looked_at():
+    with pytest.raises(MeshError, match="at most 1000"):
+        check_parts([trimesh.Trimesh()] * 1001)

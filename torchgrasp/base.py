@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from torchgrasp.border import check_moved, show
 from torchgrasp.errors import BadArgument, FailedRows, Status
 
 FINGERTIPS = (3, 5)
@@ -44,7 +45,12 @@ class Value:
     """Base of all values: `.to()` maps every tensor inside, nested values included, into a new value."""
 
     def to(self: SomeValue, *args: Any, **kwargs: Any) -> SomeValue:
-        """Return the value on another device or in another floating dtype; integers keep theirs."""
+        """Return the value on another device or in another floating dtype; integers keep theirs.
+
+        Raises:
+            BadArgument: no device that is there, or another dtype than float32 and float64.
+        """
+        check_moved(*args, **kwargs)
 
         def move(x: Tensor) -> Tensor:
             moved = x.to(*args, **kwargs)
@@ -64,17 +70,11 @@ class Batch(Value):
         """Select rows by a slice, a mask or indices. A single index of any kind keeps the batch axis.
 
         Raises:
-            BadArgument: a single boolean.
+            BadArgument: a single boolean, or what is no index.
             IndexError: a single index beyond the rows.
         """
-        if isinstance(rows, int) or getattr(rows, "ndim", None) == 0:  # also a NumPy scalar or a 0-d tensor
-            if torch.as_tensor(rows).dtype == torch.bool:
-                raise BadArgument("rows", repr(rows), "an index, a slice, a mask of all rows or a tensor of indices")
-            row = range(len(self))[rows]
-            rows = slice(row, row + 1)
-        elif isinstance(rows, Tensor) and rows.dtype == torch.bool and rows.shape == (len(self),):
-            rows = torch.nonzero(rows)[:, 0]  # once for all tensors: on a GPU the host waits for the number of rows
-        return map_tensors(lambda x: x[rows], self)
+        chosen = read_rows(rows, len(self))  # once for all tensors: on a GPU the host waits for the number of rows
+        return map_tensors(lambda x: x[chosen], self)
 
     def __iter__(self: SomeBatch) -> Iterator[SomeBatch]:
         """Iterate over the rows, each a batch of one."""
@@ -87,6 +87,31 @@ class Batch(Value):
         if failed:
             raise FailedRows("; ".join(f"{k} of {len(self)} rows: {s.sentence}" for s, k in failed.items()))
         return self
+
+
+def read_rows(rows: Any, count: int) -> slice | Tensor:
+    """Return a slice, or a tensor of indices, for what selects some of so many rows; raises as `Batch.__getitem__`."""
+    refused = BadArgument("rows", show(rows), "an index, a slice, a mask of all rows or a tensor of indices")
+    if isinstance(rows, slice):
+        return rows
+    try:
+        index = rows if isinstance(rows, Tensor) else torch.as_tensor(rows)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise refused from error
+    if index.layout is not torch.strided or index.is_meta or index.ndim > 1:
+        raise refused
+    if index.dtype == torch.bool:
+        if index.shape != (count,):
+            raise refused
+        return torch.nonzero(index)[:, 0]
+    if not isinstance(rows, Tensor) and not len(index.reshape(-1)):
+        return slice(0, 0)  # an empty list
+    if index.dtype not in (torch.int64, torch.int32):  # torch takes bytes for a mask
+        raise refused
+    if index.ndim:
+        return index
+    row = range(count)[int(index)]
+    return slice(row, row + 1)
 
 
 def join(parts: Sequence[SomeBatch]) -> SomeBatch:
@@ -136,22 +161,6 @@ def count_status(status: Int[Tensor, "*b"]) -> dict[Status, int]:
     codes, counts = torch.unique(status, return_counts=True)
     pairs = sorted(zip(codes.tolist(), counts.tolist(), strict=True), key=lambda p: (-p[1], p[0]))
     return {Status(code): count for code, count in pairs}
-
-
-def check_tensor(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
-    """Return `value` if it is a finite floating tensor of `shape` (None: any length); raise `BadArgument` otherwise."""
-    wanted = "x".join("any" if s is None else str(s) for s in shape)
-    if not isinstance(value, Tensor):
-        raise BadArgument(name, type(value).__name__, f"a torch tensor of shape {wanted}")
-    if value.ndim != len(shape) or any(s is not None and s != v for s, v in zip(shape, value.shape, strict=True)):
-        raise BadArgument(name, f"shape {tuple(value.shape)}", f"shape {wanted}")
-    if value.dtype not in (torch.float32, torch.float64):
-        raise BadArgument(name, str(value.dtype), "torch.float32 or torch.float64")
-    finite = torch.isfinite(value)
-    if not bool(finite.all()):
-        first = torch.nonzero(~finite)[0].tolist()
-        raise BadArgument(name, f"{value[tuple(first)].item()} at index {first}", "finite numbers")
-    return value
 
 
 def check_whole(name: str, value: Any, low: int, high: int) -> None:

@@ -1,15 +1,17 @@
 """The values of closing a hand: gains before, and what happened after. The other values are in `torchgrasp.values`."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.border import ANY, Measured, checked
 from torchgrasp.errors import Status
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class ClosingGains(Value):
     """Gains of the closing controller for each finger, in the frame of the hand (Eqs. 26-28).
@@ -32,6 +34,7 @@ class ObjectMotion(NamedTuple):
     angle: float
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Disturbance(Value):
     """What a trial did to all but its object.
@@ -42,13 +45,14 @@ class Disturbance(Value):
     `neighbour_pose` is the motion of each of m neighbours from its start.
     """
 
-    first_touch: Float[Tensor, "3"]
+    first_touch: Annotated[Float[Tensor, "3"], ANY]
     impulse: Float[Tensor, "3"]
     force: Float[Tensor, "3"]
     early: Bool[Tensor, "3"]
     neighbour_pose: Float[Tensor, "t m 4 4"]
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class ClosureResult(Value):
     """What happened when the hand closed on the true object.
@@ -65,15 +69,15 @@ class ClosureResult(Value):
     held: bool
     status: Status
     time: Float[Tensor, "t"]
-    forces: Float[Tensor, "t f"]
-    object_pose: Float[Tensor, "t 4 4"]
-    hand_pose: Float[Tensor, "t 4 4"]
-    joints: Float[Tensor, "t j"]
+    forces: Annotated[Float[Tensor, "t f"], ANY]
+    object_pose: Annotated[Float[Tensor, "t 4 4"], ANY]
+    hand_pose: Annotated[Float[Tensor, "t 4 4"], ANY]
+    joints: Annotated[Float[Tensor, "t j"], ANY]
     joint_names: tuple[str, ...]
     contact_order: tuple[int, ...]
     object_motion: ObjectMotion
     pushed: ObjectMotion
     slip: ObjectMotion
-    start_overlap: float
+    start_overlap: Measured
     disturbance: Disturbance
     seconds: float

@@ -12,6 +12,8 @@ from torchgrasp.files import is_file
 if TYPE_CHECKING:
     import trimesh
 
+MAX_BYTES, MAX_FACES = 50 * 1024 * 1024, 500_000
+"""Largest file and mesh of an object, as of a hand's: scans of household things have at most 100,000 faces."""
 LEAST_VOLUME = 1e-12
 """Volume [m^3] from which on a mesh is a body: a cube of 0.1 mm."""
 
@@ -20,8 +22,8 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
     """Return a closed mesh [m], checked and never repaired.
 
     Raises:
-        MeshError: no mesh in the file, non-finite vertices, an open surface, faces that are not all turned outward, or
-            no volume.
+        MeshError: no mesh in the file, or more than `MAX_BYTES` or `MAX_FACES`; non-finite vertices, an open surface,
+            faces that are not all turned outward, or no volume.
         SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; most often the unit is mm.
 
     >>> import trimesh
@@ -35,6 +37,8 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
         path, name = Path(mesh), str(mesh)
         if not is_file(path):
             raise MeshError("mesh", f"{path}, which is no file", "a mesh file (ply, obj, stl, ...)")
+        if path.stat().st_size > MAX_BYTES:
+            raise MeshError("mesh", f"{path} of {path.stat().st_size} bytes", f"at most {MAX_BYTES} bytes")
         try:
             loaded = trimesh.load_mesh(path)
         except Exception as error:  # the readers of trimesh raise whatever their format runs into
@@ -51,8 +55,8 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
 
 def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
     """Raise `MeshError` unless a mesh bounds a volume."""
-    if len(mesh.faces) == 0:
-        raise MeshError("mesh", f"{name} without faces", "a closed triangle mesh")
+    if not 0 < len(mesh.faces) <= MAX_FACES:
+        raise MeshError("mesh", f"{name} of {len(mesh.faces)} faces", f"a closed mesh of at most {MAX_FACES} triangles")
     if not np.isfinite(mesh.vertices).all():
         raise MeshError("mesh", f"{name} with a non-finite vertex", "finite vertices [m]")
     if not mesh.is_watertight:

@@ -13,7 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import SomeValue, Value, check_tensor, map_tensors
+from torchgrasp.base import SomeValue, Value, map_tensors
+from torchgrasp.border import checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, inverse, rigid, rotate
 from torchgrasp.linalg import unit
@@ -36,6 +37,7 @@ LEAST_TILT = 0.05
 """Least sine of the angle between the vertical and the direction to the camera: steeper views have no azimuth."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Plane(Value):
     """A plane of support: the points p with normal . p = offset; things stand on the side of the normal.
@@ -55,15 +57,13 @@ class Plane(Value):
     offset: float
 
     def __post_init__(self) -> None:
-        """Check the numbers once, where the value is made."""
-        check_tensor("normal", self.normal, (3,))
+        """Check the length once, where the value is made."""
         length = float(torch.linalg.vector_norm(self.normal))
         if not abs(length - 1) < 1e-4:
             raise BadArgument("normal", f"a length of {length:g}", "a unit vector")
-        if not math.isfinite(self.offset):
-            raise BadArgument("offset", self.offset, "a finite number of metres")
 
     @classmethod
+    @checked
     def horizontal(cls, height: float) -> "Plane":
         """Return the plane z = height [m]."""
         return cls(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), float(height))
@@ -74,10 +74,12 @@ class Plane(Value):
         x, y, z = self.normal.tolist()
         return x, y, z
 
+    @checked(gradients=True)
     def height(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return the heights [m] of points above the plane."""
         return points @ self.normal.to(points) - self.offset
 
+    @checked
     def moved(self, b_from_a: Float[Tensor, "4 4"]) -> "Plane":
         """Return the plane in frame b; it is given in frame a."""
         normal = b_from_a[:3, :3].double() @ self.normal.double()

@@ -1,9 +1,10 @@
 """Options of contacts and of simulated trials, with units, ranges and defaults."""
 
 import dataclasses
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
-from torchgrasp.base import FINGERTIPS, Value, check_number, check_whole
+from torchgrasp.base import FINGERTIPS, Value
+from torchgrasp.border import Range, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.plane import Plane, as_plane
 
@@ -19,6 +20,7 @@ FLAT_RADII = (0.008, 0.006, 0.004, 0.003)
 fewer is closed on the true surface, but balls of 40 mm and things 25 mm high have contacts at all."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class ContactSpec(Value):
     """What three to five contacts must satisfy (Eqs. 10-14). `ContactSpec.paper()` is the paper's own.
@@ -49,35 +51,18 @@ class ContactSpec(Value):
     0.4
     """
 
-    friction: float = 0.8
-    edges: int = 8
-    max_variance: float = 0.03
-    friction_margin: float = 0.5
-    separation: float | None = None
-    flatness: float | None = 0.44
-    flat_radius: float | None = None
+    friction: Annotated[float, Range(0.0, 10.0)] = 0.8
+    edges: Annotated[int, Range(3, 1024)] = 8
+    max_variance: Annotated[float, Range(1e-12, 1000000.0)] = 0.03
+    friction_margin: Annotated[float, Range(0.001, 1.0)] = 0.5
+    separation: Annotated[float, Range(0.0, 1.0)] | None = None
+    flatness: Annotated[float, Range(0.001, 3.1416)] | None = 0.44
+    flat_radius: Annotated[float, Range(0.0001, 0.1)] | None = None
     table: Plane | float | None = None
-    tip_radius: float | None = None
-    start_radius: float = 0.9
-    fingertips: int = 3
+    tip_radius: Annotated[float, Range(0.0, 1.0)] | None = None
+    start_radius: Annotated[float, Range(1e-06, 1.2)] = 0.9
+    fingertips: Annotated[int, Range(*FINGERTIPS)] = 3
     contact_allowed: bool = False
-
-    def __post_init__(self) -> None:
-        """Check every range once, where the value is made."""
-        _check_ranges(
-            self,
-            friction=(0.0, 10.0),
-            max_variance=(1e-12, 1e6),
-            friction_margin=(1e-3, 1.0),
-            separation=(0.0, 1.0),
-            flatness=(1e-3, 3.1416),
-            flat_radius=(1e-4, 0.1),
-            tip_radius=(0.0, 1.0),
-            start_radius=(1e-6, 1.2),
-        )
-        check_whole("edges", self.edges, 3, 1024)
-        check_whole("fingertips", self.fingertips, *FINGERTIPS)
-        as_plane(self.table)
 
     @property
     def plane(self) -> Plane | None:
@@ -110,11 +95,13 @@ class ContactSpec(Value):
         """The height [m] that an upright wall needs between fingertips on the table: their radius and a flat ring."""
         return self.fingertip_radius + (FLAT_RADII[-1] if self.flat_radius is None else self.flat_radius)
 
+    @checked
     def for_fingertips(self, radius: float) -> "ContactSpec":
         """Return the spec with the fingertip radius [m] of a hand, at least `TIP_RADIUS`; a given radius stays."""
         return self if self.tip_radius is not None else dataclasses.replace(self, tip_radius=max(radius, TIP_RADIUS))
 
     @classmethod
+    @checked
     def paper(
         cls, friction: float = 0.8, edges: int = 8, max_variance: float = 0.03, table: Plane | float | None = None
     ) -> "ContactSpec":
@@ -144,6 +131,7 @@ ClosingPart = Literal["wait", "pace", "switch"]
 """What the closing law has beyond the paper's, see `torchgrasp.control.closing.LawClosing`."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class TrialSpec(Value):
     """One simulated trial: close on the true mesh, lift it off the table, hold it.
@@ -182,64 +170,32 @@ class TrialSpec(Value):
 
     closing: ClosingMode = "uncertainty"
     holding: HoldingMode = "force"
-    mass: float = 0.1
-    friction: float = 0.8
-    gravity: float = 9.81
-    approach: float = 0.1
-    lift_height: float = 0.1
-    hold_time: float = 2.0
-    shake: float = 0.0
-    force: float = 4.0
+    mass: Annotated[float, Range(0.001, 10.0)] = 0.1
+    friction: Annotated[float, Range(0.0, 10.0)] = 0.8
+    gravity: Annotated[float, Range(0.0, 100.0)] = 9.81
+    approach: Annotated[float, Range(0.0, 1.0)] = 0.1
+    lift_height: Annotated[float, Range(0.0, 1.0)] = 0.1
+    hold_time: Annotated[float, Range(0.0, 60.0)] = 2.0
+    shake: Annotated[float, Range(0.0, 0.02)] = 0.0
+    force: Annotated[float, Range(0.01, 100.0)] = 4.0
     noise: bool = True
-    timestep: float = 1 / 500
-    control_rate: float = 100.0
+    timestep: Annotated[float, Range(0.0001, 1 / 60)] = 1 / 500
+    control_rate: Annotated[float, Range(10.0, 1000.0)] = 100.0
     simulator: Simulator = "sapien"
-    density: float | None = None
-    patch: float = 0.005
-    kp: float | None = None
-    overlap: float = 1e-3
+    density: Annotated[float, Range(1.0, 100000.0)] | None = None
+    patch: Annotated[float, Range(0.0, 1.0)] = 0.005
+    kp: Annotated[float, Range(0.001, 1000000.0)] | None = None
+    overlap: Annotated[float, Range(0.0, 1.0)] = 1e-3
     table: bool = True
     self_collision: bool = True
     without: tuple[ClosingPart, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check every range once, where the value is made."""
-        fields = {field.name: field.type for field in dataclasses.fields(self)}
-        for name in ("closing", "holding", "simulator"):
-            if getattr(self, name) not in get_args(fields[name]):
-                raise BadArgument(name, repr(getattr(self, name)), f"one of {', '.join(get_args(fields[name]))}")
+        """Check what depends on two fields."""
         check_closing_parts(self.closing, self.without)
-        _check_ranges(
-            self,
-            mass=(1e-3, 10.0),
-            friction=(0.0, 10.0),
-            gravity=(0.0, 100.0),
-            approach=(0.0, 1.0),
-            lift_height=(0.0, 1.0),
-            hold_time=(0.0, 60.0),
-            shake=(0.0, 0.02),
-            force=(0.01, 100.0),
-            timestep=(1e-4, 1 / 60),
-            control_rate=(10.0, 1000.0),
-            density=(1.0, 1e5),
-            patch=(0.0, 1.0),
-            kp=(1e-3, 1e6),
-            overlap=(0.0, 1.0),
-        )
         if not self.control_rate * self.timestep < 1 + 1e-9:
             found = f"{self.control_rate:g} Hz with a timestep of {self.timestep:g} s"
             raise BadArgument("control_rate", found, "a period of at least one timestep")
-
-
-def _check_ranges(spec: Value, **ranges: tuple[float | int, float | int]) -> None:
-    """Raise `BadArgument` for the first field outside its range; None is allowed where its type says so."""
-    types = {field.name: field.type for field in dataclasses.fields(spec)}  # pyright: ignore[reportArgumentType]
-    for name, (low, high) in ranges.items():
-        value = getattr(spec, name)
-        if value is None and type(None) not in get_args(types[name]):
-            raise BadArgument(name, value, f"a number in [{low:g}, {high:g}]")
-        if value is not None:
-            check_number(name, value, low, high)
 
 
 def check_closing_parts(closing: str, without: tuple[str, ...]) -> None:
@@ -247,9 +203,3 @@ def check_closing_parts(closing: str, without: tuple[str, ...]) -> None:
     known = get_args(ClosingPart) if closing in ("uncertainty", "fixed") else ()
     if not set(without) <= set(known):
         raise BadArgument("without", f"{without} of {closing!r}", f"some of {known}")
-
-
-def check_simulator(simulator: str) -> None:
-    """Raise `BadArgument` for an unknown simulator."""
-    if simulator not in get_args(Simulator):
-        raise BadArgument("simulator", repr(simulator), f"one of {', '.join(get_args(Simulator))}")

@@ -9,12 +9,14 @@ joints, t time steps.
 
 import dataclasses
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import FINGERTIPS, Batch, Value, check_tensor, named_tensors
+from torchgrasp.base import FINGERTIPS, Batch, Value, named_tensors, read_rows
+from torchgrasp.border import ANY, checked
 from torchgrasp.errors import BadArgument, ModelFileError, Status, TooFewPoints
 from torchgrasp.files import save_tensors
 from torchgrasp.value_files import read_value
@@ -22,6 +24,7 @@ from torchgrasp.value_files import read_value
 # ---------------------------------------------------------------------------------------------- what was seen
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class PointCloud(Value):
     """A point cloud of one object, as a camera saw it.
@@ -48,23 +51,15 @@ class PointCloud(Value):
     frustum: Float[Tensor, "4 3"] | Float[Tensor, "n 4 3"] | None = None
 
     def __post_init__(self) -> None:
-        """Check shapes and numbers once, where the value is made."""
-        check_tensor("points", self.points, (None, 3))
+        """Check the number of points once, where the value is made."""
         if len(self.points) < 4:
             raise TooFewPoints("points", f"{len(self.points)} points", "at least 4 points")
-        if self.normals is not None:
-            check_tensor("normals", self.normals, (len(self.points), 3))
-        if self.viewpoint is not None:
-            each = isinstance(self.viewpoint, Tensor) and self.viewpoint.ndim == 2
-            check_tensor("viewpoint", self.viewpoint, (len(self.points), 3) if each else (3,))
-        if self.frustum is not None:
-            each = isinstance(self.frustum, Tensor) and self.frustum.ndim == 3
-            check_tensor("frustum", self.frustum, (len(self.points), 4, 3) if each else (4, 3))
 
     def __len__(self) -> int:
         """Count the points."""
         return len(self.points)
 
+    @checked
     def select(self, rows: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> "PointCloud":
         """Return some of the points, with their normals and viewpoints.
 
@@ -72,11 +67,12 @@ class PointCloud(Value):
             rows: a mask, or indices in the order wanted.
         """
         normals, eye, frustum = self.normals, self.viewpoint, self.frustum
+        chosen = read_rows(rows, len(self))
         return PointCloud(
-            points=self.points[rows],
-            normals=None if normals is None else normals[rows],
-            viewpoint=eye if eye is None or eye.ndim == 1 else eye[rows],
-            frustum=frustum if frustum is None or frustum.ndim == 2 else frustum[rows],
+            points=self.points[chosen],
+            normals=None if normals is None else normals[chosen],
+            viewpoint=eye if eye is None or eye.ndim == 1 else eye[chosen],
+            frustum=frustum if frustum is None or frustum.ndim == 2 else frustum[chosen],
         )
 
     def split_views(self) -> "list[PointCloud]":
@@ -93,6 +89,7 @@ class PointCloud(Value):
         return views
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class ShapeEstimate(Value):
     """The posterior of the shape at query points (Eqs. 7-8).
@@ -112,6 +109,7 @@ class ShapeEstimate(Value):
 # --------------------------------------------------------------------------------------------- where to touch
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Contacts(Batch):
     """Three to five contacts a row, one for each fingertip: `points` [m] and outward unit `normals`.
@@ -120,10 +118,10 @@ class Contacts(Batch):
     nobody knows, as for contacts of another planner.
     """
 
-    points: Float[Tensor, "b f 3"]
-    normals: Float[Tensor, "b f 3"]
-    variance: Float[Tensor, "b f"] | None = None
-    std_m: Float[Tensor, "b f"] | None = None
+    points: Annotated[Float[Tensor, "b f 3"], ANY]
+    normals: Annotated[Float[Tensor, "b f 3"], ANY]
+    variance: Annotated[Float[Tensor, "b f"], ANY] | None = None
+    std_m: Annotated[Float[Tensor, "b f"], ANY] | None = None
 
     @property
     def fingertips(self) -> int:
@@ -141,6 +139,7 @@ class Contacts(Batch):
         return self.std_m
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class ContactPlan(Batch):
     """The planned contacts, one row for each start, in the order of the starts.
@@ -150,11 +149,12 @@ class ContactPlan(Batch):
     """
 
     contacts: Contacts
-    coefficients: Float[Tensor, "b f e"]
-    quality: Float[Tensor, "b"]
+    coefficients: Annotated[Float[Tensor, "b f e"], ANY]
+    quality: Annotated[Float[Tensor, "b"], ANY]
     status: Int[Tensor, "b"]
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Certificate(Batch):
     """The proof that contacts have frictional form closure (Eq. 13), or that they lack it; see `certify`.
@@ -166,16 +166,17 @@ class Certificate(Batch):
     force opposes it.
     """
 
-    margin: Float[Tensor, "b"]
-    rank_ratio: Float[Tensor, "b"]
-    residual: Float[Tensor, "b"]
+    margin: Annotated[Float[Tensor, "b"], ANY]
+    rank_ratio: Annotated[Float[Tensor, "b"], ANY]
+    residual: Annotated[Float[Tensor, "b"], ANY]
     closed: Bool[Tensor, "b"]
-    witness: Float[Tensor, "b 6"]
+    witness: Annotated[Float[Tensor, "b 6"], ANY]
 
 
 # ------------------------------------------------------------------------------------- how this hand can touch
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class ContactCode(Value):
     """The frame-invariant code q = (L, N) of Eq. (18) for the six assignments of contacts to fingers.
@@ -183,12 +184,13 @@ class ContactCode(Value):
     In assignment k finger i touches contact `permutation[k, i]`. Degenerate rows hold NaN, and `status` says so.
     """
 
-    q: Float[Tensor, "b 6 6"]
-    obj_from_vf: Float[Tensor, "b 6 4 4"]
+    q: Annotated[Float[Tensor, "b 6 6"], ANY]
+    obj_from_vf: Annotated[Float[Tensor, "b 6 4 4"], ANY]
     status: Int[Tensor, "b"]
     permutation: Int[Tensor, "6 3"]
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class IKSeeds(Batch):
     """Starts of the inverse kinematics: postures placed on contacts by their virtual frames (Eq. 24).
@@ -202,10 +204,11 @@ class IKSeeds(Batch):
     obj_from_hand: Float[Tensor, "g 4 4"]
     row: Int[Tensor, "g"]
     permutation: Int[Tensor, "g f"]
-    energy: Float[Tensor, "g"]
-    tip_error: Float[Tensor, "g f"]
+    energy: Annotated[Float[Tensor, "g"], ANY]
+    tip_error: Annotated[Float[Tensor, "g f"], ANY]
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Grasps(Batch):
     """Hand configurations on planned contacts, best first.
@@ -224,11 +227,11 @@ class Grasps(Batch):
     obj_from_hand: Float[Tensor, "g 4 4"]
     contacts: Contacts
     permutation: Int[Tensor, "g f"]
-    tip_error: Float[Tensor, "g f"]
-    clearance: Float[Tensor, "g"]
-    normal_angle: Float[Tensor, "g f"]
+    tip_error: Annotated[Float[Tensor, "g f"], ANY]
+    clearance: Annotated[Float[Tensor, "g"], ANY]
+    normal_angle: Annotated[Float[Tensor, "g f"], ANY]
     certificate: Certificate
-    score: Float[Tensor, "g"]
+    score: Annotated[Float[Tensor, "g"], ANY]
     status: Int[Tensor, "g"]
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
 
@@ -237,6 +240,7 @@ class Grasps(Batch):
         """The predicted probability that each planned grasp holds; 0 if the grasp cannot be executed."""
         return torch.where(self.status == Status.OK, torch.sigmoid(self.score), 0.0)
 
+    @checked
     def save(self, path: Path | str) -> None:
         """Write the grasps as a safetensors file, atomically; `load_grasps` reads it.
 
@@ -250,6 +254,7 @@ RIGID = 1e-4
 """Largest error of a rotation matrix in a file, that of float32 and of rounding in a text."""
 
 
+@checked
 def load_grasps(path: Path | str) -> Grasps:
     """Read grasps that `Grasps.save` wrote.
 

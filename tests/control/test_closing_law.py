@@ -224,9 +224,8 @@ def test_bad_arguments_are_named():
         closing_gains(grasp[:0], hand)
     with pytest.raises(BadArgument, match="grasps: found 12 joints"):
         closing_gains(grasp, load_hand("barrett"))
-    spoilt = dataclasses.replace(grasp, obj_from_hand=grasp.obj_from_hand * float("nan"))
     with pytest.raises(BadArgument, match="obj_from_hand: found nan"):
-        closing_gains(spoilt, hand)
+        dataclasses.replace(grasp, obj_from_hand=grasp.obj_from_hand * float("nan"))
     spoilt = dataclasses.replace(
         grasp, contacts=dataclasses.replace(grasp.contacts, std_m=grasp.contacts.std_m * float("inf"))
     )

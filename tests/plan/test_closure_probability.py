@@ -59,8 +59,8 @@ def test_bad_arguments_name_what_was_found(doubtful, generator):
     two = Contacts(contacts.points[:, :2], contacts.normals[:, :2])
     long = Contacts(contacts.points, 1.1 * contacts.normals)
     for action, match in (
-        (lambda: closure_probability(doubtful, contacts, n=0), "integer from 1"),
-        (lambda: closure_probability(doubtful, contacts, seed=-1), "integer from 0"),
+        (lambda: closure_probability(doubtful, contacts, n=0), "n: found 0"),
+        (lambda: closure_probability(doubtful, contacts, seed=-1), "seed: found -1"),
         (lambda: closure_probability(doubtful, far), "domain"),
         (lambda: closure_probability(doubtful, long), "unit vectors"),
         (lambda: closure_probability(doubtful, two), "found 2 contacts a row, allowed is 3 to 5"),

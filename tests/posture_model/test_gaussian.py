@@ -127,7 +127,7 @@ def test_bad_arguments():
         (lambda: mixture.marginal(("a", "a")), "names: found"),
         (lambda: mixture.marginal(()), "names: found"),
         (lambda: mixture.condition({"z": 1.0}), "names: found"),
-        (lambda: mixture.condition({"a": float("nan")}), "given: found nan"),
+        (lambda: mixture.condition({"a": float("nan")}), "given.*: found nan"),
         (lambda: mixture.condition(dict.fromkeys(NAMES, 0.0)), "given: found every dimension"),
         (lambda: mixture.sample(-1), "n: found -1"),
         (lambda: mixture.log_prob(torch.zeros(3, 3)), "x: found shape"),

@@ -6,7 +6,7 @@ from typing import Annotated
 import torch
 from tyro.conf import Positional, arg
 
-from torchgrasp.base import check_tensor
+from torchgrasp.border import check_tensor
 from torchgrasp.cli.common import AS_IT_IS, ViewOptions, check_seed, naming, print_notes, read_view, table_plane
 from torchgrasp.cloud import (
     cloud_from_depth,

@@ -10,7 +10,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchgrasp.base import check_tensor, check_whole
+from torchgrasp.base import check_whole
+from torchgrasp.border import check_tensor
 from torchgrasp.cloud import Advice, CloudFile, check_cloud, diagnose_cloud, read_cloud_file
 from torchgrasp.cloud.io.image import read_pose
 from torchgrasp.cloud.neighbours import draw_rows

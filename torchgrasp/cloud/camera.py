@@ -2,16 +2,16 @@
 
 import math
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import check_number
+from torchgrasp.border import Range, Seed, checked
 from torchgrasp.cloud.depth import check_rigid, cloud_from_depth
-from torchgrasp.errors import BadArgument, MeshError
+from torchgrasp.errors import MeshError
 from torchgrasp.frames import apply, inverse, rigid, rotate
 from torchgrasp.values import PointCloud
 
@@ -26,10 +26,11 @@ INTRINSICS = torch.tensor([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) 
 """Intrinsics [px] of the default camera."""
 
 
+@checked
 def look_at(
     azimuth: float,
-    elevation: float,
-    distance: float = 0.5,
+    elevation: Annotated[float, Range(-89.9, 89.9)],
+    distance: Annotated[float, Range(0.01, 10.0)] = 0.5,
     target: "Float[Tensor, '3'] | trimesh.Trimesh | None" = None,
 ) -> Float[Tensor, "4 4"]:
     """Return obj_from_camera of an upright camera that looks at a target.
@@ -47,10 +48,6 @@ def look_at(
     >>> look_at(0.0, 0.0, 0.5)[:3, 3]
     tensor([0.5000, 0.0000, 0.0000], dtype=torch.float64)
     """
-    check_number("elevation", elevation, -89.9, 89.9)
-    check_number("distance", distance, 0.01, 10.0)
-    if not math.isfinite(azimuth):
-        raise BadArgument("azimuth", azimuth, "a finite number of degrees")
     a, e = math.radians(azimuth), math.radians(elevation)
     away = torch.tensor([math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)], dtype=torch.float64)
     right = torch.tensor([-math.sin(a), math.cos(a), 0.0], dtype=torch.float64)
@@ -65,8 +62,13 @@ def look_at(
     return rigid(torch.stack([right, down, -away], -1), position)
 
 
+@checked
 def partial_view(
-    mesh: "trimesh.Trimesh", camera_pose: Float[Tensor, "4 4"], n: int = 1000, noise: bool = True, seed: int = 0
+    mesh: "trimesh.Trimesh",
+    camera_pose: Float[Tensor, "4 4"],
+    n: Annotated[int, Range(4, 1000000)] = 1000,
+    noise: bool = True,
+    seed: Seed = 0,
 ) -> PointCloud:
     """Return n points [m] that the default camera sees of a mesh. They have a viewpoint and no normals.
 
@@ -89,8 +91,6 @@ def partial_view(
     >>> len(partial_view(box, look_at(azimuth=30.0, elevation=30.0, target=box), n=500))
     500
     """
-    if n < 4:
-        raise BadArgument("n", n, "at least 4 points")
     pose = check_rigid("camera_pose", camera_pose).double()
     depth, cosine = cast_mesh(mesh, pose)
     generator = torch.Generator().manual_seed(seed)

@@ -1,12 +1,10 @@
 """Refusals of clouds that no grasp can be planned on."""
 
-import dataclasses
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import named_tensors
+from torchgrasp.border import checked
 from torchgrasp.errors import BadArgument, SuspiciousScale, TooFewPoints
 from torchgrasp.values import PointCloud
 
@@ -20,6 +18,7 @@ MIN_POINTS = 4
 """Fewest distinct points: a quadric or a posterior of fewer says nothing."""
 
 
+@checked
 def check_cloud(cloud: PointCloud) -> PointCloud:
     """Return the cloud itself, or raise what is wrong with it. A flat cloud, as of one face, is accepted.
 
@@ -38,6 +37,7 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
     return cloud
 
 
+@checked
 def remove_duplicates(cloud: PointCloud) -> PointCloud:
     """Check a cloud and return it without copies of its points.
 
@@ -66,12 +66,7 @@ def _check_distinct(points: Float[Tensor, "n 3"], rows: Int[Tensor, "m"]) -> Non
 
 def _check(cloud: PointCloud) -> Float[Tensor, "n 3"]:
     """Return the points, or raise what is wrong with the cloud, copies aside."""
-    if not isinstance(cloud, PointCloud):
-        raise BadArgument("cloud", type(cloud).__name__, "a PointCloud")
-    for name, tensor in named_tensors(cloud).items():
-        if tensor.requires_grad:
-            raise BadArgument(name, "a tensor that requires a gradient", f"a tensor without one: {name}.detach()")
-    points = dataclasses.replace(cloud).points  # the value checks itself again: its numbers may be spoilt since
+    points = cloud.points
     extent = float((points.amax(0) - points.amin(0)).max())
     if extent == 0.0:
         raise BadArgument("points", f"{len(points)} points that all coincide", "points of a surface")

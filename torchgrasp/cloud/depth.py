@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import check_tensor
+from torchgrasp.border import check_tensor, checked
 from torchgrasp.cloud.check import check_cloud
 from torchgrasp.errors import BadArgument, TooFewPoints
 from torchgrasp.frames import apply, rotate
@@ -22,6 +22,7 @@ MIN_PIXELS = 4
 """Fewest measured pixels: as many as the points of a cloud."""
 
 
+@checked
 def cloud_from_depth(
     depth: Tensor | np.ndarray,
     intrinsics: Tensor | np.ndarray | Sequence[float | int],
@@ -80,6 +81,7 @@ def frustum_of_image(intrinsics: Float[Tensor, "3 3"], size: Sequence[int]) -> F
     return unit(torch.tensor(sides, dtype=intrinsics.dtype, device=intrinsics.device))
 
 
+@checked
 def read_depth(
     depth: Tensor | np.ndarray,
     intrinsics: Tensor | np.ndarray | Sequence[float | int],
@@ -99,7 +101,12 @@ def read_depth(
     (0.5, [600.0, 0.0, 32.0], None)
     """
     image = _as_tensor("depth", depth)
-    if image.ndim != 2 or image.dtype in (torch.bool, torch.uint8, torch.int8) or image.is_complex():
+    if (
+        image.ndim != 2
+        or not image.numel()
+        or image.dtype in (torch.bool, torch.uint8, torch.int8)
+        or image.is_complex()
+    ):
         allowed = "an image (h, w) of floats in metres, or of integers such as uint16 in millimetres"
         raise BadArgument("depth", _describe(depth), allowed)
     metres = image.double() if image.is_floating_point() else image.double() / 1000

@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value, check_tensor
+from torchgrasp.base import Value
+from torchgrasp.border import check_tensor, checked
 from torchgrasp.cloud.advice import Advice, judge_pixels, judge_view
 from torchgrasp.cloud.check import check_cloud, distinct_exactly, remove_duplicates
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_planes, nearest
@@ -24,6 +25,7 @@ VIEWED = 5000
 """Most points that tell about camera, vertical, table and bodies: twice as many change no share by more than .01."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class CloudReport(Value):
     """What a cloud is like, and what could be better."""
@@ -43,6 +45,7 @@ class CloudReport(Value):
     advice: tuple[Advice, ...]  # what forbids a grasp comes first
 
 
+@checked
 def diagnose_cloud(
     cloud: PointCloud, up: Float[Tensor, "3"] | None = None, table: Plane | None = None, stands: bool = True
 ) -> CloudReport:
@@ -103,6 +106,7 @@ def diagnose_cloud(
     return dataclasses.replace(report, advice=(*advice, *_advise(report, clean)))
 
 
+@checked
 def format_report(report: CloudReport) -> str:
     """Return a report as lines for a terminal.
 

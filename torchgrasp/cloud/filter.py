@@ -1,15 +1,18 @@
 """Fewer points: one a voxel, or without the outliers."""
 
+from typing import Annotated
+
 import torch
 
-from torchgrasp.base import check_number
+from torchgrasp.border import Range, checked
 from torchgrasp.cloud.check import MIN_POINTS, check_cloud, first_of_each, remove_duplicates
 from torchgrasp.cloud.neighbours import find_inliers
 from torchgrasp.errors import TooFewPoints
 from torchgrasp.values import PointCloud
 
 
-def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
+@checked
+def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)]) -> PointCloud:
     """Return one point a voxel, the nearest to its centre, for voxels of a side [m] in [1e-5, 1].
 
     The grid starts at the cloud's lowest corner and moves with it. Points are not averaged, as a mean may lie
@@ -23,7 +26,6 @@ def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
     True
     """
     cloud = check_cloud(cloud)
-    check_number("voxel", voxel, 1e-5, 1.0)  # [m], from a sensor's resolution to the size of an object
     points = cloud.points.double()
     place = (points - points.amin(0)) / voxel
     cell = torch.floor(place)
@@ -35,6 +37,7 @@ def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
     return cloud.select(rows)
 
 
+@checked
 def remove_outliers(cloud: PointCloud) -> PointCloud:
     """Return a cloud without copies and outliers, such as flying pixels.
 

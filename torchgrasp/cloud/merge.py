@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.border import checked
 from torchgrasp.cloud.check import check_cloud
 from torchgrasp.cloud.depth import check_rigid
 from torchgrasp.cloud.prepare import estimate_normals
@@ -15,6 +16,7 @@ from torchgrasp.linalg import unit
 from torchgrasp.values import PointCloud
 
 
+@checked
 def merge_clouds(
     clouds: Sequence[PointCloud], poses: Sequence[Float[Tensor, "4 4"]] | Float[Tensor, "k 4 4"]
 ) -> PointCloud:

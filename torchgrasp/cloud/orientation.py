@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.border import checked
 from torchgrasp.cloud.check import check_cloud, remove_duplicates
 from torchgrasp.cloud.neighbours import fit_planes, nearest
 from torchgrasp.errors import BadArgument
@@ -18,6 +19,7 @@ MAX_OPPOSED = 0.35
 """Share of opposite pairs that means random signs: these give .5, 10 % of flips .18."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class NormalCheck(Value):
     """What given normals are worth."""
@@ -28,6 +30,7 @@ class NormalCheck(Value):
     scaled: int  # number of normals not of unit length; their users normalise them
 
 
+@checked
 def check_normals(cloud: PointCloud) -> NormalCheck:
     """Compare the given normals of neighbouring points.
 
@@ -61,6 +64,7 @@ def compare_normals(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"])
     return NormalCheck(flipped, opposed, oriented=opposed < MAX_OPPOSED, scaled=int(scaled.sum()))
 
 
+@checked
 def estimate_viewpoint(cloud: PointCloud) -> Float[Tensor, "3"]:
     """Return a camera position [m] that explains a single view.
 

@@ -1,12 +1,14 @@
 """The parts of a cloud: a piece of the support, and bodies that lie apart."""
 
 import math
+from typing import Annotated
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchgrasp.border import Range, checked
 from torchgrasp.cloud.check import MIN_POINTS, first_of_each
 from torchgrasp.cloud.neighbours import draw_rows, fit_planes
 from torchgrasp.errors import TooFewPoints
@@ -134,12 +136,13 @@ def find_second_body(points: Float[Tensor, "n 3"], up: Float[Tensor, "3"], spaci
     return None
 
 
+@checked
 def cut_object(
     cloud: PointCloud,
     up: Float[Tensor, "3"],
     point: Float[Tensor, "3"] | None = None,
     box: Float[Tensor, "2 3"] | None = None,
-    gap: float = GAP,
+    gap: Annotated[float, Range(0.001, 1.0)] = GAP,
 ) -> tuple[PointCloud, Plane | None]:
     """Return the points of one thing that stands on a plane, and the plane; None: none was found.
 

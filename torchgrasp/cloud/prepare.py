@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.border import checked
 from torchgrasp.cloud.check import remove_duplicates
 from torchgrasp.cloud.neighbours import find_inliers, fit_planes, fit_quadrics
 from torchgrasp.cloud.orientation import compare_normals, guess_viewpoint, orient_normals, share_facing
@@ -38,6 +39,7 @@ class PreparedCloud(Value):
         return self.viewpoint is not None and share_facing(self.points, self.normals, self.viewpoint) >= FACING
 
 
+@checked
 def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = True) -> PreparedCloud:
     """Check a cloud, and return what a shape is fitted to.
 
@@ -78,6 +80,7 @@ def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = T
     return PreparedCloud(cloud, precise.points, unit(precise.normals), precise.viewpoint, precise.frustum)
 
 
+@checked
 def estimate_normals(cloud: PointCloud) -> PointCloud:
     """Return a cloud without copies, with outward normals of local quadrics.
 
@@ -92,6 +95,7 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
     return _fit_normals(remove_duplicates(cloud), clean=False)
 
 
+@checked
 def clean_cloud(cloud: PointCloud) -> PointCloud:
     """Return the points without outliers, on their local quadrics, with outward normals.
 

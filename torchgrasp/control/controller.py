@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import check_device, settle
+from torchgrasp.border import checked
 from torchgrasp.control.closing import FixedGainClosing, LawClosing, OpenLoopClosing, PositionClosing, Revision
 from torchgrasp.control.holding import ForceHold, PositionHold
 from torchgrasp.control.observation import Observation
@@ -96,6 +97,7 @@ class GraspController:
             return self.closing.done
         return self.pressed >= PRESSING_TIME - 1e-9
 
+    @checked
     def step(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets of all joints [rad] for the next tick, a period [s] later.
 

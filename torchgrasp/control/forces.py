@@ -1,12 +1,13 @@
 """Desired forces of the fingers, their covariance (Eq. 28), and the joint targets that exert them."""
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import settle
+from torchgrasp.border import Positive, Range, checked
 from torchgrasp.control.stiffness import joint_stiffness
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, inverse, rotate
@@ -59,7 +60,10 @@ class Squeeze(NamedTuple):
     torques: Float[Tensor, "g h"]
 
 
-def squeeze(hand: Hand, grasps: Grasps, force: float = 4.0, kp: float | None = None) -> Squeeze:
+@checked
+def squeeze(
+    hand: Hand, grasps: Grasps, force: Annotated[float, Range(0.01, 100.0)] = 4.0, kp: Positive | None = None
+) -> Squeeze:
     """Return joint targets with which position-controlled fingers press at their planned contacts.
 
     The targets solve J^T f = kp (target - q) for the `desired_forces` f; they may exceed a joint's limits.

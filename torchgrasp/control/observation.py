@@ -7,10 +7,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value, check_device
+from torchgrasp.border import checked
 from torchgrasp.control.tactile import TactileState
 from torchgrasp.hand.hand import Hand
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Observation(Value):
     """Joints, fingertips and touch at a tick, in the hand's frame.
@@ -28,6 +30,7 @@ class Observation(Value):
     tactile: TactileState
 
 
+@checked
 def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> Observation:
     """Return the observation of a robot with actuated joints [rad] and fingertips as read.
 

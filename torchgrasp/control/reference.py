@@ -3,13 +3,14 @@
 import dataclasses
 import functools
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value, check_tensor
+from torchgrasp.base import Value
+from torchgrasp.border import Positive, Range, check_tensor, checked
 from torchgrasp.closing import ClosingGains
 from torchgrasp.control.closing_law import (
     FORCE_BANDWIDTH,
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from torchgrasp.control.adaptive.stability import StabilityModel
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class ClosingReference(Value):
     """What a closing hand follows, in its frame; joints are actuated [rad].
@@ -56,12 +58,13 @@ class ClosingReference(Value):
     table: Plane | None = None
 
     @classmethod
+    @checked
     def from_grasp(
         cls,
         hand: Hand,
         grasp: Grasps,
-        force: float = 4.0,
-        kp: float | None = None,
+        force: Annotated[float, Range(0.01, 100.0)] = 4.0,
+        kp: Positive | None = None,
         stability: "StabilityModel | None" = None,
     ) -> "ClosingReference":
         """Derive the reference of one grasp, on the CPU: a tick has too little work for a GPU.
@@ -142,8 +145,12 @@ class ClosingReference(Value):
         return tips - self.hand.tips.radius[:, None] * self.normals
 
 
+@checked
 def closing_gains(
-    grasp: Grasps, hand: Hand, force: float = 4.0, stability: "StabilityModel | None" = None
+    grasp: Grasps,
+    hand: Hand,
+    force: Annotated[float, Range(0.01, 100.0)] = 4.0,
+    stability: "StabilityModel | None" = None,
 ) -> ClosingGains:
     """Return target, gains and desired force of each finger for one grasp, in the hand's frame (Eqs. 26-28).
 

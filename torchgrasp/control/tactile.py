@@ -6,12 +6,14 @@ of a round tip. Samples come at the sensor's own rate.
 
 import dataclasses
 import math
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Value, check_device
+from torchgrasp.base import FINGERTIPS, Value, check_device
+from torchgrasp.border import ANY, Count, Range, checked
 from torchgrasp.linalg import unit
 
 SAMPLING_RATE = 100.0
@@ -31,6 +33,7 @@ TOUCH_ON, TOUCH_OFF = 0.2, 0.1
 """Averages [N] at which the contact flag switches: a single noisy reading crosses 0.2 N twice a second."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class TipContact(Value):
     """True contacts of f fingertips, averaged over a tick.
@@ -40,10 +43,11 @@ class TipContact(Value):
 
     normal_force: Float[Tensor, "*b f"]
     forces: Float[Tensor, "*b f 3"]
-    points: Float[Tensor, "*b f 3"]
-    normals: Float[Tensor, "*b f 3"]
+    points: Annotated[Float[Tensor, "*b f 3"], ANY]
+    normals: Annotated[Float[Tensor, "*b f 3"], ANY]
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class TactileState(Value):
     """What f fingertips report, and their memory.
@@ -56,14 +60,15 @@ class TactileState(Value):
     reading: Float[Tensor, "*b f"]
     forces: Float[Tensor, "*b f 3"]
     contact: Bool[Tensor, "*b f"]
-    points: Float[Tensor, "*b f 3"]
-    normals: Float[Tensor, "*b f 3"]
+    points: Annotated[Float[Tensor, "*b f 3"], ANY]
+    normals: Annotated[Float[Tensor, "*b f 3"], ANY]
     lagged: Float[Tensor, "*b f 4"]
     average: Float[Tensor, "*b f"]
     age: float
 
 
-def no_contact(*batch: int, fingers: int = 3) -> TactileState:
+@checked
+def no_contact(*batch: Count, fingers: Annotated[int, Range(*FINGERTIPS)] = 3) -> TactileState:
     """Return the state of fingertips in the air, due to sample.
 
     >>> no_contact().contact
@@ -75,12 +80,13 @@ def no_contact(*batch: int, fingers: int = 3) -> TactileState:
     return TactileState(zero, vectors, zero > 0, nothing, nothing, lagged, zero, 1 / SAMPLING_RATE)
 
 
+@checked
 def measure(
     tactile: TactileState,
     truth: TipContact,
     pads: Float[Tensor, "*#b f 3"],
     radius: Float[Tensor, "f"],
-    period: float,
+    period: Annotated[float, Range(1e-06, 1.0)],
     generator: torch.Generator | None = None,
 ) -> TactileState:
     """Return what the fingertips report one tick later.

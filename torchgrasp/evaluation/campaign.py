@@ -9,11 +9,12 @@ import tempfile
 import time
 from collections.abc import Generator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torch
 
-from torchgrasp.base import Value, check_whole, count_status
+from torchgrasp.base import Value, count_status
+from torchgrasp.border import Count, Range, Seed, checked
 from torchgrasp.closing import ObjectMotion
 from torchgrasp.datasets import list_objects, list_views, read_entry, read_object_mesh, read_view
 from torchgrasp.errors import BadArgument, DatasetError, GraspError, MissingExtra, Status
@@ -45,6 +46,7 @@ Ranks = Literal["best", "spread"]
 """Which of a view's grasps are tried: the best, or as many spread from the best to the worst."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class EvaluationSpec(Value):
     """Which grasps of a folder of objects are evaluated: of each view at most `grasps`, by `ranks`.
@@ -58,24 +60,19 @@ class EvaluationSpec(Value):
         BadArgument: no grasps, unknown ranks, or an unknown perturbation.
     """
 
-    grasps: int = 20
+    grasps: Count = 20
     ranks: Ranks = "best"
-    starts: int = 1000
+    starts: Count = 1000
     complete: bool = False
     only: tuple[str, ...] = ()
     planned: bool = False
-    seed: int = 0
+    seed: Seed = 0
     perturb: str = "none"
-    views: int | None = None
+    views: Count | None = None
     fingers: Fingers | None = None
 
     def __post_init__(self) -> None:
         find_perturbation(self.perturb)
-        check_whole("grasps", self.grasps, 1, 1_000_000)
-        if self.views is not None:
-            check_whole("views", self.views, 1, 1_000_000)
-        if self.ranks not in get_args(Ranks):
-            raise BadArgument("ranks", repr(self.ranks), f"one of {', '.join(get_args(Ranks))}")
 
     @property
     def tried(self) -> str:
@@ -89,6 +86,7 @@ class EvaluationSpec(Value):
         return f"the {self.grasps} best of each view" if self.grasps > 1 else "the best of each view"
 
 
+@checked
 def evaluate(
     objects: Path,
     hand: Hand,
@@ -96,7 +94,7 @@ def evaluate(
     spec: EvaluationSpec | None = None,
     *,
     folder: Path | None = None,
-    workers: int = 0,
+    workers: Annotated[int, Range(0, 1024)] = 0,
 ) -> Generator[ViewScore, None, None]:
     """Plan on every view of a folder of objects, and yield each view's score.
 
@@ -167,7 +165,13 @@ def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
     return [round(k * (executable - 1) / (most - 1)) for k in range(most)]
 
 
-def run_protocol(trial: GraspTrial, protocol: Protocol, rank: int = 0, draw: int = 0) -> ProtocolResult:
+@checked
+def run_protocol(
+    trial: GraspTrial,
+    protocol: Protocol,
+    rank: Annotated[int, Range(0, 1000000)] = 0,
+    draw: Annotated[int, Range(0, 1000000)] = 0,
+) -> ProtocolResult:
     """Put one grasp to a protocol; see `pull_grasp` and `lift_grasp`."""
     started = time.process_time()
     overlap = TrialDriver(trial, protocol.trial).grasp_overlap()

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.border import Seed, checked
 from torchgrasp.control.controller import GraspController, check_modes
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.errors import BadArgument
@@ -34,6 +35,7 @@ APPROACH_SPEED = 0.2
 """Mean speed of the hand on its way to the pre-grasp [m/s]: slow enough to push a light object without a blow."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class GraspTrial:
     """A grasp and the true object, as in `close_hand`."""
@@ -41,7 +43,7 @@ class GraspTrial:
     hand: Hand
     grasp: Grasps
     mesh: "trimesh.Trimesh | Path | str"
-    seed: int = 0
+    seed: Seed = 0
     error: Float[Tensor, "4 4"] | None = None
     belief: ShapeGP | None = None
     parts: "Sequence[trimesh.Trimesh] | None" = None

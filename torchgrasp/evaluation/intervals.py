@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.border import Measured, Seed, checked
+
 RESAMPLES = 10_000
 """Draws behind an interval: its ends are then known to a tenth of a point."""
 ONE_SIDED = 0.05
@@ -35,6 +37,7 @@ class Share(NamedTuple):
     units: int
 
 
+@checked
 def count_by(outcomes: Iterable[tuple[str, bool]]) -> dict[str, tuple[int, int]]:
     """Return the counts of outcomes that carry the name of their unit.
 
@@ -48,7 +51,8 @@ def count_by(outcomes: Iterable[tuple[str, bool]]) -> dict[str, tuple[int, int]]
     return counts
 
 
-def share_over(counts: Counts, seed: int = 0) -> Share:
+@checked
+def share_over(counts: Counts, seed: Seed = 0) -> Share:
     """Return the share of all trials that passed, with its interval over the units.
 
     Where all of n units passed in every trial, or in none, resampling tells nothing. The interval is then the one-sided
@@ -66,7 +70,8 @@ def share_over(counts: Counts, seed: int = 0) -> Share:
     return found
 
 
-def mean_over(values: Iterable[tuple[str, float]], seed: int = 0) -> Share:
+@checked
+def mean_over(values: Iterable[tuple[str, Measured]], seed: Seed = 0) -> Share:
     """Return the mean of numbers that carry the name of their unit, with its interval; NaN is left out.
 
     >>> mean_over([("tin", 1.0), ("cup", 3.0), ("tin", 2.0)])[::3]
@@ -80,7 +85,8 @@ def mean_over(values: Iterable[tuple[str, float]], seed: int = 0) -> Share:
     return contrast_over([sums], [1.0], seed)
 
 
-def difference_over(first: Counts, second: Counts, seed: int = 0) -> Share:
+@checked
+def difference_over(first: Counts, second: Counts, seed: Seed = 0) -> Share:
     """Return by how much the first share is above the second; the units are paired.
 
     An interval without width says that the units agree, not that the difference is known.
@@ -91,7 +97,8 @@ def difference_over(first: Counts, second: Counts, seed: int = 0) -> Share:
     return contrast_over([first, second], [1.0, -1.0], seed)
 
 
-def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: int = 0) -> Share:
+@checked
+def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: Seed = 0) -> Share:
     """Return a weighted sum of shares, each a ratio of sums over the same resampled units.
 
     The order of the units does not matter. `total` counts the trials of the first column. Resamples in which a column
@@ -118,6 +125,7 @@ def _combine(sums: Float[Tensor, "*r c 2"], weights: Sequence[float]) -> Float[T
     return (sums[..., 0] / sums[..., 1]) @ sums.new_tensor(weights)
 
 
+@checked
 def format_share(share: Share, unit: str = "families") -> str:
     """Return a share in words.
 

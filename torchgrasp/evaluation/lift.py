@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.border import Seed, checked
 from torchgrasp.closing import ClosureResult, Disturbance, ObjectMotion
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun, smooth_step
@@ -39,12 +40,13 @@ SLIP_DISTANCE, SLIP_ANGLE = 0.02, math.radians(30)
 """Motion [m, rad] of the object in the hand since it pressed that counts as slipped: a planned next step would fail."""
 
 
+@checked
 def close_hand(
     grasp: Grasps,
     hand: Hand,
     mesh: "trimesh.Trimesh | Path | str",
     spec: TrialSpec | None = None,
-    seed: int = 0,
+    seed: Seed = 0,
     *,
     error: Float[Tensor, "4 4"] | None = None,
     belief: ShapeGP | None = None,
@@ -81,6 +83,7 @@ def close_hand(
     return lift_grasp(GraspTrial(hand, grasp, mesh, seed, error, belief, parts, table, neighbours), spec)
 
 
+@checked
 def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResult:
     """Run a trial; see `close_hand`."""
     started = time.perf_counter()
@@ -91,6 +94,7 @@ def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResul
     return lift.result(status, time.perf_counter() - started)
 
 
+@checked
 def most_certain_first(contact_order: Sequence[int], grasp: Grasps) -> bool:
     """Return whether the finger on the most certain contact was the first to touch, as Sec. 5 expects of Eq. (27).
 

@@ -7,12 +7,14 @@ pose. The draws of one factor do not depend on the other factors.
 
 import dataclasses
 import math
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value, check_number
+from torchgrasp.border import Positive, Range, Seed, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.protocols import POSE_NOISE, PoseNoise, seed_of
 from torchgrasp.frames import rigid, rotation_from_vector
@@ -35,6 +37,13 @@ LONG_EDGE = 3.0
 """Edges of the triangulated image longer than this many of its median edges lie outside the silhouette."""
 
 
+Friction = Annotated[float, Range(0.0, 10.0)]
+"""A coefficient of friction."""
+Tilt = Annotated[float, Range(0.0, math.pi / 4)]
+"""An angle [rad] of an error that a robot may have."""
+
+
+@checked
 @dataclasses.dataclass(frozen=True)
 class Perturbation(Value):
     """What is wrong or unknown; the default is nothing.
@@ -54,22 +63,16 @@ class Perturbation(Value):
     """
 
     mass: bool = False
-    friction: tuple[float, float] | None = None
-    table: float = 0.0
-    up: float = 0.0
-    camera: tuple[float, float] = (0.0, 0.0)
-    mask: float = 0.0
-    depth: float = 0.0
+    friction: tuple[Friction, Friction] | None = None
+    table: Annotated[float, Range(0.0, 0.1)] = 0.0
+    up: Tilt = 0.0
+    camera: tuple[Annotated[float, Range(0.0, 0.1)], Tilt] = (0.0, 0.0)
+    mask: Annotated[float, Range(0.0, 0.5)] = 0.0
+    depth: Annotated[float, Range(0.0, 0.1)] = 0.0
     pose: PoseNoise = dataclasses.field(default_factory=PoseNoise)
 
     def __post_init__(self) -> None:
-        """Check the numbers once, where the value is made."""
-        check_number("table", self.table, 0.0, 0.1)
-        check_number("up", self.up, 0.0, math.pi / 4)
-        check_number("camera", self.camera[0], 0.0, 0.1)
-        check_number("camera", self.camera[1], 0.0, math.pi / 4)
-        check_number("mask", self.mask, 0.0, 0.5)
-        check_number("depth", self.depth, 0.0, 0.1)
+        """Check that the range of friction is one."""
         low, high = self.friction or (0.0, 0.0)
         check_number("friction", high, low, 10.0)
 
@@ -94,6 +97,7 @@ PERTURBATIONS = {
 """By name: nothing, one factor at a time, and all together."""
 
 
+@checked
 def find_perturbation(perturbation: Perturbation | str) -> Perturbation:
     """Return a perturbation by its name, or as it is.
 
@@ -110,7 +114,8 @@ def find_perturbation(perturbation: Perturbation | str) -> Perturbation:
     return PERTURBATIONS[perturbation]
 
 
-def household_mass(volume: float, known: float | None = None) -> float:
+@checked
+def household_mass(volume: Positive, known: Positive | None = None) -> float:
     """Return the mass [kg] of an object: the known one, else by `DENSITY` and volume [m^3] within `MASSES`.
 
     >>> household_mass(1e-6), household_mass(1e-3), household_mass(1e-3, known=0.3)
@@ -119,7 +124,8 @@ def household_mass(volume: float, known: float | None = None) -> float:
     return known if known is not None else min(max(DENSITY * volume, MASSES[0]), MASSES[1])
 
 
-def perturb_trial(spec: TrialSpec, perturbation: Perturbation, mass: float, seed: int) -> TrialSpec:
+@checked
+def perturb_trial(spec: TrialSpec, perturbation: Perturbation, mass: Positive, seed: Seed) -> TrialSpec:
     """Return a trial with the true mass [kg] and with a friction that is drawn.
 
     >>> perturb_trial(TrialSpec(), PERTURBATIONS["mass"], 0.5, 0).mass
@@ -133,7 +139,8 @@ def perturb_trial(spec: TrialSpec, perturbation: Perturbation, mass: float, seed
     return dataclasses.replace(spec, **changes)
 
 
-def perturb_view(cloud: PointCloud, perturbation: Perturbation, seed: int) -> tuple[PointCloud, Plane]:
+@checked
+def perturb_view(cloud: PointCloud, perturbation: Perturbation, seed: Seed) -> tuple[PointCloud, Plane]:
     """Return what a planner is told of an object on the table z = 0: the cloud and the table.
 
     Mask and depth change the points, the camera's error moves all of them with the viewpoint. The table has errors of

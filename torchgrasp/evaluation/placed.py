@@ -5,7 +5,7 @@ import functools
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import check_whole
+from torchgrasp.border import Range, Seed, checked
 from torchgrasp.cloud.camera import FOCAL, HEIGHT, WIDTH, look_at
 from torchgrasp.datasets import read_object_mesh
 from torchgrasp.errors import BadArgument
@@ -54,6 +55,7 @@ VIEWS = 20
 """Cameras drawn before a scene that fits into none begins again."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class PlacedScene:
     """Objects at rest on the table z = 0, and a camera that sees them.
@@ -93,7 +95,10 @@ def object_names(objects: Path | None) -> list[str]:
     return names
 
 
-def drop(objects: Path | None, count: tuple[int, int], seed: int) -> PlacedScene:
+@checked
+def drop(
+    objects: Path | None, count: tuple[Annotated[int, Range(1, 20)], Annotated[int, Range(1, 20)]], seed: Seed
+) -> PlacedScene:
     """Drop objects on a table, one after another, and let them come to rest.
 
     Each falls upright, turned at random and tilted by at most 10 degrees, within 0.13 m of the middle, from just above
@@ -110,7 +115,6 @@ def drop(objects: Path | None, count: tuple[int, int], seed: int) -> PlacedScene
         MissingExtra: SAPIEN is not installed.
     """
     low, high = count
-    check_whole("count", low, 1, 20)
     check_whole("count", high, low, 20)
     generator = torch.Generator().manual_seed(seed)
     known = object_names(objects)

@@ -4,13 +4,14 @@ import dataclasses
 import hashlib
 import json
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value, check_tensor
+from torchgrasp.base import Value
+from torchgrasp.border import Count, Length, Range, Seed, check_tensor, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import inverse, rigid, rotation_from_vector
 from torchgrasp.specs import TrialSpec
@@ -20,25 +21,28 @@ if TYPE_CHECKING:
     import trimesh
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class PoseNoise(Value):
     """Uniform errors along and about each axis, at most [m, rad]; `draws` a grasp."""
 
-    translation: float = 0.0
-    rotation: float = 0.0
-    draws: int = 1
+    translation: Length = 0.0
+    rotation: Annotated[float, Range(0.0, math.pi)] = 0.0
+    draws: Count = 1
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class PullSpec(Value):
     """Pulls by a force over mass [m/s^2], and the motion allowed [m, rad]."""
 
-    acceleration: float
-    seconds: float
-    distance: float
-    angle: float
+    acceleration: Annotated[float, Range(0.0, 100.0)]
+    seconds: Annotated[float, Range(0.0, 60.0)]
+    distance: Length
+    angle: Annotated[float, Range(0.0, math.inf)]
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Protocol(Value):
     """A test of a grasp: a trial that pulls at the object, or lifts it.
@@ -51,6 +55,7 @@ class Protocol(Value):
     pull: PullSpec | None = None
     noise: PoseNoise = dataclasses.field(default_factory=PoseNoise)
 
+    @checked
     def with_trial(self, **changes: Any) -> "Protocol":
         """Return the protocol with fields of its trial changed.
 
@@ -101,6 +106,7 @@ PROTOCOLS = {
 """
 
 
+@checked
 def find_protocol(protocol: Protocol | str) -> Protocol:
     """Return a protocol by its name, or as it is.
 
@@ -117,6 +123,7 @@ def find_protocol(protocol: Protocol | str) -> Protocol:
     return PROTOCOLS[protocol]
 
 
+@checked
 def apply_error(obj_from_hand: Float[Tensor, "4 4"], error: Float[Tensor, "4 4"] | None) -> Float[Tensor, "4 4"]:
     """Return the true pose of a hand from its planned pose and the error in it, on the CPU in float64.
 
@@ -127,7 +134,8 @@ def apply_error(obj_from_hand: Float[Tensor, "4 4"], error: Float[Tensor, "4 4"]
     return planned if error is None else planned @ check_tensor("error", error, (4, 4)).to("cpu", torch.float64)
 
 
-def seed_of(seed: int, *names: str | int) -> int:
+@checked
+def seed_of(seed: Seed, *names: str | int) -> int:
     """Return the seed of one draw: a hash of the campaign's seed and of what the draw is for.
 
     Draws for another object, view, row or repetition are independent, whatever else is drawn and in which order.
@@ -139,7 +147,8 @@ def seed_of(seed: int, *names: str | int) -> int:
     return int.from_bytes(digest[:8], "big") >> 1
 
 
-def draw_hand_errors(noise: PoseNoise, count: int, seed: int) -> Float[Tensor, "n 4 4"]:
+@checked
+def draw_hand_errors(noise: PoseNoise, count: Count, seed: Seed) -> Float[Tensor, "n 4 4"]:
     """Draw errors of the hand in its planned frame."""
     generator = torch.Generator().manual_seed(seed)
     largest = torch.tensor([noise.rotation] * 3 + [noise.translation] * 3, dtype=torch.float64)
@@ -148,7 +157,8 @@ def draw_hand_errors(noise: PoseNoise, count: int, seed: int) -> Float[Tensor, "
     return rigid(rotation_from_vector(rotations), translations)
 
 
-def draw_object_poses(noise: PoseNoise, pivot: Float[Tensor, "3"], count: int, seed: int) -> Float[Tensor, "n 4 4"]:
+@checked
+def draw_object_poses(noise: PoseNoise, pivot: Float[Tensor, "3"], count: Count, seed: Seed) -> Float[Tensor, "n 4 4"]:
     """Draw poses of an object that moves on its table and rotates about the vertical through `pivot` [m]."""
     generator = torch.Generator().manual_seed(seed)
     drawn = 2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1
@@ -164,7 +174,8 @@ def error_from_object_pose(
     return inverse(obj_from_hand) @ inverse(object_pose) @ obj_from_hand
 
 
-def draw_error(protocol: Protocol, grasp: Grasps, mesh: "trimesh.Trimesh", seed: int) -> Float[Tensor, "4 4"]:
+@checked
+def draw_error(protocol: Protocol, grasp: Grasps, mesh: "trimesh.Trimesh", seed: Seed) -> Float[Tensor, "4 4"]:
     """Draw the hand's error for one trial of a grasp, by a seed of its own (`seed_of`)."""
     if protocol.pull is not None:
         return draw_hand_errors(protocol.noise, 1, seed)[0]

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from torchgrasp.base import Value
+from torchgrasp.border import Measured, checked
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
 from torchgrasp.evaluation.protocols import Protocol, PullSpec, find_protocol
@@ -20,6 +21,7 @@ CHECK_SECONDS = 0.2
 """Interval [s] between two looks at the pulled object: ten in a pull of 2 s."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class PullResult(Value):
     """Whether the object stayed in every direction, and its largest motion [m, rad].
@@ -30,12 +32,13 @@ class PullResult(Value):
     passed: bool
     status: Status
     directions: int
-    moved: float
-    turned: float
-    force: float
-    seconds: float
+    moved: Measured
+    turned: Measured
+    force: Measured
+    seconds: Measured
 
 
+@checked
 def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") -> PullResult:
     """Close a hand on the true object and pull along the world's axes, each in a fresh scene until one fails.
 

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from torchgrasp.base import Value
+from torchgrasp.border import Measured, checked
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.calibration import judge
 from torchgrasp.evaluation.intervals import Share, count_by, share_over
@@ -22,6 +23,7 @@ STAGES: dict[str, tuple[Status, ...]] = {
 """The stages at which an attempt can fail, in order, with their statuses."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class ProtocolResult(Value):
     """The outcome of the grasp of a `rank` under a `draw` of pose errors; NaN: not measured.
@@ -35,16 +37,17 @@ class ProtocolResult(Value):
     draw: int
     passed: bool
     status: Status
-    moved: float = math.nan
-    turned: float = math.nan
-    force: float = math.nan
-    overlap: float = math.nan
-    seconds: float = math.nan
-    slip: float = math.nan
-    slip_angle: float = math.nan
-    predicted: float = math.nan
+    moved: Measured = math.nan
+    turned: Measured = math.nan
+    force: Measured = math.nan
+    overlap: Measured = math.nan
+    seconds: Measured = math.nan
+    slip: Measured = math.nan
+    slip_angle: Measured = math.nan
+    predicted: Measured = math.nan
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class ViewScore(Value):
     """The outcome of a view with `executable` planned grasps.
@@ -56,7 +59,7 @@ class ViewScore(Value):
     object: str
     view: str
     executable: int
-    seconds: float
+    seconds: Measured
     attempts: tuple[ProtocolResult, ...] = ()
     refusal: Status = Status.OK
     note: str = ""
@@ -70,6 +73,7 @@ class ViewScore(Value):
         return self.family or self.object
 
 
+@checked
 def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     """Return the numbers of an evaluation by name.
 

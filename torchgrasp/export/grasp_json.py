@@ -3,10 +3,13 @@
 DexGraspBench's own .npy is a pickled dictionary. It could run code when it is read, so it is not written.
 """
 
+from typing import Annotated
+
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from torchgrasp.border import Positive, Range, checked
 from torchgrasp.control.closing import POSE_TIME
 from torchgrasp.control.forces import squeeze
 from torchgrasp.errors import Status
@@ -32,7 +35,10 @@ CONVENTIONS = {
 """Meaning of the numbers; the file contains it."""
 
 
-def format_grasps(hand: Hand, grasps: Grasps, force: float = 4.0, kp: float | None = None) -> str:
+@checked
+def format_grasps(
+    hand: Hand, grasps: Grasps, force: Annotated[float, Range(0.01, 100.0)] = 4.0, kp: Positive | None = None
+) -> str:
     """Return grasps as JSON, with `CONVENTIONS`.
 
     The hand comes to "pose" along "approach" in its "pregrasp" posture. It closes to "grasp" in the time given.

@@ -1,9 +1,11 @@
 """Grasps as keyframes of a MuJoCo model. The hand has a free joint and position actuators."""
 
 import xml.etree.ElementTree as ET
+from typing import Annotated
 
 import numpy as np
 
+from torchgrasp.border import Positive, Range, checked
 from torchgrasp.control.forces import squeeze
 from torchgrasp.export.grasp_json import quaternion
 from torchgrasp.hand.hand import Hand
@@ -13,7 +15,10 @@ from torchgrasp.sim.mjcf import add_drive, add_links, format_numbers
 from torchgrasp.values import Grasps
 
 
-def format_keyframes(hand: Hand, grasps: Grasps, force: float = 4.0, kp: float | None = None) -> str:
+@checked
+def format_keyframes(
+    hand: Hand, grasps: Grasps, force: Annotated[float, Range(0.01, 100.0)] = 4.0, kp: Positive | None = None
+) -> str:
     """Return MJCF of the hand with four keyframes for each grasp: grasp_0_approach, _pregrasp, _grasp, _squeeze.
 
     The world is the object's frame. `qpos` is the free joint, then the joints of the model; `ctrl` is the targets of

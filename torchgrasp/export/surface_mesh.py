@@ -4,11 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
+from torchgrasp.border import checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.files import write_file
 from torchgrasp.shape.surface import Surface
 
 
+@checked
 def save_surface(surface: Surface, path: Path | str) -> Path:
     """Write a surface as `.ply`, with `std_m` [m] of each vertex, or `.glb`. Yellow marks `largest_std`, violet 0.
 
@@ -37,11 +39,13 @@ def save_surface(surface: Surface, path: Path | str) -> Path:
     return write_file(path, content)
 
 
+@checked
 def largest_std(surface: Surface) -> float:
     """Return the upper end [m] of the colour scale: the 99 % quantile over the vertices, at least 1 um."""
     return max(float(surface.std_m.double().quantile(0.99)), 1e-6)
 
 
+@checked
 def check_surface_path(path: Path | str) -> Path:
     """Return the path if `save_surface` can write its format; raise `BadArgument` for another suffix.
 

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from torchgrasp.base import FINGERTIPS
+from torchgrasp.border import Seed, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.collision_pairs import collision_pairs, draw_postures
 from torchgrasp.hand.fit_shapes import ball_tip, replace_meshes, shape_points
@@ -60,7 +61,8 @@ class Wish(NamedTuple):
     meshes: Path | None = None
 
 
-def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = None, seed: int = 0) -> str:
+@checked
+def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = None, seed: Seed = 0) -> str:
     """Write the text of a hand.toml for a clean URDF, to be looked over and checked by `check_hand`.
 
     Args:
@@ -85,7 +87,8 @@ def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = No
     return draft.toml
 
 
-def new_hand(path: Path | str, wish: Wish = Wish(), seed: int = 0, file: str = "hand.urdf") -> Draft:  # noqa: B008
+@checked
+def new_hand(path: Path | str, wish: Wish = Wish(), seed: Seed = 0, file: str = "hand.urdf") -> Draft:  # noqa: B008
     """Mend a published URDF, and draft a hand.toml for the clean copy, which is to be called `file`.
 
     Raises:

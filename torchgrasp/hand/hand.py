@@ -4,13 +4,14 @@ import dataclasses
 import functools
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.border import Count, Range, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.collision_spheres import CollisionSpheres
 from torchgrasp.hand.fingertips import Fingertips
@@ -115,25 +116,30 @@ class Hand(Value):
             found = f"{what} for {len(self.tips)} fingertips"
             raise BadArgument(argument, found, "that for three fingertips alone, as in the paper")
 
+    @checked(gradients=True)
     def check_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b h"]:
         """Return `joints` if they are within the limits; raise `BadArgument` with the first other joint."""
         self.actuated.check_limits(joints)
         return joints
 
+    @checked(gradients=True)
     def expand(self, joints: Float[Tensor, "*b h"]) -> dict[str, Float[Tensor, "*b"]]:
         """Return every movable joint of the URDF by name."""
         return dict(zip(self.tree.joint_names, self.expand_joints(joints).unbind(-1), strict=True))
 
+    @checked(gradients=True)
     def expand_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
         """Return every movable joint of the URDF, as in `tree.joint_names`."""
         return self.actuated.expand(joints)
 
+    @checked(gradients=True)
     def link_poses(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b l 4 4"]:
         """Return `hand_from_link` of every link, as in `tree.link_names`."""
         values = self.expand_joints(joints)
         poses = self.tree.poses(values.reshape(-1, values.shape[-1]))
         return poses.reshape(*joints.shape[:-1], *poses.shape[1:])
 
+    @checked(gradients=True)
     def fingertips(self, joints: Float[Tensor, "*b h"]) -> tuple[Float[Tensor, "*b f 3"], Float[Tensor, "*b f 3"]]:
         """Return the pads' contact points [m] and outward unit normals.
 
@@ -146,11 +152,13 @@ class Hand(Value):
         contact, normal, _ = self.tips.in_carriers
         return _rows(map_points(carriers, contact), joints), _rows(map_directions(carriers, normal), joints)
 
+    @checked(gradients=True)
     def tip_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b f 3"]:
         """Return the centres [m] of the tips' spheres; the contact points where the radius is 0."""
         _, carriers = self.tips.frames(self._columns(joints))
         return _rows(map_points(carriers, self.tips.in_carriers[2]), joints)
 
+    @checked(gradients=True)
     def jacobian(
         self, joints: Float[Tensor, "*b h"], at: Float[Tensor, "*b f 3"] | None = None
     ) -> Float[Tensor, "*b f 3 h"]:
@@ -178,13 +186,18 @@ class Hand(Value):
         summed = summed.index_add(1, finger * self.dof + actuated, column)
         return _rows(summed.unflatten(1, (len(self.tips), self.dof)).movedim(2, 0), joints)
 
+    @checked(gradients=True)
     def sphere_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b s 3"]:
         """Return the centres [m] of `collision_spheres`."""
         spheres, frames = self.collision_spheres, self.tree.frames(self._columns(joints))
         return _rows(map_points(frames.index_select(2, spheres.link_index), spheres.center), joints)
 
+    @checked(gradients=True)
     def self_clearance(
-        self, joints: Float[Tensor, "*b h"], below: float = math.inf, chunk: int = 1000
+        self,
+        joints: Float[Tensor, "*b h"],
+        below: Annotated[float, Range(-math.inf, math.inf)] = math.inf,
+        chunk: Count = 1000,
     ) -> Float[Tensor, "*b"]:
         """Return the signed least separation [m] of links that can meet; negative: they overlap.
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import torch
 
+from torchgrasp.border import checked
 from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.collision_spheres import spheres_from_urdf
 from torchgrasp.hand.fingertips import tips_from_files
@@ -24,6 +25,7 @@ def hands_folder() -> Path:
     return installed if installed.is_dir() else package.parent / "hands"
 
 
+@checked
 def find_hand(name_or_path: str | Path) -> Path:
     """Return the folder of a hand, given a shipped name, a folder or a hand.toml.
 
@@ -45,6 +47,7 @@ def find_hand(name_or_path: str | Path) -> Path:
     return folder
 
 
+@checked
 def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     """Load a hand from its hand.toml and URDF, with the fingers that grasp.
 
@@ -80,12 +83,14 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     )
 
 
+@checked
 def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
     """Return the same hand, where it is, grasping with other fingers; see `load_hand`."""
     other = load_hand(hand.urdf_path.parent, fingers)
     return hand if other.finger_names == hand.finger_names else other.to(hand.lower)
 
 
+@checked
 def hand_of(grasps: Grasps, hand: Hand | str | Path | None = None) -> Hand:
     """Return the hand with the fingers that grasps were planned for, by which to close it or to export them.
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from torchgrasp.border import checked
 from torchgrasp.errors import HandFileError
 from torchgrasp.hand.safe_xml import parse_urdf, read_bounded
 
@@ -116,6 +117,7 @@ class Urdf:
         return tuple(j for j in self.joints_above(link) if j.kind != "fixed")
 
 
+@checked
 def read_urdf(path: Path | str) -> Urdf:
     """Read and check a URDF file of at most 4 MiB; raises `HandFileError`.
 

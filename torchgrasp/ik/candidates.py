@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value
+from torchgrasp.border import Length, checked
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import rotate
 from torchgrasp.hand.hand import Hand
@@ -23,6 +24,7 @@ Reachable = Callable[[Tensor], Tensor]
 """Tells which poses obj_from_hand (k, 4, 4) an arm reaches, as booleans (k,)."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class GraspProblem(Value):
     """A hand, certified contacts and the world; grasps around `center`, the object's centre [m], rank higher.
@@ -66,6 +68,7 @@ def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -
     return answer.to(obj_from_hand.device)
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class GraspCandidates(Batch):
     """Configurations with finger i on contact i, a row's `permutation[:, i]`; `status` is that of the contacts."""
@@ -77,8 +80,9 @@ class GraspCandidates(Batch):
     status: Int[Tensor, "g"]
 
 
+@checked
 def check_candidates(
-    problem: GraspProblem, candidates: GraspCandidates, rolling: bool = True, tolerance: float = TIP_TOLERANCE
+    problem: GraspProblem, candidates: GraspCandidates, rolling: bool = True, tolerance: Length = TIP_TOLERANCE
 ) -> Grasps:
     """Return checked grasps (`measure_errors`); those right so far get pre-grasp and approach."""
     hand, world = problem.hand, problem.world

@@ -2,12 +2,14 @@
 
 import dataclasses
 import math
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch
+from torchgrasp.border import ANY, Length, checked
 from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, link_clearance, obstacle_clearance
@@ -24,23 +26,25 @@ ANGLE_TOLERANCE = math.radians(2)
 """How far [rad] a contact direction may lie outside the pad's cone: a soft residual leaves a little."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class GraspErrors(Batch):
     """Errors of grasps; `Grasps` explains the fields."""
 
-    tip_error: Float[Tensor, "g f"]
-    normal_angle: Float[Tensor, "g f"]
-    clearance: Float[Tensor, "g"]
+    tip_error: Annotated[Float[Tensor, "g f"], ANY]
+    normal_angle: Annotated[Float[Tensor, "g f"], ANY]
+    clearance: Annotated[Float[Tensor, "g"], ANY]
     status: Int[Tensor, "g"]
 
 
+@checked
 def measure_errors(
     hand: Hand,
     configuration: Configuration,
     contacts: Contacts,
     world: CollisionWorld,
     rolling: bool = True,
-    tolerance: float = TIP_TOLERANCE,
+    tolerance: Length = TIP_TOLERANCE,
 ) -> GraspErrors:
     """Measure grasps; `status` names the first error out of tolerance, as NaN is.
 

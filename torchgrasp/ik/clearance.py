@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value, settle
+from torchgrasp.border import checked
 from torchgrasp.hand.collision_spheres import CollisionSpheres
 from torchgrasp.ik.configuration import SpatialJacobian, wrench_of
 from torchgrasp.ik.obstacles import Obstacles
@@ -26,6 +27,7 @@ HINGES = 8
 """How many of the least clearances of each kind enter one step; the others are larger."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class CollisionWorld(Value):
     """The object's signed distance field, the table as a plane or a height [m] along z, and obstacles, if any.

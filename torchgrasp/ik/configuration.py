@@ -11,10 +11,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value
+from torchgrasp.border import checked
 from torchgrasp.frames import apply, rigid, rotate, rotation_from_vector
 from torchgrasp.hand.hand import Hand
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Configuration(Batch):
     """Joints [rad] and pose of a free hand."""

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchgrasp.border import checked
 from torchgrasp.errors import Status
 from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates
 from torchgrasp.ik.configuration import Configuration
@@ -43,6 +44,7 @@ def refine_on_contacts(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
     return check_candidates(problem, GraspCandidates(configuration, contacts, certificate, seeds.permutation, status))
 
 
+@checked
 def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
     """Return a checked grasp on fixed contacts for each triple that has seeds, best first."""
     seeds = problem.drop_unreachable(seeds)

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch
+from torchgrasp.border import checked
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, clearance_hinges
@@ -164,6 +165,7 @@ class JointProblem:
         return configuration, points, rows
 
 
+@checked
 def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: ContactSpec) -> Grasps:
     """Return a checked grasp for each triple that has seeds, best first; contacts slide where they must.
 

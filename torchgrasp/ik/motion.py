@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.border import checked
 from torchgrasp.frames import rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import CollisionWorld, along
@@ -102,6 +103,7 @@ def motion_clearance(
     return (world.obstacles.field.query(centres)[0] - hand.collision_spheres.radius.to(centres)).flatten(1).amin(1)
 
 
+@checked
 def collision_probability(
     hand: Hand, grasps: Grasps, obstacles: Obstacles, up: Float[Tensor, "3"] | None = None
 ) -> Float[Tensor, "g"]:
@@ -122,6 +124,7 @@ def collision_probability(
     )
 
 
+@checked
 def lift_clearance(vertices: Float[Tensor, "v 3"], obstacles: Obstacles, up: Float[Tensor, "3"] | None = None) -> float:
     """Return the least clearance [m] of a lifted surface from obstacles: far below zero if something lies on it."""
     up = torch.tensor([0.0, 0.0, 1.0]) if up is None else up

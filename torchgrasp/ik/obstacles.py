@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value, check_number, settle
+from torchgrasp.border import checked
 from torchgrasp.ik.sdf import SignedDistanceField
 from torchgrasp.scene.occupancy import Occupancy
 
@@ -17,6 +18,7 @@ LEVELS = (0.1, 0.5, 0.8)
 """Other probabilities whose regions tell how likely a hand collides; each distance field takes a tenth of a second."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Obstacles(Value):
     """Regions of ever greater probability to be full, as distances [m] from them.
@@ -34,6 +36,7 @@ class Obstacles(Value):
     hard: bool = True
 
     @classmethod
+    @checked
     def of(cls, occupancy: Occupancy, full: float = FULL, hard: bool = True) -> "Obstacles | None":
         """Return the obstacles of an occupancy whose voxels count as full from a probability on; None: all is free.
 

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value, check_device, check_whole, join
+from torchgrasp.border import Count, Seed, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, degenerate, inverse, rigid, rotate, virtual_frame
 from torchgrasp.hand.hand import Hand
@@ -37,6 +38,7 @@ ASKED = 3
 """Seeds whose poses an arm is asked for, to each that is kept: an arm refuses about half."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class PostureLibrary(Value):
     """Postures of a hand, with tip `centres` [m] in the frames of `tips_frame`, `feature`s and collision `spheres`."""
@@ -49,7 +51,8 @@ class PostureLibrary(Value):
     spheres: Float[Tensor, "s k 3"]
 
     @classmethod
-    def of(cls, hand: Hand, count: int | None = None, seed: int = 0) -> "PostureLibrary":
+    @checked
+    def of(cls, hand: Hand, count: Count | None = None, seed: Seed = 0) -> "PostureLibrary":
         """Draw postures within the joint limits and free of self-collision; count None: as many as work well."""
         count = (LIBRARY_SIZE if len(hand.tips) == 3 else LARGE_LIBRARY) if count is None else count
         joints = sample_configurations(hand, count, seed).joints.to(hand.lower.device, torch.float64)
@@ -82,11 +85,12 @@ def feature(centres: Float[Tensor, "*b f 3"], pads: Float[Tensor, "*b f 3"]) -> 
     return torch.cat([centres / LENGTH_SCALE, pads / COSINE_SCALE], -1).flatten(-2).float()
 
 
+@checked
 def nearest_postures(
     library: PostureLibrary,
     contacts: Contacts,
     world: CollisionWorld,
-    n_seeds: int = 8,
+    n_seeds: Count = 8,
     reachable: Reachable | None = None,
 ) -> IKSeeds:
     """Return the postures nearest to contacts, placed by Eq. (24) with the tips' centres for fingertips.

@@ -5,6 +5,7 @@ import dataclasses
 import torch
 
 from torchgrasp.base import check_whole, join, settle
+from torchgrasp.border import Count, Positive, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, degenerate, inverse, rotate, virtual_frame
 from torchgrasp.hand.hand import Hand
@@ -18,8 +19,9 @@ WRONG_SIDE = 0.3
 """Mean cosine of tips' and contacts' outward normals above which a seed touches from inside: codes have no side."""
 
 
+@checked
 def query_mixture(
-    hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: int = 8, max_energy: float = DEFAULT_ENERGY
+    hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: Count = 8, max_energy: Positive = DEFAULT_ENERGY
 ) -> IKSeeds:
     """Return the learned model's configurations near the contacts, in all six assignments (Eqs. 21-24).
 

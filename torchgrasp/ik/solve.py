@@ -5,14 +5,15 @@ Seeds of the learned model come first (Eqs. 21-24), then the nearest random post
 
 import dataclasses
 from functools import partial
-from typing import Literal, get_args
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch, check_tensor, join, pick, settle
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.base import Batch, join, pick, settle
+from torchgrasp.border import ANY, check_tensor, checked
+from torchgrasp.errors import Status
 from torchgrasp.frames import degenerate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.checks import measure_errors
@@ -37,6 +38,7 @@ EXACT, EXACT_TIPS = 1e-6, 5e-5
 """Sum of squared residuals [mm2] at which a seed is done, and tip error [m] above which further seeds are tried."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class IKSolution(Batch):
     """A configuration for each row of contacts; finger i touches contact `permutation[:, i]`.
@@ -44,16 +46,17 @@ class IKSolution(Batch):
     `clearance` [m] is the links' least; `attempts` counts the refined seeds. A row without seeds holds NaN.
     """
 
-    joints: Float[Tensor, "b h"]
-    obj_from_hand: Float[Tensor, "b 4 4"]
+    joints: Annotated[Float[Tensor, "b h"], ANY]
+    obj_from_hand: Annotated[Float[Tensor, "b 4 4"], ANY]
     permutation: Int[Tensor, "b f"]
-    tip_error: Float[Tensor, "b f"]
-    normal_angle: Float[Tensor, "b f"]
-    clearance: Float[Tensor, "b"]
+    tip_error: Annotated[Float[Tensor, "b f"], ANY]
+    normal_angle: Annotated[Float[Tensor, "b f"], ANY]
+    clearance: Annotated[Float[Tensor, "b"], ANY]
     attempts: Int[Tensor, "b"]
     status: Int[Tensor, "b"]
 
 
+@checked
 def solve_ik(
     hand: Hand,
     contacts: Contacts,
@@ -85,12 +88,8 @@ def solve_ik(
     >>> bool(solution.tip_error.max() < 1e-3)
     True
     """
-    if not isinstance(hand, Hand):
-        raise BadArgument("hand", type(hand).__name__, "a Hand from load_hand")
     check_tensor("contacts.points", contacts.points, (None, len(hand.tips), 3))
     check_tensor("contacts.normals", contacts.normals, (len(contacts), len(hand.tips), 3))
-    if method not in get_args(Method):
-        raise BadArgument("method", repr(method), f"one of {get_args(Method)}")
     if method == "cobyla":
         hand.require_three("method", "'cobyla'")
     if mixture is not None:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from torchgrasp.border import checked
 from torchgrasp.cloud.io.read import read_cloud
 from torchgrasp.errors import BadArgument
 from torchgrasp.scene.file import read_scene
@@ -27,6 +28,7 @@ MASSES = {"cylinder": 0.15, "jug": 0.20, "rabbit": 0.10, "spray": 0.15}
 """Masses [kg]: a tin, a plastic jug, a plush rabbit, a bottle a third full."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class GraspObject:
     """An object in metres, z up, resting at z = 0, with its mass [kg].
@@ -51,6 +53,7 @@ def list_objects() -> tuple[str, ...]:
     return tuple(MASSES)
 
 
+@checked
 def load_object(name: str) -> GraspObject:
     """Return one of the library's objects.
 

@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any
 
 from torchgrasp.base import Value
+from torchgrasp.border import Count, Seed, checked
 from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.pipeline.changes import Change, list_changes, more_starts
@@ -80,12 +81,13 @@ class Explanation(Value):
         return f"{self.funnel}\n{self.advice}"
 
 
+@checked
 def explain_empty(
     cloud: PointCloud | Scene,
     hand: Hand,
     spec: ContactSpec | None = None,
-    starts: int = 1000,
-    seed: int = 0,
+    starts: Count = 1000,
+    seed: Seed = 0,
     **options: Any,
 ) -> Explanation:
     """Tell why `plan_grasps` found no executable grasp, and which single change would give some.

@@ -1,15 +1,16 @@
 """From a partial point cloud, or a thing of a scene, to ranked grasps: all at once, or wave by wave."""
 
 from collections.abc import Iterator, Sequence
-from typing import overload
+from typing import Annotated, overload
 
 from typing_extensions import Unpack
 
+from torchgrasp.border import Count, Range, Seed, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand import Hand
 from torchgrasp.pipeline.chain import plan_request, stream_request
 from torchgrasp.pipeline.many import plan_many
-from torchgrasp.pipeline.task import PlanOptions, Request
+from torchgrasp.pipeline.task import Budget, PlanOptions, Request
 from torchgrasp.scene.scene import Scene
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Grasps, PointCloud
@@ -20,10 +21,10 @@ def plan_grasps(
     cloud: PointCloud | Scene,
     hand: Hand,
     spec: ContactSpec | None = None,
-    starts: int = 1000,
-    seed: int = 0,
+    starts: Count = 1000,
+    seed: Seed = 0,
     *,
-    time_budget: float | None = None,
+    time_budget: Budget | None = None,
     **options: Unpack[PlanOptions],
 ) -> Grasps: ...
 
@@ -33,24 +34,25 @@ def plan_grasps(
     cloud: Sequence[PointCloud],
     hand: Hand,
     spec: ContactSpec | None = None,
-    starts: int = 1000,
-    seed: int = 0,
+    starts: Count = 1000,
+    seed: Seed = 0,
     *,
-    time_budget: float | None = None,
-    workers: int = 0,
+    time_budget: Budget | None = None,
+    workers: Annotated[int, Range(0, 1024)] = 0,
     **options: Unpack[PlanOptions],
 ) -> list[Grasps]: ...
 
 
+@checked
 def plan_grasps(
     cloud: PointCloud | Scene | Sequence[PointCloud],
     hand: Hand,
     spec: ContactSpec | None = None,
-    starts: int = 1000,
-    seed: int = 0,
+    starts: Count = 1000,
+    seed: Seed = 0,
     *,
-    time_budget: float | None = None,
-    workers: int = 0,
+    time_budget: Budget | None = None,
+    workers: Annotated[int, Range(0, 1024)] = 0,
     **options: Unpack[PlanOptions],
 ) -> Grasps | list[Grasps]:
     """Plan grasps of a hand on the object of a partial point cloud, or on the target of a scene.
@@ -100,12 +102,13 @@ def plan_grasps(
     return plan_request(Request(cloud, **given))
 
 
+@checked
 def stream_grasps(
     cloud: PointCloud | Scene,
     hand: Hand,
     spec: ContactSpec | None = None,
-    starts: int = 1000,
-    seed: int = 0,
+    starts: Count = 1000,
+    seed: Seed = 0,
     **options: Unpack[PlanOptions],
 ) -> Iterator[Grasps]:
     """Yield executable grasps as soon as they are there: of each wave of `plan_grasps`, best first.

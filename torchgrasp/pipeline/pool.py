@@ -7,11 +7,11 @@ import os
 import threading
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import TimeoutError
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import torch
 
-from torchgrasp.base import check_number, check_whole
+from torchgrasp.border import Range, checked
 from torchgrasp.errors import MissingExtra, Status
 
 Result = TypeVar("Result")
@@ -20,8 +20,12 @@ JOIN_TIME = 10.0
 """Longest time [s] for stopped workers to end: they are killed, which takes milliseconds."""
 
 
+@checked
 def run_tasks(
-    function: Callable[..., Result], tasks: Iterable[tuple[Any, ...]], workers: int = 1, limit: float = 60.0
+    function: Callable[..., Result],
+    tasks: Iterable[tuple[Any, ...]],
+    workers: Annotated[int, Range(0, 1024)] = 1,
+    limit: Annotated[float, Range(0.001, math.inf)] = 60.0,
 ) -> Generator[Result | Status, None, None]:
     """Yield `function(*task)` for each task, in the order of the tasks.
 
@@ -42,8 +46,6 @@ def run_tasks(
     >>> list(run_tasks(pow, [(2, 3), (3, 2)], workers=0))
     [8, 9]
     """
-    check_whole("workers", workers, 0, 1024)
-    check_number("limit", limit, 1e-3, math.inf)
     return _run(function, tasks, workers, limit) if workers else (function(*task) for task in tasks)
 
 

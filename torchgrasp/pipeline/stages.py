@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchgrasp.border import Count, checked
 from torchgrasp.errors import Status
 from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.clearance import CollisionWorld
@@ -53,7 +54,8 @@ BURIED_DEPTH = 0.003
 """Depth [m] in obstacles, beyond that of neighbours that touch, at which something lies on a lifted surface."""
 
 
-def spread_rows(plan: ContactPlan, most: int) -> Int[Tensor, "k"]:
+@checked
+def spread_rows(plan: ContactPlan, most: Count) -> Int[Tensor, "k"]:
     """Return at most `most` successful rows, far apart, in plan order."""
     rows = torch.nonzero(plan.status == Status.OK)[:, 0]
     if len(rows) <= most:

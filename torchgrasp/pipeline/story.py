@@ -6,6 +6,7 @@ from typing import Any
 import torch
 
 from torchgrasp.base import count_status, join
+from torchgrasp.border import checked
 from torchgrasp.errors import Status
 from torchgrasp.pipeline.fingers import Observer
 from torchgrasp.values import Grasps
@@ -14,6 +15,7 @@ STAGES = ("plan", "certify", "query")
 """The stages of every wave, in their order."""
 
 
+@checked
 def describe(counts: dict[Status, int]) -> str:
     """Return counts of statuses as one line, the successes first.
 

@@ -3,13 +3,13 @@
 import dataclasses
 import math
 import time
-from typing import Any, TypedDict, get_args
+from typing import Annotated, Any, TypedDict
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import check_number, check_whole
+from torchgrasp.border import Count, Range, Seed, checked
 from torchgrasp.cloud.check import remove_duplicates
 from torchgrasp.errors import BadArgument
 from torchgrasp.files import sha256
@@ -29,6 +29,8 @@ from torchgrasp.values import Grasps, PointCloud
 
 LEAST_BUDGET = 1e-3
 """Least time budget [s]: the first wave takes hundreds of times as long anyway."""
+Budget = Annotated[float, Range(LEAST_BUDGET, math.inf)]
+"""A time budget [s]."""
 TARGET_POINTS = 1000
 """Points taken of a scene's target: local quadrics of as many span a centimetre, ten times a camera's noise."""
 
@@ -44,39 +46,23 @@ class PlanOptions(TypedDict, total=False):
     reachable: Reachable | None
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """The arguments of `plan_grasps`, which explains them.
-
-    Raises:
-        BadArgument: no hand, no starts, a negative seed, an unknown mode or ranking, or a budget that is not positive.
-    """
+    """The arguments of `plan_grasps`, which explains them; here they are checked."""
 
     cloud: PointCloud | Scene
     hand: Hand
     spec: ContactSpec | None = None
-    starts: int = 1000
-    seed: int = 0
+    starts: Count = 1000
+    seed: Seed = 0
     fingers: Fingers | None = None
     mode: Mode = "joint"
     ranking: Ranking | None = None
     shape: ShapeGP | None = None
     observer: Observer = lambda stage, message, value: None
     reachable: Reachable | None = None
-    time_budget: float | None = None
-
-    def __post_init__(self) -> None:
-        """Check before any work what the stages check too late, or not."""
-        if not isinstance(self.hand, Hand):
-            raise BadArgument("hand", type(self.hand).__name__, "a Hand from load_hand")
-        if self.mode not in get_args(Mode):
-            raise BadArgument("mode", repr(self.mode), f"one of {', '.join(map(repr, get_args(Mode)))}")
-        if self.ranking is not None and self.ranking not in get_args(Ranking):
-            raise BadArgument("ranking", repr(self.ranking), "'success', 'variance' or None")
-        check_whole("starts", self.starts, 1, 1_000_000)
-        check_whole("seed", self.seed, 0, 2**63 - 1)
-        if self.time_budget is not None:
-            check_number("time_budget", self.time_budget, LEAST_BUDGET, math.inf)
+    time_budget: Budget | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,7 +157,8 @@ def moved(value: Any, obj_from_upright: Float[Tensor, "4 4"]) -> Any:
     return value.moved(obj_from_upright) if isinstance(value, ShapeGP) else move(value, obj_from_upright)
 
 
-def take_target(scene: Scene, seed: int) -> PointCloud:
+@checked
+def take_target(scene: Scene, seed: Seed) -> PointCloud:
     """Return the cloud of a scene's target, random `TARGET_POINTS` of its points at most.
 
     Raises:

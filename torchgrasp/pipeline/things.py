@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from torchgrasp.base import Value, check_number
+from torchgrasp.base import Value
+from torchgrasp.border import Count, Fraction, Seed, checked
 from torchgrasp.errors import BadArgument, GraspError, Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers
@@ -29,6 +30,7 @@ COLUMN, COVER = 0.01, 5.0
 at all is left."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class ThingPlan(Value):
     """The executable grasps of one thing, best first, or the reason why there are none.
@@ -43,6 +45,7 @@ class ThingPlan(Value):
     shape: ShapeGP | None = None
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class ScenePlan(Value):
     """The things of a scene, the likeliest success first; then those without a grasp, and those not tried."""
@@ -55,15 +58,16 @@ class ScenePlan(Value):
         return next((thing for thing in self.things if thing.grasps is not None), None)
 
 
+@checked
 def plan_scene(
     scene: Scene,
     hand: Hand,
     spec: ContactSpec | None = None,
-    starts: int = 1000,
-    seed: int = 0,
+    starts: Count = 1000,
+    seed: Seed = 0,
     *,
     fingers: Fingers | None = None,
-    enough: float = 1.0,
+    enough: Fraction = 1.0,
     reachable: Reachable | None = None,
 ) -> ScenePlan:
     """Plan grasps of the things of a scene, and rank the things by predicted success.
@@ -83,7 +87,6 @@ def plan_scene(
     Raises:
         BadArgument: a scene without things, or an argument of the wrong type or range.
     """
-    check_number("enough", enough, 0.0, 1.0)
     if not scene.things:
         raise BadArgument("scene", "no thing on the table", "a scene with at least one thing")
     finger_sets(hand, fingers)  # refuses unknown ones

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import FINGERTIPS
+from torchgrasp.border import checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import degenerate
 from torchgrasp.plan.closure_lp import solve_closure_lp
@@ -30,6 +31,7 @@ UNIT_TOLERANCE = 1e-3
 """Largest difference of a given normal's length from 1: what rounding in a text file leaves."""
 
 
+@checked
 def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     """Prove in float64 that the contacts of a row have frictional form closure, Eq. (13), or that they have not.
 
@@ -52,8 +54,6 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     tensor([True])
     """
     spec = ContactSpec() if spec is None else spec
-    if not isinstance(spec, ContactSpec):
-        raise BadArgument("spec", type(spec).__name__, "a ContactSpec")
     points, normals = _checked(contacts)
     finite = torch.isfinite(points).flatten(1).all(-1) & torch.isfinite(normals).flatten(1).all(-1)
     margin, ratio, residual = (torch.full((len(points),), torch.nan, dtype=torch.float64) for _ in range(3))
@@ -139,8 +139,6 @@ def check_unit(normals: Vectors) -> Vectors:
 
 def check_contacts(contacts: Contacts) -> Contacts:
     """Return contacts of good shapes; raise `BadArgument` for others, and for a number of contacts beyond 3 to 5."""
-    if not isinstance(contacts, Contacts):
-        raise BadArgument("contacts", type(contacts).__name__, "Contacts")
     points = contacts.points
     for name, value in (("points", points), ("normals", contacts.normals)):
         if value.shape != (*points.shape[:2], 3) or not value.is_floating_point():

@@ -5,13 +5,14 @@ counts if the touched points are closed for round cones.
 """
 
 import dataclasses
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Batch
-from torchgrasp.errors import BadArgument
+from torchgrasp.border import FINITE, Range, Seed, checked
 from torchgrasp.plan.line_posterior import LinePosterior, first_contact, line_posterior, well_inside
 from torchgrasp.plan.round_cones import closed_exact, first_balance
 from torchgrasp.shape.gp import ShapeGP
@@ -24,6 +25,7 @@ GPU_DRAWS = 2**18
 """The same on a GPU, which fewer leave idle: about 700 MB (`scripts/bench.py gpu`)."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class ClosureProbability(Batch):
     """The `probability` that the contacts of each row are closed, with its `standard_error`."""
@@ -32,8 +34,13 @@ class ClosureProbability(Batch):
     standard_error: Float[Tensor, "b"]
 
 
+@checked
 def closure_probability(
-    shape: ShapeGP, contacts: Contacts, spec: ContactSpec | None = None, n: int = 2500, seed: int = 0
+    shape: ShapeGP,
+    contacts: Annotated[Contacts, FINITE],
+    spec: ContactSpec | None = None,
+    n: Annotated[int, Range(1, 10**8)] = 2500,
+    seed: Seed = 0,
 ) -> ClosureProbability:
     """Return how probable closure is on the uncertain surface, by Monte Carlo.
 
@@ -60,13 +67,6 @@ def closure_probability(
     tensor([True])
     """
     spec = ContactSpec() if spec is None else spec
-    if not isinstance(shape, ShapeGP):
-        raise BadArgument("shape", type(shape).__name__, "a ShapeGP")
-    if not isinstance(spec, ContactSpec):
-        raise BadArgument("spec", type(spec).__name__, "a ContactSpec")
-    for name, value, least in (("n", n, 1), ("seed", seed, 0)):
-        if not isinstance(value, int) or not least <= value < 2**63:
-            raise BadArgument(name, value, f"an integer from {least}")
     share = closed_share(line_posterior(shape, contacts), spec.friction, n, seed)
     middle = (n * share + 1) / (n + 2)
     return ClosureProbability(share, torch.sqrt(middle * (1 - middle) / n))

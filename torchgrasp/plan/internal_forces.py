@@ -5,11 +5,13 @@ directions in it: balance holds by construction. More contacts have a method of 
 """
 
 import math
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.border import ANY, Positive, checked
 from torchgrasp.linalg import GOLDEN_ANGLE, fibonacci_sphere, unit
 from torchgrasp.plan.cone_forces import forces_in_cones
 from torchgrasp.plan.problem import contact_pairs, pull_signs
@@ -51,11 +53,12 @@ def tangential_ratio(forces: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b
     return torch.where(push > 0, tangential / push.clamp_min(1e-12), torch.inf)
 
 
+@checked
 def least_friction_forces(
-    points: Float[Tensor, "*b f 3"],
-    normals: Float[Tensor, "*b f 3"],
-    strongest: float = 4.0,
-    preferred: Float[Tensor, "*#b f"] | None = None,
+    points: Annotated[Float[Tensor, "*b f 3"], ANY],
+    normals: Annotated[Float[Tensor, "*b f 3"], ANY],
+    strongest: Positive = 4.0,
+    preferred: Annotated[Float[Tensor, "*#b f"], ANY] | None = None,
 ) -> Float[Tensor, "*b f 3"]:
     """Return the balanced forces of the fingers on the object [N] that need the least friction.
 

@@ -17,7 +17,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Batch, check_tensor
+from torchgrasp.base import Batch
+from torchgrasp.border import check_tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
 from torchgrasp.plan.certify import check_contacts, check_unit

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import join, pick, put
+from torchgrasp.border import Count, Positive, Seed, checked
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.objectives import Improvement, Objective, improvement
@@ -33,14 +34,15 @@ Chunk = tuple[Float[Tensor, "_ f 3"], tuple[Stage, ...]]
 """Normalised starts on the surface, and the stages from there."""
 
 
+@checked
 def plan_contacts(
     shape: Shape,
     spec: ContactSpec | None = None,
-    starts: int | Float[Tensor, "b f 3"] = 1000,
-    seed: int = 0,
+    starts: Count | Float[Tensor, "b f 3"] = 1000,
+    seed: Seed = 0,
     *,
     objective: Objective = "center",
-    time_budget: float | None = None,
+    time_budget: Positive | None = None,
 ) -> ContactPlan:
     """Plan `spec.fingertips` contacts from each of many starts, Eqs. (10)-(14): one row a start, in their order.
 

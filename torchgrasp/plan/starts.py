@@ -7,7 +7,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import check_tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
 from torchgrasp.plan.flatness import normal_variation
@@ -36,24 +35,16 @@ STARTS_PER_CHUNK = 500
 
 def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor, seed: int) -> None:
     """Raise `BadArgument` for wrong arguments of `plan_contacts`."""
-    if not isinstance(shape, Shape):
-        raise BadArgument("shape", type(shape).__name__, "a ShapeGP, or an implicit surface with the same methods")
-    if not isinstance(seed, int) or not 0 <= seed < 2**63:
-        raise BadArgument("seed", seed, "an integer from 0")
-    if not isinstance(spec, ContactSpec):
-        raise BadArgument("spec", type(spec).__name__, "a ContactSpec")
     if isinstance(starts, Tensor):
         if starts.ndim == 3 and starts.shape[1] != spec.fingertips:
             allowed = f"as many as spec.fingertips: {spec.fingertips}"
             raise BadArgument("starts", f"{starts.shape[1]} contacts a row", allowed)
-        points = shape.normalise(check_tensor("starts", starts, (None, spec.fingertips, 3)))
+        points = shape.normalise(starts)
         farthest = float(torch.linalg.vector_norm(points, dim=-1).max()) if len(points) else 0.0
         if farthest > shape.domain_radius:
             found = f"a point {farthest * float(shape.scale):.4g} m from the shape's centre"
             allowed = f"at most {float(shape.domain_radius) * float(shape.scale):.4g} m, where the shape is known"
             raise BadArgument("starts", found, allowed)
-    elif isinstance(starts, bool) or not isinstance(starts, int) or starts < 1:
-        raise BadArgument("starts", repr(starts), "a positive number, or starting points of shape b x f x 3 [m]")
     elif spec.start_radius > shape.domain_radius:
         raise BadArgument("spec.start_radius", spec.start_radius, f"at most {float(shape.domain_radius):.4g}")
 

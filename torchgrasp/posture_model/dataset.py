@@ -6,8 +6,10 @@ import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Annotated
 
 from torchgrasp.base import check_whole, join
+from torchgrasp.border import Count, Range, checked
 from torchgrasp.errors import ModelFileError, OutputError
 from torchgrasp.files import LOCK, hold_folder, load_tensors, save_tensors, write_file
 from torchgrasp.hand.hand import Hand
@@ -44,7 +46,8 @@ class SampleFolder:
     def __iter__(self) -> Iterator[HandSamples]:
         return (self.chunk(i) for i in range(len(chunk_sizes(self.n))))
 
-    def chunk(self, i: int) -> HandSamples:
+    @checked
+    def chunk(self, i: Annotated[int, Range(0, 1000000)]) -> HandSamples:
         """Read chunk i; raises `ModelFileError` if it is missing, damaged, or belongs to other samples."""
         path, count = self.path(i), chunk_sizes(self.n)[i]
         tensors, meta = load_tensors(path, "samples", {"joints", "q"})
@@ -56,7 +59,8 @@ class SampleFolder:
             raise ModelFileError("path", f"{path}: the chunk of other samples", f"chunk {i} of {self.meta}")
         return HandSamples(tensors["joints"], tensors["q"], self.joint_names, dict(self.meta))
 
-    def read(self, n: int | None = None) -> HandSamples:
+    @checked
+    def read(self, n: Count | None = None) -> HandSamples:
         """Read the first `n` postures into memory; by default all. Raises `BadArgument` for n outside [1, len]."""
         n = self.n if n is None else n
         check_whole("n", n, 1, self.n)
@@ -75,11 +79,12 @@ class SampleFolder:
         return True
 
 
+@checked
 def write_samples(
     hand: Hand,
     spec: SampleSpec,
     folder: Path | str,
-    workers: int = 1,
+    workers: Annotated[int, Range(1, 1024)] = 1,
     observer: Callable[[int], object] = lambda count: None,
 ) -> SampleFolder:
     """Write samples as of `sample_configurations` chunk by chunk.
@@ -91,7 +96,6 @@ def write_samples(
         BadArgument: workers outside [1, 1024], or a hand whose postures are hardly ever kept.
         OutputError: the folder holds other samples, another run is writing it, or the disk is full.
     """
-    check_whole("workers", workers, 1, 1024)
     counts, meta = chunk_sizes(spec.n), spec.meta(hand)
     samples = SampleFolder(Path(folder), spec.n, hand.joint_names, meta)
     content = {"torchgrasp": "samples", "version": 1, "n": spec.n, "chunk": CHUNK_POSTURES}
@@ -120,6 +124,7 @@ def write_samples(
     return samples
 
 
+@checked
 def load_samples(folder: Path | str) -> SampleFolder:
     """Open a complete folder of samples.
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import check_tensor
+from torchgrasp.border import check_tensor, checked
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import degenerate, virtual_frame
 from torchgrasp.values import ContactCode, Contacts
@@ -33,6 +33,7 @@ def encode_fingertips(points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*
     return torch.cat([lengths, cosines], dim=-1)
 
 
+@checked
 def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
     """Encode contact triples for all six assignments of contacts to fingers, Eqs. (15)-(18).
 

@@ -3,11 +3,13 @@
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Annotated
 
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import check_number, check_tensor, check_whole
+from torchgrasp.base import check_whole
+from torchgrasp.border import Count, Fraction, Range, Seed, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.posture_model.checkpoint import Checkpoint
 from torchgrasp.posture_model.em import Progress, expectation_maximisation
@@ -23,15 +25,16 @@ TRIAL_STEPS = 20
 """Steps of EM before starts are compared; a whole fit takes some hundred."""
 
 
+@checked
 def fit_mixture(
     samples: HandSamples,
-    components: int,
-    seed: int = 0,
-    iterations: int = 300,
-    tolerance: float = 1e-3,
-    regularisation: float = MAX_REGULARISATION,
+    components: Count,
+    seed: Seed = 0,
+    iterations: Annotated[int, Range(1, 100000)] = 300,
+    tolerance: Fraction = 1e-3,
+    regularisation: Annotated[float, Range(0.0, MAX_REGULARISATION)] = MAX_REGULARISATION,
     *,
-    starts: int = 1,
+    starts: Annotated[int, Range(1, 1000)] = 1,
     checkpoint: Path | str | None = None,
     distributed: bool = False,
     observer: Callable[[Progress], None] = lambda progress: None,
@@ -63,16 +66,11 @@ def fit_mixture(
     if samples.q.shape[1] != len(CODE_NAMES):
         raise BadArgument("samples", f"codes of {samples.q.shape[1]} numbers", "codes of three fingertips: six numbers")
     rows = samples.rows().double()  # a copy, which is standardised in place
-    check_tensor("samples", rows, (len(samples), rows.shape[1]))
     shard = Shard.of(rows, distributed)
     n, least = shard.count(), rows.shape[1] + 2  # fewer samples leave the covariance of d dimensions singular
     if n < least:
         raise BadArgument("samples", f"{n} samples", f"at least {least}")
     check_whole("components", components, 1, n // least)
-    check_whole("iterations", iterations, 1, 100_000)
-    check_whole("starts", starts, 1, 1000)
-    check_number("tolerance", tolerance, 0.0, 1.0)
-    check_number("regularisation", regularisation, 0.0, MAX_REGULARISATION)
     names = (*samples.joint_names, *CODE_NAMES)
     centre, scale = _standardise(shard, names)
 

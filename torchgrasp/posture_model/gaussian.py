@@ -4,12 +4,14 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value, check_tensor, check_whole
+from torchgrasp.base import Value
+from torchgrasp.border import Range, Seed, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import cholesky
 
@@ -17,6 +19,7 @@ ROWS_PER_CHUNK = 8192
 """Rows evaluated together: this bounds the memory for rows x components x dimensions."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class GaussianMixture(Value):
     """A mixture of m Gaussians over d named dimensions (Eqs. 19-20), evaluated in float64.
@@ -37,9 +40,8 @@ class GaussianMixture(Value):
 
     def __post_init__(self) -> None:
         m, d = len(self.weights), len(self.names)
-        check_tensor("weights", self.weights, (m,))
-        check_tensor("means", self.means, (m, d))
-        check_tensor("covariances", self.covariances, (m, d, d))
+        if self.means.shape[1] != d:
+            raise BadArgument("names", f"{d} names of {self.means.shape[1]} dimensions", "one for each")
         if m < 1 or not bool((self.weights >= 0).all()) or abs(float(self.weights.double().sum()) - 1) > 1e-6:
             found = f"{m} weights, the least {self.weights.min() if m else None} and sum {float(self.weights.sum())}"
             raise BadArgument("weights", found, "at least one, none negative, of sum 1 within 1e-6")
@@ -54,6 +56,7 @@ class GaussianMixture(Value):
             found = f"an indefinite matrix in component {int(info.nonzero()[0])}"
             raise BadArgument("covariances", found, "symmetric positive definite matrices")
 
+    @checked
     def log_prob(self, x: Float[Tensor, "*b d"]) -> Float[Tensor, "*b"]:
         """Return the log-density of rows, Eq. (19); raises `BadArgument` for rows of another length than d."""
         if x.ndim < 1 or x.shape[-1] != len(self.names):
@@ -64,10 +67,9 @@ class GaussianMixture(Value):
         """Return log(pi_i) + log N(x | mu_i, Sigma_i) for every row and component."""
         return self.weights.double().log() + (self.whitening.log_scale - 0.5 * self.whitening.squared(x))
 
-    def sample(self, n: int, seed: int = 0) -> Float[Tensor, "n d"]:
+    @checked
+    def sample(self, n: Annotated[int, Range(0, 10**8)], seed: Seed = 0) -> Float[Tensor, "n d"]:
         """Draw n rows; n or seed out of range raises `BadArgument`."""
-        check_whole("n", n, 0, 2**63 - 1)
-        check_whole("seed", seed, 0, 2**63 - 1)
         generator = torch.Generator().manual_seed(seed)
         weights, means = self.weights.double().cpu(), self.means.double().cpu()
         draw = torch.rand(n, generator=generator, dtype=torch.float64)
@@ -80,12 +82,14 @@ class GaussianMixture(Value):
             rows[component == k] += noise[component == k] @ factor[k].T
         return rows.to(self.means.device)
 
+    @checked
     def marginal(self, names: Sequence[str]) -> "GaussianMixture":
         """Return the marginal density of some dimensions, Eq. (22); raises `BadArgument` for an unknown name."""
         index = self._index(names)
         block = self.covariances.double()[:, index][:, :, index]
         return GaussianMixture(self.weights.double(), self.means.double()[:, index], block, tuple(names))
 
+    @checked
     def condition(self, given: dict[str, float]) -> "GaussianMixture":
         """Return the density of the other dimensions given the values of some: bracket and h_i of Eq. (23).
 
@@ -95,7 +99,7 @@ class GaussianMixture(Value):
         rest = [i for i in range(len(self.names)) if i not in observed]
         if not rest:
             raise BadArgument("given", "every dimension", "some of them")
-        values = check_tensor("given", self.means.new_tensor(list(given.values()), dtype=torch.float64), (len(given),))
+        values = self.means.new_tensor(list(given.values()), dtype=torch.float64)
         if not given:
             return self.marginal(self.names)
         part = self.marginal(tuple(given))

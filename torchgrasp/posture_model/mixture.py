@@ -3,12 +3,14 @@
 import dataclasses
 import functools
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import check_whole
+from torchgrasp.border import ANY, Count, checked
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.hand.load import find_hand
@@ -22,6 +24,7 @@ DEFAULT_ENERGY = 6.295793622
 """Half the 95 % quantile of chi-square_6: in `bench.py hand --only reach` it accepts 95 % of planned grasps or more."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class GraspMixture(GaussianMixture):
     """The joint density of joints and codes of one hand (Eqs. 19-20); the names must end with `CODE_NAMES`.
@@ -60,14 +63,16 @@ class GraspMixture(GaussianMixture):
         at_zero = self.means[:, :-6].double() - (self._regression @ self.means[:, -6:, None].double())[..., 0]
         return torch.cat([self._regression.transpose(1, 2), at_zero[:, None]], 1).flatten(0, 1)
 
-    def energy(self, code: ContactCode | Float[Tensor, "*b 6"]) -> Float[Tensor, "*b"]:
+    @checked
+    def energy(self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]) -> Float[Tensor, "*b"]:
         """Return min_i f_i of Eq. (21): half the squared Mahalanobis distance to the nearest component.
 
         The hand reaches codes below `DEFAULT_ENERGY`, or `PAPER_ENERGY`. NaN gives NaN.
         """
         return map_rows(lambda q: 0.5 * self._code.whitening.squared(q).amin(-1), _codes(code))
 
-    def joints(self, code: ContactCode | Float[Tensor, "*b 6"]) -> Float[Tensor, "*b h"]:
+    @checked
+    def joints(self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]) -> Float[Tensor, "*b h"]:
         """Return the expected joints [rad] given a code, Eq. (23), which may pass the limits; NaN gives NaN."""
 
         def expect(q: Float[Tensor, "n 6"]) -> Float[Tensor, "n h"]:
@@ -78,7 +83,10 @@ class GraspMixture(GaussianMixture):
 
         return map_rows(expect, _codes(code))
 
-    def modes(self, q: Float[Tensor, "*b 6"], k: int) -> tuple[Float[Tensor, "*b k h"], Float[Tensor, "*b k"]]:
+    @checked
+    def modes(
+        self, q: Annotated[Float[Tensor, "*b 6"], ANY], k: Count
+    ) -> tuple[Float[Tensor, "*b k h"], Float[Tensor, "*b k"]]:
         """Return the conditional means of the k components most responsible for a code, and their h_i of Eq. (23).
 
         If several postures have the code, their mean may be none of them. A k outside [1, m] raises `BadArgument`.
@@ -100,6 +108,7 @@ class GraspMixture(GaussianMixture):
         """Return log h_i of Eq. (23); the logarithm does not underflow far from every component."""
         return torch.log_softmax(self._code.log_joint(q), dim=-1)
 
+    @checked
     def save(self, path: Path | str) -> Path:
         """Write the mixture atomically as safetensors for `load_mixture`; raises `OutputError`."""
         tensors = {"weights": self.weights, "means": self.means, "covariances": self.covariances}
@@ -115,6 +124,7 @@ def _codes(code: ContactCode | Tensor) -> Float[Tensor, "*b 6"]:
     return q
 
 
+@checked
 def load_mixture(name_or_path: Path | str) -> GraspMixture:
     """Read a mixture by the name or folder of its hand, or by the path of its .safetensors file.
 

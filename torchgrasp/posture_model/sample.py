@@ -3,14 +3,15 @@
 import dataclasses
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Literal, get_args
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Batch, Value, check_whole
+from torchgrasp.base import Batch, Value
+from torchgrasp.border import Range, Seed, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.compatibility import describe_compatibility
@@ -34,6 +35,7 @@ Sampling = Literal["uniform", "grasping"]
 """
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class HandSamples(Batch):
     """Postures `joints` [rad] of one hand and their codes `q` (Eq. 18); `meta` names the hand and the draw."""
@@ -48,6 +50,7 @@ class HandSamples(Batch):
         return torch.cat([self.joints, self.q], dim=-1)
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class SampleSpec(Value):
     """Which n free postures are drawn, see `Sampling`.
@@ -55,26 +58,21 @@ class SampleSpec(Value):
     Chunk i comes from (seed, i) alone, so fewer samples are a prefix of more. Other values raise `BadArgument`.
     """
 
-    n: int
-    seed: int = 0
+    n: Annotated[int, Range(1, MAX_SAMPLES)]
+    seed: Seed = 0
     sampling: Sampling = "uniform"
-
-    def __post_init__(self) -> None:
-        check_whole("n", self.n, 1, MAX_SAMPLES)
-        check_whole("seed", self.seed, 0, 2**63 - 1)
-        if self.sampling not in get_args(Sampling):
-            raise BadArgument("sampling", repr(self.sampling), f"one of {get_args(Sampling)}")
 
     def meta(self, hand: Hand) -> dict[str, str]:
         """Return what distinguishes samples, but for their number."""
         return {**describe_compatibility(hand), "seed": str(self.seed), "sampling": self.sampling}
 
 
+@checked
 def sample_configurations(
     hand: Hand,
-    n: int,
-    seed: int = 0,
-    workers: int = 1,
+    n: Annotated[int, Range(1, MAX_SAMPLES)],
+    seed: Seed = 0,
+    workers: Annotated[int, Range(1, 1024)] = 1,
     sampling: Sampling = "uniform",
     observer: Callable[[int], object] = lambda count: None,
 ) -> HandSamples:
@@ -88,7 +86,6 @@ def sample_configurations(
     torch.Size([100, 6])
     """
     spec = SampleSpec(n, seed, sampling)
-    check_whole("workers", workers, 1, 1024)
     if sampling == "grasping":
         hand.require_three("sampling", "'grasping'")
     parts = []

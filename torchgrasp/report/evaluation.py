@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from torchgrasp.border import checked
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.intervals import Share, format_share
 from torchgrasp.evaluation.score import ViewScore, summarise
@@ -22,6 +23,7 @@ SHARE_NAMES = {
 """The shares of a summary in words."""
 
 
+@checked
 def write_evaluation(path: Path | str, title: str, asked: Mapping[str, object], scores: Sequence[ViewScore]) -> Path:
     """Write the page of an evaluation, atomically: the scores of `evaluate`, and its settings by name.
 

@@ -9,6 +9,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from torchgrasp.base import count_status
+from torchgrasp.border import checked
 from torchgrasp.files import write_file
 from torchgrasp.pipeline.explain import Explanation
 from torchgrasp.report.document import escape, format_document, format_html_table
@@ -30,6 +31,7 @@ from torchgrasp.report.scenes import draw_among, draw_depth
 from torchgrasp.values import Grasps
 
 
+@checked
 def write_report(path: Path | str, run: Run) -> Path:
     """Write a run with its pictures as one HTML file, atomically.
 
@@ -39,6 +41,7 @@ def write_report(path: Path | str, run: Run) -> Path:
     return write_file(path, format_page(run, draw_pictures(run)))
 
 
+@checked
 def draw_pictures(run: Run) -> dict[str, list[tuple[str, bytes]]]:
     """Draw every picture of a run: captions and PNGs by section."""
     run = run.upright()

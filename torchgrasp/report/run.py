@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 
 from torchgrasp.base import count_status
+from torchgrasp.border import checked
 from torchgrasp.closing import ClosureResult
 from torchgrasp.errors import Status
 from torchgrasp.frames import inverse
@@ -31,6 +32,7 @@ class Stage(NamedTuple):
     seconds: float
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Run:
     """Everything that a report shows; `closure` is that on the true `mesh`, or both are None.
@@ -78,6 +80,7 @@ class Run:
         )
 
 
+@checked
 def verdict(run: Run) -> str:
     """Say in one sentence what the run ended with."""
     if run.closure is not None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from torchgrasp.border import checked
 from torchgrasp.cloud.io.arrays import MAX_BYTES, parse_npz
 from torchgrasp.errors import BadArgument, CloudFileError
 from torchgrasp.files import is_file, write_file
@@ -16,6 +17,7 @@ NAMES = ("depth", "intrinsics", "camera_pose", "labels", "mask", "table")
 """Arrays of a scene's file; the first two are required."""
 
 
+@checked
 def read_scene(path: Path | str) -> Scene:
     """Read a scene from a .npz file, by the rules of `Scene.from_depth`.
 
@@ -52,6 +54,7 @@ def is_scene(path: Path) -> bool:
         return "depth.npy" in archive.namelist()
 
 
+@checked
 def save_scene(scene: Scene, path: Path | str) -> Path:
     """Write a scene as .npz, atomically: depth in float32, labels, camera and table; `read_scene` reads it.
 

@@ -7,11 +7,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.border import checked
 from torchgrasp.cloud.depth import frustum_of_image
 from torchgrasp.frames import apply, inverse, rotate
 from torchgrasp.plane import GRID
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class DepthImage(Value):
     """A pinhole camera's depth image: `depth` [m] along the optical axis, 0 where nothing was measured.

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value, settle
+from torchgrasp.border import checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, inverse
 from torchgrasp.linalg import unit
@@ -43,6 +44,7 @@ MODEL = Path(__file__).with_name("occupancy.json")
 """Knots and weights of the model of occupancy, and what they were fitted on."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Occupancy(Value):
     """How likely each voxel is full of something that is neither the target nor the table.
@@ -178,6 +180,7 @@ def probability(kind: str, features: Float[Tensor, "n f"]) -> Float[Tensor, "n"]
     return torch.sigmoid(odds).clamp_min(LEAST)
 
 
+@checked
 def estimate_occupancy(scene: Scene, target: int) -> Occupancy:
     """Return how likely places around the target are full of something else; the scene is in its upright frame.
 

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.border import checked
 from torchgrasp.cloud.depth import read_depth
 from torchgrasp.errors import BadArgument
 from torchgrasp.plane import Plane, to_upright
@@ -24,6 +25,7 @@ CUT_OFF = 5
 """Pixels of a target at the image's border that say it is cut off: fewer are noise."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Scene(Value):
     """Things on a table, as one camera saw them, in the frame that was given ("obj").
@@ -45,6 +47,7 @@ class Scene(Value):
     target: int | None = None
 
     @classmethod
+    @checked
     def from_depth(
         cls,
         depth: Tensor | np.ndarray,
@@ -91,6 +94,7 @@ class Scene(Value):
         return scene if point is None else scene.select(point)
 
     @classmethod
+    @checked
     def from_cloud(
         cls,
         cloud: PointCloud,
@@ -152,6 +156,7 @@ class Scene(Value):
         scene = cls(points, own, image, pixels, plane, None if inside is None else 1)
         return scene if point is None else scene.select(point)
 
+    @checked
     def select(self, target: int | Sequence[float | int] | Tensor | np.ndarray) -> "Scene":
         """Return the scene with another target.
 
@@ -204,16 +209,19 @@ class Scene(Value):
         """The labels of the things, ascending."""
         return tuple(k for k in self.labels.unique().tolist() if k > 0)
 
+    @checked
     def rows_of(self, label: int | None = None) -> Bool[Tensor, "n"]:
         """Tell which points are a thing's, by default the target's."""
         return self.labels == (self.target if label is None else label)
 
+    @checked
     def cloud(self, label: int | None = None) -> PointCloud:
         """Return the points of a thing, by default the target, with the camera as viewpoint."""
         frustum = self.image.frustum
         sides = None if frustum is None else frustum.to(self.points)
         return PointCloud(self.points[self.rows_of(label)], None, self.viewpoint.to(self.points), sides)
 
+    @checked
     def to_upright(self, obj_from_upright: Float[Tensor, "4 4"]) -> "Scene":
         """Return the scene in the `upright_frame` of its target and table, all rounded."""
         return dataclasses.replace(

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import check_tensor
+from torchgrasp.border import check_tensor
 from torchgrasp.errors import NoSupport
 from torchgrasp.linalg import unit
 from torchgrasp.plane import Plane

@@ -4,22 +4,24 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.border import Positive, checked
 from torchgrasp.linalg import cholesky
 from torchgrasp.shape.gp import Normalisation, ShapeGP
 from torchgrasp.shape.gradient_kernel import gram
-from torchgrasp.shape.kernel import Kernel, kernel_by_name
+from torchgrasp.shape.kernel import Kernel, KernelName, kernel_by_name
 from torchgrasp.shape.observations import Observations
 from torchgrasp.shape.posterior import Posterior
 from torchgrasp.values import PointCloud
 
 
+@checked
 def condition(
     observations: Observations,
     normalisation: Normalisation,
     cloud: PointCloud,
-    psi_scale: float = 1.5,
-    std_factor: float = 1.0,
-    kernel: str | Kernel = "thin_plate",
+    psi_scale: Positive = 1.5,
+    std_factor: Positive = 1.0,
+    kernel: KernelName | Kernel = "thin_plate",
 ) -> ShapeGP:
     """Return the shape given normalised observations.
 

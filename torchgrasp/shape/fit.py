@@ -2,16 +2,16 @@
 
 import dataclasses
 import math
-from typing import Literal, get_args
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import join
+from torchgrasp.border import LEAST, Range, Seed, checked
 from torchgrasp.cloud.check import remove_duplicates
 from torchgrasp.cloud.prepare import PreparedCloud, prepare_cloud
-from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import fibonacci_sphere, unit
 from torchgrasp.plane import Plane, as_plane, cloud_to_upright, upright_frame
 from torchgrasp.shape.completion.complete import LEAST_NOISE, PART, Completion, Kind, complete_cloud
@@ -70,13 +70,14 @@ MAX_BUDGET = 1000
 """Greatest budget, and the limit of "sure": its factor has 4000 rows."""
 
 
+@checked
 def fit_shape(
     cloud: PointCloud,
-    noise: float = 0.01,
-    budget: int | Literal["sure"] | None = None,
-    psi_scale: float = 1.5,
+    noise: Annotated[float, Range(LEAST, 1.0)] = 0.01,
+    budget: Annotated[int, Range(OUTER_POINTS + 5, MAX_BUDGET)] | Literal["sure"] | None = None,
+    psi_scale: Annotated[float, Range(1.0, 100.0)] = 1.5,
     support: Literal["camera", "paper"] = "camera",
-    seed: int = 0,
+    seed: Seed = 0,
     *,
     table: Plane | float | None = None,
     kernel: KernelName | Kernel = "thin_plate",
@@ -117,8 +118,6 @@ def fit_shape(
     >>> fit_shape(PointCloud(0.04 * ball, ball)).predict(torch.tensor([0.0, 0.0, 0.04])).distance.abs() < 0.02
     tensor(True)
     """
-    _check_numbers(noise, budget, psi_scale, seed)
-    _check_names(support, kernel, criterion)
     plane, generator = as_plane(table), torch.Generator().manual_seed(seed)
     cloud = remove_duplicates(cloud)
     obj_from_upright = upright_frame(cloud, plane)
@@ -274,26 +273,3 @@ def _observe_completion(completion: Completion, frame: Normalisation) -> tuple[t
     mirrored = dataclasses.replace(mirrored, normal_noise=torch.hypot(mirrored.normal_noise, tilt))
     rim = observe(outline.rim, outline.rim_normals, RIM_NOISE, RIM_NORMAL_NOISE)
     return (rim, None), (mirrored, completion.deviations.to(frame.center) / frame.scale)
-
-
-def _check_numbers(noise: float, budget: int | Literal["sure"] | None, psi_scale: float, seed: int) -> None:
-    """Refuse numbers out of range."""
-    if not 0.0 < noise <= 1.0:  # also refuses NaN
-        raise BadArgument("noise", noise, "a number in (0, 1], normalised")
-    least = OUTER_POINTS + 1 + 4
-    if budget not in (None, "sure") and not (isinstance(budget, int) and least <= budget <= MAX_BUDGET):
-        raise BadArgument("budget", budget, f"{least} to {MAX_BUDGET} points, 'sure' or None")
-    if not 1.0 <= psi_scale <= 100.0:
-        raise BadArgument("psi_scale", psi_scale, "a number in [1, 100]; 1.34 and more are safe")
-    if not isinstance(seed, int) or not 0 <= seed < 2**63:
-        raise BadArgument("seed", seed, "an integer from 0")
-
-
-def _check_names(support: str, kernel: KernelName | Kernel, criterion: str) -> None:
-    """Refuse an unknown support, kernel or criterion."""
-    if support not in BUDGETS:
-        raise BadArgument("support", repr(support), "'camera' or 'paper'")
-    if not isinstance(kernel, Kernel):
-        kernel_by_name(kernel, 1.0)
-    if criterion not in get_args(Criterion):
-        raise BadArgument("criterion", repr(criterion), "'variance', 'error' or 'both'")

@@ -1,13 +1,14 @@
 """The shape as a Gaussian process over signed distance and normal, Eqs. (1), (7)-(9), in metres."""
 
 import dataclasses
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Value, check_tensor, map_tensors
+from torchgrasp.base import Value, map_tensors
+from torchgrasp.border import Positive, Range, Seed, check_tensor, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply
 from torchgrasp.linalg import cholesky, unit
@@ -103,10 +104,12 @@ class ShapeGP(Posterior, Normalisation):
         """Tell which wall is the surface at normalised points."""
         return torch.ones(len(x), 1, dtype=torch.bool, device=x.device)
 
+    @checked(gradients=True)
     def contains(self, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
         """Tell which points [m] lie in the domain."""
         return torch.linalg.vector_norm(self.normalise(points), dim=-1) <= self.domain_radius
 
+    @checked(gradients=True)
     def predict(self, points: Float[Tensor, "*b 3"]) -> ShapeEstimate:
         """Return signed distance, normal and their covariance at points [m] in the cloud's frame, Eqs. (7)-(8).
 
@@ -121,6 +124,7 @@ class ShapeGP(Posterior, Normalisation):
         std_m = self.std_factor * self.scale * surface_deviation(variance, mean[:, 1:])
         return _reshape(ShapeEstimate(mean[:, 0], unit(mean[:, 1:]), variance, covariance, std_m), points)
 
+    @checked(gradients=True)
     def normal_std(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return the calibrated standard deviation [rad] of the normal about one axis, at points [m] of the surface.
 
@@ -139,6 +143,7 @@ class ShapeGP(Posterior, Normalisation):
             std[own] = parts.variance().mean(-1).sqrt()
         return std.to(points).reshape(points.shape[:-1])
 
+    @checked(gradients=True)
     def differentiate(self, points: Float[Tensor, "*b 3"]) -> ShapeDerivatives:
         """Return distance, normal and variance differentiated by the query points [m]. Raises as `predict`."""
         jet = self.jet(self._queries(points))
@@ -152,9 +157,10 @@ class ShapeGP(Posterior, Normalisation):
         )
         return _reshape(rows, points)
 
+    @checked(gradients=True)
     def joint(self, points: Float[Tensor, "k 3"]) -> JointEstimate:
         """Return the joint posterior of (d, w) at up to 1000 points [m], normalised. Raises as `predict`."""
-        x = self._queries(check_tensor("points", points, (None, 3)))
+        x = self._queries(points)
         if len(x) > MAX_JOINT:
             raise BadArgument("points", f"{len(x)} points", f"at most {MAX_JOINT} points at once")
         return self.joint_at(x).to(points.dtype)
@@ -163,21 +169,22 @@ class ShapeGP(Posterior, Normalisation):
         """Return the joint posterior of (d, w) at normalised points; no check."""
         return joint_estimate(self, x)
 
-    def sample(self, points: Float[Tensor, "k 3"], n: int, seed: int = 0) -> Float[Tensor, "n k 4"]:
+    @checked
+    def sample(
+        self, points: Float[Tensor, "k 3"], n: Annotated[int, Range(0, 1_000_000)], seed: Seed = 0
+    ) -> Float[Tensor, "n k 4"]:
         """Draw (d, w) jointly at up to 1000 points [m], n times, normalised. Raises as `predict`."""
-        for name, value in (("n", n), ("seed", seed)):
-            if not isinstance(value, int) or not 0 <= value < 2**63:
-                raise BadArgument(name, value, "an integer from 0")
-        joint = self.joint(check_tensor("points", points, (None, 3)).double())
+        joint = self.joint(points.double())
         return draw_samples(joint, float(self.prior_block()[0, 0]), n, seed).to(points)
 
+    @checked
     def update(
         self,
         points: Float[Tensor, "m 3"],
         normals: Float[Tensor, "m 3"] | None = None,
         *,
-        noise: float = 0.001,
-        normal_noise: float = 0.05,
+        noise: Positive = 0.001,
+        normal_noise: Positive = 0.05,
     ) -> "ShapeGP":
         """Return the shape given further points, too: a finger's touch, a second view.
 
@@ -198,13 +205,10 @@ class ShapeGP(Posterior, Normalisation):
         >>> touched.predict(torch.tensor([0.0, 0.0, 0.045])).distance.abs() < 0.01
         tensor(True)
         """
-        x = self._queries(check_tensor("points", points, (None, 3)))
-        for name, value in (("noise", noise), ("normal_noise", normal_noise)):
-            if not 0.0 < value < float("inf"):  # also refuses NaN
-                raise BadArgument(name, value, "a positive number")
+        x = self._queries(points)
         direction = torch.zeros_like(x)
         if normals is not None:
-            direction = unit(check_tensor("normals", normals, (len(x), 3)).to(x))
+            direction = unit(normals.to(x))
             check_tensor("normals", direction, (len(x), 3))  # a normal of length 0 has become NaN
         new = on_surface(x, direction, torch.full_like(x[:, 0], noise / self.scale), normal_noise)
         return self.append(dataclasses.replace(new, has_normal=new.has_normal & (normals is not None)))
@@ -213,6 +217,7 @@ class ShapeGP(Posterior, Normalisation):
         """Return the shape given further observations, normalised, with the same kernel and domain."""
         return dataclasses.replace(self, **_fields(append_observations(self, new), Posterior))
 
+    @checked
     def moved(self, b_from_a: Float[Tensor, "4 4"]) -> "ShapeGP":
         """Return the shape in frame b [m]; it is given in frame a. Its normalised frame turns along."""
         rotation, n = b_from_a[:3, :3].to(self.x), len(self.x)
@@ -236,10 +241,7 @@ class ShapeGP(Posterior, Normalisation):
 
     def _queries(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "q 3"]:
         """Return normalised query points as a list; refuse points outside the domain."""
-        if not isinstance(points, Tensor) or points.ndim < 1 or points.shape[-1] != 3:
-            found = f"shape {tuple(points.shape)}" if isinstance(points, Tensor) else type(points).__name__
-            raise BadArgument("points", found, "a tensor of shape (..., 3)")
-        flat = check_tensor("points", points.reshape(-1, 3), (None, 3))
+        flat = points.reshape(-1, 3)
         x = self.normalise(flat.detach().double().to(self.device))
         radius = torch.linalg.vector_norm(x, dim=-1)
         outside = radius > self.domain_radius

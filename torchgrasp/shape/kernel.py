@@ -7,13 +7,13 @@ import dataclasses
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.errors import BadArgument
+from torchgrasp.border import LEAST, Positive, Range, checked
 
 Profile = Callable[[Tensor], Tensor]
 """A radial kernel k(r), elementwise and three times differentiable where r > 0, with k'(0) = 0."""
@@ -25,6 +25,7 @@ LEAST_PSI = 4.0 / 3.0
 """psi over the diameter of a ball in which the thin plate kernel is positive definite (dense limit: 1.313)."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Kernel:
     """A radial kernel k(r) of normalised distances.
@@ -41,7 +42,7 @@ class Kernel:
     """
 
     profile: Profile
-    diameter: float = math.inf
+    diameter: Annotated[float, Range(LEAST, math.inf)] = math.inf
     remedy: str = "use more noise, or a shorter length of the kernel"
     closed_form: Callable[[Tensor, int], tuple[Tensor, ...]] | None = None
 
@@ -84,19 +85,20 @@ def thin_plate(r: Float[Tensor, "*s"], psi: float) -> Float[Tensor, "*s"]:
     return r * r * (2.0 * r - 3.0 * psi) + psi**3
 
 
-def thin_plate_kernel(psi: float) -> Kernel:
+@checked
+def thin_plate_kernel(psi: Positive) -> Kernel:
     """Return the thin plate kernel with the closed form of its derivatives."""
     remedy = "use a psi_scale of at least 1.34: the thin plate kernel is a covariance only within 3/4 psi"
     return Kernel(partial(thin_plate, psi=psi), psi / LEAST_PSI, remedy, partial(_differentiate_thin_plate, psi))
 
 
-def matern52_kernel(length: float, variance: float = 1.0) -> Kernel:
+@checked
+def matern52_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
     """Return Matern 5/2: variance (1 + s + s^2 / 3) exp(-s) with s = sqrt(5) r / length.
 
     >>> float(matern52_kernel(1.0).profile(torch.zeros(())))
     1.0
     """
-    _check_positive(length, variance)
 
     def profile(r: Tensor) -> Tensor:
         s = (math.sqrt(5.0) / length) * r
@@ -105,17 +107,18 @@ def matern52_kernel(length: float, variance: float = 1.0) -> Kernel:
     return Kernel(profile)
 
 
-def rbf_kernel(length: float, variance: float = 1.0) -> Kernel:
+@checked
+def rbf_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
     """Return the squared exponential kernel: variance exp(-r^2 / (2 length^2)).
 
     >>> float(rbf_kernel(1.0).profile(torch.zeros(())))
     1.0
     """
-    _check_positive(length, variance)
     return Kernel(lambda r: variance * torch.exp(r * r * (-0.5 / length**2)))
 
 
-def kernel_by_name(name: str, psi: float) -> Kernel:
+@checked
+def kernel_by_name(name: KernelName, psi: Positive) -> Kernel:
     """Return "thin_plate", "matern52" or "rbf" with k(0) = psi^3 and k''(0) = -6 psi, as the thin plate has.
 
     The lengths are psi / sqrt(6) for "rbf" and sqrt(5/18) psi for "matern52".
@@ -127,9 +130,7 @@ def kernel_by_name(name: str, psi: float) -> Kernel:
         return thin_plate_kernel(psi)
     if name == "matern52":
         return matern52_kernel(psi * math.sqrt(5.0 / 18.0), psi**3)
-    if name == "rbf":
-        return rbf_kernel(psi / math.sqrt(6.0), psi**3)
-    raise BadArgument("kernel", repr(name), "'thin_plate', 'matern52', 'rbf' or a Kernel")
+    return rbf_kernel(psi / math.sqrt(6.0), psi**3)
 
 
 def _differentiate_by_distance(profile: Profile, r: Tensor, order: int) -> list[Tensor]:
@@ -152,10 +153,3 @@ def _differentiate_thin_plate(psi: float, r: Tensor, count: int) -> tuple[Tensor
         if count > 3:
             values.append((inverse * inverse).mul_(inverse).mul_(-6.0))
     return tuple(values)
-
-
-def _check_positive(length: float, variance: float) -> None:
-    """Refuse a length or a variance that is no positive number."""
-    for name, value in (("length", length), ("variance", variance)):
-        if not 0.0 < value < math.inf:
-            raise BadArgument(name, value, "a positive number, normalised")

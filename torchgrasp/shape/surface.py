@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import torch
@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value, map_tensors
+from torchgrasp.border import Range, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import limit_norm, unit
 from torchgrasp.mesh import clip_mesh
@@ -27,6 +28,7 @@ LEAST_SHARE = 0.02
 """Share of the cloud nearest to a sheet of the zero level from which on the sheet is kept: an ear, a handle."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Surface(Value):
     """A triangle mesh of the surface [m], wound outward, open at the edge of the domain.
@@ -46,7 +48,8 @@ class Surface(Value):
         return trimesh.Trimesh(self.vertices.cpu().numpy(), self.faces.cpu().numpy(), process=False)
 
 
-def extract_surface(shape: ShapeGP, resolution: int = 48) -> Surface:
+@checked
+def extract_surface(shape: ShapeGP, resolution: Annotated[int, Range(8, 256)] = 48) -> Surface:
     """Return the zero level of the mean, Eq. (9), within the domain, by marching cubes and Newton steps.
 
     `resolution` counts cells along the domain's diameter. Sheets near less than 2 % of the cloud are left out.
@@ -54,8 +57,6 @@ def extract_surface(shape: ShapeGP, resolution: int = 48) -> Surface:
     Raises:
         BadArgument: a resolution outside [8, 256], or a mean without zero level.
     """
-    if not 8 <= resolution <= 256:
-        raise BadArgument("resolution", resolution, "an integer in [8, 256]")
     walls = [_extract_wall(shape, i, resolution) for i in range(len(shape.walls))]
     before = [0, *itertools.accumulate(len(wall.vertices) for wall in walls)]
     walls = [dataclasses.replace(w, faces=w.faces + n) for w, n in zip(walls, before, strict=False)]

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from torchgrasp.border import checked
 from torchgrasp.errors import MeshError, MissingExtra, ModelFileError, OutputError
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.mesh import LEAST_VOLUME, check_solid, read_mesh
@@ -25,12 +26,16 @@ if TYPE_CHECKING:
 THRESHOLD = 0.05
 """Concavity at which CoACD stops cutting (0.01-1; its own default)."""
 
+MAX_PARTS = 1000
+"""Most parts that a caller gives: CoACD makes tens, and checking 3000 took a minute."""
+
 _SEARCH: dict[str, Any] = {"mcts_iterations": 60, "mcts_max_depth": 2, "mcts_nodes": 10}
 """A narrower search for the cuts than CoACD's own, for speed; the parts' volumes sum to 1.03 of the mesh's at most."""
 
 _log = logging.getLogger(__name__)
 
 
+@checked
 def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None = None) -> "list[trimesh.Trimesh]":
     """Return convex parts that fill a closed mesh, one if it is convex.
 
@@ -77,7 +82,9 @@ def _filled(parts: "list[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
 
 
 def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
-    """Return the caller's own parts, refusing any that is not convex."""
+    """Return the caller's own parts, refusing any that is not convex, and too many."""
+    if len(parts) > MAX_PARTS:
+        raise MeshError("parts", f"{len(parts)} parts", f"at most {MAX_PARTS}")
     for index, part in enumerate(parts):
         check_solid(part, f"part {index}")
         if not part.is_convex:

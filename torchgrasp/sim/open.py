@@ -1,10 +1,12 @@
 """The simulators of a scene by name, imported on demand."""
 
+from torchgrasp.border import checked
 from torchgrasp.sim.scene import Scene, SceneSpec
-from torchgrasp.specs import check_simulator
+from torchgrasp.specs import Simulator
 
 
-def open_scene(spec: SceneSpec, simulator: str = "sapien") -> Scene:
+@checked
+def open_scene(spec: SceneSpec, simulator: Simulator = "sapien") -> Scene:
     """Return a fresh scene at its start.
 
     Raises:
@@ -12,7 +14,6 @@ def open_scene(spec: SceneSpec, simulator: str = "sapien") -> Scene:
         HandFileError: the hand's URDF is no sound one.
         MissingExtra: the simulator is not installed.
     """
-    check_simulator(simulator)
     if simulator == "mujoco":
         from torchgrasp.sim.mujoco_scene import MujocoScene
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from torchgrasp.border import checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand import Actuator
 
@@ -37,6 +38,7 @@ NEIGHBOURS, TABLETOP, TARGET = range(3)
 """What a hand may touch otherwise than with a finger on the object: the places in `StepContacts.stray`."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Neighbour:
     """A body that stands or lies beside the object.
@@ -52,6 +54,7 @@ class Neighbour:
     mass: float | None = None
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Body:
     """A rigid body of the simulator: its mesh, convex parts that make up its surface, and its mass [kg]."""

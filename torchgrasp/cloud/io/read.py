@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgrasp.base import check_tensor, named_tensors
+from torchgrasp.base import named_tensors
+from torchgrasp.border import check_tensor, checked
 from torchgrasp.cloud.check import check_cloud
 from torchgrasp.cloud.io.arrays import MAX_BYTES, parse_npy, parse_npz
 from torchgrasp.cloud.io.pcd import parse_pcd
@@ -24,6 +25,7 @@ SCALE: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Metres in each unit of length."""
 
 
+@checked
 def read_cloud(
     path: Path | str, viewpoint: Sequence[float | int] | Tensor | None = None, unit: Literal["m", "cm", "mm"] = "m"
 ) -> PointCloud:
@@ -58,6 +60,7 @@ def read_cloud(
     return check_cloud(read_cloud_file(path, viewpoint, unit).cloud)
 
 
+@checked
 def read_cloud_file(
     path: Path | str, viewpoint: Sequence[float | int] | Tensor | None = None, unit: Literal["m", "cm", "mm"] = "m"
 ) -> CloudFile:
@@ -73,8 +76,6 @@ def read_cloud_file(
     Traceback (most recent call last):
     torchgrasp.errors.CloudFileError: path: found none.ply, which is no file, allowed is a .ply file
     """
-    if unit not in SCALE:
-        raise BadArgument("unit", repr(unit), f"one of {list(SCALE)}")
     try:
         position = None if viewpoint is None else torch.as_tensor(viewpoint, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -103,6 +104,7 @@ def read_cloud_file(
     return make_cloud(str(path), arrays, position, SCALE[unit])
 
 
+@checked
 def cloud_from_array(
     points: np.ndarray, normals: np.ndarray | None = None, viewpoint: np.ndarray | Sequence[float | int] | None = None
 ) -> PointCloud:
@@ -123,6 +125,7 @@ def cloud_from_array(
     return check_cloud(make_cloud("an array", arrays).cloud)
 
 
+@checked
 def save_cloud(cloud: PointCloud, path: Path | str) -> Path:
     """Write a cloud as `.npz` (exact) or binary `.ply` (float32), atomically.
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.border import checked
 from torchgrasp.cloud.check import MIN_POINTS
 from torchgrasp.cloud.io.text import MAX_POINTS
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_planes
@@ -21,6 +22,7 @@ FEW = 2000
 """Points that are asked whether they face a default viewpoint."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class CloudFile(Value):
     """A cloud as it was read, and a sentence for each thing that was left out."""

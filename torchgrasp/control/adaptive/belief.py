@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import settle
+from torchgrasp.border import checked
 from torchgrasp.control.closing_law import position_gain, surface_covariance
 from torchgrasp.control.forces import desired_forces
 from torchgrasp.control.observation import Observation
@@ -40,6 +41,7 @@ class Belief:
         self.hand_from_obj = inverse(self.obj_from_hand)
         self.touched: Tensor | None = None
 
+    @checked
     def revise(self, observation: Observation, reference: ClosingReference) -> ClosingReference:
         """Return the reference, replanned for the fingers in the air after a surprising touch."""
         touched = torch.zeros_like(observation.tactile.contact) if self.touched is None else self.touched

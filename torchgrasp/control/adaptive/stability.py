@@ -9,12 +9,14 @@ import dataclasses
 import functools
 import math
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value, check_tensor
+from torchgrasp.base import Value
+from torchgrasp.border import LEAST, Positive, Range, checked
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.hand.hand import Hand
@@ -50,6 +52,7 @@ def lengths_of(tips: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
     return torch.linalg.vector_norm(tips - tips.mean(-2, keepdim=True), dim=-1)
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class PreferredForces(Value):
     """How stable grasps press: normal forces [N], covariance [N^2], spring stiffness [N/m]."""
@@ -59,6 +62,7 @@ class PreferredForces(Value):
     springs: Float[Tensor, "3"]
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class StabilityModel(Value):
     """What the trials of a hand tell of its grasps.
@@ -75,7 +79,7 @@ class StabilityModel(Value):
 
     stable: GaussianMixture
     others: GaussianMixture
-    share: float
+    share: Annotated[float, Range(LEAST, 1 - 2**-53, "a number in (0, 1)")]
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
 
     def __post_init__(self) -> None:
@@ -83,10 +87,9 @@ class StabilityModel(Value):
         for mixture in (self.stable, self.others):
             if mixture.names != NAMES:
                 raise BadArgument("names", mixture.names, ", ".join(NAMES))
-        if not 0.0 < self.share < 1.0:
-            raise BadArgument("share", self.share, "a number in (0, 1)")
 
-    def preferred_forces(self, tips: Float[Tensor, "3 3"], force: float | None = None) -> PreferredForces:
+    @checked
+    def preferred_forces(self, tips: Float[Tensor, "3 3"], force: Positive | None = None) -> PreferredForces:
         """Return how stable grasps of the same lengths press [6].
 
         Args:
@@ -96,7 +99,7 @@ class StabilityModel(Value):
         Raises:
             BadArgument: numbers that are not finite.
         """
-        lengths = lengths_of(check_tensor("tips", tips, (3, 3)).double())
+        lengths = lengths_of(tips.double())
         given = dict(zip(LENGTHS, lengths.log().tolist(), strict=True))
         rest = self.stable.condition(given)
         mean, covariance = rest.marginal(FORCES).mean(), rest.marginal(FORCES).covariance()
@@ -126,6 +129,7 @@ class StabilityModel(Value):
         """The densities of stiffness and forces."""
         return self.stable.marginal((*STIFFNESS, *FORCES)), self.others.marginal((*STIFFNESS, *FORCES))
 
+    @checked
     def save(self, path: Path | str) -> Path:
         """Write the model as safetensors, atomically; `load_stability` reads it back.
 
@@ -140,6 +144,7 @@ PARTS = [(kind, part) for kind in ("stable", "others") for part in ("weights", "
 """The tensors of a file: each mixture's."""
 
 
+@checked
 def load_stability(hand: Hand, path: Path | str | None = None) -> StabilityModel | None:
     """Read the stability model of a hand.
 

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value, join
+from torchgrasp.border import Count, checked
 from torchgrasp.frames import apply, inverse, rotate
 from torchgrasp.linalg import farthest_points, reflect, reflect_directions
 from torchgrasp.shape.completion.axis import find_axis
@@ -93,7 +94,8 @@ class Completion(Value):
         return torch.cat([self.shared, local[:, None] * symmetric_root(alike, 1.0, "keep mirrored points apart")], 1)
 
 
-def complete_cloud(cloud: PointCloud, table: float | None = None, budget: int = 50) -> Completion:
+@checked
+def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count = 50) -> Completion:
     """Return the hidden side that the cloud's symmetry suggests, with its uncertainty.
 
     The cloud is mirrored across its best planes and across pairs of them. Points of better planes come first. No view

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.border import checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, rotate
 from torchgrasp.linalg import farthest_points, unit
@@ -125,6 +126,7 @@ class Outlines(Value):
         return torch.stack([view.violation(points) for view in self.views]).amax(0)
 
 
+@checked
 def silhouettes(cloud: PointCloud) -> Outlines:
     """Return the silhouette of every view of a cloud with viewpoints.
 
