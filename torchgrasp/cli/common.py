@@ -33,9 +33,10 @@ def naming(**options: str) -> Iterator[None]:
     try:
         yield
     except BadArgument as error:
-        if error.argument not in options:
+        argument = error.argument.split("[")[0]  # an item of a list has its place in brackets
+        if argument not in options:
             raise
-        raise type(error)(options[error.argument], error.found, error.allowed) from error
+        raise type(error)(options[argument], error.found, error.allowed) from error
 
 
 WIDEST = 1.5

@@ -36,7 +36,7 @@ class PoseNoise(Value):
 class PullSpec(Value):
     """Pulls by a force over mass [m/s^2], and the motion allowed [m, rad]."""
 
-    acceleration: Annotated[float, Range(0.0, 100.0)]
+    acceleration: Annotated[float, Range(0.0, 1000.0)]
     seconds: Annotated[float, Range(0.0, 60.0)]
     distance: Length
     angle: Annotated[float, Range(0.0, math.inf)]
