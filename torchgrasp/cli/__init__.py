@@ -46,6 +46,7 @@ GROUPS = {
     "hand": "Bring a hand of your own: draft, check, sample, train.",
     "shape": "See the shape that was estimated.",
 }
+"""Groups of commands, by the first word."""
 
 
 START = """torchgrasp: dexterous fingertip grasps from a partial point cloud
