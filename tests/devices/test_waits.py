@@ -9,6 +9,7 @@ import torch
 from tests.devices.conftest import sent
 from tests.devices.elsewhere import Waits, elsewhere
 from torchgrasp import ContactSpec, load_object, sample_configurations
+from torchgrasp.border import checked
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.refine import refine
@@ -59,6 +60,7 @@ def test_refinement_waits_for_the_pairs_of_links_too(device, monkeypatch, shape,
     hand, contacts, world = sent(hand), sent(grasps.contacts), sent(world)
     start = sent(Configuration(grasps.joints + 0.1, grasps.obj_from_hand))
 
+    @checked  # as a public function calls it: within the border nothing is read again
     def run(steps: int) -> object:
         monkeypatch.setattr("torchgrasp.ik.refine.ITERATIONS", steps)
         return refine(hand, start, contacts, world, 0.0)
