@@ -35,7 +35,7 @@ FEATURES = (
 LEAST_LEVER, LEAST_ARM = 0.01, 0.1
 """Lever [m] of fingertips' torsion where three lie on one line; and an arm over the lever that turns nothing."""
 STRAIGHT_LEVER, FREE_LEVER = 0.01, 0.07
-"""Added to a lever [m], so that a straight finger's, which is 0, has a logarithm. And the lever from which on more is no
+"""Added to a lever [m], so that a straight finger's, which is 0, has a logarithm. And the lever above which more is no
 better: there 4 mm and 5 N m/rad are 4 N, the force itself. Skill on bodies left out: 0.218, without this 0.213."""
 SURFACE_DRAWS = 600
 """Surfaces drawn for the probability of closure, whose error is then 0.02."""
