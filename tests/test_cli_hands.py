@@ -29,7 +29,7 @@ def test_new_writes_a_draft_that_check_takes_and_draws(barrett, capsys):
     picture = barrett / "hand.png"
     assert main(["hand", "check", str(barrett), "--out", str(picture)]) == 0
     said = capsys.readouterr().out
-    assert re.search(r"sets of fingers:\ndefault +f1_distal, f2_distal, f3_distal\n", said)
+    assert re.search(r"sets of fingers:\ndefault +f1, f2, f3\n", said)
     for words in ("mine, option default: 4 actuated of 8 joints", "spread", "f1_distal = 0.3333 f1_flex", "none"):
         assert words in said
     with Image.open(picture) as image:

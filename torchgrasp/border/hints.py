@@ -82,6 +82,7 @@ def _literal(options: tuple[Any, ...]) -> tuple[Reader, str]:
 
 def _union(options: tuple[Any, ...]) -> tuple[Reader, str]:
     """Read what any option allows; of a tensor, the error says what the last option for tensors has against it."""
+    options = tuple(x for x in options if x is not int or float not in options)  # whole numbers are numbers
     readers = [reader(option)[0] for option in options]
     text = " or ".join(dict.fromkeys(reader(option)[1] for option in options))
 
