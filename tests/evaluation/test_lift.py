@@ -180,8 +180,8 @@ def test_bad_arguments_are_refused():
         close_hand(grasp, hand, mesh, TrialSpec(control_rate=1000.0))
     with pytest.raises(BadArgument, match="joints: found 9 for"):
         close_hand(dataclasses.replace(grasp, pregrasp=grasp.pregrasp * 0 + 9), hand, mesh)
-    for wrong in (math.nan, 0.0, 2.0):
-        with pytest.raises(BadArgument, match=r"unit vector|approach: found nan"):
+    for wrong, allowed in ((math.nan, "finite"), (0.0, "unit vector"), (2.0, "unit vector")):
+        with pytest.raises(BadArgument, match=f"approach.*{allowed}"):
             close_hand(dataclasses.replace(grasp, approach=wrong * grasp.approach), hand, mesh)
     with pytest.raises(MeshError, match="parts"):
         close_hand(grasp, hand, mesh, parts=[])
