@@ -21,11 +21,26 @@ def run(code, folder):
     return done.stdout
 
 
-def test_import_brings_in_no_simulator_and_nothing_that_draws(tmp_path):
-    code = "import sys, torchgrasp; print(*sorted({m.split('.')[0] for m in sys.modules}))"
-    loaded = set(run(code, tmp_path).split())
+SIMULATORS = {"sapien", "mujoco", "coacd", "pebble"}
+DRAWERS = {"viser", "pyvista", "vtk", "vtkmodules", "matplotlib", "PIL"}
+SLOW = {"scipy", "trimesh", "yourdfpy", "pytorch_kinematics", "networkx", "lxml", "skimage", "sklearn", "embreex"}
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import torchgrasp",
+        "import torchgrasp; [torchgrasp.load_hand(name) for name in ('allegro', 'barrett', 'leap', 'shadow')]",
+        "import contextlib, torchgrasp.cli\nwith contextlib.suppress(SystemExit): torchgrasp.cli.main(['--help'])",
+    ],
+    ids=["import", "load_hand", "help"],
+)
+def test_a_start_brings_in_nothing_that_simulates_draws_or_is_slow_to_import(tmp_path, code):
+    """What is heavy is imported by the function that needs it."""
+    end = "import sys; print(*(m.split('.')[0] for m in sys.modules))"
+    loaded = set(run(f"{code}\n{end}", tmp_path).splitlines()[-1].split())
     assert "torchgrasp" in loaded
-    assert not loaded & {"sapien", "coacd", "viser", "pyvista", "vtk", "vtkmodules", "matplotlib", "skimage", "sklearn"}
+    assert not loaded & (SIMULATORS | DRAWERS | SLOW)
 
 
 def test_import_changes_no_global_state(tmp_path):

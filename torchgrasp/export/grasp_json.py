@@ -6,7 +6,6 @@ DexGraspBench's own .npy is a pickled dictionary. It could run code when it is r
 from typing import Annotated
 
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from torchgrasp.border import Positive, Range, checked
@@ -96,5 +95,7 @@ def format_grasps(
 
 def quaternion(a_from_b: Float[Tensor, "4 4"]) -> list[float]:
     """Return the rotation of a pose as a unit quaternion (w, x, y, z)."""
+    from scipy.spatial.transform import Rotation
+
     x, y, z, w = Rotation.from_matrix(a_from_b[:3, :3].double().cpu().numpy()).as_quat()
     return [float(q) for q in (w, x, y, z)]

@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from torchgrasp.hand.hand_toml import Pad
-from torchgrasp.hand.mend import pose_of
+from torchgrasp.hand.mend import place, pose_of
 from torchgrasp.hand.safe_xml import read_bounded
-from torchgrasp.hand.urdf import MAX_SIZE, Shape, Urdf, place
+from torchgrasp.hand.urdf import MAX_SIZE, Shape, Urdf
 
 if TYPE_CHECKING:
     import trimesh

@@ -11,7 +11,7 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.hand.urdf import Joint, Link, Mimic, Shape, Urdf, place
+from torchgrasp.hand.urdf import SIZES, Joint, Link, Mimic, Shape, Triple, Urdf
 
 MANY = 3
 """A hand has at most this many joints that move all its fingertips, a wrist; an arm has more."""
@@ -32,6 +32,18 @@ def pose_of(part: Joint | Shape) -> np.ndarray:
     from trimesh.transformations import compose_matrix
 
     return compose_matrix(angles=part.rpy, translate=part.xyz)
+
+
+def place(pose: np.ndarray) -> tuple[Triple, Triple]:
+    """Return translation [m] and fixed-axis angles [rad] of a 4 x 4 pose."""
+    from trimesh.transformations import euler_from_matrix
+
+    # of the two triples the smaller one, to the digits that a rotation keeps: so short numbers stay short
+    one = [float(angle) for angle in euler_from_matrix(pose)]
+    two = [math.copysign(math.pi, angle) - angle for angle in one]
+    angles = min((one, (-two[0], two[1], -two[2])), key=lambda triple: sum(map(abs, triple)))
+    x, y, z, roll, pitch, yaw = (float(x) + 0.0 for x in [*pose[:3, 3], *(round(angle, 15) for angle in angles)])
+    return (x, y, z), (roll, pitch, yaw)
 
 
 def keep_below(urdf: Urdf, root: str) -> Step:
@@ -222,9 +234,8 @@ def urdf_text(urdf: Urdf) -> str:
         for shape in link.shapes:
             collision = ET.SubElement(element, "collision")
             ET.SubElement(collision, "origin", xyz=_words(shape.xyz), rpy=_words(shape.rpy))
-            keys = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length")}[shape.kind]
             sizes = [shape.size] if shape.kind == "box" else [[x] for x in shape.size]
-            numbers = {k: _words(v) for k, v in zip(keys, sizes, strict=True)}
+            numbers = {k: _words(v) for k, v in zip(SIZES[shape.kind], sizes, strict=True)}
             ET.SubElement(ET.SubElement(collision, "geometry"), shape.kind, numbers)
     for j in urdf.joints:
         joint = ET.SubElement(robot, "joint", name=j.name, type=j.kind)

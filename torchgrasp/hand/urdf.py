@@ -1,18 +1,18 @@
-"""A URDF as values: links, joints and collision shapes of a checked tree. yourdfpy reads it; no mesh is opened."""
+"""A URDF as values: links, joints and collision shapes of a checked tree. No mesh is opened."""
 
 import dataclasses
 import functools
-import io
 import math
 import xml.etree.ElementTree as ET
 from collections import Counter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
+import torch
 
 from torchgrasp.border import checked
 from torchgrasp.errors import HandFileError
+from torchgrasp.frames import rotation_from_rpy
 from torchgrasp.hand.safe_xml import parse_urdf, read_bounded
 
 MAX_BYTES = 4 * 1024 * 1024
@@ -23,6 +23,8 @@ MAX_SHAPES = 1000
 """Most collision shapes, for the same reason; a hand has up to 100."""
 MAX_SIZE = 2.0
 """Largest collision shape [m]: a hand is smaller, and its cover of spheres grows with the surface."""
+SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "mesh": ("scale",)}
+"""The numbers of each kind of shape."""
 MEND = "torchgrasp hand new writes a clean copy"
 """What helps against what a published URDF may hold, and a clean one may not."""
 
@@ -143,86 +145,76 @@ def read_published(path: Path | str) -> Urdf:
     """
     path = Path(path)
     data = read_bounded("urdf", path, "a URDF file", MAX_BYTES)
-    return urdf_from_xml(path, data, ET.tostring(parse_urdf(path, data)))
-
-
-def urdf_from_xml(path: Path, data: bytes, xml: bytes) -> Urdf:
-    """Read the XML that passed the gate of `safe_xml`."""
-    import yourdfpy  # takes half a second
-
-    robot = yourdfpy.URDF.load(io.BytesIO(xml), build_scene_graph=False, load_meshes=False).robot
-    links, joints = tuple(map(_link, robot.links)), tuple(map(_joint, robot.joints))
-    urdf = Urdf(path, robot.name, "", links, joints, data, xml)
+    robot = parse_urdf(path, data)  # links and joints alone, each with all of its names and with finite numbers
+    links, joints = tuple(map(_link, robot.findall("link"))), tuple(map(_joint, robot.findall("joint")))
+    urdf = Urdf(path, robot.attrib["name"], "", links, joints, data, ET.tostring(robot))
     _check_names(urdf)
     _check_shapes(urdf)
     _check_joints(urdf)
     return dataclasses.replace(urdf, root=_check_tree(urdf))
 
 
-def _floats(values: Any) -> tuple[float, ...]:
-    return tuple(float(x) + 0.0 for x in values)
+def _part(element: ET.Element, tag: str) -> ET.Element:
+    """Return the first part of a name; the gate refused an element without it."""
+    return next(element.iter(tag))
 
 
-def place(origin: Any) -> tuple[Triple, Triple]:
-    """Return translation [m] and fixed-axis angles [rad] of a 4 x 4 pose; None: zeros."""
-    from trimesh.transformations import euler_from_matrix
+def _floats(element: ET.Element, *keys: str) -> list[float]:
+    """Read the numbers of attributes that the gate checked; no zero is negative."""
+    return [float(word) + 0.0 for key in keys for word in element.attrib[key].split()]
 
-    if origin is None:
-        return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    # of the two triples the smaller one, to the digits that a rotation keeps: so the numbers of the file come back
-    one = _floats(euler_from_matrix(origin))
-    two = [math.copysign(math.pi, angle) - angle for angle in one]
-    angles = min((one, (-two[0], two[1], -two[2])), key=lambda triple: sum(map(abs, triple)))
-    x, y, z, roll, pitch, yaw = _floats([*origin[:3, 3], *(round(angle, 15) for angle in angles)])
+
+def _origin(element: ET.Element) -> tuple[Triple, Triple]:
+    """Return translation [m] and fixed-axis angles [rad]; zeros without an `<origin>`."""
+    origin = element.find("origin")
+    x, y, z, roll, pitch, yaw = [0.0] * 6 if origin is None else _floats(origin, "xyz", "rpy")
     return (x, y, z), (roll, pitch, yaw)
 
 
-def _link(link: Any) -> Link:
+def _link(link: ET.Element) -> Link:
     """Read a link; its inertia is turned into the link's axes."""
-    mass, com, inertia = 0.0, (0.0, 0.0, 0.0), np.zeros((3, 3))
-    if link.inertial is not None:
-        mass, inertia = link.inertial.mass, link.inertial.inertia
-        com, rpy = place(link.inertial.origin)
-        if any(rpy):
-            turn = link.inertial.origin[:3, :3]
-            inertia = turn @ inertia @ turn.T
-    return Link(link.name, float(mass), com, _floats(inertia[np.triu_indices(3)]), tuple(map(_shape, link.collisions)))
+    shapes, inertial = tuple(map(_shape, link.findall("collision"))), link.find("inertial")
+    if inertial is None:
+        return Link(link.attrib["name"], 0.0, (0.0, 0.0, 0.0), (0.0,) * 6, shapes)
+    com, rpy = _origin(inertial)
+    xx, xy, xz, yy, yz, zz = inertia = _floats(_part(inertial, "inertia"), "ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    if any(rpy):
+        turn = rotation_from_rpy(rpy)
+        turned = turn @ turn.new_tensor([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
+        inertia = turned[tuple(torch.triu_indices(3, 3))].tolist()
+    return Link(link.attrib["name"], _floats(_part(inertial, "mass"), "value")[0], com, tuple(inertia), shapes)
 
 
-def _shape(collision: Any) -> Shape:
-    xyz, rpy = place(collision.origin)
-    box, sphere, cylinder, mesh = (getattr(collision.geometry, k) for k in ("box", "sphere", "cylinder", "mesh"))
-    if mesh is not None:
-        return Shape("mesh", _floats(mesh.scale), xyz, rpy, mesh.filename)
-    if box is not None:
-        return Shape("box", _floats(box.size), xyz, rpy)
-    if sphere is not None:
-        return Shape("sphere", (sphere.radius,), xyz, rpy)
-    return Shape("cylinder", (cylinder.radius, cylinder.length), xyz, rpy)
+def _shape(collision: ET.Element) -> Shape:
+    shape = _part(collision, "geometry")[0]
+    return Shape(shape.tag, tuple(_floats(shape, *SIZES[shape.tag])), *_origin(collision), shape.get("filename", ""))
 
 
-def _joint(joint: Any) -> Joint:
-    xyz, rpy = place(joint.origin)
-    if joint.type == "fixed":
-        return Joint(joint.name, joint.type, joint.parent, joint.child, xyz, rpy)
-    x, y, z = _floats(joint.axis)
+def _joint(joint: ET.Element) -> Joint:
+    """Read a joint. Without an axis it is about x, as ROS has it; a continuous one has no limits."""
+    name, kind, (xyz, rpy) = joint.attrib["name"], joint.attrib["type"], _origin(joint)
+    parent, child = (_part(joint, tag).attrib["link"] for tag in ("parent", "child"))
+    if kind == "fixed":
+        return Joint(name, kind, parent, child, xyz, rpy)
+    axis, limit, mimic = (joint.find(tag) for tag in ("axis", "limit", "mimic"))
+    x, y, z = (1.0, 0.0, 0.0) if axis is None else _floats(axis, "xyz")
     length = math.sqrt(x * x + y * y + z * z)
     length = length if _is_unit(length) else 1.0  # refused later
-    limit, mimic = joint.limit, joint.mimic
-    lower, upper = (None, None) if limit is None or joint.type == "continuous" else (limit.lower, limit.upper)
+    limits = {} if limit is None else {key: float(word) for key, word in limit.attrib.items()}
+    ends = {} if kind == "continuous" else limits
     return Joint(
-        joint.name,
-        joint.type,
-        joint.parent,
-        joint.child,
+        name,
+        kind,
+        parent,
+        child,
         xyz,
         rpy,
         (x / length, y / length, z / length),
-        -math.inf if lower is None else lower,
-        math.inf if upper is None else upper,
-        0.0 if limit is None else limit.effort,
-        0.0 if limit is None else limit.velocity,
-        None if mimic is None else Mimic(mimic.joint, mimic.multiplier, mimic.offset),
+        ends.get("lower", -math.inf),
+        ends.get("upper", math.inf),
+        limits.get("effort", 0.0),
+        limits.get("velocity", 0.0),
+        None if mimic is None else Mimic(mimic.attrib["joint"], *_floats(mimic, "multiplier", "offset")),
     )
 
 
