@@ -1,4 +1,4 @@
-"""The loop of a real robot, without a simulator: joints and fingertip forces go in, joint targets come out.
+"""The loop of a real robot, without a simulator: joints and fingertip forces go in, targets come out.
 
 `FakeRobot` stands for the driver of your own hand. Replace its three methods; the loop below stays as it is.
 """
@@ -31,10 +31,13 @@ class FakeRobot:
         return TipContact(force, -force[:, None] * normals, *sensed)
 
     def send(self, targets):
-        """Send a target for every joint of the URDF, in the order of `hand.tree.joint_names` [rad]."""
+        """Send a target for every joint of the URDF, in the order of `hand.tree.joint_names` [rad].
+
+        `targets.palm` [m] is for the arm; this one does not yield.
+        """
         forces = self.read_fingertips().forces  # the drives yield to them: kp (target - joint) = J^T f at rest
         torques = torch.einsum("cih,ci->h", self.reference.hand.jacobian(self.joints), forces)
-        rest = self.reference.pick(targets) - torques / self.reference.pick(self.reference.kp)
+        rest = self.reference.pick(targets.joints) - torques / self.reference.pick(self.reference.kp)
         self.joints = self.joints + 0.05 * (rest - self.joints)
 
 

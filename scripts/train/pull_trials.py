@@ -12,6 +12,7 @@ from torchgrasp.base import Value
 from torchgrasp.control.closing import LawClosing
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.targets import Targets
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
 from torchgrasp.frames import rotation_angle
 from torchgrasp.specs import TrialSpec
@@ -105,7 +106,7 @@ def _pull(run: TrialRun, holding: Holding, pull: RisingPull) -> list[tuple[Tenso
             start = scene.object_pose()
         force = pull.force((k - pressing + 1) * robot.period)
         scene.pull(force * pull.direction.numpy())
-        observation = robot.tick(hold(observation, robot.period))
+        observation = robot.tick(Targets(hold(observation, robot.period)))
         readings = readings + observation.tactile.reading / every
         pose = scene.object_pose()
         if not np.isfinite(pose).all():
@@ -123,11 +124,11 @@ def _pull(run: TrialRun, holding: Holding, pull: RisingPull) -> list[tuple[Tenso
 
 def _close(run: TrialRun, holding: Holding) -> tuple[Observation, Step]:
     """Close under the law, and return the last observation and what holds from then on."""
-    robot, targets = run.robot, run.controller.targets
-    observation, closing = robot.tick(targets), LawClosing(robot.reference)
+    robot, targets = run.robot, run.controller.targets.joints
+    observation, closing = robot.tick(Targets(targets)), LawClosing(robot.reference)
     for _ in range(robot.ticks(CLOSING_TIME)):
         targets = closing(observation, robot.period)
-        observation = robot.tick(targets)
+        observation = robot.tick(Targets(targets))
         if closing.done:
             break
     return observation, holding(robot.reference, observation, targets)

@@ -43,8 +43,8 @@ def press(controller: GraspController, seconds: float, start: float = 0.01) -> l
         contact = TipContact(push, -push[:, None] * NORMALS, points, NORMALS)
         tactile = measure(tactile, contact, NORMALS, real([0.01] * 3), PERIOD)
         seen = dataclasses.replace(observation(joints=joints), tips=points + 0.01 * NORMALS, tactile=tactile)
-        path.append((seen, controller.step(seen, PERIOD)))
-        joints = controller.targets
+        path.append((seen, controller.step(seen, PERIOD).joints))
+        joints = controller.targets.joints
     return path
 
 

@@ -198,7 +198,7 @@ def test_a_controller_runs_on_the_cpu(device, hand, grasps, shape, closing):
     truth = TipContact(torch.ones(3).double(), -reference.normals, point, reference.normals)
     tactile = measure(tactile, truth, reference.normals, hand.tips.radius.double(), 0.02)
     observation = observe(hand, reference.pregrasp, tactile)
-    assert controller.step(observation, 0.02).device == CPU
+    assert controller.step(observation, 0.02).joints.device == CPU
     with pytest.raises(BadArgument, match="observation"):
         controller.step(sent(observation), 0.02)
     with pytest.raises(BadArgument, match="truth"):

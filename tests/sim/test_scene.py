@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.load import load_hand
 from torchgrasp.sim.mount import APPROACH_JOINT, LIFT_JOINT, euler_from_rotation, mounted_urdf
-from torchgrasp.sim.scene import SceneSpec
+from torchgrasp.sim.scene import SHIFT_JOINTS, SceneSpec
 
 
 def test_euler_angles_rebuild_the_rotation():
@@ -207,3 +207,23 @@ def test_joints_without_a_drive_are_named(simulator):
         open_scene(setup, simulator)
     with pytest.raises(BadArgument, match="simulator: found 'bullet'"):
         open_scene(setup, "bullet")
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("simulator", SIMULATORS)
+def test_a_mount_that_yields_moves_the_hand_where_it_is_sent_and_lifts_it_as_well(simulator):
+    *_, world_from_hand, scene = build("barrett", standing(), simulator, yields=0.02)
+    scene.shift(np.array([0.02, -0.01, 0.005]))
+    scene.lift(0.05)
+    for _ in range(1000):
+        scene.step()
+    moved = scene.hand_pose() - world_from_hand.numpy()
+    assert moved[:3, 3] == pytest.approx([0.02, -0.01, 0.055], abs=1e-4)
+    assert np.abs(moved[:3, :3]).max() < 1e-5
+
+
+def test_a_mount_has_no_joints_for_what_it_does_not_do():
+    path = load_hand("barrett").urdf_path
+    assert not any(name in mounted(path) for name in SHIFT_JOINTS)
+    assert all(name in mounted(path, yields=0.02) for name in SHIFT_JOINTS)

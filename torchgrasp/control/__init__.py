@@ -1,10 +1,11 @@
-"""The controller of a hand, real or simulated: grasp and sensors in, joint targets out."""
+"""The controller of a hand, real or simulated: grasp and sensors in, targets of joints and palm out."""
 
 from torchgrasp.control.controller import GraspController
 from torchgrasp.control.forces import Squeeze, squeeze
 from torchgrasp.control.observation import Observation, observe
 from torchgrasp.control.reference import ClosingReference, closing_gains
 from torchgrasp.control.tactile import TactileState, TipContact, measure, no_contact
+from torchgrasp.control.targets import Targets
 from torchgrasp.closing import ClosingGains
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     "Observation",
     "Squeeze",
     "TactileState",
+    "Targets",
     "TipContact",
     "closing_gains",
     "measure",

@@ -11,6 +11,7 @@ from torchgrasp.control.closing_law import POSITION_FLOOR, POSITION_RATE, blend,
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import NOISE
+from torchgrasp.control.targets import STILL
 from torchgrasp.specs import ClosingPart
 
 Revision = Callable[[Observation, ClosingReference], ClosingReference]
@@ -37,6 +38,8 @@ of this target behind the planned contact [m] and the integral gain [1/s^2] are 
 
 class OpenLoopClosing:
     """Replay pre-grasp, grasp and squeeze, whatever is felt."""
+
+    palm = STILL
 
     def __init__(self, reference: ClosingReference) -> None:
         poses = (reference.pregrasp, reference.joints, reference.squeeze)
@@ -68,6 +71,8 @@ class LawClosing:
     `MAX_SPEED`, and a target that leads its joint by no more than the drive can exert. It ends when all
     fingers touch, each blend is at least `ARRIVED`, and the forces have been steady for a time `SETTLED`.
     """
+
+    palm = STILL
 
     def __init__(
         self, reference: ClosingReference, revise: Revision | None = None, without: tuple[ClosingPart, ...] = ()
@@ -159,6 +164,8 @@ class PositionClosing:
 
     It aims at a `depth` [m] behind the contacts. The paper's is 0, with which a finger may stop before it touches.
     """
+
+    palm = STILL
 
     def __init__(self, reference: ClosingReference, depth: float = AIM_DEPTH) -> None:
         self.reference = reference

@@ -14,6 +14,7 @@ from torchgrasp.control.closing import FixedGainClosing, LawClosing, OpenLoopClo
 from torchgrasp.control.holding import ForceHold, PositionHold
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.targets import Targets
 from torchgrasp.errors import BadArgument
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ClosingMode, ClosingPart, HoldingMode, check_closing_parts
@@ -41,7 +42,7 @@ def check_modes(closing: str, holding: str, belief: object = None, without: tupl
 
 
 class GraspController:
-    """Close a hand and hold the object: observations in, joint targets out, all on the CPU.
+    """Close a hand and hold the object: observations in, `Targets` out, all on the CPU.
 
     A closing brings the fingers to the object, then a holding presses. `closed` turns true `PRESSING_TIME` later:
     then the hand may be lifted, with further steps. The open loop keeps its squeeze.
@@ -70,7 +71,7 @@ class GraspController:
     ...     push = 2e3 * ((reference.gains.target - points) * normals).sum(-1).clamp_min(0.0)
     ...     contact = TipContact(push, -push[:, None] * normals, points, normals)
     ...     tactile = measure(tactile, contact, normals, radius, 1 / 200)
-    ...     joints = reference.pick(controller.step(observe(hand, joints, tactile), 1 / 200))
+    ...     joints = reference.pick(controller.step(observe(hand, joints, tactile), 1 / 200).joints)
     >>> bool(tactile.contact.all())
     True
     """
@@ -87,7 +88,7 @@ class GraspController:
         self.reference = reference = settle(reference, torch.device("cpu"))
         self.closing = _closing(reference, closing, belief, without)
         self._hold, self.hold = _holding(self.closing, holding), None
-        self.targets = reference.expand(reference.pregrasp)
+        self.targets = Targets(reference.expand(reference.pregrasp))
         self.time, self.pressed = 0.0, 0.0
 
     @property
@@ -98,22 +99,23 @@ class GraspController:
         return self.pressed >= PRESSING_TIME - 1e-9
 
     @checked
-    def step(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
-        """Return the targets of all joints [rad] for the next tick, a period [s] later.
+    def step(self, observation: Observation, period: float) -> Targets:
+        """Return the targets of joints and palm for the next tick, a period [s] later.
 
         Raises:
             BadArgument: an observation on another device than the CPU.
         """
-        check_device("observation", observation.joints.device, "the controller", self.targets.device)
+        check_device("observation", observation.joints.device, "the controller", self.targets.joints.device)
         over = self.closing.done or self.time >= CLOSING_TIME
         if self.hold is None and over and not isinstance(self.closing, OpenLoopClosing):
-            self.hold = self._hold(self.reference, observation, self.targets)
+            self.hold = self._hold(self.reference, observation, self.targets.joints)
         if self.hold is None:
             self.time += period
-            self.targets = self.closing(observation, period)
+            joints = self.closing(observation, period)
         else:
             self.pressed += period
-            self.targets = self.hold(observation, period)
+            joints = self.hold(observation, period)
+        self.targets = Targets(joints, self.closing.palm)
         return self.targets
 
 

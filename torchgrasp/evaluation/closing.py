@@ -186,7 +186,7 @@ class TrialRun:
         """Return whether some drive is at its largest torque."""
         reference = self.robot.reference
         effort = torch.tensor([reference.hand.actuators[name].effort for name in reference.hand.tree.joint_names])
-        return bool((reference.kp * (self.controller.targets - self.observation.joints).abs() >= effort).any())
+        return bool((reference.kp * (self.controller.targets.joints - self.observation.joints).abs() >= effort).any())
 
 
 def smooth_step(time: float) -> tuple[float, float]:

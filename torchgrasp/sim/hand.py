@@ -2,10 +2,8 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from torchgrasp.control import ClosingReference, Observation, TipContact, measure, no_contact
+from torchgrasp.control import ClosingReference, Observation, Targets, TipContact, measure, no_contact
 from torchgrasp.sim.scene import Scene, StepContacts
 
 
@@ -33,6 +31,7 @@ class SimulatedHand:
         fingers = len(reference.hand.tips)
         self.steps, self.first_touch = 0, [float("inf")] * fingers
         self.first_stray, self.stray, self.most_stray = np.full(3, np.inf), np.zeros(3), np.zeros(3)
+        self._palm = np.zeros(3)
         self.force, self.finger = np.zeros(fingers), np.zeros(fingers, dtype=bool)
         self.tactile = no_contact(fingers=fingers)
         names, centres = reference.hand.tree.joint_names, reference.hand.tips.center.double()
@@ -40,9 +39,14 @@ class SimulatedHand:
         self._to_scene = [names.index(name) for name in scene.joint_names]
         self._from_scene = [scene.joint_names.index(name) for name in names]
 
-    def tick(self, targets: Float[Tensor, " j"]) -> Observation:
-        """Drive the joints for one control period; return what the robot knows."""
-        self.scene.drive(targets[self._to_scene].numpy())
+    def tick(self, targets: Targets) -> Observation:
+        """Drive joints and palm for one control period; return what the robot knows."""
+        self.scene.drive(targets.joints[self._to_scene].numpy())
+        palm = targets.palm.numpy()
+        if palm.any() or self._palm.any():
+            rotation = self.scene.hand_pose()[:3, :3]
+            self.scene.shift(rotation @ palm, rotation @ (palm - self._palm) / self.period)
+            self._palm = palm
         contacts, before = StepContacts.none(len(self.force)), self.stray.copy()
         for _ in range(self.substeps):
             step = self.scene.step()

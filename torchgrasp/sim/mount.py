@@ -1,4 +1,4 @@
-"""The mount of a simulated hand: prismatic joints that lift it and move it along its approach.
+"""The mount of a simulated hand: prismatic joints that lift it, move it along its approach, and let it yield.
 
 Also the hand's URDF on this mount, for SAPIEN.
 """
@@ -12,7 +12,7 @@ import numpy as np
 
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.sim.scene import APPROACH_JOINT, LIFT_JOINT, SceneSpec
+from torchgrasp.sim.scene import APPROACH_JOINT, LIFT_JOINT, SHIFT_JOINTS, SceneSpec
 
 MOUNT_DRIVE = Actuator(effort=1e4, velocity=10.0, kp=1e4, kd=1e3)
 """Motor of a slide: force [N], speed [m/s], stiffness [N/m], damping [N s/m]. It carries any hand without sagging."""
@@ -39,6 +39,9 @@ def mount_slides(spec: SceneSpec) -> list[Slide]:
         x, y, z = spec.approach
         axis = (x / length, y / length, z / length)
         slides.append(Slide(APPROACH_JOINT, axis, -length - 0.01, 0.01, -length))
+    if spec.yields > 0:
+        most, axes = spec.yields + 0.01, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+        slides += [Slide(name, axis, -most, most, 0.0) for name, axis in zip(SHIFT_JOINTS, axes, strict=True)]
     return slides
 
 

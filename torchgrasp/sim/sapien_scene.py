@@ -10,6 +10,7 @@ from torchgrasp.sim.scene import (
     APPROACH_JOINT,
     LIFT_JOINT,
     NEIGHBOURS,
+    SHIFT_JOINTS,
     STILL,
     TABLETOP,
     TARGET,
@@ -29,7 +30,7 @@ class SapienScene(Scene):
         super().__init__(spec)
         self.system, self.scene, self.body, self.hand, self.neighbours = build(spec)
         active = self.hand.active_joints
-        self._mount = {j.name: j for j in active if j.name in (LIFT_JOINT, APPROACH_JOINT)}
+        self._mount = {j.name: j for j in active if j.name in (LIFT_JOINT, APPROACH_JOINT, *SHIFT_JOINTS)}
         self._places = [k for k, j in enumerate(active) if j.name not in self._mount]
         self._driven = [active[k] for k in self._places]
         self.joint_names = tuple(j.name for j in self._driven)

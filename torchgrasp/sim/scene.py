@@ -30,6 +30,9 @@ TABLE = (2.0, 2.0, 0.1)
 LIFT_JOINT, APPROACH_JOINT = "torchgrasp_lift", "torchgrasp_approach"
 """Prismatic joints of the mount: along the world's z axis, and along the approach, 0 where the hand has arrived."""
 
+SHIFT_JOINTS = ("torchgrasp_shift_x", "torchgrasp_shift_y", "torchgrasp_shift_z")
+"""Prismatic joints of a mount that yields, along the world's axes."""
+
 STILL = np.zeros(3)
 """No force, no torque."""
 
@@ -92,6 +95,7 @@ class SceneSpec:
         height: of the table [m]; None: the lowest point of the mesh.
         neighbours: further bodies.
         self_pairs: names of the links of the hand that collide with each other.
+        yields: how far [m] the mount can be displaced along each axis of the world; 0: not at all.
     """
 
     urdf_path: Path | str
@@ -112,6 +116,7 @@ class SceneSpec:
     height: float | None = None
     neighbours: tuple[Body, ...] = ()
     self_pairs: tuple[tuple[str, str], ...] = ()
+    yields: float = 0.0
 
     @property
     def body(self) -> Body:
@@ -226,6 +231,11 @@ class Scene(abc.ABC):
     def approach(self, left: float, speed: float = 0.0) -> None:
         """Set the remaining length [m] of the approach, and its speed [m/s]."""
         self._move_mount(APPROACH_JOINT, -left, speed)
+
+    def shift(self, displacement: np.ndarray, velocity: np.ndarray = STILL) -> None:
+        """Set the target displacement [m] of the hand from its path, and its velocity [m/s], if its mount yields."""
+        for joint, target, speed in zip(SHIFT_JOINTS, displacement, velocity, strict=True):
+            self._move_mount(joint, target, speed)
 
     def neighbour_poses(self) -> np.ndarray:
         """Return the poses (m, 4, 4) of the neighbours."""
