@@ -116,7 +116,7 @@ def test_a_path_that_no_file_can_have_is_refused_by_every_reader(name: str):
             read(name + suffix)
 
 
-@pytest.mark.parametrize("format", ["json", "mujoco"])
+@pytest.mark.parametrize("format", ["json", "mujoco", "moveit", "ros2"])
 def test_what_is_read_can_be_exported_or_is_refused(tmp_path: Path, grasps: Grasps, format: str, capsys: Any):
     good = named_tensors(grasps)
     changes = {

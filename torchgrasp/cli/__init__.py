@@ -18,7 +18,7 @@ from tyro.extras import SubcommandApp
 from torchgrasp import __version__
 from torchgrasp.cli import clouds, grasps, hands, shapes
 from torchgrasp.cli.evaluate import evaluate
-from torchgrasp.cli.export import export
+from torchgrasp.cli.export import export, import_grasps
 from torchgrasp.cli.hand_check import check
 from torchgrasp.cli.hand_train import train
 from torchgrasp.errors import GraspError
@@ -29,6 +29,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "grasp": grasps.grasp,
     "evaluate": evaluate,
     "export": export,
+    "import": import_grasps,
     "objects": grasps.objects,
     "cloud check": clouds.check,
     "cloud cut": clouds.cut,

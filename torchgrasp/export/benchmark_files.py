@@ -1,0 +1,100 @@
+"""Grasps as files of published benchmarks and data sets: DexGraspBench's evaluator reads them, and GraspGen's loader.
+
+Facts: https://github.com/JYChen18/DexGraspBench (README and src/util/hand_util.py) and
+https://github.com/NVlabs/GraspGen (docs/GRASP_DATASET_FORMAT.md).
+"""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+
+from torchgrasp.border import Positive, Range, checked
+from torchgrasp.control.forces import squeeze
+from torchgrasp.errors import BadArgument, Status
+from torchgrasp.export.grasp_json import quaternion
+from torchgrasp.files import format_json, write_atomically
+from torchgrasp.hand.hand import Hand
+from torchgrasp.values import Grasps
+
+BENCH_HANDS = {"allegro": ([0.0, 1.0, 0.0, 1.0], [f"joint_{k}" for k in range(16)])}
+"""Of each hand that the bench has, too: the rotation (w, x, y, z) of our root link in the frame that it moves, and our
+joints in the order of its model: first, middle, ring finger, thumb."""
+
+
+@checked
+def save_dexgraspbench(
+    hand: Hand,
+    grasps: Grasps,
+    folder: Path | str,
+    object_path: str,
+    force: Annotated[float, Range(0.01, 100.0)] = 4.0,
+    kp: Positive = 5.0,
+) -> list[Path]:
+    """Write one file for each grasp, `folder/0.npy` and so on, which DexGraspBench's evaluator reads.
+
+    A file is a dictionary: `obj_path`, `obj_scale` (1), `obj_pose` (none), and `pregrasp_qpos`, `grasp_qpos`,
+    `squeeze_qpos` (23): position [m] and quaternion (w, x, y, z) of the hand, then 16 joints [rad]. The evaluator
+    accepts nothing but a pickled dictionary; it holds arrays, numbers and a text alone.
+
+    Args:
+        hand: the Allegro hand, whose model the bench has.
+        grasps: planned for it.
+        folder: below the bench's `output/NAME_allegro/graspdata/OBJECT`.
+        object_path: folder of the object as the bench has it (`assets/...`), with the frame of the planned cloud.
+        force: normal force of the strongest finger [N].
+        kp: stiffness of the bench's drives [N m/rad].
+
+    Raises:
+        BadArgument: a hand that the bench does not have in these frames, or joints of another hand.
+        OutputError: the folder cannot be written.
+    """
+    if hand.name not in BENCH_HANDS:
+        raise BadArgument(
+            "hand", repr(hand.name), f"one of {', '.join(BENCH_HANDS)}, whose frames in the bench are known"
+        )
+    turn, order = BENCH_HANDS[hand.name]
+    postures = {
+        "pregrasp_qpos": grasps.pregrasp.double(),
+        "grasp_qpos": grasps.joints.double(),
+        "squeeze_qpos": squeeze(hand, grasps, force, kp).joints,
+    }
+    named = {key: hand.expand(joints) for key, joints in postures.items()}
+    moved_from_root = torch.eye(4, dtype=torch.float64)
+    moved_from_root[:3, :3] = rotation_of(turn)
+    paths = list[Path]()
+    for row, pose in enumerate(grasps.obj_from_hand.double().cpu()):
+        moved = pose @ moved_from_root.mT  # object from what the bench moves
+        place = [*moved[:3, 3].tolist(), *quaternion(moved)]
+        content: dict[str, Any] = {"obj_path": object_path, "obj_scale": 1.0}
+        content["obj_pose"] = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+        for key, joints in named.items():
+            content[key] = np.array([*place, *(float(joints[name][row]) for name in order)])
+        paths.append(write_atomically(Path(folder) / f"{row}.npy", lambda path, x=content: np.save(path, np.array(x))))
+    return paths
+
+
+@checked
+def format_graspgen(grasps: Grasps, object_path: str) -> str:
+    """Return grasps as the JSON of a GraspGen data set: poses of the hand's root link in the object's frame.
+
+    `object_in_gripper` tells which are executable. The fields `success` (predicted), `joints` and `joint_names` are
+    ours. `object_path` is that of the mesh in the data set, with the frame of the planned cloud and scale 1.
+    """
+    rows = {
+        "transforms": grasps.obj_from_hand.tolist(),
+        "object_in_gripper": (grasps.status == Status.OK).tolist(),
+        "success": grasps.success.tolist(),
+        "joints": grasps.joints.tolist(),
+    }
+    joint_names = grasps.meta.get("joint_names", "").split(",")
+    return format_json({"object": {"file": object_path, "scale": 1.0}, "joint_names": joint_names, "grasps": rows})
+
+
+def rotation_of(wxyz: list[float]) -> torch.Tensor:
+    """Return the matrix of a quaternion of any length."""
+    from scipy.spatial.transform import Rotation
+
+    w, x, y, z = wxyz
+    return torch.tensor(Rotation.from_quat([x, y, z, w]).as_matrix())
