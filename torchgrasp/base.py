@@ -2,6 +2,7 @@
 
 import dataclasses
 import numbers
+import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
@@ -41,8 +42,25 @@ def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValu
     return type(values[0])(**{name: merge(name, *(getattr(value, name) for value in values)) for name in fields})
 
 
+SHOWN, WIDTH = 4, 110
+"""Most numbers of a tensor that a value's text shows; letters in its lines. So no value fills a notebook's page."""
+
+
 class Value:
     """Base of all values: `.to()` maps every tensor inside, nested values included, into a new value."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Give each value the short text: a dataclass would write every number."""
+        super().__init_subclass__(**kwargs)
+        if "__repr__" not in vars(cls):
+            cls.__repr__ = Value.__repr__
+
+    def __repr__(self) -> str:
+        """Return the fields in at most 12 lines: types and shapes of tensors, numbers of small ones."""
+        fields = [f for f in dataclasses.fields(self) if f.repr]  # pyright: ignore[reportArgumentType]
+        parts = [f"{f.name}={_short(getattr(self, f.name))}" for f in fields]
+        lines = textwrap.wrap(f"{type(self).__name__}({', '.join(parts)})", WIDTH, subsequent_indent="    ")
+        return "\n".join(lines if len(lines) <= 12 else [*lines[:11], "    ...)"])
 
     def to(self: SomeValue, *args: Any, **kwargs: Any) -> SomeValue:
         """Return the value on another device or in another floating dtype; integers keep theirs.
@@ -57,6 +75,25 @@ class Value:
             return moved if x.is_floating_point() else moved.to(x.dtype)
 
         return map_tensors(move, self)
+
+
+def _short(value: Any) -> str:
+    """Return a field of a value in few letters."""
+    if isinstance(value, Tensor):
+        if value.numel() <= SHOWN and value.device.type == "cpu":
+            return _digits(value.tolist())
+        return f"{str(value.dtype).removeprefix('torch.')}{list(value.shape)}"
+    if isinstance(value, dict | list | tuple) and len(value) > SHOWN:
+        return f"{type(value).__name__} of {len(value)}"
+    text = repr(value)
+    return text if len(text) <= WIDTH or isinstance(value, Value) else f"{text[: WIDTH - 3]}..."
+
+
+def _digits(value: Any) -> str:
+    """Return numbers, in lists or not, with five digits."""
+    if isinstance(value, list):
+        return f"[{', '.join(map(_digits, value))}]"
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
 class Batch(Value):

@@ -13,6 +13,7 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply
 from torchgrasp.linalg import cholesky, unit
 from torchgrasp.plane import move
+from torchgrasp.shape.derivatives import ShapeDerivatives, carry_gradients
 from torchgrasp.shape.joint_posterior import JointEstimate, draw_samples, joint_estimate
 from torchgrasp.shape.normal_band import normal_parts
 from torchgrasp.shape.observations import Observations, on_surface
@@ -40,15 +41,6 @@ class Normalisation(Value):
     def metres(self, x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
         """Map normalised points to the cloud's frame [m]."""
         return x * self.scale + self.center.to(x)
-
-
-@dataclasses.dataclass(frozen=True)
-class ShapeDerivatives(Value):
-    """Derivatives of a `ShapeEstimate` by the query point, per metre: `normal[i, j]` is d normal_i / d point_j."""
-
-    distance: Float[Tensor, "*b 3"]
-    normal: Float[Tensor, "*b 3 3"]
-    variance: Float[Tensor, "*b 3"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,7 +105,8 @@ class ShapeGP(Posterior, Normalisation):
     def predict(self, points: Float[Tensor, "*b 3"]) -> ShapeEstimate:
         """Return signed distance, normal and their covariance at points [m] in the cloud's frame, Eqs. (7)-(8).
 
-        The estimate has the dtype of `points`. It carries no gradient to them; see `differentiate`.
+        The estimate has the dtype of `points`. If they require a gradient, all but `covariance` pass it to them, once:
+        the closed form of `differentiate`.
 
         Raises:
             BadArgument: non-finite numbers, or a point outside the domain: there a thin plate's variance turns
@@ -122,7 +115,10 @@ class ShapeGP(Posterior, Normalisation):
         mean, covariance = self.estimate(self._queries(points))
         variance = covariance[:, 0, 0]
         std_m = self.std_factor * self.scale * surface_deviation(variance, mean[:, 1:])
-        return _reshape(ShapeEstimate(mean[:, 0], unit(mean[:, 1:]), variance, covariance, std_m), points)
+        estimate = _reshape(ShapeEstimate(mean[:, 0], unit(mean[:, 1:]), variance, covariance, std_m), points)
+        if not (points.requires_grad and torch.is_grad_enabled()):
+            return estimate
+        return carry_gradients(estimate, points, self.differentiate)
 
     @checked(gradients=True)
     def normal_std(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
@@ -145,15 +141,19 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked(gradients=True)
     def differentiate(self, points: Float[Tensor, "*b 3"]) -> ShapeDerivatives:
-        """Return distance, normal and variance differentiated by the query points [m]. Raises as `predict`."""
+        """Return distance, normal, variance and std_m differentiated by the query points [m]. Raises as `predict`."""
         jet = self.jet(self._queries(points))
         length = torch.linalg.vector_norm(jet.gradient, dim=-1)[:, None, None]
         normal = jet.gradient[:, :, None] / length
-        along = normal @ (normal.transpose(1, 2) @ jet.hessian)
+        steeper = normal.transpose(1, 2) @ jet.hessian  # the derivative of the slope
+        along = normal @ steeper
+        std = surface_deviation(jet.variance, jet.gradient)[:, None]
+        relative = jet.variance_gradient / (2 * jet.variance[:, None]) - steeper[:, 0] / length[:, 0]
         rows = ShapeDerivatives(
             distance=jet.gradient / self.scale,
             normal=(jet.hessian - along) / (length * self.scale),
             variance=jet.variance_gradient / self.scale,
+            std_m=self.std_factor * std * relative,
         )
         return _reshape(rows, points)
 
