@@ -46,7 +46,7 @@ class _Estimate(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> Any:
+    def backward(ctx: Any, *gradients: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         (points,) = ctx.saved_tensors
         by = ctx.differentiate(points)
         distance, normal, variance, std_m = (g[..., None] for g in gradients)
