@@ -8,6 +8,7 @@ python scripts/train.py success                                   the predicted 
 python scripts/train.py occupancy DIR                             how likely hidden places of a scene are full
 python scripts/train.py bands DIR                                 how far off hidden sides and normals are
 python scripts/train.py objects                                   meshes, convex parts and views of the own objects
+python scripts/train.py golden                                    grasps with known verdicts, for torchgrasp selftest
 python scripts/train.py hands                                     LEAP, Shadow and left hands from tables and mirrors
 """
 
@@ -16,6 +17,7 @@ import sys
 import tyro
 from train.author_objects import objects, scene
 from train.bands import bands
+from train.golden import golden
 from train.hands.author import hands
 from train.occupancy import occupancy
 from train.stability import stability
@@ -31,6 +33,7 @@ if __name__ == "__main__":
         "bands": bands,
         "objects": objects,
         "scene": scene,
+        "golden": golden,
         "hands": hands,
     }
     try:

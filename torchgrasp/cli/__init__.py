@@ -17,6 +17,7 @@ from tyro.extras import SubcommandApp
 
 from torchgrasp import __version__
 from torchgrasp.cli import clouds, grasps, hands, shapes
+from torchgrasp.cli.doctor import doctor, selftest
 from torchgrasp.cli.evaluate import evaluate
 from torchgrasp.cli.export import export, import_grasps
 from torchgrasp.cli.hand_check import check
@@ -31,6 +32,8 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "export": export,
     "import": import_grasps,
     "objects": grasps.objects,
+    "doctor": doctor,
+    "selftest": selftest,
     "cloud check": clouds.check,
     "cloud cut": clouds.cut,
     "cloud depth": clouds.depth,
