@@ -62,14 +62,14 @@ def selftest() -> int:
     """
     from torchgrasp.evaluation.golden import GOLDEN, GoldenResult, run_golden
 
-    faults = {name: _simulator(name).remedy for name in SIMULATORS}
+    faults: dict[Simulator, str] = {name: _simulator(name).remedy for name in SIMULATORS}
     for name, remedy in faults.items():
         if remedy:
             print(f"{name}: {remedy}")
-    there = [name for name, remedy in faults.items() if not remedy]
+    there: list[Simulator] = [name for name in SIMULATORS if not faults[name]]
     if not there:
         return 1
-    progress, found = Progress(*there), dict[str, list[GoldenResult]]()
+    progress, found = Progress(*there), dict[Simulator, list[GoldenResult]]()
     with progress.bar:
         for name in there:
             found[name] = list(run_golden(name))
