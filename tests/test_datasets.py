@@ -10,7 +10,7 @@ import trimesh
 
 from torchgrasp import PointCloud
 from torchgrasp.cloud.io.read import save_cloud
-from torchgrasp.datasets import list_views, read_family, read_group, read_object_mesh, read_view
+from torchgrasp.datasets import list_views, read_family, read_group, read_object_mesh, read_view, write_objects
 from torchgrasp.errors import BadArgument, MeshError
 
 
@@ -73,3 +73,38 @@ def test_a_folder_without_a_manifest_or_the_object_is_refused(folder: Path, tmp_
         list_views(tmp_path / "empty")
     with pytest.raises(BadArgument, match="asked for"):
         list_views(folder, only=["jug"])
+
+
+def test_a_folder_of_meshes_becomes_objects_with_views_that_see_them(tmp_path: Path):
+    (tmp_path / "meshes").mkdir()
+    box = trimesh.creation.box((0.06, 0.08, 0.1))
+    box.apply_translation([0.4, 0.1, 0.3])
+    box.export(tmp_path / "meshes" / "carton.stl")
+    trimesh.creation.icosphere(subdivisions=2, radius=0.04).export(tmp_path / "meshes" / "ball.obj")
+    assert write_objects(tmp_path / "meshes", tmp_path / "out", views=2) == ["ball", "carton"]
+    assert list_views(tmp_path / "out") == [(name, f"view{k}") for name in ("ball", "carton") for k in (0, 1)]
+    mesh = read_object_mesh(tmp_path / "out", "carton")
+    np.testing.assert_allclose(mesh.bounds, [[-0.03, -0.04, 0.0], [0.03, 0.04, 0.1]], atol=1e-6)
+    cloud = read_view(tmp_path / "out", "carton", "view1")
+    gap = np.abs(trimesh.proximity.signed_distance(mesh, cloud.points.numpy()))
+    assert np.median(gap) < 0.002 and len(cloud) == 1000
+    assert cloud.viewpoint is not None and float((cloud.viewpoint - torch.tensor([0, 0, 0.05])).norm()) > 0.4
+    again = tmp_path / "again"
+    write_objects(tmp_path / "meshes", again, views=2)
+    for file in sorted(path.relative_to(again) for path in again.rglob("*") if path.is_file()):
+        assert (again / file).read_bytes() == (tmp_path / "out" / file).read_bytes()
+
+
+def test_no_meshes_two_of_a_name_and_an_open_one_are_refused(tmp_path: Path):
+    with pytest.raises(BadArgument, match="meshes"):
+        write_objects(tmp_path, tmp_path / "out")
+    box = trimesh.creation.box((0.06, 0.08, 0.1))
+    for suffix in ("stl", "ply"):
+        box.export(tmp_path / f"box.{suffix}")
+    with pytest.raises(BadArgument, match="two meshes"):
+        write_objects(tmp_path, tmp_path / "out")
+    (tmp_path / "box.ply").unlink()
+    trimesh.Trimesh(box.vertices, box.faces[:-1]).export(tmp_path / "torn.ply")
+    with pytest.raises(MeshError):
+        write_objects(tmp_path, tmp_path / "out")
+    assert not (tmp_path / "out" / "manifest.json").exists()

@@ -16,8 +16,11 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from torchgrasp.cloud.io.read import read_cloud
+from torchgrasp.border import Count, Seed, checked
+from torchgrasp.cloud.camera import look_at, partial_view
+from torchgrasp.cloud.io.read import read_cloud, save_cloud
 from torchgrasp.errors import DatasetError
+from torchgrasp.files import format_json, write_file
 from torchgrasp.json_fields import Field, read_json
 from torchgrasp.mesh import read_mesh
 from torchgrasp.values import PointCloud
@@ -31,6 +34,10 @@ MOST_SCALE, MOST_METRES, MOST_MASS = 1e4, 1e4, 1e4
 """Largest scale, its inverse being the least, largest coordinate [m] of a camera, and largest mass [kg]."""
 LONGEST_NAME = 100
 """Most letters of a name: file names have 255 bytes."""
+MESHES = (".ply", ".stl", ".obj", ".off")
+"""Suffixes of the meshes that `write_objects` takes from a folder."""
+ELEVATION, DISTANCE = (25.0, 45.0), 0.5
+"""Of a rendered view: angle above the horizontal [deg], uniform, and distance [m], as of a camera on a robot's arm."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,6 +97,50 @@ def read_entry(objects: Path, name: str) -> ObjectEntry:
         "" if group is None else group.text(),
         None if mass is None or mass.value is None else mass.number(1e-6, MOST_MASS),
     )
+
+
+@checked
+def write_objects(meshes: Path, out: Path, views: Count = 3, seed: Seed = 0) -> list[str]:
+    """Make a folder of objects from a folder of bare meshes; return the objects' names, those of the files.
+
+    Each mesh is set down: its lowest point at z = 0, the middle of its box above the origin. Each view is that of the
+    depth camera of `partial_view` from a random side. The manifest is written last, so that a folder that has one is
+    whole.
+
+    Args:
+        meshes: folder of closed meshes in metres, z up (.ply, .stl, .obj, .off).
+        out: folder to write.
+        views: of each object.
+        seed: of the cameras and of their noise.
+
+    Raises:
+        DatasetError: no meshes, or two of one name.
+        MeshError, SuspiciousScale: as `read_mesh`.
+        OutputError: the folder cannot be written.
+    """
+    files = sorted(path for path in Path(meshes).glob("*") if path.suffix.lower() in MESHES)
+    names = [path.stem for path in files]
+    if not files or len(set(names)) != len(names):
+        found = f"{meshes} without meshes" if not files else f"{meshes} with two meshes of one name"
+        raise DatasetError("meshes", found, f"a folder of files {', '.join(MESHES)}, each of its own name")
+    generator, entries = torch.Generator().manual_seed(seed), dict[str, object]()
+    for path in files:
+        mesh = read_mesh(path)
+        low, high = mesh.bounds
+        mesh = mesh.copy().apply_translation([-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]])
+        content = mesh.export(file_type="ply")
+        write_file(out / path.stem / "mesh.ply", content)
+        poses = dict[str, object]()
+        for k in range(views):
+            first, second = torch.rand(2, generator=generator).tolist()
+            elevation = ELEVATION[0] + (ELEVATION[1] - ELEVATION[0]) * second
+            camera = look_at(360.0 * first, elevation, DISTANCE, mesh)
+            noise = int(torch.randint(2**31, (1,), generator=generator))
+            save_cloud(partial_view(mesh, camera, seed=noise), out / path.stem / f"view{k}_noisy.ply")
+            poses[f"view{k}"] = {"T_object_camera": camera.tolist()}
+        entries[path.stem] = {"views": poses}
+    write_file(out / "manifest.json", format_json({"objects": entries}))
+    return names
 
 
 def check_name(field: Field, name: str) -> None:
@@ -168,7 +219,9 @@ def _read_fields(objects: Path, only: Sequence[str]) -> dict[str, Field]:
         return DatasetError("objects", found, allowed)
 
     path = Path(objects) / "manifest.json"
-    top = read_json(path, refuse, "a folder with a manifest.json in UTF-8").entries()
+    top = read_json(
+        path, refuse, "a folder with a manifest.json in UTF-8 (`torchgrasp cloud views` makes one of meshes)"
+    ).entries()
     entries = top["objects"].entries() if "objects" in top else {}
     chosen = {name: entries[name] for name in entries if not only or name in only}
     if not chosen:

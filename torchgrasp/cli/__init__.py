@@ -39,6 +39,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "cloud depth": clouds.depth,
     "cloud thin": clouds.thin,
     "cloud render": clouds.render,
+    "cloud views": clouds.views,
     "hand new": hands.new,
     "hand check": check,
     "hand sample": hands.sample,

@@ -1,4 +1,4 @@
-"""`torchgrasp cloud`: check, cut and thin a cloud, make one of a depth image, or render one from a mesh."""
+"""`torchgrasp cloud`: check, cut and thin a cloud, make one of a depth image, or render one from meshes."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,6 +6,7 @@ from typing import Annotated
 import torch
 from tyro.conf import Positional, arg
 
+from torchgrasp.base import check_whole
 from torchgrasp.border import check_tensor
 from torchgrasp.cli.common import AS_IT_IS, ViewOptions, check_seed, naming, print_notes, read_view, table_plane
 from torchgrasp.cloud import (
@@ -20,6 +21,7 @@ from torchgrasp.cloud import (
     voxel_downsample,
 )
 from torchgrasp.cloud.io.image import read_image, read_pose
+from torchgrasp.datasets import write_objects
 from torchgrasp.errors import BadArgument
 from torchgrasp.mesh import read_mesh
 from torchgrasp.plane import as_plane
@@ -178,4 +180,23 @@ def render(
     with naming(path="--out"):
         save_cloud(cloud, out)
     print(f"{len(cloud)} points, {out}")
+    return 0
+
+
+def views(
+    meshes: Annotated[Positional[Path], arg(metavar="MESHES")], /, out: Path, views: int = 3, seed: int = 0
+) -> int:
+    """Make a folder of objects for `torchgrasp evaluate` from a folder of meshes, each seen by a noisy depth camera.
+
+    Args:
+        meshes: folder of closed meshes in metres, z up (.ply, .stl, .obj, .off).
+        out: folder to write: manifest.json, and for each object mesh.ply and its views.
+        views: of each object, from random sides.
+        seed: of the cameras and of their noise.
+    """
+    check_seed(seed)
+    check_whole("--views", views, 1, 1000)
+    with naming(meshes="MESHES", mesh="MESHES", path="--out"):
+        names = write_objects(meshes, out, views, seed)
+    print(f"{len(names)} objects with {views} views each: {out}")
     return 0

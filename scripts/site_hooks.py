@@ -1,0 +1,70 @@
+"""Hooks of the documentation site: pages from outside `docs/`, and examples of docstrings as code."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import griffe
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).resolve().parents[1]
+OUTSIDE = {
+    "README.md": "README.md",
+    "CHANGELOG.md": "CHANGELOG.md",
+    "CONTRIBUTING.md": "CONTRIBUTING.md",
+    "SECURITY.md": "SECURITY.md",
+    "hands/README.md": "hands_README.md",
+    **{f"examples/{path.name}": f"examples_{path.stem}.md" for path in sorted((ROOT / "examples").glob("*.py"))},
+}
+"""Files of the project that are pages of the site, and their names there."""
+
+LINK = re.compile(r"\]\(([^)#:]+)(#[^)]*)?\)")
+"""A link or a picture of this project; those with a colon lead elsewhere."""
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add the pages from outside."""
+    for path, name in OUTSIDE.items():
+        text = (ROOT / path).read_text(encoding="utf-8")
+        if path.endswith(".py"):
+            text = f"# {path}\n\n```python\n{text}```\n"
+        files.append(File.generated(config, name, content=_relink(text, Path(path).parent)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Let links of the guides to files outside lead to their pages."""
+    if page.file.generated_by:
+        return markdown
+    return _relink(markdown, Path("docs"))
+
+
+def _relink(text: str, folder: Path) -> str:
+    """Replace links from a file in a folder of the project by those of the site, whose pages lie in one folder."""
+
+    def replace(match: re.Match[str]) -> str:
+        target = (ROOT / folder / match[1]).resolve()
+        if not target.is_relative_to(ROOT):
+            return match[0]
+        path = target.relative_to(ROOT).as_posix()
+        inside = path.removeprefix("docs/") if path.startswith("docs/") else OUTSIDE.get(path)
+        if inside is None and target.is_dir():  # the site has files alone
+            inside = OUTSIDE.get(f"{path}/README.md", "README.md")
+        return match[0] if inside is None else f"]({inside}{match[2] or ''})"
+
+    return LINK.sub(replace, text)
+
+
+class FenceExamples(griffe.Extension):
+    """Fence `>>>` blocks of docstrings: Markdown takes them for quotes."""
+
+    def on_instance(self, *, obj: griffe.Object, **_: Any) -> None:
+        """Rewrite the docstring of an object."""
+        if obj.docstring is not None:
+            obj.docstring.value = fence(obj.docstring.value)
+
+
+def fence(text: str) -> str:
+    """Return a docstring whose examples are fenced."""
+    blocks = re.split(r"\n{2,}", text)
+    return "\n\n".join(f"```pycon\n{b}\n```" if b.lstrip().startswith(">>> ") else b for b in blocks)
