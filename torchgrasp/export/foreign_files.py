@@ -12,7 +12,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from torchgrasp.border import checked
@@ -161,6 +160,8 @@ def _places(hand: Hand, order: tuple[str, ...]) -> list[int]:
 
 def _poses(numbers: np.ndarray, quaternion: Quaternion) -> Float[Tensor, "g 4 4"]:
     """Return poses from positions and quaternions."""
+    from scipy.spatial.transform import Rotation
+
     turns = numbers[:, 3:] if quaternion == "xyzw" else numbers[:, [4, 5, 6, 3]]
     far = np.abs(np.linalg.norm(turns, axis=1) - 1) > UNIT
     if far.any():
