@@ -1,0 +1,50 @@
+"""Two cores: many clouds in one call on two processes, and one plan on two threads."""
+
+import time
+from statistics import median
+
+import torch
+
+from benchmarks.common import Row
+from torchgrasp import ContactSpec, Hand, PointCloud, plan_grasps
+
+
+def bench_many(clouds: list[PointCloud], hand: Hand, spec: ContactSpec, starts: int) -> list[Row]:
+    """Measure one call of many clouds on two processes beside the loop, by the wall clock."""
+    began = time.monotonic()
+    alone = [plan_grasps(cloud, hand, spec, starts) for cloud in clouds]
+    loop, began = time.monotonic() - began, time.monotonic()
+    together = plan_grasps(clouds, hand, spec, starts, workers=2)
+    call = time.monotonic() - began
+    equal = all(torch.equal(a.joints, b.joints) for a, b in zip(alone, together, strict=True))
+    return [
+        Row(
+            f"{len(clouds)} clouds in one call, two processes; wall clock of a machine with two free cores",
+            ">= 1.7 times the loop, equal grasps",
+            f"{loop / call:.2f} times ({loop:.1f} and {call:.1f} s), {'equal' if equal else 'OTHER'} grasps",
+            loop / call >= 1.7 and equal,
+            {"loop": loop, "call": call},
+        )
+    ]
+
+
+def bench_threads(clouds: list[PointCloud], hand: Hand, spec: ContactSpec, starts: int) -> list[Row]:
+    """Measure one plan after the other on one thread and on two, by the wall clock."""
+
+    def seconds(cloud: PointCloud, threads: int) -> float:
+        torch.set_num_threads(threads)
+        began = time.monotonic()
+        plan_grasps(cloud, hand, spec, starts)
+        return time.monotonic() - began
+
+    ratios = [seconds(cloud, 1) / seconds(cloud, 2) for cloud in clouds]
+    torch.set_num_threads(1)
+    return [
+        Row(
+            f"one plan on two threads, {len(clouds)} clouds; wall clock of a machine with two free cores",
+            "none: the batches are small",
+            f"median {median(ratios):.2f} times as fast as on one",
+            None,
+            {"ratios": ratios},
+        )
+    ]
