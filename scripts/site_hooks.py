@@ -9,10 +9,11 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTSIDE = {
-    "README.md": "README.md",
+    "README.md": "measured.md",  # MkDocs takes README.md for the start page
     "CHANGELOG.md": "CHANGELOG.md",
     "CONTRIBUTING.md": "CONTRIBUTING.md",
     "SECURITY.md": "SECURITY.md",
+    "LICENSE": "LICENSE.md",
     "hands/README.md": "hands_README.md",
     **{f"examples/{path.name}": f"examples_{path.stem}.md" for path in sorted((ROOT / "examples").glob("*.py"))},
 }
@@ -49,7 +50,7 @@ def _relink(text: str, folder: Path) -> str:
         path = target.relative_to(ROOT).as_posix()
         inside = path.removeprefix("docs/") if path.startswith("docs/") else OUTSIDE.get(path)
         if inside is None and target.is_dir():  # the site has files alone
-            inside = OUTSIDE.get(f"{path}/README.md", "README.md")
+            inside = OUTSIDE.get(f"{path}/README.md", "measured.md")
         return match[0] if inside is None else f"]({inside}{match[2] or ''})"
 
     return LINK.sub(replace, text)

@@ -1,0 +1,47 @@
+"""The documentation as a site: it builds without a warning, and every public name of a listed package is in it."""
+
+import importlib
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+pytest.importorskip("mkdocs")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, built as `scripts/docs` does: a dead link is an error."""
+    folder = tmp_path_factory.mktemp("site")
+    words = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
+    done = subprocess.run(
+        words, cwd=ROOT, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+def test_every_public_name_has_its_entry(site: Path):
+    for page in sorted((ROOT / "docs" / "api").glob("*.md")):
+        package = re.findall(r"^::: (\S+)$", page.read_text(), re.MULTILINE)[0]
+        text = (site / "api" / f"{page.stem}.html").read_text()
+        module = importlib.import_module(package)
+        # a module may have its function's name: then the page has both
+        entries = {name: (f'id="{package}.{name}"', f'id="{package}.{name}.{name}"') for name in module.__all__}
+        missing = [name for name, ids in entries.items() if not any(x in text for x in ids)]
+        # constants and aliases of types have no docstring of their own that Python keeps
+        assert [name for name in missing if getattr(getattr(module, name), "__doc__", None)] == [], package
+
+
+def test_examples_of_docstrings_are_code_and_no_quotes(site: Path):
+    text = (site / "api" / "torchgrasp.html").read_text()
+    assert "&gt;&gt;&gt;" in text and "<blockquote>" not in text
+
+
+def test_nothing_is_fetched_from_elsewhere(site: Path):
+    for page in site.rglob("*.html"):
+        assert not re.search(r'<(script|img|link rel="stylesheet")[^>]*(src|href)="https?://', page.read_text()), page
