@@ -14,10 +14,15 @@ from torchgrasp.border import Range, check_tensor, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.mesh import closest_on_triangles
 
-BAND = 0.022
-"""Nodes nearer to the surface [m] are computed exactly: a finger is about as thick."""
-COARSE, NEAREST_SAMPLES = 3, 4
-"""Spacings between nodes of the coarse grid, which is interpolated; surface samples whose triangles a node tries."""
+BAND = 0.026
+"""Distance [m] from the surface within which each second node is exact: that of a palm's spheres, with clearance."""
+NEAR, INWARD = 3, 5
+"""Spacings from the surface within which every node is exact, outside and inside, where distances have ridges; farther
+off cubics err by .1 mm (docs/speed.md)."""
+FAR_SHARE = 8
+"""Samples of the surface for each that serves nodes beyond the band, off by 1 mm, in a quarter of the time."""
+NEAREST_SAMPLES = 3
+"""Nearest samples whose triangles a node tries: with two, twice as many nodes are off by .1 mm; a third costs 5 %."""
 
 LEAF = 32
 """Samples in a leaf of their tree: a quarter less time than with SciPy's 10, the same distances."""
@@ -88,28 +93,44 @@ def field_from_surface(
         raise BadArgument("spacing, margin", (spacing, margin), "spacing in [1e-4, 0.1], margin in [0, 1]")
     surface = _Surface(vertices, faces)
     low, high = vertices.amin(0).double() - margin, vertices.amax(0).double() + margin
-    # the coarse nodes are every third of the fine ones
-    counts = [COARSE * max(1, int(c)) + 1 for c in torch.ceil((high - low) / (COARSE * spacing)).tolist()]
+    # the first nodes are every fourth of the finest
+    counts = [4 * max(1, int(c)) + 1 for c in torch.ceil((high - low) / (4 * spacing)).tolist()]
     if np.prod(np.array(counts, dtype=float)) > 2e7:  # 160 MB
         raise BadArgument("spacing", spacing, f"a coarser grid than {counts} nodes")
     origin = low.cpu().numpy()
     lines = [origin[k] + spacing * np.arange(counts[k]) for k in range(3)]
-    nodes = np.stack(np.meshgrid(*(line[::COARSE] for line in lines), indexing="ij"), -1)
-    values = surface.distance(nodes.reshape(-1, 3)).reshape(nodes.shape[:3])
-    for axis in range(3):
-        values = _upsample(values, axis)
-    near = np.nonzero(np.abs(values) < BAND)
-    values[near] = surface.distance(np.stack([lines[k][near[k]] for k in range(3)], -1))
+    nodes = np.stack(np.meshgrid(*(line[::4] for line in lines), indexing="ij"), -1)
+    values = surface.distance(nodes.reshape(-1, 3), far=True).reshape(nodes.shape[:3])
+    for step, inward, outward in ((2, np.inf, BAND), (1, INWARD * spacing, NEAR * spacing)):
+        values = _refine(values)
+        near = np.nonzero((-inward < values) & (values < outward))
+        values[near] = surface.distance(np.stack([lines[k][::step][near[k]] for k in range(3)], -1))
     to = {"device": vertices.device, "dtype": torch.float64}
     return SignedDistanceField(low.to(**to), float(spacing), torch.tensor(values, **to))
 
 
+def _refine(values: np.ndarray) -> np.ndarray:
+    """Return values of a grid twice as fine: cubics through the distances, with the sign of the node before.
+
+    The sign of an open mesh jumps far from it, where a cubic through signed distances would err by centimetres.
+    """
+    sign, distance = values < 0, np.abs(values)
+    for axis in range(3):
+        sign, distance = _upsample(sign, axis), _upsample(distance, axis)
+    return np.where(sign, -distance, distance)
+
+
 def _upsample(values: np.ndarray, axis: int) -> np.ndarray:
-    """Interpolate the fine nodes between the coarse nodes of one axis."""
-    nodes = np.moveaxis(values, axis, 0)
-    steps = [nodes[:-1] + k / COARSE * (nodes[1:] - nodes[:-1]) for k in range(COARSE)]
-    fine = np.stack(steps, 1).reshape(-1, *nodes.shape[1:])
-    return np.ascontiguousarray(np.moveaxis(np.concatenate([fine, nodes[-1:]]), 0, axis))
+    """Return values with one more between each two along an axis: by a cubic, a sign that of the one before."""
+    known = np.moveaxis(values, axis, 0)
+    fine = np.empty((2 * len(known) - 1, *known.shape[1:]), dtype=known.dtype)
+    fine[::2] = known
+    if known.dtype == bool:
+        fine[1::2] = known[:-1]
+    else:
+        padded = np.concatenate([2 * known[:1] - known[1:2], known, 2 * known[-1:] - known[-2:-1]])
+        fine[1::2] = (9 * (known[:-1] + known[1:]) - padded[:-3] - padded[3:]) / 16
+    return np.moveaxis(fine, 0, axis)
 
 
 class _Surface:
@@ -134,14 +155,15 @@ class _Surface:
         samples = (corners[owner] * weights[:, :, None]).sum(1)
         self.owner = np.concatenate([np.arange(len(area)), owner])
         self.triangles, self.normals = corners, _pseudonormals(corners)
-        self.tree = KDTree(np.concatenate([corners.mean(1), samples]), leafsize=LEAF)
+        samples = np.concatenate([corners.mean(1), samples])
+        self.tree, self.few = KDTree(samples, leafsize=LEAF), KDTree(samples[::FAR_SHARE], leafsize=LEAF)
 
-    def distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the signed distances [m] of points (n, 3)."""
-        parts = []
+    def distance(self, points: np.ndarray, far: bool = False) -> np.ndarray:
+        """Return the signed distances [m] of points (n, 3); `far` tries the nearest of few samples."""
+        parts, tree, owners = [], self.few if far else self.tree, self.owner[::FAR_SHARE] if far else self.owner
         for part in (points[k : k + 8192] for k in range(0, max(1, len(points)), 8192)):
-            _, index = self.tree.query(part, k=min(NEAREST_SAMPLES, len(self.owner)))
-            owner = self.owner[index.reshape(len(part), -1)]
+            _, index = tree.query(part, k=1 if far else min(NEAREST_SAMPLES, len(owners)))
+            owner = owners[index.reshape(len(part), -1)]
             feet, feature = closest_on_triangles(np.repeat(part, owner.shape[1], 0), self.triangles[owner.reshape(-1)])
             gap = part[:, None] - feet.reshape(*owner.shape, 3)
             squared = (gap * gap).sum(-1)
@@ -158,14 +180,26 @@ def _pseudonormals(corners: np.ndarray) -> np.ndarray:
     """
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     face /= np.linalg.norm(face, axis=1, keepdims=True)
-    ids = np.unique(np.round(corners.reshape(-1, 3), 9), axis=0, return_inverse=True)[1].reshape(-1, 3)
+    ids = _alike(np.round(corners.reshape(-1, 3), 9)).reshape(-1, 3)
     ahead, back = np.roll(corners, -1, 1) - corners, np.roll(corners, 1, 1) - corners
     cosine = (ahead * back).sum(-1) / (np.linalg.norm(ahead, axis=-1) * np.linalg.norm(back, axis=-1))
     weighted = face[:, None] * np.arccos(np.clip(cosine, -1, 1))[..., None]
-    at_corner = np.zeros((ids.max() + 1, 3))
-    np.add.at(at_corner, ids.reshape(-1), weighted.reshape(-1, 3))
-    side = np.sort(np.stack([ids, np.roll(ids, -1, 1)], -1).reshape(-1, 2), axis=1)
-    side = np.unique(side, axis=0, return_inverse=True)[1].reshape(-1, 3)
-    at_side = np.zeros((side.max() + 1, 3))
-    np.add.at(at_side, side.reshape(-1), np.repeat(face, 3, 0))
+    at_corner = _sum_by(ids.reshape(-1), weighted.reshape(-1, 3))
+    side = np.sort(np.stack([ids, np.roll(ids, -1, 1)], -1), -1)
+    side = np.unique(side[..., 0] * (ids.max() + 1) + side[..., 1], return_inverse=True)[1].reshape(-1, 3)
+    at_side = _sum_by(side.reshape(-1), np.repeat(face, 3, 0))
     return np.concatenate([face[:, None], at_side[side], at_corner[ids]], 1)
+
+
+def _alike(points: np.ndarray) -> np.ndarray:
+    """Return the same number for equal points (n, 3), and no others."""
+    order = np.lexsort(points.T)
+    new = (points[order[1:]] != points[order[:-1]]).any(1)
+    number = np.empty(len(points), dtype=np.int64)
+    number[order] = np.concatenate([[0], np.cumsum(new)])
+    return number
+
+
+def _sum_by(number: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Return the sums of vectors (n, 3) of the same number."""
+    return np.stack([np.bincount(number, weights=column) for column in vectors.T], 1)
