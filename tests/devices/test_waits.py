@@ -67,8 +67,7 @@ def test_refinement_waits_for_the_pairs_of_links_too(device, monkeypatch, shape,
 
     found = waits_of_a_step(device, run, 1, 3)
     assert found.pop("optim.py") == 1
-    assert found.pop("ik/clearance.py") == 1
-    assert 4 <= found.pop("hand/self_collision.py") <= 7  # of three kinds; those of near pairs have a gradient
+    assert 3 <= found.pop("hand/self_collision.py") <= 5  # which pairs are near, of which kinds, which of each kind
     assert found == {}
 
 

@@ -7,7 +7,11 @@ import trimesh
 from scipy.optimize import linprog
 
 from torchgrasp.frames import rotation_from_vector
-from torchgrasp.hand.self_collision import box_distance, box_separation
+from torchgrasp.hand.self_collision import BoxPairs, box_distance
+
+
+def separation(*pairs: torch.Tensor) -> torch.Tensor:
+    return BoxPairs(*pairs).along_axes().amax(0)
 
 
 def boxes(n: int, generator: torch.Generator) -> tuple[torch.Tensor, ...]:
@@ -22,7 +26,7 @@ def boxes(n: int, generator: torch.Generator) -> tuple[torch.Tensor, ...]:
 
 
 def test_two_boxes_overlap_exactly_where_a_linear_programme_finds_a_common_point(generator):
-    found = box_separation(*boxes(60, generator=generator))
+    found = separation(*boxes(60, generator=generator))
     generator.manual_seed(generator.initial_seed())
     a, b, gap, half_a, half_b = (x.numpy() for x in boxes(60, generator))
     assert 10 < int((found < 0).sum()) < 50
@@ -36,7 +40,7 @@ def test_two_boxes_overlap_exactly_where_a_linear_programme_finds_a_common_point
 
 def test_separation_of_boxes_is_coals_depth_and_at_most_its_distance(generator):
     coal = pytest.importorskip("coal")
-    found = box_separation(*boxes(400, generator))
+    found = separation(*boxes(400, generator))
     generator.manual_seed(generator.initial_seed())
     a, b, gap, half_a, half_b = (x.numpy() for x in boxes(400, generator))
     truth = np.zeros(400)
@@ -64,16 +68,16 @@ def test_separation_of_boxes_closed_forms():
         (quarter, rotation_from_vector(torch.tensor([0.0, torch.pi / 4, 0]).double())[..., None], (4.0, 0.0, 0.0),
          4 - 2 * 2**0.5),  # crossing edges
     ]:  # fmt: skip
-        found = box_separation(a, b, torch.tensor(gap, dtype=torch.float64)[:, None], unit, unit)
+        found = separation(a, b, torch.tensor(gap, dtype=torch.float64)[:, None], unit, unit)
         assert float(found) == pytest.approx(expected, abs=1e-12)
 
 
 def test_separation_of_boxes_gradient_and_dtype(generator):
     given = [x[..., 10:] for x in boxes(30, generator)]  # where axes are parallel it has kinks
-    assert torch.autograd.gradcheck(box_separation, [x.requires_grad_() for x in given])
+    assert torch.autograd.gradcheck(separation, [x.requires_grad_() for x in given])
     with torch.no_grad():
-        single = box_separation(*(x.float() for x in given))
-        torch.testing.assert_close(single.double(), box_separation(*given), atol=1e-5, rtol=0)
+        single = separation(*(x.float() for x in given))
+        torch.testing.assert_close(single.double(), separation(*given), atol=1e-5, rtol=0)
 
 
 def test_box_distance_is_that_of_trimesh(generator):

@@ -73,12 +73,13 @@ def test_clearance_gradient_equals_finite_differences(hand, generator):
     assert float(same.double().mean()) > 0.95  # the rest: the closest pair changes within the step
 
 
-def test_wrenches_are_the_derivative_by_a_motion_of_the_second_shape(hand, generator):
+def test_pushes_are_the_derivative_by_a_motion_of_the_second_shape(hand, generator):
     itself, frames = hand.self_collision, frames_of(hand, random_joints(hand, 1))
     shaken = rotation_from_vector(0.1 * torch.randn(frames.shape[2], 3, generator=generator, dtype=torch.float64))
     frames = torch.einsum("lij,jkln->ikln", shaken, frames)  # no two axes are parallel, where it has kinks
-    pair, row = torch.arange(len(itself.pairs)), torch.zeros(len(itself.pairs), dtype=torch.long)
-    found = itself.wrenches(frames, pair, row)
+    separation, number, wrench = itself.pushes(frames, torch.inf)
+    assert torch.equal(separation, itself.separations(frames, torch.inf))
+    found = wrench[:, number[:, 0]]
     links = itself.link[itself.pairs[:, 1]]
     step = 1e-6 * torch.randn(6, generator=generator, dtype=torch.float64)
     for link in links.unique().tolist():
@@ -89,6 +90,19 @@ def test_wrenches_are_the_derivative_by_a_motion_of_the_second_shape(hand, gener
         ahead, back = (itself.separations(some, torch.inf)[:, 0] for some in moved)
         mine = links == link
         torch.testing.assert_close((step @ found)[mine], ((ahead - back) / 2)[mine], atol=1e-10, rtol=1e-4)
+
+
+def test_only_near_pairs_push(hand):
+    frames, margin = frames_of(hand, random_joints(hand, 200)), 0.002
+    separation, number, wrench = hand.self_collision.pushes(frames, margin)
+    torch.testing.assert_close(
+        separation.clamp_max(margin),
+        hand.self_collision.separations(frames, torch.inf).clamp_max(margin),
+        atol=1e-14,
+        rtol=0,
+    )
+    pushed = wrench[:, number].abs().amax(0) > 0
+    assert bool(pushed.any()) and torch.equal(pushed, separation < margin)
 
 
 def test_self_collision_rates_are_those_of_the_hands():

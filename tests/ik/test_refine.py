@@ -10,10 +10,10 @@ from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import apply, rigid, rotate, rotation_from_vector
 from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.checks import is_clear, measure_errors
-from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, clearance_hinges, link_clearance
-from torchgrasp.ik.configuration import Configuration, SpatialJacobian
+from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, clearance_rows, link_clearance
+from torchgrasp.ik.configuration import Configuration, SpatialJacobian, differentiate
 from torchgrasp.ik.motion import find_approach
-from torchgrasp.ik.refine import grasp_residuals, open_hand, refine, tip_residuals, tip_targets
+from torchgrasp.ik.refine import grasp_residuals, open_hand, refine, tip_rows, tip_targets
 from torchgrasp.ik.sdf import field_from_surface
 from torchgrasp.plane import Plane
 from torchgrasp.values import Contacts
@@ -62,7 +62,8 @@ def test_jacobian_against_finite_differences(hand, ball):
 
     def rows(at):
         spatial, target = SpatialJacobian.at(hand, at), tip_targets(hand, contacts)
-        return tip_residuals(spatial, target, contacts.normals), clearance_hinges(spatial, world, tips_touch=True)
+        tips, links = tip_rows(spatial, target, contacts.normals), clearance_rows(spatial, world, tips_touch=True)
+        return differentiate(spatial, [tips]), differentiate(spatial, links)
 
     tips, links = rows(posture)
     h = 1e-6
@@ -190,10 +191,10 @@ def test_a_tilted_table_is_a_level_one_seen_from_another_frame(hand, ball):
 
     here, there = (SpatialJacobian.at(hand, p) for p in (posture, moved))
     for tips_touch in (True, False):
-        for a, b in zip(
-            clearance_hinges(here, level, tips_touch), clearance_hinges(there, tilted, tips_touch), strict=True
-        ):
-            torch.testing.assert_close(a, b, atol=1e-9, rtol=1e-9)
+        a, b = (
+            differentiate(at, clearance_rows(at, world, tips_touch)) for at, world in ((here, level), (there, tilted))
+        )
+        torch.testing.assert_close(a, b, atol=1e-9, rtol=1e-9)
     torch.testing.assert_close(link_clearance(here, level, True)[2], link_clearance(there, tilted, True)[2])
     torch.testing.assert_close(
         open_hand(hand, posture, contacts, level), open_hand(hand, moved, turned, tilted), atol=1e-6, rtol=0
@@ -202,6 +203,7 @@ def test_a_tilted_table_is_a_level_one_seen_from_another_frame(hand, ball):
     torch.testing.assert_close(rotate(turn, direction[:, None])[:, 0], other)
     torch.testing.assert_close(room, same)
     plane = CollisionWorld(table=Plane.horizontal(-0.05))
-    assert all(map(torch.equal, clearance_hinges(here, level, True), clearance_hinges(here, plane, True)))
+    rows = (differentiate(here, clearance_rows(here, world, True)) for world in (level, plane))
+    assert all(map(torch.equal, *rows))
     with pytest.raises(BadArgument, match="table"):
         CollisionWorld(ball, float("nan"))

@@ -15,7 +15,7 @@ from torchgrasp.border import Count, Range, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.collision_spheres import CollisionSpheres
 from torchgrasp.hand.fingertips import Fingertips
-from torchgrasp.hand.joints import ActuatedJoints
+from torchgrasp.hand.joints import ActuatedJoints, FreeMotion
 from torchgrasp.hand.kinematics import KinematicTree, chain_from_urdf, map_directions, map_points
 from torchgrasp.hand.self_collision import SelfCollision
 from torchgrasp.hand.urdf import read_urdf
@@ -79,6 +79,11 @@ class Hand(Value):
         """
         chain = chain_from_urdf(read_urdf(self.urdf_path))
         return chain.to(dtype=self.lower.dtype, device=self.lower.device)
+
+    @functools.cached_property
+    def motion(self) -> FreeMotion:
+        """How links move with the pose and the actuated joints: tables for refinement."""
+        return FreeMotion.of(self)
 
     @property
     def joint_names(self) -> tuple[str, ...]:

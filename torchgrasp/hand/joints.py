@@ -1,6 +1,7 @@
 """The actuated joints of a hand, their limits, and the joints that follow them."""
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
@@ -9,7 +10,11 @@ from torch import Tensor
 from torchgrasp.base import Value, check_device
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand_toml import HandSpec
+from torchgrasp.hand.kinematics import Markers
 from torchgrasp.hand.urdf import Mimic, Urdf
+
+if TYPE_CHECKING:
+    from torchgrasp.hand.hand import Hand
 
 ROUNDING = 1e-6
 """Joints may pass their limits by this [rad]: limits and joints are both rounded to float32."""
@@ -56,6 +61,47 @@ class ActuatedJoints(Value):
             value, k = _first(joints, wrong)
             allowed = f"[{self.lower[k].item():.6g}, {self.upper[k].item():.6g}]"
             raise BadArgument("joints", f"{value:.6g} for {self.names[k]}", allowed)
+
+
+@dataclasses.dataclass(frozen=True)
+class FreeMotion(Value):
+    """How the links of a hand with a free pose move, and the markers by which that is told.
+
+    The q motions are three translations along the root's axes, three rotations about them, and the joints that anything
+    actuated moves. `moves[l, q]` is 1 if a motion moves link l. `coupling` gives the motions of the six numbers of a
+    step of the pose and of the actuated joints; None: they are the same.
+
+    `markers` are the collision spheres, the tips' centres and pads, then of the motions origins, axes of turns and axes
+    of slides, of which one is zero.
+    """
+
+    markers: Markers
+    moves: Float[Tensor, "l q"]
+    coupling: Float[Tensor, "q d"] | None
+
+    @classmethod
+    def of(cls, hand: "Hand") -> "FreeMotion":
+        """Tabulate the motions of a hand."""
+        tree, tips, spheres, coupling = hand.tree, hand.tips, hand.collision_spheres, hand.actuated.coupling
+        own = torch.nonzero((coupling != 0).any(1))[:, 0]
+        axes, slides = torch.eye(3).to(tree.axis), tree.prismatic[own]
+        root = torch.nonzero(tree.places == 0)[:, 0].expand(6)
+        link = torch.cat([root, tree.child[own]])
+        turning = torch.cat([0 * axes, axes, tree.axis[own] * (1 - slides[:, None])])
+        sliding = torch.cat([axes, 0 * axes, tree.axis[own] * slides[:, None]])
+        placed = [
+            (spheres.link_index, spheres.center, 1.0),
+            (tips.index, tips.center, 1.0),
+            (tips.index, tips.normal, 0.0),
+            (link, torch.zeros_like(turning), 1.0),
+            (link, turning, 0.0),
+            (link, sliding, 0.0),
+        ]
+        groups = [(at, local.to(axes), torch.full_like(local[:, 0], kind).to(axes)) for at, local, kind in placed]
+        moves = torch.cat([axes.new_ones(len(tree.moves), 6), tree.moves[:, own]], 1)
+        whole = torch.block_diag(torch.eye(6).to(axes), coupling[own])
+        same = whole.shape[0] == whole.shape[1] and torch.equal(whole, torch.eye(len(whole)).to(whole))
+        return cls(Markers.of(len(tree.link_names), groups), moves, None if same else whole)
 
 
 def _first(joints: Tensor, wrong: Tensor) -> tuple[float, int]:

@@ -4,7 +4,7 @@ The child's frame in its parent is `constant + sine sin q + cosine cos q + slide
 """
 
 import dataclasses
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -27,8 +27,8 @@ class KinematicTree(Value):
     joint that slides, `moves[l, j]` if joint j moves link l.
 
     The links of `tables` are sorted by level; `level_sizes` counts them. `joint` moves each, 0 if it is fixed. `parent`
-    indexes the level above; in a `straight` level it counts 0, 1, 2 up to that level's size. `places` gives level and
-    index of each of `link_names`.
+    indexes the level above; in a `straight` level it counts 0, 1, 2 up to that level's size. `places` is where those
+    of `link_names` are.
     """
 
     link_names: tuple[str, ...]
@@ -42,20 +42,28 @@ class KinematicTree(Value):
     parent: Int[Tensor, " l"]
     level_sizes: tuple[int, ...]
     straight: tuple[bool, ...]
-    places: tuple[tuple[int, int], ...]
+    places: Int[Tensor, " l"]
     slides: bool
 
-    def frames(self, values: Float[Tensor, "j n"]) -> Float[Tensor, "3 4 l n"]:
-        """Return three rows of `root_from_link` of every link, postures last: the fast layout."""
+    def frames(
+        self, values: Float[Tensor, "j n"], root: Float[Tensor, "3 4 n"] | None = None
+    ) -> Float[Tensor, "3 4 l n"]:
+        """Return three rows of `root_from_link` of every link, postures last: the fast layout.
+
+        With `root`, poses of the root in another frame, the links' are in that frame, too.
+        """
         constant, sine, cosine, slide = self.tables.to(values).unbind()
         local = torch.addcmul(constant, sine, values.sin().index_select(0, self.joint))
         local = torch.addcmul(local, cosine, values.cos().index_select(0, self.joint))
         if self.slides:
             local = torch.addcmul(local, slide, values.index_select(0, self.joint))
         levels, parents = local.split(self.level_sizes, 2), self.parent.split(self.level_sizes)
-        frames = list(levels[:2])  # the root is the identity
-        for k in range(2, len(levels)):
+        frames = [levels[0]] if root is None else [root[:, :, None]]
+        for k in range(1, len(levels)):
             above, level = frames[-1], levels[k]
+            if root is None and k == 1:  # the root is the identity
+                frames.append(level)
+                continue
             if not self.straight[k]:
                 above = above.index_select(2, parents[k])
             frame = above[:, 0, None] * level[0]
@@ -63,7 +71,7 @@ class KinematicTree(Value):
             frame = torch.addcmul(frame, above[:, 2, None], level[2])
             frame[:, 3] += above[:, 3]
             frames.append(frame)
-        return torch.stack([frames[level][:, :, index] for level, index in self.places], 2)
+        return torch.cat(frames, 2).index_select(2, self.places)
 
     def poses(self, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
         """Return `root_from_link` of every link for joints [rad or m]."""
@@ -77,6 +85,29 @@ class KinematicTree(Value):
         axes, origins = (x.permute(2, 1, 0) for x in (map_directions(child, self.axis), child[:, 3]))
         size = (*poses.shape[:-3], len(self.child), 3)
         return axes.reshape(size), origins.reshape(size)
+
+
+@dataclasses.dataclass(frozen=True)
+class Markers(Value):
+    """Points and directions that links carry, in groups of `sizes`: one product maps all of them."""
+
+    product: Float[Tensor, "k q"]
+    sizes: tuple[int, ...]
+
+    @classmethod
+    def of(
+        cls, links: int, groups: Sequence[tuple[Int[Tensor, "_"], Float[Tensor, "_ 3"], Float[Tensor, "_"]]]
+    ) -> "Markers":
+        """Return groups of markers: the link of each, its coordinates there, 1 for a point and 0 for a direction."""
+        link, local, point = (torch.cat(parts) for parts in zip(*groups, strict=True))
+        product = local.new_zeros(len(link), 4, links)
+        product[torch.arange(len(link), device=link.device), :, link] = torch.cat([local, point[:, None]], 1)
+        return cls(product.flatten(1), tuple(len(group[0]) for group in groups))
+
+    def place(self, frames: Float[Tensor, "3 4 l n"]) -> tuple[Float[Tensor, "3 p n"], ...]:
+        """Return the coordinates of each group in the frame of `frames`."""
+        product = self.product.to(frames).expand(3, -1, -1)
+        return torch.bmm(product, frames.flatten(1, 2)).split(self.sizes, 1)
 
 
 def map_points(frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]) -> Float[Tensor, "3 p n"]:
@@ -115,7 +146,7 @@ def tree_from_urdf(urdf: Urdf, ends: Collection[str] | None = None) -> Kinematic
         parent=torch.tensor([k for level in parents for k in level]),
         level_sizes=tuple(len(level) for level in levels),
         straight=tuple(level == list(range(len(levels[max(k - 1, 0)]))) for k, level in enumerate(parents)),
-        places=tuple(next((k, level.index(n)) for k, level in enumerate(levels) if n in level) for n in links),
+        places=torch.tensor([names.index(name) for name in links]),
         slides=any(j.kind == "prismatic" and j.child in part for j in joints),
     )
 

@@ -6,7 +6,9 @@ Boxes and spheres are exact. A cylinder becomes a prism of twelve sides, 2 % off
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -24,6 +26,8 @@ PARALLEL = 1e-10
 
 Placed = tuple[Float[Tensor, "3 3 s n"], Float[Tensor, "3 s n"]]
 """Axes and centres of shapes in the palm's frame."""
+Push = Callable[[Int[Tensor, " c"]], tuple[Float[Tensor, "3 c"], Float[Tensor, "3 c"]]]
+"""Gives the directions in which second shapes leave the first, and points on which these pushes act."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,29 +58,38 @@ class SelfCollision(Value):
             distance = self._distances(shapes[1])
             inscribed = self.half.amin(1) + self.radius
             limit = (distance - self._sums(inscribed, distance)).amin(0).clamp_max(below)
-            pair, row = torch.nonzero(distance - self._sums(self._bounding(), distance) <= limit, as_tuple=True)
+            pair, row = torch.nonzero(distance - self._sums(self._bounding, distance) <= limit, as_tuple=True)
         return least.scatter_reduce(0, row, self._separations(shapes, pair, row), "amin")
 
     def separations(self, frames: Float[Tensor, "3 4 l n"], below: float) -> Float[Tensor, "p n"]:
         """Return the separation [m] of each pair; above `below`, that of the bounding spheres."""
         shapes = self._place(frames)
         distance = self._distances(shapes[1])
-        apart = distance - self._sums(self._bounding(), distance)
+        apart = distance - self._sums(self._bounding, distance)
         pair, row = torch.nonzero(apart < below, as_tuple=True)
         return apart.index_put((pair, row), self._separations(shapes, pair, row))
 
-    def wrenches(
-        self, frames: Float[Tensor, "3 4 l n"], pair: Int[Tensor, " k"], row: Int[Tensor, " k"]
-    ) -> Float[Tensor, "6 k"]:
-        """Return the derivative of separations by a twist (translation, rotation) of the second shape."""
-        wrench, shapes, low = frames.new_zeros(6, len(pair)), self._place(frames), 0
-        for kind, count in enumerate(self.kinds):
-            at = torch.nonzero((pair >= low) & (pair < low + count))[:, 0]
-            if len(at):
-                push, point = self._push(kind, shapes, pair[at], row[at])
-                wrench[:, at] = torch.cat([push, torch.linalg.cross(point, push, dim=0)])
-            low += count
-        return wrench
+    def pushes(
+        self, frames: Float[Tensor, "3 4 l n"], below: float
+    ) -> tuple[Float[Tensor, "p n"], Int[Tensor, "p n"], Float[Tensor, "6 k"]]:
+        """Return `separations`, and wrenches: their derivatives by a twist (translation, rotation) of the second shape.
+
+        The integers tell which wrench is a pair's. It is zero for separations above `below`: that of the last column.
+        """
+        shapes = self._place(frames)
+        distance = self._distances(shapes[1])
+        apart = distance - self._sums(self._bounding, distance)
+        pair, row = torch.nonzero(apart < below, as_tuple=True)
+        separation, wrench = apart.new_zeros(len(pair)), apart.new_zeros(6, len(pair) + 1)
+        for kind, at in self._split(pair):
+            separation[at], push = self._of_kind(kind, shapes, pair[at], row[at])
+            close = torch.nonzero(separation[at] < below)[:, 0]
+            if len(close):
+                force, point = push(close)
+                wrench[:, at.start + close] = torch.cat([force, torch.linalg.cross(point, force, dim=0)])
+        number = torch.full_like(apart, len(pair), dtype=torch.long)
+        number[pair, row] = torch.arange(len(pair), device=pair.device)
+        return apart.index_put((pair, row), separation), number, wrench
 
     def link_pairs(self) -> list[tuple[int, int]]:
         """Return the pairs of links that are tested, by their indices."""
@@ -94,56 +107,58 @@ class SelfCollision(Value):
         first, second = self.pairs.unbind(1)
         return _length(center.index_select(1, second) - center.index_select(1, first))
 
+    @cached_property
     def _bounding(self) -> Float[Tensor, " s"]:
-        """Return the radii of the bounding spheres."""
+        """Radii of the bounding spheres."""
         return torch.linalg.vector_norm(self.half, dim=1) + self.radius
 
     def _sums(self, radius: Float[Tensor, " s"], like: Tensor) -> Float[Tensor, "p 1"]:
         """Return the sums of radii over the pairs."""
         return radius[self.pairs].sum(1, keepdim=True).to(like)
 
+    def _split(self, pair: Int[Tensor, " k"]) -> Iterator[tuple[int, slice]]:
+        """Yield the kinds among sorted pairs, and where the pairs of each are."""
+        first, second, _ = self.kinds
+        ends = torch.searchsorted(pair, torch.tensor([first, first + second], device=pair.device)).tolist()
+        for kind, (low, high) in enumerate(itertools.pairwise((0, *ends, len(pair)))):
+            if high > low:
+                yield kind, slice(low, high)
+
     def _separations(self, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]) -> Float[Tensor, " k"]:
-        """Return the separation of chosen pairs in chosen rows."""
-        separation, low = shapes[1].new_zeros(len(pair)), 0
-        for kind, count in enumerate(self.kinds):
-            at = torch.nonzero((pair >= low) & (pair < low + count))[:, 0]
-            if len(at):
-                separation = separation.index_put((at,), self._of_kind(kind, shapes, pair[at], row[at]))
-            low += count
-        return separation
+        """Return the separation of chosen pairs, which are sorted, in chosen rows."""
+        parts = [self._of_kind(kind, shapes, pair[at], row[at])[0] for kind, at in self._split(pair)]
+        return torch.cat(parts) if parts else shapes[1].new_zeros(0)
 
     def _of_kind(
         self, kind: int, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]
-    ) -> Float[Tensor, " k"]:
-        """Return the separation of pairs of one kind."""
-        (first, second), (one, two), _, gap = self._meet(shapes, pair, row)
-        half, radius, bounding = (x.to(gap) for x in (self.half.T, self.radius, self._bounding()))
-        if kind == 1:
-            return box_distance(_inside(two, gap).T, half[:, second].T) - radius[first]
-        apart = _length(gap) - bounding[first] - bounding[second]
-        if kind == 2:
-            return apart
-        return torch.maximum(apart, box_separation(one, two, gap, half[:, first], half[:, second]))
-
-    def _push(
-        self, kind: int, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]
-    ) -> tuple[Float[Tensor, "3 k"], Float[Tensor, "3 k"]]:
-        """Return the direction in which the second shapes leave the first, and a point on which that push acts."""
+    ) -> tuple[Float[Tensor, " k"], Push]:
+        """Return the separation of pairs of one kind, and what gives the pushes of some of them."""
         (first, second), (one, two), place, gap = self._meet(shapes, pair, row)
-        half, bounding = (x.to(gap) for x in (self.half.T, self._bounding()))
+        half, radius, bounding = (x.to(gap) for x in (self.half.T, self.radius, self._bounding))
         if kind == 1:
-            local = _inside(two, gap)
-            out = local.abs() - half[:, second]
-            inside = (torch.arange(3, device=out.device)[:, None] == out.argmax(0)).to(out)
-            slope = torch.where((out > 0).any(0), out.clamp_min(0), inside) * torch.where(local < 0, -1.0, 1.0)
-            return (two * (slope / _length(slope))).sum(1), place - gap  # any turn about the sphere's centre is free
-        direct = gap / _length(gap)
-        if kind == 2:
-            return direct, place
+
+            def from_box(at: Int[Tensor, " c"]) -> tuple[Float[Tensor, "3 c"], Float[Tensor, "3 c"]]:
+                local, axes = _inside(two[:, :, at], gap[:, at]), two[:, :, at]
+                out = local.abs() - half[:, second[at]]
+                inside = (torch.arange(3, device=out.device)[:, None] == out.argmax(0)).to(out)
+                slope = torch.where((out > 0).any(0), out.clamp_min(0), inside) * torch.where(local < 0, -1.0, 1.0)
+                # any turn about the sphere's centre is free
+                return (axes * (slope / _length(slope))).sum(1), place[:, at] - gap[:, at]
+
+            return box_distance(_inside(two, gap).T, half[:, second].T) - radius[first], from_box
         apart = _length(gap) - bounding[first] - bounding[second]
-        far = apart > box_separation(one, two, gap, half[:, first], half[:, second])
-        push, arm = box_push(one, two, gap, half[:, first], half[:, second])
-        return torch.where(far, direct, push), place + torch.where(far, 0.0, arm)
+        if kind == 2:
+            return apart, lambda at: (gap[:, at] / _length(gap[:, at]), place[:, at])
+        boxes = BoxPairs(one, two, gap, half[:, first], half[:, second])
+        along = boxes.along_axes()
+        separation = along.amax(0)
+
+        def between_boxes(at: Int[Tensor, " c"]) -> tuple[Float[Tensor, "3 c"], Float[Tensor, "3 c"]]:
+            push, arm = BoxPairs(*(x[..., at] for x in boxes)).push(along[:, at].argmax(0))
+            far, direct = apart[at] > separation[at], gap[:, at] / _length(gap[:, at])
+            return torch.where(far, direct, push), place[:, at] + torch.where(far, 0.0, arm)
+
+        return torch.maximum(apart, separation), between_boxes
 
     def _meet(
         self, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]
@@ -159,7 +174,7 @@ class SelfCollision(Value):
 
 def _inside(axes: Float[Tensor, "3 3 k"], v: Float[Tensor, "3 k"]) -> Float[Tensor, "3 k"]:
     """Return the components of vectors along the columns of `axes`."""
-    return axes[0] * v[0] + axes[1] * v[1] + axes[2] * v[2]
+    return (axes * v[:, None]).sum(0)
 
 
 def _length(v: Float[Tensor, "3 *b"]) -> Float[Tensor, "*b"]:
@@ -168,74 +183,62 @@ def _length(v: Float[Tensor, "3 *b"]) -> Float[Tensor, "*b"]:
     return torch.sqrt(squared.clamp_min(1e-24))
 
 
-def box_separation(
-    a: Float[Tensor, "3 3 k"],
-    b: Float[Tensor, "3 3 k"],
-    gap: Float[Tensor, "3 k"],
-    half_a: Float[Tensor, "3 k"],
-    half_b: Float[Tensor, "3 k"],
-) -> Float[Tensor, " k"]:
-    """Return the largest separation [m] of two boxes along 15 axes (Gottschalk et al., 1996).
+class BoxPairs(NamedTuple):
+    """Pairs of boxes: column i of the rotations `a` and `b` is axis i, `half_a` and `half_b` [m] are half sizes.
 
-    Overlap is negative: the least translation that parts the boxes. Apart, the value is a lower bound of the distance,
-    exact where a face or two crossing edges are nearest. Column i of the rotations `a` and `b` is axis i.
-    `gap` [m] reaches from the first centre to the second; `half_a` and `half_b` [m] are half sizes.
-
-    >>> still, x = torch.eye(3)[..., None], torch.tensor([[3.0], [0.0], [0.0]])
-    >>> box_separation(still, still, x, torch.ones(3, 1), torch.ones(3, 1))
-    tensor([1.])
+    `gap` [m] reaches from the first centre to the second.
     """
-    by_a, by_b, by_edges = _along_axes(a, b, gap, half_a, half_b)
-    return torch.maximum(torch.maximum(by_a, by_b).amax(0), by_edges.amax((0, 1)))
 
+    a: Float[Tensor, "3 3 k"]
+    b: Float[Tensor, "3 3 k"]
+    gap: Float[Tensor, "3 k"]
+    half_a: Float[Tensor, "3 k"]
+    half_b: Float[Tensor, "3 k"]
 
-def box_push(
-    a: Float[Tensor, "3 3 k"],
-    b: Float[Tensor, "3 3 k"],
-    gap: Float[Tensor, "3 k"],
-    half_a: Float[Tensor, "3 k"],
-    half_b: Float[Tensor, "3 k"],
-) -> tuple[Float[Tensor, "3 k"], Float[Tensor, "3 k"]]:
-    """Return the axis of `box_separation`, towards the second box, and the contact point from that box's centre [m]."""
-    by_a, by_b, by_edges = _along_axes(a, b, gap, half_a, half_b)
-    best = torch.cat([by_a, by_b, by_edges.flatten(0, 1)]).argmax(0)[None]
-    edges, i = best >= 6, torch.where(best >= 6, (best - 6) // 3, best.clamp_max(2))
-    j = torch.where(edges, (best - 6) % 3, (best - 3).clamp(0, 2))
-    along_a, along_b = (x.gather(1, at.expand(3, 1, -1))[:, 0] for x, at in ((a, i), (b, j)))
-    push = torch.where(edges, torch.linalg.cross(along_a, along_b, dim=0), torch.where(best < 3, along_a, along_b))
-    push = push / _length(push) * torch.where((push * gap).sum(0) < 0, -1.0, 1.0)
-    reach_a, reach_b = _inside(a, push).sign() * half_a, _inside(b, push).sign() * half_b
-    reach_a = reach_a.scatter(0, i, torch.where(edges, 0.0, reach_a.gather(0, i)))  # an edge is met anywhere along it
-    reach_b = reach_b.scatter(0, j, torch.where(edges, 0.0, reach_b.gather(0, j)))
-    of_a, of_b = (a * reach_a).sum(1), -(b * reach_b).sum(1)
-    between, cosine = gap + of_b - of_a, (along_a * along_b).sum(0)
-    beyond = (between * along_b).sum(0) - cosine * (between * along_a).sum(0)
-    crossed = of_b - beyond / (1 - cosine * cosine) * along_b
-    return push, torch.where(edges, crossed, torch.where(best < 3, of_b, of_a - gap))
+    def along_axes(self) -> Float[Tensor, "15 k"]:
+        """Return the separations [m] along 15 axes, the largest of which is the boxes' (Gottschalk et al., 1996).
 
+        The axes are those of both boxes, then their crossings. Overlap is negative: the least translation that parts
+        the boxes. Apart, the value is a lower bound of the distance, exact where a face or two crossing edges are
+        nearest.
 
-def _along_axes(
-    a: Float[Tensor, "3 3 k"],
-    b: Float[Tensor, "3 3 k"],
-    gap: Float[Tensor, "3 k"],
-    half_a: Float[Tensor, "3 k"],
-    half_b: Float[Tensor, "3 k"],
-) -> tuple[Float[Tensor, "3 k"], Float[Tensor, "3 k"], Float[Tensor, "3 3 k"]]:
-    """Return the separations along the faces of both boxes, and along the crossings of their edges."""
-    rotation = a[0, :, None] * b[0] + a[1, :, None] * b[1] + a[2, :, None] * b[2]  # b's axes in the frame of a
-    t, u = _inside(a, gap), _inside(b, gap)
-    size, square = rotation.abs(), rotation * rotation
-    by_a = t.abs() - half_a - (size[:, 0] * half_b[0] + size[:, 1] * half_b[1] + size[:, 2] * half_b[2])
-    by_b = u.abs() - half_b - (size[0] * half_a[0, None] + size[1] * half_a[1, None] + size[2] * half_a[2, None])
-    # axis i of a cross axis j of b; the other two axes of a box follow by rolling
-    next_t, last_t, next_a, last_a = (x.roll(k, 0)[:, None] for x in (t, half_a) for k in (-1, 1))
-    along = last_t * rotation.roll(-1, 0) - next_t * rotation.roll(1, 0)
-    reach = next_a * size.roll(1, 0) + last_a * size.roll(-1, 0)
-    reach = reach + half_b.roll(-1, 0) * size.roll(1, 1) + half_b.roll(1, 0) * size.roll(-1, 1)
-    sine = square.roll(-1, 1) + square.roll(1, 1)
-    crossing = sine > PARALLEL
-    by_edges = (along.abs() - reach) * torch.rsqrt(torch.where(crossing, sine, 1.0))
-    return by_a, by_b, torch.where(crossing, by_edges, -torch.inf)
+        >>> still, x = torch.eye(3)[..., None], torch.tensor([[3.0], [0.0], [0.0]])
+        >>> BoxPairs(still, still, x, torch.ones(3, 1), torch.ones(3, 1)).along_axes().amax(0)
+        tensor([1.])
+        """
+        a, b, gap, half_a, half_b = self
+        rotation = (a[:, :, None] * b[:, None]).sum(0)  # b's axes in the frame of a
+        t, u = _inside(a, gap), _inside(b, gap)
+        size = rotation.abs()
+        by_a = t.abs() - half_a - (size * half_b).sum(1)
+        by_b = u.abs() - half_b - (size * half_a[:, None]).sum(0)
+        # axis i of a cross axis j of b; the other two axes of a box follow by rolling
+        next_t, last_t, next_a, last_a = (x.roll(k, 0)[:, None] for x in (t, half_a) for k in (-1, 1))
+        along = last_t * rotation.roll(-1, 0) - next_t * rotation.roll(1, 0)
+        reach = next_a * size.roll(1, 0) + last_a * size.roll(-1, 0)
+        reach = reach + half_b.roll(-1, 0) * size.roll(1, 1) + half_b.roll(1, 0) * size.roll(-1, 1)
+        sine = 1 - rotation * rotation
+        crossing = sine > PARALLEL
+        by_edges = (along.abs() - reach) * torch.rsqrt(torch.where(crossing, sine, 1.0))
+        return torch.cat([by_a, by_b, torch.where(crossing, by_edges, -torch.inf).flatten(0, 1)])
+
+    def push(self, best: Int[Tensor, " k"]) -> tuple[Float[Tensor, "3 k"], Float[Tensor, "3 k"]]:
+        """Return the `best` axis, towards the second box, and the contact point from that box's centre [m]."""
+        a, b, gap, half_a, half_b = self
+        best = best[None]
+        edges, i = best >= 6, torch.where(best >= 6, (best - 6) // 3, best.clamp_max(2))
+        j = torch.where(edges, (best - 6) % 3, (best - 3).clamp(0, 2))
+        along_a, along_b = (x.gather(1, at.expand(3, 1, -1))[:, 0] for x, at in ((a, i), (b, j)))
+        push = torch.where(edges, torch.linalg.cross(along_a, along_b, dim=0), torch.where(best < 3, along_a, along_b))
+        push = push / _length(push) * torch.where((push * gap).sum(0) < 0, -1.0, 1.0)
+        reach_a, reach_b = _inside(a, push).sign() * half_a, _inside(b, push).sign() * half_b
+        reach_a = reach_a.scatter(0, i, torch.where(edges, 0.0, reach_a.gather(0, i)))  # anywhere along an edge
+        reach_b = reach_b.scatter(0, j, torch.where(edges, 0.0, reach_b.gather(0, j)))
+        of_a, of_b = (a * reach_a).sum(1), -(b * reach_b).sum(1)
+        between, cosine = gap + of_b - of_a, (along_a * along_b).sum(0)
+        beyond = (between * along_b).sum(0) - cosine * (between * along_a).sum(0)
+        crossed = of_b - beyond / (1 - cosine * cosine) * along_b
+        return push, torch.where(edges, crossed, torch.where(best < 3, of_b, of_a - gap))
 
 
 def box_distance(points: Float[Tensor, "*b 3"], half: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:

@@ -56,7 +56,7 @@ def measure_errors(
         (hand.tips.center, tip_targets(hand, contacts)) if rolling else (hand.tips.contact, contacts.points)
     )
     error = torch.linalg.vector_norm(spatial.points(hand.tips.index, touching) - target, dim=-1)
-    pads = spatial.directions(hand.tips.index, hand.tips.normal)
+    pads = spatial.pads.permute(2, 1, 0)
     angle = torch.acos((-(pads * contacts.normals).sum(-1)).clamp(-1.0, 1.0))  # from the inward normal
     links, depth, table = link_clearance(spatial, world, tips_touch=True)
     between = hand.self_clearance(configuration.joints)

@@ -5,16 +5,15 @@ import math
 from functools import cached_property
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value, settle
 from torchgrasp.border import checked
 from torchgrasp.hand.collision_spheres import CollisionSpheres
-from torchgrasp.ik.configuration import SpatialJacobian, wrench_of
+from torchgrasp.ik.configuration import Rows, SpatialJacobian
 from torchgrasp.ik.obstacles import Obstacles
 from torchgrasp.ik.sdf import SignedDistanceField
-from torchgrasp.optim import Residuals
 from torchgrasp.plane import Plane, as_plane
 
 MILLIMETRE = 1e-3
@@ -74,18 +73,6 @@ def along(points: Float[Tensor, "*b 3"], plane: Plane) -> Float[Tensor, "*b"]:
     return points[..., 0] * x + points[..., 1] * y + points[..., 2] * z
 
 
-def hinge(clearance: Float[Tensor, "g k"], jacobian: Float[Tensor, "g k d"], margin: float) -> Residuals:
-    """Return max(0, margin - clearance) [mm] and its derivative."""
-    active = (clearance < margin).to(clearance)
-    return active * (margin - clearance) / MILLIMETRE, -active[..., None] * jacobian / MILLIMETRE
-
-
-def least(clearance: Float[Tensor, "g s"]) -> tuple[Int[Tensor, "g 1"], Int[Tensor, "g k"]]:
-    """Return rows and columns of the least clearances of each row."""
-    index = clearance.topk(min(HINGES, clearance.shape[1]), dim=1, largest=False, sorted=False).indices
-    return torch.arange(len(index), device=index.device)[:, None], index
-
-
 def collision_cost(
     centres: Float[Tensor, "*b s 3"], spheres: CollisionSpheres, world: CollisionWorld
 ) -> Float[Tensor, "*b"]:
@@ -103,44 +90,52 @@ def collision_cost(
     return cost / MILLIMETRE**2
 
 
-def clearance_hinges(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> Residuals:
+def clearance_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> list[Rows]:
     """Return hinges on the least clearances of the links from each other, the object, obstacles and the table."""
-    hinges, spheres = [self_hinges(spatial)], spatial.hand.collision_spheres
-    centres = spatial.points(spheres.link_index, spheres.center)
-    radius = spheres.radius.to(centres)
+    return [self_rows(spatial), *sphere_rows(spatial, world, tips_touch)]
+
+
+def self_rows(spatial: SpatialJacobian) -> Rows:
+    """Return hinges on the links' least clearances from each other."""
+    pairs, moves = spatial.hand.self_collision, spatial.hand.motion.moves
+    separation, number, wrench = pairs.pushes(spatial.obj_from_link, SELF_CLEARANCE)
+    separation, index = separation.T.topk(min(HINGES, len(pairs.pairs)), dim=1, largest=False, sorted=False)
+    wrench = wrench.T[number.T.gather(1, index)] / -MILLIMETRE
+    first, second = moves[pairs.link[pairs.pairs]].to(wrench).unbind(1)
+    return Rows((SELF_CLEARANCE - separation).clamp_min(0) / MILLIMETRE, wrench, (second - first)[index])
+
+
+def sphere_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> list[Rows]:
+    """Return hinges on the least clearances of the links' spheres from each of object, obstacles and table."""
+    spheres, motion, centres = spatial.hand.collision_spheres, spatial.hand.motion, spatial.sphere_centres
+    radius, found = spheres.radius.to(centres), []
     for field in world.fields:
         coarse = field.nearest_node(centres) - radius
         if tips_touch and field is world.field:
             coarse = torch.where(spheres.touching, math.inf, coarse)
-        row, index = least(coarse)
-        nearest = centres[row, index]
-        distance, gradient = field.query(nearest)
-        clearance = distance - radius[index] + torch.where(torch.isinf(coarse[row, index]), 1.0, 0.0)
-        jacobian = spatial.jacobian(wrench_of(nearest, gradient), spheres.link_index[index])
-        hinges.append(hinge(clearance, jacobian, CLEARANCE))
+        found.append(coarse)
     if world.plane is not None:
         height = along(centres, world.plane) - radius - world.plane.offset
-        if tips_touch:  # their contacts decide how low they are
-            height = height + CLEARANCE * spheres.touching
-        row, index = least(height)
-        up = world.plane.normal.to(centres).expand(*index.shape, 3)
-        jacobian = spatial.jacobian(wrench_of(centres[row, index], up), spheres.link_index[index])
-        hinges.append(hinge(height[row, index], jacobian, CLEARANCE))
-    residuals, jacobians = zip(*hinges, strict=True)
-    return torch.cat(residuals, 1), torch.cat(jacobians, 1)
-
-
-def self_hinges(spatial: SpatialJacobian) -> Residuals:
-    """Return hinges on the links' least clearances from each other."""
-    pairs, frames = spatial.hand.self_collision, spatial.obj_from_link[:, :, :3].permute(2, 3, 1, 0).contiguous()
-    separation = pairs.separations(frames, SELF_CLEARANCE).T
-    row, index = least(separation)
-    separation = separation[row, index]
-    close = torch.nonzero(separation < SELF_CLEARANCE, as_tuple=True)  # the hinges of the others are flat
-    wrench = separation.new_zeros(*index.shape, 6)
-    wrench[close] = pairs.wrenches(frames, index[close], close[0]).T
-    first, second = pairs.link[pairs.pairs[index]].unbind(-1)
-    return hinge(separation, spatial.jacobian(wrench, second) - spatial.jacobian(wrench, first), SELF_CLEARANCE)
+        found.append(
+            height + CLEARANCE * spheres.touching if tips_touch else height
+        )  # contacts decide how low tips are
+    if not found:
+        return []
+    coarse, index = torch.stack(found, 1).topk(min(HINGES, len(radius)), dim=2, largest=False, sorted=False)
+    points = centres[torch.arange(len(centres), device=centres.device)[:, None, None], index]
+    clearance, direction = [], []
+    for k, field in enumerate(world.fields):
+        distance, gradient = field.query(points[:, k])
+        clearance.append(distance - radius[index[:, k]] + torch.where(torch.isinf(coarse[:, k]), 1.0, 0.0))
+        direction.append(gradient)
+    if world.plane is not None:
+        clearance.append(coarse[:, -1])
+        direction.append(world.plane.normal.to(centres).expand_as(points[:, -1]))
+    clearance, direction = torch.cat(clearance, 1), torch.cat(direction, 1)
+    direction = direction * ((clearance < CLEARANCE).to(centres) / -MILLIMETRE)[..., None]
+    wrench = torch.cat([direction, torch.linalg.cross(points.flatten(1, 2), direction)], -1)
+    moves = motion.moves[spheres.link_index].to(centres)[index.flatten(1)]
+    return [Rows((CLEARANCE - clearance).clamp_min(0) / MILLIMETRE, wrench, moves)]
 
 
 def link_clearance(
@@ -148,7 +143,7 @@ def link_clearance(
 ) -> tuple[Float[Tensor, "g"], Float[Tensor, "g"], Float[Tensor, "g"]]:
     """Return the least clearances [m]: links (no touching tips) from object, tips from object, all from table."""
     spheres = spatial.hand.collision_spheres
-    centres = spatial.points(spheres.link_index, spheres.center)
+    centres = spatial.sphere_centres
     radius = spheres.radius.to(centres)
     clearance = torch.full_like(centres[..., 0], math.inf)
     if world.field is not None:
@@ -163,7 +158,7 @@ def link_clearance(
 def obstacle_clearance(spatial: SpatialJacobian, world: CollisionWorld) -> Float[Tensor, "g"]:
     """Return the least clearance [m] of all links, fingertips too, from obstacles; infinite without any."""
     spheres = spatial.hand.collision_spheres
-    centres = spatial.points(spheres.link_index, spheres.center)
+    centres = spatial.sphere_centres
     if world.obstacles is None:
         return torch.full_like(centres[:, 0, 0], math.inf)
     return (world.obstacles.field.query(centres)[0] - spheres.radius.to(centres)).amin(1)

@@ -1,10 +1,12 @@
 """Configurations of a free hand, and Jacobians of points on it.
 
-A row of a Jacobian is the virtual work of a unit force at a point: a wrench about the object's origin. Its derivative
-by a joint is the wrench times the joint's twist.
+A row of a Jacobian is the virtual work of a force at a point: a wrench about the object's origin. Its derivative by a
+motion is the wrench times the motion's twist.
 """
 
 import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -12,8 +14,10 @@ from torch import Tensor
 
 from torchgrasp.base import Batch, Value
 from torchgrasp.border import checked
-from torchgrasp.frames import apply, rigid, rotate, rotation_from_vector
+from torchgrasp.frames import rigid, rotation_from_vector
 from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.kinematics import map_points
+from torchgrasp.optim import Residuals
 
 
 @checked
@@ -32,49 +36,51 @@ class Configuration(Batch):
         return Configuration(joints, rigid(rotation @ rotation_from_vector(step[:, 3:6]), position))
 
 
+class Rows(NamedTuple):
+    """Residuals, and how a hand's motions change them: by the work of `wrench` where `moves` is 1."""
+
+    residual: Float[Tensor, "g k"]
+    wrench: Float[Tensor, "g k 6"]
+    moves: Float[Tensor, "*g k q"]
+
+
 @dataclasses.dataclass(frozen=True)
 class SpatialJacobian(Value):
-    """Link poses and joint twists in the object's frame."""
+    """Frames of the links, `FreeMotion`'s markers and the twists of its motions, in the object's frame."""
 
     hand: Hand
-    obj_from_link: Float[Tensor, "g l 4 4"]
-    twists: Float[Tensor, "g 6 j"]
-    obj_from_hand: Float[Tensor, "g 4 4"]
+    obj_from_link: Float[Tensor, "3 4 l g"]
+    spheres: Float[Tensor, "3 s g"]
+    tips: Float[Tensor, "3 f g"]
+    pads: Float[Tensor, "3 f g"]
+    twists: Float[Tensor, "6 q g"]
 
     @classmethod
     def at(cls, hand: Hand, configuration: Configuration) -> "SpatialJacobian":
         """Evaluate the forward kinematics once."""
-        links, pose = hand.tree.poses(hand.actuated.couple(configuration.joints)), configuration.obj_from_hand
-        axes, origins = hand.tree.joint_axes(links)
-        axes, origins = rotate(pose, axes), apply(pose, origins)
-        slide = hand.tree.prismatic.to(axes)[:, None]
-        twists = torch.cat([torch.linalg.cross(origins, axes) * (1 - slide) + axes * slide, axes * (1 - slide)], -1)
-        return cls(hand, pose[:, None] @ links, twists.mT, pose)
+        root = configuration.obj_from_hand[:, :3].permute(1, 2, 0)
+        frames = hand.tree.frames(hand.actuated.couple(configuration.joints).T.contiguous(), root)
+        spheres, tips, pads, origins, turning, sliding = hand.motion.markers.place(frames)
+        twists = torch.cat([torch.linalg.cross(origins, turning, dim=0) + sliding, turning])
+        return cls(hand, frames, spheres, tips, pads, twists)
 
     def points(self, links: Int[Tensor, "k"], local: Float[Tensor, "k 3"]) -> Float[Tensor, "g k 3"]:
         """Return points fixed in links, in the object's frame [m]."""
-        g, count = self.obj_from_link.shape[:2]
-        frames = self.obj_from_link[:, :, :3].permute(1, 3, 2, 0).reshape(4 * count, 3 * g)
-        # One product with a sparse matrix is many times faster than a product for each point.
-        k = torch.arange(len(links), device=links.device)
-        selection = frames.new_zeros(len(links), count, 4)
-        selection[k, links] = torch.cat([local.to(frames), frames.new_ones(len(links), 1)], 1)
-        return (selection.flatten(1) @ frames).unflatten(1, (3, g)).permute(2, 0, 1)
+        return map_points(self.obj_from_link.index_select(2, links), local).permute(2, 1, 0)
 
-    def directions(self, links: Int[Tensor, "k"], local: Float[Tensor, "k 3"]) -> Float[Tensor, "g k 3"]:
-        """Return directions fixed in links, in the object's frame."""
-        return (self.obj_from_link[:, links, :3, :3] @ local.to(self.obj_from_hand)[:, :, None])[..., 0]
+    @property
+    def sphere_centres(self) -> Float[Tensor, "g s 3"]:
+        """Centres [m] of the hand's collision spheres."""
+        return self.spheres.permute(2, 1, 0)
 
-    def jacobian(self, wrench: Float[Tensor, "g k 6"], links: Int[Tensor, "*g k"]) -> Float[Tensor, "g k d"]:
-        """Return the derivatives by pose and joints of rows, each a wrench on a link."""
-        force, torque = wrench.split(3, -1)
-        rotation, origin = self.obj_from_hand[:, :3, :3], self.obj_from_hand[:, :3, 3]
-        torque = torque - torch.linalg.cross(origin[:, None].expand_as(force), force)  # about the hand's origin
-        moves, coupling = self.hand.tree.moves[links].to(wrench), self.hand.actuated.coupling.to(wrench)
-        joints = ((wrench @ self.twists) * moves) @ coupling
-        return torch.cat([force @ rotation, torque @ rotation, joints], -1)
+    def jacobian(self, wrench: Float[Tensor, "g k 6"], moves: Float[Tensor, "*g k q"]) -> Float[Tensor, "g k d"]:
+        """Return the derivatives of rows (`Rows`) by pose and joints."""
+        by_motion = (wrench @ self.twists.permute(2, 0, 1)) * moves
+        coupling = self.hand.motion.coupling
+        return by_motion if coupling is None else by_motion @ coupling.to(by_motion)
 
 
-def wrench_of(points: Float[Tensor, "g k 3"], directions: Float[Tensor, "g k 3"]) -> Float[Tensor, "g k 6"]:
-    """Return the wrenches of unit forces along directions at points."""
-    return torch.cat([directions, torch.linalg.cross(points, directions)], -1)
+def differentiate(spatial: SpatialJacobian, parts: Sequence[Rows]) -> Residuals:
+    """Return the residuals of all parts, one after the other, and their Jacobian by pose and joints."""
+    residual, wrench, moves = (torch.cat(x, 1) for x in zip(*parts, strict=True))
+    return residual, spatial.jacobian(wrench, moves)

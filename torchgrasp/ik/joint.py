@@ -16,11 +16,11 @@ from torchgrasp.base import Batch
 from torchgrasp.border import checked
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates
-from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, clearance_hinges
-from torchgrasp.ik.configuration import Configuration, SpatialJacobian
+from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, clearance_rows
+from torchgrasp.ik.configuration import Configuration, SpatialJacobian, differentiate
 from torchgrasp.ik.contact_first import refine_on_contacts
 from torchgrasp.ik.ranking import rank_in_group
-from torchgrasp.ik.refine import PAD_WEIGHT, TIP_WEIGHT, tip_residuals, tip_targets
+from torchgrasp.ik.refine import PAD_WEIGHT, TIP_WEIGHT, tip_rows, tip_targets
 from torchgrasp.ik.rounds import Attempts, assign, best_grasps, executable
 from torchgrasp.optim import LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.plan.certify import certify
@@ -99,16 +99,16 @@ class JointProblem:
         jet = with_variance(triple_mean_jet(shape, state.points), state.variance, state.variance_gradient)
         spatial = SpatialJacobian.at(hand, state.configuration)
         contacts = Contacts(shape.metres(state.points), jet.normals)
-        tips, tips_by_hand = tip_residuals(spatial, tip_targets(hand, contacts), jet.normals)
-        links, links_by_hand = clearance_hinges(spatial, self.world, tips_touch=True)
-        tips_by_points = self._tips_by_points(spatial, jet, tips[:, 3 * len(hand.tips) :] > 0)
+        tips = tip_rows(spatial, tip_targets(hand, contacts), jet.normals)
+        of_hand, by_hand = differentiate(spatial, [tips, *clearance_rows(spatial, self.world, tips_touch=True)])
+        tips_by_points = self._tips_by_points(spatial, jet, tips.residual[:, 3 * len(hand.tips) :] > 0)
         contact, contact_by_x = self._contact_residuals(state, jet, flat)
 
-        h, touch, free = tips_by_hand.shape[2], tips.shape[1], tips.shape[1] + links.shape[1]
-        residual = torch.cat([tips, links, contact], 1)
+        rows, h, points = by_hand.shape[1], by_hand.shape[2], tips_by_points.shape[2]
+        residual = torch.cat([of_hand, contact], 1)
         jacobian = residual.new_zeros(*residual.shape, h + contact_by_x.shape[2])
-        jacobian[:, :touch, :h], jacobian[:, touch:free, :h] = tips_by_hand, links_by_hand
-        jacobian[:, :touch, h : h + tips_by_points.shape[2]], jacobian[:, free:, h:] = tips_by_points, contact_by_x
+        jacobian[:, :rows, :h], jacobian[:, rows:, h:] = by_hand, contact_by_x
+        jacobian[:, : tips_by_points.shape[1], h : h + points] = tips_by_points
         return residual, jacobian
 
     def _tips_by_points(
@@ -118,7 +118,7 @@ class JointProblem:
         hand, normals, normal_jacobian = self.hand, jet.normals, jet.normal_jacobian
         identity, own = (torch.eye(k, dtype=normals.dtype, device=normals.device) for k in (3, len(hand.tips)))
         target = float(self.shape.scale) * identity + hand.tips.radius.to(normals)[:, None, None] * normal_jacobian
-        pads = spatial.directions(hand.tips.index, hand.tips.normal)
+        pads = spatial.pads.permute(2, 1, 0)
         tilt = (pads[..., None, :] @ normal_jacobian)[..., 0, :] * outside[..., None]
         tips = torch.einsum("gixy,ij->gixjy", target, own).flatten(3).flatten(1, 2)
         tilts = torch.einsum("giy,ij->gijy", tilt, own).flatten(2)

@@ -40,7 +40,7 @@ def find_approach(
     clearest.
     """
     spheres = hand.collision_spheres
-    centres = SpatialJacobian.at(hand, opened).points(spheres.link_index, spheres.center)
+    centres = SpatialJacobian.at(hand, opened).sphere_centres
     radius, candidates = spheres.radius.to(centres), approach_directions(hand, opened, world.plane)
     coarse = torch.stack([_clearance(centres, radius, d, world, exact=False) for d in candidates.unbind(1)], 1)
     chosen, clearance = candidates[:, 0].clone(), torch.full_like(coarse[:, 0], -math.inf)
@@ -151,5 +151,4 @@ def _lifted(points: Float[Tensor, "*b 3"], up: Float[Tensor, "3"]) -> Float[Tens
 
 def _centres(hand: Hand, configuration: Configuration) -> Float[Tensor, "g s 3"]:
     """Return the centres [m] of the hand's spheres."""
-    spheres = hand.collision_spheres
-    return SpatialJacobian.at(hand, configuration).points(spheres.link_index, spheres.center)
+    return SpatialJacobian.at(hand, configuration).sphere_centres

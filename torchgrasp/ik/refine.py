@@ -9,8 +9,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, along, clearance_hinges
-from torchgrasp.ik.configuration import Configuration, SpatialJacobian, wrench_of
+from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, along, clearance_rows
+from torchgrasp.ik.configuration import Configuration, Rows, SpatialJacobian, differentiate
 from torchgrasp.optim import SOLVED, LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.values import Contacts
 
@@ -30,27 +30,19 @@ def tip_targets(hand: Hand, contacts: Contacts) -> Float[Tensor, "g f 3"]:
     return contacts.points + hand.tips.radius.to(contacts.normals)[:, None] * contacts.normals
 
 
-def tip_residuals(
-    spatial: SpatialJacobian, target: Float[Tensor, "g f 3"], normals: Float[Tensor, "g f 3"]
-) -> Residuals:
-    """Return the residuals of the tips' centres and of the contact directions."""
-    hand = spatial.hand
-    tips = spatial.points(hand.tips.index, hand.tips.center)
-    count = len(hand.tips)
-    finger = torch.arange(count, device=tips.device)
-    coordinate = finger.repeat_interleave(3)
-    axes = torch.eye(3, dtype=tips.dtype, device=tips.device).repeat(count, 1).expand(len(tips), 3 * count, 3)
-    pads = spatial.directions(hand.tips.index, hand.tips.normal)
-    outside = hand.tips.cone.cos().to(pads) + (pads * normals).sum(-1)  # the contact direction is the inward normal
-    torques = torch.cat([torch.zeros_like(pads), torch.linalg.cross(pads, normals)], -1)
-    wrenches = torch.cat([wrench_of(tips[:, coordinate], axes), torques], 1)
-    jacobian = spatial.jacobian(wrenches, hand.tips.index[torch.cat([coordinate, finger])])
-    by_tips, by_pads = jacobian.split([3 * count, count], 1)
-    active = (outside > 0).to(tips)
-    return (
-        torch.cat([TIP_WEIGHT * (tips - target).flatten(1) / MILLIMETRE, PAD_WEIGHT * outside * active], 1),
-        torch.cat([TIP_WEIGHT * by_tips / MILLIMETRE, PAD_WEIGHT * active[..., None] * by_pads], 1),
-    )
+def tip_rows(spatial: SpatialJacobian, target: Float[Tensor, "g f 3"], normals: Float[Tensor, "g f 3"]) -> Rows:
+    """Return the residuals of the tips' centres, three to a tip, then of the contact directions."""
+    tips, motion, g = spatial.hand.tips, spatial.hand.motion, len(target)
+    centres, pads = spatial.tips.permute(2, 1, 0), spatial.pads.permute(2, 1, 0)
+    outside = tips.cone.cos().to(pads) + (pads * normals).sum(-1)  # the contact direction is the inward normal
+    weight = PAD_WEIGHT * (outside > 0).to(pads)
+    axes = torch.eye(3, dtype=pads.dtype, device=pads.device).expand(g, len(tips), 3, 3) * (TIP_WEIGHT / MILLIMETRE)
+    pulls = torch.cat([axes, torch.linalg.cross(centres[:, :, None].expand_as(axes), axes)], -1).flatten(1, 2)
+    turns = torch.linalg.cross(pads, normals) * weight[..., None]
+    residual = torch.cat([(TIP_WEIGHT / MILLIMETRE) * (centres - target).flatten(1), weight * outside], 1)
+    wrench = torch.cat([pulls, torch.cat([torch.zeros_like(turns), turns], -1)], 1)
+    moves = motion.moves[torch.cat([tips.index.repeat_interleave(3), tips.index])].to(pads)
+    return Rows(residual, wrench, moves.expand(g, -1, -1))
 
 
 def grasp_residuals(
@@ -63,11 +55,8 @@ def grasp_residuals(
 ) -> Residuals:
     """Return the residuals of tips, pads and, in a world, clearances."""
     spatial = SpatialJacobian.at(hand, configuration)
-    tips = tip_residuals(spatial, target, normals)
-    if world is None:
-        return tips
-    links = clearance_hinges(spatial, world, tips_touch)
-    return torch.cat([tips[0], links[0]], 1), torch.cat([tips[1], links[1]], 1)
+    links = [] if world is None else clearance_rows(spatial, world, tips_touch)
+    return differentiate(spatial, [tip_rows(spatial, target, normals), *links])
 
 
 def refine(
