@@ -60,8 +60,10 @@ class ClosureResult(Value):
     `time` [s] counts control ticks. `forces` [N] is the normal force of each fingertip. `object_pose` and `hand_pose`
     are the frames of object and hand in the world. `joints` has every joint of the URDF, in the order of `joint_names`.
     `contact_order` lists the fingers by their first touch. `object_motion` is the motion of the object in the hand
-    from the pre-grasp to the end. `pushed` is its part until all fingers have touched, or the closing ended; `slip` is
-    its part since the hand pressed; both are NaN if the trial ended before. `start_overlap` [m] is the depth of the
+    from the pre-grasp to the end; `slip` is its part since the hand pressed. Two motions are in the world: `pushed` is
+    from the pre-grasp until all fingers have touched, or the closing ended, `before_lift` from the start until the hand
+    rises. `unbalanced` is then the sum of the fingertips' forces over the sum of their sizes. What a trial did not
+    reach is NaN. `start_overlap` [m] is the depth of the
     opened hand in object or table at the start. `held` tells whether the object is up with the hand at the end and
     slipped little; `seconds` is wall time. Poses are in the frame of the grasp.
     """
@@ -77,6 +79,8 @@ class ClosureResult(Value):
     contact_order: tuple[int, ...]
     object_motion: ObjectMotion
     pushed: ObjectMotion
+    before_lift: ObjectMotion
+    unbalanced: Measured
     slip: ObjectMotion
     start_overlap: Measured
     disturbance: Disturbance

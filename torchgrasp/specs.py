@@ -127,7 +127,7 @@ ClosingMode = Literal["open_loop", "position", "paper_position", "fixed", "paper
 HoldingMode = Literal["force", "impedance", "position", "law"]
 """How a closed hand presses, see `TrialSpec`."""
 
-ClosingPart = Literal["wait", "pace", "switch"]
+ClosingPart = Literal["wait", "pace", "switch", "place", "palm"]
 """What the closing law has beyond the paper's, see `torchgrasp.control.closing.LawClosing`."""
 
 
@@ -138,7 +138,7 @@ class TrialSpec(Value):
 
     Args:
         closing: how the hand closes. "paper": Eqs. 25-28 as written, with forces of the hand's stability model.
-            "uncertainty": the same law with three further parts. "fixed": the same with constant gains.
+            "uncertainty": the same law with five further parts. "fixed": the same with constant gains.
             "paper_position": PI control to the contacts until 0.5 N, the paper's baseline. "position": the same, aimed
             behind the contacts. "open_loop": pre-grasp, grasp, squeeze.
         holding: how the closed hand presses: "force" (balanced forces), "impedance" (the grasp is a spring in the
@@ -196,6 +196,11 @@ class TrialSpec(Value):
         if not self.control_rate * self.timestep < 1 + 1e-9:
             found = f"{self.control_rate:g} Hz with a timestep of {self.timestep:g} s"
             raise BadArgument("control_rate", found, "a period of at least one timestep")
+
+
+def moves_palm(closing: str, without: tuple[str, ...]) -> bool:
+    """Return whether a closing moves the palm."""
+    return closing in ("uncertainty", "fixed") and not {"place", "palm"} & set(without)
 
 
 def check_closing_parts(closing: str, without: tuple[str, ...]) -> None:

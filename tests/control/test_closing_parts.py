@@ -1,4 +1,4 @@
-"""The closing law with each of its parts left out: without all three it is the paper's, and the surest is first."""
+"""The closing law with each of its parts left out: without all of them it is the paper's, and the surest is first."""
 
 import dataclasses
 from typing import get_args
@@ -39,7 +39,7 @@ def press(controller: GraspController, seconds: float, start: float = 0.01) -> l
     joints, tactile, path = torch.zeros(9).double(), no_contact(), []
     for _ in range(round(seconds / PERIOD)):
         points = TARGET + start * NORMALS + joints.reshape(3, 3)
-        push = SPRING * -((points - TARGET) * NORMALS).sum(-1).clamp_max(0.0)
+        push = SPRING * -((points + controller.targets.palm - TARGET) * NORMALS).sum(-1).clamp_max(0.0)
         contact = TipContact(push, -push[:, None] * NORMALS, points, NORMALS)
         tactile = measure(tactile, contact, NORMALS, real([0.01] * 3), PERIOD)
         seen = dataclasses.replace(observation(joints=joints), tips=points + 0.01 * NORMALS, tactile=tactile)
@@ -71,7 +71,7 @@ def test_fingers_that_search_in_vain_do_not_sink_below_the_table_but_move_freely
     low, free = (dataclasses.replace(reference(), table=t) for t in (table, None))
     tips = {}
     for name, known in (("low", low), ("free", free)):
-        law, joints = LawClosing(known), torch.zeros(9).double()
+        law, joints = LawClosing(known, without=("palm",)), torch.zeros(9).double()
         for _ in range(400):
             at = TARGET + 0.02 * NORMALS + joints.reshape(3, 3)
             joints = law(dataclasses.replace(observation(joints=joints), tips=at), PERIOD)
@@ -121,9 +121,9 @@ def test_without_waiting_a_finger_presses_at_once():
 
 def test_without_the_switch_a_position_error_is_not_forgotten_at_a_touch():
     seen = observation(0.03, (2.0, 2.0, 4.0), TOUCHING)  # the forces are as desired, the contacts 30 mm early
-    still = LawClosing(reference(), without=("wait",))(seen, PERIOD)
+    still = LawClosing(reference(), without=("wait", "place"))(seen, PERIOD)
     assert still.abs().max() < 1e-9
-    going = LawClosing(reference(), without=("wait", "switch"))(seen, PERIOD).reshape(3, 3)
+    going = LawClosing(reference(), without=("wait", "switch", "place"))(seen, PERIOD).reshape(3, 3)
     assert ((going * NORMALS).sum(-1) < -1e-4).all()
 
 

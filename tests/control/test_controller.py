@@ -5,14 +5,16 @@ import dataclasses
 import pytest
 import torch
 
-from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
+from tests.point_fingers import FREE, GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
 from torchgrasp.control.closing import (
     AIM_DEPTH,
+    FELT,
     LEAD,
     PATIENCE,
     POSE_TIME,
     SETTLED,
     STOP_FORCE,
+    WAITING_FORCE,
     FixedGainClosing,
     LawClosing,
     PositionClosing,
@@ -31,11 +33,17 @@ def test_eq25_free_fingers_approach_their_contacts():
     assert step[:, 1:].abs().max() < 1e-9
 
 
-def test_a_touching_finger_keeps_the_waiting_force_whatever_its_position_error():
+def test_a_finger_that_has_touched_rests_and_gives_way_to_more_than_the_waiting_force():
     one = torch.tensor([True, False, False])
-    for reading, sign in ((0.0, -1), (1.0, 1)):
-        step = LawClosing(reference())(observation(0.02, (reading, 0, 0), one), PERIOD).reshape(3, 3)
-        assert float((step[0] * NORMALS[0]).sum()) * sign > 0
+    law = LawClosing(reference(), without=("palm",))
+    for reading in (WAITING_FORCE, 0.1, 0.0, -0.1):
+        step = law(observation(0.02, (reading, 0, 0), one), PERIOD).reshape(3, 3)
+        assert step[0].abs().max() < 1e-12
+        one = FREE  # it stays where it touched once
+    step = law(observation(0.02, (1.0, 0, 0)), PERIOD).reshape(3, 3)
+    assert float((step[0] * NORMALS[0]).sum()) > 0
+    last = law(observation(0.02, (0.0, FELT, FELT)), PERIOD).reshape(3, 3)
+    assert float((last[0] * NORMALS[0]).sum()) < float((step[0] * NORMALS[0]).sum())  # all have: now all press
 
 
 def test_closing_ends_when_all_touch_or_patience_is_over():

@@ -67,7 +67,7 @@ def test_the_papers_forces_are_those_of_the_stability_model():
 
 
 def test_pushes_and_slips_are_parts_of_the_motion():
-    spec = dataclasses.replace(QUICK, hold_time=0.5)
+    spec = dataclasses.replace(QUICK, hold_time=0.5, without=("palm",))
     result = close("allegro", cylinder((0.0, 0.008)), spec)
     centre = torch.tensor([0.0, 0.008, HEIGHT / 2]).double()
     centres = (inverse(result.hand_pose) @ result.object_pose)[:, :3] @ torch.cat([centre, torch.ones(1).double()])
@@ -81,6 +81,24 @@ def test_pushes_and_slips_are_parts_of_the_motion():
     ):
         assert motion.distance == pytest.approx(float((end - start).norm()), abs=tolerance)
     assert result.pushed.distance > 0.001
+    start, end = (result.object_pose[k, :3] @ torch.cat([centre, torch.ones(1).double()]) for k in (0, pressed))
+    assert result.before_lift.distance == pytest.approx(float((end - start).norm()), abs=1e-9)
+    assert 0.0 < result.unbalanced < 0.3  # the fingers press on each other; the table may bear a little
+
+
+def test_the_palm_follows_an_object_that_stands_elsewhere():
+    """The hand's own motion is not the object's: `pushed` is small while the hand follows by most of the way."""
+    mesh, still = cylinder((0.0, 0.012)), dataclasses.replace(QUICK, noise=False)
+    following, resting = (close("allegro", mesh, dataclasses.replace(still, without=x)) for x in ((), ("palm",)))
+    _, grasp = pinch("allegro")
+    shifts = []
+    for result in (following, resting):
+        pressed = len(result.time) - 1 - round((LIFT_TIME + still.hold_time) * still.control_rate)
+        shifts.append(result.hand_pose[pressed, :3, 3] - grasp.obj_from_hand[0, :3, 3])
+    assert following.held
+    assert 0.003 < float(shifts[0][1]) and float(shifts[0].norm()) <= 0.0205  # a light cylinder tips before it is felt
+    assert float(shifts[1].norm()) < 1e-3
+    assert following.before_lift.distance < 0.006
 
 
 def test_an_object_that_slips_in_the_hand_is_not_held(monkeypatch):
@@ -106,7 +124,7 @@ def test_the_hand_may_be_beside_its_planned_pose_and_may_be_shaken():
 
 def test_the_hand_comes_straight_to_where_it_was_planned():
     _, grasp = pinch("allegro")
-    result = close("allegro", spec=QUICK)
+    result = close("allegro", spec=dataclasses.replace(QUICK, without=("palm",)))
     path = result.hand_pose[:, :3, 3] - grasp.obj_from_hand[0, :3, 3]
     along = path @ grasp.approach[0]
     coming = int(along.argmax())

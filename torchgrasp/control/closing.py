@@ -4,15 +4,17 @@ import dataclasses
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.control.closing_law import POSITION_FLOOR, POSITION_RATE, blend, joint_step, stay_above, tip_velocity
 from torchgrasp.control.observation import Observation
+from torchgrasp.control.placement import Placement
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import NOISE
 from torchgrasp.control.targets import STILL
-from torchgrasp.specs import ClosingPart
+from torchgrasp.linalg import limit_norm
+from torchgrasp.specs import ClosingPart, moves_palm
 
 Revision = Callable[[Observation, ClosingReference], ClosingReference]
 """Revises the reference by what the fingers feel (`Belief.revise`)."""
@@ -20,9 +22,15 @@ Revision = Callable[[Observation, ClosingReference], ClosingReference]
 POSE_TIME = 0.4
 """Time [s] from pre-grasp to grasp in open loop, and again from grasp to squeeze."""
 
-WAITING_FORCE, SETTLED, PATIENCE = 0.3, 0.1, 1.5
-"""Force [N] of a finger that waits for the others, less than the table's friction on a light object. The waiting ends
-once all have touched for ten samples [s], or after a time [s] in which a fingertip travels 60 mm."""
+WAITING_FORCE, SETTLED, PATIENCE = 0.3, 0.1, 2.5
+"""Largest force [N] of a finger that waits for the others, less than the table's friction on a light object. The
+waiting ends once all have touched for ten samples [s], or after a time [s] in which a fingertip travels 100 mm."""
+
+FELT = 0.45
+"""Reading [N] that counts as a touch at once, 4.5 deviations of its noise: the contact flag comes 50 ms later."""
+
+PALM_REACH, PALM_SPEED, PALM_RATE = 0.02, 0.04, 6.0
+"""Farthest displacement of the palm [m], its largest speed [m/s], and the rate [1/s] at which it follows the object."""
 
 LEAD, IMPATIENCE = 0.04, 0.25
 """Largest lead [rad] of a waiting finger's target over its joint: it bounds the force of a link that is stopped unfelt.
@@ -57,28 +65,31 @@ class OpenLoopClosing:
 
 
 class LawClosing:
-    """The closing law (Eqs. 25-28), and three parts that the paper does not have. `without` leaves some of them out.
+    """The closing law (Eqs. 25-28), and parts that the paper does not have. `without` leaves some of them out.
 
     * `switch`: touch decides. A finger in the air searches along its contact's normal, even beyond the contact. One
       that touches is force-controlled whatever its position error: where the shape is wrong, Eq. (26) would press on.
       No finger searches below the table, if the reference knows one: it slides along.
-    * `wait`: a finger that touches presses with `WAITING_FORCE` until all do. The holding then raises the full forces:
-      separate loops would push the object (docs/closing.md).
+    * `wait`: a finger that touches stands still until all have, and gives way to more than `WAITING_FORCE`. Then all
+      press with it. The holding raises the full forces: separate loops would push the object (docs/closing.md).
     * `pace`: before the first touch all fingers keep pace. Without it they share one limit of speed, so that
       Eq. (27) decides which is the first.
+    * `place`: touches that come early or late tell where the object is (`Placement`); all contacts move with it.
+    * `palm`: the palm follows the object, so that the joints come to those of the grasp. It needs `place`.
 
-    Without all three it is the paper's law. That needs four mends: `joint_step` for its J^-1, `POSITION_FLOOR`,
+    Without all of them it is the paper's law. That needs four mends: `joint_step` for its J^-1, `POSITION_FLOOR`,
     `MAX_SPEED`, and a target that leads its joint by no more than the drive can exert. It ends when all
     fingers touch, each blend is at least `ARRIVED`, and the forces have been steady for a time `SETTLED`.
     """
-
-    palm = STILL
 
     def __init__(
         self, reference: ClosingReference, revise: Revision | None = None, without: tuple[ClosingPart, ...] = ()
     ) -> None:
         self.reference, self.revise = reference, revise
         self.switch, self.waits, self.paces = (part not in without for part in ("switch", "wait", "pace"))
+        self.placement = None if "place" in without else Placement(reference)
+        self.follows, self.palm = moves_palm("uncertainty", without), STILL
+        self.felt = torch.zeros_like(reference.normals[:, 0], dtype=torch.bool)
         self.strongest = _strongest_lead(reference)
         self.target = reference.pregrasp
         self.waiting = self.settled = 0.0
@@ -86,17 +97,25 @@ class LawClosing:
         self.done = False
 
     def press(self) -> "LawClosing":
-        """Let fingers that waited press with their desired forces."""
-        self.waits = False
+        """Let fingers that waited press with their desired forces; the palm stays where it is."""
+        self.waits = self.follows = False
         return self
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets of all joints for the next tick."""
-        if self.revise is not None:
-            self.reference = self.revise(observation, self.reference)
+        self._revise(observation)
         reference, gains, coupling = self.reference, self.reference.gains, self.reference.hand.actuated.coupling
-        normals, contact = reference.normals, observation.tactile.contact
-        error = gains.target - reference.contact_points(observation.tips)
+        normals, contact, tips = reference.normals, observation.tactile.contact, observation.tips + self.palm
+        if self.waits:
+            contact = self.felt = self.felt | contact | (observation.tactile.reading >= FELT)
+        points, planned, drift = reference.contact_points(tips), gains.target, STILL
+        if self.placement is not None:
+            displacement = self.placement.displacement(points, contact)
+            planned = self.placement.moved(displacement)
+            if self.follows:
+                goal = limit_norm(displacement[:3], PALM_REACH)
+                drift = limit_norm(PALM_RATE * (goal - self.palm), PALM_SPEED)
+        error = planned - points
         ahead = -(error * normals).sum(-1)  # how far the planned contact still lies ahead of each fingertip
         if self.switch:
             error = error + ahead.clamp_max(0.0)[:, None] * normals
@@ -105,27 +124,43 @@ class LawClosing:
             share = torch.where(contact, 1.0, share)
         desired = -(gains.desired_force * normals).sum(-1)
         if self.waits:
-            desired = torch.where(contact, WAITING_FORCE, desired)
-        self._judge(observation, share, period)
+            rest = WAITING_FORCE if bool(contact.all()) else observation.tactile.reading.clamp_max(WAITING_FORCE)
+            desired = torch.where(contact, rest, desired)
+        self._judge(observation, contact, share, period)
         force_error = -(desired - observation.tactile.reading)[:, None] * normals
         velocity = tip_velocity(error, force_error, share, gains.position_gain, gains.force_gain, not self.paces)
         if self.paces and not bool(contact.any()):
             left = ahead.clamp_min(0.0) + POSITION_FLOOR
             velocity = velocity * (left / left.max())[:, None]
         if self.switch and reference.table is not None:
-            height = reference.table.height(observation.tips) - reference.hand.tips.radius
+            height = reference.table.height(tips) - reference.hand.tips.radius
             velocity = stay_above(velocity, height, reference.table.normal)
-        step = joint_step(observation.jacobian @ coupling, velocity, period, reference.joints - self.target)
+        self.palm = self.palm + period * drift
+        step = joint_step(observation.jacobian @ coupling, velocity - drift, period, reference.joints - self.target)
         actuated = reference.pick(observation.joints)
         lead = LEAD * (1 + self.waiting / IMPATIENCE) if self.waits else self.strongest
         target = torch.minimum(torch.maximum(self.target + step, actuated - lead), actuated + lead)
         self.target = reference.clamp(target)
         return reference.expand(self.target)
 
-    def _judge(self, observation: Observation, share: Float[Tensor, "f"], period: float) -> None:
+    def _revise(self, observation: Observation) -> None:
+        """Revise the reference by what is felt, where the palm was before it moved."""
+        if self.revise is None:
+            return
+        if bool(self.palm.any()):
+            tactile = dataclasses.replace(observation.tactile, points=observation.tactile.points + self.palm)
+            observation = dataclasses.replace(observation, tips=observation.tips + self.palm, tactile=tactile)
+        revised = self.revise(observation, self.reference)
+        if self.placement is not None and revised is not self.reference:
+            self.placement = Placement(revised)
+        self.reference = revised
+
+    def _judge(
+        self, observation: Observation, touched: Bool[Tensor, "f"], share: Float[Tensor, "f"], period: float
+    ) -> None:
         """Count the time since the first touch, and the time for which the fingers have settled."""
         contact, average = observation.tactile.contact, observation.tactile.average
-        self.waiting = self.waiting + period if bool(contact.any()) else 0.0
+        self.waiting = self.waiting + period if bool(touched.any()) else 0.0
         settled = bool(contact.all())
         if not self.waits:
             settled = settled and bool((share >= ARRIVED).all() & ((average - self.steady).abs() < NOISE).all())

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.border import Seed, checked
+from torchgrasp.control.closing import PALM_REACH
 from torchgrasp.control.controller import GraspController, check_modes
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.errors import BadArgument
@@ -25,7 +26,7 @@ from torchgrasp.sim.convex_parts import check_parts, convex_parts
 from torchgrasp.sim.hand import SimulatedHand
 from torchgrasp.sim.open import open_scene
 from torchgrasp.sim.scene import Body, Neighbour, SceneSpec
-from torchgrasp.specs import TrialSpec
+from torchgrasp.specs import TrialSpec, moves_palm
 from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
@@ -105,6 +106,7 @@ class TrialDriver:
             height=None if trial.table is None else 0.0,
             neighbours=tuple(self._body(neighbour) for neighbour in trial.neighbours),
             self_pairs=hand.self_pairs if spec.self_collision else (),
+            yields=PALM_REACH if moves_palm(spec.closing, spec.without) else 0.0,
         )
 
     def _body(self, given: Neighbour) -> Body:

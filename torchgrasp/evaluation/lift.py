@@ -134,7 +134,7 @@ class _Lift:
     def __init__(self, run: TrialRun) -> None:
         self.run, self.spec = run, run.spec
         self.ticks: list[_Tick] = []
-        self.arrived, self.pushed, self.strained = 0, 0.0, False
+        self.arrived, self.pushed, self.strained, self.unbalanced = 0, 0.0, False, math.nan
         self.touched: int | None = None
         self.pressed: int | None = None
 
@@ -155,6 +155,7 @@ class _Lift:
             self.pressed = len(self.ticks) - 1
             self.touched = self.pressed if self.touched is None else self.touched
             self.pushed, self.strained = self._moved(), run.strained()
+            self.unbalanced = run.robot.unbalanced()
             rising = run.robot.ticks(LIFT_TIME)
             for k in range(rising + run.robot.ticks(self.spec.hold_time)):
                 run.scene.lift(*self._height((k + 1) * run.robot.period, rising * run.robot.period))
@@ -216,12 +217,15 @@ class _Lift:
             return Status.TOO_WEAK
         return Status.DROPPED if rise.max() >= half else Status.NOT_LIFTED
 
-    def _motion(self, first: int | None, last: int | None) -> ObjectMotion:
-        """Return the motion of the object in the hand between two ticks; None: a tick that was not reached."""
+    def _motion(self, first: int | None, last: int | None, in_hand: bool = True) -> ObjectMotion:
+        """Return the motion of the object between two ticks, in the hand or in the world; None: a tick not reached."""
         if first is None or last is None:
             return ObjectMotion(math.nan, math.nan)
-        ends = [self.ticks[first], self.ticks[last]]
-        start, end = (inverse(torch.from_numpy(t.hand_pose)) @ torch.from_numpy(t.object_pose) for t in ends)
+        start, end = (torch.from_numpy(self.ticks[k].object_pose) for k in (first, last))
+        if in_hand:
+            start, end = (
+                inverse(torch.from_numpy(self.ticks[k].hand_pose)) @ pose for k, pose in ((first, start), (last, end))
+            )
         centres = apply(torch.stack([start, end]), torch.from_numpy(self.run.scene.centre).expand(2, 1, 3))[:, 0]
         distance = float(torch.linalg.vector_norm(centres[1] - centres[0]))
         return ObjectMotion(distance, float(rotation_angle(start[:3, :3].T @ end[:3, :3])))
@@ -249,7 +253,9 @@ class _Lift:
             joint_names=self.run.scene.joint_names,
             contact_order=tuple(sorted(touched, key=lambda finger: first_touch[finger])),
             object_motion=self._motion(self.arrived, -1),
-            pushed=self._motion(self.arrived, self.touched),
+            pushed=self._motion(self.arrived, self.touched, in_hand=False),
+            before_lift=self._motion(0, self.pressed, in_hand=False),
+            unbalanced=self.unbalanced,
             slip=self._motion(self.pressed, -1),
             start_overlap=self.run.overlap,
             disturbance=Disturbance(

@@ -1,5 +1,7 @@
 """A simulated hand as its controller knows it: joint targets in, observations out."""
 
+import math
+
 import numpy as np
 import torch
 
@@ -10,7 +12,8 @@ from torchgrasp.sim.scene import Scene, StepContacts
 class SimulatedHand:
     """The hand of a scene, with tactile fingertips.
 
-    `force` (f,) are the true normal forces [N], averaged over the last tick. `finger` flags contacts in its last step.
+    `force` (f,) are the true normal forces [N], averaged over the last tick, `pushes` (f, 3) the
+    full ones. `finger` flags contacts in its last step.
     `steps` counts steps of the simulator. `first_touch` is the step of each fingertip's first contact, infinite before.
     `first_stray` is that of each kind in `StepContacts.stray`, whose impulses [N s] are summed in `stray`. `most_stray`
     [N] is its largest force over a tick.
@@ -31,7 +34,7 @@ class SimulatedHand:
         fingers = len(reference.hand.tips)
         self.steps, self.first_touch = 0, [float("inf")] * fingers
         self.first_stray, self.stray, self.most_stray = np.full(3, np.inf), np.zeros(3), np.zeros(3)
-        self._palm = np.zeros(3)
+        self._palm, self.pushes = np.zeros(3), np.zeros((fingers, 3))
         self.force, self.finger = np.zeros(fingers), np.zeros(fingers, dtype=bool)
         self.tactile = no_contact(fingers=fingers)
         names, centres = reference.hand.tree.joint_names, reference.hand.tips.center.double()
@@ -59,7 +62,13 @@ class SimulatedHand:
             self.stray += step.stray
         self.most_stray = np.maximum(self.most_stray, (self.stray - before) / self.period)
         self.force = np.linalg.norm(contacts.impulse, axis=-1) / self.period
+        self.pushes = contacts.force
         return self._observe(contacts)
+
+    def unbalanced(self) -> float:
+        """Return the sum of the fingertips' forces over the sum of their sizes; NaN without a force."""
+        sizes = float(np.linalg.norm(self.pushes, axis=-1).sum())
+        return float(np.linalg.norm(self.pushes.sum(0))) / sizes if sizes > 0.0 else math.nan
 
     def ticks(self, seconds: float) -> int:
         """Return the control ticks in a time [s], at least one."""

@@ -7,7 +7,7 @@ import statistics
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import torch
 
@@ -28,7 +28,7 @@ from torchgrasp.evaluation import (
 from torchgrasp.evaluation.campaign import choose_rows
 from torchgrasp.evaluation.intervals import RESAMPLES
 from torchgrasp.sim.convex_parts import convex_parts
-from torchgrasp.specs import ContactSpec
+from torchgrasp.specs import ClosingPart, ContactSpec
 
 PAPER = PROTOCOLS["paper"]
 
@@ -55,7 +55,9 @@ PARTS = {
     "uncertainty without wait": Part(TrialSpec(without=("wait",))),
     "uncertainty without pace": Part(TrialSpec(without=("pace",))),
     "uncertainty without switch": Part(TrialSpec(without=("switch",))),
-    "uncertainty without all three": Part(TrialSpec(without=("wait", "pace", "switch"))),
+    "uncertainty without place": Part(TrialSpec(without=("place",))),
+    "uncertainty without palm": Part(TrialSpec(without=("palm",))),
+    "uncertainty without all five": Part(TrialSpec(without=get_args(ClosingPart))),
     "uncertainty with belief": Part(TrialSpec(), revises=True),
     "fixed": Part(TrialSpec(closing="fixed")),
     "position": Part(TrialSpec(closing="position")),

@@ -8,6 +8,7 @@ from paper.trials import TableSpec
 
 from benchmarks.close.ablation import bench_ablation
 from benchmarks.close.household import bench_grip, bench_household
+from benchmarks.close.misplaced import bench_misplaced
 from benchmarks.close.pose_noise import bench_noise
 from benchmarks.close.real_scans import bench_scans
 from benchmarks.close.simulator_agreement import bench_agreement
@@ -19,7 +20,8 @@ from benchmarks.common import Row, measure
 from torchgrasp.evaluation.campaign import EvaluationSpec
 
 SUBJECTS = (
-    "statics", "speed", "ablation", "agreement", "stability", "noise", "success", "perturb", "grip", "scans",
+    "statics", "speed", "ablation", "agreement", "stability", "noise", "success", "misplaced", "perturb", "grip",
+    "scans",
 )  # fmt: skip
 
 
@@ -30,6 +32,8 @@ def close(
     tries: int = 4,
     draws: int = 5,
     grasps: int = 1,
+    conditions: tuple[str, ...] = (),
+    laws: tuple[str, ...] = (),
     names: tuple[str, ...] = (),
     starts: int = 1000,
     workers: int = 1,
@@ -41,14 +45,16 @@ def close(
 
     Args:
         objects: folders with manifest.json and a folder for each object; without one what needs grasps is left out.
-            Only perturb, grip and scans take more than the first.
+            Only misplaced, perturb, grip and scans take more than the first.
         only: subjects to measure. statics, speed, ablation, agreement, stability, noise and success are of the closing;
-            perturb, grip and scans lift what a robot would meet, one object of each family.
+            misplaced, perturb, grip and scans lift what a robot would meet, one object of each family but for scans.
         hands: of all but ablation and agreement, which take both.
         tries: grasps of each view: the best for noise, else spread over all ranks.
         draws: errors of the hand's pose for each grasp.
-        grasps: the best of each view that perturb and grip lift.
-        names: of the objects that perturb and grip keep; by default all.
+        grasps: the best of each view that perturb and grip lift; misplaced spreads them over all ranks.
+        conditions: of misplaced; by default all.
+        laws: of misplaced; by default all.
+        names: of the objects that misplaced, perturb and grip keep; by default all.
         starts: of the contact planner.
         workers: processes that share the trials.
         threads: of torch.
@@ -69,6 +75,7 @@ def close(
         "agreement": lambda: bench_agreement(folder, spec, workers) if folder else [],
         "stability": lambda: bench_stability(folder, tries, starts, seed) if folder else [],
         "noise": lambda: bench_noise(folder, hands, draws, spec, workers) if folder else [],
+        "misplaced": lambda: bench_misplaced(household, conditions, laws) if folder else [],
         "perturb": lambda: bench_household(household) if folder else [],
         "grip": lambda: bench_grip(household) if folder else [],
         "scans": lambda: bench_scans(objects, hands, tries, starts, seed) if folder else [],

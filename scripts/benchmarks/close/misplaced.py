@@ -1,0 +1,266 @@
+"""Trials that can tell closings apart: the object is elsewhere, turned, of its real mass, of unknown friction, afloat.
+
+Plans know nothing of it. Each law closes the same grasps with the same errors on the same draws. Plans and trials are
+kept as files: a campaign that was stopped goes on where it was.
+"""
+
+import dataclasses
+import functools
+import json
+import math
+import statistics
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from paper.trials import CELL_SECONDS, Subject, TableSpec, subjects
+
+from benchmarks.close.ablation import median_over, swap_deviations
+from benchmarks.common import Row
+from torchgrasp import Grasps, Status, TrialSpec, load_hand, plan_grasps
+from torchgrasp.datasets import list_views, read_mass, read_object_mesh, read_view
+from torchgrasp.errors import GraspError
+from torchgrasp.evaluation import (
+    PERTURBATIONS,
+    PROTOCOLS,
+    GraspTrial,
+    count_by,
+    difference_over,
+    format_share,
+    household_mass,
+    lift_grasp,
+    perturb_trial,
+    pull_grasp,
+    run_tasks,
+    seed_of,
+    share_over,
+)
+from torchgrasp.evaluation.campaign import choose_rows
+from torchgrasp.evaluation.protocols import error_from_object_pose
+from torchgrasp.files import write_file
+from torchgrasp.frames import rigid, rotation_from_vector
+from torchgrasp.sim.convex_parts import convex_parts
+from torchgrasp.specs import ContactSpec
+from torchgrasp.values import load_grasps
+
+PLANNED_FRICTION = 0.6
+"""Friction that grasps are planned for, and that the lifts have unless it is drawn: as in ada-grasp-ctrl (2025)."""
+
+TABLETOP = TrialSpec(friction=PLANNED_FRICTION)
+"""Lifts of 0.1 kg."""
+
+
+class Condition(NamedTuple):
+    """What is wrong: how far [m] the object is from where it was seen, and how far it turned [rad].
+
+    `unknown` things weigh what they weigh, and have a friction between 0.3 and 1. `afloat` they are pulled at.
+    """
+
+    distance: float = 0.0
+    angle: float = 0.0
+    unknown: bool = False
+    afloat: str = ""
+    simulator: str = "sapien"
+
+
+CONDITIONS = {
+    "in place": Condition(),
+    "5 mm": Condition(0.005),
+    "10 mm": Condition(0.01),
+    "20 mm": Condition(0.02),
+    "5 degrees": Condition(angle=math.radians(5)),
+    "10 degrees": Condition(angle=math.radians(10)),
+    "10 mm, real mass, friction unknown": Condition(0.01, unknown=True),
+    "10 mm, MuJoCo": Condition(0.01, simulator="mujoco"),
+    "20 mm, MuJoCo": Condition(0.02, simulator="mujoco"),
+    "afloat, in place": Condition(afloat="dexgraspbench"),
+    "afloat, friction 0.3": Condition(afloat="dexgraspbench-hard"),
+    "afloat, 10 mm": Condition(0.01, afloat="dexgraspbench"),
+}
+"""By name. On a table the object is moved along it and turns about the vertical; afloat in any direction."""
+
+BARS = {"5 mm": (0.97, 2.0), "10 mm": (0.92, 4.0), "20 mm": (0.80, 8.0)}
+"""Least share held, and largest median motion [mm] of the object before the lift: the project's own."""
+
+
+class Law(NamedTuple):
+    """How the hand closes; `swapped` exchanges the deviations of the most and the least certain finger."""
+
+    trial: dict[str, Any]
+    swapped: bool = False
+
+
+DEFAULT = "uncertainty"
+"""The law that the others are compared with."""
+
+LAWS = {
+    DEFAULT: Law({}),
+    "uncertainty, deviations swapped": Law({}, swapped=True),
+    "uncertainty without palm": Law({"without": ("palm",)}),
+    "uncertainty without place": Law({"without": ("place",)}),
+    "uncertainty without wait": Law({"without": ("wait",)}),
+    "fixed": Law({"closing": "fixed"}),
+    "fixed without place": Law({"closing": "fixed", "without": ("place",)}),
+    "position": Law({"closing": "position"}),
+    "paper_position": Law({"closing": "paper_position"}),
+    "open_loop": Law({"closing": "open_loop"}),
+}
+"""By name; all hold by "force", but for the open loop, which keeps its squeeze."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """One trial: motion before the lift [mm], unbalanced share of the forces then, CPU time [s]; None: not measured."""
+
+    object: str
+    family: str
+    hand: str
+    rank: int
+    condition: str
+    law: str
+    status: str
+    moved: float | None
+    unbalanced: float | None
+    seconds: float
+
+    @property
+    def held(self) -> bool:
+        """Tell whether it held."""
+        return self.status == Status.OK.name
+
+
+def bench_misplaced(spec: TableSpec, conditions: Sequence[str] = (), laws: Sequence[str] = ()) -> list[Row]:
+    """Close every law in every condition, or the named ones, and compare each with `DEFAULT`, paired by grasp."""
+    conditions, laws = conditions or tuple(CONDITIONS), laws or tuple(LAWS)
+    tasks = [
+        (spec, subject, hand, condition, tuple(laws))
+        for subject in subjects(spec)
+        for condition in conditions
+        for hand in spec.hands
+    ]
+    found: list[Outcome] = []
+    for task, outcome in zip(tasks, run_tasks(try_object, tasks, spec.workers, CELL_SECONDS), strict=True):
+        if isinstance(outcome, Status):
+            raise SystemExit(f"{task[1].name} {task[2]}: {outcome.sentence}")
+        found += [Outcome(**one) for one in outcome]
+    return [row for hand in spec.hands for c in conditions for row in _rows(hand, c, laws, found)]
+
+
+def _rows(hand: str, condition: str, laws: Sequence[str], found: Sequence[Outcome]) -> Iterator[Row]:
+    """Yield a row for each law in one condition."""
+    there = [x for x in found if (x.hand, x.condition) == (hand, condition)]
+    base = [x for x in there if x.law == DEFAULT]
+    for law in laws:
+        mine = [x for x in there if x.law == law]
+        if not mine:
+            continue
+        held, against = share_over(_held(mine)), difference_over(_held(base), _held(mine))
+        moved = median_over([(x.family, math.nan if x.moved is None else x.moved) for x in mine])
+        unbalanced = [x.unbalanced for x in mine if x.unbalanced is not None]
+        lost = dict(Counter(x.status for x in mine if not x.held).most_common())
+        words = [format_share(held), "moved {:.1f} mm [{:.1f}, {:.1f}]".format(*moved)]
+        words += [f"unbalanced {statistics.median(unbalanced):.2f}"] if unbalanced else []
+        if law != DEFAULT and base:
+            low, high = 100 * against.low, 100 * against.high
+            words.append(f"{DEFAULT} is better by {100 * against.value:+.1f} points [{low:.1f}, {high:.1f}]")
+        words.append(f"lost {lost}")
+        least, most = BARS.get(condition, (0.0, math.inf)) if law == DEFAULT else (0.0, math.inf)
+        bar = f">= {least:.0%}, <= {most:g} mm" if least else "-"
+        met = held.value >= least and moved[0] <= most if least else None
+        numbers = {"held": held, "better": against, "moved_mm": moved, "lost": lost}
+        yield Row(f"{hand}, {condition}, {law}", bar, "; ".join(words), met, numbers)
+
+
+def _held(outcomes: Iterable[Outcome]) -> dict[str, tuple[int, int]]:
+    """Return the counts of what held by family."""
+    return count_by((x.family, x.held) for x in outcomes)
+
+
+def try_object(
+    spec: TableSpec, subject: Subject, hand: str, condition: str, laws: tuple[str, ...]
+) -> list[dict[str, Any]]:
+    """Return the outcomes of one object in one condition, as they are kept, a line each; what is missing is run."""
+    torch.set_num_threads(1)
+    path = spec.kept("misplaced", f"{hand}_{subject.label}_{condition}", spec.grasps).with_suffix(".jsonl")
+    kept = [json.loads(line) for line in path.read_text("utf-8").splitlines()] if path.is_file() else []
+    missing = [law for law in laws if law not in {one["law"] for one in kept}]
+    if missing:
+        kept += [dataclasses.asdict(x) for x in _try(spec, subject, hand, condition, missing)]
+        write_file(path, "".join(f"{json.dumps(one)}\n" for one in kept))
+    return [one for one in kept if one["law"] in laws]
+
+
+def _try(spec: TableSpec, subject: Subject, hand: str, condition: str, laws: list[str]) -> Iterator[Outcome]:
+    """Put grasps of one view, spread over the ranks, to one condition."""
+    folder, wrong = subject.folder, CONDITIONS[condition]
+    assert folder is not None
+    view = list_views(folder, only=[subject.name])[0][1]
+    known = subject.label, subject.family, hand
+    try:
+        grasps = _plan(spec, subject, hand, view)
+    except GraspError as error:
+        print(f"{subject.name}, {hand}: {error}", flush=True)
+        return
+    mesh, parts = _read_solid(folder, subject.name)
+    mass = household_mass(float(mesh.volume), read_mass(folder, subject.name))
+    for rank in choose_rows(len(grasps), spec.grasps, "spread"):
+        seed = seed_of(spec.seed, subject.label, view, rank, 0)
+        error = _misplace(wrong, grasps[rank], mesh, seed)
+        for law in laws:
+            began = time.process_time()
+            grasp = swap_deviations(grasps[rank]) if LAWS[law].swapped else grasps[rank]
+            trial = GraspTrial(load_hand(hand), grasp, mesh, seed_of(seed, "touch"), error, parts=parts)
+            status, moved, unbalanced = _run(trial, wrong, LAWS[law], mass, seed)
+            yield Outcome(*known, rank, condition, law, status.name, moved, unbalanced, time.process_time() - began)
+
+
+def _run(trial: GraspTrial, wrong: Condition, law: Law, mass: float, seed: int) -> tuple[Status, Any, Any]:
+    """Return status, motion before the lift [mm] and the unbalanced share of the forces."""
+    changes = law.trial | {"simulator": wrong.simulator}
+    if wrong.afloat:
+        return (
+            pull_grasp(trial, PROTOCOLS[wrong.afloat].with_trial(**{"closing": DEFAULT} | changes)).status,
+            None,
+            None,
+        )
+    spec = dataclasses.replace(TABLETOP, **changes)
+    if wrong.unknown:
+        spec = perturb_trial(spec, dataclasses.replace(PERTURBATIONS["mass"], friction=(0.3, 1.0)), mass, seed)
+    done = lift_grasp(trial, spec)
+    moved, unbalanced = 1e3 * done.before_lift.distance, done.unbalanced
+    return done.status, *(None if math.isnan(x) else x for x in (moved, unbalanced))
+
+
+def _misplace(wrong: Condition, grasp: Grasps, mesh: Any, seed: int) -> torch.Tensor:
+    """Return the hand's error: the object is off by the condition's amounts in a drawn direction."""
+    generator = torch.Generator().manual_seed(seed_of(seed, "misplaced"))
+    place, turn = torch.randn(2, 3, generator=generator, dtype=torch.float64)
+    if not wrong.afloat:
+        level = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
+        place, turn = place * level, turn * (1 - level)
+    rotation = rotation_from_vector(wrong.angle * turn / torch.linalg.vector_norm(turn))
+    centre = torch.tensor(mesh.center_mass.tolist(), dtype=torch.float64)
+    shift = wrong.distance * place / torch.linalg.vector_norm(place)
+    return error_from_object_pose(grasp.obj_from_hand[0].double(), rigid(rotation, centre + shift - rotation @ centre))
+
+
+def _plan(spec: TableSpec, subject: Subject, hand: str, view: str) -> Grasps:
+    """Return the executable grasps of a view, kept or planned."""
+    assert subject.folder is not None
+    path = spec.kept("misplaced", f"{hand}_{subject.label}_{view}", "plan").with_suffix(".safetensors")
+    if not path.is_file():
+        cloud = read_view(subject.folder, subject.name, view)
+        contacts = ContactSpec(friction=PLANNED_FRICTION, table=0.0)
+        grasps = plan_grasps(cloud, load_hand(hand), contacts, spec.starts, spec.seed)
+        grasps[grasps.status == Status.OK].save(path)
+    return load_grasps(path)
+
+
+@functools.lru_cache(maxsize=2)
+def _read_solid(folder: Path, name: str) -> tuple[Any, Any]:
+    """Return mesh and convex parts."""
+    mesh = read_object_mesh(folder, name)
+    return mesh, convex_parts(mesh)

@@ -1,0 +1,123 @@
+"""Where the object is by touch: against a general optimiser, rigid motions, and a block that stands elsewhere."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import minimize
+
+from tests.point_fingers import NORMALS, PERIOD, TARGET, observation, real, reference
+from torchgrasp.control import GraspController, TipContact, measure, no_contact
+from torchgrasp.control.closing import PALM_REACH, PALM_SPEED
+from torchgrasp.control.closing_law import surface_covariance
+from torchgrasp.control.placement import FARTHEST, HEIGHT_SPREAD, SPREAD, TILT, TURN, Placement
+from torchgrasp.linalg import unit
+from torchgrasp.plane import Plane
+
+AROUND = unit(real([[1, 0.3, 0.1], [-0.4, 1, 0], [-0.5, -0.9, 0.2]]))
+"""Normals that span the plane across z, and a little more."""
+
+
+def known(normals=AROUND, std_mm=(1.0, 3.0, 6.0), table=True):
+    """A reference of contacts 30 mm from the origin, on a table across z."""
+    start = reference()
+    covariance = surface_covariance(normals, 1e-3 * real(std_mm))
+    gains = dataclasses.replace(start.gains, target=0.03 * normals, covariance=covariance)
+    plane = Plane(real([0, 0, 1]), -0.05) if table else None
+    return dataclasses.replace(start, normals=normals, gains=gains, table=plane)
+
+
+@pytest.mark.parametrize("table", [True, False])
+@pytest.mark.parametrize("touching", [(1, 0, 0), (0, 1, 1), (1, 1, 1), (0, 0, 0)])
+@pytest.mark.parametrize("off_mm", [(8.0, 2.0, 9.0), (-3.0, 5.0, -6.0), (4.0, -9.0, -8.0)])
+def test_the_displacement_is_the_likeliest_one(table, touching, off_mm):
+    """The posterior by SciPy: a touch measures a plane, a finger in the air costs only where the plane passes it."""
+    held = known(table=table)
+    normals, off, felt = AROUND.numpy(), 1e-3 * np.array(off_mm), np.array(touching, dtype=bool)
+    target = held.gains.target.numpy()
+    arms = target - target.mean(0)
+    place = np.array([SPREAD, SPREAD, HEIGHT_SPREAD if table else SPREAD])
+    turn = np.array([TILT, TILT, TURN]) if table else np.full(3, TURN)
+    variance = np.array([n @ c @ n for n, c in zip(normals, held.gains.covariance.numpy(), strict=True)])
+
+    def cost(scaled):
+        shift, rotation = scaled[:3] * place, scaled[3:] * turn
+        plane = ((shift + np.cross(rotation, arms)) * normals).sum(-1)
+        miss = np.where(felt, plane - off, np.maximum(plane - off, 0.0))
+        return 0.5 * (scaled**2).sum() + 0.5 * (miss**2 / variance).sum()
+
+    best = minimize(cost, np.zeros(6), method="BFGS", options={"gtol": 1e-10}).x
+    found = Placement(held).displacement(held.gains.target + real(off)[:, None] * AROUND, torch.tensor(felt))
+    assert np.allclose(found.numpy(), best * np.concatenate([place, turn]), atol=2e-6)
+
+
+def test_certain_contacts_are_believed_and_leave_the_object_on_the_table():
+    flat = unit(AROUND * real([1, 1, 0]))
+    held, shift = known(flat, std_mm=(0.0, 0.0, 0.0)), real([0.006, -0.004, 0.0])
+    sure = dataclasses.replace(held.gains, covariance=held.gains.covariance / 1e4)
+    placement = Placement(dataclasses.replace(held, gains=sure))
+    off = (shift * flat).sum(-1)
+    found = placement.displacement(held.gains.target + off[:, None] * flat, torch.ones(3, dtype=torch.bool))
+    moved = placement.moved(found) - held.gains.target
+    assert torch.allclose((moved * flat).sum(-1), off, atol=5e-5)
+    assert float(found[2].abs()) < 1e-6 and float(moved[:, 2].abs().max()) < 1e-4
+
+
+def test_the_surer_of_two_touches_that_disagree_is_believed_more():
+    opposed = real([[1, 0, 0], [-1, 0, 0], [0, 1, 0]])
+    felt = torch.tensor([True, True, False])
+    for std_mm, sign in (((1.0, 9.0, 1.0), 1.0), ((9.0, 1.0, 1.0), -1.0)):
+        held = known(opposed, std_mm)
+        found = Placement(held).displacement(held.gains.target + 0.008 * opposed, felt)
+        assert float(found[0]) * sign > 1e-3
+
+
+def test_a_finger_that_has_missed_the_object_does_not_move_it_for_ever():
+    held, touching = known(), torch.tensor([False, False, False])
+    near, far = (
+        Placement(held).displacement(held.gains.target - off * AROUND, touching) for off in (FARTHEST, 10 * FARTHEST)
+    )
+    assert torch.allclose(near, far)
+
+
+def close(controller: GraspController, away: float, seconds: float = 3.5) -> tuple[torch.Tensor, torch.Tensor]:
+    """Close on a stiff block that stands `away` [m] along x; return the path of palm and joints."""
+    joints, palm, tactile, path = torch.zeros(9).double(), torch.zeros(3).double(), no_contact(), []
+    shift = real([away, 0, 0])
+    for _ in range(round(seconds / PERIOD)):
+        points = TARGET + 0.02 * NORMALS + joints.reshape(3, 3)
+        push = 2e3 * -((points + palm - TARGET - shift) * NORMALS).sum(-1).clamp_max(0.0)
+        tactile = measure(
+            tactile, TipContact(push, -push[:, None] * NORMALS, points, NORMALS), NORMALS, real([0.01] * 3), PERIOD
+        )
+        seen = dataclasses.replace(observation(joints=joints), tips=points + 0.01 * NORMALS, tactile=tactile)
+        joints, palm = controller.step(seen, PERIOD)
+        path.append(torch.cat([palm, joints]))
+        if controller.closing.done:
+            break
+    palms, angles = torch.stack(path).split([3, 9], 1)
+    return palms, angles.reshape(-1, 3, 3)
+
+
+@pytest.mark.parametrize("closing", ["uncertainty", "fixed"])
+def test_the_palm_follows_a_block_that_stands_elsewhere_and_the_fingers_come_to_the_planned_posture(closing):
+    palms, joints = close(GraspController(reference(), closing), 0.01)
+    assert palms[-1].numpy() == pytest.approx([0.01, 0, 0], abs=2.5e-3)
+    assert (palms[1:] - palms[:-1]).norm(dim=-1).max() <= PALM_SPEED * PERIOD + 1e-9
+    posture = joints[-1] + 0.02 * NORMALS  # zero where each tip is at its planned contact
+    assert (posture * NORMALS).sum(-1).abs().max() < 3e-3
+    still, moved = close(GraspController(reference(), closing, without=("palm",)), 0.01)
+    assert still.abs().max() == 0
+    assert ((moved[-1] + 0.02 * NORMALS) * NORMALS).sum(-1).abs().max() > 8e-3
+
+
+def test_the_palm_stays_where_the_object_is_in_its_place_and_goes_no_farther_than_it_may():
+    assert close(GraspController(reference()), 0.0)[0].norm(dim=-1).max() < 1e-3
+    far = close(GraspController(reference()), 0.018)[0].norm(dim=-1)
+    assert 0.01 < float(far.max()) <= PALM_REACH + 1e-9
+
+
+@pytest.mark.parametrize("closing", ["paper", "position", "open_loop"])
+def test_other_closings_leave_the_palm_to_the_arm(closing):
+    assert close(GraspController(reference(), closing), 0.01)[0].abs().max() == 0
