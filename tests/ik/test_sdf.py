@@ -62,6 +62,19 @@ def test_distance_field_of_a_flat_patch_without_margin():
     assert float(distance) == pytest.approx(0.004, abs=1e-6)
 
 
+def test_distances_of_an_open_mesh_do_not_vanish_where_their_sign_jumps():
+    side = 0.02
+    vertices = torch.tensor([[-side, -side, 0], [side, -side, 0], [side, side, 0], [-side, side, 0]]).double()
+    field = field_from_surface(vertices, torch.tensor([[0, 1, 2], [0, 2, 3]]), margin=0.05)
+    assert field.values.is_contiguous()  # else each query copies the whole grid
+    axes = (low + field.spacing * torch.arange(n) for low, n in zip(field.origin, field.values.shape, strict=True))
+    nodes = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+    beyond = torch.stack([(nodes[..., k].abs() - side).clamp_min(0) for k in range(2)] + [nodes[..., 2]], -1)
+    error = (field.values.abs() - torch.linalg.vector_norm(beyond, dim=-1)).abs()
+    assert float(error.max()) < 2e-3
+    assert float(error.median()) < 1e-4
+
+
 def test_bad_surfaces_are_named():
     vertices = torch.eye(3, dtype=torch.float64)
     with pytest.raises(BadArgument, match="faces"):

@@ -31,6 +31,14 @@ def test_variation_on_a_sphere_is_the_angle_under_which_the_ring_is_seen_from_it
     torch.testing.assert_close(found, torch.full_like(found, expected))
 
 
+def test_variation_is_infinite_but_among_the_contacts_asked_for(ellipsoid, generator):
+    points = on_surface(ellipsoid, generator, 20, 3)
+    normals, among = triple_jet(ellipsoid, points).normals, torch.rand(20, 3, generator=generator) < 0.3
+    every, found = (normal_variation(ellipsoid, points, normals, RING_RADIUS, x) for x in (None, among))
+    torch.testing.assert_close(found[among], every[among])
+    assert bool(torch.isinf(found[~among]).all() and torch.isfinite(every).all())
+
+
 def test_values_on_a_sphere_change_sign_at_the_angle_under_which_the_ring_is_seen(ellipsoid, generator):
     sphere = dataclasses.replace(ellipsoid, axes=(0.5, 0.5, 0.5))
     points = 0.5 * unit(torch.randn(5, 3, 3, generator=generator, dtype=torch.float64))

@@ -135,12 +135,12 @@ def test_far_starts_are_drawn_in_and_those_on_the_surface_stay(ellipsoid, genera
 def test_contacts_of_a_ball_are_flat_within_the_widest_ring_that_it_offers(ellipsoid, radius, flat):
     ball = dataclasses.replace(ellipsoid, axes=(1.0, 1.0, 1.0), scale=radius, doubt=0.0)
     spec = ContactSpec()
-    assert settle_flatness(ball, spec, 0).flat_radius == flat
+    assert settle_flatness(ball, spec, 0).spec.flat_radius == flat
     plan, there = (plan_contacts(ball, s, starts=25) for s in (spec, dataclasses.replace(spec, flat_radius=flat)))
     assert torch.equal(plan.contacts.points, there.contacts.points)
     given = dataclasses.replace(spec, flat_radius=0.002)
-    assert settle_flatness(ball, given, 0) == given
-    assert settle_flatness(ball, ContactSpec.paper(), 0) == ContactSpec.paper()
+    assert settle_flatness(ball, given, 0).spec == given
+    assert settle_flatness(ball, ContactSpec.paper(), 0) == (ContactSpec.paper(), None)
 
 
 def test_contacts_on_opposite_sides_of_a_thin_thing_may_be_as_near_as_it_is_thin(ellipsoid):

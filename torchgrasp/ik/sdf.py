@@ -130,7 +130,7 @@ def _upsample(values: np.ndarray, axis: int) -> np.ndarray:
     else:
         padded = np.concatenate([2 * known[:1] - known[1:2], known, 2 * known[-1:] - known[-2:-1]])
         fine[1::2] = (9 * (known[:-1] + known[1:]) - padded[:-3] - padded[3:]) / 16
-    return np.moveaxis(fine, 0, axis)
+    return np.ascontiguousarray(np.moveaxis(fine, 0, axis))  # queries would copy another layout each time
 
 
 class _Surface:

@@ -33,7 +33,7 @@ from torchgrasp.pipeline.choice import Offer, sorted_points
 from torchgrasp.pipeline.story import Story
 from torchgrasp.pipeline.task import Task
 from torchgrasp.plan.certify import certify
-from torchgrasp.plan.starts import settle_flatness
+from torchgrasp.plan.starts import Settled, settle_flatness
 from torchgrasp.posture_model.mixture import PAPER_ENERGY
 from torchgrasp.scene.occupancy import estimate_occupancy
 from torchgrasp.shape.surface import Surface, extract_surface
@@ -71,9 +71,14 @@ class Bench:
     task: Task
 
     @cached_property
+    def settled(self) -> Settled:
+        """The spec with the radius within which contacts are flat, and candidates of contacts."""
+        return settle_flatness(self.task.shape, self.task.spec, self.task.seed)
+
+    @property
     def spec(self) -> ContactSpec:
         """The spec with the radius within which contacts are flat."""
-        return settle_flatness(self.task.shape, self.task.spec, self.task.seed)
+        return self.settled.spec
 
     @cached_property
     def surface(self) -> Surface:

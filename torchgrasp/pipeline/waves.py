@@ -63,7 +63,7 @@ def plan_waves(task: Task, deadline: float) -> Iterator[Grasps]:
     task.observer("shape", text, shape)
     waves = schedule(task.starts, bench.tried) if task.mode == "joint" else [Wave(task.starts, bench.tried)]
     sizes = [wave.starts for wave in waves if wave.starts]
-    plans = plan_in_turn(shape, bench.spec, sizes, task.seed)
+    plans = plan_in_turn(shape, bench.settled, sizes, task.seed)
     story, planned = Story(task.observer, len(waves), len(sizes), bench.spec.planned_friction), 0
     for wave in waves:
         offer = bench.find(next(plans), wave.tried, story) if wave.starts else None

@@ -27,14 +27,21 @@ def ring_directions(normals: Vectors, points: Vectors, n: int) -> Float[Tensor, 
     return cone_edges(normals, tangents(points, normals), 1.0, n) + normals[:, :, None]
 
 
-def normal_variation(shape: Shape, points: Vectors, normals: Vectors, radius: float) -> Float[Tensor, "b f"]:
+def normal_variation(
+    shape: Shape, points: Vectors, normals: Vectors, radius: float, among: Bool[Tensor, "b f"] | None = None
+) -> Float[Tensor, "b f"]:
     """Return the largest angle [rad] between the normals at a contact and on its ring of a radius [m].
 
-    The ring of a contact on a thin wall is on that side of it, though it may lie nearer to the other.
+    The ring of a contact on a thin wall is on that side of it, though it may lie nearer to the other. Contacts that are
+    not `among` those asked for have infinite angles.
     """
-    variation, *others = (_wall_variation(wall, points, normals, radius) for wall in walls_of(shape))
-    for number, other in enumerate(others, start=1):
-        variation = torch.where(_owned(shape, points, number), other, variation)
+    variation = torch.full_like(points[..., 0], math.inf)
+    among = torch.ones_like(variation, dtype=torch.bool) if among is None else among
+    ring = points[:, :, None] + radius / float(shape.scale) * ring_directions(normals, points, JUDGED_POINTS)
+    walls = walls_of(shape)
+    for number, wall in enumerate(walls):
+        own = among if len(walls) == 1 else among & _owned(shape, points, number)
+        variation[own] = _wall_variation(wall, ring[own], normals[own])
     return variation
 
 
@@ -44,13 +51,11 @@ def _owned(shape: Shape, points: Vectors, number: int) -> Bool[Tensor, "b f"]:
     return owner[:, number].unflatten(0, points.shape[:2])
 
 
-def _wall_variation(shape: Shape, points: Vectors, normals: Vectors, radius: float) -> Float[Tensor, "b f"]:
-    """Return the same of one surface."""
-    around = ring_directions(normals, points, JUDGED_POINTS)
-    ring = points[:, :, None] + radius / float(shape.scale) * around
-    _, gradient = shape.mean_and_gradient(project(shape, ring.flatten(1, 2), steps=1).flatten(0, 1))
-    there = unit(gradient).unflatten(0, ring.shape[:3])
-    here = normals[:, :, None].expand_as(there)
+def _wall_variation(shape: Shape, ring: Float[Tensor, "k n 3"], normals: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
+    """Return the same for points near one surface."""
+    _, gradient = shape.mean_and_gradient(project(shape, ring, steps=1).flatten(0, 1))
+    there = unit(gradient).view_as(ring)
+    here = normals[:, None].expand_as(there)
     sine = torch.linalg.vector_norm(torch.linalg.cross(here, there), dim=-1)
     return torch.atan2(sine, (here * there).sum(-1)).amax(-1)
 

@@ -15,7 +15,7 @@ from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.objectives import Improvement, Objective, improvement
 from torchgrasp.plan.problem import ContactProblem, Shape
 from torchgrasp.plan.solver import FINISH, Stage, descend, project, start_state
-from torchgrasp.plan.starts import check_starts, chunk_sizes, drawn_starts, given_starts, settle_flatness
+from torchgrasp.plan.starts import Settled, check_starts, chunk_sizes, drawn_starts, given_starts, settle_flatness
 from torchgrasp.plan.wrench import Vectors
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan
@@ -76,21 +76,23 @@ def plan_contacts(
     """
     spec = ContactSpec() if spec is None else spec
     check_starts(shape, spec, starts, seed)
-    spec = settle_flatness(shape, spec, seed)
+    settled = settle_flatness(shape, spec, seed)
+    spec = settled.spec
     if time_budget is not None and not time_budget > 0:  # also refuses NaN
         raise BadArgument("time_budget", time_budget, "a positive number of seconds, or None")
     improve = improvement(objective, shape, spec, seed)
-    chunks = _chunks(shape, spec, starts, seed)
+    chunks = _chunks(shape, settled, starts, seed)
     if time_budget is not None:
         chunks = _within(time_budget, chunks)
     return join([plan_chunk(shape, spec, first, stages, improve) for first, stages in chunks])
 
 
-def _chunks(shape: Shape, spec: ContactSpec, starts: int | Vectors, seed: int) -> Iterator[Chunk]:
+def _chunks(shape: Shape, settled: Settled, starts: int | Vectors, seed: int) -> Iterator[Chunk]:
     """Yield starts and stages, chunk by chunk."""
     if isinstance(starts, Tensor):
         return ((first, SEARCH) for first in given_starts(shape, starts))
-    return ((first, _stages(spec)) for first in drawn_starts(shape, spec, chunk_sizes(starts), seed))
+    first_stages = _stages(settled.spec)
+    return ((first, first_stages) for first in drawn_starts(shape, settled, chunk_sizes(starts), seed))
 
 
 def _stages(spec: ContactSpec) -> tuple[Stage, ...]:
@@ -98,10 +100,10 @@ def _stages(spec: ContactSpec) -> tuple[Stage, ...]:
     return SEARCH if spec.flatness is None else TO_CENTRE
 
 
-def plan_in_turn(shape: Shape, spec: ContactSpec, sizes: Sequence[int], seed: int) -> Iterator[ContactPlan]:
-    """Yield a plan from `sizes[k]` further starts each time that one is asked for; `spec` has its `flat_radius`."""
-    chunks = [chunk_sizes(size) for size in sizes]
-    starts = drawn_starts(shape, spec, itertools.chain(*chunks), seed)
+def plan_in_turn(shape: Shape, settled: Settled, sizes: Sequence[int], seed: int) -> Iterator[ContactPlan]:
+    """Yield a plan from `sizes[k]` further starts each time that one is asked for."""
+    chunks, spec = [chunk_sizes(size) for size in sizes], settled.spec
+    starts = drawn_starts(shape, settled, itertools.chain(*chunks), seed)
     for parts in chunks:
         yield join([plan_chunk(shape, spec, next(starts), _stages(spec)) for _ in parts])
 

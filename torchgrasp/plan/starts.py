@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterable, Iterator
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,7 +11,7 @@ from torch import Tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.linalg import unit
 from torchgrasp.plan.flatness import normal_variation
-from torchgrasp.plan.problem import ContactProblem, Shape, device_of, triple_jet, walls_of
+from torchgrasp.plan.problem import ContactProblem, Shape, device_of, walls_of
 from torchgrasp.plan.round_cones import closed_exact
 from torchgrasp.plan.solver import project
 from torchgrasp.plan.wrench import Vectors
@@ -60,17 +61,30 @@ def chunk_sizes(starts: int) -> list[int]:
     return [min(STARTS_PER_CHUNK, starts - begin) for begin in range(0, starts, STARTS_PER_CHUNK)]
 
 
-def drawn_starts(shape: Shape, spec: ContactSpec, sizes: Iterable[int], seed: int) -> Iterator[Float[Tensor, "_ f 3"]]:
+class Candidates(NamedTuple):
+    """Normalised points of the surface with normals."""
+
+    points: Float[Tensor, "p 3"]
+    normals: Float[Tensor, "p 3"]
+
+
+class Settled(NamedTuple):
+    """A spec with its `flat_radius`, and the surface points that qualify as contacts, with normals, if it has one."""
+
+    spec: ContactSpec
+    candidates: Candidates | None
+
+
+def drawn_starts(shape: Shape, settled: Settled, sizes: Iterable[int], seed: int) -> Iterator[Float[Tensor, "_ f 3"]]:
     """Yield normalised starts on the surface, `sizes[k]` at a time.
 
     Without `spec.flatness` they are the paper's: points of the sphere of `spec.start_radius`, moved onto the surface
-    (Sec. 6.2). With it they are rows of `candidate_contacts`. The centre of a flat grasp may lie 30 mm from the
-    object's, where the paper's starts rarely end.
+    (Sec. 6.2). With it they are rows of candidates. The centre of a flat grasp may lie 30 mm from the object's, where
+    the paper's starts rarely end.
     """
-    generator = torch.Generator().manual_seed(seed)
-    candidates = None
-    if spec.flatness is not None:
-        candidates = candidate_contacts(shape, spec, survey(shape, spec, generator))
+    (spec, candidates), generator = settled, torch.Generator().manual_seed(seed)
+    if candidates is not None:
+        draw(shape, spec, (CANDIDATE_TRIPLES, 3), generator)  # the rows are drawn after the candidates
     for count in sizes:
         if candidates is None:
             drawn = draw(shape, spec, (count, spec.fingertips), generator)
@@ -79,20 +93,27 @@ def drawn_starts(shape: Shape, spec: ContactSpec, sizes: Iterable[int], seed: in
             yield candidate_rows(ContactProblem.of(shape, spec), *candidates, count, generator)[0]
 
 
-def settle_flatness(shape: Shape, spec: ContactSpec, seed: int) -> ContactSpec:
-    """Return the spec with its `flat_radius`, or the widest of `FLAT_RADII` at which enough starts are closed."""
-    if spec.flatness is None or spec.flat_radius is not None:
-        return spec
+def settle_flatness(shape: Shape, spec: ContactSpec, seed: int) -> Settled:
+    """Return the spec with its `flat_radius`, or the widest of `FLAT_RADII` at which enough starts are closed.
+
+    The candidates are the points of `survey` that are flat there; all of them where too few are.
+    """
+    if spec.flatness is None:
+        return Settled(spec, None)
     problem, points = ContactProblem.of(shape, spec), survey(shape, spec, torch.Generator().manual_seed(seed))
-    for radius in FLAT_RADII[:-1]:
+    good, normals = qualify(shape, spec, points)
+    settled, flat = spec, good
+    for radius in FLAT_RADII if spec.flat_radius is None else (spec.flat_radius,):
         settled = dataclasses.replace(spec, flat_radius=radius)
-        good, normals = qualify(shape, settled, points)
-        if int(good.sum()) >= spec.fingertips:
+        flat = normal_variation(shape, points, normals, radius, good) < CANDIDATE_FLATNESS * spec.flatness
+        if int(flat.sum()) >= spec.fingertips and radius not in (spec.flat_radius, FLAT_RADII[-1]):
             generator = torch.Generator().manual_seed(seed)
-            _, closed = candidate_rows(problem, points[good], normals[good], SURVEYED, generator)
+            _, closed = candidate_rows(problem, points[flat], normals[flat], SURVEYED, generator)
             if closed >= ENOUGH_CLOSED * SURVEYED:
-                return settled
-    return dataclasses.replace(spec, flat_radius=FLAT_RADII[-1])
+                break
+    if int(flat.sum()) < spec.fingertips:
+        flat = torch.ones_like(flat)
+    return Settled(settled, Candidates(points[flat], normals[flat]))
 
 
 def draw(shape: Shape, spec: ContactSpec, size: tuple[int, int], generator: torch.Generator) -> Float[Tensor, "_ f 3"]:
@@ -122,27 +143,16 @@ def draw_in(shape: Shape, points: Vectors) -> Vectors:
     return torch.where(far[:, None, None], drawn, points)
 
 
-def candidate_contacts(
-    shape: Shape, spec: ContactSpec, points: Vectors
-) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]]:
-    """Return the surface points that qualify as contacts, with normals; all where too few qualify."""
-    good, normals = qualify(shape, spec, points)
-    if int(good.sum()) < spec.fingertips:
-        good = torch.ones_like(good)
-    return points[good], normals[good]
-
-
 def qualify(shape: Shape, spec: ContactSpec, points: Vectors) -> tuple[Bool[Tensor, "b f"], Vectors]:
-    """Tell which surface points are certain, flat, inside and above the table; return the normals of all."""
+    """Tell which surface points are certain, inside and above the table; return the normals of all."""
     problem = ContactProblem.of(shape, spec)
-    jet = triple_jet(shape, points)
-    good = (jet.distance.abs() < 1e-4) & (jet.variance >= 0) & (jet.variance < spec.max_variance)
-    good &= torch.linalg.vector_norm(points, dim=-1) < problem.domain_radius
-    good &= problem.room(points, jet.normals) > 0
-    if spec.flatness is not None:
-        variation = normal_variation(shape, points, jet.normals, spec.ring_radius)
-        good &= variation < CANDIDATE_FLATNESS * spec.flatness
-    return good, jet.normals
+    distance, gradient = (x.unflatten(0, points.shape[:2]) for x in shape.mean_and_gradient(points.flatten(0, 1)))
+    normals = unit(gradient)
+    good = (distance.abs() < 1e-4) & (torch.linalg.vector_norm(points, dim=-1) < problem.domain_radius)
+    good &= problem.room(points, normals) > 0
+    variance = shape.jet(points[good]).variance  # it costs more than all else
+    good[good.clone()] = (variance >= 0) & (variance < spec.max_variance)
+    return good, normals
 
 
 def candidate_rows(

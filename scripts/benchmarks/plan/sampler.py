@@ -4,6 +4,7 @@ The rejection is the planner's own survey of the surface: certain, flat places a
 are closed. The planner moves them on. Both are checked alike.
 """
 
+import dataclasses
 import itertools
 import time
 from typing import Any
@@ -23,7 +24,7 @@ from torchgrasp.ik.sdf import field_from_surface
 from torchgrasp.pipeline import spread_rows
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.feasibility import check_feasibility
-from torchgrasp.plan.starts import STARTS_PER_CHUNK, drawn_starts
+from torchgrasp.plan.starts import STARTS_PER_CHUNK, drawn_starts, settle_flatness
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
 
@@ -59,9 +60,10 @@ def bench_sampler(views: list[Any], starts: int, seed: int) -> Row:
 
 def sample(shape: ShapeGP, seconds: float, seed: int) -> ContactPlan:
     """Return random triples, checked, as many as fit into the processor's time."""
-    began, parts = time.process_time(), []
+    began, parts, flat = time.process_time(), [], dataclasses.replace(DEFAULT, flat_radius=DEFAULT.ring_radius)
     for draw in itertools.count(seed):
-        parts += [check_feasibility(shape, DEFAULT, x) for x in drawn_starts(shape, DEFAULT, [STARTS_PER_CHUNK], draw)]
+        settled = settle_flatness(shape, flat, draw)
+        parts += [check_feasibility(shape, flat, x) for x in drawn_starts(shape, settled, [STARTS_PER_CHUNK], draw)]
         if time.process_time() - began >= seconds:
             break
     return join(parts)
