@@ -15,8 +15,9 @@ from torch import Tensor
 
 from torchgrasp.base import Batch, pick, put
 
-LARGEST_STEP = 0.3
-"""Largest step of any variable of `LeastSquares` in one iteration [m or rad]: about where its linear model ends."""
+LARGEST_STEP = 0.6
+"""Largest step of any variable of `LeastSquares` in one iteration [m or rad]. With 0.3 three flat objects gave 415
+grasps in place of 458, from as many steps; with 1.2 fewer, too."""
 SOLVED = 0.1
 """Sum of squared residuals at which `LeastSquares` is solved: 0.3 mm in the root."""
 STALLED = 0.02
@@ -76,10 +77,10 @@ def levenberg_marquardt(problem: Problem[State, Model], state: State, steps: int
     for _ in range(steps):
         x, taken = problem.step(model, damping)
         left = torch.nonzero(taken)[:, 0]  # the only wait for the device in a step
+        if not len(left):
+            break
         if len(left) < len(taken):
             whole, costs = put(whole, rows, state), costs.index_copy(0, rows, model.cost)
-            if not len(left):
-                return whole, costs
             rows, state, model, x, damping = rows[left], state[left], model[left], x[left], damping[left]
         trial_state = problem.move(state, x)
         trial = problem.linearise(trial_state, rows)

@@ -20,7 +20,7 @@ from torchgrasp.ik.checks import PAPER_TOLERANCE, TIP_PENETRATION
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, along
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.ranking import rank_in_group
-from torchgrasp.ik.rounds import Attempts, assign, best_grasps, executable
+from torchgrasp.ik.rounds import Attempts, assign, best_first, best_grasps, executable
 from torchgrasp.values import Contacts, Grasps, IKSeeds
 
 ANGLE = 0.01
@@ -137,7 +137,7 @@ def solve_as_paper(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
         results = join(attempts.results)
         if int(executable(results).sum()) >= ENOUGH or len(results) >= RUNS:
             break
-    return best_grasps(attempts)
+    return best_first(best_grasps(attempts)[0])
 
 
 def _rank(problem: GraspProblem, seeds: IKSeeds) -> Int[Tensor, "g"]:

@@ -12,7 +12,7 @@ from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candid
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.ranking import rank_in_group
 from torchgrasp.ik.refine import grasp_residuals, refine, tip_targets
-from torchgrasp.ik.rounds import Attempts, assign, best_grasps, executable
+from torchgrasp.ik.rounds import Attempts, assign, best_first, best_grasps, executable
 from torchgrasp.values import Grasps, IKSeeds
 
 SEEDS_PER_ROUND = (2, 4)
@@ -50,4 +50,4 @@ def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
     seeds = problem.drop_unreachable(seeds)
     attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
     attempts.refine(seeds, rank_seeds(problem, seeds), SEEDS_PER_ROUND, partial(refine_on_contacts, problem))
-    return best_grasps(attempts)
+    return best_first(best_grasps(attempts)[0])

@@ -16,9 +16,9 @@ from torchgrasp.values import Contacts
 
 TIP_WEIGHT, PAD_WEIGHT = 2.0, 80.0
 """Weights of a tip's millimetre and of a cosine outside the cone. A millimetre of clearance weighs 1: contact wins."""
-ITERATIONS = 40
-"""Most steps of one refinement; a row that stalls stops earlier."""
-OPENING_ITERATIONS, OPENED = 20, 1.0
+ITERATIONS = 30
+"""Most steps of one refinement; a row that stalls stops earlier. Few rows take more, and each step costs its calls."""
+OPENING_ITERATIONS, OPENED = 12, 1.0
 """Most steps to the pre-grasp, and its squared residuals [mm2] when done: half a millimetre is nothing there.
 Twice the steps to a tenth of the sum gave no grasp more on four objects."""
 OPENING, OPENING_SIGMAS = 0.012, 3.0

@@ -61,12 +61,16 @@ def executable(grasps: Grasps) -> Bool[Tensor, "g"]:
     return grasps.status == Status.OK
 
 
-def best_grasps(attempts: Attempts[Grasps]) -> Grasps:
-    """Return a success of each triple, else a failure of certified contacts, else any; best first."""
+def best_grasps(attempts: Attempts[Grasps]) -> tuple[Grasps, Int[Tensor, "t"]]:
+    """Return a success of each triple, else a failure of certified contacts, else any; and its triple."""
 
     def keys(grasps: Grasps) -> tuple[Tensor, Tensor]:
         failed = ~executable(grasps)
         return failed.int() + (failed & (grasps.status < Status.OUT_OF_REACH)).int(), -grasps.score
 
-    grasps, _ = attempts.best(keys)
+    return attempts.best(keys)
+
+
+def best_first(grasps: Grasps) -> Grasps:
+    """Return executable grasps first, those of a high score first."""
     return grasps[lexical_order((~executable(grasps)).int(), -grasps.score)]

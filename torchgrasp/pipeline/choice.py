@@ -1,10 +1,11 @@
 """Which contacts the hand tries first: those that a posture nearly fits, near the object's centre, far apart."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import join
@@ -23,6 +24,22 @@ class Offer(NamedTuple):
     certificate: Certificate
     seeds: IKSeeds
 
+    def select(self, rows: Int[Tensor, "k"]) -> "Offer":
+        """Return some of the contacts, with their seeds."""
+        number = rows.new_full((len(self.contacts),), -1)
+        number[rows] = torch.arange(len(rows), device=rows.device)
+        seeds = self.seeds[number[self.seeds.row] >= 0]
+        return Offer(self.contacts[rows], self.certificate[rows], dataclasses.replace(seeds, row=number[seeds.row]))
+
+
+def join_offers(offers: Sequence[Offer]) -> Offer:
+    """Return the contacts of all offers, one after the other."""
+    first, seeds = 0, list[IKSeeds]()
+    for offer in offers:
+        seeds.append(dataclasses.replace(offer.seeds, row=offer.seeds.row + first))
+        first += len(offer.contacts)
+    return Offer(join([x.contacts for x in offers]), join([x.certificate for x in offers]), join(seeds))
+
 
 class Untried:
     """The offers of all waves so far; each row of contacts is taken once."""
@@ -34,23 +51,19 @@ class Untried:
 
     def add(self, offer: Offer, cost: Float[Tensor, "n"]) -> None:
         """Add an offer with the costs of trying its rows, infinite where there is no seed."""
-        row = offer.seeds.row + sum(len(part) for part in self.costs)
-        self.offers.append(offer._replace(seeds=dataclasses.replace(offer.seeds, row=row)))
+        self.offers.append(offer)
         self.costs.append(cost)
 
     def take(self, most: int) -> Offer:
         """Return at most so many of the rows that cost least, far from each other and from those taken before."""
-        contacts, certificate, seeds = (join(parts) for parts in zip(*self.offers, strict=True))
-        points = sorted_points(contacts)
+        offer = join_offers(self.offers)
+        points = sorted_points(offer.contacts)
         before = torch.cat(self.taken) if self.taken else points.new_zeros(0, dtype=torch.long)
         cost = torch.cat(self.costs).index_fill(0, before, torch.inf)
         likely = torch.argsort(cost, stable=True)[: min(LIKELY * most, int(torch.isfinite(cost).sum()))]
         rows = likely[farthest_points(points[likely], most, before=points[before])].sort().values
         self.taken.append(rows)
-        number = torch.full_like(cost, -1, dtype=torch.long)
-        number[rows] = torch.arange(len(rows), device=rows.device)
-        seeds = seeds[number[seeds.row] >= 0]
-        return Offer(contacts[rows], certificate[rows], dataclasses.replace(seeds, row=number[seeds.row]))
+        return offer.select(rows)
 
 
 def sorted_points(contacts: Contacts) -> Float[Tensor, "b d"]:

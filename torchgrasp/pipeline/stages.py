@@ -13,7 +13,7 @@ from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.cobyla import solve_as_paper
 from torchgrasp.ik.contact_first import seed_costs, solve_contact_first
-from torchgrasp.ik.joint import solve_joint
+from torchgrasp.ik.joint import solve_fixed, solve_sliding
 from torchgrasp.ik.motion import collision_probability, lift_clearance
 from torchgrasp.ik.obstacles import Obstacles
 from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
@@ -27,6 +27,7 @@ from torchgrasp.ik.ranking import (
     success_features,
     success_log_odds,
 )
+from torchgrasp.ik.rounds import Attempts, best_grasps, executable
 from torchgrasp.ik.sdf import field_from_surface
 from torchgrasp.linalg import farthest_points
 from torchgrasp.pipeline.choice import Offer, sorted_points
@@ -167,12 +168,28 @@ class Bench:
         return least.clamp_min(NOTHING).log() + ARM_WEIGHT * (load_arm(contacts.points, self.center) + LEAST_ARM).log()
 
     def solve(self, offer: Offer) -> Grasps:
-        """Return checked grasps, a row for each row of contacts that has seeds."""
-        task, problem = self.task, self.problem(offer.contacts, offer.certificate)
-        if task.mode == "joint":
-            solved = solve_joint(problem, offer.seeds, task.shape, self.spec)
-        else:
-            solved = (solve_as_paper if task.mode == "paper" else solve_contact_first)(problem, offer.seeds)
+        """Return checked grasps by contact first, a row for each row of contacts that has seeds."""
+        solver = solve_as_paper if self.task.mode == "paper" else solve_contact_first
+        return self._bury(solver(self.problem(offer.contacts, offer.certificate), offer.seeds))
+
+    def touch(self, offer: Offer) -> tuple[Grasps, Offer, Grasps]:
+        """Return grasps on the contacts as they are; the contacts where none is, and their best failures."""
+        problem = self.problem(offer.contacts, offer.certificate)
+        offer = offer._replace(seeds=problem.drop_unreachable(offer.seeds))
+        grasps, row = best_grasps(solve_fixed(problem, offer.seeds))
+        solved = executable(grasps)
+        return self._bury(grasps[solved]), offer.select(row[~solved]), grasps[~solved]
+
+    def slide(self, offer: Offer, failed: Grasps) -> Grasps:
+        """Return grasps where contacts slide, or else the best failure of each row."""
+        attempts = Attempts(torch.ones_like(offer.certificate.closed), executable)
+        attempts.add(failed, torch.arange(len(failed), device=failed.status.device))
+        problem = self.problem(offer.contacts, offer.certificate)
+        solve_sliding(problem, offer.seeds, self.task.shape, self.spec, attempts)
+        return self._bury(best_grasps(attempts)[0])
+
+    def _bury(self, solved: Grasps) -> Grasps:
+        """Return grasps of a thing that cannot be lifted as buried."""
         if not self.buried:
             return solved
         buried = torch.where(solved.status == Status.OK, int(Status.BURIED), solved.status)

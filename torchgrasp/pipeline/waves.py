@@ -8,7 +8,7 @@ from typing import NamedTuple
 from torchgrasp.base import join
 from torchgrasp.errors import Status
 from torchgrasp.ik.ranking import lexical_order, rank_by_variance
-from torchgrasp.pipeline.choice import Untried
+from torchgrasp.pipeline.choice import Offer, Untried, join_offers
 from torchgrasp.pipeline.stages import OFFERED, Bench
 from torchgrasp.pipeline.story import Story
 from torchgrasp.pipeline.task import Task
@@ -50,6 +50,33 @@ def schedule(starts: int, most: int) -> list[Wave]:
     return waves
 
 
+class Trials:
+    """The grasps of all waves. Contacts slide in the last one for all rows that need it: a wave costs its own calls.
+
+    In a wave without a grasp they slide at once.
+    """
+
+    def __init__(self, bench: Bench) -> None:
+        self.bench = bench
+        self.waiting = list[tuple[Offer, Grasps]]()
+
+    def take(self, offer: Offer, last: bool) -> Grasps:
+        """Return the grasps of further contacts, and of those that waited if they are tried now."""
+        if self.bench.task.mode != "joint":
+            return self.bench.solve(offer)
+        solved, rest, failed = self.bench.touch(offer)
+        self.waiting.append((rest, failed))
+        if len(solved) and not last:
+            return solved
+        offers, failures = zip(*self.waiting, strict=True)
+        self.waiting.clear()
+        return join([solved, self.bench.slide(join_offers(offers), join(failures))])
+
+    def give_up(self) -> list[Grasps]:
+        """Return the failures of all that waits."""
+        return [failed for _, failed in self.waiting]
+
+
 def plan_waves(task: Task, deadline: float) -> Iterator[Grasps]:
     """Yield the grasps of each wave, the executable ones first, in the upright frame; `meta` counts the starts so far.
 
@@ -65,7 +92,8 @@ def plan_waves(task: Task, deadline: float) -> Iterator[Grasps]:
     sizes = [wave.starts for wave in waves if wave.starts]
     plans = plan_in_turn(shape, bench.settled, sizes, task.seed)
     story, planned = Story(task.observer, len(waves), len(sizes), bench.spec.planned_friction), 0
-    for wave in waves:
+    trials = Trials(bench)
+    for number, wave in enumerate(waves, start=1):
         offer = bench.find(next(plans), wave.tried, story) if wave.starts else None
         planned += wave.starts
         if task.mode == "joint":
@@ -73,9 +101,11 @@ def plan_waves(task: Task, deadline: float) -> Iterator[Grasps]:
                 untried.add(offer, bench.costs(offer))
             offer = untried.take(wave.tried)
         assert offer is not None
-        grasps = bench.rank(bench.solve(offer))
-        story.end_wave(grasps)
+        grasps = bench.rank(trials.take(offer, last=number == len(waves)))
         late = time.monotonic() >= deadline
+        if late:
+            grasps = join([grasps, *trials.give_up()])
+        story.end_wave(grasps)
         if late:
             story.stop()
         yield dataclasses.replace(grasps, meta={"starts": str(planned)})
