@@ -1,5 +1,6 @@
 """What the tests of devices share: the pretended device, and one planned object."""
 
+import dataclasses
 from concurrent.futures import Future
 from typing import Any
 
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from tests.devices.elsewhere import DEVICE, Elsewhere, pretend
 from torchgrasp import ContactSpec, Grasps, Hand, ShapeGP, fit_shape, load_hand, load_object, plan_grasps
-from torchgrasp.base import Value, named_tensors
+from torchgrasp.base import Value
 
 
 class SerialPool:
@@ -49,7 +50,7 @@ def tensors_of(value: Any) -> list[Tensor]:
     if isinstance(value, Tensor):
         return [value]
     if isinstance(value, Value):
-        return list(named_tensors(value).values())
+        value = tuple(getattr(value, field.name) for field in dataclasses.fields(value))
     return [x for part in value for x in tensors_of(part)] if isinstance(value, tuple | list) else []
 
 

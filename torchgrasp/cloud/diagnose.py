@@ -51,7 +51,7 @@ def diagnose_cloud(
 ) -> CloudReport:
     """Measure a cloud, and advise what would improve it.
 
-    Of large clouds 50 000 points are measured, and 5000 tell about camera, vertical, table and bodies.
+    Of large clouds 50 000 points are measured, and 5000 tell about camera, vertical, table and bodies; on the CPU.
 
     Args:
         cloud: points of one object [m].
@@ -65,7 +65,8 @@ def diagnose_cloud(
     >>> diagnose_cloud(PointCloud(0.1 * torch.rand(500, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))).copies
     0
     """
-    vertical = torch.tensor([0.0, 0.0, 1.0]) if up is None else check_tensor("up", up, (3,))
+    vertical = torch.tensor([0.0, 0.0, 1.0]) if up is None else check_tensor("up", up, (3,)).cpu()
+    cloud, table = cloud.to("cpu"), None if table is None else table.to("cpu")
     if not bool(vertical.any()):
         raise BadArgument("up", "a vector of length zero", "the direction that points up")
     check_cloud(cloud)

@@ -112,6 +112,7 @@ def label_bodies(points: Float[Tensor, "n 3"], gap: float = GAP) -> Int[Tensor, 
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
 
+    device, points = points.device, points.cpu()
     # One point of each cell of a quarter of the gap, so that dense clouds have few pairs.
     cells = torch.floor((points - points.amin(0)) / (gap / 4)).long()
     size = cells.amax(0) + 1
@@ -121,7 +122,7 @@ def label_bodies(points: Float[Tensor, "n 3"], gap: float = GAP) -> Int[Tensor, 
     links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(first), len(first)))
     label = connected_components(links, directed=False)[1][group.numpy()]
     order = np.argsort(np.argsort(-np.bincount(label), kind="stable"), kind="stable")
-    return torch.from_numpy(order[label])
+    return torch.from_numpy(order[label]).to(device)
 
 
 def find_second_body(points: Float[Tensor, "n 3"], up: Float[Tensor, "3"], spacing: float) -> Bool[Tensor, "n"] | None:
@@ -157,7 +158,8 @@ def cut_object(
         TooFewPoints: fewer than 4 points in the box, near the point or of the thing.
     """
     points = cloud.points.double()
-    keep = torch.ones(len(points), dtype=torch.bool)
+    up, (point, box) = up.to(points), (None if x is None else x.to(points) for x in (point, box))
+    keep = torch.ones(len(points), dtype=torch.bool, device=points.device)
     if box is not None:
         keep &= ((points >= box.amin(0)) & (points <= box.amax(0))).all(1)
     if point is not None:

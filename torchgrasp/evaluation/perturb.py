@@ -154,12 +154,13 @@ def perturb_view(cloud: PointCloud, perturbation: Perturbation, seed: Seed) -> t
     Raises:
         BadArgument: a cloud without a viewpoint, if the mask, the depth or the camera is wrong.
     """
-    table, points = _perturb_table(cloud, perturbation, seed), cloud.points.double()
+    device, here = cloud.points.device, cloud.to("cpu")
+    table, points = _perturb_table(here, perturbation, seed).to(device), here.points.double()
     if not (perturbation.mask or perturbation.depth or any(perturbation.camera)):
         return cloud, table
-    if cloud.viewpoint is None:
+    if here.viewpoint is None:
         raise BadArgument("cloud", "no viewpoint", "one, where the camera is wrong or what it saw")
-    viewpoint = cloud.viewpoint.double()
+    viewpoint = here.viewpoint.double()
     if perturbation.mask:
         kept = ~find_rim(points, viewpoint, round(perturbation.mask * len(points)), seed)
         count = round(perturbation.mask / (1 - perturbation.mask) * int(kept.sum()))
@@ -167,8 +168,8 @@ def perturb_view(cloud: PointCloud, perturbation: Perturbation, seed: Seed) -> t
     if perturbation.depth:
         noise = torch.randn(len(points), 1, generator=_generator(seed, "depth"), dtype=torch.float64)
         points = points + perturbation.depth * noise * unit(points - viewpoint)
-    seen = PointCloud(points.to(cloud.points), None, cloud.viewpoint, cloud.frustum)
-    return move(seen, _camera_error(viewpoint, perturbation.camera, seed)), table
+    seen = PointCloud(points.to(here.points), None, here.viewpoint, here.frustum)
+    return move(seen, _camera_error(viewpoint, perturbation.camera, seed)).to(device), table
 
 
 def find_rim(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"], count: int, seed: int) -> Bool[Tensor, " n"]:

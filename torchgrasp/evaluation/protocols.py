@@ -159,7 +159,8 @@ def draw_hand_errors(noise: PoseNoise, count: Count, seed: Seed) -> Float[Tensor
 
 @checked
 def draw_object_poses(noise: PoseNoise, pivot: Float[Tensor, "3"], count: Count, seed: Seed) -> Float[Tensor, "n 4 4"]:
-    """Draw poses of an object that moves on its table and rotates about the vertical through `pivot` [m]."""
+    """Draw poses of an object that moves on its table and turns about the vertical through `pivot` [m]; on the CPU."""
+    pivot = pivot.to("cpu", torch.float64)
     generator = torch.Generator().manual_seed(seed)
     drawn = 2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -181,4 +182,4 @@ def draw_error(protocol: Protocol, grasp: Grasps, mesh: "trimesh.Trimesh", seed:
         return draw_hand_errors(protocol.noise, 1, seed)[0]
     pivot = torch.tensor(mesh.center_mass.tolist(), dtype=torch.float64)
     pose = draw_object_poses(protocol.noise, pivot, 1, seed)[0]
-    return error_from_object_pose(grasp.obj_from_hand[0].double(), pose)
+    return error_from_object_pose(grasp.obj_from_hand[0].to(pose), pose)

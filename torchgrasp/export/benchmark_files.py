@@ -54,6 +54,7 @@ def save_dexgraspbench(
         raise BadArgument(
             "hand", repr(hand.name), f"one of {', '.join(BENCH_HANDS)}, whose frames in the bench are known"
         )
+    hand, grasps = hand.to("cpu"), grasps.to("cpu")
     turn, order = BENCH_HANDS[hand.name]
     postures = {
         "pregrasp_qpos": grasps.pregrasp.double(),

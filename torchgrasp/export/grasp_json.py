@@ -47,6 +47,7 @@ def format_grasps(
     Raises:
         BadArgument: joints of another hand, or a force or stiffness that is not positive.
     """
+    hand, grasps = hand.to("cpu"), grasps.to("cpu")
     squeezed, path = squeeze(hand, grasps, force, kp), hand.urdf_path
     forces = rotate(grasps.obj_from_hand.double(), squeezed.forces)
     postures = {"pregrasp": grasps.pregrasp.double(), "grasp": grasps.joints.double(), "squeeze": squeezed.joints}

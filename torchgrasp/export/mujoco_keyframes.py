@@ -29,6 +29,7 @@ def format_keyframes(
     Raises:
         BadArgument: joints of another hand, or a force or stiffness that is not positive.
     """
+    hand, grasps = hand.to("cpu"), grasps.to("cpu")
     squeezed, urdf = squeeze(hand, grasps, force, kp), read_urdf(hand.urdf_path)
     root = ET.Element("mujoco", model=hand.name)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")

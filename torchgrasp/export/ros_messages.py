@@ -72,6 +72,7 @@ def format_trajectories(
 
 def _points(hand: Hand, grasps: Grasps, force: float, kp: float | None) -> Iterator[list[dict[str, Any]]]:
     """Yield the trajectory points of each grasp, with every joint by name."""
+    hand, grasps = hand.to("cpu"), grasps.to("cpu")
     squeezed = squeeze(hand, grasps, force, kp)
     postures = [hand.expand(q.double()) for q in (grasps.pregrasp, grasps.joints, squeezed.joints)]
     for row in range(len(grasps)):

@@ -26,7 +26,7 @@ LIMIT = 3600.0
 
 
 def plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any]) -> list[Grasps]:
-    """Plan for each cloud; the result of each is that of `plan_grasps` alone.
+    """Plan for each cloud, on its device; the result of each is that of `plan_grasps` alone.
 
     A cloud that `plan_grasps` refuses costs no other its grasps: its own are none, and `meta["refused"]` says why.
 
@@ -49,18 +49,21 @@ def plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any])
         request = Request(cloud, **given)
         finger_sets(request.hand, request.fingers, request.mode)
     if not workers:
-        return [_plan_or_refuse(Request(cloud, **given)) for cloud in clouds]
+        planned = (_plan_or_refuse(Request(cloud, **given)) for cloud in clouds)
+        return [grasps.to(cloud.points.device) for cloud, grasps in zip(clouds, planned, strict=True)]
     hand, spec = given["hand"], given.get("spec")
     source = HandSource(hand.source.option, hand.source.urdf_path, hand.source.sha256)
     rest = {name: value for name, value in given.items() if name not in ("hand", "spec")}
     with tempfile.TemporaryDirectory() as folder:
         files = [Path(folder) / f"{k}.safetensors" for k in range(len(clouds))]
-        tasks = [(_arrays(c), source, _plain(spec), rest, file) for c, file in zip(clouds, files, strict=True)]
+        sent = [(_arrays(cloud), str(cloud.points.device)) for cloud in clouds]
+        tasks = [(*cloud, source, _plain(spec), rest, file) for cloud, file in zip(sent, files, strict=True)]
         ended = list(run_tasks(_plan_to_file, tasks, workers, LIMIT))
-        return [
+        found = (
             load_grasps(file) if end is None else refused(Request(cloud, **given), end.sentence)
             for cloud, file, end in zip(clouds, files, ended, strict=True)
-        ]
+        )
+        return [grasps.to(cloud.points.device) for cloud, grasps in zip(clouds, found, strict=True)]
 
 
 def refused(request: Request, reason: str) -> Grasps:
@@ -88,9 +91,11 @@ def _plan_or_refuse(request: Request) -> Grasps:
         return refused(request, " ".join(str(error).split()))
 
 
-def _plan_to_file(cloud: dict[str, np.ndarray], hand: HandSource, spec: Any, rest: dict[str, Any], file: Path) -> None:
-    """Plan in a worker."""
-    points = PointCloud(**{name: torch.from_numpy(array) for name, array in cloud.items()})
+def _plan_to_file(
+    cloud: dict[str, np.ndarray], device: str, hand: HandSource, spec: Any, rest: dict[str, Any], file: Path
+) -> None:
+    """Plan in a worker, on a device."""
+    points = PointCloud(**{name: torch.from_numpy(array) for name, array in cloud.items()}).to(torch.device(device))
     loaded = load_hand(hand.urdf_path.parent, hand.option)
     _plan_or_refuse(Request(points, loaded, _restored(spec), **rest)).save(file)
 

@@ -1,0 +1,160 @@
+"""The whole chain on another device: streams, lists, other fingers, reasons, scenes, and the files that it writes."""
+
+import pytest
+import torch
+
+from tests.devices.conftest import same, sent
+from tests.devices.elsewhere import DEVICE
+from torchgrasp import (
+    ContactSpec,
+    PointCloud,
+    cloud_from_depth,
+    explain_empty,
+    load_hand,
+    load_object,
+    load_scene,
+    plan_contacts,
+    plan_grasps,
+    plan_scene,
+    stream_grasps,
+)
+from torchgrasp.cloud import (
+    check_normals,
+    cut_object,
+    diagnose_cloud,
+    estimate_normals,
+    format_report,
+    prepare_cloud,
+    remove_duplicates,
+    save_cloud,
+)
+from torchgrasp.evaluation import PERTURBATIONS, draw_object_poses, find_protocol, perturb_view
+from torchgrasp.export import (
+    format_graspgen,
+    format_grasps,
+    format_keyframes,
+    format_moveit,
+    format_trajectories,
+    grasps_from_joints,
+    largest_std,
+    save_dexgraspbench,
+    save_surface,
+)
+from torchgrasp.ik import Obstacles, collision_probability, lift_clearance
+from torchgrasp.pipeline import spread_rows, take_target
+from torchgrasp.scene import estimate_occupancy
+from torchgrasp.shape import extract_surface
+from torchgrasp.shape.completion import complete_cloud, silhouettes
+from torchgrasp.testing import random_joints
+
+SPEC, CPU = ContactSpec(table=0.0), torch.device("cpu")
+VIEW, UP = load_object("cylinder").view, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+CLOSE = torch.full((40, 40), 0.5)
+LENS = torch.tensor([[50.0, 0, 20], [0, 50, 20], [0, 0, 1]])
+
+PLANS = {
+    "stream": lambda cloud, hand: list(stream_grasps(cloud, hand, SPEC, 3)),
+    "list": lambda cloud, hand: plan_grasps([cloud], hand, SPEC, 2),
+    "any fingers": lambda cloud, hand: plan_grasps(cloud, hand, SPEC, 2, fingers="auto"),
+    "four fingers": lambda cloud, hand: plan_grasps(cloud, load_hand("allegro", 4), SPEC, 3),
+    "contacts first": lambda cloud, hand: plan_grasps(cloud, hand, SPEC, 2, mode="contact_first", ranking="variance"),
+    "paper": lambda cloud, hand: plan_grasps(cloud, hand, ContactSpec.paper(), 2, mode="paper"),
+}
+CLOUDS = {
+    "remove_duplicates": remove_duplicates,
+    "prepare_cloud": lambda cloud: prepare_cloud(cloud, torch.Generator().manual_seed(0)),
+    "cut_object": lambda cloud: cut_object(cloud, UP.to(cloud.points)),
+    "cloud_from_depth": lambda cloud: cloud_from_depth(CLOSE.to(cloud.points), LENS.to(cloud.points)),
+    **{f"perturb_view, {name}": lambda cloud, x=x: perturb_view(cloud, x, 0) for name, x in PERTURBATIONS.items()},
+}
+TEXTS = {
+    "grasps": lambda hand, grasps: format_grasps(hand, grasps),
+    "keyframes": lambda hand, grasps: format_keyframes(hand, grasps),
+    "moveit": lambda hand, grasps: format_moveit(hand, grasps),
+    "trajectories": lambda hand, grasps: format_trajectories(hand, grasps),
+    "graspgen": lambda hand, grasps: format_graspgen(grasps, "object.obj"),
+}
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_grasps_of_every_kind_are_where_the_cloud_is(device, hand, name):
+    same(PLANS[name](sent(VIEW), hand), PLANS[name](VIEW, hand))
+
+
+def test_a_worker_plans_where_its_cloud_is(device, hand, monkeypatch):
+    """The workers are played by this process, which alone knows the pretended device."""
+    serial = lambda function, tasks, workers, limit: [function(*task) for task in tasks]  # noqa: E731
+    monkeypatch.setattr("torchgrasp.pipeline.many.run_tasks", serial)
+    expected = plan_grasps([VIEW], hand, SPEC, 2)
+    device.places.clear()
+    same(plan_grasps([sent(VIEW)], hand, SPEC, 2, workers=1), expected)
+    assert any(place.startswith("ik/") for place in device.places)
+    refused = plan_grasps([sent(PointCloud(1e-4 * VIEW.points, None, VIEW.viewpoint))], hand, SPEC, 2)[0]
+    assert "refused" in refused.meta and refused.joints.device == DEVICE
+
+
+def test_the_reason_for_no_grasp_is_the_same(device, hand):
+    uncertain = ContactSpec(table=0.0, max_variance=1e-6)
+    assert str(explain_empty(sent(VIEW), hand, uncertain, 2)) == str(explain_empty(VIEW, hand, uncertain, 2))
+
+
+def test_things_of_a_scene_are_planned_where_it_is(device, hand):
+    scene = load_scene()
+    same(take_target(sent(scene).select(1), 0), take_target(scene.select(1), 0))
+    there = plan_scene(sent(scene), hand, starts=2, enough=0.01)
+    assert all(thing.grasps is None or thing.grasps.joints.device == DEVICE for thing in there.things)
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_clouds(device, name):
+    same(CLOUDS[name](sent(VIEW)), CLOUDS[name](VIEW))
+
+
+def test_completion_is_on_the_cpu(device):
+    seen = estimate_normals(VIEW)
+    same(silhouettes(sent(seen)), silhouettes(seen), CPU)
+    same(complete_cloud(sent(seen), 0.0), complete_cloud(seen, 0.0), CPU)
+
+
+def test_words_about_a_cloud_are_the_same(device):
+    seen = estimate_normals(VIEW)
+    assert str(check_normals(sent(seen))) == str(check_normals(seen))
+    assert format_report(diagnose_cloud(sent(seen), sent(UP))) == format_report(diagnose_cloud(seen, UP))
+
+
+def test_obstacles_are_asked_where_they_are(device, hand, shape, grasps):
+    obstacles = Obstacles.of(estimate_occupancy(load_scene(), 1))
+    vertices = extract_surface(shape, 24).vertices
+    found = collision_probability(sent(hand), sent(grasps), sent(obstacles))
+    same(found, collision_probability(hand, grasps, obstacles))
+    assert lift_clearance(sent(vertices), sent(obstacles)) == lift_clearance(vertices, obstacles)
+    same(spread_rows(plan_contacts(sent(shape), SPEC, 6), 3), spread_rows(plan_contacts(shape, SPEC, 6), 3))
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_what_is_written_is_the_same_wherever_hand_and_grasps_are(device, hand, grasps, name):
+    expected = TEXTS[name](hand, grasps)
+    for one, other in ((hand, sent(grasps)), (sent(hand), grasps), (sent(hand), sent(grasps))):
+        assert TEXTS[name](one, other) == expected
+
+
+def test_files_are_the_same(device, shape, tmp_path):
+    surface, hand = extract_surface(shape, 24), load_hand("allegro")
+    there, here = (tmp_path / name for name in ("there", "here"))
+    joints, pose = random_joints(hand, 1, 0), torch.eye(4, dtype=torch.float64)[None]
+    grasps = grasps_from_joints(hand, joints, pose)
+    same(grasps_from_joints(sent(hand), sent(joints), sent(pose)), grasps, CPU)
+    for folder, to in ((there, sent), (here, lambda x: x)):
+        folder.mkdir()
+        save_surface(to(surface), folder / "surface.ply")
+        save_cloud(to(VIEW), folder / "cloud.ply")
+        save_dexgraspbench(hand, to(grasps), folder / "bench", "object")
+    assert largest_std(sent(surface)) == pytest.approx(largest_std(surface))
+    for name in ("surface.ply", "cloud.ply", "bench/0.npy"):
+        assert (there / name).read_bytes() == (here / name).read_bytes()
+
+
+def test_trials_are_drawn_on_the_cpu(device):
+    noise, pivot = find_protocol("pose-noise").noise, torch.ones(3)
+    assert noise is not None
+    same(draw_object_poses(noise, sent(pivot), 3, 0), draw_object_poses(noise, pivot, 3, 0), CPU)
