@@ -1,0 +1,54 @@
+"""Trials of misplaced objects: errors are of the size they are named by, and a campaign goes on where it was."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+import trimesh
+from benchmarks.close import misplaced
+from paper.trials import Subject, TableSpec
+from scipy.spatial.transform import Rotation
+
+from tests.pinch import cylinder, pinch
+from torchgrasp.base import join
+from torchgrasp.errors import Status
+from torchgrasp.frames import inverse
+
+
+@pytest.mark.parametrize("condition", ["in place", "20 mm", "10 degrees", "afloat, 10 mm"])
+def test_the_object_is_off_by_what_the_condition_says_and_stays_on_its_table(condition):
+    wrong, mesh, (_, grasp) = misplaced.CONDITIONS[condition], cylinder((0.02, 0.01)), pinch("allegro")
+    planned, centre = grasp.obj_from_hand[0].double(), torch.tensor([*mesh.center_mass, 1.0])
+    for seed in range(20):
+        error = misplaced._misplace(wrong, grasp, mesh, seed)
+        moved = planned @ inverse(planned @ error)  # of the object, in the frame in which the hand stands as planned
+        assert float((moved @ centre - centre).norm()) == pytest.approx(wrong.distance, abs=1e-9)
+        turned = Rotation.from_matrix(moved[:3, :3].numpy()).as_rotvec()
+        assert math.hypot(*turned) == pytest.approx(wrong.angle, abs=1e-7)
+        if not wrong.afloat:
+            assert abs(float((moved @ centre - centre)[2])) < 1e-9 and abs(turned[:2]).max() < 1e-9
+
+
+def test_what_was_tried_is_kept_and_only_the_rest_is_tried_anew(tmp_path, monkeypatch):
+    _, grasp = pinch("allegro")
+    mesh, tried = trimesh.creation.icosphere(2, 0.03), []
+
+    def run(trial, wrong, law, mass, seed):
+        tried.append((law, float(trial.error[0, 3])))
+        return Status.OK, 1.0, 0.1
+
+    monkeypatch.setattr(misplaced, "_run", run)
+    monkeypatch.setattr(misplaced, "_plan", lambda *_: join([grasp, grasp, grasp]))
+    monkeypatch.setattr(misplaced, "_read_solid", lambda *_: (mesh, [mesh]))
+    monkeypatch.setattr(misplaced, "list_views", lambda *_, **__: [("ball", "view0")])
+    monkeypatch.setattr(misplaced, "read_mass", lambda *_: None)
+    spec = TableSpec(tmp_path, (tmp_path,), hands=("allegro",), own=False, grasps=3, starts=20, workers=0, seed=0)
+    subject = Subject(Path(tmp_path), "ball", "balls", "solid")
+    first = misplaced.try_object(spec, subject, "allegro", "20 mm", ("uncertainty",))
+    assert [one["rank"] for one in first] == [0, 1, 2] and len(tried) == 3
+    both = misplaced.try_object(spec, subject, "allegro", "20 mm", ("uncertainty", "open_loop"))
+    assert len(both) == 6 and len(tried) == 6
+    assert misplaced.try_object(spec, subject, "allegro", "20 mm", ("uncertainty",)) == first
+    errors = [error for _, error in tried]
+    assert errors[:3] == errors[3:] and len(set(errors)) == 3  # laws are paired, grasps are not alike
