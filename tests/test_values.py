@@ -32,6 +32,13 @@ def test_raise_for_status_counts_the_failures():
         plan([0, 14, 14]).raise_for_status()
 
 
+def test_contacts_of_two_precisions_are_refused():
+    single, double = torch.rand(2, 3, 3), torch.rand(2, 3, 3, dtype=torch.float64)
+    for wrong in ((single, double), (double, single), (double, double, None, single[..., 0])):
+        with pytest.raises(BadArgument, match=r"contacts: found torch\.float32 beside torch\.float64"):
+            Contacts(*wrong)
+
+
 def test_count_status_puts_the_most_frequent_first():
     assert list(count_status(torch.tensor([0, 13, 13]))) == [Status.NOT_CLOSED, Status.OK]
 

@@ -115,13 +115,19 @@ class Contacts(Batch):
     """Three to five contacts a row, one for each fingertip: `points` [m] and outward unit `normals`.
 
     `variance` (Eq. 12, normalised units) and `std_m` [m] say how uncertain the surface is there. They are None where
-    nobody knows, as for contacts of another planner.
+    nobody knows, as for contacts of another planner. All have one dtype.
     """
 
     points: Annotated[Float[Tensor, "b f 3"], ANY]
     normals: Annotated[Float[Tensor, "b f 3"], ANY]
     variance: Annotated[Float[Tensor, "b f"], ANY] | None = None
     std_m: Annotated[Float[Tensor, "b f"], ANY] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse tensors of two precisions: torch would, in words of its own and much later."""
+        found = {str(x.dtype) for x in (self.points, self.normals, self.variance, self.std_m) if x is not None}
+        if len(found) > 1:
+            raise BadArgument("contacts", " beside ".join(sorted(found)), "one dtype for all")
 
     @property
     def fingertips(self) -> int:
