@@ -118,6 +118,7 @@ def toml_corpus(good: str) -> dict[str, str | bytes]:
         "deep": good + "x = " + "[" * 50_000 + "]" * 50_000,
         "key twice": good.replace('name = "claw"', 'name = "claw"\nname = "claw"'),
         "2 MB": good + "# " + "x" * 2_000_000,
+        "a key of 20,000 parts": ".".join("a" * 20_000) + " = 1\n" + good,
         "urdf outside": good.replace('"claw.urdf"', '"../secret.urdf"'),
         "urdf by a path": good.replace('"claw.urdf"', '"/etc/passwd"'),
         "urdf by a link": good.replace('"claw.urdf"', '"link.urdf"'),

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 import sys
 from collections.abc import Callable, Collection
 from pathlib import Path
@@ -22,6 +23,12 @@ SUPPORTED = "three to five different fingers"
 
 MAX_BYTES = 1024 * 1024
 """Largest hand.toml; those of the shipped hands have about 5 kB."""
+
+
+_DOTTED = re.compile(
+    r"""(?<![\w"'-])(?:[\w-]+|"[^"\n]*"|'[^'\n]*')(?:[ \t]*\.[ \t]*(?:[\w-]+|"[^"\n]*"|'[^'\n]*')){16}"""
+)
+"""A key of more than 16 parts: the reader of TOML takes memory by their square, 2 GB for 20,000. Ours have two."""
 
 
 class Pad(NamedTuple):
@@ -160,7 +167,10 @@ def read_hand_toml(path: Path | str, fingers: Fingers = "default") -> HandSpec:
     path = Path(path)
     data = read_bounded("hand.toml", path, "a hand.toml", MAX_BYTES)
     try:
-        top = _Table(path, "", tomllib.loads(data.decode("utf-8")))
+        text = data.decode("utf-8")
+        if _DOTTED.search(text):
+            raise HandFileError("hand.toml", f"{path}: a key of more than 16 parts", "keys of one or two")
+        top = _Table(path, "", tomllib.loads(text))
     except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
         raise HandFileError("hand.toml", f"{path}: {error}", "valid TOML in UTF-8") from error
     name, base_link, approach = top.text("name"), top.text("base_link"), top.triple("approach")
