@@ -1,0 +1,167 @@
+"""Memory, open files and threads over many plans and trials in one process; the memory of large inputs."""
+
+import gc
+import os
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.common import Row, measure, peak_mib
+from torchgrasp import (
+    ContactSpec,
+    PointCloud,
+    TrialSpec,
+    close_hand,
+    fit_shape,
+    list_objects,
+    load_hand,
+    load_object,
+    plan_contacts,
+    plan_grasps,
+)
+from torchgrasp.errors import Status
+from torchgrasp.linalg import unit
+from torchgrasp.specs import Simulator
+
+SUBJECTS = ("plans", "trials", "points", "starts")
+SPEC = ContactSpec(table=0.0)
+STARTS = 48
+"""Of a plan that is repeated: three waves."""
+WARM = 0.2
+"""Share of the calls after which memory must no longer grow: pools and caches have filled."""
+GROWTH = 0.05
+"""Bar: growth of the resident memory from then to the end, by a line through all readings."""
+
+
+def load(
+    only: tuple[str, ...] = SUBJECTS,
+    hand: str = "allegro",
+    plans: int = 500,
+    trials: int = 2000,
+    points: int = 2_000_000,
+    starts: int = 100_000,
+    simulator: Simulator = "sapien",
+    out: Path = Path("out/bench_load.json"),
+) -> None:
+    """Measure what a process holds after many calls, and at most within a large one. Needs /proc, as Linux has it.
+
+    Args:
+        only: subjects to measure: plans, trials, points, starts.
+        hand: that grasps.
+        plans: number of plans in one process, on the shipped objects in turn.
+        trials: number of grasps closed and lifted in one process.
+        points: of one cloud.
+        starts: of one contact plan.
+        simulator: of the trials.
+        out: where the numbers are written as JSON.
+    """
+    torch.set_num_threads(1)
+    subjects = {
+        "plans": partial(_plans, hand, plans),
+        "trials": partial(_trials, hand, trials, simulator),
+        "points": partial(_points, hand, points),
+        "starts": partial(_starts, starts),
+    }
+    settings = {"hand": hand, "plans": plans, "trials": trials, "points": points, "starts": starts}
+    measure("load", subjects, only, settings | {"simulator": simulator}, out)
+
+
+def _plans(hand: str, n: int) -> list[Row]:
+    """Plan again and again."""
+    model, views = load_hand(hand), [load_object(name).view for name in list_objects()]
+    return [_repeated("plans", n, lambda k: plan_grasps(views[k % len(views)], model, SPEC, STARTS, seed=k))]
+
+
+def _trials(hand: str, n: int, simulator: Simulator) -> list[Row]:
+    """Close and lift again and again."""
+    model, jug = load_hand(hand), load_object("jug")
+    grasps = plan_grasps(jug.view, model, SPEC, STARTS)
+    grasps = grasps[grasps.status == Status.OK]
+    spec = TrialSpec(hold_time=0.1, simulator=simulator)
+
+    def once(k: int) -> object:
+        return close_hand(grasps[k % len(grasps)], model, jug.mesh, spec, seed=k, parts=jug.parts)
+
+    return [_repeated(f"trials in {simulator}", n, once)]
+
+
+def _repeated(what: str, n: int, once: Callable[[int], object]) -> Row:
+    """Call n times; read memory, open files and threads 50 times."""
+    read: list[tuple[int, float, int, int]] = []
+    began = time.process_time()
+    for k in range(n):
+        once(k)
+        if (k + 1) % max(n // 50, 1) == 0:
+            gc.collect()
+            read.append((k + 1, resident_mib(), _count("fd"), _count("task")))
+    warm = [row for row in read if row[0] >= WARM * n]
+    calls, memory = np.array([row[0] for row in warm]), np.array([row[1] for row in warm])
+    slope = float(np.polyfit(calls, memory, 1)[0])
+    growth = slope * (n - WARM * n) / memory[0]
+    more = [warm[-1][i] - warm[0][i] for i in (2, 3)]
+    seconds = (time.process_time() - began) / n
+    measured = (
+        f"{memory[0]:.0f} MiB after {WARM:.0%}, then {growth:+.1%} ({1024 * slope:+.1f} KiB a call),"
+        f" {more[0]:+d} files, {more[1]:+d} threads; {seconds:.2f} s each"
+    )
+    numbers = {"read": read, "slope_kib": 1024 * slope, "growth": growth, "files": more[0], "threads": more[1]}
+    sound = growth <= GROWTH and more == [0, 0]
+    return Row(f"{n} {what} in one process", f"at most +{GROWTH:.0%}, no file, no thread", measured, sound, numbers)
+
+
+def _points(hand: str, n: int) -> list[Row]:
+    """Plan on one cloud of many points, beside one of 1 % of them."""
+    model, rows = load_hand(hand), []
+    for count in (n // 100, n):
+        cloud = _egg(count)
+        rows.append(_peak(f"a cloud of {len(cloud):,} points", lambda: plan_grasps(cloud, model, SPEC, STARTS)))  # noqa: B023
+    return rows
+
+
+def _starts(n: int) -> list[Row]:
+    """Plan contacts from many starts at once, beside 1 % of them."""
+    shape = fit_shape(load_object("jug").view, table=0.0)
+    return [
+        _peak(f"{count:,} starts", lambda: plan_contacts(shape, SPEC, starts=count))  # noqa: B023
+        for count in (n // 100, n)
+    ]
+
+
+def _peak(what: str, action: Callable[[], object]) -> Row:
+    """Call once; return time, and the memory that it took at most."""
+    gc.collect()
+    Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
+    before, began = resident_mib(), time.process_time()
+    action()
+    seconds, most = time.process_time() - began, (peak_mib() or 0.0) - before
+    return Row(what, "-", f"{seconds:.1f} s, {most:.0f} MiB more", None, {"seconds": seconds, "mib": most})
+
+
+def _egg(n: int) -> PointCloud:
+    """One side of an ellipsoid of 60 x 60 x 120 mm on the table, from a camera 0.5 m away, noise 0.5 mm."""
+    generator = torch.Generator().manual_seed(0)
+
+    def draw() -> Tensor:
+        return torch.randn(2 * n, 3, generator=generator, dtype=torch.float64)
+
+    axes, eye = torch.tensor([0.03, 0.03, 0.06]).double(), torch.tensor([0.5, 0.0, 0.3]).double()
+    on = unit(draw())
+    points = on * axes + torch.tensor([0.0, 0.0, 0.06]).double()
+    seen = (on / axes * (eye - points)).sum(1) > 0
+    return PointCloud((points + 5e-4 * draw())[seen], None, eye)
+
+
+def resident_mib() -> float:
+    """Return the resident memory of this process [MiB]."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def _count(what: str) -> int:
+    """Count open files ("fd") or threads ("task") of this process."""
+    return len(os.listdir(f"/proc/self/{what}"))
