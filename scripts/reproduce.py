@@ -28,7 +28,7 @@ from paper.tables6_7 import table6, table7
 from PIL import Image, ImageDraw, ImageFont
 
 from torchgrasp import PointCloud, ShapeGP, fit_shape, list_objects, load_object
-from torchgrasp.files import write_atomically
+from torchgrasp.files import write_file
 from torchgrasp.report.canvas import Canvas, draw_bar, map_colors
 from torchgrasp.report.palette import INK, PAPER
 from torchgrasp.report.pictures import rotated, view_of
@@ -83,7 +83,7 @@ def fig4(out: Path, seed: int = 0) -> None:
     for row, title in enumerate(ROWS):
         pen.text((12, row * TILE[1] + 10), title, INK, font)
     draw_bar(sheet, "standard deviation of the surface [mm]", most, "viridis")
-    write_atomically(out / "fig4.png", lambda path: sheet.save(path, format="PNG"))
+    write_file(out / "fig4.png", lambda file: sheet.save(file, format="PNG"))
     print(out / "fig4.png")
 
 

@@ -1,7 +1,11 @@
 """Safetensors files: round trip, refusals, atomic writes."""
 
 import dataclasses
+import fcntl
 import os
+import resource
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -9,7 +13,18 @@ from safetensors.torch import save_file
 
 from torchgrasp.base import named_tensors
 from torchgrasp.errors import ModelFileError, OutputError
-from torchgrasp.files import LOCK, hold_folder, load_tensors, save_tensors, sha256, write_atomically
+from torchgrasp.files import (
+    LOCK,
+    MOST_BYTES,
+    hold_file,
+    hold_folder,
+    load_tensors,
+    save_tensors,
+    sha256,
+    temporary_folder,
+    write_file,
+)
+from torchgrasp.files.hold import TEMPORARY
 from torchgrasp.frames import rigid, rotation_from_vector
 from torchgrasp.values import Certificate, Contacts, Grasps, load_grasps
 
@@ -122,21 +137,68 @@ def test_unequal_rows_are_refused(tmp_path):
 def test_a_failed_write_leaves_the_old_file_and_no_debris(tmp_path):
     path = save_tensors(tmp_path / "f", "toy", {"a": torch.zeros(1)}, {})
     before = path.read_bytes()
-
-    def fail(temporary):
-        temporary.write_bytes(b"half")
-        raise OSError(28, "No space left on device")
-
-    with pytest.raises(OutputError, match="No space left"):
-        write_atomically(path, fail)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        with pytest.raises(OutputError, match="File too large"):
+            write_file(path, bytes(5000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["f"]
+
+
+def test_a_file_may_be_written_by_a_function(tmp_path):
+    write_file(tmp_path / "f", lambda file: file.write(b"some") + file.write(b" bytes"))
+    assert (tmp_path / "f").read_bytes() == b"some bytes"
+
+
+def test_only_what_dead_processes_left_is_removed(tmp_path):
+    """What another thread or process is writing now stays, and so do files of other names."""
+    dead, alive, other = (tmp_path / name for name in (".f.dead.part", ".f.alive.part", ".g.dead.part"))
+    for path in (dead, alive, other):
+        path.write_bytes(b"half")
+    with alive.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        write_file(tmp_path / "f", "whole")
+    assert {path.name for path in tmp_path.iterdir()} == {"f", alive.name, other.name}
+
+
+def test_many_writers_of_one_file_leave_one_of_theirs_whole(tmp_path):
+    contents = [bytes([k]) * 100_000 for k in range(40)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda content: write_file(tmp_path / "f", content), contents))
+    assert (tmp_path / "f").read_bytes() in contents and os.listdir(tmp_path) == ["f"]
+
+
+def test_temporary_folders_of_dead_processes_are_removed_and_of_living_ones_are_not(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    (tmp_path / f"{TEMPORARY}dead").mkdir()
+    (tmp_path / f"{TEMPORARY}dead" / "hand.urdf").write_text("<robot/>")
+    with temporary_folder() as one, temporary_folder() as two:
+        assert {path.name for path in tmp_path.iterdir()} == {one.name, two.name}
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_file_is_held_by_one_run_and_its_folder_left_as_it_was(tmp_path):
+    path = tmp_path / "new" / "model.safetensors"
+    with hold_file(path), hold_file(path.with_name("other")):
+        with pytest.raises(OutputError, match=r"path: found .*model\.safetensors, in use by"), hold_file(path):
+            pytest.fail("held twice")
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_file_of_no_reasonable_size_is_refused_unread(tmp_path):
+    with save_tensors(tmp_path / "f", "toy", {"a": torch.zeros(1)}, {}).open("ab") as file:
+        file.truncate(3 * MOST_BYTES)
+    with pytest.raises(ModelFileError, match="at most"):
+        load_tensors(tmp_path / "f", "toy", {"a"})
 
 
 def test_a_file_in_the_place_of_a_folder_is_named(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(OutputError, match="writable folder"):
-        write_atomically(tmp_path / "file" / "x", lambda p: None)
+        write_file(tmp_path / "file" / "x", "")
 
 
 def test_a_folder_is_held_by_one_run_and_left_as_it_was(tmp_path):

@@ -32,6 +32,13 @@ def one_face_turned():
     return trimesh.Trimesh(box.vertices, faces, process=False)
 
 
+def one_body_turned():
+    """A box, and apart from it a smaller one inside out: the volume is positive, and the inertia is not."""
+    box, turned = trimesh.creation.box((0.1, 0.1, 0.1)), trimesh.creation.box((0.08, 0.08, 0.08))
+    turned.invert()
+    return trimesh.util.concatenate([box, turned.apply_translation((0.3, 0.0, 0.0))])
+
+
 def not_finite():
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     vertices = np.array(box.vertices)
@@ -47,12 +54,38 @@ def not_finite():
         (not_finite, "non-finite"),
         (flat, "volume"),
         (one_face_turned, "volume"),
+        (one_body_turned, "without inertia"),
         (lambda: trimesh.Trimesh(), "of 0 faces"),
     ],
 )
 def test_bad_meshes_are_refused(mesh, reason):
     with pytest.raises(MeshError, match=reason):
         read_mesh(mesh())
+
+
+def test_a_hollow_body_is_sound():
+    hole = trimesh.creation.box((0.08, 0.08, 0.08))
+    hole.invert()
+    assert read_mesh(trimesh.util.concatenate([trimesh.creation.box((0.1, 0.1, 0.1)), hole])).volume < 0.001
+
+
+def test_groups_and_materials_of_an_obj_are_left_out(tmp_path):
+    """Their reading took minutes; a corner with two textures made the surface open."""
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    corners = "".join(f"v {x} {y} {z}\n" for x, y, z in box.vertices) + "vt 0 0\nvt 1 0\nvt 0 1\n"
+    faces = "".join(f"o {k}\nusemtl {k}\nf {a + 1}/1 {b + 1}/2 {c + 1}/3\n" for k, (a, b, c) in enumerate(box.faces))
+    empty = "".join(f"g {k}\nusemtl {k}\n" for k in range(20_000))
+    (tmp_path / "box.obj").write_text(f"mtllib /dev/zero\n{corners}{faces}{empty}")
+    mesh = read_mesh(tmp_path / "box.obj")
+    assert mesh.volume == pytest.approx(0.001) and len(mesh.vertices) == 8
+
+
+@pytest.mark.parametrize("suffix", [".zip", ".3mf", ".dae", ".gltf", ".xyz", ""])
+def test_a_file_that_packs_or_names_others_is_no_mesh(tmp_path, suffix):
+    path = tmp_path / f"box{suffix}"
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(path, file_type="ply")
+    with pytest.raises(MeshError, match=r"no such file, allowed is a mesh file \(\.obj"):
+        read_mesh(path)
 
 
 @pytest.mark.parametrize("size", [1e-4, 10.0])

@@ -8,12 +8,14 @@ import numpy as np
 from torchgrasp.cloud.check import MAX_EXTENT, MIN_EXTENT
 from torchgrasp.errors import MeshError, SuspiciousScale
 from torchgrasp.files import is_file
+from torchgrasp.files.meshes import SUFFIXES, load_triangles
 
 if TYPE_CHECKING:
     import trimesh
 
 MAX_BYTES, MAX_FACES = 50 * 1024 * 1024, 500_000
 """Largest file and mesh of an object, as of a hand's: scans of household things have at most 100,000 faces."""
+MESH_FILE = f"a mesh file ({', '.join(SUFFIXES)})"
 LEAST_VOLUME = 1e-12
 """Volume [m^3] from which on a mesh is a body: a cube of 0.1 mm."""
 
@@ -22,8 +24,8 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
     """Return a closed mesh [m], checked and never repaired.
 
     Raises:
-        MeshError: no mesh in the file, or more than `MAX_BYTES` or `MAX_FACES`; non-finite vertices, an open surface,
-            faces that are not all turned outward, or no volume.
+        MeshError: no mesh in the file, another format than `SUFFIXES`, or more than `MAX_BYTES` or `MAX_FACES`;
+            non-finite vertices, an open surface, faces that are not all turned outward, or no volume.
         SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; most often the unit is mm.
 
     >>> import trimesh
@@ -34,15 +36,15 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
 
     name = "a mesh"
     if not isinstance(mesh, trimesh.Trimesh):
+        if not is_file(mesh) or Path(mesh).suffix.lower() not in SUFFIXES:
+            raise MeshError("mesh", f"{mesh}, which is no {'such ' * is_file(mesh)}file", MESH_FILE)
         path, name = Path(mesh), str(mesh)
-        if not is_file(path):
-            raise MeshError("mesh", f"{path}, which is no file", "a mesh file (ply, obj, stl, ...)")
         if path.stat().st_size > MAX_BYTES:
             raise MeshError("mesh", f"{path} of {path.stat().st_size} bytes", f"at most {MAX_BYTES} bytes")
         try:
-            loaded = trimesh.load_mesh(path)
+            loaded = load_triangles(path.read_bytes(), path.suffix.lower())
         except Exception as error:  # the readers of trimesh raise whatever their format runs into
-            raise MeshError("mesh", f"{path}: {error}", "a mesh file (ply, obj, stl, ...)") from error
+            raise MeshError("mesh", f"{path}: {error}", MESH_FILE) from error
         if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
             raise MeshError("mesh", f"{path}, which holds no faces", "a closed triangle mesh")
         mesh = loaded
@@ -65,6 +67,8 @@ def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
         volume = mesh.volume
     if not (mesh.is_winding_consistent and volume > LEAST_VOLUME):
         raise MeshError("mesh", f"{name} of volume {volume:.3g} m^3", "a positive volume, faces turned outward")
+    if not np.linalg.eigvalsh(mesh.moment_inertia).min() > 0:  # a simulator cannot move it
+        raise MeshError("mesh", f"{name} without inertia, as of a body turned inward", "every face turned outward")
 
 
 def closest_on_triangles(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from torchgrasp import load_hand
-from torchgrasp.files import write_atomically, write_file
+from torchgrasp.files import write_file
 from torchgrasp.posture_model.sample import sample_configurations
 from torchgrasp.posture_model.selection import BicCurve, CrossValidation, bic_curve, cross_validate
 
@@ -78,5 +78,5 @@ def draw_selection(curves: dict[str, tuple[BicCurve, CrossValidation]], out: Pat
             axis.grid(alpha=0.3)
         row[0].legend()
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(out, lambda path: figure.savefig(path, format="png", dpi=110))
+    write_file(out, lambda file: figure.savefig(file, format="png", dpi=110))
     print(out)

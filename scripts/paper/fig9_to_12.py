@@ -25,7 +25,7 @@ from torchgrasp import (
     plan_contacts,
     plan_grasps,
 )
-from torchgrasp.files import write_atomically
+from torchgrasp.files import write_file
 from torchgrasp.frames import virtual_frame
 from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.clearance import CollisionWorld
@@ -154,7 +154,7 @@ def save(rows: list[list[tuple[Taken, int]]], path: Path) -> None:
             (corner[0] + 10, corner[1] + 8), f"{taken.chain}{taken.hand.name}, tips within {worst:.2f} mm", INK, font
         )
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda temporary: sheet.save(temporary, format="PNG"))
+    write_file(path, lambda file: sheet.save(file, format="PNG"))
     print(path)
 
 

@@ -23,7 +23,7 @@ from torchgrasp import (
     load_object,
     plan_contacts,
 )
-from torchgrasp.files import write_atomically, write_file
+from torchgrasp.files import write_file
 from torchgrasp.linalg import farthest_points
 from torchgrasp.plan.closure_probability import closure_probability
 from torchgrasp.report.canvas import Canvas, draw_bar, map_colors
@@ -149,7 +149,7 @@ def fig5(out: Path, starts: int = 300, seed: int = 0) -> None:
         pen.text((column * TILE[0] + 12, 8), name, INK, font)
     draw_bar(sheet, "standard deviation of the surface [mm]", most, "viridis")
     out.mkdir(parents=True, exist_ok=True)
-    write_atomically(out / "fig5.png", lambda path: sheet.save(path, format="PNG"))
+    write_file(out / "fig5.png", lambda file: sheet.save(file, format="PNG"))
     print(out / "fig5.png")
 
 

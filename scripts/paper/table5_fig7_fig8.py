@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchgrasp import Hand, load_hand, load_mixture
-from torchgrasp.files import write_atomically, write_file
+from torchgrasp.files import write_file
 from torchgrasp.posture_model.encoding import encode_fingertips
 from torchgrasp.posture_model.sample import sample_configurations
 from torchgrasp.report.canvas import Canvas, Direction
@@ -161,7 +161,7 @@ def fig8(out: Path, n: int = 100_000, seed: int = 1) -> None:
     axes.legend(frameon=False, loc="upper right")
     axes.spines[["top", "right"]].set_visible(False)
     out.mkdir(parents=True, exist_ok=True)
-    write_atomically(out / "fig8.png", lambda path: figure.savefig(path, format="png"))
+    write_file(out / "fig8.png", lambda file: figure.savefig(file, format="png"))
     for name, error, deviation in zip(errors.hand.joint_names, mean, spread, strict=True):
         print(f"{name:10}{error:8.3f} +- {deviation:.3f}")
     print(f"mean {mean.mean():.3f} rad; the median of nearest codes {floor:.3f}; the paper: about {PUBLISHED_ALLEGRO}")
@@ -182,7 +182,7 @@ def draw_both(hand: Hand, true: Float[Tensor, "h"], predicted: Float[Tensor, "h"
 def _save(sheet: Image.Image, path: Path) -> None:
     """Write a picture and print its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda temporary: sheet.save(temporary, format="PNG"))
+    write_file(path, lambda file: sheet.save(file, format="PNG"))
     print(path)
 
 

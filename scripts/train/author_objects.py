@@ -9,7 +9,7 @@ import trimesh
 from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view
 from torchgrasp.cloud.io.read import save_cloud
 from torchgrasp.cloud.render import render_depth
-from torchgrasp.files import write_atomically, write_file
+from torchgrasp.files import write_file
 from torchgrasp.objects import DATA, SCENE, list_objects
 
 VIEWS = {"cylinder": (20.0, 30.0), "jug": (60.0, 35.0), "rabbit": (55.0, 30.0), "spray": (50.0, 25.0)}
@@ -38,7 +38,7 @@ def scene() -> None:
         "labels": labels.numpy().astype(np.uint8),
         "table": np.array([0.0, 0.0, 1.0, 0.0]),
     }
-    write_atomically(SCENE, lambda path: np.savez_compressed(path, **arrays))
+    write_file(SCENE, lambda file: np.savez_compressed(file, **arrays))
     print(f"{SCENE}: {', '.join(placed.names)}")
 
 
@@ -58,7 +58,7 @@ def write_object(name: str) -> None:
         "corners": np.concatenate(parts).astype(np.float32),
         "counts": np.array([len(p) for p in parts], dtype=np.int32),
     }
-    write_atomically(DATA / name / "parts.npz", lambda path: np.savez_compressed(path, **columns))
+    write_file(DATA / name / "parts.npz", lambda file: np.savez_compressed(file, **columns))
     azimuth, elevation = VIEWS[name]
     save_cloud(partial_view(mesh, look_at(azimuth, elevation, target=mesh)), DATA / name / "view.ply")
     print(f"{name}: {len(mesh.faces)} faces, {mesh.volume * 1e6:.0f} cm3, {len(parts)} parts")

@@ -1,8 +1,10 @@
 """A command that is told to end: what it held is let go, and its exit code says why."""
 
+import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -38,3 +40,47 @@ def test_a_command_that_is_told_to_end_says_so_and_leaves_nothing(tmp_path: Path
     _, told = run.communicate()
     assert (run.returncode, told) == (code, f"torchgrasp: {said}\n")
     assert list(tmp_path.iterdir()) == []
+
+
+WORKING = """
+import os, sys, time
+from pathlib import Path
+from torchgrasp import cli
+from torchgrasp.pipeline.pool import run_tasks
+
+def tell_and_sleep(path):
+    Path(path + ".part").write_text(str(os.getpid()))
+    os.rename(path + ".part", path)
+    time.sleep(3600)
+
+def work(out: Path) -> int:
+    list(run_tasks(tell_and_sleep, [(str(out / name),) for name in "ab"], workers=2, limit=3600))
+    return 0
+
+if __name__ == "__main__":
+    cli.COMMANDS["work"] = work
+    sys.exit(cli.main(["work", "--out", sys.argv[1]]))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.parametrize(("sign", "code", "said"), [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")])
+def test_workers_that_are_told_to_end_with_their_command_say_nothing(tmp_path: Path, sign: str, code: int, said: str):
+    """A terminal sends Ctrl-C to all processes of a command."""
+    pytest.importorskip("pebble")
+    (tmp_path / "script.py").write_text(WORKING)
+    command = [sys.executable, str(tmp_path / "script.py"), str(tmp_path)]
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    marks = [tmp_path / "a", tmp_path / "b"]
+    while run.poll() is None and not all(mark.exists() for mark in marks):
+        time.sleep(0.05)
+    workers = [int(mark.read_text()) for mark in marks]
+    os.killpg(run.pid, getattr(signal, sign))
+    _, told = run.communicate()
+    assert (run.returncode, told) == (code, f"torchgrasp: {said}\n")
+    while any(Path(f"/proc/{worker}").exists() for worker in workers):  # one that stayed ends the test by its time
+        time.sleep(0.05)

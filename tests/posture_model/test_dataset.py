@@ -104,7 +104,7 @@ def test_half_a_chunk_is_never_taken_for_a_whole_one(tmp_path, small):
         chunk.write_bytes(damaged)
         with pytest.raises(ModelFileError, match="chunk-000001"):
             load_samples(tmp_path).read()
-        (tmp_path / ".chunk-000001.safetensors.abc.safetensors").write_bytes(damaged)  # of a run that was killed
+        (tmp_path / ".chunk-000001.safetensors.abc.part").write_bytes(damaged)  # of a run that was killed
         write_samples(hand, SampleSpec(1100), tmp_path)
         assert contents(tmp_path) == whole
 
@@ -136,7 +136,7 @@ def test_a_full_disk_leaves_nothing_half_written_and_the_run_goes_on_later(tmp_p
         write_samples(hand, SampleSpec(1100), tmp_path / "full")
 
 
-@pytest.mark.parametrize("half", [".samples.json.abc123.json", ".chunk-000000.safetensors.abc123.safetensors"])
+@pytest.mark.parametrize("half", [".samples.json.abc123.part", ".chunk-000000.safetensors.abc123.part"])
 def test_a_run_killed_between_a_temporary_file_and_its_name_is_continued(tmp_path, small, half):
     (tmp_path / half).write_text("{")
     write_samples(load_hand("barrett"), SampleSpec(600), tmp_path)

@@ -5,6 +5,7 @@ import pytest
 import trimesh
 
 from torchgrasp.errors import MeshError
+from torchgrasp.objects import load_object
 from torchgrasp.sim.convex_parts import check_parts, convex_parts
 
 
@@ -44,6 +45,17 @@ def test_parts_of_a_concave_mesh_fill_it_and_leave_the_gap(tmp_path, capfd):
     files[0].write_bytes(b"damaged")
     assert len(convex_parts(mesh, tmp_path)) == len(parts)
     assert files[0].stat().st_size > 100
+
+
+@pytest.mark.sim
+def test_a_mesh_that_cannot_be_cut_in_its_time_is_refused(tmp_path, monkeypatch):
+    """The jug takes 4 s; here it has one."""
+    pytest.importorskip("coacd")
+    monkeypatch.setattr("torchgrasp.sim.decompose.SECONDS", 1.0)
+    monkeypatch.setattr("torchgrasp.sim.decompose.SECONDS_PER_FACE", 0.0)
+    with pytest.raises(MeshError, match=r"3516 faces that CoACD cannot cut in 1 s"):
+        convex_parts(load_object("jug").mesh, tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_parts_given_are_used_as_they_are():

@@ -75,12 +75,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings(), _end_in_order():
             warnings.showwarning = _show_warning
-            return _application(COMMANDS).cli(
+            code = _application(COMMANDS).cli(
                 prog="torchgrasp",
                 description="Dexterous fingertip grasps from a partial point cloud.",
                 args=[*given, "--help"] if given[0] in GROUPS and len(given) == 1 else given,
                 config=(tyro.conf.FlagCreatePairsOff,),
             )
+            print(end="", flush=True)  # Python's own flush would come too late for an exit code
+            return code
     except GraspError as error:
         print(f"torchgrasp: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -91,8 +93,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("torchgrasp: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of stdout went away; nobody is left to be told
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_stdout()
         return 1
+    except OSError as error:  # whatever reads and writes files raises GraspError: this is a full disk behind stdout
+        print(f"torchgrasp: {error}", file=sys.stderr)
+        _drop_stdout()
+        return 2
+
+
+def _drop_stdout() -> None:
+    """Lead stdout nowhere: Python would try to write the rest at its end."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # it may be closed, or no file
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # pyright: ignore[reportOptionalMemberAccess]
 
 
 class _Terminated(KeyboardInterrupt):

@@ -3,7 +3,8 @@
 import contextlib
 import dataclasses
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Literal
 
@@ -16,6 +17,7 @@ from torchgrasp.cloud import Advice, CloudFile, check_cloud, diagnose_cloud, rea
 from torchgrasp.cloud.io.image import read_pose
 from torchgrasp.cloud.neighbours import draw_rows
 from torchgrasp.errors import BadArgument, OutputError
+from torchgrasp.files import hold_folder
 from torchgrasp.frames import apply, rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
@@ -146,6 +148,18 @@ def check_folder(path: Path) -> None:
     finally:
         for folder in reversed(made):
             folder.rmdir()
+
+
+@contextlib.contextmanager
+def holding(
+    option: str, path: Path | None, hold: Callable[[Path], AbstractContextManager[None]] = hold_folder
+) -> Iterator[None]:
+    """Hold the folder, or file, of an option against other runs; None: nothing."""
+    with contextlib.ExitStack() as held:
+        if path is not None:
+            with naming(folder=option, path=option):
+                held.enter_context(hold(path))
+        yield
 
 
 def load_fingers(hand: str, fingers: str) -> tuple[Hand, Literal["auto"] | None]:

@@ -101,7 +101,7 @@ def evaluate(
         spec = EvaluationSpec(grasps, ranks, starts, complete, only, planned is not None, seed, perturb, views, among)
     scores = []
     with naming(folder="--out", path="--out"), hold_folder(out):
-        with naming(objects="--objects", path="--objects", workers="--workers", perturb="--perturb"):
+        with naming(objects="--objects", workers="--workers", perturb="--perturb"):
             found = evaluate_views(objects, the_hand, test, spec, folder=planned or out / "grasps", workers=workers)
             for score in found:
                 print_score(score)

@@ -17,6 +17,7 @@ from torchgrasp.cli.common import (
     check_folder,
     check_seed,
     describe_table,
+    holding,
     judge_cloud,
     load_fingers,
     naming,
@@ -147,7 +148,7 @@ def grasp(
         "report",
     ]
     progress = Progress(*names)
-    with progress.bar:
+    with progress.bar, holding("--out", out):
         origin = "no table" if plane is None else describe_table(plane)
         origin += " (lowest point)" * (plane is not None and table is None)
         camera = "camera known" if partial.viewpoint is not None else "camera estimated"

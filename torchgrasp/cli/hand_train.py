@@ -9,8 +9,9 @@ from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from torchgrasp.base import check_whole
-from torchgrasp.cli.common import check_seed, naming
+from torchgrasp.cli.common import check_seed, holding, naming
 from torchgrasp.errors import BadArgument
+from torchgrasp.files import hold_file
 from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.fit import Progress, fit_mixture
 from torchgrasp.posture_model.mixture import GraspMixture, mixture_path
@@ -57,33 +58,37 @@ def train(
         raise BadArgument("--out", out, "a file ending in .safetensors")
     with naming(hand="HAND"):
         robot = check_hand(hand)
-    begin = time.perf_counter()
-    with tqdm(desc="postures", total=n + held_out, unit_scale=True, disable=None) as bar:
-        samples = sample_configurations(robot, n + held_out, seed, workers, "grasping", bar.update)
-    print(f"{robot.name}: {len(samples)} postures in {time.perf_counter() - begin:.0f} s")
-    begin = time.perf_counter()
-    m = _choose(robot, seed, workers) if components is None else components
-    with tqdm(desc="EM", unit=" steps", disable=None) as bar:
+    written = out or mixture_path(hand)
+    with holding("--out", written, hold_file), holding("--checkpoint", checkpoint, hold_file):
+        begin = time.perf_counter()
+        with tqdm(desc="postures", total=n + held_out, unit_scale=True, disable=None) as bar:
+            samples = sample_configurations(robot, n + held_out, seed, workers, "grasping", bar.update)
+        print(f"{robot.name}: {len(samples)} postures in {time.perf_counter() - begin:.0f} s")
+        begin = time.perf_counter()
+        m = _choose(robot, seed, workers) if components is None else components
+        with tqdm(desc="EM", unit=" steps", disable=None) as bar:
 
-        def show(progress: Progress) -> None:
-            bar.update()
-            bar.set_postfix(log_likelihood=f"{float(progress.log_likelihood[-1]):.4f}")
+            def show(progress: Progress) -> None:
+                bar.update()
+                bar.set_postfix(log_likelihood=f"{float(progress.log_likelihood[-1]):.4f}")
 
-        with naming(components="--components", checkpoint="--checkpoint"):
-            mixture = fit_mixture(
-                samples[:n], m, seed, tolerance=TOLERANCE, starts=STARTS, checkpoint=checkpoint, observer=show
-            )
-    meta = mixture.meta
-    print(
-        f"{len(mixture.weights)} components in {meta['iterations']} steps (converged: {meta['converged']},"
-        f" components placed anew: {meta['reseeded']}), {time.perf_counter() - begin:.0f} s,"
-        f" added relative variance {mixture.regularisation:g}"
-    )
-    print(f"log-likelihood a posture: {meta['log_likelihood']} fitted; BIC {meta['bic']}")
-    score = evaluate_mixture(mixture, samples[n:])
-    print(score)
-    mixture = dataclasses.replace(mixture, meta=meta | score.meta())
-    print(f"written: {mixture.save(out or mixture_path(hand))}")
+            with naming(components="--components", checkpoint="--checkpoint", path="--checkpoint"):
+                mixture = fit_mixture(
+                    samples[:n], m, seed, tolerance=TOLERANCE, starts=STARTS, checkpoint=checkpoint, observer=show
+                )
+        meta = mixture.meta
+        print(
+            f"{len(mixture.weights)} components in {meta['iterations']} steps (converged: {meta['converged']},"
+            f" components placed anew: {meta['reseeded']}), {time.perf_counter() - begin:.0f} s,"
+            f" added relative variance {mixture.regularisation:g}"
+        )
+        print(f"log-likelihood a posture: {meta['log_likelihood']} fitted; BIC {meta['bic']}")
+        score = evaluate_mixture(mixture, samples[n:])
+        print(score)
+        mixture = dataclasses.replace(mixture, meta=meta | score.meta())
+        with naming(path="--out"):
+            mixture.save(written)
+        print(f"written: {written}")
     return 0
 
 

@@ -1,6 +1,5 @@
 """`torchgrasp hand`: a draft of hand.toml for any URDF, and random postures."""
 
-import tempfile
 import time
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +10,7 @@ from tyro.conf import Positional, arg
 from torchgrasp.cli.common import check_folder, check_seed, naming
 from torchgrasp.cli.hand_check import describe_sets, print_faults
 from torchgrasp.errors import OutputError
-from torchgrasp.files import write_file
+from torchgrasp.files import temporary_folder, write_file
 from torchgrasp.hand.draft import Wish, new_hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.posture_model.dataset import write_samples
@@ -54,9 +53,9 @@ def new(
     for file in texts:
         if (folder / file).exists():
             raise OutputError("URDF", f"{folder / file}, which exists", "a folder without one, as by --out")
-    with tempfile.TemporaryDirectory() as trial:
+    with temporary_folder() as trial:
         for file, text in ({urdf.name: urdf.read_text(encoding="utf-8")} | texts).items():
-            write_file(Path(trial) / file, text)
+            write_file(trial / file, text)
         if print_faults(trial):
             print(f"nothing is written; mend {urdf} and try again")
             return 2

@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import NamedTuple
 
-from torchgrasp.cli.common import naming
+from torchgrasp.cli.common import holding, naming
 from torchgrasp.cli.progress import Progress
 from torchgrasp.columns import format_columns, format_line
 from torchgrasp.errors import Status
@@ -53,7 +53,7 @@ def grasp_scene(path: Path, wanted: Wanted, choice: int | tuple[float, float] | 
     progress = Progress(
         "scene", *["fingers"] * (fingers == "auto"), "shape", "plan", "certify", "query", "refine", "report"
     )
-    with progress.bar:
+    with progress.bar, holding("--out", out):
         progress.end("scene", f"{len(scene.things)} things, labels {', '.join(map(str, scene.things))}")
         for sentence in scene.advice:
             print(f"advice  {sentence}")

@@ -5,9 +5,8 @@ import dataclasses
 import functools
 import itertools
 import math
-import tempfile
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -17,13 +16,14 @@ from torchgrasp.base import Value, count_status
 from torchgrasp.border import Count, Range, Seed, checked
 from torchgrasp.closing import ObjectMotion
 from torchgrasp.datasets import list_objects, list_views, read_entry, read_object_mesh, read_view
-from torchgrasp.errors import BadArgument, DatasetError, GraspError, MissingExtra, Status
+from torchgrasp.errors import BadArgument, DatasetError, GraspError, MissingExtra, OutputError, Status
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.perturb import find_perturbation, household_mass, perturb_trial, perturb_view
 from torchgrasp.evaluation.protocols import Protocol, draw_error, find_protocol, seed_of
 from torchgrasp.evaluation.pull import pull_grasp
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore
+from torchgrasp.files import hold_folder, temporary_folder
 from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.hand.load import hand_of, load_hand
@@ -104,11 +104,13 @@ def evaluate(
         objects: a folder as in `torchgrasp.datasets`.
         protocol: itself, or its name in `PROTOCOLS`.
         spec: which grasps; None: `EvaluationSpec()`.
-        folder: where the executable grasps of each view are kept, OBJECT/VIEW.safetensors; None: nowhere.
+        folder: where the executable grasps of each view are kept, OBJECT/VIEW.safetensors; None: nowhere. No other
+            run may write it meanwhile.
         workers: processes (`run_tasks`); the scores do not depend on their number.
 
     Raises:
         BadArgument: an unknown protocol, no objects, or a perturbation of a protocol that pulls.
+        OutputError: another run holds the folder, or it cannot be written.
         MissingExtra: the simulator, or pebble for workers, is not installed.
     """
     protocol, spec = find_protocol(protocol), EvaluationSpec() if spec is None else spec
@@ -136,8 +138,8 @@ def _evaluate(
 ) -> Generator[ViewScore, None, None]:
     """Yield the scores, lazily; `evaluate` checks at once."""
     yield from refused
-    with tempfile.TemporaryDirectory() as temporary:
-        views = [dataclasses.replace(view, shelf=Path(folder or temporary)) for view in views]
+    with _shelf(folder, spec.planned) as shelf:
+        views = [dataclasses.replace(view, shelf=shelf) for view in views]
         plans = run_tasks(_plan, [(view, protocol.trial.friction, spec) for view in views], workers, PLAN_LIMIT)
         scores = [
             dataclasses.replace(view.score, seconds=math.nan, refusal=plan) if isinstance(plan, Status) else plan
@@ -151,6 +153,19 @@ def _evaluate(
                 tried = [(at, next(results)) for at in some]
                 attempts = (ProtocolResult(*at, False, x) if isinstance(x, Status) else x for at, x in tried)
                 yield dataclasses.replace(score, attempts=tuple(attempts))
+
+
+@contextlib.contextmanager
+def _shelf(folder: Path | None, planned: bool) -> Iterator[Path]:
+    """Hold the folder of grasps; those of an earlier call are only read."""
+    if folder is None:
+        with temporary_folder() as temporary:
+            yield temporary
+    elif planned:
+        yield Path(folder)
+    else:
+        with hold_folder(Path(folder)):
+            yield Path(folder)
 
 
 def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
@@ -241,7 +256,7 @@ def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
         refusal = Status.OK if len(executable) else next(iter(failed), Status.OUT_OF_REACH)
         fingers = grasps.meta["finger_names"]
         score = dataclasses.replace(score, executable=len(executable), refusal=refusal, fingers=fingers)
-    except MissingExtra:
+    except (MissingExtra, OutputError):  # a full disk is no fault of the object
         raise
     except GraspError as error:
         score = dataclasses.replace(score, refusal=Status.BAD_OBJECT, note=" ".join(str(error).split()))

@@ -14,7 +14,7 @@ from torchgrasp.border import Positive, Range, checked
 from torchgrasp.control.forces import squeeze
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.export.grasp_json import quaternion
-from torchgrasp.files import format_json, write_atomically
+from torchgrasp.files import format_json, write_file
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values import Grasps
 
@@ -72,7 +72,7 @@ def save_dexgraspbench(
         content["obj_pose"] = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
         for key, joints in named.items():
             content[key] = np.array([*place, *(float(joints[name][row]) for name in order)])
-        paths.append(write_atomically(Path(folder) / f"{row}.npy", lambda path, x=content: np.save(path, np.array(x))))
+        paths.append(write_file(Path(folder) / f"{row}.npy", lambda file, x=content: np.save(file, np.array(x))))
     return paths
 
 

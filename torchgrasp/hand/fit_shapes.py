@@ -4,7 +4,6 @@ A mesh is sampled. Its points are boxed, and a box is cut in two wherever that s
 """
 
 import dataclasses
-import io
 import math
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
+from torchgrasp.files.meshes import load_triangles
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.mend import place, pose_of
 from torchgrasp.hand.safe_xml import read_bounded
@@ -149,8 +149,7 @@ def _read_points(urdf: Urdf, name: str, folder: Path) -> Points:
     if faces > MAX_FACES:
         raise urdf.wrong(f"mesh {name!r} of {faces} faces", allowed)
     try:
-        # from memory and without a resolver: materials and textures beside it stay closed
-        mesh = trimesh.load_mesh(io.BytesIO(data), file_type=kind, process=False, skip_materials=True)
+        mesh = load_triangles(data, f".{kind}", process=False)
     except Exception as error:  # the readers of trimesh raise whatever their format runs into
         raise urdf.wrong(f"mesh {name!r}: {error}"[:300], allowed) from error
     sound = isinstance(mesh, trimesh.Trimesh) and 0 < len(mesh.faces) <= MAX_FACES

@@ -1,7 +1,6 @@
 """Many clouds in one call: one after the other, or on several processes."""
 
 import dataclasses
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import torch
 
 from torchgrasp.base import named_tensors
 from torchgrasp.errors import BadArgument, GraspError, MissingExtra
+from torchgrasp.files import temporary_folder
 from torchgrasp.hand.hand import HandSource
 from torchgrasp.hand.load import load_hand
 from torchgrasp.pipeline.chain import plan_request
@@ -54,8 +54,8 @@ def plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any])
     hand, spec = given["hand"], given.get("spec")
     source = HandSource(hand.source.option, hand.source.urdf_path, hand.source.sha256)
     rest = {name: value for name, value in given.items() if name not in ("hand", "spec")}
-    with tempfile.TemporaryDirectory() as folder:
-        files = [Path(folder) / f"{k}.safetensors" for k in range(len(clouds))]
+    with temporary_folder() as folder:
+        files = [folder / f"{k}.safetensors" for k in range(len(clouds))]
         sent = [(_arrays(cloud), str(cloud.points.device)) for cloud in clouds]
         tasks = [(*cloud, source, _plain(spec), rest, file) for cloud, file in zip(sent, files, strict=True)]
         ended = list(run_tasks(_plan_to_file, tasks, workers, LIMIT))

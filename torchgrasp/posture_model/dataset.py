@@ -11,7 +11,7 @@ from typing import Annotated
 from torchgrasp.base import check_whole, join
 from torchgrasp.border import Count, Range, checked
 from torchgrasp.errors import ModelFileError, OutputError
-from torchgrasp.files import LOCK, hold_folder, load_tensors, save_tensors, write_file
+from torchgrasp.files import LOCK, hold_folder, is_remnant, load_tensors, save_tensors, write_file
 from torchgrasp.hand.hand import Hand
 from torchgrasp.json_fields import Field, read_json
 from torchgrasp.posture_model.sample import (
@@ -168,14 +168,12 @@ def _parse_manifest(folder: Path, manifest: Field) -> SampleFolder:
 
 
 def _begin(folder: Path, manifest: str) -> None:
-    """Write the manifest or check that it is the same; delete the half-written files of a killed run."""
+    """Write the manifest or check that it is the same."""
     path = folder / MANIFEST
-    for half in (*folder.glob(".chunk-*.safetensors"), *folder.glob(f".{MANIFEST}.*.json")):
-        half.unlink()
     if path.exists():
         if path.read_text("utf-8", errors="replace") != manifest:
             raise OutputError("folder", f"{folder}, which holds other samples", "an empty folder, or the same samples")
-    elif any(x.name != LOCK for x in folder.iterdir()):
+    elif any(x.name != LOCK and not is_remnant(x.name) for x in folder.iterdir()):
         raise OutputError("folder", f"{folder}, which holds other files", "an empty folder")
     else:
         write_file(path, manifest)

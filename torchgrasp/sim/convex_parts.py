@@ -4,11 +4,10 @@ A simulator replaces a mesh by its convex hull: a jug would be solid. CoACD cuts
 For scans of 800 to 16000 faces that takes 1 to 22 s.
 """
 
-import contextlib
 import hashlib
 import logging
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,9 +15,10 @@ import numpy as np
 import torch
 
 from torchgrasp.border import checked
-from torchgrasp.errors import MeshError, MissingExtra, ModelFileError, OutputError
+from torchgrasp.errors import MeshError, ModelFileError, OutputError
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.mesh import LEAST_VOLUME, check_solid, read_mesh
+from torchgrasp.sim.decompose import decompose
 
 if TYPE_CHECKING:
     import trimesh
@@ -43,13 +43,15 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
     folder that cannot be written costs a warning.
 
     Raises:
-        MeshError, SuspiciousScale: as `read_mesh`.
+        MeshError, SuspiciousScale: as `read_mesh`, or a mesh that takes more time or memory than its size allows.
         MissingExtra: the mesh is not convex and CoACD is not installed.
 
     >>> import trimesh
     >>> len(convex_parts(trimesh.creation.box((0.1, 0.1, 0.1))))
     1
     """
+    import trimesh
+
     mesh = read_mesh(mesh)
     if mesh.is_convex:
         return [hull(mesh.vertices)]
@@ -60,7 +62,8 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
             return _filled(_load(path))
         except (ModelFileError, ValueError):
             _log.warning("%s is damaged and will be made anew", path)
-    parts = _decompose(mesh)
+    pieces = decompose(mesh, {"threshold": THRESHOLD, **_SEARCH})
+    parts = [trimesh.Trimesh(vertices, faces).convex_hull for vertices, faces in pieces]
     try:
         _save(parts, path)
     except OutputError as error:
@@ -92,33 +95,6 @@ def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
     if not parts:
         raise MeshError("parts", "no part", "at least one convex mesh")
     return list(parts)
-
-
-def _decompose(mesh: "trimesh.Trimesh") -> "list[trimesh.Trimesh]":
-    """Cut a mesh into convex parts with CoACD, quietly."""
-    import trimesh
-
-    try:
-        import coacd
-    except ImportError as error:
-        raise MissingExtra("coacd", "sim") from error
-    coacd.set_log_level("off")
-    with _silence():
-        pieces = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), threshold=THRESHOLD, seed=0, **_SEARCH)
-    return [trimesh.Trimesh(np.asarray(v), np.asarray(f)).convex_hull for v, f in pieces]
-
-
-@contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Discard standard output at its file descriptor, where CoACD prints."""
-    stdout, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 1)
-        yield
-    finally:
-        os.dup2(stdout, 1)
-        os.close(stdout)
-        os.close(nowhere)
 
 
 def _fingerprint(mesh: "trimesh.Trimesh") -> str:

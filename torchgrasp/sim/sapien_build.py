@@ -11,14 +11,13 @@ Settings that differ from SAPIEN's defaults each have a measured reason:
 PhysX keeps 255 faces of a convex part: a ball of 30 mm loses 0.5 mm.
 """
 
-import tempfile
 import warnings
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from torchgrasp.errors import MissingExtra
+from torchgrasp.files import temporary_folder, write_file
 from torchgrasp.sim.collision_masks import pair_masks
 from torchgrasp.sim.mount import MOUNT_DRIVE, mount_slides, mounted_urdf
 from torchgrasp.sim.scene import ARMATURE, TABLE, Body, SceneSpec
@@ -107,10 +106,8 @@ def _hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
     loader = scene.create_urdf_loader()
     loader.fix_root_link = True
     loader.set_material(material.static_friction, material.dynamic_friction, 0.0)
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "hand.urdf"
-        file.write_text(mounted_urdf(spec), encoding="utf-8")
-        hand = loader.load(str(file))
+    with temporary_folder() as folder:
+        hand = loader.load(str(write_file(folder / "hand.urdf", mounted_urdf(spec))))
     slides = {slide.name: slide for slide in mount_slides(spec)}
     spec.check_drives([j.name for j in hand.active_joints if j.name not in slides])
     start = []

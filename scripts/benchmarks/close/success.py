@@ -19,7 +19,7 @@ from torchgrasp.evaluation import calibration
 from torchgrasp.evaluation.campaign import choose_rows, run_protocol
 from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.protocols import PROTOCOLS, draw_error, seed_of
-from torchgrasp.files import format_json, write_atomically, write_file
+from torchgrasp.files import format_json, write_file
 from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.ranking import FEATURES, MODEL, success_features
 from torchgrasp.pipeline import plan_grasps
@@ -249,4 +249,4 @@ def draw_reliability(path: Path, predicted: np.ndarray, trials: Trials) -> None:
         axes.errorbar([x.predicted], [value], ends, fmt="o", color="#23967f", capsize=3)
         axes.annotate(f"{count}", (x.predicted, value), (6, -12), textcoords="offset points", color="#4b525b")
     axes.set_title(f"{len(predicted)} trials on objects not fitted on")
-    write_atomically(path, lambda temporary: figure.savefig(temporary, format="png"))
+    write_file(path, lambda file: figure.savefig(file, format="png"))

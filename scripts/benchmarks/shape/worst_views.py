@@ -14,7 +14,7 @@ from benchmarks.common import Row
 from benchmarks.ground_truth import nearest_on_mesh, read_views
 from benchmarks.shape.accuracy import RESOLUTION, measure_shape
 from torchgrasp.datasets import read_group
-from torchgrasp.files import write_atomically
+from torchgrasp.files import write_file
 from torchgrasp.report.canvas import Canvas, draw_bar, map_colors
 from torchgrasp.report.palette import INK, PAPER
 from torchgrasp.report.pictures import rotated, view_of
@@ -70,7 +70,7 @@ def _draw_page(worst: Sequence[tuple[Any, ...]], path: Path) -> None:
             sheet.paste(tile, (left, top + 36 + row * TILE[1]))
     draw_bar(sheet, "above: error of the true surface; below: std_m of the estimated one [mm]", MOST, "viridis")
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda temporary: sheet.save(temporary, format="JPEG", quality=82))
+    write_file(path, lambda file: sheet.save(file, format="JPEG", quality=82))
 
 
 def _draw_view(surface: Surface, mesh: "trimesh.Trimesh", cloud: PointCloud) -> list[Image.Image]:

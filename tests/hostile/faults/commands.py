@@ -1,0 +1,97 @@
+"""The commands that write, on little work: what is slow in them is done once, before any fault, and repeated."""
+
+import dataclasses
+import functools
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from torchgrasp import cli, load_hand, load_object, plan_grasps
+from torchgrasp.cli import grasps as grasp_command
+from torchgrasp.cli import hand_train
+from torchgrasp.errors import Status
+from torchgrasp.evaluation import campaign
+from torchgrasp.evaluation.score import ProtocolResult, ViewScore
+from torchgrasp.objects import DATA
+from torchgrasp.report import page
+from torchgrasp.shape.surface import extract_surface
+from torchgrasp.specs import ContactSpec
+from torchgrasp.values import load_grasps
+
+POSE = [[1.0, 0.0, 0.0, 0.4], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]]
+
+Command = Callable[[Path], int]
+"""Runs a command that writes below a folder; returns its exit code."""
+
+
+def sample(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
+    """Three chunks of postures."""
+    monkeypatch.setattr("torchgrasp.posture_model.sample.CHUNK_POSTURES", 40)
+    monkeypatch.setattr("torchgrasp.posture_model.dataset.CHUNK_POSTURES", 40)
+    return lambda out: cli.main(["hand", "sample", "--hand", "barrett", "--n", "100", "--out", str(out / "samples")])
+
+
+def train(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
+    """A mixture of one Gaussian, with a checkpoint after every step."""
+    monkeypatch.setattr(hand_train, "check_hand", load_hand)
+    monkeypatch.setattr(hand_train, "STARTS", 1)
+    words = ["hand", "train", "barrett", "--n", "100", "--held-out", "20", "--components", "1"]
+    return lambda out: cli.main(
+        [*words, "--checkpoint", str(out / "step.safetensors"), "--out", str(out / "model.safetensors")]
+    )
+
+
+@functools.cache
+def planned() -> tuple[Any, list[tuple[Any, ...]]]:
+    """Grasps of the shipped cylinder, and what an observer of the planning was told."""
+    told: list[tuple[Any, ...]] = []
+    hand = load_hand("barrett")
+    view = load_object("cylinder").view
+    grasps = plan_grasps(view, hand, ContactSpec(table=0.0), 8, observer=lambda *x: told.append(x))
+    return grasps, told
+
+
+def grasp(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
+    """Grasps and a report without pictures."""
+    grasps, told = planned()
+
+    def repeat(*_: Any, observer: Callable[..., object], **__: Any) -> Any:
+        for one in told:
+            observer(*one)
+        return grasps
+
+    monkeypatch.setattr(grasp_command, "plan_grasps", repeat)
+    surface = extract_surface(next(value for stage, _, value in told if stage == "shape"), resolution=16)
+    monkeypatch.setattr(grasp_command, "extract_surface", lambda shape: surface)
+    monkeypatch.setattr(page, "draw_pictures", lambda run: {})
+    view = str(DATA / "cylinder" / "view.ply")
+    return lambda out: cli.main(["grasp", view, "--hand", "barrett", "--starts", "8", "--out", str(out / "grasps")])
+
+
+def evaluate(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
+    """A campaign on two views, whose trials read the grasps that were kept; nothing is simulated."""
+    grasps = planned()[0]
+    views = {name: {"T_object_camera": POSE} for name in ("left", "right")}
+    (folder / "manifest.json").write_text(json.dumps({"objects": {"cup": {"views": views}}}))
+
+    def plan(view: Any, friction: float, spec: campaign.EvaluationSpec) -> ViewScore:
+        grasps.save(view.file)
+        return dataclasses.replace(view.score, executable=len(grasps))
+
+    def try_grasp(view: Any, protocol: Any, spec: campaign.EvaluationSpec, row: int, draw: int) -> ProtocolResult:
+        score = float(load_grasps(view.file)[row].score[0])
+        return ProtocolResult(row, draw, True, Status.OK, 0.0, 0.0, score, 0.0, 0.0)
+
+    module = sys.modules["torchgrasp.cli.evaluate"]  # the package has the function under the same name
+    monkeypatch.setattr(module, "import_simulator", lambda name: None)
+    monkeypatch.setattr(campaign, "_plan", plan)
+    monkeypatch.setattr(campaign, "_try", try_grasp)
+    words = ["evaluate", "--objects", str(folder), "--hand", "barrett", "--grasps", "2", "--workers", "0"]
+    return lambda out: cli.main([*words, "--out", str(out / "evaluation")])
+
+
+COMMANDS = {"sample": sample, "train": train, "grasp": grasp, "evaluate": evaluate}
