@@ -103,6 +103,6 @@ def test_memory_is_that_of_a_process_of_its_own(folder):
     assert 100 < row.numbers["20"][0] < 1000 and len(ballast)
 
 
-def test_another_checkout_is_asked_for_its_own_numbers(folder, monkeypatch):
+def test_another_checkout_must_be_named():
     with pytest.raises(SystemExit, match="--before"):
-        bench_before([], [], [], None)
+        bench_before([], [], "barrett", 20, None)

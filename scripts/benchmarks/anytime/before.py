@@ -5,42 +5,51 @@ import math
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from statistics import mean, median
 
+import numpy as np
+
 from benchmarks.anytime.course import BEST, Course
 from benchmarks.common import Row
+from torchgrasp import PointCloud
 
 OLD = """
 import json, sys, time
 from pathlib import Path
-import torch
+import numpy, torch
 torch.set_num_threads(1)
-from torchgrasp import ContactSpec, load_hand, load_object, plan_grasps
-from torchgrasp.datasets import list_views, read_view
-objects, hand, starts, only = Path(sys.argv[1]), load_hand(sys.argv[2]), int(sys.argv[3]), json.loads(sys.argv[4])
-plan_grasps(load_object("cylinder").view, hand, ContactSpec(table=0.0), 20)
-found = {}
-for name, view in only:
-    cloud, began = read_view(objects, name, view), time.process_time()
-    grasps = plan_grasps(cloud, hand, ContactSpec(table=0.0), starts)
-    best = sorted(grasps.success.tolist(), reverse=True)[:20]
-    found[f"{name}/{view}"] = time.process_time() - began, int((grasps.status == 0).sum()), sum(best) / 20
-print(json.dumps(found))
+from torchgrasp import ContactSpec, PointCloud, load_hand, load_object, plan_grasps
+folder, hand, starts, spec = Path(sys.argv[1]), load_hand(sys.argv[2]), int(sys.argv[3]), ContactSpec(table=0.0)
+plan_grasps(load_object("cylinder").view, hand, spec, 20)
+for file in sorted(folder.glob("*.npz")):
+    points, viewpoint = (torch.from_numpy(x) for x in numpy.load(file).values())
+    began = time.process_time()
+    grasps = plan_grasps(PointCloud(points, None, viewpoint), hand, spec, starts)
+    success = torch.where(grasps.status == 0, torch.sigmoid(grasps.score), 0.0).sort(descending=True).values
+    print(json.dumps([time.process_time() - began, int((grasps.status == 0).sum()), float(success[:20].sum()) / 20]))
 """
-"""What another checkout is asked: seconds, executable grasps and mean success of the 20 best of each view."""
+"""What another checkout is asked: seconds, executable grasps and mean predicted success of the 20 best of each view.
+The clouds are handed over as arrays, which every version can take."""
 
 
 def bench_before(
-    courses: list[Course], views: list[tuple[str, str]], arguments: list[str], before: Path | None
+    courses: list[Course], clouds: list[PointCloud], hand: str, starts: int, before: Path | None
 ) -> list[Row]:
     """Measure another checkout on the same views, in the same run."""
     if before is None:
         raise SystemExit("before: the folder of a checkout, as in --before")
     environment = dict(os.environ, PYTHONPATH=str(before), OMP_NUM_THREADS="1")
-    command = [sys.executable, "-c", OLD, *arguments, json.dumps(views)]
-    done = subprocess.run(command, cwd=before, env=environment, capture_output=True, text=True, check=True)
-    old = list(json.loads(done.stdout).values())
+    with tempfile.TemporaryDirectory() as folder:
+        for k, cloud in enumerate(clouds):
+            assert cloud.viewpoint is not None
+            np.savez(Path(folder) / f"{k:04}.npz", points=cloud.points.numpy(), viewpoint=cloud.viewpoint.numpy())
+        command = [sys.executable, "-c", OLD, folder, hand, str(starts)]
+        done = subprocess.run(command, cwd=before, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"{before}: {done.stderr.strip().splitlines()[-1]}")
+    old = [json.loads(line) for line in done.stdout.splitlines()]
     pairs = [
         ("seconds of the whole call", mean(c.seconds for c in courses), mean(x[0] for x in old)),
         ("executable grasps", mean(c.executable for c in courses), mean(x[1] for x in old)),

@@ -1,6 +1,7 @@
 """Rows of the peer: seconds of one thread for each grasp, its search alone, from our postures, and our whole call."""
 
 import dataclasses
+import math
 import time
 
 from benchmarks.anytime.course import Course
@@ -17,6 +18,7 @@ from torchgrasp.pipeline.stages import Bench, spread_rows
 from torchgrasp.pipeline.task import Request, Work
 from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.solve import plan_contacts
+from torchgrasp.plan.solver import project
 
 
 @dataclasses.dataclass
@@ -40,7 +42,7 @@ def bench_peers(
     for cloud in clouds:
         _try(cloud, hand, spec, tries, peer, ours)
     whole = sum(c.seconds for c in courses) / max(sum(c.executable for c in courses), 1)
-    each, good = peer.seconds / max(peer.feasible, 1), peer.seconds / max(peer.executable, 1)
+    each, good = (peer.seconds / count if count else math.inf for count in (peer.feasible, peer.executable))
     refined = ours.seconds / max(ours.executable, 1)
     return [
         Row(
@@ -105,10 +107,9 @@ def _try(cloud: PointCloud, hand: Hand, spec: ContactSpec, tries: int, peer: Tal
         if found is None:
             continue
         configuration, touched = found
-        certificate = certify(touched, spec)
         errors = measure_errors(hand, configuration, touched, problem.world)
-        peer.feasible += bool(certificate.closed) and int(errors.status) == Status.OK
-        checked = check_feasibility(shape, spec, shape.normalise(touched.points))
+        peer.feasible += bool(certify(touched, spec).closed) and int(errors.status) == Status.OK
+        plan = check_feasibility(shape, spec, project(shape, shape.normalise(touched.points), 3))
         order = first.permutation[row : row + 1]
-        candidates = GraspCandidates(configuration, checked.contacts, certificate, order, checked.status)
+        candidates = GraspCandidates(configuration, plan.contacts, certify(plan.contacts, spec), order, plan.status)
         peer.executable += int(check_candidates(problem, candidates).status) == Status.OK

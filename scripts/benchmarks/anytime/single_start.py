@@ -20,7 +20,7 @@ from torch import Tensor
 from torchgrasp import Contacts, ContactSpec, Hand, ShapeGP
 from torchgrasp.frames import rotation_from_vector, skew
 from torchgrasp.ik.clearance import CollisionWorld, along
-from torchgrasp.ik.configuration import Configuration, SpatialJacobian, wrench_of
+from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.plan.objectives import cost_gradients
 from torchgrasp.plan.problem import triple_mean_jet
 from torchgrasp.plan.wrench import wrenches
@@ -129,9 +129,9 @@ class SingleStart:
             return torch.cat([by_configuration[:, :free] @ by_hand, by_contacts], 1).numpy()
 
         finger, radius = torch.arange(f).repeat_interleave(3), hand.tips.radius[:, None]
-        centre = spatial.points(hand.tips.index, hand.tips.center)
-        along_axes = wrench_of(centre[:, finger], torch.eye(3, dtype=at.dtype).repeat(f, 1)[None])
-        moved = spatial.jacobian(along_axes, hand.tips.index[finger])[0]
+        centre, pads, moves = spatial.tips.permute(2, 1, 0), spatial.pads.permute(2, 1, 0), hand.motion.moves.to(at)
+        along_axes = _wrenches(centre[:, finger], torch.eye(3, dtype=at.dtype).repeat(f, 1)[None])
+        moved = spatial.jacobian(along_axes, moves[hand.tips.index[finger]])[0]
         off = torch.cat([scale * jet.distance, (centre - points - radius * normals).flatten(1)], 1)[0]
         off_by_contacts = torch.cat([
             scale * (jet.gradient[0, :, None] @ own)[:, 0],
@@ -142,10 +142,9 @@ class SingleStart:
         cost, by_point, by_normal = cost_gradients(partial(least_weight, self.spec), points, normals)
         cost_by_contacts = scale * by_point.reshape(1, -1) + (by_normal[0, :, None] @ turned).sum(0)
         by_cost = rows(moved.new_zeros(1, free), cost_by_contacts)
-        pads = spatial.directions(hand.tips.index, hand.tips.normal)
         facing = -(pads * normals).sum(-1)[0] - hand.tips.cone.cos()
         torque = torch.cat([torch.zeros_like(pads), torch.linalg.cross(pads, normals)], -1)
-        facing_by_hand = -spatial.jacobian(torque, hand.tips.index)[0]
+        facing_by_hand = -spatial.jacobian(torque, moves[hand.tips.index])[0]
         by_facing = rows(facing_by_hand, -(pads[0, :, None] @ turned)[:, 0])
         clear, clear_by_hand = clearances(spatial, self.world)
         by_clear = rows(clear_by_hand, clear.new_zeros(len(clear), 3 * f)) / UNIT
@@ -182,7 +181,7 @@ def least_weight(spec: ContactSpec, points: Tensor, normals: Tensor) -> Tensor:
 def clearances(spatial: SpatialJacobian, world: CollisionWorld) -> tuple[Float[Tensor, "k"], Float[Tensor, "k d"]]:
     """Return the least clearances [m] of links from object and table, and of pairs of links, by steps of one hand."""
     spheres, pairs = spatial.hand.collision_spheres, spatial.hand.self_collision
-    centres = spatial.points(spheres.link_index, spheres.center)
+    centres, moves = spatial.sphere_centres, spatial.hand.motion.moves.to(spatial.spheres)
     assert world.field is not None and world.plane is not None
     distance, gradient = world.field.query(centres)
     height, up = along(centres, world.plane) - world.plane.offset, world.plane.normal.expand_as(gradient)
@@ -193,17 +192,21 @@ def clearances(spatial: SpatialJacobian, world: CollisionWorld) -> tuple[Float[T
     ):
         near = _least_of_each(clear[0], spheres.link_index, which)
         values.append(clear[0, near])
-        wrench = wrench_of(centres[:, near], direction[:, near])
-        jacobians.append(spatial.jacobian(wrench, spheres.link_index[near])[0])
-    frames = spatial.obj_from_link[:, :, :3].permute(2, 3, 1, 0).contiguous()
-    separation, links = pairs.separations(frames, torch.inf)[:, 0], pairs.link[pairs.pairs]
+        wrench = _wrenches(centres[:, near], direction[:, near])
+        jacobians.append(spatial.jacobian(wrench, moves[spheres.link_index[near]])[0])
+    pushes, number, wrench = pairs.pushes(spatial.obj_from_link, torch.inf)
+    separation, links = pushes[:, 0], pairs.link[pairs.pairs]
     names = links.amin(1) * len(spatial.hand.tree.link_names) + links.amax(1)
     near = _least_of_each(separation, names, torch.ones_like(names, dtype=torch.bool))
-    wrench = pairs.wrenches(frames, near, torch.zeros_like(near)).T[None]
-    first, second = links[near].unbind(-1)
+    first, second = moves[links[near]].unbind(1)
     values.append(separation[near])
-    jacobians.append((spatial.jacobian(wrench, second) - spatial.jacobian(wrench, first))[0])
+    jacobians.append(spatial.jacobian(wrench.T[number[near, 0]][None], second - first)[0])
     return torch.cat(values), torch.cat(jacobians)
+
+
+def _wrenches(points: Float[Tensor, "1 k 3"], directions: Float[Tensor, "1 k 3"]) -> Float[Tensor, "1 k 6"]:
+    """Return the wrenches of unit forces along directions at points."""
+    return torch.cat([directions, torch.linalg.cross(points, directions)], -1)
 
 
 def _least_of_each(values: Tensor, group: Tensor, which: Tensor) -> Tensor:

@@ -56,7 +56,7 @@ def anytime(
 
     subjects: dict[str, Callable[[], list[Row]]] = {
         "stream": lambda: bench_stream(all_courses()),
-        "before": lambda: bench_before(all_courses(), chosen, [str(objects), hand, str(starts)], before),
+        "before": lambda: bench_before(all_courses(), clouds, hand, starts, before),
         "pull": lambda: bench_pull(objects, chosen, all_courses(), model),
         "peers": lambda: bench_peers(clouds, all_courses(), model, SPEC, tries),
         "many": lambda: bench_many(clouds, model, SPEC, starts),
