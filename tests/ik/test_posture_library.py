@@ -1,5 +1,7 @@
 """Posture library: it finds its own postures again, in any order and place, and prefers clear ones."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -105,3 +107,13 @@ def test_a_small_library_gives_no_more_seeds_than_it_has(poses):
     assert len(nearest_postures(library, contacts, CollisionWorld(NOTHING), n_seeds=12)) == 24
     with pytest.raises(BadArgument, match=r"n_seeds: found 13, allowed is a whole number in \[1, 12\]"):
         nearest_postures(library, contacts, CollisionWorld(NOTHING), n_seeds=13)
+
+
+def test_a_library_is_drawn_once_for_a_hand_whatever_object_holds_it():
+    first = PostureLibrary.of(load_hand("barrett"), 50, seed=3)
+    assert PostureLibrary.of(load_hand("barrett").to(torch.float64), 50, seed=3) is first
+    assert PostureLibrary.of(load_hand("barrett"), 50, seed=4) is not first
+    hand = load_hand("barrett")
+    narrow = dataclasses.replace(hand, actuated=dataclasses.replace(hand.actuated, upper=0.5 * hand.upper))
+    changed = PostureLibrary.of(narrow, 50, seed=3)
+    assert bool((changed.joints <= 0.5 * hand.upper).all()) and not bool((first.joints <= 0.5 * hand.upper).all())

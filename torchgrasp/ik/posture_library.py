@@ -5,13 +5,15 @@ Clearances rank the nearest, so a hand from above comes before one from below.
 """
 
 import dataclasses
+import hashlib
 import itertools
+from collections import OrderedDict
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value, check_device, check_whole, join
+from torchgrasp.base import Value, check_device, check_whole, join, named_tensors
 from torchgrasp.border import Count, Seed, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, degenerate, inverse, rigid, rotate, virtual_frame
@@ -34,6 +36,8 @@ CANDIDATES = 64
 ASSIGNMENTS, JUDGES = 6, 500
 """Assignments of contacts to fingers in which a row is compared with the whole library: all of three fingertips. Of the
 24 or 120 of more, those to which one of so many postures is nearest."""
+KEPT = 4
+"""Libraries kept in a process, 9 MB each, 40 MB for more fingertips: two hands with two sets of fingers."""
 ASKED = 3
 """Seeds whose poses an arm is asked for, to each that is kept: an arm refuses about half."""
 
@@ -53,14 +57,38 @@ class PostureLibrary(Value):
     @classmethod
     @checked
     def of(cls, hand: Hand, count: Count | None = None, seed: Seed = 0) -> "PostureLibrary":
-        """Draw postures within the joint limits and free of self-collision; count None: as many as work well."""
+        """Draw postures within the joint limits and free of self-collision; count None: as many as work well.
+
+        The last libraries are kept: a process draws that of a hand once.
+        """
         count = (LIBRARY_SIZE if len(hand.tips) == 3 else LARGE_LIBRARY) if count is None else count
+        key = f"{_digest(hand)} {hand.lower.device} {count} {seed}"
+        if key in _KEPT:
+            _KEPT.move_to_end(key)
+            return _KEPT[key]
+        _KEPT[key] = library = cls._drawn(hand, count, seed)
+        if len(_KEPT) > KEPT:
+            _KEPT.popitem(last=False)
+        return library
+
+    @classmethod
+    def _drawn(cls, hand: Hand, count: int, seed: int) -> "PostureLibrary":
+        """Draw postures; see `of`."""
         joints = sample_configurations(hand, count, seed).joints.to(hand.lower.device, torch.float64)
         joints = joints[~degenerate(triangle_of(hand.tip_centres(joints)))]
         centres, (_, pads) = hand.tip_centres(joints), hand.fingertips(joints)
         vf_from_hand = inverse(tips_frame(centres))
         centres, pads = apply(vf_from_hand, centres), rotate(vf_from_hand, pads)
         return cls(hand, joints, vf_from_hand, centres, feature(centres, pads), hand.sphere_centres(joints).float())
+
+
+_KEPT: "OrderedDict[str, PostureLibrary]" = OrderedDict()
+
+
+def _digest(hand: Hand) -> str:
+    """Return a hash of every number of a hand, whatever file it is from."""
+    numbers = (t.detach().cpu().contiguous().numpy().tobytes() for t in named_tensors(hand).values())
+    return hashlib.sha256(b"|".join([hand.name.encode(), *numbers])).hexdigest()
 
 
 def triangle_of(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 3 3"]:
