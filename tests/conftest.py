@@ -5,10 +5,16 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 from torch import Tensor
 
 from torchgrasp.frames import rigid, rotation_from_vector
 from torchgrasp.values import PointCloud
+
+SLOW = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
+settings.register_profile("short", max_examples=100, derandomize=True, deadline=None, suppress_health_check=SLOW)
+settings.register_profile("long", max_examples=100_000, deadline=None, database=None, suppress_health_check=SLOW)
+settings.load_profile("short")  # `--hypothesis-profile=long` chooses the other
 
 
 @pytest.fixture

@@ -1,12 +1,16 @@
-"""The public law for hands: the shipped hands obey it, broken ones are told why they do not."""
+"""The public laws: shipped hands, kernels and simulators obey them, broken ones are told which they break."""
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
-from torchgrasp.errors import HandFileError
+from torchgrasp.errors import BrokenLaw, HandFileError
+from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hands_folder
-from torchgrasp.testing import check_hand
+from torchgrasp.shape import Kernel, kernel_by_name, matern52_kernel, rbf_kernel, thin_plate_kernel
+from torchgrasp.testing import check_hand, check_kernel, check_scene
 
 
 @pytest.mark.parametrize(
@@ -73,3 +77,70 @@ def test_a_contact_inside_its_tip_is_told(tmp_path, shape, depth):
 def test_a_hand_of_ones_own_is_accepted(tmp_path):
     folder = copy_of("barrett", tmp_path, "hand.toml", 'name = "barrett"', 'name = "mine"')
     assert check_hand(folder).name == "mine"
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "law"),
+    [
+        ("link_poses", lambda x: x + 1e-6, "kinematics"),
+        ("jacobian", lambda x: 1.01 * x, "jacobian"),
+        ("fingertips", lambda x: (x[0] + 1e-4 * x[0].ndim, x[1]), "batch"),
+    ],
+)
+def test_a_hand_that_moves_otherwise_is_told_which_law_it_breaks(monkeypatch, name, wrong, law):
+    right = getattr(Hand, name)
+    monkeypatch.setattr(Hand, name, lambda self, joints: wrong(right(self, joints)))
+    with pytest.raises(BrokenLaw, match=law):
+        check_hand("barrett")
+
+
+@pytest.mark.parametrize("name", ["thin_plate", "matern52", "rbf"])
+@pytest.mark.parametrize("psi", [0.5, 3.6, 10.0])
+def test_shipped_kernels_obey_the_law(name, psi):
+    kernel = kernel_by_name(name, psi)
+    assert check_kernel(kernel) is kernel
+
+
+PLATE = thin_plate_kernel(3.6)
+BROKEN = {
+    "finite": Kernel(lambda r: torch.where(r > 1, torch.nan, torch.exp(-r * r))),
+    "variance": Kernel(lambda r: -torch.exp(-r * r)),
+    "variance of normals": Kernel(torch.ones_like),
+    "smooth": Kernel(lambda r: torch.exp(-r)),
+    "derivatives of another": Kernel(rbf_kernel(1.0).profile, closed_form=matern52_kernel(1.0).derivatives),
+    "derivatives that end at a kink": Kernel(lambda r: torch.clamp(1 - r * r, min=0.0) ** 2),
+    "covariance": Kernel(torch.cos),
+    "covariance beyond the ball": Kernel(PLATE.profile, closed_form=PLATE.closed_form),
+    "covariance of the paper's psi": Kernel(PLATE.profile, 3.6),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_kernel_is_told_which_law_it_breaks(name):
+    with pytest.raises(BrokenLaw, match=rf"^{name.split()[0]}: found") as broken:
+        check_kernel(BROKEN[name])
+    assert broken.value.law == name.split()[0]
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    ("name", "wrong", "law"),
+    [
+        ("joints", lambda scene, x: x + 0.01, "joints"),
+        ("tip_poses", lambda scene, x: x[::-1], "kinematics"),
+        ("jacobian", lambda scene, x: 2 * x, "kinematics"),
+        ("penetration", lambda scene, x: 0.0, "overlap"),
+        ("object_pose", lambda scene, x: x + 0.01, "rest"),
+        ("hand_pose", lambda scene, x: x + 0.001 * scene.data.time * (scene.data.time > 0.5), "lift"),
+        ("object_pose", lambda scene, x: x + 1e-9 * np.random.default_rng().random(), "repeat"),
+    ],
+)
+def test_a_simulator_is_told_which_law_it_breaks(name, wrong, law):
+    pytest.importorskip("mujoco")
+    from torchgrasp.sim.mujoco_scene import MujocoScene
+
+    right = getattr(MujocoScene, name)
+    broken = type("Broken", (MujocoScene,), {name: lambda self, *at: wrong(self, right(self, *at))})
+    with pytest.raises(BrokenLaw, match=f"^{law}: found"):
+        check_scene(broken)

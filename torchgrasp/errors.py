@@ -8,6 +8,9 @@ import copyreg
 import enum
 from typing import Any
 
+MOST_LETTERS = 1000
+"""Longest part of a message: errors of other libraries may quote the whole file that they read."""
+
 
 class GraspError(Exception):
     """Base of all errors of torchgrasp."""
@@ -21,7 +24,9 @@ class BadArgument(GraspError, ValueError):
     """An argument has a wrong shape, type or range; the message says what was found and what is allowed."""
 
     def __init__(self, argument: str, found: object, allowed: str):
-        super().__init__(f"{argument}: found {found}, allowed is {allowed}")
+        text = str(found)
+        shown = text if len(text) <= MOST_LETTERS else f"{text[:MOST_LETTERS]}..."
+        super().__init__(f"{argument}: found {shown}, allowed is {allowed}")
         self.argument, self.found, self.allowed = argument, found, allowed
 
 
@@ -79,6 +84,14 @@ class IndefiniteCovariance(GraspError, ValueError):
 
 class DegenerateContacts(GraspError, ValueError):
     """Three contacts lie on a line or in a point, so they have no virtual frame."""
+
+
+class BrokenLaw(GraspError, AssertionError):
+    """A kernel, a hand or a simulator breaks a law of `torchgrasp.testing`; `law` is its name."""
+
+    def __init__(self, law: str, found: str, allowed: str):
+        super().__init__(f"{law}: found {found}, allowed is {allowed}")
+        self.law = law
 
 
 class FailedRows(GraspError):

@@ -12,7 +12,8 @@ from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.draft import Wish, new_hand
 from torchgrasp.hand.fit_shapes import fit_shapes
 from torchgrasp.hand.urdf import read_published, read_urdf
-from torchgrasp.testing import check_hand, random_joints
+from torchgrasp.testing import check_hand
+from torchgrasp.testing.hands import random_joints
 
 END = "</robot>"
 

@@ -19,7 +19,8 @@ from torchgrasp.pipeline.fingers import finger_sets
 from torchgrasp.pipeline.grasps import plan_grasps
 from torchgrasp.posture_model.touch import can_close
 from torchgrasp.report.hands import draw_hand, opposed_posture
-from torchgrasp.testing import check_hand, find_faults, most_met, random_joints
+from torchgrasp.testing import check_hand
+from torchgrasp.testing.hands import find_faults, most_met, random_joints
 
 FREE, FACING, CLOSING = 0.2, 0.02, 0.001
 """Shares of random postures below which three fingers are doubtful; sound public hands have 0.27, 0.05 and 0.004. Of

@@ -167,7 +167,7 @@ def _describe(value: object) -> str:
     return f"{type(value).__name__} of shape {tuple(shape)}, {dtype}"
 
 
-def check_rigid(name: str, pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+def check_rigid(name: str, pose: Tensor) -> Float[Tensor, "4 4"]:
     """Return a transform that is rigid to 1e-4; refuse others."""
     check_tensor(name, pose, (4, 4))
     rotation, eye = pose[:3, :3].double(), torch.eye(3, dtype=torch.float64, device=pose.device)

@@ -36,7 +36,7 @@ from torchgrasp.shape.condition import condition
 from torchgrasp.shape.gp import Normalisation
 from torchgrasp.shape.observations import on_surface
 from torchgrasp.shape.surface import extract_surface
-from torchgrasp.testing import random_joints
+from torchgrasp.testing.hands import random_joints
 from torchgrasp.values import PointCloud
 
 SPEC = ContactSpec(table=0.0)

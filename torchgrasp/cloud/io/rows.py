@@ -98,8 +98,9 @@ def _as_rows(source: str, name: str, array: Any) -> Tensor:
         raise CloudFileError("path", f"{source}: {name} of shape {array.shape}", "(n, 3), or (h, w, 3) of an image")
     if array.size > 3 * MAX_POINTS:
         raise CloudFileError("path", f"{source} with {array.size // 3} points", f"at most {MAX_POINTS} points")
-    # A copy: owned, writable, native bytes.
-    rows = np.array(array, dtype=np.float64, order="C")
+    # A copy: owned, writable, native bytes. What double precision cannot hold becomes infinite, as of no point.
+    with np.errstate(invalid="ignore", over="ignore"):
+        rows = np.array(array, dtype=np.float64, order="C")
     return torch.from_numpy(rows if array.ndim < 3 else rows.reshape(-1, 3))
 
 

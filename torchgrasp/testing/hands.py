@@ -1,4 +1,4 @@
-"""The public law for hands: what torchgrasp needs of a hand of your own."""
+"""The public law for hands: what planning and closing need of a hand of your own."""
 
 import io
 from collections.abc import Iterator
@@ -9,10 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.errors import HandFileError
+from torchgrasp.border import checked
+from torchgrasp.errors import BrokenLaw, HandFileError
 from torchgrasp.frames import rotation_from_rpy
 from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.hand_toml import HandSpec, read_hand_toml
+from torchgrasp.hand.hand_toml import Fingers, HandSpec, read_hand_toml
 from torchgrasp.hand.kinematics import chain_from_urdf
 from torchgrasp.hand.load import find_hand, load_hand
 from torchgrasp.hand.urdf import Shape, Urdf, read_urdf
@@ -21,18 +22,25 @@ FK_POSTURES = 50
 """Random postures in which kinematics are compared, a millisecond each."""
 FK_TOLERANCE = 1e-8
 """Largest difference [m, and entries of rotations] from other libraries' poses; rounding leaves 1e-15."""
+STEP, JACOBIAN_TOLERANCE = 1e-6, 1e-6
+"""Step [rad] of central differences, and their largest difference [m/rad] from the Jacobian: they are off by 1e-10."""
 
 
-def check_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
-    """Check a shipped hand, or one in a folder, with a finger option, and return it.
+@checked
+def check_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
+    """Check a shipped hand, or one in a folder, with a choice of fingers, and return it.
 
-    The law covers coupling, limits, drives, masses, pads, parked joints and self-collision. The forward kinematics
-    must equal those of pytorch-kinematics and of yourdfpy, which applies `<mimic>` by itself.
+    The rules for its files are about coupling, limits, drives, masses, pads, parked joints and self-collision. The
+    laws for what is made of them, by the name that an error gives them:
+
+    * `kinematics`: every link is where pytorch-kinematics and yourdfpy, which applies `<mimic>` by itself, place it.
+    * `jacobian`: that of the fingertips equals central differences.
+    * `batch`: a batch of postures equals each alone, and a batch of none is empty.
 
     Raises:
         HandFileError: a file breaks a rule; the message names the file, what was found and what is allowed.
-        BadArgument: the hand has no such option.
-        AssertionError: the library places a link elsewhere than the other readers.
+        BadArgument: the hand has no such fingers.
+        BrokenLaw: the first law that is broken.
 
     >>> check_hand("barrett").name
     'barrett'
@@ -49,11 +57,28 @@ def check_hand(name_or_path: str | Path, fingers: str = "default") -> Hand:
         raise HandFileError("hand.toml", found, "parked joints, shapes or pairs of self_collision by which they part")
     worst, link = largest_fk_error(hand, joints)
     if not worst < FK_TOLERANCE:
-        raise AssertionError(f"{hand.name}: link {link} differs by {worst:.3g} from others' pose")
+        raise BrokenLaw("kinematics", f"link {link} of {hand.name} off by {worst:.3g}", "the pose of other readers")
+    _check_jacobian(hand, joints)
     return hand
 
 
-def find_faults(name_or_path: str | Path, fingers: str = "default") -> Iterator[HandFileError]:
+def _check_jacobian(hand: Hand, joints: Float[Tensor, "n h"]) -> None:
+    """Compare the Jacobian with central differences, and rows of a batch with each alone."""
+    steps = STEP * torch.eye(hand.dof, dtype=torch.float64)
+    after, before = (hand.fingertips(joints[:, None] + sign * steps)[0] for sign in (1, -1))
+    error = ((after - before) / (2 * STEP) - hand.jacobian(joints).movedim(-1, 1)).abs().amax((0, 2, 3))
+    if not float(error.max()) < JACOBIAN_TOLERANCE:
+        found = f"the column of {hand.joint_names[int(error.argmax())]} off by {float(error.max()):.3g}"
+        raise BrokenLaw("jacobian", found, "that of central differences")
+    points, _ = hand.fingertips(joints)
+    for row in (0, len(joints) - 1):
+        if not torch.allclose(hand.fingertips(joints[row])[0], points[row], rtol=0, atol=FK_TOLERANCE):
+            raise BrokenLaw("batch", f"row {row} of {len(joints)} elsewhere than alone", "the same fingertips")
+    if hand.fingertips(joints[:0])[0].shape != (0, *points.shape[1:]):
+        raise BrokenLaw("batch", "fingertips of no postures", "an empty batch")
+
+
+def find_faults(name_or_path: str | Path, fingers: Fingers = "default") -> Iterator[HandFileError]:
     """Yield every broken rule of a hand; raises as `load_hand` if it cannot be loaded."""
     spec = read_hand_toml(find_hand(name_or_path) / "hand.toml", fingers)
     urdf, hand = read_urdf(spec.urdf), load_hand(name_or_path, fingers)

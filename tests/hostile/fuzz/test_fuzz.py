@@ -1,0 +1,48 @@
+"""Mutated files of every kind: each is read, or refused by name, in little time and memory.
+
+`--hypothesis-profile=long` tries 100,000 of each kind, new ones in every run.
+"""
+
+import pytest
+from hypothesis import event, given
+from hypothesis import strategies as st
+
+from tests.hostile.fuzz.cases import KINDS
+from tests.hostile.fuzz.limits import limited
+from tests.hostile.fuzz.mutations import edits, mutated
+from torchgrasp.errors import GraspError
+from torchgrasp.hand.draft import draft_hand
+
+MOST_LETTERS = 2000
+"""Longest message of an error: it shows a part of what was found."""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_mutated_files_are_read_or_refused_by_name(kind, tmp_path, claw):
+    folder = tmp_path / kind
+    if kind in ("urdfs", "published", "tomls"):
+        (claw.parent / "hand.toml").write_text(draft_hand(claw))
+        claw.parent.rename(folder)
+    else:
+        folder.mkdir()
+    cases = KINDS[kind](folder)
+    for case in cases:
+        case.read(case.path)
+
+    @given(st.sampled_from(range(len(cases))), edits())
+    def check(number, changes):
+        case, told = cases[number], ""
+        content = mutated(case.good, changes)
+        case.path.write_bytes(content)
+        try:
+            with limited():
+                case.read(case.path)
+            event(f"{case.path.name}: read")
+        except GraspError as error:
+            told = str(error)
+            event(f"{case.path.name}: refused")
+        finally:
+            case.path.write_bytes(case.good)
+        assert len(told) < MOST_LETTERS
+
+    check()
