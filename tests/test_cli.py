@@ -120,6 +120,7 @@ def test_check_folder_leaves_a_folder_as_it_was(tmp_path):
     assert (tmp_path / "kept" / "report.html").read_text() == "old"
 
 
+@pytest.mark.promise("F9")
 def test_a_missing_simulator_is_named_before_the_work(tmp_path, capsys, monkeypatch, refuse_work):
     monkeypatch.setattr(grasps.importlib.util, "find_spec", lambda name: None)
     arguments = [VIEW, "--hand", "allegro", "--mesh", MESH, "--close", "--out", str(tmp_path / "out")]

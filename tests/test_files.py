@@ -134,6 +134,7 @@ def test_unequal_rows_are_refused(tmp_path):
         load_grasps(tmp_path / "f")
 
 
+@pytest.mark.promise("F3")
 def test_a_failed_write_leaves_the_old_file_and_no_debris(tmp_path):
     path = save_tensors(tmp_path / "f", "toy", {"a": torch.zeros(1)}, {})
     before = path.read_bytes()
@@ -201,6 +202,7 @@ def test_a_file_in_the_place_of_a_folder_is_named(tmp_path):
         write_file(tmp_path / "file" / "x", "")
 
 
+@pytest.mark.promise("F7")
 def test_a_folder_is_held_by_one_run_and_left_as_it_was(tmp_path):
     with hold_folder(tmp_path / "new" / "deep"):
         refused = rf"folder: found .*deep, in use by process {os.getpid()} on"

@@ -7,6 +7,7 @@ from torchgrasp.errors import IndefiniteCovariance
 from torchgrasp.linalg import cholesky, farthest_points, limit_norm, squared_mahalanobis, unit
 
 
+@pytest.mark.promise("I11")
 def test_cholesky_raises_with_the_smallest_eigenvalue():
     matrix = torch.tensor([[1.0, 2.0], [2.0, 1.0]], dtype=torch.float64)
     with pytest.raises(IndefiniteCovariance, match="buy a better matrix") as caught:
@@ -19,6 +20,7 @@ def test_cholesky_refuses_nan():
         cholesky(torch.full((2, 2), float("nan")), "K", "-")
 
 
+@pytest.mark.promise("I11")
 def test_cholesky_adds_nothing(generator):
     a = torch.randn(5, 5, generator=generator, dtype=torch.float64)
     matrix = a @ a.T + torch.eye(5, dtype=torch.float64)

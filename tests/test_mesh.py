@@ -80,6 +80,7 @@ def test_groups_and_materials_of_an_obj_are_left_out(tmp_path):
     assert mesh.volume == pytest.approx(0.001) and len(mesh.vertices) == 8
 
 
+@pytest.mark.promise("H2")
 @pytest.mark.parametrize("suffix", [".zip", ".3mf", ".dae", ".gltf", ".xyz", ""])
 def test_a_file_that_packs_or_names_others_is_no_mesh(tmp_path, suffix):
     path = tmp_path / f"box{suffix}"
@@ -103,6 +104,22 @@ def test_bad_files_are_refused(tmp_path):
     path = tmp_path / "box.ply"
     trimesh.creation.box((0.1, 0.1, 0.1)).export(path)
     assert read_mesh(str(path)).volume == pytest.approx(1e-3)
+
+
+@pytest.mark.promise("H2")
+@pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj", ".off"])
+def test_a_box_of_every_format_is_read_and_opens_nothing_else(tmp_path, suffix):
+    path, opened = tmp_path / f"box{suffix}", []
+    content = trimesh.creation.box((0.1, 0.1, 0.1)).export(file_type=suffix[1:])
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    if suffix == ".obj":
+        path.write_text(f"mtllib ../secret.mtl\nusemtl a\n{path.read_text()}")
+        (tmp_path.parent / "secret.mtl").write_text("newmtl a\n")
+    read_mesh(path)  # what is imported late is imported now
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("builtins.open", lambda file, *at, **by: opened.append(str(file)) or open(file, *at, **by))
+        assert read_mesh(path).volume == pytest.approx(1e-3)
+    assert set(opened) <= {str(path)}
 
 
 def test_closest_points_of_triangles_are_those_of_trimesh():
@@ -134,6 +151,7 @@ def test_nothing_and_all_of_a_mesh():
     assert len(clip_mesh(box.vertices, box.faces, np.ones(8))[1]) == 0
 
 
+@pytest.mark.promise("H5")
 def test_a_mesh_beyond_the_limits_is_refused_before_it_is_read(tmp_path, monkeypatch):
     path = tmp_path / "big.ply"
     with path.open("wb") as file:

@@ -26,6 +26,7 @@ DRAWERS = {"viser", "pyvista", "vtk", "vtkmodules", "matplotlib", "PIL"}
 SLOW = {"scipy", "trimesh", "yourdfpy", "pytorch_kinematics", "networkx", "lxml", "skimage", "sklearn", "embreex"}
 
 
+@pytest.mark.promise("F9")
 @pytest.mark.parametrize(
     "code",
     [
@@ -69,6 +70,7 @@ def test_every_public_name_exists():
     assert [name for name in torchgrasp.__all__ if not hasattr(torchgrasp, name)] == []
 
 
+@pytest.mark.promise("H4")
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_source_has_no_neural_network_pickle_or_global_random_state(path):
     text = path.read_text()

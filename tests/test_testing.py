@@ -13,6 +13,7 @@ from torchgrasp.shape import Kernel, kernel_by_name, matern52_kernel, rbf_kernel
 from torchgrasp.testing import check_hand, check_kernel, check_scene
 
 
+@pytest.mark.promise("N13")
 @pytest.mark.parametrize(
     ("name", "fingers"), [("allegro", "default"), ("allegro", "paper_literal"), ("barrett", "default")]
 )
@@ -94,6 +95,7 @@ def test_a_hand_that_moves_otherwise_is_told_which_law_it_breaks(monkeypatch, na
         check_hand("barrett")
 
 
+@pytest.mark.promise("N3", "N4")
 @pytest.mark.parametrize("name", ["thin_plate", "matern52", "rbf"])
 @pytest.mark.parametrize("psi", [0.5, 3.6, 10.0])
 def test_shipped_kernels_obey_the_law(name, psi):

@@ -162,6 +162,7 @@ def test_the_first_bad_index_is_named():
         PointCloud(points)
 
 
+@pytest.mark.promise("I10")
 @pytest.mark.parametrize(
     "bad",
     [dict(friction=-0.1), dict(friction=11.0), dict(edges=2), dict(max_variance=0.0), dict(max_variance=float("nan"))],

@@ -27,6 +27,7 @@ def flip(cloud, share, seed=0):
     ), flipped
 
 
+@pytest.mark.promise("I8")
 @pytest.mark.parametrize("name", list_objects())
 def test_flips_are_reported_and_good_normals_are_not(name):
     thing = load_object(name)

@@ -56,6 +56,7 @@ def refused(function, value, kind, match):
             function(value)
 
 
+@pytest.mark.promise("I1")
 @pytest.mark.parametrize("name", FUNCTIONS)
 @pytest.mark.parametrize("field", ["points", "normals", "viewpoint"])
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -69,6 +70,7 @@ def test_no_number_is_refused_where_the_value_is_made_and_where_it_is_used(name,
     refused(FUNCTIONS[name], cloud, BadArgument, field)
 
 
+@pytest.mark.promise("I2")
 @pytest.mark.parametrize("name", FUNCTIONS)
 @pytest.mark.parametrize("n", [0, 1, 2, 3])
 def test_fewer_than_four_points_are_refused(name, n):
@@ -78,6 +80,7 @@ def test_fewer_than_four_points_are_refused(name, n):
     refused(FUNCTIONS[name], copies, BadArgument, "coincide|distinct")
 
 
+@pytest.mark.promise("I3")
 @pytest.mark.parametrize("distance", [0.0, 1e-12, 5e-10])
 def test_copies_change_nothing(distance):
     cloud = ball(91)
@@ -93,6 +96,7 @@ def test_copies_change_nothing(distance):
         torch.testing.assert_close(six.variance, once.variance, atol=1e-6, rtol=0)
 
 
+@pytest.mark.promise("I4")
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_a_point_and_a_line_are_refused(name):
     along = torch.linspace(0, 0.1, 50, dtype=torch.float64)[:, None] * torch.tensor([1.0, 2.0, -1.0]).double()
@@ -100,6 +104,7 @@ def test_a_point_and_a_line_are_refused(name):
     refused(FUNCTIONS[name], PointCloud(along, along + 1), BadArgument, "line")
 
 
+@pytest.mark.promise("I4")
 @pytest.mark.parametrize("thickness", [0.0, 1e-12, 1e-6, 1e-3])
 def test_a_flat_cloud_is_accepted_and_finite(thickness):
     points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -111,6 +116,7 @@ def test_a_flat_cloud_is_accepted_and_finite(thickness):
         assert bool(torch.isfinite(getattr(estimate, field)).all())
 
 
+@pytest.mark.promise("I5")
 @pytest.mark.parametrize("name", FUNCTIONS)
 @pytest.mark.parametrize("factor", [1e-6, 1e-3, 1e3, 1e6])
 def test_a_wrong_unit_is_refused_by_name(name, factor):
@@ -119,6 +125,7 @@ def test_a_wrong_unit_is_refused_by_name(name, factor):
     refused(FUNCTIONS[name], scaled, SuspiciousScale, "mm" if factor > 1 else "metres")
 
 
+@pytest.mark.promise("I5")
 @pytest.mark.parametrize("factor", [0.25, 8.0])
 def test_results_scale_with_the_cloud(factor):
     cloud = ball()
@@ -133,6 +140,7 @@ def test_results_scale_with_the_cloud(factor):
     torch.testing.assert_close(big.points, factor * small.points, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.promise("I6")
 def test_far_from_the_origin_nothing_changes():
     cloud, shift = ball(), torch.tensor([1e4, -1e4, 1e4], dtype=torch.float64)
     far = PointCloud(cloud.points + shift, cloud.normals, EYE + shift)
@@ -145,6 +153,7 @@ def test_far_from_the_origin_nothing_changes():
         torch.testing.assert_close(other.predict(at + shift).distance, one.predict(at).distance, atol=1e-7, rtol=0)
 
 
+@pytest.mark.promise("I7")
 @pytest.mark.parametrize("dtype", [torch.int64, torch.float16, torch.complex64])
 def test_other_dtypes_and_shapes_are_refused(dtype):
     refused(lambda p: PointCloud(p), torch.ones(9, 3).to(dtype), (BadArgument, TypeError), "points")
@@ -152,6 +161,7 @@ def test_other_dtypes_and_shapes_are_refused(dtype):
         refused(lambda p: PointCloud(p), torch.rand(shape), (BadArgument, TypeError), "points")
 
 
+@pytest.mark.promise("I7")
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_gradients_are_refused_and_strides_do_not_matter(name):
     cloud, function = ball(), FUNCTIONS[name]
@@ -168,6 +178,7 @@ def test_gradients_are_refused_and_strides_do_not_matter(name):
         torch.testing.assert_close(one, other)
 
 
+@pytest.mark.promise("I8")
 def test_outliers_go_lengths_do_not_matter_and_zero_is_refused():
     cloud = ball(400)
     generator = torch.Generator().manual_seed(5)

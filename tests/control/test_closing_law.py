@@ -91,6 +91,7 @@ def test_eq26_refuses_an_indefinite_covariance():
         blend(torch.ones(3), torch.diag(torch.tensor([1.0, 1.0, -1.0])))
 
 
+@pytest.mark.promise("N14")
 def test_eq27_gain_is_inverse_to_the_variance_and_bounded_for_axis_normals():
     normals = torch.cat([torch.eye(3).double(), directions(20)])
     std = torch.linspace(0, 0.03, 23, dtype=torch.float64)
@@ -103,6 +104,7 @@ def test_eq27_gain_is_inverse_to_the_variance_and_bounded_for_axis_normals():
     assert (less >= more).all()
 
 
+@pytest.mark.promise("N14")
 def test_eq28_gain_is_inverse_to_the_force_variance():
     covariance = torch.diag_embed(draw(7, 3).abs() + 0.1)
     assert torch.allclose(force_gain(covariance, 0.5), 0.5 / covariance.diagonal(dim1=-2, dim2=-1))
@@ -135,6 +137,7 @@ def test_eq25_damped_inverse_is_the_regularised_least_squares(h):
         assert np.allclose(found, oracle, atol=1e-8)
 
 
+@pytest.mark.promise("I12")
 @pytest.mark.parametrize("scale", [0.0, 1e-9, 1e-3, 1.0, 1e3])
 def test_eq25_is_bounded_and_finite_for_any_state(scale):
     """10^5 states in all: fingers that nothing moves, singular ones, and gains from zero to almost infinite."""

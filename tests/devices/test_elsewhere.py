@@ -13,6 +13,7 @@ def test_it_says_where_it_is_and_results_stay_there():
     assert x.cpu().device == torch.device("cpu") and not isinstance(x.cpu(), type(x))
 
 
+@pytest.mark.promise("F8")
 @pytest.mark.parametrize(
     "mix",
     [

@@ -95,6 +95,7 @@ def test_clouds(device, name):
     same(CLOUDS[name](sent(VIEW)), CLOUDS[name](VIEW))
 
 
+@pytest.mark.promise("N9")
 @pytest.mark.parametrize("name", SHAPES)
 def test_shapes(device, shape, name):
     x = VIEW.points[:36].double()
@@ -139,6 +140,7 @@ def test_a_library_of_another_device_is_refused(device, hand, grasps):
     same(found, nearest_postures(library, grasps.contacts, CollisionWorld(table=0.0)))
 
 
+@pytest.mark.promise("F8")
 def test_grasps_are_where_the_cloud_is(device, hand):
     same(plan_grasps(sent(VIEW), hand, SPEC, 3), plan_grasps(VIEW, hand, SPEC, 3))
 

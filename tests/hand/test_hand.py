@@ -21,11 +21,13 @@ def hand(request) -> Hand:
     return load_hand(*request.param)
 
 
+@pytest.mark.promise("N13")
 def test_fk_equals_yourdfpy_coupled_joints_included(hand):
     error, link = largest_fk_error(hand, random_joints(hand, 200))
     assert error < 1e-6, link
 
 
+@pytest.mark.promise("N8")
 def test_fk_float32_within_a_micrometre(hand):
     joints = random_joints(hand, 500)
     points, normals = hand.fingertips(joints)
@@ -74,6 +76,7 @@ def test_joint_axes_and_origins_give_the_derivative_of_any_point_of_a_link(hand)
     torch.testing.assert_close(derivative, truth, atol=2e-8, rtol=1e-6)
 
 
+@pytest.mark.promise("N9")
 def test_batch_equals_singles_and_keeps_its_shape(hand):
     joints = random_joints(hand, 6).reshape(2, 3, hand.dof)
     points, normals = hand.fingertips(joints)
@@ -172,6 +175,7 @@ def test_touching_spheres_are_the_tips(hand):
     assert set(cover.finger.tolist()) == {-1, *range(len(hand.finger_names))} | parked
 
 
+@pytest.mark.promise("I13")
 def test_joints_outside_the_limits_are_named():
     hand = load_hand("allegro")
     joints = torch.zeros(2, 12)

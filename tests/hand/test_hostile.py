@@ -207,6 +207,7 @@ print(json.dumps({"outcomes": found, "seen": seen[:20]}))
 """
 
 
+@pytest.mark.promise("I13", "H1", "H2", "H3")
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="limits are set as on Linux")
 def test_hostile_hands_are_refused_and_open_nothing(claw, tmp_path):
     (claw.parent / "hand.toml").write_text(draft_hand(claw))
@@ -252,6 +253,7 @@ def replaced(value: Any, path: tuple[Any, ...], new: Any) -> Any:
     return dict(changed) if isinstance(value, dict) else [v for _, v in changed]
 
 
+@pytest.mark.promise("H5")
 def test_every_value_of_a_hand_toml_in_every_wrong_type(claw):
     """A value of another type is refused by name, or is as good as the old one; nothing else ends the reading."""
     good = tomllib.loads(draft_hand(claw))
@@ -278,6 +280,7 @@ def test_every_value_of_a_hand_toml_in_every_wrong_type(claw):
 # -------------------------------------------------------------------------------------------------- model files
 
 
+@pytest.mark.promise("H4")
 def test_model_files_cut_at_every_byte_of_the_header_or_changed_are_refused(tmp_path):
     whole = (hands_folder() / "barrett" / "mixture.safetensors").read_bytes()
     header = 8 + int.from_bytes(whole[:8], "little")

@@ -241,6 +241,7 @@ HOSTILE = [
 ]  # fmt: skip
 
 
+@pytest.mark.promise("H2")
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_mesh_elsewhere_is_refused_by_name(claw, name):
     (claw.parent.parent / "secret.stl").write_bytes(trimesh.creation.box().export(file_type="stl"))

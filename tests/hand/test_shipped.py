@@ -67,6 +67,7 @@ def test_a_left_hand_is_the_mirror_image(image):
     assert left.check_joints(joints * turned) is not None
 
 
+@pytest.mark.promise("H6")
 @pytest.mark.parametrize("table", TABLES, ids=[table.name for table in TABLES])
 def test_the_files_are_those_of_the_table(table):
     folder = hands_folder() / table.name

@@ -95,6 +95,7 @@ HOSTILE = {
 }  # fmt: skip
 
 
+@pytest.mark.promise("H1")
 @pytest.mark.parametrize("name", HOSTILE)
 def test_hostile_urdf_is_refused(tmp_path, name):
     text, match = HOSTILE[name]

@@ -67,6 +67,7 @@ def test_every_public_function_and_value_is_behind_the_border():
     assert open_ones == ["torchgrasp.cli.main"]
 
 
+@pytest.mark.promise("I1")
 @pytest.mark.parametrize("name", sorted(checked_things()))
 @pytest.mark.filterwarnings("ignore")  # torch warns of some odd layouts
 def test_wrong_arguments_are_refused_by_name(name, tmp_path):

@@ -115,6 +115,7 @@ def test_what_is_no_manifest_is_refused(tmp_path: Path, name: str):
         list_views(tmp_path)
 
 
+@pytest.mark.promise("H2")
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no named pipes among its files")
 def test_pipes_and_links_to_the_outside_are_refused(tmp_path: Path):
     put(tmp_path / "outside")

@@ -26,6 +26,7 @@ sys.exit(cli.main(["wait", "--out", sys.argv[1]]))
 """
 
 
+@pytest.mark.promise("F6")
 @pytest.mark.parametrize(("sign", "code", "said"), [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")])
 def test_a_command_that_is_told_to_end_says_so_and_leaves_nothing(tmp_path: Path, sign: str, code: int, said: str):
     command = [sys.executable, "-c", WAITING, str(tmp_path / "out")]

@@ -47,6 +47,7 @@ def test_eq24_postures_of_the_library_are_found_and_placed(library, poses):
     assert bool((best.energy <= seeds.energy.view(12, 3).T).all())
 
 
+@pytest.mark.promise("N7")
 def test_the_order_of_the_contacts_does_not_matter(library, poses):
     contacts = touched(library, poses)
     order = torch.arange(contacts.fingertips).roll(1)

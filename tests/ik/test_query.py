@@ -56,6 +56,7 @@ def test_postures_are_found_again(motion):
     assert bool((seeds.energy < DEFAULT_ENERGY).all())
 
 
+@pytest.mark.promise("N6")
 def test_rows_are_in_order_and_the_wrong_side_comes_last(motion):
     hand, samples, mixture = barrett()
     contacts = touched_contacts(hand, samples.joints[9000:9100], motion)

@@ -35,6 +35,7 @@ def transformed(contacts: Contacts, motion: torch.Tensor, scale: float = 1.0) ->
     return Contacts(points, rotate(motion, contacts.normals))
 
 
+@pytest.mark.promise("N5")
 def test_the_posterior_moves_with_its_observations(seen_cylinder, motion, generator):
     x = seen_cylinder.points[:60] / 0.1
     n = len(x)
@@ -60,6 +61,7 @@ def test_the_posterior_moves_with_its_observations(seen_cylinder, motion, genera
     torch.testing.assert_close(a.variance, b.variance, rtol=0, atol=1e-8)
 
 
+@pytest.mark.promise("I6")
 @pytest.mark.parametrize("name", ["cylinder", "jug", "rabbit", "spray"])
 def test_a_shifted_cloud_gives_a_shifted_shape(name):
     """Ties on a raster are broken by order, not by the rounding of shifted coordinates."""
@@ -72,6 +74,7 @@ def test_a_shifted_cloud_gives_a_shifted_shape(name):
     torch.testing.assert_close(a.variance, b.variance, rtol=0, atol=1e-7)
 
 
+@pytest.mark.promise("I5", "N5")
 def test_certificates_and_codes_ignore_frames_and_units(generator, motion):
     contacts = triples(40, generator)
     spec = ContactSpec(friction=0.8, friction_margin=1.0)
@@ -84,6 +87,7 @@ def test_certificates_and_codes_ignore_frames_and_units(generator, motion):
     torch.testing.assert_close(encode(transformed(contacts, motion)).q, encode(contacts).q)
 
 
+@pytest.mark.promise("N7")
 def test_the_code_of_a_permuted_triple_is_the_permuted_set(generator):
     contacts = triples(10, generator)
     swapped = Contacts(contacts.points.flip(1), contacts.normals.flip(1))
@@ -93,6 +97,7 @@ def test_the_code_of_a_permuted_triple_is_the_permuted_set(generator):
     torch.testing.assert_close(a, b[:, index])
 
 
+@pytest.mark.promise("N10")
 def test_the_same_seed_gives_the_same_plan(seen_cylinder):
     shape = fit_shape(seen_cylinder)
     spec = ContactSpec(friction=0.8)
@@ -111,6 +116,7 @@ plan_grasps(load_object("cylinder").view, load_hand("barrett"), starts=60, seed=
 """
 
 
+@pytest.mark.promise("N10")
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_grasps_in_two_processes(tmp_path):
     digests = []
@@ -138,6 +144,7 @@ assert torch.get_num_threads() == threads
 """
 
 
+@pytest.mark.promise("N10")
 def test_no_global_state_is_touched():
     """In a process of its own: the annotation checks of the tests draw from Python's global generator themselves."""
     done = subprocess.run([sys.executable, "-c", STATE], capture_output=True, text=True, timeout=300)

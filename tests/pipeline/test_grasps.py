@@ -63,6 +63,7 @@ def closure_margin(points: np.ndarray, normals: np.ndarray, friction: float, edg
     return (-found.fun if found.status == 0 else -np.inf), int(np.linalg.matrix_rank(w, tol=1e-3))
 
 
+@pytest.mark.promise("N1")
 def test_eq13_every_grasp_passes_an_independent_programme(run):
     _, grasps, _ = run
     good = grasps[grasps.status == Status.OK]
@@ -106,6 +107,7 @@ def test_success_is_what_the_model_says_of_the_surface_that_was_planned_on(run):
     torch.testing.assert_close(best.success, 1 / (1 + (-odds - model["bias"][hand.name]).exp()), rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.promise("N5")
 def test_grasps_do_not_depend_on_the_frame_of_cloud_camera_and_table(moved_by):
     hand, view, shapes = load_hand("barrett"), load_object("cylinder").view.to(torch.float64), []
     note = lambda stage, text, value: shapes.append(value) if stage == "shape" else None  # noqa: E731

@@ -38,6 +38,7 @@ def die_once(path: str) -> str:
     return "survived"
 
 
+@pytest.mark.promise("F4", "F5")
 def test_a_failure_costs_its_own_task_alone_and_the_order_stays():
     bad = {2: "KILL", 4: "hang", 5: "exit"}
     found = list(run_tasks(act, [(bad.get(i, "square"), i) for i in range(12)], workers=2, limit=3.0))
@@ -45,6 +46,7 @@ def test_a_failure_costs_its_own_task_alone_and_the_order_stays():
     assert found == [expected.get(i, i * i) for i in range(12)]
 
 
+@pytest.mark.promise("F4")
 def test_a_death_that_is_not_the_tasks_own_is_forgiven(tmp_path):
     assert list(run_tasks(die_once, [(str(tmp_path / "mark"),)], workers=1)) == ["survived"]
 
@@ -79,6 +81,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.promise("F6")
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGKILL])
 def test_no_worker_outlives_the_run(tmp_path, sign):

@@ -76,6 +76,7 @@ def exact_products(wrench: Tensor, witness: Tensor) -> list[Fraction]:
     return [sum((Fraction(x) * y for x, y in zip(row, w, strict=True)), Fraction(0)) for row in rows]
 
 
+@pytest.mark.promise("N2")
 def test_open_rows_carry_a_wrench_that_no_contact_opposes(generator):
     points, normals = leaning(generator, 200)
     found = certify(Contacts(points, normals), SPEC)
@@ -114,6 +115,7 @@ def test_highs_gives_the_same_certificates_where_the_batch_gives_none(generator,
     torch.testing.assert_close(bound_margin(w, alone.witness), alone.margin, rtol=0, atol=1e-9)
 
 
+@pytest.mark.promise("N9")
 def test_a_certificate_does_not_depend_on_the_rows_beside_it(generator):
     points, normals = leaning(generator, 30)
     every = certify(Contacts(points, normals), SPEC)
@@ -122,6 +124,7 @@ def test_a_certificate_does_not_depend_on_the_rows_beside_it(generator):
         torch.testing.assert_close(getattr(some, name), getattr(every, name)[7:9], rtol=0, atol=1e-12)
 
 
+@pytest.mark.promise("I10")
 def test_parallel_normals_and_no_friction_leave_no_balance_at_all(generator):
     up = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand(1, 3, 3)
     for found in (
@@ -153,6 +156,7 @@ def test_planned_friction_decides():
     assert bool(certify(Contacts(triangle(), normals), ContactSpec(friction=1.0, friction_margin=0.9)).closed)
 
 
+@pytest.mark.promise("I9")
 def test_coincident_contacts_are_refused_though_eq13_holds_for_them():
     points = torch.ones(1, 3, 3, dtype=torch.float64)
     found = certify(Contacts(points, triangle()), SPEC)
@@ -162,6 +166,7 @@ def test_coincident_contacts_are_refused_though_eq13_holds_for_them():
     assert float((wrenches(points, triangle(), 0.6) @ found.witness[0]).abs().max()) < 1e-9
 
 
+@pytest.mark.promise("I9")
 def test_collinear_contacts_are_refused_though_eq13_holds_for_them():
     points = torch.tensor([[[-1.0, 0, 0], [1, 0, 0], [0.4, 0, 0]]], dtype=torch.float64)
     normals = torch.tensor([[[-1.0, 0, 0], [1, 0, 0], [1, 0, 0]]], dtype=torch.float64)
@@ -183,6 +188,7 @@ def test_rows_that_are_not_finite_are_not_closed_and_harm_no_other():
     assert found.witness.isnan().all(-1).tolist() == [False, True, True]
 
 
+@pytest.mark.promise("I7")
 def test_no_rows_give_no_certificates():
     empty = torch.zeros(0, 3, 3, dtype=torch.float64)
     assert len(certify(Contacts(empty, empty), SPEC)) == 0

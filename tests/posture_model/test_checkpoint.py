@@ -39,6 +39,7 @@ def fit_until(step: int, path: Path, samples: HandSamples) -> None:
         fit_mixture(samples, 5, iterations=20, tolerance=0.0, checkpoint=path, observer=kill)
 
 
+@pytest.mark.promise("F2")
 def test_a_fit_goes_on_where_it_was_killed(tmp_path):
     samples, path = ring(), tmp_path / "fit.safetensors"
     whole = fit_mixture(samples, 5, iterations=20, tolerance=0.0)
@@ -57,6 +58,7 @@ def test_a_fit_goes_on_where_it_was_killed(tmp_path):
     assert torch.equal(parameters(longer), parameters(fit_mixture(samples, 5, iterations=25, tolerance=0.0)))
 
 
+@pytest.mark.promise("F2")
 def test_a_fit_outlives_kill_9(tmp_path):
     path = tmp_path / "fit.safetensors"
     script = f"""

@@ -76,6 +76,7 @@ sys.exit(main({arguments!r}))
 """
 
 
+@pytest.mark.promise("F1")
 def test_a_run_that_was_interrupted_and_killed_is_continued_to_the_same_bytes(tmp_path):
     hand, n, folder = load_hand("barrett"), 70_000, tmp_path / "killed"
     arguments = ["hand", "sample", "--hand", "barrett", "--n", str(n), "--out", str(folder), "--workers", "2"]
@@ -95,6 +96,7 @@ def test_a_run_that_was_interrupted_and_killed_is_continued_to_the_same_bytes(tm
     assert contents(folder) == contents(tmp_path / "whole")
 
 
+@pytest.mark.promise("F1")
 def test_half_a_chunk_is_never_taken_for_a_whole_one(tmp_path, small):
     hand = load_hand("barrett")
     write_samples(hand, SampleSpec(1100), tmp_path)
@@ -109,6 +111,7 @@ def test_half_a_chunk_is_never_taken_for_a_whole_one(tmp_path, small):
         assert contents(tmp_path) == whole
 
 
+@pytest.mark.promise("F7")
 def test_a_second_run_on_the_folder_is_refused(tmp_path, small):
     hand = load_hand("barrett")
     with hold_folder(tmp_path), pytest.raises(OutputError, match=f"in use by process {os.getpid()} on"):
@@ -118,6 +121,7 @@ def test_a_second_run_on_the_folder_is_refused(tmp_path, small):
     assert not (tmp_path / ".lock").exists()
 
 
+@pytest.mark.promise("F3")
 def test_a_full_disk_leaves_nothing_half_written_and_the_run_goes_on_later(tmp_path, small, monkeypatch):
     hand = load_hand("barrett")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -53,6 +53,7 @@ def test_eq20_one_component_is_the_sample_mean_and_covariance():
     torch.testing.assert_close(result.covariances[0], torch.cov(x.T, correction=0))
 
 
+@pytest.mark.promise("N11")
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 def test_eq20_em_equals_scikit_learn_from_the_same_start():
     x, m, steps = clustered(), 6, 15
@@ -74,6 +75,7 @@ def test_eq20_em_equals_scikit_learn_from_the_same_start():
     np.testing.assert_allclose(float(ours.log_likelihood[-1]), theirs.score(x.numpy()), atol=1e-9)
 
 
+@pytest.mark.promise("N11")
 @pytest.mark.parametrize("m", [1, 3, 9])
 def test_log_likelihood_never_decreases(m):
     x = clustered()
@@ -133,6 +135,7 @@ def test_a_collapsed_component_is_placed_anew_and_the_fit_recovers():
     assert abs(float(fit.log_likelihood[-1] - usual.log_likelihood[-1])) < 0.05
 
 
+@pytest.mark.promise("I11")
 def test_a_component_is_placed_anew_three_times_and_no_more():
     x = clustered()
     components = start_components(Shard(x), 3, 0, 1e-6).components

@@ -25,6 +25,7 @@ def test_eq18_code_by_hand():
     torch.testing.assert_close(encode_fingertips(points, normals), torch.tensor(wanted, dtype=torch.float64))
 
 
+@pytest.mark.promise("N6")
 def test_eq18_code_is_invariant_under_rigid_motion_and_sign(generator, motion):
     points, normals = triples(100, generator)
     q = encode_fingertips(points, normals)
@@ -66,6 +67,7 @@ def test_contacts_and_pairs_are_the_same(generator):
     assert encode(contacts[2]).q.shape == (1, 6, 6)
 
 
+@pytest.mark.promise("I9")
 def test_degenerate_rows_carry_a_status(generator):
     points, normals = triples(4, generator)
     points[1] = points[1, 0]  # coincident
@@ -78,6 +80,7 @@ def test_degenerate_rows_carry_a_status(generator):
     torch.testing.assert_close(code.obj_from_vf[3, 0], virtual_frame(points[3]))
 
 
+@pytest.mark.promise("I7")
 def test_empty_batch_and_float32(generator):
     assert encode((torch.zeros(0, 3, 3), torch.zeros(0, 3, 3))).q.shape == (0, 6, 6)
     points, normals = triples(3, generator)

@@ -46,6 +46,7 @@ def test_eq21_eq22_energy_is_half_the_least_squared_mahalanobis_distance(generat
     torch.testing.assert_close(mixture.energy(q), torch.stack(each).amin(0), rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.promise("N12")
 def test_eq21_thresholds_accept_what_their_names_say():
     assert math.isclose(2 * DEFAULT_ENERGY, chi2.ppf(0.95, 6), abs_tol=1e-7)
     n = 1_000_000
@@ -59,6 +60,7 @@ def test_eq21_thresholds_accept_what_their_names_say():
     assert abs(chi2.cdf(2 * PAPER_ENERGY, 6) - 0.323) < 5e-4
 
 
+@pytest.mark.promise("N11")
 def test_eq23_conditional_mean_is_brute_force_bayes():
     # Two joints: sum the joint density over a fine grid of both, a Riemann sum that is exact for Gaussians.
     mixture = random_mixture(3)

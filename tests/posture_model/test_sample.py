@@ -29,6 +29,7 @@ def test_samples_are_free_within_limits_and_coded(name):
     assert samples.rows().shape == (2000, len(hand.joint_names) + 6)
 
 
+@pytest.mark.promise("N10")
 def test_same_seed_same_samples_for_any_number_of_workers():
     hand = load_hand("barrett")
     n = 2500  # more than one chunk

@@ -153,6 +153,7 @@ def test_copies_of_points_with_normals_change_nothing_in_the_papers_support():
     assert torch.equal(once.weights, twice.weights)
 
 
+@pytest.mark.promise("N8")
 def test_a_float32_cloud_gives_a_float64_shape():
     cloud = _cylinder().to(torch.float32)
     shape = fit_shape(cloud)

@@ -82,6 +82,7 @@ def test_eq7_and_eq8_equal_a_naive_solve(half_ball: ShapeGP):
         torch.testing.assert_close(found.covariance[i], spread, rtol=0, atol=1e-6)
 
 
+@pytest.mark.promise("N4")
 def test_eq8_variance_is_small_where_seen_and_within_zero_and_the_prior_everywhere(half_ball: ShapeGP):
     found = half_ball.predict(half_ball.metres(_queries(half_ball, 3000)))
     assert found.variance.min() > 0 and found.variance.max() < half_ball.psi**3
@@ -198,6 +199,7 @@ def test_queries_that_are_not_finite_are_refused(half_ball: ShapeGP):
         half_ball.predict(torch.full((2, 3), torch.nan))
 
 
+@pytest.mark.promise("I11")
 def test_three_points_make_the_papers_psi_indefinite_and_the_default_not():
     x = torch.tensor([[0, 0, 0.5], [0, 0, -0.5], [3**0.5 / 4, 0, 0.25]], dtype=torch.float64)
     has = torch.ones(3, dtype=torch.bool)

@@ -60,6 +60,7 @@ def test_eq4_covariance_of_normal_and_distance_is_the_derivative_in_the_normals_
     torch.testing.assert_close(block[0, 1:], db)
 
 
+@pytest.mark.promise("N3")
 def test_eq5_takes_one_derivative_in_each_argument():
     a, b = _points(2)
     step, fd = 1e-4, torch.empty(3, 3, dtype=torch.float64)
@@ -79,6 +80,7 @@ def test_eq5_matrix_is_symmetric_and_positive():
     assert torch.linalg.eigvalsh(matrix).min() > -1e-10
 
 
+@pytest.mark.promise("N3")
 @pytest.mark.parametrize("gap", [0.0, 1e-12, 1e-8, 1e-5, 9.9e-6, 1.01e-5, 1e-3])
 def test_blocks_are_right_at_and_near_coincident_points(gap: float):
     a = _points(1)[0]

@@ -108,6 +108,7 @@ def test_object_has_the_mass_centre_and_inertia_of_its_mesh(simulator):
     )
 
 
+@pytest.mark.promise("N13")
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("simulator", SIMULATORS)

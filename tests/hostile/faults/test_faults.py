@@ -72,11 +72,13 @@ def bench(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mo
     return Bench(command, whole, ended.calls, tmp_path, 1 if long else STEP)
 
 
+@pytest.mark.promise("F1")
 def test_a_killed_command_is_continued_to_the_same_bytes(bench: Bench):
     for ended, out in bench.disturb(0, kill):
         assert ended.code == -signal.SIGKILL and bench.sound(out)
 
 
+@pytest.mark.promise("F3")
 def test_a_disk_that_refuses_is_named_and_nothing_half_written_stays(bench: Bench):
     for ended, out in bench.disturb(2, fail(errno.ENOSPC), fail(errno.EROFS)):
         assert ended.code in (0, 2) and bench.sound(out)  # 0: only the removal of a lock was refused
@@ -87,12 +89,14 @@ def test_a_disk_that_refuses_is_named_and_nothing_half_written_stays(bench: Benc
         assert not [name for name in contents(out) if name.endswith(".part")]
 
 
+@pytest.mark.promise("F6")
 def test_a_command_that_is_told_to_end_says_so(bench: Bench):
     for ended, out in bench.disturb(3, send(signal.SIGINT), send(signal.SIGTERM)):
         assert ended[::2] in ((130, "torchgrasp: interrupted\n"), (143, "torchgrasp: terminated\n"))
         assert bench.sound(out)
 
 
+@pytest.mark.promise("F7")
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_second_run_on_what_another_writes_is_refused_by_name(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -65,7 +65,7 @@ def clouds(folder: Path) -> list[Case]:
 def meshes(folder: Path) -> list[Case]:
     """Return meshes in every format, one with a material that is a file."""
     ball = trimesh.creation.icosahedron().apply_scale(0.05)
-    for name in ("a.stl", "a.obj", "a.ply"):
+    for name in ("a.stl", "a.obj", "a.ply", "a.off"):
         ball.export(folder / name)
     ball.export(folder / "text.stl", file_type="stl_ascii")
     ball.export(folder / "text.ply", encoding="ascii")

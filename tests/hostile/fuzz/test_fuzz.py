@@ -19,6 +19,7 @@ SLOWNESS = {"published": 10}
 """Kinds that are read so many times slower than others, and tried so many times less often: mending takes 20 ms."""
 
 
+@pytest.mark.promise("H5")
 @pytest.mark.parametrize("kind", KINDS)
 def test_mutated_files_are_read_or_refused_by_name(kind, tmp_path, claw):
     folder = tmp_path / kind
