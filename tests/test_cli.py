@@ -200,7 +200,8 @@ def test_grasp_from_cloud_to_files(tmp_path, capsys):
     assert said.err == ""  # no bar where there is no terminal
     for stage in ("cloud", "shape", "plan", "certify", "query", "refine", "report"):
         assert any(line.startswith(stage) for line in said.out.splitlines())
-    assert sorted(p.name for p in out.iterdir()) == ["grasps.safetensors", "report.html"]
+    assert sorted(p.name for p in out.iterdir()) == ["grasps.safetensors", "report.html", "view.html"]
+    assert 'href="view.html"' in (out / "report.html").read_text()
 
     from torchgrasp.values import load_grasps
 
@@ -211,8 +212,7 @@ def test_grasp_from_cloud_to_files(tmp_path, capsys):
     assert said.out.splitlines()[-1].startswith("The barrett hand has")
 
 
-def test_an_empty_result_names_what_would_help(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(grasps, "write_report", lambda path, run: path)
+def test_an_empty_result_names_what_would_help(tmp_path, capsys):
     code = cli.main(
         [
             "grasp",
@@ -227,10 +227,11 @@ def test_an_empty_result_names_what_would_help(tmp_path, capsys, monkeypatch):
             "0",
             "--table",
             "0",
+            "--no-report",
         ]
     )
     said = capsys.readouterr().out
-    assert code == 1
+    assert code == 1 and [p.name for p in tmp_path.iterdir()] == ["grasps.safetensors"]
     assert any(line.startswith("change") and "executable" in line for line in said.splitlines())
     last = said.splitlines()[-1]
     assert (

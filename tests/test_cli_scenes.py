@@ -53,7 +53,8 @@ def middle(labels: np.ndarray, label: int) -> tuple[str, str]:
 
 @pytest.fixture(autouse=True)
 def no_report(monkeypatch):
-    monkeypatch.setattr("torchgrasp.cli.scene_grasps.write_report", lambda path, run: path)
+    monkeypatch.setattr("torchgrasp.cli.results.write_report", lambda path, run, view: path)
+    monkeypatch.setattr("torchgrasp.cli.results.write_viewer", lambda path, run: path)
 
 
 @pytest.mark.parametrize("click", [True, False])

@@ -26,6 +26,7 @@ from torchgrasp.cli.common import (
     table_plane,
 )
 from torchgrasp.cli.progress import Progress
+from torchgrasp.cli.results import write_results
 from torchgrasp.cli.scene_grasps import Wanted, grasp_scene
 from torchgrasp.columns import format_columns
 from torchgrasp.errors import BadArgument, MissingExtra, Status
@@ -37,7 +38,7 @@ from torchgrasp.objects import DATA, MASSES, list_objects, load_object
 from torchgrasp.pipeline.explain import explain_empty
 from torchgrasp.pipeline.grasps import plan_grasps
 from torchgrasp.pipeline.task import LEAST_BUDGET
-from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows, write_report
+from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows
 from torchgrasp.report.run import Run, verdict
 from torchgrasp.scene.file import is_scene
 from torchgrasp.shape.surface import extract_surface
@@ -72,13 +73,14 @@ def grasp(
     mode: Mode = "joint",
     label: int | None = None,
     point: tuple[float, float] | None = None,
+    no_report: bool = False,
 ) -> int:
     """Plan grasps of the object in a partial cloud, and close on it in simulation; or of a thing in a scene.
 
-    Writes grasps.safetensors and report.html into the output folder. Where no grasp is executable, single changes are
-    tried, and the one that helps most is named. The cloud is checked as by `cloud check`. Refused
-    are: a camera below the table or that the points contradict, a plane left in, two bodies, and another unit. Other
-    findings are printed as advice.
+    Writes grasps.safetensors, report.html and view.html, which turns, into the output folder. Where no grasp is
+    executable, single changes are tried, and the one that helps most is named. The cloud is checked as by `cloud
+    check`. Refused are: a camera below the table or that the points contradict, a plane left in, two bodies, and
+    another unit. Other findings are printed as advice.
 
     Args:
         cloud: point cloud of one object (.ply, .pcd, .npy, .npz, .xyz, .txt, .csv), or a scene (.npz with depth and
@@ -100,6 +102,7 @@ def grasp(
         mode: contacts, pose and joints together; contacts first and the learned model after; or the paper as written.
         label: of the thing to grasp in a scene; by default the easiest.
         point: column and row of a pixel on the thing to grasp in a scene.
+        no_report: write the grasps alone, without the pages.
     """
     with naming(path="--out"):
         check_folder(out)
@@ -117,7 +120,7 @@ def grasp(
         check_whole("--starts", starts, 1, 1_000_000)
         check_seed(seed)
         wanted = Wanted(the_hand, spec, starts, seed, among)
-        return grasp_scene(cloud, wanted, point if label is None else label, out)
+        return grasp_scene(cloud, wanted, point if label is None else label, out, no_report)
     if label is not None or point is not None:
         raise BadArgument("--label, --point", f"{cloud}, which is no scene", "a .npz file with depth and intrinsics")
     if close:
@@ -171,9 +174,7 @@ def grasp(
             progress.end("closing", f"{closure.time[-1]:.1f} s simulated, {closure.status.name.lower()}")
             run = dataclasses.replace(run, stages=tuple(progress.stages), mesh=true_mesh, closure=closure)
         with naming(path="--out"):
-            grasps.save(out / "grasps.safetensors")
-            write_report(out / "report.html", run)
-        progress.end("report", f"{out / 'grasps.safetensors'}, {out / 'report.html'}")
+            progress.end("report", write_results(out, run, no_report))
     if len(run.executable):
         print(f"\n{format_columns([GRASP_COLUMNS, *grasp_rows(run.executable, 5)])}\n")
     print(verdict(run))

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from torchgrasp.cli.common import holding, naming
 from torchgrasp.cli.progress import Progress
+from torchgrasp.cli.results import write_results
 from torchgrasp.columns import format_columns, format_line
 from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
@@ -15,7 +16,7 @@ from torchgrasp.pipeline.explain import explain_empty
 from torchgrasp.pipeline.grasps import plan_grasps
 from torchgrasp.pipeline.task import take_target
 from torchgrasp.pipeline.things import ThingPlan, plan_scene
-from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows, write_report
+from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows
 from torchgrasp.report.run import Run, verdict
 from torchgrasp.scene.file import read_scene
 from torchgrasp.shape.surface import extract_surface
@@ -35,7 +36,9 @@ class Wanted(NamedTuple):
     fingers: Fingers | None
 
 
-def grasp_scene(path: Path, wanted: Wanted, choice: int | tuple[float, float] | None, out: Path) -> int:
+def grasp_scene(
+    path: Path, wanted: Wanted, choice: int | tuple[float, float] | None, out: Path, no_report: bool = False
+) -> int:
     """Plan grasps of a thing of a scene, and write them with a report.
 
     Args:
@@ -43,6 +46,7 @@ def grasp_scene(path: Path, wanted: Wanted, choice: int | tuple[float, float] | 
         wanted: what is planned for.
         choice: label of the thing, or column and row of a pixel on it; None: the easiest thing.
         out: folder to write.
+        no_report: write the grasps alone.
     """
     hand, spec, starts, seed, fingers = wanted
     names = {name: f"CLOUD: {name}" for name in ("depth", "intrinsics", "mask", "labels", "camera_pose", "table")}
@@ -79,9 +83,7 @@ def grasp_scene(path: Path, wanted: Wanted, choice: int | tuple[float, float] | 
             progress.values.get("plan"), scene=scene, explanation=explanation,
         )  # fmt: skip
         with naming(path="--out"):
-            grasps.save(out / "grasps.safetensors")
-            write_report(out / "report.html", run)
-        progress.end("report", f"{out / 'grasps.safetensors'}, {out / 'report.html'}")
+            progress.end("report", write_results(out, run, no_report))
     if len(run.executable):
         print(f"\n{format_columns([GRASP_COLUMNS, *grasp_rows(run.executable, 5)])}\n")
     print(verdict(run))

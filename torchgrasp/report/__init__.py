@@ -3,5 +3,6 @@
 from torchgrasp.report.evaluation import write_evaluation
 from torchgrasp.report.page import draw_pictures, write_report
 from torchgrasp.report.run import Run, Stage, verdict
+from torchgrasp.report.turning import write_viewer
 
-__all__ = ["Run", "Stage", "draw_pictures", "verdict", "write_evaluation", "write_report"]
+__all__ = ["Run", "Stage", "draw_pictures", "verdict", "write_evaluation", "write_report", "write_viewer"]

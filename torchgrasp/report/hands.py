@@ -71,7 +71,7 @@ def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> byte
     points, normals = (x.cpu().numpy() for x in hand.fingertips(joints[None].double()))
     canvas = Canvas()
     for solid in solids:
-        canvas.add_mesh(solid.vertices, solid.faces, solid.color)
+        canvas.add_mesh(solid.vertices, solid.faces, solid.color, solid.normals)
     canvas.add_arrows(points[0], normals[0], NORMAL, FINGERS[: len(hand.tips)])
     frame = FRAME * float(np.linalg.norm(np.ptp(solids[0].vertices, axis=0)))
     canvas.add_arrows(np.zeros((3, 3)), np.eye(3), frame, AXES)

@@ -32,13 +32,18 @@ from torchgrasp.values import Grasps
 
 
 @checked
-def write_report(path: Path | str, run: Run) -> Path:
+def write_report(path: Path | str, run: Run, view: str = "") -> Path:
     """Write a run with its pictures as one HTML file, atomically.
+
+    Args:
+        path: file to write.
+        run: what it shows.
+        view: name of the page beside it that `write_viewer` wrote, if any; the report links to it.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    return write_file(path, format_page(run, draw_pictures(run)))
+    return write_file(path, format_page(run, draw_pictures(run), view))
 
 
 @checked
@@ -78,8 +83,8 @@ def draw_pictures(run: Run) -> dict[str, list[tuple[str, bytes]]]:
     return sections
 
 
-def format_page(run: Run, pictures: dict[str, list[tuple[str, bytes]]]) -> str:
-    """Return the page of a run as text."""
+def format_page(run: Run, pictures: dict[str, list[tuple[str, bytes]]], view: str = "") -> str:
+    """Return the page of a run as text, with a link to its `view`."""
     good = run.closure.held if run.closure is not None else len(run.executable) > 0
     title = f"Grasps of the {run.object_name} with the {run.hand.name} hand"
     stages = [(s.name, s.message, f"{s.seconds:.1f}") for s in run.stages]
@@ -87,6 +92,8 @@ def format_page(run: Run, pictures: dict[str, list[tuple[str, bytes]]]) -> str:
     body = [
         f'<p class="source">from {escape(run.source)}, {len(run.cloud)} points</p>',
         f'<p class="verdict{"" if good else " bad"}">{escape(verdict(run))}</p>',
+        *[f'<p class="view"><a href="{escape(view)}">Turn it, step through the grasps, replay the closing</a></p>']
+        * bool(view),
         *(_section(name, shots, run) for name, shots in pictures.items()),
         "<h2>Stages</h2>",
         format_html_table(("stage", "result", "seconds"), stages, numbers={2}),

@@ -71,7 +71,7 @@ def draw_grasp(surface: Surface, hand: Hand, grasp: Grasps, direction: Direction
     canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, to_array(surface.normals))
     add_contacts(canvas, grasp.contacts)
     for solid in solids:
-        canvas.add_mesh(solid.vertices, solid.faces, solid.color)
+        canvas.add_mesh(solid.vertices, solid.faces, solid.color, solid.normals)
     corners = np.concatenate([vertices, *(s.vertices for s in solids)])
     canvas.add_table(corners, table)
     return canvas.render_png(corners, direction)
@@ -86,7 +86,7 @@ def draw_tick(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, tick:
     canvas = Canvas()
     canvas.add_mesh(places[tick], np.asarray(mesh.faces), OBJECT)
     for solid in postures[tick]:
-        canvas.add_mesh(solid.vertices, solid.faces, solid.color)
+        canvas.add_mesh(solid.vertices, solid.faces, solid.color, solid.normals)
     corners = np.concatenate([*places.values(), *(s.vertices for solids in postures.values() for s in solids)])
     canvas.add_table(corners, float(places[0][:, 2].min()))
     return canvas.render_png(corners, direction)

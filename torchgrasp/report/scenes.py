@@ -49,7 +49,7 @@ def draw_among(scene: Scene, surface: Surface, hand: Hand, grasp: Grasps, direct
     canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, to_array(surface.normals))
     add_contacts(canvas, grasp.contacts)
     for solid in solids:
-        canvas.add_mesh(solid.vertices, solid.faces, solid.color)
+        canvas.add_mesh(solid.vertices, solid.faces, solid.color, solid.normals)
     others = (scene.labels > 0) & ~scene.rows_of()
     points, labels = to_array(scene.points[others]), scene.labels[others].cpu().numpy()
     corners = np.concatenate([vertices, points, *(s.vertices for s in solids)])
