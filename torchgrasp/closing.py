@@ -54,6 +54,25 @@ class Disturbance(Value):
 
 @checked
 @dataclasses.dataclass(frozen=True)
+class ClosingTrace(Value):
+    """What the fingertips truly did at every tick, and what the controller made of it; all in the hand's frame.
+
+    `forces` [N] act on the object, friction included, at `points` [m] with outward `normals`, NaN without contact.
+    `sliding` [m/s] is the speed of each tip along the surface, `blend` lambda of Eq. (26), NaN without the law.
+    `friction` is what the hand believes, `load` [N] what it feels, NaN before the holding "grip".
+    """
+
+    forces: Annotated[Float[Tensor, "t f 3"], ANY]
+    points: Annotated[Float[Tensor, "t f 3"], ANY]
+    normals: Annotated[Float[Tensor, "t f 3"], ANY]
+    sliding: Annotated[Float[Tensor, "t f"], ANY]
+    blend: Annotated[Float[Tensor, "t f"], ANY]
+    friction: Annotated[Float[Tensor, "t"], ANY]
+    load: Annotated[Float[Tensor, "t"], ANY]
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
 class ClosureResult(Value):
     """What happened when the hand closed on the true object.
 
@@ -65,7 +84,8 @@ class ClosureResult(Value):
     rises. `unbalanced` is then the sum of the fingertips' forces over the sum of their sizes. What a trial did not
     reach is NaN. `start_overlap` [m] is the depth of the
     opened hand in object or table at the start. `held` tells whether the object is up with the hand at the end and
-    slipped little; `seconds` is wall time. Poses are in the frame of the grasp.
+    slipped little; `seconds` is wall time. Poses are in the frame of the grasp. `phases` [s] are the times at which the
+    hand had arrived, all fingers had touched, and the hand had pressed; NaN if it never did.
     """
 
     held: bool
@@ -84,4 +104,6 @@ class ClosureResult(Value):
     slip: ObjectMotion
     start_overlap: Measured
     disturbance: Disturbance
+    trace: ClosingTrace
+    phases: Annotated[Float[Tensor, "3"], ANY]
     seconds: float

@@ -163,6 +163,7 @@ class Status(enum.IntEnum):
     MOVED = 46, "the object moved or turned too far in the hand when it was pulled"
     TOO_WEAK = 47, "the hand's drives were at their largest torque and the object was not held"
     SLIPPED = 48, "the object was lifted, but slipped or turned too far in the hand"
+    TOO_HEAVY = 49, "the object is heavier than the hand can hold at the friction it felt, and was put down"
     # the run
     BAD_OBJECT = 60, "the files of the object are not what they should be"
     TIMED_OUT = 61, "it took longer than its limit and was ended"

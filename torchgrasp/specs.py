@@ -124,7 +124,7 @@ Ranking = Literal["success", "variance"]
 ClosingMode = Literal["open_loop", "position", "paper_position", "fixed", "paper", "uncertainty"]
 """How a hand closes, see `TrialSpec`."""
 
-HoldingMode = Literal["force", "impedance", "position", "law"]
+HoldingMode = Literal["force", "grip", "impedance", "position", "law"]
 """How a closed hand presses, see `TrialSpec`."""
 
 ClosingPart = Literal["wait", "pace", "switch", "place", "palm"]
@@ -141,8 +141,9 @@ class TrialSpec(Value):
             "uncertainty": the same law with five further parts. "fixed": the same with constant gains.
             "paper_position": PI control to the contacts until 0.5 N, the paper's baseline. "position": the same, aimed
             behind the contacts. "open_loop": pre-grasp, grasp, squeeze.
-        holding: how the closed hand presses: "force" (balanced forces), "impedance" (the grasp is a spring in the
-            hand), "position" (joints stay at their targets) or "law" (Eq. 25 goes on). In open loop the squeeze stays.
+        holding: how the closed hand presses: "force" (balanced forces), "grip" (as the felt load asks),
+            "impedance" (the grasp is a spring in the hand), "position" (joints stay at their targets) or "law" (Eq. 25
+            goes on). In open loop the squeeze stays.
         without: parts that "uncertainty" or "fixed" leaves out.
         mass: mass of the object [kg].
         friction: coefficient of friction of every contact.

@@ -7,7 +7,7 @@ import pytest
 import torch
 import trimesh
 
-from torchgrasp.closing import ClosureResult, Disturbance, ObjectMotion
+from torchgrasp.closing import ClosingTrace, ClosureResult, Disturbance, ObjectMotion
 from torchgrasp.errors import Status
 from torchgrasp.hand.load import load_hand
 from torchgrasp.report.run import Run, Stage
@@ -75,6 +75,13 @@ def run() -> Run:
         disturbance=Disturbance(
             torch.full((3,), math.inf), *torch.zeros(2, 3), torch.zeros(3, dtype=torch.bool), lifted[:, None]
         ),
+        trace=ClosingTrace(
+            *torch.zeros(3, steps, 3, 3, dtype=F64),
+            torch.zeros(steps, 3, dtype=F64),
+            time[:, None].expand(steps, 3).clone(),
+            *torch.full((2, steps), math.nan, dtype=F64),
+        ),
+        phases=torch.tensor([0.0, 0.5, 0.75], dtype=F64),
         seconds=1.0,
     )
     cloud = PointCloud(vertices[vertices[:, 0] > 0], None, torch.tensor([0.5, 0.1, 0.3], dtype=F64))

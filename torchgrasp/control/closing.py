@@ -94,6 +94,7 @@ class LawClosing:
         self.target = reference.pregrasp
         self.waiting = self.settled = 0.0
         self.steady = torch.zeros_like(reference.normals[:, 0])
+        self.share = torch.full_like(self.steady, torch.nan)
         self.done = False
 
     def press(self) -> "LawClosing":
@@ -126,6 +127,7 @@ class LawClosing:
         if self.waits:
             rest = WAITING_FORCE if bool(contact.all()) else observation.tactile.reading.clamp_max(WAITING_FORCE)
             desired = torch.where(contact, rest, desired)
+        self.share = share
         self._judge(observation, contact, share, period)
         force_error = -(desired - observation.tactile.reading)[:, None] * normals
         velocity = tip_velocity(error, force_error, share, gains.position_gain, gains.force_gain, not self.paces)

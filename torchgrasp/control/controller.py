@@ -11,11 +11,12 @@ from torch import Tensor
 from torchgrasp.base import check_device, settle
 from torchgrasp.border import checked
 from torchgrasp.control.closing import FixedGainClosing, LawClosing, OpenLoopClosing, PositionClosing, Revision
+from torchgrasp.control.grip import GripHold
 from torchgrasp.control.holding import ForceHold, PositionHold
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.targets import Targets
-from torchgrasp.errors import BadArgument
+from torchgrasp.errors import BadArgument, Status
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ClosingMode, ClosingPart, HoldingMode, check_closing_parts
 
@@ -98,6 +99,17 @@ class GraspController:
             return self.closing.done
         return self.pressed >= PRESSING_TIME - 1e-9
 
+    @property
+    def status(self) -> Status:
+        """`OK`, or `TOO_HEAVY` once the holding "grip" feels more than the hand can hold: put the object down."""
+        return self.hold.status if isinstance(self.hold, GripHold) else Status.OK
+
+    @property
+    def blend(self) -> Float[Tensor, " f"]:
+        """Lambda of each finger (Eq. 26) at the last tick; NaN before it and without the law."""
+        nothing = torch.full_like(self.reference.normals[:, 0], torch.nan)
+        return self.closing.share if isinstance(self.closing, LawClosing) and self.hold is None else nothing
+
     @checked
     def step(self, observation: Observation, period: float) -> Targets:
         """Return the targets of joints and palm for the next tick, a period [s] later.
@@ -154,4 +166,4 @@ def _holding(
         return functools.partial(Impedance, stability=load_stability(closing.reference.hand))
     if mode == "law" and isinstance(closing, LawClosing):
         return lambda *_: closing.press()
-    return ForceHold if mode == "force" else PositionHold
+    return {"force": ForceHold, "grip": GripHold}.get(mode, PositionHold)

@@ -39,9 +39,13 @@ def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> O
     """
     check_device("tactile", tactile.lagged.device, "the hand", hand.lower.device)
     joints = joints.double()
-    tips = hand.tip_centres(joints)
-    axes, origins = hand.tree.joint_axes(hand.link_poses(joints))
-    turning = torch.linalg.cross(axes.expand(len(tips), -1, 3), tips[:, None] - origins)
+    tips, everything = hand.tip_centres(joints), hand.expand_joints(joints)
+    return Observation(everything, tips, joint_jacobian(hand, everything, tips), tactile)
+
+
+def joint_jacobian(hand: Hand, joints: Float[Tensor, " j"], points: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3 j"]:
+    """Return the Jacobian of points on the fingertips [m/rad] by all joints of the URDF, each on its own."""
+    axes, origins = hand.tree.joint_axes(hand.tree.poses(joints[None])[0])
+    turning = torch.linalg.cross(axes.expand(len(points), -1, 3), points[:, None] - origins)
     columns = torch.where(hand.tree.prismatic[:, None] > 0, axes, turning)
-    columns = columns * hand.tree.moves[hand.tips.index][:, :, None]
-    return Observation(hand.expand_joints(joints), tips, columns.transpose(1, 2), tactile)
+    return (columns * hand.tree.moves[hand.tips.index][:, :, None]).transpose(1, 2)

@@ -29,6 +29,10 @@ also stands for tips that are not round."""
 CUTOFF, FLAG_CUTOFF = 20.0, 5.0
 """Cut-off of the force's low-pass [Hz], a lag of 8 ms; of the average behind the contact flag: 0.04 N of noise pass."""
 
+SLIDE_NOISE = 2e-3
+"""Standard deviation of the speed at which a fingertip slides [m/s]. Behind the low-pass a slide of 20 mm/s is told
+from it within 10 ms; piezoelectric skins tell the onset of slip within 20 ms (arXiv 2602.16127)."""
+
 TOUCH_ON, TOUCH_OFF = 0.2, 0.1
 """Averages [N] at which the contact flag switches: a single noisy reading crosses 0.2 N twice a second."""
 
@@ -39,12 +43,14 @@ class TipContact(Value):
     """True contacts of f fingertips, averaged over a tick.
 
     `forces` [N] act on the object, friction included. `points` [m] and outward `normals` are NaN without contact.
+    `sliding` [m/s] is the speed of the tip along the surface; None: no tip slides.
     """
 
     normal_force: Float[Tensor, "*b f"]
     forces: Float[Tensor, "*b f 3"]
     points: Annotated[Float[Tensor, "*b f 3"], ANY]
     normals: Annotated[Float[Tensor, "*b f 3"], ANY]
+    sliding: Float[Tensor, "*b f"] | None = None
 
 
 @checked
@@ -53,8 +59,8 @@ class TactileState(Value):
     """What f fingertips report, and their memory.
 
     `reading` [N] is the normal force, `forces` [N] the full one. `points` [m] and `normals` are NaN without contact.
-    `lagged` [N] is normal force and full force behind the low-pass. `average` [N] is the slow mean of the readings.
-    `age` [s] counts from the last sample.
+    `lagged` is normal force and full force [N], and the speed of sliding [m/s], behind the low-pass. `average` [N] is
+    the slow mean of the readings, `sliding` [m/s] the reading of that speed. `age` [s] counts from the last sample.
     """
 
     reading: Float[Tensor, "*b f"]
@@ -62,8 +68,9 @@ class TactileState(Value):
     contact: Bool[Tensor, "*b f"]
     points: Annotated[Float[Tensor, "*b f 3"], ANY]
     normals: Annotated[Float[Tensor, "*b f 3"], ANY]
-    lagged: Float[Tensor, "*b f 4"]
+    lagged: Float[Tensor, "*b f 5"]
     average: Float[Tensor, "*b f"]
+    sliding: Float[Tensor, "*b f"]
     age: float
 
 
@@ -74,10 +81,10 @@ def no_contact(*batch: Count, fingers: Annotated[int, Range(*FINGERTIPS)] = 3) -
     >>> no_contact().contact
     tensor([False, False, False])
     """
-    lagged = torch.zeros(*batch, fingers, 4, dtype=torch.float64)
-    zero, vectors = lagged[..., 0], lagged[..., 1:]
+    lagged = torch.zeros(*batch, fingers, 5, dtype=torch.float64)
+    zero, vectors = lagged[..., 0], lagged[..., 1:4]
     nothing = torch.full_like(vectors, torch.nan)
-    return TactileState(zero, vectors, zero > 0, nothing, nothing, lagged, zero, 1 / SAMPLING_RATE)
+    return TactileState(zero, vectors, zero > 0, nothing, nothing, lagged, zero, zero, 1 / SAMPLING_RATE)
 
 
 @checked
@@ -103,19 +110,21 @@ def measure(
         BadArgument: true contacts on another device than the state.
     """
     check_device("truth", truth.forces.device, "the tactile state", tactile.lagged.device)
-    force = torch.cat([truth.normal_force[..., None], truth.forces], dim=-1)
+    sliding = torch.zeros_like(truth.normal_force) if truth.sliding is None else truth.sliding
+    force = torch.cat([truth.normal_force[..., None], truth.forces, sliding[..., None]], dim=-1)
     lagged = tactile.lagged + low_pass(CUTOFF, period) * (force - tactile.lagged)
     age, interval = tactile.age + period, 1 / SAMPLING_RATE
     if age < interval - 1e-9:
         return dataclasses.replace(tactile, lagged=lagged, age=age)
-    reading, forces = lagged[..., 0], lagged[..., 1:]
+    reading, forces, sliding = lagged[..., 0], lagged[..., 1:4], lagged[..., 4]
     points, normals = truth.points, truth.normals
     if generator is not None:
         along = torch.where(torch.isfinite(normals), normals, pads)
         noise = torch.randn(2, *forces.shape, generator=generator, dtype=forces.dtype)
-        push = (noise[0] * along).sum(-1, keepdim=True)
-        across = noise - (noise * along).sum(-1, keepdim=True) * along
+        normal_part = (noise * along).sum(-1, keepdim=True)
+        push, across = normal_part[0], noise - normal_part * along
         reading = reading + NOISE * push[..., 0]
+        sliding = sliding + SLIDE_NOISE * normal_part[1, ..., 0]
         forces = forces - NOISE * push * along + TANGENTIAL_NOISE * across[0]
         curvature_radius = torch.where(radius > 0, radius, FLAT_RADIUS)[:, None]
         normals = unit(truth.normals + PLACE_NOISE / curvature_radius * across[1])
@@ -123,7 +132,7 @@ def measure(
     average = tactile.average + low_pass(FLAG_CUTOFF, max(period, interval)) * (reading - tactile.average)
     contact = torch.where(tactile.contact, average > TOUCH_OFF, average > TOUCH_ON)
     age = min(max(age - interval, 0.0), interval)
-    return TactileState(reading, forces, contact, points, normals, lagged, average, age)
+    return TactileState(reading, forces, contact, points, normals, lagged, average, sliding, age)
 
 
 def low_pass(cutoff: float, period: float) -> float:

@@ -1,6 +1,7 @@
 """The one driver of trials: a fresh scene, the approach, the closing and the pressing."""
 
 import dataclasses
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +14,7 @@ from torch import Tensor
 from torchgrasp.border import Seed, checked
 from torchgrasp.control.closing import PALM_REACH
 from torchgrasp.control.controller import GraspController, check_modes
+from torchgrasp.control.grip import GripHold
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.protocols import apply_error
@@ -183,6 +185,12 @@ class TrialRun:
     def step(self) -> None:
         """Let the controller act for one control tick."""
         self.observation = self.robot.tick(self.controller.step(self.observation, self.robot.period))
+
+    @property
+    def felt(self) -> tuple[float, float]:
+        """Friction that is believed, and load that is felt [N], NaN without the holding "grip"."""
+        hold = self.controller.hold
+        return (hold.friction.mean, hold.weight) if isinstance(hold, GripHold) else (math.nan, math.nan)
 
     def strained(self) -> bool:
         """Return whether some drive is at its largest torque."""

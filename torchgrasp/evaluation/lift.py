@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.border import Seed, checked
-from torchgrasp.closing import ClosureResult, Disturbance, ObjectMotion
+from torchgrasp.closing import ClosingTrace, ClosureResult, Disturbance, ObjectMotion
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun, smooth_step
 from torchgrasp.frames import apply, inverse, rotation_angle
@@ -116,7 +116,10 @@ class _ObjectLost(Exception):
 
 
 class _Tick(NamedTuple):
-    """The truth at a tick; `touching` counts fingers on the object, `centre` is the object's mass centre [m]."""
+    """The truth at a tick; `touching` counts fingers on the object, `centre` is the object's mass centre [m].
+
+    `contact` has a row a finger: force, point, normal, speed of sliding, blend. `felt` is friction and load.
+    """
 
     time: float
     forces: np.ndarray
@@ -126,6 +129,8 @@ class _Tick(NamedTuple):
     joints: np.ndarray
     touching: int
     centre: np.ndarray
+    contact: np.ndarray
+    felt: tuple[float, float]
 
 
 class _Lift:
@@ -161,11 +166,24 @@ class _Lift:
                 run.scene.lift(*self._height((k + 1) * run.robot.period, rising * run.robot.period))
                 run.step()
                 self._record()
+                if run.controller.status is Status.TOO_HEAVY:
+                    return self._put_down((k + 1) * run.robot.period, rising * run.robot.period)
         except FloatingPointError:
             return Status.UNSTABLE
         except _ObjectLost:
             pass
         return self._verdict()
+
+    def _put_down(self, time: float, rising: float) -> Status:
+        """Lower the hand to where it was, in the time [s] in which it rose that far, and open it no further."""
+        height, _ = self._height(time, rising)
+        ticks = self.run.robot.ticks(min(time, rising))
+        for k in range(ticks):
+            share, rate = smooth_step((k + 1) / ticks)
+            self.run.scene.lift(height * (1 - share), -height * rate / (ticks * self.run.robot.period))
+            self.run.step()
+            self._record()
+        return Status.TOO_HEAVY if self._moved() < PUSHED_DISTANCE else Status.DROPPED
 
     def _height(self, time: float, rising: float) -> tuple[float, float]:
         """Return height [m] and speed [m/s] of a hand that rises for `rising` seconds."""
@@ -183,8 +201,9 @@ class _Lift:
         now, touching, pose = robot.steps * self.spec.timestep, int(robot.finger.sum()), scene.object_pose()
         centre = pose[:3, :3] @ scene.centre + pose[:3, 3]
         tick = _Tick(
-            now, robot.force, pose, scene.hand_pose(), scene.neighbour_poses(), scene.joints(), touching, centre
-        )
+            now, robot.force, pose, scene.hand_pose(), scene.neighbour_poses(), scene.joints(), touching, centre,
+            _contact_rows(self.run), self.run.felt,
+        )  # fmt: skip
         self.ticks.append(tick)
         moved = self._moved()
         if not np.isfinite(tick.joints).all() or not np.isfinite(moved):
@@ -232,9 +251,9 @@ class _Lift:
 
     def result(self, status: Status, seconds: float) -> ClosureResult:
         """Return the record as a value."""
-        time, forces, object_pose, hand_pose, neighbour_pose, joints, *_ = (
-            torch.from_numpy(np.stack(column)) for column in zip(*self.ticks, strict=True)
-        )
+        columns = [torch.from_numpy(np.stack(column)) for column in zip(*self.ticks, strict=True)]
+        time, forces, object_pose, hand_pose, neighbour_pose, joints, *_, contact, felt = columns
+        reached = [math.nan if k is None else float(time[k]) for k in (self.arrived, self.touched, self.pressed)]
         robot, obj_from_world = self.run.robot, self.run.obj_from_world
         first_touch, first_stray = robot.first_touch, torch.from_numpy(robot.first_stray)
         touched = [finger for finger, step in enumerate(first_touch) if np.isfinite(step)]
@@ -265,5 +284,17 @@ class _Lift:
                 early=first_stray < min(first_touch),
                 neighbour_pose=neighbour_pose,
             ),
+            trace=ClosingTrace(
+                *contact[..., :9].unflatten(-1, (3, 3)).unbind(-2), *contact[..., 9:].unbind(-1), *felt.T
+            ),
+            phases=torch.tensor(reached, dtype=torch.float64),
             seconds=seconds,
         )
+
+
+def _contact_rows(run: TrialRun) -> np.ndarray:
+    """Return force, point, normal, sliding and blend of each finger (f, 11)."""
+    truth = run.robot.truth
+    sliding = torch.zeros_like(truth.normal_force) if truth.sliding is None else truth.sliding
+    blend = run.controller.blend
+    return torch.cat([truth.forces, truth.points, truth.normals, sliding[:, None], blend[:, None]], -1).numpy()

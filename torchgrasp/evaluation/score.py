@@ -17,7 +17,14 @@ from torchgrasp.evaluation.intervals import Share, count_by, share_over
 STAGES: dict[str, tuple[Status, ...]] = {
     "start": (Status.START_OVERLAP,),
     "closing": (Status.NO_CONTACT, Status.EJECTED),
-    "pulling or lifting": (Status.MOVED, Status.DROPPED, Status.NOT_LIFTED, Status.SLIPPED, Status.TOO_WEAK),
+    "pulling or lifting": (
+        Status.MOVED,
+        Status.DROPPED,
+        Status.NOT_LIFTED,
+        Status.SLIPPED,
+        Status.TOO_WEAK,
+        Status.TOO_HEAVY,
+    ),
     "simulation": (Status.UNSTABLE, Status.TIMED_OUT, Status.WORKER_DIED),
 }
 """The stages at which an attempt can fail, in order, with their statuses."""

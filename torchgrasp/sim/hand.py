@@ -12,9 +12,9 @@ from torchgrasp.sim.scene import Scene, StepContacts
 class SimulatedHand:
     """The hand of a scene, with tactile fingertips.
 
-    `force` (f,) are the true normal forces [N], averaged over the last tick, `pushes` (f, 3) the
-    full ones. `finger` flags contacts in its last step.
-    `steps` counts steps of the simulator. `first_touch` is the step of each fingertip's first contact, infinite before.
+    `truth` are the contacts of the last tick. `force` (f,) are the true normal forces [N], averaged over it,
+    `pushes` (f, 3) the full ones. `finger` flags contacts in its last step. `steps` counts steps of the simulator.
+    `first_touch` is the step of each fingertip's first contact, infinite before.
     `first_stray` is that of each kind in `StepContacts.stray`, whose impulses [N s] are summed in `stray`. `most_stray`
     [N] is its largest force over a tick.
 
@@ -37,6 +37,9 @@ class SimulatedHand:
         self._palm, self.pushes = np.zeros(3), np.zeros((fingers, 3))
         self.force, self.finger = np.zeros(fingers), np.zeros(fingers, dtype=bool)
         self.tactile = no_contact(fingers=fingers)
+        nothing = torch.full((fingers, 3), torch.nan, dtype=torch.float64)
+        self.truth = TipContact(torch.zeros(fingers).double(), torch.zeros_like(nothing), nothing, nothing)
+        self._places: tuple[np.ndarray, np.ndarray] | None = None
         names, centres = reference.hand.tree.joint_names, reference.hand.tips.center.double()
         self._centres = torch.cat([centres, torch.ones(fingers, 1, dtype=torch.float64)], dim=-1).numpy()
         self._to_scene = [names.index(name) for name in scene.joint_names]
@@ -78,15 +81,30 @@ class SimulatedHand:
         """Return the hand's own knowledge: contacts only as the fingertips sense them."""
         world_from_hand = self.scene.hand_pose()
         rotation, origin = world_from_hand[:3, :3], world_from_hand[:3, 3]
-        centres = (self.scene.tip_poses() @ self._centres[:, :, None])[:, :3, 0]
+        tips = self.scene.tip_poses()
+        centres = (tips @ self._centres[:, :, None])[:, :3, 0]
         with np.errstate(invalid="ignore", divide="ignore"):
             points = contacts.moment / contacts.weight[:, None]
             normals = -contacts.impulse / np.linalg.norm(contacts.impulse, axis=-1, keepdims=True)
         vectors = torch.from_numpy(np.concatenate([contacts.force, normals]) @ rotation)
         places = torch.from_numpy((np.concatenate([points, centres]) - origin) @ rotation)
         f = len(self.force)
-        truth = TipContact(torch.from_numpy(self.force), vectors[:f], places[:f], vectors[f:])
+        sliding = torch.from_numpy(self._sliding(tips, points, normals))
+        self.truth = TipContact(torch.from_numpy(self.force), vectors[:f], places[:f], vectors[f:], sliding)
         normals, radius = self.reference.normals, self.reference.hand.tips.radius
-        self.tactile = measure(self.tactile, truth, normals, radius, self.period, self.generator)
+        self.tactile = measure(self.tactile, self.truth, normals, radius, self.period, self.generator)
         joints, jacobian = self.scene.joints()[self._from_scene], self.scene.jacobian(centres)[..., self._from_scene]
         return Observation(torch.from_numpy(joints), places[f:], torch.from_numpy(rotation.T @ jacobian), self.tactile)
+
+    def _sliding(self, tips: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Return the speed [m/s] of each tip along the object's surface since the last tick; 0 without contact."""
+        pose, before = self.scene.object_pose(), self._places
+        self._places = tips, pose
+        if before is None:
+            return np.zeros(len(tips))
+        here = np.concatenate([points, np.ones((len(points), 1))], 1)
+        on_tip = (before[0] @ np.linalg.inv(tips) @ here[:, :, None])[:, :3, 0]
+        on_object = (here @ (before[1] @ np.linalg.inv(pose)).T)[:, :3]
+        moved = on_object - on_tip
+        along = moved - (moved * normals).sum(-1, keepdims=True) * normals
+        return np.nan_to_num(np.linalg.norm(along, axis=-1)) / self.period

@@ -168,11 +168,11 @@ def _lift(spec: TableSpec, subject: Subject, hand: str, name: str, force: float)
     folder, perturbation = subject.folder, PERTURBATIONS[name]
     assert folder is not None
     began = time.process_time()
-    mesh, parts = _read_solid(folder, subject.name)
+    mesh, parts = read_solid(folder, subject.name)
     view = list_views(folder, only=[subject.name])[0][1]
     mass = household_mass(float(mesh.volume), read_mass(folder, subject.name))
     try:
-        grasps = _best(_plan(spec, subject, hand, view, name), spec.grasps)
+        grasps = _best(plan_view(spec, subject, hand, view, name), spec.grasps)
     except GraspError as error:
         print(f"{subject.name}, {hand}, {name}: {error}", flush=True)
         grasps = []
@@ -198,7 +198,7 @@ def _best(grasps: Grasps, most: int) -> list[Grasps]:
     return [grasps[row] for row in range(min(len(grasps), most))]
 
 
-def _plan(spec: TableSpec, subject: Subject, hand: str, view: str, name: str) -> Grasps:
+def plan_view(spec: TableSpec, subject: Subject, hand: str, view: str, name: str) -> Grasps:
     """Return the executable grasps of a view, kept or planned; what only the lift meets shares one plan."""
     assert subject.folder is not None
     perturbation = PERTURBATIONS[name]
@@ -214,7 +214,7 @@ def _plan(spec: TableSpec, subject: Subject, hand: str, view: str, name: str) ->
 
 
 @functools.lru_cache(maxsize=2)
-def _read_solid(folder: Path, name: str) -> tuple[Any, Any]:
+def read_solid(folder: Path, name: str) -> tuple[Any, Any]:
     """Return mesh and convex parts."""
     mesh = read_object_mesh(folder, name)
     return mesh, convex_parts(mesh)

@@ -7,6 +7,7 @@ import torch
 from paper.trials import TableSpec
 
 from benchmarks.close.ablation import bench_ablation
+from benchmarks.close.holding import bench_holding
 from benchmarks.close.household import bench_grip, bench_household
 from benchmarks.close.misplaced import bench_misplaced
 from benchmarks.close.pose_noise import bench_noise
@@ -21,7 +22,7 @@ from torchgrasp.evaluation.campaign import EvaluationSpec
 
 SUBJECTS = (
     "statics", "speed", "ablation", "agreement", "stability", "noise", "success", "misplaced", "perturb", "grip",
-    "scans",
+    "scans", "holding",
 )  # fmt: skip
 
 
@@ -47,7 +48,8 @@ def close(
         objects: folders with manifest.json and a folder for each object; without one what needs grasps is left out.
             Only misplaced, perturb, grip and scans take more than the first.
         only: subjects to measure. statics, speed, ablation, agreement, stability, noise and success are of the closing;
-            misplaced, perturb, grip and scans lift what a robot would meet, one object of each family but for scans.
+            misplaced, perturb, grip, scans and holding lift what a robot would meet, one object of each family (not
+            scans).
         hands: of all but ablation and agreement, which take both.
         tries: grasps of each view: the best for noise, else spread over all ranks.
         draws: errors of the hand's pose for each grasp.
@@ -78,6 +80,7 @@ def close(
         "misplaced": lambda: bench_misplaced(household, conditions, laws) if folder else [],
         "perturb": lambda: bench_household(household) if folder else [],
         "grip": lambda: bench_grip(household) if folder else [],
+        "holding": lambda: bench_holding(household) if folder else [],
         "scans": lambda: bench_scans(objects, hands, tries, starts, seed) if folder else [],
         "success": lambda: bench_success(folder, hands, tries, workers, out.parent / "success") if folder else [],
     }

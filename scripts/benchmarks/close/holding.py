@@ -1,0 +1,116 @@
+"""Holding what one cannot know: the true mass, a friction that nobody told, and what statics say of it.
+
+The best grasp of one view of each object is lifted with every holding and friction. Static analysis at the contacts
+there are when the hand has pressed says whether its drives could hold the object, and at the end what would suffice.
+Plans and lifts are kept as files.
+"""
+
+import dataclasses
+import json
+import statistics
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import torch
+from paper.trials import CELL_SECONDS, Subject, TableSpec, subjects
+
+from benchmarks.close.household import HOUSEHOLD, plan_view, read_solid
+from benchmarks.common import Row
+from torchgrasp.datasets import list_views, read_mass
+from torchgrasp.errors import GraspError, Status
+from torchgrasp.evaluation import (
+    close_hand,
+    count_by,
+    difference_over,
+    format_share,
+    household_mass,
+    run_tasks,
+    seed_of,
+)
+from torchgrasp.evaluation.intervals import share_over
+from torchgrasp.evaluation.statics import least_grip_at
+from torchgrasp.files import format_json, write_file
+from torchgrasp.hand.load import load_hand
+
+FRICTIONS = (0.4, 0.7, 1.0)
+"""Frictions that the hand does not know."""
+
+HOLDINGS = {"force": 4.0, "grip": 4.0}
+"""Holdings by name, and the force [N] with which they press at first."""
+
+LEAST_HELD, MOST_SPENT = 0.92, 1.3
+"""The project's bars: share held of what can be held, and force over what suffices."""
+
+HOLD_TIME = 4.0
+"""Time [s] after the lift: forces have fallen to what suffices."""
+
+
+def bench_holding(spec: TableSpec) -> list[Row]:
+    """Lift every object with every holding and friction."""
+    rows: list[Row] = []
+    for hand in spec.hands:
+        tasks = [(spec, subject, hand) for subject in subjects(spec)]
+        lifts: list[dict[str, Any]] = []
+        for task, found in zip(tasks, run_tasks(hold_object, tasks, spec.workers, CELL_SECONDS), strict=True):
+            if isinstance(found, Status):
+                raise SystemExit(f"{task[1].name} {hand}: {found.sentence}")
+            lifts += found
+        base = [x for x in lifts if x["holding"] == "force"]
+        rows += [_row(hand, name, [x for x in lifts if x["holding"] == name], base) for name in HOLDINGS]
+    return rows
+
+
+def hold_object(spec: TableSpec, subject: Subject, hand: str) -> list[dict[str, Any]]:
+    """Return the lifts of one object, kept or run."""
+    torch.set_num_threads(1)
+    path = spec.kept("holding", f"{hand}_{subject.label}", HOLDINGS, FRICTIONS, HOLD_TIME).with_suffix(".json")
+    if not path.is_file():
+        write_file(path, format_json(list(_lift(spec, subject, hand))))
+    return json.loads(path.read_text("utf-8"))
+
+
+def _lift(spec: TableSpec, subject: Subject, hand_name: str) -> Iterator[dict[str, Any]]:
+    """Lift the best grasp of the first view."""
+    assert subject.folder is not None
+    hand, view = load_hand(hand_name), list_views(subject.folder, only=[subject.name])[0][1]
+    try:
+        grasps = plan_view(spec, subject, hand_name, view, "none")
+    except GraspError as error:
+        print(f"{subject.name}, {hand_name}: {error}", flush=True)
+        return
+    mesh, parts = read_solid(subject.folder, subject.name)
+    mass = household_mass(float(mesh.volume), read_mass(subject.folder, subject.name))
+    for friction in FRICTIONS if len(grasps) else ():
+        seed = seed_of(spec.seed, subject.label, view, str(friction))
+        for name, force in HOLDINGS.items():
+            changes = {"holding": name, "force": force, "mass": mass, "friction": friction, "hold_time": HOLD_TIME}
+            done = close_hand(grasps[0], hand, mesh, dataclasses.replace(HOUSEHOLD.trial, **changes), seed, parts=parts)
+            told = {"object": subject.label, "family": subject.family, "holding": name, "friction": friction}
+            told |= {"mass": mass, "status": done.status.name, "slip": done.slip.distance, "turn": done.slip.angle}
+            pressed = int((done.time <= done.phases[2]).sum()) - 1
+            for when, tick in (("pressed", pressed), ("end", len(done.time) - 1)):
+                told[when] = least_grip_at(done, tick, hand, mesh, mass, friction) if tick >= 0 else (None, 0.0)
+            yield told
+
+
+def _row(hand: str, name: str, lifts: Sequence[dict[str, Any]], base: Sequence[dict[str, Any]]) -> Row:
+    """Return what one holding held of what can be held, and what force it spent."""
+    can = {(x["object"], x["friction"]) for x in lifts + list(base) if x["pressed"][0] is not None}
+    counts, first = (
+        count_by((x["family"], x["status"] == "OK") for x in some if (x["object"], x["friction"]) in can)
+        for some in (lifts, base)
+    )
+    share, change = share_over(counts), difference_over(counts, first)
+    held = [x for x in lifts if x["status"] == "OK"]
+    spent = statistics.median(x["end"][1] / x["end"][0] for x in held if x["end"][0])
+    lost = dict(Counter(x["status"] for x in lifts if x["status"] != "OK" and (x["object"], x["friction"]) in can))
+    rest = dict(Counter(x["status"] for x in lifts if (x["object"], x["friction"]) not in can))
+    words = (
+        f"{format_share(share)}, change {100 * change.value:+.1f} [{100 * change.low:+.1f}, {100 * change.high:+.1f}]"
+    )
+    words += f"; lost {lost}; of what cannot be held {rest}; force {spent:.2f}x of what suffices"
+    met = None if name == "force" else share.value >= LEAST_HELD and spent <= MOST_SPENT
+    numbers = {"share": share, "change": change, "spent": spent, "lost": lost, "rest": rest}
+    bar = f">= {LEAST_HELD:.0%} of what can be held, <= {MOST_SPENT}x"
+    return Row(f"held by holding {name}, {hand}", bar if name != "force" else "-", words, met, numbers)

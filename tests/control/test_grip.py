@@ -1,0 +1,130 @@
+"""Grip by the felt load: least forces beside SciPy, what is believed of friction, and a hand that carries a block."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
+from torchgrasp.control.friction import PRIOR_STD, FrictionBelief
+from torchgrasp.control.grip import LEAST_PUSH, GripHold
+from torchgrasp.control.least_forces import LeastForces, friction_ratios, grasp_map
+from torchgrasp.control.observation import Observation
+from torchgrasp.errors import Status
+from torchgrasp.plane import Plane
+
+POINTS, OUTWARD = TARGET.numpy(), NORMALS.numpy()
+FREE = np.zeros((3, 3, 1))
+FLOOR = np.full(3, 0.1)
+
+
+def solve(load: list[float], friction: float, floor=FLOOR) -> np.ndarray:
+    """Least forces, by as many calls as ticks of a tenth of a second."""
+    solver = LeastForces(GAINS.desired_force.numpy().copy(), np.ones(1), 100.0)
+    for _ in range(10):
+        forces = solver.solve(POINTS, OUTWARD, FREE, np.array(load, float), friction, floor)
+    return forces
+
+
+def least_sum(load: np.ndarray, friction: float) -> float:
+    """The least normal sum by SciPy's general optimiser, from several starts."""
+    from scipy.optimize import minimize
+
+    def push(x: np.ndarray) -> np.ndarray:
+        return -(x.reshape(3, 3) * OUTWARD).sum(-1)
+
+    def slack(x: np.ndarray) -> np.ndarray:
+        across = x.reshape(3, 3) + push(x)[:, None] * OUTWARD
+        return friction**2 * push(x) ** 2 - (across**2).sum(-1)
+
+    held = {"type": "eq", "fun": lambda x: grasp_map(POINTS) @ x - load}
+    cones = {"type": "ineq", "fun": slack}
+    floors = {"type": "ineq", "fun": lambda x: push(x) - FLOOR}
+    starts = [k * GAINS.desired_force.numpy().ravel() for k in (1.0, 2.0, 4.0)]
+    found = [minimize(lambda x: push(x).sum(), x, constraints=[held, cones, floors], tol=1e-10) for x in starts]
+    return min(float(x.fun) for x in found if x.success)
+
+
+@pytest.mark.parametrize("friction", [0.4, 0.8])
+@pytest.mark.parametrize("load", [[0, 1, 0, 0, 0, 0], [0.5, 2, 1, 0, 0, 0.02], [0, 3, 0, 0.01, 0, 0]])
+def test_forces_carry_the_load_within_the_cones_with_little_more_than_the_least_sum(load, friction):
+    forces = solve(load, friction)
+    assert np.allclose(grasp_map(POINTS) @ forces.ravel(), load, atol=1e-9)
+    assert (friction_ratios(forces, OUTWARD) < friction).all()
+    push = -(forces * OUTWARD).sum(-1)
+    assert (push > FLOOR).all()
+    least = least_sum(np.array(load, float), friction)
+    assert 0.999 * least < push.sum() < 1.15 * least
+
+
+def test_floors_are_kept():
+    floor = np.array([1.0, 1.0, 2.0])
+    push = -(solve([0, 0, 0, 0, 0, 0], 0.5, floor) * OUTWARD).sum(-1)
+    assert (push > floor).all() and push.sum() == pytest.approx(4.0, rel=0.15)
+
+
+def test_friction_belief_is_the_posterior_of_a_gaussian():
+    belief = FrictionBelief(0.8)
+    belief.slides(0.5, 4.0)
+    noise = 0.4 * math.hypot(1.0, 0.5) / 4.0
+    precision = PRIOR_STD**-2 + noise**-2
+    assert belief.mean == pytest.approx((0.8 * PRIOR_STD**-2 + 0.5 * noise**-2) / precision)
+    assert belief.std == pytest.approx(precision**-0.5)
+    assert belief.low < belief.mean < belief.high
+
+
+def carried(weight: float, friction: float, seconds: float = 4.0) -> tuple[GripHold, Observation, list[float]]:
+    """Hold a block whose weight comes off its table in half a second, after another one, without noise.
+
+    The joints follow at once: what the hand wants is what is felt. A finger slides where that exceeds its cone.
+    """
+    strong = {name: drive._replace(effort=8.0) for name, drive in reference().hand.actuators.items()}
+    hand = dataclasses.replace(reference().hand, actuators=strong)
+    known = dataclasses.replace(reference(), hand=hand, table=Plane(real([0, 1, 0]), -0.1))
+    seen = observation(0.0, (2.0, 2.0, 4.0), TOUCHING)
+    hold, sums = GripHold(known, seen, torch.zeros(9).double()), []
+    for k in range(round(seconds / PERIOD)):
+        hold(seen, PERIOD)
+        lifted = min(max((k * PERIOD - 1.0) / 0.5, 0.0), 1.0) * weight
+        bearing = np.zeros(6)
+        bearing[1] = lifted
+        short = grasp_map(POINTS) @ hold.sent.ravel() - bearing
+        forces = hold.sent - (np.linalg.pinv(grasp_map(POINTS)) @ short).reshape(3, 3)
+        push = -(forces * OUTWARD).sum(-1)
+        slides = friction_ratios(forces, OUTWARD) > friction
+        across = forces + push[:, None] * OUTWARD
+        length = np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
+        forces = np.where(slides[:, None], across * friction * push[:, None] / length - push[:, None] * OUTWARD, forces)
+        tactile = dataclasses.replace(
+            seen.tactile,
+            reading=torch.from_numpy(push),
+            forces=torch.from_numpy(forces),
+            sliding=torch.from_numpy(0.02 * slides),
+        )
+        seen = dataclasses.replace(seen, tactile=tactile)
+        sums.append(float(push.sum()))
+    return hold, seen, sums
+
+
+def test_a_heavy_block_is_gripped_harder_before_it_slides_and_a_light_one_is_released():
+    for weight in (0.5, 1.5):
+        hold, _, sums = carried(weight, 0.8)
+        needed = 4 * weight / 3 / 0.8  # each finger bears a third; the thumb presses as hard as two
+        assert hold.status is Status.OK
+        assert needed < sums[-1] < 1.15 * max(needed, 4 * LEAST_PUSH)
+        assert sums[95] == pytest.approx(8.0, rel=0.2)  # on the table it presses as planned
+    assert carried(1.0, 0.8)[0].weight == pytest.approx(1.0, rel=0.05)
+
+
+def test_fingers_that_slide_teach_the_friction_and_press_harder():
+    slippery, _, hard = carried(2.0, 0.35)
+    sticky, _, soft = carried(2.0, 2.0)
+    assert slippery.friction.mean < 0.7 and sticky.friction.mean == 0.8
+    assert hard[-1] > 1.2 * soft[-1]
+
+
+def test_what_exceeds_the_torques_is_too_heavy():
+    hold, _, _ = carried(40.0, 0.8)
+    assert hold.status is Status.TOO_HEAVY and hold.weight > 5.0

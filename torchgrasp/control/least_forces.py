@@ -1,0 +1,176 @@
+"""The least forces of fingertips that carry a load: a barrier method in NumPy, a few Newton steps a tick.
+
+With normal forces n_i, tangential forces t_i and torques of the joints tau_j this minimises
+
+    sum n_i + PENALTY sum max(|tau_j| / effort_j - KNEE, 0)^2 - eps sum [log(mu^2 n_i^2 - |t_i|^2) + log(n_i - floor_i)]
+
+over all forces that balance the load. Tensors of 3 x 3 cost more in calls than in arithmetic, so torch is left out.
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+Array = np.ndarray
+
+STEPS, NEAR, LENGTHS = 8, 0.3, 2.0 ** np.arange(8)
+"""Newton's steps a call at most, from the forces of the tick before, and the decrement below which no further one is
+made. The lengths that are tried, over that of a step which is safe for every self-concordant function."""
+
+GAP = 0.01
+"""eps over the size of load and floors: three fingers press with 9 % more than the least sum, at a distance
+from the cones that the noise of the load does not cross."""
+
+PENALTY, KNEE = 500.0, 0.9
+"""Weight [N] of joint torques and normal forces over their limits, and the share of the limits where it sets in: at the
+limit a newton more costs 14 N. A quadratic needs one step of Newton's."""
+
+GROWTH = np.concatenate([[0.0], 0.02 * 2.0 ** np.arange(9)])
+"""Multiples of the first internal forces that are added where a load that grew leaves the friction cones."""
+
+BEYOND = 1.05
+"""Where no multiple reaches the cones, they are widened to this over the ratio needed; later ticks narrow them."""
+
+
+def grasp_map(points: Float[Array, "f 3"]) -> Float[Array, "6 n"]:
+    """Return the map from forces at points [m], one after the other, to force and torque about their centre.
+
+    >>> grasp_map(np.eye(3)).shape
+    (6, 9)
+    """
+    x, y, z = (points - points.mean(0)).T
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3, -1)
+    force = np.broadcast_to(np.eye(3)[:, :, None], cross.shape)
+    return np.concatenate([force, cross]).transpose(0, 2, 1).reshape(6, -1)
+
+
+def friction_ratios(forces: Float[Array, "f 3"], normals: Float[Array, "f 3"]) -> Float[Array, "f"]:
+    """Return tangential over normal force, infinite where a finger does not press.
+
+    >>> friction_ratios(np.array([[0.5, 0.0, -1.0]]), np.array([[0.0, 0.0, 1.0]])).tolist()
+    [0.5]
+    """
+    push = -(forces * normals).sum(-1)
+    slide = np.linalg.norm(forces + push[:, None] * normals, axis=-1)
+    return np.where(push > 0, slide / np.maximum(push, 1e-12), np.inf)
+
+
+class LeastForces:
+    """Find least forces, each time from those found before.
+
+    Args:
+        start: forces on the object to start from [N]; they press at every contact.
+        effort: largest torque of every joint [N m].
+        most: largest normal force of a finger [N].
+    """
+
+    def __init__(self, start: Float[Array, "f 3"], effort: Float[Array, " j"], most: float) -> None:
+        self.forces, self.start, self.effort, self.most = start, start, effort, most
+
+    def solve(
+        self,
+        points: Float[Array, "f 3"],
+        normals: Float[Array, "f 3"],
+        jacobian: Float[Array, "f 3 j"],
+        load: Float[Array, "6"],
+        friction: float,
+        floor: Float[Array, "f"],
+    ) -> Float[Array, "f 3"]:
+        """Return forces [N] with the sum and torque of the load, inside cones of a friction, above the floors [N].
+
+        Where none are found, those of the least friction so far.
+        """
+        count = len(points)
+        limits = np.concatenate([jacobian.reshape(3 * count, -1).T / self.effort[:, None], self._normal(normals)])
+        gap = GAP * (float(np.linalg.norm(load[:3])) + float(floor.sum()))
+        barrier = _Barrier(grasp_map(points), normals, limits, load, gap)
+        tried = barrier.place(self.forces) + GROWTH[:, None] * barrier.place(self.start, 0.0)
+        z = barrier.choose(tried, friction, floor)
+        for _ in range(STEPS):
+            step, decrement = barrier.newton(z)
+            trial = z + np.minimum(LENGTHS / (1 + decrement), 1.0)[:, None] * step
+            value = barrier.value(trial)
+            if not np.isfinite(value).any():
+                break
+            z = trial[int(value.argmin())]
+            if decrement < NEAR:
+                break
+        self.forces = barrier.forces(z)
+        return self.forces
+
+    def share(self, normals: Float[Array, "f 3"], jacobian: Float[Array, "f 3 j"]) -> float:
+        """Return the largest of joint torques and normal forces, over its limit."""
+        torque = np.abs(np.einsum("nij,ni->j", jacobian, self.forces)) / self.effort
+        return max(float(torque.max()), float((-(self.forces * normals).sum(-1)).max()) / self.most)
+
+    def _normal(self, normals: Float[Array, "f 3"]) -> Float[Array, "f n"]:
+        """Return the map from forces, one after the other, to normal forces over their limit."""
+        count = len(normals)
+        return -(np.eye(count)[:, :, None] * normals / self.most).reshape(count, -1)
+
+
+class _Barrier:
+    """What is minimised, over the coordinates z of the k dimensions of forces that balance."""
+
+    def __init__(
+        self,
+        balance: Float[Array, "6 n"],
+        normals: Float[Array, "f 3"],
+        limits: Float[Array, "l n"],
+        load: Float[Array, "6"],
+        gap: float,
+    ) -> None:
+        self.count, self.gap = len(normals), gap
+        self.basis = np.linalg.svd(balance)[2][6:].T
+        self.carried = np.linalg.lstsq(balance, load, rcond=None)[0]
+        self.rows = self.basis.reshape(self.count, 3, -1)
+        self.spread = np.einsum("nik,nil->nkl", self.rows, self.rows)
+        self.tau, self.tau_0 = limits @ self.basis, limits @ self.carried
+        self.push = -np.einsum("ni,nik->nk", normals, self.rows)
+        self.push_0 = -(normals * self.carried.reshape(self.count, 3)).sum(-1)
+
+    def place(self, forces: Float[Array, "f 3"], share: float = 1.0) -> Float[Array, " k"]:
+        """Return the coordinates of the forces nearest to given ones, less a share of those that carry the load."""
+        return self.basis.T @ (forces.ravel() - share * self.carried)
+
+    def forces(self, z: Float[Array, "*g k"]) -> Float[Array, "*g f 3"]:
+        """Return the forces."""
+        return (self.carried + z @ self.basis.T).reshape(*z.shape[:-1], self.count, 3)
+
+    def choose(self, tried: Float[Array, "g k"], friction: float, floor: Float[Array, "f"]) -> Float[Array, " k"]:
+        """Return the best of several starts, having widened the cones and lowered the floors for it as needed."""
+        push, forces = tried @ self.push.T + self.push_0, self.forces(tried)
+        across = np.sqrt(((forces**2).sum(-1) - push**2).clip(min=0.0))
+        ratio = np.where(push > 0, across / np.maximum(push, 1e-12), np.inf).max(-1)
+        above = (push > floor).all(-1)
+        self.floor = floor if above.any() else np.minimum(floor, 0.5 * push[-1]).clip(min=0.0)
+        ratio = np.where(above if above.any() else np.arange(len(tried)) == len(tried) - 1, ratio, np.inf)
+        self.slack = 1.0 + max(friction, BEYOND * float(ratio.min()) if ratio.min() >= friction else 0.0) ** 2
+        value = self.value(tried)
+        return tried[int((value if np.isfinite(value).any() else ratio).argmin())]
+
+    def value(self, z: Float[Array, "g k"]) -> Float[Array, " g"]:
+        """Return what is minimised, infinite outside."""
+        n, t = z @ self.push.T + self.push_0, z @ self.tau.T + self.tau_0
+        cone = self.slack * n * n - (self.forces(z) ** 2).sum(-1)
+        inside = ((cone > 0) & (n > self.floor)).all(-1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            logs = np.log(cone).sum(-1) + np.log(n - self.floor).sum(-1)
+        over = PENALTY * ((np.abs(t) - KNEE).clip(min=0.0) ** 2).sum(-1)
+        return np.where(inside, n.sum(-1) + over - self.gap * logs, np.inf)
+
+    def newton(self, z: Float[Array, " k"]) -> tuple[Float[Array, " k"], float]:
+        """Return Newton's step, and its decrement."""
+        gap, push = self.gap, self.push
+        n, t, force = push @ z + self.push_0, self.tau @ z + self.tau_0, self.forces(z)
+        cone = self.slack * n * n - (force * force).sum(-1)
+        half = self.slack * n[:, None] * push - np.einsum("ni,nik->nk", force, self.rows)  # half the cone's gradient
+        above, over = n - self.floor, np.sign(t) * (np.abs(t) - KNEE).clip(min=0.0)
+        gradient = push.sum(0) + 2 * PENALTY * over @ self.tau - gap * ((2 / cone) @ half + (1 / above) @ push)
+        hessian = (self.tau.T * (2 * PENALTY * (over != 0))) @ self.tau + gap * ((push.T / above**2) @ push)
+        hessian += gap * ((half.T * (4 / cone**2)) @ half - 2 * self.slack * (push.T / cone) @ push)
+        hessian += gap * np.einsum("n,nkl->kl", 2 / cone, self.spread)
+        step = -np.linalg.solve(hessian + 1e-9 * np.eye(len(z)), gradient)
+        return step, math.sqrt(max(-float(gradient @ step), 0.0) / gap)
