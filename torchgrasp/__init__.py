@@ -17,7 +17,7 @@ from torchgrasp.values import (
     ShapeEstimate,
     load_grasps,
 )
-from torchgrasp.closing import ClosingGains, ClosureResult, Disturbance, ObjectMotion
+from torchgrasp.closing import ClosingGains, ClosingTrace, ClosureResult, Disturbance, ObjectMotion
 from torchgrasp.cloud import cloud_from_depth, merge_clouds, read_cloud
 from torchgrasp.scene import Scene, read_scene, save_scene
 from torchgrasp.objects import GraspObject, list_objects, load_object, load_scene
@@ -49,6 +49,7 @@ __all__ = [
     "TrialSpec",
     "Certificate",
     "ClosingGains",
+    "ClosingTrace",
     "ClosureResult",
     "ContactCode",
     "ContactPlan",
