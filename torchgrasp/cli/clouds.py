@@ -186,7 +186,7 @@ def render(
 def views(
     meshes: Annotated[Positional[Path], arg(metavar="MESHES")], /, out: Path, views: int = 3, seed: int = 0
 ) -> int:
-    """Make a folder of objects for `torchgrasp evaluate` from a folder of meshes, each seen by a noisy depth camera.
+    """Make a folder of objects from a folder of meshes: each is seen by a noisy depth camera, as trials need it.
 
     Args:
         meshes: folder of closed meshes in metres, z up (.ply, .stl, .obj, .off).
