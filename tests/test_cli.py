@@ -258,7 +258,11 @@ def test_the_bare_command_shows_where_to_begin(capsys):
 
 @pytest.mark.parametrize(
     ("typed", "offered"),
-    [(["clo"], {"cloud"}), (["cloud", ""], {"check", "cut", "depth", "thin", "render", "views"}), (["hand", "tr"], {"train"})],
+    [
+        (["clo"], {"cloud"}),
+        (["cloud", ""], {"check", "cut", "depth", "thin", "render", "views"}),
+        (["hand", "tr"], {"train"}),
+    ],
 )
 def test_the_shell_completes_commands_of_a_group(typed, offered, tmp_path, capsys):
     with pytest.raises(SystemExit):
