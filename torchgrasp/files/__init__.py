@@ -1,26 +1,11 @@
-"""Files: whole or not at all, in locked folders; tensors as safetensors with JSON metadata.
+"""Files: whole or not at all, in locked folders; tensors as safetensors with JSON metadata. Not public.
 
 Nothing here is pickled: a file from a stranger can be malformed, but it cannot run code.
 """
 
-from torchgrasp.files.hold import LOCK, hold_file, hold_folder, temporary_folder
-from torchgrasp.files.read import is_file, sha256
-from torchgrasp.files.tensors import DTYPES, MOST_BYTES, VERSION, load_tensors, save_tensors
-from torchgrasp.files.write import format_json, is_remnant, write_file
-
-__all__ = [
-    "DTYPES",
-    "LOCK",
-    "MOST_BYTES",
-    "VERSION",
-    "format_json",
-    "hold_file",
-    "hold_folder",
-    "is_file",
-    "is_remnant",
-    "load_tensors",
-    "save_tensors",
-    "sha256",
-    "temporary_folder",
-    "write_file",
-]
+from torchgrasp.files.hold import LOCK as LOCK, hold_file as hold_file, hold_folder as hold_folder
+from torchgrasp.files.hold import temporary_folder as temporary_folder
+from torchgrasp.files.read import is_file as is_file, sha256 as sha256
+from torchgrasp.files.tensors import DTYPES as DTYPES, MOST_BYTES as MOST_BYTES, VERSION as VERSION
+from torchgrasp.files.tensors import load_tensors as load_tensors, save_tensors as save_tensors
+from torchgrasp.files.write import format_json as format_json, is_remnant as is_remnant, write_file as write_file
