@@ -134,6 +134,7 @@ def test_every_subpackage_names_its_public_things():
 
     silent = []
     for found in pkgutil.walk_packages(torchgrasp.__path__, "torchgrasp."):
-        if found.ispkg and not getattr(importlib.import_module(found.name), "__all__", None):
+        package = importlib.import_module(found.name)
+        if found.ispkg and not getattr(package, "__all__", None) and "Not public." not in (package.__doc__ or ""):
             silent.append(found.name)
     assert silent == []
