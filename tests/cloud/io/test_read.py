@@ -375,3 +375,11 @@ def test_saving_into_a_file_for_a_folder_is_refused(tmp_path, points):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError):
         save_cloud(PointCloud(torch.from_numpy(points)), tmp_path / "file" / "a.npz")
+
+
+def test_a_mesh_of_too_many_faces_is_refused_before_its_faces_are_read(tmp_path):
+    header = ["ply", "format binary_little_endian 1.0", "element vertex 3", "property float x", "property float y"]
+    header += ["property float z", "element face 500001", "property list uchar int vertex_indices", "end_header\n"]
+    (tmp_path / "mesh.ply").write_bytes("\n".join(header).encode())  # no body: nobody gets that far
+    with pytest.raises(CloudFileError, match="500001 faces"):
+        read_cloud(tmp_path / "mesh.ply")
