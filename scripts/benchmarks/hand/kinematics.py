@@ -15,13 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pinocchio
 import pytorch_kinematics
 import torch
 from torch import Tensor
 
 from benchmarks.common import Row
-from benchmarks.hand.coal_reference import exact_clearance
 from torchgrasp import load_hand
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import chain_from_urdf
@@ -144,6 +142,8 @@ def _seconds(action: Callable[[Tensor], object], rows: Tensor, threads: int, rep
 
 def bench_collision(n: int, threads: int) -> list[Row]:
     """Compare verdicts on self-collision with exact hulls, and time them."""
+    from benchmarks.hand.coal_reference import exact_clearance
+
     rows = []
     for name in HANDS:
         hand = load_hand(name)
