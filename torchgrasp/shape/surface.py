@@ -83,15 +83,15 @@ def _extract_wall(whole: ShapeGP, number: int, resolution: int) -> Surface:
         np.nan_to_num(volume, nan=1.0), 0.0, mask=~np.isnan(volume), spacing=(step,) * 3, gradient_direction="ascent"
     )
     used, faces = np.unique(faces[_carry_cloud(corners - radius, faces, shape)], return_inverse=True)
-    x = torch.from_numpy(corners[used].astype(np.float64) - radius).to(device)
-    faces = torch.from_numpy(faces.reshape(-1, 3).astype(np.int64)).to(device)
+    x = torch.tensor(corners[used].astype(np.float64) - radius).to(device)
+    faces = torch.tensor(faces.reshape(-1, 3).astype(np.int64)).to(device)
     for _ in range(NEWTON_STEPS):
         value, gradient = shape.mean_and_gradient(x)
         x = x + limit_norm(newton_step(value, gradient, gradient, LEAST_SLOPE)[:, None] * gradient, step)
     if others:
         value = torch.stack([wall.mean(x) for wall in others]).amax(0)
         vertices, triangles, _ = clip_mesh(x.cpu().numpy(), faces.cpu().numpy(), value.cpu().numpy())
-        x, faces = torch.from_numpy(vertices).to(x), torch.from_numpy(triangles).to(faces)
+        x, faces = torch.tensor(vertices).to(x), torch.tensor(triangles).to(faces)
     jet = shape.jet(x)
     a, b, c = x[faces].unbind(1)
     across = torch.linalg.cross(b - a, c - a)

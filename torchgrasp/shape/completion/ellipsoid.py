@@ -77,13 +77,13 @@ def find_ellipsoid(
         return None
     if axes[2] > MAX_RATIO * axes[0]:
         return None
-    root = torch.from_numpy(_exponential(parameters[3:]))
+    root = torch.tensor(_exponential(parameters[3:]))
     direction = fibonacci_sphere(GRID)
     across = unit(direction @ torch.linalg.inv(root))
     reach = _support(parameters, across.numpy())
     moved = np.stack([_support(parameters + step, across.numpy()) - reach for step in STEP * np.eye(9)], 1)
-    spread = torch.from_numpy(moved / STEP @ np.linalg.cholesky(covariance))
-    return Ellipsoid(torch.from_numpy(parameters[:3]) + direction @ root, across, spread, misfit)
+    spread = torch.tensor(moved / STEP @ np.linalg.cholesky(covariance))
+    return Ellipsoid(torch.tensor(parameters[:3]) + direction @ root, across, spread, misfit)
 
 
 @dataclasses.dataclass(frozen=True)
