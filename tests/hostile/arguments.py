@@ -123,7 +123,7 @@ def few_points() -> PointCloud:
 def grasp_problem() -> GraspProblem:
     """Return a problem of inverse kinematics, whose contacts have a deviation."""
     fields = {name: sample(hint, Path()) for name, hint in hints_of(GraspProblem).items() if name != "reachable"}
-    std = torch.full(fields["contacts"].points.shape[:2], 0.001)
+    std = torch.full_like(fields["contacts"].points[..., 0], 0.001)
     return GraspProblem(**fields | {"contacts": dataclasses.replace(fields["contacts"], std_m=std)})
 
 

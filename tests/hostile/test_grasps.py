@@ -106,7 +106,7 @@ def test_metadata_that_is_no_text_is_refused(tmp_path: Path, grasps: Grasps, val
 def test_a_path_that_is_no_file_is_refused(tmp_path: Path):
     os.mkfifo(tmp_path / "pipe.safetensors")
     for path in (tmp_path / "pipe.safetensors", "a" * 5000, "a\0b", tmp_path):
-        with pytest.raises(ModelFileError, match="no file"):
+        with pytest.raises(ModelFileError, match=r"no file|a{900}\.\.\."):
             load_grasps(path)
 
 

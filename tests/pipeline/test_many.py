@@ -35,11 +35,15 @@ def test_a_bad_cloud_costs_no_other_its_grasps(alone):
     assert plan_grasps([], HAND) == []
 
 
-def test_processes_change_nothing(alone):
+def test_processes_change_nothing_but_rounding(alone):
+    """Some processes round otherwise: one fit in forty differs in its last digits (docs/speed.md)."""
     pytest.importorskip("pebble")
     assert torch.get_num_threads() == 1 or pytest.skip("workers have one thread")
     found = plan_grasps([*VIEWS, SMALL], HAND, SPEC, 12, seed=2, workers=2)
-    assert all(same(one, other) for one, other in zip(found[:2], alone, strict=True))
+    for one, other in zip(found[:2], alone, strict=True):
+        assert one.meta == other.meta and one.status.tolist() == other.status.tolist()
+        torch.testing.assert_close(one.joints, other.joints, atol=1e-5, rtol=0)
+        torch.testing.assert_close(one.contacts.points, other.contacts.points, atol=1e-6, rtol=0)
     assert found[2].meta == plan_grasps([SMALL], HAND, SPEC, 12, seed=2)[0].meta and "refused" in found[2].meta
 
 

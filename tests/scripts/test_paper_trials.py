@@ -34,7 +34,7 @@ def grasps():
     _, grasp = pinch("allegro")
     rows = []
     for k in (1, 2, 3, 4):
-        std = torch.full((1, 3), 1e-3 * k)
+        std = torch.full((1, 3), 1e-3 * k, dtype=torch.float64)
         contacts = dataclasses.replace(grasp.contacts, std_m=std, variance=std**2)
         rows.append(dataclasses.replace(grasp, contacts=contacts))
     lost = dataclasses.replace(rows.pop(), status=torch.full_like(grasp.status, int(Status.TIP_ERROR)))

@@ -170,7 +170,7 @@ def hold(
         contacts = scene.step()
         points, joints = contacts.moment / contacts.weight[:, None], scene.joints()[order]
         from_tips = np.einsum("cij,ci->j", scene.jacobian(points), contacts.force)[order]
-        driven = np.clip(reference.kp.numpy() * (controller.targets.numpy() - joints), -effort, effort)
+        driven = np.clip(reference.kp.numpy() * (controller.targets.joints.numpy() - joints), -effort, effort)
         sums.append(contacts.force.sum(0))
         torques.append(np.where(np.abs(joints - middle) < reach, driven - from_tips, 0.0))
         pressed.append(robot.force.sum())
