@@ -88,7 +88,7 @@ class LeastForces:
         barrier = _Barrier(grasp_map(points), normals, limits, load, gap)
         tried = barrier.place(self.forces) + GROWTH[:, None] * barrier.place(self.start, 0.0)
         z = barrier.choose(tried, friction, floor)
-        for _ in range(STEPS):
+        for _ in range(STEPS if math.isfinite(barrier.slack) else 0):  # no cone holds a finger that does not press
             step, decrement = barrier.newton(z)
             trial = z + np.minimum(LENGTHS / (1 + decrement), 1.0)[:, None] * step
             value = barrier.value(trial)
