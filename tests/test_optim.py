@@ -33,13 +33,9 @@ def starts(generator: torch.Generator, count: int = 20) -> Tensor:
     return 2 * torch.randn(count, 2, generator=generator, dtype=torch.float64)
 
 
-def test_the_bottom_of_a_curved_valley_is_found_from_most_places_and_no_row_ends_higher(generator):
-    start = starts(generator)
-    found = solve(start)
-    reached = (found - 1).abs().amax(1) < 1e-6
-    assert int(reached.sum()) >= 18  # a row rests where a step gains too little, on the valley's floor
-    before, after = (rosenbrock(Point(x), torch.arange(20))[0].square().sum(1) for x in (start, found))
-    assert bool((after < before).all())
+def test_the_bottom_of_a_curved_valley_is_found_from_anywhere(generator):
+    found = solve(starts(generator))
+    torch.testing.assert_close(found, torch.ones_like(found), atol=1e-6, rtol=0)
 
 
 def test_no_step_raises_a_cost_or_is_longer_than_allowed(generator):

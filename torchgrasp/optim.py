@@ -15,9 +15,8 @@ from torch import Tensor
 
 from torchgrasp.base import Batch, pick, put
 
-LARGEST_STEP = 0.6
-"""Largest step of any variable of `LeastSquares` in one iteration [m or rad]. With 0.3 three pairs
-of a flat object and a hand gave 415 grasps in place of 458, from as many steps."""
+LARGEST_STEP = 0.3
+"""Largest step of any variable of `LeastSquares` in one iteration, where the problem names none."""
 SOLVED = 0.1
 """Sum of squared residuals at which `LeastSquares` is solved: 0.3 mm in the root."""
 STALLED = 0.02
@@ -112,6 +111,7 @@ class LeastSquares(Problem[State, LinearResiduals]):
     residuals: Callable[[State, Int[Tensor, "a"]], Residuals]
     moved: Callable[[State, Float[Tensor, "a d"]], State]
     solved: float = SOLVED
+    largest: float = LARGEST_STEP
 
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> LinearResiduals:
         """Evaluate residuals, Jacobian and the sum of squares."""
@@ -119,14 +119,14 @@ class LeastSquares(Problem[State, LinearResiduals]):
         return LinearResiduals(residual.square().sum(1), residual, jacobian)
 
     def step(self, model: LinearResiduals, damping: Damping) -> Steps:
-        """Return the damped step, at most `LARGEST_STEP`; zero where there is no factor yet."""
+        """Return the damped step, at most `largest`; zero where there is no factor yet."""
         normal = model.jacobian.mT @ model.jacobian
         diagonal = normal.diagonal(dim1=1, dim2=2)
         # Relative damping alone would leave a joint that moves nothing undamped.
         factor, info = torch.linalg.cholesky_ex(normal + torch.diag_embed(damping[:, None] * diagonal + 1e-3))
         x = -torch.cholesky_solve(model.jacobian.mT @ model.residual[..., None], factor)[..., 0]
         x = torch.where((info == 0)[:, None], x, 0.0)
-        x = x * (LARGEST_STEP / x.abs().amax(1, keepdim=True).clamp_min(LARGEST_STEP))
+        x = x * (self.largest / x.abs().amax(1, keepdim=True).clamp_min(self.largest))
         return x, ~(model.cost < self.solved) & torch.isfinite(damping)
 
     def move(self, state: State, x: Float[Tensor, "a d"]) -> State:

@@ -20,7 +20,7 @@ from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, clearance_rows
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian, differentiate
 from torchgrasp.ik.contact_first import refine_on_contacts
 from torchgrasp.ik.ranking import rank_in_group
-from torchgrasp.ik.refine import PAD_WEIGHT, TIP_WEIGHT, tip_rows, tip_targets
+from torchgrasp.ik.refine import HAND_STEP, PAD_WEIGHT, TIP_WEIGHT, tip_rows, tip_targets
 from torchgrasp.ik.rounds import Attempts, assign, best_first, best_grasps, executable
 from torchgrasp.optim import LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.plan.certify import certify
@@ -157,6 +157,7 @@ class JointProblem:
             sliding = LeastSquares(
                 lambda x, at, flat=flat: self.residuals(x, None if flat is None else flat[at]),
                 lambda x, step: x.integrate(self.hand, step),
+                largest=HAND_STEP,
             )
             state, cost = levenberg_marquardt(sliding, state, stage.steps)
             kept = torch.nonzero(cost < stage.hopeless)[:, 0]
