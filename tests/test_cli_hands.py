@@ -10,7 +10,7 @@ from PIL import Image
 
 from torchgrasp.cli import main
 from torchgrasp.hand.load import hands_folder
-from torchgrasp.report.canvas import SIZE
+from torchgrasp.report.hands import TILE
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def test_new_writes_a_draft_that_check_takes_and_draws(barrett, capsys):
     for words in ("mine, option default: 4 actuated of 8 joints", "spread", "f1_distal = 0.3333 f1_flex", "none"):
         assert words in said
     with Image.open(picture) as image:
-        assert image.width > SIZE[0] and len(np.unique(np.asarray(image).reshape(-1, 3), axis=0)) > 100
+        assert image.width == 2 * TILE[0] and len(np.unique(np.asarray(image).reshape(-1, 3), axis=0)) > 100
     assert main(["hand", "new", str(barrett / "hand.urdf")]) == 2  # what is there is not overwritten
     assert "exists" in capsys.readouterr().err
 

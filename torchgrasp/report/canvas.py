@@ -5,14 +5,14 @@ import io
 import numpy as np
 from jaxtyping import Float
 
-from torchgrasp.report.palette import INK, PAPER, TABLE, rgb
+from torchgrasp.report.palette import INK, PAPER, RAMPS, TABLE, rgb
 from torchgrasp.report.raster import Camera, Triangles, concatenate, render
 
 Direction = tuple[float, float, float]
 Colors = tuple[str, ...]
 
-SIZE = (900, 720)
-"""Width and height of a still [pixels]."""
+SIZE = (720, 576)
+"""Width and height of a still [pixels]: twice what a page of three columns has."""
 
 VIEW_ANGLE = np.deg2rad(24.0)
 """Vertical angle of view [rad]: of a long lens, which distorts little."""
@@ -47,7 +47,7 @@ class Canvas:
         from trimesh import creation
 
         size = 0.006 * float(np.linalg.norm(np.ptp(points, axis=0)))
-        ball = creation.icosphere(subdivisions=1, radius=1.0)
+        ball = creation.icosphere(subdivisions=0, radius=1.0)  # so small that nobody counts its faces
         corners = (points[:, None, None] + size * ball.vertices[ball.faces]).reshape(-1, 3, 3)
         normals = np.tile(ball.vertices[ball.faces], (len(points), 1, 1))
         shades = np.broadcast_to(np.repeat(colors, len(ball.faces), 0)[:, None], corners.shape)
@@ -100,7 +100,7 @@ class Canvas:
         if bar:
             draw_bar(image, *bar)
         buffer = io.BytesIO()
-        image.save(buffer, format="PNG")
+        image.save(buffer, format="PNG", compress_level=4)  # 5 % larger than by 6, in two thirds of the time
         return buffer.getvalue()
 
 
@@ -151,10 +151,9 @@ def _sharp_normals(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> Flo
 
 
 def map_colors(values: Float[np.ndarray, " n"], colors: str) -> Float[np.ndarray, "n 3"]:
-    """Return the colours of values in [0, 1] by a map of matplotlib."""
-    import matplotlib
-
-    return matplotlib.colormaps[colors](np.clip(values, 0.0, 1.0))[:, :3]
+    """Return the colours of values in [0, 1] by one of the `RAMPS`, blended between its steps."""
+    ramp = np.array([rgb(f"#{color}") for color in RAMPS[colors].split()])
+    return np.stack([np.interp(values, np.linspace(0.0, 1.0, len(ramp)), part) for part in ramp.T], -1)
 
 
 def draw_bar(image: object, title: str, most: float, colors: str) -> None:
@@ -163,11 +162,11 @@ def draw_bar(image: object, title: str, most: float, colors: str) -> None:
 
     assert isinstance(image, Image.Image)
     width, height = image.size
-    left, right, top, bottom = 200, width - 200, height - 28, height - 12
+    left, right, top, bottom = width // 5, width - width // 5, height - 24, height - 10
     ramp = map_colors(np.linspace(0.0, 1.0, right - left), colors)
     strip = (255 * np.broadcast_to(ramp, (bottom - top, *ramp.shape)) + 0.5).astype(np.uint8)
     image.paste(Image.fromarray(strip), (left, top))
-    draw, font = ImageDraw.Draw(image), ImageFont.load_default(23)
+    draw, font = ImageDraw.Draw(image), ImageFont.load_default(20)
     for i in range(4):
-        draw.text((left + i * (right - left) / 3, top - 5), f"{most * i / 3:.1f}", INK, font, anchor="ms")
-    draw.text(((left + right) / 2, top - 34), title, INK, font, anchor="ms")
+        draw.text((left + i * (right - left) / 3, top - 4), f"{most * i / 3:.1f}", INK, font, anchor="ms")
+    draw.text(((left + right) / 2, top - 29), title, INK, font, anchor="ms")

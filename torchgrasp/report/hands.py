@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgrasp.hand.hand import Hand
 from torchgrasp.linalg import unit
-from torchgrasp.report.canvas import SIZE, Canvas, Direction
+from torchgrasp.report.canvas import Canvas, Direction
 from torchgrasp.report.palette import AXES, FINGERS, GRID, HAND, INK, PAPER
 from torchgrasp.report.pictures import rotated
 from torchgrasp.report.solids import PARKED, finger_of_links, solids_from_hand
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
     from PIL.ImageFont import FreeTypeFont, ImageFont
 
-TILE = (SIZE[0] * 3 // 4, SIZE[1] * 3 // 4)
+TILE = (675, 540)
 """Width and height of one of the four views [pixels]."""
 BAR = 30
 """Height of the line of one joint [pixels]: room for its name."""

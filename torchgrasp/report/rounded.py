@@ -1,5 +1,6 @@
 """Collision shapes of a URDF as meshes with rounded edges, which show where a box ends."""
 
+import functools
 import itertools
 from typing import NamedTuple
 
@@ -29,6 +30,7 @@ class Rounded(NamedTuple):
     normals: Float[np.ndarray, "v 3"]
 
 
+@functools.lru_cache(maxsize=512)  # those of a hand are drawn again and again
 def round_shape(shape: Shape) -> Rounded:
     """Return a box, a cylinder or a sphere with rounded edges in the frame of its link.
 

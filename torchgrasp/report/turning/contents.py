@@ -13,7 +13,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.motion import APPROACH_DISTANCE
 from torchgrasp.report.canvas import Direction, map_colors
 from torchgrasp.report.page import GRASP_COLUMNS, grasp_rows
-from torchgrasp.report.palette import FINGERS, OBJECT, TABLE
+from torchgrasp.report.palette import FINGERS, OBJECT, RAMPS, TABLE, rgb
 from torchgrasp.report.pictures import facing, to_array, view_of
 from torchgrasp.report.run import Run, verdict
 from torchgrasp.report.solids import link_poses, solids_of_links
@@ -28,9 +28,6 @@ POSTURES = ("approach", "pre-grasp", "grasp", "squeeze")
 
 COLUMNS = (0, 1, 5, 3, 6)
 """Rank, success, margin, clearance and deviation, of the columns of the report."""
-
-STOPS = 17
-"""Colours of the legend from 0 to its end; a browser blends those between."""
 
 
 def describe(run: Run) -> dict[str, Any]:
@@ -82,7 +79,6 @@ def _surface(run: Run) -> dict[str, object]:
     surface, std_m = run.surface, to_array(run.surface.std_m)
     kept, faces = thin_mesh(to_array(surface.vertices), surface.faces.cpu().numpy(), MOST_FACES)
     most = max(float(np.quantile(std_m, 0.99)), 1e-6) if len(std_m) else 1e-6
-    ramp = map_colors(np.linspace(0.0, 1.0, STOPS), "viridis")
     return {
         "points": pack(to_array(surface.vertices)[kept]),
         "normals": pack(to_array(surface.normals)[kept]),
@@ -90,7 +86,7 @@ def _surface(run: Run) -> dict[str, object]:
         "std": pack(std_m[kept]),
         "colors": pack(np.round(255 * map_colors(std_m[kept] / most, "viridis")), "u1"),
         "most_mm": 1e3 * most,
-        "ramp": [[round(255 * part) for part in color] for color in ramp.tolist()],
+        "ramp": [[round(255 * part) for part in rgb(f"#{color}")] for color in RAMPS["viridis"].split()],
     }
 
 
