@@ -1,10 +1,18 @@
 """Checked linear algebra."""
 
+import numpy as np
 import pytest
 import torch
 
 from torchgrasp.errors import IndefiniteCovariance
-from torchgrasp.linalg import cholesky, farthest_points, limit_norm, squared_mahalanobis, unit
+from torchgrasp.linalg import (
+    cholesky,
+    farthest_points,
+    limit_norm,
+    solve_least_squares,
+    squared_mahalanobis,
+    unit,
+)
 
 
 @pytest.mark.promise("I11")
@@ -80,3 +88,24 @@ def test_farthest_points_keep_away_from_points_before(generator):
         known.append(points[pick])
     assert len(set(picks)) == 12
     assert torch.equal(farthest_points(points, 5, 3, before=points[:0]), farthest_points(points, 5, 3))
+
+
+@pytest.mark.parametrize(("n", "k", "rank"), [(984, 2, 2), (40, 7, 7), (40, 5, 3), (3, 6, 3)])
+def test_least_squares_are_the_shortest(generator, n, k, rank):
+    rows = torch.randn(n, rank, generator=generator, dtype=torch.float64)
+    rows = rows @ torch.randn(rank, k, generator=generator, dtype=torch.float64)
+    values = torch.randn(n, generator=generator, dtype=torch.float64)
+    oracle = np.linalg.lstsq(rows.numpy(), values.numpy(), rcond=None)[0]
+    torch.testing.assert_close(solve_least_squares(rows, values), torch.from_numpy(oracle), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.promise("N10")
+def test_least_squares_have_the_same_bits_in_every_call(generator):
+    """Memory that others have used lies below each call: a workspace that is read before it is set shows."""
+    rows = torch.randn(984, 2, generator=generator, dtype=torch.float64)
+    values = torch.randn(984, generator=generator, dtype=torch.float64)
+    first = solve_least_squares(rows, values)
+    for size in range(200):
+        used = torch.full((size,), 7)
+        del used
+        assert torch.equal(solve_least_squares(rows, values), first)

@@ -45,6 +45,18 @@ def limit_norm(v: Float[Tensor, "*b d"], longest: float) -> Float[Tensor, "*b d"
     return v * (longest / torch.linalg.vector_norm(v, dim=-1, keepdim=True).clamp_min(longest))
 
 
+def solve_least_squares(rows: Float[Tensor, "n k"], values: Float[Tensor, "n"]) -> Float[Tensor, "k"]:
+    """Return the shortest x that minimises |rows x - values|, by singular values.
+
+    `torch.linalg.lstsq` is not used: its driver for processors begins with column pivots that it never sets, so the
+    same system is solved with other last digits from call to call.
+
+    >>> solve_least_squares(torch.tensor([[1.0], [1.0]]), torch.tensor([1.0, 3.0]))
+    tensor([2.])
+    """
+    return torch.linalg.pinv(rows) @ values
+
+
 def cholesky(matrix: Float[Tensor, "*b n n"], what: str, remedy: str) -> Float[Tensor, "*b n n"]:
     """Return the lower Cholesky factor, without jitter.
 

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.linalg import solve_least_squares
+
 STEEP = 0.3
 """Length of a normal's level part from which on it helps to find a vertical axis."""
 HALF_WEIGHT = 0.004
@@ -109,7 +111,6 @@ def _fit_to_lines(points: Float[Tensor, "n 3"], lines: Lines) -> Float[Tensor, "
     miss, center = torch.zeros_like(lines.offset), points[:, :2].mean(0)
     for _ in range(ITERATIONS):
         weight = lines.slope / (1.0 + (miss / HALF_WEIGHT) ** 2)
-        system, known = weight[:, None].sqrt() * lines.across, (weight.sqrt() * lines.offset)[:, None]
-        center = torch.linalg.lstsq(system, known).solution[:, 0]
+        center = solve_least_squares(weight[:, None].sqrt() * lines.across, weight.sqrt() * lines.offset)
         miss = lines.offset - lines.across @ center
     return center

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.linalg import unit
+from torchgrasp.linalg import solve_least_squares, unit
 from torchgrasp.shape.completion.revolution import fit_axis
 
 WALL = 0.5
@@ -95,7 +95,7 @@ def find_vessel(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> 
         terms = torch.cat([powers, -inside[:, None], out], 1)  # the last two columns move the axis
         if not bool((weight > 0).sum() > 2 * terms.shape[1]):
             return None
-        found = torch.linalg.lstsq(weight * terms, weight * radius[:, None]).solution[:, 0]
+        found = solve_least_squares(weight * terms, weight[:, 0] * radius)
         miss, center = radius - terms @ found, center + found[-2:]
     thickness = float(found[DEGREE + 1])
 
