@@ -1,6 +1,6 @@
 """From the paper's chain to the library's, one stage exchanged at a time: what each is worth, on the same views."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from paper.rows import Cell, Plan, Row, TableSpec
@@ -36,7 +36,12 @@ def ladder(spec: Asked) -> None:
     Args:
         spec: what the table is made of.
     """
-    rows = gather(run_cells(spec, RUNGS))
+    judge_ladder(spec, run_cells(spec, RUNGS))
+
+
+def judge_ladder(spec: TableSpec, cells: Iterator[tuple[Cell, ...]]) -> None:
+    """Print and write the ladder of the cells of its rungs."""
+    rows = gather(cells)
     numbers: dict[str, Any] = {}
     hands = dict.fromkeys(cell.hand for cell in rows[0])
     for hand in ("all", *hands) if len(hands) > 1 else hands:

@@ -32,9 +32,11 @@ PUBLISHED = {
 }
 """Per cent of the paper's cylinder, spray and jug, of 30 trials each."""
 
+FORCE: HoldingMode = "force"
+"""The holding under which all closings are compared."""
 OWN: dict[ClosingMode, HoldingMode] = {
-    "uncertainty": "force",
-    "fixed": "force",
+    "uncertainty": FORCE,
+    "fixed": FORCE,
     "paper": "impedance",
     "position": "position",
     "paper_position": "position",
@@ -42,17 +44,33 @@ OWN: dict[ClosingMode, HoldingMode] = {
 """The closings of Table 7, and how each holds where each holds in its own way."""
 
 
+ROWS6 = tuple(Row(f"{t:.2f}", Plan(support="paper", variance=t), "risky", "uncertainty", "force") for t in THRESHOLDS)
+"""Rows of Table 6.
+
+The thresholds are variances of the paper's shape: on the completed one hardly any contact reaches the first of them.
+"""
+ROWS7 = tuple(
+    Row(f"{closing}, {holding}", Plan(variance=THRESHOLDS[0]), "risky", closing, holding)
+    for closing, own in OWN.items()
+    for holding in dict.fromkeys((FORCE, own))
+)
+"""Rows of Table 7, on the library's default shape."""
+
+
 def table6(spec: Asked) -> None:
     """Print Table 6: how often grasps hold whose contacts are less and less certain, on the paper's shape.
 
-    The thresholds are variances of that shape: on the completed one hardly any contact reaches the first of them. The
-    riskiest grasps of each view are lifted under the library's closing.
+    The riskiest grasps of each view are lifted under the library's closing.
 
     Args:
         spec: what the table is made of.
     """
-    plans = {f"{t:.2f}": Plan(support="paper", variance=t) for t in THRESHOLDS}
-    rows = gather(run_cells(spec, [Row(name, plan, "risky", "uncertainty", "force") for name, plan in plans.items()]))
+    judge_table6(spec, run_cells(spec, ROWS6))
+
+
+def judge_table6(spec: TableSpec, cells: Iterator[tuple[Cell, ...]]) -> None:
+    """Print and write Table 6 of the cells of its rows."""
+    rows = gather(cells)
     numbers = report(rows)
     fall = contrast_over([count_held(row) for row in rows], line_weights(THRESHOLDS))
     found = "excludes zero" if fall.low > 0 or fall.high < 0 else "does not exclude zero"
@@ -63,16 +81,19 @@ def table6(spec: Asked) -> None:
 def table7(spec: Asked) -> None:
     """Print Table 7: how often the same grasps hold, closed in five ways, held alike and as each closing does itself.
 
-    The shape is the library's default. The riskiest grasps below the first threshold are lifted.
+    The riskiest grasps below the first threshold are lifted.
 
     Args:
         spec: what the table is made of.
     """
-    plan = Plan(variance=THRESHOLDS[0])
-    ways = [(closing, holding) for closing, own in OWN.items() for holding in dict.fromkeys(["force", own])]
-    rows = gather(run_cells(spec, [Row(f"{c}, {h}", plan, "risky", c, h) for c, h in ways]))
+    judge_table7(spec, run_cells(spec, ROWS7))
+
+
+def judge_table7(spec: TableSpec, cells: Iterator[tuple[Cell, ...]]) -> None:
+    """Print and write Table 7 of the cells of its rows."""
+    rows = gather(cells)
     numbers, held = report(rows), {row[0].row: count_held(row) for row in rows}
-    alike = [f"{closing}, force" for closing in OWN]
+    alike = [f"{closing}, {FORCE}" for closing in OWN]
     own = [f"{closing}, {holding}" for closing, holding in OWN.items()]
     pairs = [(names[0], name) for names in (alike, own) for name in names[1:]]
     pairs += [(names[2], name) for names in (alike, own) for name in names[3:]]  # the paper's law over the baselines

@@ -1,0 +1,36 @@
+"""scripts/package.py: what it looks for and refuses, without a build."""
+
+import sys
+
+import package
+import pytest
+
+
+def test_a_failing_command_ends_with_its_last_words(tmp_path):
+    with pytest.raises(SystemExit, match=r"ended with 3:\nthe reason"):
+        package.run(sys.executable, "-c", "import sys; print('the reason'); sys.exit(3)", cwd=tmp_path)
+    assert package.run(sys.executable, "-c", "import sys; sys.exit(1)", cwd=tmp_path, codes=(1,)) == ""
+
+
+def test_the_surrounding_package_is_hidden_from_commands(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", "/nowhere")
+    assert package.run(sys.executable, "-c", "import os; print('PYTHONPATH' in os.environ)", cwd=tmp_path) == "False\n"
+
+
+def test_one_interpreter_of_each_version_is_found(tmp_path, monkeypatch):
+    for version in ("3.9.1", "3.10.2", "3.12.9", "3.12.1"):
+        python = tmp_path / "versions" / version / "bin" / "python"
+        python.parent.mkdir(parents=True)
+        python.symlink_to(sys.executable)
+    monkeypatch.setenv("PYENV_ROOT", str(tmp_path))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    names = [path.split("/")[-3] for path in package.find_pythons()]
+    assert names == ["3.10.2", "3.12.9"]
+
+
+def test_files_are_counted_and_links_are_not_followed(tmp_path):
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep" / "file").write_bytes(bytes(5000))
+    before = package.size_of(tmp_path)
+    (tmp_path / "link").symlink_to(tmp_path / "deep" / "file")
+    assert 5000 <= before and package.size_of(tmp_path) - before < 1000
