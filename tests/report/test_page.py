@@ -56,7 +56,7 @@ def test_report_is_written_whole_with_pictures(run, tmp_path):
     path = write_report(tmp_path / "deep" / "report.html", run)
     page = path.read_text(encoding="utf-8")
     assert page.startswith("<!doctype html>") and page.endswith("</html>\n")
-    assert len(re.findall("data:image/png", page)) == 10
+    assert len(re.findall("data:image/png", page)) == 7
     assert [p.name for p in path.parent.iterdir()] == ["report.html"]
 
 

@@ -50,9 +50,7 @@ def test_a_run_in_a_scene_shows_it_first(run, scene, monkeypatch):
         "draw_surface",
         "draw_contacts",
         "draw_grasp",
-        "draw_tick",
-        "plot_forces",
-        "plot_motion",
+        "draw_film",
     ):
         monkeypatch.setattr(f"torchgrasp.report.page.{name}", lambda *a: b"")
     monkeypatch.setattr("torchgrasp.report.page.draw_among", lambda *a: b"")

@@ -3,7 +3,7 @@
 import io
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from torchgrasp.report.palette import INK, PAPER, RAMPS, TABLE, rgb
 from torchgrasp.report.raster import Camera, Triangles, concatenate, render
@@ -85,6 +85,10 @@ class Canvas:
         normals, shade = (np.broadcast_to(row, corners.shape) for row in ((0.0, 0.0, 1.0), rgb(TABLE)))
         self.solid.append(_triangles(corners, normals, shade, lit=False))
 
+    def render(self, camera: Camera, size: tuple[int, int] = SIZE) -> UInt8[np.ndarray, "h w 3"]:
+        """Return what a camera sees, in pixels."""
+        return render(concatenate(self.solid), concatenate(self.transparent), camera, size, rgb(PAPER))
+
     def render_png(
         self, corners: Float[np.ndarray, "n 3"], direction: Direction, bar: tuple[str, float, str] | None = None
     ) -> bytes:
@@ -94,9 +98,7 @@ class Canvas:
         """
         from PIL import Image
 
-        camera = frame_camera(corners, direction, 0.09 if bar else 0.0)
-        pixels = render(concatenate(self.solid), concatenate(self.transparent), camera, SIZE, rgb(PAPER))
-        image = Image.fromarray(pixels)
+        image = Image.fromarray(self.render(frame_camera(corners, direction, 0.09 if bar else 0.0)))
         if bar:
             draw_bar(image, *bar)
         buffer = io.BytesIO()
@@ -104,7 +106,9 @@ class Canvas:
         return buffer.getvalue()
 
 
-def frame_camera(corners: Float[np.ndarray, "n 3"], direction: Direction, drop: float = 0.0) -> Camera:
+def frame_camera(
+    corners: Float[np.ndarray, "n 3"], direction: Direction, drop: float = 0.0, size: tuple[int, int] = SIZE
+) -> Camera:
     """Return a camera that sees all `corners` and a `drop`, the empty share of the picture below."""
     x, y, z = direction
     flat = float(np.hypot(x, y))
@@ -119,7 +123,7 @@ def frame_camera(corners: Float[np.ndarray, "n 3"], direction: Direction, drop: 
     local = corners @ frame.T
     middle, half = (local.min(0) + local.max(0)) / 2, np.ptp(local, axis=0) / 2
     # The nearest corners look largest, so the distance is counted from them.
-    reach = max(half[1] / (1.0 - 1.5 * drop), half[0] * SIZE[1] / SIZE[0]) / np.tan(VIEW_ANGLE / 2)
+    reach = max(half[1] / (1.0 - 1.5 * drop), half[0] * size[1] / size[0]) / np.tan(VIEW_ANGLE / 2)
     distance = half[2] + 1.12 * reach
     center = middle @ frame - frame[1] * drop * distance * np.tan(VIEW_ANGLE / 2)
     return Camera(center + back * distance, frame, float(VIEW_ANGLE))

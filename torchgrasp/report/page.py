@@ -12,6 +12,7 @@ from torchgrasp.base import count_status
 from torchgrasp.border import checked
 from torchgrasp.files import write_file
 from torchgrasp.pipeline.explain import Explanation
+from torchgrasp.report.closing import describe_film, draw_film
 from torchgrasp.report.document import escape, format_document, format_html_table
 from torchgrasp.report.palette import FINGERS
 from torchgrasp.report.pictures import (
@@ -19,10 +20,7 @@ from torchgrasp.report.pictures import (
     draw_contacts,
     draw_grasp,
     draw_surface,
-    draw_tick,
     facing,
-    plot_forces,
-    plot_motion,
     rotated,
     view_of,
 )
@@ -75,10 +73,7 @@ def draw_pictures(run: Run) -> dict[str, list[tuple[str, bytes]]]:
     if run.closure is not None and run.mesh is not None:
         side = rotated(facing(best), 20.0) if len(best) else view
         sections["Closing on the true object"] = [
-            ("Before the hand comes.", draw_tick(run.mesh, run.hand, run.closure, 0, side)),
-            ("At the end.", draw_tick(run.mesh, run.hand, run.closure, -1, side)),
-            ("Normal force of each fingertip.", plot_forces(run.closure, run.hand.tips.names)),
-            ("Motion of hand and object.", plot_motion(run.closure)),
+            (describe_film(run.mesh, run.hand, run.closure), draw_film(run.mesh, run.hand, run.closure, side))
         ]
     return sections
 
