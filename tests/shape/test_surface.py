@@ -1,6 +1,7 @@
 """The zero level of a sphere's posterior against the sphere."""
 
 import math
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import trimesh
 from torchgrasp.errors import BadArgument
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.surface import extract_surface
+from torchgrasp.shape.surface import _grid, extract_mesh, extract_surface
 from torchgrasp.values import PointCloud
 
 RADIUS, CENTER = 0.04, torch.tensor([0.2, -0.1, 0.3], dtype=torch.float64)
@@ -47,6 +48,32 @@ def test_surface_carries_the_cloud_of_one_view(seen_cylinder: PointCloud):
     _, distance, _ = trimesh.proximity.closest_point(mesh, seen_cylinder.points[::10].numpy())
     assert np.median(distance) < 0.001
     assert mesh.volume == pytest.approx(math.pi * 0.03**2 * 0.12, rel=0.2)
+
+
+@pytest.mark.parametrize("support", ["camera", "paper"])
+def test_the_grid_is_the_mean_wherever_the_surface_passes(
+    support: Literal["camera", "paper"], seen_cylinder: PointCloud
+):
+    shape = fit_shape(seen_cylinder, support=support, table=0.0 if support == "camera" else None)
+    radius, step = shape.domain_radius, 2 * shape.domain_radius / 32
+    found = _grid(shape, radius, step, 32)
+    line = torch.linspace(-radius, radius, 33, dtype=torch.float64)
+    nodes = torch.cartesian_prod(line, line, line)
+    mean = shape.mean(nodes).reshape(33, 33, 33).numpy()
+    inside = ~np.isnan(found)
+    assert (inside == (torch.linalg.vector_norm(nodes, dim=1) <= radius * (1 + 1e-9)).reshape(33, 33, 33).numpy()).all()
+    assert (np.sign(found) == np.sign(mean))[inside].all()
+    exact = np.isclose(found, mean, rtol=0, atol=1e-9)
+    for axis in range(3):  # both ends of an edge across the surface are exact
+        sign, sure = np.moveaxis(mean > 0, axis, 0), np.moveaxis(exact | ~inside, axis, 0)
+        across = sign[1:] != sign[:-1]
+        assert sure[1:][across].all() and sure[:-1][across].all()
+    assert exact.mean() < 0.6
+
+
+def test_a_mesh_alone_is_that_of_the_surface(ball: ShapeGP):
+    mesh, surface = extract_mesh(ball), extract_surface(ball)
+    assert torch.equal(mesh.vertices, surface.vertices) and torch.equal(mesh.faces, surface.faces)
 
 
 @pytest.mark.parametrize("resolution", [0, 7, 257])
