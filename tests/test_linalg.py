@@ -10,6 +10,7 @@ from torchgrasp.linalg import (
     farthest_points,
     limit_norm,
     solve_least_squares,
+    squared_distance,
     squared_mahalanobis,
     unit,
 )
@@ -63,6 +64,12 @@ def test_each_farthest_point_is_the_farthest_from_those_before_it(generator):
     for k in range(1, 12):
         nearest = torch.cdist(p, p[picks[:k]]).amin(1)
         assert nearest[picks[k]] == nearest.max()
+
+
+def test_farthest_points_are_the_same_however_distances_are_measured(generator):
+    p = torch.rand(200, 3, generator=generator, dtype=torch.float64).round(decimals=1)  # with ties
+    picks = farthest_points(p, 40, first=3, tie=1e-9)
+    assert torch.equal(picks, farthest_points(p, 40, first=3, tie=1e-9, distance=lambda x, y: squared_distance(x, y)))
 
 
 def test_of_points_that_tie_the_first_is_the_farthest():
