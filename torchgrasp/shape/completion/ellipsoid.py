@@ -31,6 +31,8 @@ GRID = 400
 """Points of the ellipsoid among which hidden ones are chosen."""
 STEP = 1e-5
 """Step of the differences by the parameters [m, or without unit]."""
+FORWARD = float(np.sqrt(np.finfo(float).eps))
+"""The same while it is fitted, over a parameter or 1, whichever is more: half the digits."""
 UPPER = np.triu_indices(3)
 """Entries of a symmetric matrix that are parameters."""
 
@@ -69,20 +71,20 @@ def find_ellipsoid(
     rows = farthest_points(points, PROBES, tie=TIE)
     fit = _Fit(points[rows].numpy(), normals[rows].numpy(), outline, table)
     parameters, covariance = fit.solve()
-    axes = np.exp(np.linalg.eigvalsh(_symmetric(parameters[3:])))
-    distance, normal = fit.distance_and_normal(parameters)
+    one = parameters[None]
+    axes = np.exp(np.linalg.eigvalsh(_symmetric(one[:, 3:])[0]))
+    distance, normal = (x[0] for x in fit.distance_and_normal(one))
     misfit = float(np.sqrt((distance**2).mean()))
     agreement = float((normal * fit.normals).sum(1).mean())
     if misfit > min(MAX_MISFIT, MAX_RELATIVE_MISFIT * float(axes.mean())) or agreement < LEAST_AGREEMENT:
         return None
     if axes[2] > MAX_RATIO * axes[0]:
         return None
-    root = torch.tensor(_exponential(parameters[3:]))
+    root = torch.tensor(_exponential(one[:, 3:])[0])
     direction = fibonacci_sphere(GRID)
     across = unit(direction @ torch.linalg.inv(root))
-    reach = _support(parameters, across.numpy())
-    moved = np.stack([_support(parameters + step, across.numpy()) - reach for step in STEP * np.eye(9)], 1)
-    spread = torch.tensor(moved / STEP @ np.linalg.cholesky(covariance))
+    moved = _support(one + STEP * np.eye(9), across.numpy()) - _support(one, across.numpy())
+    spread = torch.tensor(moved.T / STEP @ np.linalg.cholesky(covariance))
     return Ellipsoid(torch.tensor(parameters[:3]) + direction @ root, across, spread, misfit)
 
 
@@ -104,18 +106,27 @@ class _Fit:
         longest = np.ptp(self.points, axis=0).max()
         radius = np.log(np.clip(np.sqrt(max(ball[3] + ball[:3] @ ball[:3], 0.0)), longest / 4, longest))
         start = np.concatenate([ball[:3], radius * np.eye(3)[UPPER]])
-        found = least_squares(self.residuals, start, x_scale="jac", loss="soft_l1", max_nfev=40)
+        found = least_squares(
+            lambda x: self.residuals(x[None])[0], start, self.jacobian, x_scale="jac", loss="soft_l1", max_nfev=40
+        )
         return found.x, np.linalg.inv(found.jac.T @ found.jac)
 
+    def jacobian(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the derivative of the residuals by differences, all at once: one by one takes four times as long."""
+        step = FORWARD * np.maximum(1.0, np.abs(parameters))
+        found = self.residuals(np.concatenate([parameters[None], parameters + np.diag(step)]))
+        return ((found[1:] - found[0]) / step[:, None]).T
+
     def residuals(self, parameters: np.ndarray) -> np.ndarray:
-        """Return what is left of points, normals, outline, table and of the prior, over its deviation."""
+        """Return what is left of points, normals, outline, table and of the prior, over its deviation; (k, 9) rows."""
         distance, normal = self.distance_and_normal(parameters)
-        share = np.sqrt(len(self.points) / INDEPENDENT)
-        shape = _symmetric(parameters[3:])
+        share, k = np.sqrt(len(self.points) / INDEPENDENT), len(parameters)
+        shape = _symmetric(parameters[:, 3:])
+        mean = np.trace(shape, axis1=1, axis2=2)[:, None, None] / 3
         parts = [
             distance / (POINT_NOISE * share),
-            ((normal - self.normals) / (SLOPE_NOISE * share)).ravel(),
-            ((shape - np.eye(3) * np.trace(shape) / 3) / ELONGATION).ravel(),
+            ((normal - self.normals) / (SLOPE_NOISE * share)).reshape(k, -1),
+            ((shape - np.eye(3) * mean) / ELONGATION).reshape(k, -1),
         ]
         for view in self.outline.views:
             across = view.rim_normals.numpy()  # the camera lies in the tangent planes of the outline
@@ -124,31 +135,37 @@ class _Fit:
         if self.table is not None:
             bottom = -_support(parameters, np.array([[0.0, 0.0, -1.0]])) - self.table
             parts.append(np.maximum(bottom, 0.0) / TABLE_NOISE)
-        return np.concatenate(parts)
+        return np.concatenate(parts, 1)
 
     def distance_and_normal(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return distance [m] of the points from the ellipsoid, to first order, and its normals there."""
-        inverse = _exponential(-parameters[3:])
-        local = (self.points - parameters[:3]) @ inverse
-        length = np.linalg.norm(local, axis=1, keepdims=True)
+        """Return distance [m] of the points from ellipsoids, to first order, and their normals there."""
+        inverse = _exponential(-parameters[:, 3:])
+        local = (self.points - parameters[:, None, :3]) @ inverse
+        length = _length(local)
         slope = local @ inverse / length
-        steep = np.linalg.norm(slope, axis=1, keepdims=True)
-        return ((length - 1.0) / steep)[:, 0], slope / steep
+        steep = _length(slope)
+        return ((length - 1.0) / steep)[..., 0], slope / steep
+
+
+def _length(vectors: np.ndarray) -> np.ndarray:
+    """Return the lengths of vectors (..., 3), as (..., 1)."""
+    return np.sqrt(np.einsum("...i,...i->...", vectors, vectors))[..., None]
 
 
 def _support(parameters: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Return how far [m] the ellipsoid reaches along unit vectors."""
-    return across @ parameters[:3] + np.linalg.norm(across @ _exponential(parameters[3:]), axis=1)
+    """Return how far [m] ellipsoids (k, 9) reach along unit vectors."""
+    reach = across @ _exponential(parameters[:, 3:])
+    return parameters[:, :3] @ across.T + _length(reach)[..., 0]
 
 
 def _symmetric(entries: np.ndarray) -> np.ndarray:
-    """Return the symmetric matrix with these upper entries."""
-    matrix = np.zeros((3, 3))
-    matrix[UPPER] = entries
-    return matrix + matrix.T - np.diag(np.diag(matrix))
+    """Return the symmetric matrices with these upper entries."""
+    matrix = np.zeros((len(entries), 3, 3))
+    matrix[:, UPPER[0], UPPER[1]] = matrix[:, UPPER[1], UPPER[0]] = entries
+    return matrix
 
 
 def _exponential(entries: np.ndarray) -> np.ndarray:
-    """Return the exponential of a symmetric matrix."""
+    """Return the exponentials of symmetric matrices."""
     values, vectors = np.linalg.eigh(_symmetric(entries))
-    return vectors * np.exp(values) @ vectors.T
+    return vectors * np.exp(values)[:, None] @ vectors.swapaxes(1, 2)
