@@ -16,6 +16,10 @@ BEST = 20
 """Best grasps of a set by which it is judged: as many as an evaluation tries of a view."""
 
 
+def ignore(stage: str, message: str, value: Any) -> None:
+    """Do nothing: for this observer nothing is made that is only told."""
+
+
 def finger_sets(hand: Hand, fingers: Fingers | None, mode: Mode = "joint") -> tuple[Hand, ...]:
     """Return the hand with each set of fingers that is wanted: its own, another, or with "auto" all that it declares.
 

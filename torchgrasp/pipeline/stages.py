@@ -37,7 +37,8 @@ from torchgrasp.plan.certify import certify
 from torchgrasp.plan.starts import Settled, settle_flatness
 from torchgrasp.posture_model.mixture import PAPER_ENERGY
 from torchgrasp.scene.occupancy import estimate_occupancy
-from torchgrasp.shape.surface import Surface, extract_surface
+from torchgrasp.shape.posterior import surface_deviation
+from torchgrasp.shape.surface import Mesh, extract_mesh
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Certificate, ContactPlan, Contacts, Grasps, IKSeeds
 
@@ -51,6 +52,8 @@ are executable, of four or five contacts twice as many (docs/fingers.md)."""
 JUDGED_SEEDS, ARM_WEIGHT, NOTHING = 2, 0.3, 1e-3
 """Seeds that judge a row of contacts; weight of the log of the load's arm beside the log of the least residual; least
 residual [mm2] that counts. Weights of 0.1 to 1 give as many executable grasps."""
+CERTAIN, ASKED = 0.004, 500
+"""Standard deviation [m] of the surface below which it counts as certain, and vertices that are asked, at most."""
 BURIED_DEPTH = 0.003
 """Depth [m] in obstacles, beyond that of neighbours that touch, at which something lies on a lifted surface."""
 
@@ -82,9 +85,17 @@ class Bench:
         return self.settled.spec
 
     @cached_property
-    def surface(self) -> Surface:
+    def surface(self) -> Mesh:
         """The estimated surface."""
-        return extract_surface(self.task.shape)
+        return extract_mesh(self.task.shape)
+
+    @property
+    def certain(self) -> float:
+        """The share of the surface that is known to `CERTAIN`."""
+        shape, vertices = self.task.shape, self.surface.vertices
+        jet = shape.jet(shape.normalise(vertices[:: len(vertices) // ASKED + 1]))
+        std_m = shape.std_factor * shape.scale * surface_deviation(jet.variance, jet.gradient)
+        return float((std_m < CERTAIN).double().mean())
 
     @cached_property
     def obstacles(self) -> Obstacles | None:

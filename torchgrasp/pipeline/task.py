@@ -17,12 +17,12 @@ from torchgrasp.frames import inverse
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.ik.candidates import Reachable
-from torchgrasp.pipeline.fingers import Observer, finger_sets
+from torchgrasp.pipeline.fingers import Observer, finger_sets, ignore
 from torchgrasp.pipeline.provenance import metadata
 from torchgrasp.plane import cloud_to_upright, move, upright_frame
 from torchgrasp.posture_model.mixture import GraspMixture, load_mixture, mixture_path
 from torchgrasp.scene.scene import Scene
-from torchgrasp.shape.fit import fit_shape
+from torchgrasp.shape.fit import FitOptions, fit_upright
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec, Mode, Ranking
 from torchgrasp.values import Grasps, PointCloud
@@ -60,7 +60,7 @@ class Request:
     mode: Mode = "joint"
     ranking: Ranking | None = None
     shape: ShapeGP | None = None
-    observer: Observer = lambda stage, message, value: None
+    observer: Observer = ignore
     reachable: Reachable | None = None
     time_budget: Budget | None = None
 
@@ -120,9 +120,13 @@ class Work:
             mixture, mixture_sha256 = load_mixture(path), sha256(path)
         frame = upright_frame(cloud, spec.plane)
         level, reachable, observer = None if spec.table is None else 0.0, request.reachable, request.observer
+
+        def tell(stage: str, message: str, value: Any) -> None:
+            observer(stage, message, moved(value, frame))
+
         if request.shape is None:
             support = "paper" if as_paper else "camera"
-            shape = fit_shape(cloud_to_upright(cloud, frame), support=support, seed=request.seed, table=level)
+            shape = fit_upright(cloud_to_upright(cloud, frame), request.seed, level, FitOptions(support=support))
         else:
             shape = request.shape.moved(inverse(frame))
         task = Task(
@@ -136,7 +140,7 @@ class Work:
             mixture,
             None if scene is None else scene.to_upright(frame),
             None if reachable is None else lambda poses: reachable(frame.to(poses) @ poses),
-            lambda stage, message, value: observer(stage, message, moved(value, frame)),
+            ignore if observer is ignore else tell,
         )
         return cls(task, hands, cloud, spec, frame, mixture_sha256, deadline)
 

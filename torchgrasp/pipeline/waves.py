@@ -9,7 +9,8 @@ from torchgrasp.base import join
 from torchgrasp.errors import Status
 from torchgrasp.ik.ranking import lexical_order, rank_by_variance
 from torchgrasp.pipeline.choice import Offer, Untried, join_offers
-from torchgrasp.pipeline.stages import OFFERED, Bench
+from torchgrasp.pipeline.fingers import ignore
+from torchgrasp.pipeline.stages import CERTAIN, OFFERED, Bench
 from torchgrasp.pipeline.story import Story
 from torchgrasp.pipeline.task import Task
 from torchgrasp.plan.solve import plan_in_turn
@@ -20,8 +21,6 @@ from torchgrasp.values import Grasps
 FIRST, GROWTH = 16, 3
 """Rows of contacts that the hand tries in the first wave, and how many times as many in the next. A wave costs what
 some 30 rows do beside its own: two waves more made the whole call a fifth longer."""
-CERTAIN = 0.004
-"""Standard deviation [m] of the surface below which the line of the stage "shape" calls it certain."""
 
 
 class Wave(NamedTuple):
@@ -83,11 +82,10 @@ def plan_waves(task: Task, deadline: float) -> Iterator[Grasps]:
     No wave begins after `deadline`, of `time.monotonic`.
     """
     check_starts(task.shape, task.spec, task.starts, task.seed)
-    bench, untried = Bench(task), Untried()
-    surface, shape = bench.surface, task.shape
-    certain = float((surface.std_m < CERTAIN).double().mean())
-    text = f"{len(shape.x)} points, {certain:.0%} of the surface certain to {1e3 * CERTAIN:g} mm"
-    task.observer("shape", text, shape)
+    bench, untried, shape = Bench(task), Untried(), task.shape
+    if task.observer is not ignore:
+        text = f"{len(shape.x)} points, {bench.certain:.0%} of the surface certain to {1e3 * CERTAIN:g} mm"
+        task.observer("shape", text, shape)
     waves = schedule(task.starts, bench.tried) if task.mode == "joint" else [Wave(task.starts, bench.tried)]
     sizes = [wave.starts for wave in waves if wave.starts]
     plans = plan_in_turn(shape, bench.settled, sizes, task.seed)

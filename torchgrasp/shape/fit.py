@@ -118,34 +118,45 @@ def fit_shape(
     >>> fit_shape(PointCloud(0.04 * ball, ball)).predict(torch.tensor([0.0, 0.0, 0.04])).distance.abs() < 0.02
     tensor(True)
     """
-    plane, generator = as_plane(table), torch.Generator().manual_seed(seed)
-    cloud = remove_duplicates(cloud)
-    obj_from_upright = upright_frame(cloud, plane)
-    seen = prepare_cloud(cloud_to_upright(cloud, obj_from_upright), generator, clean=support == "camera")
-    height = None if plane is None else 0.0  # of the table in the upright frame
-    as_paper = support == "paper"
-    supports = (_paper_support(seen, noise, generator),) if as_paper else _camera_supports(seen, noise, height)
-    most, stop = (MAX_BUDGET, noise) if budget == "sure" else (budget or BUDGETS[support], -math.inf)
-    options = _Options(noise, psi_scale, kernel, criterion, most, stop)
-    walls = [_fit_surface(seen, beside, options) for beside in supports]
-    shape, middle = walls[0], supports[0].middle
-    shape = shape if middle is None else tie_walls(HollowShape.join(shape, walls[1], seen.cloud), middle)
-    return shape.moved(obj_from_upright)
+    plane, cloud = as_plane(table), remove_duplicates(cloud)
+    frame = upright_frame(cloud, plane)
+    options = FitOptions(noise, budget, psi_scale, support, kernel, criterion)
+    return fit_upright(cloud_to_upright(cloud, frame), seed, None if plane is None else 0.0, options).moved(frame)
 
 
 @dataclasses.dataclass(frozen=True)
-class _Options:
-    """How a surface is fitted: see `fit_shape`; at most so many points, until no score exceeds `stop`."""
+class FitOptions:
+    """How a surface is fitted: see `fit_shape`."""
 
-    noise: float
-    psi_scale: float
-    kernel: KernelName | Kernel
-    criterion: Criterion
-    most: int
-    stop: float
+    noise: float = 0.01
+    budget: int | Literal["sure"] | None = None
+    psi_scale: float = 1.5
+    support: Literal["camera", "paper"] = "camera"
+    kernel: KernelName | Kernel = "thin_plate"
+    criterion: Criterion = "variance"
+
+    @property
+    def most(self) -> int:
+        """The greatest number of observed points."""
+        return MAX_BUDGET if self.budget == "sure" else self.budget or BUDGETS[self.support]
+
+    @property
+    def stop(self) -> float:
+        """The score that no point has where selection ends."""
+        return self.noise if self.budget == "sure" else -math.inf
 
 
-def _fit_surface(seen: PreparedCloud, beside: "_Support", options: _Options) -> ShapeGP:
+def fit_upright(cloud: PointCloud, seed: int, table: float | None, options: FitOptions) -> ShapeGP:
+    """Return `fit_shape` of a cloud without duplicates in its `upright_frame`, with the height of the table there."""
+    generator, as_paper = torch.Generator().manual_seed(seed), options.support == "paper"
+    seen, noise = prepare_cloud(cloud, generator, clean=not as_paper), options.noise
+    supports = (_paper_support(seen, noise, generator),) if as_paper else _camera_supports(seen, noise, table)
+    walls = [_fit_surface(seen, beside, options) for beside in supports]
+    shape, middle = walls[0], supports[0].middle
+    return shape if middle is None else tie_walls(HollowShape.join(shape, walls[1], seen.cloud), middle)
+
+
+def _fit_surface(seen: PreparedCloud, beside: "_Support", options: FitOptions) -> ShapeGP:
     """Return the posterior of one surface, in the upright frame."""
     cloud, points, normals = seen.cloud, seen.points, seen.normals
     if beside.rows is not None:
