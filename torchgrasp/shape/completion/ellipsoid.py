@@ -5,6 +5,7 @@ the normals, the outline and the table, and its covariance says how sure it is.
 """
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import torch
@@ -106,8 +107,9 @@ class _Fit:
         longest = np.ptp(self.points, axis=0).max()
         radius = np.log(np.clip(np.sqrt(max(ball[3] + ball[:3] @ ball[:3], 0.0)), longest / 4, longest))
         start = np.concatenate([ball[:3], radius * np.eye(3)[UPPER]])
+        jacobian: Any = self.jacobian  # of which SciPy's annotations do not know
         found = least_squares(
-            lambda x: self.residuals(x[None])[0], start, self.jacobian, x_scale="jac", loss="soft_l1", max_nfev=40
+            lambda x: self.residuals(x[None])[0], start, jacobian, x_scale="jac", loss="soft_l1", max_nfev=40
         )
         return found.x, np.linalg.inv(found.jac.T @ found.jac)
 
