@@ -2,7 +2,7 @@
 """Build wheel and sdist of the last commit, and try the wheel in an empty environment of every Python there is.
 
 python scripts/package.py                                 all Pythons that are found, torch as pip finds it
-python scripts/package.py --python python3.10 python3.13  these alone
+python scripts/package.py --python python3.10 python3.13  these alone; none after --python: it only builds
 python scripts/package.py --torch-index https://download.pytorch.org/whl/cpu   a CPU build of torch
 
 Nothing but Python, its venv module and git is needed. Environments are made one at a time and removed.
@@ -38,7 +38,8 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="package-") as folder:  # runs of torchgrasp clear away "torchgrasp-*"
         work = Path(folder)
         wheel = build(work, asked.out.resolve())
-        rows = [try_wheel(work, wheel, python, asked.torch_index) for python in asked.python or find_pythons()]
+        pythons = find_pythons() if asked.python is None else asked.python
+        rows = [try_wheel(work, wheel, python, asked.torch_index) for python in pythons]
     (asked.out / "package.json").write_text(json.dumps(rows, indent=1))
     return 0
 

@@ -5,6 +5,7 @@ python scripts/survey.py                      the whole library, with what break
 python scripts/survey.py torchgrasp/plan      one folder or file of it
 """
 
+import argparse
 import ast
 import re
 import sys
@@ -103,4 +104,6 @@ def is_text(node: ast.AST) -> bool:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:] or ["torchgrasp"]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("places", nargs="*", default=["torchgrasp"], help="folders and files; by default the library")
+    sys.exit(main(parser.parse_args().places))

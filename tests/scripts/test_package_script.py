@@ -1,9 +1,31 @@
-"""scripts/package.py: what it looks for and refuses, without a build."""
+"""scripts/package.py: what it looks for and refuses, without a build; what a package index will show."""
 
+import re
 import sys
+from pathlib import Path
 
 import package
 import pytest
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_the_long_description_leads_nowhere_inside_the_project():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    hook = project["tool"]["hatch"]["metadata"]["hooks"]["fancy-pypi-readme"]
+    (fragment,) = hook["fragments"]
+    readme = shown = (ROOT / fragment["path"]).read_text()
+    for change in hook["substitutions"]:
+        shown = re.sub(change["pattern"], change["replacement"], shown)
+    targets = re.findall(r"\]\(([^)]*)\)", shown)
+    assert targets and all(target.startswith("https://") for target in targets)
+    assert "From left to right" in readme and "From left to right" not in shown  # a caption without its picture
+    assert [x for x in readme.splitlines() if x.startswith("#")] == [x for x in shown.splitlines() if x.startswith("#")]
 
 
 def test_a_failing_command_ends_with_its_last_words(tmp_path):
