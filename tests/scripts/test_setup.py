@@ -52,8 +52,12 @@ def set_up(tmp_path):
         shutil.copy(ROOT / name, project / name)
     (fake / "python").write_text(STAND_IN.format(python=sys.executable, folder=str(fake)))
     (fake / "python").chmod(0o755)
+    tools = fake / "tools"
+    tools.mkdir()
+    (tools / "nvidia-smi").touch(0o755)
 
-    def run(installed=False, configured=None, index=None, **environment):
+    def run(installed=False, configured=None, index=None, gpu=False, **environment):
+        (tools / "nvidia-smi").write_text(f"#!/bin/sh\nexit {0 if gpu else 9}\n")
         answers = {"installed": installed, "configured": configured, "index": index}
         (fake / "answers.json").write_text(json.dumps(answers))
         (fake / "calls.txt").unlink(missing_ok=True)
@@ -61,7 +65,7 @@ def set_up(tmp_path):
         done = subprocess.run(
             ["bash", "-euo", "pipefail", "-c", "source scripts/_setup"],
             cwd=project,
-            env={**clean, "PYTHON": str(fake / "python"), **environment},
+            env={**clean, "PYTHON": str(fake / "python"), "PATH": f"{tools}:{clean['PATH']}", **environment},
             capture_output=True,
             text=True,
             check=False,
@@ -102,6 +106,22 @@ def test_a_cuda_build_is_taken_with_its_size_where_there_is_no_other(set_up, whe
     assert done.returncode == 0, done.stderr
     assert "2.3 GB" in done.stdout
     assert "torch==" in installs[0] and "--index-url" not in installs[0]
+
+
+def test_beside_a_gpu_the_cuda_build_is_taken_and_its_size_told(set_up, wheel):
+    wheel.write_bytes(b"")
+    os.truncate(wheel, 2_300_000_000)
+    given = {"configured": report(wheel, "triton"), "index": report(wheel), "gpu": True}
+    done, installs = set_up(**given)
+    assert done.returncode == 0, done.stderr
+    assert "2.3 GB" in done.stdout and "TORCHGRASP_CUDA=0" in done.stdout and "--index-url" not in installs[0]
+
+
+def test_a_cpu_build_can_be_asked_for_beside_a_gpu(set_up, wheel):
+    given = {"configured": report(wheel, "triton"), "index": report(wheel), "gpu": True}
+    done, installs = set_up(TORCHGRASP_CUDA="0", **given)
+    assert done.returncode == 0, done.stderr
+    assert f"--index-url {INDEX}" in installs[0]
 
 
 def test_a_size_that_cannot_be_known_does_not_stop_the_set_up(set_up, wheel):
