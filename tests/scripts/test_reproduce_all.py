@@ -106,6 +106,14 @@ def test_an_unknown_part_is_named(tmp_path):
         reproduce(Whole(tmp_path, parts=("fig13",)), TINY)
 
 
+def test_a_part_that_fails_is_named_and_the_others_are_made(steps, tmp_path, capsys):
+    few = dataclasses.replace(TINY, fitted=30, apart=20)  # too few postures for sixty Gaussians
+    with pytest.raises(SystemExit, match="not made: fig6"):
+        reproduce(Whole(tmp_path, parts=("fig6", "fig7"), workers=0), few)
+    assert (tmp_path / "index.html").read_text().count("Not finished.") == 1 and (tmp_path / "fig7.png").is_file()
+    assert "Fig. 6: " in capsys.readouterr().out
+
+
 def test_every_part_of_the_paper_is_there_once():
     titles = " ".join(part.title for part in (*FIGURES, *TRIALS))
     assert re.findall(r"Table (\d)", titles) == ["3", "4", "5", "6", "7"]

@@ -129,5 +129,5 @@ def _picture(path: Path, name: str) -> str:
     packed = io.BytesIO()
     with Image.open(path) as picture:
         picture.convert("RGB").save(packed, format="JPEG", quality=QUALITY)
-    data = base64.b64encode(packed.getvalue()).decode("ascii")
-    return f'<figure><img alt="{name}" src="data:image/jpeg;base64,{data}"><figcaption>{name}</figcaption></figure>'
+    data, title = base64.b64encode(packed.getvalue()).decode("ascii"), name.replace("fig", "Fig. ")
+    return f'<figure><img alt="{title}" src="data:image/jpeg;base64,{data}"><figcaption>{title}</figcaption></figure>'

@@ -97,35 +97,36 @@ class Trials:
 FIGURES = (
     Figure(
         "table3", "Table 3", "Points that the filter keeps of 1000, and seconds of filter and shape. The paper has "
-        "whole clouds alone; one view is what a camera sees.", table3, 20.0,
+        "whole clouds alone; one view is what a camera sees.", table3, 5.0,
     ),
     Figure(
-        "fig4", "Fig. 4", "Whole and partial clouds, and the shapes that follow from them.", fig4, 60.0,
+        "fig4", "Fig. 4", "Whole and partial clouds, and the shapes that follow from them.", fig4, 15.0,
         pictures=("fig4",), numbers=False,
     ),
     Figure(
         "table4", "Table 4", "Certified contact triples, the time of a start and the distance of their centre from "
-        "the object's. S is the threshold of the variance, Eq. (12).", table4, 100.0, {"starts": "starts"},
+        "the object's. S is the threshold of the variance, Eq. (12); closes is the mean probability of closure on the "
+        "uncertain surface.", table4, 100.0, {"starts": "starts"},
     ),
     Figure(
         "fig5", "Fig. 5", "Planned contacts on the surface, coloured by its standard deviation: a column of the "
-        "paper's problem and one of the default one for each object.", fig5, 60.0, {"starts": "drawn"}, ("fig5",),
+        "paper's problem and one of the default one for each object.", fig5, 25.0, {"starts": "drawn"}, ("fig5",),
         numbers=False,
     ),
     Figure(
         "fig6", "Fig. 6", "The number of Gaussians by the Bayesian information criterion and by cross-validation.",
-        fig6, 300.0, {"n": "fitted", "apart": "apart", "folds": "folds"}, ("fig6",),
+        fig6, 190.0, {"n": "fitted", "apart": "apart", "folds": "folds"}, ("fig6",),
     ),
     Figure(
         "table5", "Table 5", "Mean absolute error [rad] of the joints of the Barrett hand that the learned model "
-        "predicts, in four cases and over all held-out postures.", table5, 60.0, {"n": "postures"},
+        "predicts, in four cases and over all held-out postures.", table5, 15.0, {"n": "postures"},
     ),
     Figure(
         "fig7", "Fig. 7", "The four cases of Table 5: the true posture, and transparent the predicted one.", fig7,
-        30.0, {"n": "postures"}, ("fig7",), numbers=False,
+        6.0, {"n": "postures"}, ("fig7",), numbers=False,
     ),
     Figure(
-        "fig8", "Fig. 8", "Mean absolute error [rad] of the joints of the Allegro hand.", fig8, 60.0,
+        "fig8", "Fig. 8", "Mean absolute error [rad] of the joints of the Allegro hand.", fig8, 30.0,
         {"n": "postures"}, ("fig8",),
     ),
     Figure(

@@ -17,7 +17,7 @@ from paper.rows import Cell, TableSpec
 from paper.trials import run_cells, subjects
 from paper.whole.page import write_pages
 from paper.whole.parts import FIGURES, FULL, QUICK, TRIALS, Figure, Sizes, Trials
-from torchgrasp.errors import Status
+from torchgrasp.errors import GraspError, Status
 from torchgrasp.evaluation import run_tasks
 from torchgrasp.files import format_json, hold_folder, write_file
 
@@ -71,16 +71,21 @@ def reproduce(spec: Whole, sizes: Sizes) -> None:
     work = sum(p.seconds for p in missing) + sum(p.seconds * _lifts(p, table) for p, table in left)
     style = "{percentage:3.0f}% |{bar}| {elapsed}, {remaining} left{postfix}"
     with hold_folder(spec.out), tqdm(total=work, disable=None, bar_format=style, smoothing=0.05) as bar:
-        for part, lost in zip(missing, make_figures(spec, missing, sizes), strict=True):
-            _tell(bar, part.title, lost.sentence if isinstance(lost, Status) else "")
+        lost: dict[str, str] = {}
+        for part, found in zip(missing, make_figures(spec, missing, sizes), strict=True):
+            if reason := found.sentence if isinstance(found, Status) else found:
+                lost[part.name] = reason
+            bar.write(f"{part.title}: {reason or 'done'}")
             bar.update(part.seconds)
         write_pages(spec.out, sizes, asked)
         for part, table in left:
             make_table(part, table, bar)
             write_pages(spec.out, sizes, asked)
-            _tell(bar, part.title)
+            bar.write(f"{part.title}: done")
     write_pages(spec.out, sizes, asked)
     print(spec.out / "index.html")
+    if lost:
+        raise SystemExit(f"not made: {', '.join(lost)}")
 
 
 def make_figures(spec: Whole, missing: list[Figure], sizes: Sizes) -> Iterator[str | Status]:
@@ -90,14 +95,17 @@ def make_figures(spec: Whole, missing: list[Figure], sizes: Sizes) -> Iterator[s
 
 
 def make_figure(name: str, out: Path, sizes: Sizes) -> str:
-    """Make one figure, keep what it printed, and return its name."""
+    """Make one figure and keep what it printed; return why it could not be made, or nothing."""
     torch.set_num_threads(1)
     part = next(part for part in FIGURES if part.name == name)
     began, said = time.process_time(), io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(io.StringIO()):
-        part.make(out, **part.options(sizes))
+        try:
+            part.make(out, **part.options(sizes))
+        except GraspError as error:
+            return str(error)
     finish(out, name, part.options(sizes), said.getvalue(), time.process_time() - began)
-    return name
+    return ""
 
 
 def make_table(part: Trials, table: TableSpec, bar: "tqdm[Any]") -> None:
@@ -142,8 +150,3 @@ def _lifts(part: Trials, table: TableSpec) -> float:
     """Return by how much a table is larger than one object with one hand at quick sizes."""
     each = table.grasps * table.draws / (QUICK.grasps * QUICK.draws) if part.repeated else 1.0
     return each * len(subjects(table)) * len(table.hands)
-
-
-def _tell(bar: "tqdm[Any]", title: str, lost: str = "") -> None:
-    """Print that a part is there, above the bar."""
-    bar.write(f"{title}: {lost or 'done'}")

@@ -39,8 +39,8 @@ def table3(content: dict[str, Any]) -> Table:
 
 def table4(content: dict[str, Any]) -> Table:
     """Return Table 4."""
-    heads = ("object", "problem", "S", f"grasps of {content['starts']}", "ms a start", "Q cm", "closure probable to")
-    heads += ("the paper's", "grasps of 1000", "s a start", "Q cm")
+    heads = ("object", "problem", "S", f"of {content['starts']}", "ms a start", "Q cm", "closes")
+    heads += ("the paper's", "of 1000", "s a start", "Q cm")
     rows = []
     for row in content["rows"]:
         theirs = PLANNED[row["object"]] if row["threshold"] == THRESHOLDS[0] else ("",) * 4
