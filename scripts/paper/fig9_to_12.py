@@ -184,6 +184,6 @@ def draw(taken: Taken, index: int, eye: Direction) -> Image.Image:
 
 def _add_frame(canvas: Canvas, contacts: Contacts) -> None:
     """Add the normals of a triple and its virtual frame."""
-    canvas.add_arrows(contacts.points[0].numpy(), contacts.normals[0].numpy(), NORMAL, FINGERS)
+    canvas.add_arrows(contacts.points[0].numpy(), contacts.normals[0].numpy(), NORMAL, FINGERS[:3])
     frame = virtual_frame(contacts.points[0]).numpy()
     canvas.add_arrows(np.tile(frame[:3, 3], (3, 1)), frame[:3, :3].T, FRAME, AXES)

@@ -148,7 +148,7 @@ def fig8(out: Path, n: int = 100_000, seed: int = 1) -> None:
     mean, spread = errors.error.mean(0).numpy(), errors.error.std(0).numpy()
     figure = Figure(figsize=(8.4, 4.2), dpi=140, facecolor=PAPER, layout="constrained")
     axes = figure.add_subplot(facecolor=PAPER)
-    place, fingers = np.arange(len(mean)), np.repeat(FINGERS, 4)
+    place, fingers = np.arange(len(mean)), np.repeat(FINGERS[:3], 4)
     axes.bar(place, mean, 0.65, yerr=[np.minimum(mean, spread), spread], color=fingers, ecolor=INK, capsize=3)
     axes.axhline(PUBLISHED_ALLEGRO, color="#d62728", linestyle="--", linewidth=1.3, label="the paper: around 0.2 rad")
     axes.axhline(float(mean.mean()), color=INK, linewidth=1.3, label=f"our mean {mean.mean():.3f} rad")
