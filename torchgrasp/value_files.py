@@ -9,6 +9,7 @@ from jaxtyping import AbstractArray, jaxtyped
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.border.hints import is_subclass
 from torchgrasp.errors import ModelFileError
 from torchgrasp.files import load_tensors
 
@@ -46,9 +47,9 @@ def _tensor_fields(of: type[Value], prefix: str = "") -> dict[str, tuple[Any, ..
     fields: dict[str, tuple[Any, ...]] = {}
     for name, hint in _hints(of).items():
         kinds = typing.get_args(hint) if typing.get_origin(hint) not in (None, dict) else (hint,)
-        if isinstance(hint, type) and issubclass(hint, Value):
+        if is_subclass(hint, Value):
             fields |= _tensor_fields(hint, f"{prefix}{name}.")
-        elif isinstance(kinds[0], type) and issubclass(kinds[0], AbstractArray):
+        elif is_subclass(kinds[0], AbstractArray):
             fields[prefix + name] = kinds
     return fields
 
@@ -57,7 +58,7 @@ def _build(of: type[SomeValue], tensors: dict[str, Tensor], prefix: str, rest: d
     """Return a value of tensors by dotted name; a missing one is None."""
     values: dict[str, Any] = dict(rest)
     for name, hint in _hints(of).items():
-        if isinstance(hint, type) and issubclass(hint, Value):
+        if is_subclass(hint, Value):
             values[name] = _build(hint, tensors, f"{prefix}{name}.", {})
         elif name not in rest:
             values[name] = tensors.get(prefix + name)

@@ -34,7 +34,7 @@ def reader(hint: Any) -> tuple[Reader, str]:
         return _union(inside)
     if origin is typing.Literal:
         return _literal(inside)
-    if isinstance(hint, type) and issubclass(hint, AbstractArray):
+    if is_subclass(hint, AbstractArray):
         return _tensor(hint)
     if hint in (int, float, bool):
         return _number(hint, Range(-(2**63), 2**63 - 1, "a whole number") if hint is int else NUMBERS)
@@ -189,7 +189,18 @@ def _instance(kind: type) -> tuple[Reader, str]:
 def has_tensor(hint: Any) -> bool:
     """Tell whether a hint names a tensor."""
     inner = () if typing.get_origin(hint) is collections.abc.Callable else typing.get_args(hint)
-    return (isinstance(hint, type) and issubclass(hint, AbstractArray | Tensor)) or any(has_tensor(x) for x in inner)
+    return is_subclass(hint, AbstractArray, Tensor) or any(has_tensor(x) for x in inner)
+
+
+def is_subclass(hint: Any, *kinds: type) -> bool:
+    """Tell whether a hint is a class, and below one of others.
+
+    `list[int]` is none: Python 3.10 calls it a type all the same, and then refuses it to `issubclass`.
+
+    >>> is_subclass(bool, int), is_subclass(list[int], list)
+    (True, False)
+    """
+    return typing.get_origin(hint) is None and isinstance(hint, type) and issubclass(hint, kinds)
 
 
 def fields_of(kind: type, hints: Callable[[type], dict[str, Any]]) -> Callable[[], dict[str, Any]]:
