@@ -262,6 +262,8 @@ def test_the_bare_command_shows_where_to_begin(capsys):
         (["clo"], {"cloud"}),
         (["cloud", ""], {"check", "cut", "depth", "thin", "render", "views"}),
         (["hand", "tr"], {"train"}),
+        (["vi"], {"view"}),
+        (["view", "--n"], {"--no-browser"}),
     ],
 )
 def test_the_shell_completes_commands_of_a_group(typed, offered, tmp_path, capsys):

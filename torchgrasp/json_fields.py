@@ -50,10 +50,10 @@ class Field(NamedTuple):
             raise self.wrong(f"a list of at most {most}")
         return [Field(self.path, f"{self.place}[{i}]", x, self.refuse) for i, x in enumerate(self.value)]
 
-    def text(self) -> str:
-        """Return a text of at most `MOST_LETTERS`."""
-        if not isinstance(self.value, str) or len(self.value) > MOST_LETTERS:
-            raise self.wrong(f"a text of at most {MOST_LETTERS} letters")
+    def text(self, most: int = MOST_LETTERS) -> str:
+        """Return a text of at most so many letters."""
+        if not isinstance(self.value, str) or len(self.value) > most:
+            raise self.wrong(f"a text of at most {most} letters")
         return self.value
 
     def number(self, low: float, high: float) -> float:

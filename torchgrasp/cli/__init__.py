@@ -22,12 +22,14 @@ from torchgrasp.cli.evaluate import evaluate
 from torchgrasp.cli.export import export, import_grasps
 from torchgrasp.cli.hand_check import check
 from torchgrasp.cli.hand_train import train
+from torchgrasp.cli.results import view
 from torchgrasp.errors import GraspError
 
 __all__ = ["COMMANDS", "main"]
 
 COMMANDS: dict[str, Callable[..., int]] = {
     "grasp": grasps.grasp,
+    "view": view,
     "evaluate": evaluate,
     "export": export,
     "import": import_grasps,

@@ -22,6 +22,8 @@ from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.mesh import read_mesh
 from torchgrasp.posture_model import GraspMixture, SampleSpec, load_samples, write_samples
 from torchgrasp.posture_model.encoding import CODE_NAMES
+from torchgrasp.report.turning.buffers import pack
+from torchgrasp.report.turning.shown import read_page
 from torchgrasp.values import Certificate, Contacts, Grasps
 
 
@@ -133,6 +135,29 @@ def models(folder: Path) -> list[Case]:
     ]
 
 
+def pages(folder: Path) -> list[Case]:
+    """Return a page that turns, with one grasp by two links."""
+    three, eye, faces = np.eye(3), np.eye(4), pack(np.array([[0, 1, 2]]), "u4")
+    mesh = {"points": pack(three), "faces": faces}
+    record = {"ticks": pack(np.arange(2), "u4"), "time": pack(np.arange(2.0)), "forces": pack(np.ones((2, 3)))}
+    poses = {"object": pack(np.stack([eye] * 2)), "links": pack(np.broadcast_to(eye, (2, 2, 4, 4)))}
+    contents = {
+        "title": "Grasps", "verdict": "held", "eye": [1.0, 0.0, 0.0], "table": "#eceae4", "cloud": pack(three),
+        "others": None, "fingers": [["index", "#2f6db5"], ["middle", "#23967f"], ["thumb", "#e0762f"]],
+        "hand": [mesh | {"link": 1, "color": "#a9b0ba"}],
+        "surface": mesh | {"normals": pack(three), "std": pack(np.ones(3)), "colors": pack(three, "u1"), "most_mm": 3},
+        "grasps": {
+            "heads": ["rank", "success", "closure margin", "clearance mm", "surface std mm"],
+            "rows": [["1", "97%", "0.02", "4.0", "1.0"]], "points": pack(three[None]), "normals": pack(three[None]),
+            "links": pack(np.broadcast_to(eye, (1, 4, 2, 4, 4))),
+        },
+        "replay": mesh | record | poses,
+    }  # fmt: skip
+    page = f'<p></p><script type="application/json" id="data">{json.dumps(contents)}</script>'
+    (folder / "view.html").write_text(page)
+    return [saved(folder / "view.html", read_page)]
+
+
 def manifests(folder: Path) -> list[Case]:
     """Return the manifest of a folder of objects."""
     pose = {"T_object_camera": np.eye(4).tolist()}
@@ -147,4 +172,5 @@ def samples(folder: Path) -> list[Case]:
     return [saved(folder / "samples.json", lambda x: load_samples(x.parent).read())]
 
 
-KINDS = {make.__name__: make for make in (clouds, meshes, images, urdfs, published, tomls, models, manifests, samples)}
+MAKERS = (clouds, meshes, images, urdfs, published, tomls, models, pages, manifests, samples)
+KINDS = {make.__name__: make for make in MAKERS}

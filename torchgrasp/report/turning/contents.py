@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchgrasp.closing import ClosureResult
 from torchgrasp.control.forces import squeeze
+from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.motion import APPROACH_DISTANCE
 from torchgrasp.report.canvas import Direction, map_colors
@@ -44,7 +45,7 @@ def describe(run: Run) -> dict[str, Any]:
         "eye": _eye(facing(best[0]) if len(best) else view_of(run.cloud)),
         "table": None if run.spec.table is None else TABLE,
         "object": OBJECT,
-        "fingers": list(zip(run.hand.tips.names, FINGERS, strict=False)),
+        "fingers": [list(pair) for pair in zip(run.hand.tips.names, FINGERS, strict=False)],
         "cloud": _points(run.cloud.points),
         "others": _others(run),
         "surface": _surface(run),
@@ -52,6 +53,20 @@ def describe(run: Run) -> dict[str, Any]:
         "postures": POSTURES,
         "grasps": _grasps(run.hand, best),
         "replay": replay,
+    }
+
+
+def describe_grasps(title: str, hand: Hand, grasps: Grasps) -> dict[str, Any]:
+    """Return what can be shown of the best of these grasps without the cloud and the shape that they are of."""
+    best = grasps[grasps.status == Status.OK][:MOST_GRASPS]
+    return {
+        "title": title,
+        "verdict": f"The {hand.name} hand has {len(best)} of the best executable grasps here.",
+        "eye": _eye(facing(best[0]) if len(best) else (1.0, -0.8, 0.6)),
+        "table": None,
+        "fingers": [list(pair) for pair in zip(hand.tips.names, FINGERS, strict=False)],
+        "hand": _pieces(hand),
+        "grasps": _grasps(hand, best),
     }
 
 

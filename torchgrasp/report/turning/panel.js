@@ -132,6 +132,20 @@ if (count) {
   });
 }
 
+/* Keys do what buttons and rows do; a slider that has the focus keeps its arrows. */
+if (count) {
+  add(panel, "p", { className: "source" }, "Keys: up and down step through the grasps, 1 to 4 choose the posture.");
+  window.addEventListener("keydown", (event) => {
+    const step = { ArrowUp: -1, ArrowDown: 1 }[event.key], posture = run.postures[Number(event.key) - 1];
+    if (event.ctrlKey || event.altKey || event.metaKey || (step && event.target.type === "range")) return;
+    if (posture) show({ posture, tick: null });
+    if (!step) return;
+    show({ grasp: Math.min(Math.max(state.grasp + step, 1), count), tick: null });
+    event.preventDefault(); // of the panel's own scrolling
+    document.querySelector("#grasps tr.on").scrollIntoView({ block: "nearest" });
+  });
+}
+
 /* The part of the address after "#" names a state; what it cannot mean is told on the page. */
 function read() {
   const asked = new URLSearchParams(location.hash.slice(1)), change = {};
