@@ -12,7 +12,7 @@ from torchgrasp.base import count_status
 from torchgrasp.border import checked
 from torchgrasp.files import write_file
 from torchgrasp.pipeline.explain import Explanation
-from torchgrasp.report.closing import describe_film, draw_film
+from torchgrasp.report.closing.film import describe_film, draw_film
 from torchgrasp.report.document import escape, format_document, format_html_table
 from torchgrasp.report.palette import FINGERS
 from torchgrasp.report.pictures import (
