@@ -160,6 +160,13 @@ def test_the_film_shows_the_loss_in_its_colour_and_the_object_falling_behind(run
     assert "Lost at 0.7" in describe_film(run.mesh, run.hand, out)
 
 
+def test_a_closing_without_the_law_has_no_panel_of_lambda(run, closing):
+    trace = dataclasses.replace(closing.trace, blend=torch.full_like(closing.trace.blend, math.nan))
+    other = dataclasses.replace(closing, trace=trace)
+    both = [picture(draw_film(run.mesh, run.hand, c, (1.0, 0.0, 0.3))) for c in (closing, other)]
+    assert both[1].shape[0] < both[0].shape[0]
+
+
 def test_trials_that_ended_at_once_or_diverged_have_a_film(run, closing):
     first = {name: getattr(closing, name)[:1] for name in ("time", "forces", "object_pose", "hand_pose", "joints")}
     trace = ClosingTrace(*(getattr(closing.trace, f.name)[:1] for f in dataclasses.fields(ClosingTrace)))

@@ -124,7 +124,7 @@ def _panels(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -> list
         """Return a line for each finger."""
         return [Line(*row) for row in zip(values.T, FINGERS, labels, strict=False)]
 
-    blank = [""] * len(names)
+    blank, blend = [""] * len(names), to_array(trace.blend)
     return [
         Panel(
             "normal force [N], in the order of touch:",
@@ -133,7 +133,8 @@ def _panels(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -> list
             of_fingers(forces, ranks),
             [(float(time[tick]), FINGERS[finger]) for finger, tick in zip(order, touches, strict=True)],
         ),
-        Panel("lambda: 0 by position, 1 by force", 1.0, 150, of_fingers(to_array(trace.blend), blank)),
+        *[Panel("lambda: 0 by position, 1 by force", 1.0, 150, of_fingers(blend, blank))]
+        * bool(np.isfinite(blend).any()),
         Panel("sliding of the fingertips [mm/s]", MOST_SLIDING, 150, of_fingers(1e3 * to_array(trace.sliding), blank)),
         Panel(
             "motion [mm]:",
