@@ -132,7 +132,7 @@ FIGURES = (
     Figure(
         "grasps", "Figs. 9 to 12", "One contact triple by two postures of a hand (Fig. 9) and by two hands (Fig. 10); "
         "grasps of the Barrett (Fig. 11) and the Allegro hand (Fig. 12), those of the paper's own chain first.",
-        grasps, 300.0, {"starts": "drawn"}, ("fig9", "fig10", "fig11", "fig12"), numbers=False,
+        grasps, 120.0, {"starts": "drawn"}, ("fig9", "fig10", "fig11", "fig12"), numbers=False,
     ),
 )  # fmt: skip
 """What is made one by one, in the order of the paper."""
@@ -140,12 +140,12 @@ FIGURES = (
 TRIALS = (
     Trials(
         "table6", "Table 6", "How often grasps hold that the planner lets be ever less certain, on the paper's shape. "
-        "The riskiest ones are lifted.", ROWS6, judge_table6, 30.0,
+        "The riskiest ones are lifted.", ROWS6, judge_table6, 22.0,
     ),
     Trials(
         "table7", "Table 7", "How often the same grasps hold under five ways of closing, each with the library's "
         "holding (force) and with its own. The paper compares its law with position control.", ROWS7, judge_table7,
-        60.0,
+        32.0,
     ),
     Trials(
         "ladder", "From the paper's chain to the default one", "One stage is exchanged at a time, and the best grasp "
