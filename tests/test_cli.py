@@ -102,6 +102,27 @@ def test_bad_input_ends_in_one_sentence_and_leaves_nothing(name, tmp_path, capsy
     assert not (tmp_path / "made").exists()
 
 
+@pytest.mark.parametrize("name", ["a" * 300, "a/" * 3000, "a\0b", "\ud800"])
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ("CLOUD", ["grasp", "NAME", "--hand", "barrett", "--out", "out"]),
+        ("--out", ["grasp", VIEW, "--hand", "barrett", "--out", "NAME"]),
+        ("--out", ["hand", "sample", "--hand", "barrett", "--n", "10", "--out", "NAME"]),
+        ("--checkpoint", ["hand", "train", "barrett", "--n", "100", "--checkpoint", "NAME", "--out", "out"]),
+        ("--objects", ["evaluate", "--objects", "NAME", "--hand", "barrett", "--out", "out"]),
+    ],
+)
+def test_what_no_file_can_be_called_is_refused_by_the_option(
+    name, option, words, tmp_path, monkeypatch, capsys, refuse_work
+):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main([name if word == "NAME" else word for word in words]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"torchgrasp: {option}: found") and said.count("\n") == 1 and len(said) < 300
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("out", ["file", "file/deeper", "/proc/nothing/here"])
 def test_a_folder_that_cannot_be_written_is_refused_before_the_work(out, tmp_path, capsys, refuse_work):
     (tmp_path / "file").write_text("x")

@@ -4,6 +4,7 @@ import dataclasses
 import fcntl
 import os
 import resource
+import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 
@@ -19,6 +20,7 @@ from torchgrasp.files import (
     hold_file,
     hold_folder,
     load_tensors,
+    read_bytes,
     save_tensors,
     sha256,
     temporary_folder,
@@ -27,6 +29,15 @@ from torchgrasp.files import (
 from torchgrasp.files.hold import TEMPORARY
 from torchgrasp.frames import rigid, rotation_from_vector
 from torchgrasp.values import Certificate, Contacts, Grasps, load_grasps
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_file_is_read_as_far_as_it_says_it_is(tmp_path):
+    """The system's own files say that they are empty; /proc/kmsg is one, and a reader of it waits for ever."""
+    (tmp_path / "a").write_bytes(b"12\n3")
+    (tmp_path / "link").symlink_to("/proc/self/maps")
+    assert read_bytes(tmp_path / "a") == b"12\n3"
+    assert read_bytes(tmp_path / "link") == b""
 
 
 def some_grasps(g: int = 2, h: int = 4, f: int = 3) -> Grasps:

@@ -8,8 +8,8 @@ import copyreg
 import enum
 from typing import Any
 
-MOST_LETTERS = 1000
-"""Longest part of a message: errors of other libraries may quote the whole file that they read."""
+MOST_LETTERS = 600
+"""Longest part of a message: errors of other libraries quote whole files, and names from files have any length."""
 
 
 class GraspError(Exception):
@@ -24,9 +24,9 @@ class BadArgument(GraspError, ValueError):
     """An argument has a wrong shape, type or range; the message says what was found and what is allowed."""
 
     def __init__(self, argument: str, found: object, allowed: str):
-        text = str(found)
-        shown = text if len(text) <= MOST_LETTERS else f"{text[:MOST_LETTERS]}..."
-        super().__init__(f"{argument}: found {shown}, allowed is {allowed}")
+        parts = (argument, str(found), allowed)
+        named, shown, wanted = (x if len(x) <= MOST_LETTERS else f"{x[:MOST_LETTERS]}..." for x in parts)
+        super().__init__(f"{named}: found {shown}, allowed is {wanted}")
         self.argument, self.found, self.allowed = argument, found, allowed
 
 

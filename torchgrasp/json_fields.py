@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.files import is_file
+from torchgrasp.files import is_file, read_bytes
 
 Refuse = Callable[[str, str], BadArgument]
 """Makes the error of a reader of what was found and what is allowed."""
@@ -80,11 +80,9 @@ def read_json(path: Path, refuse: Refuse, allowed: str, most: int = MOST_BYTES) 
     if not is_file(path):  # a pipe or a device would block, or never end
         raise refuse(f"{path}, which is no file", allowed)
     try:
-        with path.open("rb") as file:
-            data = file.read(most + 1)
-        if len(data) > most:
+        if path.stat().st_size > most:
             raise ValueError(f"more than {most} bytes")
-        value = json.loads(data.decode("utf-8"), parse_constant=_refuse_constant)
+        value = json.loads(read_bytes(path).decode("utf-8"), parse_constant=_refuse_constant)
     except (OSError, ValueError, RecursionError) as error:
         raise refuse(f"{path}: {error}", allowed) from error
     return Field(path, "", value, refuse)

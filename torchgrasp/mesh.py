@@ -7,7 +7,7 @@ import numpy as np
 
 from torchgrasp.cloud.check import MAX_EXTENT, MIN_EXTENT
 from torchgrasp.errors import MeshError, SuspiciousScale
-from torchgrasp.files import is_file
+from torchgrasp.files import is_file, read_bytes
 from torchgrasp.files.meshes import SUFFIXES, load_triangles
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
         if path.stat().st_size > MAX_BYTES:
             raise MeshError("mesh", f"{path} of {path.stat().st_size} bytes", f"at most {MAX_BYTES} bytes")
         try:
-            loaded = load_triangles(path.read_bytes(), path.suffix.lower())
+            loaded = load_triangles(read_bytes(path), path.suffix.lower())
         except Exception as error:  # the readers of trimesh raise whatever their format runs into
             raise MeshError("mesh", f"{path}: {error}", MESH_FILE) from error
         if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:

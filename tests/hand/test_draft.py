@@ -4,13 +4,17 @@ import pytest
 import torch
 import trimesh
 
+from tests.hostile.fuzz.limits import limited
 from torchgrasp import ContactSpec, Status, certify, fit_mixture, plan_grasps
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.frames import apply, rotate
+from torchgrasp.hand.collision_pairs import collision_pairs
 from torchgrasp.hand.draft import draft_hand
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.load import hands_folder, load_hand
+from torchgrasp.hand.self_collision import SelfCollision
+from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.posture_model.sample import sample_configurations
 from torchgrasp.testing import check_hand
 
@@ -142,6 +146,45 @@ def test_what_cannot_be_guessed_is_asked_for(claw, tmp_path):
         draft_hand(write_with_frame(claw))
     with pytest.raises(HandFileError, match="no file"):
         draft_hand(tmp_path / "none.urdf")
+
+
+def test_more_pairs_of_shapes_than_can_be_tested_are_refused_in_little_memory(claw):
+    """210 links have 21,945 pairs; their frames in all postures would take a gigabyte."""
+    box = '<collision><geometry><box size="0.01 0.01 0.01"/></geometry></collision>'
+    many = "".join(
+        f'<link name="x{k}">{box}</link>'
+        f'<joint name="jx{k}" type="fixed"><parent link="base"/><child link="x{k}"/></joint>'
+        for k in range(210)
+    )
+    claw.write_text(claw.read_text().replace("</robot>", many + "</robot>"))
+    with limited(2**29), pytest.raises(HandFileError, match="pairs of shapes to test for collisions"):
+        draft_hand(claw)
+
+
+def test_links_that_always_overlap_are_left_alone_after_a_first_look(claw, monkeypatch):
+    urdf = read_urdf(claw)
+    coupling = {j.name: j.mimic for j in urdf.movable if j.mimic is not None}
+    always = claw.read_text().replace("</robot>", OVERLAPPING + "</robot>")
+    claw.write_text(always)
+    crowded, tested = read_urdf(claw), []
+
+    def count(self, frames, below, real=SelfCollision.separations):
+        tested.append(len(self.pairs))
+        return real(self, frames, below)
+
+    monkeypatch.setattr(SelfCollision, "separations", count)
+    found = collision_pairs(crowded, coupling, n=3000)
+    assert tested[0] == tested[-1] + 1  # of the two in one place
+    monkeypatch.setattr("torchgrasp.hand.collision_pairs.FIRST_LOOK", 3000)
+    assert collision_pairs(crowded, coupling, n=3000) == found
+    assert found and ("one", "two") not in found
+
+
+OVERLAPPING = "".join(
+    f'<link name="{name}"><collision><geometry><sphere radius="0.001"/></geometry></collision></link>'
+    f'<joint name="to_{name}" type="fixed"><parent link="base"/><child link="{name}"/><origin xyz="1 0 0"/></joint>'
+    for name in ("one", "two")
+)
 
 
 def test_names_of_the_urdf_cannot_break_the_toml(claw):

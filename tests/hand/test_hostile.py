@@ -117,6 +117,7 @@ def toml_corpus(good: str) -> dict[str, str | bytes]:
         "cut": good[: len(good) // 2],
         "deep": good + "x = " + "[" * 50_000 + "]" * 50_000,
         "key twice": good.replace('name = "claw"', 'name = "claw"\nname = "claw"'),
+        "a long option": good.replace("options.default", "options." + "d" * 20_000),
         "2 MB": good + "# " + "x" * 2_000_000,
         "a key of 20,000 parts": ".".join("a" * 20_000) + " = 1\n" + good,
         "urdf outside": good.replace('"claw.urdf"', '"../secret.urdf"'),

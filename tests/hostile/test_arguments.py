@@ -2,6 +2,8 @@
 
 import dataclasses
 import inspect
+import typing
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -30,6 +32,9 @@ MADE_INSIDE = {
 """Values that only the library makes, many of them in each step of a loop."""
 
 
+NO_PATHS = ["a" * 5000, "b" * 256, "c/" * 2500, "a\0b", "\ud800"]
+"""Texts that no file can be called; as paths, too, they are refused the same way."""
+NO_PATHS += map(Path, NO_PATHS)
 NO_NUMBERS = "meta", "sparse", "negative bit", "half", "bfloat16"
 """Tensors that no annotation forbids, and the library does."""
 
@@ -97,6 +102,8 @@ def test_wrong_arguments_are_refused_by_name(name, tmp_path):
 
 def wrong_values(hint: Any) -> list[Any]:
     values = [value for value in HOSTILE if is_wrong(value, hint)]
+    if Path in (hint, *typing.get_args(hint)):
+        values += NO_PATHS
     for tensor in tensors_in(hint):
         bare = getattr(tensor, "__origin__", tensor)
         valid = sample_tensor(bare)

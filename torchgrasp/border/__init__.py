@@ -6,6 +6,7 @@ than one argument, or on what a file holds, stays in the function.
 """
 
 from torchgrasp.border.checked import checked
+from torchgrasp.border.paths import check_path
 from torchgrasp.border.ranges import ANY, FINITE, LEAST, Count, Fraction, Length, Measured, Positive, Range, Seed
 from torchgrasp.border.tensors import check_moved, check_tensor, show
 
@@ -21,6 +22,7 @@ __all__ = [
     "Range",
     "Seed",
     "check_moved",
+    "check_path",
     "check_tensor",
     "checked",
     "show",

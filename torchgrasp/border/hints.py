@@ -8,12 +8,14 @@ import numbers
 import types
 import typing
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import AbstractArray
 from torch import Tensor
 
+from torchgrasp.border.paths import check_path
 from torchgrasp.border.ranges import ANY, FINITE, MOST, Range
 from torchgrasp.border.tensors import Call, TensorHint, check_dense, show
 from torchgrasp.errors import BadArgument
@@ -40,6 +42,8 @@ def reader(hint: Any) -> tuple[Reader, str]:
         return _number(hint, Range(-(2**63), 2**63 - 1, "a whole number") if hint is int else NUMBERS)
     if origin is not None and isinstance(origin, type):
         return _container(origin, inside)
+    if hint is Path:
+        return _path(Path)
     if isinstance(hint, type) and hint not in (object, Any):
         return _instance(hint)
     return (lambda name, value, call: value), "anything"
@@ -83,7 +87,8 @@ def _literal(options: tuple[Any, ...]) -> tuple[Reader, str]:
 def _union(options: tuple[Any, ...]) -> tuple[Reader, str]:
     """Read what any option allows; of a tensor, the error says what the last option for tensors has against it."""
     options = tuple(x for x in options if x is not int or float not in options)  # whole numbers are numbers
-    readers = [reader(option)[0] for option in options]
+    named = Path in options  # a text beside a path is one, too
+    readers = [_path(str)[0] if named and option is str else reader(option)[0] for option in options]
     text = " or ".join(dict.fromkeys(reader(option)[1] for option in options))
 
     def read(name: str, value: Any, call: Call) -> Any:
@@ -164,6 +169,17 @@ def _container(origin: type, inside: tuple[Any, ...]) -> tuple[Reader, str]:
         return value
 
     return read, name_of
+
+
+def _path(kind: type[Path | str]) -> tuple[Reader, str]:
+    """Read a path, or a text that is one."""
+    inner, text = _instance(kind)
+
+    def read(name: str, value: Any, call: Call) -> Any:
+        check_path(name, inner(name, value, call))
+        return value
+
+    return read, text
 
 
 def _instance(kind: type) -> tuple[Reader, str]:

@@ -4,18 +4,23 @@ Exit codes: 0 done, 1 no executable grasp or object not held, 2 bad input, 130 i
 """
 
 import contextlib
+import functools
+import inspect
 import os
 import signal
 import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, get_type_hints
 
 import torch
 import tyro
 from tyro.extras import SubcommandApp
 
 from torchgrasp import __version__
+from torchgrasp.border import check_path
 from torchgrasp.cli import clouds, grasps, hands, shapes
 from torchgrasp.cli.doctor import doctor, selftest
 from torchgrasp.cli.evaluate import evaluate
@@ -143,5 +148,20 @@ def _application(commands: dict[str, Callable[..., int]]) -> SubcommandApp:
         if group and group not in groups:
             groups[group] = SubcommandApp()
             top.command(groups[group], name=group, help=GROUPS[group])
-        (groups[group] if group else top).command(name=last)(function)
+        (groups[group] if group else top).command(name=last)(_naming_paths(function))
     return top
+
+
+def _naming_paths(function: Callable[..., int]) -> Callable[..., int]:
+    """Return a command that refuses by its option what is no path."""
+    signature, hints = inspect.signature(function), get_type_hints(function, include_extras=True)
+
+    @functools.wraps(function)
+    def command(*args: Any, **named: Any) -> int:
+        for name, value in signature.bind(*args, **named).arguments.items():
+            if isinstance(value, Path):
+                positional = tyro.conf.Positional in getattr(hints[name], "__metadata__", ())
+                check_path(name.upper() if positional else f"--{name.replace('_', '-')}", value)
+        return function(*args, **named)
+
+    return command

@@ -18,7 +18,7 @@ from torchgrasp.border import checked
 from torchgrasp.cloud.io.arrays import MAX_BYTES, parse_npz
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.export.benchmark_files import BENCH_HANDS, rotation_of
-from torchgrasp.files import is_file
+from torchgrasp.files import is_file, read_bytes
 from torchgrasp.hand.hand import Hand
 from torchgrasp.json_fields import Field, read_json
 
@@ -128,7 +128,7 @@ def _read_bench(path: Path, hand: Hand, order: tuple[str, ...], quaternion: Quat
     try:
         if path.stat().st_size > MAX_BYTES:
             raise ValueError("a larger file")
-        tables = parse_npz(path.read_bytes(), ("grasp_qpos", "pregrasp_qpos"), "grasp_qpos")
+        tables = parse_npz(read_bytes(path), ("grasp_qpos", "pregrasp_qpos"), "grasp_qpos")
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError) as error:
         raise _refuse(f"{path}: {error}", allowed) from error
     for name, table in tables.items():

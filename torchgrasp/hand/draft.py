@@ -11,16 +11,18 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from torchgrasp.base import FINGERTIPS
 from torchgrasp.border import Seed, checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.hand.collision_pairs import collision_pairs, draw_postures
+from torchgrasp.hand.collision_pairs import ROWS_PER_CHUNK, collision_pairs, draw_postures
 from torchgrasp.hand.fit_shapes import ball_tip, replace_meshes, shape_points
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.mend import fix_wrist, keep_below, mend_bodies, mend_joints, merge_frames, urdf_text
-from torchgrasp.hand.pads import guess_pads, is_primitive, order_by_facing
+from torchgrasp.hand.pads import guess_pads, is_primitive, order_by_facing, palm_of
 from torchgrasp.hand.urdf import MEND, Mimic, Triple, Urdf, read_published
 
 DRAFT_POSTURES = 20_000
@@ -110,12 +112,11 @@ def new_hand(path: Path | str, wish: Wish = Wish(), seed: Seed = 0, file: str = 
     told += more
     tips = tuple(taken_again.get(x, x) for x in (taken.get(tip, tip) for tip in wish.tips))
     tips = _checked_tips(urdf, tips)
-    frames = tree_from_urdf(urdf).frames(draw_postures(urdf, _coupling(urdf), DRAFT_POSTURES, seed))
+    frames = _frames(urdf, (*tips, palm_of(urdf, tips)), seed)
     guess = guess_pads(urdf, frames, tips, surfaces)
     order = list(range(len(tips)))
     if not wish.tips:
-        at = [next(i for i, x in enumerate(urdf.links) if x.name == tip) for tip in tips]
-        order = order_by_facing(frames[:, :, at], guess.pads)
+        order = order_by_facing(frames[:, :, :-1], guess.pads)
     sets = {name: [tips[k] for k in sorted(order[:n])] for name, n in OPTIONS.items() if n <= len(tips)}
     simple = {x.name for x in urdf.links if is_primitive(x)}
     clean, more = replace_meshes(urdf, points)
@@ -131,6 +132,13 @@ def new_hand(path: Path | str, wish: Wish = Wish(), seed: Seed = 0, file: str = 
     name, mended = wish.name or urdf.name, bool(told)
     toml = _toml_text(clean, chosen, sets, guess.approach, (name, file if mended else published.path.name), seed)
     return Draft(toml, urdf_text(clean) if mended else "", tuple(told))
+
+
+def _frames(urdf: Urdf, links: tuple[str, ...], seed: int) -> Float[Tensor, "3 4 _ n"]:
+    """Return the frames of some links in random postures; a part at a time, since those of all links are many."""
+    tree, at = tree_from_urdf(urdf), [[x.name for x in urdf.links].index(link) for link in links]
+    values = draw_postures(urdf, _coupling(urdf), DRAFT_POSTURES, seed)
+    return torch.cat([tree.frames(part)[:, :, at] for part in values.split(ROWS_PER_CHUNK, 1)], -1)
 
 
 def _checked_tips(urdf: Urdf, tips: tuple[str, ...]) -> tuple[str, ...]:

@@ -52,17 +52,16 @@ class Guess(NamedTuple):
 
 
 def guess_pads(
-    urdf: Urdf, frames: Float[Tensor, "3 4 l n"], tips: Sequence[str], surfaces: Mapping[str, Points]
+    urdf: Urdf, frames: Float[Tensor, "3 4 _ n"], tips: Sequence[str], surfaces: Mapping[str, Points]
 ) -> Guess:
-    """Guess the pads of the tips and the direction out of the palm, from the links' frames in random postures.
+    """Guess the pads of the tips and the direction out of the palm, from frames of tips and palm in random postures.
 
     A tip of one box, cylinder or sphere has its pad on that. Another gets a ball that touches its surface, of points
     (n, 3) in `surfaces`, where the pad is.
     """
     links = {x.name: i for i, x in enumerate(urdf.links)}
-    index = torch.tensor([links[tip] for tip in tips])
-    cores = [_core(urdf, urdf.links[i], surfaces) for i in index.tolist()]
-    tip_frames = frames.index_select(2, index)
+    cores = [_core(urdf, urdf.links[links[tip]], surfaces) for tip in tips]
+    tip_frames = frames[:, :, :-1]
     centres = map_points(tip_frames, torch.tensor(np.stack(cores)))  # 3 f n
     middle = centres[:, :3].mean(1, keepdim=True)
     spread = torch.linalg.vector_norm(centres[:, :3] - middle, dim=0).sum(0)
@@ -78,14 +77,17 @@ def guess_pads(
         single = is_primitive(link)
         ends.append(outward)
         pads.append(_pad(link.shapes[0], core, way, outward) if single else _ball(surfaces[tip], way, outward))
-    # the palm carries most fingers
-    bases = Counter(urdf.movers(tip)[-1].parent for tip in tips)
-    palm = max(bases, key=lambda name: bases[name])
-    points = surfaces.get(palm, np.zeros((1, 3)))
-    palm_centre = map_points(frames[:, :, [links[palm]], :1], torch.tensor((points.min(0) + points.max(0))[None] / 2))
+    points = surfaces.get(palm_of(urdf, tips), np.zeros((1, 3)))
+    palm_centre = map_points(frames[:, :, -1:, :1], torch.tensor((points.min(0) + points.max(0))[None] / 2))
     out = (middle[:, 0, near].mean(1) - palm_centre[:, 0, 0]).numpy()
     axis = int(np.abs(out).argmax())
     return Guess(tuple(pads), tuple(ends), _triple(np.sign(out[axis]) * np.eye(3)[axis]))
+
+
+def palm_of(urdf: Urdf, tips: Sequence[str]) -> str:
+    """Return the link that carries most of the fingers."""
+    bases = Counter(urdf.movers(tip)[-1].parent for tip in tips)
+    return max(bases, key=lambda name: bases[name])
 
 
 def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> list[int]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from torchgrasp.errors import HandFileError
+from torchgrasp.files import is_file, read_bytes
 
 MAX_DEPTH = 64
 """Deepest nesting of elements; a URDF needs six."""
@@ -64,11 +65,11 @@ NUMBERS: dict[str, dict[str, tuple[int, str | None]]] = {
 
 def read_bounded(source: str, path: Path, wanted: str, most: int) -> bytes:
     """Read a file of at most `most` bytes; `source` and `wanted` describe it in the error."""
-    if not path.is_file():
+    if not is_file(path):
         raise HandFileError(source, f"{path}, which is no file", wanted)
     if path.stat().st_size > most:
         raise HandFileError(source, f"{path}: {path.stat().st_size} bytes", f"at most {most} bytes")
-    return path.read_bytes()
+    return read_bytes(path)
 
 
 class _BoundedBuilder(ET.TreeBuilder):

@@ -21,6 +21,8 @@ from torchgrasp.hand.urdf import Shape, Triple, Urdf
 
 PRISM_BOXES = 6
 """Boxes whose union is the prism of a cylinder: each reaches from one side to the opposite one."""
+MOST_PAIRS = 20_000
+"""Most pairs of shapes to test; all of the Shadow hand's, which has most of the shipped ones, are 7427."""
 PARALLEL = 1e-10
 """Squared sine below which two edges count as parallel; the faces' normals then cover their product."""
 
@@ -256,18 +258,26 @@ def box_distance(points: Float[Tensor, "*b 3"], half: Float[Tensor, "*b 3"]) -> 
 
 
 def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None) -> SelfCollision:
-    """Return the shapes of a URDF with the pairs of links to test; None: all but neighbours."""
+    """Return the shapes of a URDF with the pairs of links to test; None: all but neighbours.
+
+    Raises:
+        HandFileError: more than `MOST_PAIRS`.
+    """
     names = [x.name for x in urdf.links]
     tested = {frozenset(pair) for pair in (itertools.combinations(names, 2) if pairs is None else pairs)}
     if pairs is None:
         tested -= {frozenset((j.parent, j.child)) for j in urdf.joints}
     shapes = [(i, *part) for i, link in enumerate(urdf.links) for shape in link.shapes for part in _parts(shape)]
     link, rotation, center, half, radius = zip(*shapes, strict=True)
+    places = {i: list(of) for i, of in itertools.groupby(range(len(shapes)), link.__getitem__)}
+    meeting = [(i, j) for i in places for j in places if j >= i and frozenset((names[i], names[j])) in tested]
+    if (many := sum(len(places[i]) * len(places[j]) for i, j in meeting)) > MOST_PAIRS:
+        raise urdf.wrong(f"{many} pairs of shapes to test for collisions", f"at most {MOST_PAIRS}, a cylinder as six")
     kinds: tuple[list[tuple[int, int]], ...] = ([], [], [])
-    for one, two in itertools.combinations(range(len(shapes)), 2):
-        if frozenset((names[link[one]], names[link[two]])) in tested:
-            spheres = radius[one] > 0, radius[two] > 0
-            kinds[sum(spheres)].append((two, one) if spheres == (False, True) else (one, two))
+    found = sorted((one, two) for i, j in meeting for one in places[i] for two in places[j] if two > one)
+    for one, two in found:
+        spheres = radius[one] > 0, radius[two] > 0
+        kinds[sum(spheres)].append((two, one) if spheres == (False, True) else (one, two))
     return SelfCollision(
         link=torch.tensor(link),
         rotation=torch.stack(rotation, -1),

@@ -9,7 +9,7 @@ import torch
 from torchgrasp.border import checked
 from torchgrasp.cloud.io.arrays import MAX_BYTES, parse_npz
 from torchgrasp.errors import BadArgument, CloudFileError
-from torchgrasp.files import is_file, write_file
+from torchgrasp.files import is_file, read_bytes, write_file
 from torchgrasp.plane import Plane
 from torchgrasp.scene.scene import Scene
 
@@ -34,7 +34,7 @@ def read_scene(path: Path | str) -> Scene:
     if path.stat().st_size > MAX_BYTES:
         raise CloudFileError("path", f"{path} of {path.stat().st_size} bytes", f"at most {MAX_BYTES} bytes")
     try:
-        arrays = parse_npz(path.read_bytes(), NAMES, "depth")
+        arrays = parse_npz(read_bytes(path), NAMES, "depth")
         depth, intrinsics, table = arrays.pop("depth"), arrays.pop("intrinsics"), arrays.pop("table", None)
         plane = None if table is None else Plane(torch.tensor(table[:3].astype(float)), float(table[3]))
     except BadArgument:

@@ -10,6 +10,7 @@ import trimesh
 
 from torchgrasp.cloud.io.lzf import decompress
 from torchgrasp.cloud.io.read import cloud_from_array, read_cloud, read_cloud_file, save_cloud
+from torchgrasp.cloud.io.text import read_lines
 from torchgrasp.errors import BadArgument, CloudFileError, GraspError, OutputError, SuspiciousScale, TooFewPoints
 from torchgrasp.values import PointCloud
 
@@ -257,6 +258,15 @@ def test_the_arrays_of_another_npz_are_listed(tmp_path, points):
     np.savez(tmp_path / "a.npz", xyz=points, rgb=points)
     with pytest.raises(CloudFileError, match=r"no array named 'points', but \['xyz', 'rgb'\]"):
         read_cloud(tmp_path / "a.npz")
+
+
+def test_a_text_of_empty_lines_or_of_many_columns_is_refused_without_reading_it_all(monkeypatch):
+    monkeypatch.setattr("torchgrasp.cloud.io.text.MAX_LINES", 1000)
+    with pytest.raises(ValueError, match="more than 1000 lines"):
+        read_lines(b"\n" * 1001 + b"1 2 3\n")
+    with pytest.raises(ValueError, match="more than 16 numbers in a line"):
+        read_lines(b"x y z\n" + b"1 " * 17 + b"\nx\n")
+    assert read_lines(b"\n" * 999 + b"1 2 3\n").tolist() == [[1.0, 2.0, 3.0]]
 
 
 def test_arrays_and_text(tmp_path, points):

@@ -15,8 +15,8 @@ class TooSlow(Exception):
 
 
 @contextlib.contextmanager
-def limited() -> Iterator[None]:
-    """Raise `TooSlow` after `SECONDS` of the processor, and `MemoryError` beyond `BYTES` more than there are.
+def limited(most: int = BYTES) -> Iterator[None]:
+    """Raise `TooSlow` after `SECONDS` of the processor, and `MemoryError` beyond `most` bytes more than there are.
 
     Only Linux has both limits; elsewhere there are none.
     """
@@ -31,7 +31,7 @@ def limited() -> Iterator[None]:
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     before = resource.getrlimit(resource.RLIMIT_AS)
     handler = signal.signal(signal.SIGVTALRM, end)
-    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + BYTES, before[1]))
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + most, before[1]))
     signal.setitimer(signal.ITIMER_VIRTUAL, SECONDS)
     try:
         yield

@@ -11,7 +11,7 @@ from torchgrasp.cloud.depth import check_rigid
 from torchgrasp.cloud.io.arrays import MAX_BYTES, parse_npy, parse_npz
 from torchgrasp.cloud.io.text import read_lines
 from torchgrasp.errors import BadArgument
-from torchgrasp.files import is_file
+from torchgrasp.files import is_file, read_bytes
 
 
 def read_image(name: str, path: Path | str) -> np.ndarray:
@@ -58,7 +58,7 @@ def _read_bytes(name: str, path: Path | str, suffixes: tuple[str, ...]) -> tuple
         raise BadArgument(name, f"{path}, which is no file", allowed)
     if path.suffix.lower() not in suffixes or path.stat().st_size > MAX_BYTES:
         raise BadArgument(name, f"{path} of {path.stat().st_size} bytes", f"{allowed} of at most {MAX_BYTES} bytes")
-    return path.read_bytes(), path.suffix.lower()
+    return read_bytes(path), path.suffix.lower()
 
 
 def _parse_png(data: bytes) -> np.ndarray:

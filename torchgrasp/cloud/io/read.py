@@ -18,7 +18,7 @@ from torchgrasp.cloud.io.ply import format_ply, parse_ply
 from torchgrasp.cloud.io.rows import CloudFile, make_cloud
 from torchgrasp.cloud.io.text import read_lines
 from torchgrasp.errors import BadArgument, CloudFileError
-from torchgrasp.files import is_file, write_file
+from torchgrasp.files import is_file, read_bytes, write_file
 from torchgrasp.values import PointCloud
 
 SCALE: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -98,7 +98,7 @@ def read_cloud_file(
     if path.stat().st_size > MAX_BYTES:
         raise CloudFileError("path", f"{path} of {path.stat().st_size} bytes", f"at most {MAX_BYTES} bytes")
     try:
-        arrays = parsers[suffix](path.read_bytes())
+        arrays = parsers[suffix](read_bytes(path))
     except Exception as error:  # zlib, zipfile, numpy and trimesh each raise their own
         raise CloudFileError("path", f"{path}: {error!r}", f"a well-formed {suffix} file") from error
     return make_cloud(str(path), arrays, position, SCALE[unit])

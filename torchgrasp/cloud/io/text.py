@@ -9,6 +9,8 @@ from jaxtyping import Float
 
 MAX_POINTS = 5_000_000
 """Most points that are read: more than the largest depth images have."""
+MAX_LINES = 2 * MAX_POINTS
+"""Most lines of a text, empty ones and comments too: they take as long to read."""
 MAX_COLUMNS = 16
 """Most numbers of a point: position, normal, colour and a few more."""
 MAX_LINE = 4096
@@ -43,7 +45,7 @@ def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
     `#` starts a comment. A first line that begins with the words x y z names the columns.
 
     Raises:
-        ValueError: no numbers; lines of different length; a line or file that is too long.
+        ValueError: no numbers; lines of different length; a line or file that is too long or too wide.
 
     >>> read_lines(b"# x y z\n1, 2, 3\n").tolist()
     [[1.0, 2.0, 3.0]]
@@ -51,10 +53,13 @@ def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
 
     def lines() -> Iterator[str]:
         stream = io.TextIOWrapper(io.BytesIO(data), encoding="ascii")
-        count = 0
+        all_lines = count = 0
         while line := stream.readline(MAX_LINE + 1):
+            all_lines += 1
             if len(line) > MAX_LINE:
                 raise ValueError(f"a line of more than {MAX_LINE} characters")
+            if all_lines > MAX_LINES:
+                raise ValueError(f"more than {MAX_LINES} lines")
             line = line.split("#")[0].replace(",", " ").replace(";", " ")
             if not line.isspace() and line:
                 count += 1
@@ -62,6 +67,8 @@ def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
                     continue
                 if count > MAX_POINTS:
                     raise ValueError(f"more than {MAX_POINTS} lines of numbers")
+                if count <= 2 and len(line.split()) > MAX_COLUMNS:  # the others have as many, or are refused
+                    raise ValueError(f"more than {MAX_COLUMNS} numbers in a line")
                 yield line
 
     with warnings.catch_warnings():
