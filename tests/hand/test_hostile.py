@@ -117,7 +117,6 @@ def toml_corpus(good: str) -> dict[str, str | bytes]:
         "cut": good[: len(good) // 2],
         "deep": good + "x = " + "[" * 50_000 + "]" * 50_000,
         "key twice": good.replace('name = "claw"', 'name = "claw"\nname = "claw"'),
-        "a long option": good.replace("options.default", "options." + "d" * 20_000),
         "2 MB": good + "# " + "x" * 2_000_000,
         "a key of 20,000 parts": ".".join("a" * 20_000) + " = 1\n" + good,
         "urdf outside": good.replace('"claw.urdf"', '"../secret.urdf"'),
@@ -324,3 +323,11 @@ def test_other_model_files_are_refused(tmp_path):
         with pytest.raises(ModelFileError, match="path"):
             load_mixture(path)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_name_from_a_file_does_not_fill_a_message(claw):
+    target = claw.parent / "hand.toml"
+    target.write_text(draft_hand(claw).replace("options.default", "options." + "d" * 20_000))
+    with pytest.raises(GraspError, match=r"ddd\.\.\.$") as refused:
+        load_hand(claw.parent)
+    assert len(str(refused.value)) < 2000

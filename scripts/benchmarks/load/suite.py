@@ -1,11 +1,15 @@
 """Memory, open files and threads over many plans and trials in one process; the memory of large inputs."""
 
 import gc
+import importlib
+import inspect
 import os
 import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -24,16 +28,19 @@ from torchgrasp import (
     plan_contacts,
     plan_grasps,
 )
+from torchgrasp.border.tensors import Call
 from torchgrasp.errors import Status
 from torchgrasp.linalg import unit
 from torchgrasp.specs import Simulator
 
-SUBJECTS = ("plans", "trials", "points", "starts")
+SUBJECTS = ("plans", "trials", "points", "starts", "checks")
 SPEC = ContactSpec(table=0.0)
 STARTS = 48
 """Of a plan that is repeated: three waves."""
 WARM = 0.2
 """Share of the calls after which memory must no longer grow: pools and caches have filled."""
+CHECKS = 0.01
+"""Bar: share of a plan's time that the check of arguments takes."""
 GROWTH = 0.05
 """Bar: growth of the resident memory from then to the end, by a line through all readings."""
 
@@ -51,7 +58,7 @@ def load(
     """Measure what a process holds after many calls, and at most within a large one. Needs /proc, as Linux has it.
 
     Args:
-        only: subjects to measure: plans, trials, points, starts.
+        only: subjects to measure: plans, trials, points, starts, checks.
         hand: that grasps.
         plans: number of plans in one process, on the shipped objects in turn.
         trials: number of grasps closed and lifted in one process.
@@ -66,6 +73,7 @@ def load(
         "trials": partial(_trials, hand, trials, simulator),
         "points": partial(_points, hand, points),
         "starts": partial(_starts, starts),
+        "checks": partial(_checks, hand),
     }
     settings = {"hand": hand, "plans": plans, "trials": trials, "points": points, "starts": starts}
     measure("load", subjects, only, settings | {"simulator": simulator}, out)
@@ -130,6 +138,37 @@ def _starts(n: int) -> list[Row]:
         _peak(f"{count:,} starts", lambda: plan_contacts(shape, SPEC, starts=count))  # noqa: B023
         for count in (n // 100, n)
     ]
+
+
+def _checks(hand: str) -> list[Row]:
+    """Plan, and measure what reading arguments at the border takes of it: binding, reading, finite numbers."""
+    model, view, rows = load_hand(hand), load_object("jug").view, list[Row]()
+    border = importlib.import_module("torchgrasp.border.checked")  # the package has the function under the same name
+    spent = [0.0]
+
+    def timed(function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **named: Any) -> Any:
+            began = time.process_time()
+            try:
+                return function(*args, **named)
+            finally:
+                spent[0] += time.process_time() - began
+
+        return call
+
+    plan_grasps(view, model, SPEC, STARTS)  # what is read once is read now
+    with (
+        patch.object(border, "_read", timed(getattr(border, "_read"))),  # noqa: B009
+        patch.object(Call, "check_finite", timed(Call.check_finite)),
+        patch.object(inspect.Signature, "bind", timed(inspect.Signature.bind)),
+    ):
+        for starts in (100, 1000):
+            spent[0], began = 0.0, time.process_time()
+            plan_grasps(view, model, SPEC, starts)
+            share = spent[0] / (time.process_time() - began)
+            numbers = {"seconds": spent[0], "share": share}
+            rows.append(Row(f"checks in a plan of {starts} starts", "1 %", f"{share:.2%}", share <= CHECKS, numbers))
+    return rows
 
 
 def _peak(what: str, action: Callable[[], object]) -> Row:
