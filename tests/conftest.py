@@ -1,6 +1,7 @@
 """Generators, analytic shapes and small hands that several tests share."""
 
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,18 @@ SLOW = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
 settings.register_profile("short", max_examples=100, derandomize=True, deadline=None, suppress_health_check=SLOW)
 settings.register_profile("long", max_examples=100_000, deadline=None, database=None, suppress_health_check=SLOW)
 settings.load_profile("short")  # `--hypothesis-profile=long` chooses the other
+
+
+SIMULATED = re.compile(r"(close_hand|evaluate|drop|lift_grasp|open_scene|pull_grasp|run_protocol|open)\(")
+"""What an example calls that opens a simulator."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the examples of docstrings that simulate, as tests that do are marked."""
+    for item in items:
+        if isinstance(item, pytest.DoctestItem) and item.dtest is not None:
+            if any(SIMULATED.search(example.source) for example in item.dtest.examples):
+                item.add_marker(pytest.mark.sim)
 
 
 @pytest.fixture

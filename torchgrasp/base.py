@@ -85,7 +85,7 @@ def _short(value: Any) -> str:
         return f"{str(value.dtype).removeprefix('torch.')}{list(value.shape)}"
     if isinstance(value, dict | list | tuple) and len(value) > SHOWN:
         return f"{type(value).__name__} of {len(value)}"
-    text = repr(value)
+    text = " ".join(repr(value).split()) if isinstance(value, Value) else repr(value)  # wrapped once, as a whole
     return text if len(text) <= WIDTH or isinstance(value, Value) else f"{text[: WIDTH - 3]}..."
 
 

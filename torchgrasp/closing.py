@@ -17,6 +17,12 @@ class ClosingGains(Value):
     """Gains of the closing controller for each finger, in the frame of the hand (Eqs. 26-28).
 
     `force_source` is "analytic", or "stability" if the stability model chose among the balanced forces.
+
+    >>> from torchgrasp import closing_gains, load_hand
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> gains = closing_gains(load_shipped_grasp("jug", "allegro"), load_hand("allegro"))
+    >>> gains.desired_force.norm(dim=-1).round(decimals=1)  # [N] of each finger
+    tensor([2.8000, 1.2000, 4.0000], dtype=torch.float64)
     """
 
     target: Float[Tensor, "f 3"]
@@ -28,7 +34,12 @@ class ClosingGains(Value):
 
 
 class ObjectMotion(NamedTuple):
-    """Motion of an object in the hand: `distance` [m] of its centre, and the `angle` [rad] of its rotation."""
+    """Motion of an object in the hand: `distance` [m] of its centre, and the `angle` [rad] of its rotation.
+
+    >>> slip = ObjectMotion(distance=0.004, angle=0.1)
+    >>> f"{1000 * slip.distance:g} mm, {57.3 * slip.angle:.0f} degrees"
+    '4 mm, 6 degrees'
+    """
 
     distance: float
     angle: float

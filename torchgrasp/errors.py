@@ -13,7 +13,15 @@ MOST_LETTERS = 600
 
 
 class GraspError(Exception):
-    """Base of all errors of torchgrasp."""
+    """Base of all errors of torchgrasp.
+
+    >>> from torchgrasp import load_hand
+    >>> try:
+    ...     load_hand("octopus")
+    ... except GraspError as error:
+    ...     print(type(error).__name__)
+    HandFileError
+    """
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the error with its class and fields, so that worker processes can raise it."""
@@ -87,7 +95,12 @@ class DegenerateContacts(GraspError, ValueError):
 
 
 class BrokenLaw(GraspError, AssertionError):
-    """A kernel, a hand or a simulator breaks a law of `torchgrasp.testing`; `law` is its name."""
+    """A kernel, a hand or a simulator breaks a law of `torchgrasp.testing`; `law` is its name.
+
+    >>> error = BrokenLaw("order", "2 nan", "finite numbers")
+    >>> error.law, str(error)
+    ('order', 'order: found 2 nan, allowed is finite numbers')
+    """
 
     def __init__(self, law: str, found: str, allowed: str):
         super().__init__(f"{law}: found {found}, allowed is {allowed}")

@@ -81,7 +81,13 @@ class Plane(Value):
 
     @checked
     def moved(self, b_from_a: Float[Tensor, "4 4"]) -> "Plane":
-        """Return the plane in frame b; it is given in frame a."""
+        """Return the plane in frame b; it is given in frame a.
+
+        >>> raised = torch.eye(4)
+        >>> raised[2, 3] = 0.5  # the table's frame stands 0.5 m above the floor
+        >>> Plane.horizontal(0.1).moved(raised).offset
+        0.6
+        """
         normal = b_from_a[:3, :3].double() @ self.normal.double()
         return Plane(unit(normal), self.offset + float(normal @ b_from_a[:3, 3].double()))
 

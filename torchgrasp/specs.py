@@ -97,7 +97,12 @@ class ContactSpec(Value):
 
     @checked
     def for_fingertips(self, radius: float) -> "ContactSpec":
-        """Return the spec with the fingertip radius [m] of a hand, at least `TIP_RADIUS`; a given radius stays."""
+        """Return the spec with the fingertip radius [m] of a hand, at least `TIP_RADIUS`; a given radius stays.
+
+        >>> wide, points = ContactSpec().for_fingertips(0.015), ContactSpec(tip_radius=0.0).for_fingertips(0.015)
+        >>> wide.tip_radius, points.tip_radius
+        (0.015, 0.0)
+        """
         return self if self.tip_radius is not None else dataclasses.replace(self, tip_radius=max(radius, TIP_RADIUS))
 
     @classmethod
@@ -105,7 +110,11 @@ class ContactSpec(Value):
     def paper(
         cls, friction: float = 0.8, edges: int = 8, max_variance: float = 0.03, table: Plane | float | None = None
     ) -> "ContactSpec":
-        """Return the paper's own problem: full friction, no separation or flatness; contacts lie above the table."""
+        """Return the paper's own problem: full friction, no separation or flatness; contacts lie above the table.
+
+        >>> ContactSpec.paper(friction=0.8).planned_friction, ContactSpec.paper().flatness
+        (0.8, None)
+        """
         spec = cls(friction, edges, max_variance, friction_margin=1.0, flatness=None, table=table, start_radius=0.1)
         return dataclasses.replace(spec, separation=0.0, tip_radius=0.0)
 
@@ -167,6 +176,13 @@ class TrialSpec(Value):
     Raises:
         BadArgument: a number outside its range, an unknown closing, holding, part or simulator, parts of a closing
             that has none, or a control period below one timestep.
+
+    >>> TrialSpec(closing="open_loop", mass=0.3).holding
+    'force'
+    >>> TrialSpec(closing="open_loop", without=("palm",))
+    Traceback (most recent call last):
+        ...
+    torchgrasp.errors.BadArgument: without: found ('palm',) of 'open_loop', allowed is some of ()
     """
 
     closing: ClosingMode = "uncertainty"

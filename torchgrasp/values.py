@@ -41,8 +41,9 @@ class PointCloud(Value):
         TooFewPoints: fewer than 4 points.
 
     >>> import torch
-    >>> len(PointCloud(torch.rand(100, 3)))
-    100
+    >>> cloud = PointCloud(torch.rand(100, 3), viewpoint=torch.eye(3)[:2].repeat_interleave(50, 0))
+    >>> len(cloud), len(cloud.select(torch.arange(10))), [len(view) for view in cloud.split_views()]
+    (100, 10, [50, 50])
     """
 
     points: Float[Tensor, "n 3"]
@@ -116,6 +117,11 @@ class Contacts(Batch):
 
     `variance` (Eq. 12, normalised units) and `std_m` [m] say how uncertain the surface is there. They are None where
     nobody knows, as for contacts of another planner. All have one dtype.
+
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> contacts = load_shipped_grasp("jug", "allegro").contacts
+    >>> contacts.fingertips, contacts.require_std() < 0.005  # [m]
+    (3, tensor([[True, True, True]]))
     """
 
     points: Annotated[Float[Tensor, "b f 3"], ANY]
@@ -135,11 +141,7 @@ class Contacts(Batch):
         return self.points.shape[-2]
 
     def require_std(self) -> Float[Tensor, "b f"]:
-        """Return `std_m`.
-
-        Raises:
-            BadArgument: these contacts have none.
-        """
+        """Return `std_m`; raise `BadArgument` if these contacts have none."""
         if self.std_m is None:
             raise BadArgument("contacts.std_m", "None", "the standard deviation [m] of the surface at each contact")
         return self.std_m
@@ -225,6 +227,11 @@ class Grasps(Batch):
     between pad axis and contact direction. `score` ranks the grasps, or says what ranking them by success would be:
     `plan_grasps` makes it the log-odds of `success`.
     `meta` holds names, units, hashes and the seed as text.
+
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> grasp = load_shipped_grasp("jug", "barrett")
+    >>> grasp.joints.shape, f"{float(grasp.success):.2f}", grasp.tip_error < 0.001  # [m]
+    (torch.Size([1, 4]), '0.98', tensor([[True, True, True]]))
     """
 
     joints: Float[Tensor, "g h"]
@@ -267,6 +274,13 @@ def load_grasps(path: Path | str) -> Grasps:
     Raises:
         ModelFileError: the file is missing or malformed; a pose that is not rigid, an unknown status, contacts that are
             not each under one finger, or not three to five of them.
+
+    >>> import tempfile
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> file = Path(tempfile.mkdtemp(), "grasps.safetensors")
+    >>> load_shipped_grasp("jug", "barrett").save(file)
+    >>> load_grasps(file).meta["hand"]
+    'barrett'
     """
     grasps, meta = read_value(path, "grasps", Grasps, meta={})
     rotation, last = grasps.obj_from_hand[:, :3, :3].double(), grasps.obj_from_hand[:, 3]

@@ -13,9 +13,10 @@ from tests.pinch import cylinder, pinch
 from tests.scores import GOOD, SCORES, STUCK
 from torchgrasp import cli
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.evaluation.campaign import EvaluationSpec, choose_rows, evaluate, run_protocol
+from torchgrasp.evaluation.campaign import EvaluationSpec, choose_rows, evaluate
 from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.protocols import PROTOCOLS, Protocol
+from torchgrasp.evaluation.pull import run_protocol
 from torchgrasp.evaluation.score import STAGES, summarise
 from torchgrasp.files import hold_folder
 from torchgrasp.hand.load import load_hand
@@ -153,6 +154,15 @@ def test_a_robot_plans_on_what_it_believes_and_lifts_what_is(folder, tmp_path):
     assert found["none"][1].passed and found["none"][1].slip < 0.005 and found["none"][1].slip_angle < 0.2
     with pytest.raises(BadArgument, match="perturb: found 'table' with 'dexgraspbench'"):
         evaluate(folder, hand, "dexgraspbench", asked)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_grasps_of_an_earlier_call_keep_the_reason_why_there_are_none(folder, tmp_path):
+    smooth, spec = Protocol("smooth", TrialSpec(friction=0.0)), EvaluationSpec(1, starts=20, only=("tin",))
+    (score,) = evaluate(folder, load_hand("barrett"), smooth, spec, folder=tmp_path)
+    assert score.executable == 0 and score.refusal is not Status.OK
+    (again,) = evaluate(folder, load_hand("barrett"), smooth, dataclasses.replace(spec, planned=True), folder=tmp_path)
+    assert again.refusal is score.refusal and summarise([again])["failures"] == {"planning": {score.refusal.name: 1}}
 
 
 @pytest.mark.sim

@@ -138,7 +138,15 @@ def _bind_many(axis: str, middle: tuple[int, ...], sizes: dict[str, Any]) -> boo
 
 
 def check_tensor(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
-    """Return `value` if it is a finite floating tensor of `shape` (None: any length); raise `BadArgument` otherwise."""
+    """Return `value` if it is a finite floating tensor of `shape` (None: any length); raise `BadArgument` otherwise.
+
+    >>> check_tensor("points", torch.zeros(5, 3), (None, 3)).shape
+    torch.Size([5, 3])
+    >>> check_tensor("points", torch.zeros(5, 2), (None, 3))
+    Traceback (most recent call last):
+        ...
+    torchgrasp.errors.BadArgument: points: found shape (5, 2), allowed is shape _ x 3
+    """
     call = Call(gradients=True)
     TensorHint("Float", " ".join("_" if s is None else str(s) for s in shape)).read(name, value, call)
     call.found[name] = value
@@ -147,7 +155,14 @@ def check_tensor(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor
 
 
 def check_moved(*args: Any, **kwargs: Any) -> None:
-    """Refuse what `Tensor.to` cannot do, and types or devices without our numbers; raise `BadArgument`."""
+    """Refuse what `Tensor.to` cannot do, and types or devices without our numbers; raise `BadArgument`.
+
+    >>> check_moved(torch.float64)
+    >>> check_moved(torch.int32)
+    Traceback (most recent call last):
+        ...
+    torchgrasp.errors.BadArgument: to: found torch.int32, allowed is a device, torch.float32 or torch.float64
+    """
     given = ", ".join([*map(repr, args), *(f"{key}={value!r}" for key, value in kwargs.items())])
     allowed = "a device, torch.float32 or torch.float64"
     try:

@@ -72,7 +72,12 @@ All commands: torchgrasp --help. To read: README.md and docs/ of the repository.
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return its exit code. Errors end as one sentence on stderr."""
+    """Run the command line; return its exit code. Errors end as one sentence on stderr.
+
+    >>> main(["--version"])
+    torchgrasp ...
+    0
+    """
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given in ([], ["--version"]):
         print(f"torchgrasp {__version__}" if given else START)

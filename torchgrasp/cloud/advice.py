@@ -28,7 +28,11 @@ FEWEST = 50
 
 @dataclasses.dataclass(frozen=True)
 class Advice(Value):
-    """Something wrong with a cloud: what was found, what is right with its command, and whether it forbids a grasp."""
+    """Something wrong with a cloud: what was found, what is right with its command, and whether it forbids a grasp.
+
+    >>> print(Advice("the cloud is empty", "look again", refused=True))
+    the cloud is empty: look again
+    """
 
     found: str
     mend: str

@@ -28,7 +28,13 @@ VIEWED = 5000
 @checked
 @dataclasses.dataclass(frozen=True)
 class CloudReport(Value):
-    """What a cloud is like, and what could be better."""
+    """What a cloud is like, and what could be better.
+
+    >>> from torchgrasp import load_object
+    >>> report = diagnose_cloud(load_object("jug").view)
+    >>> report.points, f"{1000 * report.noise:.1f} mm", report.advice
+    (1000, '0.7 mm', ())
+    """
 
     points: int
     measured: int  # how many of them the figures are taken from

@@ -22,7 +22,13 @@ MAX_OPPOSED = 0.35
 @checked
 @dataclasses.dataclass(frozen=True)
 class NormalCheck(Value):
-    """What given normals are worth."""
+    """What given normals are worth.
+
+    >>> ball = unit(torch.randn(500, 3))
+    >>> found = check_normals(PointCloud(0.05 * ball, 2 * ball))
+    >>> found.oriented, found.scaled, int(found.flipped.sum())
+    (True, 500, 0)
+    """
 
     flipped: Bool[Tensor, "n"]  # which normals oppose most of their neighbours'
     opposed: float  # share of opposite normals among pairs of neighbours

@@ -156,6 +156,12 @@ def cut_object(
 
     Raises:
         TooFewPoints: fewer than 4 points in the box, near the point or of the thing.
+
+    >>> from torchgrasp import load_scene
+    >>> seen = PointCloud(load_scene().points.double())
+    >>> thing, table = cut_object(seen, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    >>> len(seen) > 2 * len(thing), f"{abs(table.offset):.3f}"
+    (True, '0.001')
     """
     points = cloud.points.double()
     up, (point, box) = up.to(points), (None if x is None else x.to(points) for x in (point, box))

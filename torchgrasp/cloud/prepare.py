@@ -25,7 +25,12 @@ MAX_VIEWS, MIN_VIEW_POINTS = 16, 10
 
 @dataclasses.dataclass(frozen=True)
 class PreparedCloud(Value):
-    """A cloud that `prepare_cloud` has checked: later stages check nothing."""
+    """A cloud that `prepare_cloud` has checked: later stages check nothing.
+
+    >>> from torchgrasp import load_object
+    >>> prepare_cloud(load_object("jug").view, torch.Generator().manual_seed(0)).one_sided
+    True
+    """
 
     cloud: PointCloud  # distinct points [m] with outward normals, in the given dtype
     points: Float[Tensor, "n 3"]  # at most 2000 of them, in float64
@@ -54,6 +59,11 @@ def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = T
     Raises:
         BadArgument, SuspiciousScale: see `check_cloud`; more than 16 cameras.
         TooFewPoints: see `check_cloud`; fewer than 10 points of one camera of several.
+
+    >>> from torchgrasp import load_object
+    >>> prepared = prepare_cloud(load_object("jug").view, torch.Generator().manual_seed(0))
+    >>> prepared.normals.dtype, prepared.viewpoint is not None
+    (torch.float64, True)
     """
     cloud = remove_duplicates(cloud)
     points, normals, viewpoint = cloud.points, cloud.normals, cloud.viewpoint

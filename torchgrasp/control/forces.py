@@ -53,7 +53,16 @@ def contacts_in_hand(grasps: Grasps) -> tuple[Float[Tensor, "g f 3"], Float[Tens
 
 
 class Squeeze(NamedTuple):
-    """The third pose of a grasp: joint targets [rad], forces on the object [N], torques [N m]."""
+    """The third pose of a grasp: joint targets [rad], forces on the object [N], torques [N m].
+
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> pressed = squeeze(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
+    >>> pressed.forces.norm(dim=-1).round(decimals=1)  # [N] of each finger
+    tensor([[2., 2., 4.]], dtype=torch.float64)
+    >>> pressed.forces.sum(1).norm() < 1e-6  # they balance
+    tensor(True)
+    """
 
     joints: Float[Tensor, "g h"]
     forces: Float[Tensor, "g f 3"]

@@ -22,6 +22,13 @@ class Observation(Value):
         tips: centres of the fingertips [m].
         jacobian: of these centres, by all joints [m/rad].
         tactile: what the fingertips report.
+
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.control import no_contact
+    >>> hand = load_hand("barrett")
+    >>> seen = observe(hand, (hand.lower + hand.upper) / 2, no_contact())
+    >>> seen.joints.shape, seen.tips.shape, seen.jacobian.shape
+    (torch.Size([8]), torch.Size([3, 3]), torch.Size([3, 3, 8]))
     """
 
     joints: Float[Tensor, " j"]
@@ -36,6 +43,13 @@ def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> O
 
     Raises:
         BadArgument: joints or fingertips on another device than the hand.
+
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.control import no_contact
+    >>> hand = load_hand("barrett")
+    >>> joints = (hand.lower + hand.upper) / 2
+    >>> torch.allclose(observe(hand, joints, no_contact()).tips, hand.tip_centres(joints))
+    True
     """
     check_device("tactile", tactile.lagged.device, "the hand", hand.lower.device)
     joints = joints.double()

@@ -45,6 +45,17 @@ class ClosingReference(Value):
         normals: outward normals of the planned contacts.
         gains: targets, gains and desired forces (Eqs. 26-28).
         table: into which no fingertip presses while it searches; None: none is known.
+
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> reference = ClosingReference.from_grasp(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
+    >>> every = reference.expand(reference.joints)  # followers, too
+    >>> every.shape, torch.equal(reference.pick(every), reference.joints)
+    (torch.Size([8]), True)
+    >>> torch.equal(reference.clamp(reference.joints + 9), reference.hand.upper)
+    True
+    >>> reference.contact_points(reference.gains.target).shape  # on the pads, from the tips' centres
+    torch.Size([3, 3])
     """
 
     hand: Hand
@@ -155,5 +166,11 @@ def closing_gains(
     """Return target, gains and desired force of each finger for one grasp, in the hand's frame (Eqs. 26-28).
 
     Arguments and errors are those of `ClosingReference.from_grasp`.
+
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> gains = closing_gains(load_shipped_grasp("jug", "barrett"), load_hand("barrett"), force=2.0)
+    >>> f"{gains.desired_force.norm(dim=-1).max():.1f} N"
+    '2.0 N'
     """
     return ClosingReference.from_grasp(hand, grasp, force, stability=stability).gains

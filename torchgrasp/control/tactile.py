@@ -44,6 +44,11 @@ class TipContact(Value):
 
     `forces` [N] act on the object, friction included. `points` [m] and outward `normals` are NaN without contact.
     `sliding` [m/s] is the speed of the tip along the surface; None: no tip slides.
+
+    >>> normals, pressed = torch.eye(3), torch.tensor([2.0, 0.0, 1.0])  # [N]
+    >>> truth = TipContact(pressed, -pressed[:, None] * normals, 0.03 * normals, normals)
+    >>> truth.forces[0]
+    tensor([-2., -0., -0.])
     """
 
     normal_force: Float[Tensor, "*b f"]
@@ -61,6 +66,10 @@ class TactileState(Value):
     `reading` [N] is the normal force, `forces` [N] the full one. `points` [m] and `normals` are NaN without contact.
     `lagged` is normal force and full force [N], and the speed of sliding [m/s], behind the low-pass. `average` [N] is
     the slow mean of the readings, `sliding` [m/s] the reading of that speed. `age` [s] counts from the last sample.
+
+    >>> in_air = no_contact()
+    >>> in_air.reading, in_air.points[0]
+    (tensor([0., 0., 0.], dtype=torch.float64), tensor([nan, nan, nan], dtype=torch.float64))
     """
 
     reading: Float[Tensor, "*b f"]
@@ -108,6 +117,12 @@ def measure(
 
     Raises:
         BadArgument: true contacts on another device than the state.
+
+    >>> normals, pressed = torch.eye(3).double(), torch.tensor([2.0, 0.0, 1.0]).double()  # [N]
+    >>> truth = TipContact(pressed, -pressed[:, None] * normals, 0.03 * normals, normals)
+    >>> felt = measure(no_contact(), truth, normals, torch.full((3,), 0.012).double(), period=0.01)
+    >>> felt.contact, felt.reading  # behind the low-pass
+    (tensor([ True, False, False]), tensor([1.4308, 0.0000, 0.7154], dtype=torch.float64))
     """
     check_device("truth", truth.forces.device, "the tactile state", tactile.lagged.device)
     sliding = torch.zeros_like(truth.normal_force) if truth.sliding is None else truth.sliding

@@ -17,6 +17,9 @@ class Targets(NamedTuple):
         joints: targets of all joints of the URDF, in the order of `hand.tree.joint_names` [rad].
         palm: displacement of the palm [m] from where the arm brought it, in the axes of the hand. The wrist does not
             turn.
+
+    >>> Targets(torch.zeros(16)).palm  # the arm stays
+    tensor([0., 0., 0.], dtype=torch.float64)
     """
 
     joints: Float[Tensor, " j"]

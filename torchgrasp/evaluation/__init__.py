@@ -1,18 +1,18 @@
 """What is asked of a grasp: trials in simulation, published protocols, campaigns and their scores."""
 
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
-from torchgrasp.evaluation.campaign import EvaluationSpec, evaluate, run_protocol
+from torchgrasp.evaluation.campaign import EvaluationSpec, evaluate
 from torchgrasp.evaluation.intervals import Share, contrast_over, count_by, difference_over, format_share, mean_over
 from torchgrasp.evaluation.intervals import share_over
-from torchgrasp.evaluation.lift import close_hand, lift_grasp, most_certain_first
+from torchgrasp.evaluation.lift import close_hand, lift_grasp
 from torchgrasp.evaluation.perturb import PERTURBATIONS, Perturbation, find_perturbation, household_mass
 from torchgrasp.evaluation.perturb import perturb_trial, perturb_view
 from torchgrasp.evaluation.placed import PlacedScene, drop
 from torchgrasp.pipeline.pool import run_tasks
 from torchgrasp.evaluation.protocols import PROTOCOLS, PoseNoise, Protocol, PullSpec, apply_error
 from torchgrasp.evaluation.protocols import draw_error, draw_hand_errors, draw_object_poses, find_protocol, seed_of
-from torchgrasp.evaluation.pull import PullResult, pull_grasp
-from torchgrasp.evaluation.score import ProtocolResult, ViewScore, summarise
+from torchgrasp.evaluation.pull import PullResult, pull_grasp, run_protocol
+from torchgrasp.evaluation.score import ProtocolResult, ViewScore, most_certain_first, summarise
 
 __all__ = [
     "PERTURBATIONS",

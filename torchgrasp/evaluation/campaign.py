@@ -14,14 +14,12 @@ import torch
 
 from torchgrasp.base import Value, count_status
 from torchgrasp.border import Count, Range, Seed, checked
-from torchgrasp.closing import ObjectMotion
 from torchgrasp.datasets import list_objects, list_views, read_entry, read_object_mesh, read_view
 from torchgrasp.errors import BadArgument, DatasetError, GraspError, MissingExtra, OutputError, Status
-from torchgrasp.evaluation.closing import GraspTrial, TrialDriver
-from torchgrasp.evaluation.lift import lift_grasp
+from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.perturb import find_perturbation, household_mass, perturb_trial, perturb_view
 from torchgrasp.evaluation.protocols import Protocol, draw_error, find_protocol, seed_of
-from torchgrasp.evaluation.pull import pull_grasp
+from torchgrasp.evaluation.pull import run_protocol
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore
 from torchgrasp.files import hold_folder, temporary_folder
 from torchgrasp.hand.hand import Hand, HandSource
@@ -41,6 +39,9 @@ MOST_FRICTION = 1.0
 """Largest friction that grasps are planned for: MultiDex grants 3, more than fingertips have."""
 PLAN_LIMIT, TRIAL_LIMIT = 900.0, 120.0
 """Wall time [s] after which planning on a view, and an attempt, are ended: many times the usual."""
+
+REFUSAL = "refusal"
+"""Where the file of a view's executable grasps keeps why there are none: a later call that tries them says it, too."""
 
 Ranks = Literal["best", "spread"]
 """Which of a view's grasps are tried: the best, or as many spread from the best to the worst."""
@@ -112,6 +113,16 @@ def evaluate(
         BadArgument: an unknown protocol, no objects, or a perturbation of a protocol that pulls.
         OutputError: another run holds the folder, or it cannot be written.
         MissingExtra: the simulator, or pebble for workers, is not installed.
+
+    >>> import tempfile
+    >>> from torchgrasp import load_hand, load_object
+    >>> from torchgrasp.datasets import write_objects
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> _ = load_object("cylinder").mesh.export(folder / "tin.ply")
+    >>> _ = write_objects(folder, folder / "objects", views=1)
+    >>> scores = evaluate(folder / "objects", load_hand("barrett"), "tabletop", EvaluationSpec(1, starts=10))
+    >>> [score.executable > 0 for score in scores]
+    [True]
     """
     protocol, spec = find_protocol(protocol), EvaluationSpec() if spec is None else spec
     if spec.perturb != "none" and protocol.pull is not None:
@@ -180,28 +191,6 @@ def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
     return [round(k * (executable - 1) / (most - 1)) for k in range(most)]
 
 
-@checked
-def run_protocol(
-    trial: GraspTrial,
-    protocol: Protocol,
-    rank: Annotated[int, Range(0, 1000000)] = 0,
-    draw: Annotated[int, Range(0, 1000000)] = 0,
-) -> ProtocolResult:
-    """Put one grasp to a protocol; see `pull_grasp` and `lift_grasp`."""
-    started = time.process_time()
-    overlap = TrialDriver(trial, protocol.trial).grasp_overlap()
-    if protocol.pull is not None:
-        pull = pull_grasp(trial, protocol)
-        status, moved, turned, force = pull.status, pull.moved, pull.turned, pull.force
-        slip = ObjectMotion(math.nan, math.nan)
-    else:
-        lift = lift_grasp(trial, protocol.trial)
-        status, (moved, turned), slip = lift.status, lift.object_motion, lift.slip
-        force = math.nan if status is Status.START_OVERLAP else float(lift.forces[-1].mean())
-    spent = time.process_time() - started
-    return ProtocolResult(rank, draw, status is Status.OK, status, moved, turned, force, overlap, spent, *slip)
-
-
 @dataclasses.dataclass(frozen=True)
 class _View:
     """A view and a hand by their files; `shelf` is the folder of grasps."""
@@ -242,7 +231,9 @@ def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
             if (grasps.meta.get("cloud_sha256"), grasps.meta.get("hand_sha256")) != (digest(cloud), hand.source.sha256):
                 raise BadArgument("folder", f"{view.file} of another cloud or hand", "grasps of this view")
             fingers = grasps.meta.get("finger_names", "")
-            return dataclasses.replace(score, executable=len(grasps), fingers=fingers)
+            told = Status.__members__.get(grasps.meta.get(REFUSAL, ""), Status.OUT_OF_REACH)
+            refusal = Status.OK if len(grasps) else told
+            return dataclasses.replace(score, executable=len(grasps), refusal=refusal, fingers=fingers)
         started = time.process_time()
         contacts = ContactSpec(friction=min(friction, MOST_FRICTION), table=table)
         stages: list[tuple[str, str, Any]] = []
@@ -251,9 +242,9 @@ def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
         )
         executable = grasps[grasps.status == Status.OK]
         starts = next(value.status for name, _, value in stages if name == "plan")
-        executable.save(view.file)
         failed = count_status(grasps.status if len(grasps) else starts[starts != Status.OK])
         refusal = Status.OK if len(executable) else next(iter(failed), Status.OUT_OF_REACH)
+        dataclasses.replace(executable, meta=grasps.meta | {REFUSAL: refusal.name}).save(view.file)
         fingers = grasps.meta["finger_names"]
         score = dataclasses.replace(score, executable=len(executable), refusal=refusal, fingers=fingers)
     except (MissingExtra, OutputError):  # a full disk is no fault of the object

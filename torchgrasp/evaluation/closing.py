@@ -41,7 +41,15 @@ APPROACH_SPEED = 0.2
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspTrial:
-    """A grasp and the true object, as in `close_hand`."""
+    """A grasp and the true object, as in `close_hand`.
+
+    >>> from torchgrasp import load_hand, load_object
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
+    >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
+    >>> TrialDriver(trial, TrialSpec()).grasp_overlap() < 0.01  # [m] of the fingertips at their contacts
+    True
+    """
 
     hand: Hand
     grasp: Grasps
@@ -63,6 +71,13 @@ class TrialDriver:
 
     Raises:
         BadArgument, MeshError: as in `close_hand`.
+
+    >>> from torchgrasp import load_hand, load_object
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
+    >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
+    >>> TrialDriver(trial, TrialSpec(approach=0.0)).open().starts  # nothing overlaps
+    True
     """
 
     def __init__(self, trial: GraspTrial, spec: TrialSpec, reference: ClosingReference | None = None) -> None:
@@ -148,7 +163,19 @@ def derive_reference(hand: Hand, grasp: Grasps, spec: TrialSpec) -> ClosingRefer
 
 
 class TrialRun:
-    """One run of a trial in a fresh scene; its phases yield after every control tick."""
+    """One run of a trial in a fresh scene; its phases yield after every control tick.
+
+    >>> from torchgrasp import load_hand, load_object
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
+    >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
+    >>> run = TrialDriver(trial, TrialSpec(closing="open_loop")).open()
+    >>> len(list(run.approach())), len(list(run.close())) > 10  # ticks
+    (50, True)
+    >>> run.step()
+    >>> run.strained(), run.robot.force > 0.1
+    (False, array([ True,  True,  True]))
+    """
 
     def __init__(self, driver: TrialDriver) -> None:
         spec, trial = driver.spec, driver.trial

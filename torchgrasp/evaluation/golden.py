@@ -12,9 +12,8 @@ import torch
 from torchgrasp.border import checked
 from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.hand.load import load_hand
-from torchgrasp.objects import DATA, load_object
+from torchgrasp.objects import load_object, load_shipped_grasp
 from torchgrasp.specs import Simulator, TrialSpec
-from torchgrasp.values import load_grasps
 
 OFF = 0.06
 """How far [m] the hand of a lost grasp stands back along its approach: no fingertip touches."""
@@ -61,7 +60,7 @@ def run_golden(simulator: Simulator) -> Iterator[GoldenResult]:
     """
     for case in GOLDEN:
         thing, hand = load_object(case.object), load_hand(case.hand)
-        grasp = load_grasps(DATA / case.object / f"{case.hand}.safetensors")
+        grasp = load_shipped_grasp(case.object, case.hand)
         error = torch.eye(4, dtype=torch.float64)
         if not case.held:
             error[:3, 3] = -OFF * hand.approach

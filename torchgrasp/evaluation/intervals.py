@@ -28,6 +28,9 @@ class Share(NamedTuple):
     """A share or a difference of shares, its 95 % interval, and how many trials and units stand behind it.
 
     A single unit has no interval: its ends are NaN. Nothing measured is NaN altogether.
+
+    >>> Share(0.9, 0.8, 1.0, total=20, units=10).low
+    0.8
     """
 
     value: float
@@ -103,6 +106,11 @@ def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: See
 
     The order of the units does not matter. `total` counts the trials of the first column. Resamples in which a column
     has no trial are left out.
+
+    >>> new, old = {"tin": (4, 4), "cup": (4, 4)}, {"tin": (2, 4), "cup": (1, 4)}
+    >>> found = contrast_over([new, old], [1.0, -1.0])
+    >>> found.value, found.low <= found.value <= found.high
+    (0.625, True)
     """
     names = sorted({name for counts in columns for name, (_, total) in counts.items() if total})
     total = sum(total for _, total in columns[0].values())

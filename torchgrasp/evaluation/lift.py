@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchgrasp.border import Seed, checked
 from torchgrasp.closing import ClosingTrace, ClosureResult, Disturbance, ObjectMotion
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.errors import Status
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun, smooth_step
 from torchgrasp.frames import apply, inverse, rotation_angle
 from torchgrasp.hand.hand import Hand
@@ -79,36 +79,34 @@ def close_hand(
         BadArgument: a belief or the holding "law" for a closing that does not follow the law (Eq. 25).
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
+
+    >>> from torchgrasp import load_hand, load_object
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> jug, grasp, hand = load_object("jug"), load_shipped_grasp("jug", "allegro"), load_hand("allegro")
+    >>> result = close_hand(grasp, hand, jug.mesh, TrialSpec(hold_time=0.2), parts=jug.parts)
+    >>> result.held, result.slip.distance < 0.01, result.disturbance.early, result.trace.forces.shape[1:]
+    (True, True, tensor([False, False, False]), torch.Size([3, 3]))
     """
     return lift_grasp(GraspTrial(hand, grasp, mesh, seed, error, belief, parts, table, neighbours), spec)
 
 
 @checked
 def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResult:
-    """Run a trial; see `close_hand`."""
+    """Run a trial; see `close_hand`.
+
+    >>> from torchgrasp import load_hand, load_object
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
+    >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
+    >>> lift_grasp(trial, TrialSpec(closing="open_loop", lift_height=0.0, hold_time=0.0)).status.name
+    'OK'
+    """
     started = time.perf_counter()
     driver = TrialDriver(trial, TrialSpec() if spec is None else spec)
     run = driver.open()
     lift = _Lift(run)
     status = lift.perform()
     return lift.result(status, time.perf_counter() - started)
-
-
-@checked
-def most_certain_first(contact_order: Sequence[int], grasp: Grasps) -> bool:
-    """Return whether the finger on the most certain contact was the first to touch, as Sec. 5 expects of Eq. (27).
-
-    Args:
-        contact_order: fingers by their first touch (`ClosureResult`); without any the answer is no.
-        grasp: one row; of equally certain fingers any may be the first.
-
-    Raises:
-        BadArgument: not exactly one row, or contacts without `std_m`.
-    """
-    if len(grasp) != 1:
-        raise BadArgument("grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]")
-    std_m = grasp.contacts.require_std()[0]
-    return len(contact_order) > 0 and bool(std_m[contact_order[0]] == std_m.min())
 
 
 class _ObjectLost(Exception):

@@ -60,6 +60,9 @@ class Perturbation(Value):
 
     Raises:
         BadArgument: a number outside its range.
+
+    >>> Perturbation(mass=True, friction=(0.4, 1.0)).friction
+    (0.4, 1.0)
     """
 
     mass: bool = False
@@ -153,6 +156,12 @@ def perturb_view(cloud: PointCloud, perturbation: Perturbation, seed: Seed) -> t
 
     Raises:
         BadArgument: a cloud without a viewpoint, if the mask, the depth or the camera is wrong.
+
+    >>> from torchgrasp import load_object
+    >>> view = load_object("jug").view
+    >>> seen, table = perturb_view(view, Perturbation(table=0.005), seed=0)
+    >>> torch.equal(seen.points, view.points), 0 < abs(table.offset) <= 0.005
+    (True, True)
     """
     device, here = cloud.points.device, cloud.to("cpu")
     table, points = _perturb_table(here, perturbation, seed).to(device), here.points.double()

@@ -65,6 +65,12 @@ class PlacedScene:
         meshes: where they lie, in the world frame [m].
         parts: convex parts of each, there.
         camera_pose: world_from_camera.
+
+    >>> from torchgrasp import load_object
+    >>> jug = load_object("jug")
+    >>> scene = PlacedScene(("jug",), (jug.mesh,), (tuple(jug.parts),), torch.eye(4).double())
+    >>> len(scene), scene.centres().round(2)
+    (1, array([[-0.  , -0.  ,  0.07]]))
     """
 
     names: tuple[str, ...]
@@ -113,6 +119,10 @@ def drop(
         BadArgument: no objects, or a count outside [1, 20].
         MeshError: a mesh is open.
         MissingExtra: SAPIEN is not installed.
+
+    >>> scene = drop(None, (2, 2), seed=0)
+    >>> len(scene.names), bool((scene.centres()[:, 2] > 0).all())
+    (2, True)
     """
     low, high = count
     check_whole("count", high, low, 20)

@@ -24,7 +24,11 @@ if TYPE_CHECKING:
 @checked
 @dataclasses.dataclass(frozen=True)
 class PoseNoise(Value):
-    """Uniform errors along and about each axis, at most [m, rad]; `draws` a grasp."""
+    """Uniform errors along and about each axis, at most [m, rad]; `draws` a grasp.
+
+    >>> PoseNoise(translation=0.005, rotation=math.radians(5)).draws
+    1
+    """
 
     translation: Length = 0.0
     rotation: Annotated[float, Range(0.0, math.pi)] = 0.0
@@ -34,7 +38,11 @@ class PoseNoise(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class PullSpec(Value):
-    """Pulls by a force over mass [m/s^2], and the motion allowed [m, rad]."""
+    """Pulls by a force over mass [m/s^2], and the motion allowed [m, rad].
+
+    >>> find_protocol("dexgraspbench").pull.acceleration
+    10.0
+    """
 
     acceleration: Annotated[float, Range(0.0, 1000.0)]
     seconds: Annotated[float, Range(0.0, 60.0)]
@@ -129,6 +137,11 @@ def apply_error(obj_from_hand: Float[Tensor, "4 4"], error: Float[Tensor, "4 4"]
 
     Raises:
         BadArgument: an error that is no finite (4, 4).
+
+    >>> error = torch.eye(4).double()
+    >>> error[0, 3] = 0.01  # the hand stands 10 mm off, along its own axis
+    >>> apply_error(torch.eye(4).double(), error)[:3, 3]
+    tensor([0.0100, 0.0000, 0.0000], dtype=torch.float64)
     """
     planned = obj_from_hand.to("cpu", torch.float64)
     return planned if error is None else planned @ check_tensor("error", error, (4, 4)).to("cpu", torch.float64)
@@ -149,7 +162,12 @@ def seed_of(seed: Seed, *names: str | int) -> int:
 
 @checked
 def draw_hand_errors(noise: PoseNoise, count: Count, seed: Seed) -> Float[Tensor, "n 4 4"]:
-    """Draw errors of the hand in its planned frame."""
+    """Draw errors of the hand in its planned frame.
+
+    >>> errors = draw_hand_errors(PoseNoise(translation=0.005), 100, seed=0)
+    >>> errors.shape, bool((errors[:, :3, 3].abs() <= 0.005).all())
+    (torch.Size([100, 4, 4]), True)
+    """
     generator = torch.Generator().manual_seed(seed)
     largest = torch.tensor([noise.rotation] * 3 + [noise.translation] * 3, dtype=torch.float64)
     drawn = 2 * torch.rand(count, 6, generator=generator, dtype=torch.float64) - 1
@@ -159,7 +177,12 @@ def draw_hand_errors(noise: PoseNoise, count: Count, seed: Seed) -> Float[Tensor
 
 @checked
 def draw_object_poses(noise: PoseNoise, pivot: Float[Tensor, "3"], count: Count, seed: Seed) -> Float[Tensor, "n 4 4"]:
-    """Draw poses of an object that moves on its table and turns about the vertical through `pivot` [m]; on the CPU."""
+    """Draw poses of an object that moves on its table and turns about the vertical through `pivot` [m]; on the CPU.
+
+    >>> poses = draw_object_poses(PoseNoise(translation=0.005), torch.zeros(3).double(), 100, seed=0)
+    >>> poses[:, 2, 3].abs().max()  # it stays on the table
+    tensor(0., dtype=torch.float64)
+    """
     pivot = pivot.to("cpu", torch.float64)
     generator = torch.Generator().manual_seed(seed)
     drawn = 2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1
@@ -177,7 +200,14 @@ def error_from_object_pose(
 
 @checked
 def draw_error(protocol: Protocol, grasp: Grasps, mesh: "trimesh.Trimesh", seed: Seed) -> Float[Tensor, "4 4"]:
-    """Draw the hand's error for one trial of a grasp, by a seed of its own (`seed_of`)."""
+    """Draw the hand's error for one trial of a grasp, by a seed of its own (`seed_of`).
+
+    >>> from torchgrasp import load_object
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> grasp, mesh = load_shipped_grasp("jug", "barrett"), load_object("jug").mesh
+    >>> draw_error(find_protocol("paper"), grasp, mesh, seed=0)[:3, 3].norm() < 0.05  # [m]
+    tensor(True)
+    """
     if protocol.pull is not None:
         return draw_hand_errors(protocol.noise, 1, seed)[0]
     pivot = torch.tensor(mesh.center_mass.tolist(), dtype=torch.float64)

@@ -1,17 +1,21 @@
-"""Pulls at a grasped object in six directions."""
+"""Pulls at a grasped object in six directions, and either kind of protocol: pulls or a lift."""
 
 import dataclasses
 import math
 import time
+from typing import Annotated
 
 import numpy as np
 import torch
 
 from torchgrasp.base import Value
-from torchgrasp.border import Measured, checked
+from torchgrasp.border import Measured, Range, checked
+from torchgrasp.closing import ObjectMotion
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
+from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.protocols import Protocol, PullSpec, find_protocol
+from torchgrasp.evaluation.score import ProtocolResult
 from torchgrasp.frames import rotation_angle
 
 DIRECTIONS = tuple(np.array(sign) * axis for axis in np.eye(3) for sign in (-1.0, 1.0))
@@ -27,6 +31,9 @@ class PullResult(Value):
     """Whether the object stayed in every direction, and its largest motion [m, rad].
 
     `directions` were tried, `status` is of the last. `force` [N] is the fingers' mean before the first pull, or NaN.
+
+    >>> PullResult(True, Status.OK, 6, moved=0.004, turned=0.02, force=6.8, seconds=2.0).passed
+    True
     """
 
     passed: bool
@@ -47,6 +54,14 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
     Raises:
         BadArgument: an unknown protocol or one that lifts; else as `close_hand`.
         MeshError, MissingExtra: as `close_hand`.
+
+    >>> from torchgrasp import load_hand, load_object
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "allegro")
+    >>> protocol = dataclasses.replace(find_protocol("dexgraspbench"), pull=PullSpec(10.0, 0.1, 0.05, 0.26))
+    >>> found = pull_grasp(GraspTrial(load_hand("allegro"), grasp, jug.mesh, parts=jug.parts), protocol)
+    >>> found.passed, found.directions
+    (True, 6)
     """
     started = time.process_time()
     protocol = find_protocol(protocol)
@@ -93,3 +108,33 @@ def _look(run: TrialRun, spec: PullSpec, start: np.ndarray) -> tuple[Status, np.
     moved = np.linalg.norm((pose @ centre - start @ centre)[:3])
     turned = float(rotation_angle(torch.from_numpy(start[:3, :3].T @ pose[:3, :3])))
     return Status.OK if moved < spec.distance and turned < spec.angle else Status.MOVED, np.array([moved, turned])
+
+
+@checked
+def run_protocol(
+    trial: GraspTrial,
+    protocol: Protocol,
+    rank: Annotated[int, Range(0, 1000000)] = 0,
+    draw: Annotated[int, Range(0, 1000000)] = 0,
+) -> ProtocolResult:
+    """Put one grasp to a protocol; see `pull_grasp` and `lift_grasp`.
+
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.objects import load_object, load_shipped_grasp
+    >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
+    >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
+    >>> run_protocol(trial, find_protocol("paper")).passed
+    True
+    """
+    started = time.process_time()
+    overlap = TrialDriver(trial, protocol.trial).grasp_overlap()
+    if protocol.pull is not None:
+        pull = pull_grasp(trial, protocol)
+        status, moved, turned, force = pull.status, pull.moved, pull.turned, pull.force
+        slip = ObjectMotion(math.nan, math.nan)
+    else:
+        lift = lift_grasp(trial, protocol.trial)
+        status, (moved, turned), slip = lift.status, lift.object_motion, lift.slip
+        force = math.nan if status is Status.START_OVERLAP else float(lift.forces[-1].mean())
+    spent = time.process_time() - started
+    return ProtocolResult(rank, draw, status is Status.OK, status, moved, turned, force, overlap, spent, *slip)

@@ -10,9 +10,10 @@ import torch
 
 from torchgrasp.base import Value
 from torchgrasp.border import Measured, checked
-from torchgrasp.errors import Status
+from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.calibration import judge
 from torchgrasp.evaluation.intervals import Share, count_by, share_over
+from torchgrasp.values import Grasps
 
 STAGES: dict[str, tuple[Status, ...]] = {
     "start": (Status.START_OVERLAP,),
@@ -38,6 +39,9 @@ class ProtocolResult(Value):
     The object moved by `moved` [m] and `turned` [rad], in a lift relative to the hand. `force` [N] is the fingers' mean
     normal force, `overlap` [m] the depth of the grasp pose in the object, `seconds` CPU time. In a lift the object
     slipped by `slip` [m] and `slip_angle` [rad] since the hand pressed. `predicted` is the grasp's predicted success.
+
+    >>> ProtocolResult(rank=0, draw=0, passed=True, status=Status.OK, predicted=0.9).predicted
+    0.9
     """
 
     rank: int
@@ -61,6 +65,9 @@ class ViewScore(Value):
 
     Without any, `refusal` is the commonest reason; `note` may say more. `seconds` is the CPU time of planning. `family`
     and `group` are the object's (`torchgrasp.datasets`), "" where unknown. `fingers` are those that grasp.
+
+    >>> ViewScore("mug", "view0", executable=0, seconds=4.0, refusal=Status.OUT_OF_REACH, family="cup").unit
+    'cup'
     """
 
     object: str
@@ -91,6 +98,12 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     "overlap_mm", "plan_cpu_s" (of a view) and "trial_cpu_s" are means. "slip_mm" and "slip_deg" are the median and the
     95 % quantile over the grasps that held. "success" judges the predictions
     (`torchgrasp.evaluation.calibration.judge`); None without any.
+
+    >>> held = ProtocolResult(0, 0, True, Status.OK, predicted=0.9)
+    >>> lost = ViewScore("pen", "view0", 0, 3.0, refusal=Status.OUT_OF_REACH)
+    >>> found = summarise([ViewScore("jug", "view0", 40, 4.0, (held,)), lost])
+    >>> found["gsr"].value, found["top1"].value, found["refused"]
+    (1.0, 0.5, 1)
     """
     attempts = [attempt for score in scores for attempt in score.attempts]
     spent = [*(score.seconds for score in scores), *(a.seconds for a in attempts)]
@@ -157,3 +170,26 @@ def _mean(values: Iterable[float]) -> float | None:
     """Return the mean of the known values, or None."""
     known = [value for value in values if not math.isnan(value)]
     return sum(known) / len(known) if known else None
+
+
+@checked
+def most_certain_first(contact_order: Sequence[int], grasp: Grasps) -> bool:
+    """Return whether the finger on the most certain contact was the first to touch, as Sec. 5 expects of Eq. (27).
+
+    Args:
+        contact_order: fingers by their first touch (`ClosureResult`); without any the answer is no.
+        grasp: one row; of equally certain fingers any may be the first.
+
+    Raises:
+        BadArgument: not exactly one row, or contacts without `std_m`.
+
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> grasp = load_shipped_grasp("jug", "barrett")
+    >>> order = grasp.contacts.require_std()[0].argsort().tolist()
+    >>> most_certain_first(order, grasp), most_certain_first(order[::-1], grasp)
+    (True, False)
+    """
+    if len(grasp) != 1:
+        raise BadArgument("grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]")
+    std_m = grasp.contacts.require_std()[0]
+    return len(contact_order) > 0 and bool(std_m[contact_order[0]] == std_m.min())

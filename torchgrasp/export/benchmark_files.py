@@ -49,6 +49,13 @@ def save_dexgraspbench(
     Raises:
         BadArgument: a hand that the bench does not have in these frames, or joints of another hand.
         OutputError: the folder cannot be written.
+
+    >>> import tempfile
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> hand, grasp = load_hand("allegro"), load_shipped_grasp("jug", "allegro")
+    >>> [file.name for file in save_dexgraspbench(hand, grasp, tempfile.mkdtemp(), "assets/object/jug")]
+    ['0.npy']
     """
     if hand.name not in BENCH_HANDS:
         raise BadArgument(
@@ -82,6 +89,11 @@ def format_graspgen(grasps: Grasps, object_path: str) -> str:
 
     `object_in_gripper` tells which are executable. The fields `success` (predicted), `joints` and `joint_names` are
     ours. `object_path` is that of the mesh in the data set, with the frame of the planned cloud and scale 1.
+
+    >>> import json
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> json.loads(format_graspgen(load_shipped_grasp("jug", "barrett"), "meshes/jug.obj"))["object"]
+    {'file': 'meshes/jug.obj', 'scale': 1.0}
     """
     rows = {
         "transforms": grasps.obj_from_hand.tolist(),

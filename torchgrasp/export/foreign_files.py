@@ -33,7 +33,12 @@ Quaternion = Literal["wxyz", "xyzw"]
 
 
 class ForeignGrasps(NamedTuple):
-    """Joints [rad], poses of the hand's root link in the object's frame, and joints of the opened hand if known."""
+    """Joints [rad], poses of the hand's root link in the object's frame, and joints of the opened hand if known.
+
+    >>> poses = torch.eye(4).double().repeat(5, 1, 1)
+    >>> ForeignGrasps(torch.zeros(5, 12).double(), poses, pregrasp=None).joints.shape
+    torch.Size([5, 12])
+    """
 
     joints: Float[Tensor, "g h"]
     obj_from_hand: Float[Tensor, "g 4 4"]
@@ -61,6 +66,16 @@ def read_foreign(
     Raises:
         BadArgument: an order that misses a joint of the hand.
         ModelFileError: a missing or malformed file, or numbers that are not finite.
+
+    >>> import tempfile
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.export import format_grasps
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
+    >>> file = Path(tempfile.mkdtemp(), "grasps.json")
+    >>> _ = file.write_text(format_grasps(hand, grasp))
+    >>> torch.allclose(read_foreign(file, hand).joints, grasp.joints, atol=1e-5)
+    True
     """
     path = Path(path)
     if path.suffix.lower() == ".npz":

@@ -46,6 +46,13 @@ def format_grasps(
 
     Raises:
         BadArgument: joints of another hand, or a force or stiffness that is not positive.
+
+    >>> import json
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> text = format_grasps(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
+    >>> sorted(json.loads(text)["grasps"][0]["joints"])
+    ['grasp', 'pregrasp', 'squeeze']
     """
     hand, grasps = hand.to("cpu"), grasps.to("cpu")
     squeezed, path = squeeze(hand, grasps, force, kp), hand.urdf_path

@@ -28,6 +28,12 @@ def format_keyframes(
 
     Raises:
         BadArgument: joints of another hand, or a force or stiffness that is not positive.
+
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> text = format_keyframes(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
+    >>> text.count("<key ")
+    4
     """
     hand, grasps = hand.to("cpu"), grasps.to("cpu")
     squeezed, urdf = squeeze(hand, grasps, force, kp), read_urdf(hand.urdf_path)

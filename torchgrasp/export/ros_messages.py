@@ -37,6 +37,12 @@ def format_moveit(
 
     Raises:
         BadArgument: joints of another hand, or a force or stiffness that is not positive.
+
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> text = format_moveit(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
+    >>> print(text.splitlines()[2])
+    # the hand's frame is link 'palm' of hand.urdf; joints in the order of joint_names
     """
     root = read_urdf(hand.urdf_path).root
     messages = [
@@ -64,6 +70,12 @@ def format_trajectories(
 
     The hand stands at its pose already; `format_moveit` and `format_grasps` say where. Arguments and errors are those
     of `format_moveit`.
+
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> text = format_trajectories(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
+    >>> text.count("time_from_start")
+    3
     """
     root = read_urdf(hand.urdf_path).root
     documents = [_document(_posture(root, points)) for points in _points(hand, grasps, force, kp)]

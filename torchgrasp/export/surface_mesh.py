@@ -17,6 +17,13 @@ def save_surface(surface: Surface, path: Path | str) -> Path:
     Raises:
         BadArgument: another suffix.
         OutputError: the file cannot be written.
+
+    >>> import tempfile
+    >>> from torchgrasp import fit_shape, load_object
+    >>> from torchgrasp.shape import extract_surface
+    >>> surface = extract_surface(fit_shape(load_object("jug").view), 24)
+    >>> save_surface(surface, Path(tempfile.mkdtemp(), "jug.ply")).stat().st_size > 10_000
+    True
     """
     import matplotlib
     import trimesh
@@ -41,7 +48,14 @@ def save_surface(surface: Surface, path: Path | str) -> Path:
 
 @checked
 def largest_std(surface: Surface) -> float:
-    """Return the upper end [m] of the colour scale: the 99 % quantile over the vertices, at least 1 um."""
+    """Return the upper end [m] of the colour scale: the 99 % quantile over the vertices, at least 1 um.
+
+    >>> from torchgrasp import fit_shape, load_object
+    >>> from torchgrasp.shape import extract_surface
+    >>> surface = extract_surface(fit_shape(load_object("jug").view), 24)
+    >>> 0.001 < largest_std(surface) < 0.05
+    True
+    """
     return max(float(surface.std_m.double().quantile(0.99)), 1e-6)
 
 

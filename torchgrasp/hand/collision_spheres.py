@@ -31,7 +31,13 @@ INSET = 0.001
 
 @dataclasses.dataclass(frozen=True)
 class CollisionSpheres(Value):
-    """Spheres [m] fixed to links. `finger`: index in grasp order, -1 palm, -2 parked; `touching`: fingertips."""
+    """Spheres [m] fixed to links. `finger`: index in grasp order, -1 palm, -2 parked; `touching`: fingertips.
+
+    >>> from torchgrasp import load_hand
+    >>> spheres = load_hand("barrett").collision_spheres
+    >>> len(spheres.radius), float(spheres.radius.max()) < 0.05, int(spheres.touching.sum())
+    (117, True, 3)
+    """
 
     link_index: Int[Tensor, " s"]
     center: Float[Tensor, "s 3"]

@@ -47,6 +47,9 @@ class Draft(NamedTuple):
     """A first hand.toml, the clean URDF that it speaks of, and sentences on what was mended.
 
     `urdf` is empty where the URDF is clean as it is.
+
+    >>> Draft('name = "mine"', urdf="", mended=()).toml
+    'name = "mine"'
     """
 
     toml: str
@@ -55,7 +58,11 @@ class Draft(NamedTuple):
 
 
 class Wish(NamedTuple):
-    """What a user may say of a hand: the links of its tips, its name, the root below an arm, the folder of meshes."""
+    """What a user may say of a hand: the links of its tips, its name, the root below an arm, the folder of meshes.
+
+    >>> Wish(tips=("thumb_tip", "index_tip", "ring_tip"), name="mine").root
+    ''
+    """
 
     tips: tuple[str, ...] = ()
     name: str = ""
@@ -96,6 +103,11 @@ def new_hand(path: Path | str, wish: Wish = Wish(), seed: Seed = 0, file: str = 
     Raises:
         HandFileError: the URDF or a mesh of it is missing, malformed or hostile, or nothing can mend it.
         BadArgument: fewer than three tips, more than five, or one without a collision shape or a joint that moves it.
+
+    >>> from torchgrasp import load_hand
+    >>> draft = new_hand(load_hand("barrett").urdf_path, Wish(name="mine"))
+    >>> 'name = "mine"' in draft.toml, draft.mended
+    (True, ())
     """
     published = read_published(path)
     urdf, told = keep_below(published, wish.root or published.root)

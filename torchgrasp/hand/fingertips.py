@@ -23,6 +23,14 @@ class Fingertips(Value):
 
     `index` locates the links in the whole tree. Each tip is fixed to a carrier, the last link that a joint moves.
     `chains` is the tree that leads to the carriers, `carrier` their index in it.
+
+    >>> from torchgrasp import load_hand
+    >>> hand = load_hand("allegro")
+    >>> hand.tips.names, hand.tips.radius
+    (('index', 'middle', 'thumb'), tensor([0.0120, 0.0120, 0.0120], dtype=torch.float64))
+    >>> _, carriers = hand.tips.frames(hand.expand_joints(hand.lower[None]).T)
+    >>> carriers.shape  # rows, columns, fingers, postures
+    torch.Size([3, 4, 3, 1])
     """
 
     names: tuple[str, ...]

@@ -25,7 +25,12 @@ if TYPE_CHECKING:
 
 
 class Actuator(NamedTuple):
-    """Drive of one joint: effort [N m], velocity [rad/s], stiffness [N m/rad], damping [N m s/rad]."""
+    """Drive of one joint: effort [N m], velocity [rad/s], stiffness [N m/rad], damping [N m s/rad].
+
+    >>> from torchgrasp import load_hand
+    >>> load_hand("barrett").actuators["f1_flex"]
+    Actuator(effort=4.7, velocity=2.0, kp=10.0, kd=0.3)
+    """
 
     effort: float
     velocity: float
@@ -34,7 +39,13 @@ class Actuator(NamedTuple):
 
 
 class HandSource(NamedTuple):
-    """Origin of a hand: finger option or names of its fingers, URDF, SHA-256 of both files, all options."""
+    """Origin of a hand: finger option or names of its fingers, URDF, SHA-256 of both files, all options.
+
+    >>> from torchgrasp import load_hand
+    >>> source = load_hand("allegro").source
+    >>> source.option, source.options, source.urdf_path.name
+    ('default', ('default', 'four', 'paper_literal'), 'hand.urdf')
+    """
 
     option: str
     urdf_path: Path
@@ -50,6 +61,18 @@ class Hand(Value):
 
     `joints` (.., h) are the actuated joints of the grasping fingers, in the order of `joint_names`. Every method raises
     `BadArgument` for joints of a wrong count or dtype, and for NaN or infinity. `approach` points out of the palm.
+
+    >>> from torchgrasp import load_hand
+    >>> hand = load_hand("barrett")
+    >>> hand.joint_names, hand.dof
+    (('spread', 'f1_flex', 'f2_flex', 'f3_flex'), 4)
+    >>> q = (hand.lower + hand.upper) / 2
+    >>> hand.tip_centres(q).shape, hand.link_poses(q).shape, hand.sphere_centres(q).shape
+    (torch.Size([3, 3]), torch.Size([12, 4, 4]), torch.Size([117, 3]))
+    >>> hand.jacobian(q).shape  # of the pads' contact points
+    torch.Size([3, 3, 4])
+    >>> bool(hand.self_clearance(q) > 0), hand.expand_joints(q).shape
+    (True, torch.Size([8]))
     """
 
     name: str
@@ -116,14 +139,29 @@ class Hand(Value):
         return self.actuated.upper
 
     def require_three(self, argument: str, what: str) -> None:
-        """Refuse another number of fingertips than the three of the paper; raise `BadArgument` for an argument."""
+        """Refuse another number of fingertips than the three of the paper; raise `BadArgument` for an argument.
+
+        >>> from torchgrasp import load_hand
+        >>> load_hand("allegro", fingers=4).require_three("hand", "the mixture")
+        Traceback (most recent call last):
+            ...
+        torchgrasp.errors.BadArgument: hand: found the mixture for 4 fingertips, allowed is that for three ...
+        """
         if len(self.tips) != 3:
             found = f"{what} for {len(self.tips)} fingertips"
             raise BadArgument(argument, found, "that for three fingertips alone, as in the paper")
 
     @checked(gradients=True)
     def check_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b h"]:
-        """Return `joints` if they are within the limits; raise `BadArgument` with the first other joint."""
+        """Return `joints` if they are within the limits; raise `BadArgument` with the first other joint.
+
+        >>> from torchgrasp import load_hand
+        >>> hand = load_hand("barrett")
+        >>> hand.check_joints(hand.upper + 1)
+        Traceback (most recent call last):
+            ...
+        torchgrasp.errors.BadArgument: joints: found 4.14159 for spread, allowed is [0, 3.14159]
+        """
         self.actuated.check_limits(joints)
         return joints
 

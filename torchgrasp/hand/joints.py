@@ -22,7 +22,16 @@ ROUNDING = 1e-6
 
 @dataclasses.dataclass(frozen=True)
 class ActuatedJoints(Value):
-    """Joints that move the grasping fingers [rad or m]; the URDF's joints are `coupling @ joints + offset`."""
+    """Joints that move the grasping fingers [rad or m]; the URDF's joints are `coupling @ joints + offset`.
+
+    >>> from torchgrasp import load_hand
+    >>> actuated = load_hand("barrett").actuated
+    >>> joints = actuated.lower.expand(5, -1)
+    >>> actuated.check(joints)
+    >>> actuated.check_limits(joints)
+    >>> actuated.expand(joints).shape, torch.equal(actuated.couple(joints), actuated.expand(joints))
+    (torch.Size([5, 8]), True)
+    """
 
     names: tuple[str, ...]
     lower: Float[Tensor, " h"]

@@ -29,6 +29,16 @@ class KinematicTree(Value):
     The links of `tables` are sorted by level; `level_sizes` counts them. `joint` moves each, 0 if it is fixed. `parent`
     indexes the level above; in a `straight` level it counts 0, 1, 2 up to that level's size. `places` is where those
     of `link_names` are.
+
+    >>> from torchgrasp import load_hand
+    >>> hand = load_hand("barrett")
+    >>> every = hand.expand_joints(hand.lower[None])
+    >>> poses = hand.tree.poses(every)
+    >>> torch.equal(poses[0, :, :3].permute(1, 2, 0), hand.tree.frames(every.T)[..., 0])
+    True
+    >>> axes, origins = hand.tree.joint_axes(poses)
+    >>> axes.shape
+    torch.Size([1, 8, 3])
     """
 
     link_names: tuple[str, ...]

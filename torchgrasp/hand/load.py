@@ -19,7 +19,11 @@ from torchgrasp.values import Grasps
 
 
 def hands_folder() -> Path:
-    """Return the folder of the shipped hands: in the package, or beside it in a checkout."""
+    """Return the folder of the shipped hands: in the package, or beside it in a checkout.
+
+    >>> (hands_folder() / "allegro" / "hand.toml").is_file()
+    True
+    """
     package = Path(__file__).resolve().parents[1]
     installed = package / "assets" / "hands"
     return installed if installed.is_dir() else package.parent / "hands"
@@ -31,6 +35,9 @@ def find_hand(name_or_path: str | Path) -> Path:
 
     Raises:
         HandFileError: no such hand, or a shipped name that is a folder here, too.
+
+    >>> find_hand("allegro").name
+    'allegro'
     """
     shipped = hands_folder()
     names = sorted(p.parent.name for p in shipped.glob("*/hand.toml"))
@@ -85,7 +92,11 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
 
 @checked
 def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
-    """Return the same hand, where it is, grasping with other fingers; see `load_hand`."""
+    """Return the same hand, where it is, grasping with other fingers; see `load_hand`.
+
+    >>> with_fingers(load_hand("allegro"), 4).finger_names
+    ('index', 'middle', 'ring', 'thumb')
+    """
     other = load_hand(hand.urdf_path.parent, fingers)
     return hand if other.finger_names == hand.finger_names else other.to(hand.lower)
 

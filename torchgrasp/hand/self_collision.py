@@ -37,6 +37,13 @@ class SelfCollision(Value):
     """Boxes (`radius` 0) and spheres (`half` sizes 0) fixed to links, in link frames [m], and the pairs to test.
 
     `pairs` lists box and box, sphere and box, sphere and sphere. `kinds` counts each.
+
+    >>> from torchgrasp import load_hand
+    >>> hand = load_hand("barrett")
+    >>> links, frames = hand.self_collision, hand.tree.frames(hand.expand_joints(hand.lower[None]).T)
+    >>> pairs, pushed = links.separations(frames, torch.inf), links.pushes(frames, below=0.01)[0]
+    >>> torch.allclose(links.clearance(frames), pairs.amin(0)), len(links.link_pairs()) <= len(pushed)
+    (True, True)
     """
 
     link: Int[Tensor, " s"]

@@ -87,6 +87,13 @@ class Urdf:
     """A checked URDF: one tree of links, finite numbers throughout.
 
     `data` are the bytes of the file, `xml` those of its links and joints alone.
+
+    >>> from torchgrasp.hand import hands_folder
+    >>> urdf = read_urdf(hands_folder() / "barrett" / "hand.urdf")
+    >>> [joint.name for joint in urdf.movers("f1_tip")], len(urdf.joints_above("f1_tip"))
+    (['f1_distal', 'f1_flex', 'spread'], 4)
+    >>> type(urdf.wrong("a knot", "a tree")).__name__
+    'HandFileError'
     """
 
     path: Path
@@ -124,6 +131,11 @@ def read_urdf(path: Path | str) -> Urdf:
     """Read and check a URDF file of at most 4 MiB; raises `HandFileError`.
 
     It has to be a clean one: no meshes as collision shapes, no joint without limits, none that follows a follower.
+
+    >>> from torchgrasp.hand import hands_folder
+    >>> urdf = read_urdf(hands_folder() / "barrett" / "hand.urdf")
+    >>> urdf.root, urdf.links[0].mass, urdf.links[0].shapes[0].kind, urdf.movable[1].mimic.ratio
+    ('palm', 0.6086, 'cylinder', 1.0)
     """
     urdf = read_published(path)
     for link in urdf.links:

@@ -33,6 +33,17 @@ class GraspProblem(Value):
 
     Raises:
         BadArgument: contacts without `std_m`, by which the pre-grasp opens.
+
+    >>> from torchgrasp import PostureLibrary, load_hand
+    >>> from torchgrasp.ik import nearest_postures
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
+    >>> middle = grasp.contacts.points[0].mean(0)
+    >>> high = lambda poses: poses[:, 2, 3] > 0.1  # or ask your arm: which palms does it bring there?
+    >>> problem = GraspProblem(hand, grasp.contacts, grasp.certificate, CollisionWorld(), middle, high)
+    >>> seeds = nearest_postures(PostureLibrary.of(hand, 200), grasp.contacts, problem.world)
+    >>> bool((problem.drop_unreachable(seeds).obj_from_hand[:, 2, 3] > 0.1).all())
+    True
     """
 
     hand: Hand
@@ -71,7 +82,14 @@ def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspCandidates(Batch):
-    """Configurations with finger i on contact i, a row's `permutation[:, i]`; `status` is that of the contacts."""
+    """Configurations with finger i on contact i, a row's `permutation[:, i]`; `status` is that of the contacts.
+
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> grasp = load_shipped_grasp("jug", "barrett")
+    >>> placed = Configuration(grasp.joints, grasp.obj_from_hand)
+    >>> len(GraspCandidates(placed, grasp.contacts, grasp.certificate, grasp.permutation, grasp.status))
+    1
+    """
 
     configuration: Configuration
     contacts: Contacts
@@ -84,7 +102,18 @@ class GraspCandidates(Batch):
 def check_candidates(
     problem: GraspProblem, candidates: GraspCandidates, rolling: bool = True, tolerance: Length = TIP_TOLERANCE
 ) -> Grasps:
-    """Return checked grasps (`measure_errors`); those right so far get pre-grasp and approach."""
+    """Return checked grasps (`measure_errors`); those right so far get pre-grasp and approach.
+
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
+    >>> middle = grasp.contacts.points[0].mean(0)
+    >>> problem = GraspProblem(hand, grasp.contacts, grasp.certificate, CollisionWorld(), middle)
+    >>> placed, order = Configuration(grasp.joints, grasp.obj_from_hand), torch.tensor([[0, 1, 2]])
+    >>> tried = GraspCandidates(placed, grasp.contacts, grasp.certificate, order, grasp.status)
+    >>> check_candidates(problem, tried).status
+    tensor([0])
+    """
     hand, world = problem.hand, problem.world
     configuration, contacts, certificate = candidates.configuration, candidates.contacts, candidates.certificate
     unproven = (candidates.status == Status.OK) & ~certificate.closed

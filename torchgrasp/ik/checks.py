@@ -29,7 +29,16 @@ ANGLE_TOLERANCE = math.radians(2)
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspErrors(Batch):
-    """Errors of grasps; `Grasps` explains the fields."""
+    """Errors of grasps; `Grasps` explains the fields.
+
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> grasp = load_shipped_grasp("jug", "barrett")
+    >>> placed = Configuration(grasp.joints, grasp.obj_from_hand)
+    >>> found = measure_errors(load_hand("barrett"), placed, grasp.contacts, CollisionWorld(table=0.0))
+    >>> Status(int(found.status)).name, found.tip_error < 0.001, found.clearance > 0
+    ('OK', tensor([[True, True, True]]), tensor([True]))
+    """
 
     tip_error: Annotated[Float[Tensor, "g f"], ANY]
     normal_angle: Annotated[Float[Tensor, "g f"], ANY]
@@ -50,6 +59,13 @@ def measure_errors(
 
     Round fingertips may roll on their contacts within the pads' cones. If not `rolling`, the pads' contact points
     count, in any direction, as in the paper. `tolerance` [m] is that of tips.
+
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> grasp, high = load_shipped_grasp("jug", "barrett"), CollisionWorld(table=0.1)
+    >>> placed = Configuration(grasp.joints, grasp.obj_from_hand)
+    >>> Status(int(measure_errors(load_hand("barrett"), placed, grasp.contacts, high).status)).name
+    'TABLE_COLLISION'
     """
     spatial = SpatialJacobian.at(hand, configuration)
     touching, target = (

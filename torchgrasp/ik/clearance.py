@@ -33,6 +33,9 @@ class CollisionWorld(Value):
 
     Raises:
         BadArgument: a table that is neither.
+
+    >>> CollisionWorld(table=0.02).plane.offset
+    0.02
     """
 
     field: SignedDistanceField | None = None

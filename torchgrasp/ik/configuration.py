@@ -23,7 +23,16 @@ from torchgrasp.optim import Residuals
 @checked
 @dataclasses.dataclass(frozen=True)
 class Configuration(Batch):
-    """Joints [rad] and pose of a free hand."""
+    """Joints [rad] and pose of a free hand.
+
+    >>> from torchgrasp import load_hand
+    >>> hand = load_hand("barrett")
+    >>> start = Configuration(hand.lower[None], torch.eye(4).double()[None])
+    >>> step = torch.zeros(1, 10).double()
+    >>> step[:, 2] = 0.01  # 10 mm along the palm's axis
+    >>> start.integrate(hand, step).obj_from_hand[0, :3, 3]
+    tensor([0.0000, 0.0000, 0.0100], dtype=torch.float64)
+    """
 
     joints: Float[Tensor, "g h"]
     obj_from_hand: Float[Tensor, "g 4 4"]

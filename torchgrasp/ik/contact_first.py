@@ -46,7 +46,18 @@ def refine_on_contacts(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
 
 @checked
 def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
-    """Return a checked grasp on fixed contacts for each triple that has seeds, best first."""
+    """Return a checked grasp on fixed contacts for each triple that has seeds, best first.
+
+    >>> from torchgrasp import PostureLibrary, load_hand
+    >>> from torchgrasp.ik import CollisionWorld, nearest_postures
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
+    >>> middle = grasp.contacts.points[0].mean(0)
+    >>> problem = GraspProblem(hand, grasp.contacts, grasp.certificate, CollisionWorld(), middle)
+    >>> seeds = nearest_postures(PostureLibrary.of(hand, 1000), grasp.contacts, problem.world)
+    >>> bool(solve_contact_first(problem, seeds).tip_error.max() < 0.002)  # [m]
+    True
+    """
     seeds = problem.drop_unreachable(seeds)
     attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
     attempts.refine(seeds, rank_seeds(problem, seeds), SEEDS_PER_ROUND, partial(refine_on_contacts, problem))

@@ -198,6 +198,16 @@ def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: Conta
     """Return a checked grasp for each triple that has seeds, best first; contacts slide where they must.
 
     Seeds are tried in their order. Slid contacts are certified anew; their failures have a planning `Status`.
+
+    >>> from torchgrasp import PostureLibrary, fit_shape, load_hand, load_object
+    >>> from torchgrasp.ik import CollisionWorld, nearest_postures
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
+    >>> middle = grasp.contacts.points[0].mean(0)
+    >>> problem = GraspProblem(hand, grasp.contacts, grasp.certificate, CollisionWorld(), middle)
+    >>> seeds = nearest_postures(PostureLibrary.of(hand, 1000), grasp.contacts, problem.world)
+    >>> solve_joint(problem, seeds, fit_shape(load_object("jug").view), ContactSpec()).status
+    tensor([0])
     """
     seeds = problem.drop_unreachable(seeds)
     attempts = solve_fixed(problem, seeds)

@@ -111,6 +111,13 @@ def collision_probability(
 
     Hidden voxels are full together or free together: the same unseen extent of a thing decides. So the likeliest
     voxel that a hand sweeps counts, not their number. `up` is the direction of the lift; None: z.
+
+    >>> from torchgrasp import load_hand, load_scene
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.scene import estimate_occupancy
+    >>> obstacles = Obstacles.of(estimate_occupancy(load_scene(), 1))
+    >>> collision_probability(load_hand("barrett"), load_shipped_grasp("jug", "barrett"), obstacles)
+    tensor([0.9000], dtype=torch.float64)
     """
     up = torch.tensor([0.0, 0.0, 1.0]) if up is None else up
     configuration = Configuration(grasps.joints, grasps.obj_from_hand)
@@ -126,7 +133,15 @@ def collision_probability(
 
 @checked
 def lift_clearance(vertices: Float[Tensor, "v 3"], obstacles: Obstacles, up: Float[Tensor, "3"] | None = None) -> float:
-    """Return the least clearance [m] of a lifted surface from obstacles: far below zero if something lies on it."""
+    """Return the least clearance [m] of a lifted surface from obstacles: far below zero if something lies on it.
+
+    >>> from torchgrasp import load_scene
+    >>> from torchgrasp.scene import estimate_occupancy
+    >>> scene = load_scene()
+    >>> obstacles = Obstacles.of(estimate_occupancy(scene, 1))
+    >>> lift_clearance(scene.cloud(1).points, obstacles) > 0  # nothing lies on it
+    True
+    """
     up = torch.tensor([0.0, 0.0, 1.0]) if up is None else up
     return float(obstacles.field.query(_lifted(vertices, up))[0].min())
 

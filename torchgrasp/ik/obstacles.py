@@ -28,6 +28,14 @@ class Obstacles(Value):
         distances: from the regions of at least the probability of each of `levels`, not signed, on the same grid.
         levels: ascending.
         hard: whether links may not touch what counts as full; else that only costs success.
+
+    >>> from torchgrasp import load_scene
+    >>> from torchgrasp.scene import estimate_occupancy
+    >>> scene = load_scene()
+    >>> obstacles = Obstacles.of(estimate_occupancy(scene, 1))
+    >>> neighbour = scene.cloud(2).points.double().mean(0)
+    >>> obstacles.likelihood(neighbour[None], torch.tensor([0.03]))
+    tensor(0.9000, dtype=torch.float64)
     """
 
     field: SignedDistanceField

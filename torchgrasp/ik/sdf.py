@@ -31,7 +31,15 @@ LEAF = 32
 @checked
 @dataclasses.dataclass(frozen=True)
 class SignedDistanceField(Value):
-    """Signed distances [m] on a grid, negative inside; node i is at origin + i * spacing."""
+    """Signed distances [m] on a grid, negative inside; node i is at origin + i * spacing.
+
+    >>> nodes = torch.cartesian_prod(*[torch.linspace(-0.1, 0.1, 41)] * 3)
+    >>> ball = nodes.norm(dim=1).reshape(41, 41, 41) - 0.05
+    >>> field = SignedDistanceField(torch.full((3,), -0.1), 0.005, ball)
+    >>> distance, gradient = field.query(torch.tensor([0.0, 0.0, 0.08]))
+    >>> f"{distance:.3f}", gradient.round(), f"{field.nearest_node(torch.tensor([0.0, 0.0, 0.02])):.3f}"
+    ('0.030', tensor([0., 0., 1.]), '-0.030')
+    """
 
     origin: Float[Tensor, "3"]
     spacing: float
@@ -87,6 +95,12 @@ def field_from_surface(
 
     Raises:
         BadArgument: wrong shapes, faces that name no vertex or have no area, or a grid of more than 2e7 nodes.
+
+    >>> from torchgrasp import load_object
+    >>> mesh = load_object("cylinder").mesh
+    >>> field = field_from_surface(torch.tensor(mesh.vertices), torch.tensor(mesh.faces), spacing=0.01)
+    >>> field.query(torch.tensor(mesh.center_mass))[0] < -0.02  # [m]: inside
+    tensor(True)
     """
     check_tensor("vertices", vertices, (None, 3))
     if not 1e-4 <= spacing <= 0.1 or not 0 <= margin <= 1:

@@ -44,6 +44,12 @@ class IKSolution(Batch):
     """A configuration for each row of contacts; finger i touches contact `permutation[:, i]`.
 
     `clearance` [m] is the links' least; `attempts` counts the refined seeds. A row without seeds holds NaN.
+
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> found = solve_ik(load_hand("barrett"), load_shipped_grasp("jug", "barrett").contacts)
+    >>> found.joints.shape, Status(int(found.status)).name
+    (torch.Size([1, 4]), 'OK')
     """
 
     joints: Annotated[Float[Tensor, "b h"], ANY]

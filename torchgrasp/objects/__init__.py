@@ -11,12 +11,12 @@ from torchgrasp.cloud.io.read import read_cloud
 from torchgrasp.errors import BadArgument
 from torchgrasp.scene.file import read_scene
 from torchgrasp.scene.scene import Scene
-from torchgrasp.values import PointCloud
+from torchgrasp.values import Grasps, PointCloud, load_grasps
 
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["GraspObject", "list_objects", "load_object", "load_scene"]
+__all__ = ["GraspObject", "list_objects", "load_object", "load_scene", "load_shipped_grasp"]
 
 DATA = Path(__file__).parent / "data"
 """Folder of the objects: `<name>/mesh.ply`, `<name>/parts.npz` and `<name>/view.ply`."""
@@ -27,6 +27,9 @@ SCENE = DATA / "scene.npz"
 MASSES = {"cylinder": 0.15, "jug": 0.20, "rabbit": 0.10, "spray": 0.15}
 """Masses [kg]: a tin, a plastic jug, a plush rabbit, a bottle a third full."""
 
+GRASPED = {(name, hand) for name in ("cylinder", "jug") for hand in ("allegro", "barrett")}
+"""Objects and hands of which a grasp is shipped."""
+
 
 @checked
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +38,10 @@ class GraspObject:
 
     `mesh` is the true, closed surface. The union of the convex `parts` replaces it in simulation. `view` is a noisy
     cloud from one side, with its viewpoint.
+
+    >>> jug = load_object("jug")
+    >>> jug.mass, [f"{1000 * side:.0f} mm" for side in jug.mesh.extents], len(jug.parts)
+    (0.2, ['120 mm', '78 mm', '153 mm'], 43)
     """
 
     name: str
@@ -73,6 +80,27 @@ def load_object(name: str) -> GraspObject:
         corners = np.split(file["corners"].astype(np.float64), np.cumsum(file["counts"])[:-1])
     parts = [trimesh.convex.convex_hull(c) for c in corners]
     return GraspObject(name, mesh, parts, read_cloud(DATA / name / "view.ply"), MASSES[name])
+
+
+@checked
+def load_shipped_grasp(name: str, hand: str) -> Grasps:
+    """Return one grasp that the library planned for its own object: something to close, draw and export at once.
+
+    Args:
+        name: "cylinder" or "jug".
+        hand: "allegro" or "barrett".
+
+    Raises:
+        BadArgument: no grasp of this object by this hand is shipped.
+
+    >>> grasp = load_shipped_grasp("jug", "barrett")
+    >>> grasp.joints.shape, grasp.certificate.closed
+    (torch.Size([1, 4]), tensor([True]))
+    """
+    if (name, hand) not in GRASPED:
+        allowed = " or ".join(f"{' by '.join(known)}" for known in sorted(GRASPED))
+        raise BadArgument("name and hand", f"{name} by {hand}", allowed)
+    return load_grasps(DATA / name / f"{hand}.safetensors")
 
 
 def load_scene() -> Scene:

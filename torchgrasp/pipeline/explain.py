@@ -33,6 +33,10 @@ class Trial(Value):
     """What one change gave: the executable grasps, and the `expected_success` of the best ones.
 
     `choice` tells whether a user can choose the change; else it is a fact of the world.
+
+    >>> funnel = Funnel(())
+    >>> print(Trial("with friction 0.8", choice=False, executable=2, expected=1.7, funnel=funnel))
+    with friction 0.8: 2 executable grasps
     """
 
     words: str
@@ -51,6 +55,13 @@ class Explanation(Value):
     """Where the grasps were lost, and what single changes gave, the most helpful first; `starts` were tried of each.
 
     `str` is the whole answer: a line for each stage, and the best change in a sentence.
+
+    >>> from torchgrasp.pipeline import Losses
+    >>> funnel = Funnel((Losses("grasps", "postures", 40, {Status.TABLE_COLLISION: 40}),))
+    >>> lower = Trial("if the table were 20 mm lower", choice=True, executable=9, expected=7.5, funnel=funnel)
+    >>> print(Explanation(50, funnel, (lower,)))
+    grasps: 0 of 40 postures (40 table_collision)
+    What would help most (1 change tried): if the table were 20 mm lower: 9 executable grasps, from 50 starts.
     """
 
     starts: int

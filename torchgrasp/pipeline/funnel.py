@@ -11,7 +11,12 @@ from torchgrasp.values import Certificate, ContactPlan, Grasps, IKSeeds
 
 @dataclasses.dataclass(frozen=True)
 class Losses(Value):
-    """How many `things` a stage was given, and how many it lost for each reason, the most frequent first."""
+    """How many `things` a stage was given, and how many it lost for each reason, the most frequent first.
+
+    >>> lost = Losses("contacts", "starts", 50, {Status.NOT_CLOSED: 10})
+    >>> lost.kept, str(lost)
+    (40, 'contacts: 40 of 50 starts (10 not_closed)')
+    """
 
     stage: str
     things: str
@@ -39,6 +44,10 @@ class Funnel(Value):
 
     "contacts" are planned from starts. Those without a posture near them are out of reach; of the others the likeliest
     are tried. "grasps" are the executable ones; each of the others counts by what its best posture lacks.
+
+    >>> found = Funnel((Losses("contacts", "starts", 50, {Status.NOT_CLOSED: 10}),))
+    >>> found.share(frozenset({Status.NOT_CLOSED}))
+    0.2
     """
 
     stages: tuple[Losses, ...]

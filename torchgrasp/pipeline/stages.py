@@ -60,7 +60,14 @@ BURIED_DEPTH = 0.003
 
 @checked
 def spread_rows(plan: ContactPlan, most: Count) -> Int[Tensor, "k"]:
-    """Return at most `most` successful rows, far apart, in plan order."""
+    """Return at most `most` successful rows, far apart, in plan order.
+
+    >>> from torchgrasp import fit_shape, load_object, plan_contacts
+    >>> plan = plan_contacts(fit_shape(load_object("jug").view), starts=20)
+    >>> rows = spread_rows(plan, 3)
+    >>> len(rows), bool((plan.status[rows] == Status.OK).all())
+    (3, True)
+    """
     rows = torch.nonzero(plan.status == Status.OK)[:, 0]
     if len(rows) <= most:
         return rows

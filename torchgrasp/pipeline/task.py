@@ -36,7 +36,12 @@ TARGET_POINTS = 1000
 
 
 class PlanOptions(TypedDict, total=False):
-    """The further arguments of `plan_grasps`, which explains them."""
+    """The further arguments of `plan_grasps`, which explains them.
+
+    >>> options: PlanOptions = {"fingers": 4, "ranking": "success"}  # plan_grasps(cloud, hand, **options)
+    >>> sorted(options)
+    ['fingers', 'ranking']
+    """
 
     fingers: Fingers | None
     mode: Mode
@@ -168,6 +173,10 @@ def take_target(scene: Scene, seed: Seed) -> PointCloud:
     Raises:
         BadArgument: no target, or a label that no thing has.
         TooFewPoints: fewer than 4 points.
+
+    >>> from torchgrasp import load_scene
+    >>> len(take_target(load_scene().select(2), seed=0)) <= TARGET_POINTS
+    True
     """
     if scene.target not in scene.things:
         raise BadArgument("target", scene.target, f"one of the labels {list(scene.things)}: scene.select(label)")

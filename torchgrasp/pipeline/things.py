@@ -36,6 +36,11 @@ class ThingPlan(Value):
     """The executable grasps of one thing, best first, or the reason why there are none.
 
     `success` is the predicted one of the best grasp, 0 without. `shape` is the estimated one, if it was planned on.
+
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> grasp = load_shipped_grasp("jug", "allegro")
+    >>> ThingPlan(2, float(grasp.success[0]), grasp).success > 0.9
+    True
     """
 
     label: int
@@ -48,7 +53,12 @@ class ThingPlan(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ScenePlan(Value):
-    """The things of a scene, the likeliest success first; then those without a grasp, and those not tried."""
+    """The things of a scene, the likeliest success first; then those without a grasp, and those not tried.
+
+    >>> empty = ThingPlan(1, success=0.0, reason="too flat")
+    >>> ScenePlan((empty,)).best is None
+    True
+    """
 
     things: tuple[ThingPlan, ...]
 
@@ -86,6 +96,11 @@ def plan_scene(
 
     Raises:
         BadArgument: a scene without things, or an argument of the wrong type or range.
+
+    >>> from torchgrasp import load_hand, load_scene
+    >>> plan = plan_scene(load_scene(), load_hand("barrett"), starts=30, enough=0.5)
+    >>> plan.best.success > 0.5, plan.things[-1].reason
+    (True, 'not tried: another thing is easy enough')
     """
     if not scene.things:
         raise BadArgument("scene", "no thing on the table", "a scene with at least one thing")

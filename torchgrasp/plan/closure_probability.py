@@ -28,7 +28,11 @@ GPU_DRAWS = 2**18
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosureProbability(Batch):
-    """The `probability` that the contacts of each row are closed, with its `standard_error`."""
+    """The `probability` that the contacts of each row are closed, with its `standard_error`.
+
+    >>> ClosureProbability(torch.tensor([0.97]), torch.tensor([0.01])).probability
+    tensor([0.9700])
+    """
 
     probability: Float[Tensor, "b"]
     standard_error: Float[Tensor, "b"]

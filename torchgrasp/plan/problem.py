@@ -34,7 +34,17 @@ LEAST_SIDE = 0.05
 
 @runtime_checkable
 class Shape(Protocol):
-    """A `ShapeGP`, or another implicit surface with an uncertainty."""
+    """A `ShapeGP`, or another implicit surface with an uncertainty.
+
+    >>> from torchgrasp import fit_shape, load_object
+    >>> shape = fit_shape(load_object("jug").view)
+    >>> isinstance(shape, Shape)
+    True
+    >>> x = shape.normalise(shape.cloud.points[:2])
+    >>> distance, gradient = shape.mean_and_gradient(x)
+    >>> torch.allclose(shape.jet(x).distance, distance), torch.allclose(shape.metres(x), shape.cloud.points[:2])
+    (True, True)
+    """
 
     @property
     def scale(self) -> float: ...  # noqa: D102

@@ -33,7 +33,17 @@ META_KEYS = ("hand", "fingers", "hand_sha256", "hand_codes", "seed", "sampling")
 
 @dataclasses.dataclass(frozen=True)
 class SampleFolder:
-    """A complete folder of `n` samples; chunks are read on demand. `meta` is that of `HandSamples`."""
+    """A complete folder of `n` samples; chunks are read on demand. `meta` is that of `HandSamples`.
+
+    >>> import tempfile
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.posture_model import SampleSpec
+    >>> folder = write_samples(load_hand("barrett"), SampleSpec(100), tempfile.mkdtemp())
+    >>> len(folder), folder.holds(0), folder.path(0).name
+    (100, True, 'chunk-000000.safetensors')
+    >>> folder.read(10).joints.shape, len(folder.chunk(0))
+    (torch.Size([10, 4]), 100)
+    """
 
     folder: Path
     n: int
@@ -95,6 +105,14 @@ def write_samples(
     Raises:
         BadArgument: workers outside [1, 1024], or a hand whose postures are hardly ever kept.
         OutputError: the folder holds other samples, another run is writing it, or the disk is full.
+
+    >>> import tempfile
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.posture_model import SampleSpec
+    >>> told = []
+    >>> _ = write_samples(load_hand("barrett"), SampleSpec(100), tempfile.mkdtemp(), observer=told.append)
+    >>> told
+    [0, 100]
     """
     counts, meta = chunk_sizes(spec.n), spec.meta(hand)
     samples = SampleFolder(Path(folder), spec.n, hand.joint_names, meta)

@@ -30,7 +30,11 @@ MAX_RESEEDS = 3
 
 @dataclasses.dataclass(frozen=True)
 class Components(Value):
-    """Weights, means and covariances of m Gaussians in d dimensions (Eqs. 19-20)."""
+    """Weights, means and covariances of m Gaussians in d dimensions (Eqs. 19-20).
+
+    >>> Components(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None]).means.shape
+    torch.Size([1, 2])
+    """
 
     weights: Float[Tensor, "m"]
     means: Float[Tensor, "m d"]
@@ -43,6 +47,10 @@ class Progress(Value):
 
     `reseeded` counts how often each component was placed anew, a jump after which the likelihood may fall.
     `log_likelihood` [nats] is the data's mean before each step.
+
+    >>> start = Components(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None])
+    >>> Progress(start, torch.zeros(1, dtype=torch.int64), torch.zeros(0)).jumped
+    False
     """
 
     components: Components

@@ -31,6 +31,13 @@ class GaussianMixture(Value):
     >>> mixture = GaussianMixture(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None], ("a", "b"))
     >>> mixture.condition({"b": 3.0}).means
     tensor([[0.]], dtype=torch.float64)
+    >>> model = GaussianMixture(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None], ("a", "b"))
+    >>> model.log_prob(torch.zeros(2)), model.log_joint(torch.zeros(1, 2)).shape
+    (tensor(-1.8379), torch.Size([1, 1]))
+    >>> model.mean(), model.covariance().diag()
+    (tensor([0., 0.], dtype=torch.float64), tensor([1., 1.], dtype=torch.float64))
+    >>> model.marginal(["b"]).names, model.sample(5).shape
+    (('b',), torch.Size([5, 2]))
     """
 
     weights: Float[Tensor, "m"]
@@ -65,7 +72,7 @@ class GaussianMixture(Value):
 
     def log_joint(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
         """Return log(pi_i) + log N(x | mu_i, Sigma_i) for every row and component."""
-        return self.weights.double().log() + (self.whitening.log_scale - 0.5 * self.whitening.squared(x))
+        return self.weights.double().log() + (self.whitening.log_scale - 0.5 * self.whitening.squared(x.double()))
 
     @checked
     def sample(self, n: Annotated[int, Range(0, 10**8)], seed: Seed = 0) -> Float[Tensor, "n d"]:

@@ -31,6 +31,15 @@ class GraspMixture(GaussianMixture):
 
     The dimensions are the joints [rad], in the order of the hand, then the code: L1 L2 L3 [m] N1 N2 N3. The fit added
     `regularisation` to every variance, relative to the samples' variance. `meta` describes hand, samples and fit.
+
+    >>> from torchgrasp import encode
+    >>> from torchgrasp.hand.load import load_hand
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> model, code = load_mixture("barrett"), encode(load_shipped_grasp("jug", "barrett").contacts)
+    >>> model.energy(code).shape, model.joints(code).shape  # of the six assignments of contacts to fingers
+    (torch.Size([1, 6]), torch.Size([1, 6, 4]))
+    >>> model.modes(code.q[0], k=2)[0].shape  # of each the two likeliest postures
+    torch.Size([6, 2, 4])
     """
 
     regularisation: float = 0.0
@@ -110,7 +119,13 @@ class GraspMixture(GaussianMixture):
 
     @checked
     def save(self, path: Path | str) -> Path:
-        """Write the mixture atomically as safetensors for `load_mixture`; raises `OutputError`."""
+        """Write the mixture atomically as safetensors for `load_mixture`; raises `OutputError`.
+
+        >>> import tempfile
+        >>> file = load_mixture("barrett").save(Path(tempfile.mkdtemp(), "mixture.safetensors"))
+        >>> load_mixture(file).joint_names
+        ('spread', 'f1_flex', 'f2_flex', 'f3_flex')
+        """
         tensors = {"weights": self.weights, "means": self.means, "covariances": self.covariances}
         meta = {**self.meta, "names": " ".join(self.names), "regularisation": repr(self.regularisation)}
         return save_tensors(path, "mixture", tensors, meta)

@@ -38,7 +38,13 @@ Sampling = Literal["uniform", "grasping"]
 @checked
 @dataclasses.dataclass(frozen=True)
 class HandSamples(Batch):
-    """Postures `joints` [rad] of one hand and their codes `q` (Eq. 18); `meta` names the hand and the draw."""
+    """Postures `joints` [rad] of one hand and their codes `q` (Eq. 18); `meta` names the hand and the draw.
+
+    >>> from torchgrasp import load_hand
+    >>> samples = sample_configurations(load_hand("barrett"), 50)
+    >>> samples.joints.shape, samples.rows().shape, samples.meta["hand"]
+    (torch.Size([50, 4]), torch.Size([50, 10]), 'barrett')
+    """
 
     joints: Float[Tensor, "n h"]
     q: Float[Tensor, "n q"]
@@ -56,6 +62,10 @@ class SampleSpec(Value):
     """Which n free postures are drawn, see `Sampling`.
 
     Chunk i comes from (seed, i) alone, so fewer samples are a prefix of more. Other values raise `BadArgument`.
+
+    >>> from torchgrasp import load_hand
+    >>> SampleSpec(1000, seed=7).meta(load_hand("barrett"))["seed"]
+    '7'
     """
 
     n: Annotated[int, Range(1, MAX_SAMPLES)]

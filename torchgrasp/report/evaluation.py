@@ -29,6 +29,13 @@ def write_evaluation(path: Path | str, title: str, asked: Mapping[str, object], 
 
     Raises:
         OutputError: the file cannot be written.
+
+    >>> import tempfile
+    >>> from torchgrasp.evaluation import ProtocolResult
+    >>> jug = ViewScore("jug", "view0", 40, 4.0, (ProtocolResult(0, 0, True, Status.OK, predicted=0.9),))
+    >>> page = write_evaluation(Path(tempfile.mkdtemp(), "evaluation.html"), "Jugs", {"hand": "allegro"}, [jug])
+    >>> "allegro" in page.read_text()
+    True
     """
     return write_file(path, format_evaluation(title, asked, scores))
 

@@ -40,13 +40,33 @@ def write_report(path: Path | str, run: Run, view: str = "") -> Path:
 
     Raises:
         OutputError: the file cannot be written.
+
+    >>> import tempfile
+    >>> from torchgrasp import ContactSpec, fit_shape, load_hand, load_object
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.shape import extract_surface
+    >>> view, none = load_object("jug").view, load_shipped_grasp("jug", "barrett")[:0]
+    >>> surface, hand = extract_surface(fit_shape(view), 24), load_hand("barrett")
+    >>> run = Run("jug", Path("jug.ply"), view, hand, ContactSpec(), surface, none, ())
+    >>> "no executable grasp" in write_report(Path(tempfile.mkdtemp(), "report.html"), run).read_text()
+    True
     """
     return write_file(path, format_page(run, draw_pictures(run), view))
 
 
 @checked
 def draw_pictures(run: Run) -> dict[str, list[tuple[str, bytes]]]:
-    """Draw every picture of a run: captions and PNGs by section."""
+    """Draw every picture of a run: captions and PNGs by section.
+
+    >>> from torchgrasp import ContactSpec, fit_shape, load_hand, load_object
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.shape import extract_surface
+    >>> view, none = load_object("jug").view, load_shipped_grasp("jug", "barrett")[:0]
+    >>> surface, hand = extract_surface(fit_shape(view), 24), load_hand("barrett")
+    >>> pictures = draw_pictures(Run("jug", Path("jug.ply"), view, hand, ContactSpec(), surface, none, ()))
+    >>> {section: len(drawn) for section, drawn in pictures.items()}
+    {'Seen and unseen': 3}
+    """
     run = run.upright()
     table = None if run.spec.table is None else 0.0
     view, best = view_of(run.cloud), run.executable

@@ -25,7 +25,11 @@ if TYPE_CHECKING:
 
 
 class Stage(NamedTuple):
-    """A finished stage, its result and wall time [s]."""
+    """A finished stage, its result and wall time [s].
+
+    >>> Stage("fit", "1000 points, scale 0.12 m", seconds=0.3).name
+    'fit'
+    """
 
     name: str
     message: str
@@ -38,6 +42,15 @@ class Run:
     """Everything that a report shows; `closure` is that on the true `mesh`, or both are None.
 
     The cloud is that of the target of `scene`, if there is one. `explanation` tells why no grasp is executable.
+
+    >>> from torchgrasp import fit_shape, load_hand, load_object
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.shape import extract_surface
+    >>> view, hand, grasp = load_object("jug").view, load_hand("barrett"), load_shipped_grasp("jug", "barrett")
+    >>> surface = extract_surface(fit_shape(view), 24)
+    >>> run = Run("jug", Path("jug.ply"), view, hand, ContactSpec(), surface, grasp, ())
+    >>> len(run.executable), len(run.upright().cloud)
+    (1, 1000)
     """
 
     object_name: str
@@ -82,7 +95,16 @@ class Run:
 
 @checked
 def verdict(run: Run) -> str:
-    """Say in one sentence what the run ended with."""
+    """Say in one sentence what the run ended with.
+
+    >>> from torchgrasp import fit_shape, load_hand, load_object
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.shape import extract_surface
+    >>> view, hand, grasp = load_object("jug").view, load_hand("barrett"), load_shipped_grasp("jug", "barrett")
+    >>> surface = extract_surface(fit_shape(view), 24)
+    >>> verdict(Run("jug", Path("jug.ply"), view, hand, ContactSpec(), surface, grasp, ()))
+    'The barrett hand has 1 executable grasp of the jug.'
+    """
     if run.closure is not None:
         return closing_sentence(run)
     if count := len(run.executable):

@@ -27,6 +27,12 @@ def read_scene(path: Path | str) -> Scene:
     Raises:
         CloudFileError: no such file, or malformed content.
         BadArgument: what `Scene.from_depth` refuses.
+
+    >>> import tempfile
+    >>> from torchgrasp import load_scene
+    >>> file = save_scene(load_scene(), Path(tempfile.mkdtemp(), "scene.npz"))
+    >>> read_scene(file).things
+    (1, 2, 3, 4)
     """
     path = Path(path)
     if path.suffix.lower() != ".npz" or not is_file(path):
@@ -61,6 +67,12 @@ def save_scene(scene: Scene, path: Path | str) -> Path:
     Raises:
         BadArgument: another suffix.
         OutputError: the file cannot be written.
+
+    >>> import tempfile
+    >>> from torchgrasp import load_scene
+    >>> file = save_scene(load_scene(), Path(tempfile.mkdtemp(), "scene.npz"))
+    >>> sorted(np.load(file))
+    ['camera_pose', 'depth', 'intrinsics', 'labels', 'table']
     """
     path, buffer = Path(path), io.BytesIO()
     if path.suffix.lower() != ".npz":

@@ -19,6 +19,13 @@ class DepthImage(Value):
     """A pinhole camera's depth image: `depth` [m] along the optical axis, 0 where nothing was measured.
 
     `intrinsics` [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] are pixels. `obj_from_camera` is the camera's pose.
+
+    >>> camera = torch.tensor([[100.0, 0, 1.5], [0, 100, 1.5], [0, 0, 1]])
+    >>> image = DepthImage(torch.full((4, 4), 0.5), camera, torch.eye(4))
+    >>> image.points()[0, 0]  # [m]
+    tensor([-0.0075, -0.0075,  0.5000], dtype=torch.float64)
+    >>> image.frustum.shape, image.to_upright(torch.eye(4)).obj_from_camera.shape
+    (torch.Size([4, 3]), torch.Size([4, 4]))
     """
 
     depth: Float[Tensor, "h w"]
@@ -35,7 +42,7 @@ class DepthImage(Value):
 
     def to_upright(self, obj_from_upright: Float[Tensor, "4 4"]) -> "DepthImage":
         """Return the image with its camera in an upright frame, rounded."""
-        pose = inverse(obj_from_upright).to(self.obj_from_camera.device) @ self.obj_from_camera.double()
+        pose = inverse(obj_from_upright.double()).to(self.obj_from_camera.device) @ self.obj_from_camera.double()
         return dataclasses.replace(self, obj_from_camera=torch.round(pose / GRID**1.5) * GRID**1.5)
 
     def points(self) -> Float[Tensor, "h w 3"]:

@@ -50,6 +50,10 @@ class Occupancy(Value):
     """How likely each voxel is full of something that is neither the target nor the table.
 
     The centre of voxel (i, j, k) is at `origin` + (i, j, k) * `spacing` [m].
+
+    >>> free = Occupancy(torch.zeros(3), 0.01, torch.zeros(2, 3, 4))
+    >>> free.centres[-1, -1, -1]
+    tensor([0.0100, 0.0200, 0.0300], dtype=torch.float64)
     """
 
     origin: Float[Tensor, "3"]
@@ -189,6 +193,11 @@ def estimate_occupancy(scene: Scene, target: int) -> Occupancy:
 
     Raises:
         BadArgument: a target without points.
+
+    >>> from torchgrasp import load_scene
+    >>> found = estimate_occupancy(load_scene(), target=1)
+    >>> bool((found.probability > 0.5).any()), bool((found.probability < 0.01).any())
+    (True, True)
     """
     device, scene = scene.points.device, settle(scene, torch.device("cpu"))
     if not bool(scene.rows_of(target).any()):

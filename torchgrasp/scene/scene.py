@@ -37,6 +37,14 @@ class Scene(Value):
         pixels: row and column of each point in the image.
         table: the plane that things stand on; None: unknown.
         target: label of the thing to be grasped; None: not chosen.
+
+    >>> from torchgrasp import load_scene
+    >>> scene = load_scene()
+    >>> target = scene.select([394, 312])  # a clicked pixel: column, row
+    >>> target.target in scene.things, len(target.cloud()) == int(target.rows_of().sum())
+    (True, True)
+    >>> scene.to_upright(torch.eye(4)).things
+    (1, 2, 3, 4)
     """
 
     points: Float[Tensor, "n 3"]
@@ -79,6 +87,12 @@ class Scene(Value):
             BadArgument: what `read_depth` refuses; mask or labels of another size; a target that is the table; a
                 point where nothing was measured; a camera below the table.
             NoSupport: no plane that things stand on.
+
+        >>> from torchgrasp import load_scene
+        >>> image = load_scene().image
+        >>> scene = Scene.from_depth(image.depth, image.intrinsics, image.obj_from_camera)
+        >>> len(scene.things) > 1, scene.table is not None
+        (True, True)
         """
         if sum(given is not None for given in (mask, labels, point)) > 1 and mask is not None:
             raise BadArgument("mask", "a mask beside labels or a point", "one of them")
@@ -122,6 +136,12 @@ class Scene(Value):
         Raises:
             BadArgument: no viewpoint, or several; labels or mask of another size; and as `from_depth`.
             NoSupport: no plane that things stand on.
+
+        >>> from torchgrasp import PointCloud, load_scene
+        >>> seen = load_scene()
+        >>> scene = Scene.from_cloud(PointCloud(seen.points, viewpoint=seen.viewpoint))
+        >>> len(scene.things) > 1
+        True
         """
         if sum(given is not None for given in (mask, labels, box)) > 1:
             raise BadArgument("mask", "several of mask, labels and box", "one of them")
@@ -224,6 +244,7 @@ class Scene(Value):
     @checked
     def to_upright(self, obj_from_upright: Float[Tensor, "4 4"]) -> "Scene":
         """Return the scene in the `upright_frame` of its target and table, all rounded."""
+        obj_from_upright = obj_from_upright.double()
         return dataclasses.replace(
             self,
             points=to_upright(self.points, obj_from_upright),

@@ -32,6 +32,12 @@ def condition(
     Raises:
         BadArgument: an unknown kernel.
         IndefiniteCovariance: psi is too small for these observations.
+
+    >>> x, noise = torch.cat([torch.eye(3), -torch.eye(3)]).double() / 2, torch.full((6,), 0.01).double()
+    >>> seen = Observations(x, 0 * noise, 2 * x, noise > 0, noise, noise)
+    >>> shape = condition(seen, Normalisation(torch.zeros(3).double(), 0.05), PointCloud(0.05 * x))
+    >>> shape.predict(0.05 * x[:2]).distance.abs() < 0.01
+    tensor([True, True])
     """
     observations = observations.to(normalisation.center)
     psi = psi_scale * longest_distance(observations.x)

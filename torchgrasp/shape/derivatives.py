@@ -14,7 +14,14 @@ from torchgrasp.values import ShapeEstimate
 
 @dataclasses.dataclass(frozen=True)
 class ShapeDerivatives(Value):
-    """Derivatives of a `ShapeEstimate` by the query point, per metre: `normal[i, j]` is d normal_i / d point_j."""
+    """Derivatives of a `ShapeEstimate` by the query point, per metre: `normal[i, j]` is d normal_i / d point_j.
+
+    >>> from torchgrasp import fit_shape, load_object
+    >>> view = load_object("jug").view
+    >>> slopes = fit_shape(view).differentiate(view.points[:4])
+    >>> slopes.distance.shape, slopes.normal.shape, slopes.std_m.shape
+    (torch.Size([4, 3]), torch.Size([4, 3, 3]), torch.Size([4, 3]))
+    """
 
     distance: Float[Tensor, "*b 3"]
     normal: Float[Tensor, "*b 3 3"]

@@ -29,7 +29,12 @@ REACH = 1.25
 
 @dataclasses.dataclass(frozen=True)
 class Normalisation(Value):
-    """A frame without units: points [m] minus `center` [m], divided by `scale` [m]."""
+    """A frame without units: points [m] minus `center` [m], divided by `scale` [m].
+
+    >>> frame = Normalisation(torch.tensor([0.0, 0.0, 0.1]), scale=0.05)
+    >>> frame.normalise(torch.tensor([0.0, 0.0, 0.15])), frame.metres(torch.tensor([0.0, 0.0, 1.0]))
+    (tensor([0.0000, 0.0000, 1.0000]), tensor([0.0000, 0.0000, 0.1500]))
+    """
 
     center: Float[Tensor, "3"]
     scale: float
@@ -54,6 +59,21 @@ class ShapeGP(Posterior, Normalisation):
         cloud: what the camera saw, after cleaning.
         kind: what the hidden side follows from: "ball", "revolution", "mirrored", "vessel", "guess" (the outline
             alone), "cut off" by the image's border, or "whole" without a hidden side.
+
+    >>> from torchgrasp import fit_shape, load_object
+    >>> view = load_object("jug").view
+    >>> shape, points = fit_shape(view), view.points[:4]
+    >>> bool(shape.contains(points).all()), shape.differentiate(points).distance.shape
+    (True, torch.Size([4, 3]))
+    >>> shape.joint(points).covariance.shape, shape.sample(points, n=10).shape
+    (torch.Size([16, 16]), torch.Size([10, 4, 4]))
+    >>> x, few = shape.normalise(points), torch.full((4,), 0.01).double()
+    >>> shape.joint_at(x).mean.shape, shape.wall_at(x).shape, ShapeGP.of(shape, shape, shape.cloud, 2.0).psi
+    (torch.Size([4, 4]), torch.Size([4, 1]), 2.0)
+    >>> len(shape.append(Observations(x, few, x, few < 0, few, few)).x) - len(shape.x)
+    4
+    >>> shape.moved(torch.eye(4)).to(torch.float32).predict(points.float()).distance.dtype
+    torch.float32
     """
 
     psi: float

@@ -25,6 +25,17 @@ class HollowShape(ShapeGP):
 
     Args:
         lining: the inner wall, positive inside the vessel and negative all around.
+
+    >>> import trimesh
+    >>> from torchgrasp import fit_shape
+    >>> from torchgrasp.cloud import look_at, partial_view
+    >>> outline = [[0, 0], [0.04, 0], [0.04, 0.09], [0.034, 0.09], [0.034, 0.006], [0, 0.006]]
+    >>> cup = trimesh.creation.revolve(outline)  # radius and height [m]
+    >>> shape = fit_shape(partial_view(cup, look_at(0.0, 35.0, target=cup)), table=0.0)
+    >>> shape.predict(torch.tensor([[0.0, 0.0, 0.06], [0.037, 0.0, 0.06]]).double()).distance > 0
+    tensor([ True, False])
+    >>> HollowShape.join(shape.outer, shape.lining, shape.cloud).kind
+    'vessel'
     """
 
     lining: ShapeGP

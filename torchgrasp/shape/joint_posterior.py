@@ -20,6 +20,12 @@ class JointEstimate(Value):
     """The joint posterior of (d, w) at k points, point by point and normalised.
 
     The gradient w has no unit length. Points i and j have the block `covariance.reshape(k, 4, k, 4)[i, :, j]`.
+
+    >>> from torchgrasp import fit_shape, load_object
+    >>> view = load_object("jug").view
+    >>> joint = fit_shape(view).joint(view.points[:4])
+    >>> joint.mean.shape, torch.linalg.eigvalsh(joint.covariance).min() > -1e-9
+    (torch.Size([4, 4]), tensor(True))
     """
 
     mean: Float[Tensor, "k 4"]

@@ -87,7 +87,12 @@ def thin_plate(r: Float[Tensor, "*s"], psi: float) -> Float[Tensor, "*s"]:
 
 @checked
 def thin_plate_kernel(psi: Positive) -> Kernel:
-    """Return the thin plate kernel with the closed form of its derivatives."""
+    """Return the thin plate kernel with the closed form of its derivatives.
+
+    >>> kernel = thin_plate_kernel(psi=2.0)
+    >>> kernel.diameter
+    1.5
+    """
     remedy = "use a psi_scale of at least 1.34: the thin plate kernel is a covariance only within 3/4 psi"
     return Kernel(partial(thin_plate, psi=psi), psi / LEAST_PSI, remedy, partial(_differentiate_thin_plate, psi))
 
@@ -125,6 +130,10 @@ def kernel_by_name(name: KernelName, psi: Positive) -> Kernel:
 
     Raises:
         BadArgument: another name.
+
+    >>> wide = kernel_by_name("rbf", psi=2.0).profile(torch.tensor([0.0, 1.0]))
+    >>> wide[0]  # psi^3
+    tensor(8.)
     """
     if name == "thin_plate":
         return thin_plate_kernel(psi)

@@ -14,6 +14,13 @@ class Observations(Batch):
     """Signed distances at points, and normals where `has_normal`; all is normalised.
 
     The noises are standard deviations. Other points ignore their normal.
+
+    >>> some, outward = torch.ones(3), torch.eye(3)
+    >>> oriented = torch.tensor([False, True, True])
+    >>> seen = Observations(outward, 0 * some, outward, oriented, 0.01 * some, 0.05 * some)
+    >>> values, variances = seen.rows()
+    >>> len(values), seen.with_normals_first().has_normal
+    (9, tensor([ True,  True, False]))
     """
 
     x: Float[Tensor, "n 3"]

@@ -24,7 +24,14 @@ WIDTH = 24
 
 @dataclasses.dataclass(frozen=True)
 class MeanJet(Batch):
-    """The mean to second order; gradients do not have unit length."""
+    """The mean to second order; gradients do not have unit length.
+
+    >>> from torchgrasp import fit_shape, load_object
+    >>> shape = fit_shape(load_object("jug").view)
+    >>> jet = shape.mean_jet(shape.normalise(shape.cloud.points[:5]))
+    >>> jet.normals.norm(dim=1), jet.hessian.shape
+    (tensor([1.0000, 1.0000, 1.0000, 1.0000, 1.0000], dtype=torch.float64), torch.Size([5, 3, 3]))
+    """
 
     distance: Float[Tensor, "*b"]
     gradient: Float[Tensor, "*b 3"]

@@ -41,6 +41,11 @@ class Surface(Value):
     """A triangle mesh of the surface [m], wound outward, open at the edge of the domain.
 
     Normals are unit gradients of the mean; `std_m` [m] is the surface's standard deviation.
+
+    >>> from torchgrasp import fit_shape, load_object
+    >>> surface = extract_surface(fit_shape(load_object("jug").view), resolution=24)
+    >>> surface.mesh().is_watertight, float(surface.std_m.min()) > 0
+    (True, True)
     """
 
     vertices: Float[Tensor, "v 3"]
@@ -63,6 +68,11 @@ def extract_surface(shape: ShapeGP, resolution: Annotated[int, Range(8, 256)] = 
 
     Raises:
         BadArgument: a resolution outside [8, 256], or a mean without zero level.
+
+    >>> from torchgrasp import fit_shape, load_object
+    >>> surface = extract_surface(fit_shape(load_object("jug").view, table=0.0), resolution=24)
+    >>> len(surface.faces) > 500, f"{surface.vertices[:, 2].max():.2f} m"
+    (True, '0.17 m')
     """
     walls = list[Surface]()
     for wall, (x, faces) in zip(shape.walls, _trace_walls(shape, resolution), strict=True):

@@ -23,6 +23,17 @@ class SimulatedHand:
         reference: what the hand follows.
         control_rate: ticks a second [Hz].
         generator: draws the noise of the fingertips; None: no noise.
+
+    >>> from torchgrasp import load_hand, load_object
+    >>> from torchgrasp.evaluation import GraspTrial, TrialDriver
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.specs import TrialSpec
+    >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
+    >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
+    >>> run = TrialDriver(trial, TrialSpec()).open()  # a fresh scene
+    >>> seen = run.robot.tick(run.controller.targets)
+    >>> seen.tactile.contact, run.robot.ticks(0.5), run.robot.unbalanced()
+    (tensor([False, False, False]), 50, nan)
     """
 
     def __init__(

@@ -50,6 +50,11 @@ class Neighbour:
         mesh: closed [m], where it lies, in the frame of the grasp.
         parts: convex bodies that make up its surface; None: its own decomposition (`convex_parts`).
         mass: [kg]; None: as the object's, by `TrialSpec.mass` or `TrialSpec.density`.
+
+    >>> import trimesh
+    >>> box = trimesh.creation.box([0.05, 0.05, 0.1])
+    >>> Neighbour(box.apply_translation([0.2, 0.0, 0.05]), parts=[box]).mass is None  # as the object's
+    True
     """
 
     mesh: "trimesh.Trimesh"
@@ -60,7 +65,13 @@ class Neighbour:
 @checked
 @dataclasses.dataclass(frozen=True)
 class Body:
-    """A rigid body of the simulator: its mesh, convex parts that make up its surface, and its mass [kg]."""
+    """A rigid body of the simulator: its mesh, convex parts that make up its surface, and its mass [kg].
+
+    >>> import trimesh
+    >>> box = trimesh.creation.box([0.1, 0.1, 0.1])
+    >>> Body(box, [box], mass=0.6).inertia.diagonal().round(6)  # m a^2 / 6
+    array([0.001, 0.001, 0.001])
+    """
 
     mesh: "trimesh.Trimesh"
     parts: "Sequence[trimesh.Trimesh]"
@@ -96,6 +107,15 @@ class SceneSpec:
         neighbours: further bodies.
         self_pairs: names of the links of the hand that collide with each other.
         yields: how far [m] the mount can be displaced along each axis of the world; 0: not at all.
+
+    >>> from torchgrasp import load_hand, load_object
+    >>> jug, hand = load_object("jug"), load_hand("barrett")
+    >>> start = dict.fromkeys(hand.tree.joint_names, 0.1)
+    >>> drives, tips = hand.actuators, hand.tips.links
+    >>> spec = SceneSpec(hand.urdf_path, np.eye(4), start, drives, tips, jug.mesh, jug.parts, mass=0.2)
+    >>> spec.check_drives(list(hand.tree.joint_names))
+    >>> spec.body.mass, round(spec.table_height, 3)
+    (0.2, 0.0)
     """
 
     urdf_path: Path | str
@@ -147,6 +167,12 @@ class StepContacts:
         force: of each fingertip on the object (f, 3) [N], friction included.
         stray: sums of normal impulses (3,) [N s] of the hand on neighbours, on the table, and of links other than the
             fingers' on the object.
+
+    >>> tick, step = StepContacts.none(), StepContacts.none()
+    >>> step.add(1, np.array([0.0, 0.0, 0.02]), 0.02, np.array([0.0, 0.0, 0.1]))
+    >>> tick.accumulate(step, count=5)
+    >>> tick.impulse[1], (tick.moment[1] / tick.weight[1]).round(3)
+    (array([0.  , 0.  , 0.02]), array([0. , 0. , 0.1]))
     """
 
     impulse: np.ndarray
@@ -181,6 +207,26 @@ class Scene(abc.ABC):
 
     `centre` [m] is the object's mass centre in its own frame, `timestep` is in seconds. A simulator sets `joint_names`
     and its handles of bodies.
+
+    >>> from torchgrasp import load_hand, load_object
+    >>> from torchgrasp.evaluation import GraspTrial, TrialDriver
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.sim import open_scene
+    >>> from torchgrasp.specs import TrialSpec
+    >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
+    >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
+    >>> scene = open_scene(TrialDriver(trial, TrialSpec()).scene_spec)
+    >>> scene.penetration(), scene.neighbour_poses().shape
+    (0.0, (0, 4, 4))
+    >>> scene.drive(scene.joints() + 0.1)
+    >>> scene.pull(np.array([0.0, 0.0, -1.0]))  # [N]
+    >>> scene.approach(0.05, speed=-0.1)
+    >>> scene.lift(0.01, speed=0.1)
+    >>> scene.shift(np.array([0.001, 0.0, 0.0]))
+    >>> scene.step().finger, scene.object_pose().shape, scene.hand_pose().shape
+    (array([False, False, False]), (4, 4), (4, 4))
+    >>> scene.jacobian(scene.tip_poses()[:, :3, 3]).shape  # [m/rad] by all joints
+    (3, 3, 8)
     """
 
     joint_names: tuple[str, ...]

@@ -25,7 +25,16 @@ FEW = 2000
 @checked
 @dataclasses.dataclass(frozen=True)
 class CloudFile(Value):
-    """A cloud as it was read, and a sentence for each thing that was left out."""
+    """A cloud as it was read, and a sentence for each thing that was left out.
+
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from torchgrasp.cloud import read_cloud_file
+    >>> file = Path(tempfile.mkdtemp(), "cloud.npy")
+    >>> np.save(file, np.vstack([np.random.default_rng(0).random((50, 3)) * 0.1, np.full((3, 3), np.nan)]))
+    >>> read_cloud_file(file).notes
+    ('3 of 53 rows with NaN or infinity were left out',)
+    """
 
     cloud: PointCloud
     notes: tuple[str, ...]

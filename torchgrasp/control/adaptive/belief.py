@@ -33,7 +33,17 @@ NEWTON_STEPS, LEAST_SLOPE = 6, 0.3
 
 
 class Belief:
-    """A shape, the planned pose of the hand, and which fingers have touched."""
+    """A shape, the planned pose of the hand, and which fingers have touched.
+
+    >>> from torchgrasp import ClosingReference, fit_shape, load_hand, load_object
+    >>> from torchgrasp.control import no_contact, observe
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> grasp, hand = load_shipped_grasp("jug", "allegro"), load_hand("allegro")
+    >>> reference, seen = ClosingReference.from_grasp(hand, grasp), observe(hand, grasp.joints[0], no_contact())
+    >>> belief = Belief(fit_shape(load_object("jug").view), grasp.obj_from_hand[0])
+    >>> belief.revise(seen, reference) is reference  # nothing was touched
+    True
+    """
 
     def __init__(self, shape: ShapeGP, obj_from_hand: Float[Tensor, "4 4"]) -> None:
         self.obj_from_hand = obj_from_hand.double()

@@ -106,6 +106,15 @@ class Impedance:
         reference, observation, start: as for `ForceHold`.
         springs: stiffness [N/m] along the `side_lengths`; None: `GRASP_STIFFNESS`.
         stability: of the hand's grasps; None: the grasp does not adapt.
+
+    >>> from torchgrasp import ClosingReference, load_hand
+    >>> from torchgrasp.control import no_contact, observe
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> grasp, hand = load_shipped_grasp("jug", "allegro"), load_hand("allegro")
+    >>> seen = observe(hand, grasp.joints[0], no_contact())
+    >>> hold = Impedance(ClosingReference.from_grasp(hand, grasp), seen, seen.joints)
+    >>> hold.forces(seen.tips).norm(dim=1).round(decimals=1)  # [N] of each finger
+    tensor([2.8000, 1.2000, 4.0000], dtype=torch.float64)
     """
 
     def __init__(

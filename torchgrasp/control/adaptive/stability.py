@@ -55,7 +55,14 @@ def lengths_of(tips: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
 @checked
 @dataclasses.dataclass(frozen=True)
 class PreferredForces(Value):
-    """How stable grasps press: normal forces [N], covariance [N^2], spring stiffness [N/m]."""
+    """How stable grasps press: normal forces [N], covariance [N^2], spring stiffness [N/m].
+
+    >>> from torchgrasp import load_hand
+    >>> tips = torch.tensor([[0.03, 0, 0], [0, 0.03, 0], [-0.03, 0, 0]]).double()
+    >>> wanted = load_stability(load_hand("allegro")).preferred_forces(tips, force=2.0)
+    >>> wanted.forces.max(), bool((wanted.springs > 0).all())
+    (tensor(2., dtype=torch.float64), True)
+    """
 
     forces: Float[Tensor, "3"]
     covariance: Float[Tensor, "3 3"]
@@ -75,6 +82,14 @@ class StabilityModel(Value):
 
     Raises:
         BadArgument: other names, or a share outside (0, 1).
+
+    >>> from torchgrasp import load_hand
+    >>> model = load_stability(load_hand("allegro"))
+    >>> firm = model.stable.mean().repeat(2, 1)
+    >>> firm[1, 6:] /= 8  # forces come last
+    >>> better, worse = model.log_odds(firm)
+    >>> bool(better > worse)
+    True
     """
 
     stable: GaussianMixture
@@ -135,6 +150,13 @@ class StabilityModel(Value):
 
         Raises:
             OutputError: the file cannot be written.
+
+        >>> import tempfile
+        >>> from torchgrasp import load_hand
+        >>> hand = load_hand("allegro")
+        >>> file = load_stability(hand).save(Path(tempfile.mkdtemp(), "stability.safetensors"))
+        >>> load_stability(hand, file).meta["hand"]
+        'allegro'
         """
         tensors = {f"{kind}.{part}": getattr(getattr(self, kind), part) for kind, part in PARTS}
         return save_tensors(path, "stability", tensors, {**self.meta, "share": repr(self.share)})
@@ -155,6 +177,10 @@ def load_stability(hand: Hand, path: Path | str | None = None) -> StabilityModel
     Raises:
         ModelFileError: the file is missing or malformed.
         BadArgument: it is the model of another hand.
+
+    >>> from torchgrasp import load_hand
+    >>> load_stability(load_hand("leap")) is None, load_stability(load_hand("allegro")).share > 0.5
+    (True, True)
     """
     if path is None:
         path = hand.urdf_path.parent / FILE

@@ -35,6 +35,16 @@ def write_viewer(path: Path | str, run: Run) -> Path:
 
     Raises:
         OutputError: the file cannot be written.
+
+    >>> import tempfile
+    >>> from torchgrasp import ContactSpec, fit_shape, load_hand, load_object
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.shape import extract_surface
+    >>> view, hand, grasp = load_object("jug").view, load_hand("barrett"), load_shipped_grasp("jug", "barrett")
+    >>> surface = extract_surface(fit_shape(view), 24)
+    >>> run = Run("jug", Path("jug.ply"), view, hand, ContactSpec(), surface, grasp, ())
+    >>> write_viewer(Path(tempfile.mkdtemp(), "view.html"), run).stat().st_size < 8 * 2**20
+    True
     """
     return write_file(path, format_viewer(run))
 

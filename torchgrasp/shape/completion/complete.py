@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchgrasp.base import Batch, Value, join
 from torchgrasp.border import Count, checked
+from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, inverse, rotate
 from torchgrasp.linalg import farthest_points, reflect, reflect_directions
 from torchgrasp.shape.completion.axis import find_axis
@@ -64,6 +65,12 @@ class Completion(Value):
         planes: the planes n.x = o that were used, as (n, o), the best of each part first.
         scores: of the planes: 1 if the mirror image lies on the cloud, below .15 for no support.
         kind: what the points follow from, by which the bands are calibrated.
+
+    >>> from torchgrasp import load_object
+    >>> from torchgrasp.cloud import estimate_normals
+    >>> found = complete_cloud(estimate_normals(load_object("jug").view))
+    >>> found.kind, len(found.points) == len(found.moved(torch.eye(4).double()).normals)
+    ('revolution', True)
     """
 
     points: Float[Tensor, "m 3"]
@@ -104,7 +111,8 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count 
     A body of revolution and its attached part are mirrored separately, in the frame of the axis. Any plane through the
     axis explains the body. The part alone tells the plane of a handle.
 
-    The cloud is clean, with outward normals and viewpoints. The table has its height [m] and normal z.
+    The cloud is clean, with outward normals and viewpoints; others raise `BadArgument`. The table has its height [m]
+    and normal z.
 
     >>> from torchgrasp.linalg import unit
     >>> eye = torch.tensor([0.0, 0.0, 1.0]).double()
@@ -112,6 +120,8 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count 
     >>> bool(complete_cloud(PointCloud(0.05 * cap, cap, eye)).points[:, 2].min() < -0.02)
     True
     """
+    if cloud.normals is None or cloud.viewpoint is None:
+        raise BadArgument("cloud", "no normals or no viewpoint", "outward normals and viewpoints: see prepare_cloud")
     scorer = SymmetryScorer.of(cloud.to("cpu", torch.float64), table)
     if scorer.outline.cut:  # an image's border is no outline, and half a thing is not symmetric
         return _nothing(scorer)

@@ -45,6 +45,14 @@ class Silhouette(Value):
         rim_normals: normals there of the cone that the camera and the outline span.
         cut: whether the object reaches the border of the image. Beyond it nothing is outside the outline.
         gap: greatest width [m] of a part within the outline where nothing was measured; 0: none. It may be a hole.
+
+    >>> from torchgrasp import load_object
+    >>> jug = load_object("jug").view
+    >>> view, middle = silhouettes(jug).views[0], jug.points.mean(0, keepdim=True)
+    >>> bool(view.hull_distance(middle) < 0), bool(view.violation(2 * middle) > 0), view.cut
+    (True, True, False)
+    >>> len(view.moved(torch.eye(4).double()).rim) == len(view.rim)
+    True
     """
 
     viewpoint: Float[Tensor, "3"]
@@ -89,7 +97,16 @@ class Silhouette(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Outlines(Value):
-    """The silhouettes of all views of one object; each view's bounds hold."""
+    """The silhouettes of all views of one object; each view's bounds hold.
+
+    >>> from torchgrasp import load_object
+    >>> seen = silhouettes(load_object("jug").view)
+    >>> beside = torch.tensor([[0.5, 0.0, 0.1]]).double()  # nothing hides it from the camera
+    >>> bool(seen.hull_distance(beside) > 0), bool(seen.violation(beside) > 0)
+    (True, True)
+    >>> len(seen.moved(torch.eye(4).double()).views)
+    1
+    """
 
     views: tuple[Silhouette, ...]
 
@@ -131,7 +148,8 @@ def silhouettes(cloud: PointCloud) -> Outlines:
     """Return the silhouette of every view of a cloud with viewpoints.
 
     Raises:
-        BadArgument: part of a view is beside or behind its camera, or a view shows both sides of the object.
+        BadArgument: a cloud without viewpoint, part of a view is beside or behind its camera, or a view shows both
+            sides of the object.
 
     >>> cap = torch.rand(99, 3).double() * torch.tensor([0.1, 0.1, 0.01])
     >>> len(silhouettes(PointCloud(cap, viewpoint=torch.tensor([0.0, 0.0, 9.0]).double())).views)
@@ -139,7 +157,8 @@ def silhouettes(cloud: PointCloud) -> Outlines:
     """
     views = cloud.split_views()
     for view in views:
-        assert view.viewpoint is not None
+        if view.viewpoint is None:
+            raise BadArgument("cloud", "no viewpoint", "a cloud with viewpoints")
         _check_view(view.points, view.viewpoint)
     return Outlines(tuple(silhouette(view) for view in views))
 
