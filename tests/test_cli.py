@@ -11,7 +11,9 @@ import trimesh
 from torchgrasp import cli
 from torchgrasp.cli import grasps
 from torchgrasp.cli.common import check_folder
+from torchgrasp.cli.evaluate import print_score
 from torchgrasp.errors import MissingExtra
+from torchgrasp.evaluation.score import ViewScore
 from torchgrasp.objects import DATA
 
 VIEW = str(DATA / "cylinder" / "view.ply")
@@ -267,6 +269,22 @@ def test_groups_of_commands_have_help(words, capsys):
     said = capsys.readouterr().out
     assert end.value.code == 0 and f"torchgrasp {' '.join(w for w in words if w[0] != '-')}" in said
     assert "evaluate" not in said
+
+
+def test_too_few_numbers_of_an_option_are_refused_without_markup(capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.main(["cloud", "check", VIEW, "--viewpoint", "1", "2"])
+    said = capsys.readouterr().err
+    assert end.value.code == 2 and "FLOAT FLOAT FLOAT" in said and "[bold]" not in said
+    assert len({len(line) for line in said.splitlines()}) == 1  # the frame is in line
+
+
+def test_lines_of_an_evaluation_keep_their_columns_for_names_of_any_length(capsys):
+    scores = [ViewScore(name, "view0", 40, 4.0, note="x") for name in ("jug", "a" * 60)]
+    for score in scores:
+        print_score(score, (60, 5))
+    short, long = capsys.readouterr().out.splitlines()
+    assert short.index("view0") == long.index("view0") == 62 and len(short) == len(long)
 
 
 def test_the_bare_command_shows_where_to_begin(capsys):

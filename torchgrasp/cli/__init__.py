@@ -7,6 +7,7 @@ import contextlib
 import functools
 import inspect
 import os
+import re
 import signal
 import sys
 import threading
@@ -85,11 +86,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # The batches are small: a second thread costs more than it brings, and one gives the same bits on any machine.
     torch.set_num_threads(1)
     try:
-        with warnings.catch_warnings(), _end_in_order():
+        plain = contextlib.redirect_stderr(_WithoutMarkup(sys.stderr))  # pyright: ignore[reportArgumentType]
+        with warnings.catch_warnings(), _end_in_order(), plain:
             warnings.showwarning = _show_warning
             code = _application(COMMANDS).cli(
                 prog="torchgrasp",
-                description="Dexterous fingertip grasps from a partial point cloud.",
+                description="Dexterous fingertip grasps from a partial point cloud. --version: print the version.",
                 args=[*given, "--help"] if given[0] in GROUPS and len(given) == 1 else given,
                 config=(tyro.conf.FlagCreatePairsOff,),
             )
@@ -117,6 +119,23 @@ def _drop_stdout() -> None:
     """Lead stdout nowhere: Python would try to write the rest at its end."""
     with contextlib.suppress(OSError, ValueError, AttributeError):  # it may be closed, or no file
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # pyright: ignore[reportOptionalMemberAccess]
+
+
+class _WithoutMarkup:
+    """A stream without tyro's markup, which its message on too few numbers of an option shows as it is."""
+
+    def __init__(self, stream: Any) -> None:
+        self.stream = stream
+
+    def write(self, text: str) -> int:
+        """Write the text; the frame around it stays in line."""
+        room = " " * len("[bold][/bold]")
+        return self.stream.write(
+            re.sub(r"\[bold\](.*?)\[/bold\](.*?)( │?)$", rf"\1\2{room}\3", text, flags=re.MULTILINE)
+        )
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
 
 
 class _Terminated(KeyboardInterrupt):

@@ -1,5 +1,6 @@
 """`torchgrasp evaluate`: the library's grasps under published protocols, in simulation."""
 
+import contextlib
 import dataclasses
 from pathlib import Path
 from typing import Any, Literal
@@ -9,7 +10,8 @@ from torchgrasp.cli.common import check_seed, load_fingers, naming
 from torchgrasp.cli.grasps import import_simulator
 from torchgrasp.cli.scenes import evaluate_clutter
 from torchgrasp.columns import format_columns, format_line
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.datasets import list_objects, list_views
+from torchgrasp.errors import BadArgument, DatasetError, Status
 from torchgrasp.evaluation.campaign import EvaluationSpec, Ranks
 from torchgrasp.evaluation.campaign import evaluate as evaluate_views
 from torchgrasp.evaluation.intervals import format_share
@@ -103,8 +105,9 @@ def evaluate(
     with naming(folder="--out", path="--out"), hold_folder(out):
         with naming(objects="--objects", workers="--workers", perturb="--perturb"):
             found = evaluate_views(objects, the_hand, test, spec, folder=planned or out / "grasps", workers=workers)
+            widths = name_widths(objects, spec)
             for score in found:
-                print_score(score)
+                print_score(score, widths)
                 scores.append(score)
         summary = summarise(scores)
         print_summary(protocol, spec.tried, summary)
@@ -117,13 +120,23 @@ def evaluate(
     return 0
 
 
-def print_score(score: ViewScore) -> None:
-    """Print the line of a view."""
+def name_widths(objects: Path, spec: EvaluationSpec) -> tuple[int, int]:
+    """Return the letters of the longest names of objects, as they are printed, and of views."""
+    names, views = list_objects(objects, spec.only), [""]
+    for name in names:
+        with contextlib.suppress(DatasetError):  # a bad entry is refused when it is its turn
+            views += [view for _, view in list_views(objects, spec.complete, [name], spec.views)]
+    return max(len(ascii(name)) for name in names), max(map(len, views))
+
+
+def print_score(score: ViewScore, widths: tuple[int, int] = (12, 6)) -> None:
+    """Print the line of a view, its names in columns so wide."""
     failed = [attempt.status for attempt in score.attempts if attempt.status is not Status.OK]
     reasons = ", ".join(f"{failed.count(status)} {status.name.lower()}" for status in dict.fromkeys(failed))
     reasons = reasons if score.attempts else score.note or score.refusal.sentence
     passed = f"{sum(attempt.passed for attempt in score.attempts)}/{len(score.attempts)}"
-    print(format_line((score.object, score.view, score.executable, passed, reasons), (-12, -6, 5, 7, -1)), flush=True)
+    cells = (score.object, score.view, score.executable, passed, reasons)
+    print(format_line(cells, (-widths[0], -widths[1], 5, 7, -1)), flush=True)
 
 
 def print_summary(protocol: str, tried: str, summary: dict[str, Any]) -> None:

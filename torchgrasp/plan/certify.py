@@ -123,7 +123,9 @@ def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None]
     if solution.x is None:
         return -np.inf, np.inf, None
     phi, dual = solution.x[:m] + solution.x[m], solution.eqlin.marginals[:6]
-    return float(solution.x[m]), float(np.abs(phi @ wrench).max()), -dual / np.linalg.norm(dual)
+    length = np.linalg.norm(dual)
+    witness = -dual / length if length > 0 else None  # no multipliers: the balance of wrenches costs no margin
+    return float(solution.x[m]), float(np.abs(phi @ wrench).max()), witness
 
 
 def check_unit(normals: Vectors) -> Vectors:

@@ -117,6 +117,7 @@ def format_page(run: Run, pictures: dict[str, list[tuple[str, bytes]]], view: st
         rows = grasp_rows(run.executable)
         body.append(f"<h2>Best grasps ({len(rows)} of {len(run.executable)})</h2>")
         body.append(format_html_table(GRASP_COLUMNS, rows, numbers=range(len(GRASP_COLUMNS))))
+        body.append(f'<p class="source">{GRASP_LEGEND}</p>')
     if run.explanation is not None:
         body += _explanation(run.explanation)
     if run.plan is not None:
@@ -146,6 +147,15 @@ def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
 
 GRASP_COLUMNS = ("rank", "success", "tip error mm", "clearance mm", "pad angle deg", "closure margin", "surface std mm")
 """Heads of `grasp_rows`; errors, angles and deviations are of the worst finger."""
+
+GRASP_LEGEND = (
+    "success: predicted probability that the grasp holds, from trials in simulation; tip error: how far a "
+    "fingertip ends from its contact; clearance: least distance of links from the estimated object, the table and "
+    "each other; pad angle: between the pad's axis and the contact's normal; closure margin: of the certificate, "
+    "above 0 the contacts resist every wrench; surface std: standard deviation of the surface at a contact. Of "
+    "several fingers the worst counts."
+)
+"""What the columns mean, below the table of a report."""
 
 
 def _explanation(explanation: Explanation) -> list[str]:
