@@ -42,6 +42,13 @@ def draw_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, direc
         hand: that closed.
         closure: what happened.
         direction: from the object to the camera.
+
+    >>> from torchgrasp import TrialSpec, close_hand, load_hand
+    >>> from torchgrasp.objects import load_object, load_shipped_grasp
+    >>> jug, hand, grasp = load_object("jug"), load_hand("barrett"), load_shipped_grasp("jug", "barrett")
+    >>> result = close_hand(grasp, hand, jug.mesh, TrialSpec("open_loop", hold_time=0.2), parts=jug.parts)
+    >>> draw_film(jug.mesh, hand, result, (1.0, -1.0, 0.5))[1:4]
+    b'PNG'
     """
     from PIL import Image, ImageDraw, ImageFont
 
@@ -62,7 +69,15 @@ def draw_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, direc
 
 
 def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -> str:
-    """Say what the film of a closing shows: the order of touch, and when and why the object was lost."""
+    """Say what the film of a closing shows: the order of touch, and when and why the object was lost.
+
+    >>> from torchgrasp import TrialSpec, close_hand, load_hand
+    >>> from torchgrasp.objects import load_object, load_shipped_grasp
+    >>> jug, hand, grasp = load_object("jug"), load_hand("barrett"), load_shipped_grasp("jug", "barrett")
+    >>> result = close_hand(grasp, hand, jug.mesh, TrialSpec("open_loop", hold_time=0.2), parts=jug.parts)
+    >>> describe_film(jug.mesh, hand, result).split(". ")[1]
+    'The object was held'
+    """
     order = ", ".join(hand.tips.names[finger] for finger in closure.contact_order) or "none"
     lost = explain_loss(closure, _centre(mesh), hand.tips.names)
     return f"In the order of touch: {order}. {lost or 'The object was held.'} Each picture is taken from the hand."
