@@ -12,8 +12,9 @@ from torchgrasp import cli
 from torchgrasp.cli import grasps
 from torchgrasp.cloud import look_at, partial_view, read_cloud, save_cloud
 from torchgrasp.cloud.camera import INTRINSICS
-from torchgrasp.objects import DATA, load_object
+from torchgrasp.objects import DATA, load_object, load_scene
 from torchgrasp.plane import Plane
+from torchgrasp.scene import read_scene
 from torchgrasp.values import PointCloud
 
 VIEW = DATA / "jug" / "view.ply"
@@ -247,6 +248,22 @@ def test_cut_leaves_the_thing_at_the_point_without_the_table(tmp_path, capsys):
     assert "--table -0.0" in capsys.readouterr().out
     assert cli.main(["cloud", "cut", path, "--out", str(tmp_path / "c.npz"), "--box", *"778899"]) == 2
     assert "0 points in the box" in capsys.readouterr().err and not (tmp_path / "c.npz").exists()
+
+
+def test_scene_is_that_of_the_depth_image(tmp_path, capsys):
+    image = load_scene().image
+    np.save(tmp_path / "depth.npy", image.depth.numpy())
+    np.savetxt(tmp_path / "pose.txt", image.obj_from_camera.numpy())
+    k = image.intrinsics
+    numbers = [str(float(x)) for x in (k[0, 0], k[1, 1], k[0, 2], k[1, 2])]
+    words = ["cloud", "scene", str(tmp_path / "depth.npy"), "--intrinsics", *numbers, "--out", str(tmp_path / "s.npz")]
+    assert cli.main([*words, "--camera-pose", str(tmp_path / "pose.txt")]) == 0
+    found, said = read_scene(tmp_path / "s.npz"), capsys.readouterr().out
+    assert len(found.things) == len(load_scene().things) == said.count("thing ") and found.target is None
+    assert found.table is not None and abs(found.table.offset) < 0.002  # the shipped scene stands at z = 0
+    np.save(tmp_path / "mask.npy", load_scene().image.depth.numpy() < 0)
+    assert cli.main([*words, "--mask", str(tmp_path / "mask.npy")]) == 2
+    assert "--mask" in capsys.readouterr().err
 
 
 def test_thin_leaves_one_point_a_voxel_and_no_outliers(tmp_path, capsys):

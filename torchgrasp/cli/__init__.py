@@ -45,6 +45,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "cloud check": clouds.check,
     "cloud cut": clouds.cut,
     "cloud depth": clouds.depth,
+    "cloud scene": clouds.scene,
     "cloud thin": clouds.thin,
     "cloud render": clouds.render,
     "cloud views": clouds.views,

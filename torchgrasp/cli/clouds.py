@@ -1,4 +1,4 @@
-"""`torchgrasp cloud`: check, cut and thin a cloud, make one of a depth image, or render one from meshes."""
+"""`torchgrasp cloud`: check, cut and thin a cloud, make one or a scene of a depth image, or render one from meshes."""
 
 from pathlib import Path
 from typing import Annotated
@@ -25,6 +25,7 @@ from torchgrasp.datasets import write_objects
 from torchgrasp.errors import BadArgument
 from torchgrasp.mesh import read_mesh
 from torchgrasp.plane import as_plane
+from torchgrasp.scene import Scene, save_scene
 
 
 def check(
@@ -121,6 +122,36 @@ def depth(
         save_cloud(cloud, out)
     frame = "the camera's frame: give its vertical with --up" if pose is None else "the frame of the pose"
     print(f"{len(cloud)} points in {frame}, {out}")
+    return 0
+
+
+def scene(
+    depth: Annotated[Positional[Path], arg(metavar="DEPTH")],
+    /,
+    intrinsics: tuple[float, float, float, float],
+    out: Path,
+    mask: Path | None = None,
+    camera_pose: Path | None = None,
+) -> int:
+    """Write the scene of a depth image: the table and the things on it, for `torchgrasp grasp`.
+
+    Args:
+        depth: image as for `cloud depth`.
+        intrinsics: fx fy cx cy in pixels, of the image's own resolution.
+        out: scene to write (.npz).
+        mask: image of the depth's size that is not 0 at the object to be grasped; by default every thing is found.
+        camera_pose: file with frame_from_camera, 4 x 4 (.npy, or .txt); by default results are in the camera's frame.
+    """
+    options = {name: f"--{name.replace('_', '-')}" for name in ("intrinsics", "mask", "camera_pose")}
+    with naming(**options, depth="DEPTH", path="--out"):
+        inside = None if mask is None else read_image("mask", mask)
+        pose = None if camera_pose is None else read_pose("camera_pose", camera_pose)
+        seen = Scene.from_depth(read_image("depth", depth), intrinsics, pose, mask=inside)
+        save_scene(seen, out)
+    for label in seen.things:
+        print(f"thing {label}: {int(seen.rows_of(label).sum())} points{' (the target)' * (label == seen.target)}")
+    table = "unknown" if seen.table is None else seen.table.describe()
+    print("\n".join([f"table: {table}", *(f"advice: {sentence}" for sentence in seen.advice), str(out)]))
     return 0
 
 
