@@ -12,9 +12,11 @@ from torchgrasp import cli
 from torchgrasp.cli import grasps
 from torchgrasp.cloud import look_at, partial_view, read_cloud, save_cloud
 from torchgrasp.cloud.camera import INTRINSICS
+from torchgrasp.errors import BadArgument
 from torchgrasp.objects import DATA, load_object, load_scene
 from torchgrasp.plane import Plane
 from torchgrasp.scene import read_scene
+from torchgrasp.shape.fit import fit_shape
 from torchgrasp.values import PointCloud
 
 VIEW = DATA / "jug" / "view.ply"
@@ -173,6 +175,16 @@ def test_what_is_left_out_or_unsure_is_said_and_planned_with(name, tmp_path, cap
     assert (code, said.err) == (130, "torchgrasp: interrupted\n") and len(planned) == 1
     lines = [s for s in said.out.splitlines() if s.startswith(("note", "advice"))]
     assert any(words in s for s in lines) if words else lines == []
+
+
+def test_a_surface_from_all_sides_is_refused_by_the_check_as_by_the_fit(tmp_path, capsys):
+    points, _ = trimesh.sample.sample_surface(load_object("jug").mesh, 1500, seed=0)
+    np.save(tmp_path / "merged.npy", np.asarray(points))
+    assert cli.main(["cloud", "check", str(tmp_path / "merged.npy")]) == 1
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("refused")]
+    assert "which no camera sees at once: a single view, the viewpoint of each point, or outward normals" in line
+    with pytest.raises(BadArgument, match="which no camera sees at once"):
+        fit_shape(read_cloud(tmp_path / "merged.npy"))
 
 
 def test_shipped_views_are_never_refused(capsys):

@@ -16,16 +16,23 @@ from torchgrasp.cloud import (
     format_report,
     look_at,
     partial_view,
+    prepare_cloud,
     remove_outliers,
     save_cloud,
     voxel_downsample,
 )
 from torchgrasp.cloud.io.image import read_image, read_pose
+from torchgrasp.cloud.neighbours import draw_rows
 from torchgrasp.datasets import write_objects
 from torchgrasp.errors import BadArgument
 from torchgrasp.mesh import read_mesh
 from torchgrasp.plane import as_plane
 from torchgrasp.scene import Scene, save_scene
+from torchgrasp.shape.completion import silhouettes
+from torchgrasp.values import PointCloud
+
+MOST_JUDGED = 20_000
+"""Points of a cloud, drawn at random, of which it is asked whether one camera sees them: more are no more certain."""
 
 
 def check(
@@ -52,7 +59,23 @@ def check(
     print(format_report(report))
     for note in file.notes:
         print(f"{'note':12}{note}")
-    return int(any(advice.refused for advice in report.advice))
+    refused = any(advice.refused for advice in report.advice)
+    error = None if refused else _no_view(file.cloud)
+    if error is not None:
+        print(f"{'refused':12}{error.found}: {error.allowed}")
+    return int(refused or error is not None)
+
+
+def _no_view(cloud: PointCloud) -> BadArgument | None:
+    """Return what the fit of a shape would say of a cloud that no camera sees at once; None: nothing."""
+    some = cloud.select(draw_rows(len(cloud), MOST_JUDGED))
+    try:
+        seen = prepare_cloud(some, torch.Generator().manual_seed(0))
+        if seen.viewpoint is not None:
+            silhouettes(seen.cloud)
+    except BadArgument as error:
+        return error
+    return None
 
 
 def cut(
