@@ -299,7 +299,7 @@ def test_the_bare_command_shows_where_to_begin(capsys):
     ("typed", "offered"),
     [
         (["clo"], {"cloud"}),
-        (["cloud", ""], {"check", "cut", "depth", "thin", "render", "views"}),
+        (["cloud", ""], {"check", "cut", "depth", "scene", "thin", "render", "views"}),
         (["hand", "tr"], {"train"}),
         (["vi"], {"view"}),
         (["view", "--n"], {"--no-browser"}),
