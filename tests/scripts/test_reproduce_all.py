@@ -147,7 +147,7 @@ def test_tables_6_and_7_stand_beside_the_papers_objects_and_hand():
     cells += [cell("0.03", "jug", "allegro", 4, 4)]  # of a folder
     table = tables.held({"rows": dict.fromkeys(names, numbers), "cells": cells})
     assert table.rows[0][:4] == ("0.03", "no grasp", "no grasp", "25 of 4")
-    assert table.rows[0][5:] == ("3 of 4", "", "40", "63", "57")
+    assert table.rows[0][4:] == ("50 [25, 75] of 8", "3 of 4", "40, 63, 57")
     assert all(len(row) == len(table.heads) for row in table.rows)
 
 
@@ -157,7 +157,7 @@ def test_tables_are_as_wide_as_their_heads_and_name_the_best(tmp_path):
     assert found.rows == [(hand, "10", "5", "5", str(theirs)) for hand, theirs in GAUSSIANS.items()]
     rung = {"graspable": [1.0, 0.5, 1.0, 4, 2], "held_of_all": [0.5, None, None, 4, 1], "worth": None}
     found = tables.ladder({"ladder": {"all": {"paper": rung}, "allegro": {"paper": rung}}})
-    assert len(found.rows[0]) == len(found.heads) and found.rows[0][-1] == ""
+    assert len(found.rows[0]) == len(found.heads) and found.rows[0][1:] == ("100 [50, 100] of 4", "50 of 4", "")
     row = {"object": "jug", "setting": "paper", "threshold": 0.03, "grasps": 0, "milliseconds": 1.0}
     found = tables.table4({"starts": 9, "rows": [row | {"quality": None, "spread": None, "probability": None}]})
     assert len(found.rows[0]) == len(found.heads) and found.rows[0][3:7] == ("0", "1.00", "-", "-")

@@ -119,7 +119,7 @@ def _section(out: Path, part: Figure | Trials, content: dict[str, Any] | None) -
     else:
         lines += [f"<pre>{escape(chr(10).join(content['said']))}</pre>"] * bool(content["said"])
     lines += [_picture(out / f"{name}.png", name) for name in getattr(part, "pictures", ())]
-    options = ", ".join(f"{key} {value}" for key, value in content["asked"].items() if isinstance(value, int))
+    options = ", ".join(f"{key} {value}" for key, value in content["asked"].items() if type(value) is int)
     command = f"scripts/reproduce.py {part.name}" + (f"; {options}" if options else "")
     return "\n".join([*lines, f'<p class="source"><code>{escape(command)}</code></p>'])
 

@@ -11,7 +11,7 @@ from paper.table4_fig5 import THRESHOLDS
 from paper.table5_fig7_fig8 import PUBLISHED as PREDICTED
 from paper.table5_fig7_fig8 import PUBLISHED_ALLEGRO
 from paper.tables6_7 import PUBLISHED as HELD
-from torchgrasp.evaluation import Share, format_share
+from torchgrasp.evaluation import Share
 
 HAND, OBJECTS = "allegro", ("cylinder", "spray", "jug")
 """The hand and the objects of the paper's Tables 6 and 7, in its order."""
@@ -84,14 +84,13 @@ def fig8(content: dict[str, Any]) -> Table:
 def held(content: dict[str, Any]) -> Table:
     """Return Table 6 or 7: the paper's objects, then all objects and hands."""
     names = tuple(f"{name} %" for name in OBJECTS)
-    heads = ("row", *names, "all objects, both hands", "with a grasp", "the paper's", *names)
+    heads = ("row", *names, "all objects and hands %", "with a grasp", f"the paper's {', '.join(OBJECTS)} %")
     counts, rows = count_own(content), []
     for name, numbers in content["rows"].items():
         own = tuple(_percent(*counts[name][x]) for x in OBJECTS)
-        theirs = tuple(HELD[name].split()) if name in HELD else ("",) * len(OBJECTS)
-        share = format_share(_share(numbers["held"]))
-        rows.append((name, *own, share, f"{numbers['graspable']} of {numbers['objects']}", "", *theirs))
-    return Table(heads, rows, range(1, 10))
+        theirs, share = ", ".join(HELD.get(name, "").split()), _share(numbers["held"])
+        rows.append((name, *own, _format(share), f"{numbers['graspable']} of {numbers['objects']}", theirs))
+    return Table(heads, rows, range(1, 7))
 
 
 def count_own(content: dict[str, Any]) -> dict[str, dict[str, tuple[int, int]]]:
@@ -108,11 +107,15 @@ def count_own(content: dict[str, Any]) -> dict[str, dict[str, tuple[int, int]]]:
 def ladder(content: dict[str, Any]) -> Table:
     """Return the ladder: each hand, and what each rung is worth to both."""
     hands = [hand for hand in content["ladder"] if hand != "all"]
-    heads = ("rung", *(head for hand in hands for head in (f"{hand}: with a grasp", "held of all")), "worth, points")
+    heads = (
+        "rung",
+        *(head for hand in hands for head in (f"{hand}: with a grasp %", "held of all %")),
+        "worth, points",
+    )
     rows = []
     for rung, together in content["ladder"]["all"].items():
         each = [content["ladder"][hand][rung] for hand in hands]
-        shares = [format_share(_share(found[key])) for found in each for key in ("graspable", "held_of_all")]
+        shares = [_format(_share(found[key])) for found in each for key in ("graspable", "held_of_all")]
         rows.append((rung, *shares, _points(together["worth"])))
     return Table(heads, rows, range(1, len(heads)))
 
@@ -134,6 +137,14 @@ def _share(found: Sequence[float | None]) -> Share:
     """Return a share that was written as JSON, in which NaN is null."""
     value, low, high, total, units = (math.nan if x is None else x for x in found)
     return Share(value, low, high, int(total), int(units))
+
+
+def _format(share: Share) -> str:
+    """Return a share in per cent with its interval and its number of trials."""
+    if math.isnan(share.value):
+        return "-"
+    ends = "" if math.isnan(share.low) else f" [{100 * share.low:.0f}, {100 * share.high:.0f}]"
+    return f"{100 * share.value:.0f}{ends} of {share.total}"
 
 
 def _points(found: Sequence[float | None] | None) -> str:
