@@ -5,7 +5,7 @@ The names below are the library, in the order of the data flow. Each subpackage 
 
 from torchgrasp.errors import GraspError, Status
 from torchgrasp.plane import Plane
-from torchgrasp.specs import ContactSpec, TrialSpec
+from torchgrasp.specs import ContactSpec, SensorModel, TrialSpec
 from torchgrasp.values import (
     Certificate,
     ContactCode,
@@ -46,6 +46,7 @@ __all__ = [
     "Status",
     "Plane",
     "ContactSpec",
+    "SensorModel",
     "TrialSpec",
     "Certificate",
     "ClosingGains",

@@ -140,6 +140,40 @@ ClosingPart = Literal["wait", "pace", "switch", "place", "palm"]
 """What the closing law has beyond the paper's, see `torchgrasp.control.closing.LawClosing`."""
 
 
+SensorKind = Literal["tactile", "torque", "binary"]
+"""What senses a fingertip's contact, see `SensorModel`."""
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class SensorModel(Value):
+    """What the fingertips of a hand tell, and so what its controller relies on; `FingertipSensor` simulates it.
+
+    Args:
+        kind: "tactile": force, place and sliding of each contact, as a BioTac tells them. "torque": the force alone,
+            by the torques of the finger's joints. "binary": whether the fingertip touches.
+        delay: age [s] of what is told, in whole samples of the sensor.
+        noise: multiple of the usual noise.
+        dead: fingers whose sensor is known to tell nothing, by their names.
+
+    Raises:
+        BadArgument: a number outside its range, an unknown kind.
+
+    >>> SensorModel("binary").full
+    False
+    """
+
+    kind: SensorKind = "tactile"
+    delay: Annotated[float, Range(0.0, 0.2)] = 0.0
+    noise: Annotated[float, Range(0.0, 100.0)] = 1.0
+    dead: tuple[str, ...] = ()
+
+    @property
+    def full(self) -> bool:
+        """Whether all fingers tell force, place and sliding."""
+        return self.kind == "tactile" and not self.dead
+
+
 @checked
 @dataclasses.dataclass(frozen=True)
 class TrialSpec(Value):
@@ -154,6 +188,8 @@ class TrialSpec(Value):
             "impedance" (the grasp is a spring in the hand), "position" (joints stay at their targets) or "law" (Eq. 25
             goes on). In open loop the squeeze stays.
         without: parts that "uncertainty" or "fixed" leaves out.
+        sensor: what the fingertips tell; the hand knows it.
+        max_force: largest normal force [N] of a fingertip that the object bears; None: any.
         mass: mass of the object [kg].
         friction: coefficient of friction of every contact.
         gravity: [m/s^2].
@@ -162,7 +198,7 @@ class TrialSpec(Value):
         hold_time: time [s] after the lift.
         shake: amplitude [m] of a vertical sinusoid of 5 Hz during the hold.
         force: desired normal force of the strongest finger [N].
-        noise: whether the tactile sensor is noisy: 0.1 N normal, 0.3 N tangential, 1.5 mm of contact position.
+        noise: whether the sensor is noisy; a tactile one: 0.1 N normal, 0.3 N tangential, 1.5 mm of contact position.
         timestep: of the simulator [s].
         control_rate: of the controller [Hz].
         simulator: "sapien" or "mujoco".
@@ -206,10 +242,14 @@ class TrialSpec(Value):
     table: bool = True
     self_collision: bool = True
     without: tuple[ClosingPart, ...] = ()
+    sensor: SensorModel = dataclasses.field(default_factory=SensorModel)
+    max_force: Annotated[float, Range(0.1, 1000.0)] | None = None
 
     def __post_init__(self) -> None:
         """Check what depends on two fields."""
         check_closing_parts(self.closing, self.without)
+        check_sensor(self.sensor, self.closing, self.holding)
+        check_force(self.force, self.max_force)
         if not self.control_rate * self.timestep < 1 + 1e-9:
             found = f"{self.control_rate:g} Hz with a timestep of {self.timestep:g} s"
             raise BadArgument("control_rate", found, "a period of at least one timestep")
@@ -225,3 +265,18 @@ def check_closing_parts(closing: str, without: tuple[str, ...]) -> None:
     known = get_args(ClosingPart) if closing in ("uncertainty", "fixed") else ()
     if not set(without) <= set(known):
         raise BadArgument("without", f"{without} of {closing!r}", f"some of {known}")
+
+
+def check_sensor(sensor: SensorModel, closing: str, holding: str) -> None:
+    """Raise `BadArgument` for a closing or holding that needs what the sensor does not tell."""
+    poor = f"one of kind {sensor.kind!r}" + (f" with {', '.join(sensor.dead)} dead" if sensor.dead else "")
+    if not sensor.full and closing in ("position", "paper_position", "paper"):
+        raise BadArgument("sensor", poor, f"for closing {closing!r}: kind 'tactile', all of its fingertips alive")
+    if not sensor.full and closing != "open_loop" and holding not in ("force", "position"):
+        raise BadArgument("sensor", poor, f"for holding {holding!r}: kind 'tactile', all of its fingertips alive")
+
+
+def check_force(force: float, max_force: float | None) -> None:
+    """Raise `BadArgument` for a force [N] that the object does not bear."""
+    if max_force is not None and force > max_force:
+        raise BadArgument("force", force, f"at most {max_force:g}, the largest that the object bears")

@@ -21,7 +21,7 @@ from torchgrasp.control.closing import (
 )
 from torchgrasp.control.closing_law import MAX_SPEED, POSITION_FLOOR, POSITION_RATE
 from torchgrasp.control.controller import CLOSING_TIME, PRESSING_TIME, GraspController
-from torchgrasp.control.holding import RAMP, ForceHold, held_forces
+from torchgrasp.control.holding.force import RAMP, ForceHold, held_forces
 from torchgrasp.control.observation import Observation
 from torchgrasp.errors import BadArgument
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
-from torchgrasp.control.friction import PRIOR_STD, FrictionBelief
-from torchgrasp.control.grip import LEAST_PUSH, GripHold
-from torchgrasp.control.least_forces import LeastForces, friction_ratios, grasp_map
+from torchgrasp.control.holding.friction import PRIOR_STD, FrictionBelief
+from torchgrasp.control.holding.grip import LEAST_PUSH, GripHold
+from torchgrasp.control.holding.least_forces import LeastForces, friction_ratios, grasp_map
 from torchgrasp.control.observation import Observation
 from torchgrasp.errors import Status
 from torchgrasp.plane import Plane

@@ -11,6 +11,7 @@ from torchgrasp.control.closing_law import POSITION_FLOOR, POSITION_RATE, blend,
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.placement import Placement
 from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.state import Part
 from torchgrasp.control.tactile import NOISE
 from torchgrasp.control.targets import STILL
 from torchgrasp.linalg import limit_norm
@@ -27,7 +28,8 @@ WAITING_FORCE, SETTLED, PATIENCE = 0.3, 0.1, 2.5
 waiting ends once all have touched for ten samples [s], or after a time [s] in which a fingertip travels 100 mm."""
 
 FELT = 0.45
-"""Reading [N] that counts as a touch at once, 4.5 deviations of its noise: the contact flag comes 50 ms later."""
+"""Reading [N] that counts as a touch at once, 4.5 deviations of its noise: the contact flag comes 50 ms later. What is
+noisier has the flag alone."""
 
 PALM_REACH, PALM_SPEED, PALM_RATE = 0.02, 0.04, 6.0
 """Farthest displacement of the palm [m], its largest speed [m/s], and the rate [1/s] at which it follows the object."""
@@ -44,7 +46,7 @@ STOP_FORCE, STOP_DISTANCE, AIM_DEPTH, INTEGRAL_RATE = 0.5, 1e-3, 0.02, 2.0
 of this target behind the planned contact [m] and the integral gain [1/s^2] are tuned (docs/closing.md)."""
 
 
-class OpenLoopClosing:
+class OpenLoopClosing(Part):
     """Replay pre-grasp, grasp and squeeze, whatever is felt."""
 
     palm = STILL
@@ -64,7 +66,7 @@ class OpenLoopClosing:
         return torch.lerp(self.poses[first], self.poses[first + 1], progress - first)
 
 
-class LawClosing:
+class LawClosing(Part):
     """The closing law (Eqs. 25-28), and parts that the paper does not have. `without` leaves some of them out.
 
     * `switch`: touch decides. A finger in the air searches along its contact's normal, even beyond the contact. One
@@ -75,6 +77,7 @@ class LawClosing:
     * `pace`: before the first touch all fingers keep pace. Without it they share one limit of speed, so that
       Eq. (27) decides which is the first.
     * `place`: touches that come early or late tell where the object is (`Placement`); all contacts move with it.
+    * A finger without a sensor touches, as far as anyone knows, where its contact is believed to be; it rests there.
     * `palm`: the palm follows the object, so that the joints come to those of the grasp. It needs `place`.
 
     Without all of them it is the paper's law. That needs four mends: `joint_step` for its J^-1, `POSITION_FLOOR`,
@@ -90,11 +93,12 @@ class LawClosing:
         self.placement = None if "place" in without else Placement(reference)
         self.follows, self.palm = moves_palm("uncertainty", without), STILL
         self.felt = torch.zeros_like(reference.normals[:, 0], dtype=torch.bool)
+        self.alive, self.quick = reference.alive, reference.sensor.kind == "tactile" and reference.sensor.noise <= 1.0
         self.strongest = _strongest_lead(reference)
         self.target = reference.pregrasp
         self.waiting = self.settled = 0.0
         self.steady = torch.zeros_like(reference.normals[:, 0])
-        self.share = torch.full_like(self.steady, torch.nan)
+        self.share = torch.zeros_like(self.steady)
         self.done = False
 
     def press(self) -> "LawClosing":
@@ -108,7 +112,8 @@ class LawClosing:
         reference, gains, coupling = self.reference, self.reference.gains, self.reference.hand.actuated.coupling
         normals, contact, tips = reference.normals, observation.tactile.contact, observation.tips + self.palm
         if self.waits:
-            contact = self.felt = self.felt | contact | (observation.tactile.reading >= FELT)
+            quick = observation.tactile.reading >= FELT if self.quick else contact
+            contact = self.felt | contact | quick
         points, planned, drift = reference.contact_points(tips), gains.target, STILL
         if self.placement is not None:
             displacement = self.placement.displacement(points, contact)
@@ -118,6 +123,8 @@ class LawClosing:
                 drift = limit_norm(PALM_RATE * (goal - self.palm), PALM_SPEED)
         error = planned - points
         ahead = -(error * normals).sum(-1)  # how far the planned contact still lies ahead of each fingertip
+        arrived = ~self.alive & (ahead <= 0.0)
+        contact = self.felt = self.felt | contact | arrived if self.waits else contact | arrived
         if self.switch:
             error = error + ahead.clamp_max(0.0)[:, None] * normals
         share = blend(error, gains.covariance)
@@ -129,6 +136,7 @@ class LawClosing:
             desired = torch.where(contact, rest, desired)
         self.share = share
         self._judge(observation, contact, share, period)
+        desired = torch.where(self.alive, desired, observation.tactile.reading)
         force_error = -(desired - observation.tactile.reading)[:, None] * normals
         velocity = tip_velocity(error, force_error, share, gains.position_gain, gains.force_gain, not self.paces)
         if self.paces and not bool(contact.any()):
@@ -163,7 +171,7 @@ class LawClosing:
         """Count the time since the first touch, and the time for which the fingers have settled."""
         contact, average = observation.tactile.contact, observation.tactile.average
         self.waiting = self.waiting + period if bool(touched.any()) else 0.0
-        settled = bool(contact.all())
+        settled = bool((contact | (touched & ~self.alive)).all())
         if not self.waits:
             settled = settled and bool((share >= ARRIVED).all() & ((average - self.steady).abs() < NOISE).all())
         self.settled = self.settled + period if settled else 0.0
@@ -196,7 +204,7 @@ class FixedGainClosing(LawClosing):
         super().__init__(dataclasses.replace(reference, gains=isotropic), revise, without)
 
 
-class PositionClosing:
+class PositionClosing(Part):
     """The paper's baseline (Table 7): an isotropic PI position controller per fingertip that stops at `STOP_FORCE`.
 
     It aims at a `depth` [m] behind the contacts. The paper's is 0, with which a finger may stop before it touches.

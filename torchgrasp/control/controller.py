@@ -11,14 +11,16 @@ from torch import Tensor
 from torchgrasp.base import check_device, settle
 from torchgrasp.border import checked
 from torchgrasp.control.closing import FixedGainClosing, LawClosing, OpenLoopClosing, PositionClosing, Revision
-from torchgrasp.control.grip import GripHold
-from torchgrasp.control.holding import ForceHold, PositionHold
+from torchgrasp.control.holding.force import ForceHold, PositionHold
+from torchgrasp.control.holding.grip import GripHold
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.state import ControllerState, Part, pack, unpack
+from torchgrasp.control.tactile import no_contact
 from torchgrasp.control.targets import Targets
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.specs import ClosingMode, ClosingPart, HoldingMode, check_closing_parts
+from torchgrasp.specs import ClosingMode, ClosingPart, HoldingMode, check_closing_parts, check_sensor
 
 Step = Callable[[Observation, float], Float[Tensor, " j"]]
 """Turns what is known, and the time to the next tick [s], into the targets of all joints [rad]."""
@@ -56,7 +58,7 @@ class GraspController:
 
     Raises:
         BadArgument: unknown names; a belief, parts or "law" for a closing that has none; "impedance" for more than
-            three fingertips.
+            three fingertips; a closing or holding that needs what the sensor does not tell.
 
     A hand that is driven at 200 Hz; here joints follow at once and the object yields by 1 mm for 2 N:
 
@@ -86,9 +88,11 @@ class GraspController:
         without: tuple[ClosingPart, ...] = (),
     ) -> None:
         check_modes(closing, holding, belief, without)
+        check_sensor(reference.sensor, closing, holding)
+        self.modes = f"closing {closing}, holding {holding}, without {', '.join(without) or 'nothing'}"
         self.reference = reference = settle(reference, torch.device("cpu"))
         self.closing = _closing(reference, closing, belief, without)
-        self._hold, self.hold = _holding(self.closing, holding), None
+        self._hold, self.hold, self._law = _holding(self.closing, holding), None, holding == "law"
         self.targets = Targets(reference.expand(reference.pregrasp))
         self.time, self.pressed = 0.0, 0.0
 
@@ -108,7 +112,8 @@ class GraspController:
     def blend(self) -> Float[Tensor, " f"]:
         """Lambda of each finger (Eq. 26) at the last tick; NaN before it and without the law."""
         nothing = torch.full_like(self.reference.normals[:, 0], torch.nan)
-        return self.closing.share if isinstance(self.closing, LawClosing) and self.hold is None else nothing
+        acts = self.hold is None and self.time > 0.0
+        return self.closing.share if acts and isinstance(self.closing, LawClosing) else nothing
 
     @checked
     def step(self, observation: Observation, period: float) -> Targets:
@@ -129,6 +134,69 @@ class GraspController:
             joints = self.hold(observation, period)
         self.targets = Targets(joints, self.closing.palm)
         return self.targets
+
+    @checked
+    def state(self) -> ControllerState:
+        """Return what changes from tick to tick, to be saved: `restore` goes on from it.
+
+        Raises:
+            BadArgument: a controller with a belief, whose shape is none of its numbers.
+        """
+        if isinstance(self.closing, LawClosing) and self.closing.revise is not None:
+            raise BadArgument("state", "that of a controller with a belief", "that of one without")
+        return pack(self._modes(self.hold), self._numbers(self.hold))
+
+    @checked
+    def restore(self, state: ControllerState) -> None:
+        """Go on from a state as the controller of it would have: the same observations give the same bits.
+
+        The controller has to be made of the same grasp and modes.
+
+        Raises:
+            BadArgument: the state of another hand, or of other modes.
+
+        >>> from torchgrasp import load_hand, load_object, plan_grasps
+        >>> from torchgrasp.control import ClosingReference, no_contact, observe
+        >>> hand = load_hand("allegro")
+        >>> grasp = plan_grasps(load_object("cylinder").view, hand, starts=20)[0]
+        >>> reference = ClosingReference.from_grasp(hand, grasp)
+        >>> one, other, seen = GraspController(reference), GraspController(reference), None
+        >>> for _ in range(3):
+        ...     targets = one.step(observe(hand, reference.pregrasp, no_contact()), 0.01)
+        >>> other.restore(one.state())
+        >>> bool((other.targets.joints == targets.joints).all())
+        True
+        """
+        hold = self._blank() if state.layout.startswith(self._modes(self.closing)) else None
+        numbers = unpack(self._modes(hold), self._numbers(hold), state)
+        if numbers is None:
+            raise BadArgument("state", state.layout[:80], f"one of {self._modes(hold)}, and of this hand's fingers")
+        self.time, self.pressed = (float(numbers[f"controller.{name}"]) for name in ("time", "pressed"))
+        self.targets = Targets(numbers["controller.joints"], numbers["controller.palm"])
+        self.closing.go_on("closing", numbers)
+        self.hold = hold
+        if isinstance(hold, Part) and hold is not self.closing:
+            hold.go_on("hold", numbers)
+
+    def _blank(self) -> Step:
+        """Return the holding as after touching nothing."""
+        if self._law:
+            return self.closing
+        reference = self.reference
+        target, joints = reference.gains.target, self.targets.joints
+        jacobian = torch.zeros(*target.shape, len(joints), dtype=torch.float64)
+        return self._hold(reference, Observation(joints, target, jacobian, no_contact(fingers=len(target))), joints)
+
+    def _modes(self, hold: Step | None) -> str:
+        """Return the modes and the phase in words."""
+        return f"{self.modes}, {'in the air' if hold is None else 'pressing'}"
+
+    def _numbers(self, hold: Step | None) -> dict[str, Tensor]:
+        """Return every number of the controller, with those of a holding."""
+        mine = {"time": self.time, "pressed": self.pressed, **self.targets._asdict()}
+        mine = {f"controller.{name}": torch.as_tensor(x, dtype=torch.float64).clone() for name, x in mine.items()}
+        held = hold.numbers("hold") if isinstance(hold, Part) and hold is not self.closing else {}
+        return mine | self.closing.numbers("closing") | held
 
 
 Closing = OpenLoopClosing | PositionClosing | LawClosing

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.state import Part
 from torchgrasp.linalg import unit
 
 SPREAD, HEIGHT_SPREAD = 0.01, 0.001
@@ -23,12 +24,12 @@ FARTHEST = 0.025
 """A finger in the air bounds the object's place by no more than this [m]: farther on it has missed the object."""
 
 
-class Placement:
+class Placement(Part):
     """The belief of the object's displacement, in the hand's frame before its palm moved."""
 
     def __init__(self, reference: ClosingReference) -> None:
         gains, normals = reference.gains, reference.normals
-        self.target, self.normals = gains.target, normals
+        self.target, self.normals, self.alive = gains.target, normals, reference.alive
         self.arms = gains.target - gains.target.mean(0)
         self.rows = torch.cat([normals, torch.linalg.cross(self.arms, normals)], -1)
         self.weight = 1 / torch.einsum("fi,fij,fj->f", normals, gains.covariance, normals)
@@ -46,9 +47,10 @@ class Placement:
 
         Args:
             points: of the fingertips, those that touch first [m].
-            touching: which of them touch.
+            touching: which of them touch, as their sensors tell.
         """
         off = ((points - self.target) * self.normals).sum(-1)
+        touching = touching & self.alive
         active, found = touching, torch.zeros_like(self.prior[0])
         for _ in range(len(off)):
             weight = self.weight * active
@@ -56,7 +58,7 @@ class Placement:
                 self.prior + self.rows.T @ (weight[:, None] * self.rows),
                 self.rows.T @ (weight * off.clamp_min(-FARTHEST)),
             )
-            missed = touching | active | (off < self.rows @ found)
+            missed = touching | active | (self.alive & (off < self.rows @ found))
             if torch.equal(missed, active):
                 break
             active = missed

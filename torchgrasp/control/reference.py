@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Annotated
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
@@ -24,6 +24,7 @@ from torchgrasp.control.stiffness import drive_stiffness, joint_stiffness, tip_c
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand import Hand
 from torchgrasp.plane import Plane
+from torchgrasp.specs import SensorModel
 from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
@@ -45,6 +46,8 @@ class ClosingReference(Value):
         normals: outward normals of the planned contacts.
         gains: targets, gains and desired forces (Eqs. 26-28).
         table: into which no fingertip presses while it searches; None: none is known.
+        sensor: what the fingertips tell.
+        max_force: largest normal force [N] of a fingertip that the object bears; None: any.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.objects import load_shipped_grasp
@@ -67,6 +70,8 @@ class ClosingReference(Value):
     normals: Float[Tensor, "f 3"]
     gains: ClosingGains
     table: Plane | None = None
+    sensor: SensorModel = dataclasses.field(default_factory=SensorModel)
+    max_force: Annotated[float, Range(0.1, 1000.0)] | None = None
 
     @classmethod
     @checked
@@ -146,6 +151,18 @@ class ClosingReference(Value):
     def _actuated(self) -> list[int]:
         """Places of the actuated joints among all."""
         return [self.hand.tree.joint_names.index(name) for name in self.hand.joint_names]
+
+    @property
+    def alive(self) -> Bool[Tensor, "f"]:
+        """Which fingertips tell anything.
+
+        Raises:
+            BadArgument: a dead fingertip that the hand has not.
+        """
+        names, dead = self.hand.finger_names, self.sensor.dead
+        if not set(dead) <= set(names):
+            raise BadArgument("sensor", f"dead fingers {dead}", f"some of {names}")
+        return torch.tensor([name not in dead for name in names])
 
     def clamp(self, actuated: Float[Tensor, " h"]) -> Float[Tensor, " h"]:
         """Return joints within their limits."""

@@ -6,7 +6,7 @@ of a round tip. Samples come at the sensor's own rate.
 
 import dataclasses
 import math
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -124,6 +124,25 @@ def measure(
     >>> felt.contact, felt.reading  # behind the low-pass
     (tensor([ True, False, False]), tensor([1.4308, 0.0000, 0.7154], dtype=torch.float64))
     """
+    return sample(tactile, truth, pads, radius, period, None if generator is None else Noise(generator))
+
+
+class Noise(NamedTuple):
+    """What draws the noise, and how many times the usual it is."""
+
+    generator: torch.Generator
+    scale: float = 1.0
+
+
+def sample(
+    tactile: TactileState,
+    truth: TipContact,
+    pads: Float[Tensor, "*#b f 3"],
+    radius: Float[Tensor, "f"],
+    period: float,
+    noise: Noise | None,
+) -> TactileState:
+    """Return what the fingertips report one tick later, as in `measure`."""
     check_device("truth", truth.forces.device, "the tactile state", tactile.lagged.device)
     sliding = torch.zeros_like(truth.normal_force) if truth.sliding is None else truth.sliding
     force = torch.cat([truth.normal_force[..., None], truth.forces, sliding[..., None]], dim=-1)
@@ -133,11 +152,11 @@ def measure(
         return dataclasses.replace(tactile, lagged=lagged, age=age)
     reading, forces, sliding = lagged[..., 0], lagged[..., 1:4], lagged[..., 4]
     points, normals = truth.points, truth.normals
-    if generator is not None:
+    if noise is not None:
         along = torch.where(torch.isfinite(normals), normals, pads)
-        noise = torch.randn(2, *forces.shape, generator=generator, dtype=forces.dtype)
-        normal_part = (noise * along).sum(-1, keepdim=True)
-        push, across = normal_part[0], noise - normal_part * along
+        drawn = noise.scale * torch.randn(2, *forces.shape, generator=noise.generator, dtype=forces.dtype)
+        normal_part = (drawn * along).sum(-1, keepdim=True)
+        push, across = normal_part[0], drawn - normal_part * along
         reading = reading + NOISE * push[..., 0]
         sliding = sliding + SLIDE_NOISE * normal_part[1, ..., 0]
         forces = forces - NOISE * push * along + TANGENTIAL_NOISE * across[0]
@@ -145,9 +164,14 @@ def measure(
         normals = unit(truth.normals + PLACE_NOISE / curvature_radius * across[1])
         points = truth.points + curvature_radius * (truth.normals - normals)
     average = tactile.average + low_pass(FLAG_CUTOFF, max(period, interval)) * (reading - tactile.average)
-    contact = torch.where(tactile.contact, average > TOUCH_OFF, average > TOUCH_ON)
+    contact = flag(tactile.contact, average, 1.0 if noise is None else max(noise.scale, 1.0))
     age = min(max(age - interval, 0.0), interval)
     return TactileState(reading, forces, contact, points, normals, lagged, average, sliding, age)
+
+
+def flag(before: Bool[Tensor, "*b f"], average: Float[Tensor, "*b f"], doubt: Float[Tensor, "f"] | float) -> Tensor:
+    """Return contact flags by averages [N], as many times the usual ones as the sensor is noisier (`doubt`)."""
+    return torch.where(before, average > TOUCH_OFF * doubt, average > TOUCH_ON * doubt)
 
 
 def low_pass(cutoff: float, period: float) -> float:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchgrasp.border import Seed, checked
 from torchgrasp.control.closing import PALM_REACH
 from torchgrasp.control.controller import GraspController, check_modes
-from torchgrasp.control.grip import GripHold
+from torchgrasp.control.holding.grip import GripHold
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.protocols import apply_error
@@ -100,6 +100,8 @@ class TrialDriver:
             table = Plane.horizontal(float(body.mesh.bounds[0, 2]) if trial.table is None else 0.0)
             known = table.moved(inverse(grasp.obj_from_hand[0]))  # the hand's true pose may be another
             self.reference = dataclasses.replace(self.reference, table=known)
+        told = {"sensor": spec.sensor, "max_force": spec.max_force}
+        self.reference = self.reference if reference else dataclasses.replace(self.reference, **told)
         if spec.kp is not None:
             drives = {name: drive._replace(kp=spec.kp) for name, drive in drives.items()}
         true_pose = apply_error(grasp.obj_from_hand[0], trial.error)

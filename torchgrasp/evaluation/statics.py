@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgrasp.border import Count, Positive, Range, checked
 from torchgrasp.closing import ClosureResult
-from torchgrasp.control.least_forces import grasp_map
+from torchgrasp.control.holding.least_forces import grasp_map
 from torchgrasp.control.observation import joint_jacobian
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, inverse

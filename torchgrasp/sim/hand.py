@@ -5,7 +5,7 @@ import math
 import numpy as np
 import torch
 
-from torchgrasp.control import ClosingReference, Observation, Targets, TipContact, measure, no_contact
+from torchgrasp.control import ClosingReference, FingertipSensor, Observation, Targets, TipContact
 from torchgrasp.sim.scene import Scene, StepContacts
 
 
@@ -39,7 +39,7 @@ class SimulatedHand:
     def __init__(
         self, scene: Scene, reference: ClosingReference, control_rate: float, generator: torch.Generator | None
     ) -> None:
-        self.scene, self.reference, self.generator = scene, reference, generator
+        self.scene, self.reference = scene, reference
         self.substeps = max(1, round(1 / (control_rate * scene.timestep)))
         self.period = self.substeps * scene.timestep
         fingers = len(reference.hand.tips)
@@ -47,7 +47,7 @@ class SimulatedHand:
         self.first_stray, self.stray, self.most_stray = np.full(3, np.inf), np.zeros(3), np.zeros(3)
         self._palm, self.pushes = np.zeros(3), np.zeros((fingers, 3))
         self.force, self.finger = np.zeros(fingers), np.zeros(fingers, dtype=bool)
-        self.tactile = no_contact(fingers=fingers)
+        self.sensor = FingertipSensor(reference, generator)
         nothing = torch.full((fingers, 3), torch.nan, dtype=torch.float64)
         self.truth = TipContact(torch.zeros(fingers).double(), torch.zeros_like(nothing), nothing, nothing)
         self._places: tuple[np.ndarray, np.ndarray] | None = None
@@ -102,10 +102,10 @@ class SimulatedHand:
         f = len(self.force)
         sliding = torch.from_numpy(self._sliding(tips, points, normals))
         self.truth = TipContact(torch.from_numpy(self.force), vectors[:f], places[:f], vectors[f:], sliding)
-        normals, radius = self.reference.normals, self.reference.hand.tips.radius
-        self.tactile = measure(self.tactile, self.truth, normals, radius, self.period, self.generator)
         joints, jacobian = self.scene.joints()[self._from_scene], self.scene.jacobian(centres)[..., self._from_scene]
-        return Observation(torch.from_numpy(joints), places[f:], torch.from_numpy(rotation.T @ jacobian), self.tactile)
+        turned = torch.from_numpy(rotation.T @ jacobian)
+        tactile = self.sensor(self.truth, turned, self.period)
+        return Observation(torch.from_numpy(joints), places[f:], turned, tactile)
 
     def _sliding(self, tips: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Return the speed [m/s] of each tip along the object's surface since the last tick; 0 without contact."""

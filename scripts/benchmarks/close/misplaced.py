@@ -43,7 +43,7 @@ from torchgrasp.evaluation.protocols import error_from_object_pose
 from torchgrasp.files import write_file
 from torchgrasp.frames import rigid, rotation_from_vector
 from torchgrasp.sim.convex_parts import convex_parts
-from torchgrasp.specs import ContactSpec
+from torchgrasp.specs import ContactSpec, SensorModel
 from torchgrasp.values import load_grasps
 
 PLANNED_FRICTION = 0.6
@@ -87,10 +87,14 @@ BARS = {"5 mm": (0.97, 2.0), "10 mm": (0.92, 4.0), "20 mm": (0.80, 8.0)}
 
 
 class Law(NamedTuple):
-    """How the hand closes; `swapped` exchanges the deviations of the most and the least certain finger."""
+    """How the hand closes; `swapped` exchanges the deviations of the most and the least certain finger.
+
+    `dead` are the fingers, in grasp order, whose sensor is.
+    """
 
     trial: dict[str, Any]
     swapped: bool = False
+    dead: tuple[int, ...] = ()
 
 
 DEFAULT = "uncertainty"
@@ -109,6 +113,21 @@ LAWS = {
     "open_loop": Law({"closing": "open_loop"}),
 }
 """By name; all hold by "force", but for the open loop, which keeps its squeeze."""
+
+SENSED = {
+    "readings 20 ms old": Law({"sensor": SensorModel(delay=0.02)}),
+    "readings 40 ms old": Law({"sensor": SensorModel(delay=0.04)}),
+    "three times the noise": Law({"sensor": SensorModel(noise=3.0)}),
+    "joint torques": Law({"sensor": SensorModel("torque")}),
+    "binary": Law({"sensor": SensorModel("binary")}),
+    "binary, 40 ms old": Law({"sensor": SensorModel("binary", delay=0.04)}),
+    "first finger dead": Law({}, dead=(0,)),
+    "thumb dead": Law({}, dead=(-1,)),
+}
+"""`DEFAULT` with poorer fingertips, by name."""
+
+LAWS_OF_SENSORS = (DEFAULT, *SENSED, "open_loop")
+"""What is compared to tell the worth of sensors."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -211,15 +230,18 @@ def _try(spec: TableSpec, subject: Subject, hand: str, condition: str, laws: lis
         error = _misplace(wrong, grasps[rank], mesh, seed)
         for law in laws:
             began = time.process_time()
-            grasp = swap_deviations(grasps[rank]) if LAWS[law].swapped else grasps[rank]
+            followed = (LAWS | SENSED)[law]
+            grasp = swap_deviations(grasps[rank]) if followed.swapped else grasps[rank]
             trial = GraspTrial(load_hand(hand), grasp, mesh, seed_of(seed, "touch"), error, parts=parts)
-            status, moved, unbalanced = _run(trial, wrong, LAWS[law], mass, seed)
+            status, moved, unbalanced = _run(trial, wrong, followed, mass, seed)
             yield Outcome(*known, rank, condition, law, status.name, moved, unbalanced, time.process_time() - began)
 
 
 def _run(trial: GraspTrial, wrong: Condition, law: Law, mass: float, seed: int) -> tuple[Status, Any, Any]:
     """Return status, motion before the lift [mm] and the unbalanced share of the forces."""
     changes = law.trial | {"simulator": wrong.simulator}
+    if law.dead:
+        changes["sensor"] = SensorModel(dead=tuple(trial.hand.finger_names[k] for k in law.dead))
     if wrong.afloat:
         return (
             pull_grasp(trial, PROTOCOLS[wrong.afloat].with_trial(**{"closing": DEFAULT} | changes)).status,

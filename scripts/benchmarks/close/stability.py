@@ -15,7 +15,7 @@ from torchgrasp import ContactSpec, Grasps, Hand, Status, load_hand, plan_grasps
 from torchgrasp.control import ClosingReference
 from torchgrasp.control.adaptive.impedance import GRASP_STIFFNESS, Impedance
 from torchgrasp.control.adaptive.stability import StabilityModel, lengths_of, load_stability, state_of
-from torchgrasp.control.holding import ForceHold
+from torchgrasp.control.holding.force import ForceHold
 from torchgrasp.evaluation.campaign import choose_rows
 from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.linalg import unit

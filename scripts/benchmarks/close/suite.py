@@ -9,7 +9,7 @@ from paper.trials import TableSpec
 from benchmarks.close.ablation import bench_ablation
 from benchmarks.close.holding import bench_holding
 from benchmarks.close.household import bench_grip, bench_household
-from benchmarks.close.misplaced import bench_misplaced
+from benchmarks.close.misplaced import LAWS_OF_SENSORS, bench_misplaced
 from benchmarks.close.pose_noise import bench_noise
 from benchmarks.close.real_scans import bench_scans
 from benchmarks.close.simulator_agreement import bench_agreement
@@ -21,8 +21,8 @@ from benchmarks.common import Row, measure
 from torchgrasp.evaluation.campaign import EvaluationSpec
 
 SUBJECTS = (
-    "statics", "speed", "ablation", "agreement", "stability", "noise", "success", "misplaced", "perturb", "grip",
-    "scans", "holding",
+    "statics", "speed", "ablation", "agreement", "stability", "noise", "success", "misplaced", "sensors",
+    "perturb", "grip", "scans", "holding",
 )  # fmt: skip
 
 
@@ -48,8 +48,8 @@ def close(
         objects: folders with manifest.json and a folder for each object; without one what needs grasps is left out.
             Only misplaced, perturb, grip and scans take more than the first.
         only: subjects to measure. statics, speed, ablation, agreement, stability, noise and success are of the closing;
-            misplaced, perturb, grip, scans and holding lift what a robot would meet, one object of each family (not
-            scans).
+            misplaced, sensors, perturb, grip, scans and holding lift what a robot would meet, one object of each family
+            (not scans).
         hands: of all but ablation and agreement, which take both.
         tries: grasps of each view: the best for noise, else spread over all ranks.
         draws: errors of the hand's pose for each grasp.
@@ -78,6 +78,7 @@ def close(
         "stability": lambda: bench_stability(folder, tries, starts, seed) if folder else [],
         "noise": lambda: bench_noise(folder, hands, draws, spec, workers) if folder else [],
         "misplaced": lambda: bench_misplaced(household, conditions, laws) if folder else [],
+        "sensors": lambda: bench_misplaced(household, conditions, laws or LAWS_OF_SENSORS) if folder else [],
         "perturb": lambda: bench_household(household) if folder else [],
         "grip": lambda: bench_grip(household) if folder else [],
         "holding": lambda: bench_holding(household) if folder else [],

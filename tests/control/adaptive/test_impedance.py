@@ -18,7 +18,7 @@ from torchgrasp.control.adaptive.impedance import (
     spring_forces,
 )
 from torchgrasp.control.adaptive.stability import PreferredForces, StabilityModel
-from torchgrasp.control.holding import RAMP, held_forces
+from torchgrasp.control.holding.force import RAMP, held_forces
 from torchgrasp.frames import rigid, rotation_from_vector, virtual_frame
 
 

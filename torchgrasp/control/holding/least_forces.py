@@ -12,6 +12,8 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from torchgrasp.control.state import Part
+
 Array = np.ndarray
 
 STEPS, NEAR, LENGTHS = 8, 0.3, 2.0 ** np.arange(8)
@@ -57,7 +59,7 @@ def friction_ratios(forces: Float[Array, "f 3"], normals: Float[Array, "f 3"]) -
     return np.where(push > 0, slide / np.maximum(push, 1e-12), np.inf)
 
 
-class LeastForces:
+class LeastForces(Part):
     """Find least forces, each time from those found before.
 
     Args:

@@ -9,16 +9,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.control.friction import CREEP_CUTOFF, CREEPING, LEAST_STD, SLIPPING, FrictionBelief
-from torchgrasp.control.holding import RAMP, held_forces
-from torchgrasp.control.least_forces import LeastForces, friction_ratios, grasp_map
+from torchgrasp.control.holding.force import RAMP, held_forces
+from torchgrasp.control.holding.friction import CREEP_CUTOFF, CREEPING, LEAST_STD, SLIPPING, FrictionBelief
+from torchgrasp.control.holding.least_forces import LeastForces, friction_ratios, grasp_map
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.state import Part
 from torchgrasp.control.tactile import low_pass
 from torchgrasp.errors import Status
 
 FRICTION = 0.8
 """Mean of the friction before anything is felt: that of a grasp's plan by default (`ContactSpec`)."""
+
+BORNE = 1000.0
+"""Largest normal force of a finger [N] on an object that bears any: no hand presses as hard."""
 
 LEAST_PUSH = 0.4
 """Least normal force of a finger [N]: four standard deviations of its reading."""
@@ -69,24 +73,18 @@ OVERLOADED = 0.25
 """Time [s] for which the limits are exceeded, or a fingertip slides at the limits, before the load is too heavy."""
 
 
-class GripHold:
+class GripHold(Part):
     """Press with the least forces that carry the felt load.
 
     `status` turns `TOO_HEAVY` when the limits of torque or force do not suffice: then the hand should be put down.
     `weight` [N] is the load that is felt.
 
     Args:
-        reference, observation, start: as for `ForceHold`.
-        max_force: largest normal force of a finger [N].
+        reference, observation, start: as for `ForceHold`; no finger presses harder than `reference.max_force`.
     """
 
-    def __init__(
-        self,
-        reference: ClosingReference,
-        observation: Observation,
-        start: Float[Tensor, " j"],
-        max_force: float = 1e3,
-    ) -> None:
+    def __init__(self, reference: ClosingReference, observation: Observation, start: Float[Tensor, " j"]) -> None:
+        max_force = BORNE if reference.max_force is None else reference.max_force
         hand = reference.hand
         self.reference, self.start, self.rest = reference, start, observation.joints
         effort = np.array([hand.actuators[name].effort for name in hand.tree.joint_names])

@@ -6,13 +6,17 @@ from torch import Tensor
 
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.state import Part
 from torchgrasp.plan.internal_forces import least_friction_forces
+
+MOST_FACTOR = 1.5
+"""Largest factor of the forces: a sensor that reads too little does not crush what is held."""
 
 RAMP = 0.4
 """Time [s] in which the forces rise to the desired ones: the sensor lags by 8 ms only."""
 
 
-class ForceHold:
+class ForceHold(Part):
     """Press with forces that are balanced at the sensed contacts; the joints stay compliant.
 
     One common factor keeps the sum of the forces. A loop for each finger would drift and push the object.
@@ -27,18 +31,21 @@ class ForceHold:
         self.start, self.rest = start, observation.joints
         forces, self.strength = held_forces(reference, observation)
         self.lead = torch.einsum("cij,ci->j", observation.jacobian, forces) / reference.kp
-        self.factor, self.time = 1.0, 0.0
+        largest = float(torch.linalg.vector_norm(forces, dim=-1).max())
+        self.most = MOST_FACTOR if reference.max_force is None else min(MOST_FACTOR, reference.max_force / largest)
+        self.factor, self.time = min(1.0, self.most), 0.0
+        self.told = reference.sensor.kind != "binary"
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets of all joints for the next tick."""
         self.time += period
         share = min(self.time / RAMP, 1.0)
-        if share == 1.0:
-            self.factor = regulate(self.factor, observation, self.strength, period)
+        if share == 1.0 and self.told:
+            self.factor = min(regulate(self.factor, observation, self.strength, period), self.most)
         return self.start + share * (self.rest + self.factor * self.lead - self.start)
 
 
-class PositionHold:
+class PositionHold(Part):
     """Keep the joint targets of the closing's end; arguments as for `ForceHold`."""
 
     def __init__(self, reference: ClosingReference, observation: Observation, start: Float[Tensor, " j"]) -> None:
@@ -52,11 +59,11 @@ class PositionHold:
 def regulate(factor: float, observation: Observation, strength: float, period: float) -> float:
     """Return the common factor of the forces a tick later; it integrates the missing share of their sum."""
     lacking = 1 - float(observation.tactile.reading.sum()) / strength
-    return min(max(factor + period * lacking, 0.5), 1.5)
+    return min(max(factor + period * lacking, 0.5), MOST_FACTOR)
 
 
 def held_forces(reference: ClosingReference, observation: Observation) -> tuple[Float[Tensor, "f 3"], float]:
-    """Return forces [N] that are balanced at the sensed contacts, and their normal sum.
+    """Return forces [N] that are balanced at the sensed contacts, and the normal sum of those that are felt.
 
     The planned forces stay where a finger is in the air or no balanced set presses.
     """
@@ -69,4 +76,4 @@ def held_forces(reference: ClosingReference, observation: Observation) -> tuple[
         balanced = least_friction_forces(sensed.points[None], sensed.normals[None], float(push.max()), preferred)[0]
         if bool(torch.isfinite(balanced).all()):
             forces, normals = balanced, sensed.normals
-    return forces, float(-(forces * normals).sum())
+    return forces, float(-((forces * normals).sum(-1) * reference.alive).sum())

@@ -2,6 +2,8 @@
 
 import math
 
+from torchgrasp.control.state import Part
+
 SLIPPING, CREEPING, CREEP_CUTOFF = 0.008, 0.002, 1.0
 """Speeds [m/s] from which a fingertip counts as sliding: four standard deviations of its reading, and five of its slow
 mean behind a cut-off [Hz]."""
@@ -19,7 +21,7 @@ LEAST_FRICTION, MOST_FRICTION = 0.15, 1.5
 """Frictions that are believed."""
 
 
-class FrictionBelief:
+class FrictionBelief(Part):
     """Mean and standard deviation of the friction of all fingertips on the object.
 
     >>> belief = FrictionBelief(0.8)

@@ -1,0 +1,170 @@
+"""Poorer fingertips: what each kind tells, how late, and that the closing law relies on no more than that."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from tests.point_fingers import NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
+from torchgrasp.control import FingertipSensor, GraspController, TipContact, feel_flags, feel_torques, no_contact
+from torchgrasp.control.closing import LawClosing
+from torchgrasp.control.holding.force import MOST_FACTOR, ForceHold
+from torchgrasp.control.sensing import FLAGGED, TORQUE_NOISE
+from torchgrasp.errors import BadArgument
+from torchgrasp.specs import SensorModel, TrialSpec
+
+JACOBIAN = torch.eye(9).double().reshape(3, 3, 9)
+FINGERS = reference().hand.finger_names
+
+
+def having(**changes):
+    return dataclasses.replace(reference(), sensor=SensorModel(**changes))
+
+
+def touch(force) -> TipContact:
+    push = real(force)
+    return TipContact(push, -push[:, None] * NORMALS, TARGET, NORMALS)
+
+
+def told(known, force, ticks=100, seed=None):
+    generator = None if seed is None else torch.Generator().manual_seed(seed)
+    sensor = FingertipSensor(known, generator)
+    return [sensor(touch(force), JACOBIAN, PERIOD) for _ in range(ticks)]
+
+
+def test_old_readings_are_those_of_before():
+    fresh = told(having(), (1.0, 2.0, 3.0))
+    for late in (1, 4):
+        old = told(having(delay=late / 100), (1.0, 2.0, 3.0))
+        for k in range(late, 100):
+            assert torch.equal(old[k].reading, fresh[k - late].reading)
+            assert torch.equal(old[k].contact, fresh[k - late].contact)
+    assert (old[0].reading == 0).all()
+
+
+def test_noise_scales():
+    one, three = (torch.stack([t.reading for t in told(having(noise=n), (2.0, 2.0, 2.0), 100, 1)]) for n in (1.0, 3.0))
+    clean = torch.stack([t.reading for t in told(having(), (2.0, 2.0, 2.0), 100)])
+    assert torch.allclose(three - clean, 3 * (one - clean), atol=1e-12)
+
+
+def test_torques_tell_the_forces_but_not_where_they_act():
+    last = told(having(kind="torque"), (1.0, 2.0, 0.0))[-1]
+    assert torch.allclose(last.reading, real([1.0, 2.0, 0.0]), rtol=1e-3)
+    assert torch.allclose(last.forces, -last.reading[:, None] * NORMALS, atol=1e-9)
+    assert last.contact.tolist() == [True, True, False]
+    assert not torch.isfinite(last.points).any() and not torch.isfinite(last.normals).any()
+
+
+def test_noise_of_torques_is_that_of_forces_along_the_axes_of_unit_levers():
+    readings = torch.stack([t.reading for t in told(having(kind="torque"), (2.0, 2.0, 2.0), 1500, 1)[50:]])
+    passed = math.sqrt(1 - math.exp(-0.4 * math.pi)) / math.sqrt(1 + math.exp(-0.4 * math.pi))  # of an AR(1) low-pass
+    assert float(readings.std()) == pytest.approx(TORQUE_NOISE * passed, rel=0.1)
+
+
+def test_a_robot_with_torque_sensors_feels_what_the_simulated_one_does():
+    known, tactile = having(kind="torque"), no_contact()
+    torques = torch.einsum("fcj,fc->j", JACOBIAN, touch((1.0, 2.0, 0.5)).forces)
+    for expected in told(known, (1.0, 2.0, 0.5), 20):
+        tactile = feel_torques(tactile, known, JACOBIAN, torques, PERIOD)
+        assert torch.allclose(tactile.reading, expected.reading) and torch.equal(tactile.contact, expected.contact)
+
+
+def test_a_binary_fingertip_tells_the_same_of_every_force():
+    weak, strong = told(having(kind="binary"), (1.0, 0.1, 0.0))[-1], told(having(kind="binary"), (9.0, 0.1, 0.0))[-1]
+    assert weak.contact.tolist() == [True, False, False]
+    for name in ("reading", "forces", "contact", "average", "sliding"):
+        assert torch.equal(getattr(weak, name), getattr(strong, name))
+    assert torch.equal(feel_flags(weak, weak.contact).reading, real([FLAGGED, 0.0, 0.0]))
+
+
+def test_a_dead_fingertip_is_silent_and_the_others_are_as_ever():
+    quiet, all_of_them = (told(x, (2.0, 2.0, 2.0), seed=3)[-1] for x in (having(dead=FINGERS[1:2]), having()))
+    assert quiet.reading[1] == 0 and not quiet.contact[1] and not torch.isfinite(quiet.points[1]).any()
+    for k in (0, 2):
+        assert quiet.reading[k] == all_of_them.reading[k] and torch.equal(quiet.normals[k], all_of_them.normals[k])
+    with pytest.raises(BadArgument, match="little_toe"):
+        FingertipSensor(having(dead=("little_toe",)))
+
+
+def test_a_finger_without_a_sensor_rests_where_its_contact_should_be_and_is_waited_for_no_longer():
+    law = LawClosing(having(dead=FINGERS[2:]), without=("place",))
+    two = torch.tensor([True, True, False])
+    before = law(observation(0.01, (0.3, 0.3, 0.0), two), PERIOD).reshape(3, 3)
+    assert float((before[2] * NORMALS[2]).sum()) < 0  # it comes on
+    rests = [law(observation(-0.001, (0.3, 0.3, 0.0), two), PERIOD).reshape(3, 3) for _ in range(12)]
+    assert torch.allclose(rests[0][2], rests[-1][2], atol=1e-9) and law.done
+    other = LawClosing(reference(), without=("place",))
+    for _ in range(12):
+        other(observation(-0.001, (0.3, 0.3, 0.0), two), PERIOD)
+    assert not other.done  # one that could tell has not touched: it searches on
+
+
+def test_a_dead_finger_in_the_air_says_nothing_of_where_the_object_is():
+    moved = {}
+    for name, known in (("dead", having(dead=FINGERS[2:])), ("alive", reference())):
+        law = LawClosing(known)
+        tips = TARGET + 0.01 * NORMALS - 0.01 * NORMALS * real([[0.0], [0.0], [1.0]])  # the last is beyond its contact
+        law(dataclasses.replace(observation(), tips=tips), PERIOD)
+        moved[name] = float(law.palm.norm())
+    assert moved["dead"] == 0 and moved["alive"] > 0
+
+
+def test_without_forces_the_squeeze_is_not_regulated_and_with_some_by_those_alone():
+    start, silent = torch.zeros(9).double(), observation(0.0, (0.0, 0.0, 0.0), TOUCHING)
+    for known, factor in ((having(kind="binary"), 1.0), (reference(), MOST_FACTOR)):
+        hold = ForceHold(known, silent, start)
+        for _ in range(150):
+            hold(silent, PERIOD)
+        assert hold.factor == factor
+    right = observation(0.0, (2.0, 2.0, 0.0), TOUCHING)
+    hold = ForceHold(having(dead=FINGERS[2:]), right, start)
+    for _ in range(150):
+        hold(right, PERIOD)
+    assert hold.factor == pytest.approx(1.0)
+
+
+def test_no_finger_presses_harder_than_the_object_bears():
+    fragile, seen = dataclasses.replace(reference(), max_force=2.0), observation(0.0, (0.0, 0.0, 0.0), TOUCHING)
+    for holding in ("force", "grip"):
+        controller = GraspController(fragile, holding=holding)
+        for _ in range(200):
+            targets = controller.step(seen, PERIOD)
+        pressed = 2.0 * targets.joints.reshape(3, 3)  # kp times the lead of sliding joints is force
+        assert float(-(pressed * NORMALS).sum(-1).min()) <= 2.0 + 0.02, holding
+        assert float((pressed * NORMALS).sum(-1).abs().max()) <= 2.0 + 0.02, holding
+    with pytest.raises(BadArgument, match="force"):
+        TrialSpec(force=4.0, max_force=2.0)
+
+
+@pytest.mark.parametrize(("closing", "holding"), [("paper", "force"), ("position", "force"), ("uncertainty", "grip")])
+def test_what_needs_more_than_the_sensor_tells_is_refused(closing, holding):
+    for sensor in (SensorModel("binary"), SensorModel(dead=FINGERS[:1])):
+        with pytest.raises(BadArgument, match="sensor"):
+            TrialSpec(closing=closing, holding=holding, sensor=sensor)
+        with pytest.raises(BadArgument, match="sensor"):
+            GraspController(dataclasses.replace(reference(), sensor=sensor), closing, holding)
+    assert TrialSpec(closing="open_loop", sensor=SensorModel("binary")).sensor.kind == "binary"
+
+
+@pytest.mark.parametrize(
+    "changes", [{"noise": 1.0}, {"noise": 3.0}, {"kind": "torque"}, {"kind": "torque", "noise": 3.0}]
+)
+def test_noise_alone_is_no_touch(changes):
+    levers = 0.05 * JACOBIAN  # a torque's noise is 0.2 N here, twice a tactile fingertip's
+    sensor = FingertipSensor(having(**changes), torch.Generator().manual_seed(2))
+    reports = [sensor(touch((0.0, 0.0, 0.0)), levers, PERIOD) for _ in range(500)]
+    assert not torch.stack([t.contact for t in reports]).any()
+
+
+def test_what_torques_barely_tell_is_no_force():
+    stretched = JACOBIAN.clone()
+    stretched[0, 0] *= 1e-3  # the first finger is stretched out along its normal
+    torques = 0.01 * torch.ones(9).double()
+    known, tactile = having(kind="torque"), no_contact()
+    for _ in range(20):
+        tactile = feel_torques(tactile, known, stretched, torques, PERIOD)
+    assert abs(float(tactile.reading[0])) < 1.0  # by least squares it would be 10 N
+    assert tactile.reading[1:].tolist() == pytest.approx([0.0, 0.01], rel=1e-3)
+    assert abs(float(tactile.forces[1, 1]) - 0.01) < 1e-4

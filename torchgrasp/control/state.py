@@ -1,0 +1,108 @@
+"""The numbers of a controller that change while it runs: it goes on from them in another process.
+
+Every number that a `Part` keeps is its state, so no field can be forgotten. What a part is given when it is made
+(values such as the reference, functions, models) is none.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.base import Value
+from torchgrasp.border import checked
+from torchgrasp.errors import Status
+from torchgrasp.files import save_tensors
+from torchgrasp.value_files import read_value
+
+
+class Part:
+    """A part of a controller: its tensors, arrays and numbers, and those of parts inside it, are its state."""
+
+    def numbers(self, name: str) -> dict[str, Tensor]:
+        """Return copies of the state by dotted names that begin with a name."""
+        found: dict[str, Tensor] = {}
+        for field, value in vars(self).items():
+            key = f"{name}.{field}"
+            if isinstance(value, Part):
+                found |= value.numbers(key)
+            elif isinstance(value, Tensor | np.ndarray | float | bool | Status):
+                exact = torch.float64 if isinstance(value, float) else None
+                found[key] = torch.as_tensor(value, dtype=exact).detach().clone()
+        return found
+
+    def go_on(self, name: str, numbers: dict[str, Tensor]) -> None:
+        """Take over a state of the same layout."""
+        for field, value in list(vars(self).items()):
+            key = f"{name}.{field}"
+            if isinstance(value, Part):
+                value.go_on(key, numbers)
+            elif key in numbers:
+                setattr(self, field, _like(value, numbers[key]))
+
+
+def _like(value: Any, number: Tensor) -> Any:
+    """Return a number in the type that a part keeps it in."""
+    if isinstance(value, Tensor):
+        return number.clone()
+    if isinstance(value, np.ndarray):
+        return number.numpy().copy()
+    return Status(int(number)) if isinstance(value, Status) else type(value)(number.item())
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class ControllerState(Value):
+    """The state of a `GraspController` at a tick; `load_controller_state` reads what `save` wrote.
+
+    Args:
+        numbers: all numbers of its parts, one after the other.
+        layout: what they are: the modes of the controller, names and shapes.
+    """
+
+    numbers: Float[Tensor, " n"]
+    layout: str
+
+    @checked
+    def save(self, path: Path | str) -> None:
+        """Write the state as a safetensors file, whole or not at all.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        save_tensors(path, "controller", {"numbers": self.numbers}, {"layout": self.layout})
+
+
+@checked
+def load_controller_state(path: Path | str) -> ControllerState:
+    """Read a state that `ControllerState.save` wrote.
+
+    Raises:
+        ModelFileError: the file is missing or malformed.
+    """
+    state, meta = read_value(path, "controller", ControllerState, layout="")
+    return dataclasses.replace(state, layout=meta.get("layout", ""))
+
+
+def pack(modes: str, numbers: dict[str, Tensor]) -> ControllerState:
+    """Return a state of named numbers: flags and codes are whole, so float64 holds them as they are."""
+    flat = [x.to(torch.float64).reshape(-1) for x in numbers.values()]
+    return ControllerState(torch.cat(flat), _layout(modes, numbers))
+
+
+def unpack(modes: str, numbers: dict[str, Tensor], state: ControllerState) -> dict[str, Tensor] | None:
+    """Return the numbers of a state by name, in shape and type of given ones; None if it has another layout."""
+    sizes = [x.numel() for x in numbers.values()]
+    if state.layout != _layout(modes, numbers) or len(state.numbers) != sum(sizes):
+        return None
+    parts = state.numbers.to("cpu", torch.float64).split(sizes)
+    return {name: x.reshape(like.shape).to(like.dtype) for (name, like), x in zip(numbers.items(), parts, strict=True)}
+
+
+def _layout(modes: str, numbers: dict[str, Tensor]) -> str:
+    """Return modes, names and shapes in one line."""
+    return "; ".join([modes, *(f"{name} {list(x.shape)} {x.dtype}" for name, x in numbers.items())])
