@@ -1,4 +1,4 @@
-"""Trials that can tell closings apart: the object is elsewhere, turned, of its real mass, of unknown friction, afloat.
+"""Trials that can tell closings apart: the object is elsewhere, turned, of another shape, mass or friction, afloat.
 
 Plans know nothing of it. Each law closes the same grasps with the same errors on the same draws. Plans and trials are
 kept as files: a campaign that was stopped goes on where it was.
@@ -19,6 +19,7 @@ import torch
 from paper.trials import CELL_SECONDS, Subject, TableSpec, subjects
 
 from benchmarks.close.ablation import median_over, swap_deviations
+from benchmarks.close.drawn import draw_solid
 from benchmarks.common import Row
 from torchgrasp import Grasps, Status, TrialSpec, load_hand, plan_grasps
 from torchgrasp.datasets import list_views, read_mass, read_object_mesh, read_view
@@ -42,6 +43,7 @@ from torchgrasp.evaluation.campaign import choose_rows
 from torchgrasp.evaluation.protocols import error_from_object_pose
 from torchgrasp.files import write_file
 from torchgrasp.frames import rigid, rotation_from_vector
+from torchgrasp.shape.fit import fit_shape
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ContactSpec, SensorModel
 from torchgrasp.values import load_grasps
@@ -56,7 +58,8 @@ TABLETOP = TrialSpec(friction=PLANNED_FRICTION)
 class Condition(NamedTuple):
     """What is wrong: how far [m] the object is from where it was seen, and how far it turned [rad].
 
-    `unknown` things weigh what they weigh, and have a friction between 0.3 and 1. `afloat` they are pulled at.
+    `unknown` things weigh what they weigh, and have a friction between 0.3 and 1. `afloat` they are pulled at. `drawn`
+    ones have a shape of the posterior's (`draw_solid`): the deviations are what they say.
     """
 
     distance: float = 0.0
@@ -64,6 +67,7 @@ class Condition(NamedTuple):
     unknown: bool = False
     afloat: str = ""
     simulator: str = "sapien"
+    drawn: bool = False
 
 
 CONDITIONS = {
@@ -73,6 +77,8 @@ CONDITIONS = {
     "20 mm": Condition(0.02),
     "5 degrees": Condition(angle=math.radians(5)),
     "10 degrees": Condition(angle=math.radians(10)),
+    "drawn": Condition(drawn=True),
+    "drawn, 10 mm": Condition(0.01, drawn=True),
     "10 mm, real mass, friction unknown": Condition(0.01, unknown=True),
     "10 mm, MuJoCo": Condition(0.01, simulator="mujoco"),
     "20 mm, MuJoCo": Condition(0.02, simulator="mujoco"),
@@ -185,12 +191,20 @@ def _rows(hand: str, condition: str, laws: Sequence[str], found: Sequence[Outcom
         if law != DEFAULT and base:
             low, high = 100 * against.low, 100 * against.high
             words.append(f"{DEFAULT} is better by {100 * against.value:+.1f} points [{low:.1f}, {high:.1f}]")
+            words.append("it moves things by {:+.2f} mm [{:.2f}, {:.2f}] less".format(*_moved_less(base, mine)))
         words.append(f"lost {lost}")
         least, most = BARS.get(condition, (0.0, math.inf)) if law == DEFAULT else (0.0, math.inf)
         bar = f">= {least:.0%}, <= {most:g} mm" if least else "-"
         met = held.value >= least and moved[0] <= most if least else None
         numbers = {"held": held, "better": against, "moved_mm": moved, "lost": lost}
         yield Row(f"{hand}, {condition}, {law}", bar, "; ".join(words), met, numbers)
+
+
+def _moved_less(base: Sequence[Outcome], mine: Sequence[Outcome]) -> tuple[float, float, float]:
+    """Return the median over the same grasps by which the base moves things less [mm], with its interval."""
+    before = {(x.object, x.rank): x.moved for x in base}
+    pairs = [(x.family, x.moved, before.get((x.object, x.rank))) for x in mine]
+    return median_over([(family, own - other) for family, own, other in pairs if own is not None and other is not None])
 
 
 def _held(outcomes: Iterable[Outcome]) -> dict[str, tuple[int, int]]:
@@ -227,6 +241,13 @@ def _try(spec: TableSpec, subject: Subject, hand: str, condition: str, laws: lis
     mass = household_mass(float(mesh.volume), read_mass(folder, subject.name))
     for rank in choose_rows(len(grasps), spec.grasps, "spread"):
         seed = seed_of(spec.seed, subject.label, view, rank, 0)
+        if wrong.drawn:
+            try:
+                mesh = draw_solid(fit_shape(read_view(folder, subject.name, view), table=0.0), seed)
+                parts = convex_parts(mesh)
+            except GraspError as problem:
+                print(f"{subject.name}, {hand}: {problem}", flush=True)
+                continue
         error = _misplace(wrong, grasps[rank], mesh, seed)
         for law in laws:
             began = time.process_time()
