@@ -14,6 +14,7 @@ SHOWN_BY = {
     "torchgrasp.closing.ClosingTrace": "torchgrasp.evaluation.lift.close_hand",
     "torchgrasp.closing.ClosureResult": "torchgrasp.evaluation.lift.close_hand",
     "torchgrasp.closing.Disturbance": "torchgrasp.evaluation.lift.close_hand",
+    "torchgrasp.control.log.ControlLog": "torchgrasp.control.log.load_control_log",
     "torchgrasp.hand.urdf.Joint": "torchgrasp.hand.urdf.read_urdf",
     "torchgrasp.hand.urdf.Link": "torchgrasp.hand.urdf.read_urdf",
     "torchgrasp.hand.urdf.Mimic": "torchgrasp.hand.urdf.read_urdf",

@@ -76,6 +76,17 @@ def load_control_log(path: Path | str) -> ControlLog:
 
     Raises:
         ModelFileError: the file is missing or malformed.
+
+    >>> import tempfile
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.control import observe
+    >>> hand, recorder = load_hand("barrett"), ControlRecorder()
+    >>> recorder.add(observe(hand, hand.lower, no_contact()), 0.01, Targets(torch.zeros(8).double()))
+    >>> file = Path(tempfile.mkdtemp(), "log.safetensors")
+    >>> recorder.log().save(file)
+    >>> log = load_control_log(file)
+    >>> log.joints.shape, [period for seen, period, targets in log.ticks()]
+    (torch.Size([1, 8]), [0.01])
     """
     return read_value(path, "control log", ControlLog)[0]
 

@@ -66,6 +66,14 @@ def feel_torques(
         jacobian: of the fingertips by all joints [m/rad], as in `Observation`.
         torques: of all joints [N m] that hold against contacts: without those for weight, friction and acceleration.
         period: since the state before [s].
+
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
+    >>> reference = ClosingReference.from_grasp(hand, grasp)
+    >>> jacobian, none = torch.eye(9)[:, :8].double().reshape(3, 3, 8), torch.zeros(8).double()
+    >>> feel_torques(no_contact(), reference, jacobian, none, 0.01).contact
+    tensor([False, False, False])
     """
     forces_by, radius = _forces_by_torques(reference, jacobian), reference.hand.tips.radius
     told = measure(tactile, _pushes(reference, forces_by @ torques), reference.normals, radius, period)

@@ -62,6 +62,12 @@ class ControllerState(Value):
     Args:
         numbers: all numbers of its parts, one after the other.
         layout: what they are: the modes of the controller, names and shapes.
+
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp(), "state.safetensors")
+    >>> ControllerState(torch.zeros(3).double(), "made by GraspController.state").save(file)
+    >>> load_controller_state(file).layout
+    'made by GraspController.state'
     """
 
     numbers: Float[Tensor, " n"]
@@ -83,6 +89,15 @@ def load_controller_state(path: Path | str) -> ControllerState:
 
     Raises:
         ModelFileError: the file is missing or malformed.
+
+    >>> import tempfile
+    >>> from torchgrasp import GraspController, load_hand
+    >>> from torchgrasp.control import ClosingReference
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> reference = ClosingReference.from_grasp(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
+    >>> file = Path(tempfile.mkdtemp(), "state.safetensors")
+    >>> GraspController(reference).state().save(file)
+    >>> GraspController(reference).restore(load_controller_state(file))
     """
     state, meta = read_value(path, "controller", ControllerState, layout="")
     return dataclasses.replace(state, layout=meta.get("layout", ""))
