@@ -8,6 +8,7 @@ import pytest
 import torch
 import trimesh
 
+from tests.cups import cup_view
 from torchgrasp.errors import BadArgument
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
@@ -74,6 +75,14 @@ def test_the_grid_is_the_mean_wherever_the_surface_passes(
 def test_a_mesh_alone_is_that_of_the_surface(ball: ShapeGP):
     mesh, surface = extract_mesh(ball), extract_surface(ball)
     assert torch.equal(mesh.vertices, surface.vertices) and torch.equal(mesh.faces, surface.faces)
+
+
+def test_both_walls_of_a_vessel_are_wound_outward():
+    surface = extract_surface(fit_shape(cup_view(0.004), table=0.0))
+    a, b, c = surface.vertices[surface.faces].unbind(1)
+    across = torch.linalg.cross(b - a, c - a)
+    facing = (across * surface.normals[surface.faces].sum(1)).sum(1)
+    assert (facing > 0)[torch.linalg.vector_norm(across, dim=1) > 1e-7].double().mean() > 0.99
 
 
 @pytest.mark.parametrize("resolution", [0, 7, 257])

@@ -126,14 +126,15 @@ def _trace_wall(whole: ShapeGP, number: int, resolution: int) -> tuple[Float[Ten
         motion = limit_norm(newton_step(value, gradient, gradient, LEAST_SLOPE)[:, None] * gradient, step)
         x[rows], normals[rows] = x[rows] + motion, gradient
         rows = rows[torch.linalg.vector_norm(motion, dim=-1) > SHORT]
+    if others:  # the cut turns triangles around, so they are wound after it
+        value = torch.stack([wall.mean(x) for wall in others]).amax(0)
+        vertices, triangles, _ = clip_mesh(x.cpu().numpy(), faces.cpu().numpy(), value.cpu().numpy())
+        x, faces = torch.tensor(vertices).to(x), torch.tensor(triangles).to(faces)
+        normals = shape.mean_and_gradient(x)[1]
     a, b, c = x[faces].unbind(1)
     across = torch.linalg.cross(b - a, c - a)
     outward = (across * normals[faces].sum(1)).sum() > 0
     faces = faces if bool(outward) else faces.flip(1)
-    if others:
-        value = torch.stack([wall.mean(x) for wall in others]).amax(0)
-        vertices, triangles, _ = clip_mesh(x.cpu().numpy(), faces.cpu().numpy(), value.cpu().numpy())
-        x, faces = torch.tensor(vertices).to(x), torch.tensor(triangles).to(faces)
     return x, faces
 
 
