@@ -299,6 +299,7 @@ def test_the_bare_command_shows_where_to_begin(capsys):
     ("typed", "offered"),
     [
         (["clo"], {"cloud"}),
+        (["ca"], {"campaign"}),
         (["cloud", ""], {"check", "cut", "depth", "scene", "thin", "render", "views"}),
         (["hand", "tr"], {"train"}),
         (["vi"], {"view"}),

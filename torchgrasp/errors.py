@@ -181,3 +181,4 @@ class Status(enum.IntEnum):
     BAD_OBJECT = 60, "the files of the object are not what they should be"
     TIMED_OUT = 61, "it took longer than its limit and was ended"
     WORKER_DIED = 62, "the process that worked on it died, twice"
+    BROKEN = 63, "an error within the library ended the work on it"

@@ -26,7 +26,7 @@ def read_value(path: Path | str, kind: str, of: type[SomeValue], **rest: Any) ->
         path: of the file.
         kind: of the file, such as "grasps".
         of: class of the value.
-        rest: fields that are no tensors.
+        rest: fields that are no tensors; others keep their defaults.
 
     Raises:
         ModelFileError: a file as in `load_tensors`, or a tensor of another shape or type.
@@ -57,10 +57,11 @@ def _tensor_fields(of: type[Value], prefix: str = "") -> dict[str, tuple[Any, ..
 def _build(of: type[SomeValue], tensors: dict[str, Tensor], prefix: str, rest: dict[str, Any]) -> SomeValue:
     """Return a value of tensors by dotted name; a missing one is None."""
     values: dict[str, Any] = dict(rest)
+    own = _tensor_fields(of)
     for name, hint in _hints(of).items():
         if is_subclass(hint, Value):
             values[name] = _build(hint, tensors, f"{prefix}{name}.", {})
-        elif name not in rest:
+        elif name in own and name not in rest:
             values[name] = tensors.get(prefix + name)
     return of(**values)
 

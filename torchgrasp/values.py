@@ -283,6 +283,12 @@ def load_grasps(path: Path | str) -> Grasps:
     'barrett'
     """
     grasps, meta = read_value(path, "grasps", Grasps, meta={})
+    check_grasps(path, grasps)
+    return dataclasses.replace(grasps, meta=meta)
+
+
+def check_grasps(path: Path | str, grasps: Grasps) -> None:
+    """Refuse grasps of a file that no program of ours wrote; raise `ModelFileError`."""
     rotation, last = grasps.obj_from_hand[:, :3, :3].double(), grasps.obj_from_hand[:, 3]
     error = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().amax((1, 2))
     mirrored, sheared = torch.linalg.det(rotation) < 0, (last != torch.eye(4).to(last)[3]).any(1)
@@ -296,4 +302,3 @@ def load_grasps(path: Path | str) -> Grasps:
     for found, rows in wrong.items():
         if bool(rows.any()):
             raise ModelFileError("path", f"{path}: {found}", "grasps that Grasps.save wrote")
-    return dataclasses.replace(grasps, meta=meta)

@@ -15,7 +15,7 @@ from torchgrasp import PointCloud
 from torchgrasp.cloud.io.read import save_cloud
 from torchgrasp.datasets import list_objects, list_views, read_entry, read_object_mesh, read_view
 from torchgrasp.errors import BadArgument, CloudFileError, DatasetError, MeshError, Status
-from torchgrasp.evaluation.campaign import EvaluationSpec, evaluate
+from torchgrasp.evaluation import EvaluationSpec, evaluate
 from torchgrasp.hand.load import load_hand
 
 POSE = [[1.0, 0.0, 0.0, 0.4], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]]

@@ -54,6 +54,21 @@ def test_a_folder_holds_what_sample_configurations_returns_for_any_number_of_wor
         result.read(1701)
 
 
+def test_a_folder_serves_a_loader_posture_by_posture(tmp_path, small):
+    write_samples(load_hand("barrett"), SampleSpec(1100), tmp_path)
+    samples, whole = load_samples(tmp_path), load_samples(tmp_path).read()
+    drawn = torch.Generator().manual_seed(0)
+    batches = list(torch.utils.data.DataLoader(samples, batch_size=64, shuffle=True, generator=drawn))
+    joints, codes = (torch.cat(parts) for parts in zip(*batches, strict=True))
+    order = torch.cat([joints, codes], 1)[:, 0].argsort()
+    assert torch.equal(joints[order], whole.joints[whole.joints[:, 0].argsort()]) and codes.shape == (1100, 6)
+    assert torch.equal(samples[-1][1], whole.q[1099])
+    with pytest.raises(IndexError):
+        samples[1100]
+    with pytest.raises(TypeError):
+        samples["joints"]
+
+
 HELD_RUN = """
 import signal, sys, threading
 from torchgrasp.cli import main

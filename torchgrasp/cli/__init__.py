@@ -23,6 +23,7 @@ from tyro.extras import SubcommandApp
 from torchgrasp import __version__
 from torchgrasp.border import check_path
 from torchgrasp.cli import clouds, grasps, hands, shapes
+from torchgrasp.cli.campaign import campaign
 from torchgrasp.cli.doctor import doctor, selftest
 from torchgrasp.cli.evaluate import evaluate
 from torchgrasp.cli.export import export, import_grasps
@@ -37,6 +38,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "grasp": grasps.grasp,
     "view": view,
     "evaluate": evaluate,
+    "campaign": campaign,
     "export": export,
     "import": import_grasps,
     "objects": grasps.objects,

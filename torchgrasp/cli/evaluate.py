@@ -12,12 +12,12 @@ from torchgrasp.cli.scenes import evaluate_clutter
 from torchgrasp.columns import format_columns, format_line
 from torchgrasp.datasets import list_objects, list_views
 from torchgrasp.errors import BadArgument, DatasetError, Status
-from torchgrasp.evaluation.campaign import EvaluationSpec, Ranks
 from torchgrasp.evaluation.campaign import evaluate as evaluate_views
 from torchgrasp.evaluation.intervals import format_share
 from torchgrasp.evaluation.protocols import find_protocol
 from torchgrasp.evaluation.scenes import ClutterSpec
 from torchgrasp.evaluation.score import ViewScore, summarise
+from torchgrasp.evaluation.views import EvaluationSpec, Ranks
 from torchgrasp.files import format_json, hold_folder, write_file
 from torchgrasp.report.evaluation import SHARE_NAMES, write_evaluation
 from torchgrasp.specs import ClosingMode, HoldingMode, Simulator, TrialSpec

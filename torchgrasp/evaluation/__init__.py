@@ -1,7 +1,8 @@
 """What is asked of a grasp: trials in simulation, published protocols, campaigns and their scores."""
 
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
-from torchgrasp.evaluation.campaign import EvaluationSpec, evaluate
+from torchgrasp.evaluation.views import EvaluationSpec
+from torchgrasp.evaluation.campaign import evaluate
 from torchgrasp.evaluation.intervals import Share, contrast_over, count_by, difference_over, format_share, mean_over
 from torchgrasp.evaluation.intervals import share_over
 from torchgrasp.evaluation.lift import close_hand, lift_grasp

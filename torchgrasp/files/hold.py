@@ -12,6 +12,7 @@ from filelock import FileLock, Timeout
 
 from torchgrasp.errors import OutputError
 from torchgrasp.files.own import abandoned, own
+from torchgrasp.files.write import is_remnant, write_file
 
 LOCK = ".lock"
 """Name of the lock file in a folder; the file names the run that holds the lock."""
@@ -29,6 +30,22 @@ def hold_folder(folder: Path) -> Iterator[None]:
     """
     with _hold("folder", folder, folder / LOCK):
         yield
+
+
+def begin_folder(path: Path, content: str, what: str) -> None:
+    """Begin a folder by the file that says what it is to hold, or check that it was begun so.
+
+    Raises:
+        OutputError: it holds other things of the kind `what`, or other files.
+    """
+    folder = path.parent
+    if path.exists():
+        if path.read_text("utf-8", errors="replace") != content:
+            raise OutputError("folder", f"{folder}, which holds other {what}", f"an empty folder, or the same {what}")
+    elif any(x.name != LOCK and not is_remnant(x.name) for x in folder.iterdir()):
+        raise OutputError("folder", f"{folder}, which holds other files", "an empty folder")
+    else:
+        write_file(path, content)
 
 
 @contextlib.contextmanager

@@ -29,11 +29,16 @@ def save_tensors(path: Path | str, kind: str, tensors: dict[str, Tensor], meta: 
     Raises:
         OutputError: the file cannot be written.
     """
+    # as bytes, since a full disk then is an OSError, which save_file makes an error of its own
+    return write_file(path, pack_tensors(kind, tensors, meta))
+
+
+def pack_tensors(kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) -> bytes:
+    """Return the bytes of such a file; equal values give equal bytes."""
     contiguous = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}  # a file shares no memory
     # One JSON string: safetensors writes several metadata keys in random order, and equal values must give equal bytes.
     header = {"torchgrasp": json.dumps({**meta, "kind": kind, "version": VERSION}, sort_keys=True)}
-    # as bytes, since a full disk then is an OSError, which save_file makes an error of its own
-    return write_file(path, save(contiguous, header))
+    return save(contiguous, header)
 
 
 def load_tensors(

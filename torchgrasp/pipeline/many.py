@@ -11,7 +11,7 @@ import torch
 from torchgrasp.base import named_tensors
 from torchgrasp.errors import BadArgument, GraspError, MissingExtra
 from torchgrasp.files import temporary_folder
-from torchgrasp.hand.hand import HandSource
+from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.load import load_hand
 from torchgrasp.pipeline.chain import plan_request
 from torchgrasp.pipeline.fingers import finger_sets
@@ -68,7 +68,12 @@ def plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any])
 
 def refused(request: Request, reason: str) -> Grasps:
     """Return no grasps, with the reason in `meta`."""
-    hand, f = request.hand, len(request.hand.tips)
+    return dataclasses.replace(no_grasps(request.hand), meta={"hand": request.hand.name, "refused": reason})
+
+
+def no_grasps(hand: Hand) -> Grasps:
+    """Return no grasps of a hand."""
+    f = len(hand.tips)
 
     def none(*shape: int) -> torch.Tensor:
         return torch.zeros(0, *shape, dtype=torch.float64)
@@ -77,7 +82,7 @@ def refused(request: Request, reason: str) -> Grasps:
     certificate = Certificate(none(), none(), none(), none().bool(), none(6))
     return Grasps(
         none(hand.dof), none(hand.dof), none(3), none(4, 4), contacts, none(f).long(), none(f), none(), none(f),
-        certificate, none(), none().long(), {"hand": hand.name, "refused": reason},
+        certificate, none(), none().long(),
     )  # fmt: skip
 
 

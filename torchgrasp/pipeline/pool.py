@@ -1,5 +1,6 @@
 """Tasks on worker processes: a simulator that hangs or dies costs its own task alone."""
 
+import collections
 import contextlib
 import math
 import multiprocessing
@@ -60,7 +61,9 @@ def _run(
     # The function goes along so that its module is imported before the first task's time begins to run.
     pool = ProcessPool(workers, initializer=_begin, initargs=[function], context=multiprocessing.get_context("spawn"))
     try:
-        for task, first in [(task, pool.schedule(function, task, timeout=limit)) for task in tasks]:
+        waiting = collections.deque((task, pool.schedule(function, task, timeout=limit)) for task in tasks)
+        while waiting:
+            task, first = waiting.popleft()  # results that were yielded leave the memory
             try:
                 try:
                     result = first.result()

@@ -2,16 +2,19 @@
 
 import dataclasses
 import json
+import operator
 import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated
 
+from torch import Tensor
+
 from torchgrasp.base import check_whole, join
 from torchgrasp.border import Count, Range, checked
 from torchgrasp.errors import ModelFileError, OutputError
-from torchgrasp.files import LOCK, hold_folder, is_remnant, load_tensors, save_tensors, write_file
+from torchgrasp.files import Recent, begin_folder, hold_folder, load_tensors, save_tensors
 from torchgrasp.hand.hand import Hand
 from torchgrasp.json_fields import Field, read_json
 from torchgrasp.posture_model.sample import (
@@ -27,6 +30,8 @@ MANIFEST = "samples.json"
 """File that describes the samples of a folder."""
 MAX_MANIFEST = 1024 * 1024
 """Most bytes of a manifest: the file of a stranger must not fill the memory."""
+KEPT = 128
+"""Chunks that stay in memory: all of a million postures, which take 200 MB."""
 META_KEYS = ("hand", "fingers", "hand_sha256", "hand_codes", "seed", "sampling")
 """The keys of `SampleSpec.meta`."""
 
@@ -34,6 +39,9 @@ META_KEYS = ("hand", "fingers", "hand_sha256", "hand_codes", "seed", "sampling")
 @dataclasses.dataclass(frozen=True)
 class SampleFolder:
     """A complete folder of `n` samples; chunks are read on demand. `meta` is that of `HandSamples`.
+
+    Iteration is over chunks. By an index it is a map-style dataset for `torch.utils.data.DataLoader`: item i is the
+    joints (h,) and the code (6,) of posture i. The last few chunks that items were taken from stay in memory.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand
@@ -43,15 +51,25 @@ class SampleFolder:
     (100, True, 'chunk-000000.safetensors')
     >>> folder.read(10).joints.shape, len(folder.chunk(0))
     (torch.Size([10, 4]), 100)
+    >>> joints, code = folder[-1]
     """
 
     folder: Path
     n: int
     joint_names: tuple[str, ...]
     meta: dict[str, str]
+    recent: Recent[HandSamples] = dataclasses.field(
+        default_factory=lambda: Recent[HandSamples](KEPT), repr=False, compare=False
+    )
 
     def __len__(self) -> int:
         return self.n
+
+    def __getitem__(self, i: int) -> tuple[Tensor, Tensor]:
+        """Return joints and code of posture i; raises `IndexError` beyond the last, `ModelFileError` as `chunk`."""
+        chunk, row = divmod(range(self.n)[operator.index(i)], CHUNK_POSTURES)
+        samples = self.recent.get(chunk, self.chunk)
+        return samples.joints[row], samples.q[row]
 
     def __iter__(self) -> Iterator[HandSamples]:
         return (self.chunk(i) for i in range(len(chunk_sizes(self.n))))
@@ -126,7 +144,7 @@ def write_samples(
         return counts[i]
 
     with hold_folder(samples.folder):
-        _begin(samples.folder, json.dumps(content, indent=1) + "\n")
+        begin_folder(samples.folder / MANIFEST, json.dumps(content, indent=1) + "\n", "samples")
         missing = [i for i in range(len(counts)) if not samples.holds(i)]  # a damaged chunk is drawn again
         lacking = sum(counts[i] for i in missing)
         needed, free = 8 * lacking * (hand.dof + 6), shutil.disk_usage(samples.folder).free
@@ -183,15 +201,3 @@ def _parse_manifest(folder: Path, manifest: Field) -> SampleFolder:
         raise fields["joint_names"].wrong("the name of a joint")
     meta = {key: fields[key].text() for key in META_KEYS}
     return SampleFolder(folder, fields["n"].whole(1, MAX_SAMPLES), names, meta)
-
-
-def _begin(folder: Path, manifest: str) -> None:
-    """Write the manifest or check that it is the same."""
-    path = folder / MANIFEST
-    if path.exists():
-        if path.read_text("utf-8", errors="replace") != manifest:
-            raise OutputError("folder", f"{folder}, which holds other samples", "an empty folder, or the same samples")
-    elif any(x.name != LOCK and not is_remnant(x.name) for x in folder.iterdir()):
-        raise OutputError("folder", f"{folder}, which holds other files", "an empty folder")
-    else:
-        write_file(path, manifest)

@@ -25,8 +25,8 @@ from torchgrasp.evaluation import (
     seed_of,
     share_over,
 )
-from torchgrasp.evaluation.campaign import choose_rows
 from torchgrasp.evaluation.intervals import RESAMPLES
+from torchgrasp.evaluation.views import choose_rows
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ClosingPart, ContactSpec
 

@@ -39,8 +39,8 @@ from torchgrasp.evaluation import (
     seed_of,
     share_over,
 )
-from torchgrasp.evaluation.campaign import choose_rows
 from torchgrasp.evaluation.protocols import error_from_object_pose
+from torchgrasp.evaluation.views import choose_rows
 from torchgrasp.files import write_file
 from torchgrasp.frames import rigid, rotation_from_vector
 from torchgrasp.shape.fit import fit_shape

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from benchmarks.common import Row
 from torchgrasp import load_hand
-from torchgrasp.evaluation.campaign import EvaluationSpec, evaluate
+from torchgrasp.evaluation import EvaluationSpec, evaluate
 from torchgrasp.evaluation.intervals import count_by, difference_over, format_share, share_over
 from torchgrasp.evaluation.protocols import PROTOCOLS
 

@@ -10,7 +10,7 @@ from sklearn.metrics import cohen_kappa_score, confusion_matrix
 
 from benchmarks.common import Row
 from torchgrasp import load_hand
-from torchgrasp.evaluation.campaign import EvaluationSpec, evaluate
+from torchgrasp.evaluation import EvaluationSpec, evaluate
 from torchgrasp.evaluation.intervals import count_by, format_share, share_over
 from torchgrasp.evaluation.protocols import PROTOCOLS
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore

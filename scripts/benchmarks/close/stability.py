@@ -16,8 +16,8 @@ from torchgrasp.control import ClosingReference
 from torchgrasp.control.adaptive.impedance import GRASP_STIFFNESS, Impedance
 from torchgrasp.control.adaptive.stability import StabilityModel, lengths_of, load_stability, state_of
 from torchgrasp.control.holding.force import ForceHold
-from torchgrasp.evaluation.campaign import choose_rows
 from torchgrasp.evaluation.closing import GraspTrial
+from torchgrasp.evaluation.views import choose_rows
 from torchgrasp.linalg import unit
 from torchgrasp.sim.convex_parts import convex_parts
 

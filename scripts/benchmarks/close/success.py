@@ -16,10 +16,10 @@ from benchmarks.common import Row
 from torchgrasp.datasets import list_views, read_family, read_object_mesh, read_view
 from torchgrasp.errors import Status
 from torchgrasp.evaluation import calibration
-from torchgrasp.evaluation.campaign import choose_rows
 from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.protocols import PROTOCOLS, draw_error, seed_of
 from torchgrasp.evaluation.pull import run_protocol
+from torchgrasp.evaluation.views import choose_rows
 from torchgrasp.files import format_json, write_file
 from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.ranking import FEATURES, MODEL, success_features

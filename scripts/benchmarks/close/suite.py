@@ -18,7 +18,7 @@ from benchmarks.close.stability import bench_stability
 from benchmarks.close.statics import bench_statics
 from benchmarks.close.success import bench_success
 from benchmarks.common import Row, measure
-from torchgrasp.evaluation.campaign import EvaluationSpec
+from torchgrasp.evaluation.views import EvaluationSpec
 
 SUBJECTS = (
     "statics", "speed", "ablation", "agreement", "stability", "noise", "success", "misplaced", "sensors",

@@ -16,6 +16,7 @@ from torchgrasp.cli import hand_train
 from torchgrasp.errors import Status
 from torchgrasp.evaluation import campaign
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore
+from torchgrasp.evaluation.views import EvaluationSpec
 from torchgrasp.objects import DATA
 from torchgrasp.report import page
 from torchgrasp.shape.surface import extract_surface
@@ -78,11 +79,11 @@ def evaluate(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
     views = {name: {"T_object_camera": POSE} for name in ("left", "right")}
     (folder / "manifest.json").write_text(json.dumps({"objects": {"cup": {"views": views}}}))
 
-    def plan(view: Any, friction: float, spec: campaign.EvaluationSpec) -> ViewScore:
+    def plan(view: Any, friction: float, spec: EvaluationSpec) -> ViewScore:
         grasps.save(view.file)
         return dataclasses.replace(view.score, executable=len(grasps))
 
-    def try_grasp(view: Any, protocol: Any, spec: campaign.EvaluationSpec, row: int, draw: int) -> ProtocolResult:
+    def try_grasp(view: Any, protocol: Any, spec: EvaluationSpec, row: int, draw: int) -> ProtocolResult:
         score = float(load_grasps(view.file)[row].score[0])
         return ProtocolResult(row, draw, True, Status.OK, 0.0, 0.0, score, 0.0, 0.0)
 

@@ -59,7 +59,8 @@ class ObjectEntry:
     mass: float | None
 
 
-def list_objects(objects: Path, only: Sequence[str] = ()) -> list[str]:
+@checked
+def list_objects(objects: Path | str, only: Sequence[str] = ()) -> list[str]:
     """Return the names of the objects of a folder, sorted; `only` selects some. Their entries may be bad.
 
     Raises:
@@ -68,14 +69,30 @@ def list_objects(objects: Path, only: Sequence[str] = ()) -> list[str]:
     return sorted(_read_fields(objects, only))
 
 
-def read_entry(objects: Path, name: str) -> ObjectEntry:
+@checked
+def read_entry(objects: Path | str, name: str) -> ObjectEntry:
     """Return what the manifest says of an object.
 
     Raises:
         DatasetError: no such object, a field that is missing or of a wrong type or range, or a name that is no name of
             a folder.
     """
-    field = _read_fields(objects, [name])[name]
+    return _parse_entry(name, _read_fields(objects, [name])[name])
+
+
+def read_entries(objects: Path | str, only: Sequence[str] = ()) -> dict[str, ObjectEntry | DatasetError]:
+    """Return what the manifest says of each object, sorted by name, or what is wrong with its entry."""
+    found: dict[str, ObjectEntry | DatasetError] = {}
+    for name, field in sorted(_read_fields(objects, only).items()):
+        try:
+            found[name] = _parse_entry(name, field)
+        except DatasetError as error:
+            found[name] = error
+    return found
+
+
+def _parse_entry(name: str, field: Field) -> ObjectEntry:
+    """Return the entry of an object, checked."""
     check_name(field, name)
     fields, views = field.entries(), {}
     if "views" not in fields:
@@ -100,7 +117,7 @@ def read_entry(objects: Path, name: str) -> ObjectEntry:
 
 
 @checked
-def write_objects(meshes: Path, out: Path, views: Count = 3, seed: Seed = 0) -> list[str]:
+def write_objects(meshes: Path | str, out: Path | str, views: Count = 3, seed: Seed = 0) -> list[str]:
     """Make a folder of objects from a folder of bare meshes; return the objects' names, those of the files.
 
     Each mesh is set down: its lowest point at z = 0, the middle of its box above the origin. Each view is that of the
@@ -117,6 +134,12 @@ def write_objects(meshes: Path, out: Path, views: Count = 3, seed: Seed = 0) -> 
         DatasetError: no meshes, or two of one name.
         MeshError, SuspiciousScale: as `read_mesh`.
         OutputError: the folder cannot be written.
+
+    >>> import tempfile, trimesh
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> _ = trimesh.creation.box((0.05, 0.06, 0.12)).export(folder / "carton.stl")
+    >>> write_objects(folder, folder / "objects", views=1)
+    ['carton']
     """
     files = sorted(path for path in Path(meshes).glob("*") if path.suffix.lower() in MESHES)
     names = [path.stem for path in files]
@@ -129,17 +152,17 @@ def write_objects(meshes: Path, out: Path, views: Count = 3, seed: Seed = 0) -> 
         low, high = mesh.bounds
         mesh = mesh.copy().apply_translation([-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]])
         content = mesh.export(file_type="ply")
-        write_file(out / path.stem / "mesh.ply", content)
+        write_file(Path(out) / path.stem / "mesh.ply", content)
         poses = dict[str, object]()
         for k in range(views):
             first, second = torch.rand(2, generator=generator).tolist()
             elevation = ELEVATION[0] + (ELEVATION[1] - ELEVATION[0]) * second
             camera = look_at(360.0 * first, elevation, DISTANCE, mesh)
             noise = int(torch.randint(2**31, (1,), generator=generator))
-            save_cloud(partial_view(mesh, camera, seed=noise), out / path.stem / f"view{k}_noisy.ply")
+            save_cloud(partial_view(mesh, camera, seed=noise), Path(out) / path.stem / f"view{k}_noisy.ply")
             poses[f"view{k}"] = {"T_object_camera": camera.tolist()}
         entries[path.stem] = {"views": poses}
-    write_file(out / "manifest.json", format_json({"objects": entries}))
+    write_file(Path(out) / "manifest.json", format_json({"objects": entries}))
     return names
 
 
@@ -151,8 +174,9 @@ def check_name(field: Field, name: str) -> None:
         raise field.refuse(f"{field.path}: the name {name[:LONGEST_NAME]!r}", allowed)
 
 
+@checked
 def list_views(
-    objects: Path, whole: bool = False, only: Sequence[str] = (), most: int | None = None
+    objects: Path | str, whole: bool = False, only: Sequence[str] = (), most: Count | None = None
 ) -> list[tuple[str, str]]:
     """Return sorted pairs of object and view, at most so many of an object; None: all.
 
@@ -160,17 +184,32 @@ def list_views(
 
     Raises:
         DatasetError: no manifest, none of the objects in it, or a bad entry.
+
+    >>> import tempfile, trimesh
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> _ = trimesh.creation.box((0.05, 0.06, 0.12)).export(folder / "carton.stl")
+    >>> _ = write_objects(folder, folder / "objects", views=1)
+    >>> list_views(folder / "objects")
+    [('carton', 'view0')]
     """
-    entries = {name: read_entry(objects, name) for name in list_objects(objects, only)}
+    entries = {name: _parse_entry(name, field) for name, field in sorted(_read_fields(objects, only).items())}
     return [(name, view) for name, x in entries.items() for view in ([WHOLE] if whole else sorted(x.views))[:most]]
 
 
-def read_view(objects: Path, name: str, view: str, camera: bool = True) -> PointCloud:
+@checked
+def read_view(objects: Path | str, name: str, view: str, camera: bool = True) -> PointCloud:
     """Return a noisy view without normals, with its viewpoint if `camera`.
 
     Raises:
         DatasetError: as `read_entry`, or no such view.
         CloudFileError: a bad file.
+
+    >>> import tempfile, trimesh
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> _ = trimesh.creation.box((0.05, 0.06, 0.12)).export(folder / "carton.stl")
+    >>> _ = write_objects(folder, folder / "objects", views=1)
+    >>> len(read_view(folder / "objects", "carton", "view0"))
+    1000
     """
     entry = read_entry(objects, name)
     if view == WHOLE:
@@ -183,28 +222,40 @@ def read_view(objects: Path, name: str, view: str, camera: bool = True) -> Point
     return PointCloud(cloud.points * entry.scale, None, viewpoint * entry.scale if camera else None)
 
 
-def read_object_mesh(objects: Path, name: str) -> "trimesh.Trimesh":
-    """Return the true mesh of an object; raises as `read_entry` and `read_mesh`."""
+@checked
+def read_object_mesh(objects: Path | str, name: str) -> "trimesh.Trimesh":
+    """Return the true mesh of an object; raises as `read_entry` and `read_mesh`.
+
+    >>> import tempfile, trimesh
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> _ = trimesh.creation.box((0.05, 0.06, 0.12)).export(folder / "carton.stl")
+    >>> _ = write_objects(folder, folder / "objects", views=1)
+    >>> round(float(read_object_mesh(folder / "objects", "carton").volume), 6)
+    0.00036
+    """
     scale = read_entry(objects, name).scale
     return read_mesh(_file(objects, name, "mesh.ply")).apply_scale(scale)
 
 
-def read_family(objects: Path, name: str) -> str:
+@checked
+def read_family(objects: Path | str, name: str) -> str:
     """Return the family of look-alikes of an object, see `ObjectEntry`."""
     return read_entry(objects, name).family
 
 
-def read_group(objects: Path, name: str) -> str:
+@checked
+def read_group(objects: Path | str, name: str) -> str:
     """Return the group of an object, see `ObjectEntry`."""
     return read_entry(objects, name).group
 
 
-def read_mass(objects: Path, name: str) -> float | None:
+@checked
+def read_mass(objects: Path | str, name: str) -> float | None:
     """Return the mass [kg] of an object, see `ObjectEntry`."""
     return read_entry(objects, name).mass
 
 
-def _file(objects: Path, name: str, file: str) -> Path:
+def _file(objects: Path | str, name: str, file: str) -> Path:
     """Return the path of an object's file, which may not be linked to one outside the folder."""
     path, folder = Path(objects) / name / file, Path(objects).resolve()
     if not path.resolve().is_relative_to(folder):
@@ -212,7 +263,7 @@ def _file(objects: Path, name: str, file: str) -> Path:
     return path
 
 
-def _read_fields(objects: Path, only: Sequence[str]) -> dict[str, Field]:
+def _read_fields(objects: Path | str, only: Sequence[str]) -> dict[str, Field]:
     """Return the entries of the objects asked for, all of them if `only` is empty."""
 
     def refuse(found: str, allowed: str) -> DatasetError:

@@ -1,0 +1,112 @@
+"""A campaign on a real object: what is written is what `evaluate` finds, and what others compute of it."""
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.campaign.conftest import LIFT, QUICK
+from torchgrasp import ContactSpec, Status, certify, cli, load_hand
+from torchgrasp.campaign import CampaignSpec, run_campaign
+from torchgrasp.campaign import job as job_module
+from torchgrasp.datasets import read_shards, read_view
+from torchgrasp.errors import BadArgument, DatasetError
+from torchgrasp.evaluation import EvaluationSpec, evaluate
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+def test_the_records_are_what_evaluate_finds(data: Path, carton: Path):
+    (score,) = evaluate(carton, load_hand("barrett"), LIFT, QUICK.trials)
+    job = read_shards(data).job(0)
+    assert job.row.executable == score.executable and job.row.status is Status.OK
+    assert [Status(x) for x in job.outcome[:, 0].tolist()] == [a.status for a in score.attempts]
+    assert job.passed[:, 0].tolist() == [a.passed for a in score.attempts]
+    assert job.grasps.success.tolist() == [a.predicted for a in score.attempts]
+    cloud = read_view(carton, "carton", "view0")
+    assert torch.equal(job.cloud.points, cloud.points.double()) and torch.equal(job.cloud.viewpoint, cloud.viewpoint)
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+def test_a_loader_makes_batches_of_what_the_job_holds(data: Path):
+    data = read_shards(data, points=300)
+    assert len(data) == 2
+    (batch,) = torch.utils.data.DataLoader(data, batch_size=2)
+    grasps = data.job(0).grasps
+    assert batch["points"].shape == (2, 300, 3) and batch["points"].dtype == torch.float32
+    assert torch.equal(batch["joints"], grasps.joints.float()) and torch.equal(
+        batch["contacts"], grasps.contacts.points.float()
+    )
+    again = certify(grasps.contacts, ContactSpec(friction=0.6))
+    assert torch.allclose(batch["margin"].double(), again.margin, atol=1e-6) and torch.equal(
+        batch["closed"], again.closed
+    )
+    cloud = {tuple(p) for p in data.job(0).cloud.points.float().tolist()}
+    assert all(tuple(p) in cloud for p in batch["points"][1].tolist())
+    assert torch.equal(batch["points"][0], data[0]["points"]) and not torch.equal(
+        batch["points"][0], batch["points"][1]
+    )
+    few = dataclasses.replace(data, points=5000)[0]["points"]
+    assert few.shape == (5000, 3)
+    with pytest.raises(IndexError):
+        data[2]
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+def test_bad_objects_and_errors_of_the_library_have_rows(carton: Path, tmp_path: Path, monkeypatch, capsys):
+    pytest.importorskip("sapien")
+    objects = tmp_path / "objects"
+    shutil.copytree(carton, objects)
+    entries = json.loads((objects / "manifest.json").read_text())["objects"]
+    entries |= {"../up": entries["carton"], "gone": entries["carton"], "blind": {"views": {}}, "loose": 5}
+    (objects / "manifest.json").write_text(json.dumps({"objects": entries}))
+    monkeypatch.setattr(job_module, "try_grasp", lambda *_: 1 / 0)
+    words = ["campaign", str(objects), "--hand", "barrett", "--out", str(tmp_path / "out"), "--starts", "20"]
+    assert cli.main([*words, "--workers", "0"]) == 0
+    said = capsys.readouterr().out
+    rows = {row.object: row for row in read_shards(tmp_path / "out").jobs}
+    assert rows["carton"].status is Status.BROKEN and "ZeroDivisionError" in rows["carton"].note
+    bad = {"'../up'": "the name", "gone": "no file", "blind": "no view", "'loose'": "object"}
+    assert {name: rows[name].status for name in bad} == dict.fromkeys(bad, Status.BAD_OBJECT)
+    assert all(words in rows[name].note for name, words in bad.items())
+    assert "5 jobs: 4 bad_object, 1 broken" in said and "0 grasps" in said
+    assert not (tmp_path / "up").exists() and set(x.name for x in tmp_path.iterdir()) == {"objects", "out"}
+
+
+def test_bad_arguments_are_named_before_any_work(carton: Path, tmp_path: Path, capsys):
+    for trials in (EvaluationSpec(planned=True), EvaluationSpec(complete=True), EvaluationSpec(fingers="auto")):
+        with pytest.raises(BadArgument, match="trials: found"):
+            CampaignSpec(trials=trials)
+    with pytest.raises(BadArgument, match="a protocol that lifts"):
+        CampaignSpec("dexgraspbench", EvaluationSpec(perturb="mass"))
+    for licence in ("", "a\nb", "x" * 101):
+        with pytest.raises(BadArgument, match="licence: found"):
+            CampaignSpec(licence=licence)
+    with pytest.raises(DatasetError, match="objects: found"):
+        run_campaign(tmp_path / "none", load_hand("barrett"), tmp_path / "out")
+    words = ["campaign", str(carton), "--hand", "barrett", "--out", str(tmp_path / "out")]
+    for more, named in (
+        (["--hand", "fist"], "--hand"), (["--fingers", "auto"], "--fingers"), (["--workers", "-1"], "--workers"),
+        (["--seed", "-1"], "--seed"), (["--grasps", "0"], "--grasps"), (["--jobs-in-shard", "0"], "--jobs-in-shard"),
+        (["--only", "jug"], "OBJECTS"), (["--licence", ""], "--licence"),
+    ):  # fmt: skip
+        assert cli.main([*words, *more]) == 2
+        assert capsys.readouterr().err.startswith(f"torchgrasp: {named}: found"), more
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_other_versions_and_hands_on_a_machine_end_the_campaign(carton: Path):
+    from torchgrasp.evaluation.views import View
+
+    source = load_hand("barrett").source
+    view, spec = View(carton, "carton", "view0", source), EvaluationSpec()
+    with pytest.raises(BadArgument, match="workers: found one with"):
+        job_module.run_job(view, LIFT, spec, {"campaign": "x", "versions": "{}"})
+    other = dataclasses.replace(view, hand=source._replace(sha256="0"))
+    with pytest.raises(BadArgument, match="hand: found"):
+        job_module.run_job(other, LIFT, spec, {"campaign": "x", "versions": json.dumps(job_module.versions())})

@@ -1,0 +1,110 @@
+"""A campaign on a folder of objects: from views to a data set on disk."""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated
+
+from torchgrasp.border import Range, checked
+from torchgrasp.campaign.cluster import run_on_cluster
+from torchgrasp.campaign.folder import Campaign, carry_out
+from torchgrasp.campaign.job import empty_shard, run_job, versions
+from torchgrasp.campaign.spec import CampaignSpec
+from torchgrasp.datasets.objects import read_entries
+from torchgrasp.datasets.reader import GraspShards
+from torchgrasp.datasets.shards import JobRow, short
+from torchgrasp.errors import DatasetError, Status
+from torchgrasp.evaluation.campaign import PLAN_LIMIT, TRIAL_LIMIT
+from torchgrasp.evaluation.views import View
+from torchgrasp.files import sha256
+from torchgrasp.hand.hand import Hand, HandSource
+from torchgrasp.pipeline.pool import run_tasks
+
+
+@checked
+def run_campaign(
+    objects: Path | str,
+    hand: Hand,
+    folder: Path | str,
+    spec: CampaignSpec | None = None,
+    workers: Annotated[int, Range(0, 1024)] | str = 0,
+    observer: Callable[[JobRow], object] = lambda row: None,
+) -> GraspShards:
+    """Plan on every view of a folder of objects, try the grasps in simulation, and write a data set of them.
+
+    Each job, one object and view, ends with a row: its grasps, or the reason why there are none. The same call
+    continues a run that was interrupted or killed; it does again what was lost with a process. Equal results give
+    equal bytes, whatever the workers, their order and the interruptions (docs/promises.md, N10, on equal results).
+
+    Args:
+        objects: a folder as in `torchgrasp.datasets`. On a cluster it has the same path on every machine.
+        hand: from `load_hand`; its fingers grasp.
+        folder: of the data set; no other run may write it meanwhile.
+        spec: what is planned and tried; None: `CampaignSpec()`.
+        workers: processes here, 0: this one; or the address of a Dask scheduler, as "tcp://10.0.0.1:8786", whose
+            workers have one thread each.
+        observer: called with the row of each job that was done.
+
+    Raises:
+        BadArgument: no objects, no scheduler at the address, or a machine with other versions or another hand.
+        OutputError: the folder holds another campaign or other files, another run holds it, or it cannot be written.
+        MissingExtra: the simulator, pebble for workers, or Dask for a cluster is not installed.
+
+    >>> import tempfile, trimesh
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.datasets import write_objects
+    >>> from torchgrasp.evaluation import EvaluationSpec
+    >>> meshes = Path(tempfile.mkdtemp())
+    >>> _ = trimesh.creation.cylinder(radius=0.03, height=0.12).export(meshes / "tin.stl")
+    >>> _ = write_objects(meshes, meshes / "objects", views=1)
+    >>> spec = CampaignSpec("dexgraspbench", EvaluationSpec(1, starts=20))
+    >>> data = run_campaign(meshes / "objects", load_hand("barrett"), meshes / "data", spec)
+    >>> [(row.object, row.status.name) for row in data.jobs], len(data)
+    ([('tin', 'OK')], 1)
+    """
+    spec = CampaignSpec() if spec is None else spec
+    place, test = Path(objects).resolve(), spec.test
+    rows = _list_jobs(place, spec)
+    asked = {
+        "torchgrasp": "campaign",
+        "version": 1,
+        "licence": spec.licence,
+        "objects_sha256": sha256(place / "manifest.json"),
+        "hand": {
+            "name": hand.name,
+            "option": hand.source.option,
+            "sha256": hand.source.sha256,
+            "joint_names": ", ".join(hand.joint_names),
+            "finger_names": ", ".join(hand.finger_names),
+        },
+        "protocol": dataclasses.asdict(test),
+        "trials": dataclasses.asdict(spec.trials),
+        "jobs_in_shard": spec.jobs_in_shard,
+        "versions": versions(),
+    }
+    campaign = Campaign(asked, rows, lambda row: empty_shard(row, hand, test.noise.draws))
+    source = HandSource(hand.source.option, hand.source.urdf_path, hand.source.sha256)
+    limit = PLAN_LIMIT + TRIAL_LIMIT * spec.trials.grasps * test.noise.draws
+
+    def work(numbers: Sequence[int]) -> Iterator[bytes | Status]:
+        views = [View(place, rows[j].object, rows[j].view, source) for j in numbers]
+        tasks = [(view, test, spec.trials, campaign.meta) for view in views]
+        if isinstance(workers, str):
+            return run_on_cluster(run_job, tasks, workers, limit)
+        return run_tasks(run_job, tasks, workers, limit)
+
+    return carry_out(campaign, Path(folder), work, observer)
+
+
+def _list_jobs(objects: Path, spec: CampaignSpec) -> tuple[JobRow, ...]:
+    """Return a row for each view of each object, in order; one for an object with a bad entry."""
+    rows: list[JobRow] = []
+    for name, entry in read_entries(objects, spec.trials.only).items():
+        if isinstance(entry, DatasetError):
+            rows.append(JobRow(short(ascii(name)), "", Status.BAD_OBJECT, short(str(entry))))
+        else:
+            of_object = JobRow(name, "", family=entry.family, group=entry.group)
+            rows += [of_object._replace(view=view) for view in sorted(entry.views)[: spec.trials.views]]
+            if not entry.views:
+                rows.append(of_object._replace(status=Status.BAD_OBJECT, note="the manifest names no view"))
+    return tuple(rows)

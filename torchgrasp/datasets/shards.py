@@ -1,0 +1,161 @@
+"""A shard: the records of some jobs of a campaign in one file. A job is one object and view."""
+
+import dataclasses
+import itertools
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchgrasp.base import Value, map_tensors, named_tensors
+from torchgrasp.errors import ModelFileError, Status
+from torchgrasp.files import pack_tensors
+from torchgrasp.json_fields import MOST_LETTERS, Field
+from torchgrasp.value_files import read_value
+from torchgrasp.values import Grasps, check_grasps
+
+KIND = "grasp-shard"
+"""Kind of the file."""
+MOST = 1_000_000
+"""Most points, grasps and tries of one job."""
+LONGEST_META = 10_000
+"""Letters of an entry of a grasp's metadata: the names of all joints are one."""
+
+
+class JobRow(NamedTuple):
+    """What came of a job.
+
+    `status` is OK, or why there is no grasp: the commonest failure, a bad object, or the end of its process. `note`
+    may say more. Of the `executable` grasps that were planned, `grasps` were kept and tried; `passed` of all tries
+    passed. The cloud has so many `points`. `meta` is that of `Grasps`.
+
+    >>> JobRow("mug", "view0", Status.NOT_CLOSED, points=1000).as_json()["status"]
+    'NOT_CLOSED'
+    """
+
+    object: str
+    view: str
+    status: Status = Status.OK
+    note: str = ""
+    family: str = ""
+    group: str = ""
+    executable: int = 0
+    points: int = 0
+    grasps: int = 0
+    passed: int = 0
+    meta: dict[str, str] = {}  # noqa: RUF012
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the row for a JSON file."""
+        return {**self._asdict(), "status": self.status.name}
+
+
+@dataclasses.dataclass(frozen=True)
+class Records(Value):
+    """The tensors of jobs, one job after the other.
+
+    Letters: p points, j jobs, g grasps, d tries of a grasp. A job without a camera has a viewpoint of zeros. `passed`
+    and `outcome` (a `Status`) are of each try in the simulator. Metres, in the object's frame.
+    """
+
+    points: Float[Tensor, "p 3"]
+    viewpoints: Float[Tensor, "j 3"]
+    grasps: Grasps
+    passed: Bool[Tensor, "g d"]
+    outcome: Int[Tensor, "g d"]
+
+
+class Shard(NamedTuple):
+    """The rows of jobs, and their records."""
+
+    rows: tuple[JobRow, ...]
+    records: Records
+
+    def take(self, i: int) -> "Shard":
+        """Return job i alone."""
+        row, before = self.rows[i], self.rows[:i]
+        p, g = sum(x.points for x in before), sum(x.grasps for x in before)
+        points, grasps, records = slice(p, p + row.points), slice(g, g + row.grasps), self.records
+        taken = Records(
+            records.points[points],
+            records.viewpoints[i : i + 1],
+            records.grasps[grasps],
+            records.passed[grasps],
+            records.outcome[grasps],
+        )
+        return Shard((row,), taken)
+
+
+def join_shards(parts: Sequence[Shard]) -> Shard:
+    """Put shards one behind the other."""
+    records = map_tensors(lambda *tensors: torch.cat(tensors), *(part.records for part in parts))
+    return Shard(tuple(itertools.chain(*(part.rows for part in parts))), records)
+
+
+def pack_shard(shard: Shard, meta: dict[str, str]) -> bytes:
+    """Return the bytes of a shard's file; `meta` says of which campaign."""
+    jobs = json.dumps([row.as_json() for row in shard.rows])
+    return pack_tensors(KIND, named_tensors(shard.records), {**meta, "jobs": jobs})
+
+
+def load_shard(path: Path, meta: dict[str, str] | None = None) -> Shard:
+    """Read a shard; `meta` is what its metadata must hold.
+
+    Raises:
+        ModelFileError: the file is missing, damaged, or of another campaign.
+    """
+    records, found = read_value(path, KIND, Records)
+    if meta is not None and {key: found.get(key) for key in meta} != meta:
+        other = {key: found.get(key) for key in meta}
+        raise ModelFileError("path", f"{path} of {other}", f"a shard of {meta}")
+
+    def refuse(found: str, allowed: str) -> ModelFileError:
+        return ModelFileError("path", found, allowed)
+
+    try:
+        jobs = json.loads(found.get("jobs", ""))
+    except (ValueError, RecursionError) as error:
+        raise refuse(f"{path}: {error}", "a shard with a list of its jobs") from error
+    rows = tuple(read_row(field) for field in Field(path, "jobs", jobs, refuse).items(MOST))
+    check_grasps(path, records.grasps)
+    counted = sum(row.points for row in rows), len(rows), sum(row.grasps for row in rows)
+    sizes = len(records.points), len(records.viewpoints), len(records.grasps)
+    known = {int(status) for status in Status}
+    if counted != sizes or not set(records.outcome.unique().tolist()) <= known:
+        raise refuse(f"{path} of {counted} points, jobs and grasps, with tensors of {sizes}", "equal counts")
+    return Shard(rows, records)
+
+
+def read_row(field: Field, bare: bool = False) -> JobRow:
+    """Read the row of a job from JSON; a `bare` one has no metadata.
+
+    Raises:
+        ModelFileError: a field that is missing or of a wrong type or range.
+    """
+    fields = field.entries()
+    if missing := set(JobRow._fields) - ({"meta"} if bare else set()) - set(fields):
+        raise field.wrong(f"an object with {min(missing)!r}")
+    texts = {name: fields[name].text() for name in ("object", "view", "note", "family", "group")}
+    counts = {name: fields[name].whole(0, MOST) for name in ("executable", "points", "grasps", "passed")}
+    status = fields["status"].text()
+    if status not in Status.__members__:
+        raise fields["status"].wrong("the name of a Status")
+    meta = {} if bare else {key: _long_text(x) for key, x in fields["meta"].entries().items()}
+    return JobRow(**texts, status=Status[status], **counts, meta=meta)  # pyright: ignore[reportArgumentType]
+
+
+def _long_text(field: Field) -> str:
+    """Return a text that may be a list of names."""
+    if not isinstance(field.value, str) or len(field.value) > LONGEST_META:
+        raise field.wrong(f"a text of at most {LONGEST_META} letters")
+    return field.value
+
+
+def short(text: str) -> str:
+    """Return a text as it is kept in a row: on one line, cut to what its reader takes."""
+    line = " ".join(text.split())
+    return line if len(line) <= MOST_LETTERS else f"{line[: MOST_LETTERS - 3]}..."

@@ -1,0 +1,190 @@
+"""One view of a data set: planned on as a robot sees it, and its grasps put to a protocol on the true mesh."""
+
+import dataclasses
+import functools
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from torchgrasp.base import Value, count_status
+from torchgrasp.border import Count, Seed, checked
+from torchgrasp.datasets import read_entry, read_object_mesh, read_view
+from torchgrasp.errors import BadArgument, GraspError, MissingExtra, OutputError, Status
+from torchgrasp.evaluation.closing import GraspTrial
+from torchgrasp.evaluation.perturb import find_perturbation, household_mass, perturb_trial, perturb_view
+from torchgrasp.evaluation.protocols import Protocol, draw_error, seed_of
+from torchgrasp.evaluation.pull import run_protocol
+from torchgrasp.evaluation.score import ProtocolResult, ViewScore
+from torchgrasp.hand.hand import Hand, HandSource
+from torchgrasp.hand.hand_toml import Fingers
+from torchgrasp.hand.load import hand_of, load_hand
+from torchgrasp.pipeline.grasps import plan_grasps
+from torchgrasp.pipeline.provenance import digest
+from torchgrasp.sim.convex_parts import convex_parts
+from torchgrasp.specs import ContactSpec
+from torchgrasp.values import Grasps, PointCloud, load_grasps
+
+if TYPE_CHECKING:
+    import trimesh
+
+MOST_FRICTION = 1.0
+"""Largest friction that grasps are planned for: MultiDex grants 3, more than fingertips have."""
+REFUSAL = "refusal"
+"""Where the file of a view's executable grasps keeps why there are none: a later call that tries them says it, too."""
+
+Ranks = Literal["best", "spread"]
+"""Which of a view's grasps are tried: the best, or as many spread from the best to the worst."""
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class EvaluationSpec(Value):
+    """Which grasps of a folder of objects are evaluated: of each view at most `grasps`, by `ranks`.
+
+    `complete` plans on whole clouds with normals, as if the shape were known. `only` names objects; (): all. `planned`
+    takes the grasps that an earlier call left in its folder. `starts` are those of the contact planner. `perturb` names
+    what the robot does not know (`PERTURBATIONS`). At most `views` of each object are taken; None: all. `fingers` grasp
+    as in `plan_grasps`: "auto" takes the likeliest set for each view; None: the hand's own.
+
+    Raises:
+        BadArgument: no grasps, unknown ranks, or an unknown perturbation.
+    """
+
+    grasps: Count = 20
+    ranks: Ranks = "best"
+    starts: Count = 1000
+    complete: bool = False
+    only: tuple[str, ...] = ()
+    planned: bool = False
+    seed: Seed = 0
+    perturb: str = "none"
+    views: Count | None = None
+    fingers: Fingers | None = None
+
+    def __post_init__(self) -> None:
+        find_perturbation(self.perturb)
+
+    @property
+    def tried(self) -> str:
+        """Return in words which grasps are tried.
+
+        >>> EvaluationSpec(20).tried, EvaluationSpec(6, "spread").tried
+        ('the 20 best of each view', 'up to 6 of each view, spread over all ranks')
+        """
+        if self.ranks == "spread":
+            return f"up to {self.grasps} of each view, spread over all ranks"
+        return f"the {self.grasps} best of each view" if self.grasps > 1 else "the best of each view"
+
+
+def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
+    """Return the rows of a view's executable grasps that are tried.
+
+    >>> choose_rows(100, 5, "best"), choose_rows(100, 5, "spread"), choose_rows(3, 5, "spread")
+    ([0, 1, 2, 3, 4], [0, 25, 50, 74, 99], [0, 1, 2])
+    """
+    most = min(most, executable)
+    if ranks == "best" or most < 2:
+        return list(range(most))
+    return [round(k * (executable - 1) / (most - 1)) for k in range(most)]
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """A view and a hand by their files."""
+
+    objects: Path
+    object: str
+    view: str
+    hand: HandSource
+
+    @property
+    def score(self) -> ViewScore:
+        """The score before any work."""
+        entry = read_entry(self.objects, self.object)
+        return ViewScore(self.object, self.view, 0, 0.0, family=entry.family, group=entry.group)
+
+    def load_hand(self) -> Hand:
+        """Load the hand."""
+        return load_hand(self.hand.urdf_path.parent, self.hand.option)
+
+
+class PlannedView(NamedTuple):
+    """What planning on a view gave: its score without attempts, what was seen, and the executable grasps.
+
+    Without cloud and grasps the object was refused.
+    """
+
+    score: ViewScore
+    cloud: PointCloud | None = None
+    grasps: Grasps | None = None
+
+
+def plan_view(view: View, friction: float, spec: EvaluationSpec, planned: Path | None = None) -> PlannedView:
+    """Plan on a view; without any executable grasp, name the commonest failure.
+
+    `planned` is a file of grasps of an earlier call, which are read instead.
+
+    Raises:
+        MissingExtra, OutputError: no fault of the object.
+    """
+    hand, score = view.load_hand(), view.score
+    started = time.process_time()
+    cloud = grasps = None
+    try:
+        _read_solid(view.objects, view.object)  # a bad mesh is refused before any work; its parts are cached
+        seen, table = perturb_view(
+            read_view(view.objects, view.object, view.view),
+            find_perturbation(spec.perturb),
+            seed_of(spec.seed, view.object, view.view),
+        )
+        if planned is not None:
+            grasps = load_grasps(planned)
+            if (grasps.meta.get("cloud_sha256"), grasps.meta.get("hand_sha256")) != (digest(seen), hand.source.sha256):
+                raise BadArgument("folder", f"{planned} of another cloud or hand", "grasps of this view")
+            fingers = grasps.meta.get("finger_names", "")
+            told = Status.__members__.get(grasps.meta.get(REFUSAL, ""), Status.OUT_OF_REACH)
+            refusal = Status.OK if len(grasps) else told
+            score = dataclasses.replace(score, executable=len(grasps), refusal=refusal, fingers=fingers)
+            return PlannedView(score, seen, grasps)
+        started = time.process_time()
+        contacts = ContactSpec(friction=min(friction, MOST_FRICTION), table=table)
+        stages: list[tuple[str, str, Any]] = []
+        found = plan_grasps(
+            seen, hand, contacts, spec.starts, spec.seed, fingers=spec.fingers, observer=lambda *x: stages.append(x)
+        )
+        cloud, grasps = seen, found[found.status == Status.OK]
+        starts = next(value.status for name, _, value in stages if name == "plan")
+        failed = count_status(found.status if len(found) else starts[starts != Status.OK])
+        refusal = Status.OK if len(grasps) else next(iter(failed), Status.OUT_OF_REACH)
+        fingers = found.meta["finger_names"]
+        score = dataclasses.replace(score, executable=len(grasps), refusal=refusal, fingers=fingers)
+    except (MissingExtra, OutputError):  # a full disk is no fault of the object
+        raise
+    except GraspError as error:
+        cloud = grasps = None
+        score = dataclasses.replace(score, refusal=Status.BAD_OBJECT, note=" ".join(str(error).split()))
+    return PlannedView(dataclasses.replace(score, seconds=time.process_time() - started), cloud, grasps)
+
+
+def try_grasp(
+    view: View, grasp: Grasps, protocol: Protocol, spec: EvaluationSpec, at: tuple[int, int]
+) -> ProtocolResult:
+    """Try one grasp of a view; `at` is its rank, and the draw of what the robot does not know."""
+    hand = hand_of(grasp, view.load_hand())
+    mesh, parts = _read_solid(view.objects, view.object)
+    seed = seed_of(spec.seed, view.object, view.view, *at)
+    perturbation = find_perturbation(spec.perturb)
+    mass = household_mass(float(mesh.volume), read_entry(view.objects, view.object).mass)
+    trial = perturb_trial(protocol.trial, perturbation, mass, seed)
+    noise = protocol.noise if spec.perturb == "none" else perturbation.pose
+    protocol = dataclasses.replace(protocol, trial=trial, noise=noise)
+    error = draw_error(protocol, grasp, mesh, seed)
+    attempt = GraspTrial(hand, grasp, mesh, seed_of(seed, "touch"), error, parts=parts)
+    return dataclasses.replace(run_protocol(attempt, protocol, *at), predicted=float(grasp.success[0]))
+
+
+@functools.lru_cache(maxsize=2)
+def _read_solid(objects: Path, name: str) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh]]":
+    """Return mesh and convex parts, kept for the next trial."""
+    mesh = read_object_mesh(objects, name)
+    return mesh, convex_parts(mesh)
