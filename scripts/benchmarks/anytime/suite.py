@@ -28,6 +28,7 @@ def anytime(
     hand: str = "allegro",
     starts: int = 1000,
     tries: int = 10,
+    most: int | None = None,
     before: Path | None = None,
     out: Path = Path("out/bench_anytime.json"),
 ) -> None:
@@ -41,11 +42,12 @@ def anytime(
         hand: that grasps.
         starts: of the contact planner.
         tries: single starts of the peer on each view.
+        most: views in all, the first ones; a hundred with 100 starts each take "many" five minutes.
         before: another checkout of the project, for the ratios of "before".
         out: where the numbers are written as JSON.
     """
     torch.set_num_threads(1)
-    chosen = list_views(objects, only=names, most=views)
+    chosen = list_views(objects, only=names, most=views)[:most]
     clouds, model = [read_view(objects, *one) for one in chosen], load_hand(hand)
     watch(load_object("cylinder").view, model, SPEC, 40)  # the first call alone imports
     courses: list[Course] = []
