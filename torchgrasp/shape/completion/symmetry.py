@@ -18,6 +18,8 @@ MATCH_DISTANCE = 0.003
 """Distance [m] over which a mirrored point stops matching the cloud: a few times the camera's noise."""
 PROBES = 150
 """Points of the cloud that score a plane."""
+LEAF = 32
+"""Points in a leaf of their tree: a fifth less time than with SciPy's 10, the same distances."""
 OFFSETS, FINE_OFFSETS = 17, 65
 """Offsets tried for each direction of a plane, and for one whose direction is known."""
 ANGLES, FINE_ANGLES = 24, 96
@@ -75,7 +77,7 @@ class SymmetryScorer:
 
         assert cloud.normals is not None
         points, normals, plane = cloud.points, cloud.normals, None if table is None else Plane.horizontal(table)
-        tree, upright = KDTree(points.numpy()), table is not None
+        tree, upright = KDTree(points.numpy(), leafsize=LEAF), table is not None
         whole = cls(points, normals, tree, silhouettes(cloud), plane, upright, points[:0], normals[:0])
         return whole.for_part(torch.arange(len(cloud)))
 
@@ -86,7 +88,7 @@ class SymmetryScorer:
         points, normals = apply(axis_from_cloud, self.points), rotate(axis_from_cloud, self.normals)
         table = None if self.table is None else self.table.moved(axis_from_cloud)
         probes, probe_normals = apply(axis_from_cloud, self.probes), rotate(axis_from_cloud, self.probe_normals)
-        outline, tree = self.outline.moved(axis_from_cloud), KDTree(points.numpy())
+        outline, tree = self.outline.moved(axis_from_cloud), KDTree(points.numpy(), leafsize=LEAF)
         return SymmetryScorer(points, normals, tree, outline, table, True, probes, probe_normals)
 
     def for_part(self, rows: Int[Tensor, "k"]) -> "SymmetryScorer":
