@@ -35,7 +35,7 @@ MADE_INSIDE = {
 
 NO_PATHS = ["a" * 5000, "b" * 256, "c/" * 2500, "a\0b", "\ud800"]
 """Texts that no file can be called; as paths, too, they are refused the same way."""
-NO_PATHS += map(Path, NO_PATHS)
+NO_PATHS += [Path(text) for text in NO_PATHS]
 NO_NUMBERS = "meta", "sparse", "negative bit", "half", "bfloat16"
 """Tensors that no annotation forbids, and the library does."""
 
