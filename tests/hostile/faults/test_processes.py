@@ -1,0 +1,196 @@
+"""Commands as processes of their own: killed at random moments, or left by a worker that dies or never answers.
+
+The long ones, 20 kills of each command at its real work, run with `--hypothesis-profile=long`.
+"""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.hostile.faults.commands import POSE
+from tests.hostile.faults.inject import contents
+from torchgrasp.objects import DATA
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+
+REAL = """
+import sys, time
+time.perf_counter = time.process_time = lambda: 0.0  # pages tell how long the work took
+import torchgrasp.posture_model.dataset, torchgrasp.posture_model.sample
+torchgrasp.posture_model.dataset.CHUNK_POSTURES = torchgrasp.posture_model.sample.CHUNK_POSTURES = 300
+from torchgrasp import cli
+
+if __name__ == "__main__":
+    sys.exit(cli.main(sys.argv[1:]))
+"""
+"""The command line, whose clocks stand still and whose chunks are small; workers import it, too."""
+
+STUB = """
+import dataclasses, os, signal, sys, time
+from pathlib import Path
+from torchgrasp import cli
+from torchgrasp.errors import Status
+from torchgrasp.evaluation import campaign
+from torchgrasp.evaluation.score import ProtocolResult
+
+def plan(view, friction, spec):
+    return dataclasses.replace(view.score, executable=2)
+
+def attempt(view, protocol, spec, row, draw):
+    if (view.view, row) == ("left", 1):
+        mark = view.objects / str(time.time())
+        mark.write_text(str(os.getpid()))
+        mark.rename(mark.with_suffix(".worker"))
+        if os.environ["HOW"] == "dies":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if os.environ["HOW"] == "hangs" or len(list(view.objects.glob("*.worker"))) == 1:
+            time.sleep(3600)
+    return ProtocolResult(row, draw, True, Status.OK)
+
+campaign._plan, campaign._try, campaign.TRIAL_LIMIT = plan, attempt, float(os.environ.get("LIMIT", "3600"))
+
+if __name__ == "__main__":
+    sys.modules["torchgrasp.cli.evaluate"].import_simulator = lambda name: None
+    sys.exit(cli.main(sys.argv[1:]))
+"""
+"""`evaluate` without planning and simulation; the second grasp of the view "left" meets with something."""
+
+
+def objects(folder: Path, *views: str) -> list[str]:
+    """Make a folder of one object; return the words that evaluate it."""
+    (folder / "cup").mkdir(parents=True)
+    shutil.copy(DATA / "cylinder" / "mesh.ply", folder / "cup" / "mesh.ply")
+    for view in views:
+        shutil.copy(DATA / "cylinder" / "view.ply", folder / "cup" / f"{view}_noisy.ply")
+    entry = {"views": {view: {"T_object_camera": POSE} for view in views}}
+    (folder / "manifest.json").write_text(json.dumps({"objects": {"cup": entry}}))
+    return ["evaluate", "--objects", str(folder), "--hand", "barrett", "--workers", "2", "--out"]
+
+
+def words(name: str, folder: Path) -> list[str]:
+    """Return the words of a command but for its output."""
+    if name == "evaluate":
+        return [*objects(folder / "objects", "left", "right")[:-1], "--grasps", "2", "--starts", "5", "--out"]
+    return {
+        "grasp": ["grasp", str(DATA / "cylinder" / "view.ply"), "--hand", "barrett", "--starts", "8", "--out"],
+        "sample": ["hand", "sample", "--hand", "barrett", "--n", "3000", "--workers", "2", "--out"],
+        "train": ["hand", "train", "barrett", "--n", "2000", "--held-out", "100", "--components", "3", "--out"],
+    }[name]
+
+
+def start(script: str, folder: Path, given: list[str], **environment: str) -> subprocess.Popen[str]:
+    """Start a script of the above; SIGINT reaches it, whatever the tests' own process does with it."""
+    (folder / "script.py").write_text(script)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return subprocess.Popen(
+            [sys.executable, str(folder / "script.py"), *given],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"OMP_NUM_THREADS": "1", "XDG_CACHE_HOME": str(folder / "cache")} | environment,
+        )
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def descendants(pid: int) -> list[int]:
+    """Return the processes below one."""
+    children: dict[int, list[int]] = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            children.setdefault(int(stat.read_text().rpartition(")")[2].split()[1]), []).append(int(stat.parent.name))
+        except OSError:  # it has just ended
+            continue
+    found = [pid]
+    for one in found:
+        found += children.get(one, [])
+    return found[1:]
+
+
+def gone(processes: list[int]) -> bool:
+    """Wait until none of them is left; one that stays ends the test by its time."""
+    while any(Path(f"/proc/{one}").exists() for one in processes):
+        time.sleep(0.05)
+    return True
+
+
+@pytest.mark.promise("F1")
+@pytest.mark.parametrize("name", ["sample", "grasp", "train", pytest.param("evaluate", marks=pytest.mark.sim)])
+def test_a_process_killed_at_random_moments_is_continued_to_the_same_bytes(
+    name: str, tmp_path: Path, request: pytest.FixtureRequest
+):
+    long = request.config.getoption("--hypothesis-profile") == "long"
+    if name != "sample" and not long:
+        pytest.skip("takes minutes")
+    given, draw = words(name, tmp_path), random.Random(name)
+
+    def command(out: Path) -> list[str]:
+        model = name == "train"
+        extra = ["--checkpoint", str(out / "step.safetensors")] if model else []
+        return [*given, str(out / "model.safetensors" if model else out), *extra]
+
+    began = time.monotonic()
+    first = start(REAL, tmp_path, command(tmp_path / "whole"))
+    said = first.communicate()
+    assert first.returncode == 0, said
+    lasts, whole = time.monotonic() - began, contents(tmp_path / "whole")
+    killed = attempts = 0
+    while killed < (20 if long else 1):
+        out = tmp_path / f"out{attempts}"
+        for _ in range(5):  # it is continued, and killed again
+            run = start(REAL, tmp_path, command(out))
+            time.sleep(draw.uniform(0.2, 1.0) * lasts)
+            below = descendants(run.pid)
+            run.kill()
+            run.communicate()
+            killed += run.returncode == -signal.SIGKILL
+            assert gone(below)
+        run = start(REAL, tmp_path, command(out))
+        said = run.communicate()
+        assert run.returncode == 0, said
+        assert contents(out) == whole
+        attempts += 1
+    print(f"{name}: {killed} kills, {lasts:.1f} s undisturbed")
+
+
+@pytest.mark.parametrize("how", ["hangs", "dies", "is killed"])
+def test_a_worker_that_is_lost_costs_its_own_row_and_the_row_says_so(how: str, tmp_path: Path):
+    pytest.importorskip("pebble")
+    given = objects(tmp_path / "objects", "left", "right")
+    run = start(STUB, tmp_path, [*given, str(tmp_path / "out")], HOW=how, **{"LIMIT": "3"} if how == "hangs" else {})
+    if how == "is killed":
+        worker = None
+        while worker is None and run.poll() is None:
+            worker = next((tmp_path / "objects").glob("*.worker"), None)
+            time.sleep(0.05)
+        assert worker is not None
+        os.kill(int(worker.read_text()), signal.SIGKILL)
+    said = run.communicate()
+    assert run.returncode == 0, said
+    views = json.loads((tmp_path / "out" / "evaluate.json").read_text())["views"]
+    found = {(view["view"], row["rank"]): row["status"] for view in views for row in view["attempts"]}
+    lost = {"hangs": "TIMED_OUT", "dies": "WORKER_DIED", "is killed": "OK"}[how]  # a death from outside is forgiven
+    assert found == {("left", 0): "OK", ("left", 1): lost, ("right", 0): "OK", ("right", 1): "OK"}
+
+
+@pytest.mark.promise("F6")
+@pytest.mark.parametrize(("sign", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
+def test_no_worker_outlives_an_evaluation_that_is_told_to_end(sign: signal.Signals, code: int, tmp_path: Path):
+    pytest.importorskip("pebble")
+    run = start(STUB, tmp_path, [*objects(tmp_path / "objects", "left", "right"), str(tmp_path / "out")], HOW="hangs")
+    while run.poll() is None and not list((tmp_path / "objects").glob("*.worker")):
+        time.sleep(0.05)
+    below = descendants(run.pid)
+    assert len(below) >= 2
+    run.send_signal(sign)  # to the command alone
+    run.communicate()
+    assert run.returncode == code and gone(below)
