@@ -1,5 +1,6 @@
 """Worker processes that hang, die and raise; what a caller sees, and what is left behind."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -49,6 +50,34 @@ def test_a_failure_costs_its_own_task_alone_and_the_order_stays():
 @pytest.mark.promise("F4")
 def test_a_death_that_is_not_the_tasks_own_is_forgiven(tmp_path):
     assert list(run_tasks(die_once, [(str(tmp_path / "mark"),)], workers=1)) == ["survived"]
+
+
+class Heavy:
+    """A task whose workers die while they begin, as many times as the folder has no mark."""
+
+    def __init__(self, folder: str, deaths: int) -> None:
+        self.folder, self.deaths = folder, deaths
+
+    def __call__(self, value: int) -> int:
+        return value * value
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        self.__dict__ |= state
+        if multiprocessing.parent_process() is not None:
+            number = len(os.listdir(self.folder))
+            if number < self.deaths:
+                open(os.path.join(self.folder, str(number)), "w").close()
+                os._exit(7)
+
+
+@pytest.mark.promise("F4")
+def test_workers_that_die_before_they_take_a_task_are_replaced(tmp_path):
+    assert list(run_tasks(Heavy(str(tmp_path), 1), [(2,), (3,)], workers=1)) == [4, 9]
+
+
+@pytest.mark.promise("F4")
+def test_workers_that_always_die_before_they_take_a_task_end(tmp_path):
+    assert list(run_tasks(Heavy(str(tmp_path), 1000), [(2,), (3,)], workers=1)) == [Status.WORKER_DIED] * 2
 
 
 def test_an_error_comes_when_its_turn_comes_and_workers_have_one_thread():

@@ -8,6 +8,7 @@ import os
 import threading
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import TimeoutError
+from concurrent.futures.process import BrokenProcessPool
 from typing import Annotated, Any, TypeVar
 
 import torch
@@ -53,7 +54,25 @@ def run_tasks(
 def _run(
     function: Callable[..., Result], tasks: Iterable[tuple[Any, ...]], workers: int, limit: float
 ) -> Generator[Result | Status, None, None]:
-    """Yield the results of workers."""
+    """Yield the results of workers; where all of them die before they take a task, others take their place."""
+    waiting, lost = collections.deque(tasks), 0
+    while waiting:
+        before = len(waiting)
+        for result in _run_pool(function, waiting, workers, limit):
+            waiting.popleft()
+            lost = 0
+            yield result
+        lost += len(waiting) == before
+        if lost == 2:
+            waiting.popleft()
+            lost = 0
+            yield Status.WORKER_DIED
+
+
+def _run_pool(
+    function: Callable[..., Result], tasks: Iterable[tuple[Any, ...]], workers: int, limit: float
+) -> Generator[Result | Status, None, None]:
+    """Yield the results of one pool of workers until all tasks are done, or the pool is broken."""
     try:
         from pebble import ProcessExpired, ProcessPool
     except ImportError as error:
@@ -61,18 +80,27 @@ def _run(
     # The function goes along so that its module is imported before the first task's time begins to run.
     pool = ProcessPool(workers, initializer=_begin, initargs=[function], context=multiprocessing.get_context("spawn"))
     try:
-        waiting = collections.deque((task, pool.schedule(function, task, timeout=limit)) for task in tasks)
+        try:
+            waiting = collections.deque((task, pool.schedule(function, task, timeout=limit)) for task in tasks)
+        except RuntimeError:  # it broke meanwhile
+            return
         while waiting:
             task, first = waiting.popleft()  # results that were yielded leave the memory
             try:
                 try:
                     result = first.result()
                 except ProcessExpired:  # a machine short of memory kills the innocent too: once more
-                    result = pool.schedule(function, task, timeout=limit).result()
+                    try:
+                        second = pool.schedule(function, task, timeout=limit)
+                    except RuntimeError:
+                        return
+                    result = second.result()
             except TimeoutError:
                 result = Status.TIMED_OUT
             except ProcessExpired:
                 result = Status.WORKER_DIED
+            except BrokenProcessPool:
+                return
             yield result
     finally:
         pool.stop()
