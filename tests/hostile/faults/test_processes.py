@@ -46,7 +46,7 @@ def plan(view, friction, spec):
 
 def attempt(view, protocol, spec, row, draw):
     if (view.view, row) == ("left", 1):
-        mark = view.objects / str(time.time())
+        mark = view.objects / f"{os.getpid()}.new"
         mark.write_text(str(os.getpid()))
         mark.rename(mark.with_suffix(".worker"))
         if os.environ["HOW"] == "dies":
