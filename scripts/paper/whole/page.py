@@ -18,7 +18,7 @@ from torchgrasp.report.document import escape, format_document, format_html_tabl
 TIMES = ("filter_s", "shape_s", "milliseconds", "seconds", "plan_cpu_s")
 """Names of the numbers that are times: they differ from run to run."""
 DIGITS = 6
-"""Significant digits in results.json: another process may round the last bits otherwise."""
+"""Significant digits in results.json: another machine rounds the last bits otherwise."""
 ORDER = ("table3", "fig4", "table4", "fig5", "fig6", "table5", "fig7", "fig8", "grasps", "table6", "table7", "ladder")
 """Of the parts on the page."""
 QUALITY = 88
