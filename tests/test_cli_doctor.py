@@ -7,8 +7,7 @@ import pytest
 
 from torchgrasp import cli
 from torchgrasp.evaluation import golden
-from torchgrasp.objects import load_object
-from torchgrasp.values import load_grasps
+from torchgrasp.objects import load_object, load_shipped_grasp
 
 
 def without(monkeypatch, *names):
@@ -42,7 +41,7 @@ def test_without_a_simulator_the_selftest_says_so_and_fails(monkeypatch, capsys)
 
 def test_golden_grasps_fit_their_hands_and_objects():
     for case in golden.GOLDEN:
-        grasp = load_grasps(golden.DATA / case.object / f"{case.hand}.safetensors").raise_for_status()
+        grasp = load_shipped_grasp(case.object, case.hand).raise_for_status()
         assert len(grasp) == 1 and bool(grasp.certificate.closed.all())
         low, high = load_object(case.object).mesh.bounds
         points = grasp.contacts.points[0].numpy()

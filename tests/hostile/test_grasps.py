@@ -105,14 +105,14 @@ def test_metadata_that_is_no_text_is_refused(tmp_path: Path, grasps: Grasps, val
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no named pipes among its files")
 def test_a_path_that_is_no_file_is_refused(tmp_path: Path):
     os.mkfifo(tmp_path / "pipe.safetensors")
-    for path in (tmp_path / "pipe.safetensors", "a" * 5000, "a\0b", tmp_path):
-        with pytest.raises(ModelFileError, match=r"no file|a{900}\.\.\."):
+    for path in (tmp_path / "pipe.safetensors", tmp_path):
+        with pytest.raises(ModelFileError, match="no file"):
             load_grasps(path)
 
 
 @pytest.mark.parametrize("name", ["a" * 5000, "a\0b"])
 def test_a_path_that_no_file_can_have_is_refused_by_every_reader(name: str):
-    for read, suffix in ((read_cloud, ".ply"), (read_mesh, ".stl"), (read_scene, ".npz")):
+    for read, suffix in ((read_cloud, ".ply"), (read_mesh, ".stl"), (read_scene, ".npz"), (load_grasps, "")):
         with pytest.raises(BadArgument, match="allowed is"):
             read(name + suffix)
 
