@@ -3,7 +3,7 @@
 
 python scripts/package.py                                 all Pythons that are found, torch as pip finds it
 python scripts/package.py --python python3.10 python3.13  these alone; none after --python: it only builds
-python scripts/package.py --torch-index https://download.pytorch.org/whl/cpu   a CPU build of torch
+python scripts/package.py --torch-index INDEX             torch from there, such as PyTorch's index of CPU wheels
 
 Nothing but Python, its venv module and git is needed. Environments are made one at a time and removed.
 """

@@ -272,14 +272,10 @@ def load_grasps(path: Path | str) -> Grasps:
     """Read grasps that `Grasps.save` wrote.
 
     Raises:
-        ModelFileError: the file is missing or malformed; a pose that is not rigid, an unknown status, contacts that are
-            not each under one finger, or not three to five of them.
+        ModelFileError: no such file; a pose that is not rigid, an unknown status, or not three to five contacts.
 
-    >>> import tempfile
-    >>> from torchgrasp.objects import load_shipped_grasp
-    >>> file = Path(tempfile.mkdtemp(), "grasps.safetensors")
-    >>> load_shipped_grasp("jug", "barrett").save(file)
-    >>> load_grasps(file).meta["hand"]
+    >>> from torchgrasp.objects import DATA
+    >>> load_grasps(DATA / "jug" / "barrett.safetensors").meta["hand"]
     'barrett'
     """
     grasps, meta = read_value(path, "grasps", Grasps, meta={})

@@ -265,11 +265,7 @@ def box_distance(points: Float[Tensor, "*b 3"], half: Float[Tensor, "*b 3"]) -> 
 
 
 def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None) -> SelfCollision:
-    """Return the shapes of a URDF with the pairs of links to test; None: all but neighbours.
-
-    Raises:
-        HandFileError: more than `MOST_PAIRS`.
-    """
+    """Return the shapes of a URDF with the `pairs` of links to test; None: all but neighbours; `MOST_PAIRS` at most."""
     names = [x.name for x in urdf.links]
     tested = {frozenset(pair) for pair in (itertools.combinations(names, 2) if pairs is None else pairs)}
     if pairs is None:
@@ -281,8 +277,7 @@ def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None
     if (many := sum(len(places[i]) * len(places[j]) for i, j in meeting)) > MOST_PAIRS:
         raise urdf.wrong(f"{many} pairs of shapes to test for collisions", f"at most {MOST_PAIRS}, a cylinder as six")
     kinds: tuple[list[tuple[int, int]], ...] = ([], [], [])
-    found = sorted((one, two) for i, j in meeting for one in places[i] for two in places[j] if two > one)
-    for one, two in found:
+    for one, two in sorted((one, two) for i, j in meeting for one in places[i] for two in places[j] if two > one):
         spheres = radius[one] > 0, radius[two] > 0
         kinds[sum(spheres)].append((two, one) if spheres == (False, True) else (one, two))
     return SelfCollision(
