@@ -3,7 +3,7 @@
 import os
 import signal
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 
 import torch
@@ -86,7 +86,7 @@ def die_at(number: int, row: JobRow, meta: dict[str, str], deadly: int) -> bytes
 def work_on(asked: Campaign, workers: int, function=cheap_job, *more):
     """Return the work of `carry_out` on processes here."""
 
-    def work(numbers: Sequence[int]) -> Iterator[bytes | Status]:
+    def work(numbers: Sequence[int]) -> Generator[bytes | Status, None, None]:
         tasks = [(j, asked.rows[j], asked.meta, *more) for j in numbers]
         return run_tasks(function, tasks, workers, 60.0)
 

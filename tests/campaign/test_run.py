@@ -15,6 +15,7 @@ from torchgrasp.campaign import job as job_module
 from torchgrasp.datasets import read_shards, read_view
 from torchgrasp.errors import BadArgument, DatasetError
 from torchgrasp.evaluation import EvaluationSpec, evaluate
+from torchgrasp.evaluation.views import View
 
 
 @pytest.mark.sim
@@ -78,6 +79,19 @@ def test_bad_objects_and_errors_of_the_library_have_rows(carton: Path, tmp_path:
     assert not (tmp_path / "up").exists() and set(x.name for x in tmp_path.iterdir()) == {"objects", "out"}
 
 
+def test_a_fault_of_the_machine_is_no_row_of_a_job(carton: Path, monkeypatch):
+    """What an object's own files do wrong is refused by name, so an OSError is of the installation or the disk."""
+
+    def fail(*_: object) -> None:
+        raise OSError("no space left")
+
+    monkeypatch.setattr(job_module, "plan_view", fail)
+    view = View(carton, "carton", "view0", load_hand("barrett").source)
+    meta = {"campaign": "x", "versions": json.dumps(job_module.versions())}
+    with pytest.raises(OSError, match="no space left"):
+        job_module.run_job(view, LIFT, EvaluationSpec(), meta)
+
+
 def test_bad_arguments_are_named_before_any_work(carton: Path, tmp_path: Path, capsys):
     for trials in (EvaluationSpec(planned=True), EvaluationSpec(complete=True), EvaluationSpec(fingers="auto")):
         with pytest.raises(BadArgument, match="trials: found"):
@@ -101,8 +115,6 @@ def test_bad_arguments_are_named_before_any_work(carton: Path, tmp_path: Path, c
 
 
 def test_other_versions_and_hands_on_a_machine_end_the_campaign(carton: Path):
-    from torchgrasp.evaluation.views import View
-
     source = load_hand("barrett").source
     view, spec = View(carton, "carton", "view0", source), EvaluationSpec()
     with pytest.raises(BadArgument, match="workers: found one with"):

@@ -52,6 +52,20 @@ def test_a_death_that_is_not_the_tasks_own_is_forgiven(tmp_path):
     assert list(run_tasks(die_once, [(str(tmp_path / "mark"),)], workers=1)) == ["survived"]
 
 
+def test_here_a_task_has_one_thread_and_the_caller_its_own():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        for _ in range(2):
+            results = run_tasks(act, [("threads",), ("raise", 5)], workers=0)
+            assert next(results) == 1 and torch.get_num_threads() == 2
+            with pytest.raises(BadArgument):
+                next(results)
+            assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
 class Heavy:
     """A task whose workers die while they begin, as many times as the folder has no mark."""
 

@@ -6,6 +6,8 @@ from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from typing import Any, TypeVar
 
+import torch
+
 from torchgrasp.errors import BadArgument, MissingExtra, Status
 
 Result = TypeVar("Result")
@@ -56,10 +58,11 @@ def run_on_cluster(
 
 
 def _bounded(function: Callable[..., Result], limit: float, *task: Any) -> Result:
-    """Call a function in a worker, which ends if it takes longer: nothing else would stop a simulator."""
+    """Call a function on one thread of a worker, which ends if it takes longer: nothing else stops a simulator."""
     clock = threading.Timer(limit, os._exit, [1])
     clock.daemon = True
     clock.start()
+    torch.set_num_threads(1)
     try:
         return function(*task)
     finally:

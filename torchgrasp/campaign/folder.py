@@ -3,7 +3,7 @@
 import contextlib
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ ROUNDS = 3
 LOST = (Status.WORKER_DIED, Status.TIMED_OUT)
 """Ends of a job that say nothing about it: the next call tries it again."""
 
-Work = Callable[[Sequence[int]], Iterator[bytes | Status]]
+Work = Callable[[Sequence[int]], Generator[bytes | Status, None, None]]
 """Yields the file of each of some jobs by number, or how its process ended."""
 
 
@@ -64,7 +64,7 @@ def carry_out(
         if waiting:
             (folder / CARD).unlink(missing_ok=True)  # until the new one is true
         for _ in range(ROUNDS):
-            with contextlib.closing(_as_generator(work(waiting))) as results:
+            with contextlib.closing(work(waiting)) as results:  # which ends the workers
                 for j, result in zip(waiting, results, strict=True):
                     if isinstance(result, Status):
                         lost[j] = result
@@ -79,11 +79,6 @@ def carry_out(
             observer(store.put(j, pack_shard(campaign.empty(row), campaign.meta)))
         store.finish()
     return read_shards(folder)
-
-
-def _as_generator(results: Iterator[bytes | Status]) -> Any:
-    """Return results that can be closed, which ends the workers."""
-    return results if hasattr(results, "close") else (x for x in results)
 
 
 class _Store:

@@ -40,9 +40,8 @@ def run_job(view: View, protocol: Protocol, spec: EvaluationSpec, meta: dict[str
 
     Raises:
         BadArgument: other versions or another hand than the campaign's, as on a machine of a cluster.
-        MissingExtra, OutputError: no fault of the object.
+        MissingExtra, OutputError, OSError: no fault of the object, whose own files are refused by name.
     """
-    torch.set_num_threads(1)
     hand, here = view.load_hand(), json.dumps(versions())
     if here != meta["versions"]:
         raise BadArgument("workers", f"one with {here}", f"workers with {meta['versions']}")
@@ -50,7 +49,7 @@ def run_job(view: View, protocol: Protocol, spec: EvaluationSpec, meta: dict[str
         raise BadArgument("hand", f"{view.hand.urdf_path} with other files", "the same hand on every machine")
     try:
         shard = _work(view, hand, protocol, spec)
-    except (MissingExtra, OutputError, MemoryError):
+    except (MissingExtra, OutputError, MemoryError, OSError):
         raise
     except Exception as error:  # of the library: a week of other jobs shall not end with it
         row = JobRow(view.object, view.view, Status.BROKEN, short(f"{type(error).__name__}: {error}"))

@@ -1,7 +1,7 @@
 """A campaign on a folder of objects: from views to a data set on disk."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -86,7 +86,7 @@ def run_campaign(
     source = HandSource(hand.source.option, hand.source.urdf_path, hand.source.sha256)
     limit = PLAN_LIMIT + TRIAL_LIMIT * spec.trials.grasps * test.noise.draws
 
-    def work(numbers: Sequence[int]) -> Iterator[bytes | Status]:
+    def work(numbers: Sequence[int]) -> Generator[bytes | Status, None, None]:
         views = [View(place, rows[j].object, rows[j].view, source) for j in numbers]
         tasks = [(view, test, spec.trials, campaign.meta) for view in views]
         if isinstance(workers, str):

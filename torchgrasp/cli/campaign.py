@@ -7,6 +7,7 @@ from tyro.conf import Positional, arg
 
 from torchgrasp.base import check_whole
 from torchgrasp.campaign import CampaignSpec, run_campaign
+from torchgrasp.campaign.folder import LOST
 from torchgrasp.cli.common import check_seed, naming
 from torchgrasp.cli.grasps import import_simulator
 from torchgrasp.columns import format_line
@@ -84,7 +85,7 @@ def campaign(
     said = ", ".join(f"{n} {name.lower()}" for name, n in counts["status"].items())
     print(f"{counts['jobs']} jobs: {said}")
     print(f"{len(data)} grasps, {counts['passed']} of {counts['tries']} tries passed: {out}")
-    lost = sum(row.status in (Status.WORKER_DIED, Status.TIMED_OUT) for row in data.jobs)
+    lost = sum(row.status in LOST for row in data.jobs)
     if lost:
         print(f"{lost} jobs were lost with their processes: the same command tries them again")
     return 1 if lost else 0

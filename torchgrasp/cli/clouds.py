@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import torch
 from tyro.conf import Positional, arg
 
@@ -31,6 +32,11 @@ from torchgrasp.scene import Scene, save_scene
 from torchgrasp.shape.completion import silhouettes
 from torchgrasp.values import PointCloud
 
+IMAGE_OPTIONS = {
+    "depth": "DEPTH", "points": "DEPTH", "intrinsics": "--intrinsics", "mask": "--mask", "camera_pose": "--camera-pose",
+    "path": "--out",
+}  # fmt: skip
+"""Names on the command line of what is read beside a depth image, and written."""
 MOST_JUDGED = 20_000
 """Points of a cloud, drawn at random, of which it is asked whether one camera sees them: more are no more certain."""
 
@@ -136,16 +142,21 @@ def depth(
         mask: image of the depth's size that is not 0 at the object (.png, .npy, or .npz with an array "mask").
         camera_pose: file with frame_from_camera, 4 x 4 (.npy, or .txt); by default the cloud is in the camera's frame.
     """
-    options = {name: f"--{name.replace('_', '-')}" for name in ("intrinsics", "mask", "camera_pose")}
-    with naming(**options, depth="DEPTH", points="DEPTH", path="--out"):
-        image = read_image("depth", depth)
-        inside = None if mask is None else read_image("mask", mask)
-        pose = None if camera_pose is None else read_pose("camera_pose", camera_pose)
+    with naming(**IMAGE_OPTIONS):
+        image, inside, pose = read_images(depth, mask, camera_pose)
         cloud = cloud_from_depth(image, intrinsics, inside, pose)
         save_cloud(cloud, out)
     frame = "the camera's frame: give its vertical with --up" if pose is None else "the frame of the pose"
     print(f"{len(cloud)} points in {frame}, {out}")
     return 0
+
+
+def read_images(
+    depth: Path, mask: Path | None, camera_pose: Path | None
+) -> tuple[np.ndarray, np.ndarray | None, torch.Tensor | None]:
+    """Return a depth image, its mask and the pose of its camera, as far as they are given."""
+    inside = None if mask is None else read_image("mask", mask)
+    return read_image("depth", depth), inside, None if camera_pose is None else read_pose("camera_pose", camera_pose)
 
 
 def scene(
@@ -165,11 +176,9 @@ def scene(
         mask: image of the depth's size that is not 0 at the object to be grasped; by default every thing is found.
         camera_pose: file with frame_from_camera, 4 x 4 (.npy, or .txt); by default results are in the camera's frame.
     """
-    options = {name: f"--{name.replace('_', '-')}" for name in ("intrinsics", "mask", "camera_pose")}
-    with naming(**options, depth="DEPTH", path="--out"):
-        inside = None if mask is None else read_image("mask", mask)
-        pose = None if camera_pose is None else read_pose("camera_pose", camera_pose)
-        seen = Scene.from_depth(read_image("depth", depth), intrinsics, pose, mask=inside)
+    with naming(**IMAGE_OPTIONS):
+        image, inside, pose = read_images(depth, mask, camera_pose)
+        seen = Scene.from_depth(image, intrinsics, pose, mask=inside)
         save_scene(seen, out)
     for label in seen.things:
         print(f"thing {label}: {int(seen.rows_of(label).sum())} points{' (the target)' * (label == seen.target)}")

@@ -8,8 +8,6 @@ from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Annotated
 
-import torch
-
 from torchgrasp.border import Range, checked
 from torchgrasp.datasets import list_objects, list_views
 from torchgrasp.errors import BadArgument, DatasetError, Status
@@ -130,7 +128,6 @@ class _View(View):
 
 def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
     """Plan on a view and keep the grasps, or count those of an earlier call."""
-    torch.set_num_threads(1)
     found = plan_view(view, friction, spec, view.file if spec.planned else None)
     if found.grasps is not None and not spec.planned:
         meta = found.grasps.meta | {REFUSAL: found.score.refusal.name}

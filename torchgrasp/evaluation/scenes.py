@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from torchgrasp.base import Value, check_number, check_whole
 from torchgrasp.errors import Status
@@ -95,7 +94,6 @@ def evaluate_scenes(
 
 def _try_scene(objects: Path | None, source: HandSource, spec: ClutterSpec, index: int) -> SceneScore:
     """Run one scene."""
-    torch.set_num_threads(1)
     hand = load_hand(source.urdf_path.parent, source.option)
     seed = int(np.random.SeedSequence((spec.seed, index)).generate_state(1)[0])
     planner = functools.partial(_plan, hand=hand, spec=spec)

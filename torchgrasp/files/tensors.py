@@ -59,7 +59,8 @@ def load_tensors(
         with safe_open(path, framework="pt") as file:
             meta = json.loads((file.metadata() or {}).get("torchgrasp", "{}"))
             found = set(file.keys())
-            tensors = {name: file.get_tensor(name).clone() for name in found & allowed}  # the others stay unread
+            # The others stay unread. A copy is aligned as what was saved: unaligned numbers round otherwise.
+            tensors = {name: file.get_tensor(name).clone() for name in found & allowed}
     except (SafetensorError, OSError, ValueError, KeyError, RecursionError) as error:
         raise ModelFileError("path", f"{path}: {error}", f"a safetensors file of kind {kind!r}") from error
     if not isinstance(meta, dict) or not all(isinstance(x, str) for x in meta.values()):

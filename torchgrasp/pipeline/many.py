@@ -100,7 +100,7 @@ def _plan_to_file(
     cloud: dict[str, np.ndarray], device: str, hand: HandSource, spec: Any, rest: dict[str, Any], file: Path
 ) -> None:
     """Plan in a worker, on a device."""
-    points = PointCloud(**{name: torch.tensor(array) for name, array in cloud.items()}).to(torch.device(device))
+    points = PointCloud(**{name: torch.from_numpy(array) for name, array in cloud.items()}).to(torch.device(device))
     loaded = load_hand(hand.urdf_path.parent, hand.option)
     _plan_or_refuse(Request(points, loaded, _restored(spec), **rest)).save(file)
 
@@ -122,4 +122,4 @@ def _restored(plain: Any) -> ContactSpec | None:
     if not isinstance(plain, tuple):
         return plain
     spec, normal, offset = plain
-    return dataclasses.replace(spec, table=Plane(torch.tensor(normal), offset))
+    return dataclasses.replace(spec, table=Plane(torch.from_numpy(normal), offset))

@@ -31,8 +31,8 @@ def run_tasks(
 ) -> Generator[Result | Status, None, None]:
     """Yield `function(*task)` for each task, in the order of the tasks.
 
-    A worker is a fresh process of one thread. A late task gives `Status.TIMED_OUT`, a task whose process dies twice
-    `Status.WORKER_DIED`. All workers end when the caller stops listening.
+    A task runs on one thread, a worker is a fresh process. A late task gives `Status.TIMED_OUT`, a task whose process
+    dies twice `Status.WORKER_DIED`. All workers end when the caller stops listening.
 
     Args:
         function: of a module, so that a worker can import it.
@@ -48,7 +48,19 @@ def run_tasks(
     >>> list(run_tasks(pow, [(2, 3), (3, 2)], workers=0))
     [8, 9]
     """
-    return _run(function, tasks, workers, limit) if workers else (function(*task) for task in tasks)
+    return _run(function, tasks, workers, limit) if workers else _run_here(function, tasks)
+
+
+def _run_here(function: Callable[..., Result], tasks: Iterable[tuple[Any, ...]]) -> Generator[Result, None, None]:
+    """Yield the results of this process, which has its threads again in between."""
+    for task in tasks:
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            result = function(*task)
+        finally:
+            torch.set_num_threads(threads)
+        yield result
 
 
 def _run(

@@ -118,8 +118,8 @@ def _trace_wall(whole: ShapeGP, number: int, resolution: int) -> tuple[Float[Ten
         np.nan_to_num(volume, nan=1.0), 0.0, mask=~np.isnan(volume), spacing=(step,) * 3, gradient_direction="ascent"
     )
     used, faces = np.unique(faces[_carry_cloud(corners - radius, faces, shape)], return_inverse=True)
-    x = torch.tensor(corners[used].astype(np.float64) - radius).to(device)
-    faces = torch.tensor(faces.reshape(-1, 3).astype(np.int64)).to(device)
+    x = torch.from_numpy(corners[used].astype(np.float64) - radius).to(device)
+    faces = torch.from_numpy(faces.reshape(-1, 3).astype(np.int64)).to(device)
     normals, rows = torch.zeros_like(x), torch.arange(len(x), device=device)
     for _ in range(NEWTON_STEPS):
         value, gradient = shape.mean_and_gradient(x[rows])
@@ -129,7 +129,7 @@ def _trace_wall(whole: ShapeGP, number: int, resolution: int) -> tuple[Float[Ten
     if others:  # the cut turns triangles around, so they are wound after it
         value = torch.stack([wall.mean(x) for wall in others]).amax(0)
         vertices, triangles, _ = clip_mesh(x.cpu().numpy(), faces.cpu().numpy(), value.cpu().numpy())
-        x, faces = torch.tensor(vertices).to(x), torch.tensor(triangles).to(faces)
+        x, faces = torch.from_numpy(vertices).to(x), torch.from_numpy(triangles).to(faces)
         normals = shape.mean_and_gradient(x)[1]
     a, b, c = x[faces].unbind(1)
     across = torch.linalg.cross(b - a, c - a)

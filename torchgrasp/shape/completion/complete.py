@@ -271,7 +271,7 @@ def _merge(scorer: SymmetryScorer, merged: _Image, images: list[_Image]) -> _Ima
         new = image[(distance > NEW) & _allowed(scorer, image.points) & ~_on_table(scorer, image)]
         if len(merged) and len(new):
             distance, _ = KDTree(merged.points.numpy()).query(new.points.numpy())
-            new = new[torch.tensor(distance) > SPACING]
+            new = new[torch.from_numpy(distance) > SPACING]
         merged = join([merged, new[_thin(new.points)]])
     return merged
 

@@ -81,12 +81,12 @@ def find_ellipsoid(
         return None
     if axes[2] > MAX_RATIO * axes[0]:
         return None
-    root = torch.tensor(_exponential(one[:, 3:])[0])
+    root = torch.from_numpy(_exponential(one[:, 3:])[0])
     direction = fibonacci_sphere(GRID)
     across = unit(direction @ torch.linalg.inv(root))
     moved = _support(one + STEP * np.eye(9), across.numpy()) - _support(one, across.numpy())
-    spread = torch.tensor(moved.T / STEP @ np.linalg.cholesky(covariance))
-    return Ellipsoid(torch.tensor(parameters[:3]) + direction @ root, across, spread, misfit)
+    spread = torch.from_numpy(moved.T / STEP @ np.linalg.cholesky(covariance))
+    return Ellipsoid(torch.from_numpy(parameters[:3]) + direction @ root, across, spread, misfit)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -197,16 +197,16 @@ def silhouette(view: PointCloud) -> Silhouette:
     outside += np.where(inside, 0.5, -0.5) * cell  # the outline runs between two cells
     seen = ~unseen if not unseen.any() else _distance(~unseen) * cell > GROW * spacing
     rim, rim_normals = _rim(outside, seen, corner, cell, pixels, depths)
-    origin, axes = view.viewpoint.double().cpu(), torch.tensor(axes)
+    origin, axes = view.viewpoint.double().cpu(), torch.from_numpy(axes)
     return Silhouette(
         viewpoint=origin,
         axes=axes,
-        corner=torch.tensor(corner),
+        corner=torch.from_numpy(corner),
         cell=cell,
-        outside=torch.tensor(outside),
-        depth=torch.tensor(np.where(unseen, 0.0, raster[tuple(nearest)])),  # nothing there is in front of it
-        rim=torch.tensor(rim) @ axes + origin,
-        rim_normals=torch.tensor(rim_normals) @ axes,
+        outside=torch.from_numpy(outside),
+        depth=torch.from_numpy(np.where(unseen, 0.0, raster[tuple(nearest)])),  # nothing there is in front of it
+        rim=torch.from_numpy(rim) @ axes + origin,
+        rim_normals=torch.from_numpy(rim_normals) @ axes,
         cut=bool(unseen.any()),
         gap=gap * float(np.median(depths)),
     )
@@ -239,7 +239,7 @@ def _check_view(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> 
         raise BadArgument("viewpoint", found, "the position of a camera that has the whole cloud in front of it")
     _, pixels, depth = _project(points, viewpoint)
     apart, index = KDTree(pixels.numpy()).query(pixels.numpy(), k=min(PIXELS, len(pixels)))
-    deeper = depth[:, None] - depth[torch.tensor(index)] - torch.tensor(apart) * depth[:, None]
+    deeper = depth[:, None] - depth[torch.from_numpy(index)] - torch.from_numpy(apart) * depth[:, None]
     points = points.double().cpu()
     radius = torch.linalg.vector_norm(points - (points.amax(0) + points.amin(0)) / 2, dim=-1).max()
     share = float((deeper.amax(1) > BEHIND * radius).double().mean())
@@ -288,7 +288,7 @@ def _rim(
     position = corner + cell * np.stack([column, row], -1)
     if len(position) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3))
-    picks = farthest_points(torch.tensor(position), 16, tie=TIE).numpy()
+    picks = farthest_points(torch.from_numpy(position), 16, tie=TIE).numpy()
     position, slope = position[picks], slope[picks]
     _, index = KDTree(pixels).query(position, k=min(4, len(pixels)))
     depth = np.median(depths[index].reshape(len(position), -1), axis=-1)

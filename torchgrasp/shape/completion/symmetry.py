@@ -110,8 +110,8 @@ class SymmetryScorer:
         """Return the nearest point's distance [m] and index; infinity and 0 beyond the limit."""
         distance, index = self.tree.query(points.reshape(-1, 3).numpy(), distance_upper_bound=limit)  # pyright: ignore
         shape = points.shape[:-1]
-        index = torch.tensor(np.where(np.isinf(distance), 0, index)).reshape(shape)
-        return torch.tensor(distance).reshape(shape), index
+        index = torch.from_numpy(np.where(np.isinf(distance), 0, index)).reshape(shape)
+        return torch.from_numpy(distance).reshape(shape), index
 
     def score(self, planes: Float[Tensor, "p 4"]) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
         """Return scores of planes n.x = o, as (n, o), and violations of free space.

@@ -130,8 +130,8 @@ def _merge(
     for part in parts:
         part = part[(part.points[:, 2] < vessel.rim - RIM) & (part.points[:, 2] >= least)]
         allowed = (outline.hull_distance(part.points) < HULL_MARGIN) & (outline.violation(part.points) < FRONT_MARGIN)
-        new = part[allowed & torch.tensor(tree.query(part.points.numpy())[0] > NEW)]
+        new = part[allowed & torch.from_numpy(tree.query(part.points.numpy())[0] > NEW)]
         if len(merged) and len(new):
-            new = new[torch.tensor(KDTree(merged.points.numpy()).query(new.points.numpy())[0] > SPACING)]
+            new = new[torch.from_numpy(KDTree(merged.points.numpy()).query(new.points.numpy())[0] > SPACING)]
         merged = join([merged, new[farthest_points(new.points, 4 * BUDGET, tie=TIE)]]) if len(new) else merged
     return merged[farthest_points(merged.points, BUDGET, tie=TIE)]
