@@ -274,8 +274,10 @@ def load_grasps(path: Path | str) -> Grasps:
     Raises:
         ModelFileError: no such file; a pose that is not rigid, an unknown status, or not three to five contacts.
 
-    >>> from torchgrasp.objects import DATA
-    >>> load_grasps(DATA / "jug" / "barrett.safetensors").meta["hand"]
+    >>> import tempfile
+    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> load_shipped_grasp("jug", "barrett").save(file := Path(tempfile.mkdtemp(), "grasps.safetensors"))
+    >>> load_grasps(file).meta["hand"]
     'barrett'
     """
     grasps, meta = read_value(path, "grasps", Grasps, meta={})
@@ -285,16 +287,14 @@ def load_grasps(path: Path | str) -> Grasps:
 
 def check_grasps(path: Path | str, grasps: Grasps) -> None:
     """Refuse grasps of a file that no program of ours wrote; raise `ModelFileError`."""
-    rotation, last = grasps.obj_from_hand[:, :3, :3].double(), grasps.obj_from_hand[:, 3]
+    f, rotation, last = grasps.contacts.fingertips, grasps.obj_from_hand[:, :3, :3].double(), grasps.obj_from_hand[:, 3]
     error = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().amax((1, 2))
     mirrored, sheared = torch.linalg.det(rotation) < 0, (last != torch.eye(4).to(last)[3]).any(1)
-    f, order = grasps.contacts.fingertips, grasps.permutation.sort(1).values
     wrong = {
         f"{f} fingertips, not three to five": torch.tensor([not FINGERTIPS[0] <= f <= FINGERTIPS[1]]),
         "obj_from_hand that is not rigid": ~(error <= RIGID) | mirrored | sheared,
         "an unknown status": ~torch.isin(grasps.status, torch.tensor([int(status) for status in Status])),
-        "a permutation that is none": (order != torch.arange(f)).any(1),
+        "a permutation that is none": (grasps.permutation.sort(1).values != torch.arange(f)).any(1),
     }
-    for found, rows in wrong.items():
-        if bool(rows.any()):
-            raise ModelFileError("path", f"{path}: {found}", "grasps that Grasps.save wrote")
+    for found in (name for name, rows in wrong.items() if bool(rows.any())):
+        raise ModelFileError("path", f"{path}: {found}", "grasps that Grasps.save wrote")
