@@ -9,7 +9,7 @@ from typing import Any
 
 from PIL import Image
 
-from paper.whole.parts import FIGURES, FULL, TRIALS, Figure, Sizes, Trials
+from paper.whole.parts import EVERY, FIGURES, FULL, TRIALS, Figure, Sizes, Trials
 from paper.whole.tables import HAND, TABLES, count_own
 from torchgrasp import __version__
 from torchgrasp.files import format_json, write_file
@@ -58,7 +58,8 @@ def describe(sizes: Sizes) -> str:
     """Say how many trials were made, and of how many."""
     if sizes == FULL:
         return "every trial (--full)"
-    few = [f"{name} {x} of {y}" for name, x, y in zip(vars(sizes), _values(sizes), _values(FULL), strict=True) if x < y]
+    pairs = zip(vars(sizes), _values(sizes), _values(FULL), strict=True)
+    few = [f"{name} {x} of {'all' if y == EVERY else y}" for name, x, y in pairs if x < y]
     return f"fewer trials than --full: {', '.join(few)}"
 
 

@@ -33,7 +33,7 @@ class Whole:
         out: folder of index.html, results.json, times.json and of all that is kept.
         objects: folders of objects with noisy views, beside the library's own four; docs/data.md says what is in them.
         parts: names of the parts to make, such as table3; by default all.
-        full: every trial instead of what two cores do in half an hour.
+        full: every trial instead of what two cores do in some 20 minutes.
         workers: processes; the results do not depend on their number.
     """
 

@@ -43,7 +43,8 @@ def table4(content: dict[str, Any]) -> Table:
     heads += ("the paper's", "of 1000", "s a start", "Q cm")
     rows = []
     for row in content["rows"]:
-        theirs = PLANNED[row["object"]] if row["threshold"] == THRESHOLDS[0] else ("",) * 4
+        as_paper = row["threshold"] == THRESHOLDS[0] and row["setting"] == "paper"
+        theirs = PLANNED[row["object"]] if as_paper else ("",) * 4
         quality = f"{row['quality']:.3f} ± {row['spread']:.3f}" if row["grasps"] > 1 else "-"
         ours = (f"{row['threshold']:.2f}", str(row["grasps"]), f"{row['milliseconds']:.2f}", quality)
         beside = tuple(str(x).replace("+-", "±") for x in theirs)
