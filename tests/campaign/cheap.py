@@ -11,7 +11,7 @@ import torch
 from torchgrasp.campaign.folder import Campaign
 from torchgrasp.datasets.shards import JobRow, Records, Shard, pack_shard
 from torchgrasp.errors import Status
-from torchgrasp.pipeline.pool import run_tasks
+from torchgrasp.pipeline.pool import run_as_they_end
 from torchgrasp.values import Certificate, Contacts, Grasps
 
 JOINTS, FINGERS, TRIES = 4, 3, 2
@@ -83,12 +83,19 @@ def die_at(number: int, row: JobRow, meta: dict[str, str], deadly: int) -> bytes
     return cheap_job(number, row, meta)
 
 
+def wait_at(number: int, row: JobRow, meta: dict[str, str], patient: int, path: str) -> bytes:
+    """Do a job; one of them waits for a file."""
+    while number == patient and not Path(path).exists():
+        time.sleep(0.02)
+    return cheap_job(number, row, meta)
+
+
 def work_on(asked: Campaign, workers: int, function=cheap_job, *more):
     """Return the work of `carry_out` on processes here."""
 
-    def work(numbers: Sequence[int]) -> Generator[bytes | Status, None, None]:
+    def work(numbers: Sequence[int]) -> Generator[tuple[int, bytes | Status], None, None]:
         tasks = [(j, asked.rows[j], asked.meta, *more) for j in numbers]
-        return run_tasks(function, tasks, workers, 60.0)
+        return run_as_they_end(function, tasks, workers, 60.0)
 
     return work
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.campaign.cheap import ASKED, campaign, cheap_job, contents, die_at, records, work_on
+from tests.campaign.cheap import ASKED, campaign, cheap_job, contents, die_at, records, wait_at, work_on
 from torchgrasp.campaign.folder import carry_out
 from torchgrasp.datasets import read_shards
 from torchgrasp.errors import ModelFileError, OutputError, Status
@@ -120,6 +120,23 @@ def test_a_deadly_job_is_named_and_the_next_call_tries_it_again(whole: Path, tmp
     again = []
     carry_out(asked, tmp_path / "out", work_on(asked, 0), again.append)
     assert len(again) == 1 and contents(tmp_path / "out") == contents(whole)
+
+
+@pytest.mark.promise("F1")
+def test_a_job_is_on_disk_as_soon_as_it_ended(whole: Path, tmp_path: Path):
+    """The first job waits until another one is told, which is on disk by then."""
+    pytest.importorskip("pebble")
+    asked, told = campaign(JOBS), []
+
+    def tell(row) -> None:
+        told.append(row)
+        if len(told) == 5:
+            assert len(list((tmp_path / "out" / "parts").iterdir())) == 5
+            (tmp_path / "go").touch()
+
+    carry_out(asked, tmp_path / "out", work_on(asked, 2, wait_at, 0, str(tmp_path / "go")), tell)
+    assert contents(tmp_path / "out") == contents(whole)
+    assert [(row.object, row.view) for row in told].index(("thing000", "view0")) >= 5
 
 
 def test_what_is_damaged_is_made_anew(whole: Path, tmp_path: Path):

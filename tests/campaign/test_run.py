@@ -68,8 +68,10 @@ def test_bad_objects_and_errors_of_the_library_have_rows(carton: Path, tmp_path:
     (objects / "manifest.json").write_text(json.dumps({"objects": entries}))
     monkeypatch.setattr(job_module, "try_grasp", lambda *_: 1 / 0)
     words = ["campaign", str(objects), "--hand", "barrett", "--out", str(tmp_path / "out"), "--starts", "20"]
-    assert cli.main([*words, "--workers", "0"]) == 0
+    words += ["--grasps", "1", "--workers", "0"]
+    assert cli.main(words) == 1
     said = capsys.readouterr().out
+    assert said.endswith("\n1 job failed by no fault of the object (broken): the same command tries again\n")
     rows = {row.object: row for row in read_shards(tmp_path / "out").jobs}
     assert rows["carton"].status is Status.BROKEN and "ZeroDivisionError" in rows["carton"].note
     bad = {"'../up'": "the name", "gone": "no file", "blind": "no view", "'loose'": "object"}
@@ -77,6 +79,9 @@ def test_bad_objects_and_errors_of_the_library_have_rows(carton: Path, tmp_path:
     assert all(words in rows[name].note for name, words in bad.items())
     assert "5 jobs: 4 bad_object, 1 broken" in said and "0 grasps" in said
     assert not (tmp_path / "up").exists() and set(x.name for x in tmp_path.iterdir()) == {"objects", "out"}
+    monkeypatch.undo()
+    assert cli.main(words) == 0
+    assert "5 jobs: 4 bad_object, 1 ok" in capsys.readouterr().out
 
 
 def test_a_fault_of_the_machine_is_no_row_of_a_job(carton: Path, monkeypatch):

@@ -11,15 +11,17 @@ import pytest
 import torch
 
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.pipeline.pool import run_tasks
+from torchgrasp.pipeline.pool import run_as_they_end, run_tasks
 
 pytest.importorskip("pebble")
 
 
 def act(what: str, value: int = 0) -> object:
-    """Return a square, hang, die in one of two ways, raise, or report the threads."""
+    """Return a square, soon or later, hang, die in one of two ways, raise, or report the threads."""
     if what == "hang":
         time.sleep(600)
+    if what == "slow":
+        time.sleep(1)
     if what == "exit":
         os._exit(3)
     if what == "KILL":
@@ -50,6 +52,20 @@ def test_a_failure_costs_its_own_task_alone_and_the_order_stays():
 @pytest.mark.promise("F4")
 def test_a_death_that_is_not_the_tasks_own_is_forgiven(tmp_path):
     assert list(run_tasks(die_once, [(str(tmp_path / "mark"),)], workers=1)) == ["survived"]
+
+
+@pytest.mark.promise("F4")
+def test_a_task_whose_worker_died_goes_before_those_that_wait(tmp_path):
+    tasks = [(str(tmp_path / "mark"),), *((str(tmp_path),) for _ in range(7))]
+    found = list(run_as_they_end(die_once, tasks, 1, 60.0))
+    numbers = [number for number, result in found if result == "survived"]
+    assert sorted(numbers) == list(range(8)) and numbers.index(0) <= 2
+
+
+def test_a_task_that_ends_early_waits_for_its_turn_or_not(tmp_path):
+    tasks = [("slow", 5), ("square", 3), ("square", 4)]
+    assert list(run_tasks(act, tasks, workers=2)) == [25, 9, 16]
+    assert [number for number, _ in run_as_they_end(act, tasks, 2, 60.0)][-1] == 0
 
 
 def test_here_a_task_has_one_thread_and_the_caller_its_own():

@@ -17,11 +17,11 @@ ASKED, README, PARTS = "campaign.json", "README.md", "parts"
 """What was asked; the card for people; the folder of jobs whose shard is not whole yet."""
 ROUNDS = 3
 """How often a job whose process died is tried in one call, and twice each time: the innocent die with the guilty."""
-LOST = (Status.WORKER_DIED, Status.TIMED_OUT)
-"""Ends of a job that say nothing about it: the next call tries it again."""
+FAILED = (Status.WORKER_DIED, Status.TIMED_OUT, Status.BROKEN)
+"""Ends of a job that say nothing about its object: the next call tries it again."""
 
-Work = Callable[[Sequence[int]], Generator[bytes | Status, None, None]]
-"""Yields the file of each of some jobs by number, or how its process ended."""
+Work = Callable[[Sequence[int]], Generator[tuple[int, bytes | Status], None, None]]
+"""Takes numbers of jobs; yields, as they end, place among these and file of each, or how its process ended."""
 
 
 class Campaign(NamedTuple):
@@ -65,7 +65,8 @@ def carry_out(
             (folder / CARD).unlink(missing_ok=True)  # until the new one is true
         for _ in range(ROUNDS):
             with contextlib.closing(work(waiting)) as results:  # which ends the workers
-                for j, result in zip(waiting, results, strict=True):
+                for place, result in results:
+                    j = waiting[place]
                     if isinstance(result, Status):
                         lost[j] = result
                     else:
@@ -116,7 +117,7 @@ class _Store:
 
     def _look(self, k: int) -> None:
         """Find the sound jobs of a shard: in its file, or each in its own."""
-        settled = {j: row for j, row in self._saved(k).items() if row.status not in LOST}
+        settled = {j: row for j, row in self._saved(k).items() if row.status not in FAILED}
         self.rows |= settled
         if len(settled) == len(self._jobs(k)):
             self._settle(k)
@@ -125,7 +126,7 @@ class _Store:
             if j not in settled:
                 with contextlib.suppress(ModelFileError):
                     row = self._row_of(j, load_shard(self._part(j), self.campaign.meta))
-                    if row.status not in LOST:
+                    if row.status not in FAILED:
                         self.rows[j] = row._replace(meta={})
         self._close(k)
 

@@ -18,7 +18,7 @@ from torchgrasp.evaluation.campaign import PLAN_LIMIT, TRIAL_LIMIT
 from torchgrasp.evaluation.views import View
 from torchgrasp.files import sha256
 from torchgrasp.hand.hand import Hand, HandSource
-from torchgrasp.pipeline.pool import run_tasks
+from torchgrasp.pipeline.pool import run_as_they_end
 
 
 @checked
@@ -32,9 +32,10 @@ def run_campaign(
 ) -> GraspShards:
     """Plan on every view of a folder of objects, try the grasps in simulation, and write a data set of them.
 
-    Each job, one object and view, ends with a row: its grasps, or the reason why there are none. The same call
-    continues a run that was interrupted or killed; it does again what was lost with a process. Equal results give
-    equal bytes, whatever the workers, their order and the interruptions (docs/promises.md, N10, on equal results).
+    Each job, one object and view, ends with a row: its grasps, or the reason why there are none. Each is on disk as
+    soon as it ended. The same call continues a run that was interrupted or killed, and tries again what failed
+    (`WORKER_DIED`, `TIMED_OUT`, `BROKEN`). Equal results give equal bytes, whatever the workers, their order and the
+    interruptions (docs/promises.md, N10, on equal results).
 
     Args:
         objects: a folder as in `torchgrasp.datasets`. On a cluster it has the same path on every machine.
@@ -86,12 +87,12 @@ def run_campaign(
     source = HandSource(hand.source.option, hand.source.urdf_path, hand.source.sha256)
     limit = PLAN_LIMIT + TRIAL_LIMIT * spec.trials.grasps * test.noise.draws
 
-    def work(numbers: Sequence[int]) -> Generator[bytes | Status, None, None]:
+    def work(numbers: Sequence[int]) -> Generator[tuple[int, bytes | Status], None, None]:
         views = [View(place, rows[j].object, rows[j].view, source) for j in numbers]
         tasks = [(view, test, spec.trials, campaign.meta) for view in views]
         if isinstance(workers, str):
             return run_on_cluster(run_job, tasks, workers, limit)
-        return run_tasks(run_job, tasks, workers, limit)
+        return run_as_they_end(run_job, tasks, workers, limit)
 
     return carry_out(campaign, Path(folder), work, observer)
 

@@ -7,7 +7,7 @@ from tyro.conf import Positional, arg
 
 from torchgrasp.base import check_whole
 from torchgrasp.campaign import CampaignSpec, run_campaign
-from torchgrasp.campaign.folder import LOST
+from torchgrasp.campaign.folder import FAILED
 from torchgrasp.cli.common import check_seed, naming
 from torchgrasp.cli.grasps import import_simulator
 from torchgrasp.columns import format_line
@@ -45,7 +45,7 @@ def campaign(
 
     Prints a line for each job, one object and view. Writes shards of safetensors with README.md and card.json, which
     torchgrasp.datasets.read_shards reads. The same command continues a run that was interrupted or killed, and tries
-    again what was lost with a process; it ends with 1 while something is.
+    failed jobs again: worker_died, timed_out, and broken, an error of the library. It ends with 1 while some are left.
 
     Args:
         objects: folder with manifest.json, and for each object mesh.ply and noisy views; see docs/data.md.
@@ -85,10 +85,12 @@ def campaign(
     said = ", ".join(f"{n} {name.lower()}" for name, n in counts["status"].items())
     print(f"{counts['jobs']} jobs: {said}")
     print(f"{len(data)} grasps, {counts['passed']} of {counts['tries']} tries passed: {out}")
-    lost = sum(row.status in LOST for row in data.jobs)
-    if lost:
-        print(f"{lost} jobs were lost with their processes: the same command tries them again")
-    return 1 if lost else 0
+    failed = [row for row in data.jobs if row.status in FAILED]
+    if failed:
+        reasons = ", ".join(sorted({row.status.name.lower() for row in failed}))
+        jobs = "1 job" if len(failed) == 1 else f"{len(failed)} jobs"
+        print(f"{jobs} failed by no fault of the object ({reasons}): the same command tries again")
+    return 1 if failed else 0
 
 
 def print_job(row: JobRow) -> None:
