@@ -10,7 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from torchgrasp import cli
 from torchgrasp.cli.results import write_results
+from torchgrasp.cloud import save_cloud
 from torchgrasp.errors import BadArgument
+from torchgrasp.pipeline.provenance import digest
 from torchgrasp.report.turning import write_viewer
 from torchgrasp.report.turning.buffers import pack
 from torchgrasp.report.turning.contents import POSTURES, describe, describe_grasps
@@ -192,6 +194,26 @@ def test_a_page_of_other_grasps_is_left_aside(folder, monkeypatch, capsys):
     assert cli.main(["view", str(file)]) == 130
     said = capsys.readouterr().out
     assert "shows other grasps" in said and "1 grasps at" in said
+
+
+def test_without_a_page_a_cloud_is_shown_if_it_is_theirs(two, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("viser")
+    end(monkeypatch, [])
+    seen, other = (tmp_path / f"{name}.npz" for name in ("seen", "other"))
+    save_cloud(two.cloud, seen), save_cloud(two.cloud.select(torch.arange(200)), other)
+    run = dataclasses.replace(two, grasps=signed(two))
+    run.grasps.meta["cloud_sha256"] = digest(two.cloud)
+    write_results(tmp_path, run, no_report=True)
+    shown = []
+    monkeypatch.setattr("torchgrasp.report.turning.live.LiveView._add_panel", lambda view: shown.append(view.shown))
+    monkeypatch.setattr("torchgrasp.report.turning.live.LiveView.show", lambda view: None)
+    assert cli.main(["view", str(tmp_path), "--no-browser"]) == 130
+    assert "--cloud FILE" in capsys.readouterr().out and shown[-1].cloud is None
+    assert cli.main(["view", str(tmp_path), "--no-browser", "--cloud", str(seen)]) == 130
+    assert "note" not in capsys.readouterr().out
+    np.testing.assert_allclose(shown[-1].cloud, two.cloud.points, atol=1e-6)
+    assert cli.main(["view", str(tmp_path), "--no-browser", "--cloud", str(other)]) == 2
+    assert "--cloud: found" in capsys.readouterr().err
 
 
 def test_what_cannot_be_viewed_is_told(folder, monkeypatch, capsys):
