@@ -271,6 +271,18 @@ def test_groups_of_commands_have_help(words, capsys):
     assert "evaluate" not in said
 
 
+@pytest.mark.parametrize("command", list(cli.COMMANDS))
+def test_help_says_no_default_that_says_nothing_and_breaks_lines_by_their_width(command, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    with pytest.raises(SystemExit):
+        cli.main([*command.split(), "--help"])
+    said = capsys.readouterr().out
+    assert "None" not in said and "default: False" not in said
+    rows = [line.strip("│ ") for line in said.splitlines() if line.startswith("│ " + 10 * " ")]
+    short = [row for row in rows if len(row) < 40]
+    assert all(row.endswith((".", ")", "]")) for row in short), short
+
+
 def test_too_few_numbers_of_an_option_are_refused_without_markup(capsys):
     with pytest.raises(SystemExit) as end:
         cli.main(["cloud", "check", VIEW, "--viewpoint", "1", "2"])
@@ -303,7 +315,7 @@ def test_the_bare_command_shows_where_to_begin(capsys):
         (["cloud", ""], {"check", "cut", "depth", "scene", "thin", "render", "views"}),
         (["hand", "tr"], {"train"}),
         (["vi"], {"view"}),
-        (["view", "--n"], {"--no-browser"}),
+        (["view", "--n"], {"--no-browser", "--no-viewpoint", "--no-normals"}),
     ],
 )
 def test_the_shell_completes_commands_of_a_group(typed, offered, tmp_path, capsys):

@@ -14,7 +14,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import torch
 import tyro
@@ -191,4 +191,33 @@ def _naming_paths(function: Callable[..., int]) -> Callable[..., int]:
                 check_path(name.upper() if positional else f"--{name.replace('_', '-')}", value)
         return function(*args, **named)
 
+    # The parser prints the text of an argument as it stands, and looks behind wrappers for it: lines are joined here.
+    command.__doc__ = re.sub(r"\n {8,}", " ", inspect.cleandoc(function.__doc__ or ""))
+    command.__signature__ = signature  # pyright: ignore[reportAttributeAccessIssue]
+    command.__annotations__ = {name: _shown(hint, signature.parameters.get(name)) for name, hint in hints.items()}
+    del command.__wrapped__
     return command
+
+
+def _shown(hint: Any, parameter: inspect.Parameter | None) -> Any:
+    """Return the annotation of an option; the help is silent of a default that says nothing: None, False and ()."""
+    quiet = parameter is not None and any(parameter.default is empty for empty in (None, False, ()))
+    if not quiet or get_origin(hint) is Annotated:
+        return hint
+    kinds = [kind for kind in get_args(hint) if kind is not type(None)]
+    metavar = _metavar(kinds[0]) if type(None) in get_args(hint) and len(kinds) == 1 else None
+    return Annotated[hint, tyro.conf.arg(metavar=metavar, help_behavior_hint="")]
+
+
+def _metavar(kind: Any) -> str:
+    """Return what stands for a value in the help.
+
+    >>> _metavar(tuple[float, float]), _metavar(tuple[float, ...]), _metavar(Literal["a", "b"])
+    ('FLOAT FLOAT', 'FLOAT [FLOAT ...]', '{a,b}')
+    """
+    parts = get_args(kind)
+    if get_origin(kind) is Literal:
+        return f"{{{','.join(map(str, parts))}}}"
+    if get_origin(kind) is tuple:
+        return f"{_metavar(parts[0])} [{_metavar(parts[0])} ...]" if ... in parts else " ".join(map(_metavar, parts))
+    return "PATH" if kind is Path else kind.__name__.upper()

@@ -101,7 +101,7 @@ def cut(
         view: how the file is meant.
         point: a point on or near the thing; all farther than 0.5 m away is left out. By default the largest thing.
         box: two corners of a box; all outside is left out first.
-        gap: least distance between two things.
+        gap: least distance between two things [m].
     """
     if not 0.001 <= gap <= 1.0:
         raise BadArgument("--gap", gap, "a number of metres in [0.001, 1]")

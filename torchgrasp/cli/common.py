@@ -6,10 +6,11 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor
+from tyro.conf import arg
 
 from torchgrasp.base import check_whole
 from torchgrasp.border import check_tensor
@@ -45,6 +46,11 @@ WIDEST = 1.5
 """Tangent of half the widest angle of view: that of 113 degrees, more than depth cameras have."""
 
 
+def unsaid(metavar: str | None = None) -> Any:
+    """Return how the help shows an option whose default says nothing."""
+    return arg(metavar=metavar, help_behavior_hint="")
+
+
 @dataclasses.dataclass(frozen=True)
 class ViewOptions:
     """How the file of a cloud is meant.
@@ -59,12 +65,12 @@ class ViewOptions:
             y down, z forward). The cloud is moved into the pose's frame. Results are there, and the camera is known.
     """
 
-    viewpoint: tuple[float, float, float] | None = None
-    no_viewpoint: bool = False
-    no_normals: bool = False
+    viewpoint: Annotated[tuple[float, float, float] | None, unsaid("X Y Z")] = None
+    no_viewpoint: Annotated[bool, unsaid()] = False
+    no_normals: Annotated[bool, unsaid()] = False
     unit: Literal["m", "cm", "mm"] = "m"
-    up: tuple[float, float, float] | None = None
-    camera_pose: Path | None = None
+    up: Annotated[tuple[float, float, float] | None, unsaid("X Y Z")] = None
+    camera_pose: Annotated[Path | None, unsaid("PATH")] = None
 
     @property
     def vertical(self) -> Tensor | None:
