@@ -21,7 +21,21 @@ def test_the_doctor_names_what_is_there(capsys):
     for name in ("torch", "numpy", "scipy", "safetensors"):
         assert importlib.metadata.version(name) in told
     assert "allegro" in told and "GPU" in told and code in (0, 1)
-    assert (code == 0) == ("pip install" not in told)
+    assert (code == 0) == ("missing" not in told and "cannot be loaded" not in told)
+
+
+def test_what_one_command_needs_is_told_and_is_no_fault(monkeypatch, capsys):
+    code, version = cli.main(["doctor"]), importlib.metadata.version
+    capsys.readouterr()
+
+    def without_viser(name):
+        if name == "viser":
+            raise importlib.metadata.PackageNotFoundError(name)
+        return version(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", without_viser)
+    assert cli.main(["doctor"]) == code
+    assert "`torchgrasp view` needs it: pip install 'torchgrasp[view]'" in capsys.readouterr().out
 
 
 def test_the_doctor_names_what_is_missing_and_what_installs_it(monkeypatch, capsys):

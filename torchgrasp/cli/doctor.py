@@ -20,6 +20,8 @@ CORE = ("torch", "numpy", "scipy", "trimesh", "pytorch-kinematics", "yourdfpy", 
 """Packages without which nothing runs."""
 SIMULATORS: dict[Simulator, str] = {"sapien": "sim", "mujoco": "mujoco"}
 """Simulators, and the extra that installs each."""
+OPTIONAL = {"viser": ("view", "`torchgrasp view`"), "distributed": ("cluster", "`torchgrasp campaign --scheduler`")}
+"""Packages of one command each: the extra that installs it, and the command."""
 
 
 class Finding(NamedTuple):
@@ -33,7 +35,8 @@ class Finding(NamedTuple):
 def doctor() -> int:
     """Tell what is installed and what is missing, with the command that installs it.
 
-    The exit code is 1 if a simulator or a package is missing; planning needs no simulator.
+    The exit code is 1 if a simulator or a package is missing; planning needs no simulator, and what one command alone
+    needs is no fault.
     """
     findings = [
         Finding(
@@ -45,7 +48,8 @@ def doctor() -> int:
         Finding("processor", f"{os.cpu_count()} cores; a command uses one, and --workers N uses N"),
         _gpu(),
         *(_simulator(name) for name in SIMULATORS),
-        _package("coacd", "pip install 'torchgrasp[sim]'"),
+        *(_package(name, "pip install 'torchgrasp[sim]'") for name in ("coacd", "pebble")),
+        *(_option(name) for name in OPTIONAL),
     ]
     print(format_columns([(x.part, x.found) for x in findings], left={0, 1}))
     missing = [x for x in findings if x.remedy]
@@ -94,6 +98,13 @@ def _package(name: str, remedy: str = "pip install torchgrasp") -> Finding:
         return Finding(name, importlib.metadata.version(name))
     except importlib.metadata.PackageNotFoundError:
         return Finding(name, "missing", remedy)
+
+
+def _option(name: str) -> Finding:
+    """Return the version of a package that one command needs; where it is not, what installs it is no remedy."""
+    extra, command = OPTIONAL[name]
+    found = _package(name)
+    return found if not found.remedy else Finding(name, f"none; {command} needs it: pip install 'torchgrasp[{extra}]'")
 
 
 def _gpu() -> Finding:

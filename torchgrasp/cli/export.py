@@ -77,7 +77,7 @@ def export(
             write_file(out, format_graspgen(best, str(object)))
         else:
             write_file(out, TEXTS[format](robot, best, force, kp))
-    print(f"{len(best)} grasps of the {robot.name} hand: {out}")
+    print(f"{len(best)} grasp{'s' * (len(best) != 1)} of the {robot.name} hand: {out}")
     return 0 if len(best) else 1
 
 

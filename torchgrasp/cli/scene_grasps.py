@@ -77,7 +77,7 @@ def grasp_scene(
             if not bool((grasps.status == Status.OK).any()):
                 explanation = explain_empty(scene, hand, spec, starts, seed, fingers=fingers, observer=progress.end)
         spec, hand = dataclasses.replace(spec, table=scene.table), hand_of(grasps, hand)
-        cloud, name = take_target(scene, seed), f"thing {scene.target}"
+        cloud, name = take_target(scene, seed), f"thing with label {scene.target}"
         run = Run(
             name, path, cloud, hand, spec, extract_surface(shape), grasps, tuple(progress.stages),
             progress.values.get("plan"), scene=scene, explanation=explanation,
