@@ -39,7 +39,7 @@ def empty(row: JobRow) -> Shard:
     return Shard((row,), records(torch.Generator(), 0, 0))
 
 
-def records(rng: torch.Generator, points: int, count: int) -> Records:
+def records(rng: torch.Generator, points: int, count: int, tries: int = TRIES) -> Records:
     """Return sound records of one job."""
 
     def draw(*shape: int) -> torch.Tensor:
@@ -54,7 +54,7 @@ def records(rng: torch.Generator, points: int, count: int) -> Records:
         draw(n, JOINTS), draw(n, JOINTS), draw(n, 3), pose, contacts, order, draw(n, f), draw(n), draw(n, f),
         certificate, draw(n), status,
     )  # fmt: skip
-    passed = draw(n, TRIES) > 0.4
+    passed = draw(n, tries) > 0.4
     outcome = torch.where(passed, int(Status.OK), int(Status.DROPPED))
     return Records(draw(points, 3), draw(1, 3), grasps, passed, outcome)
 

@@ -81,6 +81,11 @@ def test_states_of_other_controllers_and_files_are_refused(tmp_path):
     state = one.state()
     with pytest.raises(BadArgument, match="state"):
         one.restore(dataclasses.replace(state, numbers=state.numbers[1:]))
+    for k in range(len(state.numbers)):  # a bit of a file suffices: 1e300 as a joint would move a hand anywhere
+        changed = state.numbers.clone()
+        changed[k] = changed[k].nextafter(real(9.0))
+        with pytest.raises(BadArgument, match="state: found numbers that are not those of its digest"):
+            one.restore(dataclasses.replace(state, numbers=changed))
     (tmp_path / "no.safetensors").write_bytes(b"no")
     with pytest.raises(ModelFileError):
         load_controller_state(tmp_path / "no.safetensors")

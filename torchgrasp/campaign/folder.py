@@ -11,7 +11,7 @@ from torchgrasp.campaign.card import card_of, describe
 from torchgrasp.datasets.reader import CARD, GraspShards, read_shards, shard_path
 from torchgrasp.datasets.shards import JobRow, Shard, join_shards, load_shard, pack_shard
 from torchgrasp.errors import ModelFileError, Status
-from torchgrasp.files import begin_folder, format_json, hold_folder, sha256, write_file
+from torchgrasp.files import begin_folder, format_json, hold_folder, remove_file, sha256, write_file
 
 ASKED, README, PARTS = "campaign.json", "README.md", "parts"
 """What was asked; the card for people; the folder of jobs whose shard is not whole yet."""
@@ -62,7 +62,7 @@ def carry_out(
                 observer(store.put(j, pack_shard(campaign.empty(campaign.rows[j]), campaign.meta)))
         waiting, lost = store.missing(), dict[int, Status]()
         if waiting:
-            (folder / CARD).unlink(missing_ok=True)  # until the new one is true
+            remove_file(folder / CARD)  # until the new one is true
         for _ in range(ROUNDS):
             with contextlib.closing(work(waiting)) as results:  # which ends the workers
                 for place, result in results:
@@ -158,7 +158,7 @@ class _Store:
         """Note the hash of a shard that is whole, and remove the files of its jobs."""
         self.digests[k] = sha256(shard_path(self.folder, k))
         for j in self._jobs(k):
-            self._part(j).unlink(missing_ok=True)
+            remove_file(self._part(j))
 
     def _jobs(self, k: int) -> range:
         """Return the jobs of a shard."""

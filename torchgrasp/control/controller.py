@@ -153,7 +153,7 @@ class GraspController:
         The controller has to be made of the same grasp and modes.
 
         Raises:
-            BadArgument: the state of another hand, or of other modes.
+            BadArgument: the state of another hand or of other modes, or one that was changed.
 
         >>> from torchgrasp import load_hand, load_object, plan_grasps
         >>> from torchgrasp.control import ClosingReference, no_contact, observe

@@ -5,6 +5,7 @@ Every number that a `Part` keeps is its state, so no field can be forgotten. Wha
 """
 
 import dataclasses
+import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.border import checked
-from torchgrasp.errors import Status
+from torchgrasp.errors import BadArgument, Status
 from torchgrasp.files import save_tensors
 from torchgrasp.value_files import read_value
 
@@ -61,7 +62,7 @@ class ControllerState(Value):
 
     Args:
         numbers: all numbers of its parts, one after the other.
-        layout: what they are: the modes of the controller, names and shapes.
+        layout: what they are: the modes of the controller, names and shapes, and the SHA-256 of the numbers.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp(), "state.safetensors")
@@ -105,19 +106,30 @@ def load_controller_state(path: Path | str) -> ControllerState:
 
 def pack(modes: str, numbers: dict[str, Tensor]) -> ControllerState:
     """Return a state of named numbers: flags and codes are whole, so float64 holds them as they are."""
-    flat = [x.to(torch.float64).reshape(-1) for x in numbers.values()]
-    return ControllerState(torch.cat(flat), _layout(modes, numbers))
+    flat = torch.cat([x.to(torch.float64).reshape(-1) for x in numbers.values()])
+    return ControllerState(flat, _layout(modes, numbers) + _digest(flat))
 
 
 def unpack(modes: str, numbers: dict[str, Tensor], state: ControllerState) -> dict[str, Tensor] | None:
-    """Return the numbers of a state by name, in shape and type of given ones; None if it has another layout."""
-    sizes = [x.numel() for x in numbers.values()]
-    if state.layout != _layout(modes, numbers) or len(state.numbers) != sum(sizes):
+    """Return the numbers of a state by name, in shape and type of given ones; None if it has another layout.
+
+    Raises:
+        BadArgument: numbers that no controller gave: they would move a hand anywhere.
+    """
+    sizes, flat, layout = [x.numel() for x in numbers.values()], state.numbers.to("cpu", torch.float64), state.layout
+    if not layout.startswith(_layout(modes, numbers)) or len(flat) != sum(sizes):
         return None
-    parts = state.numbers.to("cpu", torch.float64).split(sizes)
+    if layout != _layout(modes, numbers) + _digest(flat):
+        raise BadArgument("state", "numbers that are not those of its digest", "a state that a controller gave")
+    parts = flat.split(sizes)
     return {name: x.reshape(like.shape).to(like.dtype) for (name, like), x in zip(numbers.items(), parts, strict=True)}
 
 
 def _layout(modes: str, numbers: dict[str, Tensor]) -> str:
     """Return modes, names and shapes in one line."""
     return "; ".join([modes, *(f"{name} {list(x.shape)} {x.dtype}" for name, x in numbers.items())])
+
+
+def _digest(numbers: Float[Tensor, " n"]) -> str:
+    """Return the SHA-256 of numbers as the end of a layout."""
+    return f"; sha256 {hashlib.sha256(numbers.numpy().tobytes()).hexdigest()}"

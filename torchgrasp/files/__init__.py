@@ -11,4 +11,5 @@ from torchgrasp.files.recent import Recent as Recent
 from torchgrasp.files.tensors import DTYPES as DTYPES, MOST_BYTES as MOST_BYTES, VERSION as VERSION
 from torchgrasp.files.tensors import load_tensors as load_tensors, pack_tensors as pack_tensors
 from torchgrasp.files.tensors import save_tensors as save_tensors
-from torchgrasp.files.write import format_json as format_json, is_remnant as is_remnant, write_file as write_file
+from torchgrasp.files.write import format_json as format_json, is_remnant as is_remnant
+from torchgrasp.files.write import remove_file as remove_file, write_file as write_file

@@ -22,6 +22,9 @@ DTYPES = (torch.float32, torch.float64, torch.int64, torch.bool)
 MOST_BYTES = 1024**3
 """Largest file [bytes]: hundreds of times the largest of ours, a chunk of samples."""
 
+LARGEST = 1e30
+"""Largest number: beyond it float32 and squares in float64 overflow. No length, angle, force or score comes near."""
+
 
 def save_tensors(path: Path | str, kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) -> Path:
     """Write tensors and metadata as one safetensors file of a `kind`, such as "grasps".
@@ -48,7 +51,7 @@ def load_tensors(
 
     Raises:
         ModelFileError: the file is missing, malformed or larger than `MOST_BYTES`, has another kind, version or
-            tensors, or a number is not finite.
+            tensors, or a number is not finite or beyond `LARGEST`.
     """
     allowed = names.union(optional)
     if not is_file(path):
@@ -73,6 +76,7 @@ def load_tensors(
     for name, t in tensors.items():
         if t.dtype not in DTYPES:
             raise ModelFileError("path", f"{path}: {name} of {t.dtype}", f"one of {', '.join(map(str, DTYPES))}")
-        if t.is_floating_point() and not bool(torch.isfinite(t).all()):
-            raise ModelFileError("path", f"{path}: a non-finite number in {name}", "finite numbers")
+        if t.is_floating_point() and not bool((t.abs() <= LARGEST).all()):
+            found = f"{path}: a number beyond {LARGEST:g} or a non-finite number in {name}"
+            raise ModelFileError("path", found, "finite numbers")
     return tensors, meta

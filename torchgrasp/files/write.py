@@ -54,6 +54,18 @@ def write_file(path: Path | str, content: str | bytes | Callable[[IO[bytes]], ob
     return path
 
 
+def remove_file(path: Path) -> None:
+    """Remove a file, if it is there.
+
+    Raises:
+        OutputError: it cannot be removed.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError("path", f"{path} ({error.strerror or error})", "a file that can be removed") from error
+
+
 def is_remnant(name: str, of: str = "") -> bool:
     """Tell whether a name is that of a file not yet moved into place.
 

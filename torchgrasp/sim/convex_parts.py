@@ -59,7 +59,7 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
     path = (home / "torchgrasp" if cache is None else Path(cache)) / f"{_fingerprint(mesh)}.safetensors"
     if path.is_file():
         try:
-            return _filled(_load(path))
+            return _filled(_load(path, mesh))
         except (ModelFileError, ValueError):
             _log.warning("%s is damaged and will be made anew", path)
     pieces = decompose(mesh, {"threshold": THRESHOLD, **_SEARCH})
@@ -114,12 +114,15 @@ def _save(parts: "list[trimesh.Trimesh]", path: Path) -> None:
     save_tensors(path, "parts", tensors, {})
 
 
-def _load(path: Path) -> "list[trimesh.Trimesh]":
-    """Read parts that `_save` wrote, as hulls of their corners."""
+def _load(path: Path, mesh: "trimesh.Trimesh") -> "list[trimesh.Trimesh]":
+    """Read parts of a mesh that `_save` wrote, as hulls of their corners; none is far outside the mesh."""
     from scipy.spatial import QhullError
 
     tensors, _ = load_tensors(path, "parts", {"vertices", "counts"})
     try:
+        outside = (tensors["vertices"] - torch.tensor(mesh.bounds.mean(0))).abs() > torch.tensor(mesh.extents)
+        if bool(outside.any()):
+            raise RuntimeError("corners far outside the mesh")
         corners = torch.split(tensors["vertices"], tensors["counts"].tolist())
         return [hull(c.numpy()) for c in corners]
     except (QhullError, RuntimeError) as error:

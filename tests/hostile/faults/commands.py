@@ -9,14 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
+from tests.campaign.cheap import records
 from torchgrasp import cli, load_hand, load_object, plan_grasps
 from torchgrasp.cli import grasps as grasp_command
 from torchgrasp.cli import hand_train
+from torchgrasp.datasets.shards import JobRow, Shard, pack_shard
 from torchgrasp.errors import Status
 from torchgrasp.evaluation import campaign
+from torchgrasp.evaluation.protocols import Protocol
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore
-from torchgrasp.evaluation.views import EvaluationSpec
+from torchgrasp.evaluation.views import EvaluationSpec, View
 from torchgrasp.objects import DATA
 from torchgrasp.report import page
 from torchgrasp.shape.surface import extract_surface
@@ -95,4 +99,21 @@ def evaluate(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
     return lambda out: cli.main([*words, "--out", str(out / "evaluation")])
 
 
-COMMANDS = {"sample": sample, "train": train, "grasp": grasp, "evaluate": evaluate}
+def gather(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
+    """A campaign of two shards, one job of which is refused; nothing is planned or simulated."""
+    views = {name: {"T_object_camera": POSE} for name in ("left", "right")}
+    objects = {"cup": {"views": views}, "jug": {"views": {"front": views["left"]}}, "loose": 5}
+    (folder / "manifest.json").write_text(json.dumps({"objects": objects}))
+
+    def work(view: View, protocol: Protocol, spec: EvaluationSpec, meta: dict[str, str]) -> bytes:
+        found = records(torch.Generator().manual_seed(len(view.view)), 4, 2, protocol.noise.draws)
+        row = JobRow(view.object, view.view, executable=2, points=4, grasps=2, passed=int(found.passed.sum()))
+        return pack_shard(Shard((row,), found), meta)
+
+    monkeypatch.setattr("torchgrasp.campaign.run.run_job", work)
+    monkeypatch.setattr(sys.modules["torchgrasp.cli.campaign"], "import_simulator", lambda name: None)
+    words = ["campaign", str(folder), "--hand", "barrett", "--jobs-in-shard", "2", "--workers", "0"]
+    return lambda out: cli.main([*words, "--out", str(out / "campaign")])
+
+
+COMMANDS = {"sample": sample, "train": train, "grasp": grasp, "evaluate": evaluate, "campaign": gather}

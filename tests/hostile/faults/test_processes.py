@@ -79,6 +79,10 @@ def words(name: str, folder: Path) -> list[str]:
     """Return the words of a command but for its output."""
     if name == "evaluate":
         return [*objects(folder / "objects", "left", "right")[:-1], "--grasps", "2", "--starts", "5", "--out"]
+    if name == "campaign":
+        place = objects(folder / "objects", "front", "left", "right")[2]
+        sizes = ["--grasps", "1", "--starts", "5", "--jobs-in-shard", "2", "--workers", "2"]
+        return ["campaign", place, "--hand", "barrett", "--protocol", "dexgraspbench", *sizes, "--out"]
     return {
         "grasp": ["grasp", str(DATA / "cylinder" / "view.ply"), "--hand", "barrett", "--starts", "8", "--out"],
         "sample": ["hand", "sample", "--hand", "barrett", "--n", "3000", "--workers", "2", "--out"],
@@ -124,7 +128,10 @@ def gone(processes: list[int]) -> bool:
 
 
 @pytest.mark.promise("F1")
-@pytest.mark.parametrize("name", ["sample", "grasp", "train", pytest.param("evaluate", marks=pytest.mark.sim)])
+@pytest.mark.parametrize(
+    "name",
+    ["sample", "grasp", "train", *(pytest.param(name, marks=pytest.mark.sim) for name in ("evaluate", "campaign"))],
+)
 def test_a_process_killed_at_random_moments_is_continued_to_the_same_bytes(
     name: str, tmp_path: Path, request: pytest.FixtureRequest
 ):

@@ -1,7 +1,6 @@
-"""Small good files of every kind that the library reads, each with its reader."""
+"""Small good files of every kind that strangers give the library, each with its reader."""
 
 import json
-import shutil
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -11,20 +10,21 @@ import numpy as np
 import torch
 import trimesh
 
-from torchgrasp import PointCloud, load_grasps, load_hand, load_mixture, read_cloud, read_scene
+from torchgrasp import (
+    PointCloud,
+    cloud_from_depth,
+    load_hand,
+    read_cloud,
+    read_scene,
+)
 from torchgrasp.cloud.io.image import read_image, read_pose
 from torchgrasp.cloud.io.read import save_cloud
-from torchgrasp.control.adaptive.stability import load_stability
-from torchgrasp.datasets import list_objects, read_entry
+from torchgrasp.datasets import list_objects, list_views, read_entry
+from torchgrasp.export import format_grasps, grasps_from_joints, read_foreign
 from torchgrasp.hand.draft import new_hand
-from torchgrasp.hand.load import hands_folder
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.mesh import read_mesh
-from torchgrasp.posture_model import GraspMixture, SampleSpec, load_samples, write_samples
-from torchgrasp.posture_model.encoding import CODE_NAMES
-from torchgrasp.report.turning.buffers import pack
-from torchgrasp.report.turning.shown import read_page
-from torchgrasp.values import Certificate, Contacts, Grasps
+from torchgrasp.objects import load_shipped_grasp
 
 
 class Case(NamedTuple):
@@ -76,7 +76,7 @@ def meshes(folder: Path) -> list[Case]:
 
 
 def images(folder: Path) -> list[Case]:
-    """Return scenes, depth images and camera poses."""
+    """Return scenes, and what the clouds of depth images are made of: image, mask, camera pose."""
     from PIL import Image
 
     depth = np.full((6, 8), 0.5)
@@ -87,8 +87,15 @@ def images(folder: Path) -> list[Case]:
     np.save(folder / "depth.npy", depth), np.save(folder / "pose.npy", pose)
     np.savetxt(folder / "pose.txt", pose)
     Image.fromarray((1000 * depth).astype(np.uint16)).save(folder / "depth.png")
-    readers = {"scene": read_scene, "depth": lambda x: read_image("depth", x), "pose": lambda x: read_pose("pose", x)}
-    return [saved(path, readers[path.stem]) for path in sorted(folder.iterdir())]
+    Image.fromarray(np.full((6, 8), 255, np.uint8)).save(folder / "mask.png")
+    np.savez(folder / "mask.npz", mask=depth > 0)
+
+    def read(path: Path) -> None:
+        given = {"depth": depth, "mask": None, "pose": pose}
+        given[path.stem] = read_pose("pose", path) if path.stem == "pose" else read_image(path.stem, path)
+        cloud_from_depth(given["depth"], camera, given["mask"], given["pose"])
+
+    return [saved(path, read_scene if path.stem == "scene" else read) for path in sorted(folder.iterdir())]
 
 
 def urdfs(folder: Path) -> list[Case]:
@@ -110,67 +117,33 @@ def tomls(folder: Path) -> list[Case]:
     return [saved(folder / "hand.toml", lambda x: load_hand(x.parent))]
 
 
-def models(folder: Path) -> list[Case]:
-    """Return grasps, mixtures, a stability model and a chunk of samples, small where they can be."""
-    one, two = torch.ones(2), torch.ones(2, 3)
-    contacts = Contacts(torch.rand(2, 3, 3), torch.eye(3).expand(2, 3, 3).contiguous(), torch.rand(2, 3))
-    certificate = Certificate(one, one, one, one > 0, torch.ones(2, 6))
-    pose, status = torch.eye(4).repeat(2, 1, 1), torch.zeros(2, dtype=torch.int64)
-    direction, order = torch.eye(3)[:2], torch.arange(3).repeat(2, 1)
-    Grasps(
-        two, two, direction, pose, contacts, order, two, one, two, certificate, one, status, {"hand": "barrett"}
-    ).save(folder / "grasps.safetensors")
-    half = torch.full((1, 7), 0.5, dtype=torch.float64)
-    eye = torch.eye(7, dtype=torch.float64)[None]
-    mixture = GraspMixture(torch.ones(1, dtype=torch.float64), half, eye, ("j", *CODE_NAMES))
-    mixture.save(folder / "mixture.safetensors")
-    hand = load_hand("barrett")
-    write_samples(hand, SampleSpec(20), folder / "samples")
-    shutil.copy(hands_folder() / "barrett" / "stability.safetensors", folder)
-    return [
-        saved(folder / "grasps.safetensors", load_grasps),
-        saved(folder / "mixture.safetensors", load_mixture),
-        saved(folder / "stability.safetensors", lambda x: load_stability(hand, x)),
-        saved(folder / "samples" / "chunk-000000.safetensors", lambda x: load_samples(x.parent).read()),
-    ]
-
-
-def pages(folder: Path) -> list[Case]:
-    """Return a page that turns, with one grasp by two links."""
-    three, eye, faces = np.eye(3), np.eye(4), pack(np.array([[0, 1, 2]]), "u4")
-    mesh = {"points": pack(three), "faces": faces}
-    record = {"ticks": pack(np.arange(2), "u4"), "time": pack(np.arange(2.0)), "forces": pack(np.ones((2, 3)))}
-    poses = {"object": pack(np.stack([eye] * 2)), "links": pack(np.broadcast_to(eye, (2, 2, 4, 4)))}
-    contents = {
-        "title": "Grasps", "verdict": "held", "eye": [1.0, 0.0, 0.0], "table": "#eceae4", "cloud": pack(three),
-        "others": None, "fingers": [["index", "#2f6db5"], ["middle", "#23967f"], ["thumb", "#e0762f"]],
-        "hand": [mesh | {"link": 1, "color": "#a9b0ba"}],
-        "surface": mesh | {"normals": pack(three), "std": pack(np.ones(3)), "colors": pack(three, "u1"), "most_mm": 3},
-        "grasps": {
-            "heads": ["rank", "success", "closure margin", "clearance mm", "surface std mm"],
-            "rows": [["1", "97%", "0.02", "4.0", "1.0"]], "points": pack(three[None]), "normals": pack(three[None]),
-            "links": pack(np.broadcast_to(eye, (1, 4, 2, 4, 4))),
-        },
-        "replay": mesh | record | poses,
-    }  # fmt: skip
-    page = f'<p></p><script type="application/json" id="data">{json.dumps(contents)}</script>'
-    (folder / "view.html").write_text(page)
-    return [saved(folder / "view.html", read_page)]
-
-
 def manifests(folder: Path) -> list[Case]:
     """Return the manifest of a folder of objects."""
     pose = {"T_object_camera": np.eye(4).tolist()}
     cup = {"views": {"front": pose, "back": pose}, "suggested_scale": 0.5, "family": "cups", "mass_kg": 0.2}
     (folder / "manifest.json").write_text(json.dumps({"objects": {"cup": cup | {"group": "shell"}, "jug": cup}}))
-    return [saved(folder / "manifest.json", lambda x: [read_entry(x.parent, name) for name in list_objects(x.parent)])]
+
+    def read(path: Path) -> None:
+        for name in list_objects(path.parent):
+            read_entry(path.parent, name)
+        list_views(path.parent)
+
+    return [saved(folder / "manifest.json", read)]
 
 
-def samples(folder: Path) -> list[Case]:
-    """Return the JSON of a folder of samples."""
-    write_samples(load_hand("barrett"), SampleSpec(20), folder)
-    return [saved(folder / "samples.json", lambda x: load_samples(x.parent).read())]
+def foreign(folder: Path) -> list[Case]:
+    """Return grasps in the formats that `torchgrasp import` reads."""
+    hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
+    (folder / "own.json").write_text(format_grasps(hand, grasp))
+    row = np.concatenate([[0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0], grasp.joints[0].numpy()])
+    (folder / "multi.json").write_text(json.dumps({"pose": [row[:7].tolist()] * 2, "dofs": [row[7:].tolist()] * 2}))
+    np.savez(folder / "bench.npz", grasp_qpos=row[None], pregrasp_qpos=row[None])
+
+    def read(path: Path) -> None:
+        grasps_from_joints(hand, *read_foreign(path, hand, hand.joint_names))
+
+    return [saved(path, read) for path in sorted(folder.iterdir())]
 
 
-MAKERS = (clouds, meshes, images, urdfs, published, tomls, models, pages, manifests, samples)
+MAKERS = (clouds, meshes, images, urdfs, published, tomls, manifests, foreign)
 KINDS = {make.__name__: make for make in MAKERS}

@@ -7,12 +7,14 @@ import pytest
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
 
-from tests.hostile.fuzz.cases import KINDS
+from tests.hostile.fuzz import cases as strange
+from tests.hostile.fuzz import own
 from tests.hostile.fuzz.limits import limited
 from tests.hostile.fuzz.mutations import edits, mutated
 from torchgrasp.errors import GraspError
 from torchgrasp.hand.draft import draft_hand
 
+KINDS = strange.KINDS | own.KINDS
 MOST_LETTERS = 2000
 """Longest message of an error: it shows a part of what was found."""
 SLOWNESS = {"published": 10}

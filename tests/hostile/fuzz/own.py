@@ -1,0 +1,169 @@
+"""Small good files of every kind that the library writes for itself, each with its reader."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+
+from tests.campaign.cheap import campaign, work_on
+from tests.hostile.fuzz.cases import Case, saved
+from torchgrasp import (
+    GraspController,
+    HandSamples,
+    fit_mixture,
+    hand_of,
+    load_grasps,
+    load_hand,
+    load_mixture,
+)
+from torchgrasp.campaign.folder import carry_out
+from torchgrasp.control import (
+    ClosingReference,
+    ControlRecorder,
+    load_control_log,
+    load_controller_state,
+    no_contact,
+    observe,
+)
+from torchgrasp.control.adaptive.stability import load_stability
+from torchgrasp.datasets import read_shards
+from torchgrasp.export import format_grasps, format_moveit
+from torchgrasp.hand.load import hands_folder
+from torchgrasp.objects import load_shipped_grasp
+from torchgrasp.posture_model import GraspMixture, SampleSpec, load_samples, write_samples
+from torchgrasp.posture_model.encoding import CODE_NAMES
+from torchgrasp.report.turning.buffers import pack
+from torchgrasp.report.turning.contents import describe_grasps
+from torchgrasp.report.turning.shown import read_page, read_shown
+from torchgrasp.sim.convex_parts import _load, _save  # pyright: ignore[reportPrivateUsage]
+from torchgrasp.values import Certificate, Contacts, Grasps
+
+
+def models(folder: Path) -> list[Case]:
+    """Return grasps, mixtures, a stability model and a chunk of samples, small where they can be."""
+    one, two = torch.ones(2), torch.ones(2, 3)
+    contacts = Contacts(torch.rand(2, 3, 3), torch.eye(3).expand(2, 3, 3).contiguous(), torch.rand(2, 3))
+    certificate = Certificate(one, one, one, one > 0, torch.ones(2, 6))
+    pose, status = torch.eye(4).repeat(2, 1, 1), torch.zeros(2, dtype=torch.int64)
+    direction, order = torch.eye(3)[:2], torch.arange(3).repeat(2, 1)
+    Grasps(
+        two, two, direction, pose, contacts, order, two, one, two, certificate, one, status, {"hand": "barrett"}
+    ).save(folder / "grasps.safetensors")
+    half = torch.full((1, 7), 0.5, dtype=torch.float64)
+    eye = torch.eye(7, dtype=torch.float64)[None]
+    mixture = GraspMixture(torch.ones(1, dtype=torch.float64), half, eye, ("j", *CODE_NAMES))
+    mixture.save(folder / "mixture.safetensors")
+    hand = load_hand("barrett")
+    write_samples(hand, SampleSpec(20), folder / "samples")
+    shutil.copy(hands_folder() / "barrett" / "stability.safetensors", folder)
+    return [
+        saved(folder / "grasps.safetensors", load_grasps),
+        saved(folder / "mixture.safetensors", load_mixture),
+        saved(folder / "stability.safetensors", lambda x: load_stability(hand, x)),
+        saved(folder / "samples" / "chunk-000000.safetensors", lambda x: load_samples(x.parent).read()),
+    ]
+
+
+def shown(folder: Path) -> list[Case]:
+    """Return grasps, as the commands take them that write or show them."""
+    hand = load_hand("barrett")
+    load_shipped_grasp("jug", "barrett").save(folder / "grasps.safetensors")
+
+    def read(path: Path) -> None:
+        grasps = load_grasps(path)
+        hand_of(grasps, "barrett"), format_grasps(hand, grasps), format_moveit(hand, grasps)
+        read_shown(describe_grasps("", hand, grasps))
+
+    return [saved(folder / "grasps.safetensors", read)]
+
+
+def pages(folder: Path) -> list[Case]:
+    """Return a page that turns, with one grasp by two links."""
+    three, eye, faces = np.eye(3), np.eye(4), pack(np.array([[0, 1, 2]]), "u4")
+    mesh = {"points": pack(three), "faces": faces}
+    record = {"ticks": pack(np.arange(2), "u4"), "time": pack(np.arange(2.0)), "forces": pack(np.ones((2, 3)))}
+    poses = {"object": pack(np.stack([eye] * 2)), "links": pack(np.broadcast_to(eye, (2, 2, 4, 4)))}
+    contents = {
+        "title": "Grasps", "verdict": "held", "eye": [1.0, 0.0, 0.0], "table": "#eceae4", "cloud": pack(three),
+        "others": None, "fingers": [["index", "#2f6db5"], ["middle", "#23967f"], ["thumb", "#e0762f"]],
+        "hand": [mesh | {"link": 1, "color": "#a9b0ba"}],
+        "surface": mesh | {"normals": pack(three), "std": pack(np.ones(3)), "colors": pack(three, "u1"), "most_mm": 3},
+        "grasps": {
+            "heads": ["rank", "success", "closure margin", "clearance mm", "surface std mm"],
+            "rows": [["1", "97%", "0.02", "4.0", "1.0"]], "points": pack(three[None]), "normals": pack(three[None]),
+            "links": pack(np.broadcast_to(eye, (1, 4, 2, 4, 4))),
+        },
+        "replay": mesh | record | poses,
+    }  # fmt: skip
+    page = f'<p></p><script type="application/json" id="data">{json.dumps(contents)}</script>'
+    (folder / "view.html").write_text(page)
+    return [saved(folder / "view.html", read_page)]
+
+
+def samples(folder: Path) -> list[Case]:
+    """Return the JSON of a folder of samples."""
+    write_samples(load_hand("barrett"), SampleSpec(20), folder)
+    return [saved(folder / "samples.json", lambda x: load_samples(x.parent).read())]
+
+
+def shards(folder: Path) -> list[Case]:
+    """Return what a campaign left: its card, a shard, and what was asked, which is compared when it is continued."""
+    asked = campaign(3)
+    carry_out(asked, folder, work_on(asked, 0))
+
+    def read(path: Path) -> None:
+        data = read_shards(path.parent)
+        for j in range(len(data.jobs)):
+            data.job(j)
+        for g in range(len(data)):
+            data[g]
+
+    def go_on(path: Path) -> None:
+        carry_out(asked, path.parent, work_on(asked, 0))
+
+    readers = {"card.json": read, "shard-000000.safetensors": read, "campaign.json": go_on}
+    return [saved(folder / name, reader) for name, reader in readers.items()]
+
+
+def controls(folder: Path) -> list[Case]:
+    """Return the state of a controller, with which another goes on, and the log of a closing."""
+    hand = load_hand("barrett")
+    reference = ClosingReference.from_grasp(hand, load_shipped_grasp("jug", "barrett"))
+    controller, recorder = GraspController(reference, holding="grip"), ControlRecorder()
+    seen = observe(hand, reference.pregrasp, no_contact())
+    while controller.pressed < 0.1:
+        recorder.add(seen, 0.1, controller.step(seen, 0.1))
+    controller.state().save(folder / "state.safetensors"), recorder.log().save(folder / "log.safetensors")
+
+    def go_on(path: Path) -> None:
+        controller.restore(load_controller_state(path))
+        controller.step(seen, 0.01)
+
+    readers = {"state": go_on, "log": lambda x: list(load_control_log(x).ticks())}
+    return [saved(folder / f"{name}.safetensors", reader) for name, reader in readers.items()]
+
+
+def checkpoints(folder: Path) -> list[Case]:
+    """Return the checkpoint of a fit, which goes on from it."""
+    rows = torch.rand(40, 7, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    postures = HandSamples(rows[:, :1], rows[:, 1:], ("knuckle",))
+
+    def fit(path: Path) -> None:
+        fit_mixture(postures, 2, iterations=3, checkpoint=path)
+
+    fit(folder / "step.safetensors")
+    return [saved(folder / "step.safetensors", fit)]
+
+
+def parts(folder: Path) -> list[Case]:
+    """Return convex parts as the cache keeps them."""
+    ball = trimesh.creation.icosahedron().apply_scale(0.05)
+    _save([ball, ball.copy().apply_translation([0.01, 0.0, 0.0])], folder / "parts.safetensors")
+    return [saved(folder / "parts.safetensors", lambda x: _load(x, ball))]
+
+
+MAKERS = (models, shown, pages, samples, shards, controls, checkpoints, parts)
+KINDS = {make.__name__: make for make in MAKERS}
