@@ -261,5 +261,5 @@ def views(
     check_whole("--views", views, 1, 1000)
     with naming(meshes="MESHES", mesh="MESHES", path="--out"):
         names = write_objects(meshes, out, views, seed)
-    print(f"{len(names)} objects with {views} views each: {out}")
+    print(f"{len(names)} objects with {views} view{'s' * (views != 1)} each: {out}")
     return 0

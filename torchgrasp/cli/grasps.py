@@ -4,6 +4,7 @@ import dataclasses
 import importlib
 import importlib.util
 import math
+import re
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -205,10 +206,11 @@ def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] 
 
 
 def object_name(path: Path) -> str:
-    """Name an object by its file, or by the folder of a generic file.
+    """Name an object by its file, or by its folder where files have the names of docs/data.md.
 
-    >>> object_name(Path("objects/jug/mesh.ply")), object_name(Path("mug.pcd"))
-    ('jug', 'mug')
+    >>> object_name(Path("objects/jug/view0_noisy.ply")), object_name(Path("mug.pcd")), object_name(Path("cloud.ply"))
+    ('jug', 'mug', 'object in cloud.ply')
     """
-    generic = path.stem.rstrip("0123456789") in ("mesh", "view", "cloud", "model", "points")
-    return path.resolve().parent.name or "object" if generic else path.stem
+    if re.fullmatch(r"(mesh|view\d*)(_noisy)?", path.stem):
+        return path.resolve().parent.name or "object"
+    return f"object in {path.name}" if path.stem in ("cloud", "model", "points", "scan") else path.stem
