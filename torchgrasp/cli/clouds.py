@@ -54,7 +54,7 @@ def check(
         cloud: point cloud of one object (.ply, .pcd, .npy, .npz, .xyz, .txt, .csv).
         view: how the file is meant.
         table: height of the table along the vertical, or four numbers nx ny nz d of the plane n . p = d, in metres; by
-            default the table is at the lowest point of the cloud.
+            default the table is at the lowest point of the cloud that is no outlier.
         no_table: there is no table.
     """
     file = read_view("FILE", cloud, view, whole=True)

@@ -95,7 +95,7 @@ def grasp(
         time_budget: seconds for planning; the wave of starts that ends after them is the last. By default all starts.
         view: how the file of the cloud is meant.
         table: height of the table along the vertical, or four numbers nx ny nz d of the plane n . p = d, in metres; by
-            default the table is at the lowest point of the cloud.
+            default the table is at the lowest point of the cloud that is no outlier.
         no_table: there is no table.
         friction: coefficient of friction between fingertips and object.
         fingers: which grasp: an option of the hand, a number of fingers, or their names as in index,middle,thumb;

@@ -29,7 +29,7 @@ def surface(
         out: mesh to write: .ply, with the standard deviation of each vertex as "std_m" in metres, or .glb.
         view: how the file of the cloud is meant.
         table: height of the table along the vertical, or four numbers nx ny nz d of the plane n . p = d, in metres; by
-            default the table is at the lowest point of the cloud.
+            default the table is at the lowest point of the cloud that is no outlier.
         no_table: there is no table.
         support: what is observed of the hidden side: outline, symmetry and free space, or the paper's points.
         resolution: cells along the diameter of the surface's domain, 8 to 256.
