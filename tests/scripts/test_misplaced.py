@@ -36,7 +36,7 @@ def test_what_was_tried_is_kept_and_only_the_rest_is_tried_anew(tmp_path, monkey
 
     def run(trial, wrong, law, mass, seed):
         tried.append((law, float(trial.error[0, 3])))
-        return Status.OK, 1.0, 0.1
+        return Status.OK, 1.0, 0.1, 4.0
 
     monkeypatch.setattr(misplaced, "_run", run)
     monkeypatch.setattr(misplaced, "_plan", lambda *_: join([grasp, grasp, grasp]))

@@ -13,12 +13,13 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from paper.trials import CELL_SECONDS, Subject, TableSpec, subjects
 
 from benchmarks.close.ablation import median_over, swap_deviations
+from benchmarks.close.conditions import BARS, CONDITIONS, DEFAULT, FRAGILE, LAWS, SENSED, Condition, Law
 from benchmarks.close.drawn import draw_solid
 from benchmarks.common import Row
 from torchgrasp import Grasps, Status, TrialSpec, load_hand, plan_grasps
@@ -55,90 +56,12 @@ TABLETOP = TrialSpec(friction=PLANNED_FRICTION)
 """Lifts of 0.1 kg."""
 
 
-class Condition(NamedTuple):
-    """What is wrong: how far [m] the object is from where it was seen, and how far it turned [rad].
-
-    `unknown` things weigh what they weigh, and have a friction between 0.3 and 1. `afloat` they are pulled at. `drawn`
-    ones have a shape of the posterior's (`draw_solid`): the deviations are what they say.
-    """
-
-    distance: float = 0.0
-    angle: float = 0.0
-    unknown: bool = False
-    afloat: str = ""
-    simulator: str = "sapien"
-    drawn: bool = False
-
-
-CONDITIONS = {
-    "in place": Condition(),
-    "5 mm": Condition(0.005),
-    "10 mm": Condition(0.01),
-    "20 mm": Condition(0.02),
-    "5 degrees": Condition(angle=math.radians(5)),
-    "10 degrees": Condition(angle=math.radians(10)),
-    "drawn": Condition(drawn=True),
-    "drawn, 10 mm": Condition(0.01, drawn=True),
-    "10 mm, real mass, friction unknown": Condition(0.01, unknown=True),
-    "10 mm, MuJoCo": Condition(0.01, simulator="mujoco"),
-    "20 mm, MuJoCo": Condition(0.02, simulator="mujoco"),
-    "afloat, in place": Condition(afloat="dexgraspbench"),
-    "afloat, friction 0.3": Condition(afloat="dexgraspbench-hard"),
-    "afloat, 10 mm": Condition(0.01, afloat="dexgraspbench"),
-}
-"""By name. On a table the object is moved along it and turns about the vertical; afloat in any direction."""
-
-BARS = {"5 mm": (0.97, 2.0), "10 mm": (0.92, 4.0), "20 mm": (0.80, 8.0)}
-"""Least share held, and largest median motion [mm] of the object before the lift: the project's own."""
-
-
-class Law(NamedTuple):
-    """How the hand closes; `swapped` exchanges the deviations of the most and the least certain finger.
-
-    `dead` are the fingers, in grasp order, whose sensor is.
-    """
-
-    trial: dict[str, Any]
-    swapped: bool = False
-    dead: tuple[int, ...] = ()
-
-
-DEFAULT = "uncertainty"
-"""The law that the others are compared with."""
-
-LAWS = {
-    DEFAULT: Law({}),
-    "uncertainty, deviations swapped": Law({}, swapped=True),
-    "uncertainty without palm": Law({"without": ("palm",)}),
-    "uncertainty without place": Law({"without": ("place",)}),
-    "uncertainty without wait": Law({"without": ("wait",)}),
-    "fixed": Law({"closing": "fixed"}),
-    "fixed without place": Law({"closing": "fixed", "without": ("place",)}),
-    "position": Law({"closing": "position"}),
-    "paper_position": Law({"closing": "paper_position"}),
-    "open_loop": Law({"closing": "open_loop"}),
-}
-"""By name; all hold by "force", but for the open loop, which keeps its squeeze."""
-
-SENSED = {
-    "readings 20 ms old": Law({"sensor": SensorModel(delay=0.02)}),
-    "readings 40 ms old": Law({"sensor": SensorModel(delay=0.04)}),
-    "three times the noise": Law({"sensor": SensorModel(noise=3.0)}),
-    "joint torques": Law({"sensor": SensorModel("torque")}),
-    "binary": Law({"sensor": SensorModel("binary")}),
-    "binary, 40 ms old": Law({"sensor": SensorModel("binary", delay=0.04)}),
-    "first finger dead": Law({}, dead=(0,)),
-    "thumb dead": Law({}, dead=(-1,)),
-}
-"""`DEFAULT` with poorer fingertips, by name."""
-
-LAWS_OF_SENSORS = (DEFAULT, *SENSED, "open_loop")
-"""What is compared to tell the worth of sensors."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """One trial: motion before the lift [mm], unbalanced share of the forces then, CPU time [s]; None: not measured."""
+    """One trial: motion before the lift [mm], unbalanced share of the forces then, CPU time [s]; None: not measured.
+
+    `most` is the largest normal force of a fingertip over a tick [N].
+    """
 
     object: str
     family: str
@@ -150,6 +73,7 @@ class Outcome:
     moved: float | None
     unbalanced: float | None
     seconds: float
+    most: float | None = None
 
     @property
     def held(self) -> bool:
@@ -188,6 +112,8 @@ def _rows(hand: str, condition: str, laws: Sequence[str], found: Sequence[Outcom
         lost = dict(Counter(x.status for x in mine if not x.held).most_common())
         words = [format_share(held), "moved {:.1f} mm [{:.1f}, {:.1f}]".format(*moved)]
         words += [f"unbalanced {statistics.median(unbalanced):.2f}"] if unbalanced else []
+        most = [x.most for x in mine if x.most is not None]
+        words += [f"largest force {statistics.median(most):.1f} N, {max(most):.1f} N in the worst"] if most else []
         if law != DEFAULT and base:
             low, high = 100 * against.low, 100 * against.high
             words.append(f"{DEFAULT} is better by {100 * against.value:+.1f} points [{low:.1f}, {high:.1f}]")
@@ -251,30 +177,28 @@ def _try(spec: TableSpec, subject: Subject, hand: str, condition: str, laws: lis
         error = _misplace(wrong, grasps[rank], mesh, seed)
         for law in laws:
             began = time.process_time()
-            followed = (LAWS | SENSED)[law]
+            followed = (LAWS | SENSED | FRAGILE)[law]
             grasp = swap_deviations(grasps[rank]) if followed.swapped else grasps[rank]
             trial = GraspTrial(load_hand(hand), grasp, mesh, seed_of(seed, "touch"), error, parts=parts)
-            status, moved, unbalanced = _run(trial, wrong, followed, mass, seed)
-            yield Outcome(*known, rank, condition, law, status.name, moved, unbalanced, time.process_time() - began)
+            status, moved, unbalanced, most = _run(trial, wrong, followed, mass, seed)
+            spent = time.process_time() - began
+            yield Outcome(*known, rank, condition, law, status.name, moved, unbalanced, spent, most)
 
 
-def _run(trial: GraspTrial, wrong: Condition, law: Law, mass: float, seed: int) -> tuple[Status, Any, Any]:
-    """Return status, motion before the lift [mm] and the unbalanced share of the forces."""
+def _run(trial: GraspTrial, wrong: Condition, law: Law, mass: float, seed: int) -> tuple[Status, Any, Any, Any]:
+    """Return status, motion before the lift [mm], unbalanced share of the forces, and a fingertip's largest [N]."""
     changes = law.trial | {"simulator": wrong.simulator}
     if law.dead:
         changes["sensor"] = SensorModel(dead=tuple(trial.hand.finger_names[k] for k in law.dead))
     if wrong.afloat:
-        return (
-            pull_grasp(trial, PROTOCOLS[wrong.afloat].with_trial(**{"closing": DEFAULT} | changes)).status,
-            None,
-            None,
-        )
+        spec = PROTOCOLS[wrong.afloat].with_trial(**{"closing": DEFAULT} | changes)
+        return pull_grasp(trial, spec).status, None, None, None
     spec = dataclasses.replace(TABLETOP, **changes)
     if wrong.unknown:
         spec = perturb_trial(spec, dataclasses.replace(PERTURBATIONS["mass"], friction=(0.3, 1.0)), mass, seed)
     done = lift_grasp(trial, spec)
-    moved, unbalanced = 1e3 * done.before_lift.distance, done.unbalanced
-    return done.status, *(None if math.isnan(x) else x for x in (moved, unbalanced))
+    moved, unbalanced, most = 1e3 * done.before_lift.distance, done.unbalanced, float(done.forces.max())
+    return done.status, *(None if math.isnan(x) else x for x in (moved, unbalanced, most))
 
 
 def _misplace(wrong: Condition, grasp: Grasps, mesh: Any, seed: int) -> torch.Tensor:

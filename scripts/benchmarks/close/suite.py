@@ -7,9 +7,10 @@ import torch
 from paper.trials import TableSpec
 
 from benchmarks.close.ablation import bench_ablation
+from benchmarks.close.conditions import LAWS_OF_SENSORS
 from benchmarks.close.holding import bench_holding
 from benchmarks.close.household import bench_grip, bench_household
-from benchmarks.close.misplaced import LAWS_OF_SENSORS, bench_misplaced
+from benchmarks.close.misplaced import bench_misplaced
 from benchmarks.close.pose_noise import bench_noise
 from benchmarks.close.real_scans import bench_scans
 from benchmarks.close.simulator_agreement import bench_agreement

@@ -1,0 +1,95 @@
+"""What closings are put to: where the object is, what it is like, how the hand closes, and what its fingertips tell."""
+
+import math
+from typing import Any, NamedTuple
+
+from torchgrasp.specs import SensorModel
+
+
+class Condition(NamedTuple):
+    """What is wrong: how far [m] the object is from where it was seen, and how far it turned [rad].
+
+    `unknown` things weigh what they weigh, and have a friction between 0.3 and 1. `afloat` they are pulled at. `drawn`
+    ones have a shape of the posterior's (`draw_solid`): the deviations are what they say.
+    """
+
+    distance: float = 0.0
+    angle: float = 0.0
+    unknown: bool = False
+    afloat: str = ""
+    simulator: str = "sapien"
+    drawn: bool = False
+
+
+CONDITIONS = {
+    "in place": Condition(),
+    "5 mm": Condition(0.005),
+    "10 mm": Condition(0.01),
+    "20 mm": Condition(0.02),
+    "5 degrees": Condition(angle=math.radians(5)),
+    "10 degrees": Condition(angle=math.radians(10)),
+    "drawn": Condition(drawn=True),
+    "drawn, 10 mm": Condition(0.01, drawn=True),
+    "10 mm, real mass, friction unknown": Condition(0.01, unknown=True),
+    "10 mm, MuJoCo": Condition(0.01, simulator="mujoco"),
+    "20 mm, MuJoCo": Condition(0.02, simulator="mujoco"),
+    "afloat, in place": Condition(afloat="dexgraspbench"),
+    "afloat, friction 0.3": Condition(afloat="dexgraspbench-hard"),
+    "afloat, 10 mm": Condition(0.01, afloat="dexgraspbench"),
+}
+"""By name. On a table the object is moved along it and turns about the vertical; afloat in any direction."""
+
+BARS = {"5 mm": (0.97, 2.0), "10 mm": (0.92, 4.0), "20 mm": (0.80, 8.0)}
+"""Least share held, and largest median motion [mm] of the object before the lift: the project's own."""
+
+
+class Law(NamedTuple):
+    """How the hand closes; `swapped` exchanges the deviations of the most and the least certain finger.
+
+    `dead` are the fingers, in grasp order, whose sensor is.
+    """
+
+    trial: dict[str, Any]
+    swapped: bool = False
+    dead: tuple[int, ...] = ()
+
+
+DEFAULT = "uncertainty"
+"""The law that the others are compared with."""
+
+LAWS = {
+    DEFAULT: Law({}),
+    "uncertainty, deviations swapped": Law({}, swapped=True),
+    "uncertainty without palm": Law({"without": ("palm",)}),
+    "uncertainty without place": Law({"without": ("place",)}),
+    "uncertainty without wait": Law({"without": ("wait",)}),
+    "fixed": Law({"closing": "fixed"}),
+    "fixed without place": Law({"closing": "fixed", "without": ("place",)}),
+    "position": Law({"closing": "position"}),
+    "paper_position": Law({"closing": "paper_position"}),
+    "open_loop": Law({"closing": "open_loop"}),
+}
+"""By name; all hold by "force", but for the open loop, which keeps its squeeze."""
+
+SENSED = {
+    "readings 20 ms old": Law({"sensor": SensorModel(delay=0.02)}),
+    "readings 40 ms old": Law({"sensor": SensorModel(delay=0.04)}),
+    "three times the noise": Law({"sensor": SensorModel(noise=3.0)}),
+    "joint torques": Law({"sensor": SensorModel("torque")}),
+    "binary": Law({"sensor": SensorModel("binary")}),
+    "binary, 40 ms old": Law({"sensor": SensorModel("binary", delay=0.04)}),
+    "first finger dead": Law({}, dead=(0,)),
+    "thumb dead": Law({}, dead=(-1,)),
+}
+"""`DEFAULT` with poorer fingertips, by name."""
+
+FRAGILE = {
+    "2 N": Law({"force": 2.0}),
+    "2 N, at most": Law({"force": 2.0, "max_force": 2.0}),
+    "2 N, grip": Law({"force": 2.0, "holding": "grip"}),
+    "2 N, grip, at most": Law({"force": 2.0, "max_force": 2.0, "holding": "grip"}),
+}
+"""`DEFAULT` with a light grip, and with an object that bears no more of a fingertip, by name."""
+
+LAWS_OF_SENSORS = (DEFAULT, *SENSED, "open_loop")
+"""What is compared to tell the worth of sensors."""
