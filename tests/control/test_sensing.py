@@ -6,11 +6,11 @@ import math
 import pytest
 import torch
 
-from tests.point_fingers import NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
+from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
 from torchgrasp.control import FingertipSensor, GraspController, TipContact, feel_flags, feel_torques, no_contact
-from torchgrasp.control.closing import LawClosing
+from torchgrasp.control.closing import OVERDUE, STALLED, LawClosing
 from torchgrasp.control.holding.force import MOST_FACTOR, ForceHold
-from torchgrasp.control.sensing import FLAGGED, TORQUE_NOISE
+from torchgrasp.control.sensing import FLAGGED, TORQUE_NOISE, DriveFeel
 from torchgrasp.errors import BadArgument
 from torchgrasp.specs import SensorModel, TrialSpec
 
@@ -88,17 +88,54 @@ def test_a_dead_fingertip_is_silent_and_the_others_are_as_ever():
         FingertipSensor(having(dead=("little_toe",)))
 
 
-def test_a_finger_without_a_sensor_rests_where_its_contact_should_be_and_is_waited_for_no_longer():
-    law = LawClosing(having(dead=FINGERS[2:]), without=("place",))
-    two = torch.tensor([True, True, False])
-    before = law(observation(0.01, (0.3, 0.3, 0.0), two), PERIOD).reshape(3, 3)
-    assert float((before[2] * NORMALS[2]).sum()) < 0  # it comes on
-    rests = [law(observation(-0.001, (0.3, 0.3, 0.0), two), PERIOD).reshape(3, 3) for _ in range(12)]
-    assert torch.allclose(rests[0][2], rests[-1][2], atol=1e-9) and law.done
-    other = LawClosing(reference(), without=("place",))
-    for _ in range(12):
-        other(observation(-0.001, (0.3, 0.3, 0.0), two), PERIOD)
-    assert not other.done  # one that could tell has not touched: it searches on
+def closes(sensor: SensorModel, contact, off: float, ticks: int = 12, joints=None) -> tuple[LawClosing, torch.Tensor]:
+    """How far the last finger's target comes on while the others touch as given, its tip off its contact [m]."""
+    law = LawClosing(dataclasses.replace(reference(), sensor=sensor), without=("place",))
+    seen = observation(off, (0.3, 0.3, 0.0), contact, joints)
+    targets = torch.stack([law(seen, PERIOD).reshape(3, 3)[2] for _ in range(ticks)])
+    return law, -((targets - targets[0]) * NORMALS[2]).sum(-1)
+
+
+DEAD, TWO = SensorModel(dead=FINGERS[2:]), torch.tensor([True, True, False])
+
+
+def test_a_finger_without_a_sensor_rests_at_its_contact_until_the_others_touch_and_then_searches():
+    alone = torch.tensor([True, False, False])
+    for contact, off, comes_on in ((alone, 0.01, True), (alone, -0.001, False), (TWO, -0.001, True)):
+        law, steps = closes(DEAD, contact, off)
+        assert (float(steps[-1]) > 1e-3) == comes_on and not law.done
+        if not comes_on:
+            assert torch.allclose(steps, steps[:1], atol=1e-9)
+
+
+def test_a_finger_without_a_sensor_is_no_longer_waited_for_once_no_surface_is_left_to_meet():
+    deviation = float((NORMALS[2] @ GAINS.covariance[2] @ NORMALS[2]).sqrt())
+    for off, done in ((-0.9 * OVERDUE * deviation, False), (-1.1 * OVERDUE * deviation, True)):
+        assert closes(DEAD, TWO, off)[0].done == done
+    assert not closes(SensorModel(), TWO, -1.1 * OVERDUE * deviation)[0].done  # one that could tell searches on
+
+
+def test_a_finger_without_a_sensor_stands_where_its_drives_push_against_something():
+    joints = torch.zeros(9).double()  # something keeps it where it is
+    known = dataclasses.replace(reference(), kp=torch.full((9,), 100.0).double(), sensor=DEAD)
+    law, seen = LawClosing(known, without=("place",)), observation(-0.001, (0.3, 0.3, 0.0), TWO, joints)
+    targets = torch.stack([law(seen, PERIOD).reshape(3, 3)[2] for _ in range(120)])
+    ahead = -(targets * NORMALS[2]).sum(-1)
+    assert law.done and bool(law.felt.all())
+    assert STALLED < 100.0 * float(ahead[-1]) < 3 * STALLED  # it stands, the lag of the average later
+    assert torch.allclose(ahead[-20:], ahead[-1:], atol=1e-9)
+
+
+def test_drives_feel_what_keeps_a_joint_from_its_target_and_not_that_it_moves():
+    known, still = reference(), torch.zeros(9).double()
+    drive = next(iter(known.hand.actuators.values()))
+    pushed, moving = DriveFeel(known), DriveFeel(known)
+    for k in range(200):
+        felt = pushed(observation(joints=still), still - (0.5 * NORMALS / known.kp[0]).flatten(), PERIOD)
+        at = still + 0.2 * PERIOD * (k + 1)  # at 0.2 rad/s a drive lags by d/k of it
+        free = moving(observation(joints=at), at + drive.kd / known.kp * 0.2, PERIOD)
+    assert torch.allclose(felt, real([0.5, 0.5, 0.5]), rtol=1e-3)
+    assert float(free.abs().max()) < 1e-6
 
 
 def test_a_dead_finger_in_the_air_says_nothing_of_where_the_object_is():

@@ -10,6 +10,7 @@ from torchgrasp.control import GraspController, load_controller_state
 from torchgrasp.control.holding.grip import GripHold
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.plane import Plane
+from torchgrasp.specs import SensorModel
 
 MODES = [
     ("uncertainty", "force"), ("fixed", "grip"), ("uncertainty", "impedance"), ("paper", "law"),
@@ -62,6 +63,16 @@ def test_what_grip_has_learned_goes_with_it():
     assert isinstance(one.hold, GripHold) and isinstance(other.hold, GripHold)
     assert other.hold.weight == one.hold.weight > 0
     assert other.hold.friction.mean == one.hold.friction.mean != 0.8
+
+
+def test_what_drives_have_felt_goes_with_it():
+    blind = dataclasses.replace(known(), sensor=SensorModel(dead=known().hand.finger_names[:1]))
+    one, other = GraspController(blind), GraspController(blind)
+    for k in range(75):
+        one.step(seen(k), PERIOD)
+    other.restore(one.state())
+    for k in range(75, 200):
+        assert torch.equal(one.step(seen(k), PERIOD).joints, other.step(seen(k), PERIOD).joints)
 
 
 def test_a_state_is_a_copy():

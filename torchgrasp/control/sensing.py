@@ -10,8 +10,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.border import Positive, checked
+from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.state import Part
 from torchgrasp.control.tactile import (
+    FLAG_CUTOFF,
     NOISE,
     SAMPLING_RATE,
     TOUCH_ON,
@@ -19,6 +22,7 @@ from torchgrasp.control.tactile import (
     TactileState,
     TipContact,
     flag,
+    low_pass,
     measure,
     no_contact,
     sample,
@@ -96,6 +100,30 @@ def _pushes(reference: ClosingReference, forces: Float[Tensor, "f 3"]) -> TipCon
     """Return contacts with forces, at places that nobody knows."""
     push, nothing = -(forces * reference.normals).sum(-1), torch.full_like(forces, torch.nan)
     return TipContact(push.clamp_min(0.0), forces, nothing, nothing)
+
+
+class DriveFeel(Part):
+    """What fingers feel by their drives alone: a joint that is kept from its target is pushed against.
+
+    A drive of stiffness k and damping d exerts k (target - q) - d dq/dt. A hand of other drives has their currents.
+    """
+
+    def __init__(self, reference: ClosingReference) -> None:
+        hand = reference.hand
+        self.reference, self.before = reference, reference.expand(reference.pregrasp)
+        damping = [hand.actuators[name].kd for name in hand.tree.joint_names]
+        self.damping = torch.tensor(damping, dtype=torch.float64)
+        self.pushes = torch.zeros_like(reference.normals[:, 0])
+
+    def __call__(self, observation: Observation, targets: Float[Tensor, " j"], period: float) -> Float[Tensor, "f"]:
+        """Return how hard each fingertip presses [N], averaged as for a contact flag, by the targets of the tick."""
+        joints = observation.joints
+        torques = self.reference.kp * (targets - joints) - self.damping * (joints - self.before) / period
+        self.before = joints
+        forces = _forces_by_torques(self.reference, observation.jacobian) @ torques
+        pushes = -(forces * self.reference.normals).sum(-1)
+        self.pushes = self.pushes + low_pass(FLAG_CUTOFF, period) * (pushes - self.pushes)
+        return self.pushes
 
 
 class FingertipSensor:
