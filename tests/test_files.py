@@ -119,6 +119,7 @@ def test_foreign_files_are_refused(tmp_path):
         "version": ({"a": torch.zeros(1)}, '{"kind": "toy", "version": "99"}'),
         "other tensors": ({"b": torch.zeros(1)}, '{"kind": "toy", "version": "1"}'),
         "nan": ({"a": torch.tensor([float("nan")])}, '{"kind": "toy", "version": "1"}'),
+        "overflow": ({"a": torch.tensor([-1e31])}, '{"kind": "toy", "version": "1"}'),
         "no object": ({"a": torch.zeros(1)}, "[1]"),
         "no json": ({"a": torch.zeros(1)}, "{"),
         "no metadata": ({"a": torch.zeros(1)}, None),
