@@ -1,6 +1,7 @@
 """What every value is made of: frozen dataclasses of tensors, batches with rows, checks and counts."""
 
 import dataclasses
+import functools
 import numbers
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
@@ -38,8 +39,19 @@ def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValu
             raise BadArgument(name, "None beside a tensor", "a tensor in every value, or in none")
         return function(*found) if all(tensors) else found[0]
 
-    fields = [f.name for f in dataclasses.fields(values[0])]  # pyright: ignore[reportArgumentType]
-    return type(values[0])(**{name: merge(name, *(getattr(value, name) for value in values)) for name in fields})
+    kind = type(values[0])
+    fields = {name: merge(name, *(getattr(value, name) for value in values)) for name in _names(kind)}
+    if hasattr(kind, "__post_init__"):
+        return kind(**fields)
+    new = object.__new__(kind)  # what comes of checked fields is not checked again: loops make thousands of values
+    new.__dict__.update(fields)
+    return new
+
+
+@functools.cache
+def _names(kind: type) -> tuple[str, ...]:
+    """Return the names of the fields of a kind of value."""
+    return tuple(f.name for f in dataclasses.fields(kind))
 
 
 SHOWN, WIDTH = 4, 110

@@ -67,8 +67,12 @@ class Problem(abc.ABC, Generic[State, Model]):
         return model
 
 
+@torch.no_grad()
 def levenberg_marquardt(problem: Problem[State, Model], state: State, steps: int) -> tuple[State, Float[Tensor, "b"]]:
-    """Lower the cost of every row by damped Gauss-Newton steps of one evaluation each; return states and costs."""
+    """Lower the cost of every row by damped Gauss-Newton steps of one evaluation each; return states and costs.
+
+    No gradient flows through it: without a graph its many small operations are quicker.
+    """
     whole, rows = state, torch.arange(len(state))
     model = problem.linearise(state, rows)
     costs = model.cost

@@ -54,7 +54,7 @@ def test_the_planner_waits_once_a_step(device, shape, triples):
     assert waits_of_a_step(device, run, 2, 5) == {"optim.py": 1}
 
 
-def test_refinement_waits_for_the_pairs_of_links_too(device, monkeypatch, shape, hand, grasps):
+def test_refinement_waits_for_the_pairs_of_links_too(device, shape, hand, grasps):
     surface = extract_surface(shape, 24)
     world = CollisionWorld(field_from_surface(surface.vertices, surface.faces, 0.01), 0.0)
     hand, contacts, world = sent(hand), sent(grasps.contacts), sent(world)
@@ -62,8 +62,7 @@ def test_refinement_waits_for_the_pairs_of_links_too(device, monkeypatch, shape,
 
     @checked  # as a public function calls it: within the border nothing is read again
     def run(steps: int) -> object:
-        monkeypatch.setattr("torchgrasp.ik.refine.ITERATIONS", steps)
-        return refine(hand, start, contacts, world, 0.0)
+        return refine(hand, start, contacts, world, 0.0, steps)
 
     found = waits_of_a_step(device, run, 1, 3)
     assert found.pop("optim.py") == 1

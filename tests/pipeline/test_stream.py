@@ -29,13 +29,13 @@ def same(first, second):
 def whole():
     """All grasps of one call, and what an observer heard."""
     heard = []
-    return plan_grasps(VIEW, HAND, SPEC, 120, observer=lambda *stage: heard.append(stage)), heard
+    return plan_grasps(VIEW, HAND, SPEC, 150, observer=lambda *stage: heard.append(stage)), heard
 
 
 @pytest.fixture(scope="module")
 def parts():
     """The same wave by wave."""
-    return list(stream_grasps(VIEW, HAND, SPEC, 120))
+    return list(stream_grasps(VIEW, HAND, SPEC, 150))
 
 
 def test_the_union_of_the_stream_is_the_batch_call(whole, parts):
@@ -44,7 +44,7 @@ def test_the_union_of_the_stream_is_the_batch_call(whole, parts):
     union = join(parts)
     union = union[torch.argsort(-union.score, stable=True)]
     assert same(union, grasps[grasps.status == Status.OK])
-    assert [int(part.meta["starts"]) for part in parts] == [64, 120, 120]
+    assert [int(part.meta["starts"]) for part in parts] == [32, 150, 150]
     assert parts[-1].meta == grasps.meta
 
 
@@ -58,12 +58,12 @@ def test_each_wave_holds_executable_grasps_best_first(parts):
 
 def test_a_budget_ends_after_the_wave_that_passes_it(parts):
     heard = []
-    short = plan_grasps(VIEW, HAND, SPEC, 120, time_budget=1e-3, observer=lambda *stage: heard.append(stage))
+    short = plan_grasps(VIEW, HAND, SPEC, 150, time_budget=1e-3, observer=lambda *stage: heard.append(stage))
     assert same(short[short.status == Status.OK], parts[0])
-    assert short.meta["starts"] == "64"
+    assert short.meta["starts"] == "32"
     stages = {stage: value for stage, _, value in heard}
     assert list(stages) == ["shape", "wave", "plan", "certify", "query", "refine"] and len(heard) == 6
-    assert len(stages["plan"]) == 64  # what was not planned has no status
+    assert len(stages["plan"]) == 32  # what was not planned has no status
     assert len(short) <= FIRST
     assert same(plan_grasps(VIEW, HAND, SPEC, 20, time_budget=1e6), plan_grasps(VIEW, HAND, SPEC, 20))
     for wrong in (0.0, -1.0, float("nan")):
@@ -76,7 +76,7 @@ def test_an_observer_hears_of_each_wave_and_of_the_stages_of_all(whole):
     stages = [stage for stage, _, _ in heard]
     assert stages == ["shape", "wave", "plan", "certify", "query", "wave", "refine"]
     values = {stage: value for stage, _, value in heard}
-    assert len(values["plan"]) == 120 and bool(values["certify"].closed.all())
+    assert len(values["plan"]) == 150 and bool(values["certify"].closed.all())
     assert int(values["query"].row.max()) == len(values["certify"]) - 1  # rows of all waves
     assert same(values["refine"], grasps)
     waves = [value for stage, _, value in heard if stage == "wave"]
@@ -85,7 +85,7 @@ def test_an_observer_hears_of_each_wave_and_of_the_stages_of_all(whole):
 
 def test_who_stops_listening_stops_the_work():
     heard = []
-    stream = stream_grasps(VIEW, HAND, SPEC, 120, observer=lambda stage, text, value: heard.append(stage))
+    stream = stream_grasps(VIEW, HAND, SPEC, 150, observer=lambda stage, text, value: heard.append(stage))
     assert heard == []  # nothing is done before the first grasps are asked for
     next(stream)
     stream.close()

@@ -11,7 +11,7 @@ from torchgrasp.errors import Status
 from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.ranking import rank_in_group
-from torchgrasp.ik.refine import grasp_residuals, refine, tip_targets
+from torchgrasp.ik.refine import ITERATIONS, grasp_residuals, refine, tip_targets
 from torchgrasp.ik.rounds import Attempts, assign, best_first, best_grasps, executable
 from torchgrasp.values import Grasps, IKSeeds
 
@@ -36,10 +36,10 @@ def rank_seeds(problem: GraspProblem, seeds: IKSeeds) -> Int[Tensor, "g"]:
     return rank_in_group(seeds.row, seed_costs(problem, seeds))
 
 
-def refine_on_contacts(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
+def refine_on_contacts(problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS) -> Grasps:
     """Return a checked grasp for each seed, its contacts fixed."""
     contacts, start = assign(problem.contacts, seeds), Configuration(seeds.joints, seeds.obj_from_hand)
-    configuration = refine(problem.hand, start, contacts, problem.world)
+    configuration = refine(problem.hand, start, contacts, problem.world, steps=steps)
     certificate, status = problem.certificate[seeds.row], torch.full_like(seeds.row, Status.OK)
     return check_candidates(problem, GraspCandidates(configuration, contacts, certificate, seeds.permutation, status))
 

@@ -20,7 +20,7 @@ from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, clearance_rows
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian, differentiate
 from torchgrasp.ik.contact_first import refine_on_contacts
 from torchgrasp.ik.ranking import rank_in_group
-from torchgrasp.ik.refine import HAND_STEP, PAD_WEIGHT, TIP_WEIGHT, tip_rows, tip_targets
+from torchgrasp.ik.refine import HAND_STEP, ITERATIONS, PAD_WEIGHT, TIP_WEIGHT, tip_rows, tip_targets
 from torchgrasp.ik.rounds import Attempts, assign, best_first, best_grasps, executable
 from torchgrasp.optim import LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.plan.certify import certify
@@ -168,10 +168,10 @@ class JointProblem:
         return configuration, points, rows
 
 
-def solve_fixed(problem: GraspProblem, seeds: IKSeeds) -> Attempts[Grasps]:
+def solve_fixed(problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS) -> Attempts[Grasps]:
     """Return attempts with the best seeds of each triple on its own contacts."""
     attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
-    attempts.refine(seeds, rank_in_group(seeds.row), (FIXED_SEEDS,), partial(refine_on_contacts, problem))
+    attempts.refine(seeds, rank_in_group(seeds.row), (FIXED_SEEDS,), partial(refine_on_contacts, problem, steps=steps))
     return attempts
 
 

@@ -63,7 +63,12 @@ def grasp_residuals(
 
 
 def refine(
-    hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld | None, solved: float = SOLVED
+    hand: Hand,
+    configuration: Configuration,
+    contacts: Contacts,
+    world: CollisionWorld | None,
+    solved: float = SOLVED,
+    steps: int = ITERATIONS,
 ) -> Configuration:
     """Return configurations with finger i on contact i and clear links, as far as possible.
 
@@ -75,7 +80,7 @@ def refine(
         return grasp_residuals(hand, state, target[rows], normals[rows], world, tips_touch=True)
 
     problem = LeastSquares(evaluate, lambda x, step: x.integrate(hand, step), solved, HAND_STEP)
-    return levenberg_marquardt(problem, configuration, ITERATIONS)[0]
+    return levenberg_marquardt(problem, configuration, steps)[0]
 
 
 def open_hand(

@@ -115,12 +115,21 @@ def field_from_surface(
     lines = [origin[k] + spacing * np.arange(counts[k]) for k in range(3)]
     nodes = np.stack(np.meshgrid(*(line[::4] for line in lines), indexing="ij"), -1)
     values = surface.distance(nodes.reshape(-1, 3), far=True).reshape(nodes.shape[:3])
+    known = np.zeros(values.shape, dtype=bool)
     for step, inward, outward in ((2, np.inf, BAND), (1, INWARD * spacing, NEAR * spacing)):
-        values = _refine(values)
-        near = np.nonzero((-inward < values) & (values < outward))
+        values, known = _refine(values), _keep(known)
+        near = np.nonzero((-inward < values) & (values < outward) & ~known)
         values[near] = surface.distance(np.stack([lines[k][::step][near[k]] for k in range(3)], -1))
+        known[near] = True
     to = {"device": vertices.device, "dtype": torch.float64}
     return SignedDistanceField(low.to(**to), float(spacing), torch.tensor(values, **to))
+
+
+def _keep(known: np.ndarray) -> np.ndarray:
+    """Return which nodes of a grid twice as fine are known: every second along each axis."""
+    fine = np.zeros([2 * count - 1 for count in known.shape], dtype=bool)
+    fine[::2, ::2, ::2] = known
+    return fine
 
 
 def _refine(values: np.ndarray) -> np.ndarray:

@@ -18,9 +18,13 @@ from torchgrasp.plan.starts import check_starts
 from torchgrasp.specs import Ranking
 from torchgrasp.values import Grasps
 
-FIRST, GROWTH = 16, 3
+FIRST, GROWTH = 8, 6
 """Rows of contacts that the hand tries in the first wave, and how many times as many in the next. A wave costs what
-some 30 rows do beside its own: two waves more made the whole call a fifth longer."""
+some 30 rows do beside its own: two waves more made the whole call a fifth longer. After the second 56 rows have been
+tried: most objects have fifty grasps then."""
+HASTY = 8
+"""Most steps of a hand in the first wave. Nine in ten of the seeds of the Allegro hand that succeed are done after six.
+Twenty further steps of few rows cost as many calls as those of all. The second wave tries the rest again."""
 
 
 class Wave(NamedTuple):
@@ -34,9 +38,9 @@ def schedule(starts: int, most: int) -> list[Wave]:
     """Return the waves in which `starts` are planned and `most` rows tried; a smaller rest joins the last wave.
 
     >>> [tuple(wave) for wave in schedule(1000, 250)]
-    [(64, 16), (192, 48), (744, 186)]
+    [(32, 8), (192, 48), (776, 194)]
     >>> [tuple(wave) for wave in schedule(300, 160)]
-    [(64, 16), (192, 48), (44, 96)]
+    [(32, 8), (192, 48), (76, 104)]
     """
     waves, size, most = list[Wave](), FIRST, min(most, starts)
     tried = planned = 0
@@ -52,17 +56,27 @@ def schedule(starts: int, most: int) -> list[Wave]:
 class Trials:
     """The grasps of all waves. Contacts slide in the last one for all rows that need it: a wave costs its own calls.
 
-    In a wave without a grasp they slide at once.
+    In a wave without a grasp they slide at once. What the first wave did not solve in few steps is tried again in the
+    second.
     """
 
     def __init__(self, bench: Bench) -> None:
         self.bench = bench
-        self.waiting = list[tuple[Offer, Grasps]]()
+        self.hurried, self.waiting = list[tuple[Offer, Grasps]](), list[tuple[Offer, Grasps]]()
+        self.first = True
 
     def take(self, offer: Offer, last: bool) -> Grasps:
         """Return the grasps of further contacts, and of those that waited if they are tried now."""
         if self.bench.task.mode != "joint":
             return self.bench.solve(offer)
+        first, self.first = self.first, False
+        if first and not last:
+            solved, rest, failed = self.bench.touch(offer, HASTY)
+            if len(solved):
+                self.hurried.append((rest, failed))
+                return solved
+        offer = join_offers([*(rest for rest, _ in self.hurried), offer])
+        self.hurried.clear()
         solved, rest, failed = self.bench.touch(offer)
         self.waiting.append((rest, failed))
         if len(solved) and not last:
@@ -73,7 +87,7 @@ class Trials:
 
     def give_up(self) -> list[Grasps]:
         """Return the failures of all that waits."""
-        return [failed for _, failed in self.waiting]
+        return [failed for _, failed in (*self.hurried, *self.waiting)]
 
 
 def plan_waves(task: Task, deadline: float) -> Iterator[Grasps]:
