@@ -152,8 +152,9 @@ def check_folder(path: Path) -> None:
     except OSError as error:
         raise OutputError("path", f"{path} ({error.strerror or error})", "a folder that can be written") from error
     finally:
-        for folder in reversed(made):
-            folder.rmdir()
+        with contextlib.suppress(OSError):  # an empty folder may stay
+            for folder in reversed(made):
+                folder.rmdir()
 
 
 @contextlib.contextmanager
