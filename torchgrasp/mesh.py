@@ -8,13 +8,13 @@ import numpy as np
 from torchgrasp.cloud.check import MAX_EXTENT, MIN_EXTENT
 from torchgrasp.errors import MeshError, SuspiciousScale
 from torchgrasp.files import is_file, read_bytes
-from torchgrasp.files.meshes import SUFFIXES, load_triangles
+from torchgrasp.files.meshes import MAX_FACES, SUFFIXES, load_triangles
 
 if TYPE_CHECKING:
     import trimesh
 
-MAX_BYTES, MAX_FACES = 50 * 1024 * 1024, 500_000
-"""Largest file and mesh of an object, as of a hand's: scans of household things have at most 100,000 faces."""
+MAX_BYTES = 50 * 1024 * 1024
+"""Largest file of an object's mesh, as of a hand's."""
 MESH_FILE = f"a mesh file ({', '.join(SUFFIXES)})"
 LEAST_VOLUME = 1e-12
 """Volume [m^3] from which on a mesh is a body: a cube of 0.1 mm."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from torchgrasp.files.meshes import load_triangles
+from torchgrasp.files.meshes import MAX_FACES, load_triangles
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.mend import place, pose_of
 from torchgrasp.hand.safe_xml import read_bounded
@@ -25,8 +25,6 @@ MAX_MESH = 50 * 1024 * 1024
 """Largest mesh [bytes]."""
 MAX_MESHES = 4 * MAX_MESH
 """Largest size of all meshes of a hand [bytes]."""
-MAX_FACES = 500_000
-"""Most triangles of a mesh; those of public hands have up to 13,000."""
 MESH_KINDS = (".stl", ".obj", ".ply")
 """Formats of meshes: those that are geometry alone."""
 SAMPLES = 4000
@@ -144,32 +142,15 @@ def _read_points(urdf: Urdf, name: str, folder: Path) -> Points:
 
     path = mesh_file(urdf, name, folder)
     data = read_bounded("urdf", path, "a mesh", MAX_MESH)
-    kind, allowed = path.suffix.lower()[1:], f"a triangle mesh of at most {MAX_FACES} faces"
-    faces = {"obj": data.count(b"\nf "), "ply": _ply_faces(data), "stl": _stl_faces(data)}[kind]
-    if faces > MAX_FACES:
-        raise urdf.wrong(f"mesh {name!r} of {faces} faces", allowed)
+    allowed = f"a triangle mesh of at most {MAX_FACES} faces"
     try:
-        mesh = load_triangles(data, f".{kind}", process=False)
+        mesh = load_triangles(data, path.suffix.lower(), process=False)
     except Exception as error:  # the readers of trimesh raise whatever their format runs into
         raise urdf.wrong(f"mesh {name!r}: {error}"[:300], allowed) from error
     sound = isinstance(mesh, trimesh.Trimesh) and 0 < len(mesh.faces) <= MAX_FACES
     if not sound or not np.isfinite(mesh.vertices).all():
         raise urdf.wrong(f"mesh {name!r} without faces, or with vertices that are no numbers", allowed)
     return _sample(mesh)
-
-
-def _stl_faces(data: bytes) -> int:
-    """Return the count of faces of an STL file, whichever form it has."""
-    declared = int.from_bytes(data[80:84], "little")
-    return declared if len(data) == 84 + 50 * declared else data.count(b"facet normal")
-
-
-def _ply_faces(data: bytes) -> int:
-    """Return the count of faces that a PLY file declares."""
-    for line in data[:10_000].splitlines():
-        if line.startswith(b"element face "):
-            return int(line.split()[-1]) if line.split()[-1].isdigit() else MAX_FACES + 1
-    return 0
 
 
 def _primitive_points(shape: Shape) -> Points:

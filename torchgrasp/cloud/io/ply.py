@@ -1,16 +1,14 @@
 """The PLY format; of meshes, points of the surface are read."""
 
-import io
 from typing import Any
 
 import numpy as np
 
 from torchgrasp.cloud.io.text import MAX_POINTS, read_table
+from torchgrasp.files.meshes import load_triangles
 
 MAX_MESH_TEXT = 64 * 2**20
 """Most bytes of a mesh in text: the parser needs 20 times the memory."""
-MOST_FACES = 500_000
-"""Most faces of a mesh, as of an object's: ten million took 22 s and 3.7 GB."""
 MESH_POINTS = 2000
 """Points drawn from the surface of a mesh: as many as a shape is fitted to."""
 TYPES = {
@@ -55,8 +53,6 @@ def parse_ply(data: bytes) -> dict[str, Any]:
     if any(not 0 <= count <= 2 * MAX_POINTS for _, count, _ in elements):
         raise ValueError(f"elements {[(name, count) for name, count, _ in elements]}; at most {MAX_POINTS} points")
     faces = sum(count for name, count, _ in elements if name == "face")
-    if faces > MOST_FACES:
-        raise ValueError(f"a mesh of {faces} faces; at most {MOST_FACES}")
     if faces:
         if encoding == "ascii" and len(body) > MAX_MESH_TEXT:
             raise ValueError(f"a mesh of {len(body)} bytes of text, more than {MAX_MESH_TEXT}; a binary one may have")
@@ -116,8 +112,8 @@ def _sample_mesh(data: bytes) -> tuple[np.ndarray, np.ndarray | None]:
     """Return surface points of a mesh, with normals if it is closed."""
     import trimesh
 
-    try:  # without a resolver: a texture that the header names is not opened
-        mesh = trimesh.load(io.BytesIO(data), file_type="ply", process=False, skip_materials=True)
+    try:
+        mesh = load_triangles(data, ".ply", process=False)
     except Exception as error:  # the parser raises whatever the bytes provoke
         raise ValueError(f"a mesh that cannot be parsed ({error})") from error
     if not isinstance(mesh, trimesh.Trimesh) or not mesh.area > 0 or not np.isfinite(mesh.vertices).all():
