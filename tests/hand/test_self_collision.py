@@ -6,12 +6,11 @@ import torch
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import rotation_from_vector
-from torchgrasp.hand.collision_pairs import MEETING_DISTANCE, collision_pairs
+from torchgrasp.hand.collision_pairs import MEETING_DISTANCE, collision_pairs, self_collision_from_urdf
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.load import load_hand
-from torchgrasp.hand.self_collision import self_collision_from_urdf
 from torchgrasp.hand.urdf import Mimic, read_urdf
 from torchgrasp.testing import check_hand
 from torchgrasp.testing.hands import random_joints

@@ -1,28 +1,18 @@
-"""Signed separations of a hand's links, by their collision shapes.
-
-Boxes and spheres are exact. A cylinder becomes a prism of twelve sides, 2 % off.
-"""
+"""Signed separations of a hand's links, by their collision shapes: boxes and spheres, which are exact."""
 
 import dataclasses
 import itertools
-import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.frames import rotation_from_rpy
 from torchgrasp.hand.kinematics import map_points
-from torchgrasp.hand.urdf import Shape, Triple, Urdf
 
-PRISM_BOXES = 6
-"""Boxes whose union is the prism of a cylinder: each reaches from one side to the opposite one."""
-MOST_PAIRS = 20_000
-"""Most pairs of shapes to test; all of the Shadow hand's, which has most of the shipped ones, are 7427."""
 PARALLEL = 1e-10
 """Squared sine below which two edges count as parallel; the faces' normals then cover their product."""
 
@@ -99,6 +89,16 @@ class SelfCollision(Value):
         number = torch.full_like(apart, len(pair), dtype=torch.long)
         number[pair, row] = torch.arange(len(pair), device=pair.device)
         return apart.index_put((pair, row), separation), number, wrench
+
+    def count_near(self, frames: Float[Tensor, "3 4 l n"], below: float) -> int:
+        """Return how many pairs, over all rows, have bounding spheres nearer than `below`."""
+        distance = self._distances(self._place(frames)[1])
+        return int((distance - self._sums(self._bounding, distance) < below).sum())
+
+    def only(self, kept: Bool[Tensor, " p"]) -> "SelfCollision":
+        """Return the same shapes with some of the pairs."""
+        one, two, three = (int(kind.sum()) for kind in kept.split(self.kinds))
+        return dataclasses.replace(self, pairs=self.pairs[kept], kinds=(one, two, three))
 
     def link_pairs(self) -> list[tuple[int, int]]:
         """Return the pairs of links that are tested, by their indices."""
@@ -262,44 +262,3 @@ def box_distance(points: Float[Tensor, "*b 3"], half: Float[Tensor, "*b 3"]) -> 
     outside, inside = squared > 0, torch.maximum(torch.maximum(ox, oy), oz)
     # the root's derivative is infinite at 0; there the largest coordinate is the distance
     return torch.where(outside, torch.sqrt(torch.where(outside, squared, 1.0)), inside)
-
-
-def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None) -> SelfCollision:
-    """Return the shapes of a URDF with the `pairs` of links to test; None: all but neighbours; `MOST_PAIRS` at most."""
-    names = [x.name for x in urdf.links]
-    tested = {frozenset(pair) for pair in (itertools.combinations(names, 2) if pairs is None else pairs)}
-    if pairs is None:
-        tested -= {frozenset((j.parent, j.child)) for j in urdf.joints}
-    shapes = [(i, *part) for i, link in enumerate(urdf.links) for shape in link.shapes for part in _parts(shape)]
-    link, rotation, center, half, radius = zip(*shapes, strict=True)
-    places = {i: list(of) for i, of in itertools.groupby(range(len(shapes)), link.__getitem__)}
-    meeting = [(i, j) for i in places for j in places if j >= i and frozenset((names[i], names[j])) in tested]
-    if (many := sum(len(places[i]) * len(places[j]) for i, j in meeting)) > MOST_PAIRS:
-        raise urdf.wrong(f"{many} pairs of shapes to test for collisions", f"at most {MOST_PAIRS}, a cylinder as six")
-    kinds: tuple[list[tuple[int, int]], ...] = ([], [], [])
-    for one, two in sorted((one, two) for i, j in meeting for one in places[i] for two in places[j] if two > one):
-        spheres = radius[one] > 0, radius[two] > 0
-        kinds[sum(spheres)].append((two, one) if spheres == (False, True) else (one, two))
-    return SelfCollision(
-        link=torch.tensor(link),
-        rotation=torch.stack(rotation, -1),
-        center=torch.tensor(center, dtype=torch.float64),
-        half=torch.tensor(half, dtype=torch.float64),
-        radius=torch.tensor(radius, dtype=torch.float64),
-        pairs=torch.tensor([pair for kind in kinds for pair in kind], dtype=torch.long).reshape(-1, 2),
-        kinds=(len(kinds[0]), len(kinds[1]), len(kinds[2])),
-    )
-
-
-def _parts(shape: Shape) -> list[tuple[Float[Tensor, "3 3"], Triple, Triple, float]]:
-    """Return the boxes or the sphere of a shape: rotation, centre, half sizes, radius."""
-    rotation = rotation_from_rpy(shape.rpy)
-    if shape.kind == "sphere":
-        return [(rotation, shape.xyz, (0.0, 0.0, 0.0), shape.size[0])]
-    if shape.kind == "box":
-        x, y, z = shape.size
-        return [(rotation, shape.xyz, (x / 2, y / 2, z / 2), 0.0)]
-    step = math.pi / PRISM_BOXES
-    corner = 2 * shape.size[0] / (1 + math.cos(step / 2))  # as far outside the circle as the sides are inside
-    half = (corner * math.cos(step / 2), corner * math.sin(step / 2), shape.size[1] / 2)
-    return [(rotation @ rotation_from_rpy((0.0, 0.0, k * step)), shape.xyz, half, 0.0) for k in range(PRISM_BOXES)]
