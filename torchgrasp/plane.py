@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import SomeValue, Value, map_tensors
-from torchgrasp.border import checked
+from torchgrasp.border import Pose, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, inverse, rigid, rotate
 from torchgrasp.linalg import unit
@@ -80,7 +80,7 @@ class Plane(Value):
         return points @ self.normal.to(points) - self.offset
 
     @checked
-    def moved(self, b_from_a: Float[Tensor, "4 4"]) -> "Plane":
+    def moved(self, b_from_a: Pose) -> "Plane":
         """Return the plane in frame b; it is given in frame a.
 
         >>> raised = torch.eye(4)

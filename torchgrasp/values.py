@@ -16,9 +16,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import FINGERTIPS, Batch, Value, named_tensors, read_rows
-from torchgrasp.border import ANY, checked
+from torchgrasp.border import ANY, Poses, Rows, checked
 from torchgrasp.errors import BadArgument, ModelFileError, Status, TooFewPoints
 from torchgrasp.files import save_tensors
+from torchgrasp.frames import is_rigid
 from torchgrasp.value_files import read_value
 
 # ---------------------------------------------------------------------------------------------- what was seen
@@ -156,7 +157,7 @@ class ContactPlan(Batch):
     of the cloud, or the value of the chosen objective. Less is better.
     """
 
-    contacts: Contacts
+    contacts: Annotated[Contacts, Rows("b")]
     coefficients: Annotated[Float[Tensor, "b f e"], ANY]
     quality: Annotated[Float[Tensor, "b"], ANY]
     status: Int[Tensor, "b"]
@@ -209,7 +210,7 @@ class IKSeeds(Batch):
     """
 
     joints: Float[Tensor, "g h"]
-    obj_from_hand: Float[Tensor, "g 4 4"]
+    obj_from_hand: Poses
     row: Int[Tensor, "g"]
     permutation: Int[Tensor, "g f"]
     energy: Annotated[Float[Tensor, "g"], ANY]
@@ -237,13 +238,13 @@ class Grasps(Batch):
     joints: Float[Tensor, "g h"]
     pregrasp: Float[Tensor, "g h"]
     approach: Float[Tensor, "g 3"]
-    obj_from_hand: Float[Tensor, "g 4 4"]
-    contacts: Contacts
+    obj_from_hand: Poses
+    contacts: Annotated[Contacts, Rows("g")]
     permutation: Int[Tensor, "g f"]
     tip_error: Annotated[Float[Tensor, "g f"], ANY]
     clearance: Annotated[Float[Tensor, "g"], ANY]
     normal_angle: Annotated[Float[Tensor, "g f"], ANY]
-    certificate: Certificate
+    certificate: Annotated[Certificate, Rows("g")]
     score: Annotated[Float[Tensor, "g"], ANY]
     status: Int[Tensor, "g"]
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
@@ -261,10 +262,6 @@ class Grasps(Batch):
             OutputError: the file cannot be written.
         """
         save_tensors(path, "grasps", named_tensors(self), self.meta)
-
-
-RIGID = 1e-4
-"""Largest error of a rotation matrix in a file, that of float32 and of rounding in a text."""
 
 
 @checked
@@ -287,12 +284,10 @@ def load_grasps(path: Path | str) -> Grasps:
 
 def check_grasps(path: Path | str, grasps: Grasps) -> None:
     """Refuse grasps of a file that no program of ours wrote; raise `ModelFileError`."""
-    f, rotation, last = grasps.contacts.fingertips, grasps.obj_from_hand[:, :3, :3].double(), grasps.obj_from_hand[:, 3]
-    error = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().amax((1, 2))
-    mirrored, sheared = torch.linalg.det(rotation) < 0, (last != torch.eye(4).to(last)[3]).any(1)
+    f = grasps.contacts.fingertips
     wrong = {
         f"{f} fingertips, not three to five": torch.tensor([not FINGERTIPS[0] <= f <= FINGERTIPS[1]]),
-        "obj_from_hand that is not rigid": ~(error <= RIGID) | mirrored | sheared,
+        "obj_from_hand that is not rigid": ~is_rigid(grasps.obj_from_hand),
         "an unknown status": ~torch.isin(grasps.status, torch.tensor([int(status) for status in Status])),
         "a permutation that is none": (grasps.permutation.sort(1).values != torch.arange(f)).any(1),
     }

@@ -21,16 +21,20 @@ from torch import Tensor
 import torchgrasp
 from torchgrasp import PointCloud, fit_shape, load_hand, load_object, load_scene
 from torchgrasp.border import ANY, Range
+from torchgrasp.control import ClosingReference, ControlRecorder, GraspController
+from torchgrasp.control.adaptive.belief import Belief
 from torchgrasp.control.adaptive.stability import NAMES, StabilityModel
 from torchgrasp.errors import Status
-from torchgrasp.ik import GraspProblem
+from torchgrasp.ik import GraspProblem, PostureLibrary
+from torchgrasp.objects import load_shipped_grasp
 from torchgrasp.plan import Shape
 from torchgrasp.posture_model import GaussianMixture, GraspMixture
 from torchgrasp.posture_model.encoding import CODE_NAMES
 from torchgrasp.shape import Kernel, thin_plate_kernel
+from torchgrasp.values import Certificate, Contacts, Grasps
 
 NAN, INF = float("nan"), float("inf")
-LENGTHS = {"b": 2, "n": 6, "g": 1, "f": 3, "t": 4, "k": 2, "v": 5, "q": 6, "c": 3}
+LENGTHS = {"b": 1, "n": 6, "g": 1, "f": 3, "t": 4, "k": 2, "v": 5, "q": 6, "c": 3}
 """Lengths of the letters in samples; others are 4."""
 
 
@@ -83,6 +87,11 @@ def spoilt(valid: Tensor) -> dict[str, Tensor]:
     return {str(x): torch.where(last, torch.tensor(x, dtype=valid.dtype), valid) for x in (NAN, INF, -INF)}
 
 
+def crooked(valid: Tensor) -> list[Tensor]:
+    """Return transforms that scale, mirror or shear, and one of zeros."""
+    return [3 * valid, torch.diag(torch.tensor([-1.0, 1, 1, 1])).to(valid) @ valid, valid.cumsum(-1), 0 * valid]
+
+
 def hints_of(thing: Any) -> dict[str, Any]:
     """Return the annotations of a function or dataclass with their marks."""
     late = {"trimesh": trimesh, "StabilityModel": StabilityModel}
@@ -101,7 +110,15 @@ def special(kind: type) -> Any:
         torchgrasp.Scene: load_scene,
         torchgrasp.GraspObject: lambda: load_object("cylinder"),
         PointCloud: few_points,
+        Grasps: lambda: load_shipped_grasp("jug", "barrett"),
+        Contacts: lambda: special(Grasps).contacts,
+        Certificate: lambda: special(Grasps).certificate,
+        ClosingReference: lambda: ClosingReference.from_grasp(special(torchgrasp.Hand), special(Grasps)),
+        GraspController: lambda: GraspController(special(ClosingReference)),
+        ControlRecorder: ControlRecorder,
+        Belief: lambda: Belief(special(torchgrasp.ShapeGP), torch.eye(4, dtype=torch.float64)),
         GraspProblem: grasp_problem,
+        PostureLibrary: lambda: PostureLibrary.of(special(torchgrasp.Hand), 100),
         torchgrasp.Plane: lambda: torchgrasp.Plane.horizontal(0.0),
         torchgrasp.ShapeGP: lambda: fit_shape(special(PointCloud), budget=30),
         Kernel: lambda: thin_plate_kernel(2.0),
@@ -209,7 +226,8 @@ def is_wrong(value: Any, hint: Any) -> bool:
         if origin in (typing.Union, types.UnionType):
             hints += inside
         elif origin is typing.Annotated and isinstance(inside[1], Range):
-            if is_number(value, inside[0]) and inside[1].low <= value <= inside[1].high:
+            huge = isinstance(value, int) and abs(value) >= 2**1024  # no floating number
+            if is_number(value, inside[0]) and inside[1].low <= value <= inside[1].high and not huge:
                 return False
         elif origin is typing.Annotated and inside == (float, ANY):
             if is_number(value, float) and (not abs(value) >= 1e308 or isinstance(value, float)):

@@ -3,6 +3,8 @@
 import dataclasses
 import inspect
 import typing
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +13,16 @@ import pytest
 from tests.hostile.arguments import (
     HOSTILE,
     broken,
+    crooked,
     hints_of,
     is_wrong,
     public,
     sample,
     sample_tensor,
-    special,
     spoilt,
     tensors_in,
 )
-from torchgrasp.border import ANY
+from torchgrasp.border import ANY, RIGID
 from torchgrasp.errors import BadArgument
 
 MADE_INSIDE = {
@@ -44,22 +46,32 @@ def behind(thing: Any) -> bool:
     return hasattr(thing, "__border__")
 
 
-def checked_things() -> dict[str, tuple[Any, Any]]:
-    """Return what is called, and what has its annotations, by name: functions, methods of a valid object, values."""
-    found: dict[str, tuple[Any, Any]] = {}
+def checked_things() -> dict[str, tuple[Callable[[], Any], Any]]:
+    """Return what gives each function, value and method of a value to call, and what has its annotations, by name."""
+    found: dict[str, tuple[Callable[[], Any], Any]] = {}
     for name, thing in public().items():
         if inspect.isfunction(thing) and behind(thing):
-            found[name] = thing, thing
+            found[name] = partial(_itself, thing), thing
         elif inspect.isclass(thing):
             if behind(thing.__init__) and dataclasses.is_dataclass(thing):
-                found[name] = thing, thing
+                found[name] = partial(_itself, thing), thing
             for key, method in vars(thing).items():
                 inner = method.__func__ if isinstance(method, classmethod | staticmethod) else method
                 if inspect.isfunction(inner) and behind(inner) and not key.startswith("_"):
-                    owner = thing if isinstance(method, classmethod | staticmethod) else special(thing)
-                    if owner is not None:
-                        found[f"{name}.{key}"] = getattr(owner, key), inner
+                    still = isinstance(method, classmethod | staticmethod)
+                    found[f"{name}.{key}"] = partial(_method, thing, key, still), inner
     return found
+
+
+def _itself(thing: Any) -> Any:
+    return thing
+
+
+def _method(thing: type, key: str, still: bool) -> Any:
+    return getattr(thing if still else sample(thing, Path("x")), key)
+
+
+THINGS = checked_things()
 
 
 def test_every_public_function_and_value_is_behind_the_border():
@@ -74,10 +86,11 @@ def test_every_public_function_and_value_is_behind_the_border():
 
 
 @pytest.mark.promise("I1")
-@pytest.mark.parametrize("name", sorted(checked_things()))
+@pytest.mark.parametrize("name", sorted(THINGS))
 @pytest.mark.filterwarnings("ignore")  # torch warns of some odd layouts
 def test_wrong_arguments_are_refused_by_name(name, tmp_path):
-    call, annotated = checked_things()[name]
+    make, annotated = THINGS[name]
+    call = make()
     hints, parameters = hints_of(annotated), inspect.signature(call).parameters
     required = {
         key: sample(hints[key], tmp_path)
@@ -109,6 +122,8 @@ def wrong_values(hint: Any) -> list[Any]:
         bare = getattr(tensor, "__origin__", tensor)
         valid = sample_tensor(bare)
         values += [value for how, value in broken(valid).items() if how in NO_NUMBERS or is_wrong(value, hint)]
+        if getattr(tensor, "__metadata__", ())[:1] == (RIGID,):
+            values += crooked(valid)
         if getattr(tensor, "__metadata__", ())[:1] != (ANY,):
             values += spoilt(valid).values()
     return values

@@ -7,7 +7,8 @@ than one argument, or on what a file holds, stays in the function.
 
 from torchgrasp.border.checked import checked
 from torchgrasp.border.paths import check_path
-from torchgrasp.border.ranges import ANY, FINITE, LEAST, Count, Fraction, Length, Measured, Positive, Range, Seed
+from torchgrasp.border.ranges import ANY, FINITE, LEAST, RIGID, Count, Fraction, Length, Measured
+from torchgrasp.border.ranges import Pose, Poses, Positive, Range, Rows, Seed
 from torchgrasp.border.tensors import check_moved, check_tensor, show
 
 __all__ = [
@@ -18,8 +19,12 @@ __all__ = [
     "Fraction",
     "Length",
     "Measured",
+    "Pose",
+    "Poses",
     "Positive",
+    "RIGID",
     "Range",
+    "Rows",
     "Seed",
     "check_moved",
     "check_path",

@@ -85,7 +85,7 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
         for name, (read, kind) in readers().items():
             if name in bound.arguments:
                 bound.arguments[name] = _read(read, kind, name, bound.arguments[name], shared)
-        shared.check_finite()
+        shared.check_numbers()
         _thread.inside = True
         try:
             return function(*bound.args, **bound.kwargs)

@@ -16,7 +16,7 @@ from jaxtyping import AbstractArray
 from torch import Tensor
 
 from torchgrasp.border.paths import check_path
-from torchgrasp.border.ranges import ANY, FINITE, MOST, Range
+from torchgrasp.border.ranges import ANY, FINITE, MOST, RIGID, Range, Rows
 from torchgrasp.border.tensors import Call, TensorHint, check_dense, show
 from torchgrasp.errors import BadArgument
 
@@ -62,7 +62,7 @@ def _number(kind: Callable[[Any], Any], allowed: Range) -> tuple[Reader, str]:
         if not isinstance(value, numbers.Integral if kind is int else numbers.Real):
             return False
         least: Any = allowed.low  # integers of any length are compared as they are, and NaN is in no range
-        return bool(least <= value <= allowed.high)
+        return bool(least <= value <= allowed.high) and (abs(value) <= MOST or isinstance(value, float))
 
     def read(name: str, value: Any, call: Call) -> Any:
         if not is_good(value):
@@ -132,11 +132,19 @@ def _annotated(hint: Any, mark: Any) -> tuple[Reader, str]:
     def read(name: str, value: Any, call: Call) -> Any:
         if mark == ANY and hint is float and isinstance(value, float):
             return value
+        if isinstance(mark, Rows):
+            result = inner(name, value, call)
+            if (wanted := call.sizes.setdefault(mark.letter, len(result))) != len(result):
+                raise BadArgument(name, f"{len(result)} rows", f"{wanted}, as many as the others have")
+            return result
         if mark not in (ANY, FINITE) or (mark == ANY and call.strict):
-            return inner(name, value, call)
-        own = Call(
-            call.gradients, call.deep, call.strict or mark == FINITE, call.sizes, call.found if mark == FINITE else {}
-        )
+            result = inner(name, value, call)
+            if mark == RIGID:
+                call.rigid[name] = result
+            return result
+        own = Call(call.gradients, call.deep, call.strict or mark == FINITE, call.sizes)
+        own.found = call.found if mark == FINITE else own.found
+        own.rigid = call.rigid
         result = inner(name, value, own)
         call.sizes = own.sizes
         return result

@@ -6,7 +6,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchgrasp.border.ranges import RIGID
 from torchgrasp.errors import BadArgument
+from torchgrasp.frames import is_rigid
 
 DTYPES = {
     "Float": (torch.float32, torch.float64),
@@ -22,7 +24,7 @@ class Call:
 
     `deep` looks into values; from inside, they were looked into where they were made. `strict` asks for finite numbers
     in fields that need none, too. `sizes` are the lengths bound to letters so far;
-    `found` are tensors whose numbers must be finite, by name.
+    `found` are tensors whose numbers must be finite, by name, and `rigid` those that must be rigid transforms.
     """
 
     gradients: bool
@@ -30,24 +32,28 @@ class Call:
     strict: bool = False
     sizes: dict[str, Any] = dataclasses.field(default_factory=dict[str, Any])
     found: dict[str, Tensor] = dataclasses.field(default_factory=dict[str, Tensor])
+    rigid: dict[str, Tensor] = dataclasses.field(default_factory=dict[str, Tensor])
 
     def inner(self, strict: bool = False) -> "Call":
         """Return the same for the fields of a value: their letters are their own."""
-        return Call(self.gradients, self.deep, self.strict or strict, {}, self.found)
+        return Call(self.gradients, self.deep, self.strict or strict, {}, self.found, self.rigid)
 
-    def check_finite(self) -> None:
-        """Refuse NaN and infinity, with one wait for each device; raise `BadArgument`."""
-        finite: dict[str, Tensor] = {name: torch.isfinite(x).all() for name, x in self.found.items()}
-        by_device: dict[torch.device, list[str]] = {}
-        for name, flag in finite.items():
-            by_device.setdefault(flag.device, []).append(name)
-        for names in by_device.values():
-            if bool(torch.stack([finite[name] for name in names]).all()):
+    def check_numbers(self) -> None:
+        """Refuse NaN, infinity and transforms that are not rigid, with one wait for each device."""
+        good = {(name, "finite numbers"): torch.isfinite(x) for name, x in self.found.items()}
+        good |= {(name, RIGID): is_rigid(x) for name, x in self.rigid.items()}
+        by_device: dict[torch.device, list[tuple[str, str]]] = {}
+        for key, flags in good.items():
+            by_device.setdefault(flags.device, []).append(key)
+        for keys in by_device.values():
+            if bool(torch.stack([good[key].all() for key in keys]).all()):
                 continue
-            name = next(name for name in names if not bool(finite[name]))
-            first = torch.nonzero(~torch.isfinite(self.found[name]))[0].tolist()
-            found = f"{self.found[name][tuple(first)].item()} at index {first}"
-            raise BadArgument(name, found, "finite numbers")
+            name, allowed = next(key for key in keys if not bool(good[key].all()))
+            first = tuple(torch.nonzero(~good[name, allowed])[0].tolist())
+            value = (self.rigid if allowed == RIGID else self.found)[name][first]
+            place = f" at index {list(first)}" if first else ""
+            found = value.item() if value.ndim == 0 else value.tolist()
+            raise BadArgument(name, f"{found}{place}", allowed)
 
 
 SHOWN = 60
@@ -150,7 +156,7 @@ def check_tensor(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor
     call = Call(gradients=True)
     TensorHint("Float", " ".join("_" if s is None else str(s) for s in shape)).read(name, value, call)
     call.found[name] = value
-    call.check_finite()
+    call.check_numbers()
     return value
 
 

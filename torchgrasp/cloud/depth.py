@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.border import check_tensor, checked
+from torchgrasp.border import RIGID, check_tensor, checked
 from torchgrasp.cloud.check import check_cloud
 from torchgrasp.errors import BadArgument, TooFewPoints
-from torchgrasp.frames import apply, rotate
+from torchgrasp.frames import apply, is_rigid, rotate
 from torchgrasp.linalg import unit
 from torchgrasp.values import PointCloud
 
@@ -170,8 +170,6 @@ def _describe(value: object) -> str:
 def check_rigid(name: str, pose: Tensor) -> Float[Tensor, "4 4"]:
     """Return a transform that is rigid to 1e-4; refuse others."""
     check_tensor(name, pose, (4, 4))
-    rotation, eye = pose[:3, :3].double(), torch.eye(3, dtype=torch.float64, device=pose.device)
-    error = float((rotation @ rotation.T - eye).abs().max())
-    if error > 1e-4 or float(torch.linalg.det(rotation)) < 0 or pose[3].tolist() != [0, 0, 0, 1]:
-        raise BadArgument(name, pose.tolist(), "a rigid transform: a right-handed rotation, and the row 0 0 0 1")
+    if not bool(is_rigid(pose)):
+        raise BadArgument(name, pose.tolist(), RIGID)
     return pose

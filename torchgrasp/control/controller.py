@@ -2,14 +2,14 @@
 
 import functools
 from collections.abc import Callable
-from typing import get_args
+from typing import Annotated, get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import check_device, settle
-from torchgrasp.border import checked
+from torchgrasp.border import Range, checked
 from torchgrasp.control.closing import FixedGainClosing, LawClosing, OpenLoopClosing, PositionClosing, Revision
 from torchgrasp.control.holding.force import ForceHold, PositionHold
 from torchgrasp.control.holding.grip import GripHold
@@ -28,6 +28,8 @@ Step = Callable[[Observation, float], Float[Tensor, " j"]]
 CLOSING_TIME = 4.0
 """Longest time [s] of closing before the hand presses with what it has: a fingertip travels 0.16 m in it."""
 
+Tick = Annotated[float, Range(1e-5, 1.0)]
+"""Time [s] from one tick to the next: drives are asked at 10 Hz to 1 kHz, and time does not go back."""
 PRESSING_TIME = 0.5
 """Time [s] from the end of closing until the hand counts as closed: the forces have risen (`RAMP`)."""
 
@@ -116,12 +118,16 @@ class GraspController:
         return self.closing.share if acts and isinstance(self.closing, LawClosing) else nothing
 
     @checked
-    def step(self, observation: Observation, period: float) -> Targets:
+    def step(self, observation: Observation, period: Tick) -> Targets:
         """Return the targets of joints and palm for the next tick, a period [s] later.
 
         Raises:
-            BadArgument: an observation on another device than the CPU.
+            BadArgument: an observation of another hand, or on another device than the CPU; a period outside `Tick`.
         """
+        shape = len(self.reference.normals), 3, len(self.targets.joints)
+        found = tuple(observation.jacobian.shape)
+        if found != shape or observation.tactile.reading.shape != shape[:1]:
+            raise BadArgument("observation", f"fingertips, 3 and joints {found}", f"those of the hand, {shape}")
         check_device("observation", observation.joints.device, "the controller", self.targets.joints.device)
         over = self.closing.done or self.time >= CLOSING_TIME
         if self.hold is None and over and not isinstance(self.closing, OpenLoopClosing):

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import Positive, Range, check_tensor, checked
+from torchgrasp.border import Pose, Positive, Range, check_tensor, checked
 from torchgrasp.closing import ClosingGains
 from torchgrasp.control.closing_law import (
     FORCE_BANDWIDTH,
@@ -63,7 +63,7 @@ class ClosingReference(Value):
 
     hand: Hand
     kp: Float[Tensor, " j"]
-    obj_from_hand: Float[Tensor, "4 4"]
+    obj_from_hand: Pose
     pregrasp: Float[Tensor, " h"]
     joints: Float[Tensor, " h"]
     squeeze: Float[Tensor, " h"]
@@ -95,14 +95,14 @@ class ClosingReference(Value):
 
         Raises:
             BadArgument: not exactly one row, joints or fingers of another hand, a force or stiffness that is not
-                positive, or numbers in the grasp that are not finite.
+                positive, joints beyond their limits, or numbers in the grasp that are not finite.
         """
         if len(grasp) != 1:
             raise BadArgument("grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]")
         check_squeeze(hand, grasp, force, kp)
         contacts = grasp.contacts
-        check_tensor("grasp.joints", grasp.joints, (1, hand.dof))
-        check_tensor("grasp.obj_from_hand", grasp.obj_from_hand, (1, 4, 4))
+        hand.actuated.check_limits(grasp.joints, "grasp.joints")
+        hand.actuated.check_limits(grasp.pregrasp, "grasp.pregrasp")
         check_tensor("grasp.contacts.points", contacts.points, (1, len(hand.tips), 3))
         check_tensor("grasp.contacts.normals", contacts.normals, (1, len(hand.tips), 3))
         std_m = check_tensor("grasp.contacts.std_m", contacts.std_m, (1, len(hand.tips))).to("cpu", torch.float64)

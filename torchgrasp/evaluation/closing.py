@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.border import Seed, checked
+from torchgrasp.border import Pose, Seed, checked
 from torchgrasp.control.closing import PALM_REACH
 from torchgrasp.control.controller import GraspController, check_modes
 from torchgrasp.control.holding.grip import GripHold
@@ -55,7 +55,7 @@ class GraspTrial:
     grasp: Grasps
     mesh: "trimesh.Trimesh | Path | str"
     seed: Seed = 0
-    error: Float[Tensor, "4 4"] | None = None
+    error: Pose | None = None
     belief: ShapeGP | None = None
     parts: "Sequence[trimesh.Trimesh] | None" = None
     table: Plane | None = None

@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from torchgrasp.border import Seed, checked
+from torchgrasp.border import Pose, Seed, checked
 from torchgrasp.closing import ClosingTrace, ClosureResult, Disturbance, ObjectMotion
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun, smooth_step
@@ -48,7 +46,7 @@ def close_hand(
     spec: TrialSpec | None = None,
     seed: Seed = 0,
     *,
-    error: Float[Tensor, "4 4"] | None = None,
+    error: Pose | None = None,
     belief: ShapeGP | None = None,
     parts: "Sequence[trimesh.Trimesh] | None" = None,
     table: Plane | None = None,

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import check_whole
-from torchgrasp.border import Range, Seed, checked
+from torchgrasp.border import Pose, Range, Seed, checked
 from torchgrasp.cloud.camera import FOCAL, HEIGHT, WIDTH, look_at
 from torchgrasp.datasets import read_object_mesh
 from torchgrasp.errors import BadArgument
@@ -76,7 +76,7 @@ class PlacedScene:
     names: tuple[str, ...]
     meshes: "tuple[trimesh.Trimesh, ...]"
     parts: "tuple[tuple[trimesh.Trimesh, ...], ...]"
-    camera_pose: Float[Tensor, "4 4"]
+    camera_pose: Pose
 
     def __len__(self) -> int:
         """Count the objects."""

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import Count, Length, Range, Seed, check_tensor, checked
+from torchgrasp.border import Count, Length, Pose, Range, Seed, check_tensor, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import inverse, rigid, rotation_from_vector
 from torchgrasp.specs import TrialSpec
@@ -132,7 +132,7 @@ def find_protocol(protocol: Protocol | str) -> Protocol:
 
 
 @checked
-def apply_error(obj_from_hand: Float[Tensor, "4 4"], error: Float[Tensor, "4 4"] | None) -> Float[Tensor, "4 4"]:
+def apply_error(obj_from_hand: Pose, error: Pose | None) -> Float[Tensor, "4 4"]:
     """Return the true pose of a hand from its planned pose and the error in it, on the CPU in float64.
 
     Raises:
@@ -191,9 +191,7 @@ def draw_object_poses(noise: PoseNoise, pivot: Float[Tensor, "3"], count: Count,
     return rigid(rotation, noise.translation * drawn[:, [1, 2, 2]] * (1 - up) + pivot - rotation @ pivot)
 
 
-def error_from_object_pose(
-    obj_from_hand: Float[Tensor, "4 4"], object_pose: Float[Tensor, "4 4"]
-) -> Float[Tensor, "4 4"]:
+def error_from_object_pose(obj_from_hand: Pose, object_pose: Pose) -> Float[Tensor, "4 4"]:
     """Return the error of a hand whose object is elsewhere."""
     return inverse(obj_from_hand) @ inverse(object_pose) @ obj_from_hand
 

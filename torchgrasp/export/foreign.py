@@ -4,9 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.border import Length, checked
+from torchgrasp.border import Length, Poses, checked
 from torchgrasp.control.closing_law import damped_inverse
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.errors import Status
 from torchgrasp.frames import apply, rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.plan.certify import certify
@@ -15,15 +15,13 @@ from torchgrasp.values import Contacts, Grasps
 
 OPENING, OPENING_STEPS = 0.02, 4
 """How far [m] fingertips stand off where no pre-grasp is given, and in how many linear steps: within 1 mm."""
-RIGID = 1e-6
-"""Largest error of a rotation matrix, beyond rounding in float32."""
 
 
 @checked
 def grasps_from_joints(
     hand: Hand,
     joints: Float[Tensor, "g h"],
-    obj_from_hand: Float[Tensor, "g 4 4"],
+    obj_from_hand: Poses,
     pregrasp: Float[Tensor, "g h"] | None = None,
     spec: ContactSpec | None = None,
     std_m: Length | None = None,
@@ -54,7 +52,6 @@ def grasps_from_joints(
     """
     hand, joints, pose = hand.to("cpu", torch.float64), joints.double().cpu(), obj_from_hand.double().cpu()
     hand.check_joints(joints)
-    _check_rigid(pose)
     pads, pad_normals = hand.fingertips(joints)
     normals = -rotate(pose, pad_normals)
     std = None if std_m is None else torch.full_like(normals[..., 0], std_m)
@@ -83,17 +80,6 @@ def grasps_from_joints(
             "units": "metre, radian",
         },
     )
-
-
-def _check_rigid(pose: Float[Tensor, "g 4 4"]) -> None:
-    """Refuse poses that are not rigid."""
-    rotation, last = pose[:, :3, :3], pose[:, 3]
-    error = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().amax((1, 2))
-    bad = ~(error <= RIGID) | (torch.linalg.det(rotation) < 0) | (last != torch.eye(4, dtype=torch.float64)[3]).any(1)
-    if bool(bad.any()):
-        raise BadArgument(
-            "obj_from_hand", f"pose {int(bad.int().argmax())} that is not rigid", "rotations, translations"
-        )
 
 
 def _open(hand: Hand, joints: Float[Tensor, "g h"], away: Float[Tensor, "g f 3"]) -> Float[Tensor, "g h"]:

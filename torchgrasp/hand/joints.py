@@ -48,28 +48,28 @@ class ActuatedJoints(Value):
         """Return every movable joint without a check, for which the host would wait for a GPU."""
         return joints @ self.coupling.to(joints).T + self.offset.to(joints)
 
-    def check(self, joints: Tensor) -> None:
+    def check(self, joints: Tensor, name: str = "joints") -> None:
         """Refuse joints of a wrong count, dtype or device, NaN and infinity."""
         if joints.ndim < 1 or joints.shape[-1] != len(self.names):
             wanted = f"{len(self.names)} joints last: {self.names}"
-            raise BadArgument("joints", f"shape {tuple(joints.shape)}", wanted)
+            raise BadArgument(name, f"shape {tuple(joints.shape)}", wanted)
         if joints.dtype not in (torch.float32, torch.float64):
-            raise BadArgument("joints", str(joints.dtype), "torch.float32 or torch.float64")
-        check_device("joints", joints.device, "the hand", self.lower.device)
+            raise BadArgument(name, str(joints.dtype), "torch.float32 or torch.float64")
+        check_device(name, joints.device, "the hand", self.lower.device)
         finite = torch.isfinite(joints)
         if not bool(finite.all()):
             value, k = _first(joints, ~finite)
-            raise BadArgument("joints", f"{value} for {self.names[k]}", "finite numbers")
+            raise BadArgument(name, f"{value} for {self.names[k]}", "finite numbers")
 
-    def check_limits(self, joints: Tensor) -> None:
+    def check_limits(self, joints: Tensor, name: str = "joints") -> None:
         """Refuse joints beyond their limits, too."""
-        self.check(joints)
+        self.check(joints, name)
         low, high = self.lower.to(joints), self.upper.to(joints)
         wrong = (joints < low - ROUNDING) | (joints > high + ROUNDING)
         if bool(wrong.any()):
             value, k = _first(joints, wrong)
             allowed = f"[{self.lower[k].item():.6g}, {self.upper[k].item():.6g}]"
-            raise BadArgument("joints", f"{value:.6g} for {self.names[k]}", allowed)
+            raise BadArgument(name, f"{value:.6g} for {self.names[k]}", allowed)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,13 +2,14 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value
-from torchgrasp.border import Length, checked
+from torchgrasp.border import Length, Rows, checked
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.frames import rotate
 from torchgrasp.hand.hand import Hand
@@ -47,8 +48,8 @@ class GraspProblem(Value):
     """
 
     hand: Hand
-    contacts: Contacts
-    certificate: Certificate
+    contacts: Annotated[Contacts, Rows("b")]
+    certificate: Annotated[Certificate, Rows("b")]
     world: CollisionWorld
     center: Float[Tensor, "3"]
     reachable: Reachable | None = None
@@ -91,9 +92,9 @@ class GraspCandidates(Batch):
     1
     """
 
-    configuration: Configuration
-    contacts: Contacts
-    certificate: Certificate
+    configuration: Annotated[Configuration, Rows("g")]
+    contacts: Annotated[Contacts, Rows("g")]
+    certificate: Annotated[Certificate, Rows("g")]
     permutation: Int[Tensor, "g f"]
     status: Int[Tensor, "g"]
 

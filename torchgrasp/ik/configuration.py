@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value
-from torchgrasp.border import checked
+from torchgrasp.border import Poses, checked
 from torchgrasp.frames import rigid, rotation_from_vector
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import map_points
@@ -35,7 +35,7 @@ class Configuration(Batch):
     """
 
     joints: Float[Tensor, "g h"]
-    obj_from_hand: Float[Tensor, "g 4 4"]
+    obj_from_hand: Poses
 
     def integrate(self, hand: Hand, step: Float[Tensor, "g d"]) -> "Configuration":
         """Step by a translation [m], a rotation vector (both in the hand's axes) and joints, clamped to the limits."""

@@ -60,6 +60,14 @@ class PostureLibrary(Value):
     feature: Float[Tensor, "s d"]
     spheres: Float[Tensor, "s k 3"]
 
+    def __post_init__(self) -> None:
+        """Refuse postures of another hand."""
+        f, spheres = len(self.hand.tips), len(self.hand.collision_spheres.radius)
+        wanted = (self.hand.dof, f, 6 * f, spheres)
+        found = tuple(x.shape[1] for x in (self.joints, self.centres, self.feature, self.spheres))
+        if found != wanted:
+            raise BadArgument("library", f"joints, tips, features and spheres {found}", f"those of the hand, {wanted}")
+
     @classmethod
     @checked
     def of(cls, hand: Hand, count: Count | None = None, seed: Seed = 0) -> "PostureLibrary":

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import checked
+from torchgrasp.border import Pose, checked
 from torchgrasp.cloud.depth import frustum_of_image
 from torchgrasp.frames import apply, inverse, rotate
 from torchgrasp.plane import GRID
@@ -30,7 +30,7 @@ class DepthImage(Value):
 
     depth: Float[Tensor, "h w"]
     intrinsics: Float[Tensor, "3 3"]
-    obj_from_camera: Float[Tensor, "4 4"]
+    obj_from_camera: Pose
     bounded: bool = True  # whether its border is the camera's; an image made of a cloud has none
 
     @property
@@ -40,7 +40,7 @@ class DepthImage(Value):
             return None
         return rotate(self.obj_from_camera.double(), frustum_of_image(self.intrinsics.double(), self.depth.shape))
 
-    def to_upright(self, obj_from_upright: Float[Tensor, "4 4"]) -> "DepthImage":
+    def to_upright(self, obj_from_upright: Pose) -> "DepthImage":
         """Return the image with its camera in an upright frame, rounded."""
         pose = inverse(obj_from_upright.double()).to(self.obj_from_camera.device) @ self.obj_from_camera.double()
         return dataclasses.replace(self, obj_from_camera=torch.round(pose / GRID**1.5) * GRID**1.5)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import checked
+from torchgrasp.border import Pose, checked
 from torchgrasp.cloud.depth import read_depth
 from torchgrasp.errors import BadArgument
 from torchgrasp.plane import Plane, to_upright
@@ -231,18 +231,27 @@ class Scene(Value):
 
     @checked
     def rows_of(self, label: int | None = None) -> Bool[Tensor, "n"]:
-        """Tell which points are a thing's, by default the target's."""
-        return self.labels == (self.target if label is None else label)
+        """Tell which points are a thing's, by default the target's: none where there is no target."""
+        label = self.target if label is None else label
+        return torch.zeros_like(self.labels, dtype=torch.bool) if label is None else self.labels == label
 
     @checked
     def cloud(self, label: int | None = None) -> PointCloud:
-        """Return the points of a thing, by default the target, with the camera as viewpoint."""
-        frustum = self.image.frustum
+        """Return the points of a thing, by default the target, with the camera as viewpoint.
+
+        Raises:
+            BadArgument: a label of nothing, or no target.
+            TooFewPoints: fewer than 4 points.
+        """
+        rows, frustum = self.rows_of(label), self.image.frustum
+        if not bool(rows.any()):
+            found = f"{label if label is not None else self.target}, of which no point is seen"
+            raise BadArgument("label", found, f"one of {list(self.things)}")
         sides = None if frustum is None else frustum.to(self.points)
-        return PointCloud(self.points[self.rows_of(label)], None, self.viewpoint.to(self.points), sides)
+        return PointCloud(self.points[rows], None, self.viewpoint.to(self.points), sides)
 
     @checked
-    def to_upright(self, obj_from_upright: Float[Tensor, "4 4"]) -> "Scene":
+    def to_upright(self, obj_from_upright: Pose) -> "Scene":
         """Return the scene in the `upright_frame` of its target and table, all rounded."""
         obj_from_upright = obj_from_upright.double()
         return dataclasses.replace(

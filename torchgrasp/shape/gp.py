@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value, map_tensors
-from torchgrasp.border import Positive, Range, Seed, check_tensor, checked
+from torchgrasp.border import Pose, Positive, Range, Seed, check_tensor, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply
 from torchgrasp.linalg import cholesky, unit
@@ -238,7 +238,7 @@ class ShapeGP(Posterior, Normalisation):
         return dataclasses.replace(self, **_fields(append_observations(self, new), Posterior))
 
     @checked
-    def moved(self, b_from_a: Float[Tensor, "4 4"]) -> "ShapeGP":
+    def moved(self, b_from_a: Pose) -> "ShapeGP":
         """Return the shape in frame b [m]; it is given in frame a. Its normalised frame turns along."""
         rotation, n = b_from_a[:3, :3].to(self.x), len(self.x)
 
