@@ -22,14 +22,15 @@ from torchgrasp.errors import BadArgument, Status
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ClosingMode, ClosingPart, HoldingMode, check_closing_parts, check_sensor
 
+Tick = Annotated[float, Range(1e-5, 1.0)]
+"""Time [s] from one tick to the next: drives are asked at 10 Hz to 1 kHz, and time does not go back."""
+
 Step = Callable[[Observation, float], Float[Tensor, " j"]]
 """Turns what is known, and the time to the next tick [s], into the targets of all joints [rad]."""
 
 CLOSING_TIME = 4.0
 """Longest time [s] of closing before the hand presses with what it has: a fingertip travels 0.16 m in it."""
 
-Tick = Annotated[float, Range(1e-5, 1.0)]
-"""Time [s] from one tick to the next: drives are asked at 10 Hz to 1 kHz, and time does not go back."""
 PRESSING_TIME = 0.5
 """Time [s] from the end of closing until the hand counts as closed: the forces have risen (`RAMP`)."""
 

@@ -30,7 +30,7 @@ ALWAYS = 0.98
 FIRST_LOOK = 1000
 """Postures after which links that overlap in each are left alone: of those in `ALWAYS`, one in 10^9 does."""
 MOST_TESTS = 20_000_000
-"""Most separations of near shapes [each 0.6 us] left to measure after a look, 12 s; the Shadow hand measures 2 million in all."""
+"""Most separations of near shapes [each 0.6 us] left to measure after a look, 12 s; Shadow has 2 million in all."""
 ROWS_PER_CHUNK, NUMBERS_PER_CHUNK = 1000, 500_000
 """Most postures tested at a time, and most separations: 400 MB where all are of boxes that are near."""
 

@@ -393,3 +393,12 @@ def test_a_mesh_of_too_many_faces_is_refused_before_its_faces_are_read(tmp_path)
     (tmp_path / "mesh.ply").write_bytes("\n".join(header).encode())  # no body: nobody gets that far
     with pytest.raises(CloudFileError, match="500001 faces"):
         read_cloud(tmp_path / "mesh.ply")
+
+
+def test_a_header_of_many_properties_is_refused_before_its_faces_are_read(tmp_path):
+    """1500 lists took the reader of trimesh 10 s."""
+    header = ["ply", "format binary_little_endian 1.0", "element vertex 3", "property float x", "property float y"]
+    header += ["property float z", "element face 1", *(f"property list uchar int p{k}" for k in range(254))]
+    (tmp_path / "mesh.ply").write_bytes("\n".join([*header, "end_header\n"]).encode() + bytes(10_000))
+    with pytest.raises(CloudFileError, match="257 properties"):
+        read_cloud(tmp_path / "mesh.ply")
