@@ -62,7 +62,7 @@ def _number(kind: Callable[[Any], Any], allowed: Range) -> tuple[Reader, str]:
         if not isinstance(value, numbers.Integral if kind is int else numbers.Real):
             return False
         least: Any = allowed.low  # integers of any length are compared as they are, and NaN is in no range
-        return bool(least <= value <= allowed.high) and (abs(value) <= MOST or isinstance(value, float))
+        return bool(least <= value <= allowed.high and (abs(value) <= MOST or isinstance(value, float)))
 
     def read(name: str, value: Any, call: Call) -> Any:
         if not is_good(value):

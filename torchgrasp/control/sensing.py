@@ -27,6 +27,7 @@ from torchgrasp.control.tactile import (
     no_contact,
     sample,
 )
+from torchgrasp.errors import BadArgument
 
 FLAGGED = 0.3
 """Reading [N] that stands for a flag: that of a finger which waits, so that the force loop leaves it where it is."""
@@ -71,6 +72,9 @@ def feel_torques(
         torques: of all joints [N m] that hold against contacts: without those for weight, friction and acceleration.
         period: since the state before [s].
 
+    Raises:
+        BadArgument: a jacobian of another hand.
+
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.objects import load_shipped_grasp
     >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
@@ -79,6 +83,11 @@ def feel_torques(
     >>> feel_torques(no_contact(), reference, jacobian, none, 0.01).contact
     tensor([False, False, False])
     """
+    jacobian, torques = jacobian.double(), torques.double()
+    shape = len(reference.normals), 3, len(reference.kp)
+    if jacobian.shape != shape:
+        found = f"fingertips, 3 and joints {tuple(jacobian.shape)}"
+        raise BadArgument("jacobian", found, f"those of the hand, {shape}")
     forces_by, radius = _forces_by_torques(reference, jacobian), reference.hand.tips.radius
     told = measure(tactile, _pushes(reference, forces_by @ torques), reference.normals, radius, period)
     if told.reading is tactile.reading:

@@ -143,7 +143,7 @@ def lift_clearance(vertices: Float[Tensor, "v 3"], obstacles: Obstacles, up: Flo
     True
     """
     up = torch.tensor([0.0, 0.0, 1.0]) if up is None else up
-    return float(obstacles.field.query(_lifted(vertices, up))[0].min())
+    return float(obstacles.field.query(_lifted(vertices, up))[0].min()) if len(vertices) else math.inf
 
 
 def _closing(hand: Hand, configuration: Configuration, pregrasp: Float[Tensor, "g h"]) -> Float[Tensor, "g k s 3"]:
