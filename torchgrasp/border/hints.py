@@ -61,8 +61,8 @@ def _number(kind: Callable[[Any], Any], allowed: Range) -> tuple[Reader, str]:
             return kind is bool and type(value).__name__ in ("bool", "bool_")
         if not isinstance(value, numbers.Integral if kind is int else numbers.Real):
             return False
-        least: Any = allowed.low  # integers of any length are compared as they are, and NaN is in no range
-        return bool(least <= value <= allowed.high and (abs(value) <= MOST or isinstance(value, float)))
+        x: Any = value  # integers of any length are compared as they are, and NaN is in no range
+        return bool(allowed.low <= x <= allowed.high and (abs(x) <= MOST or isinstance(x, float)))
 
     def read(name: str, value: Any, call: Call) -> Any:
         if not is_good(value):

@@ -7,6 +7,9 @@ from torch import Tensor
 
 from torchgrasp.linalg import unit
 
+BLOCK = 1 << 14
+"""Points about which quadrics are fitted at once: in some 100 MiB, whatever the size of the cloud."""
+
 
 def draw_rows(count: int, most: int) -> Int[Tensor, "m"]:
     """Return the indices of at most so many points, drawn with a fixed seed, ascending."""
@@ -50,7 +53,16 @@ def fit_quadrics(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Fl
 
     Planes would move points of a ball of radius r inward by s^2 / 2r, where s is the neighbours' spread.
     """
-    near, weight = _neighbourhood(points, 30)  # five for each of a quadric's six unknowns
+    distance, index = nearest(points, 30)  # five for each of a quadric's six unknowns
+    blocks = zip(points.split(BLOCK), distance.split(BLOCK), index.split(BLOCK), strict=True)
+    feet, normals, rms = zip(*(_fit_block(at, points[rows], _weigh(d)) for at, d, rows in blocks), strict=True)
+    return torch.cat(feet), torch.cat(normals), torch.cat(rms)
+
+
+def _fit_block(
+    points: Float[Tensor, "m 3"], near: Float[Tensor, "m k 3"], weight: Float[Tensor, "m k"]
+) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"], Float[Tensor, "m"]]:
+    """Return the same about some points, given the points near each."""
     _, axes = _principal_axes(near, weight)
     height, u, v = ((near - points[:, None]) @ axes).unbind(-1)
     size = torch.stack([u, v], -1).norm(dim=-1).amax(-1, keepdim=True)
@@ -69,10 +81,15 @@ def fit_quadrics(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Fl
 def _neighbourhood(
     points: Float[Tensor, "n 3"], k: int, rows: Int[Tensor, "m"] | None = None
 ) -> tuple[Float[Tensor, "m k 3"], Float[Tensor, "m k"]]:
-    """Return the k nearest points and their weights exp(-(d / 0.7 d_k)^2), normalised."""
+    """Return the k nearest points and their weights."""
     distance, index = nearest(points, k, rows)
+    return points[index], _weigh(distance)
+
+
+def _weigh(distance: Float[Tensor, "m k"]) -> Float[Tensor, "m k"]:
+    """Return the weights exp(-(d / 0.7 d_k)^2) of near points, normalised."""
     weight = torch.exp(-((distance / (0.7 * distance[:, -1:])) ** 2))
-    return points[index], weight / weight.sum(-1, keepdim=True)
+    return weight / weight.sum(-1, keepdim=True)
 
 
 def _principal_axes(
