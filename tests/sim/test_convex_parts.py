@@ -6,7 +6,7 @@ import trimesh
 
 from torchgrasp.errors import MeshError
 from torchgrasp.objects import load_object
-from torchgrasp.sim.convex_parts import check_parts, convex_parts
+from torchgrasp.sim.convex_parts import check_parts, convex_parts, hull
 
 
 def bracket():
@@ -84,3 +84,9 @@ def test_a_cube_whose_faces_are_flat_but_for_rounding_errors_gives_a_closed_part
     assert cube.is_convex and not cube.convex_hull.is_watertight
     (part,) = check_parts(convex_parts(cube, tmp_path))
     assert part.volume == pytest.approx(0.04**3, rel=1e-4)
+
+
+def test_corners_in_a_plane_have_no_volume():
+    corners = np.zeros((12, 3))
+    corners[0, 0], corners[10], corners[11] = -0.016, (-0.0325, 0.0, -0.0263), (-0.0325, 0.0, 0.0263)
+    assert hull(corners).volume == 0

@@ -75,8 +75,9 @@ def hull(corners: np.ndarray) -> "trimesh.Trimesh":
     """Return the convex hull of corners; Qhull may leave one open whose faces are flat but for rounding errors."""
     import trimesh
 
-    body = trimesh.convex.convex_hull(corners)
-    return body if body.is_watertight else trimesh.convex.convex_hull(np.round(corners, 6))
+    with np.errstate(divide="ignore", invalid="ignore"):  # of corners in a plane, by their volume: zero
+        body = trimesh.convex.convex_hull(corners)
+        return body if body.is_watertight else trimesh.convex.convex_hull(np.round(corners, 6))
 
 
 def _filled(parts: "list[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
