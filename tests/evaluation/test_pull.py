@@ -112,7 +112,7 @@ def test_bad_arguments_are_named():
         pull_grasp(dataclasses.replace(trial, grasp=grasp[:0]))
     with pytest.raises(BadArgument, match="force: found -1"):
         QUICK.with_trial(force=-1.0)
-    with pytest.raises(BadArgument, match="joints: found 9 for"):
+    with pytest.raises(BadArgument, match=r"grasp\.pregrasp: found 9 for"):
         pull_grasp(dataclasses.replace(trial, grasp=dataclasses.replace(grasp, pregrasp=grasp.pregrasp * 0 + 9)))
     with pytest.raises(BadArgument, match="error: found"):
         pull_grasp(dataclasses.replace(trial, error=torch.full((4, 4), math.nan)))

@@ -101,14 +101,14 @@ class ClosingReference(Value):
             raise BadArgument("grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]")
         check_squeeze(hand, grasp, force, kp)
         contacts = grasp.contacts
-        hand.actuated.check_limits(grasp.joints, "grasp.joints")
-        hand.actuated.check_limits(grasp.pregrasp, "grasp.pregrasp")
         check_tensor("grasp.contacts.points", contacts.points, (1, len(hand.tips), 3))
         check_tensor("grasp.contacts.normals", contacts.normals, (1, len(hand.tips), 3))
         std_m = check_tensor("grasp.contacts.std_m", contacts.std_m, (1, len(hand.tips))).to("cpu", torch.float64)
         if stability is not None:
             hand.require_three("stability", "a model of stability")
         hand, grasp = hand.to("cpu", torch.float64), grasp.to("cpu", torch.float64)
+        hand.actuated.check_limits(grasp.joints, "grasp.joints")
+        hand.actuated.check_limits(grasp.pregrasp, "grasp.pregrasp")
         points, normals = contacts_in_hand(grasp)
         preferred = deviation = None
         sure = FORCE_FLOOR

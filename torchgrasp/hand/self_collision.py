@@ -34,6 +34,9 @@ class SelfCollision(Value):
     >>> pairs, pushed = links.separations(frames, torch.inf), links.pushes(frames, below=0.01)[0]
     >>> torch.allclose(links.clearance(frames), pairs.amin(0)), len(links.link_pairs()) <= len(pushed)
     (True, True)
+    >>> near = links.only(pairs.amin(1) < 0.01)  # those of its pairs that come this near
+    >>> near.count_near(frames, 0.01) == len(near.pairs) <= links.count_near(frames, 0.01)
+    True
     """
 
     link: Int[Tensor, " s"]
