@@ -13,6 +13,7 @@ from torchgrasp.linalg import (
     squared_distance,
     squared_mahalanobis,
     unit,
+    unit_of_any,
 )
 
 
@@ -49,6 +50,16 @@ def test_unit(generator):
     v = torch.randn(9, 3, generator=generator)
     torch.testing.assert_close(unit(v).norm(dim=-1), torch.ones(9))
     assert bool(torch.isnan(unit(torch.zeros(3))).all())
+
+
+def test_a_direction_of_any_length_has_one(generator):
+    v = torch.randn(50, 3, generator=generator, dtype=torch.float64)
+    for length in (1.0, 1e-300, 1e160, 1e300):
+        assert torch.allclose(unit_of_any(v * length), unit(v), rtol=0, atol=1e-15)
+    for length in (1.0, 1e-9, 1e9):
+        assert torch.equal(unit_of_any(v * length), unit(v * length))
+    assert torch.equal(unit_of_any(v.float()), unit(v.float()))
+    assert bool(unit_of_any(torch.zeros(1, 3)).isnan().all())
 
 
 def test_farthest_points_are_all_points_when_there_are_few(generator):

@@ -19,6 +19,12 @@ def unit(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
     return v / torch.linalg.vector_norm(v, dim=-1, keepdim=True)
 
 
+def unit_of_any(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
+    """Return `unit` of vectors whose squares may overflow or vanish, and the same bits of all others."""
+    exponent = torch.frexp(v.abs().amax(-1, keepdim=True)).exponent - 1
+    return unit(v / torch.pow(torch.full_like(v[..., :1], 2.0), exponent))  # a power of two rounds nothing
+
+
 def fibonacci_sphere(n: int, angle: float = math.pi * (1 + math.sqrt(5)), start: float = 0.5) -> Float[Tensor, "n 3"]:
     """Return n unit vectors spread evenly over the sphere, from +z to -z, in float64.
 

@@ -12,7 +12,7 @@ from torchgrasp.cloud.depth import check_rigid
 from torchgrasp.cloud.prepare import estimate_normals
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, rotate
-from torchgrasp.linalg import unit
+from torchgrasp.linalg import unit_of_any
 from torchgrasp.values import PointCloud
 
 
@@ -63,7 +63,7 @@ def _view_in_frame(cloud: PointCloud, obj_from_cloud: Float[Tensor, "4 4"]) -> P
     cloud = estimate_normals(cloud) if cloud.normals is None else cloud
     assert cloud.normals is not None
     pose, dtype = obj_from_cloud.to(cloud.points).double(), cloud.points.dtype
-    points, normals = apply(pose, cloud.points.double()), rotate(pose, unit(cloud.normals.double()))
+    points, normals = apply(pose, cloud.points.double()), rotate(pose, unit_of_any(cloud.normals.double()))
     viewpoint, frustum = cloud.viewpoint, cloud.frustum
     if viewpoint is not None:
         viewpoint = apply(pose, viewpoint.double().reshape(-1, 3)).reshape(viewpoint.shape).to(dtype)

@@ -11,7 +11,7 @@ from torchgrasp.base import Value, map_tensors
 from torchgrasp.border import Pose, Positive, Range, Seed, check_tensor, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply
-from torchgrasp.linalg import cholesky, unit
+from torchgrasp.linalg import cholesky, unit, unit_of_any
 from torchgrasp.plane import move
 from torchgrasp.shape.derivatives import ShapeDerivatives, carry_gradients
 from torchgrasp.shape.joint_posterior import JointEstimate, draw_samples, joint_estimate
@@ -228,7 +228,7 @@ class ShapeGP(Posterior, Normalisation):
         x = self._queries(points)
         direction = torch.zeros_like(x)
         if normals is not None:
-            direction = unit(normals.to(x))
+            direction = unit_of_any(normals.to(x))
             check_tensor("normals", direction, (len(x), 3))  # a normal of length 0 has become NaN
         new = on_surface(x, direction, torch.full_like(x[:, 0], noise / self.scale), normal_noise)
         return self.append(dataclasses.replace(new, has_normal=new.has_normal & (normals is not None)))
