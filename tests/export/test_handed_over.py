@@ -212,6 +212,15 @@ def test_a_malformed_file_is_refused_by_name(tmp_path, content):
         read_foreign(file, hand, hand.joint_names)
 
 
+def test_a_pose_of_too_few_numbers_is_refused_by_its_place(tmp_path):
+    hand, grasp = pinch("allegro")
+    content = json.loads(format_grasps(hand, grasp))
+    content["grasps"][0]["pose"]["position"].pop()
+    (tmp_path / "grasps.json").write_text(json.dumps(content))
+    with pytest.raises(BadArgument, match=r"grasps\[0\]\.pose\.position.*allowed is 3 numbers"):
+        read_foreign(tmp_path / "grasps.json", hand)
+
+
 def test_an_npz_of_pickles_wrong_shapes_or_nan_is_refused(tmp_path):
     hand, _ = pinch("allegro")
     file = tmp_path / "grasps.npz"

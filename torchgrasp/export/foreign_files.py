@@ -107,8 +107,8 @@ def _read_own(rows: Field, hand: Hand) -> ForeignGrasps:
             posture = _entry(_entry(fields, "joints", row).entries(), named, row).entries()
             values.append([_entry(posture, name, row).number(-FAR, FAR) for name in hand.joint_names])
         pose = _entry(fields, "pose", row).entries()
-        parts = [*_entry(pose, "position", row).items(3), *_entry(pose, "quaternion_wxyz", row).items(4)]
-        poses.append([part.number(-FAR, FAR) for part in parts])
+        position, quaternion = _entry(pose, "position", row), _entry(pose, "quaternion_wxyz", row)
+        poses.append([*_numbers(position, 3), *_numbers(quaternion, 4)])
     h = len(hand.joint_names)
     return ForeignGrasps(
         torch.tensor(joints, dtype=torch.float64).reshape(-1, h),
@@ -126,10 +126,15 @@ def _entry(fields: dict[str, Field], name: str, row: Field) -> Field:
 
 def _table(field: Field, width: int) -> np.ndarray:
     """Return a list of lists of so many numbers."""
-    rows = [[x.number(-FAR, FAR) for x in row.items(width)] for row in field.items(MOST_GRASPS)]
-    if any(len(row) != width for row in rows):
-        raise field.wrong(f"rows of {width} numbers")
-    return np.array(rows, dtype=float).reshape(-1, width)
+    return np.array([_numbers(row, width) for row in field.items(MOST_GRASPS)], dtype=float).reshape(-1, width)
+
+
+def _numbers(field: Field, count: int) -> list[float]:
+    """Return so many numbers, no more and no fewer."""
+    numbers = [x.number(-FAR, FAR) for x in field.items(count)]
+    if len(numbers) != count:
+        raise field.wrong(f"{count} numbers")
+    return numbers
 
 
 def _read_bench(path: Path, hand: Hand, order: tuple[str, ...], quaternion: Quaternion) -> ForeignGrasps:

@@ -402,3 +402,13 @@ def test_a_header_of_many_properties_is_refused_before_its_faces_are_read(tmp_pa
     (tmp_path / "mesh.ply").write_bytes("\n".join([*header, "end_header\n"]).encode() + bytes(10_000))
     with pytest.raises(CloudFileError, match="257 properties"):
         read_cloud(tmp_path / "mesh.ply")
+
+
+def test_columns_whose_squares_overflow_are_no_normals(tmp_path, points):
+    table = np.concatenate([points, np.tile([0.0, 0.0, 1.0], (len(points), 1))], 1)
+    table[0, 3] = 1e200
+    np.save(tmp_path / "table.npy", table)
+    assert read_cloud_file(tmp_path / "table.npy").cloud.normals is not None  # one of many: the others are normals
+    table[:, 3] = 1e200
+    np.save(tmp_path / "table.npy", table)
+    assert read_cloud_file(tmp_path / "table.npy").cloud.normals is None

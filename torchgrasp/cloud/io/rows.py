@@ -123,7 +123,7 @@ def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dic
     if table.shape[-1] == 6:
         more = table[..., 3:].reshape(-1, 3).astype(np.float64)
         more = more[np.isfinite(more).all(1) & more.any(1)]
-        length = np.linalg.norm(more, axis=1)
+        length = np.linalg.norm(more.clip(-2, 2), axis=1)  # no unit vector has more, and squares would overflow
         if len(more) and np.mean(np.abs(length - 1) < UNIT_LENGTH) >= MOST_UNIT:
             split["normals"] = table[..., 3:]
         else:
