@@ -63,6 +63,15 @@ def test_bad_meshes_are_refused(mesh, reason):
         read_mesh(mesh())
 
 
+def test_a_mesh_of_a_plane_is_refused(tmp_path):
+    """Its surface is closed, but its corners have two numbers: the third of every `v` is missing."""
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    lines = [f"v {x} {y}" for x, y, _ in box.vertices] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in box.faces]
+    (tmp_path / "flat.obj").write_text("\n".join(lines) + "\n")
+    with pytest.raises(MeshError, match="allowed is"):
+        read_mesh(tmp_path / "flat.obj")
+
+
 def test_a_hollow_body_is_sound():
     hole = trimesh.creation.box((0.08, 0.08, 0.08))
     hole.invert()

@@ -59,6 +59,9 @@ def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
     """Raise `MeshError` unless a mesh bounds a volume."""
     if not 0 < len(mesh.faces) <= MAX_FACES:
         raise MeshError("mesh", f"{name} of {len(mesh.faces)} faces", f"a closed mesh of at most {MAX_FACES} triangles")
+    if mesh.faces.shape[1] != 3 or mesh.vertices.shape[1] != 3:
+        found = f"{name} of faces {mesh.faces.shape} and vertices {mesh.vertices.shape}"
+        raise MeshError("mesh", found, "triangles in space")
     if not np.isfinite(mesh.vertices).all():
         raise MeshError("mesh", f"{name} with a non-finite vertex", "finite vertices [m]")
     if not mesh.is_watertight:
