@@ -21,6 +21,9 @@ class Condition(NamedTuple):
     drawn: bool = False
 
 
+IN_MUJOCO = ", MuJoCo"
+"""What the name of a condition ends with whose trials run in MuJoCo."""
+
 CONDITIONS = {
     "in place": Condition(),
     "5 mm": Condition(0.005),
@@ -31,8 +34,9 @@ CONDITIONS = {
     "drawn": Condition(drawn=True),
     "drawn, 10 mm": Condition(0.01, drawn=True),
     "10 mm, real mass, friction unknown": Condition(0.01, unknown=True),
-    "10 mm, MuJoCo": Condition(0.01, simulator="mujoco"),
-    "20 mm, MuJoCo": Condition(0.02, simulator="mujoco"),
+    f"in place{IN_MUJOCO}": Condition(simulator="mujoco"),
+    f"10 mm{IN_MUJOCO}": Condition(0.01, simulator="mujoco"),
+    f"20 mm{IN_MUJOCO}": Condition(0.02, simulator="mujoco"),
     "afloat, in place": Condition(afloat="dexgraspbench"),
     "afloat, friction 0.3": Condition(afloat="dexgraspbench-hard"),
     "afloat, 10 mm": Condition(0.01, afloat="dexgraspbench"),

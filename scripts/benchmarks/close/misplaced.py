@@ -19,8 +19,9 @@ import torch
 from paper.trials import CELL_SECONDS, Subject, TableSpec, subjects
 
 from benchmarks.close.ablation import median_over, swap_deviations
-from benchmarks.close.conditions import BARS, CONDITIONS, DEFAULT, FRAGILE, LAWS, SENSED, Condition, Law
+from benchmarks.close.conditions import BARS, CONDITIONS, DEFAULT, FRAGILE, IN_MUJOCO, LAWS, SENSED, Condition, Law
 from benchmarks.close.drawn import draw_solid
+from benchmarks.close.simulator_agreement import Verdicts, agreement_row
 from benchmarks.common import Row
 from torchgrasp import Grasps, Status, TrialSpec, load_hand, plan_grasps
 from torchgrasp.datasets import list_views, read_mass, read_object_mesh, read_view
@@ -95,7 +96,21 @@ def bench_misplaced(spec: TableSpec, conditions: Sequence[str] = (), laws: Seque
         if isinstance(outcome, Status):
             raise SystemExit(f"{task[1].name} {task[2]}: {outcome.sentence}")
         found += [Outcome(**one) for one in outcome]
-    return [row for hand in spec.hands for c in conditions for row in _rows(hand, c, laws, found)]
+    rows = [row for hand in spec.hands for c in conditions for row in _rows(hand, c, laws, found)]
+    return rows + _agreement_rows(found)
+
+
+def _agreement_rows(found: Sequence[Outcome]) -> list[Row]:
+    """Return the agreement of the simulators where both ran the same trials: in each condition, and in all."""
+    held = {(x.hand, x.object, x.rank, x.condition, x.law): x.held for x in found}
+    pairs: dict[str, list[Verdicts]] = {}
+    for x in found:
+        other = held.get((x.hand, x.object, x.rank, f"{x.condition}{IN_MUJOCO}", x.law))
+        if other is not None:
+            pairs.setdefault(f"{x.hand}, {x.condition}", []).append((x.family, x.held, other))
+    if len(pairs) > 1:
+        pairs["all of these"] = [one for verdicts in pairs.values() for one in verdicts]
+    return [agreement_row(name, verdicts) for name, verdicts in pairs.items()]
 
 
 def _rows(hand: str, condition: str, laws: Sequence[str], found: Sequence[Outcome]) -> Iterator[Row]:
