@@ -8,6 +8,7 @@ import torch
 from benchmarks.anytime.before import bench_before
 from benchmarks.anytime.cores import bench_many, bench_threads
 from benchmarks.anytime.course import Course, watch
+from benchmarks.anytime.field import bench_field
 from benchmarks.anytime.memory import bench_memory
 from benchmarks.anytime.peers import bench_peers
 from benchmarks.anytime.stream import bench_pull, bench_stream
@@ -36,7 +37,7 @@ def anytime(
 
     Args:
         objects: folder with manifest.json and a folder for each object.
-        only: subjects to measure: stream, before, pull, peers, many, threads, memory.
+        only: subjects to measure: stream, before, pull, peers, many, threads, memory, field.
         names: objects to keep; all by default.
         views: of each object, at most.
         hand: that grasps.
@@ -63,6 +64,7 @@ def anytime(
         "peers": lambda: bench_peers(clouds, all_courses(), model, SPEC, tries),
         "many": lambda: bench_many(clouds, model, SPEC, starts),
         "threads": lambda: bench_threads(clouds, model, SPEC, starts),
+        "field": lambda: bench_field(clouds),
         "memory": lambda: bench_memory(objects, chosen, hand, (starts, MANY)),
     }
     measure("anytime", subjects, only, {"hand": hand, "starts": starts, "views": len(chosen)}, out)
