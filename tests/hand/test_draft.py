@@ -184,6 +184,23 @@ def test_links_are_tested_until_they_are_settled(claw, monkeypatch):
         collision_pairs(crowded, coupling, n=3000)
 
 
+def test_too_many_shapes_in_one_place_are_refused_before_any_is_measured(tmp_path, monkeypatch):
+    rods = [
+        f'<link name="x{k}"><collision><geometry><box size="0.1 0.004 0.004"/></geometry></collision></link>'
+        f'<joint name="jx{k}" type="revolute"><parent link="base"/><child link="x{k}"/>'
+        f'<origin rpy="0 0 {0.02 * k}"/><axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/>'
+        "</joint>"
+        for k in range(150)
+    ]
+    path = tmp_path / "rods.urdf"
+    path.write_text(f'<robot name="rods"><link name="base"/>{"".join(rods)}</robot>')
+    urdf, measured = read_urdf(path), []
+    monkeypatch.setattr(SelfCollision, "separations", lambda *arguments: measured.append(arguments))
+    with limited(2**28), pytest.raises(HandFileError, match="11175000 separations are to be measured"):
+        collision_pairs(urdf, {})
+    assert not measured
+
+
 OVERLAPPING = "".join(
     f'<link name="{name}"><collision><geometry><sphere radius="0.001"/></geometry></collision></link>'
     f'<joint name="to_{name}" type="fixed"><parent link="base"/><child link="{name}"/><origin xyz="1 0 0"/></joint>'

@@ -29,10 +29,13 @@ ALWAYS = 0.98
 """Links that overlap in a larger share of the postures overlap by construction, and are no pair to test."""
 FIRST_LOOK = 1000
 """Postures after which links that overlap in each are left alone: of those in `ALWAYS`, one in 10^9 does."""
-MOST_TESTS = 20_000_000
-"""Most separations of near shapes [each 0.6 us] left to measure after a look, 12 s; Shadow has 2 million in all."""
-ROWS_PER_CHUNK, NUMBERS_PER_CHUNK = 1000, 500_000
-"""Most postures tested at a time, and most separations: 400 MB where all are of boxes that are near."""
+MOST_FIRST, MOST_TESTS = 2_000_000, 20_000_000
+"""Most separations of near shapes [each 0.6 us] to measure in the first look, and after a look in all that follow.
+
+Shadow has 0.5 million in the first look, and 2 million in all.
+"""
+ROWS_PER_CHUNK, NUMBERS_PER_CHUNK = 1000, 100_000
+"""Most postures tested at a time, and most separations: 200 MB where all are of boxes that are near."""
 
 
 def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, seed: int = 0) -> list[tuple[str, str]]:
@@ -52,11 +55,14 @@ def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, 
         return []
     links, owner = torch.unique(shapes.link[shapes.pairs].sort(1).values, dim=0, return_inverse=True)
     met, near = torch.zeros(2, len(links))
-    rows, done = max(1, min(ROWS_PER_CHUNK, NUMBERS_PER_CHUNK // len(shapes.pairs))), 0
+    done = 0
     for look in draw_postures(urdf, coupling, n, seed).split(FIRST_LOOK, 1):
         if not len(owner):
             break
-        frames = look.new_zeros(0)
+        rows = max(1, min(ROWS_PER_CHUNK, NUMBERS_PER_CHUNK // len(owner)))
+        frames = tree.frames(look[:, :rows])
+        if not done:
+            _limit_near(urdf, shapes, frames, look.shape[1], MOST_FIRST)
         for values in look.split(rows, 1):
             frames = tree.frames(values)
             apart = shapes.separations(frames, MEETING_DISTANCE)
@@ -69,12 +75,17 @@ def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, 
         settled = (met == torch.inf) | ((near > 0) & (met + (n - done) <= ALWAYS * n))  # whatever the rest says
         kept = ~settled[owner]
         shapes, owner = shapes.only(kept), owner[kept]
-        left = shapes.count_near(frames, MEETING_DISTANCE) * (n - done) // frames.shape[3]
-        if left > MOST_TESTS:
-            found = f"shapes of {len(owner)} pairs so near each other that {left} separations are to be measured"
-            raise urdf.wrong(found, f"at most {MOST_TESTS}: fewer shapes in one place")
+        _limit_near(urdf, shapes, frames, n - done, MOST_TESTS)
     meeting = links[(near > 0) & (met <= ALWAYS * n)]
     return [(tree.link_names[i], tree.link_names[j]) for i, j in meeting.tolist()]
+
+
+def _limit_near(urdf: Urdf, shapes: SelfCollision, frames: Float[Tensor, "3 4 l n"], ahead: int, most: int) -> None:
+    """Refuse shapes that, if the postures ahead are like those of `frames`, have too many separations to measure."""
+    left = shapes.count_near(frames, MEETING_DISTANCE) * ahead // frames.shape[3]
+    if left > most:
+        found = f"shapes of {len(shapes.pairs)} pairs so near each other that {left} separations are to be measured"
+        raise urdf.wrong(found, f"at most {most}: fewer shapes in one place")
 
 
 def draw_postures(urdf: Urdf, coupling: Mapping[str, Mimic], n: int, seed: int) -> Float[Tensor, "j n"]:
