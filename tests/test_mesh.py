@@ -1,5 +1,7 @@
 """Meshes: refusals, closest points of triangles against trimesh, and cuts against areas in closed form."""
 
+import contextlib
+
 import numpy as np
 import pytest
 import trimesh
@@ -175,3 +177,12 @@ def test_a_mesh_beyond_the_limits_is_refused_before_it_is_read(tmp_path, monkeyp
 def test_too_many_parts_are_refused_before_they_are_looked_at():
     with pytest.raises(MeshError, match="at most 1000"):
         check_parts([trimesh.Trimesh()] * 1001)
+
+
+def test_what_a_reader_logs_stays_with_it(tmp_path, caplog):
+    """A number too many on a line is no fault of the corners; trimesh tells of it with a traceback."""
+    text = trimesh.creation.box((0.1, 0.1, 0.1)).export(file_type="stl_ascii")
+    (tmp_path / "box.stl").write_text(text.replace("normal ", "normal x ", 1))
+    with contextlib.suppress(MeshError):
+        read_mesh(tmp_path / "box.stl")
+    assert not caplog.records

@@ -74,6 +74,9 @@ START = """torchgrasp: dexterous fingertip grasps from a partial point cloud
 All commands: torchgrasp --help. To read: README.md and docs/ of the repository."""
 """What `torchgrasp` alone prints."""
 
+STDERR = 2
+"""The last descriptor of a standard stream (POSIX)."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return its exit code. Errors end as one sentence on stderr.
@@ -88,6 +91,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     # The batches are small: a second thread costs more than it brings, and one gives the same bits on any machine.
     torch.set_num_threads(1)
+    with _open_streams():
+        return _run(given)
+
+
+def _run(given: list[str]) -> int:
+    """Run the command that the words name; return its exit code."""
     try:
         plain = contextlib.redirect_stderr(_WithoutMarkup(sys.stderr))  # pyright: ignore[reportArgumentType]
         with warnings.catch_warnings(), _end_in_order(), plain:
@@ -116,6 +125,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"torchgrasp: {error}", file=sys.stderr)
         _drop_stdout()
         return 2
+
+
+@contextlib.contextmanager
+def _open_streams() -> Iterator[None]:
+    """Lead the streams nowhere that the process was started without, as by a daemon.
+
+    Otherwise the first file that is opened takes their place, and what libraries print goes into it.
+    """
+    with contextlib.ExitStack() as stack:
+        if None in (sys.stdin, sys.stdout, sys.stderr):
+            while (free := os.open(os.devnull, os.O_RDWR)) <= STDERR:
+                pass
+            os.close(free)
+        nowhere = stack.enter_context(open(os.devnull, "w")) if None in (sys.stdout, sys.stderr) else None
+        if sys.stdout is None:
+            stack.enter_context(contextlib.redirect_stdout(nowhere))
+        if sys.stderr is None:
+            stack.enter_context(contextlib.redirect_stderr(nowhere))
+        yield
 
 
 def _drop_stdout() -> None:

@@ -1,7 +1,10 @@
 """Triangles of mesh files of strangers: one file each, nothing packed, and nothing that a file names is opened."""
 
+import contextlib
 import io
+import logging
 import re
+from collections.abc import Iterator
 from typing import Any
 
 SUFFIXES = (".obj", ".off", ".ply", ".stl")
@@ -34,7 +37,22 @@ def load_triangles(data: bytes, suffix: str, **options: Any) -> Any:
     if (faces := _count_faces(data, suffix)) > MAX_FACES:
         raise ValueError(f"a mesh of {faces} faces; at most {MAX_FACES}")
     # from memory and without a resolver: materials and textures beside it stay closed
-    return trimesh.load_mesh(io.BytesIO(data), file_type=suffix[1:], skip_materials=True, **options)
+    with _quiet(trimesh.util.log):
+        return trimesh.load_mesh(io.BytesIO(data), file_type=suffix[1:], skip_materials=True, **options)
+
+
+@contextlib.contextmanager
+def _quiet(log: logging.Logger) -> Iterator[None]:
+    """Keep what readers log to themselves: where nobody listens, Python prints it on stderr, traceback and all."""
+
+    def drop(record: logging.LogRecord) -> bool:
+        return False
+
+    log.addFilter(drop)
+    try:
+        yield
+    finally:
+        log.removeFilter(drop)
 
 
 def _count_faces(data: bytes, suffix: str) -> int:
