@@ -297,6 +297,7 @@ def test_model_files_cut_at_every_byte_of_the_header_or_changed_are_refused(tmp_
             pass
 
 
+@pytest.mark.promise("H4")
 def test_other_model_files_are_refused(tmp_path):
     whole = (hands_folder() / "barrett" / "mixture.safetensors").read_bytes()
 

@@ -101,6 +101,7 @@ def test_a_bad_entry_is_refused_by_field_and_the_others_are_read(tmp_path: Path,
     assert len(str(refused.value)) < 500
 
 
+@pytest.mark.promise("H2")
 @pytest.mark.parametrize("name", NAMES, ids=ascii)
 def test_a_name_is_one_part_of_a_path(tmp_path: Path, name: str):
     for entries in ({name: GOOD}, {"cup": {"views": {name: GOOD["views"]["v0"]}}}):
@@ -143,6 +144,7 @@ def test_a_view_that_is_not_there_is_named(tmp_path: Path):
         read_view(write(tmp_path, {"cup": GOOD}), "cup", "v1")
 
 
+@pytest.mark.promise("H2")
 def test_bad_entries_and_names_cost_their_objects_alone(tmp_path: Path):
     outside = tmp_path / "outside"
     put(outside)
@@ -157,6 +159,7 @@ def test_bad_entries_and_names_cost_their_objects_alone(tmp_path: Path):
     assert precious.read_text() == "precious" and not list(outside.glob("*.safetensors"))
 
 
+@pytest.mark.promise("H2")
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
 def test_two_names_never_share_a_file_of_grasps(tmp_path: Path):

@@ -9,6 +9,7 @@ import pytest
 LIST = [sys.executable, "-c", "import sys; from torchgrasp.cli import main; sys.exit(main(['objects']))"]
 
 
+@pytest.mark.promise("F3")
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="the system has no /dev/full")
 def test_a_full_disk_behind_stdout_is_named():
     with open("/dev/full", "w") as full:

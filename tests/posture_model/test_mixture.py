@@ -124,6 +124,7 @@ def tensors_of(mixture: GraspMixture) -> dict[str, torch.Tensor]:
     return {name: getattr(mixture, name).clone() for name in ("weights", "means", "covariances")}
 
 
+@pytest.mark.promise("H4")
 @pytest.mark.parametrize(
     ("name", "spoil"),
     [

@@ -169,6 +169,7 @@ def test_a_process_killed_at_random_moments_is_continued_to_the_same_bytes(
     print(f"{name}: {killed} kills, {lasts:.1f} s undisturbed")
 
 
+@pytest.mark.promise("F4", "F5")
 @pytest.mark.parametrize("how", ["hangs", "dies", "is killed"])
 def test_a_worker_that_is_lost_costs_its_own_row_and_the_row_says_so(how: str, tmp_path: Path):
     pytest.importorskip("pebble")
