@@ -141,6 +141,18 @@ def test_closing_ends_in_time_and_a_holding_takes_over(closing):
     assert controller.closed
 
 
+@pytest.mark.parametrize("holding", ["force", "grip", "position", "law"])
+def test_targets_stay_while_the_forces_of_the_holding_are_sought(holding):
+    controller = GraspController(reference(), holding=holding)
+    seen = observation(contact=TOUCHING, reading=(2.0, 2.0, 4.0))
+    while controller.hold is None:
+        before = controller.targets.joints
+        targets = controller.step(seen, PERIOD)
+    assert torch.equal(targets.joints, before) and controller.pressed == 0.0
+    controller.step(seen, PERIOD)
+    assert controller.pressed == PERIOD
+
+
 def test_the_first_targets_are_the_opened_hand_and_unknown_names_are_refused():
     assert torch.equal(GraspController(reference()).targets.joints, reference().pregrasp)
     with pytest.raises((BadArgument, TypeError), match="slow"):

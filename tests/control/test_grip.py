@@ -10,7 +10,7 @@ import torch
 from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
 from torchgrasp.control.holding.friction import PRIOR_STD, FrictionBelief
 from torchgrasp.control.holding.grip import LEAST_PUSH, GripHold
-from torchgrasp.control.holding.least_forces import LeastForces, friction_ratios, grasp_map
+from torchgrasp.control.holding.least_forces import LeastForces, balance, friction_ratios, grasp_map
 from torchgrasp.control.observation import Observation
 from torchgrasp.errors import Status
 from torchgrasp.plane import Plane
@@ -24,7 +24,7 @@ def solve(load: list[float], friction: float, floor=FLOOR) -> np.ndarray:
     """Least forces, by as many calls as ticks of a tenth of a second."""
     solver = LeastForces(GAINS.desired_force.numpy().copy(), np.ones(1), 100.0)
     for _ in range(10):
-        forces = solver.solve(POINTS, OUTWARD, FREE, np.array(load, float), friction, floor)
+        forces = solver.solve(balance(POINTS), OUTWARD, FREE, np.array(load, float), friction, floor)
     return forces
 
 
@@ -57,6 +57,20 @@ def test_forces_carry_the_load_within_the_cones_with_little_more_than_the_least_
     assert (push > FLOOR).all()
     least = least_sum(np.array(load, float), friction)
     assert 0.999 * least < push.sum() < 1.15 * least
+
+
+@pytest.mark.parametrize("fingertips", [3, 4, 5])
+def test_one_decomposition_gives_grasp_map_inverse_and_null_space(fingertips):
+    generator = np.random.default_rng(fingertips)
+    points, forces = generator.normal(size=(2, fingertips, 3))
+    found, arms = balance(points), points - points.mean(0)
+    total = np.concatenate([forces.sum(0), np.cross(arms, forces).sum(0)])
+    np.testing.assert_allclose(found.wrench @ forces.ravel(), total, atol=1e-12)
+    np.testing.assert_allclose(found.inverse, np.linalg.pinv(found.wrench), atol=1e-12)
+    np.testing.assert_allclose(found.wrench @ found.free, 0.0, atol=1e-12)
+    np.testing.assert_allclose(found.free.T @ found.free, np.eye(3 * fingertips - 6), atol=1e-12)
+    line = balance(np.arange(fingertips)[:, None] * np.array([0.0, 0.01, 0.02]))
+    assert np.isfinite(line.inverse).all() and abs(line.inverse).max() < 1e3
 
 
 def test_floors_are_kept():

@@ -143,6 +143,17 @@ def test_three_contacts_are_searched_and_centred_alike():
     assert float((searched - centred)[good].median()) < 0.02
 
 
+@pytest.mark.parametrize("uneven", [False, True])
+def test_few_sets_of_three_contacts_and_many_are_searched_alike(uneven):
+    points, normals = tripods(20, 8)
+    preferred = points.new_tensor([1.0, 2.0, 3.0]).expand(20, 3) if uneven else None
+    together = least_friction_forces(points, normals, 4.0, preferred)
+    assert int(torch.isfinite(together).flatten(1).all(1).sum()) > 15
+    for k in range(20):
+        alone = least_friction_forces(points[k], normals[k], 4.0, None if preferred is None else preferred[k])
+        torch.testing.assert_close(alone, together[k], rtol=0, atol=1e-9, equal_nan=True)
+
+
 def test_four_fingers_against_a_thumb_press_with_a_quarter_each_or_as_is_preferred():
     corners = [[0.03, y, z] for y, z in ((-0.02, -0.02), (-0.02, 0.02), (0.02, -0.02), (0.02, 0.02))]
     points = torch.tensor([*corners, [-0.03, 0.0, 0.0]], dtype=torch.float64)

@@ -122,6 +122,8 @@ class GraspController:
     def step(self, observation: Observation, period: Tick) -> Targets:
         """Return the targets of joints and palm for the next tick, a period [s] later.
 
+        In the tick in which the closing ends its targets stay: the holding's forces are sought instead.
+
         Raises:
             BadArgument: an observation of another hand, or on another device than the CPU; a period outside `Tick`.
         """
@@ -132,8 +134,8 @@ class GraspController:
         check_device("observation", observation.joints.device, "the controller", self.targets.joints.device)
         over = self.closing.done or self.time >= CLOSING_TIME
         if self.hold is None and over and not isinstance(self.closing, OpenLoopClosing):
-            self.hold = self._hold(self.reference, observation, self.targets.joints)
-        if self.hold is None:
+            self.hold, joints = self._hold(self.reference, observation, self.targets.joints), self.targets.joints
+        elif self.hold is None:
             self.time += period
             joints = self.closing(observation, period)
         else:

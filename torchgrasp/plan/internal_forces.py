@@ -4,9 +4,11 @@ Of three contacts a push along each side of the triangle spans the null space of
 directions in it: balance holds by construction. More contacts have a method of centres (`cone_forces`).
 """
 
+import functools
 import math
-from typing import Annotated
+from typing import Annotated, Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -20,6 +22,8 @@ DIRECTIONS, NEIGHBOURS = 1024, 64
 """Directions in the null space that are tried first, 0.06 rad apart, and around the best in each refinement."""
 REFINEMENTS, SHRINK = 24, 0.75
 """Rounds of the search, and the radius of each over the last: from 0.12 rad down to 1e-4 rad."""
+FEW = 8
+"""Sets of contacts up to which NumPy searches sooner than torch."""
 EVENNESS = 0.01
 """Worth of equal normal forces against the friction angle (its tangent): it decides only between equally good sets."""
 PREFERENCE = 0.2
@@ -102,27 +106,56 @@ def _search_forces(
 ) -> Float[Tensor, "*b 3 3"]:
     """Return the forces of three contacts, NaN where none push everywhere."""
     basis = internal_forces(points)
-    preferred = None if preferred is None else (preferred / preferred.amax(-1, keepdim=True))[..., None, :]
+    push = -(basis * normals[..., None, :, :]).sum(-1)
+    slide = basis + push[..., None] * normals[..., None, :, :]
+    asked = [push.mT.reshape(-1, 3, 3), slide.flatten(-2).mT.reshape(-1, 9, 3)]
+    if preferred is not None:
+        asked.append((preferred / preferred.amax(-1, keepdim=True)).expand(push.shape[:-1]).reshape(-1, 3, 1))
+    asked = [x.detach().double() for x in asked]
+    if len(asked[0]) <= FEW and not points.is_cuda:
+        with np.errstate(over="ignore", invalid="ignore"):  # of contacts that are not finite, or far away
+            weights, cost = map(torch.from_numpy, _search_weights(np, *(x.numpy() for x in asked)))
+    else:
+        weights, cost = _search_weights(torch, *asked)
+    forces = torch.einsum("...k,...kci->...ci", weights.to(points).reshape(points.shape[:-1]), basis)
+    return torch.where(torch.isfinite(cost).reshape(points.shape[:-2])[..., None, None], forces, torch.nan)
 
-    def best(weights: Float[Tensor, "*b k 3"]) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b"]]:
-        """Return the best of k combinations, and its cost; infinite where a contact pulls."""
-        forces = torch.einsum("...jk,...kci->...jci", weights, basis)
-        outward = normals[..., None, :, :]
-        push = -(forces * outward).sum(-1)
+
+def _search_weights(space: Any, push: Any, slide: Any, preferred: Any = None) -> tuple[Any, Any]:
+    """Return the best weights of the pushes for each of b sets, and their costs; infinite where a contact pulls.
+
+    Args:
+        space: `torch`, or `numpy` with arrays: the fewer the sets, the more of the time goes into calls.
+        push: (b, 3, 3), normal forces at each contact of each push.
+        slide: (b, 9, 3), tangential forces at each contact of each push.
+        preferred: (b, 3, 1), proportions of the normal forces; None: equal ones.
+    """
+    rows, rounds = space.arange(len(push), device=push.device), _rounds()
+    if space is torch:
+        rounds = tuple(torch.from_numpy(x).to(push.device) for x in rounds)
+    weights = space.zeros_like(push[:, 0])
+    cost = weights[:, 0]
+    for steps in rounds:
+        tried = weights[:, :, None] + steps
+        normal = (push @ tried).clip(min=1e-12)
+        across = slide @ tried
+        ratio = space.amax((across * across).reshape(len(push), 3, 3, -1).sum(2) / (normal * normal), 1) ** 0.5
+        least, most = space.amin(normal, 1), space.amax(normal, 1)
         if preferred is None:
-            uneven = EVENNESS * push.amax(-1) / push.amin(-1).clamp_min(1e-12)
+            uneven = EVENNESS * most / least
         else:
-            uneven = PREFERENCE * torch.linalg.vector_norm(push / push.amax(-1, keepdim=True) - preferred, dim=-1)
-        cost = tangential_ratio(forces, outward.expand_as(forces)).amax(-1) + uneven
-        least = cost.argmin(-1, keepdim=True)
-        index = least[..., None].expand(*least.shape, 3)
-        return weights.gather(-2, index)[..., 0, :], cost.gather(-1, least)[..., 0]
+            off = normal / most[:, None] - preferred
+            uneven = PREFERENCE * (off * off).sum(1) ** 0.5
+        costs = space.where(least > 1e-12, ratio + uneven, math.inf)
+        best = space.argmin(costs, -1)
+        weights, cost = tried[rows, :, best], costs[rows, best]
+        weights = weights / (weights * weights).sum(-1)[:, None] ** 0.5
+    return weights, cost
 
-    weights, cost = best(fibonacci_sphere(DIRECTIONS, GOLDEN_ANGLE, 0.0).to(points).expand(*points.shape[:-2], -1, 3))
-    around, radius = fibonacci_sphere(NEIGHBOURS, GOLDEN_ANGLE, 0.0).to(points), 4 / math.sqrt(DIRECTIONS)
-    for _ in range(REFINEMENTS):
-        near = unit(weights[..., None, :] + radius * around)
-        weights, cost = best(torch.cat([weights[..., None, :], near], dim=-2))
-        radius *= SHRINK
-    forces = torch.einsum("...k,...kci->...ci", weights, basis)
-    return torch.where(torch.isfinite(cost)[..., None, None], forces, torch.nan)
+
+@functools.cache
+def _rounds() -> tuple[np.ndarray, ...]:
+    """Return the steps that each round of the search tries: all directions first, then ever shorter ones."""
+    around = np.concatenate([np.zeros((1, 3)), fibonacci_sphere(NEIGHBOURS, GOLDEN_ANGLE, 0.0).numpy()]).T
+    radii = 4 / math.sqrt(DIRECTIONS) * SHRINK ** np.arange(REFINEMENTS)
+    return fibonacci_sphere(DIRECTIONS, GOLDEN_ANGLE, 0.0).numpy().T.copy(), *(radius * around for radius in radii)

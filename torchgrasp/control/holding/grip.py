@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgrasp.control.holding.force import RAMP, held_forces
 from torchgrasp.control.holding.friction import CREEP_CUTOFF, CREEPING, LEAST_STD, SLIPPING, FrictionBelief
-from torchgrasp.control.holding.least_forces import LeastForces, friction_ratios, grasp_map
+from torchgrasp.control.holding.least_forces import Balance, LeastForces, balance, friction_ratios
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.state import Part
@@ -111,12 +111,12 @@ class GripHold(Part):
         """Return the targets of all joints for the next tick."""
         self.time += period
         jacobian = observation.jacobian.numpy()
-        points = self._feel(observation, period)
+        contacts = self._feel(observation, period)
         self._learn(observation, period)
         floor = np.maximum(self.grip, self.least)
-        wanted = self.solver.solve(points, self.normals, jacobian, self.load, self.aim, floor)
+        wanted = self.solver.solve(contacts, self.normals, jacobian, self.load, self.aim, floor)
         self._judge(wanted, jacobian, period)
-        step = self._command(points, wanted, period) - self.sent
+        step = self._command(contacts, wanted, period) - self.sent
         length = np.linalg.norm(step, axis=-1, keepdims=True)
         self.sent = self.sent + step * np.minimum(1.0, RISE * period / np.maximum(length, 1e-9))
         torque = np.einsum("cij,ci->j", jacobian, self.sent).clip(-self.solver.effort, self.solver.effort)
@@ -124,31 +124,29 @@ class GripHold(Part):
         lead = torch.from_numpy(torque) / self.reference.kp
         return self.start + share * (self.rest + lead - self.start)
 
-    def _command(self, points: np.ndarray, wanted: np.ndarray, period: float) -> np.ndarray:
+    def _command(self, contacts: Balance, wanted: np.ndarray, period: float) -> np.ndarray:
         """Return forces for the drives: the fingers' deflection bears what they do not carry."""
-        balance = grasp_map(points)
-        inverse = np.linalg.pinv(balance)
         if self.time > RAMP:
             lacking = ((self.felt - wanted) * self.normals).sum(-1)
             self.trim = self.trim - period * TRACKING * lacking[:, None] * self.normals
             flat = self.trim.ravel()
-            self.trim = (flat - inverse @ (balance @ flat)).reshape(-1, 3)
+            self.trim = (flat - contacts.inverse @ (contacts.wrench @ flat)).reshape(-1, 3)
             largest, bound = (float(np.linalg.norm(x, axis=-1).max()) for x in (self.trim, MOST_TRIM * wanted))
             self.trim = self.trim * min(1.0, bound / max(largest, 1e-9))
-        return wanted + self.trim - (inverse @ (self.load - CARRIED * self.carried)).reshape(-1, 3)
+        return wanted + self.trim - (contacts.inverse @ (self.load - CARRIED * self.carried)).reshape(-1, 3)
 
-    def _feel(self, observation: Observation, period: float) -> np.ndarray:
-        """Filter forces, load and normals; return where the fingertips touch [m]."""
+    def _feel(self, observation: Observation, period: float) -> Balance:
+        """Filter forces, load and normals; return how forces sum up where the fingertips touch."""
         normals = self._sensed(observation, self.normals)
         self.normals = self.normals + low_pass(PLACE_CUTOFF, period) * (normals - self.normals)
         self.normals /= np.linalg.norm(self.normals, axis=-1, keepdims=True)
-        points = observation.tips.numpy() - self.radius[:, None] * self.normals
+        contacts = balance(observation.tips.numpy() - self.radius[:, None] * self.normals)
         forces = observation.tactile.forces.numpy()
         self.felt = self.felt + low_pass(RATIO_CUTOFF, period) * (forces - self.felt)
-        load = self._weight(grasp_map(points) @ forces.ravel())
+        load = self._weight(contacts.wrench @ forces.ravel())
         self.load = self.load + low_pass(LOAD_CUTOFF, period) * (load - self.load)
         self.carried = self.carried + low_pass(CARRY_CUTOFF, period) * (load - self.carried)
-        return points
+        return contacts
 
     def _weight(self, load: np.ndarray) -> np.ndarray:
         """Return the part of a load that may be a weight: upwards, if a table is known, which bears the rest."""

@@ -8,6 +8,7 @@ over all forces that balance the load. Tensors of 3 x 3 cost more in calls than 
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -35,17 +36,38 @@ BEYOND = 1.05
 """Where no multiple reaches the cones, they are widened to this over the ratio needed; later ticks narrow them."""
 
 
+CROSS = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float)
+"""Rows of the matrices of the cross products with x, y and z, one a row."""
+
+FLAT = 1e-12
+"""Singular value of a grasp map, over its largest, below which forces cannot bear the load: contacts on one line."""
+
+
+class Balance(NamedTuple):
+    """How forces at contacts sum up: the grasp map, its pseudo-inverse, and k directions of forces that cancel."""
+
+    wrench: Float[Array, "6 n"]
+    inverse: Float[Array, "n 6"]
+    free: Float[Array, "n k"]
+
+
 def grasp_map(points: Float[Array, "f 3"]) -> Float[Array, "6 n"]:
     """Return the map from forces at points [m], one after the other, to force and torque about their centre.
 
     >>> grasp_map(np.eye(3)).shape
     (6, 9)
     """
-    x, y, z = (points - points.mean(0)).T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3, -1)
-    force = np.broadcast_to(np.eye(3)[:, :, None], cross.shape)
-    return np.concatenate([force, cross]).transpose(0, 2, 1).reshape(6, -1)
+    count = len(points)
+    cross = ((points - points.sum(0) / count) @ CROSS).reshape(count, 3, 3)
+    return np.concatenate([np.tile(np.eye(3), count), cross.transpose(1, 0, 2).reshape(3, -1)])
+
+
+def balance(points: Float[Array, "f 3"]) -> Balance:
+    """Return grasp map, its pseudo-inverse and its null space at points [m], by one decomposition."""
+    wrench = grasp_map(points)
+    left, values, right = np.linalg.svd(wrench)
+    inverse = np.where(values > FLAT * values[0], 1 / np.maximum(values, FLAT * values[0]), 0.0)
+    return Balance(wrench, (right[:6].T * inverse) @ left.T, right[6:].T)
 
 
 def friction_ratios(forces: Float[Array, "f 3"], normals: Float[Array, "f 3"]) -> Float[Array, "f"]:
@@ -73,7 +95,7 @@ class LeastForces(Part):
 
     def solve(
         self,
-        points: Float[Array, "f 3"],
+        balance: Balance,
         normals: Float[Array, "f 3"],
         jacobian: Float[Array, "f 3 j"],
         load: Float[Array, "6"],
@@ -84,10 +106,10 @@ class LeastForces(Part):
 
         Where none are found, those of the least friction so far.
         """
-        count = len(points)
+        count = len(normals)
         limits = np.concatenate([jacobian.reshape(3 * count, -1).T / self.effort[:, None], self._normal(normals)])
         gap = GAP * (float(np.linalg.norm(load[:3])) + float(floor.sum()))
-        barrier = _Barrier(grasp_map(points), normals, limits, load, gap)
+        barrier = _Barrier(balance, normals, limits, load, gap)
         tried = barrier.place(self.forces) + GROWTH[:, None] * barrier.place(self.start, 0.0)
         z = barrier.choose(tried, friction, floor)
         for _ in range(STEPS if math.isfinite(barrier.slack) else 0):  # no cone holds a finger that does not press
@@ -118,15 +140,14 @@ class _Barrier:
 
     def __init__(
         self,
-        balance: Float[Array, "6 n"],
+        balance: Balance,
         normals: Float[Array, "f 3"],
         limits: Float[Array, "l n"],
         load: Float[Array, "6"],
         gap: float,
     ) -> None:
         self.count, self.gap = len(normals), gap
-        self.basis = np.linalg.svd(balance)[2][6:].T
-        self.carried = np.linalg.lstsq(balance, load, rcond=None)[0]
+        self.basis, self.carried = balance.free, balance.inverse @ load
         self.rows = self.basis.reshape(self.count, 3, -1)
         self.spread = np.einsum("nik,nil->nkl", self.rows, self.rows)
         self.tau, self.tau_0 = limits @ self.basis, limits @ self.carried
