@@ -1,13 +1,13 @@
-"""Valid and hostile arguments of public functions, both made from their signatures; beartype says which are wrong."""
+"""Hostile arguments of public functions, made from their signatures; beartype says which are wrong."""
 
-import collections.abc
 import dataclasses
-import functools
 import importlib
 import inspect
 import pkgutil
 import types
 import typing
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,23 +19,12 @@ from jaxtyping import AbstractArray, jaxtyped
 from torch import Tensor
 
 import torchgrasp
-from torchgrasp import PointCloud, fit_shape, load_hand, load_object, load_scene
-from torchgrasp.border import ANY, Range
-from torchgrasp.control import ClosingReference, ControlRecorder, GraspController
-from torchgrasp.control.adaptive.belief import Belief
-from torchgrasp.control.adaptive.stability import NAMES, StabilityModel
+from tests.hostile.samples import Lengths, hints_of, sample, sample_tensor
+from torchgrasp.border import ANY, RIGID, Range
+from torchgrasp.border.checked import lengths_of
 from torchgrasp.errors import Status
-from torchgrasp.ik import GraspProblem, PostureLibrary
-from torchgrasp.objects import load_shipped_grasp
-from torchgrasp.plan import Shape
-from torchgrasp.posture_model import GaussianMixture, GraspMixture
-from torchgrasp.posture_model.encoding import CODE_NAMES
-from torchgrasp.shape import Kernel, thin_plate_kernel
-from torchgrasp.values import Certificate, Contacts, Grasps
 
 NAN, INF = float("nan"), float("inf")
-LENGTHS = {"b": 1, "n": 6, "g": 1, "f": 3, "t": 4, "k": 2, "v": 5, "q": 6, "c": 3}
-"""Lengths of the letters in samples; others are 4."""
 
 
 class Odd:
@@ -53,6 +42,13 @@ HOSTILE = [
     Status.OK, torch.device("cpu"), torch.float16, trimesh.Trimesh(),
 ]  # fmt: skip
 """What people and programs pass by mistake."""
+
+
+NO_PATHS = ["a" * 5000, "b" * 256, "c/" * 2500, "a\0b", "\ud800"]
+"""Texts that no file can be called; as paths, too, they are refused the same way."""
+NO_PATHS += [Path(text) for text in NO_PATHS]
+NO_NUMBERS = "meta", "sparse", "negative bit", "half", "bfloat16"
+"""Tensors that no annotation forbids, and the library does."""
 
 
 def broken(valid: Tensor) -> dict[str, Tensor]:
@@ -79,6 +75,13 @@ def broken(valid: Tensor) -> dict[str, Tensor]:
     return out
 
 
+def longer(valid: Tensor, hint: Any, own: Lengths) -> list[Tensor]:
+    """Return tensors that are too long along an axis whose length is given."""
+    axes, given = hint.dim_str.split(), len(valid.shape)
+    places = [k for k, axis in enumerate(axes[::-1]) if axis.isdigit() or axis in own]  # variable axes are first
+    return [torch.cat([valid, valid.narrow(-1 - k, 0, 1)], -1 - k) for k in places if k < given]
+
+
 def spoilt(valid: Tensor) -> dict[str, Tensor]:
     """Return tensors with one number that is none."""
     if not valid.is_floating_point() or not valid.numel():
@@ -90,131 +93,6 @@ def spoilt(valid: Tensor) -> dict[str, Tensor]:
 def crooked(valid: Tensor) -> list[Tensor]:
     """Return transforms that scale, mirror or shear, and one of zeros."""
     return [3 * valid, torch.diag(torch.tensor([-1.0, 1, 1, 1])).to(valid) @ valid, valid.cumsum(-1), 0 * valid]
-
-
-def hints_of(thing: Any) -> dict[str, Any]:
-    """Return the annotations of a function or dataclass with their marks."""
-    late = {"trimesh": trimesh, "StabilityModel": StabilityModel}
-    hints = typing.get_type_hints(thing, localns=late, include_extras=True)
-    return {name: hint for name, hint in hints.items() if name != "return"}
-
-
-@functools.cache
-def special(kind: type) -> Any:
-    """Return a valid object of a class whose fields depend on each other."""
-    half = torch.full((1, 7), 0.5, dtype=torch.float64)
-    mixture = (torch.ones(1, dtype=torch.float64), half, torch.eye(7, dtype=torch.float64)[None], ("j", *CODE_NAMES))
-    nine = GaussianMixture(torch.ones(1), torch.zeros(1, 9), torch.eye(9)[None], NAMES)
-    made = {
-        torchgrasp.Hand: lambda: load_hand("barrett"),
-        torchgrasp.Scene: load_scene,
-        torchgrasp.GraspObject: lambda: load_object("cylinder"),
-        PointCloud: few_points,
-        Grasps: lambda: load_shipped_grasp("jug", "barrett"),
-        Contacts: lambda: special(Grasps).contacts,
-        Certificate: lambda: special(Grasps).certificate,
-        ClosingReference: lambda: ClosingReference.from_grasp(special(torchgrasp.Hand), special(Grasps)),
-        GraspController: lambda: GraspController(special(ClosingReference)),
-        ControlRecorder: ControlRecorder,
-        Belief: lambda: Belief(special(torchgrasp.ShapeGP), torch.eye(4, dtype=torch.float64)),
-        GraspProblem: grasp_problem,
-        PostureLibrary: lambda: PostureLibrary.of(special(torchgrasp.Hand), 100),
-        torchgrasp.Plane: lambda: torchgrasp.Plane.horizontal(0.0),
-        torchgrasp.ShapeGP: lambda: fit_shape(special(PointCloud), budget=30),
-        Kernel: lambda: thin_plate_kernel(2.0),
-        GaussianMixture: lambda: GaussianMixture(*mixture),
-        GraspMixture: lambda: GraspMixture(*mixture),
-        StabilityModel: lambda: StabilityModel(nine, nine, 0.5),
-        trimesh.Trimesh: lambda: trimesh.creation.box([0.05, 0.05, 0.1]),
-        torch.Generator: lambda: torch.Generator().manual_seed(0),
-    }  # fmt: skip
-    return made[kind]() if kind in made else None
-
-
-def few_points() -> PointCloud:
-    """Return some of a shipped view."""
-    view = load_object("cylinder").view
-    return PointCloud(view.points[:150], None, view.viewpoint)
-
-
-def grasp_problem() -> GraspProblem:
-    """Return a problem of inverse kinematics, whose contacts have a deviation."""
-    fields = {name: sample(hint, Path()) for name, hint in hints_of(GraspProblem).items() if name != "reachable"}
-    std = torch.full_like(fields["contacts"].points[..., 0], 0.001)
-    return GraspProblem(**fields | {"contacts": dataclasses.replace(fields["contacts"], std_m=std)})
-
-
-def sample(hint: Any, path: Path) -> Any:
-    """Return a valid argument for an annotation."""
-    origin, inside = typing.get_origin(hint), typing.get_args(hint)
-    if origin is typing.Annotated:
-        mark = inside[1]
-        if isinstance(mark, Range):
-            middle = mark.low if mark.low > 0 else min(mark.high, 1)
-            return inside[0](max(middle, min(mark.high, 1)) if inside[0] is float else middle)
-        return sample(inside[0], path)
-    if origin in (typing.Union, types.UnionType):
-        return sample(inside[0], path)
-    if origin is typing.Literal:
-        return inside[0]
-    if isinstance(hint, type) and issubclass(hint, AbstractArray):
-        return sample_tensor(hint)
-    if hint is Shape:
-        return special(torchgrasp.ShapeGP)
-    if hint is torch.Tensor:
-        return torch.ones(3, dtype=torch.float64)
-    if hint is np.ndarray:
-        return np.ones((6, 3))
-    simple = {
-        int: 1,
-        float: 0.5,
-        bool: True,
-        str: "x",
-        bytes: b"x",
-        Path: path / "x",
-        object: 0,
-        Any: 0,
-        type(None): None,
-    }
-    if hint in simple:
-        return simple[hint]
-    if origin is collections.abc.Callable:
-        return lambda *arguments: None
-    if origin is tuple:
-        return () if inside[-1:] == (...,) else tuple(sample(x, path) for x in inside)
-    if isinstance(origin, type) and issubclass(origin, collections.abc.Mapping):
-        return {sample(inside[0], path): sample(inside[1], path)}
-    if isinstance(origin, type):
-        return [sample(inside[0], path)] if inside else []
-    if isinstance(hint, typing.TypeVar):
-        return 0
-    if issubclass(hint, Status):
-        return Status.OK
-    found = special(hint)
-    if found is None and dataclasses.is_dataclass(hint):
-        required = [f.name for f in dataclasses.fields(hint) if f.default is f.default_factory is dataclasses.MISSING]
-        hints = hints_of(hint)
-        found = hint(**{name: sample(hints[name], path) for name in required})
-    if found is None and issubclass(hint, tuple):
-        found = hint(*(sample(x, path) for x in hints_of(hint).values()))
-    assert found is not None, hint
-    return found
-
-
-def sample_tensor(hint: Any) -> Tensor:
-    """Return a tensor of a shape that an annotation allows."""
-    shape = []
-    for axis in hint.dim_str.split():
-        name = axis.lstrip("*#")
-        if axis[0] != "*" and axis != "...":
-            shape.append(int(name) if name.isdigit() else LENGTHS.get(name, 4))
-    kind = hint.dtype.__name__
-    if kind == "Float":
-        if shape[-2:] == [4, 4]:
-            return torch.eye(4, dtype=torch.float64).expand(*shape).clone()
-        x = torch.rand(shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-        return x / x.norm(dim=-1, keepdim=True) if shape[-1:] == [3] else x
-    return torch.zeros(shape, dtype=torch.int64 if kind == "Int" else torch.bool)
 
 
 def is_wrong(value: Any, hint: Any) -> bool:
@@ -279,3 +157,90 @@ def public() -> dict[str, Any]:
             if package.__name__ != "torchgrasp.border" and (inspect.isfunction(thing) or inspect.isclass(thing)):
                 found.setdefault(f"{thing.__module__}.{thing.__qualname__}", thing)
     return found
+
+
+def behind(thing: Any) -> bool:
+    """Tell whether a function is behind the border."""
+    return hasattr(thing, "__border__")
+
+
+def methods_of(kind: type) -> dict[str, tuple[Any, Any]]:
+    """Return the public methods of a class that take arguments, as they are found in it, and as functions.
+
+    Those of the library alone, inherited ones, too; what is abstract is for others to write.
+    """
+    found: dict[str, tuple[Any, Any]] = {}
+    for key in dir(kind):
+        method = inspect.getattr_static(kind, key)
+        function = method.__func__ if isinstance(method, classmethod | staticmethod) else method
+        own = inspect.isfunction(function) and function.__module__.startswith("torchgrasp")
+        open_to_all = getattr(function, "__isabstractmethod__", False) or getattr(kind, "_is_protocol", False)
+        if own and not key.startswith("_") and not open_to_all:
+            if len(inspect.signature(function).parameters) > (not isinstance(method, staticmethod)):
+                found[key] = method, function
+    return found
+
+
+def checked_things() -> dict[str, tuple[Callable[[], Any], Any]]:
+    """Return what gives each function, value and method of a value to call, and what has its annotations, by name."""
+    found: dict[str, tuple[Callable[[], Any], Any]] = {}
+    for name, thing in public().items():
+        if inspect.isfunction(thing) and behind(thing):
+            found[name] = partial(_itself, thing), thing
+        elif inspect.isclass(thing):
+            if behind(thing.__init__) and dataclasses.is_dataclass(thing):
+                found[name] = partial(_itself, thing), thing
+            for key, (method, function) in methods_of(thing).items():
+                if behind(function):
+                    still = isinstance(method, classmethod | staticmethod)
+                    found[f"{name}.{key}"] = partial(_method, thing, key, still), function
+    return found
+
+
+def _itself(thing: Any) -> Any:
+    return thing
+
+
+def _method(thing: type, key: str, still: bool) -> Any:
+    return getattr(thing if still else sample(thing, Path("x")), key)
+
+
+def required(thing: Any, call: Any, path: Path) -> dict[str, Any]:
+    """Return valid arguments for the parameters without a default."""
+    hints, parameters = hints_of(thing), inspect.signature(call).parameters
+    return {
+        key: sample(hints[key], path, own_lengths(call))
+        for key, p in parameters.items()
+        if p.default is p.empty and p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)
+    }
+
+
+def wrong_arguments(thing: Any, call: Any) -> Iterator[tuple[str, Any]]:
+    """Yield each parameter with each value that it must not have."""
+    hints = hints_of(thing)
+    for key, parameter in inspect.signature(call).parameters.items():
+        if key in hints and parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
+            for value in wrong_values(hints[key], own_lengths(call)):
+                yield key, value
+
+
+def own_lengths(call: Any) -> dict[str, int]:
+    """Return the lengths that the letters of a method have in its value."""
+    return lengths_of(getattr(call, "__self__", None))
+
+
+def wrong_values(hint: Any, own: Lengths) -> list[Any]:
+    """Return values that an annotation does not allow."""
+    values = [value for value in HOSTILE if is_wrong(value, hint)]
+    if Path in (hint, *typing.get_args(hint)):
+        values += NO_PATHS
+    for tensor in tensors_in(hint):
+        bare = getattr(tensor, "__origin__", tensor)
+        valid = sample_tensor(bare, own)
+        values += [x for x in longer(valid, bare, own) if bare is hint or is_wrong(x, hint)]
+        values += [value for how, value in broken(valid).items() if how in NO_NUMBERS or is_wrong(value, hint)]
+        if getattr(tensor, "__metadata__", ())[:1] == (RIGID,):
+            values += crooked(valid)
+        if getattr(tensor, "__metadata__", ())[:1] != (ANY,):
+            values += spoilt(valid).values()
+    return values

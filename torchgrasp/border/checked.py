@@ -1,5 +1,6 @@
 """The decorator of public functions and of values."""
 
+import dataclasses
 import functools
 import importlib
 import importlib.util
@@ -9,7 +10,9 @@ import typing
 from collections.abc import Callable
 from typing import Any, TypeVar, overload
 
-from torchgrasp.border.hints import fields_of, has_tensor, reader
+from jaxtyping import AbstractArray
+
+from torchgrasp.border.hints import fields_of, has_tensor, is_subclass, reader
 from torchgrasp.border.tensors import Call
 
 Thing = TypeVar("Thing", bound=Callable[..., Any])
@@ -25,9 +28,9 @@ def checked(*, gradients: bool) -> Callable[[Thing], Thing]: ...
 def checked(thing: Any = None, *, gradients: bool = False) -> Any:
     """Check the arguments of a function, or of a dataclass where it is made, by their annotations.
 
-    Numbers of NumPy become Python's own. A value is also checked where it is given to a function. Calls from inside a
-    checked function pass unread. So do values of tensors that it computes, unless they have a `__post_init__`: their
-    numbers may come from files.
+    Numbers of NumPy become Python's own. A value is also checked where it is given to a function. A method's letters
+    have the lengths that they have in the fields of its value. Calls from inside a checked function pass unread. So do
+    values of tensors that it computes, unless they have a `__post_init__`: their numbers may come from files.
 
     Args:
         thing: a function, a method, or a dataclass.
@@ -52,7 +55,7 @@ def checked(thing: Any = None, *, gradients: bool = False) -> Any:
 def _checked(thing: Any, gradients: bool) -> Any:
     """Decorate a function or a dataclass."""
     if not isinstance(thing, type):
-        return _guard(thing, thing, gradients, lambda: False)
+        return _guard(thing, thing, gradients, None)
     fields = fields_of(thing, resolve)
     setattr(thing, "__checked_fields__", staticmethod(fields))  # noqa: B010
 
@@ -64,9 +67,10 @@ def _checked(thing: Any, gradients: bool) -> Any:
     return thing
 
 
-def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool]) -> Any:
+def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool] | None) -> Any:
     """Return the function behind its border."""
     signature = inspect.signature(function)
+    of_value = next(iter(signature.parameters), "") == "self" and not isinstance(owner, type)
 
     @functools.cache
     def readers() -> dict[str, Any]:
@@ -79,9 +83,11 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         inside = getattr(_thread, "inside", False)
-        if inside and not always():
+        if inside and (always is None or not always()):
             return function(*args, **kwargs)
         bound, shared = signature.bind(*args, **kwargs), Call(gradients, deep=not inside)
+        if of_value:
+            shared.sizes.update(lengths_of(args[0]))
         for name, (read, kind) in readers().items():
             if name in bound.arguments:
                 bound.arguments[name] = _read(read, kind, name, bound.arguments[name], shared)
@@ -103,6 +109,23 @@ def _read(read: Any, kind: Any, name: str, value: Any, call: Call) -> Any:
     if kind is inspect.Parameter.VAR_KEYWORD:
         return {key: read(key, x, call) for key, x in value.items()}
     return read(name, value, call)
+
+
+def lengths_of(value: Any) -> dict[str, int]:
+    """Return the lengths of the letters in a value's annotations: a method's letters are those of its value."""
+    named = ((field, axes, getattr(value, field)) for field, axes in _axes(type(value)).items())
+    pairs = ((axis, n) for _, axes, x in named for axis, n in zip(axes, x.shape, strict=False))
+    return {axis: n for axis, n in pairs if axis.isalpha()}
+
+
+@functools.cache
+def _axes(kind: type) -> dict[str, list[str]]:
+    """Return the axes of a dataclass's tensors, by field; those of any number of axes have no lengths."""
+    if not dataclasses.is_dataclass(kind):
+        return {}
+    hints = fields_of(kind, resolve)()
+    axes = {name: hint.dim_str.split() for name, hint in hints.items() if is_subclass(hint, AbstractArray)}
+    return {name: found for name, found in axes.items() if not any(axis[0] in "*.#" for axis in found)}
 
 
 def resolve(thing: Any) -> dict[str, Any]:

@@ -15,6 +15,7 @@ DTYPES = {
     "Int": (torch.int64, torch.int32),
     "Bool": (torch.bool,),
 }
+DTYPES["Shaped"] = tuple(dtype for dtypes in DTYPES.values() for dtype in dtypes)
 """The dtypes that each kind of annotation allows. Half precision is no length: at 0.3 m it rounds to 0.1 mm."""
 
 
@@ -173,7 +174,7 @@ def check_moved(*args: Any, **kwargs: Any) -> None:
     allowed = "a device, torch.float32 or torch.float64"
     try:
         moved = torch.empty(0, dtype=torch.float32).to(*args, **kwargs)
-    except (RuntimeError, TypeError, AssertionError) as error:
+    except (RuntimeError, TypeError, ValueError, AssertionError) as error:
         raise BadArgument("to", given, allowed) from error
     if moved.is_meta or moved.dtype not in DTYPES["Float"]:
         raise BadArgument("to", given, allowed)

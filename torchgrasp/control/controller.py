@@ -15,7 +15,7 @@ from torchgrasp.control.holding.force import ForceHold, PositionHold
 from torchgrasp.control.holding.grip import GripHold
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
-from torchgrasp.control.state import ControllerState, Part, pack, unpack
+from torchgrasp.control.state import ControllerState, Part, go_on, numbers_of, pack, unpack
 from torchgrasp.control.tactile import no_contact
 from torchgrasp.control.targets import Targets
 from torchgrasp.errors import BadArgument, Status
@@ -182,10 +182,10 @@ class GraspController:
             raise BadArgument("state", state.layout[:80], f"one of {self._modes(hold)}, and of this hand's fingers")
         self.time, self.pressed = (float(numbers[f"controller.{name}"]) for name in ("time", "pressed"))
         self.targets = Targets(numbers["controller.joints"], numbers["controller.palm"])
-        self.closing.go_on("closing", numbers)
+        go_on(self.closing, "closing", numbers)
         self.hold = hold
         if isinstance(hold, Part) and hold is not self.closing:
-            hold.go_on("hold", numbers)
+            go_on(hold, "hold", numbers)
 
     def _blank(self) -> Step:
         """Return the holding as after touching nothing."""
@@ -204,8 +204,8 @@ class GraspController:
         """Return every number of the controller, with those of a holding."""
         mine = {"time": self.time, "pressed": self.pressed, **self.targets._asdict()}
         mine = {f"controller.{name}": torch.as_tensor(x, dtype=torch.float64).clone() for name, x in mine.items()}
-        held = hold.numbers("hold") if isinstance(hold, Part) and hold is not self.closing else {}
-        return mine | self.closing.numbers("closing") | held
+        held = numbers_of(hold, "hold") if isinstance(hold, Part) and hold is not self.closing else {}
+        return mine | numbers_of(self.closing, "closing") | held
 
 
 Closing = OpenLoopClosing | PositionClosing | LawClosing

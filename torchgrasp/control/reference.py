@@ -139,10 +139,12 @@ class ClosingReference(Value):
             gains=gains,
         )
 
+    @checked
     def expand(self, actuated: Float[Tensor, " h"]) -> Float[Tensor, " j"]:
         """Return all joints of the URDF; NaN, as of a diverged simulation, may pass."""
         return self.hand.actuated.coupling @ actuated + self.hand.actuated.offset
 
+    @checked
     def pick(self, joints: Float[Tensor, " j"]) -> Float[Tensor, " h"]:
         """Return the actuated joints out of all joints of the URDF."""
         return joints[self._actuated]
@@ -164,10 +166,12 @@ class ClosingReference(Value):
             raise BadArgument("sensor", f"dead fingers {dead}", f"some of {names}")
         return torch.tensor([name not in dead for name in names])
 
+    @checked
     def clamp(self, actuated: Float[Tensor, " h"]) -> Float[Tensor, " h"]:
         """Return joints within their limits."""
         return torch.minimum(torch.maximum(actuated, self.hand.lower), self.hand.upper)
 
+    @checked
     def contact_points(self, tips: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
         """Return the first points to touch [m] of fingertips with given centres [m]."""
         return tips - self.hand.tips.radius[:, None] * self.normals

@@ -24,26 +24,28 @@ from torchgrasp.value_files import read_value
 class Part:
     """A part of a controller: its tensors, arrays and numbers, and those of parts inside it, are its state."""
 
-    def numbers(self, name: str) -> dict[str, Tensor]:
-        """Return copies of the state by dotted names that begin with a name."""
-        found: dict[str, Tensor] = {}
-        for field, value in vars(self).items():
-            key = f"{name}.{field}"
-            if isinstance(value, Part):
-                found |= value.numbers(key)
-            elif isinstance(value, Tensor | np.ndarray | float | bool | Status):
-                exact = torch.float64 if isinstance(value, float) else None
-                found[key] = torch.as_tensor(value, dtype=exact).detach().clone()
-        return found
 
-    def go_on(self, name: str, numbers: dict[str, Tensor]) -> None:
-        """Take over a state of the same layout."""
-        for field, value in list(vars(self).items()):
-            key = f"{name}.{field}"
-            if isinstance(value, Part):
-                value.go_on(key, numbers)
-            elif key in numbers:
-                setattr(self, field, _like(value, numbers[key]))
+def numbers_of(part: Part, name: str) -> dict[str, Tensor]:
+    """Return copies of a part's state by dotted names that begin with a name."""
+    found: dict[str, Tensor] = {}
+    for field, value in vars(part).items():
+        key = f"{name}.{field}"
+        if isinstance(value, Part):
+            found |= numbers_of(value, key)
+        elif isinstance(value, Tensor | np.ndarray | float | bool | Status):
+            exact = torch.float64 if isinstance(value, float) else None
+            found[key] = torch.as_tensor(value, dtype=exact).detach().clone()
+    return found
+
+
+def go_on(part: Part, name: str, numbers: dict[str, Tensor]) -> None:
+    """Let a part take over a state of the same layout."""
+    for field, value in list(vars(part).items()):
+        key = f"{name}.{field}"
+        if isinstance(value, Part):
+            go_on(value, key, numbers)
+        elif key in numbers:
+            setattr(part, field, _like(value, numbers[key]))
 
 
 def _like(value: Any, number: Tensor) -> Any:

@@ -9,6 +9,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.border import checked
+from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand_toml import HandSpec
 from torchgrasp.hand.kinematics import KinematicTree, map_directions, map_points, pose_in_carrier, tree_from_urdf
 from torchgrasp.hand.urdf import Urdf
@@ -60,8 +62,11 @@ class Fingertips(Value):
         contact, center = (map_points(pose, x)[..., 0].T for x in (self.contact, self.center))
         return contact, map_directions(pose, self.normal)[..., 0].T, center
 
+    @checked(gradients=True)
     def frames(self, values: Float[Tensor, "j n"]) -> tuple[Float[Tensor, "3 4 l n"], Float[Tensor, "3 4 f n"]]:
         """Return the frames of all links of `chains` and of the carriers."""
+        if len(values) != len(self.chains.joint_names):
+            raise BadArgument("values", f"{len(values)} joints", f"all {len(self.chains.joint_names)} of the URDF")
         frames = self.chains.frames(values)
         return frames, frames.index_select(2, self.carrier)
 

@@ -138,6 +138,7 @@ class Hand(Value):
         """Upper limits of the actuated joints [rad]."""
         return self.actuated.upper
 
+    @checked
     def require_three(self, argument: str, what: str) -> None:
         """Refuse another number of fingertips than the three of the paper; raise `BadArgument` for an argument.
 

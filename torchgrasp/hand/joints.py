@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value, check_device
+from torchgrasp.border import checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand_toml import HandSpec
 from torchgrasp.hand.kinematics import Markers
@@ -39,15 +40,18 @@ class ActuatedJoints(Value):
     coupling: Float[Tensor, "j h"]
     offset: Float[Tensor, " j"]
 
+    @checked(gradients=True)
     def expand(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
         """Return every movable joint of the URDF."""
         self.check(joints)
         return self.couple(joints)
 
+    @checked(gradients=True)
     def couple(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
         """Return every movable joint without a check, for which the host would wait for a GPU."""
         return joints @ self.coupling.to(joints).T + self.offset.to(joints)
 
+    @checked(gradients=True)
     def check(self, joints: Tensor, name: str = "joints") -> None:
         """Refuse joints of a wrong count, dtype or device, NaN and infinity."""
         if joints.ndim < 1 or joints.shape[-1] != len(self.names):
@@ -61,6 +65,7 @@ class ActuatedJoints(Value):
             value, k = _first(joints, ~finite)
             raise BadArgument(name, f"{value} for {self.names[k]}", "finite numbers")
 
+    @checked(gradients=True)
     def check_limits(self, joints: Tensor, name: str = "joints") -> None:
         """Refuse joints beyond their limits, too."""
         self.check(joints, name)

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.border import checked
 from torchgrasp.frames import rotation_from_rpy, skew
 from torchgrasp.hand.urdf import Joint, Urdf
 
@@ -55,6 +56,7 @@ class KinematicTree(Value):
     places: Int[Tensor, " l"]
     slides: bool
 
+    @checked(gradients=True)
     def frames(
         self, values: Float[Tensor, "j n"], root: Float[Tensor, "3 4 n"] | None = None
     ) -> Float[Tensor, "3 4 l n"]:
@@ -83,12 +85,14 @@ class KinematicTree(Value):
             frames.append(frame)
         return torch.cat(frames, 2).index_select(2, self.places)
 
+    @checked(gradients=True)
     def poses(self, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
         """Return `root_from_link` of every link for joints [rad or m]."""
         frames = self.frames(values.T.contiguous())
         last = torch.eye(4, dtype=frames.dtype, device=frames.device)[3, :, None, None].expand(1, 4, *frames.shape[2:])
         return torch.cat([frames, last]).permute(3, 2, 0, 1)
 
+    @checked(gradients=True)
     def joint_axes(self, poses: Float[Tensor, "*b l 4 4"]) -> tuple[Float[Tensor, "*b j 3"], Float[Tensor, "*b j 3"]]:
         """Return axis and origin of every joint in the root's frame, from the links' poses."""
         child = poses.reshape(-1, *poses.shape[-3:])[..., :3, :].permute(2, 3, 1, 0).index_select(2, self.child)

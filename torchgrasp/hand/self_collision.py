@@ -4,18 +4,22 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Iterator
 from functools import cached_property
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.border import Range, checked
+from torchgrasp.errors import BadArgument
 from torchgrasp.hand.kinematics import map_points
 
 PARALLEL = 1e-10
 """Squared sine below which two edges count as parallel; the faces' normals then cover their product."""
 
+Bound = Annotated[float, Range(-torch.inf, torch.inf, "a number")]
+"""Separations [m] above it are not needed; infinite: all are."""
 Placed = tuple[Float[Tensor, "3 3 s n"], Float[Tensor, "3 s n"]]
 """Axes and centres of shapes in the palm's frame."""
 Push = Callable[[Int[Tensor, " c"]], tuple[Float[Tensor, "3 c"], Float[Tensor, "3 c"]]]
@@ -47,7 +51,8 @@ class SelfCollision(Value):
     pairs: Int[Tensor, "p 2"]
     kinds: tuple[int, int, int]
 
-    def clearance(self, frames: Float[Tensor, "3 4 l n"], below: float = torch.inf) -> Float[Tensor, " n"]:
+    @checked(gradients=True)
+    def clearance(self, frames: Float[Tensor, "3 4 l n"], below: Bound = torch.inf) -> Float[Tensor, " n"]:
         """Return the signed least separation [m]; infinite without pairs.
 
         Values above `below` are some larger number: pairs are skipped by their bounding and inscribed spheres.
@@ -63,7 +68,8 @@ class SelfCollision(Value):
             pair, row = torch.nonzero(distance - self._sums(self._bounding, distance) <= limit, as_tuple=True)
         return least.scatter_reduce(0, row, self._separations(shapes, pair, row), "amin")
 
-    def separations(self, frames: Float[Tensor, "3 4 l n"], below: float) -> Float[Tensor, "p n"]:
+    @checked(gradients=True)
+    def separations(self, frames: Float[Tensor, "3 4 l n"], below: Bound) -> Float[Tensor, "p n"]:
         """Return the separation [m] of each pair; above `below`, that of the bounding spheres."""
         shapes = self._place(frames)
         distance = self._distances(shapes[1])
@@ -71,8 +77,9 @@ class SelfCollision(Value):
         pair, row = torch.nonzero(apart < below, as_tuple=True)
         return apart.index_put((pair, row), self._separations(shapes, pair, row))
 
+    @checked(gradients=True)
     def pushes(
-        self, frames: Float[Tensor, "3 4 l n"], below: float
+        self, frames: Float[Tensor, "3 4 l n"], below: Bound
     ) -> tuple[Float[Tensor, "p n"], Int[Tensor, "p n"], Float[Tensor, "6 k"]]:
         """Return `separations`, and wrenches: their derivatives by a twist (translation, rotation) of the second shape.
 
@@ -93,11 +100,13 @@ class SelfCollision(Value):
         number[pair, row] = torch.arange(len(pair), device=pair.device)
         return apart.index_put((pair, row), separation), number, wrench
 
-    def count_near(self, frames: Float[Tensor, "3 4 l n"], below: float) -> int:
+    @checked(gradients=True)
+    def count_near(self, frames: Float[Tensor, "3 4 l n"], below: Bound) -> int:
         """Return how many pairs, over all rows, have bounding spheres nearer than `below`."""
         distance = self._distances(self._place(frames)[1])
         return int((distance - self._sums(self._bounding, distance) < below).sum())
 
+    @checked
     def only(self, kept: Bool[Tensor, " p"]) -> "SelfCollision":
         """Return the same shapes with some of the pairs."""
         one, two, three = (int(kind.sum()) for kind in kept.split(self.kinds))
@@ -109,7 +118,9 @@ class SelfCollision(Value):
         return [(int(one), int(two)) for one, two in links]
 
     def _place(self, frames: Float[Tensor, "3 4 l n"]) -> Placed:
-        """Return the shapes' axes and centres in the palm's frame."""
+        """Return the shapes' axes and centres in the palm's frame; raise `BadArgument` for frames of too few links."""
+        if frames.shape[2] < self._links:
+            raise BadArgument("frames", f"{frames.shape[2]} links", f"at least {self._links}")
         links, rotation = frames.index_select(2, self.link), self.rotation.to(frames)[..., None]
         axes = links[:, 0, None] * rotation[0] + links[:, 1, None] * rotation[1] + links[:, 2, None] * rotation[2]
         return axes, map_points(links, self.center)
@@ -118,6 +129,11 @@ class SelfCollision(Value):
         """Return the distance between the centres of each pair."""
         first, second = self.pairs.unbind(1)
         return _length(center.index_select(1, second) - center.index_select(1, first))
+
+    @cached_property
+    def _links(self) -> int:
+        """Least number of links whose frames place every shape."""
+        return int(self.link.max()) + 1 if len(self.link) else 0
 
     @cached_property
     def _bounding(self) -> Float[Tensor, " s"]:

@@ -104,6 +104,7 @@ class Urdf:
     data: bytes
     xml: bytes
 
+    @checked
     def wrong(self, found: str, allowed: str) -> HandFileError:
         """Make the error for a broken rule."""
         return HandFileError("urdf", f"{self.path}: {found}", allowed)
@@ -113,6 +114,7 @@ class Urdf:
         """The joints that are not fixed."""
         return tuple(j for j in self.joints if j.kind != "fixed")
 
+    @checked
     def joints_above(self, link: str) -> tuple[Joint, ...]:
         """Return the joints from a link to the root, nearest first."""
         above, chain = {j.child: j for j in self.joints}, []
@@ -121,6 +123,7 @@ class Urdf:
             link = above[link].parent
         return tuple(chain)
 
+    @checked
     def movers(self, link: str) -> tuple[Joint, ...]:
         """Return the movable joints above a link."""
         return tuple(j for j in self.joints_above(link) if j.kind != "fixed")

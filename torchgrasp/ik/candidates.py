@@ -58,6 +58,7 @@ class GraspProblem(Value):
         """Check the contacts once, before any work."""
         self.contacts.require_std()
 
+    @checked
     def drop_unreachable(self, seeds: IKSeeds) -> IKSeeds:
         """Return the seeds whose poses are reached."""
         return seeds if self.reachable is None else seeds[ask_reachable(self.reachable, seeds.obj_from_hand)]

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchgrasp.base import Batch, Value
 from torchgrasp.border import Poses, checked
+from torchgrasp.errors import BadArgument
 from torchgrasp.frames import rigid, rotation_from_vector
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import map_points
@@ -37,8 +38,11 @@ class Configuration(Batch):
     joints: Float[Tensor, "g h"]
     obj_from_hand: Poses
 
+    @checked(gradients=True)
     def integrate(self, hand: Hand, step: Float[Tensor, "g d"]) -> "Configuration":
         """Step by a translation [m], a rotation vector (both in the hand's axes) and joints, clamped to the limits."""
+        if step.shape[1] != 6 + self.joints.shape[1]:
+            raise BadArgument("step", f"{step.shape[1]} numbers", f"6 of the pose and {self.joints.shape[1]} joints")
         rotation, position = self.obj_from_hand[:, :3, :3], self.obj_from_hand[:, :3, 3]
         joints = (self.joints + step[:, 6:]).clamp(hand.lower.to(position), hand.upper.to(position))
         position = position + (rotation @ step[:, :3, None])[..., 0]

@@ -61,6 +61,7 @@ class Obstacles(Value):
         field = SignedDistanceField(occupancy.origin.double(), occupancy.spacing, outside - inside)
         return cls(field, distances.float(), torch.tensor(levels, dtype=torch.float64), hard).to(device)
 
+    @checked(gradients=True)
     def likelihood(self, centres: Float[Tensor, "*b s 3"], radius: Float[Tensor, "s"]) -> Float[Tensor, "*b"]:
         """Return the largest probability of a voxel that spheres [m] meet: the middle between two levels."""
         met = centres.new_zeros(centres.shape[:-2])

@@ -50,6 +50,7 @@ class SignedDistanceField(Value):
         """Index of the last node along each axis."""
         return torch.tensor(self.values.shape, device=self.values.device) - 1
 
+    @checked(gradients=True)
     def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return the value [m] at the nearest node, at most 0.87 spacings off; outside the grid it is too small."""
         flat = 0

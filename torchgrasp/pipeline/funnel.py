@@ -5,6 +5,7 @@ import dataclasses
 import torch
 
 from torchgrasp.base import Value, count_status
+from torchgrasp.border import checked
 from torchgrasp.errors import Status
 from torchgrasp.values import Certificate, ContactPlan, Grasps, IKSeeds
 
@@ -53,6 +54,7 @@ class Funnel(Value):
     stages: tuple[Losses, ...]
 
     @classmethod
+    @checked
     def of(cls, plan: ContactPlan, closed: Certificate, seeds: IKSeeds, grasps: Grasps) -> "Funnel":
         """Return the funnel of what "plan", "certify", "query" and "refine" of `plan_grasps` told its observer.
 
@@ -87,6 +89,7 @@ class Funnel(Value):
         """What was lost most often where most was lost; `Status.OK` where nothing was."""
         return next(iter(self.worst.lost), Status.OK)
 
+    @checked
     def share(self, reasons: frozenset[Status]) -> float:
         """Return the share lost for some reasons, summed over the stages."""
         shares = (n / stage.given for stage in self.stages for status, n in stage.lost.items() if status in reasons)

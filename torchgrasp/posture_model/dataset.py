@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchgrasp.base import check_whole, join
 from torchgrasp.border import Count, Range, checked
-from torchgrasp.errors import ModelFileError, OutputError
+from torchgrasp.errors import BadArgument, ModelFileError, OutputError
 from torchgrasp.files import Recent, begin_folder, hold_folder, load_tensors, save_tensors
 from torchgrasp.hand.hand import Hand
 from torchgrasp.json_fields import Field, read_json
@@ -34,6 +34,10 @@ KEPT = 128
 """Chunks that stay in memory: all of a million postures, which take 200 MB."""
 META_KEYS = ("hand", "fingers", "hand_sha256", "hand_codes", "seed", "sampling")
 """The keys of `SampleSpec.meta`."""
+
+
+Chunk = Annotated[int, Range(0, 1_000_000)]
+"""The number of a chunk."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,9 +79,12 @@ class SampleFolder:
         return (self.chunk(i) for i in range(len(chunk_sizes(self.n))))
 
     @checked
-    def chunk(self, i: Annotated[int, Range(0, 1000000)]) -> HandSamples:
+    def chunk(self, i: Chunk) -> HandSamples:
         """Read chunk i; raises `ModelFileError` if it is missing, damaged, or belongs to other samples."""
-        path, count = self.path(i), chunk_sizes(self.n)[i]
+        sizes = chunk_sizes(self.n)
+        if i >= len(sizes):
+            raise BadArgument("i", i, f"a chunk in [0, {len(sizes) - 1}]")
+        path, count = self.path(i), sizes[i]
         tensors, meta = load_tensors(path, "samples", {"joints", "q"})
         shapes = tuple(tuple(tensors[name].shape) for name in ("joints", "q"))
         wanted = (count, len(self.joint_names)), (count, 6)
@@ -94,11 +101,13 @@ class SampleFolder:
         check_whole("n", n, 1, self.n)
         return join([self.chunk(i) for i in range(len(chunk_sizes(n)))])[:n]
 
-    def path(self, i: int) -> Path:
+    @checked
+    def path(self, i: Chunk) -> Path:
         """Return the file of chunk i."""
         return self.folder / f"chunk-{i:06d}.safetensors"
 
-    def holds(self, i: int) -> bool:
+    @checked
+    def holds(self, i: Chunk) -> bool:
         """Tell whether chunk i is on disk and sound."""
         try:
             self.chunk(i)

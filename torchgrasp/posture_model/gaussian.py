@@ -70,6 +70,7 @@ class GaussianMixture(Value):
             raise BadArgument("x", f"shape {tuple(x.shape)}", f"rows of {len(self.names)} numbers")
         return map_rows(lambda rows: torch.logsumexp(self.log_joint(rows), -1), x)
 
+    @checked(gradients=True)
     def log_joint(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
         """Return log(pi_i) + log N(x | mu_i, Sigma_i) for every row and component."""
         return self.weights.double().log() + (self.whitening.log_scale - 0.5 * self.whitening.squared(x.double()))

@@ -72,6 +72,7 @@ class SampleSpec(Value):
     seed: Seed = 0
     sampling: Sampling = "uniform"
 
+    @checked
     def meta(self, hand: Hand) -> dict[str, str]:
         """Return what distinguishes samples, but for their number."""
         return {**describe_compatibility(hand), "seed": str(self.seed), "sampling": self.sampling}

@@ -40,6 +40,7 @@ class DepthImage(Value):
             return None
         return rotate(self.obj_from_camera.double(), frustum_of_image(self.intrinsics.double(), self.depth.shape))
 
+    @checked
     def to_upright(self, obj_from_upright: Pose) -> "DepthImage":
         """Return the image with its camera in an upright frame, rounded."""
         pose = inverse(obj_from_upright.double()).to(self.obj_from_camera.device) @ self.obj_from_camera.double()

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value, map_tensors
-from torchgrasp.border import Pose, Positive, Range, Seed, check_tensor, checked
+from torchgrasp.border import Pose, Positive, Range, Seed, check_moved, check_tensor, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply
 from torchgrasp.linalg import cholesky, unit, unit_of_any
@@ -39,10 +39,12 @@ class Normalisation(Value):
     center: Float[Tensor, "3"]
     scale: float
 
+    @checked(gradients=True)
     def normalise(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
         """Map points [m] to the normalised frame."""
         return (points - self.center.to(points)) / self.scale
 
+    @checked(gradients=True)
     def metres(self, x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
         """Map normalised points to the cloud's frame [m]."""
         return x * self.scale + self.center.to(x)
@@ -83,8 +85,14 @@ class ShapeGP(Posterior, Normalisation):
     kind: str = dataclasses.field(default="guess", kw_only=True)
 
     @classmethod
+    @checked
     def of(
-        cls, posterior: Posterior, normalisation: Normalisation, cloud: PointCloud, psi: float, std_factor: float = 1.0
+        cls,
+        posterior: Posterior,
+        normalisation: Normalisation,
+        cloud: PointCloud,
+        psi: Positive,
+        std_factor: Positive = 1.0,
     ) -> "ShapeGP":
         """Return the shape of a posterior, with its domain."""
         reach = REACH * float(torch.linalg.vector_norm(posterior.x, dim=-1).max())
@@ -99,6 +107,7 @@ class ShapeGP(Posterior, Normalisation):
 
     def to(self, *args: Any, **kwargs: Any) -> "ShapeGP":
         """Return the shape on another device. Its condition number of 1e7 needs float64."""
+        check_moved(*args, **kwargs)
         device = torch.empty(0, device=self.x.device).to(*args, **kwargs).device
         return super().to(device)
 
@@ -112,6 +121,7 @@ class ShapeGP(Posterior, Normalisation):
         """The surfaces that enclose the material, each with a posterior of its own."""
         return (self,)
 
+    @checked(gradients=True)
     def wall_at(self, x: Float[Tensor, "q 3"]) -> Bool[Tensor, "q walls"]:
         """Tell which wall is the surface at normalised points."""
         return torch.ones(len(x), 1, dtype=torch.bool, device=x.device)
@@ -185,6 +195,7 @@ class ShapeGP(Posterior, Normalisation):
             raise BadArgument("points", f"{len(x)} points", f"at most {MAX_JOINT} points at once")
         return self.joint_at(x).to(points.dtype)
 
+    @checked(gradients=True)
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
         """Return the joint posterior of (d, w) at normalised points; no check."""
         return joint_estimate(self, x)
@@ -233,6 +244,7 @@ class ShapeGP(Posterior, Normalisation):
         new = on_surface(x, direction, torch.full_like(x[:, 0], noise / self.scale), normal_noise)
         return self.append(dataclasses.replace(new, has_normal=new.has_normal & (normals is not None)))
 
+    @checked
     def append(self, new: Observations) -> "ShapeGP":
         """Return the shape given further observations, normalised, with the same kernel and domain."""
         return dataclasses.replace(self, **_fields(append_observations(self, new), Posterior))

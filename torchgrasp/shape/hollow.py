@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.border import Pose, checked
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.joint_posterior import JointEstimate
 from torchgrasp.shape.observations import Observations
@@ -41,6 +42,7 @@ class HollowShape(ShapeGP):
     lining: ShapeGP
 
     @classmethod
+    @checked
     def join(cls, outer: ShapeGP, lining: ShapeGP, cloud: PointCloud) -> "HollowShape":
         """Return the vessel of two walls in the same normalised frame; `cloud` is what was seen of both."""
         fields = {f.name: getattr(outer, f.name) for f in dataclasses.fields(ShapeGP)}
@@ -57,32 +59,39 @@ class HollowShape(ShapeGP):
         """The outer and the inner wall."""
         return self.outer, self.lining
 
+    @checked(gradients=True)
     def wall_at(self, x: Float[Tensor, "q 3"]) -> Bool[Tensor, "q walls"]:
         """Tell which wall is the surface at normalised points."""
         inner = self.lining.mean(x) > self.outer.mean(x)
         return torch.stack([~inner, inner], 1)
 
+    @checked(gradients=True)
     def mean(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q"]:
         """Return the mean signed distance at normalised points."""
         return torch.maximum(self.outer.mean(x), self.lining.mean(x))
 
+    @checked(gradients=True)
     def mean_and_gradient(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]:
         """Return the mean signed distance and its gradient at normalised points."""
         (a, slope_a), (b, slope_b) = (wall.mean_and_gradient(x) for wall in self.walls)
         return torch.maximum(a, b), torch.where((b > a)[:, None], slope_b, slope_a)
 
+    @checked(gradients=True)
     def estimate(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
         """Return the mean and the covariance of (d, w) at normalised points."""
         return self._by_wall(x, lambda wall, own: wall.estimate(own))  # pyright: ignore[reportReturnType]
 
+    @checked(gradients=True)
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
         """Return mean and variance with derivatives at normalised points."""
         return SurfaceJet(*self._by_wall(x, lambda wall, own: _fields(wall.jet(own))))
 
+    @checked(gradients=True)
     def mean_jet(self, x: Float[Tensor, "q 3"]) -> MeanJet:
         """Return the mean with its derivatives at normalised points."""
         return MeanJet(*self._by_wall(x, lambda wall, own: _fields(wall.mean_jet(own))))
 
+    @checked(gradients=True)
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
         """Return the joint posterior of (d, w) at normalised points."""
         parts, owner = [wall.joint_at(x) for wall in self.walls], self.wall_at(x)
@@ -92,12 +101,14 @@ class HollowShape(ShapeGP):
             covariance += part.covariance * (own[:, None] & own)
         return JointEstimate(mean, covariance)
 
+    @checked
     def append(self, new: Observations) -> "HollowShape":
         """Return the shape given further observations, normalised, each of the wall at its point."""
         outer, inner = self.wall_at(new.x).T
         return self.join(self.outer.append(new[outer]), self.lining.append(new[inner]), self.cloud)
 
-    def moved(self, b_from_a: Float[Tensor, "4 4"]) -> "HollowShape":
+    @checked
+    def moved(self, b_from_a: Pose) -> "HollowShape":
         """Return the shape in frame b [m]; it is given in frame a."""
         outer = self.outer.moved(b_from_a)
         return self.join(outer, self.lining.moved(b_from_a), outer.cloud)

@@ -25,6 +25,10 @@ LEAST_PSI = 4.0 / 3.0
 """psi over the diameter of a ball in which the thin plate kernel is positive definite (dense limit: 1.313)."""
 
 
+Orders = Annotated[int, Range(1, 4)]
+"""How many of k and its derivatives: three derivatives are the most that are used."""
+
+
 @checked
 @dataclasses.dataclass(frozen=True)
 class Kernel:
@@ -46,7 +50,8 @@ class Kernel:
     remedy: str = "use more noise, or a shorter length of the kernel"
     closed_form: Callable[[Tensor, int], tuple[Tensor, ...]] | None = None
 
-    def derivatives(self, r: Float[Tensor, "*s"], count: int) -> tuple[Float[Tensor, "*s"], ...]:
+    @checked(gradients=True)
+    def derivatives(self, r: Float[Tensor, "*s"], count: Orders) -> tuple[Float[Tensor, "*s"], ...]:
         """Return the first `count` of k and its derivatives in r^2 / 2; see `differentiate`."""
         return differentiate(self.profile, r, count) if self.closed_form is None else self.closed_form(r, count)
 

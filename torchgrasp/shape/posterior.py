@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value
+from torchgrasp.border import checked
 from torchgrasp.linalg import unit
 from torchgrasp.shape.gradient_kernel import cross_covariance, separations
 from torchgrasp.shape.kernel import Kernel
@@ -113,10 +114,12 @@ class Posterior(Value):
         """Number of observed points with normals."""
         return int(self.has_normal.sum())
 
+    @checked(gradients=True)
     def ordered(self, rows: Shaped[Tensor, "rows *c"]) -> Shaped[Tensor, "rows *c"]:
         """Bring rows from the order of `gram` into that of the factor."""
         return rows if self.order is None else rows[self.order]
 
+    @checked(gradients=True)
     def mean(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q"]:
         """Return the mean signed distance at normalised points; for grids of many points."""
 
@@ -128,6 +131,7 @@ class Posterior(Value):
 
         return in_chunks(evaluate, x, 2048)[0]
 
+    @checked(gradients=True)
     def mean_and_gradient(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]:
         """Return the mean signed distance and its gradient at normalised points; see `jet`."""
 
@@ -143,6 +147,7 @@ class Posterior(Value):
 
         return in_chunks(evaluate, x, 2 * CACHED_POINTS if x.device.type == "cpu" else GPU_POINTS)  # pyright: ignore[reportReturnType]
 
+    @checked(gradients=True)
     def estimate(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
         """Return the mean and the covariance of (d, w) at normalised points, Eqs. (7)-(8)."""
         prior, rows = self.prior_block(), len(self.factor)
@@ -168,6 +173,7 @@ class Posterior(Value):
 
         return in_chunks(evaluate, x, size)  # pyright: ignore[reportReturnType]
 
+    @checked(gradients=True)
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
         """Return mean and variance with derivatives at normalised points: no check, no autograd.
 
@@ -182,6 +188,7 @@ class Posterior(Value):
         chunk = CACHED_POINTS if x.device.type == "cpu" else GPU_POINTS
         return SurfaceJet(*in_chunks(partial(_jet, self), x, chunk))
 
+    @checked(gradients=True)
     def mean_jet(self, x: Float[Tensor, "q 3"]) -> MeanJet:
         """Return the mean's part of `jet`: without the variance it costs less than half."""
         chunk = CACHED_POINTS if x.device.type == "cpu" else GPU_POINTS
@@ -192,12 +199,14 @@ class Posterior(Value):
         here = self.x.new_zeros(1, 3)
         return cross_covariance(self.kernel, here, here, 1)[:, 0]
 
+    @checked(gradients=True)
     def distance_rows(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q rows"]:
         """Return the covariance of the distances at points with the observations, the first block of `cross`."""
         d, r = separations(x, self.x)
         k, first = self.kernel.derivatives(r, 2)
         return _distance_rows(d, k, first, self.n_oriented)
 
+    @checked(gradients=True)
     def whiten(self, rows: Float[Tensor, "q rows"]) -> Float[Tensor, "q rows"]:
         """Return covariances with the observations times L^-T: their products are what the observations explain."""
         rows = rows if self.order is None else rows[:, self.order]
@@ -210,6 +219,7 @@ class Posterior(Value):
             torch.mm(source[:, :end], block, out=out[:, start:end])
         return out
 
+    @checked(gradients=True)
     def cross(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "4 q rows"]:
         """Return the covariance of (d, w) at points with the observations."""
         return cross_covariance(self.kernel, x, self.x, self.n_oriented)

@@ -1,11 +1,14 @@
 """A simulated hand as its controller knows it: joint targets in, observations out."""
 
 import math
+from typing import Annotated
 
 import numpy as np
 import torch
 
+from torchgrasp.border import Range, checked
 from torchgrasp.control import ClosingReference, FingertipSensor, Observation, Targets, TipContact
+from torchgrasp.errors import BadArgument
 from torchgrasp.sim.scene import Scene, StepContacts
 
 
@@ -56,8 +59,11 @@ class SimulatedHand:
         self._to_scene = [names.index(name) for name in scene.joint_names]
         self._from_scene = [scene.joint_names.index(name) for name in names]
 
+    @checked
     def tick(self, targets: Targets) -> Observation:
         """Drive joints and palm for one control period; return what the robot knows."""
+        if len(targets.joints) != len(self._to_scene):
+            raise BadArgument("targets", f"{len(targets.joints)} joints", f"all {len(self._to_scene)} of the URDF")
         self.scene.drive(targets.joints[self._to_scene].numpy())
         palm = targets.palm.numpy()
         if palm.any() or self._palm.any():
@@ -84,7 +90,8 @@ class SimulatedHand:
         sizes = float(np.linalg.norm(self.pushes, axis=-1).sum())
         return float(np.linalg.norm(self.pushes.sum(0))) / sizes if sizes > 0.0 else math.nan
 
-    def ticks(self, seconds: float) -> int:
+    @checked
+    def ticks(self, seconds: Annotated[float, Range(0.0, 1e6)]) -> int:
         """Return the control ticks in a time [s], at least one."""
         return max(1, round(seconds / self.period))
 

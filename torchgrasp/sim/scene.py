@@ -7,11 +7,11 @@ import abc
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from torchgrasp.border import checked
+from torchgrasp.border import Count, Range, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand import Actuator
 
@@ -148,6 +148,7 @@ class SceneSpec:
         """The height [m] of the table."""
         return float(self.mesh.bounds[0, 2]) if self.height is None else self.height
 
+    @checked
     def check_drives(self, names: list[str]) -> None:
         """Refuse joints without a start or a drive."""
         missing = [name for name in names if name not in self.joints or name not in self.drives]
@@ -183,23 +184,36 @@ class StepContacts:
     stray: np.ndarray
 
     @classmethod
-    def none(cls, fingers: int = 3) -> "StepContacts":
+    @checked
+    def none(cls, fingers: Annotated[int, Range(1, 1000)] = 3) -> "StepContacts":
         """Return sums to add contacts to."""
         impulse, moment, force = np.zeros((3, fingers, 3))
         return cls(impulse, moment, np.zeros(fingers), np.zeros(fingers, dtype=bool), force, np.zeros(3))
 
-    def add(self, finger: int, impulse: np.ndarray, size: float, point: np.ndarray) -> None:
+    @checked
+    def add(self, finger: Annotated[int, Range(0, 1000)], impulse: np.ndarray, size: float, point: np.ndarray) -> None:
         """Add a contact of a fingertip by impulse [N s], its size, and place [m]."""
+        if finger >= len(self.weight):
+            raise BadArgument("finger", finger, f"one of {len(self.weight)}")
+        for name, vector in (("impulse", impulse), ("point", point)):
+            _check_vector(name, vector)
         self.impulse[finger] += impulse
         self.moment[finger] += size * point
         self.weight[finger] += size
 
-    def accumulate(self, step: "StepContacts", count: int) -> None:
+    @checked
+    def accumulate(self, step: "StepContacts", count: Count) -> None:
         """Add one of `count` steps: impulses are summed, forces are averaged."""
         self.impulse[:] += step.impulse
         self.moment[:] += step.moment
         self.weight[:] += step.weight
         self.force[:] += step.force / count
+
+
+def _check_vector(name: str, vector: np.ndarray) -> None:
+    """Refuse an array of another shape than (3,), or of what is no number."""
+    if vector.shape != (3,) or vector.dtype.kind not in "iuf":
+        raise BadArgument(name, f"shape {vector.shape} of {vector.dtype}", "shape (3,) of numbers")
 
 
 class Scene(abc.ABC):
@@ -270,16 +284,21 @@ class Scene(abc.ABC):
     def _move_mount(self, joint: str, target: float, speed: float) -> None:
         """Set target [m] and target speed [m/s] of a joint of the mount."""
 
+    @checked
     def lift(self, height: float, speed: float = 0.0) -> None:
         """Set target height [m] and speed [m/s] of the hand."""
         self._move_mount(LIFT_JOINT, height, speed)
 
+    @checked
     def approach(self, left: float, speed: float = 0.0) -> None:
         """Set the remaining length [m] of the approach, and its speed [m/s]."""
         self._move_mount(APPROACH_JOINT, -left, speed)
 
+    @checked
     def shift(self, displacement: np.ndarray, velocity: np.ndarray = STILL) -> None:
         """Set the target displacement [m] of the hand from its path, and its velocity [m/s], if its mount yields."""
+        for name, vector in (("displacement", displacement), ("velocity", velocity)):
+            _check_vector(name, vector)
         for joint, target, speed in zip(SHIFT_JOINTS, displacement, velocity, strict=True):
             self._move_mount(joint, target, speed)
 

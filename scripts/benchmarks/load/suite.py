@@ -161,7 +161,7 @@ def _checks(hand: str) -> list[Row]:
     plan_grasps(view, model, SPEC, STARTS)  # what is read once is read now
     with (
         patch.object(border, "_read", timed(getattr(border, "_read"))),  # noqa: B009
-        patch.object(Call, "check_finite", timed(Call.check_finite)),
+        patch.object(Call, "check_numbers", timed(Call.check_numbers)),
         patch.object(inspect.Signature, "bind", timed(inspect.Signature.bind)),
     ):
         for starts in (100, 1000):

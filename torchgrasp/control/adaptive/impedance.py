@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.border import checked
 from torchgrasp.control.adaptive.stability import StabilityModel, lengths_of, state_of
 from torchgrasp.control.closing_law import damped_inverse
 from torchgrasp.control.holding.force import RAMP, held_forces, regulate
@@ -164,6 +165,7 @@ class Impedance(Part):
         self.raised += share * (MOST_RAISE - self.raised)
         self.springs = self.springs * (preferred.springs / self.springs) ** share
 
+    @checked
     def forces(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
         """Return the fingertips' forces on the object [N]."""
         frame = self._frame(tips)

@@ -130,6 +130,7 @@ class StabilityModel(Value):
         forces = mean.exp()
         return PreferredForces(forces, forces[:, None] * covariance * forces, rest.marginal(STIFFNESS).mean().exp())
 
+    @checked(gradients=True)
     def log_odds(self, state: Float[Tensor, "*b 9"]) -> Float[Tensor, "*b"]:
         """Return the log-odds that a grasp is stable, by Bayes' rule.
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value, join
-from torchgrasp.border import Count, checked
+from torchgrasp.border import Count, Pose, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, inverse, rotate
 from torchgrasp.linalg import farthest_points, reflect, reflect_directions
@@ -83,7 +83,8 @@ class Completion(Value):
     outline: Outlines
     kind: Kind
 
-    def moved(self, b_from_a: Float[Tensor, "4 4"]) -> "Completion":
+    @checked
+    def moved(self, b_from_a: Pose) -> "Completion":
         """Return the completion in frame b; it is given in frame a."""
         normals = rotate(b_from_a, self.planes[:, :3])
         planes = torch.cat([normals, self.planes[:, 3:] + normals @ b_from_a[:3, 3:]], 1)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import checked
+from torchgrasp.border import Pose, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.frames import apply, rotate
 from torchgrasp.linalg import farthest_points, unit
@@ -66,18 +66,21 @@ class Silhouette(Value):
     cut: bool
     gap: float
 
+    @checked(gradients=True)
     def hull_distance(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return the signed distance [m] to the visual hull, positive outside."""
         outside, _, depth = self._look_up(points)
         return outside * depth
 
+    @checked(gradients=True)
     def violation(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return the distance [m] by which points violate the view; 0 where hidden."""
         outside, visible, depth = self._look_up(points)
         in_front = (visible - depth - FRONT_MARGIN).clamp_min(0)
         return torch.where(outside > 0, outside * depth, in_front)
 
-    def moved(self, b_from_a: Float[Tensor, "4 4"]) -> "Silhouette":
+    @checked
+    def moved(self, b_from_a: Pose) -> "Silhouette":
         """Return the silhouette in frame b; it is given in frame a."""
         viewpoint, rim = apply(b_from_a, self.viewpoint[None])[0], apply(b_from_a, self.rim)
         axes, rim_normals = rotate(b_from_a, self.axes), rotate(b_from_a, self.rim_normals)
@@ -130,14 +133,17 @@ class Outlines(Value):
         """Greatest width [m] within an outline where the view measured nothing."""
         return max(view.gap for view in self.views)
 
-    def moved(self, b_from_a: Float[Tensor, "4 4"]) -> "Outlines":
+    @checked
+    def moved(self, b_from_a: Pose) -> "Outlines":
         """Return the outlines in frame b; they are given in frame a."""
         return Outlines(tuple(view.moved(b_from_a) for view in self.views))
 
+    @checked(gradients=True)
     def hull_distance(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return the signed distance [m] to the visual hull of all views."""
         return torch.stack([view.hull_distance(points) for view in self.views]).amax(0)
 
+    @checked(gradients=True)
     def violation(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return the greatest violation [m] of a view."""
         return torch.stack([view.violation(points) for view in self.views]).amax(0)

@@ -1,0 +1,203 @@
+"""Valid arguments of public functions, and valid values, made from annotations."""
+
+import collections.abc
+import dataclasses
+import functools
+import tempfile
+import types
+import typing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import AbstractArray
+from torch import Tensor
+
+import torchgrasp
+from torchgrasp import PointCloud, fit_shape, load_hand, load_object, load_scene
+from torchgrasp.border import Range
+from torchgrasp.cloud import estimate_normals
+from torchgrasp.control import ClosingReference, ControlRecorder, GraspController, no_contact, observe
+from torchgrasp.control.adaptive.belief import Belief
+from torchgrasp.control.adaptive.impedance import Impedance
+from torchgrasp.control.adaptive.stability import NAMES, StabilityModel
+from torchgrasp.errors import Status
+from torchgrasp.hand.urdf import Urdf, read_urdf
+from torchgrasp.ik import GraspProblem, PostureLibrary
+from torchgrasp.objects import load_shipped_grasp
+from torchgrasp.pipeline.funnel import Funnel, Losses
+from torchgrasp.plan import Shape
+from torchgrasp.posture_model import GaussianMixture, GraspMixture, SampleSpec, write_samples
+from torchgrasp.posture_model.dataset import SampleFolder
+from torchgrasp.posture_model.encoding import CODE_NAMES
+from torchgrasp.shape import Kernel, thin_plate_kernel
+from torchgrasp.shape.completion.complete import Completion, complete_cloud
+from torchgrasp.shape.completion.silhouette import Outlines, Silhouette, silhouettes
+from torchgrasp.shape.hollow import HollowShape
+from torchgrasp.shape.posterior import Posterior
+from torchgrasp.sim.hand import SimulatedHand
+from torchgrasp.sim.scene import Scene, StepContacts
+from torchgrasp.values import Certificate, Contacts, Grasps
+
+LENGTHS = {"b": 1, "n": 6, "g": 1, "f": 3, "t": 4, "k": 2, "v": 5, "q": 6, "c": 3}
+"""Lengths of the letters in samples; others are 4."""
+Lengths = collections.abc.Mapping[str, int]
+NONE: Lengths = types.MappingProxyType({})
+
+
+def hints_of(thing: Any) -> dict[str, Any]:
+    """Return the annotations of a function or dataclass with their marks."""
+    late = {"trimesh": trimesh, "StabilityModel": StabilityModel}
+    hints = typing.get_type_hints(thing, localns=late, include_extras=True)
+    return {name: hint for name, hint in hints.items() if name != "return"}
+
+
+@functools.cache
+def special(kind: type) -> Any:
+    """Return a valid object of a class whose fields depend on each other."""
+    half = torch.full((1, 7), 0.5, dtype=torch.float64)
+    mixture = (torch.ones(1, dtype=torch.float64), half, torch.eye(7, dtype=torch.float64)[None], ("j", *CODE_NAMES))
+    nine = GaussianMixture(torch.ones(1), torch.zeros(1, 9), torch.eye(9)[None], NAMES)
+    made = {
+        torchgrasp.Hand: lambda: load_hand("barrett"),
+        torchgrasp.Scene: load_scene,
+        torchgrasp.GraspObject: lambda: load_object("cylinder"),
+        PointCloud: few_points,
+        Grasps: lambda: load_shipped_grasp("jug", "barrett"),
+        Contacts: lambda: special(Grasps).contacts,
+        Certificate: lambda: special(Grasps).certificate,
+        ClosingReference: lambda: ClosingReference.from_grasp(special(torchgrasp.Hand), special(Grasps)),
+        GraspController: lambda: GraspController(special(ClosingReference)),
+        ControlRecorder: ControlRecorder,
+        Belief: lambda: Belief(special(torchgrasp.ShapeGP), torch.eye(4, dtype=torch.float64)),
+        GraspProblem: grasp_problem,
+        PostureLibrary: lambda: PostureLibrary.of(special(torchgrasp.Hand), 100),
+        Impedance: impedance,
+        Urdf: lambda: read_urdf(special(torchgrasp.Hand).urdf_path),
+        Funnel: lambda: Funnel((Losses("contacts", "starts", 50, {Status.NOT_CLOSED: 10}),)),
+        SampleFolder: lambda: write_samples(special(torchgrasp.Hand), SampleSpec(20), tempfile.mkdtemp()),
+        Completion: lambda: complete_cloud(estimate_normals(special(PointCloud))),
+        Outlines: lambda: silhouettes(special(PointCloud)),
+        Silhouette: lambda: special(Outlines).views[0],
+        Posterior: lambda: special(torchgrasp.ShapeGP),
+        HollowShape: lambda: HollowShape.join(*[special(torchgrasp.ShapeGP)] * 2, special(PointCloud)),
+        Scene: type("Nowhere", (Scene,), {name: nothing for name in ("__init__", *Scene.__abstractmethods__)}),
+        SimulatedHand: simulated_hand,
+        StepContacts: StepContacts.none,
+        torchgrasp.Plane: lambda: torchgrasp.Plane.horizontal(0.0),
+        torchgrasp.ShapeGP: lambda: fit_shape(special(PointCloud), budget=30),
+        Kernel: lambda: thin_plate_kernel(2.0),
+        GaussianMixture: lambda: GaussianMixture(*mixture),
+        GraspMixture: lambda: GraspMixture(*mixture),
+        StabilityModel: lambda: StabilityModel(nine, nine, 0.5),
+        trimesh.Trimesh: lambda: trimesh.creation.box([0.05, 0.05, 0.1]),
+        torch.Generator: lambda: torch.Generator().manual_seed(0),
+    }  # fmt: skip
+    of_hand = {type(part): part for part in vars(load_hand("barrett")).values() if dataclasses.is_dataclass(part)}
+    return made[kind]() if kind in made else of_hand.get(kind)
+
+
+def few_points() -> PointCloud:
+    """Return some of a shipped view."""
+    view = load_object("cylinder").view
+    return PointCloud(view.points[:150], None, view.viewpoint)
+
+
+def impedance() -> Impedance:
+    """Return what holds a shipped grasp."""
+    reference = special(ClosingReference)
+    seen = observe(reference.hand, reference.joints, no_contact())
+    return Impedance(reference, seen, seen.joints)
+
+
+def nothing(*arguments: Any) -> None:
+    """Do nothing."""
+
+
+def simulated_hand() -> SimulatedHand:
+    """Return a hand whose scene has nothing but names: what a border refuses reaches none."""
+    reference, scene = special(ClosingReference), special(Scene)
+    scene.timestep, scene.joint_names = 0.002, reference.hand.tree.joint_names
+    return SimulatedHand(scene, reference, 50.0, None)
+
+
+def grasp_problem() -> GraspProblem:
+    """Return a problem of inverse kinematics, whose contacts have a deviation."""
+    fields = {name: sample(hint, Path()) for name, hint in hints_of(GraspProblem).items() if name != "reachable"}
+    std = torch.full_like(fields["contacts"].points[..., 0], 0.001)
+    return GraspProblem(**fields | {"contacts": dataclasses.replace(fields["contacts"], std_m=std)})
+
+
+def sample(hint: Any, path: Path, own: Lengths = NONE) -> Any:
+    """Return a valid argument for an annotation; `own` are the lengths of some letters."""
+    origin, inside = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Annotated:
+        mark = inside[1]
+        if isinstance(mark, Range):
+            middle = mark.low if mark.low > 0 else min(mark.high, 1)
+            return inside[0](max(middle, min(mark.high, 1)) if inside[0] is float else middle)
+        return sample(inside[0], path, own)
+    if origin in (typing.Union, types.UnionType):
+        return sample(inside[0], path, own)
+    if origin is typing.Literal:
+        return inside[0]
+    if isinstance(hint, type) and issubclass(hint, AbstractArray):
+        return sample_tensor(hint, own)
+    if hint is Shape:
+        return special(torchgrasp.ShapeGP)
+    if hint is torch.Tensor:
+        return torch.ones(3, dtype=torch.float64)
+    if hint is np.ndarray:
+        return np.ones((6, 3))
+    simple = {
+        int: 1,
+        float: 0.5,
+        bool: True,
+        str: "x",
+        bytes: b"x",
+        Path: path / "x",
+        object: 0,
+        Any: 0,
+        type(None): None,
+    }
+    if hint in simple:
+        return simple[hint]
+    if origin is collections.abc.Callable:
+        return lambda *arguments: None
+    if origin is tuple:
+        return () if inside[-1:] == (...,) else tuple(sample(x, path) for x in inside)
+    if isinstance(origin, type) and issubclass(origin, collections.abc.Mapping):
+        return {sample(inside[0], path): sample(inside[1], path)}
+    if isinstance(origin, type):
+        return [sample(inside[0], path)] if inside else []
+    if isinstance(hint, typing.TypeVar):
+        return 0
+    if issubclass(hint, Status):
+        return Status.OK
+    found = special(hint)
+    if found is None and dataclasses.is_dataclass(hint):
+        required = [f.name for f in dataclasses.fields(hint) if f.default is f.default_factory is dataclasses.MISSING]
+        hints = hints_of(hint)
+        found = hint(**{name: sample(hints[name], path) for name in required})
+    if found is None and issubclass(hint, tuple):
+        found = hint(*(sample(x, path) for x in hints_of(hint).values()))
+    assert found is not None, hint
+    return found
+
+
+def sample_tensor(hint: Any, own: Lengths = NONE) -> Tensor:
+    """Return a tensor of a shape that an annotation allows."""
+    shape = []
+    for axis in hint.dim_str.split():
+        name = axis.lstrip("*#")
+        if axis[0] != "*" and axis != "...":
+            shape.append(int(name) if name.isdigit() else {**LENGTHS, **own}.get(name, 4))
+    kind = hint.dtype.__name__
+    if kind == "Float":
+        if shape[-2:] == [4, 4]:
+            return torch.eye(4, dtype=torch.float64).expand(*shape).clone()
+        x = torch.rand(shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        return x / x.norm(dim=-1, keepdim=True) if shape[-1:] == [3] else x
+    return torch.zeros(shape, dtype=torch.int64 if kind == "Int" else torch.bool)

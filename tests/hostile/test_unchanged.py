@@ -1,0 +1,68 @@
+"""Public calls, with valid and with hostile arguments, change neither these nor the state of the process.
+
+They run in a process of their own: the annotation checks of the tests draw from Python's global generator themselves.
+"""
+
+import subprocess
+import sys
+import warnings
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.hostile.arguments import checked_things, required, wrong_arguments
+from tests.hostile.samples import hints_of
+from tests.hostile.unchanged import changes
+from torchgrasp.base import Value
+from torchgrasp.border import Count
+
+SHARES = 4
+"""Processes that share the calls."""
+IMPORTED = "sympy", "sapien"
+"""Packages of others that are imported late, and leave a filter of warnings and variables of the environment."""
+ROOT = Path(__file__).parents[2]
+SWEEP = "from pathlib import Path; from tests.hostile.test_unchanged import sweep; sweep({}, Path({!r}))"
+
+
+def sweep(share: int, folder: Path) -> None:
+    """Print every call of a share that changes something, and what."""
+    warnings.simplefilter("ignore")
+    for package in filter(find_spec, IMPORTED):
+        import_module(package)
+    for name, (make, annotated) in sorted(checked_things().items())[share::SHARES]:
+        call, hints = make(), hints_of(annotated)
+        good = required(annotated, call, folder)
+        one = {key: 1 for key, hint in hints.items() if hint == Count}  # one start, one row: little work
+        wrong = list(wrong_arguments(annotated, call))  # beartype draws which items it looks at
+        value = getattr(call, "__self__", None)
+        kept = [value if isinstance(value, Value) else None, good, [x for _, x in wrong]]
+
+        def run(call: Any = call, good: Any = good | one) -> None:
+            call(**good)
+
+        def refuse(call: Any = call, good: Any = good, wrong: Any = wrong) -> None:
+            for key, x in wrong:
+                try:
+                    call(**good | {key: x})
+                except Exception:  # which one is asserted elsewhere
+                    continue
+
+        for how, act in (("valid", run), ("hostile", refuse)):
+            if changed := changes(act, *kept):
+                print(name, how, *changed, sep="; ", flush=True)
+
+
+@pytest.mark.promise("N10")
+@pytest.mark.parametrize("share", range(SHARES))
+def test_no_call_changes_its_arguments_or_the_state_of_the_process(share, tmp_path):
+    found = subprocess.run(
+        [sys.executable, "-c", SWEEP.format(share, str(tmp_path))],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+    assert (found.returncode, found.stdout) == (0, ""), found.stdout + found.stderr
