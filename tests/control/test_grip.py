@@ -89,14 +89,16 @@ def test_friction_belief_is_the_posterior_of_a_gaussian():
     assert belief.low < belief.mean < belief.high
 
 
-def carried(weight: float, friction: float, seconds: float = 4.0) -> tuple[GripHold, Observation, list[float]]:
+def carried(
+    weight: float, friction: float, seconds: float = 4.0, max_force: float | None = None
+) -> tuple[GripHold, Observation, list[float]]:
     """Hold a block whose weight comes off its table in half a second, after another one, without noise.
 
     The joints follow at once: what the hand wants is what is felt. A finger slides where that exceeds its cone.
     """
     strong = {name: drive._replace(effort=8.0) for name, drive in reference().hand.actuators.items()}
     hand = dataclasses.replace(reference().hand, actuators=strong)
-    known = dataclasses.replace(reference(), hand=hand, table=Plane(real([0, 1, 0]), -0.1))
+    known = dataclasses.replace(reference(), hand=hand, table=Plane(real([0, 1, 0]), -0.1), max_force=max_force)
     seen = observation(0.0, (2.0, 2.0, 4.0), TOUCHING)
     hold, sums = GripHold(known, seen, torch.zeros(9).double()), []
     for k in range(round(seconds / PERIOD)):
@@ -142,3 +144,10 @@ def test_fingers_that_slide_teach_the_friction_and_press_harder():
 def test_what_exceeds_the_torques_is_too_heavy():
     hold, _, _ = carried(40.0, 0.8)
     assert hold.status is Status.TOO_HEAVY and hold.weight > 5.0
+
+
+def test_a_fragile_block_is_carried_by_what_it_bears():
+    hold, seen, sums = carried(1.0, 0.8, max_force=2.0)
+    assert hold.status is Status.OK and hold.weight == pytest.approx(1.0, rel=0.05)
+    assert max(sums) < 1.05 * 4.0  # the thumb presses with 2 N, the others with the half
+    assert float(seen.tactile.reading.max()) < 2.0

@@ -62,6 +62,9 @@ SLID = 0.03
 """Time [s] of sliding after which its ratio
 of forces is that of its friction: until then the filtered forces lag."""
 
+FLOOR = 0.8
+"""Largest force of a balanced set above all floors, over what a finger may press at most: the load needs the rest."""
+
 RISE = 60.0
 """Fastest rise of a force [N/s]: a light touch becomes a firm grip in 0.1 s."""
 
@@ -92,7 +95,7 @@ class GripHold(Part):
         self.normals, self.radius = self._sensed(observation, reference.normals.numpy()), hand.tips.radius.numpy()
         self.solver = LeastForces(forces.numpy().copy(), effort, max_force)
         push = np.abs((forces.numpy() * self.normals).sum(-1))
-        self.grip, self.least = np.minimum(push, max_force), np.full(len(push), LEAST_PUSH)
+        self.planned, self.grip, self.least = push, np.minimum(push, max_force), np.full(len(push), LEAST_PUSH)
         self.felt, self.load, self.carried = np.zeros((len(push), 3)), np.zeros(6), np.zeros(6)
         self.up = None if reference.table is None else reference.table.normal.numpy()
         self.friction, self.optimism = FrictionBelief(FRICTION), 0.0
@@ -113,8 +116,7 @@ class GripHold(Part):
         jacobian = observation.jacobian.numpy()
         contacts = self._feel(observation, period)
         self._learn(observation, period)
-        floor = np.maximum(self.grip, self.least)
-        wanted = self.solver.solve(contacts, self.normals, jacobian, self.load, self.aim, floor)
+        wanted = self.solver.solve(contacts, self.normals, jacobian, self.load, self.aim, self._floor())
         self._judge(wanted, jacobian, period)
         step = self._command(contacts, wanted, period) - self.sent
         length = np.linalg.norm(step, axis=-1, keepdims=True)
@@ -123,6 +125,12 @@ class GripHold(Part):
         share = min(self.time / RAMP, 1.0)
         lead = torch.from_numpy(torque) / self.reference.kp
         return self.start + share * (self.rest + lead - self.start)
+
+    def _floor(self) -> np.ndarray:
+        """Return the least normal forces [N]; planned forces above them stay within the limit."""
+        floor = np.maximum(self.grip, self.least)
+        largest = float((floor / self.planned).max() * self.planned.max())
+        return floor * min(1.0, FLOOR * self.solver.most / largest)
 
     def _command(self, contacts: Balance, wanted: np.ndarray, period: float) -> np.ndarray:
         """Return forces for the drives: the fingers' deflection bears what they do not carry."""
