@@ -48,6 +48,7 @@ def test_the_planner_waits_once_a_step(device, shape, triples):
     spec, there = ContactSpec.paper(), sent(shape)
     problem, state = ContactProblem.of(there, spec), start_state(there, sent(triples))
 
+    @checked  # as a public function calls it: within the border nothing is read again
     def run(steps: int) -> object:
         return descend(there, problem, state, Stage(centre=3.0, cones=0.3, steps=steps, settled=0.0))
 
@@ -60,7 +61,7 @@ def test_refinement_waits_for_the_pairs_of_links_too(device, shape, hand, grasps
     hand, contacts, world = sent(hand), sent(grasps.contacts), sent(world)
     start = sent(Configuration(grasps.joints + 0.1, grasps.obj_from_hand))
 
-    @checked  # as a public function calls it: within the border nothing is read again
+    @checked
     def run(steps: int) -> object:
         return refine(hand, start, contacts, world, 0.0, steps)
 
@@ -77,7 +78,12 @@ def test_a_pick_of_the_selection_waits_once(device):
     seen = on_surface(x, torch.nn.functional.normalize(x, dim=-1), noise, 0.05)
     known = off_surface(torch.zeros_like(x[:1]), -torch.ones_like(x[:1, 0]), 0.1)
     kernel = kernel_by_name("thin_plate", 3.6)
-    assert waits_of_a_step(device, lambda picks: select_points(seen, known, kernel, picks), 4, 9) == {"linalg.py": 1}
+
+    @checked
+    def run(picks: int) -> object:
+        return select_points(seen, known, kernel, picks)
+
+    assert waits_of_a_step(device, run, 4, 9) == {"linalg.py": 1}
 
 
 def test_expectation_waits_only_for_its_factors(device, hand):
@@ -98,7 +104,12 @@ def test_expectation_waits_only_for_its_factors(device, hand):
 def test_farthest_points_and_kinematics_never_wait(device, hand):
     there, joints = sent(hand), elsewhere(torch.zeros(4, hand.dof))
     points = elsewhere(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)))
+
+    @checked
+    def run() -> None:
+        farthest_points(points, 10)
+        there.tree.poses(there.actuated.couple(joints))
+
     device.places.clear()
-    farthest_points(points, 10)
-    there.tree.poses(there.actuated.couple(joints))
+    run()
     assert not device.places
