@@ -9,7 +9,12 @@ from scipy.optimize import linprog
 
 from torchgrasp.frames import rotation_from_vector
 from torchgrasp.plan.cone_forces import forces_in_cones
-from torchgrasp.plan.internal_forces import internal_forces, least_friction_forces, tangential_ratio
+from torchgrasp.plan.internal_forces import (
+    _search_weights,
+    internal_forces,
+    least_friction_forces,
+    tangential_ratio,
+)
 
 FINGERTIPS = pytest.mark.parametrize("fingertips", [3, 4, 5])
 
@@ -152,6 +157,21 @@ def test_few_sets_of_three_contacts_and_many_are_searched_alike(uneven):
     for k in range(20):
         alone = least_friction_forces(points[k], normals[k], 4.0, None if preferred is None else preferred[k])
         torch.testing.assert_close(alone, together[k], rtol=0, atol=1e-9, equal_nan=True)
+
+
+@FINGERTIPS
+def test_no_contacts_need_no_forces(fingertips):
+    nothing = torch.zeros(2, 0, fingertips, 3)
+    assert least_friction_forces(nothing, nothing).shape == nothing.shape
+    assert least_friction_forces(nothing[0], nothing[0], 4.0, nothing[0, ..., 0]).shape == nothing.shape[1:]
+
+
+def test_arrays_need_no_device():
+    """They have none before NumPy 2."""
+    former = type("Former", (np.ndarray,), {"device": property()})
+    push, slide = np.random.default_rng(0).normal(size=(2, 3, 3)), np.random.default_rng(1).normal(size=(2, 9, 3))
+    for found, now in zip(_search_weights(np, push.view(former), slide), _search_weights(np, push, slide), strict=True):
+        np.testing.assert_array_equal(found, now)
 
 
 def test_four_fingers_against_a_thumb_press_with_a_quarter_each_or_as_is_preferred():

@@ -112,7 +112,7 @@ def _search_forces(
     if preferred is not None:
         asked.append((preferred / preferred.amax(-1, keepdim=True)).expand(push.shape[:-1]).reshape(-1, 3, 1))
     asked = [x.detach().double() for x in asked]
-    if len(asked[0]) <= FEW and not points.is_cuda:
+    if len(asked[0]) <= FEW and points.device.type == "cpu":
         with np.errstate(over="ignore", invalid="ignore"):  # of contacts that are not finite, or far away
             weights, cost = map(torch.from_numpy, _search_weights(np, *(x.numpy() for x in asked)))
     else:
@@ -130,16 +130,16 @@ def _search_weights(space: Any, push: Any, slide: Any, preferred: Any = None) ->
         slide: (b, 9, 3), tangential forces at each contact of each push.
         preferred: (b, 3, 1), proportions of the normal forces; None: equal ones.
     """
-    rows, rounds = space.arange(len(push), device=push.device), _rounds()
+    rows, *rounds = np.arange(len(push)), *_rounds()
     if space is torch:
-        rounds = tuple(torch.from_numpy(x).to(push.device) for x in rounds)
+        rows, *rounds = (torch.from_numpy(x).to(push.device) for x in (rows, *rounds))
     weights = space.zeros_like(push[:, 0])
     cost = weights[:, 0]
     for steps in rounds:
         tried = weights[:, :, None] + steps
         normal = (push @ tried).clip(min=1e-12)
         across = slide @ tried
-        ratio = space.amax((across * across).reshape(len(push), 3, 3, -1).sum(2) / (normal * normal), 1) ** 0.5
+        ratio = space.amax((across * across).reshape(*push.shape, steps.shape[1]).sum(2) / (normal * normal), 1) ** 0.5
         least, most = space.amin(normal, 1), space.amax(normal, 1)
         if preferred is None:
             uneven = EVENNESS * most / least
