@@ -151,3 +151,18 @@ def test_a_fragile_block_is_carried_by_what_it_bears():
     assert hold.status is Status.OK and hold.weight == pytest.approx(1.0, rel=0.05)
     assert max(sums) < 1.05 * 4.0  # the thumb presses with 2 N, the others with the half
     assert float(seen.tactile.reading.max()) < 2.0
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("sideways", [slice(0, 1), slice(0, 3)])
+@pytest.mark.parametrize("max_force", [None, 2.0])
+def test_a_finger_whose_planned_force_is_along_the_surface_leaves_floors(sideways, max_force):
+    """A finger in the air keeps the planned forces; the sensed normals of the others may be across them."""
+    normals, points = NORMALS.clone(), TARGET.clone()
+    normals[sideways], points[2] = real([0, 1, 0]), torch.nan
+    seen = observation(0.0, (2.0, 2.0, 4.0), TOUCHING)
+    tactile = dataclasses.replace(seen.tactile, normals=normals, points=points)
+    known, seen = dataclasses.replace(reference(), max_force=max_force), dataclasses.replace(seen, tactile=tactile)
+    floor = GripHold(known, seen, torch.zeros(9).double())._floor()
+    assert np.isfinite(floor).all() and (floor > 0).all()
+    assert max_force is not None or (floor >= LEAST_PUSH).all()

@@ -65,6 +65,9 @@ of forces is that of its friction: until then the filtered forces lag."""
 FLOOR = 0.8
 """Largest force of a balanced set above all floors, over what a finger may press at most: the load needs the rest."""
 
+WEAKEST = 0.01
+"""Least planned normal force, over the largest, that counts: no multiple of less lifts a finger above its floor."""
+
 RISE = 60.0
 """Fastest rise of a force [N/s]: a light touch becomes a firm grip in 0.1 s."""
 
@@ -95,7 +98,8 @@ class GripHold(Part):
         self.normals, self.radius = self._sensed(observation, reference.normals.numpy()), hand.tips.radius.numpy()
         self.solver = LeastForces(forces.numpy().copy(), effort, max_force)
         push = np.abs((forces.numpy() * self.normals).sum(-1))
-        self.planned, self.grip, self.least = push, np.minimum(push, max_force), np.full(len(push), LEAST_PUSH)
+        self.planned = np.maximum(push, WEAKEST * max(float(push.max()), LEAST_PUSH))
+        self.grip, self.least = np.minimum(push, max_force), np.full(len(push), LEAST_PUSH)
         self.felt, self.load, self.carried = np.zeros((len(push), 3)), np.zeros(6), np.zeros(6)
         self.up = None if reference.table is None else reference.table.normal.numpy()
         self.friction, self.optimism = FrictionBelief(FRICTION), 0.0
