@@ -153,6 +153,12 @@ def test_targets_stay_while_the_forces_of_the_holding_are_sought(holding):
     assert controller.pressed == PERIOD
 
 
+def test_joints_of_a_diverged_simulation_pass():
+    known, lost = reference(), torch.full((9,), torch.nan).double()
+    assert torch.isnan(known.expand(lost)).all() and torch.isnan(known.pick(lost)).all()
+    assert torch.isnan(known.hand.actuated.couple(lost)).all()
+
+
 def test_the_first_targets_are_the_opened_hand_and_unknown_names_are_refused():
     assert torch.equal(GraspController(reference()).targets.joints, reference().pregrasp)
     with pytest.raises((BadArgument, TypeError), match="slow"):

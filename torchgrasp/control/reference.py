@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import Pose, Positive, Range, check_tensor, checked
+from torchgrasp.border import ANY, Pose, Positive, Range, check_tensor, checked
 from torchgrasp.closing import ClosingGains
 from torchgrasp.control.closing_law import (
     FORCE_BANDWIDTH,
@@ -140,13 +140,13 @@ class ClosingReference(Value):
         )
 
     @checked
-    def expand(self, actuated: Float[Tensor, " h"]) -> Float[Tensor, " j"]:
+    def expand(self, actuated: Annotated[Float[Tensor, " h"], ANY]) -> Float[Tensor, " j"]:
         """Return all joints of the URDF; NaN, as of a diverged simulation, may pass."""
         return self.hand.actuated.coupling @ actuated + self.hand.actuated.offset
 
     @checked
-    def pick(self, joints: Float[Tensor, " j"]) -> Float[Tensor, " h"]:
-        """Return the actuated joints out of all joints of the URDF."""
+    def pick(self, joints: Annotated[Float[Tensor, " j"], ANY]) -> Float[Tensor, " h"]:
+        """Return the actuated joints out of all joints of the URDF; NaN may pass."""
         return joints[self._actuated]
 
     @functools.cached_property

@@ -1,14 +1,14 @@
 """The actuated joints of a hand, their limits, and the joints that follow them."""
 
 import dataclasses
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value, check_device
-from torchgrasp.border import checked
+from torchgrasp.border import ANY, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand_toml import HandSpec
 from torchgrasp.hand.kinematics import Markers
@@ -47,8 +47,8 @@ class ActuatedJoints(Value):
         return self.couple(joints)
 
     @checked(gradients=True)
-    def couple(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
-        """Return every movable joint without a check, for which the host would wait for a GPU."""
+    def couple(self, joints: Annotated[Float[Tensor, "*b h"], ANY]) -> Float[Tensor, "*b j"]:
+        """Return every movable joint without a look at numbers, for which the host would wait for a GPU."""
         return joints @ self.coupling.to(joints).T + self.offset.to(joints)
 
     @checked(gradients=True)
