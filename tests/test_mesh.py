@@ -1,6 +1,7 @@
 """Meshes: refusals, closest points of triangles against trimesh, and cuts against areas in closed form."""
 
 import contextlib
+import threading
 
 import numpy as np
 import pytest
@@ -186,3 +187,17 @@ def test_what_a_reader_logs_stays_with_it(tmp_path, caplog):
     with contextlib.suppress(MeshError):
         read_mesh(tmp_path / "box.stl")
     assert not caplog.records
+
+
+def test_what_other_threads_log_meanwhile_is_kept(tmp_path, caplog, monkeypatch):
+    def read_beside_another(*arguments, **options):
+        thread = threading.Thread(target=trimesh.util.log.error, args=("of another",))
+        thread.start()
+        thread.join()
+        trimesh.util.log.error("of this")
+        return trimesh.creation.box((0.1, 0.1, 0.1))
+
+    monkeypatch.setattr(trimesh, "load_mesh", read_beside_another)
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "box.stl")
+    read_mesh(tmp_path / "box.stl")
+    assert [record.message for record in caplog.records] == ["of another"]

@@ -4,6 +4,7 @@ import contextlib
 import io
 import logging
 import re
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -43,10 +44,11 @@ def load_triangles(data: bytes, suffix: str, **options: Any) -> Any:
 
 @contextlib.contextmanager
 def _quiet(log: logging.Logger) -> Iterator[None]:
-    """Keep what readers log to themselves: where nobody listens, Python prints it on stderr, traceback and all."""
+    """Keep what readers log in this thread to themselves: else Python prints it on stderr, traceback and all."""
+    here = threading.get_ident()
 
     def drop(record: logging.LogRecord) -> bool:
-        return False
+        return record.thread != here
 
     log.addFilter(drop)
     try:

@@ -197,7 +197,7 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked(gradients=True)
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of (d, w) at normalised points; no check."""
+        """Return the joint posterior of (d, w) at normalised points, of any number."""
         return joint_estimate(self, x)
 
     @checked

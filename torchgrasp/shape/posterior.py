@@ -175,7 +175,7 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
-        """Return mean and variance with derivatives at normalised points: no check, no autograd.
+        """Return mean and variance with derivatives at normalised points, without autograd.
 
         (a, b) are the weights of distances and normals. With d = x - x_j, k', k'' and k''' are derivatives in
         |d|^2 / 2.
