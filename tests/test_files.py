@@ -184,6 +184,22 @@ def test_many_writers_of_one_file_leave_one_of_theirs_whole(tmp_path):
     assert (tmp_path / "f").read_bytes() in contents and os.listdir(tmp_path) == ["f"]
 
 
+def test_a_temporary_folder_that_is_taken_before_it_is_locked_is_made_anew(tmp_path, monkeypatch):
+    made, make = [], tempfile.mkdtemp
+
+    def make_and_lose(**options) -> str:
+        made.append(make(**options))
+        if len(made) == 1:  # another process sweeps it away as abandoned
+            os.rmdir(made[0])
+        return made[-1]
+
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(tempfile, "mkdtemp", make_and_lose)
+    with temporary_folder() as folder:
+        assert folder.is_dir() and str(folder) == made[1]
+    assert len(made) == 2 and not any(tmp_path.iterdir())
+
+
 def test_temporary_folders_of_dead_processes_are_removed_and_of_living_ones_are_not(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     (tmp_path / f"{TEMPORARY}dead").mkdir()

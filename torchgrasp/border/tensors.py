@@ -15,8 +15,8 @@ DTYPES = {
     "Int": (torch.int64, torch.int32),
     "Bool": (torch.bool,),
 }
-DTYPES["Shaped"] = tuple(dtype for dtypes in DTYPES.values() for dtype in dtypes)
 """The dtypes that each kind of annotation allows. Half precision is no length: at 0.3 m it rounds to 0.1 mm."""
+DTYPES["Shaped"] = tuple(dtype for dtypes in DTYPES.values() for dtype in dtypes)
 
 
 @dataclasses.dataclass

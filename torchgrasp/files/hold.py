@@ -108,7 +108,10 @@ def temporary_folder() -> Iterator[Path]:
                 shutil.rmtree(remnant, ignore_errors=True)
     while True:
         folder = tempfile.mkdtemp(prefix=TEMPORARY, dir=home)
-        handle = None if os.name == "nt" else os.open(folder, os.O_RDONLY)  # Windows opens no folder
+        try:
+            handle = None if os.name == "nt" else os.open(folder, os.O_RDONLY)  # Windows opens no folder
+        except FileNotFoundError:  # another process took it for abandoned, before it could be locked
+            continue
         if handle is None or own(handle):
             break
         os.close(handle)
