@@ -3,6 +3,7 @@
 They run in a process of their own: the annotation checks of the tests draw from Python's global generator themselves.
 """
 
+import random
 import subprocess
 import sys
 import warnings
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from tests.hostile.arguments import checked_things, required, wrong_arguments
 from tests.hostile.samples import hints_of
@@ -53,6 +55,36 @@ def sweep(share: int, folder: Path) -> None:
         for how, act in (("valid", run), ("hostile", refuse)):
             if changed := changes(act, *kept):
                 print(name, how, *changed, sep="; ", flush=True)
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (lambda x: x["points"][0].neg_(), "argument 0"),
+        (lambda x: x.update(more=1), "argument 0"),
+        (lambda x: torch.rand(1), "generator of torch"),
+        (lambda x: random.random(), "generator of Python"),
+        (lambda x: warnings.simplefilter("ignore"), "warnings.filters"),
+        (lambda x: sys.path.append("nowhere"), "sys.path"),
+    ],
+)
+def test_changes_are_noticed_even_where_the_call_raises(change, found):
+    given, path, state = {"points": torch.ones(2, 3)}, list(sys.path), random.getstate()
+
+    def call() -> None:
+        change(given)
+        raise ValueError
+
+    with warnings.catch_warnings(), torch.random.fork_rng(devices=[]):
+        noticed = changes(call, given)
+    sys.path[:] = path
+    random.setstate(state)
+    assert noticed == [found]
+
+
+def test_a_call_that_changes_nothing_is_told_so():
+    given = {"points": torch.ones(2, 3)}
+    assert changes(lambda: given["points"] + 1, given) == []
 
 
 @pytest.mark.promise("N10")
