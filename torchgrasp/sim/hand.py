@@ -9,7 +9,8 @@ import torch
 from torchgrasp.border import Range, checked
 from torchgrasp.control import ClosingReference, FingertipSensor, Observation, Targets, TipContact
 from torchgrasp.errors import BadArgument
-from torchgrasp.sim.scene import Scene, StepContacts
+from torchgrasp.sim.scene import Scene
+from torchgrasp.sim.step_contacts import StepContacts
 
 
 class SimulatedHand:

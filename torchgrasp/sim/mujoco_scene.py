@@ -8,7 +8,8 @@ from torchgrasp.errors import HandFileError, MissingExtra
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.sim.mjcf import NEIGHBOUR, OBJECT, scene_mjcf
 from torchgrasp.sim.mount import MOUNT_DRIVE, mount_slides
-from torchgrasp.sim.scene import NEIGHBOURS, STILL, TABLETOP, TARGET, Scene, SceneSpec, StepContacts
+from torchgrasp.sim.scene import NEIGHBOURS, STILL, TABLETOP, TARGET, Scene, SceneSpec
+from torchgrasp.sim.step_contacts import StepContacts
 
 
 class MujocoScene(Scene):

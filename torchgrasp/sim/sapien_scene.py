@@ -16,8 +16,8 @@ from torchgrasp.sim.scene import (
     TARGET,
     Scene,
     SceneSpec,
-    StepContacts,
 )
+from torchgrasp.sim.step_contacts import StepContacts
 
 _PLACES = {"neighbour": NEIGHBOURS, "table": TABLETOP, "object": TARGET}
 """Column of `Disturbance` for the bodies of each name."""
