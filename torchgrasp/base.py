@@ -178,6 +178,19 @@ def put(whole: SomeBatch, at: Int[Tensor, "a"], part: SomeBatch) -> SomeBatch:
     return map_tensors(lambda rows, new: rows.index_copy(0, at, new), whole, part)
 
 
+def in_chunks(evaluate: Callable[[Tensor], tuple[Any, ...]], x: Tensor, size: int) -> tuple[Any, ...]:
+    """Evaluate a function of the leading axis in chunks of bounded memory."""
+    if len(x) <= size:
+        return evaluate(x)
+    whole: tuple[Any, ...] = ()
+    for start in range(0, len(x), size):
+        pieces = evaluate(x[start : start + size])
+        whole = whole or tuple(p.new_empty((len(x), *p.shape[1:])) for p in pieces)
+        for target, piece in zip(whole, pieces, strict=True):
+            target[start : start + size] = piece
+    return whole
+
+
 def named_tensors(value: Value, prefix: str = "") -> dict[str, Tensor]:
     """Return every tensor inside a value by its dotted field name."""
     tensors: dict[str, Tensor] = {}

@@ -5,6 +5,7 @@ import inspect
 from typing import Any
 
 import pytest
+import torch
 
 import torchgrasp
 from tests.hostile.arguments import HOSTILE, behind, checked_things, methods_of, public, required, wrong_arguments
@@ -68,3 +69,9 @@ def test_wrong_arguments_are_refused_by_name(name, tmp_path):
 
 def show(value: Any) -> str:
     return f"{type(value).__name__} {value!r}"[:60]
+
+
+def test_a_method_takes_its_value_by_name():
+    shape = torchgrasp.fit_shape(torchgrasp.load_object("jug").view)
+    points = shape.cloud.points[:2]
+    assert torch.equal(type(shape).normalise(self=shape, points=points), shape.normalise(points))

@@ -10,6 +10,7 @@ from scipy.optimize import linprog
 from torchgrasp.frames import rotation_from_vector
 from torchgrasp.plan.cone_forces import forces_in_cones
 from torchgrasp.plan.internal_forces import (
+    _rounds,
     _search_weights,
     internal_forces,
     least_friction_forces,
@@ -164,6 +165,15 @@ def test_no_contacts_need_no_forces(fingertips):
     nothing = torch.zeros(2, 0, fingertips, 3)
     assert least_friction_forces(nothing, nothing).shape == nothing.shape
     assert least_friction_forces(nothing[0], nothing[0], 4.0, nothing[0, ..., 0]).shape == nothing.shape[1:]
+
+
+def test_contacts_on_the_cpu_are_searched_whatever_the_default_device_is():
+    points, normals = tripods(1, 8)
+    here = least_friction_forces(points, normals)
+    _rounds.cache_clear()
+    with torch.device("meta"):
+        there = least_friction_forces(points, normals)
+    torch.testing.assert_close(there, here, rtol=0, atol=0)
 
 
 def test_arrays_need_no_device():

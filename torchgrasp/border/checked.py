@@ -87,7 +87,7 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
             return function(*args, **kwargs)
         bound, shared = signature.bind(*args, **kwargs), Call(gradients, deep=not inside)
         if of_value:
-            shared.sizes.update(lengths_of(args[0]))
+            shared.sizes.update(lengths_of(bound.arguments["self"]))
         for name, (read, kind) in readers().items():
             if name in bound.arguments:
                 bound.arguments[name] = _read(read, kind, name, bound.arguments[name], shared)

@@ -60,12 +60,12 @@ def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, 
         if not len(owner):
             break
         rows = max(1, min(ROWS_PER_CHUNK, NUMBERS_PER_CHUNK // len(owner)))
-        frames = tree.frames(look[:, :rows])
+        first, *others = look.split(rows, 1)
+        frames = tree.frames(first)
         if not done:
             _limit_near(urdf, shapes, frames, look.shape[1], MOST_FIRST)
-        for values in look.split(rows, 1):
-            frames = tree.frames(values)
-            apart = shapes.separations(frames, MEETING_DISTANCE)
+        for posed in itertools.chain([frames], map(tree.frames, others)):
+            apart = shapes.separations(posed, MEETING_DISTANCE)
             least = apart.new_full((len(links), apart.shape[1]), torch.inf)
             least.scatter_reduce_(0, owner[:, None].expand_as(apart), apart, "amin")
             met += (least < 0).sum(1)

@@ -18,9 +18,9 @@ from torchgrasp.linalg import GOLDEN_ANGLE, fibonacci_sphere, unit
 from torchgrasp.plan.cone_forces import forces_in_cones
 from torchgrasp.plan.problem import contact_pairs, pull_signs
 
-DIRECTIONS, NEIGHBOURS = 1024, 64
+DIRECTIONS, NEIGHBOURS = 1024, 128
 """Directions in the null space that are tried first, 0.06 rad apart, and around the best in each refinement."""
-REFINEMENTS, SHRINK = 24, 0.75
+REFINEMENTS, SHRINK = 12, 0.55
 """Rounds of the search, and the radius of each over the last: from 0.12 rad down to 1e-4 rad."""
 FEW = 8
 """Sets of contacts up to which NumPy searches sooner than torch."""
@@ -156,6 +156,8 @@ def _search_weights(space: Any, push: Any, slide: Any, preferred: Any = None) ->
 @functools.cache
 def _rounds() -> tuple[np.ndarray, ...]:
     """Return the steps that each round of the search tries: all directions first, then ever shorter ones."""
-    around = np.concatenate([np.zeros((1, 3)), fibonacci_sphere(NEIGHBOURS, GOLDEN_ANGLE, 0.0).numpy()]).T
+    with torch.device("cpu"):  # whatever the default device is
+        first, near = (fibonacci_sphere(n, GOLDEN_ANGLE, 0.0).numpy() for n in (DIRECTIONS, NEIGHBOURS))
+    around = np.concatenate([np.zeros((1, 3)), near]).T
     radii = 4 / math.sqrt(DIRECTIONS) * SHRINK ** np.arange(REFINEMENTS)
-    return fibonacci_sphere(DIRECTIONS, GOLDEN_ANGLE, 0.0).numpy().T.copy(), *(radius * around for radius in radii)
+    return first.T.copy(), *(radius * around for radius in radii)

@@ -15,9 +15,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import in_chunks
 from torchgrasp.linalg import unit
 from torchgrasp.shape.joint_posterior import distance_covariance
-from torchgrasp.shape.posterior import Posterior, in_chunks, surface_deviation
+from torchgrasp.shape.posterior import Posterior, surface_deviation
 
 FOOTPRINT = 0.012
 """Half the width [m] over which a fingertip feels the slope of the surface: the radius of its sphere."""

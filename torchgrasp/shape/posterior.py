@@ -1,15 +1,13 @@
 """The posterior in the normalised frame: mean, derivatives and covariances, Eqs. (7)-(8)."""
 
 import dataclasses
-from collections.abc import Callable
 from functools import cached_property, partial
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from torchgrasp.base import Batch, Value
+from torchgrasp.base import Batch, Value, in_chunks
 from torchgrasp.border import checked
 from torchgrasp.linalg import unit
 from torchgrasp.shape.gradient_kernel import cross_covariance, separations
@@ -286,19 +284,6 @@ def _distance_rows(
 def _sum_differences(c: Float[Tensor, "q n"], x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"]) -> Float[Tensor, "q 3"]:
     """Return sum_j c_j (x - y_j), by a matrix product."""
     return x * c.sum(1, keepdim=True) - c @ y
-
-
-def in_chunks(evaluate: Callable[[Tensor], tuple[Any, ...]], x: Tensor, size: int) -> tuple[Any, ...]:
-    """Evaluate a function of the leading axis in chunks of bounded memory."""
-    if len(x) <= size:
-        return evaluate(x)
-    whole: tuple[Any, ...] = ()
-    for start in range(0, len(x), size):
-        pieces = evaluate(x[start : start + size])
-        whole = whole or tuple(p.new_empty((len(x), *p.shape[1:])) for p in pieces)
-        for target, piece in zip(whole, pieces, strict=True):
-            target[start : start + size] = piece
-    return whole
 
 
 def _distances(x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"]) -> Float[Tensor, "q n"]:

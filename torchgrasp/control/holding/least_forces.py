@@ -95,7 +95,7 @@ class LeastForces(Part):
 
     def solve(
         self,
-        balance: Balance,
+        contacts: Balance,
         normals: Float[Array, "f 3"],
         jacobian: Float[Array, "f 3 j"],
         load: Float[Array, "6"],
@@ -109,7 +109,7 @@ class LeastForces(Part):
         count = len(normals)
         limits = np.concatenate([jacobian.reshape(3 * count, -1).T / self.effort[:, None], self._normal(normals)])
         gap = GAP * (float(np.linalg.norm(load[:3])) + float(floor.sum()))
-        barrier = _Barrier(balance, normals, limits, load, gap)
+        barrier = _Barrier(contacts, normals, limits, load, gap)
         tried = barrier.place(self.forces) + GROWTH[:, None] * barrier.place(self.start, 0.0)
         z = barrier.choose(tried, friction, floor)
         for _ in range(STEPS if math.isfinite(barrier.slack) else 0):  # no cone holds a finger that does not press
@@ -140,14 +140,14 @@ class _Barrier:
 
     def __init__(
         self,
-        balance: Balance,
+        contacts: Balance,
         normals: Float[Array, "f 3"],
         limits: Float[Array, "l n"],
         load: Float[Array, "6"],
         gap: float,
     ) -> None:
         self.count, self.gap = len(normals), gap
-        self.basis, self.carried = balance.free, balance.inverse @ load
+        self.basis, self.carried = contacts.free, contacts.inverse @ load
         self.rows = self.basis.reshape(self.count, 3, -1)
         self.spread = np.einsum("nik,nil->nkl", self.rows, self.rows)
         self.tau, self.tau_0 = limits @ self.basis, limits @ self.carried

@@ -48,7 +48,6 @@ NEARBY, NEARBY_ANGLE, NEARBY_SHIFT = 5, 0.15, 0.045
 PENALTY = 0.05
 """Score that an image of an image loses: of two equal points the one mirrored once is kept."""
 
-
 Kind = Literal["ball", "revolution", "mirrored", "guess", "cut off"]
 """What a hidden side follows from: an ellipsoid, an axis, mirror planes, or nothing but the outline."""
 
