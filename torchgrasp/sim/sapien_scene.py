@@ -22,6 +22,9 @@ from torchgrasp.sim.step_contacts import StepContacts
 _PLACES = {"neighbour": NEIGHBOURS, "table": TABLETOP, "object": TARGET}
 """Column of `Disturbance` for the bodies of each name."""
 
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
+"""Coordinates after and before each one, in a vector product."""
+
 
 class SapienScene(Scene):
     """Table, object and hand in one SAPIEN scene."""
@@ -54,7 +57,7 @@ class SapienScene(Scene):
 
     def _map_joints(self) -> None:
         """Prepare the Jacobian: each driven joint's frame in its link, and the tips it moves."""
-        self._frames = [_matrix(j.pose_in_child) for j in self._driven]
+        self._frames = np.array([_matrix(j.pose_in_child) for j in self._driven])
         self._slides = np.array([j.type == "prismatic" for j in self._driven])
         self._moves = np.zeros((len(self.tips), len(self._driven)))
         for t, tip in enumerate(self.tips):
@@ -74,22 +77,17 @@ class SapienScene(Scene):
         self.scene.step()
         contacts = StepContacts.none(len(self.tips))
         for contact in self.system.get_contacts():
-            first, second = (self._name_of[body] for body in contact.bodies)
-            if first in self._links and second in self._links:
+            first, second = contact.bodies
+            first, second = self._name_of[first], self._name_of[second]
+            if (first in self._links) == (second in self._links):
                 continue
-            if first in self._links:
-                link, other, sign = first, second, -1.0
-            elif second in self._links:
-                link, other, sign = second, first, 1.0
-            else:
-                continue
+            link, other, sign = (first, second, -1.0) if first in self._links else (second, first, 1.0)
             finger = self._finger_of.get(link) if other == "object" else None
             if finger is None:
-                size = sum(float(np.linalg.norm(point.impulse)) for point in contact.points)
-                contacts.stray[_PLACES[other]] += size
+                contacts.stray[_PLACES[other]] += sum(_length(point.impulse) for point in contact.points)
                 continue
             for point in contact.points:
-                size = float(np.linalg.norm(point.impulse))
+                size = _length(point.impulse)
                 if size > 0.0:
                     contacts.finger[finger] = True
                     if link in self._tip_of:
@@ -125,11 +123,11 @@ class SapienScene(Scene):
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
         """Return the geometric Jacobian (f, 3, j) of points on the fingertips."""
-        links = [self._pose(j.child_link) for j in self._driven]
-        frames = np.stack([link @ frame for link, frame in zip(links, self._frames, strict=True)])
+        frames = np.array([_matrix(j.child_link.entity_pose) for j in self._driven]) @ self._frames
         arms = points[:, None, :] - frames[None, :, :3, 3]
         axes = np.broadcast_to(frames[:, :3, 0], arms.shape)
-        columns = np.where(self._slides[:, None], axes, np.cross(axes, arms)) * self._moves[..., None]
+        turned = axes[..., _NEXT] * arms[..., _LAST] - axes[..., _LAST] * arms[..., _NEXT]  # np.cross takes 70 us
+        columns = np.where(self._slides[:, None], axes, turned) * self._moves[..., None]
         return columns.transpose(0, 2, 1)
 
     def penetration(self) -> float:
@@ -159,3 +157,8 @@ class SapienScene(Scene):
 def _matrix(pose: Any) -> np.ndarray:
     """Return a pose of SAPIEN as a matrix (4, 4)."""
     return np.asarray(pose.to_transformation_matrix(), float)
+
+
+def _length(impulse: np.ndarray) -> float:
+    """Return the length of a vector as `np.linalg.norm` does, to the bit, in a third of its time."""
+    return float(np.sqrt(impulse.dot(impulse)))
