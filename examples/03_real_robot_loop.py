@@ -3,6 +3,8 @@
 `FakeRobot` stands for the driver of your own hand. Replace its three methods; the loop below stays as it is.
 """
 
+import gc
+
 import torch
 
 from torchgrasp import ContactSpec, load_hand, load_object, plan_grasps
@@ -47,6 +49,8 @@ print("palm to", grasp.obj_from_hand[0].numpy().round(3).tolist(), "with the joi
 
 reference = ClosingReference.from_grasp(hand, grasp, force=4.0)
 controller, robot, tactile = GraspController(reference), FakeRobot(reference), no_contact()
+gc.collect()
+gc.freeze()  # else Python looks through all that was imported in some tick, for 0.1 s
 ticks = 0
 while not controller.closed:  # then lift the arm, and go on stepping
     # `measure` filters the forces and flags contacts; a sensor that does so itself fills a `TactileState`
