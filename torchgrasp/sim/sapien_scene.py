@@ -22,9 +22,6 @@ from torchgrasp.sim.step_contacts import StepContacts
 _PLACES = {"neighbour": NEIGHBOURS, "table": TABLETOP, "object": TARGET}
 """Column of `Disturbance` for the bodies of each name."""
 
-_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
-"""Coordinates after and before each one, in a vector product."""
-
 
 class SapienScene(Scene):
     """Table, object and hand in one SAPIEN scene."""
@@ -126,8 +123,7 @@ class SapienScene(Scene):
         frames = np.array([_matrix(j.child_link.entity_pose) for j in self._driven]) @ self._frames
         arms = points[:, None, :] - frames[None, :, :3, 3]
         axes = np.broadcast_to(frames[:, :3, 0], arms.shape)
-        turned = axes[..., _NEXT] * arms[..., _LAST] - axes[..., _LAST] * arms[..., _NEXT]  # np.cross takes 70 us
-        columns = np.where(self._slides[:, None], axes, turned) * self._moves[..., None]
+        columns = np.where(self._slides[:, None], axes, np.cross(axes, arms)) * self._moves[..., None]
         return columns.transpose(0, 2, 1)
 
     def penetration(self) -> float:
@@ -160,5 +156,5 @@ def _matrix(pose: Any) -> np.ndarray:
 
 
 def _length(impulse: np.ndarray) -> float:
-    """Return the length of a vector as `np.linalg.norm` does, to the bit, in a third of its time."""
+    """Return the length of a vector as `np.linalg.norm` does, to the bit, in less than half of its time."""
     return float(np.sqrt(impulse.dot(impulse)))
