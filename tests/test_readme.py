@@ -33,7 +33,7 @@ def test_the_guide_to_hands_runs_as_it_stands(tmp_path):
     pytest.importorskip("sapien")
     tools, guide = tmp_path / "tools", (ROOT / "docs" / "hands.md").read_text()
     tools.mkdir()
-    command = '-c "import sys; from torchgrasp.cli import main; sys.exit(main())"'
+    command = '-c "from torchgrasp.cli import run_and_exit; run_and_exit()"'
     for name, words in (("python", ""), ("torchgrasp", command)):
         (tools / name).write_text(f'#!/bin/sh\nexec "{sys.executable}" {words} "$@"\n')
         (tools / name).chmod(0o755)

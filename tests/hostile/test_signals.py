@@ -22,14 +22,14 @@ def wait(out: Path) -> int:
     return 0
 
 cli.COMMANDS["wait"] = wait
-sys.exit(cli.main(["wait", "--out", sys.argv[1]]))
+cli.run_and_exit()
 """
 
 
 @pytest.mark.promise("F6")
 @pytest.mark.parametrize(("sign", "code", "said"), [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")])
 def test_a_command_that_is_told_to_end_says_so_and_leaves_nothing(tmp_path: Path, sign: str, code: int, said: str):
-    command = [sys.executable, "-c", WAITING, str(tmp_path / "out")]
+    command = [sys.executable, "-c", WAITING, "wait", "--out", str(tmp_path / "out")]
     # a shell's background processes ignore SIGINT, and their children inherit that
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
@@ -41,6 +41,52 @@ def test_a_command_that_is_told_to_end_says_so_and_leaves_nothing(tmp_path: Path
     _, told = run.communicate()
     assert (run.returncode, told) == (code, f"torchgrasp: {said}\n")
     assert list(tmp_path.iterdir()) == []
+
+
+ENDING = """
+import atexit, sys, time
+from torchgrasp import cli
+
+def tell(word):
+    print(word, flush=True)
+    time.sleep(0.5)
+
+def wait() -> int:
+    try:
+        tell("works")
+        time.sleep(600)
+    finally:
+        tell("tidies")
+
+def last() -> int:
+    return 0
+
+atexit.register(tell, "leaves")
+cli.COMMANDS |= {"wait": wait, "last": last}
+cli.run_and_exit()
+"""
+
+
+@pytest.mark.promise("F6")
+@pytest.mark.parametrize(
+    ("command", "code", "words", "said"),
+    [("wait", 130, ["works", "tidies", "leaves"], "torchgrasp: interrupted\n"), ("last", 0, ["leaves"], "")],
+)
+def test_signals_do_not_disturb_an_end(command: str, code: int, words: list[str], said: str):
+    """An impatient user sends both signals while the command tidies up, and while Python itself ends."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        script = [sys.executable, "-c", ENDING, command]
+        run = subprocess.Popen(script, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert run.stdout is not None
+    for word in words:
+        assert run.stdout.readline() == f"{word}\n"
+        for sign in (signal.SIGINT, *([] if word == "works" else [signal.SIGTERM])):
+            run.send_signal(sign)
+    _, told = run.communicate()
+    assert (run.returncode, told) == (code, said)
 
 
 WORKING = """
@@ -60,7 +106,7 @@ def work(out: Path) -> int:
 
 if __name__ == "__main__":
     cli.COMMANDS["work"] = work
-    sys.exit(cli.main(["work", "--out", sys.argv[1]]))
+    cli.run_and_exit()
 """
 
 
@@ -71,7 +117,7 @@ def test_workers_that_are_told_to_end_with_their_command_say_nothing(tmp_path: P
     """A terminal sends Ctrl-C to all processes of a command."""
     pytest.importorskip("pebble")
     (tmp_path / "script.py").write_text(WORKING)
-    command = [sys.executable, str(tmp_path / "script.py"), str(tmp_path)]
+    command = [sys.executable, str(tmp_path / "script.py"), "work", "--out", str(tmp_path)]
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)

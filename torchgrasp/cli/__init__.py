@@ -10,11 +10,10 @@ import os
 import re
 import signal
 import sys
-import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, NoReturn, get_args, get_origin, get_type_hints
 
 import torch
 import tyro
@@ -32,7 +31,7 @@ from torchgrasp.cli.hand_train import train
 from torchgrasp.cli.results import view
 from torchgrasp.errors import GraspError
 
-__all__ = ["COMMANDS", "main"]
+__all__ = ["COMMANDS", "main", "run_and_exit"]
 
 COMMANDS: dict[str, Callable[..., int]] = {
     "grasp": grasps.grasp,
@@ -95,11 +94,40 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _run(given)
 
 
+def run_and_exit() -> NoReturn:
+    """Run the command line of this process, and end the process.
+
+    The first SIGINT or SIGTERM ends the command in order. Later ones, of an impatient user, cannot disturb that end.
+
+    >>> import subprocess
+    >>> code = "from torchgrasp.cli import run_and_exit; run_and_exit()"
+    >>> subprocess.run([sys.executable, "-c", code, "--version"], capture_output=True).returncode
+    0
+    """
+    told = False
+
+    def end(sign: int, _: object) -> None:
+        nonlocal told
+        if not told:
+            told = True
+            raise _Terminated if sign == signal.SIGTERM else KeyboardInterrupt
+
+    signs = [sign for sign in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(sign) is not signal.SIG_IGN]
+    for sign in signs:
+        signal.signal(sign, end)
+    try:
+        code = main()
+    finally:
+        for sign in signs:
+            signal.signal(sign, signal.SIG_IGN)
+    sys.exit(code)
+
+
 def _run(given: list[str]) -> int:
     """Run the command that the words name; return its exit code."""
     try:
         plain = contextlib.redirect_stderr(_WithoutMarkup(sys.stderr))  # pyright: ignore[reportArgumentType]
-        with warnings.catch_warnings(), _end_in_order(), plain:
+        with warnings.catch_warnings(), plain:
             warnings.showwarning = _show_warning
             code = _application(COMMANDS).cli(
                 prog="torchgrasp",
@@ -171,23 +199,6 @@ class _WithoutMarkup:
 
 class _Terminated(KeyboardInterrupt):
     """SIGTERM, which ends a command as SIGINT does: workers are stopped, and nothing half-written stays."""
-
-
-@contextlib.contextmanager
-def _end_in_order() -> Iterator[None]:
-    """Raise `_Terminated` at SIGTERM within the context; only the main thread may say so."""
-
-    def end(*_: object) -> None:
-        raise _Terminated
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, end)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: object) -> None:

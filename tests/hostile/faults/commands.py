@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from tests.campaign.cheap import records
-from torchgrasp import cli, load_hand, load_object, plan_grasps
+from torchgrasp import load_hand, load_object, plan_grasps
 from torchgrasp.cli import grasps as grasp_command
 from torchgrasp.cli import hand_train
 from torchgrasp.datasets.shards import JobRow, Shard, pack_shard
@@ -29,15 +29,15 @@ from torchgrasp.values import load_grasps
 
 POSE = [[1.0, 0.0, 0.0, 0.4], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]]
 
-Command = Callable[[Path], int]
-"""Runs a command that writes below a folder; returns its exit code."""
+Command = Callable[[Path], list[str]]
+"""The words of a command that writes below a folder."""
 
 
 def sample(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
     """Three chunks of postures."""
     monkeypatch.setattr("torchgrasp.posture_model.sample.CHUNK_POSTURES", 40)
     monkeypatch.setattr("torchgrasp.posture_model.dataset.CHUNK_POSTURES", 40)
-    return lambda out: cli.main(["hand", "sample", "--hand", "barrett", "--n", "100", "--out", str(out / "samples")])
+    return lambda out: ["hand", "sample", "--hand", "barrett", "--n", "100", "--out", str(out / "samples")]
 
 
 def train(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
@@ -45,9 +45,11 @@ def train(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
     monkeypatch.setattr(hand_train, "check_hand", load_hand)
     monkeypatch.setattr(hand_train, "STARTS", 1)
     words = ["hand", "train", "barrett", "--n", "100", "--held-out", "20", "--components", "1"]
-    return lambda out: cli.main(
-        [*words, "--checkpoint", str(out / "step.safetensors"), "--out", str(out / "model.safetensors")]
-    )
+    return lambda out: [
+        *words,
+        *("--checkpoint", str(out / "step.safetensors")),
+        *("--out", str(out / "model.safetensors")),
+    ]
 
 
 @functools.cache
@@ -74,7 +76,7 @@ def grasp(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
     monkeypatch.setattr(grasp_command, "extract_surface", lambda shape: surface)
     monkeypatch.setattr(page, "draw_pictures", lambda run: {})
     view = str(DATA / "cylinder" / "view.ply")
-    return lambda out: cli.main(["grasp", view, "--hand", "barrett", "--starts", "8", "--out", str(out / "grasps")])
+    return lambda out: ["grasp", view, "--hand", "barrett", "--starts", "8", "--out", str(out / "grasps")]
 
 
 def evaluate(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
@@ -96,7 +98,7 @@ def evaluate(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
     monkeypatch.setattr(campaign, "_plan", plan)
     monkeypatch.setattr(campaign, "_try", try_grasp)
     words = ["evaluate", "--objects", str(folder), "--hand", "barrett", "--grasps", "2", "--workers", "0"]
-    return lambda out: cli.main([*words, "--out", str(out / "evaluation")])
+    return lambda out: [*words, "--out", str(out / "evaluation")]
 
 
 def gather(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
@@ -113,7 +115,7 @@ def gather(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
     monkeypatch.setattr("torchgrasp.campaign.run.run_job", work)
     monkeypatch.setattr(sys.modules["torchgrasp.cli.campaign"], "import_simulator", lambda name: None)
     words = ["campaign", str(folder), "--hand", "barrett", "--jobs-in-shard", "2", "--workers", "0"]
-    return lambda out: cli.main([*words, "--out", str(out / "campaign")])
+    return lambda out: [*words, "--out", str(out / "campaign")]
 
 
 COMMANDS = {"sample": sample, "train": train, "grasp": grasp, "evaluate": evaluate, "campaign": gather}

@@ -5,10 +5,13 @@ import io
 import json
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from torchgrasp import cli
 
 CALLS = ("mkdir", "open", "write", "fsync", "chmod", "replace", "unlink", "rmdir")
 """The calls of `os` that change a disk, and that the library's writing goes through."""
@@ -54,7 +57,7 @@ UNCAUGHT = 70
 REAL = {name: getattr(os, name) for name in CALLS}
 
 
-def run(command: Callable[[], int], happen: Happening | None = None, at: int = -1) -> Ended:
+def run(words: list[str], happen: Happening | None = None, at: int = -1) -> Ended:
     """Run a command in a child; `happen` comes before its call number `at`. Its clocks stand still."""
     ours, theirs = os.pipe()
     child = os.fork()
@@ -65,13 +68,17 @@ def run(command: Callable[[], int], happen: Happening | None = None, at: int = -
         _watch(calls, happen, at)
         time.perf_counter = time.process_time = lambda: 0.0
         said = io.StringIO()
-        code = 70  # of an error that nobody caught
+        code = UNCAUGHT
         with (
             contextlib.suppress(Exception),
             contextlib.redirect_stdout(io.StringIO()),
             contextlib.redirect_stderr(said),
         ):
-            code = command()
+            sys.argv[1:] = words
+            try:
+                cli.run_and_exit()
+            except SystemExit as ended:
+                code = ended.code
         _send_all(theirs, json.dumps([code, calls, said.getvalue()]).encode())
         os._exit(0)
     os.close(theirs)

@@ -5,20 +5,20 @@ Some calls of each command are tried; `--hypothesis-profile=long` tries all.
 
 import contextlib
 import errno
-import functools
 import io
 import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
-from tests.hostile.faults.commands import COMMANDS
+from tests.hostile.faults.commands import COMMANDS, Command
 from tests.hostile.faults.inject import Ended, Happening, contents, fail, kill, run, send
+from torchgrasp import cli
 from torchgrasp.datasets.shards import load_shard
 from torchgrasp.files import hold_file, hold_folder
 
@@ -37,7 +37,7 @@ STEP = 8
 class Bench(NamedTuple):
     """A command on folders of its own, with what it writes undisturbed and the calls that it makes."""
 
-    command: Callable[[Path], int]
+    command: Command
     whole: dict[str, bytes]
     calls: list[str]
     folder: Path
@@ -47,9 +47,8 @@ class Bench(NamedTuple):
         """Let something happen at many calls, each in a fresh folder; then the command is run again to its end."""
         for at in range(first % self.step, len(self.calls), self.step):
             out = self.folder / str(at)
-            begin = functools.partial(self.command, out)
-            yield run(begin, happenings[at // self.step % len(happenings)], at), out
-            again = run(begin)
+            yield run(self.command(out), happenings[at // self.step % len(happenings)], at), out
+            again = run(self.command(out))
             assert (again.code, again.said) == (0, ""), (at, self.calls[at], again.said)
             assert contents(out) == self.whole, (at, self.calls[at])
 
@@ -69,8 +68,8 @@ class Bench(NamedTuple):
 def bench(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
     command = COMMANDS[request.param](monkeypatch, tmp_path)
     with contextlib.redirect_stdout(io.StringIO()):
-        assert command(tmp_path / "first") == 0  # imports what the children would import each
-    ended = run(lambda: command(tmp_path / "whole"))
+        assert cli.main(command(tmp_path / "first")) == 0  # imports what the children would import each
+    ended = run(command(tmp_path / "whole"))
     whole = contents(tmp_path / "whole")
     assert (ended.code, ended.said) == (0, "")
     assert {"open", "write", "fsync", "replace", "unlink"} <= set(ended.calls) and len(whole) > 1
@@ -108,8 +107,8 @@ def test_a_second_run_on_what_another_writes_is_refused_by_name(
 ):
     command, out = COMMANDS[name](monkeypatch, tmp_path), tmp_path / "out"
     with hold_file(out / "model.safetensors") if name == "train" else hold_folder(out / HELD[name]):
-        assert command(out) == 2
+        assert cli.main(command(out)) == 2
         said = capsys.readouterr().err
         assert said.startswith("torchgrasp: --out: found") and f"in use by process {os.getpid()} on" in said
         assert not [file for file in contents(out) if not Path(file).name.startswith(".")]
-    assert command(out) == 0
+    assert cli.main(command(out)) == 0

@@ -29,7 +29,7 @@ torchgrasp.posture_model.dataset.CHUNK_POSTURES = torchgrasp.posture_model.sampl
 from torchgrasp import cli
 
 if __name__ == "__main__":
-    sys.exit(cli.main(sys.argv[1:]))
+    cli.run_and_exit()
 """
 """The command line, whose clocks stand still and whose chunks are small; workers import it, too."""
 
@@ -59,7 +59,7 @@ campaign._plan, campaign._try, campaign.TRIAL_LIMIT = plan, attempt, float(os.en
 
 if __name__ == "__main__":
     sys.modules["torchgrasp.cli.evaluate"].import_simulator = lambda name: None
-    sys.exit(cli.main(sys.argv[1:]))
+    cli.run_and_exit()
 """
 """`evaluate` without planning and simulation; the second grasp of the view "left" meets with something."""
 
