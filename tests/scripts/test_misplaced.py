@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.pinch import cylinder, pinch
 from torchgrasp.base import join
-from torchgrasp.errors import Status
-from torchgrasp.frames import inverse
+from torchgrasp.frames import inverse, rigid, rotation_from_vector
 
 
 @pytest.mark.parametrize("condition", ["in place", "20 mm", "10 degrees", "afloat, 10 mm"])
@@ -36,7 +36,7 @@ def test_what_was_tried_is_kept_and_only_the_rest_is_tried_anew(tmp_path, monkey
 
     def run(trial, wrong, law, mass, seed):
         tried.append((law, float(trial.error[0, 3])))
-        return Status.OK, 1.0, 0.1, 4.0
+        return {"status": "OK", "moved": 1.0, "unbalanced": 0.1}
 
     monkeypatch.setattr(misplaced, "_run", run)
     monkeypatch.setattr(misplaced, "_plan", lambda *_: join([grasp, grasp, grasp]))
@@ -52,3 +52,19 @@ def test_what_was_tried_is_kept_and_only_the_rest_is_tried_anew(tmp_path, monkey
     assert misplaced.try_object(spec, subject, "allegro", "20 mm", ("uncertainty",)) == first
     errors = [error for _, error in tried]
     assert errors[:3] == errors[3:] and len(set(errors)) == 3  # laws are paired, grasps are not alike
+
+
+@pytest.mark.parametrize(("arrival", "moved"), [(0.1, 0.0), (0.2, 30.0), (math.nan, 50.0)])
+def test_early_motion_is_that_of_the_centre_until_the_hand_arrived(arrival: float, moved: float):
+    """The object turns about its centre, then is shifted twice."""
+    mesh = cylinder((0.02, 0.01))
+    centre = torch.tensor(mesh.center_mass.tolist(), dtype=torch.float64)
+    rotation = rotation_from_vector(torch.tensor([0.3, -0.2, 0.9], dtype=torch.float64))
+    shifts = torch.tensor([[0.0, 0, 0], [0.0, 0, 0], [0.03, 0, 0], [0.03, 0.04, 0]], dtype=torch.float64)
+    turns = [torch.eye(3, dtype=torch.float64), rotation, rotation, rotation]
+    poses = [rigid(turn, centre + shift - turn @ centre) for turn, shift in zip(turns, shifts, strict=True)]
+    time = torch.tensor([0.0, 0.1, 0.2, 0.3], dtype=torch.float64)
+    done = SimpleNamespace(
+        time=time, object_pose=torch.stack(poses), phases=torch.tensor([arrival], dtype=torch.float64)
+    )
+    assert misplaced._moved_early(done, SimpleNamespace(mesh=mesh)) == pytest.approx(moved, abs=1e-6)

@@ -23,7 +23,7 @@ from benchmarks.close.conditions import BARS, CONDITIONS, DEFAULT, FRAGILE, IN_M
 from benchmarks.close.drawn import draw_solid
 from benchmarks.close.simulator_agreement import Verdicts, agreement_row
 from benchmarks.common import Row
-from torchgrasp import Grasps, Status, TrialSpec, load_hand, plan_grasps
+from torchgrasp import ClosureResult, Grasps, Status, TrialSpec, load_hand, plan_grasps
 from torchgrasp.datasets import list_views, read_mass, read_object_mesh, read_view
 from torchgrasp.errors import GraspError
 from torchgrasp.evaluation import (
@@ -44,7 +44,8 @@ from torchgrasp.evaluation import (
 from torchgrasp.evaluation.protocols import error_from_object_pose
 from torchgrasp.evaluation.views import choose_rows
 from torchgrasp.files import write_file
-from torchgrasp.frames import rigid, rotation_from_vector
+from torchgrasp.frames import apply, rigid, rotation_from_vector
+from torchgrasp.mesh import read_mesh
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ContactSpec, SensorModel
@@ -57,11 +58,15 @@ TABLETOP = TrialSpec(friction=PLANNED_FRICTION)
 """Lifts of 0.1 kg."""
 
 
+HIT = 5.0
+"""Motion [mm] of the object in the approach that counts as a hit by the opened hand: a graze moves things less."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Outcome:
     """One trial: motion before the lift [mm], unbalanced share of the forces then, CPU time [s]; None: not measured.
 
-    `most` is the largest normal force of a fingertip over a tick [N].
+    `most` is the largest normal force of a fingertip over a tick [N], `early` the motion in the approach [mm].
     """
 
     object: str
@@ -75,6 +80,7 @@ class Outcome:
     unbalanced: float | None
     seconds: float
     most: float | None = None
+    early: float | None = None
 
     @property
     def held(self) -> bool:
@@ -134,6 +140,10 @@ def _rows(hand: str, condition: str, laws: Sequence[str], found: Sequence[Outcom
             words.append(f"{DEFAULT} is better by {100 * against.value:+.1f} points [{low:.1f}, {high:.1f}]")
             words.append("it moves things by {:+.2f} mm [{:.2f}, {:.2f}] less".format(*_moved_less(base, mine)))
         words.append(f"lost {lost}")
+        early = [x.early for x in mine if not x.held and x.early is not None]
+        words += (
+            [f"{sum(x > HIT for x in early)} of these were moved by over {HIT:g} mm in the approach"] if early else []
+        )
         least, most = BARS.get(condition, (0.0, math.inf)) if law == DEFAULT else (0.0, math.inf)
         bar = f">= {least:.0%}, <= {most:g} mm" if least else "-"
         met = held.value >= least and moved[0] <= most if least else None
@@ -195,25 +205,37 @@ def _try(spec: TableSpec, subject: Subject, hand: str, condition: str, laws: lis
             followed = (LAWS | SENSED | FRAGILE)[law]
             grasp = swap_deviations(grasps[rank]) if followed.swapped else grasps[rank]
             trial = GraspTrial(load_hand(hand), grasp, mesh, seed_of(seed, "touch"), error, parts=parts)
-            status, moved, unbalanced, most = _run(trial, wrong, followed, mass, seed)
-            spent = time.process_time() - began
-            yield Outcome(*known, rank, condition, law, status.name, moved, unbalanced, spent, most)
+            measured = _run(trial, wrong, followed, mass, seed)
+            yield Outcome(*known, rank, condition, law, seconds=time.process_time() - began, **measured)
 
 
-def _run(trial: GraspTrial, wrong: Condition, law: Law, mass: float, seed: int) -> tuple[Status, Any, Any, Any]:
-    """Return status, motion before the lift [mm], unbalanced share of the forces, and a fingertip's largest [N]."""
+def _run(trial: GraspTrial, wrong: Condition, law: Law, mass: float, seed: int) -> dict[str, Any]:
+    """Return what an `Outcome` has of a trial."""
     changes = law.trial | {"simulator": wrong.simulator}
     if law.dead:
         changes["sensor"] = SensorModel(dead=tuple(trial.hand.finger_names[k] for k in law.dead))
     if wrong.afloat:
         spec = PROTOCOLS[wrong.afloat].with_trial(**{"closing": DEFAULT} | changes)
-        return pull_grasp(trial, spec).status, None, None, None
+        return {"status": pull_grasp(trial, spec).status.name, "moved": None, "unbalanced": None}
     spec = dataclasses.replace(TABLETOP, **changes)
     if wrong.unknown:
         spec = perturb_trial(spec, dataclasses.replace(PERTURBATIONS["mass"], friction=(0.3, 1.0)), mass, seed)
     done = lift_grasp(trial, spec)
-    moved, unbalanced, most = 1e3 * done.before_lift.distance, done.unbalanced, float(done.forces.max())
-    return done.status, *(None if math.isnan(x) else x for x in (moved, unbalanced, most))
+    measured = {
+        "moved": 1e3 * done.before_lift.distance,
+        "unbalanced": done.unbalanced,
+        "most": float(done.forces.max()),
+        "early": _moved_early(done, trial),
+    }
+    return {"status": done.status.name} | {name: None if math.isnan(x) else x for name, x in measured.items()}
+
+
+def _moved_early(done: ClosureResult, trial: GraspTrial) -> float:
+    """Return the motion [mm] of the object's centre while the hand approached."""
+    arrived = int((done.time <= done.phases[0]).sum()) - 1  # the last tick, if the hand never arrived
+    centre = torch.tensor(read_mesh(trial.mesh).center_mass.tolist(), dtype=torch.float64)
+    start, end = apply(done.object_pose[[0, arrived]], centre.expand(2, 1, 3))[:, 0]
+    return 1e3 * float(torch.linalg.vector_norm(end - start))
 
 
 def _misplace(wrong: Condition, grasp: Grasps, mesh: Any, seed: int) -> torch.Tensor:
