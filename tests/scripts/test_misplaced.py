@@ -67,4 +67,15 @@ def test_early_motion_is_that_of_the_centre_until_the_hand_arrived(arrival: floa
     done = SimpleNamespace(
         time=time, object_pose=torch.stack(poses), phases=torch.tensor([arrival], dtype=torch.float64)
     )
-    assert misplaced._moved_early(done, SimpleNamespace(mesh=mesh)) == pytest.approx(moved, abs=1e-6)
+    assert misplaced._moved_early(done, mesh) == pytest.approx(moved, abs=1e-6)
+
+
+def test_what_is_lost_in_place_too_is_counted_by_object_rank_and_law():
+    def lost(rank: int, condition: str, law: str = "uncertainty", status: str = "SLIPPED", early: float = 0.0):
+        return misplaced.Outcome("ball", "balls", "allegro", rank, condition, law, status, 1.0, 0.1, 1.0, 4.0, early)
+
+    in_place = [lost(0, "in place"), lost(1, "in place", status="OK"), lost(2, "in place", "open_loop")]
+    mine = [lost(0, "20 mm"), lost(1, "20 mm", early=9.0), lost(2, "20 mm"), lost(3, "20 mm", status="OK", early=9.0)]
+    words = misplaced._when_lost(mine, in_place)
+    assert words == ["1 of these were moved by over 5 mm in the approach", "1 are lost in place, too"]
+    assert len(misplaced._when_lost(in_place, in_place)) == len(misplaced._when_lost(mine, [])) == 1

@@ -45,7 +45,6 @@ from torchgrasp.evaluation.protocols import error_from_object_pose
 from torchgrasp.evaluation.views import choose_rows
 from torchgrasp.files import write_file
 from torchgrasp.frames import apply, rigid, rotation_from_vector
-from torchgrasp.mesh import read_mesh
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ContactSpec, SensorModel
@@ -56,7 +55,6 @@ PLANNED_FRICTION = 0.6
 
 TABLETOP = TrialSpec(friction=PLANNED_FRICTION)
 """Lifts of 0.1 kg."""
-
 
 HIT = 5.0
 """Motion [mm] of the object in the approach that counts as a hit by the opened hand: a graze moves things less."""
@@ -139,16 +137,23 @@ def _rows(hand: str, condition: str, laws: Sequence[str], found: Sequence[Outcom
             low, high = 100 * against.low, 100 * against.high
             words.append(f"{DEFAULT} is better by {100 * against.value:+.1f} points [{low:.1f}, {high:.1f}]")
             words.append("it moves things by {:+.2f} mm [{:.2f}, {:.2f}] less".format(*_moved_less(base, mine)))
-        words.append(f"lost {lost}")
-        early = [x.early for x in mine if not x.held and x.early is not None]
-        words += (
-            [f"{sum(x > HIT for x in early)} of these were moved by over {HIT:g} mm in the approach"] if early else []
-        )
+        words += [f"lost {lost}", *_when_lost(mine, [x for x in found if (x.hand, x.condition) == (hand, "in place")])]
         least, most = BARS.get(condition, (0.0, math.inf)) if law == DEFAULT else (0.0, math.inf)
         bar = f">= {least:.0%}, <= {most:g} mm" if least else "-"
         met = held.value >= least and moved[0] <= most if least else None
         numbers = {"held": held, "better": against, "moved_mm": moved, "lost": lost}
         yield Row(f"{hand}, {condition}, {law}", bar, "; ".join(words), met, numbers)
+
+
+def _when_lost(mine: Sequence[Outcome], in_place: Sequence[Outcome]) -> list[str]:
+    """Say how many of the lost were hit in the approach, and how many are lost in place, too, where that was tried."""
+    lost = [x for x in mine if not x.held]
+    early = [x.early for x in lost if x.early is not None]
+    words = [f"{sum(x > HIT for x in early)} of these were moved by over {HIT:g} mm in the approach"] if early else []
+    if in_place and lost and lost[0].condition != "in place":
+        anyway = {(x.object, x.rank, x.law) for x in in_place if not x.held}
+        words.append(f"{sum((x.object, x.rank, x.law) in anyway for x in lost)} are lost in place, too")
+    return words
 
 
 def _moved_less(base: Sequence[Outcome], mine: Sequence[Outcome]) -> tuple[float, float, float]:
@@ -225,16 +230,15 @@ def _run(trial: GraspTrial, wrong: Condition, law: Law, mass: float, seed: int) 
         "moved": 1e3 * done.before_lift.distance,
         "unbalanced": done.unbalanced,
         "most": float(done.forces.max()),
-        "early": _moved_early(done, trial),
+        "early": _moved_early(done, trial.mesh),
     }
     return {"status": done.status.name} | {name: None if math.isnan(x) else x for name, x in measured.items()}
 
 
-def _moved_early(done: ClosureResult, trial: GraspTrial) -> float:
+def _moved_early(done: ClosureResult, mesh: Any) -> float:
     """Return the motion [mm] of the object's centre while the hand approached."""
     arrived = int((done.time <= done.phases[0]).sum()) - 1  # the last tick, if the hand never arrived
-    centre = torch.tensor(read_mesh(trial.mesh).center_mass.tolist(), dtype=torch.float64)
-    start, end = apply(done.object_pose[[0, arrived]], centre.expand(2, 1, 3))[:, 0]
+    start, end = apply(done.object_pose[[0, arrived]], _centre(mesh).expand(2, 1, 3))[:, 0]
     return 1e3 * float(torch.linalg.vector_norm(end - start))
 
 
@@ -246,9 +250,14 @@ def _misplace(wrong: Condition, grasp: Grasps, mesh: Any, seed: int) -> torch.Te
         level = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
         place, turn = place * level, turn * (1 - level)
     rotation = rotation_from_vector(wrong.angle * turn / torch.linalg.vector_norm(turn))
-    centre = torch.tensor(mesh.center_mass.tolist(), dtype=torch.float64)
+    centre = _centre(mesh)
     shift = wrong.distance * place / torch.linalg.vector_norm(place)
     return error_from_object_pose(grasp.obj_from_hand[0].double(), rigid(rotation, centre + shift - rotation @ centre))
+
+
+def _centre(mesh: Any) -> torch.Tensor:
+    """Return the mass centre [m]."""
+    return torch.tensor(mesh.center_mass.tolist(), dtype=torch.float64)
 
 
 def _plan(spec: TableSpec, subject: Subject, hand: str, view: str) -> Grasps:
