@@ -54,18 +54,18 @@ class SimulatedHand:
         self.sensor = FingertipSensor(reference, generator)
         nothing = torch.full((fingers, 3), torch.nan, dtype=torch.float64)
         self.truth = TipContact(torch.zeros(fingers).double(), torch.zeros_like(nothing), nothing, nothing)
-        self._places: tuple[np.ndarray, np.ndarray] | None = None
+        self._poses: np.ndarray | None = None
         names, centres = reference.hand.tree.joint_names, reference.hand.tips.center.double()
         self._centres = torch.cat([centres, torch.ones(fingers, 1, dtype=torch.float64)], dim=-1).numpy()
-        self._to_scene = [names.index(name) for name in scene.joint_names]
-        self._from_scene = [scene.joint_names.index(name) for name in names]
+        self._to_scene = np.array([names.index(name) for name in scene.joint_names])
+        self._from_scene = np.array([scene.joint_names.index(name) for name in names])
 
     @checked
     def tick(self, targets: Targets) -> Observation:
         """Drive joints and palm for one control period; return what the robot knows."""
         if len(targets.joints) != len(self._to_scene):
             raise BadArgument("targets", f"{len(targets.joints)} joints", f"all {len(self._to_scene)} of the URDF")
-        self.scene.drive(targets.joints[self._to_scene].numpy())
+        self.scene.drive(targets.joints.numpy()[self._to_scene])
         palm = targets.palm.numpy()
         if palm.any() or self._palm.any():
             rotation = self.scene.hand_pose()[:3, :3]
@@ -77,12 +77,13 @@ class SimulatedHand:
             self.steps += 1
             contacts.accumulate(step, self.substeps)
             self.finger = step.finger
-            for i in np.flatnonzero(step.weight > 0):
-                self.first_touch[i] = min(self.first_touch[i], self.steps)
-            self.first_stray[(step.stray > 0) & np.isinf(self.first_stray)] = self.steps
-            self.stray += step.stray
+            for i, weight in enumerate(step.weight.tolist()):
+                if weight > 0.0:
+                    self.first_touch[i] = min(self.first_touch[i], self.steps)
+            if step.stray.any():
+                self.first_stray[(step.stray > 0) & np.isinf(self.first_stray)] = self.steps
+                self.stray += step.stray
         self.most_stray = np.maximum(self.most_stray, (self.stray - before) / self.period)
-        self.force = np.linalg.norm(contacts.impulse, axis=-1) / self.period
         self.pushes = contacts.force
         return self._observe(contacts)
 
@@ -102,28 +103,32 @@ class SimulatedHand:
         rotation, origin = world_from_hand[:3, :3], world_from_hand[:3, 3]
         tips = self.scene.tip_poses()
         centres = (tips @ self._centres[:, :, None])[:, :3, 0]
+        sizes = np.linalg.norm(contacts.impulse, axis=-1)
+        self.force = sizes / self.period
         with np.errstate(invalid="ignore", divide="ignore"):
             points = contacts.moment / contacts.weight[:, None]
-            normals = -contacts.impulse / np.linalg.norm(contacts.impulse, axis=-1, keepdims=True)
+            normals = -contacts.impulse / sizes[:, None]
         vectors = torch.from_numpy(np.concatenate([contacts.force, normals]) @ rotation)
         places = torch.from_numpy((np.concatenate([points, centres]) - origin) @ rotation)
         f = len(self.force)
         sliding = torch.from_numpy(self._sliding(tips, points, normals))
         self.truth = TipContact(torch.from_numpy(self.force), vectors[:f], places[:f], vectors[f:], sliding)
-        joints, jacobian = self.scene.joints()[self._from_scene], self.scene.jacobian(centres)[..., self._from_scene]
+        joints = self.scene.joints()[self._from_scene]
+        jacobian = self.scene.jacobian(centres).take(self._from_scene, -1)
         turned = torch.from_numpy(rotation.T @ jacobian)
         tactile = self.sensor(self.truth, turned, self.period)
         return Observation(torch.from_numpy(joints), places[f:], turned, tactile)
 
     def _sliding(self, tips: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Return the speed [m/s] of each tip along the object's surface since the last tick; 0 without contact."""
-        pose, before = self.scene.object_pose(), self._places
-        self._places = tips, pose
-        if before is None:
+        poses, before = np.concatenate([tips, self.scene.object_pose()[None]]), self._poses
+        self._poses = poses
+        if before is None or np.isnan(points).all():
             return np.zeros(len(tips))
         here = np.concatenate([points, np.ones((len(points), 1))], 1)
-        on_tip = (before[0] @ np.linalg.inv(tips) @ here[:, :, None])[:, :3, 0]
-        on_object = (here @ (before[1] @ np.linalg.inv(pose)).T)[:, :3]
+        then = before @ np.linalg.inv(poses)
+        on_tip, on_object = (then[:-1] @ here[:, :, None])[:, :3, 0], (here @ then[-1].T)[:, :3]
         moved = on_object - on_tip
         along = moved - (moved * normals).sum(-1, keepdims=True) * normals
-        return np.nan_to_num(np.linalg.norm(along, axis=-1)) / self.period
+        speed = np.linalg.norm(along, axis=-1) / self.period
+        return np.where(np.isnan(speed), 0.0, speed)

@@ -257,4 +257,4 @@ class Scene(abc.ABC):
 
     def tip_poses(self) -> np.ndarray:
         """Return the poses (f, 4, 4) of the fingertips' links."""
-        return np.stack([self._pose(tip) for tip in self.tips])
+        return np.array([self._pose(tip) for tip in self.tips])

@@ -48,8 +48,8 @@ class StepContacts:
         """Add a contact of a fingertip by impulse [N s], its size, and place [m]."""
         if finger >= len(self.weight):
             raise BadArgument("finger", finger, f"one of {len(self.weight)}")
-        for name, vector in (("impulse", impulse), ("point", point)):
-            check_vector(name, vector)
+        check_vector("impulse", impulse)
+        check_vector("point", point)
         self.impulse[finger] += impulse
         self.moment[finger] += size * point
         self.weight[finger] += size
@@ -57,10 +57,10 @@ class StepContacts:
     @checked
     def accumulate(self, step: "StepContacts", count: Count) -> None:
         """Add one of `count` steps: impulses are summed, forces are averaged."""
-        self.impulse[:] += step.impulse
-        self.moment[:] += step.moment
-        self.weight[:] += step.weight
-        self.force[:] += step.force / count
+        np.add(self.impulse, step.impulse, out=self.impulse)
+        np.add(self.moment, step.moment, out=self.moment)
+        np.add(self.weight, step.weight, out=self.weight)
+        np.add(self.force, step.force / count, out=self.force)
 
 
 def check_vector(name: str, vector: np.ndarray) -> None:
