@@ -105,20 +105,33 @@ def _search_forces(
     points: Float[Tensor, "*b 3 3"], normals: Float[Tensor, "*b 3 3"], preferred: Float[Tensor, "*#b 3"] | None
 ) -> Float[Tensor, "*b 3 3"]:
     """Return the forces of three contacts, NaN where none push everywhere."""
-    basis = internal_forces(points)
-    push = -(basis * normals[..., None, :, :]).sum(-1)
-    slide = basis + push[..., None] * normals[..., None, :, :]
-    asked = [push.mT.reshape(-1, 3, 3), slide.flatten(-2).mT.reshape(-1, 9, 3)]
+    sets = [x.double().reshape(-1, 3, 3) for x in (points, normals)]
     if preferred is not None:
-        asked.append((preferred / preferred.amax(-1, keepdim=True)).expand(push.shape[:-1]).reshape(-1, 3, 1))
-    asked = [x.detach().double() for x in asked]
-    if len(asked[0]) <= FEW and points.device.type == "cpu":
-        with np.errstate(over="ignore", invalid="ignore"):  # of contacts that are not finite, or far away
-            weights, cost = map(torch.from_numpy, _search_weights(np, *(x.numpy() for x in asked)))
+        proportions = (preferred / preferred.amax(-1, keepdim=True)).double()
+        sets.append(proportions.expand(points.shape[:-1]).reshape(-1, 3, 1))
+    if len(sets[0]) <= FEW and points.device.type == "cpu":
+        with np.errstate(all="ignore"):  # of contacts that are not finite, or far away, and of those that pull
+            forces = torch.from_numpy(_search_sets(np, *(x.numpy() for x in sets)))
     else:
-        weights, cost = _search_weights(torch, *asked)
-    forces = torch.einsum("...k,...kci->...ci", weights.to(points).reshape(points.shape[:-1]), basis)
-    return torch.where(torch.isfinite(cost).reshape(points.shape[:-2])[..., None, None], forces, torch.nan)
+        forces = _search_sets(torch, *sets)
+    return forces.to(points).reshape(points.shape)
+
+
+def _search_sets(space: Any, points: Any, normals: Any, preferred: Any = None) -> Any:
+    """Return the forces (b, 3, 3) of b sets of contacts; arguments as for `_search_weights`.
+
+    With NumPy all of it is: a hand that begins to hold has one tick for it, and torch's calls took a third of that.
+    """
+    signs = pull_signs(3, torch.device("cpu")).T.numpy() if space is np else pull_signs(3, points.device).T
+    sides = points[:, [1, 2, 0]] - points
+    sides = sides / ((sides * sides).sum(-1) ** 0.5)[..., None]
+    basis = signs[..., None] * sides[:, :, None]
+    push = -(basis * normals[:, None]).sum(-1)
+    slide = basis + push[..., None] * normals[:, None]
+    turned = push.swapaxes(1, 2), slide.reshape(-1, 3, 9).swapaxes(1, 2)
+    weights, cost = _search_weights(space, *turned, preferred)
+    forces = (weights[:, None] @ basis.reshape(-1, 3, 9)).reshape(-1, 3, 3)
+    return space.where(space.isfinite(cost)[:, None, None], forces, math.nan)
 
 
 def _search_weights(space: Any, push: Any, slide: Any, preferred: Any = None) -> tuple[Any, Any]:
@@ -134,10 +147,10 @@ def _search_weights(space: Any, push: Any, slide: Any, preferred: Any = None) ->
     if space is torch:
         rows, *rounds = (torch.from_numpy(x).to(push.device) for x in (rows, *rounds))
     weights = space.zeros_like(push[:, 0])
-    cost = weights[:, 0]
+    best, costs = rows, weights
     for steps in rounds:
         tried = weights[:, :, None] + steps
-        normal = (push @ tried).clip(min=1e-12)
+        normal = push @ tried
         across = slide @ tried
         ratio = space.amax((across * across).reshape(*push.shape, steps.shape[1]).sum(2) / (normal * normal), 1) ** 0.5
         least, most = space.amin(normal, 1), space.amax(normal, 1)
@@ -148,9 +161,9 @@ def _search_weights(space: Any, push: Any, slide: Any, preferred: Any = None) ->
             uneven = PREFERENCE * (off * off).sum(1) ** 0.5
         costs = space.where(least > 1e-12, ratio + uneven, math.inf)
         best = space.argmin(costs, -1)
-        weights, cost = tried[rows, :, best], costs[rows, best]
+        weights = tried[rows, :, best]
         weights = weights / (weights * weights).sum(-1)[:, None] ** 0.5
-    return weights, cost
+    return weights, costs[rows, best]
 
 
 @functools.cache
