@@ -33,7 +33,7 @@ from torchgrasp.posture_model import (
     load_samples,
     sample_configurations,
 )
-from torchgrasp.ik import IKSolution, PostureLibrary, solve_ik
+from torchgrasp.ik import IKSolution, PostureLibrary, SignedDistanceField, solve_ik, surface_field
 from torchgrasp.pipeline import ScenePlan, ThingPlan, explain_empty, plan_grasps, plan_scene, stream_grasps
 from torchgrasp.control import ClosingReference, GraspController, closing_gains
 from torchgrasp.sim import Neighbour
@@ -47,6 +47,7 @@ __all__ = [
     "Plane",
     "ContactSpec",
     "SensorModel",
+    "SignedDistanceField",
     "TrialSpec",
     "Certificate",
     "ClosingGains",
@@ -91,6 +92,7 @@ __all__ = [
     "IKSolution",
     "PostureLibrary",
     "solve_ik",
+    "surface_field",
     "plan_grasps",
     "stream_grasps",
     "explain_empty",

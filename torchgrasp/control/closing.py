@@ -86,6 +86,8 @@ class LawClosing(Part):
     * A finger without a sensor rests where its contact is believed to be until the others touch. Then it searches as
       they do, until its drives feel it or it is `OVERDUE`.
     * `palm`: the palm follows the object, so that the joints come to those of the grasp. It needs `place`.
+    * `retry` is the controller's: where the closed hand feels that a lift would fail, it closes once more. It needs
+      `place`: the next closing begins with a displaced palm and expects the object there (`begin_at`).
 
     Without all of them it is the paper's law. That needs four mends: `joint_step` for its J^-1, `POSITION_FLOOR`,
     `MAX_SPEED`, and a target that leads its joint by no more than the drive can exert. It ends when all
@@ -99,6 +101,7 @@ class LawClosing(Part):
         self.switch, self.waits, self.paces = (part not in without for part in ("switch", "wait", "pace"))
         self.placement = None if "place" in without else Placement(reference)
         self.follows, self.palm = moves_palm("uncertainty", without), STILL
+        self.believed = torch.zeros(6, dtype=torch.float64)  # displacement of the object [m, rad]
         self.felt = torch.zeros_like(reference.normals[:, 0], dtype=torch.bool)
         self.alive, self.quick = reference.alive, reference.sensor.kind == "tactile" and reference.sensor.noise <= 1.0
         self.drives = None if bool(self.alive.all()) else DriveFeel(reference)
@@ -108,6 +111,11 @@ class LawClosing(Part):
         self.steady = torch.zeros_like(reference.normals[:, 0])
         self.share = torch.zeros_like(self.steady)
         self.done = False
+
+    def begin_at(self, displacement: Float[Tensor, "6"], palm: Float[Tensor, "3"]) -> "LawClosing":
+        """Begin with a displaced palm [m], and expect the object by a displacement [m, rad] from where it was seen."""
+        self.placement, self.palm, self.believed = Placement(self.reference, displacement), palm, displacement
+        return self
 
     def press(self) -> "LawClosing":
         """Let fingers that waited press with their desired forces; the palm stays where it is."""
@@ -124,10 +132,10 @@ class LawClosing(Part):
             contact = self.felt | contact | quick
         points, planned, drift = reference.contact_points(tips), gains.target, STILL
         if self.placement is not None:
-            displacement = self.placement.displacement(points, contact)
-            planned = self.placement.moved(displacement)
+            self.believed = self.placement.displacement(points, contact)
+            planned = self.placement.moved(self.believed)
             if self.follows:
-                goal = limit_norm(displacement[:3], PALM_REACH)
+                goal = limit_norm(self.believed[:3], PALM_REACH)
                 drift = limit_norm(PALM_RATE * (goal - self.palm), PALM_SPEED)
         error = planned - points
         ahead = -(error * normals).sum(-1)  # how far the planned contact still lies ahead of each fingertip

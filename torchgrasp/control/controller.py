@@ -10,17 +10,33 @@ from torch import Tensor
 
 from torchgrasp.base import check_device, settle
 from torchgrasp.border import Range, checked
-from torchgrasp.control.closing import FixedGainClosing, LawClosing, OpenLoopClosing, PositionClosing, Revision
+from torchgrasp.control.closing import (
+    PALM_REACH,
+    FixedGainClosing,
+    LawClosing,
+    OpenLoopClosing,
+    PositionClosing,
+    Revision,
+)
 from torchgrasp.control.holding.force import ForceHold, PositionHold
 from torchgrasp.control.holding.grip import GripHold
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.retry import PressCheck, Reopening
 from torchgrasp.control.state import ControllerState, Part, go_on, numbers_of, pack, unpack
 from torchgrasp.control.tactile import no_contact
 from torchgrasp.control.targets import Targets
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.specs import ClosingMode, ClosingPart, HoldingMode, check_closing_parts, check_sensor
+from torchgrasp.specs import (
+    ClosingMode,
+    ClosingPart,
+    HoldingMode,
+    check_closing_parts,
+    check_sensor,
+    closes_again,
+    moves_palm,
+)
 
 Tick = Annotated[float, Range(1e-5, 1.0)]
 """Time [s] from one tick to the next: drives are asked at 10 Hz to 1 kHz, and time does not go back."""
@@ -33,6 +49,12 @@ CLOSING_TIME = 4.0
 
 PRESSING_TIME = 0.5
 """Time [s] from the end of closing until the hand counts as closed: the forces have risen (`RAMP`)."""
+
+PHASES = "in the air", "pressing", "opening"
+"""What a controller is at: its fingers close, they press, or they open to close once more."""
+
+ATTEMPTS = 2
+"""Most times that a hand closes (`PressCheck`)."""
 
 
 def check_modes(closing: str, holding: str, belief: object = None, without: tuple[str, ...] = ()) -> None:
@@ -51,7 +73,8 @@ class GraspController:
     """Close a hand and hold the object: observations in, `Targets` out, all on the CPU.
 
     A closing brings the fingers to the object, then a holding presses. `closed` turns true `PRESSING_TIME` later:
-    then the hand may be lifted, with further steps. The open loop keeps its squeeze.
+    then the hand may be lifted, with further steps. The open loop keeps its squeeze. On a table that the reference
+    knows, a hand that feels no grasp to lift opens again instead, and closes where touches say that the object is.
 
     Args:
         reference: what the hand follows.
@@ -94,9 +117,17 @@ class GraspController:
         check_sensor(reference.sensor, closing, holding)
         self.modes = f"closing {closing}, holding {holding}, without {', '.join(without) or 'nothing'}"
         self.reference = reference = settle(reference, torch.device("cpu"))
-        self.closing = _closing(reference, closing, belief, without)
-        self._hold, self.hold, self._law = _holding(self.closing, holding), None, holding == "law"
+        self._close = functools.partial(_closing, reference, closing, belief, without)
+        self._choose, self._law = functools.partial(_holding, mode=holding), holding == "law"
+        self._begin(self._close())
         self.targets = Targets(reference.expand(reference.pregrasp))
+        self.most = ATTEMPTS if closes_again(closing, without) and reference.table is not None else 1
+        self.attempts, self._reach = 1, PALM_REACH if moves_palm(closing, without) else 0.0
+
+    def _begin(self, closing: "Closing") -> None:
+        """Begin to close."""
+        self.closing, self.hold, self.check, self.reopening = closing, None, None, None
+        self._hold = self._choose(closing)
         self.time, self.pressed = 0.0, 0.0
 
     @property
@@ -104,7 +135,7 @@ class GraspController:
         """Whether the hand has closed and pressed: it may be lifted."""
         if isinstance(self.closing, OpenLoopClosing):
             return self.closing.done
-        return self.pressed >= PRESSING_TIME - 1e-9
+        return self.pressed >= PRESSING_TIME - 1e-9 and (self.check is None or self.check.secure)
 
     @property
     def status(self) -> Status:
@@ -115,7 +146,7 @@ class GraspController:
     def blend(self) -> Float[Tensor, " f"]:
         """Lambda of each finger (Eq. 26) at the last tick; NaN before it and without the law."""
         nothing = torch.full_like(self.reference.normals[:, 0], torch.nan)
-        acts = self.hold is None and self.time > 0.0
+        acts = self.hold is None and self.reopening is None and self.time > 0.0
         return self.closing.share if acts and isinstance(self.closing, LawClosing) else nothing
 
     @checked
@@ -132,9 +163,13 @@ class GraspController:
         if found != shape or observation.tactile.reading.shape != shape[:1]:
             raise BadArgument("observation", f"fingertips, 3 and joints {found}", f"those of the hand, {shape}")
         check_device("observation", observation.joints.device, "the controller", self.targets.joints.device)
+        if self.reopening is not None:
+            self.targets = self._reopen(self.reopening, period)
+            return self.targets
         over = self.closing.done or self.time >= CLOSING_TIME
         if self.hold is None and over and not isinstance(self.closing, OpenLoopClosing):
             self.hold, joints = self._hold(self.reference, observation, self.targets.joints), self.targets.joints
+            self.check = self._check()
         elif self.hold is None:
             self.time += period
             joints = self.closing(observation, period)
@@ -142,7 +177,38 @@ class GraspController:
             self.pressed += period
             joints = self.hold(observation, period)
         self.targets = Targets(joints, self.closing.palm)
+        self._judge(observation)
         return self.targets
+
+    def _check(self) -> PressCheck | None:
+        """Return what judges the pressing hand; None: the closing has no further attempt in any case."""
+        if self.most == 1 or not isinstance(self.closing, LawClosing):
+            return None
+        last = self.attempts >= self.most
+        return PressCheck(self.reference, self.closing.believed, self.closing.palm, last)
+
+    def _judge(self, observation: Observation) -> None:
+        """Open the hand again once it is known that a lift would fail."""
+        if self.check is None:
+            return
+        self.check(observation, self.pressed, PRESSING_TIME - 1e-9)
+        if self.check.judged and not self.check.secure:
+            self.reopening = self._reopening(self.check.displacement)
+            self.hold, self.check, self.pressed = None, None, 0.0
+
+    def _reopening(self, displacement: Float[Tensor, "6"]) -> Reopening:
+        """Return what opens the hand from where it is, and follows a displacement of the object [m, rad]."""
+        return Reopening(self.reference, displacement, self.targets.joints, self.targets.palm, self._reach)
+
+    def _reopen(self, reopening: Reopening, period: float) -> Targets:
+        """Return the targets of the opening hand; at its end begin to close once more."""
+        targets = Targets(reopening(period), reopening.palm)
+        if reopening.done:
+            closing = self._close()
+            assert isinstance(closing, LawClosing)
+            self._begin(closing.begin_at(reopening.displacement, reopening.palm))
+            self.attempts += 1
+        return targets
 
     @checked
     def state(self) -> ControllerState:
@@ -153,7 +219,8 @@ class GraspController:
         """
         if isinstance(self.closing, LawClosing) and self.closing.revise is not None:
             raise BadArgument("state", "that of a controller with a belief", "that of one without")
-        return pack(self._modes(self.hold), self._numbers(self.hold))
+        parts = self._parts(self.hold, self.check, self.reopening)
+        return pack(f"{self.modes}, {self._phase}", self._numbers(parts))
 
     @checked
     def restore(self, state: ControllerState) -> None:
@@ -176,16 +243,20 @@ class GraspController:
         >>> bool((other.targets.joints == targets.joints).all())
         True
         """
-        hold = self._blank() if state.layout.startswith(self._modes(self.closing)) else None
-        numbers = unpack(self._modes(hold), self._numbers(hold), state)
+        phase = next((x for x in PHASES if state.layout.startswith(f"{self.modes}, {x}")), PHASES[0])
+        hold = self._blank() if phase == "pressing" else None
+        check = self._check() if phase == "pressing" else None
+        reopening = self._reopening(torch.zeros(6, dtype=torch.float64)) if phase == "opening" else None
+        parts = self._parts(hold, check, reopening)
+        numbers = unpack(f"{self.modes}, {phase}", self._numbers(parts), state)
         if numbers is None:
-            raise BadArgument("state", state.layout[:80], f"one of {self._modes(hold)}, and of this hand's fingers")
+            raise BadArgument("state", state.layout[:80], f"one of {self.modes}, {phase}, and of this hand's fingers")
         self.time, self.pressed = (float(numbers[f"controller.{name}"]) for name in ("time", "pressed"))
+        self.attempts = int(numbers["controller.attempts"])
         self.targets = Targets(numbers["controller.joints"], numbers["controller.palm"])
-        go_on(self.closing, "closing", numbers)
-        self.hold = hold
-        if isinstance(hold, Part) and hold is not self.closing:
-            go_on(hold, "hold", numbers)
+        self.hold, self.check, self.reopening = hold, check, reopening
+        for name, part in parts.items():
+            go_on(part, name, numbers)
 
     def _blank(self) -> Step:
         """Return the holding as after touching nothing."""
@@ -196,16 +267,24 @@ class GraspController:
         jacobian = torch.zeros(*target.shape, len(joints), dtype=torch.float64)
         return self._hold(reference, Observation(joints, target, jacobian, no_contact(fingers=len(target))), joints)
 
-    def _modes(self, hold: Step | None) -> str:
-        """Return the modes and the phase in words."""
-        return f"{self.modes}, {'in the air' if hold is None else 'pressing'}"
+    @property
+    def _phase(self) -> str:
+        """The phase in words."""
+        return PHASES[2] if self.reopening is not None else PHASES[0] if self.hold is None else PHASES[1]
 
-    def _numbers(self, hold: Step | None) -> dict[str, Tensor]:
-        """Return every number of the controller, with those of a holding."""
-        mine = {"time": self.time, "pressed": self.pressed, **self.targets._asdict()}
-        mine = {f"controller.{name}": torch.as_tensor(x, dtype=torch.float64).clone() for name, x in mine.items()}
-        held = numbers_of(hold, "hold") if isinstance(hold, Part) and hold is not self.closing else {}
-        return mine | numbers_of(self.closing, "closing") | held
+    def _parts(self, hold: Step | None, check: PressCheck | None, reopening: Reopening | None) -> dict[str, Part]:
+        """Return the parts whose numbers are the controller's, by name."""
+        found = {"closing": self.closing, "hold": hold, "check": check, "reopening": reopening}
+        again = hold is self.closing
+        return {name: x for name, x in found.items() if isinstance(x, Part) and not (again and name == "hold")}
+
+    def _numbers(self, parts: dict[str, Part]) -> dict[str, Tensor]:
+        """Return every number of the controller and of parts of it."""
+        mine = {"time": self.time, "pressed": self.pressed, "attempts": self.attempts, **self.targets._asdict()}
+        found = {f"controller.{name}": torch.as_tensor(x, dtype=torch.float64).clone() for name, x in mine.items()}
+        for name, part in parts.items():
+            found |= numbers_of(part, name)
+        return found
 
 
 Closing = OpenLoopClosing | PositionClosing | LawClosing

@@ -25,9 +25,14 @@ FARTHEST = 0.025
 
 
 class Placement(Part):
-    """The belief of the object's displacement, in the hand's frame before its palm moved."""
+    """The belief of the object's displacement, in the hand's frame before its palm moved.
 
-    def __init__(self, reference: ClosingReference) -> None:
+    Args:
+        reference: of the closing.
+        expected: displacement [m, rad] before anything is touched; None: the object is where it was seen.
+    """
+
+    def __init__(self, reference: ClosingReference, expected: Float[Tensor, "6"] | None = None) -> None:
         gains, normals = reference.gains, reference.normals
         self.target, self.normals, self.alive = gains.target, normals, reference.alive
         self.arms = gains.target - gains.target.mean(0)
@@ -41,6 +46,7 @@ class Placement(Part):
             place = place + across * (HEIGHT_SPREAD**-2 - SPREAD**-2)
             turn = eye / TILT**2 + across * (TURN**-2 - TILT**-2)
         self.prior = torch.block_diag(place, turn)
+        self.expected = torch.zeros_like(self.prior[0]) if expected is None else expected
 
     def displacement(self, points: Float[Tensor, "f 3"], touching: Bool[Tensor, "f"]) -> Float[Tensor, "6"]:
         """Return the likeliest displacement of the contacts' centre [m] and rotation about it [rad].
@@ -50,13 +56,13 @@ class Placement(Part):
             touching: which of them touch, as their sensors tell.
         """
         off = ((points - self.target) * self.normals).sum(-1)
+        beyond = (off - self.rows @ self.expected).clamp_min(-FARTHEST)
         touching = touching & self.alive
-        active, found = touching, torch.zeros_like(self.prior[0])
+        active, found = touching, self.expected
         for _ in range(len(off)):
             weight = self.weight * active
-            found = torch.linalg.solve(
-                self.prior + self.rows.T @ (weight[:, None] * self.rows),
-                self.rows.T @ (weight * off.clamp_min(-FARTHEST)),
+            found = self.expected + torch.linalg.solve(
+                self.prior + self.rows.T @ (weight[:, None] * self.rows), self.rows.T @ (weight * beyond)
             )
             missed = touching | active | (self.alive & (off < self.rows @ found))
             if torch.equal(missed, active):

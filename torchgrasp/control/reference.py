@@ -23,6 +23,7 @@ from torchgrasp.control.forces import check_squeeze, contacts_in_hand, desired_f
 from torchgrasp.control.stiffness import drive_stiffness, joint_stiffness, tip_compliance
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand import Hand
+from torchgrasp.ik.sdf import SignedDistanceField
 from torchgrasp.plane import Plane
 from torchgrasp.specs import SensorModel
 from torchgrasp.values import Grasps
@@ -46,6 +47,8 @@ class ClosingReference(Value):
         normals: outward normals of the planned contacts.
         gains: targets, gains and desired forces (Eqs. 26-28).
         table: into which no fingertip presses while it searches; None: none is known.
+        surface: estimated surface of the object in the frame of the grasp (`surface_field`), by which touches tell
+            where the object is; None: tangent planes of the contacts stand for it.
         sensor: what the fingertips tell.
         max_force: largest normal force [N] of a fingertip that the object bears; None: any.
 
@@ -70,6 +73,7 @@ class ClosingReference(Value):
     normals: Float[Tensor, "f 3"]
     gains: ClosingGains
     table: Plane | None = None
+    surface: SignedDistanceField | None = None
     sensor: SensorModel = dataclasses.field(default_factory=SensorModel)
     max_force: Annotated[float, Range(0.1, 1000.0)] | None = None
 

@@ -20,6 +20,7 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.protocols import apply_error
 from torchgrasp.frames import inverse, rigid
 from torchgrasp.hand.hand import Hand
+from torchgrasp.ik.sdf import SignedDistanceField
 from torchgrasp.linalg import unit
 from torchgrasp.mesh import read_mesh
 from torchgrasp.plane import GRID, Plane, to_upright
@@ -60,6 +61,7 @@ class GraspTrial:
     parts: "Sequence[trimesh.Trimesh] | None" = None
     table: Plane | None = None
     neighbours: Sequence[Neighbour] = ()
+    surface: SignedDistanceField | None = None
 
 
 class TrialDriver:
@@ -100,7 +102,7 @@ class TrialDriver:
             table = Plane.horizontal(float(body.mesh.bounds[0, 2]) if trial.table is None else 0.0)
             known = table.moved(inverse(grasp.obj_from_hand[0]))  # the hand's true pose may be another
             self.reference = dataclasses.replace(self.reference, table=known)
-        told = {"sensor": spec.sensor, "max_force": spec.max_force}
+        told = {"sensor": spec.sensor, "max_force": spec.max_force, "surface": trial.surface}
         self.reference = self.reference if reference else dataclasses.replace(self.reference, **told)
         if spec.kp is not None:
             drives = {name: drive._replace(kp=spec.kp) for name, drive in drives.items()}

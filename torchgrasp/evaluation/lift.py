@@ -15,6 +15,7 @@ from torchgrasp.errors import Status
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun, smooth_step
 from torchgrasp.frames import apply, inverse, rotation_angle
 from torchgrasp.hand.hand import Hand
+from torchgrasp.ik.sdf import SignedDistanceField
 from torchgrasp.plane import Plane
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.sim.scene import Neighbour
@@ -51,6 +52,7 @@ def close_hand(
     parts: "Sequence[trimesh.Trimesh] | None" = None,
     table: Plane | None = None,
     neighbours: Sequence[Neighbour] = (),
+    surface: SignedDistanceField | None = None,
 ) -> ClosureResult:
     """Close a hand on the true object, lift it and hold it, in simulation.
 
@@ -70,6 +72,8 @@ def close_hand(
         parts: convex bodies that stand for the mesh; None: its own decomposition (`convex_parts`).
         table: what the object stands on, in the frame of the grasp; None: level, at the mesh's lowest point.
         neighbours: further bodies on the table, which the hand may push.
+        surface: estimated surface of the object (`surface_field`), by which touches tell where it is; None: the
+            contacts' tangent planes alone tell it.
 
     Raises:
         BadArgument: not exactly one row, joints of another hand, or a pre-grasp outside the joint limits.
@@ -85,7 +89,7 @@ def close_hand(
     >>> result.held, result.slip.distance < 0.01, result.disturbance.early, result.trace.forces.shape[1:]
     (True, True, tensor([False, False, False]), torch.Size([3, 3]))
     """
-    return lift_grasp(GraspTrial(hand, grasp, mesh, seed, error, belief, parts, table, neighbours), spec)
+    return lift_grasp(GraspTrial(hand, grasp, mesh, seed, error, belief, parts, table, neighbours, surface), spec)
 
 
 @checked
@@ -284,6 +288,7 @@ class _Lift:
                 *contact[..., :9].unflatten(-1, (3, 3)).unbind(-2), *contact[..., 9:].unbind(-1), *felt.T
             ),
             phases=torch.tensor(reached, dtype=torch.float64),
+            attempts=self.run.controller.attempts,
             seconds=seconds,
         )
 

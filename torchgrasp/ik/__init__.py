@@ -10,12 +10,12 @@ from torchgrasp.ik.motion import collision_probability, lift_clearance
 from torchgrasp.ik.obstacles import Obstacles
 from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
 from torchgrasp.ik.query import query_mixture
-from torchgrasp.ik.sdf import SignedDistanceField, field_from_surface
+from torchgrasp.ik.sdf import SignedDistanceField, field_from_surface, surface_field
 from torchgrasp.ik.solve import IKSolution, solve_ik
 
 __all__ = [
     "CollisionWorld", "Configuration", "GraspCandidates", "GraspErrors", "GraspProblem", "IKSolution",
     "Obstacles", "PostureLibrary", "SignedDistanceField", "check_candidates", "collision_probability",
     "field_from_surface", "lift_clearance", "measure_errors", "nearest_postures", "query_mixture",
-    "solve_contact_first", "solve_ik", "solve_joint",
+    "solve_contact_first", "solve_ik", "solve_joint", "surface_field",
 ]  # fmt: skip

@@ -13,6 +13,8 @@ from torchgrasp.base import Value
 from torchgrasp.border import Range, check_tensor, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.mesh import closest_on_triangles
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.surface import extract_mesh
 
 BAND = 0.026
 """Distance [m] from the surface within which each second node is exact: that of a palm's spheres, with clearance."""
@@ -124,6 +126,22 @@ def field_from_surface(
         known[near] = True
     to = {"device": vertices.device, "dtype": torch.float64}
     return SignedDistanceField(low.to(**to), float(spacing), torch.tensor(values, **to))
+
+
+@checked
+def surface_field(shape: ShapeGP, spacing: Annotated[float, Range(0.001, 0.02)] = 0.004) -> SignedDistanceField:
+    """Return the signed distance field of a shape's estimated surface: by it touches tell where the object is.
+
+    The nodes are `spacing` [m] apart; 4 mm err by less than the surface itself.
+
+    >>> from torchgrasp import fit_shape, load_object
+    >>> jug = load_object("jug")
+    >>> field = surface_field(fit_shape(jug.view, table=0.0), spacing=0.008)
+    >>> field.query(torch.tensor(jug.mesh.center_mass))[0] < -0.02  # [m]: inside
+    tensor(True)
+    """
+    mesh = extract_mesh(shape)
+    return field_from_surface(mesh.vertices, mesh.faces, spacing)
 
 
 def _keep(known: np.ndarray) -> np.ndarray:

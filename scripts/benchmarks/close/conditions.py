@@ -64,6 +64,7 @@ DEFAULT = "uncertainty"
 LAWS = {
     DEFAULT: Law({}),
     "uncertainty, deviations swapped": Law({}, swapped=True),
+    "uncertainty without retry": Law({"without": ("retry",)}),
     "uncertainty without palm": Law({"without": ("palm",)}),
     "uncertainty without place": Law({"without": ("place",)}),
     "uncertainty without wait": Law({"without": ("wait",)}),

@@ -45,6 +45,7 @@ from torchgrasp.evaluation.protocols import error_from_object_pose
 from torchgrasp.evaluation.views import choose_rows
 from torchgrasp.files import write_file
 from torchgrasp.frames import apply, rigid, rotation_from_vector
+from torchgrasp.ik.sdf import surface_field
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ContactSpec, SensorModel
@@ -195,11 +196,13 @@ def _try(spec: TableSpec, subject: Subject, hand: str, condition: str, laws: lis
         return
     mesh, parts = _read_solid(folder, subject.name)
     mass = household_mass(float(mesh.volume), read_mass(folder, subject.name))
+    shape = fit_shape(read_view(folder, subject.name, view), table=0.0)
+    surface = surface_field(shape)
     for rank in choose_rows(len(grasps), spec.grasps, "spread"):
         seed = seed_of(spec.seed, subject.label, view, rank, 0)
         if wrong.drawn:
             try:
-                mesh = draw_solid(fit_shape(read_view(folder, subject.name, view), table=0.0), seed)
+                mesh = draw_solid(shape, seed)
                 parts = convex_parts(mesh)
             except GraspError as problem:
                 print(f"{subject.name}, {hand}: {problem}", flush=True)
@@ -209,7 +212,8 @@ def _try(spec: TableSpec, subject: Subject, hand: str, condition: str, laws: lis
             began = time.process_time()
             followed = (LAWS | SENSED | FRAGILE)[law]
             grasp = swap_deviations(grasps[rank]) if followed.swapped else grasps[rank]
-            trial = GraspTrial(load_hand(hand), grasp, mesh, seed_of(seed, "touch"), error, parts=parts)
+            touch = seed_of(seed, "touch")
+            trial = GraspTrial(load_hand(hand), grasp, mesh, touch, error, parts=parts, surface=surface)
             measured = _run(trial, wrong, followed, mass, seed)
             yield Outcome(*known, rank, condition, law, seconds=time.process_time() - began, **measured)
 

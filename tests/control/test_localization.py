@@ -1,0 +1,170 @@
+"""Tactile localization: displacements of bodies whose distance field is known in closed form are found again."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from tests.point_fingers import GAINS, TARGET, observation, real, reference
+from torchgrasp.control.localization import (
+    FINER,
+    FINEST,
+    NORMAL_STD,
+    SPREAD,
+    SURFACE_STD,
+    TURNS,
+    Localization,
+    Touches,
+)
+from torchgrasp.frames import rigid, rotation_from_vector
+from torchgrasp.ik.sdf import SignedDistanceField
+from torchgrasp.linalg import unit
+from torchgrasp.plane import Plane
+from torchgrasp.specs import SensorModel
+
+CENTER, RADIUS = TARGET.mean(0), 0.03
+HALF = real([0.03, 0.02, 0.045])
+
+
+def ball(points):
+    return (points - CENTER).norm(dim=-1) - RADIUS
+
+
+def block(points):
+    beyond = (points - CENTER).abs() - HALF
+    return beyond.clamp_min(0).norm(dim=-1) + beyond.amax(-1).clamp_max(0)
+
+
+def field(distance, obj_from_hand=None) -> SignedDistanceField:
+    """The field of a body given in the hand's frame, on a grid in that of the object."""
+    pose = torch.eye(4).double() if obj_from_hand is None else obj_from_hand
+    origin = pose[:3, 3] - 0.12
+    nodes = origin + 0.003 * torch.cartesian_prod(*[torch.arange(81).double()] * 3)
+    return SignedDistanceField(origin, 0.003, distance((nodes - pose[:3, 3]) @ pose[:3, :3]).reshape(81, 81, 81))
+
+
+def known(surface, obj_from_hand=None, **changes):
+    """The reference of an object on a table whose normal is the hand's y axis."""
+    gains = dataclasses.replace(GAINS, target=TARGET)
+    pose = torch.eye(4).double() if obj_from_hand is None else obj_from_hand
+    table = Plane(real([0, 1, 0]), -0.1)
+    return dataclasses.replace(reference(), gains=gains, table=table, surface=surface, obj_from_hand=pose, **changes)
+
+
+def displaced(shift, turn=0.0):
+    """Where points of an object go that moves along the table and turns about its normal; and directions."""
+    rotation = rotation_from_vector(real([0, turn, 0]))
+    return lambda x: (x - CENTER) @ rotation.T + CENTER + shift, lambda n: n @ rotation.T
+
+
+def touch(reference, points, normals, contact=(True, True, True), tips=None) -> Touches:
+    touches, contact = Touches(reference), torch.tensor(contact)
+    seen = observation(contact=contact)
+    tactile = dataclasses.replace(
+        seen.tactile,
+        points=torch.where(contact[:, None], points, torch.nan),
+        normals=torch.where(contact[:, None], normals, torch.nan),
+    )
+    tips = points + reference.hand.tips.radius[:, None] * normals if tips is None else tips
+    touches.add(dataclasses.replace(seen, tips=tips, tactile=tactile), torch.zeros(3).double())
+    return touches
+
+
+def locate(reference, touches):
+    search = Localization(reference)
+    while not search.done:
+        search(touches)
+    return search.displacement
+
+
+BALL_POINTS = unit(real([[1, 0.3, 0.5], [0.8, -0.2, -1], [-1, 0.1, 0.2]]))
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.015, 0.0), (-0.012, 0.02), (0.021, -0.027)])
+def test_a_ball_is_found_again_from_three_touches(shift):
+    wanted = real([shift[0], 0.0, shift[1]])
+    there = known(field(ball))
+    found = locate(there, touch(there, CENTER + RADIUS * BALL_POINTS + wanted, BALL_POINTS))
+    assert (found[:3] - wanted).norm() < 2 * FINEST
+
+
+def test_one_touch_tells_where_a_ball_is_as_far_as_its_normal_is_known():
+    # the normal of one contact tells on which side of the ball it is: a plane would tell nothing along itself
+    wanted, normal = real([0.02, 0.0, 0.012]), unit(real([[0.6, 0.0, -0.8]] * 3))
+    there = known(field(ball))
+    tips = CENTER + real([[0, 0, 0], [0, 0.2, 0], [0, -0.2, 0]])  # the others are far off
+    touches = touch(there, CENTER + RADIUS * normal + wanted, normal, (True, False, False), tips)
+    along = torch.linalg.cross(normal[0], real([0, 1, 0]))
+    known_by = {0: SURFACE_STD, 1: NORMAL_STD * RADIUS}  # across the surface, and along it
+    shares = [SPREAD**2 / (SPREAD**2 + known_by[k] ** 2) for k in (0, 1)]  # of Gaussians
+    found = locate(there, touches)[:3]
+    for axis, share in zip((normal[0], along), shares, strict=True):
+        assert abs(float(found @ axis) - share * float(wanted @ axis)) < 2e-3
+
+
+@pytest.mark.parametrize("turn", [-0.2, 0.1])
+def test_a_block_is_found_again_with_its_turn(turn):
+    points = CENTER + real([[0.03, 0.005, 0.03], [0.03, -0.005, -0.03], [-0.012, 0.0, 0.045]])
+    normals, wanted = real([[1, 0, 0], [1, 0, 0], [0, 0, 1]]), real([0.008, 0.0, -0.014])
+    there, (place, direct) = known(field(block)), displaced(wanted, turn)
+    found = locate(there, touch(there, place(points), direct(normals)))
+    assert (found[:3] - wanted).norm() < 3e-3 and abs(float(found[4]) - turn) <= FINER[-1]
+
+
+def test_the_search_does_not_depend_on_the_objects_frame():
+    pose = rigid(rotation_from_vector(real([0.4, -1.0, 2.0])), real([0.5, -0.2, 0.1]))
+    wanted = real([0.01, 0.0, -0.017])
+    one, other = known(field(ball)), known(field(ball, pose), pose)
+    found = [locate(x, touch(x, CENTER + RADIUS * BALL_POINTS + wanted, BALL_POINTS)) for x in (one, other)]
+    assert (found[0] - found[1]).norm() < 2 * FINEST
+
+
+def test_a_fingertip_in_the_air_is_outside_of_the_object():
+    # a touch at the side of a slab tells nothing along it; the tip in the air does
+    there = known(field(block))
+    point, normal = CENTER + real([[0.03, 0, 0]] * 3), real([[1, 0, 0]] * 3)
+    tips = torch.stack([point[0], CENTER + real([0, 0, 0.048]), CENTER + real([0, 0.2, 0])])
+    free = locate(there, touch(there, point, normal, (True, False, False), tips + real([0, 0, 0.05])))
+    stopped = locate(there, touch(there, point, normal, (True, False, False), tips))
+    assert abs(float(free[2])) < 2e-3
+    assert stopped[2] <= -0.008 + SURFACE_STD  # a tip of 10 mm, 3 mm from the end of the slab
+
+
+def test_a_finger_that_is_dead_or_tells_no_place_says_nothing():
+    there = known(field(ball))
+    name = there.hand.finger_names[2]
+    dead = dataclasses.replace(there, sensor=SensorModel(dead=(name,)))
+    wanted = real([0.012, 0.0, -0.01])
+    points = CENTER + RADIUS * BALL_POINTS + wanted
+    tips = points + real([[0], [0], [2e-3]]) * BALL_POINTS  # so near that the last one would have to touch
+    found = locate(dead, touch(dead, points, BALL_POINTS, (True, True, False), tips))
+    assert (found[:3] - wanted).norm() < 4e-3
+    refused = locate(there, touch(there, points, BALL_POINTS, (True, True, False), tips))
+    assert (refused[:3] - wanted).norm() > (found[:3] - wanted).norm()
+
+
+def test_nothing_touched_is_nothing_moved():
+    there = known(field(ball))
+    far = CENTER + real([[0.2, 0, 0], [0, 0.2, 0], [0, 0, 0.2]])
+    assert locate(there, touch(there, far, BALL_POINTS, (False, False, False), far)).norm() == 0.0
+
+
+def test_noise_moves_the_place_by_less_than_it_is_itself():
+    generator = torch.Generator().manual_seed(0)
+    there, wanted, errors = known(field(ball)), real([0.01, 0.0, 0.014]), []
+    for _ in range(20):
+        drawn = torch.randn(2, 3, 3, generator=generator, dtype=torch.float64)
+        normals = unit(BALL_POINTS + 0.1 * drawn[0])
+        points = CENTER + RADIUS * BALL_POINTS + wanted + 1.5e-3 * drawn[1]
+        errors.append(float((locate(there, touch(there, points, normals))[:3] - wanted).norm()))
+    assert sorted(errors)[10] < 3e-3 and max(errors) < 7e-3
+
+
+def test_a_call_tries_one_turn():
+    there = known(field(ball))
+    search, touches = Localization(there), touch(there, CENTER + RADIUS * BALL_POINTS, BALL_POINTS)
+    for k in range(len(TURNS) + len(FINER)):
+        assert not search.done and search.steps == k
+        search(touches)
+    assert search.done and math.isfinite(search.cost)
