@@ -16,6 +16,7 @@ from torchgrasp.evaluation.closing import derive_reference
 from torchgrasp.evaluation.lift import LIFT_TIME
 from torchgrasp.frames import inverse
 from torchgrasp.hand.load import load_hand
+from torchgrasp.ik.sdf import field_from_surface
 from torchgrasp.specs import TrialSpec
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
@@ -52,6 +53,21 @@ def test_waiting_keeps_the_object_still(name, aside):
     waiting, pressing = (close(name, mesh, dataclasses.replace(still, without=part)) for part in ((), ("wait",)))
     assert waiting.held and pressing.held
     assert waiting.pushed.distance < 0.5 * pressing.pushed.distance
+
+
+@pytest.mark.parametrize("aside", [0.02, 0.024])
+def test_a_hand_that_closed_beside_the_object_closes_once_more(aside):
+    """The object stands off along its own tangents at the contacts: no plane there tells it, its round surface does."""
+    planned = cylinder()
+    seen = field_from_surface(torch.tensor(planned.vertices), torch.tensor(planned.faces), 0.004)
+    still = dataclasses.replace(QUICK, noise=False)
+    once, again = (
+        close("allegro", cylinder((aside, 0.0)), dataclasses.replace(still, without=part), surface=seen)
+        for part in (("retry",), ())
+    )
+    assert (once.attempts, once.held) == (1, False)
+    assert (again.attempts, again.held) == (2, True)
+    assert close("allegro", spec=still, surface=seen).attempts == 1  # where it was seen
 
 
 @pytest.mark.parametrize("closing", ["paper", "paper_position"])

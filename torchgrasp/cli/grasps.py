@@ -34,6 +34,7 @@ from torchgrasp.errors import BadArgument, MissingExtra, Status
 from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.files import sha256
 from torchgrasp.hand.load import hand_of
+from torchgrasp.ik.sdf import FIELD_SPACING, field_from_surface
 from torchgrasp.mesh import read_mesh
 from torchgrasp.objects import DATA, MASSES, list_objects, load_object
 from torchgrasp.pipeline.explain import explain_empty
@@ -171,7 +172,8 @@ def grasp(
         stages = tuple(progress.stages)
         run = Run(name, cloud, partial, the_hand, spec, surface, grasps, stages, plan, explanation=explanation)
         if close and true_mesh is not None and len(run.executable):
-            closure = close_hand(run.executable[0], the_hand, true_mesh, trial, seed=seed, parts=parts)
+            felt = field_from_surface(surface.vertices, surface.faces, FIELD_SPACING)
+            closure = close_hand(run.executable[0], the_hand, true_mesh, trial, seed=seed, parts=parts, surface=felt)
             progress.end("closing", f"{closure.time[-1]:.1f} s simulated, {closure.status.name.lower()}")
             run = dataclasses.replace(run, stages=tuple(progress.stages), mesh=true_mesh, closure=closure)
         with naming(path="--out"):

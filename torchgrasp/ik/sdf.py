@@ -26,6 +26,9 @@ FAR_SHARE = 8
 NEAREST_SAMPLES = 3
 """Nearest samples whose triangles a node tries: with two, twice as many nodes are off by .1 mm; a third costs 5 %."""
 
+FIELD_SPACING = 0.004
+"""Distance [m] between nodes that tell touches where a surface is: they err by less than the surface itself."""
+
 LEAF = 32
 """Samples in a leaf of their tree: a quarter less time than with SciPy's 10, the same distances."""
 
@@ -129,10 +132,10 @@ def field_from_surface(
 
 
 @checked
-def surface_field(shape: ShapeGP, spacing: Annotated[float, Range(0.001, 0.02)] = 0.004) -> SignedDistanceField:
+def surface_field(shape: ShapeGP, spacing: Annotated[float, Range(0.001, 0.02)] = FIELD_SPACING) -> SignedDistanceField:
     """Return the signed distance field of a shape's estimated surface: by it touches tell where the object is.
 
-    The nodes are `spacing` [m] apart; 4 mm err by less than the surface itself.
+    The nodes are `spacing` [m] apart.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> jug = load_object("jug")

@@ -9,7 +9,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.common import Row, least_seconds
-from torchgrasp import ContactSpec, TrialSpec, close_hand, load_grasps, load_hand, load_object, plan_grasps
+from torchgrasp import (
+    ContactSpec,
+    TrialSpec,
+    close_hand,
+    fit_shape,
+    load_grasps,
+    load_hand,
+    load_object,
+    plan_grasps,
+    surface_field,
+)
 from torchgrasp.control import GraspController, Observation
 from torchgrasp.evaluation import GraspTrial, TrialDriver
 from torchgrasp.objects import GraspObject
@@ -74,7 +84,8 @@ def _step_row(name: str, path: Path) -> Row:
     a tick over all trials tells whether that tick is slow each time.
     """
     jug = _jug()
-    trial = GraspTrial(load_hand(name), load_grasps(path), jug.mesh, parts=jug.parts)
+    surface = surface_field(fit_shape(jug.view, table=0.0))  # so that some ticks search for the object
+    trial = GraspTrial(load_hand(name), load_grasps(path), jug.mesh, parts=jug.parts, surface=surface)
     driver = TrialDriver(trial, TrialSpec(approach=0.0, holding="grip"))
     ticks = _ticks(driver)
     collection = _seconds(gc.collect)
