@@ -81,7 +81,8 @@ def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -
     order = ", ".join(hand.tips.names[finger] for finger in closure.contact_order) or "none"
     lost = explain_loss(closure, _centre(mesh), hand.tips.names)
     again = f" The hand closed {closure.attempts} times." if closure.attempts > 1 else ""
-    return f"In the order of touch: {order}. {lost or 'The object was held.'}{again} Each picture is taken from the hand."
+    end = (lost or "The object was held.") + again
+    return f"In the order of touch: {order}. {end} Each picture is taken from the hand."
 
 
 def _centre(mesh: "trimesh.Trimesh") -> torch.Tensor:
