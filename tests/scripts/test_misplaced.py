@@ -41,6 +41,7 @@ def test_what_was_tried_is_kept_and_only_the_rest_is_tried_anew(tmp_path, monkey
     monkeypatch.setattr(misplaced, "_run", run)
     monkeypatch.setattr(misplaced, "_plan", lambda *_: join([grasp, grasp, grasp]))
     monkeypatch.setattr(misplaced, "_read_solid", lambda *_: (mesh, [mesh]))
+    monkeypatch.setattr(misplaced, "_fit", lambda *_: (None, None))
     monkeypatch.setattr(misplaced, "list_views", lambda *_, **__: [("ball", "view0")])
     monkeypatch.setattr(misplaced, "read_mass", lambda *_: None)
     spec = TableSpec(tmp_path, (tmp_path,), hands=("allegro",), own=False, grasps=3, starts=20, workers=0, seed=0)

@@ -45,8 +45,9 @@ from torchgrasp.evaluation.protocols import error_from_object_pose
 from torchgrasp.evaluation.views import choose_rows
 from torchgrasp.files import write_file
 from torchgrasp.frames import apply, rigid, rotation_from_vector
-from torchgrasp.ik.sdf import surface_field
+from torchgrasp.ik.sdf import SignedDistanceField, surface_field
 from torchgrasp.shape.fit import fit_shape
+from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ContactSpec, SensorModel
 from torchgrasp.values import load_grasps
@@ -196,8 +197,7 @@ def _try(spec: TableSpec, subject: Subject, hand: str, condition: str, laws: lis
         return
     mesh, parts = _read_solid(folder, subject.name)
     mass = household_mass(float(mesh.volume), read_mass(folder, subject.name))
-    shape = fit_shape(read_view(folder, subject.name, view), table=0.0)
-    surface = surface_field(shape)
+    shape, surface = _fit(folder, subject.name, view)
     for rank in choose_rows(len(grasps), spec.grasps, "spread"):
         seed = seed_of(spec.seed, subject.label, view, rank, 0)
         if wrong.drawn:
@@ -274,6 +274,13 @@ def _plan(spec: TableSpec, subject: Subject, hand: str, view: str) -> Grasps:
         grasps = plan_grasps(cloud, load_hand(hand), contacts, spec.starts, spec.seed)
         grasps[grasps.status == Status.OK].save(path)
     return load_grasps(path)
+
+
+@functools.lru_cache(maxsize=2)
+def _fit(folder: Path, name: str, view: str) -> tuple[ShapeGP, SignedDistanceField]:
+    """Return the shape of a view, and its surface as touches are compared with it."""
+    shape = fit_shape(read_view(folder, name, view), table=0.0)
+    return shape, surface_field(shape)
 
 
 @functools.lru_cache(maxsize=2)
