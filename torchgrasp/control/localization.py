@@ -102,13 +102,13 @@ class Localization(Part):
 
     def __call__(self, touches: Touches) -> None:
         """Try one more turn; at last those near the best one."""
-        step = round(self.steps) - len(TURNS)
-        if step == 0:
+        step = round(self.steps)
+        if step == len(TURNS):
             self.middle, self.facing = self.shift, self.turn
-        if step < 0:
+        if step < len(TURNS):
             shifts, turn = _square(FARTHEST, PITCH), TURNS[step]
         else:
-            shifts, turn = self.middle + _square(PITCH - FINEST, FINEST), self.facing + FINER[step]
+            shifts, turn = self.middle + _square(PITCH - FINEST, FINEST), self.facing + FINER[step - len(TURNS)]
         costs = self._costs(touches, shifts, turn)
         best = int(costs.argmin())
         if float(costs[best]) < self.cost:
