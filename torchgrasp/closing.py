@@ -96,8 +96,8 @@ class ClosureResult(Value):
     reach is NaN. `start_overlap` [m] is the depth of the
     opened hand in object or table at the start. `held` tells whether the object is up with the hand at the end and
     slipped little; `seconds` is wall time. Poses are in the frame of the grasp. `phases` [s] are the times at which the
-    hand had arrived, all fingers had touched, and the hand had pressed; NaN if it never did. `attempts` counts how
-    often the hand closed.
+    hand had arrived, all fingers had touched, and the hand had pressed; NaN if it never did. `halts` counts how often
+    the hand stopped on its way because it touched something, `attempts` how often it closed.
     """
 
     held: bool
@@ -118,5 +118,6 @@ class ClosureResult(Value):
     disturbance: Disturbance
     trace: ClosingTrace
     phases: Annotated[Float[Tensor, "3"], ANY]
+    halts: int
     attempts: int
     seconds: float

@@ -136,7 +136,7 @@ ClosingMode = Literal["open_loop", "position", "paper_position", "fixed", "paper
 HoldingMode = Literal["force", "grip", "impedance", "position", "law"]
 """How a closed hand presses, see `TrialSpec`."""
 
-ClosingPart = Literal["wait", "pace", "switch", "place", "palm", "retry"]
+ClosingPart = Literal["wait", "pace", "switch", "place", "palm", "guard", "retry"]
 """What the closing law has beyond the paper's, see `torchgrasp.control.closing.LawClosing`."""
 
 
@@ -181,7 +181,7 @@ class TrialSpec(Value):
 
     Args:
         closing: how the hand closes. "paper": Eqs. 25-28 as written, with forces of the hand's stability model.
-            "uncertainty": the same law with six further parts. "fixed": the same with constant gains.
+            "uncertainty": the same law with seven further parts. "fixed": the same with constant gains.
             "paper_position": PI control to the contacts until 0.5 N, the paper's baseline. "position": the same, aimed
             behind the contacts. "open_loop": pre-grasp, grasp, squeeze.
         holding: how the closed hand presses: "force" (balanced forces), "grip" (as the felt load asks),
@@ -258,6 +258,11 @@ class TrialSpec(Value):
 def moves_palm(closing: str, without: tuple[str, ...]) -> bool:
     """Return whether a closing moves the palm."""
     return closing in ("uncertainty", "fixed") and not {"place", "palm"} & set(without)
+
+
+def guards_approach(closing: str, without: tuple[str, ...]) -> bool:
+    """Return whether a hand stops where it touches something on its way to the pre-grasp."""
+    return moves_palm(closing, without) and "guard" not in without
 
 
 def closes_again(closing: str, without: tuple[str, ...]) -> bool:

@@ -70,6 +70,22 @@ def test_a_hand_that_closed_beside_the_object_closes_once_more(aside):
     assert close("allegro", spec=still, surface=seen).attempts == 1  # where it was seen
 
 
+@pytest.mark.parametrize("aside", [(0.02, -0.02), (0.0, 0.03)])
+def test_a_hand_that_touches_something_on_its_way_goes_round_it(aside):
+    """The object stands where the opened hand comes down: pushed over by one that goes on, held by one that stops."""
+    planned = cylinder()
+    seen = field_from_surface(torch.tensor(planned.vertices), torch.tensor(planned.faces), 0.004)
+    still = dataclasses.replace(QUICK, noise=False)
+    swept, guarded = (
+        close("allegro", cylinder(aside), dataclasses.replace(still, without=part), surface=seen)
+        for part in (("guard",), ())
+    )
+    assert (swept.halts, swept.held) == (0, False)
+    assert guarded.halts >= 1 and guarded.held
+    assert guarded.before_lift.distance < swept.before_lift.distance
+    assert close("allegro", spec=still, surface=seen).halts == 0  # where it was seen
+
+
 @pytest.mark.parametrize("closing", ["paper", "paper_position"])
 def test_the_papers_closings_lift_what_stands_where_it_was_seen(closing):
     result = close("allegro", spec=dataclasses.replace(QUICK, closing=closing))

@@ -1,8 +1,7 @@
-"""The controller of a grasp, from closing to the end of the hold; it needs no simulator."""
+"""The controller of a grasp, from the approach to the end of the hold; it needs no simulator."""
 
 import functools
-from collections.abc import Callable
-from typing import Annotated, get_args
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
@@ -10,16 +9,10 @@ from torch import Tensor
 
 from torchgrasp.base import check_device, settle
 from torchgrasp.border import Range, checked
-from torchgrasp.control.closing import (
-    PALM_REACH,
-    FixedGainClosing,
-    LawClosing,
-    OpenLoopClosing,
-    PositionClosing,
-    Revision,
-)
-from torchgrasp.control.holding.force import ForceHold, PositionHold
+from torchgrasp.control.approach import GuardedApproach, can_guard
+from torchgrasp.control.closing import PALM_REACH, LawClosing, OpenLoopClosing
 from torchgrasp.control.holding.grip import GripHold
+from torchgrasp.control.modes import Closing, Step, check_modes, choose_holding, make_closing
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.retry import PressCheck, Reopening
@@ -32,17 +25,14 @@ from torchgrasp.specs import (
     ClosingMode,
     ClosingPart,
     HoldingMode,
-    check_closing_parts,
     check_sensor,
     closes_again,
+    guards_approach,
     moves_palm,
 )
 
 Tick = Annotated[float, Range(1e-5, 1.0)]
 """Time [s] from one tick to the next: drives are asked at 10 Hz to 1 kHz, and time does not go back."""
-
-Step = Callable[[Observation, float], Float[Tensor, " j"]]
-"""Turns what is known, and the time to the next tick [s], into the targets of all joints [rad]."""
 
 CLOSING_TIME = 4.0
 """Longest time [s] of closing before the hand presses with what it has: a fingertip travels 0.16 m in it."""
@@ -50,23 +40,14 @@ CLOSING_TIME = 4.0
 PRESSING_TIME = 0.5
 """Time [s] from the end of closing until the hand counts as closed: the forces have risen (`RAMP`)."""
 
-PHASES = "in the air", "pressing", "opening"
-"""What a controller is at: its fingers close, they press, or they open to close once more."""
+PHASES = "in the air", "pressing", "opening", "approaching"
+"""What a controller is at: its fingers close, they press, they open to close once more, or the arm brings them."""
+
+STAGE, COUNTED = ("hold", "check", "reopening", "guard"), ("time", "pressed", "attempts", "halts")
+"""Attributes of a controller: parts that are there in some phases, and numbers of its own."""
 
 ATTEMPTS = 2
 """Most times that a hand closes (`PressCheck`)."""
-
-
-def check_modes(closing: str, holding: str, belief: object = None, without: tuple[str, ...] = ()) -> None:
-    """Refuse unknown names, and what a closing has not: parts, a law (Eq. 25) to hold with or to revise."""
-    for name, value, mode in (("closing", closing, ClosingMode), ("holding", holding, HoldingMode)):
-        if value not in get_args(mode):
-            raise BadArgument(name, repr(value), f"one of {', '.join(get_args(mode))}")
-    if belief is not None and closing not in ("fixed", "uncertainty"):
-        raise BadArgument("belief", f"one for {closing!r}", "None, or a closing under the law")
-    if holding == "law" and closing not in ("fixed", "uncertainty", "paper"):
-        raise BadArgument("holding", f"'law' after {closing!r}", "another, or a closing under the law")
-    check_closing_parts(closing, without)
 
 
 class GraspController:
@@ -76,15 +57,21 @@ class GraspController:
     then the hand may be lifted, with further steps. The open loop keeps its squeeze. On a table that the reference
     knows, a hand that feels no grasp to lift opens again instead, and closes where touches say that the object is.
 
+    With an `approach` the controller begins before the pre-grasp. While it is `approaching` the arm brings the opened
+    hand to where `Targets.left` says. Where a fingertip touches, the hand stops, draws back and goes to where the touch
+    says that the object is (`GuardedApproach`); `halts` counts how often.
+
     Args:
         reference: what the hand follows.
         closing, holding: as in `TrialSpec`.
         belief: the shape that the grasp was planned on, which touches revise under the law (Eq. 25); None: they do not.
         without: parts that the closing leaves out, as in `TrialSpec`.
+        approach: length [m] of the approach that is still before the hand; 0: it is at its pre-grasp.
 
     Raises:
         BadArgument: unknown names; a belief, parts or "law" for a closing that has none; "impedance" for more than
             three fingertips; a closing or holding that needs what the sensor does not tell.
+        BadArgument: an approach without the part "guard", or whose touches would tell nothing (`can_guard`).
 
     A hand that is driven at 200 Hz; here joints follow at once and the object yields by 1 mm for 2 N:
 
@@ -112,19 +99,30 @@ class GraspController:
         holding: HoldingMode = "force",
         belief: ShapeGP | None = None,
         without: tuple[ClosingPart, ...] = (),
+        approach: Annotated[float, Range(0.0, 1.0)] = 0.0,
     ) -> None:
         check_modes(closing, holding, belief, without)
         check_sensor(reference.sensor, closing, holding)
+        if approach and not (guards_approach(closing, without) and can_guard(reference)):
+            allowed = "0 without the part 'guard', or without a table, a surface and a direction in the reference"
+            raise BadArgument("approach", approach, allowed)
         self.modes = f"closing {closing}, holding {holding}, without {', '.join(without) or 'nothing'}"
         self.reference = reference = settle(reference, torch.device("cpu"))
-        self._close = functools.partial(_closing, reference, closing, belief, without)
-        self._choose, self._law = functools.partial(_holding, mode=holding), holding == "law"
+        self._guard = functools.partial(GuardedApproach, reference, approach)
+        self.guard, self.halts = self._guard() if approach else None, 0
+        self._close = functools.partial(make_closing, reference, closing, belief, without)
+        self._choose, self._law = functools.partial(choose_holding, mode=holding), holding == "law"
         self._begin(self._close())
-        self.targets = Targets(reference.expand(reference.pregrasp))
+        self.targets = Targets(reference.expand(reference.pregrasp), left=approach)
         self.most = ATTEMPTS if closes_again(closing, without) and reference.table is not None else 1
         self.attempts, self._reach = 1, PALM_REACH if moves_palm(closing, without) else 0.0
 
-    def _begin(self, closing: "Closing") -> None:
+    @property
+    def approaching(self) -> bool:
+        """Whether the hand is still on its way to the pre-grasp."""
+        return self.guard is not None
+
+    def _begin(self, closing: Closing) -> None:
         """Begin to close."""
         self.closing, self.hold, self.check, self.reopening = closing, None, None, None
         self._hold = self._choose(closing)
@@ -163,6 +161,9 @@ class GraspController:
         if found != shape or observation.tactile.reading.shape != shape[:1]:
             raise BadArgument("observation", f"fingertips, 3 and joints {found}", f"those of the hand, {shape}")
         check_device("observation", observation.joints.device, "the controller", self.targets.joints.device)
+        if self.guard is not None:
+            self.targets = self._approach(self.guard, observation, period)
+            return self.targets
         if self.reopening is not None:
             self.targets = self._reopen(self.reopening, period)
             return self.targets
@@ -179,6 +180,15 @@ class GraspController:
         self.targets = Targets(joints, self.closing.palm)
         self._judge(observation)
         return self.targets
+
+    def _approach(self, guard: GuardedApproach, observation: Observation, period: float) -> Targets:
+        """Return the targets of the approaching hand; at its end expect the object where it was touched."""
+        guard(observation, period)
+        if guard.done:
+            self.guard, self.halts = None, round(guard.halts)
+            if self.halts and isinstance(self.closing, LawClosing):
+                self.closing.begin_at(guard.displacement, guard.palm)
+        return Targets(self.targets.joints, guard.palm, guard.left)
 
     def _check(self) -> PressCheck | None:
         """Return what judges the pressing hand; None: the closing has no further attempt in any case."""
@@ -219,7 +229,7 @@ class GraspController:
         """
         if isinstance(self.closing, LawClosing) and self.closing.revise is not None:
             raise BadArgument("state", "that of a controller with a belief", "that of one without")
-        parts = self._parts(self.hold, self.check, self.reopening)
+        parts = self._parts({name: getattr(self, name) for name in STAGE})
         return pack(f"{self.modes}, {self._phase}", self._numbers(parts))
 
     @checked
@@ -244,17 +254,23 @@ class GraspController:
         True
         """
         phase = next((x for x in PHASES if state.layout.startswith(f"{self.modes}, {x}")), PHASES[0])
-        hold = self._blank() if phase == "pressing" else None
-        check = self._check() if phase == "pressing" else None
-        reopening = self._reopening(torch.zeros(6, dtype=torch.float64)) if phase == "opening" else None
-        parts = self._parts(hold, check, reopening)
+        stage: dict[str, Any] = dict.fromkeys(STAGE)
+        if phase == "approaching":
+            stage["guard"] = self._guard()
+        elif phase == "pressing":
+            stage["hold"], stage["check"] = self._blank(), self._check()
+        elif phase == "opening":
+            stage["reopening"] = self._reopening(torch.zeros(6, dtype=torch.float64))
+        parts = self._parts(stage)
         numbers = unpack(f"{self.modes}, {phase}", self._numbers(parts), state)
         if numbers is None:
             raise BadArgument("state", state.layout[:80], f"one of {self.modes}, {phase}, and of this hand's fingers")
-        self.time, self.pressed = (float(numbers[f"controller.{name}"]) for name in ("time", "pressed"))
-        self.attempts = int(numbers["controller.attempts"])
-        self.targets = Targets(numbers["controller.joints"], numbers["controller.palm"])
-        self.hold, self.check, self.reopening = hold, check, reopening
+        self.time, self.pressed, attempts, halts = (float(numbers[f"controller.{name}"]) for name in COUNTED)
+        self.attempts, self.halts = round(attempts), round(halts)
+        joints, palm, left = (numbers[f"controller.{name}"] for name in Targets._fields)
+        self.targets = Targets(joints, palm, float(left))
+        for name, part in stage.items():
+            setattr(self, name, part)
         for name, part in parts.items():
             go_on(part, name, numbers)
 
@@ -270,56 +286,19 @@ class GraspController:
     @property
     def _phase(self) -> str:
         """The phase in words."""
+        if self.guard is not None:
+            return PHASES[3]
         return PHASES[2] if self.reopening is not None else PHASES[0] if self.hold is None else PHASES[1]
 
-    def _parts(self, hold: Step | None, check: PressCheck | None, reopening: Reopening | None) -> dict[str, Part]:
-        """Return the parts whose numbers are the controller's, by name."""
-        found = {"closing": self.closing, "hold": hold, "check": check, "reopening": reopening}
-        again = hold is self.closing
-        return {name: x for name, x in found.items() if isinstance(x, Part) and not (again and name == "hold")}
+    def _parts(self, stage: dict[str, Any]) -> dict[str, Part]:
+        """Return the parts whose numbers are the controller's, by name; a law that goes on is no second one."""
+        found = {name: x for name, x in stage.items() if isinstance(x, Part) and x is not self.closing}
+        return {"closing": self.closing, **found}
 
     def _numbers(self, parts: dict[str, Part]) -> dict[str, Tensor]:
         """Return every number of the controller and of parts of it."""
-        mine = {"time": self.time, "pressed": self.pressed, "attempts": self.attempts, **self.targets._asdict()}
+        mine = {name: getattr(self, name) for name in COUNTED} | self.targets._asdict()
         found = {f"controller.{name}": torch.as_tensor(x, dtype=torch.float64).clone() for name, x in mine.items()}
         for name, part in parts.items():
             found |= numbers_of(part, name)
         return found
-
-
-Closing = OpenLoopClosing | PositionClosing | LawClosing
-
-
-def _closing(
-    reference: ClosingReference, mode: ClosingMode, belief: ShapeGP | None, without: tuple[ClosingPart, ...]
-) -> Closing:
-    """Return the closing of a mode."""
-    if mode == "open_loop":
-        return OpenLoopClosing(reference)
-    if mode == "position":
-        return PositionClosing(reference)
-    if mode == "paper_position":
-        return PositionClosing(reference, depth=0.0)
-    if mode == "paper":
-        return LawClosing(reference, without=get_args(ClosingPart))
-    revise: Revision | None = None
-    if belief is not None:
-        from torchgrasp.control.adaptive.belief import Belief
-
-        revise = Belief(belief, reference.obj_from_hand).revise
-    return (FixedGainClosing if mode == "fixed" else LawClosing)(reference, revise, without)
-
-
-def _holding(
-    closing: Closing, mode: HoldingMode
-) -> Callable[[ClosingReference, Observation, Float[Tensor, " j"]], Step]:
-    """Return the maker of a holding; only the impedance reads the stability model."""
-    if mode == "impedance":
-        closing.reference.hand.require_three("holding", "'impedance', whose virtual frame is of three,")
-        from torchgrasp.control.adaptive.impedance import Impedance
-        from torchgrasp.control.adaptive.stability import load_stability
-
-        return functools.partial(Impedance, stability=load_stability(closing.reference.hand))
-    if mode == "law" and isinstance(closing, LawClosing):
-        return lambda *_: closing.press()
-    return {"force": ForceHold, "grip": GripHold}.get(mode, PositionHold)

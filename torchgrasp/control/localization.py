@@ -5,8 +5,6 @@ The object is where these are likeliest, moved along its table and turned about 
 tangent planes alone, which do not tell how far an object is off along its own surface.
 """
 
-import math
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -36,6 +34,9 @@ normal: 17 degrees, of the sensor and of the surface."""
 
 GAP = 0.001
 """Least distance [m] between the surface and a fingertip in the air: a nearer one touches."""
+
+NOWHERE = 1e9
+"""Cost before anything was tried: more than that of any place, and finite, so that a state can be saved."""
 
 WORST = 20.0
 """Most that one point or normal may speak against a place: a surface that is wrong there is no proof."""
@@ -86,7 +87,7 @@ class Localization(Part):
         across = torch.eye(3, dtype=torch.float64)[int(self.up.abs().argmin())]
         first = unit(torch.linalg.cross(self.up, across))
         self.axes = torch.stack([first, torch.linalg.cross(self.up, first)])
-        self.steps, self.cost = 0.0, math.inf
+        self.steps, self.cost = 0.0, NOWHERE
         self.shift, self.turn = torch.zeros(2, dtype=torch.float64), 0.0
         self.middle, self.facing = self.shift, self.turn
 

@@ -24,8 +24,8 @@ class ControlLog(Batch):
     """What went into a controller and came out of it; a row a tick. `ControlRecorder` makes it.
 
     `joints`, `tips`, `jacobian`, `reading`, `forces`, `contact`, `points`, `normals`, `average` and `sliding` are as in
-    `Observation` and its fingertips. Points and normals are 0 where none were `sensed`. `targets` [rad] and `palm` [m]
-    were commanded, `period` [s] is the time until the next tick.
+    `Observation` and its fingertips. Points and normals are 0 where none were `sensed`. `targets` [rad], `palm` and
+    `left` [m] were commanded, `period` [s] is the time until the next tick.
     """
 
     period: Float[Tensor, " t"]
@@ -42,6 +42,7 @@ class ControlLog(Batch):
     sliding: Float[Tensor, "t f"]
     targets: Float[Tensor, "t j"]
     palm: Float[Tensor, "t 3"]
+    left: Float[Tensor, " t"]
 
     def ticks(self) -> Iterator[tuple[Observation, float, Targets]]:
         """Yield observation, period and targets of each tick."""
@@ -58,7 +59,7 @@ class ControlLog(Batch):
                 sliding=self.sliding[k],
             )
             seen = Observation(self.joints[k], self.tips[k], self.jacobian[k], tactile)
-            yield seen, float(self.period[k]), Targets(self.targets[k], self.palm[k])
+            yield seen, float(self.period[k]), Targets(self.targets[k], self.palm[k], float(self.left[k]))
 
     @checked
     def save(self, path: Path | str) -> None:
@@ -129,6 +130,7 @@ class ControlRecorder:
             "sliding": seen.sliding,
             "targets": targets.joints,
             "palm": targets.palm,
+            "left": torch.tensor(targets.left, dtype=torch.float64),
         }
         self._rows.append(ControlLog(**{name: x[None].clone() for name, x in row.items()}))
 

@@ -22,8 +22,10 @@ from torchgrasp.control.closing_law import (
 from torchgrasp.control.forces import check_squeeze, contacts_in_hand, desired_forces, force_covariance, press
 from torchgrasp.control.stiffness import drive_stiffness, joint_stiffness, tip_compliance
 from torchgrasp.errors import BadArgument
+from torchgrasp.frames import inverse, rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.sdf import SignedDistanceField
+from torchgrasp.linalg import unit
 from torchgrasp.plane import Plane
 from torchgrasp.specs import SensorModel
 from torchgrasp.values import Grasps
@@ -46,6 +48,7 @@ class ClosingReference(Value):
         squeeze: joint targets that press in open loop (`squeeze`).
         normals: outward normals of the planned contacts.
         gains: targets, gains and desired forces (Eqs. 26-28).
+        approach: unit vector along which the opened hand comes to its pre-grasp; None: it has no approach.
         table: into which no fingertip presses while it searches; None: none is known.
         surface: estimated surface of the object in the frame of the grasp (`surface_field`), by which touches tell
             where the object is; None: tangent planes of the contacts stand for it.
@@ -72,6 +75,7 @@ class ClosingReference(Value):
     squeeze: Float[Tensor, " h"]
     normals: Float[Tensor, "f 3"]
     gains: ClosingGains
+    approach: Float[Tensor, "3"] | None = None
     table: Plane | None = None
     surface: SignedDistanceField | None = None
     sensor: SensorModel = dataclasses.field(default_factory=SensorModel)
@@ -141,6 +145,7 @@ class ClosingReference(Value):
             squeeze=press(grasp.joints, jacobian, forces, joint_stiffness(hand, kp)).joints[0],
             normals=normals[0],
             gains=gains,
+            approach=_approach_in_hand(grasp),
         )
 
     @checked
@@ -179,6 +184,12 @@ class ClosingReference(Value):
     def contact_points(self, tips: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
         """Return the first points to touch [m] of fingertips with given centres [m]."""
         return tips - self.hand.tips.radius[:, None] * self.normals
+
+
+def _approach_in_hand(grasp: Grasps) -> Float[Tensor, "3"] | None:
+    """Return the direction in which the hand of one grasp approaches, in its own axes."""
+    direction = rotate(inverse(grasp.obj_from_hand), grasp.approach[:, None])[0, 0]
+    return unit(direction) if bool((direction != 0.0).any()) else None
 
 
 @checked

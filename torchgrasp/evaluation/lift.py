@@ -288,6 +288,7 @@ class _Lift:
                 *contact[..., :9].unflatten(-1, (3, 3)).unbind(-2), *contact[..., 9:].unbind(-1), *felt.T
             ),
             phases=torch.tensor(reached, dtype=torch.float64),
+            halts=self.run.controller.halts,
             attempts=self.run.controller.attempts,
             seconds=seconds,
         )

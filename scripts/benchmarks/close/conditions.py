@@ -65,6 +65,7 @@ LAWS = {
     DEFAULT: Law({}),
     "uncertainty, deviations swapped": Law({}, swapped=True),
     "uncertainty without retry": Law({"without": ("retry",)}),
+    "uncertainty without guard": Law({"without": ("guard",)}),
     "uncertainty without palm": Law({"without": ("palm",)}),
     "uncertainty without place": Law({"without": ("place",)}),
     "uncertainty without wait": Law({"without": ("wait",)}),

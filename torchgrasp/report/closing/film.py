@@ -80,9 +80,16 @@ def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -
     """
     order = ", ".join(hand.tips.names[finger] for finger in closure.contact_order) or "none"
     lost = explain_loss(closure, _centre(mesh), hand.tips.names)
-    again = f" The hand closed {closure.attempts} times." if closure.attempts > 1 else ""
-    end = (lost or "The object was held.") + again
+    halts, attempts = closure.halts, closure.attempts
+    on_its_way = f" On its way the hand touched something {_times(halts)}." if halts else ""
+    again = f" The hand closed {_times(attempts)}." if attempts > 1 else ""
+    end = (lost or "The object was held.") + on_its_way + again
     return f"In the order of touch: {order}. {end} Each picture is taken from the hand."
+
+
+def _times(count: int) -> str:
+    """Return a count in words."""
+    return "once" if count == 1 else f"{count} times"
 
 
 def _centre(mesh: "trimesh.Trimesh") -> torch.Tensor:

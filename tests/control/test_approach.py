@@ -1,0 +1,187 @@
+"""The guarded approach: an open hand that comes down over a ball which is not where it was seen."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from tests.control.test_localization import CENTER, RADIUS, ball, field
+from tests.point_fingers import PERIOD, TARGET, observation, real, reference
+from torchgrasp.control import ControllerState, GraspController, load_controller_state
+from torchgrasp.control.approach import ACCELERATION, BACK, FEELING, HALTS, SPEED, GuardedApproach, can_guard
+from torchgrasp.control.closing import PALM_REACH, PALM_SPEED
+from torchgrasp.control.localization import FINER, TURNS
+from torchgrasp.errors import BadArgument
+from torchgrasp.plane import Plane
+from torchgrasp.specs import SensorModel
+
+DOWN, LENGTH, TIP = real([0.0, -1.0, 0.0]), 0.08, 0.01
+OPEN = real([[0.052, 0, 0.02], [0.052, 0, -0.02], [-0.036, 0, 0]])
+"""Tips of the opened hand [m]: 6 mm beside the ball in its place."""
+
+
+def above(**changes):
+    known = {"table": Plane(real([0, 1, 0]), -0.1), "surface": field(ball), "approach": DOWN}
+    return dataclasses.replace(reference(), **(known | changes))
+
+
+def feel(hand, shift):
+    """What the open hand feels of a ball displaced by `shift`: each tip that overlaps it touches its nearest point."""
+    tips = OPEN + hand.palm - hand.left * hand.direction
+    out = tips - (CENTER + shift)
+    normals = out / out.norm(dim=-1, keepdim=True)
+    contact = out.norm(dim=-1) < RADIUS + TIP
+    seen, touched = observation(contact=contact), contact[:, None]
+    points = OPEN - TIP * normals  # in the axes of the displaced hand
+    tactile = dataclasses.replace(
+        seen.tactile, points=torch.where(touched, points, torch.nan), normals=torch.where(touched, normals, torch.nan)
+    )
+    return dataclasses.replace(seen, tips=OPEN, tactile=tactile)
+
+
+def come(hand, shift, ticks=3000):
+    """Let the hand come; return `left` and `palm` of every tick."""
+    lefts, palms = [hand.left], [hand.palm]
+    for _ in range(ticks):
+        if hand.done:
+            return real(lefts), torch.stack(palms)
+        hand(feel(hand, shift), PERIOD)
+        lefts.append(hand.left)
+        palms.append(hand.palm)
+    raise AssertionError("the hand never arrived")
+
+
+def test_an_object_in_its_place_does_not_stop_the_hand():
+    hand = GuardedApproach(above(), LENGTH)
+    lefts, palms = come(hand, real([0, 0, 0]))
+    speeds = -lefts.diff() / PERIOD
+    assert hand.halts == 0 and lefts[-1] == 0.0 and not palms.any()
+    assert (speeds > 0).all() and speeds.max() <= SPEED * (1 + 1e-9)
+    changes = speeds.diff().abs() / PERIOD
+    assert changes[:-1].max() <= ACCELERATION * 1.2  # braking is sampled
+    assert speeds[-1] <= 0.02  # it arrives slowly
+
+
+@pytest.mark.parametrize("shift", [(0.016, 0, 0), (-0.015, 0, 0.004), (0.012, 0, 0.014)])
+def test_a_touch_tells_where_the_palm_has_to_go(shift):
+    shift = real(shift)
+    hand = GuardedApproach(above(), LENGTH)
+    _, palms = come(hand, shift)
+    assert 1 <= hand.halts < HALTS
+    assert (hand.displacement[:3] - shift).norm() < 0.005
+    assert (hand.palm - shift).norm() < 0.005 and hand.palm[1] == 0.0
+    assert not feel(hand, shift).tactile.contact.any()
+    assert palms.diff(dim=0).norm(dim=-1).max() <= PALM_SPEED * PERIOD * (1 + 1e-9)
+
+
+def test_the_hand_rests_while_it_feels_and_draws_back_before_its_palm_moves():
+    shift, hand = real([0.016, 0, 0]), GuardedApproach(above(), LENGTH)
+    lefts, palms = come(hand, shift)
+    stopped = int((lefts.diff() == 0).int().argmax())
+    rest = lefts[stopped:].eq(lefts[stopped]).int().cumprod(0).sum()
+    assert abs(int(rest) * PERIOD - (FEELING + (len(TURNS) + len(FINER) + 2) * PERIOD)) <= 2 * PERIOD
+    first = int((palms.abs().sum(-1) > 0).int().argmax())
+    assert lefts[first] == pytest.approx(float(lefts[stopped]) + BACK)
+    assert lefts.max() <= LENGTH
+
+
+def test_the_palm_goes_no_farther_than_the_arm_yields():
+    hand = GuardedApproach(above(), LENGTH)
+    for _ in range(2000):
+        hand(feel(hand, real([0.03, 0, 0])), PERIOD)
+        assert hand.palm.norm() <= PALM_REACH * (1 + 1e-9)
+
+
+def test_after_the_last_halt_the_hand_goes_on_whatever_it_feels():
+    hand, everywhere = GuardedApproach(above(), LENGTH), observation(contact=torch.ones(3, dtype=torch.bool))
+    for _ in range(3000):
+        hand(everywhere, PERIOD)
+    assert hand.done and hand.halts == HALTS
+
+
+def test_a_touch_without_a_place_moves_no_palm():
+    hand, touching = GuardedApproach(above(), LENGTH), observation(contact=torch.ones(3, dtype=torch.bool))
+    nowhere = torch.full((3, 3), torch.nan).double()
+    tactile = dataclasses.replace(touching.tactile, points=nowhere, normals=nowhere)
+    for _ in range(3000):
+        hand(dataclasses.replace(touching, tactile=tactile), PERIOD)
+    assert hand.done and not hand.palm.any()
+
+
+def approach(controller, shift):
+    """Step a controller until its hand has arrived; return what it commanded."""
+    commanded = [controller.targets]
+    while controller.approaching:
+        commanded.append(controller.step(feel(controller.guard, shift), PERIOD))
+    return commanded
+
+
+def test_the_controller_begins_to_close_where_the_object_was_touched():
+    shift, controller = real([0.016, 0, 0]), GraspController(above(), approach=LENGTH)
+    commanded = approach(controller, shift)
+    assert commanded[0].left == LENGTH and commanded[-1].left == 0.0 and controller.halts >= 1
+    opened = controller.reference.expand(controller.reference.pregrasp)
+    assert all(torch.equal(x.joints, opened) for x in commanded)
+    assert torch.equal(controller.closing.palm, commanded[-1].palm)
+    assert (controller.closing.believed[:3] - shift).norm() < 0.005
+    after = controller.step(observation(0.02), PERIOD)
+    assert after.left == 0.0 and (after.palm - shift).norm() < 0.005
+
+
+@pytest.mark.parametrize("ticks", [3, 40, 75, 90, 110])
+def test_an_approach_goes_on_from_its_state_to_the_bit(tmp_path, ticks):
+    shift = real([0.016, 0, 0])
+    one, other = (GraspController(above(), approach=LENGTH) for _ in range(2))
+    for _ in range(ticks):
+        one.step(feel(one.guard, shift), PERIOD)
+    one.state().save(tmp_path / "state.safetensors")
+    other.restore(load_controller_state(tmp_path / "state.safetensors"))
+    assert other.approaching
+    for first, second in zip(approach(one, shift), approach(other, shift), strict=True):
+        assert torch.equal(first.palm, second.palm) and first.left == second.left
+    assert torch.equal(one.closing.believed, other.closing.believed) and one.halts == other.halts
+
+
+def test_a_state_of_the_closing_ends_the_approach():
+    one, other = (GraspController(above(), approach=LENGTH) for _ in range(2))
+    approach(one, real([0, 0, 0]))
+    one.step(observation(0.02), PERIOD)
+    state = one.state()
+    assert isinstance(state, ControllerState)
+    other.restore(state)
+    assert not other.approaching and other.targets.left == 0.0
+
+
+@pytest.mark.parametrize(
+    ("closing", "without", "missing"),
+    [
+        ("uncertainty", ("guard",), {}),
+        ("uncertainty", ("palm",), {}),
+        ("position", (), {}),
+        ("open_loop", (), {}),
+        ("uncertainty", (), {"table": None}),
+        ("uncertainty", (), {"surface": None}),
+        ("uncertainty", (), {"approach": None}),
+        ("uncertainty", (), {"sensor": SensorModel("binary")}),
+    ],
+)
+def test_what_cannot_be_guarded_is_refused(closing, without, missing):
+    held = above(**missing)
+    assert can_guard(held) is not bool(missing)
+    with pytest.raises(BadArgument, match="approach"):
+        GraspController(held, closing, without=without, approach=LENGTH)
+    assert not GraspController(held, closing, without=without).approaching
+
+
+def test_the_reference_knows_the_direction_in_the_hands_axes():
+    assert TARGET.shape == OPEN.shape  # one tip a contact
+    from torchgrasp import load_hand
+    from torchgrasp.control import ClosingReference
+    from torchgrasp.objects import load_shipped_grasp
+
+    grasp = load_shipped_grasp("jug", "allegro")
+    found = ClosingReference.from_grasp(load_hand("allegro"), grasp).approach
+    back = grasp.obj_from_hand[0, :3, :3].double() @ found
+    assert torch.allclose(back, grasp.approach[0].double(), atol=1e-6)
+    still = dataclasses.replace(grasp, approach=torch.zeros_like(grasp.approach))
+    assert ClosingReference.from_grasp(load_hand("allegro"), still).approach is None

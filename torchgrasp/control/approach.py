@@ -1,0 +1,100 @@
+"""The guarded approach: a hand that touches something on its way stops, and goes to where the object is.
+
+An open hand that runs into an object topples it or pushes it away, farther than any closing can follow. A guarded move
+stops at the first touch. The touch and the fingertips in the air tell where the object is (`Localization`); the hand
+draws back, moves its palm aside and goes on.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.control.closing import PALM_REACH, PALM_SPEED
+from torchgrasp.control.localization import Localization, Touches
+from torchgrasp.control.observation import Observation
+from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.state import Part
+from torchgrasp.control.targets import STILL
+from torchgrasp.linalg import limit_norm, unit
+
+SPEED, ACCELERATION = 0.1, 1.0
+"""Largest speed [m/s] of the palm along its approach, and the rate [m/s^2] at which it changes, except for a stop. A
+touch is known 20 ms after it happened: 2 mm later."""
+
+HALTS, FEELING, BACK = 3, 0.06, 0.02
+"""How often the hand stops, the time [s] for which a touch is averaged, and the way [m] that the hand draws back then:
+a fingertip's width."""
+
+
+def can_guard(reference: ClosingReference) -> bool:
+    """Return whether touches on the way tell where the object is: by their places, on a known table and surface."""
+    known = reference.approach is not None and reference.table is not None and reference.surface is not None
+    return known and reference.sensor.kind == "tactile"
+
+
+class GuardedApproach(Part):
+    """Bring the opened hand straight to its pre-grasp, and stop where it touches something.
+
+    `left` [m] is the rest of the approach, `palm` [m] the palm's displacement from it, `halts` how often it stopped.
+    `displacement` [m, rad] is that of the object, as the last touch tells it. After `HALTS` stops the hand goes on
+    whatever it feels.
+
+    Args:
+        reference: of the closing; it has an approach, a surface and a table.
+        length: of the approach [m].
+    """
+
+    def __init__(self, reference: ClosingReference, length: float) -> None:
+        assert reference.approach is not None and reference.table is not None
+        self.reference, self.length, self.direction = reference, length, reference.approach
+        self.up = unit(reference.table.normal)
+        self.left, self.speed, self.retreat, self.halts = length, 0.0, 0.0, 0.0
+        self.palm, self.goal, self.displacement = STILL, STILL, torch.zeros(6, dtype=torch.float64)
+        self.felt, self.feeling = 0.0, False
+        self.touches, self.search = Touches(reference), Localization(reference)
+
+    @property
+    def done(self) -> bool:
+        """Whether the hand is at its pre-grasp."""
+        return self.left <= 0.0
+
+    def __call__(self, observation: Observation, period: float) -> None:
+        """Choose `left` and `palm` for the next tick."""
+        if self.feeling:
+            self._feel(observation, period)
+        elif self.left < self.retreat:
+            self.speed = min(self.speed + ACCELERATION * period, SPEED)
+            self.left = min(self.left + self.speed * period, self.retreat)
+            if self.left >= self.retreat:
+                self.speed = self.retreat = 0.0
+        elif not torch.equal(self.palm, self.goal):
+            way = self.goal - self.palm
+            near = float(torch.linalg.vector_norm(way)) <= PALM_SPEED * period
+            self.palm = self.goal if near else self.palm + limit_norm(way, PALM_SPEED * period)
+        elif self.halts < HALTS and bool(observation.tactile.contact.any()):
+            self.speed, self.felt, self.feeling = 0.0, 0.0, True
+            self.touches, self.search = Touches(self.reference), Localization(self.reference)
+        else:
+            braking = math.sqrt(2 * ACCELERATION * self.left)  # the speed from which the hand just stops in time
+            self.speed = min(self.speed + ACCELERATION * period, SPEED, max(braking, ACCELERATION * period))
+            self.left = max(self.left - self.speed * period, 0.0)
+
+    def _feel(self, observation: Observation, period: float) -> None:
+        """Average the touch, then search for the object; at the end choose how the hand goes on."""
+        if self.felt < FEELING:
+            self.felt += period
+            self.touches.add(observation, self.palm - self.left * self.direction)
+        elif not self.search.done and bool(self.touches.felt.any()):
+            self.search(self.touches)
+        else:
+            self.feeling, self.halts = False, self.halts + 1.0
+            if self.search.done:
+                self.displacement = self.search.displacement
+                self.goal = self._aside(self.displacement[:3])
+            self.retreat = min(self.left + BACK, self.length)
+
+    def _aside(self, shift: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+        """Return the part of a displacement [m] that the palm follows: along the table, within its reach."""
+        return limit_norm(shift - (shift @ self.up) * self.up, PALM_REACH)
