@@ -86,7 +86,8 @@ class LawClosing(Part):
     * A finger without a sensor rests where its contact is believed to be until the others touch. Then it searches as
       they do, until its drives feel it or it is `OVERDUE`.
     * `palm`: the palm follows the object, so that the joints come to those of the grasp. It needs `place`.
-    * `guard` is the controller's: on its way to the pre-grasp the hand stops where it touches something. It needs `palm`.
+    * `guard` is the controller's: on its way to the pre-grasp the hand stops where it touches something, and goes
+      round it. It needs `palm`.
     * `retry` is the controller's: where the closed hand feels that a lift would fail, it closes once more. It needs
       `place`: the next closing begins with a displaced palm and expects the object there (`begin_at`).
 

@@ -18,10 +18,13 @@ from torchgrasp.evaluation.score import ProtocolResult, ViewScore
 from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.hand.load import hand_of, load_hand
+from torchgrasp.ik.sdf import SignedDistanceField, surface_field
 from torchgrasp.pipeline.grasps import plan_grasps
 from torchgrasp.pipeline.provenance import digest
+from torchgrasp.plane import Plane
+from torchgrasp.shape.fit import fit_shape
 from torchgrasp.sim.convex_parts import convex_parts
-from torchgrasp.specs import ContactSpec
+from torchgrasp.specs import ContactSpec, closes_again
 from torchgrasp.values import Grasps, PointCloud, load_grasps
 
 if TYPE_CHECKING:
@@ -132,11 +135,7 @@ def plan_view(view: View, friction: float, spec: EvaluationSpec, planned: Path |
     cloud = grasps = None
     try:
         _read_solid(view.objects, view.object)  # a bad mesh is refused before any work; its parts are cached
-        seen, table = perturb_view(
-            read_view(view.objects, view.object, view.view),
-            find_perturbation(spec.perturb),
-            seed_of(spec.seed, view.object, view.view),
-        )
+        seen, table = _see(view.objects, view.object, view.view, spec.perturb, spec.seed)
         if planned is not None:
             grasps = load_grasps(planned)
             if (grasps.meta.get("cloud_sha256"), grasps.meta.get("hand_sha256")) != (digest(seen), hand.source.sha256):
@@ -178,9 +177,24 @@ def try_grasp(
     trial = perturb_trial(protocol.trial, perturbation, mass, seed)
     noise = protocol.noise if spec.perturb == "none" else perturbation.pose
     protocol = dataclasses.replace(protocol, trial=trial, noise=noise)
-    error = draw_error(protocol, grasp, mesh, seed)
-    attempt = GraspTrial(hand, grasp, mesh, seed_of(seed, "touch"), error, parts=parts)
+    error, surface = draw_error(protocol, grasp, mesh, seed), None
+    if protocol.pull is None and closes_again(trial.closing, trial.without):
+        surface = _fit_surface(view.objects, view.object, view.view, spec.perturb, spec.seed)
+    attempt = GraspTrial(hand, grasp, mesh, seed_of(seed, "touch"), error, parts=parts, surface=surface)
     return dataclasses.replace(run_protocol(attempt, protocol, *at), predicted=float(grasp.success[0]))
+
+
+def _see(objects: Path, name: str, view: str, perturb: str, seed: int) -> tuple[PointCloud, Plane]:
+    """Return what a robot sees of a view, and the table."""
+    cloud = read_view(objects, name, view)
+    return perturb_view(cloud, find_perturbation(perturb), seed_of(seed, name, view))
+
+
+@functools.lru_cache(maxsize=2)
+def _fit_surface(objects: Path, name: str, view: str, perturb: str, seed: int) -> SignedDistanceField:
+    """Return the estimated surface of what a robot sees, by which touches tell it where the object is."""
+    cloud, table = _see(objects, name, view, perturb, seed)
+    return surface_field(fit_shape(cloud, table=table))
 
 
 @functools.lru_cache(maxsize=2)

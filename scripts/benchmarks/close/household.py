@@ -23,6 +23,7 @@ from torchgrasp.errors import GraspError, Status
 from torchgrasp.evaluation import (
     PERTURBATIONS,
     PROTOCOLS,
+    Perturbation,
     PoseNoise,
     close_hand,
     count_by,
@@ -38,7 +39,9 @@ from torchgrasp.evaluation import (
 )
 from torchgrasp.files import format_json, write_file
 from torchgrasp.hand.load import load_hand
+from torchgrasp.ik.sdf import SignedDistanceField, surface_field
 from torchgrasp.pipeline import plan_grasps
+from torchgrasp.shape.fit import fit_shape
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Grasps, load_grasps
@@ -185,7 +188,8 @@ def _lift(spec: TableSpec, subject: Subject, hand: str, name: str, force: float)
             seed = seed_of(spec.seed, subject.label, view, rank, draw)
             trial = perturb_trial(dataclasses.replace(HOUSEHOLD.trial, force=force), perturbation, mass, seed)
             error = draw_error(dataclasses.replace(HOUSEHOLD, noise=perturbation.pose), grasp, mesh, seed)
-            done = close_hand(grasp, load_hand(hand), mesh, trial, seed, error=error, parts=parts)
+            felt = fit_surface(spec, subject, view, name)
+            done = close_hand(grasp, load_hand(hand), mesh, trial, seed, error=error, parts=parts, surface=felt)
             spent += time.process_time() - began
             slip = done.slip.distance, done.slip.angle
             told = subject.label, subject.family, rank, done.status.name, slip, trial.mass, trial.friction
@@ -201,16 +205,33 @@ def _best(grasps: Grasps, most: int) -> list[Grasps]:
 def plan_view(spec: TableSpec, subject: Subject, hand: str, view: str, name: str) -> Grasps:
     """Return the executable grasps of a view, kept or planned; what only the lift meets shares one plan."""
     assert subject.folder is not None
-    perturbation = PERTURBATIONS[name]
-    seen = dataclasses.replace(perturbation, mass=False, friction=None, pose=PoseNoise())
+    seen = _seen(name)
     path = spec.kept("household", f"{hand}_{subject.label}_{view}", "plan", seen).with_suffix(".safetensors")
     if not path.is_file():
         cloud, seed = read_view(subject.folder, subject.name, view), seed_of(spec.seed, subject.label, view)
-        cloud, table = perturb_view(cloud, perturbation, seed)
+        cloud, table = perturb_view(cloud, seen, seed)
         contacts = ContactSpec(friction=HOUSEHOLD.trial.friction, table=table)
         grasps = plan_grasps(cloud, load_hand(hand), contacts, spec.starts, spec.seed)
         grasps[grasps.status == Status.OK].save(path)
     return load_grasps(path)
+
+
+def fit_surface(spec: TableSpec, subject: Subject, view: str, name: str) -> SignedDistanceField:
+    """Return the surface that is estimated of a view under a perturbation, with which touches are compared."""
+    assert subject.folder is not None
+    return _fit(subject.folder, subject.name, view, name, seed_of(spec.seed, subject.label, view))
+
+
+@functools.lru_cache(maxsize=2)
+def _fit(folder: Path, object_name: str, view: str, name: str, seed: int) -> SignedDistanceField:
+    """Return the estimated surface of what is seen."""
+    cloud, table = perturb_view(read_view(folder, object_name, view), _seen(name), seed)
+    return surface_field(fit_shape(cloud, table=table))
+
+
+def _seen(name: str) -> Perturbation:
+    """Return the part of a perturbation that changes what is seen."""
+    return dataclasses.replace(PERTURBATIONS[name], mass=False, friction=None, pose=PoseNoise())
 
 
 @functools.lru_cache(maxsize=2)
