@@ -92,7 +92,7 @@ def close(controller: GraspController, away: float, seconds: float = 3.5) -> tup
             tactile, TipContact(push, -push[:, None] * NORMALS, points, NORMALS), NORMALS, real([0.01] * 3), PERIOD
         )
         seen = dataclasses.replace(observation(joints=joints), tips=points + 0.01 * NORMALS, tactile=tactile)
-        joints, palm = controller.step(seen, PERIOD)
+        joints, palm, _ = controller.step(seen, PERIOD)
         path.append(torch.cat([palm, joints]))
         if controller.closing.done:
             break
