@@ -19,9 +19,10 @@ from torchgrasp.control.state import Part
 from torchgrasp.control.targets import STILL
 from torchgrasp.linalg import limit_norm, unit
 
-SPEED, ACCELERATION = 0.1, 1.0
+SPEED, ACCELERATION = 0.2, 1.0
 """Largest speed [m/s] of the palm along its approach, and the rate [m/s^2] at which it changes, except for a stop. A
-touch is known 20 ms after it happened: 2 mm later."""
+touch is known 20 ms after it happened: 4 mm later. At half of the speed fewer things stay where they are: what links
+push that feel nothing topples (docs/closing.md)."""
 
 HALTS, FEELING, BACK = 3, 0.06, 0.02
 """How often the hand stops, the time [s] for which a touch is averaged, and the way [m] that the hand draws back then:

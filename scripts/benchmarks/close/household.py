@@ -85,11 +85,12 @@ class Lift:
         return self.status == Status.OK.name
 
 
-def bench_household(spec: TableSpec) -> list[Row]:
-    """Lift with nothing unknown, with each factor alone, and with all of them."""
+def bench_household(spec: TableSpec, only: Sequence[str] = ()) -> list[Row]:
+    """Lift with nothing unknown, with each factor alone, and with all of them, or under some perturbations only."""
     rows: list[Row] = []
+    chosen = [name for name in PERTURBATIONS if not only or name in only]
     for hand in spec.hands:
-        cases = [(name, GRIPS.get(hand, HOUSEHOLD.trial.force)) for name in PERTURBATIONS]
+        cases = [(name, GRIPS.get(hand, HOUSEHOLD.trial.force)) for name in chosen]
         found = _run(spec, hand, cases)
         rows += [_row(f"{hand}, {case[0]}", found[case], found[cases[0]], case[0] == "all") for case in cases]
     return rows

@@ -55,7 +55,7 @@ def close(
         tries: grasps of each view: the best for noise, else spread over all ranks.
         draws: errors of the hand's pose for each grasp.
         grasps: the best of each view that perturb and grip lift; misplaced spreads them over all ranks.
-        conditions: of misplaced; by default all.
+        conditions: of misplaced and sensors, or perturbations of perturb; by default all.
         laws: of misplaced; by default all.
         names: of the objects that misplaced, perturb and grip keep; by default all.
         starts: of the contact planner.
@@ -80,7 +80,7 @@ def close(
         "noise": lambda: bench_noise(folder, hands, draws, spec, workers) if folder else [],
         "misplaced": lambda: bench_misplaced(household, conditions, laws) if folder else [],
         "sensors": lambda: bench_misplaced(household, conditions, laws or LAWS_OF_SENSORS) if folder else [],
-        "perturb": lambda: bench_household(household) if folder else [],
+        "perturb": lambda: bench_household(household, conditions) if folder else [],
         "grip": lambda: bench_grip(household) if folder else [],
         "holding": lambda: bench_holding(household) if folder else [],
         "scans": lambda: bench_scans(objects, hands, tries, starts, seed) if folder else [],
