@@ -47,12 +47,15 @@ def seen(monkeypatch):
         _, grasp = pinch("allegro")
         return join([grasp, grasp])
 
-    def lift(grasp, hand, mesh, spec, seed, *, error, parts):
+    def lift(grasp, hand, mesh, spec, seed, *, error, parts, surface):
+        assert surface is known
         record.lifts.append((spec, seed, error))
         slip = ObjectMotion(0.002, 0.1)
         return SimpleNamespace(status=Status.OK if spec.friction > 0.7 else Status.SLIPPED, slip=slip)
 
     monkeypatch.setattr(household, "plan_grasps", plan)
+    known = object()
+    monkeypatch.setattr(household, "fit_surface", lambda *_: known)
     monkeypatch.setattr(household, "close_hand", lift)
     return record
 
@@ -76,6 +79,8 @@ def test_one_object_of_a_family_is_planned_on_once_for_all_that_only_the_lift_me
     assert all(torch.allclose(error, still, atol=1e-12) for _, _, error in seen.lifts[:1])
     assert max(float((error - still).abs().max()) for _, _, error in seen.lifts) > 1e-3
     assert by_name["all"].met is (by_name["all"].numbers["best"].value >= household.LEAST_HELD)
+    two = household.bench_household(spec(folder, tmp_path / "out"), ("all", "none"))
+    assert [str(row) for row in two] == [str(by_name[name]) for name in ("none", "all")]
 
 
 def test_what_is_kept_is_not_run_again_and_a_refusal_fails(folder, seen, tmp_path, monkeypatch):
@@ -92,10 +97,12 @@ def test_what_is_kept_is_not_run_again_and_a_refusal_fails(folder, seen, tmp_pat
 
 def test_the_bench_asks_for_what_its_command_says(folder, tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(suite, "bench_household", lambda spec: asked.append(spec) or [])
+    monkeypatch.setattr(suite, "bench_household", lambda *given: asked.append(given) or [])
     out = tmp_path / "bench.json"
-    suite.close((folder,), ("perturb",), ("barrett",), grasps=2, names=("ball",), starts=50, workers=3, seed=4, out=out)
-    (found,) = asked
+    told = {"grasps": 2, "names": ("ball",), "starts": 50, "workers": 3, "seed": 4, "out": out}
+    suite.close((folder,), ("perturb",), ("barrett",), conditions=("all",), **told)
+    ((found, conditions),) = asked
+    assert conditions == ("all",)
     assert (found.objects, found.hands, found.only, found.out) == ((folder,), ("barrett",), ("ball",), tmp_path)
     assert (found.grasps, found.starts, found.workers, found.seed) == (2, 50, 3, 4)
     assert found.representatives and not found.own and found.views == found.draws == 1
