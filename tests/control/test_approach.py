@@ -173,6 +173,12 @@ def test_what_cannot_be_guarded_is_refused(closing, without, missing):
     assert not GraspController(held, closing, without=without).approaching
 
 
+@pytest.mark.parametrize("length", ["0.1", float("nan"), -0.1, 1.1, None])
+def test_a_length_that_is_none_is_refused(length):
+    with pytest.raises(BadArgument, match="approach"):
+        GraspController(above(), approach=length)
+
+
 def test_the_reference_knows_the_direction_in_the_hands_axes():
     assert TARGET.shape == OPEN.shape  # one tip a contact
     from torchgrasp import load_hand

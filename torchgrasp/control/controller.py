@@ -92,6 +92,7 @@ class GraspController:
     True
     """
 
+    @checked
     def __init__(
         self,
         reference: ClosingReference,
