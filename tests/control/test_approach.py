@@ -8,7 +8,7 @@ import torch
 from tests.control.test_localization import CENTER, RADIUS, ball, field
 from tests.point_fingers import PERIOD, TARGET, observation, real, reference
 from torchgrasp.control import ControllerState, GraspController, load_controller_state
-from torchgrasp.control.approach import ACCELERATION, BACK, FEELING, HALTS, SPEED, GuardedApproach, can_guard
+from torchgrasp.control.approach import ACCELERATION, BACK, CAREFUL, FEELING, HALTS, SPEED, GuardedApproach, can_guard
 from torchgrasp.control.closing import PALM_REACH, PALM_SPEED
 from torchgrasp.control.localization import FINER, TURNS
 from torchgrasp.errors import BadArgument
@@ -82,6 +82,7 @@ def test_the_hand_rests_while_it_feels_and_draws_back_before_its_palm_moves():
     assert abs(int(rest) * PERIOD - (FEELING + (len(TURNS) + len(FINER) + 2) * PERIOD)) <= 2 * PERIOD
     first = int((palms.abs().sum(-1) > 0).int().argmax())
     assert lefts[first] == pytest.approx(float(lefts[stopped]) + BACK)
+    assert (-lefts[first:].diff()).max() <= CAREFUL * PERIOD * (1 + 1e-9)  # it comes slowly then
     assert lefts.max() <= LENGTH
 
 

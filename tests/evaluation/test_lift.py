@@ -55,7 +55,7 @@ def test_waiting_keeps_the_object_still(name, aside):
     assert waiting.pushed.distance < 0.5 * pressing.pushed.distance
 
 
-@pytest.mark.parametrize("aside", [0.02, 0.024])
+@pytest.mark.parametrize("aside", [0.022, 0.024, -0.024])
 def test_a_hand_that_closed_beside_the_object_closes_once_more(aside):
     """The object stands off along its own tangents at the contacts: no plane there tells it, its round surface does."""
     planned = cylinder()
@@ -70,7 +70,7 @@ def test_a_hand_that_closed_beside_the_object_closes_once_more(aside):
     assert close("allegro", spec=still, surface=seen).attempts == 1  # where it was seen
 
 
-@pytest.mark.parametrize("aside", [(0.02, -0.02), (0.0, 0.03)])
+@pytest.mark.parametrize("aside", [(0.0, 0.03), (0.0, -0.04)])
 def test_a_hand_that_touches_something_on_its_way_goes_round_it(aside):
     """The object stands where the opened hand comes down: pushed over by one that goes on, held by one that stops."""
     planned = cylinder()
@@ -82,7 +82,7 @@ def test_a_hand_that_touches_something_on_its_way_goes_round_it(aside):
     )
     assert (swept.halts, swept.held) == (0, False)
     assert guarded.halts >= 1 and guarded.held
-    assert guarded.before_lift.distance < swept.before_lift.distance
+    assert guarded.before_lift.distance < 0.005 < 0.1 < swept.before_lift.distance
     assert close("allegro", spec=still, surface=seen).halts == 0  # where it was seen
 
 

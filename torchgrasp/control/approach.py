@@ -19,10 +19,10 @@ from torchgrasp.control.state import Part
 from torchgrasp.control.targets import STILL
 from torchgrasp.linalg import limit_norm, unit
 
-SPEED, ACCELERATION = 0.2, 1.0
-"""Largest speed [m/s] of the palm along its approach, and the rate [m/s^2] at which it changes, except for a stop. A
-touch is known 20 ms after it happened: 4 mm later. At half of the speed fewer things stay where they are: what links
-push that feel nothing topples (docs/closing.md)."""
+SPEED, CAREFUL, ACCELERATION = 0.2, 0.08, 1.0
+"""Largest speed [m/s] of the palm along its approach, that after it touched something, and the rate [m/s^2] at which it
+changes, except for a stop. A touch is known 20 ms after it happened: 4 mm later. A hand that is slow from the start
+pushes longer with links that feel nothing, and topples more (docs/closing.md)."""
 
 HALTS, FEELING, BACK = 3, 0.06, 0.02
 """How often the hand stops, the time [s] for which a touch is averaged, and the way [m] that the hand draws back then:
@@ -79,7 +79,8 @@ class GuardedApproach(Part):
             self.touches, self.search = Touches(self.reference), Localization(self.reference)
         else:
             braking = math.sqrt(2 * ACCELERATION * self.left)  # the speed from which the hand just stops in time
-            self.speed = min(self.speed + ACCELERATION * period, SPEED, max(braking, ACCELERATION * period))
+            fastest = CAREFUL if self.halts else SPEED
+            self.speed = min(self.speed + ACCELERATION * period, fastest, max(braking, ACCELERATION * period))
             self.left = max(self.left - self.speed * period, 0.0)
 
     def _feel(self, observation: Observation, period: float) -> None:
