@@ -265,6 +265,11 @@ def guards_approach(closing: str, without: tuple[str, ...]) -> bool:
     return moves_palm(closing, without) and "guard" not in without
 
 
+def needs_surface(closing: str, without: tuple[str, ...]) -> bool:
+    """Return whether a hand over a table finds an object by its estimated surface."""
+    return guards_approach(closing, without) or closes_again(closing, without)
+
+
 def closes_again(closing: str, without: tuple[str, ...]) -> bool:
     """Return whether a hand that closed in vain closes once more."""
     return closing in ("uncertainty", "fixed") and not {"place", "retry"} & set(without)

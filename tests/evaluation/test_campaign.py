@@ -13,6 +13,7 @@ from tests.pinch import cylinder, pinch
 from tests.scores import GOOD, SCORES, STUCK
 from torchgrasp import cli
 from torchgrasp.errors import BadArgument, Status
+from torchgrasp.evaluation import views
 from torchgrasp.evaluation.campaign import evaluate
 from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.protocols import PROTOCOLS, Protocol
@@ -21,6 +22,7 @@ from torchgrasp.evaluation.score import STAGES, summarise
 from torchgrasp.evaluation.views import EvaluationSpec, choose_rows
 from torchgrasp.files import hold_folder
 from torchgrasp.hand.load import load_hand
+from torchgrasp.objects import load_shipped_grasp
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import load_grasps
 
@@ -209,3 +211,32 @@ def test_the_command_writes_numbers_and_a_page(folder, tmp_path, capsys):
     page = (tmp_path / "out" / "evaluate.html").read_text()
     assert "<h1>Grasps of the allegro hand under dexgraspbench</h1>" in page and "bad_object" in page
     assert cli.main([*words, "--grasps", "1", "--planned", str(tmp_path / "out" / "grasps")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "known"),
+    [
+        ({}, True),
+        ({"without": ("retry",)}, True),
+        ({"without": ("guard",)}, True),
+        ({"without": ("guard", "retry")}, False),
+        ({"closing": "open_loop"}, False),
+        ({"table": False, "approach": 0.0}, False),
+    ],
+)
+def test_a_hand_that_finds_the_object_by_touches_knows_the_estimated_surface(folder, monkeypatch, changes, known):
+    tried = []
+
+    def run(trial, protocol, *at):
+        tried.append(trial)
+        return GOOD
+
+    monkeypatch.setattr(views, "run_protocol", run)
+    hand, grasp = load_hand("allegro"), load_shipped_grasp("jug", "allegro")
+    view = views.View(folder, "tin", "view0", hand.source)
+    views.try_grasp(view, grasp, Protocol("quick", TrialSpec(**changes)), EvaluationSpec(1), (0, 0))
+    (trial,) = tried
+    assert (trial.surface is not None) is known
+    if known:  # the tin's axis is inside, what is 3 cm beside its wall is not
+        inside, outside = trial.surface.query(torch.tensor([[0.0, 0, 0.06], [0.06, 0, 0.06]]))[0]
+        assert inside < -0.02 and outside > 0.02

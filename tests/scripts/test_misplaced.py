@@ -78,5 +78,5 @@ def test_what_is_lost_in_place_too_is_counted_by_object_rank_and_law():
     in_place = [lost(0, "in place"), lost(1, "in place", status="OK"), lost(2, "in place", "open_loop")]
     mine = [lost(0, "20 mm"), lost(1, "20 mm", early=9.0), lost(2, "20 mm"), lost(3, "20 mm", status="OK", early=9.0)]
     words = misplaced._when_lost(mine, in_place)
-    assert words == ["1 of these were moved by over 5 mm in the approach", "1 are lost in place, too"]
+    assert words == ["2 were moved by over 5 mm in the approach, 1 of them lost", "1 are lost in place, too"]
     assert len(misplaced._when_lost(in_place, in_place)) == len(misplaced._when_lost(mine, [])) == 1

@@ -9,27 +9,19 @@ from torch import Tensor
 
 from torchgrasp.base import check_device, settle
 from torchgrasp.border import Range, checked
-from torchgrasp.control.approach import GuardedApproach, can_guard
 from torchgrasp.control.closing import PALM_REACH, LawClosing, OpenLoopClosing
 from torchgrasp.control.holding.grip import GripHold
 from torchgrasp.control.modes import Closing, Step, check_modes, choose_holding, make_closing
 from torchgrasp.control.observation import Observation
+from torchgrasp.control.recovery.approach import GuardedApproach, can_guard
+from torchgrasp.control.recovery.retry import PressCheck, Reopening
 from torchgrasp.control.reference import ClosingReference
-from torchgrasp.control.retry import PressCheck, Reopening
-from torchgrasp.control.state import ControllerState, Part, go_on, numbers_of, pack, unpack
+from torchgrasp.control.state import ControllerState, Part, gather, go_on, pack, unpack
 from torchgrasp.control.tactile import no_contact
 from torchgrasp.control.targets import Targets
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.specs import (
-    ClosingMode,
-    ClosingPart,
-    HoldingMode,
-    check_sensor,
-    closes_again,
-    guards_approach,
-    moves_palm,
-)
+from torchgrasp.specs import ClosingMode, ClosingPart, HoldingMode, check_sensor, closes_again, moves_palm
 
 Tick = Annotated[float, Range(1e-5, 1.0)]
 """Time [s] from one tick to the next: drives are asked at 10 Hz to 1 kHz, and time does not go back."""
@@ -40,10 +32,10 @@ CLOSING_TIME = 4.0
 PRESSING_TIME = 0.5
 """Time [s] from the end of closing until the hand counts as closed: the forces have risen (`RAMP`)."""
 
-PHASES = "in the air", "pressing", "opening", "approaching"
-"""What a controller is at: its fingers close, they press, they open to close once more, or the arm brings them."""
+IN_THE_AIR, PHASES = "in the air", {"guard": "approaching", "reopening": "opening", "hold": "pressing"}
+"""What a controller is at: its fingers close, or it has one of these parts."""
 
-STAGE, COUNTED = ("hold", "check", "reopening", "guard"), ("time", "pressed", "attempts", "halts")
+STAGE, COUNTED = (*PHASES, "check"), ("time", "pressed", "attempts", "halts")
 """Attributes of a controller: parts that are there in some phases, and numbers of its own."""
 
 ATTEMPTS = 2
@@ -104,19 +96,25 @@ class GraspController:
     ) -> None:
         check_modes(closing, holding, belief, without)
         check_sensor(reference.sensor, closing, holding)
-        if approach and not (guards_approach(closing, without) and can_guard(reference)):
+        if approach and not can_guard(reference, closing, without):
             allowed = "0 without the part 'guard', or without a table, a surface and a direction in the reference"
             raise BadArgument("approach", approach, allowed)
-        self.modes = f"closing {closing}, holding {holding}, without {', '.join(without) or 'nothing'}"
+        self.modes = (
+            f"closing {closing}, holding {holding}, without {', '.join(without) or 'nothing'}, {approach:g} m off"
+        )
         self.reference = reference = settle(reference, torch.device("cpu"))
-        self._guard = functools.partial(GuardedApproach, reference, approach)
-        self.guard, self.halts = self._guard() if approach else None, 0
+        self.length, self.halts = approach, 0
+        self.guard = self._guard()
         self._close = functools.partial(make_closing, reference, closing, belief, without)
         self._choose, self._law = functools.partial(choose_holding, mode=holding), holding == "law"
         self._begin(self._close())
         self.targets = Targets(reference.expand(reference.pregrasp), left=approach)
         self.most = ATTEMPTS if closes_again(closing, without) and reference.table is not None else 1
         self.attempts, self._reach = 1, PALM_REACH if moves_palm(closing, without) else 0.0
+
+    def _guard(self) -> GuardedApproach | None:
+        """Return what brings the hand along its approach; None: it has none."""
+        return GuardedApproach(self.reference, self.length) if self.length else None
 
     @property
     def approaching(self) -> bool:
@@ -254,13 +252,14 @@ class GraspController:
         >>> bool((other.targets.joints == targets.joints).all())
         True
         """
-        phase = next((x for x in PHASES if state.layout.startswith(f"{self.modes}, {x}")), PHASES[0])
+        phases = (x for x in PHASES.values() if state.layout.startswith(f"{self.modes}, {x}"))
+        phase = next(phases, IN_THE_AIR)
         stage: dict[str, Any] = dict.fromkeys(STAGE)
-        if phase == "approaching":
+        if phase == PHASES["guard"]:
             stage["guard"] = self._guard()
-        elif phase == "pressing":
+        elif phase == PHASES["hold"]:
             stage["hold"], stage["check"] = self._blank(), self._check()
-        elif phase == "opening":
+        elif phase == PHASES["reopening"]:
             stage["reopening"] = self._reopening(torch.zeros(6, dtype=torch.float64))
         parts = self._parts(stage)
         numbers = unpack(f"{self.modes}, {phase}", self._numbers(parts), state)
@@ -287,9 +286,7 @@ class GraspController:
     @property
     def _phase(self) -> str:
         """The phase in words."""
-        if self.guard is not None:
-            return PHASES[3]
-        return PHASES[2] if self.reopening is not None else PHASES[0] if self.hold is None else PHASES[1]
+        return next((phase for part, phase in PHASES.items() if getattr(self, part) is not None), IN_THE_AIR)
 
     def _parts(self, stage: dict[str, Any]) -> dict[str, Part]:
         """Return the parts whose numbers are the controller's, by name; a law that goes on is no second one."""
@@ -299,7 +296,4 @@ class GraspController:
     def _numbers(self, parts: dict[str, Part]) -> dict[str, Tensor]:
         """Return every number of the controller and of parts of it."""
         mine = {name: getattr(self, name) for name in COUNTED} | self.targets._asdict()
-        found = {f"controller.{name}": torch.as_tensor(x, dtype=torch.float64).clone() for name, x in mine.items()}
-        for name, part in parts.items():
-            found |= numbers_of(part, name)
-        return found
+        return gather(mine, parts)

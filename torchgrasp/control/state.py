@@ -38,6 +38,14 @@ def numbers_of(part: Part, name: str) -> dict[str, Tensor]:
     return found
 
 
+def gather(own: dict[str, Any], parts: dict[str, Part]) -> dict[str, Tensor]:
+    """Return copies of a controller's own numbers and of the states of its parts, by dotted names."""
+    found = {f"controller.{name}": torch.as_tensor(x, dtype=torch.float64).clone() for name, x in own.items()}
+    for name, part in parts.items():
+        found |= numbers_of(part, name)
+    return found
+
+
 def go_on(part: Part, name: str, numbers: dict[str, Tensor]) -> None:
     """Let a part take over a state of the same layout."""
     for field, value in list(vars(part).items()):

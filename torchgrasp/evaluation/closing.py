@@ -12,11 +12,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.border import Pose, Seed, checked
-from torchgrasp.control.approach import can_guard
 from torchgrasp.control.closing import PALM_REACH
 from torchgrasp.control.controller import GraspController
 from torchgrasp.control.holding.grip import GripHold
 from torchgrasp.control.modes import check_modes
+from torchgrasp.control.recovery.approach import can_guard
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.protocols import apply_error
@@ -31,7 +31,7 @@ from torchgrasp.sim.convex_parts import check_parts, convex_parts
 from torchgrasp.sim.hand import SimulatedHand
 from torchgrasp.sim.open import open_scene
 from torchgrasp.sim.scene import Body, Neighbour, SceneSpec
-from torchgrasp.specs import TrialSpec, guards_approach, moves_palm
+from torchgrasp.specs import TrialSpec, moves_palm
 from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
@@ -190,7 +190,7 @@ class TrialRun:
         generator = torch.Generator().manual_seed(trial.seed) if spec.noise else None
         self.robot = SimulatedHand(self.scene, driver.reference, spec.control_rate, generator)
         reference, parts = self.robot.reference, spec.without
-        guarded = spec.approach if guards_approach(spec.closing, parts) and can_guard(reference) else 0.0
+        guarded = spec.approach if can_guard(reference, spec.closing, parts) else 0.0
         self.controller = GraspController(reference, spec.closing, spec.holding, trial.belief, parts, guarded)
         self.overlap = self.scene.penetration()
 
@@ -202,7 +202,12 @@ class TrialRun:
     def approach(self) -> Iterator[None]:
         """Bring the opened hand straight to its pre-grasp, guarded or in one sweep."""
         if self.controller.approaching:
-            yield from self._guarded()
+            self.observation = self.robot.tick(self.controller.targets)
+            yield
+            while self.controller.approaching:
+                self.step()
+                yield
+            self.scene.approach(0.0)
             return
         length = self.spec.approach
         ticks = self.robot.ticks(length / APPROACH_SPEED) if length else 0
@@ -211,18 +216,6 @@ class TrialRun:
             self.scene.approach(length * (1 - share), length * rate / (ticks * self.robot.period))
             self.robot.tick(self.controller.targets)
             yield
-
-    def _guarded(self) -> Iterator[None]:
-        """Let the controller bring the hand to its pre-grasp."""
-        self.observation = self.robot.tick(self.controller.targets)
-        yield
-        while self.controller.approaching:
-            left = self.controller.targets.left
-            targets = self.controller.step(self.observation, self.robot.period)
-            self.scene.approach(targets.left, (left - targets.left) / self.robot.period)
-            self.observation = self.robot.tick(targets)
-            yield
-        self.scene.approach(0.0)
 
     def close(self) -> Iterator[None]:
         """Close the fingers and press, until the hand counts as closed."""
@@ -234,7 +227,11 @@ class TrialRun:
 
     def step(self) -> None:
         """Let the controller act for one control tick."""
-        self.observation = self.robot.tick(self.controller.step(self.observation, self.robot.period))
+        left = self.controller.targets.left
+        targets = self.controller.step(self.observation, self.robot.period)
+        if left > 0.0:
+            self.scene.approach(targets.left, (left - targets.left) / self.robot.period)
+        self.observation = self.robot.tick(targets)
 
     @property
     def felt(self) -> tuple[float, float]:

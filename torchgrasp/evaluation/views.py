@@ -24,7 +24,7 @@ from torchgrasp.pipeline.provenance import digest
 from torchgrasp.plane import Plane
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.sim.convex_parts import convex_parts
-from torchgrasp.specs import ContactSpec, closes_again
+from torchgrasp.specs import ContactSpec, needs_surface
 from torchgrasp.values import Grasps, PointCloud, load_grasps
 
 if TYPE_CHECKING:
@@ -178,7 +178,7 @@ def try_grasp(
     noise = protocol.noise if spec.perturb == "none" else perturbation.pose
     protocol = dataclasses.replace(protocol, trial=trial, noise=noise)
     error, surface = draw_error(protocol, grasp, mesh, seed), None
-    if protocol.pull is None and closes_again(trial.closing, trial.without):
+    if trial.table and needs_surface(trial.closing, trial.without):
         surface = _fit_surface(view.objects, view.object, view.view, spec.perturb, spec.seed)
     attempt = GraspTrial(hand, grasp, mesh, seed_of(seed, "touch"), error, parts=parts, surface=surface)
     return dataclasses.replace(run_protocol(attempt, protocol, *at), predicted=float(grasp.success[0]))

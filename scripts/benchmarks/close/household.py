@@ -29,6 +29,7 @@ from torchgrasp.evaluation import (
     count_by,
     difference_over,
     draw_error,
+    find_perturbation,
     format_share,
     household_mass,
     perturb_trial,
@@ -86,9 +87,11 @@ class Lift:
 
 
 def bench_household(spec: TableSpec, only: Sequence[str] = ()) -> list[Row]:
-    """Lift with nothing unknown, with each factor alone, and with all of them, or under some perturbations only."""
+    """Lift with nothing unknown, and with each factor alone and all of them, or under some perturbations only."""
     rows: list[Row] = []
-    chosen = [name for name in PERTURBATIONS if not only or name in only]
+    for name in only:
+        find_perturbation(name)  # raises for an unknown one
+    chosen = [name for name in PERTURBATIONS if not only or name in ("none", *only)]
     for hand in spec.hands:
         cases = [(name, GRIPS.get(hand, HOUSEHOLD.trial.force)) for name in chosen]
         found = _run(spec, hand, cases)
@@ -189,7 +192,7 @@ def _lift(spec: TableSpec, subject: Subject, hand: str, name: str, force: float)
             seed = seed_of(spec.seed, subject.label, view, rank, draw)
             trial = perturb_trial(dataclasses.replace(HOUSEHOLD.trial, force=force), perturbation, mass, seed)
             error = draw_error(dataclasses.replace(HOUSEHOLD, noise=perturbation.pose), grasp, mesh, seed)
-            felt = fit_surface(spec, subject, view, name)
+            felt = fit_surface(folder, subject.name, view, _seen(name), seed_of(spec.seed, subject.label, view))
             done = close_hand(grasp, load_hand(hand), mesh, trial, seed, error=error, parts=parts, surface=felt)
             spent += time.process_time() - began
             slip = done.slip.distance, done.slip.angle
@@ -217,16 +220,10 @@ def plan_view(spec: TableSpec, subject: Subject, hand: str, view: str, name: str
     return load_grasps(path)
 
 
-def fit_surface(spec: TableSpec, subject: Subject, view: str, name: str) -> SignedDistanceField:
-    """Return the surface that is estimated of a view under a perturbation, with which touches are compared."""
-    assert subject.folder is not None
-    return _fit(subject.folder, subject.name, view, name, seed_of(spec.seed, subject.label, view))
-
-
 @functools.lru_cache(maxsize=2)
-def _fit(folder: Path, object_name: str, view: str, name: str, seed: int) -> SignedDistanceField:
-    """Return the estimated surface of what is seen."""
-    cloud, table = perturb_view(read_view(folder, object_name, view), _seen(name), seed)
+def fit_surface(folder: Path, name: str, view: str, seen: Perturbation, seed: int) -> SignedDistanceField:
+    """Return the surface that is estimated of a view, with which touches are compared."""
+    cloud, table = perturb_view(read_view(folder, name, view), seen, seed)
     return surface_field(fit_shape(cloud, table=table))
 
 

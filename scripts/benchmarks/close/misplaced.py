@@ -148,10 +148,11 @@ def _rows(hand: str, condition: str, laws: Sequence[str], found: Sequence[Outcom
 
 
 def _when_lost(mine: Sequence[Outcome], in_place: Sequence[Outcome]) -> list[str]:
-    """Say how many of the lost were hit in the approach, and how many are lost in place, too, where that was tried."""
-    lost = [x for x in mine if not x.held]
-    early = [x.early for x in lost if x.early is not None]
-    words = [f"{sum(x > HIT for x in early)} of these were moved by over {HIT:g} mm in the approach"] if early else []
+    """Say how many were hit in the approach, and how many of the lost are lost in place, too, where that was tried."""
+    lost, seen = [x for x in mine if not x.held], [x for x in mine if x.early is not None]
+    hit = [x for x in seen if x.early is not None and x.early > HIT]
+    told = f"{len(hit)} were moved by over {HIT:g} mm in the approach, {sum(not x.held for x in hit)} of them lost"
+    words = [told] if seen else []
     if in_place and lost and lost[0].condition != "in place":
         anyway = {(x.object, x.rank, x.law) for x in in_place if not x.held}
         words.append(f"{sum((x.object, x.rank, x.law) in anyway for x in lost)} are lost in place, too")

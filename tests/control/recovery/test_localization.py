@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.point_fingers import GAINS, TARGET, observation, real, reference
-from torchgrasp.control.localization import (
+from torchgrasp.control.recovery.localization import (
     FINER,
     FINEST,
     NORMAL_STD,

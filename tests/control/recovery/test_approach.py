@@ -5,13 +5,24 @@ import dataclasses
 import pytest
 import torch
 
-from tests.control.test_localization import CENTER, RADIUS, ball, field
-from tests.point_fingers import PERIOD, TARGET, observation, real, reference
-from torchgrasp.control import ControllerState, GraspController, load_controller_state
-from torchgrasp.control.approach import ACCELERATION, BACK, CAREFUL, FEELING, HALTS, SPEED, GuardedApproach, can_guard
+from tests.control.recovery.test_localization import CENTER, RADIUS, ball, field
+from tests.point_fingers import PERIOD, observation, real, reference
+from torchgrasp.control import ClosingReference, GraspController, load_controller_state
 from torchgrasp.control.closing import PALM_REACH, PALM_SPEED
-from torchgrasp.control.localization import FINER, TURNS
+from torchgrasp.control.recovery.approach import (
+    ACCELERATION,
+    BACK,
+    CAREFUL,
+    FEELING,
+    HALTS,
+    SPEED,
+    GuardedApproach,
+    can_guard,
+)
+from torchgrasp.control.recovery.localization import FINER, TURNS
 from torchgrasp.errors import BadArgument
+from torchgrasp.hand.load import load_hand
+from torchgrasp.objects import load_shipped_grasp
 from torchgrasp.plane import Plane
 from torchgrasp.specs import SensorModel
 
@@ -147,9 +158,7 @@ def test_a_state_of_the_closing_ends_the_approach():
     one, other = (GraspController(above(), approach=LENGTH) for _ in range(2))
     approach(one, real([0, 0, 0]))
     one.step(observation(0.02), PERIOD)
-    state = one.state()
-    assert isinstance(state, ControllerState)
-    other.restore(state)
+    other.restore(one.state())
     assert not other.approaching and other.targets.left == 0.0
 
 
@@ -168,10 +177,18 @@ def test_a_state_of_the_closing_ends_the_approach():
 )
 def test_what_cannot_be_guarded_is_refused(closing, without, missing):
     held = above(**missing)
-    assert can_guard(held) is not bool(missing)
+    assert not can_guard(held, closing, without)
     with pytest.raises(BadArgument, match="approach"):
         GraspController(held, closing, without=without, approach=LENGTH)
     assert not GraspController(held, closing, without=without).approaching
+
+
+@pytest.mark.parametrize(("length", "missing"), [(0.0, {}), (0.0, {"table": None}), (0.05, {})])
+def test_a_state_of_another_approach_is_refused(length, missing):
+    one, other = GraspController(above(), approach=LENGTH), GraspController(above(**missing), approach=length)
+    with pytest.raises(BadArgument, match="state"):
+        other.restore(one.state())
+    assert other.approaching is (length > 0) and other.targets.left == length
 
 
 @pytest.mark.parametrize("length", ["0.1", float("nan"), -0.1, 1.1, None])
@@ -181,11 +198,6 @@ def test_a_length_that_is_none_is_refused(length):
 
 
 def test_the_reference_knows_the_direction_in_the_hands_axes():
-    assert TARGET.shape == OPEN.shape  # one tip a contact
-    from torchgrasp import load_hand
-    from torchgrasp.control import ClosingReference
-    from torchgrasp.objects import load_shipped_grasp
-
     grasp = load_shipped_grasp("jug", "allegro")
     found = ClosingReference.from_grasp(load_hand("allegro"), grasp).approach
     back = grasp.obj_from_hand[0, :3, :3].double() @ found

@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.control.localization import Localization, Touches
 from torchgrasp.control.observation import Observation
+from torchgrasp.control.recovery.localization import Localization, Touches
+from torchgrasp.control.recovery.palm import next_palm, palm_goal
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.state import Part
-from torchgrasp.linalg import limit_norm, unit
 from torchgrasp.plan.internal_forces import least_friction_forces, tangential_ratio
 
 FEELING, FELT = 0.1, 0.3
@@ -25,9 +25,8 @@ ASIDE = 0.008
 """Distance [m] of the object from where the hand closed, from which it closes again: twice the error of
 `Localization`."""
 
-OPENING, SHIFTING, RESTING = 0.5, 0.04, 0.1
-"""Time [s] in which the fingers open, speed [m/s] at which the palm then moves, and time [s] in which all comes to
-rest."""
+OPENING, RESTING = 0.5, 0.1
+"""Times [s] in which the fingers open, before the palm moves, and in which all then comes to rest."""
 
 
 class PressCheck(Part):
@@ -97,12 +96,8 @@ class Reopening(Part):
         reach: float,
     ) -> None:
         self.displacement, self.start, self.opened = displacement, joints, reference.expand(reference.pregrasp)
-        shift = displacement[:3]
-        if reference.table is not None:
-            up = unit(reference.table.normal)
-            shift = shift - (shift @ up) * up
         self.palm, self.time = palm, 0.0
-        self.goal = limit_norm(shift, reach) if reach else palm
+        self.goal = palm_goal(displacement[:3], reference.table, reach) if reach else palm
 
     @property
     def done(self) -> bool:
@@ -111,11 +106,8 @@ class Reopening(Part):
 
     def __call__(self, period: float) -> Float[Tensor, " j"]:
         """Return the targets of all joints for the next tick; first the fingers open, then the palm moves."""
-        way = self.goal - self.palm
-        left = float(torch.linalg.vector_norm(way))
-        if self.time >= OPENING and left > 0.0:
-            step = SHIFTING * period
-            self.palm = self.goal if left <= step else self.palm + limit_norm(way, step)
+        if self.time >= OPENING and not torch.equal(self.palm, self.goal):
+            self.palm = next_palm(self.palm, self.goal, period)
         else:
             self.time += period
         return torch.lerp(self.start, self.opened, min(self.time / OPENING, 1.0))

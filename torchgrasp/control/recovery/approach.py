@@ -8,16 +8,15 @@ draws back, moves its palm aside and goes on.
 import math
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from torchgrasp.control.closing import PALM_REACH, PALM_SPEED
-from torchgrasp.control.localization import Localization, Touches
+from torchgrasp.control.closing import PALM_REACH
 from torchgrasp.control.observation import Observation
+from torchgrasp.control.recovery.localization import Localization, Touches
+from torchgrasp.control.recovery.palm import next_palm, palm_goal
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.state import Part
 from torchgrasp.control.targets import STILL
-from torchgrasp.linalg import limit_norm, unit
+from torchgrasp.specs import guards_approach
 
 SPEED, CAREFUL, ACCELERATION = 0.2, 0.08, 1.0
 """Largest speed [m/s] of the palm along its approach, that after it touched something, and the rate [m/s^2] at which it
@@ -29,10 +28,13 @@ HALTS, FEELING, BACK = 3, 0.06, 0.02
 a fingertip's width."""
 
 
-def can_guard(reference: ClosingReference) -> bool:
-    """Return whether touches on the way tell where the object is: by their places, on a known table and surface."""
+def can_guard(reference: ClosingReference, closing: str, without: tuple[str, ...]) -> bool:
+    """Return whether a closing stops at touches, and these tell where the object is.
+
+    They do by their places, on a known table and surface.
+    """
     known = reference.approach is not None and reference.table is not None and reference.surface is not None
-    return known and reference.sensor.kind == "tactile"
+    return guards_approach(closing, without) and known and reference.sensor.kind == "tactile"
 
 
 class GuardedApproach(Part):
@@ -43,14 +45,13 @@ class GuardedApproach(Part):
     whatever it feels.
 
     Args:
-        reference: of the closing; it has an approach, a surface and a table.
+        reference: of the closing, which `can_guard`.
         length: of the approach [m].
     """
 
     def __init__(self, reference: ClosingReference, length: float) -> None:
-        assert reference.approach is not None and reference.table is not None
+        assert reference.approach is not None
         self.reference, self.length, self.direction = reference, length, reference.approach
-        self.up = unit(reference.table.normal)
         self.left, self.speed, self.retreat, self.halts = length, 0.0, 0.0, 0.0
         self.palm, self.goal, self.displacement = STILL, STILL, torch.zeros(6, dtype=torch.float64)
         self.felt, self.feeling = 0.0, False
@@ -71,9 +72,7 @@ class GuardedApproach(Part):
             if self.left >= self.retreat:
                 self.speed = self.retreat = 0.0
         elif not torch.equal(self.palm, self.goal):
-            way = self.goal - self.palm
-            near = float(torch.linalg.vector_norm(way)) <= PALM_SPEED * period
-            self.palm = self.goal if near else self.palm + limit_norm(way, PALM_SPEED * period)
+            self.palm = next_palm(self.palm, self.goal, period)
         elif self.halts < HALTS and bool(observation.tactile.contact.any()):
             self.speed, self.felt, self.feeling = 0.0, 0.0, True
             self.touches, self.search = Touches(self.reference), Localization(self.reference)
@@ -94,9 +93,5 @@ class GuardedApproach(Part):
             self.feeling, self.halts = False, self.halts + 1.0
             if self.search.done:
                 self.displacement = self.search.displacement
-                self.goal = self._aside(self.displacement[:3])
+                self.goal = palm_goal(self.displacement[:3], self.reference.table, PALM_REACH)
             self.retreat = min(self.left + BACK, self.length)
-
-    def _aside(self, shift: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-        """Return the part of a displacement [m] that the palm follows: along the table, within its reach."""
-        return limit_norm(shift - (shift @ self.up) * self.up, PALM_REACH)

@@ -8,8 +8,9 @@ import torch
 from tests.control.test_closing_parts import press
 from tests.point_fingers import NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
 from torchgrasp.control import GraspController, load_controller_state
+from torchgrasp.control.closing import PALM_SPEED
 from torchgrasp.control.controller import ATTEMPTS, CLOSING_TIME, PRESSING_TIME
-from torchgrasp.control.retry import ASIDE, OPENING, RESTING, SHIFTING, PressCheck, Reopening
+from torchgrasp.control.recovery.retry import ASIDE, OPENING, RESTING, PressCheck, Reopening
 from torchgrasp.plane import Plane
 from torchgrasp.specs import SensorModel, closes_again
 
@@ -84,8 +85,8 @@ def test_a_hand_opens_before_its_palm_moves():
             assert torch.equal(opening.palm, STILL)
     assert torch.equal(opening.palm, goal)
     speeds = torch.stack(palms).diff(dim=0).norm(dim=-1) / PERIOD
-    assert speeds.max() <= SHIFTING * (1 + 1e-9)
-    assert abs(ticks * PERIOD - (OPENING + float(goal.norm()) / SHIFTING + RESTING)) < 3 * PERIOD
+    assert speeds.max() <= PALM_SPEED * (1 + 1e-9)
+    assert abs(ticks * PERIOD - (OPENING + float(goal.norm()) / PALM_SPEED + RESTING)) < 3 * PERIOD
 
 
 @pytest.mark.parametrize(("reach", "length"), [(0.02, 0.02), (0.0, 0.0)])
@@ -110,7 +111,7 @@ def test_a_hand_that_meets_nothing_closes_as_often_as_it_may(closing):
     controller = GraspController(known(), closing)
     ticks = close(controller, observation(0.02))
     assert controller.attempts == ATTEMPTS
-    assert ticks * PERIOD < ATTEMPTS * (CLOSING_TIME + PRESSING_TIME) + OPENING + 0.02 / SHIFTING + RESTING + 0.2
+    assert ticks * PERIOD < ATTEMPTS * (CLOSING_TIME + PRESSING_TIME) + OPENING + 0.02 / PALM_SPEED + RESTING + 0.2
 
 
 @pytest.mark.parametrize(
