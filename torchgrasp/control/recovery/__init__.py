@@ -1,1 +1,1 @@
-"""What a hand does that touches something on its way, or closed in vain: it finds the object and goes there."""
+"""A hand that touches something on its way, or closed in vain, finds the object and goes there. Not public."""
