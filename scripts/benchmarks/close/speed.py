@@ -2,6 +2,7 @@
 
 import functools
 import gc
+import os
 import statistics
 import tempfile
 import time
@@ -21,6 +22,7 @@ from torchgrasp import (
     surface_field,
 )
 from torchgrasp.control import GraspController, Observation
+from torchgrasp.errors import Status
 from torchgrasp.evaluation import GraspTrial, TrialDriver
 from torchgrasp.objects import GraspObject
 from torchgrasp.pipeline.pool import run_tasks
@@ -36,6 +38,13 @@ MEDIAN_STEP, WORST_STEP = 1e-3, 2e-3
 
 TASKS = 48
 """Trials that the processes share."""
+
+ALLOCATOR = {"GLIBC_TUNABLES": "glibc.malloc.mxfast=0"}
+"""What the environment of a robot's process has, as docs/closing.md tells: glibc else puts off the merging of freed
+blocks until some tick asks for a large one, and that tick takes milliseconds longer."""
+
+STEPPING = 1200.0
+"""Longest time [s] in which steps are timed."""
 
 
 def bench_closing_speed() -> list[Row]:
@@ -78,6 +87,18 @@ def _trial_row(name: str, path: Path) -> Row:
 
 
 def _step_row(name: str, path: Path) -> Row:
+    """Return the row of a step, timed in a process of its own: a process reads `ALLOCATOR` when it starts."""
+    usual = dict(os.environ)
+    os.environ.update(ALLOCATOR)
+    (found,) = run_tasks(time_steps, [(name, str(path))], 1, STEPPING)
+    os.environ.clear()
+    os.environ.update(usual)
+    if isinstance(found, Status):
+        raise SystemExit(f"steps of the {name} hand: {found.sentence}")
+    return found
+
+
+def time_steps(name: str, path: str) -> Row:
     """Return the time of one step of the controller, by the processor's clock: of a trial's ticks, again and again.
 
     A loop of plain arithmetic, as long as the median step, has a worst of its own on the same computer. The median of
@@ -85,7 +106,7 @@ def _step_row(name: str, path: Path) -> Row:
     """
     jug = _jug()
     surface = surface_field(fit_shape(jug.view, table=0.0))  # so that some ticks search for the object
-    trial = GraspTrial(load_hand(name), load_grasps(path), jug.mesh, parts=jug.parts, surface=surface)
+    trial = GraspTrial(load_hand(name), load_grasps(Path(path)), jug.mesh, parts=jug.parts, surface=surface)
     driver = TrialDriver(trial, TrialSpec(approach=0.0, holding="grip"))
     ticks = _ticks(driver)
     collection = _seconds(gc.collect)
