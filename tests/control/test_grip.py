@@ -146,6 +146,14 @@ def test_what_exceeds_the_torques_is_too_heavy():
     assert hold.status is Status.TOO_HEAVY and hold.weight > 5.0
 
 
+def test_what_the_limits_cannot_carry_by_belief_is_not_too_heavy_while_nothing_slides():
+    weight, most = 5.0, 2.0
+    believed = FrictionBelief(0.8).high * 2 * most  # the thumb presses with 2 N, the others with the half
+    assert believed < weight
+    assert carried(weight, 3.0, max_force=most)[0].status is Status.OK
+    assert carried(weight, 0.8, max_force=most)[0].status is Status.TOO_HEAVY
+
+
 def test_a_fragile_block_is_carried_by_what_it_bears():
     hold, seen, sums = carried(1.0, 0.8, max_force=2.0)
     assert hold.status is Status.OK and hold.weight == pytest.approx(1.0, rel=0.05)

@@ -75,8 +75,9 @@ TRACKING, MOST_TRIM = 4.0, 0.5
 """Rate [1/s] at which the normal forces that are felt are brought to the wanted ones by internal forces, which move
 nothing, and the bound of these, over the largest wanted force."""
 
-OVERLOADED = 0.25
-"""Time [s] for which a fingertip slides at the limits before the load is too heavy."""
+AT_LIMIT, OVERLOADED = 0.95, 0.25
+"""Share of the limits at which forces count as at them, and time [s] for which a fingertip slides there before the load
+is too heavy. What slides is felt to weigh no more than the limits bear, so that it hardly asks for more than them."""
 
 
 class GripHold(Part):
@@ -217,7 +218,7 @@ class GripHold(Part):
         if share > 1.0 or push > max(self._enough(), float(self.grip.sum())):
             goal = self.friction.high
         self.aim += min(max(goal - self.aim, -RELAX * period), RELAX * period)
-        beyond = share > 1.0 and bool((self.slid > SLID).any())
+        beyond = share > AT_LIMIT and bool((self.slid > SLID).any())
         self.over = self.over + period if beyond and self.weight > LIFTED else 0.0
         if self.over > OVERLOADED:
             self.status = Status.TOO_HEAVY
