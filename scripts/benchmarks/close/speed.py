@@ -8,6 +8,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
 from benchmarks.common import Row, least_seconds
 from torchgrasp import (
@@ -88,11 +89,8 @@ def _trial_row(name: str, path: Path) -> Row:
 
 def _step_row(name: str, path: Path) -> Row:
     """Return the row of a step, timed in a process of its own: a process reads `ALLOCATOR` when it starts."""
-    usual = dict(os.environ)
-    os.environ.update(ALLOCATOR)
-    (found,) = run_tasks(time_steps, [(name, str(path))], 1, STEPPING)
-    os.environ.clear()
-    os.environ.update(usual)
+    with mock.patch.dict(os.environ, ALLOCATOR):
+        (found,) = run_tasks(time_steps, [(name, str(path))], 1, STEPPING)
     if isinstance(found, Status):
         raise SystemExit(f"steps of the {name} hand: {found.sentence}")
     return found
@@ -106,7 +104,7 @@ def time_steps(name: str, path: str) -> Row:
     """
     jug = _jug()
     surface = surface_field(fit_shape(jug.view, table=0.0))  # so that some ticks search for the object
-    trial = GraspTrial(load_hand(name), load_grasps(Path(path)), jug.mesh, parts=jug.parts, surface=surface)
+    trial = GraspTrial(load_hand(name), load_grasps(path), jug.mesh, parts=jug.parts, surface=surface)
     driver = TrialDriver(trial, TrialSpec(approach=0.0, holding="grip"))
     ticks = _ticks(driver)
     collection = _seconds(gc.collect)
