@@ -5,9 +5,9 @@ import tempfile
 from pathlib import Path
 
 from torchgrasp import load_hand, load_object, plan_grasps
+from torchgrasp.app.author.draft import draft_hand
 from torchgrasp.base import count_status
 from torchgrasp.files import write_file
-from torchgrasp.hand.draft import draft_hand
 from torchgrasp.testing import check_hand
 
 folder = Path(tempfile.mkdtemp()) / "mine"

@@ -11,7 +11,7 @@ import trimesh
 
 from torchgrasp import load_hand
 from torchgrasp.campaign import CampaignSpec, run_campaign
-from torchgrasp.datasets import read_shards, write_objects
+from torchgrasp.data import read_shards, write_objects
 from torchgrasp.evaluation import EvaluationSpec
 
 folder = Path(tempfile.mkdtemp())

@@ -9,7 +9,7 @@ import torch
 from hypothesis import HealthCheck, settings
 from torch import Tensor
 
-from torchgrasp.frames import rigid, rotation_from_vector
+from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.values import PointCloud
 
 SLOW = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]

@@ -2,7 +2,7 @@
 
 import torch
 
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.round_cones import closed_exact
 from torchgrasp.shape.condition import condition
 from torchgrasp.shape.gp import Normalisation, ShapeGP

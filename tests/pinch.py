@@ -11,7 +11,7 @@ import torch
 import trimesh
 
 from torchgrasp.evaluation.lift import close_hand
-from torchgrasp.frames import rigid, rotate, rotation_from_vector
+from torchgrasp.geometry.frames import rigid, rotate, rotation_from_vector
 from torchgrasp.hand.load import load_hand
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import Certificate, Contacts, Grasps

@@ -4,7 +4,7 @@ import dataclasses
 
 import torch
 
-from torchgrasp.closing import ClosingGains
+from torchgrasp.closure import ClosingGains
 from torchgrasp.control import ClosingReference, Observation, no_contact
 from torchgrasp.control.closing_law import surface_covariance
 from torchgrasp.hand.joints import ActuatedJoints

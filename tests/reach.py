@@ -5,9 +5,9 @@ import torch
 import trimesh
 from torch import Tensor
 
-from torchgrasp.frames import apply, rotate
+from torchgrasp.geometry.frames import apply, rotate
+from torchgrasp.geometry.signed_distance import SignedDistanceField, field_from_surface
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.sdf import SignedDistanceField, field_from_surface
 from torchgrasp.values import Contacts
 
 

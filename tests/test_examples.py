@@ -11,12 +11,12 @@ from typing import Any
 import torchgrasp
 
 SHOWN_BY = {
-    "torchgrasp.closing.ClosingTrace": "torchgrasp.evaluation.lift.close_hand",
-    "torchgrasp.closing.ClosureResult": "torchgrasp.evaluation.lift.close_hand",
-    "torchgrasp.closing.Disturbance": "torchgrasp.evaluation.lift.close_hand",
+    "torchgrasp.closure.ClosingTrace": "torchgrasp.evaluation.lift.close_hand",
+    "torchgrasp.closure.ClosureResult": "torchgrasp.evaluation.lift.close_hand",
+    "torchgrasp.closure.Disturbance": "torchgrasp.evaluation.lift.close_hand",
     "torchgrasp.control.log.ControlLog": "torchgrasp.control.log.load_control_log",
-    "torchgrasp.datasets.reader.GraspShards": "torchgrasp.datasets.reader.read_shards",
-    "torchgrasp.datasets.reader.ShardJob": "torchgrasp.datasets.reader.read_shards",
+    "torchgrasp.data.reader.GraspShards": "torchgrasp.data.reader.read_shards",
+    "torchgrasp.data.reader.ShardJob": "torchgrasp.data.reader.read_shards",
     "torchgrasp.hand.urdf.Joint": "torchgrasp.hand.urdf.read_urdf",
     "torchgrasp.hand.urdf.Link": "torchgrasp.hand.urdf.read_urdf",
     "torchgrasp.hand.urdf.Mimic": "torchgrasp.hand.urdf.read_urdf",

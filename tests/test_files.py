@@ -27,7 +27,7 @@ from torchgrasp.files import (
     write_file,
 )
 from torchgrasp.files.hold import TEMPORARY
-from torchgrasp.frames import rigid, rotation_from_vector
+from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.values import Certificate, Contacts, Grasps, load_grasps
 
 

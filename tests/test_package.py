@@ -32,7 +32,7 @@ SLOW = {"scipy", "trimesh", "yourdfpy", "pytorch_kinematics", "networkx", "lxml"
     [
         "import torchgrasp",
         "import torchgrasp; [torchgrasp.load_hand(name) for name in ('allegro', 'barrett', 'leap', 'shadow')]",
-        "import contextlib, torchgrasp.cli\nwith contextlib.suppress(SystemExit): torchgrasp.cli.main(['--help'])",
+        "from contextlib import suppress\nfrom torchgrasp.app.cli import main\nwith suppress(SystemExit): main(['--help'])",
     ],
     ids=["import", "load_hand", "help"],
 )

@@ -33,7 +33,7 @@ def test_the_guide_to_hands_runs_as_it_stands(tmp_path):
     pytest.importorskip("sapien")
     tools, guide = tmp_path / "tools", (ROOT / "docs" / "hands.md").read_text()
     tools.mkdir()
-    command = '-c "from torchgrasp.cli import run_and_exit; run_and_exit()"'
+    command = '-c "from torchgrasp.app.cli import run_and_exit; run_and_exit()"'
     for name, words in (("python", ""), ("torchgrasp", command)):
         (tools / name).write_text(f'#!/bin/sh\nexec "{sys.executable}" {words} "$@"\n')
         (tools / name).chmod(0o755)
@@ -68,7 +68,7 @@ def test_every_example_is_short_and_numbered():
 
 @pytest.mark.parametrize("line", [line for block in fenced("bash") for line in block.splitlines() if line.strip()])
 def test_commands_of_the_readme_exist_and_take_their_flags(line, capsys):
-    from torchgrasp.cli import COMMANDS, main
+    from torchgrasp.app.cli import COMMANDS, main
 
     groups = {name.split()[0] for name in COMMANDS if " " in name}
     words = shlex.split(line, comments=True)

@@ -4,7 +4,7 @@ The names below are the library, in the order of the data flow. Each subpackage 
 """
 
 from torchgrasp.errors import GraspError, Status
-from torchgrasp.plane import Plane
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.specs import ContactSpec, SensorModel, TrialSpec
 from torchgrasp.values import (
     Certificate,
@@ -17,10 +17,10 @@ from torchgrasp.values import (
     ShapeEstimate,
     load_grasps,
 )
-from torchgrasp.closing import ClosingGains, ClosingTrace, ClosureResult, Disturbance, ObjectMotion
+from torchgrasp.closure import ClosingGains, ClosingTrace, ClosureResult, Disturbance, ObjectMotion
 from torchgrasp.cloud import cloud_from_depth, merge_clouds, read_cloud
 from torchgrasp.scene import Scene, read_scene, save_scene
-from torchgrasp.objects import GraspObject, list_objects, load_object, load_scene
+from torchgrasp.data.shipped import GraspObject, list_objects, load_object, load_scene
 from torchgrasp.shape import ShapeGP, fit_shape
 from torchgrasp.plan import ClosureProbability, certify, closure_probability, plan_contacts
 from torchgrasp.hand import Hand, hand_of, load_hand
@@ -34,7 +34,7 @@ from torchgrasp.posture_model import (
     sample_configurations,
 )
 from torchgrasp.ik import IKSolution, PostureLibrary, SignedDistanceField, solve_ik, surface_field
-from torchgrasp.pipeline import ScenePlan, ThingPlan, explain_empty, plan_grasps, plan_scene, stream_grasps
+from torchgrasp.planner import ScenePlan, ThingPlan, explain_empty, plan_grasps, plan_scene, stream_grasps
 from torchgrasp.control import ClosingReference, GraspController, closing_gains
 from torchgrasp.sim import Neighbour
 from torchgrasp.evaluation import close_hand

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from torchgrasp.border import check_moved, show
+from torchgrasp.checks import check_moved, show
 from torchgrasp.errors import BadArgument, FailedRows, Status
 
 FINGERTIPS = (3, 5)

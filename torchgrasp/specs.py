@@ -4,9 +4,9 @@ import dataclasses
 from typing import Annotated, Literal, get_args
 
 from torchgrasp.base import FINGERTIPS, Value
-from torchgrasp.border import Range, checked
+from torchgrasp.checks import Range, checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.plane import Plane, as_plane
+from torchgrasp.geometry.plane import Plane, as_plane
 
 Simulator = Literal["sapien", "mujoco"]
 """The simulators."""

@@ -9,7 +9,7 @@ from jaxtyping import AbstractArray, jaxtyped
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border.hints import is_subclass
+from torchgrasp.checks.hints import is_subclass
 from torchgrasp.errors import ModelFileError
 from torchgrasp.files import load_tensors
 

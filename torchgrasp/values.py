@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import FINGERTIPS, Batch, Value, named_tensors, read_rows
-from torchgrasp.border import ANY, Poses, Rows, checked
+from torchgrasp.checks import ANY, Poses, Rows, checked
 from torchgrasp.errors import BadArgument, ModelFileError, Status, TooFewPoints
 from torchgrasp.files import save_tensors
-from torchgrasp.frames import is_rigid
+from torchgrasp.geometry.frames import is_rigid
 from torchgrasp.value_files import read_value
 
 # ---------------------------------------------------------------------------------------------- what was seen
@@ -119,7 +119,7 @@ class Contacts(Batch):
     `variance` (Eq. 12, normalised units) and `std_m` [m] say how uncertain the surface is there. They are None where
     nobody knows, as for contacts of another planner. All have one dtype.
 
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> contacts = load_shipped_grasp("jug", "allegro").contacts
     >>> contacts.fingertips, contacts.require_std() < 0.005  # [m]
     (3, tensor([[True, True, True]]))
@@ -229,7 +229,7 @@ class Grasps(Batch):
     `plan_grasps` makes it the log-odds of `success`.
     `meta` holds names, units, hashes and the seed as text.
 
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "barrett")
     >>> grasp.joints.shape, f"{float(grasp.success):.2f}", grasp.tip_error < 0.001  # [m]
     (torch.Size([1, 4]), '0.98', tensor([[True, True, True]]))
@@ -272,7 +272,7 @@ def load_grasps(path: Path | str) -> Grasps:
         ModelFileError: no such file; a pose that is not rigid, an unknown status, or not three to five contacts.
 
     >>> import tempfile
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> load_shipped_grasp("jug", "barrett").save(file := Path(tempfile.mkdtemp(), "grasps.safetensors"))
     >>> load_grasps(file).meta["hand"]
     'barrett'

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchgrasp.files import write_file
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 
 
 @dataclasses.dataclass(frozen=True)

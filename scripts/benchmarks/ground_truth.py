@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.datasets import list_views, read_object_mesh, read_view
-from torchgrasp.mesh import closest_on_triangles
+from torchgrasp.data import list_views, read_object_mesh, read_view
+from torchgrasp.geometry.mesh import closest_on_triangles
 from torchgrasp.values import PointCloud
 
 if TYPE_CHECKING:

@@ -8,10 +8,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 from paper.table3 import sample_whole
 from torchgrasp import PointCloud, ShapeGP, fit_shape, list_objects, load_object
+from torchgrasp.app.report.canvas import Canvas, draw_bar, map_colors
+from torchgrasp.app.report.palette import INK, PAPER
+from torchgrasp.app.report.pictures import rotated, view_of
 from torchgrasp.files import write_file
-from torchgrasp.report.canvas import Canvas, draw_bar, map_colors
-from torchgrasp.report.palette import INK, PAPER
-from torchgrasp.report.pictures import rotated, view_of
 from torchgrasp.shape.surface import Surface, extract_surface
 
 TILE = (340, 360)

@@ -25,18 +25,18 @@ from torchgrasp import (
     plan_contacts,
     plan_grasps,
 )
+from torchgrasp.app.report.canvas import Canvas, Direction
+from torchgrasp.app.report.palette import AXES, FINGERS, INK, OBJECT, PAPER
+from torchgrasp.app.report.pictures import facing
+from torchgrasp.app.report.solids import solids_from_hand
 from torchgrasp.files import write_file
-from torchgrasp.frames import virtual_frame
+from torchgrasp.geometry.frames import virtual_frame
+from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.contact_first import rank_seeds, refine_on_contacts
 from torchgrasp.ik.query import query_mixture
-from torchgrasp.ik.sdf import field_from_surface
-from torchgrasp.pipeline import spread_rows
-from torchgrasp.report.canvas import Canvas, Direction
-from torchgrasp.report.palette import AXES, FINGERS, INK, OBJECT, PAPER
-from torchgrasp.report.pictures import facing
-from torchgrasp.report.solids import solids_from_hand
+from torchgrasp.planner import spread_rows
 from torchgrasp.shape.surface import Surface, extract_surface
 
 SPEC = ContactSpec(table=0.0)

@@ -23,12 +23,12 @@ from torchgrasp import (
     load_object,
     plan_contacts,
 )
+from torchgrasp.app.report.canvas import Canvas, draw_bar, map_colors
+from torchgrasp.app.report.palette import INK, PAPER
+from torchgrasp.app.report.pictures import rotated
 from torchgrasp.files import write_file
-from torchgrasp.linalg import farthest_points
+from torchgrasp.geometry.linalg import farthest_points
 from torchgrasp.plan.closure_probability import closure_probability
-from torchgrasp.report.canvas import Canvas, draw_bar, map_colors
-from torchgrasp.report.palette import INK, PAPER
-from torchgrasp.report.pictures import rotated
 from torchgrasp.shape.surface import Surface, extract_surface
 
 THRESHOLDS = (0.03, 0.06, 0.10)

@@ -18,12 +18,12 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchgrasp import Hand, load_hand, load_mixture
+from torchgrasp.app.report.canvas import Canvas, Direction
+from torchgrasp.app.report.palette import FINGERS, GRID, INK, PAPER
+from torchgrasp.app.report.solids import solids_from_hand
 from torchgrasp.files import write_file
 from torchgrasp.posture_model.encoding import encode_fingertips
 from torchgrasp.posture_model.sample import sample_configurations
-from torchgrasp.report.canvas import Canvas, Direction
-from torchgrasp.report.palette import FINGERS, GRID, INK, PAPER
-from torchgrasp.report.solids import solids_from_hand
 
 PUBLISHED = {
     "cases": [[0.03, 0.06, 0.27, 0.26], [0.17, 0.01, 0.27, 0.002], [0.04, 0.07, 0.25, 0.08], [0.03, 0.2, 0.06, 0.56]],

@@ -17,15 +17,15 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from paper.rows import Cell, Lift, Order, Plan, Row, Subject, Support, TableSpec
-from torchgrasp.datasets import list_views, read_family, read_group, read_object_mesh, read_view
+from torchgrasp.data import list_views, read_family, read_group, read_object_mesh, read_view
+from torchgrasp.data.shipped import list_objects, load_object
 from torchgrasp.errors import GraspError, Status
 from torchgrasp.evaluation import PROTOCOLS, close_hand, draw_error, run_tasks, seed_of
 from torchgrasp.files import format_json, write_file
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.ranking import rank_by_variance
-from torchgrasp.objects import list_objects, load_object
-from torchgrasp.pipeline import plan_grasps
+from torchgrasp.planner import plan_grasps
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.sim.convex_parts import convex_parts

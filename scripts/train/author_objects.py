@@ -1,4 +1,4 @@
-"""Write the files of torchgrasp's own objects into torchgrasp/objects/data, the same bytes every time.
+"""Write the files of torchgrasp's own objects into torchgrasp/data/shipped/data, the same bytes every time.
 
 Run it after a change of `train/object_shapes.py` or of the virtual camera; it needs the extra `dev`.
 """
@@ -9,8 +9,8 @@ import trimesh
 from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view
 from torchgrasp.cloud.io.read import save_cloud
 from torchgrasp.cloud.render import render_depth
+from torchgrasp.data.shipped import DATA, SCENE, list_objects
 from torchgrasp.files import write_file
-from torchgrasp.objects import DATA, SCENE, list_objects
 
 VIEWS = {"cylinder": (20.0, 30.0), "jug": (60.0, 35.0), "rabbit": (55.0, 30.0), "spray": (50.0, 25.0)}
 """Azimuth and elevation [deg] of the camera for each object."""

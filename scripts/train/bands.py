@@ -14,7 +14,7 @@ import tyro
 from benchmarks.ground_truth import read_views, sample_mesh
 
 from torchgrasp.columns import format_columns
-from torchgrasp.datasets import read_family
+from torchgrasp.data import read_family
 from torchgrasp.evaluation.intervals import mean_over
 from torchgrasp.shape.fit import STD_FACTORS, VESSEL_STD_FACTOR, WHOLE_STD_FACTOR, fit_shape
 from train.normal_bands import measure_normals, report_normals
@@ -40,7 +40,7 @@ def bands(objects: tyro.conf.Positional[Path], beside: Path | None = None, views
     """Print the factors for `torchgrasp/shape/fit.py` and `normal_band.py`, and what bands hold on families left out.
 
     Args:
-        objects: a folder of objects as `torchgrasp.datasets` reads it.
+        objects: a folder of objects as `torchgrasp.data` reads it.
         beside: a second folder, which chooses nothing and is only measured.
         views: names of the views of each object, such as view0; by default all.
     """

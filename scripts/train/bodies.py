@@ -15,8 +15,8 @@ import trimesh
 
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.io.read import save_cloud
+from torchgrasp.data.shipped import list_objects, load_object
 from torchgrasp.files import write_file
-from torchgrasp.objects import list_objects, load_object
 
 COUNTS = {
     "box": 5, "rod": 3, "lying": 2, "egg": 3, "bottle": 4, "tub": 2, "joined": 3,
@@ -31,7 +31,7 @@ GOLDEN_ANGLE = 137.5
 
 
 def author_folder(folder: Path) -> None:
-    """Write the bodies as a folder of objects with one noisy view each (`torchgrasp.datasets`)."""
+    """Write the bodies as a folder of objects with one noisy view each (`torchgrasp.data`)."""
     solids = {name: load_object(name).mesh for name in list_objects()}
     for kind, count in COUNTS.items():
         for k in range(count):

@@ -1,9 +1,9 @@
 """`scripts/train.py golden`: the shipped grasps with known verdicts."""
 
 from torchgrasp import ContactSpec, load_hand, load_object, plan_grasps
+from torchgrasp.data.shipped import DATA
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.golden import GOLDEN, run_golden
-from torchgrasp.objects import DATA
 from torchgrasp.specs import Simulator
 
 SIMULATORS: tuple[Simulator, ...] = ("sapien", "mujoco")

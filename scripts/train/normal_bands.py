@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchgrasp.columns import format_columns
 from torchgrasp.evaluation.intervals import mean_over
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.normal_band import normal_parts
 from torchgrasp.shape.surface import extract_surface

@@ -18,8 +18,8 @@ from torchgrasp.cloud.render import render_depth
 from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.arrange import scatter
 from torchgrasp.files import format_json, write_file
-from torchgrasp.frames import inverse
-from torchgrasp.plane import Plane, upright_frame
+from torchgrasp.geometry.frames import inverse
+from torchgrasp.geometry.plane import Plane, upright_frame
 from torchgrasp.scene import DepthImage, Scene
 from torchgrasp.scene.occupancy import (
     ABOVE,

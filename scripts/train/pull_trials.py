@@ -14,7 +14,7 @@ from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.targets import Targets
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
-from torchgrasp.frames import rotation_angle
+from torchgrasp.geometry.frames import rotation_angle
 from torchgrasp.specs import TrialSpec
 
 Step = Callable[[Observation, float], Float[Tensor, " j"]]

@@ -35,9 +35,9 @@ from torchgrasp.control.adaptive.stability import FILE, NAMES, StabilityModel, l
 from torchgrasp.errors import BadArgument, GraspError
 from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.files import load_tensors, save_tensors
-from torchgrasp.frames import rigid, rotation_from_vector
-from torchgrasp.linalg import unit
-from torchgrasp.pipeline.pool import run_tasks
+from torchgrasp.geometry.frames import rigid, rotation_from_vector
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.jobs import run_tasks
 from torchgrasp.posture_model.compatibility import describe_compatibility
 from torchgrasp.posture_model.em import expectation_maximisation
 from torchgrasp.posture_model.gaussian import GaussianMixture

@@ -9,9 +9,9 @@ from pathlib import Path
 import torch
 
 from torchgrasp.campaign.folder import Campaign
-from torchgrasp.datasets.shards import JobRow, Records, Shard, pack_shard
+from torchgrasp.data.shards import JobRow, Records, Shard, pack_shard
 from torchgrasp.errors import Status
-from torchgrasp.pipeline.pool import run_as_they_end
+from torchgrasp.jobs import run_as_they_end
 from torchgrasp.values import Certificate, Contacts, Grasps
 
 JOINTS, FINGERS, TRIES = 4, 3, 2

@@ -7,7 +7,7 @@ import trimesh
 
 from torchgrasp import load_hand
 from torchgrasp.campaign import CampaignSpec, run_campaign
-from torchgrasp.datasets import write_objects
+from torchgrasp.data import write_objects
 from torchgrasp.evaluation import PROTOCOLS, EvaluationSpec
 
 LIFT = PROTOCOLS["tabletop"].with_trial(hold_time=0.1)

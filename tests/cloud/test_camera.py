@@ -5,7 +5,7 @@ import trimesh
 
 from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view
 from torchgrasp.errors import BadArgument, MeshError
-from torchgrasp.frames import inverse
+from torchgrasp.geometry.frames import inverse
 
 
 @pytest.fixture(scope="module")

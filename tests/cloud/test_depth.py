@@ -4,7 +4,7 @@ import torch
 
 from torchgrasp.cloud.depth import cloud_from_depth, read_depth
 from torchgrasp.errors import BadArgument, SuspiciousScale, TooFewPoints
-from torchgrasp.frames import rigid, rotation_from_vector
+from torchgrasp.geometry.frames import rigid, rotation_from_vector
 
 K = torch.tensor([[600.0, 0, 30], [0, 550.0, 20], [0, 0, 1]], dtype=torch.float64)
 

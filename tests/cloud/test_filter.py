@@ -2,8 +2,8 @@ import pytest
 import torch
 
 from torchgrasp.cloud.filter import remove_outliers, voxel_downsample
+from torchgrasp.data.shipped import list_objects, load_object
 from torchgrasp.errors import BadArgument, TooFewPoints
-from torchgrasp.objects import list_objects, load_object
 from torchgrasp.values import PointCloud
 
 

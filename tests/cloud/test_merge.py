@@ -8,10 +8,10 @@ from torchgrasp.cloud.filter import remove_outliers, voxel_downsample
 from torchgrasp.cloud.io.read import read_cloud, save_cloud
 from torchgrasp.cloud.merge import merge_clouds
 from torchgrasp.cloud.prepare import clean_cloud
+from torchgrasp.data.shipped import load_object
 from torchgrasp.errors import BadArgument, TooFewPoints
-from torchgrasp.frames import apply, inverse
-from torchgrasp.linalg import unit
-from torchgrasp.objects import load_object
+from torchgrasp.geometry.frames import apply, inverse
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.values import PointCloud
 

@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.orientation import check_normals, estimate_viewpoint, share_facing
 from torchgrasp.cloud.prepare import estimate_normals
+from torchgrasp.data.shipped import list_objects, load_object
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import apply, inverse
-from torchgrasp.objects import list_objects, load_object
+from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.values import PointCloud
 

@@ -5,9 +5,9 @@ import trimesh
 
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.prepare import MAX_POINTS, clean_cloud, estimate_normals, prepare_cloud
+from torchgrasp.data.shipped import list_objects, load_object
 from torchgrasp.errors import TooFewPoints
-from torchgrasp.linalg import unit
-from torchgrasp.objects import list_objects, load_object
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.values import PointCloud
 
 

@@ -8,7 +8,7 @@ import torch
 
 from torchgrasp.cloud import check, diagnose, filter, merge, orientation, prepare
 from torchgrasp.errors import BadArgument, GraspError, SuspiciousScale, TooFewPoints
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.values import PointCloud
 

@@ -27,7 +27,7 @@ from torchgrasp.control.closing_law import (
 from torchgrasp.control.reference import ClosingReference, closing_gains
 from torchgrasp.control.stiffness import joint_stiffness, tip_compliance
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
-from torchgrasp.frames import apply, inverse, rigid, rotate, rotation_from_vector
+from torchgrasp.geometry.frames import apply, inverse, rigid, rotate, rotation_from_vector
 from torchgrasp.hand.load import load_hand
 from torchgrasp.values import Certificate, Contacts, Grasps
 

@@ -13,7 +13,7 @@ from torchgrasp.control.closing import STOP_DISTANCE, LawClosing, PositionClosin
 from torchgrasp.control.closing_law import MAX_SPEED, position_gain, surface_covariance
 from torchgrasp.control.observation import Observation
 from torchgrasp.errors import BadArgument
-from torchgrasp.plane import Plane
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.specs import ClosingPart, TrialSpec
 
 ALL = get_args(ClosingPart)

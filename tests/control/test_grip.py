@@ -13,7 +13,7 @@ from torchgrasp.control.holding.grip import LEAST_PUSH, GripHold
 from torchgrasp.control.holding.least_forces import LeastForces, balance, friction_ratios, grasp_map
 from torchgrasp.control.observation import Observation
 from torchgrasp.errors import Status
-from torchgrasp.plane import Plane
+from torchgrasp.geometry.plane import Plane
 
 POINTS, OUTWARD = TARGET.numpy(), NORMALS.numpy()
 FREE = np.zeros((3, 3, 1))

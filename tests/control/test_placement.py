@@ -12,8 +12,8 @@ from torchgrasp.control import GraspController, TipContact, measure, no_contact
 from torchgrasp.control.closing import PALM_REACH, PALM_SPEED
 from torchgrasp.control.closing_law import surface_covariance
 from torchgrasp.control.placement import FARTHEST, HEIGHT_SPREAD, SPREAD, TILT, TURN, Placement
-from torchgrasp.linalg import unit
-from torchgrasp.plane import Plane
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.plane import Plane
 
 AROUND = unit(real([[1, 0.3, 0.1], [-0.4, 1, 0], [-0.5, -0.9, 0.2]]))
 """Normals that span the plane across z, and a little more."""

@@ -9,7 +9,7 @@ from tests.point_fingers import PERIOD, TOUCHING, observation, real, reference
 from torchgrasp.control import GraspController, load_controller_state
 from torchgrasp.control.holding.grip import GripHold
 from torchgrasp.errors import BadArgument, ModelFileError
-from torchgrasp.plane import Plane
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.specs import SensorModel
 
 MODES = [

@@ -9,12 +9,12 @@ import torch
 from tests.devices.conftest import sent
 from tests.devices.elsewhere import Waits, elsewhere
 from torchgrasp import ContactSpec, load_object, sample_configurations
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
+from torchgrasp.geometry.linalg import farthest_points
+from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.refine import refine
-from torchgrasp.ik.sdf import field_from_surface
-from torchgrasp.linalg import farthest_points
 from torchgrasp.plan.problem import ContactProblem
 from torchgrasp.plan.solver import Stage, descend, start_state
 from torchgrasp.posture_model.em import expectation, expectation_maximisation

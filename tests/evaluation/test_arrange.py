@@ -4,7 +4,7 @@ import trimesh
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.arrange import scatter
-from torchgrasp.frames import apply
+from torchgrasp.geometry.frames import apply
 
 
 def test_scattered_meshes_stand_on_the_table_and_apart():

@@ -12,6 +12,7 @@ import trimesh
 from tests.pinch import cylinder, pinch
 from tests.scores import GOOD, SCORES, STUCK
 from torchgrasp import cli
+from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation import views
 from torchgrasp.evaluation.campaign import evaluate
@@ -22,7 +23,6 @@ from torchgrasp.evaluation.score import STAGES, summarise
 from torchgrasp.evaluation.views import EvaluationSpec, choose_rows
 from torchgrasp.files import hold_folder
 from torchgrasp.hand.load import load_hand
-from torchgrasp.objects import load_shipped_grasp
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import load_grasps
 
@@ -175,7 +175,7 @@ def test_grasps_of_an_earlier_call_keep_the_reason_why_there_are_none(folder, tm
 def test_each_view_is_grasped_with_the_fingers_that_were_chosen_for_it(folder, tmp_path, monkeypatch):
     """Here most fingers always win, which are others than the hand's own; later trials find them by the files."""
     pytest.importorskip("sapien")
-    monkeypatch.setattr("torchgrasp.pipeline.fingers.expected_success", lambda grasps: grasps.contacts.points.shape[1])
+    monkeypatch.setattr("torchgrasp.planner.fingers.expected_success", lambda grasps: grasps.contacts.points.shape[1])
     test = PROTOCOLS["dexgraspbench"]
     test = dataclasses.replace(test, pull=dataclasses.replace(test.pull, seconds=0.1))
     spec = EvaluationSpec(1, starts=25, only=("tin",), fingers="auto")

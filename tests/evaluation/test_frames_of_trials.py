@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from tests.pinch import QUICK, cylinder, pinch
 from torchgrasp.evaluation import close_hand
-from torchgrasp.frames import apply, inverse, rigid, rotate
-from torchgrasp.plane import Plane
+from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.sim import Neighbour
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]

@@ -14,9 +14,9 @@ from torchgrasp.errors import BadArgument, MeshError, Status
 from torchgrasp.evaluation import GraspTrial, TrialDriver, close_hand, most_certain_first
 from torchgrasp.evaluation.closing import derive_reference
 from torchgrasp.evaluation.lift import LIFT_TIME
-from torchgrasp.frames import inverse
+from torchgrasp.geometry.frames import inverse
+from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.hand.load import load_hand
-from torchgrasp.ik.sdf import field_from_surface
 from torchgrasp.specs import TrialSpec
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]

@@ -17,7 +17,7 @@ from torchgrasp.evaluation.protocols import (
     error_from_object_pose,
     seed_of,
 )
-from torchgrasp.frames import apply, inverse, rigid, rotation_angle, rotation_from_vector
+from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_angle, rotation_from_vector
 
 
 def test_errors_of_the_pose_stay_within_the_protocol_s():

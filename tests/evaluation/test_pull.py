@@ -14,7 +14,7 @@ from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.protocols import PROTOCOLS, PullSpec
 from torchgrasp.evaluation.pull import DIRECTIONS, pull_grasp
-from torchgrasp.frames import apply, inverse
+from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.values import PointCloud
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]

@@ -13,7 +13,7 @@ from tests.pinch import pinch
 from torchgrasp import cli
 from torchgrasp.control.forces import squeeze
 from torchgrasp.export import format_grasps, format_keyframes
-from torchgrasp.frames import apply
+from torchgrasp.geometry.frames import apply
 from torchgrasp.hand.load import load_hand
 
 HANDS = ["allegro", "barrett"]

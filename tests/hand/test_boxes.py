@@ -6,7 +6,7 @@ import torch
 import trimesh
 from scipy.optimize import linprog
 
-from torchgrasp.frames import rotation_from_vector
+from torchgrasp.geometry.frames import rotation_from_vector
 from torchgrasp.hand.self_collision import BoxPairs, box_distance
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import rotation_from_rpy
+from torchgrasp.geometry.frames import rotation_from_rpy
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.urdf import read_urdf

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 import torch
 
+from torchgrasp.app.author.draft import draft_hand, new_hand
 from torchgrasp.errors import GraspError, HandFileError, ModelFileError
-from torchgrasp.hand.draft import draft_hand, new_hand
 from torchgrasp.hand.load import hands_folder, load_hand
 from torchgrasp.posture_model.mixture import load_mixture
 

@@ -8,9 +8,9 @@ import torch
 import trimesh
 import yourdfpy
 
+from torchgrasp.app.author.draft import Wish, new_hand
+from torchgrasp.app.author.fit_shapes import fit_shapes
 from torchgrasp.errors import BadArgument, HandFileError
-from torchgrasp.hand.draft import Wish, new_hand
-from torchgrasp.hand.fit_shapes import fit_shapes
 from torchgrasp.hand.urdf import read_published, read_urdf
 from torchgrasp.testing import check_hand
 from torchgrasp.testing.hands import random_joints
@@ -274,7 +274,7 @@ def test_a_broken_mesh_is_refused_by_name(claw, name):
 
 
 def test_too_many_bytes_of_meshes_are_refused(claw, monkeypatch):
-    monkeypatch.setattr(sys.modules["torchgrasp.hand.fit_shapes"], "MAX_MESHES", 1000)
+    monkeypatch.setattr(sys.modules["torchgrasp.app.author.fit_shapes"], "MAX_MESHES", 1000)
     with pytest.raises(HandFileError, match="in all"):
         new_hand(mesh_claw(claw))
 

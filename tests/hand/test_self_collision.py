@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import rotation_from_vector
+from torchgrasp.geometry.frames import rotation_from_vector
 from torchgrasp.hand.collision_pairs import MEETING_DISTANCE, collision_pairs, self_collision_from_urdf
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import read_hand_toml

@@ -7,13 +7,13 @@ import torch
 from train.hands.author import MIRRORS, TABLES, mirrored
 from train.hands.files import format_toml, format_urdf
 
+from torchgrasp.data.shipped import load_object
 from torchgrasp.evaluation import close_hand
 from torchgrasp.hand.collision_pairs import collision_pairs
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.load import hands_folder, load_hand
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.objects import load_object
-from torchgrasp.pipeline.grasps import plan_grasps
+from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.specs import ContactSpec
 from torchgrasp.testing import check_hand
 from torchgrasp.testing.hands import random_joints

@@ -17,18 +17,18 @@ from torch import Tensor
 
 import torchgrasp
 from torchgrasp import PointCloud, fit_shape, load_hand, load_object, load_scene
-from torchgrasp.border import Range
+from torchgrasp.checks import Range
 from torchgrasp.cloud import estimate_normals
 from torchgrasp.control import ClosingReference, ControlRecorder, GraspController, no_contact, observe
 from torchgrasp.control.adaptive.belief import Belief
 from torchgrasp.control.adaptive.impedance import Impedance
 from torchgrasp.control.adaptive.stability import NAMES, StabilityModel
+from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.errors import Status
 from torchgrasp.hand.urdf import Urdf, read_urdf
 from torchgrasp.ik import GraspProblem, PostureLibrary
-from torchgrasp.objects import load_shipped_grasp
-from torchgrasp.pipeline.funnel import Funnel, Losses
 from torchgrasp.plan import Shape
+from torchgrasp.planner.funnel import Funnel, Losses
 from torchgrasp.posture_model import GaussianMixture, GraspMixture, SampleSpec, write_samples
 from torchgrasp.posture_model.dataset import SampleFolder
 from torchgrasp.posture_model.encoding import CODE_NAMES

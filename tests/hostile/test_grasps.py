@@ -14,8 +14,8 @@ from torchgrasp import cli, load_grasps, load_object, plan_grasps
 from torchgrasp.base import named_tensors
 from torchgrasp.cloud.io.read import read_cloud
 from torchgrasp.errors import BadArgument, ModelFileError
+from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.hand.load import load_hand
-from torchgrasp.mesh import read_mesh
 from torchgrasp.scene.file import read_scene
 from torchgrasp.values import Grasps
 

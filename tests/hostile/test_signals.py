@@ -93,7 +93,7 @@ WORKING = """
 import os, sys, time
 from pathlib import Path
 from torchgrasp import cli
-from torchgrasp.pipeline.pool import run_tasks
+from torchgrasp.jobs import run_tasks
 
 def tell_and_sleep(path):
     Path(path + ".part").write_text(str(os.getpid()))

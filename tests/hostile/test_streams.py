@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-LIST = [sys.executable, "-c", "import sys; from torchgrasp.cli import main; sys.exit(main(['objects']))"]
+LIST = [sys.executable, "-c", "import sys; from torchgrasp.app.cli import main; sys.exit(main(['objects']))"]
 
 
 @pytest.mark.promise("F3")

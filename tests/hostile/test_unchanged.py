@@ -19,7 +19,7 @@ from tests.hostile.arguments import checked_things, required, wrong_arguments
 from tests.hostile.samples import hints_of
 from tests.hostile.unchanged import changes
 from torchgrasp.base import Value
-from torchgrasp.border import Count
+from torchgrasp.checks import Count
 
 SHARES = 4
 """Processes that share the calls."""

@@ -7,11 +7,11 @@ import torch
 
 from tests.reach import touched_contacts
 from torchgrasp.errors import Status
+from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration
-from torchgrasp.ik.sdf import SignedDistanceField
 from torchgrasp.values import Certificate
 
 

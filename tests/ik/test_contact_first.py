@@ -8,7 +8,7 @@ import trimesh
 
 from tests.reach import field_of_mesh
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.frames import apply
+from torchgrasp.geometry.frames import apply
 from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.clearance import CollisionWorld

@@ -7,7 +7,8 @@ import torch
 
 from torchgrasp import ContactSpec, certify, fit_shape, load_hand, load_object, plan_contacts
 from torchgrasp.errors import Status
-from torchgrasp.frames import apply
+from torchgrasp.geometry.frames import apply
+from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration
@@ -15,7 +16,6 @@ from torchgrasp.ik.contact_first import solve_contact_first
 from torchgrasp.ik.joint import JointProblem, JointState, solve_joint
 from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
 from torchgrasp.ik.rounds import assign
-from torchgrasp.ik.sdf import field_from_surface
 from torchgrasp.plan.flatness import flatness_constraint
 from torchgrasp.plan.problem import triple_jet
 from torchgrasp.plan.solver import normalise_tensions

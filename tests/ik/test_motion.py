@@ -7,12 +7,12 @@ import torch
 
 from tests.pinch import HEIGHT, RADIUS, cylinder, pinch
 from tests.reach import field_of_mesh
-from torchgrasp.frames import apply, rigid, rotation_from_vector
+from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.ik.motion import APPROACH_DISTANCE, FINE_STEPS, approach_directions, find_approach
-from torchgrasp.ik.sdf import SignedDistanceField
-from torchgrasp.linalg import unit
 
 
 def spheres_on_path(posture, hand, direction, places=81):

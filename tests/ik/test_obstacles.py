@@ -9,7 +9,7 @@ import torch
 
 from torchgrasp import ContactSpec, certify, fit_shape, load_hand, load_object, plan_contacts
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.frames import apply
+from torchgrasp.geometry.frames import apply
 from torchgrasp.ik import (
     CollisionWorld,
     GraspProblem,

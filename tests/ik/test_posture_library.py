@@ -8,11 +8,11 @@ import torch
 
 from tests.reach import touched_contacts
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import apply, rigid, rotation_from_vector
+from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
+from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, collision_cost
 from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
-from torchgrasp.ik.sdf import SignedDistanceField
 from torchgrasp.values import Contacts
 
 NOTHING = SignedDistanceField(torch.zeros(3, dtype=torch.float64), 1.0, torch.ones(2, 2, 2, dtype=torch.float64))

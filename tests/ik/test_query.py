@@ -9,7 +9,7 @@ import torch
 from tests.reach import touched_contacts
 from torchgrasp import load_object, plan_grasps
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.frames import apply, inverse, rigid, rotate, virtual_frame
+from torchgrasp.geometry.frames import apply, inverse, rigid, rotate, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.query import WRONG_SIDE, query_mixture

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from tests.pinch import pinch
-from torchgrasp.frames import apply, inverse, rigid, rotate, rotation_from_vector
+from torchgrasp.geometry.frames import apply, inverse, rigid, rotate, rotation_from_vector
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.ik.ranking import (
     FEATURES,
     centred_friction,
@@ -20,7 +21,6 @@ from torchgrasp.ik.ranking import (
     success_features,
     success_log_odds,
 )
-from torchgrasp.linalg import unit
 from torchgrasp.plan.closure_probability import closure_probability
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.specs import ContactSpec

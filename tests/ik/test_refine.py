@@ -7,15 +7,15 @@ import torch
 
 from tests.reach import touched_contacts
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.frames import apply, rigid, rotate, rotation_from_vector
+from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vector
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.checks import is_clear, measure_errors
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, clearance_rows, link_clearance
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian, differentiate
 from torchgrasp.ik.motion import find_approach
 from torchgrasp.ik.refine import grasp_residuals, open_hand, refine, tip_rows, tip_targets
-from torchgrasp.ik.sdf import field_from_surface
-from torchgrasp.plane import Plane
 from torchgrasp.values import Contacts
 
 

@@ -5,7 +5,7 @@ import torch
 
 from tests.reach import touched_contacts
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.frames import apply, rigid, rotate, rotation_from_vector, virtual_frame
+from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vector, virtual_frame
 from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.cobyla import refine_by_cobyla

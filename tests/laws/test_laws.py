@@ -16,7 +16,7 @@ from torchgrasp import (
     load_object,
     plan_contacts,
 )
-from torchgrasp.frames import apply, rotate
+from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.shape.condition import condition
 from torchgrasp.shape.gp import Normalisation
 from torchgrasp.shape.observations import Observations

@@ -10,8 +10,8 @@ from scipy.optimize import linprog
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import apply, rotate
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.frames import apply, rotate
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan import closure_lp
 from torchgrasp.plan.certify import bound_margin, certify
 from torchgrasp.plan.wrench import wrenches

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from tests.cups import RADIUS, cup_view, ring
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.flatness import GUIDING_POINTS, INSIDE, flatness_constraint, normal_variation
 from torchgrasp.plan.problem import triple_jet
 from torchgrasp.plan.solver import project

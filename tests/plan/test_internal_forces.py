@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.optimize import linprog
 
-from torchgrasp.frames import rotation_from_vector
+from torchgrasp.geometry.frames import rotation_from_vector
 from torchgrasp.plan.cone_forces import forces_in_cones
 from torchgrasp.plan.internal_forces import (
     _rounds,

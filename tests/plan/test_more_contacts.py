@@ -11,8 +11,8 @@ from benchmarks.proof.exact_lp import proves_margin_above, proves_margin_below, 
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import apply, degenerate, rotate
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.frames import apply, degenerate, rotate
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure_lp import solve_closure_lp
 from torchgrasp.plan.round_cones import closed_exact, first_balance, most_opposing

@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchgrasp.data.shipped import load_object
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.linalg import unit
-from torchgrasp.objects import load_object
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure_probability import closure_probability
 from torchgrasp.plan.objectives import differentiate_cost, epsilon_cost, min_weight_cost, raise_probability

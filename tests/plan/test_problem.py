@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.problem import (
     CONE_MARGIN,
     INSIDE,

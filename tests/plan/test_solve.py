@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.frames import degenerate
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.frames import degenerate
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.feasibility import check_feasibility, first_violation
 from torchgrasp.plan.flatness import normal_variation

@@ -8,8 +8,8 @@ import torch
 from scipy.optimize import linprog
 from torch import Tensor
 
-from torchgrasp.linalg import unit
-from torchgrasp.objects import load_object
+from torchgrasp.data.shipped import load_object
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.objectives import differentiate_cost
 from torchgrasp.plan.problem import ContactProblem, forces_from_tensions
 from torchgrasp.plan.solve import plan_contacts

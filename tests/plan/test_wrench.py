@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchgrasp.frames import apply, rotate
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.frames import apply, rotate
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.round_cones import closed_exact
 from torchgrasp.plan.wrench import (

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchgrasp.cli import main
+from torchgrasp.app.cli import main
 from torchgrasp.errors import BadArgument, ModelFileError, OutputError
 from torchgrasp.files import hold_folder
 from torchgrasp.hand.load import load_hand
@@ -71,7 +71,7 @@ def test_a_folder_serves_a_loader_posture_by_posture(tmp_path, small):
 
 HELD_RUN = """
 import signal, sys, threading
-from torchgrasp.cli import main
+from torchgrasp.app.cli import main
 from torchgrasp.posture_model import dataset
 
 interrupted = threading.Event()

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.frames import apply, inverse, rotate, virtual_frame
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.frames import apply, inverse, rotate, virtual_frame
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.posture_model.encoding import PERMUTATIONS, encode, encode_fingertips
 from torchgrasp.values import Contacts
 

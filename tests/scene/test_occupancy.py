@@ -11,7 +11,7 @@ from torchgrasp.cloud.camera import INTRINSICS, look_at
 from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.cloud.render import render_depth
 from torchgrasp.errors import BadArgument
-from torchgrasp.plane import Plane
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene import DepthImage, Scene, estimate_occupancy
 
 BOXES = {  # size and position of the lower face's middle

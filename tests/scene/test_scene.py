@@ -6,8 +6,8 @@ import trimesh
 from torchgrasp.cloud.camera import INTRINSICS, look_at
 from torchgrasp.cloud.render import render_depth
 from torchgrasp.errors import BadArgument, NoSupport
-from torchgrasp.frames import apply, rigid, rotation_from_vector
-from torchgrasp.plane import Plane
+from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene import Scene
 from torchgrasp.values import PointCloud
 

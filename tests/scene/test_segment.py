@@ -4,7 +4,7 @@ import trimesh
 
 from torchgrasp.cloud.camera import INTRINSICS, look_at
 from torchgrasp.cloud.render import render_depth
-from torchgrasp.plane import Plane
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.segment import on_surface, segment
 

@@ -8,7 +8,7 @@ from torchgrasp.cloud.camera import INTRINSICS, look_at
 from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.cloud.render import render_depth
 from torchgrasp.errors import BadArgument, NoSupport
-from torchgrasp.frames import apply, rigid, rotation_from_vector
+from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
 from torchgrasp.scene.support import fit_support
 
 POSE = look_at(30.0, 40.0, 0.6)

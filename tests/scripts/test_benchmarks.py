@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.covariance import covariance
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure_lp import solve_closure_lp
 from torchgrasp.plan.wrench import wrenches

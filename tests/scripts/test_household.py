@@ -12,7 +12,7 @@ from paper.trials import TableSpec
 
 from tests.pinch import pinch
 from torchgrasp.base import join
-from torchgrasp.closing import ObjectMotion
+from torchgrasp.closure import ObjectMotion
 from torchgrasp.errors import Status, TooFewPoints
 from torchgrasp.evaluation import PERTURBATIONS
 

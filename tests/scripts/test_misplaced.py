@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.pinch import cylinder, pinch
 from torchgrasp.base import join
-from torchgrasp.frames import inverse, rigid, rotation_from_vector
+from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
 
 
 @pytest.mark.parametrize("condition", ["in place", "20 mm", "10 degrees", "afloat, 10 mm"])

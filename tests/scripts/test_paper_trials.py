@@ -18,9 +18,9 @@ from paper.trials import fill, in_order, run_cells, subjects
 
 from tests.pinch import pinch
 from torchgrasp.base import join
-from torchgrasp.closing import ObjectMotion
+from torchgrasp.closure import ObjectMotion
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.frames import inverse
+from torchgrasp.geometry.frames import inverse
 
 ROWS = (
     Row("one", Plan(), "success", "uncertainty", "force"),

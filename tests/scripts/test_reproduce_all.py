@@ -14,10 +14,10 @@ from paper.whole.parts import FIGURES, FULL, QUICK, TRIALS, Sizes
 from paper.whole.run import Whole, reproduce
 
 from tests.pinch import pinch
+from torchgrasp.app.report.document import format_html_table
 from torchgrasp.base import join
-from torchgrasp.closing import ObjectMotion
+from torchgrasp.closure import ObjectMotion
 from torchgrasp.errors import Status
-from torchgrasp.report.document import format_html_table
 
 TINY = Sizes(starts=8, drawn=8, postures=200, fitted=100, apart=50, folds=2, families=0, grasps=2, draws=1)
 PARTS = ("table5", "table6")

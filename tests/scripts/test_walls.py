@@ -5,7 +5,7 @@ import torch
 from benchmarks.shape.walls import estimated_thickness, measure_walls, true_wall
 
 from tests.cups import RADIUS, cup, cup_view
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.values import PointCloud
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument, IndefiniteCovariance, SuspiciousScale
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.kernel import Kernel, KernelName, matern52_kernel

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from tests.covariance import covariance
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.condition import condition, longest_distance
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import Normalisation, ShapeGP

@@ -5,8 +5,8 @@ import torch
 from torch import Tensor
 
 from tests.cups import HEIGHT, RADIUS, cup, cup_view, ring
-from torchgrasp.linalg import unit
-from torchgrasp.mesh import closest_on_triangles
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.mesh import closest_on_triangles
 from torchgrasp.plan.line_posterior import line_posterior
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.hollow import HollowShape

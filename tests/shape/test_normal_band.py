@@ -8,7 +8,7 @@ import torch
 from tests.half_ball import RADIUS, ball
 from torchgrasp import PointCloud, fit_shape
 from torchgrasp.errors import BadArgument
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.normal_band import BEND, EDGE, FOOTPRINT, LEAST, OWN, normal_parts
 
 

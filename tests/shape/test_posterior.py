@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tests.covariance import covariance
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.condition import condition, posterior_given
 from torchgrasp.shape.gp import Normalisation, ShapeGP
 from torchgrasp.shape.gradient_kernel import cross_covariance

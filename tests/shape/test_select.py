@@ -10,7 +10,7 @@ from torch import Tensor
 from tests.covariance import covariance
 from torchgrasp.base import join
 from torchgrasp.errors import IndefiniteCovariance
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.condition import posterior_given
 from torchgrasp.shape.kernel import kernel_by_name, thin_plate
 from torchgrasp.shape.observations import Observations, on_surface

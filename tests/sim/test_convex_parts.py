@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from torchgrasp.data.shipped import load_object
 from torchgrasp.errors import MeshError
-from torchgrasp.objects import load_object
 from torchgrasp.sim.convex_parts import check_parts, convex_parts, hull
 
 

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-from torchgrasp.datasets.shards import JobRow
+from torchgrasp.data.shards import JobRow
 from torchgrasp.errors import Status
 
 FIELDS = (
@@ -96,7 +96,7 @@ standard deviation of the surface at its contacts, its predicted success, and it
 ## Reading
 
 ```python
-from torchgrasp.datasets import read_shards
+from torchgrasp.data import read_shards
 
 data = read_shards(".", points=512)  # for a torch DataLoader: each item is a dict of one grasp
 first = data.job(0)  # or job by job: row, cloud, grasps, passed, outcome

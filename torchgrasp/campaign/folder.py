@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchgrasp.campaign.card import card_of, describe
-from torchgrasp.datasets.reader import CARD, GraspShards, read_shards, shard_path
-from torchgrasp.datasets.shards import JobRow, Shard, join_shards, load_shard, pack_shard
+from torchgrasp.data.reader import CARD, GraspShards, read_shards, shard_path
+from torchgrasp.data.shards import JobRow, Shard, join_shards, load_shard, pack_shard
 from torchgrasp.errors import ModelFileError, Status
 from torchgrasp.files import begin_folder, format_json, hold_folder, remove_file, sha256, write_file
 

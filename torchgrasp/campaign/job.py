@@ -5,12 +5,12 @@ import json
 
 import torch
 
-from torchgrasp.datasets.shards import JobRow, Records, Shard, pack_shard, short
+from torchgrasp.data.shards import JobRow, Records, Shard, pack_shard, short
 from torchgrasp.errors import BadArgument, MissingExtra, OutputError, Status
 from torchgrasp.evaluation.protocols import Protocol
 from torchgrasp.evaluation.views import EvaluationSpec, View, choose_rows, plan_view, try_grasp
 from torchgrasp.hand.hand import Hand
-from torchgrasp.pipeline.many import no_grasps
+from torchgrasp.planner.many import no_grasps
 
 PACKAGES = ("torchgrasp", "torch", "numpy", "scipy", "trimesh", "sapien", "mujoco", "coacd")
 """Packages on whose versions the numbers depend."""

@@ -5,20 +5,20 @@ from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Annotated
 
-from torchgrasp.border import Range, checked
 from torchgrasp.campaign.cluster import run_on_cluster
 from torchgrasp.campaign.folder import Campaign, carry_out
 from torchgrasp.campaign.job import empty_shard, run_job, versions
 from torchgrasp.campaign.spec import CampaignSpec
-from torchgrasp.datasets.objects import read_entries
-from torchgrasp.datasets.reader import GraspShards
-from torchgrasp.datasets.shards import JobRow, short
+from torchgrasp.checks import Range, checked
+from torchgrasp.data.manifest import read_entries
+from torchgrasp.data.reader import GraspShards
+from torchgrasp.data.shards import JobRow, short
 from torchgrasp.errors import DatasetError, Status
 from torchgrasp.evaluation.campaign import PLAN_LIMIT, TRIAL_LIMIT
 from torchgrasp.evaluation.views import View
 from torchgrasp.files import sha256
 from torchgrasp.hand.hand import Hand, HandSource
-from torchgrasp.pipeline.pool import run_as_they_end
+from torchgrasp.jobs import run_as_they_end
 
 
 @checked
@@ -38,7 +38,7 @@ def run_campaign(
     interruptions (docs/promises.md, N10, on equal results).
 
     Args:
-        objects: a folder as in `torchgrasp.datasets`. On a cluster it has the same path on every machine.
+        objects: a folder as in `torchgrasp.data`. On a cluster it has the same path on every machine.
         hand: from `load_hand`; its fingers grasp.
         folder: of the data set; no other run may write it meanwhile.
         spec: what is planned and tried; None: `CampaignSpec()`.
@@ -53,7 +53,7 @@ def run_campaign(
 
     >>> import tempfile, trimesh
     >>> from torchgrasp import load_hand
-    >>> from torchgrasp.datasets import write_objects
+    >>> from torchgrasp.data import write_objects
     >>> from torchgrasp.evaluation import EvaluationSpec
     >>> meshes = Path(tempfile.mkdtemp())
     >>> _ = trimesh.creation.cylinder(radius=0.03, height=0.12).export(meshes / "tin.stl")

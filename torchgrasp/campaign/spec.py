@@ -4,7 +4,7 @@ import dataclasses
 from typing import Annotated
 
 from torchgrasp.base import Value
-from torchgrasp.border import Range, checked
+from torchgrasp.checks import Range, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.protocols import Protocol, find_protocol
 from torchgrasp.evaluation.views import EvaluationSpec

@@ -12,8 +12,8 @@ from torchgrasp.cloud.orientation import share_facing
 from torchgrasp.cloud.parts import LEVEL, find_second_body, find_support
 from torchgrasp.cloud.prepare import FACING
 from torchgrasp.cloud.visibility import MAX_BEHIND, MAX_EDGE_ON, share_unseen
-from torchgrasp.linalg import unit
-from torchgrasp.plane import Plane
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.values import PointCloud
 
 MAX_DOWN = 0.15

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.border import Range, Seed, checked
+from torchgrasp.checks import Range, Seed, checked
 from torchgrasp.cloud.depth import check_rigid, cloud_from_depth
 from torchgrasp.errors import MeshError
-from torchgrasp.frames import apply, inverse, rigid, rotate
+from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.values import PointCloud
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument, SuspiciousScale, TooFewPoints
 from torchgrasp.values import PointCloud
 

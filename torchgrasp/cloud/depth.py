@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.border import RIGID, check_tensor, checked
+from torchgrasp.checks import RIGID, check_tensor, checked
 from torchgrasp.cloud.check import check_cloud
 from torchgrasp.errors import BadArgument, TooFewPoints
-from torchgrasp.frames import apply, is_rigid, rotate
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.frames import apply, is_rigid, rotate
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.values import PointCloud
 
 MAX_SHIFT = 0.15

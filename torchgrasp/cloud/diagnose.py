@@ -8,15 +8,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import check_tensor, checked
+from torchgrasp.checks import check_tensor, checked
 from torchgrasp.cloud.advice import Advice, judge_pixels, judge_view
 from torchgrasp.cloud.check import check_cloud, distinct_exactly, remove_duplicates
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_planes, nearest
 from torchgrasp.cloud.orientation import NormalCheck, compare_normals, share_facing
 from torchgrasp.cloud.prepare import MAX_POINTS, clean_cloud
 from torchgrasp.errors import BadArgument
-from torchgrasp.linalg import unit
-from torchgrasp.plane import Plane
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.values import PointCloud
 
 MEASURED = 50_000

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import torch
 
-from torchgrasp.border import Range, checked
+from torchgrasp.checks import Range, checked
 from torchgrasp.cloud.check import MIN_POINTS, check_cloud, first_of_each, remove_duplicates
 from torchgrasp.cloud.neighbours import find_inliers
 from torchgrasp.errors import TooFewPoints

@@ -6,13 +6,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.cloud.check import check_cloud
 from torchgrasp.cloud.depth import check_rigid
 from torchgrasp.cloud.prepare import estimate_normals
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import apply, rotate
-from torchgrasp.linalg import unit_of_any
+from torchgrasp.geometry.frames import apply, rotate
+from torchgrasp.geometry.linalg import unit_of_any
 from torchgrasp.values import PointCloud
 
 

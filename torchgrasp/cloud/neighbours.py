@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 
 BLOCK = 1 << 14
 """Points about which quadrics are fitted at once: in some 100 MiB, whatever the size of the cloud."""

@@ -8,11 +8,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.cloud.check import check_cloud, remove_duplicates
 from torchgrasp.cloud.neighbours import fit_planes, nearest
 from torchgrasp.errors import BadArgument
-from torchgrasp.linalg import fibonacci_sphere, unit
+from torchgrasp.geometry.linalg import fibonacci_sphere, unit
 from torchgrasp.values import PointCloud
 
 MAX_OPPOSED = 0.35

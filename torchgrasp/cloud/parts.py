@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.border import Range, checked
+from torchgrasp.checks import Range, checked
 from torchgrasp.cloud.check import MIN_POINTS, first_of_each
 from torchgrasp.cloud.neighbours import draw_rows, fit_planes
 from torchgrasp.errors import TooFewPoints
-from torchgrasp.plane import Plane
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.values import PointCloud
 
 CANDIDATES = 200

@@ -7,12 +7,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.cloud.check import remove_duplicates
 from torchgrasp.cloud.neighbours import find_inliers, fit_planes, fit_quadrics
 from torchgrasp.cloud.orientation import compare_normals, guess_viewpoint, orient_normals, share_facing
 from torchgrasp.errors import BadArgument, TooFewPoints
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.values import PointCloud
 
 FACING = 0.9

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchgrasp.cloud.camera import HEIGHT, INTRINSICS, WIDTH, add_noise, cast_mesh
 from torchgrasp.cloud.depth import check_rigid
-from torchgrasp.frames import rotate
+from torchgrasp.geometry.frames import rotate
 
 if TYPE_CHECKING:
     import trimesh

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 
 MAX_EDGE_ON = 0.15
 """Largest share of a view's points on surfaces that the camera sees edge-on: 222 views have .10 at most."""

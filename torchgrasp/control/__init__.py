@@ -9,7 +9,7 @@ from torchgrasp.control.sensing import FingertipSensor, feel_flags, feel_torques
 from torchgrasp.control.state import ControllerState, load_controller_state
 from torchgrasp.control.tactile import TactileState, TipContact, measure, no_contact
 from torchgrasp.control.targets import Targets
-from torchgrasp.closing import ClosingGains
+from torchgrasp.closure import ClosingGains
 from torchgrasp.specs import SensorModel
 
 __all__ = [

@@ -15,7 +15,7 @@ from torchgrasp.control.sensing import DriveFeel
 from torchgrasp.control.state import Part
 from torchgrasp.control.tactile import NOISE
 from torchgrasp.control.targets import STILL
-from torchgrasp.linalg import limit_norm
+from torchgrasp.geometry.linalg import limit_norm
 from torchgrasp.specs import ClosingPart, moves_palm
 
 Revision = Callable[[Observation, ClosingReference], ClosingReference]

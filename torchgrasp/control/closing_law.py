@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.linalg import cholesky, limit_norm, squared_mahalanobis
+from torchgrasp.geometry.linalg import cholesky, limit_norm, squared_mahalanobis
 
 POSITION_FLOOR = 0.005
 """Isotropic standard deviation [m] of Sigma_cov: the accuracy of hand pose and joint zeros. Without it the inverse in

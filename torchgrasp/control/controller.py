@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import check_device, settle
-from torchgrasp.border import Range, checked
+from torchgrasp.checks import Range, checked
 from torchgrasp.control.closing import PALM_REACH, LawClosing, OpenLoopClosing
 from torchgrasp.control.holding.grip import GripHold
 from torchgrasp.control.modes import Closing, Step, check_modes, choose_holding, make_closing

@@ -7,10 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import settle
-from torchgrasp.border import Positive, Range, checked
+from torchgrasp.checks import Positive, Range, checked
 from torchgrasp.control.stiffness import joint_stiffness
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import apply, inverse, rotate
+from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.plan.internal_forces import least_friction_forces
 from torchgrasp.values import Grasps
@@ -56,7 +56,7 @@ class Squeeze(NamedTuple):
     """The third pose of a grasp: joint targets [rad], forces on the object [N], torques [N m].
 
     >>> from torchgrasp import load_hand
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> pressed = squeeze(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
     >>> pressed.forces.norm(dim=-1).round(decimals=1)  # [N] of each finger
     tensor([[2., 2., 4.]], dtype=torch.float64)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Batch, join, named_tensors
-from torchgrasp.border import Positive, checked
+from torchgrasp.checks import Positive, checked
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.tactile import no_contact
 from torchgrasp.control.targets import Targets

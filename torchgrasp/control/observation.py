@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value, check_device
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.control.tactile import TactileState
 from torchgrasp.hand.hand import Hand
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.state import Part
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 
 SPREAD, HEIGHT_SPREAD = 0.01, 0.001
 """Standard deviations [m] of the object's place: along the table, or in every direction without one; across the table.

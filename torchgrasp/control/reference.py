@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import ANY, Pose, Positive, Range, check_tensor, checked
-from torchgrasp.closing import ClosingGains
+from torchgrasp.checks import ANY, Pose, Positive, Range, check_tensor, checked
+from torchgrasp.closure import ClosingGains
 from torchgrasp.control.closing_law import (
     FORCE_BANDWIDTH,
     FORCE_FLOOR,
@@ -22,11 +22,11 @@ from torchgrasp.control.closing_law import (
 from torchgrasp.control.forces import check_squeeze, contacts_in_hand, desired_forces, force_covariance, press
 from torchgrasp.control.stiffness import drive_stiffness, joint_stiffness, tip_compliance
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import inverse, rotate
+from torchgrasp.geometry.frames import inverse, rotate
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.sdf import SignedDistanceField
-from torchgrasp.linalg import unit
-from torchgrasp.plane import Plane
 from torchgrasp.specs import SensorModel
 from torchgrasp.values import Grasps
 
@@ -56,7 +56,7 @@ class ClosingReference(Value):
         max_force: largest normal force [N] of a fingertip that the object bears; None: any.
 
     >>> from torchgrasp import load_hand
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> reference = ClosingReference.from_grasp(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
     >>> every = reference.expand(reference.joints)  # followers, too
     >>> every.shape, torch.equal(reference.pick(every), reference.joints)
@@ -204,7 +204,7 @@ def closing_gains(
     Arguments and errors are those of `ClosingReference.from_grasp`.
 
     >>> from torchgrasp import load_hand
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> gains = closing_gains(load_shipped_grasp("jug", "barrett"), load_hand("barrett"), force=2.0)
     >>> f"{gains.desired_force.norm(dim=-1).max():.1f} N"
     '2.0 N'

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.border import Positive, checked
+from torchgrasp.checks import Positive, checked
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.state import Part
@@ -76,7 +76,7 @@ def feel_torques(
         BadArgument: a jacobian of another hand.
 
     >>> from torchgrasp import load_hand
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
     >>> reference = ClosingReference.from_grasp(hand, grasp)
     >>> jacobian, none = torch.eye(9)[:, :8].double().reshape(3, 3, 8), torch.zeros(8).double()

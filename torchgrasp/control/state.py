@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.files import save_tensors
 from torchgrasp.value_files import read_value
@@ -104,7 +104,7 @@ def load_controller_state(path: Path | str) -> ControllerState:
     >>> import tempfile
     >>> from torchgrasp import GraspController, load_hand
     >>> from torchgrasp.control import ClosingReference
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> reference = ClosingReference.from_grasp(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
     >>> file = Path(tempfile.mkdtemp(), "state.safetensors")
     >>> GraspController(reference).state().save(file)

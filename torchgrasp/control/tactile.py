@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import FINGERTIPS, Value, check_device
-from torchgrasp.border import ANY, Count, Range, checked
-from torchgrasp.linalg import unit
+from torchgrasp.checks import ANY, Count, Range, checked
+from torchgrasp.geometry.linalg import unit
 
 SAMPLING_RATE = 100.0
 """Of a fingertip [Hz]: one sample for each tick of a controller at 100 Hz."""

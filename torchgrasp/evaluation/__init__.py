@@ -9,7 +9,7 @@ from torchgrasp.evaluation.lift import close_hand, lift_grasp
 from torchgrasp.evaluation.perturb import PERTURBATIONS, Perturbation, find_perturbation, household_mass
 from torchgrasp.evaluation.perturb import perturb_trial, perturb_view
 from torchgrasp.evaluation.placed import PlacedScene, drop
-from torchgrasp.pipeline.pool import run_tasks
+from torchgrasp.jobs import run_tasks
 from torchgrasp.evaluation.protocols import PROTOCOLS, PoseNoise, Protocol, PullSpec, apply_error
 from torchgrasp.evaluation.protocols import draw_error, draw_hand_errors, draw_object_poses, find_protocol, seed_of
 from torchgrasp.evaluation.pull import PullResult, pull_grasp, run_protocol

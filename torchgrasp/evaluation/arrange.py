@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgrasp.base import check_number
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import rigid, rotation_from_vector
+from torchgrasp.geometry.frames import rigid, rotation_from_vector
 
 if TYPE_CHECKING:
     import trimesh

@@ -8,15 +8,15 @@ from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Annotated
 
-from torchgrasp.border import Range, checked
-from torchgrasp.datasets import list_objects, list_views
+from torchgrasp.checks import Range, checked
+from torchgrasp.data import list_entries, list_views
 from torchgrasp.errors import BadArgument, DatasetError, Status
 from torchgrasp.evaluation.protocols import Protocol, find_protocol
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore
 from torchgrasp.evaluation.views import REFUSAL, EvaluationSpec, View, choose_rows, plan_view, try_grasp
 from torchgrasp.files import hold_folder, temporary_folder
 from torchgrasp.hand.hand import Hand
-from torchgrasp.pipeline.pool import run_tasks
+from torchgrasp.jobs import run_tasks
 from torchgrasp.values import load_grasps
 
 PLAN_LIMIT, TRIAL_LIMIT = 900.0, 120.0
@@ -38,7 +38,7 @@ def evaluate(
     Only the simulator knows the true mesh. An object with bad files or a bad entry is refused; the others go on.
 
     Args:
-        objects: a folder as in `torchgrasp.datasets`.
+        objects: a folder as in `torchgrasp.data`.
         protocol: itself, or its name in `PROTOCOLS`.
         spec: which grasps; None: `EvaluationSpec()`.
         folder: where the executable grasps of each view are kept, OBJECT/VIEW.safetensors; None: nowhere. No other
@@ -52,7 +52,7 @@ def evaluate(
 
     >>> import tempfile
     >>> from torchgrasp import load_hand, load_object
-    >>> from torchgrasp.datasets import write_objects
+    >>> from torchgrasp.data import write_objects
     >>> folder = Path(tempfile.mkdtemp())
     >>> _ = load_object("cylinder").mesh.export(folder / "tin.ply")
     >>> _ = write_objects(folder, folder / "objects", views=1)
@@ -64,7 +64,7 @@ def evaluate(
     if spec.perturb != "none" and protocol.pull is not None:
         raise BadArgument("perturb", f"{spec.perturb!r} with {protocol.name!r}", "a protocol that lifts")
     views, refused = [], []
-    for name in list_objects(objects, spec.only):
+    for name in list_entries(objects, spec.only):
         try:
             found = list_views(objects, spec.complete, [name], spec.views)
         except DatasetError as error:

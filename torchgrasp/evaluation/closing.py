@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.border import Pose, Seed, checked
+from torchgrasp.checks import Pose, Seed, checked
 from torchgrasp.control.closing import PALM_REACH
 from torchgrasp.control.controller import GraspController
 from torchgrasp.control.holding.grip import GripHold
@@ -20,12 +20,12 @@ from torchgrasp.control.recovery.approach import can_guard
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.protocols import apply_error
-from torchgrasp.frames import inverse, rigid
+from torchgrasp.geometry.frames import inverse, rigid
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.mesh import read_mesh
+from torchgrasp.geometry.plane import GRID, Plane, to_upright
+from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.sdf import SignedDistanceField
-from torchgrasp.linalg import unit
-from torchgrasp.mesh import read_mesh
-from torchgrasp.plane import GRID, Plane, to_upright
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.sim.convex_parts import check_parts, convex_parts
 from torchgrasp.sim.hand import SimulatedHand
@@ -47,7 +47,7 @@ class GraspTrial:
     """A grasp and the true object, as in `close_hand`.
 
     >>> from torchgrasp import load_hand, load_object
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
     >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
     >>> TrialDriver(trial, TrialSpec()).grasp_overlap() < 0.01  # [m] of the fingertips at their contacts
@@ -77,7 +77,7 @@ class TrialDriver:
         BadArgument, MeshError: as in `close_hand`.
 
     >>> from torchgrasp import load_hand, load_object
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
     >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
     >>> TrialDriver(trial, TrialSpec(approach=0.0)).open().starts  # nothing overlaps
@@ -172,7 +172,7 @@ class TrialRun:
     """One run of a trial in a fresh scene; its phases yield after every control tick.
 
     >>> from torchgrasp import load_hand, load_object
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
     >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
     >>> run = TrialDriver(trial, TrialSpec(closing="open_loop")).open()

@@ -17,10 +17,10 @@ from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.placed import PlacedScene, aim, settle
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
-from torchgrasp.pipeline.things import ScenePlan
-from torchgrasp.plane import Plane
+from torchgrasp.planner.things import ScenePlan
 from torchgrasp.scene.scene import Scene
 from torchgrasp.sim.scene import NEIGHBOURS, Neighbour
 from torchgrasp.specs import TrialSpec

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import torch
 
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
+from torchgrasp.data.shipped import load_object, load_shipped_grasp
 from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.hand.load import load_hand
-from torchgrasp.objects import load_object, load_shipped_grasp
 from torchgrasp.specs import Simulator, TrialSpec
 
 OFF = 0.06

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.border import Measured, Seed, checked
+from torchgrasp.checks import Measured, Seed, checked
 
 RESAMPLES = 10_000
 """Draws behind an interval: its ends are then known to a tenth of a point."""

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 
-from torchgrasp.border import Pose, Seed, checked
-from torchgrasp.closing import ClosingTrace, ClosureResult, Disturbance, ObjectMotion
+from torchgrasp.checks import Pose, Seed, checked
+from torchgrasp.closure import ClosingTrace, ClosureResult, Disturbance, ObjectMotion
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun, smooth_step
-from torchgrasp.frames import apply, inverse, rotation_angle
+from torchgrasp.geometry.frames import apply, inverse, rotation_angle
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.sdf import SignedDistanceField
-from torchgrasp.plane import Plane
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.sim.scene import Neighbour
 from torchgrasp.specs import TrialSpec
@@ -83,7 +83,7 @@ def close_hand(
         MissingExtra: the simulator is not installed.
 
     >>> from torchgrasp import load_hand, load_object
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> jug, grasp, hand = load_object("jug"), load_shipped_grasp("jug", "allegro"), load_hand("allegro")
     >>> result = close_hand(grasp, hand, jug.mesh, TrialSpec(hold_time=0.2), parts=jug.parts)
     >>> result.held, result.slip.distance < 0.01, result.disturbance.early, result.trace.forces.shape[1:]
@@ -97,7 +97,7 @@ def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResul
     """Run a trial; see `close_hand`.
 
     >>> from torchgrasp import load_hand, load_object
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
     >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
     >>> lift_grasp(trial, TrialSpec(closing="open_loop", lift_height=0.0, hold_time=0.0)).status.name

@@ -14,12 +14,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value, check_number
-from torchgrasp.border import Positive, Range, Seed, checked
+from torchgrasp.checks import Positive, Range, Seed, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.protocols import POSE_NOISE, PoseNoise, seed_of
-from torchgrasp.frames import rigid, rotation_from_vector
-from torchgrasp.linalg import unit
-from torchgrasp.plane import Plane, move
+from torchgrasp.geometry.frames import rigid, rotation_from_vector
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.plane import Plane, move
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import PointCloud
 

@@ -13,14 +13,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import check_whole
-from torchgrasp.border import Pose, Range, Seed, checked
+from torchgrasp.checks import Pose, Range, Seed, checked
 from torchgrasp.cloud.camera import FOCAL, HEIGHT, WIDTH, look_at
-from torchgrasp.datasets import read_object_mesh
+from torchgrasp.data import read_object_mesh
+from torchgrasp.data.shipped import list_objects, load_object
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import apply, inverse, rigid, rotation_from_vector
-from torchgrasp.linalg import farthest_points
-from torchgrasp.mesh import read_mesh
-from torchgrasp.objects import list_objects, load_object
+from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
+from torchgrasp.geometry.linalg import farthest_points
+from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.sim.convex_parts import convex_parts, hull
 from torchgrasp.sim.scene import Body
 from torchgrasp.specs import TrialSpec

@@ -11,9 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import Count, Length, Pose, Range, Seed, check_tensor, checked
+from torchgrasp.checks import Count, Length, Pose, Range, Seed, check_tensor, checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import inverse, rigid, rotation_from_vector
+from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import Grasps
 
@@ -201,7 +201,7 @@ def draw_error(protocol: Protocol, grasp: Grasps, mesh: "trimesh.Trimesh", seed:
     """Draw the hand's error for one trial of a grasp, by a seed of its own (`seed_of`).
 
     >>> from torchgrasp import load_object
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp, mesh = load_shipped_grasp("jug", "barrett"), load_object("jug").mesh
     >>> draw_error(find_protocol("paper"), grasp, mesh, seed=0)[:3, 3].norm() < 0.05  # [m]
     tensor(True)

@@ -9,14 +9,14 @@ import numpy as np
 import torch
 
 from torchgrasp.base import Value
-from torchgrasp.border import Measured, Range, checked
-from torchgrasp.closing import ObjectMotion
+from torchgrasp.checks import Measured, Range, checked
+from torchgrasp.closure import ObjectMotion
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.protocols import Protocol, PullSpec, find_protocol
 from torchgrasp.evaluation.score import ProtocolResult
-from torchgrasp.frames import rotation_angle
+from torchgrasp.geometry.frames import rotation_angle
 
 DIRECTIONS = tuple(np.array(sign) * axis for axis in np.eye(3) for sign in (-1.0, 1.0))
 """-x, +x, -y, +y, -z, +z of the world."""
@@ -56,7 +56,7 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
         MeshError, MissingExtra: as `close_hand`.
 
     >>> from torchgrasp import load_hand, load_object
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "allegro")
     >>> protocol = dataclasses.replace(find_protocol("dexgraspbench"), pull=PullSpec(10.0, 0.1, 0.05, 0.26))
     >>> found = pull_grasp(GraspTrial(load_hand("allegro"), grasp, jug.mesh, parts=jug.parts), protocol)
@@ -120,7 +120,7 @@ def run_protocol(
     """Put one grasp to a protocol; see `pull_grasp` and `lift_grasp`.
 
     >>> from torchgrasp import load_hand
-    >>> from torchgrasp.objects import load_object, load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_object, load_shipped_grasp
     >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
     >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
     >>> run_protocol(trial, find_protocol("paper")).passed

@@ -17,8 +17,8 @@ from torchgrasp.evaluation.placed import drop, object_names
 from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.hand.load import load_hand
-from torchgrasp.pipeline.pool import run_tasks
-from torchgrasp.pipeline.things import ScenePlan, plan_scene
+from torchgrasp.jobs import run_tasks
+from torchgrasp.planner.things import ScenePlan, plan_scene
 from torchgrasp.scene.scene import Scene
 from torchgrasp.specs import ContactSpec, TrialSpec
 

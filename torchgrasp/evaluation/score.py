@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from torchgrasp.base import Value
-from torchgrasp.border import Measured, checked
+from torchgrasp.checks import Measured, checked
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.calibration import judge
 from torchgrasp.evaluation.intervals import Share, count_by, share_over
@@ -64,7 +64,7 @@ class ViewScore(Value):
     """The outcome of a view with `executable` planned grasps.
 
     Without any, `refusal` is the commonest reason; `note` may say more. `seconds` is the CPU time of planning. `family`
-    and `group` are the object's (`torchgrasp.datasets`), "" where unknown. `fingers` are those that grasp.
+    and `group` are the object's (`torchgrasp.data`), "" where unknown. `fingers` are those that grasp.
 
     >>> ViewScore("mug", "view0", executable=0, seconds=4.0, refusal=Status.OUT_OF_REACH, family="cup").unit
     'cup'
@@ -183,7 +183,7 @@ def most_certain_first(contact_order: Sequence[int], grasp: Grasps) -> bool:
     Raises:
         BadArgument: not exactly one row, or contacts without `std_m`.
 
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "barrett")
     >>> order = grasp.contacts.require_std()[0].argsort().tolist()
     >>> most_certain_first(order, grasp), most_certain_first(order[::-1], grasp)

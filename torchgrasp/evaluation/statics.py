@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.border import Count, Positive, Range, checked
-from torchgrasp.closing import ClosureResult
+from torchgrasp.checks import Count, Positive, Range, checked
+from torchgrasp.closure import ClosureResult
 from torchgrasp.control.holding.least_forces import grasp_map
 from torchgrasp.control.observation import joint_jacobian
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import apply, inverse
+from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.hand.hand import Hand
 
 if TYPE_CHECKING:

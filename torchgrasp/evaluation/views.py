@@ -7,22 +7,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from torchgrasp.base import Value, count_status
-from torchgrasp.border import Count, Seed, checked
-from torchgrasp.datasets import read_entry, read_object_mesh, read_view
+from torchgrasp.checks import Count, Seed, checked
+from torchgrasp.data import read_entry, read_object_mesh, read_view
 from torchgrasp.errors import BadArgument, GraspError, MissingExtra, OutputError, Status
 from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.perturb import find_perturbation, household_mass, perturb_trial, perturb_view
 from torchgrasp.evaluation.protocols import Protocol, draw_error, seed_of
 from torchgrasp.evaluation.pull import run_protocol
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.hand.load import hand_of, load_hand
-from torchgrasp.ik.sdf import SignedDistanceField, surface_field
-from torchgrasp.pipeline.grasps import plan_grasps
-from torchgrasp.pipeline.provenance import digest
-from torchgrasp.plane import Plane
+from torchgrasp.planner.grasps import plan_grasps
+from torchgrasp.planner.provenance import digest
 from torchgrasp.shape.fit import fit_shape
+from torchgrasp.shape.surface import surface_field
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ContactSpec, needs_surface
 from torchgrasp.values import Grasps, PointCloud, load_grasps

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 
-from torchgrasp.border import Positive, Range, checked
+from torchgrasp.checks import Positive, Range, checked
 from torchgrasp.control.forces import squeeze
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.export.grasp_json import quaternion
@@ -52,7 +52,7 @@ def save_dexgraspbench(
 
     >>> import tempfile
     >>> from torchgrasp import load_hand
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand, grasp = load_hand("allegro"), load_shipped_grasp("jug", "allegro")
     >>> [file.name for file in save_dexgraspbench(hand, grasp, tempfile.mkdtemp(), "assets/object/jug")]
     ['0.npy']
@@ -91,7 +91,7 @@ def format_graspgen(grasps: Grasps, object_path: str) -> str:
     ours. `object_path` is that of the mesh in the data set, with the frame of the planned cloud and scale 1.
 
     >>> import json
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> json.loads(format_graspgen(load_shipped_grasp("jug", "barrett"), "meshes/jug.obj"))["object"]
     {'file': 'meshes/jug.obj', 'scale': 1.0}
     """

@@ -4,10 +4,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.border import Length, Poses, checked
+from torchgrasp.checks import Length, Poses, checked
 from torchgrasp.control.closing_law import damped_inverse
 from torchgrasp.errors import Status
-from torchgrasp.frames import apply, rotate
+from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.plan.certify import certify
 from torchgrasp.specs import ContactSpec

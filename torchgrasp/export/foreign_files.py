@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.cloud.io.arrays import MAX_BYTES, parse_npz
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.export.benchmark_files import BENCH_HANDS, rotation_of
@@ -70,7 +70,7 @@ def read_foreign(
     >>> import tempfile
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.export import format_grasps
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
     >>> file = Path(tempfile.mkdtemp(), "grasps.json")
     >>> _ = file.write_text(format_grasps(hand, grasp))

@@ -8,12 +8,12 @@ from typing import Annotated
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.border import Positive, Range, checked
+from torchgrasp.checks import Positive, Range, checked
 from torchgrasp.control.closing import POSE_TIME
 from torchgrasp.control.forces import squeeze
 from torchgrasp.errors import Status
 from torchgrasp.files import format_json
-from torchgrasp.frames import rotate
+from torchgrasp.geometry.frames import rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.ik.motion import APPROACH_DISTANCE
@@ -49,7 +49,7 @@ def format_grasps(
 
     >>> import json
     >>> from torchgrasp import load_hand
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> text = format_grasps(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
     >>> sorted(json.loads(text)["grasps"][0]["joints"])
     ['grasp', 'pregrasp', 'squeeze']

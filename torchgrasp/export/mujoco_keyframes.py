@@ -5,7 +5,7 @@ from typing import Annotated
 
 import numpy as np
 
-from torchgrasp.border import Positive, Range, checked
+from torchgrasp.checks import Positive, Range, checked
 from torchgrasp.control.forces import squeeze
 from torchgrasp.export.grasp_json import quaternion
 from torchgrasp.hand.hand import Hand
@@ -30,7 +30,7 @@ def format_keyframes(
         BadArgument: joints of another hand, or a force or stiffness that is not positive.
 
     >>> from torchgrasp import load_hand
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> text = format_keyframes(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
     >>> text.count("<key ")
     4

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.border import Positive, Range, checked
+from torchgrasp.checks import Positive, Range, checked
 from torchgrasp.control.closing import POSE_TIME
 from torchgrasp.control.forces import squeeze
 from torchgrasp.export.grasp_json import quaternion
@@ -39,7 +39,7 @@ def format_moveit(
         BadArgument: joints of another hand, or a force or stiffness that is not positive.
 
     >>> from torchgrasp import load_hand
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> text = format_moveit(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
     >>> print(text.splitlines()[2])
     # the hand's frame is link 'palm' of hand.urdf; joints in the order of joint_names
@@ -72,7 +72,7 @@ def format_trajectories(
     of `format_moveit`.
 
     >>> from torchgrasp import load_hand
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> text = format_trajectories(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
     >>> text.count("time_from_start")
     3

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.files import write_file
 from torchgrasp.shape.surface import Surface

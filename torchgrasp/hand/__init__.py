@@ -1,6 +1,5 @@
 """The robot model: a hand's URDF and hand.toml, its kinematics and its collision shapes."""
 
-from torchgrasp.hand.draft import Draft, Wish, draft_hand, new_hand
 from torchgrasp.hand.collision_spheres import CollisionSpheres
 from torchgrasp.hand.fingertips import Fingertips
 from torchgrasp.hand.hand import Actuator, Hand, HandSource
@@ -14,7 +13,6 @@ __all__ = [
     "ActuatedJoints",
     "Actuator",
     "CollisionSpheres",
-    "Draft",
     "Fingertips",
     "Hand",
     "HandSource",
@@ -25,13 +23,10 @@ __all__ = [
     "SelfCollision",
     "Shape",
     "Urdf",
-    "Wish",
-    "draft_hand",
     "find_hand",
     "hand_of",
     "hands_folder",
     "load_hand",
-    "new_hand",
     "read_urdf",
     "with_fingers",
 ]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchgrasp.base import check_whole
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import rotation_from_rpy
+from torchgrasp.geometry.frames import rotation_from_rpy
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.self_collision import SelfCollision
 from torchgrasp.hand.urdf import Mimic, Shape, Triple, Urdf

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.frames import rotation_from_rpy
+from torchgrasp.geometry.frames import rotation_from_rpy
 from torchgrasp.hand.hand_toml import HandSpec
 from torchgrasp.hand.urdf import Shape, Triple, Urdf
 

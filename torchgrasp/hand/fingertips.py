@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand_toml import HandSpec
 from torchgrasp.hand.kinematics import KinematicTree, map_directions, map_points, pose_in_carrier, tree_from_urdf

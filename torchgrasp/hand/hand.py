@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import Count, Range, checked
+from torchgrasp.checks import Count, Range, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.collision_spheres import CollisionSpheres
 from torchgrasp.hand.fingertips import Fingertips

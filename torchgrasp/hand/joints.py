@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value, check_device
-from torchgrasp.border import ANY, checked
+from torchgrasp.checks import ANY, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand_toml import HandSpec
 from torchgrasp.hand.kinematics import Markers

@@ -12,8 +12,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import checked
-from torchgrasp.frames import rotation_from_rpy, skew
+from torchgrasp.checks import checked
+from torchgrasp.geometry.frames import rotation_from_rpy, skew
 from torchgrasp.hand.urdf import Joint, Urdf
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.collision_pairs import self_collision_from_urdf
 from torchgrasp.hand.collision_spheres import spheres_from_urdf

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import torch
 
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.errors import HandFileError
-from torchgrasp.frames import rotation_from_rpy
+from torchgrasp.geometry.frames import rotation_from_rpy
 from torchgrasp.hand.safe_xml import parse_urdf, read_bounded
 
 MAX_BYTES = 4 * 1024 * 1024

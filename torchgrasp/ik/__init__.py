@@ -10,7 +10,8 @@ from torchgrasp.ik.motion import collision_probability, lift_clearance
 from torchgrasp.ik.obstacles import Obstacles
 from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
 from torchgrasp.ik.query import query_mixture
-from torchgrasp.ik.sdf import SignedDistanceField, field_from_surface, surface_field
+from torchgrasp.geometry.signed_distance import SignedDistanceField, field_from_surface
+from torchgrasp.shape.surface import surface_field
 from torchgrasp.ik.solve import IKSolution, solve_ik
 
 __all__ = [

@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value
-from torchgrasp.border import Length, Rows, checked
+from torchgrasp.checks import Length, Rows, checked
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.frames import rotate
+from torchgrasp.geometry.frames import rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.checks import TIP_TOLERANCE, is_clear, measure_errors
 from torchgrasp.ik.clearance import CollisionWorld
@@ -37,7 +37,7 @@ class GraspProblem(Value):
 
     >>> from torchgrasp import PostureLibrary, load_hand
     >>> from torchgrasp.ik import nearest_postures
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
     >>> middle = grasp.contacts.points[0].mean(0)
     >>> high = lambda poses: poses[:, 2, 3] > 0.1  # or ask your arm: which palms does it bring there?
@@ -86,7 +86,7 @@ def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -
 class GraspCandidates(Batch):
     """Configurations with finger i on contact i, a row's `permutation[:, i]`; `status` is that of the contacts.
 
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "barrett")
     >>> placed = Configuration(grasp.joints, grasp.obj_from_hand)
     >>> len(GraspCandidates(placed, grasp.contacts, grasp.certificate, grasp.permutation, grasp.status))
@@ -107,7 +107,7 @@ def check_candidates(
     """Return checked grasps (`measure_errors`); those right so far get pre-grasp and approach.
 
     >>> from torchgrasp import load_hand
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
     >>> middle = grasp.contacts.points[0].mean(0)
     >>> problem = GraspProblem(hand, grasp.contacts, grasp.certificate, CollisionWorld(), middle)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch
-from torchgrasp.border import ANY, Length, checked
+from torchgrasp.checks import ANY, Length, checked
 from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, link_clearance, obstacle_clearance
@@ -32,7 +32,7 @@ class GraspErrors(Batch):
     """Errors of grasps; `Grasps` explains the fields.
 
     >>> from torchgrasp import load_hand
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "barrett")
     >>> placed = Configuration(grasp.joints, grasp.obj_from_hand)
     >>> found = measure_errors(load_hand("barrett"), placed, grasp.contacts, CollisionWorld(table=0.0))
@@ -61,7 +61,7 @@ def measure_errors(
     count, in any direction, as in the paper. `tolerance` [m] is that of tips.
 
     >>> from torchgrasp import load_hand
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp, high = load_shipped_grasp("jug", "barrett"), CollisionWorld(table=0.1)
     >>> placed = Configuration(grasp.joints, grasp.obj_from_hand)
     >>> Status(int(measure_errors(load_hand("barrett"), placed, grasp.contacts, high).status)).name

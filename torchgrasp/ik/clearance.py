@@ -9,12 +9,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value, settle
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
+from torchgrasp.geometry.plane import Plane, as_plane
+from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.collision_spheres import CollisionSpheres
 from torchgrasp.ik.configuration import Rows, SpatialJacobian
 from torchgrasp.ik.obstacles import Obstacles
-from torchgrasp.ik.sdf import SignedDistanceField
-from torchgrasp.plane import Plane, as_plane
 
 MILLIMETRE = 1e-3
 """Unit of all residuals [m]: it makes lengths as large as angles times their weights."""

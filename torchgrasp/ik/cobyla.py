@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchgrasp.base import join
 from torchgrasp.errors import Status
-from torchgrasp.frames import apply, degenerate, inverse, virtual_frame
+from torchgrasp.geometry.frames import apply, degenerate, inverse, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import map_points
 from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates

@@ -13,12 +13,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value
-from torchgrasp.border import Poses, checked
+from torchgrasp.checks import Poses, checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import rigid, rotation_from_vector
+from torchgrasp.geometry.frames import rigid, rotation_from_vector
+from torchgrasp.geometry.optim import Residuals
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import map_points
-from torchgrasp.optim import Residuals
 
 
 @checked

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.errors import Status
 from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates
 from torchgrasp.ik.configuration import Configuration
@@ -50,7 +50,7 @@ def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
 
     >>> from torchgrasp import PostureLibrary, load_hand
     >>> from torchgrasp.ik import CollisionWorld, nearest_postures
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
     >>> middle = grasp.contacts.points[0].mean(0)
     >>> problem = GraspProblem(hand, grasp.contacts, grasp.certificate, CollisionWorld(), middle)

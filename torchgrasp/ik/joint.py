@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
+from torchgrasp.geometry.optim import LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, clearance_rows
@@ -22,7 +23,6 @@ from torchgrasp.ik.contact_first import refine_on_contacts
 from torchgrasp.ik.ranking import rank_in_group
 from torchgrasp.ik.refine import HAND_STEP, ITERATIONS, PAD_WEIGHT, TIP_WEIGHT, tip_rows, tip_targets
 from torchgrasp.ik.rounds import Attempts, assign, best_first, best_grasps, executable
-from torchgrasp.optim import LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.flatness import FlatnessConstraint, flatness_constraint
@@ -201,7 +201,7 @@ def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: Conta
 
     >>> from torchgrasp import PostureLibrary, fit_shape, load_hand, load_object
     >>> from torchgrasp.ik import CollisionWorld, nearest_postures
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
     >>> middle = grasp.contacts.points[0].mean(0)
     >>> problem = GraspProblem(hand, grasp.contacts, grasp.certificate, CollisionWorld(), middle)

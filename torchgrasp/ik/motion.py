@@ -6,14 +6,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.border import checked
-from torchgrasp.frames import rotate
+from torchgrasp.checks import checked
+from torchgrasp.geometry.frames import rotate
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import CollisionWorld, along
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.ik.obstacles import Obstacles
-from torchgrasp.linalg import unit
-from torchgrasp.plane import Plane
 from torchgrasp.values import Grasps
 
 APPROACH_DISTANCE = 0.1
@@ -113,7 +113,7 @@ def collision_probability(
     voxel that a hand sweeps counts, not their number. `up` is the direction of the lift; None: z.
 
     >>> from torchgrasp import load_hand, load_scene
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> from torchgrasp.scene import estimate_occupancy
     >>> obstacles = Obstacles.of(estimate_occupancy(load_scene(), 1))
     >>> collision_probability(load_hand("barrett"), load_shipped_grasp("jug", "barrett"), obstacles)

@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value, check_number, settle
-from torchgrasp.border import checked
-from torchgrasp.ik.sdf import SignedDistanceField
+from torchgrasp.checks import checked
+from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.scene.occupancy import Occupancy
 
 FULL = 0.3

@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value, check_device, check_whole, join, named_tensors
-from torchgrasp.border import Count, Seed, checked
+from torchgrasp.checks import Count, Seed, checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import apply, degenerate, inverse, rigid, rotate, virtual_frame
+from torchgrasp.geometry.frames import apply, degenerate, inverse, rigid, rotate, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import Reachable, ask_reachable
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, collision_cost
@@ -146,7 +146,7 @@ def nearest_postures(
             another device than the library, or of another number than its fingertips.
 
     >>> from torchgrasp import load_hand
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp, library = load_shipped_grasp("jug", "barrett"), PostureLibrary.of(load_hand("barrett"), 1000)
     >>> seeds = nearest_postures(library, grasp.contacts, CollisionWorld(), n_seeds=4)
     >>> seeds.row, bool(seeds.tip_error.max() < 0.05)  # [m], before any refinement

@@ -5,9 +5,9 @@ import dataclasses
 import torch
 
 from torchgrasp.base import check_whole, join, settle
-from torchgrasp.border import Count, Positive, checked
+from torchgrasp.checks import Count, Positive, checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import apply, degenerate, inverse, rotate, virtual_frame
+from torchgrasp.geometry.frames import apply, degenerate, inverse, rotate, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.ranking import lexical_order
 from torchgrasp.posture_model.compatibility import check_compatible

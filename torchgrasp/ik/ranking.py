@@ -15,9 +15,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.frames import apply, inverse, rotate
+from torchgrasp.geometry.frames import apply, inverse, rotate
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.hand.hand import Hand
-from torchgrasp.linalg import unit
 from torchgrasp.plan.closure_probability import closure_share
 from torchgrasp.plan.internal_forces import least_friction_forces, tangential_ratio
 from torchgrasp.shape.gp import ShapeGP

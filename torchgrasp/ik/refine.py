@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchgrasp.geometry.optim import SOLVED, LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, along, clearance_rows
 from torchgrasp.ik.configuration import Configuration, Rows, SpatialJacobian, differentiate
-from torchgrasp.optim import SOLVED, LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.values import Contacts
 
 TIP_WEIGHT, PAD_WEIGHT = 2.0, 80.0

@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch, join, pick, settle
-from torchgrasp.border import ANY, check_tensor, checked
+from torchgrasp.checks import ANY, check_tensor, checked
 from torchgrasp.errors import Status
-from torchgrasp.frames import degenerate
+from torchgrasp.geometry.frames import degenerate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.checks import measure_errors
 from torchgrasp.ik.clearance import CollisionWorld
@@ -46,7 +46,7 @@ class IKSolution(Batch):
     `clearance` [m] is the links' least; `attempts` counts the refined seeds. A row without seeds holds NaN.
 
     >>> from torchgrasp import load_hand
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> found = solve_ik(load_hand("barrett"), load_shipped_grasp("jug", "barrett").contacts)
     >>> found.joints.shape, Status(int(found.status)).name
     (torch.Size([1, 4]), 'OK')

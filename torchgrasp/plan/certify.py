@@ -11,9 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import FINGERTIPS
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import degenerate
+from torchgrasp.geometry.frames import degenerate
 from torchgrasp.plan.closure_lp import solve_closure_lp
 from torchgrasp.plan.wrench import MIN_MARGIN, MIN_RANK_RATIO, Vectors, rank_ratio, wrenches
 from torchgrasp.specs import ContactSpec

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Batch
-from torchgrasp.border import FINITE, Range, Seed, checked
+from torchgrasp.checks import FINITE, Range, Seed, checked
 from torchgrasp.plan.line_posterior import LinePosterior, first_contact, line_posterior, well_inside
 from torchgrasp.plan.round_cones import closed_exact, first_balance
 from torchgrasp.shape.gp import ShapeGP
@@ -62,7 +62,7 @@ def closure_probability(
     Raises:
         BadArgument: a wrong argument, or a contact that is not finite or outside the shape's domain.
 
-    >>> from torchgrasp.linalg import unit
+    >>> from torchgrasp.geometry.linalg import unit
     >>> from torchgrasp import PointCloud, fit_shape
     >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
     >>> corners = torch.tensor([[[1.0, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0]]])

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.frames import skew
+from torchgrasp.geometry.frames import skew
 from torchgrasp.plan.closure_lp import solve_closure_lp
 from torchgrasp.plan.wrench import Vectors, centre_and_radius, wrenches
 

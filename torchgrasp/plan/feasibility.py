@@ -5,7 +5,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchgrasp.errors import Status
-from torchgrasp.frames import degenerate
+from torchgrasp.geometry.frames import degenerate
 from torchgrasp.plan.closure_lp import solve_closure_lp
 from torchgrasp.plan.flatness import normal_variation
 from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Batch
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.problem import Shape, triple_mean_jet, walls_of
 from torchgrasp.plan.solver import project
 from torchgrasp.plan.wrench import Vectors, cone_edges, tangents

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.border import ANY, Positive, checked
-from torchgrasp.linalg import GOLDEN_ANGLE, fibonacci_sphere, unit
+from torchgrasp.checks import ANY, Positive, checked
+from torchgrasp.geometry.linalg import GOLDEN_ANGLE, fibonacci_sphere, unit
 from torchgrasp.plan.cone_forces import forces_in_cones
 from torchgrasp.plan.problem import contact_pairs, pull_signs
 

@@ -18,9 +18,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Batch
-from torchgrasp.border import check_tensor
+from torchgrasp.checks import check_tensor
 from torchgrasp.errors import BadArgument
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import check_contacts, check_unit
 from torchgrasp.plan.wrench import Vectors, tangents
 from torchgrasp.shape.gp import ShapeGP

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchgrasp.base import pick, put
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.closure_lp import solve_closure_lp
 from torchgrasp.plan.closure_probability import closure_share
 from torchgrasp.plan.feasibility import check_feasibility

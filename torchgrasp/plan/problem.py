@@ -19,8 +19,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch, map_tensors
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.plan.wrench import Vectors
-from torchgrasp.plane import Plane
 from torchgrasp.shape.posterior import MeanJet, SurfaceJet
 from torchgrasp.specs import ContactSpec
 

@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.frames import degenerate, subsets
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.frames import degenerate, subsets
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.closure_lp import solve_closure_lp
 from torchgrasp.plan.wrench import BALANCED, Vectors, centre_and_radius, wrenches
 

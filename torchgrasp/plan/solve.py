@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import join, pick, put
-from torchgrasp.border import Count, Positive, Seed, checked
+from torchgrasp.checks import Count, Positive, Seed, checked
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.objectives import Improvement, Objective, improvement

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch
-from torchgrasp.linalg import limit_norm
-from torchgrasp.optim import Damping, Linearisation, Problem, Steps, Verdict, levenberg_marquardt
+from torchgrasp.geometry.linalg import limit_norm
+from torchgrasp.geometry.optim import Damping, Linearisation, Problem, Steps, Verdict, levenberg_marquardt
 from torchgrasp.plan.problem import (
     ContactProblem,
     Shape,

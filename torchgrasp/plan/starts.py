@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.flatness import normal_variation
 from torchgrasp.plan.problem import ContactProblem, Shape, device_of, walls_of
 from torchgrasp.plan.round_cones import closed_exact

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.frames import subsets
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.frames import subsets
+from torchgrasp.geometry.linalg import unit
 
 Vectors = Float[Tensor, "b f 3"]
 """A vector at each of the contacts in every row: points or normals."""

@@ -12,7 +12,7 @@ from typing import Annotated
 from torch import Tensor
 
 from torchgrasp.base import check_whole, join
-from torchgrasp.border import Count, Range, checked
+from torchgrasp.checks import Count, Range, checked
 from torchgrasp.errors import BadArgument, ModelFileError, OutputError
 from torchgrasp.files import Recent, begin_folder, hold_folder, load_tensors, save_tensors
 from torchgrasp.hand.hand import Hand

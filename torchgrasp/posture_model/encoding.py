@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.border import check_tensor, checked
+from torchgrasp.checks import check_tensor, checked
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.frames import degenerate, virtual_frame
+from torchgrasp.geometry.frames import degenerate, virtual_frame
 from torchgrasp.values import ContactCode, Contacts
 
 PERMUTATIONS: tuple[tuple[int, int, int], ...] = tuple(itertools.permutations(range(3)))  # pyright: ignore[reportAssignmentType]

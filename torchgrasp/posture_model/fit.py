@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import check_whole
-from torchgrasp.border import Count, Fraction, Range, Seed, checked
+from torchgrasp.checks import Count, Fraction, Range, Seed, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.posture_model.checkpoint import Checkpoint
 from torchgrasp.posture_model.em import Progress, expectation_maximisation

@@ -11,9 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import Range, Seed, checked
+from torchgrasp.checks import Range, Seed, checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.linalg import cholesky
+from torchgrasp.geometry.linalg import cholesky
 
 ROWS_PER_CHUNK = 8192
 """Rows evaluated together: this bounds the memory for rows x components x dimensions."""

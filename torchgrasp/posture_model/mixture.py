@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import check_whole
-from torchgrasp.border import ANY, Count, checked
+from torchgrasp.checks import ANY, Count, checked
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.hand.load import find_hand
@@ -34,7 +34,7 @@ class GraspMixture(GaussianMixture):
 
     >>> from torchgrasp import encode
     >>> from torchgrasp.hand.load import load_hand
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> model, code = load_mixture("barrett"), encode(load_shipped_grasp("jug", "barrett").contacts)
     >>> model.energy(code).shape, model.joints(code).shape  # of the six assignments of contacts to fingers
     (torch.Size([1, 6]), torch.Size([1, 6, 4]))

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value
-from torchgrasp.border import Range, Seed, checked
+from torchgrasp.checks import Range, Seed, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.compatibility import describe_compatibility

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.geometry.linalg import fibonacci_sphere, unit
 from torchgrasp.hand.hand import Hand
-from torchgrasp.linalg import fibonacci_sphere, unit
 from torchgrasp.specs import ContactSpec
 
 ROLL = math.radians(25)

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from torchgrasp.cloud.depth import check_rigid, read_depth
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import apply, inverse, rigid
-from torchgrasp.linalg import unit
-from torchgrasp.plane import Plane, as_plane
+from torchgrasp.geometry.frames import apply, inverse, rigid
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.segment import on_surface, segment
 from torchgrasp.scene.support import fit_support

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.cloud.io.arrays import MAX_BYTES, parse_npz
 from torchgrasp.errors import BadArgument, CloudFileError
 from torchgrasp.files import is_file, read_bytes, write_file
-from torchgrasp.plane import Plane
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene.scene import Scene
 
 NAMES = ("depth", "intrinsics", "camera_pose", "labels", "mask", "table")

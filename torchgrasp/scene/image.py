@@ -7,10 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import Pose, checked
+from torchgrasp.checks import Pose, checked
 from torchgrasp.cloud.depth import frustum_of_image
-from torchgrasp.frames import apply, inverse, rotate
-from torchgrasp.plane import GRID
+from torchgrasp.geometry.frames import apply, inverse, rotate
+from torchgrasp.geometry.plane import GRID
 
 
 @checked

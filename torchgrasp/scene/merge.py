@@ -5,9 +5,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.frames import inverse, rotate
-from torchgrasp.linalg import unit
-from torchgrasp.plane import Plane
+from torchgrasp.geometry.frames import inverse, rotate
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene.image import DepthImage
 
 GAP, TOUCH = 0.008, 3

@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value, settle
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import apply, inverse
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.frames import apply, inverse
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.scene.scene import DepthImage, Scene
 
 SPACING = 0.005

@@ -9,10 +9,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import Pose, checked
+from torchgrasp.checks import Pose, checked
 from torchgrasp.cloud.depth import read_depth
 from torchgrasp.errors import BadArgument
-from torchgrasp.plane import Plane, to_upright
+from torchgrasp.geometry.plane import Plane, to_upright
 from torchgrasp.scene.build import find_table, image_of_cloud, label_image, read_image, read_labels
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.values import PointCloud

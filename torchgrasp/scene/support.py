@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.border import check_tensor
+from torchgrasp.checks import check_tensor
 from torchgrasp.errors import NoSupport
-from torchgrasp.linalg import unit
-from torchgrasp.plane import Plane
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.plane import Plane
 
 SAMPLE = 20_000
 """Points that are looked at: with 5 % of them on a plane, its normal is still certain to a tenth of a degree."""

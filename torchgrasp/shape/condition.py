@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.border import Positive, checked
-from torchgrasp.linalg import cholesky
+from torchgrasp.checks import Positive, checked
+from torchgrasp.geometry.linalg import cholesky
 from torchgrasp.shape.gp import Normalisation, ShapeGP
 from torchgrasp.shape.gradient_kernel import gram
 from torchgrasp.shape.kernel import Kernel, KernelName, kernel_by_name

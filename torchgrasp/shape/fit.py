@@ -9,11 +9,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import join
-from torchgrasp.border import LEAST, Range, Seed, checked
+from torchgrasp.checks import LEAST, Range, Seed, checked
 from torchgrasp.cloud.check import remove_duplicates
 from torchgrasp.cloud.prepare import PreparedCloud, prepare_cloud
-from torchgrasp.linalg import fibonacci_sphere, unit
-from torchgrasp.plane import Plane, as_plane, cloud_to_upright, upright_frame
+from torchgrasp.geometry.linalg import fibonacci_sphere, unit
+from torchgrasp.geometry.plane import Plane, as_plane, cloud_to_upright, upright_frame
 from torchgrasp.shape.completion.complete import LEAST_NOISE, PART, Completion, Kind, complete_cloud
 from torchgrasp.shape.completion.doubt import warn_of_doubts
 from torchgrasp.shape.completion.free_space import free_space, free_space_violations

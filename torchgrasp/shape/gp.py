@@ -8,11 +8,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value, map_tensors
-from torchgrasp.border import Pose, Positive, Range, Seed, check_moved, check_tensor, checked
+from torchgrasp.checks import Pose, Positive, Range, Seed, check_moved, check_tensor, checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import apply
-from torchgrasp.linalg import cholesky, unit, unit_of_any
-from torchgrasp.plane import move
+from torchgrasp.geometry.frames import apply
+from torchgrasp.geometry.linalg import cholesky, unit, unit_of_any
+from torchgrasp.geometry.plane import move
 from torchgrasp.shape.derivatives import ShapeDerivatives, carry_gradients
 from torchgrasp.shape.joint_posterior import JointEstimate, draw_samples, joint_estimate
 from torchgrasp.shape.normal_band import normal_parts

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.border import Pose, checked
+from torchgrasp.checks import Pose, checked
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.joint_posterior import JointEstimate
 from torchgrasp.shape.observations import Observations

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.border import LEAST, Positive, Range, checked
+from torchgrasp.checks import LEAST, Positive, Range, checked
 
 Profile = Callable[[Tensor], Tensor]
 """A radial kernel k(r), elementwise and three times differentiable where r > 0, with k'(0) = 0."""

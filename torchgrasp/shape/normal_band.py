@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import in_chunks
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.joint_posterior import distance_covariance
 from torchgrasp.shape.posterior import Posterior, surface_deviation
 

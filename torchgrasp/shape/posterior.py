@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value, in_chunks
-from torchgrasp.border import checked
-from torchgrasp.linalg import unit
+from torchgrasp.checks import checked
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.gradient_kernel import cross_covariance, separations
 from torchgrasp.shape.kernel import Kernel
 

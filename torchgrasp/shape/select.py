@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.linalg import cholesky
+from torchgrasp.geometry.linalg import cholesky
 from torchgrasp.shape.condition import posterior_given
 from torchgrasp.shape.gradient_kernel import cross_covariance
 from torchgrasp.shape.kernel import Kernel

@@ -11,10 +11,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value, map_tensors
-from torchgrasp.border import Range, checked
+from torchgrasp.checks import Range, checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.linalg import limit_norm, unit
-from torchgrasp.mesh import clip_mesh
+from torchgrasp.geometry.linalg import limit_norm, unit
+from torchgrasp.geometry.mesh import clip_mesh
+from torchgrasp.geometry.signed_distance import FIELD_SPACING, SignedDistanceField, field_from_surface
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.posterior import surface_deviation
 
@@ -206,3 +207,19 @@ def _carry_cloud(corners: np.ndarray, faces: np.ndarray, shape: ShapeGP) -> np.n
     _, nearest = KDTree(corners).query(cloud)
     share = np.bincount(label[nearest], minlength=label.max() + 1) / len(cloud)
     return (share >= min(LEAST_SHARE, share.max()))[label[faces[:, 0]]]
+
+
+@checked
+def surface_field(shape: ShapeGP, spacing: Annotated[float, Range(0.001, 0.02)] = FIELD_SPACING) -> SignedDistanceField:
+    """Return the signed distance field of a shape's estimated surface: by it touches tell where the object is.
+
+    The nodes are `spacing` [m] apart.
+
+    >>> from torchgrasp import fit_shape, load_object
+    >>> jug = load_object("jug")
+    >>> field = surface_field(fit_shape(jug.view, table=0.0), spacing=0.008)
+    >>> field.query(torch.tensor(jug.mesh.center_mass))[0] < -0.02  # [m]: inside
+    tensor(True)
+    """
+    mesh = extract_mesh(shape)
+    return field_from_surface(mesh.vertices, mesh.faces, spacing)

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.linalg import cholesky
+from torchgrasp.geometry.linalg import cholesky
 from torchgrasp.shape.gradient_kernel import covariance_rows, gram
 from torchgrasp.shape.observations import Observations
 from torchgrasp.shape.posterior import Posterior

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value, join
-from torchgrasp.linalg import farthest_points, fibonacci_sphere
+from torchgrasp.geometry.linalg import farthest_points, fibonacci_sphere
 from torchgrasp.shape.completion.complete import LEAST_NOISE, PART
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 from torchgrasp.shape.completion.vessel import RIM, Vessel

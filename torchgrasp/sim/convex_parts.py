@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.errors import MeshError, ModelFileError, OutputError
 from torchgrasp.files import load_tensors, save_tensors
-from torchgrasp.mesh import LEAST_VOLUME, check_solid, read_mesh
+from torchgrasp.geometry.mesh import LEAST_VOLUME, check_solid, read_mesh
 from torchgrasp.sim.decompose import decompose
 
 if TYPE_CHECKING:

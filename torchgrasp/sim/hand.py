@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 import torch
 
-from torchgrasp.border import Range, checked
+from torchgrasp.checks import Range, checked
 from torchgrasp.control import ClosingReference, FingertipSensor, Observation, Targets, TipContact
 from torchgrasp.errors import BadArgument
 from torchgrasp.sim.scene import Scene
@@ -30,7 +30,7 @@ class SimulatedHand:
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.evaluation import GraspTrial, TrialDriver
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> from torchgrasp.specs import TrialSpec
     >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
     >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)

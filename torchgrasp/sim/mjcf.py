@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from torchgrasp.frames import rotation_from_rpy
+from torchgrasp.geometry.frames import rotation_from_rpy
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.urdf import Link, Urdf, read_urdf
 from torchgrasp.sim.collision_masks import pair_masks

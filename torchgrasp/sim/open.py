@@ -1,6 +1,6 @@
 """The simulators of a scene by name, imported on demand."""
 
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.sim.scene import Scene, SceneSpec
 from torchgrasp.specs import Simulator
 
@@ -16,7 +16,7 @@ def open_scene(spec: SceneSpec, simulator: Simulator = "sapien") -> Scene:
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.evaluation import GraspTrial, TrialDriver
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> from torchgrasp.specs import TrialSpec
     >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
     >>> driver = TrialDriver(GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts), TrialSpec())

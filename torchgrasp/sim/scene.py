@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.sim.step_contacts import StepContacts, check_vector
@@ -165,7 +165,7 @@ class Scene(abc.ABC):
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.evaluation import GraspTrial, TrialDriver
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> from torchgrasp.sim import open_scene
     >>> from torchgrasp.specs import TrialSpec
     >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")

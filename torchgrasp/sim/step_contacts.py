@@ -5,7 +5,7 @@ from typing import Annotated
 
 import numpy as np
 
-from torchgrasp.border import Count, Range, checked
+from torchgrasp.checks import Count, Range, checked
 from torchgrasp.errors import BadArgument
 
 

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.errors import BrokenLaw, HandFileError
-from torchgrasp.frames import rotation_from_rpy
+from torchgrasp.geometry.frames import rotation_from_rpy
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers, HandSpec, read_hand_toml
 from torchgrasp.hand.kinematics import chain_from_urdf

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.border import Seed, checked
+from torchgrasp.checks import Seed, checked
 from torchgrasp.errors import BrokenLaw
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.gradient_kernel import gram
 from torchgrasp.shape.kernel import NEAR, Kernel, differentiate
 

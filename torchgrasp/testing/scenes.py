@@ -6,9 +6,9 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.errors import BrokenLaw
-from torchgrasp.frames import rigid, rotation_from_vector
+from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.sim.scene import Scene, SceneSpec

@@ -8,8 +8,8 @@ import torch
 import trimesh
 
 from benchmarks.common import Row, least_seconds
-from torchgrasp.ik.sdf import field_from_surface
-from torchgrasp.pipeline.stages import COARSE, FINE
+from torchgrasp.geometry.signed_distance import field_from_surface
+from torchgrasp.planner.stages import COARSE, FINE
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import extract_mesh
 from torchgrasp.values import PointCloud

@@ -7,8 +7,8 @@ import torch
 
 from benchmarks.common import Row, peak_mib
 from torchgrasp import ContactSpec, Status, load_hand, plan_grasps
-from torchgrasp.datasets import read_view
-from torchgrasp.pipeline.pool import run_tasks
+from torchgrasp.data import read_view
+from torchgrasp.jobs import run_tasks
 
 MOST = 1.2 * 1024
 """Bar of the peak [MiB]."""

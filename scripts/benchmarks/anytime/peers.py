@@ -14,11 +14,11 @@ from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.joint import solve_joint
 from torchgrasp.ik.ranking import rank_in_group
 from torchgrasp.ik.rounds import assign
-from torchgrasp.pipeline.stages import Bench, spread_rows
-from torchgrasp.pipeline.task import Request, Work
 from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.solve import plan_contacts
 from torchgrasp.plan.solver import project
+from torchgrasp.planner.stages import Bench, spread_rows
+from torchgrasp.planner.task import Request, Work
 
 
 @dataclasses.dataclass

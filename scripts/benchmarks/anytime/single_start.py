@@ -18,7 +18,7 @@ from scipy.optimize import linprog, minimize
 from torch import Tensor
 
 from torchgrasp import Contacts, ContactSpec, Hand, ShapeGP
-from torchgrasp.frames import rotation_from_vector, skew
+from torchgrasp.geometry.frames import rotation_from_vector, skew
 from torchgrasp.ik.clearance import CollisionWorld, along
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.plan.objectives import cost_gradients

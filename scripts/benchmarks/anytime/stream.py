@@ -7,7 +7,7 @@ from statistics import mean, median
 from benchmarks.anytime.course import BEST, TIMES, Course
 from benchmarks.common import Row
 from torchgrasp import Hand
-from torchgrasp.datasets import read_object_mesh
+from torchgrasp.data import read_object_mesh
 from torchgrasp.evaluation import GraspTrial, find_protocol, run_protocol
 
 

@@ -14,7 +14,7 @@ from benchmarks.anytime.peers import bench_peers
 from benchmarks.anytime.stream import bench_pull, bench_stream
 from benchmarks.common import Row, measure
 from torchgrasp import ContactSpec, load_hand, load_object
-from torchgrasp.datasets import list_views, read_view
+from torchgrasp.data import list_views, read_view
 
 SPEC = ContactSpec(table=0.0)
 MANY = 10_000

@@ -13,7 +13,7 @@ import torch
 
 from benchmarks.common import Row
 from torchgrasp import Grasps, Status, TrialSpec, close_hand, fit_shape, load_hand, plan_grasps
-from torchgrasp.datasets import list_views, read_family, read_object_mesh, read_view
+from torchgrasp.data import list_views, read_family, read_object_mesh, read_view
 from torchgrasp.evaluation import (
     PROTOCOLS,
     count_by,

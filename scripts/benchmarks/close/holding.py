@@ -17,7 +17,7 @@ from paper.trials import CELL_SECONDS, Subject, TableSpec, subjects
 
 from benchmarks.close.household import HOUSEHOLD, plan_view, read_solid
 from benchmarks.common import Row
-from torchgrasp.datasets import list_views, read_mass
+from torchgrasp.data import list_views, read_mass
 from torchgrasp.errors import GraspError, Status
 from torchgrasp.evaluation import (
     close_hand,

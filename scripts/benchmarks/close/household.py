@@ -18,7 +18,7 @@ import torch
 from paper.trials import CELL_SECONDS, Subject, TableSpec, subjects
 
 from benchmarks.common import Row
-from torchgrasp.datasets import list_views, read_mass, read_object_mesh, read_view
+from torchgrasp.data import list_views, read_mass, read_object_mesh, read_view
 from torchgrasp.errors import GraspError, Status
 from torchgrasp.evaluation import (
     PERTURBATIONS,
@@ -39,10 +39,11 @@ from torchgrasp.evaluation import (
     share_over,
 )
 from torchgrasp.files import format_json, write_file
+from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.load import load_hand
-from torchgrasp.ik.sdf import SignedDistanceField, surface_field
-from torchgrasp.pipeline import plan_grasps
+from torchgrasp.planner import plan_grasps
 from torchgrasp.shape.fit import fit_shape
+from torchgrasp.shape.surface import surface_field
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Grasps, load_grasps

@@ -24,7 +24,7 @@ from benchmarks.close.drawn import draw_solid
 from benchmarks.close.simulator_agreement import Verdicts, agreement_row
 from benchmarks.common import Row
 from torchgrasp import ClosureResult, Grasps, Status, TrialSpec, load_hand, plan_grasps
-from torchgrasp.datasets import list_views, read_mass, read_object_mesh, read_view
+from torchgrasp.data import list_views, read_mass, read_object_mesh, read_view
 from torchgrasp.errors import GraspError
 from torchgrasp.evaluation import (
     PERTURBATIONS,
@@ -44,10 +44,11 @@ from torchgrasp.evaluation import (
 from torchgrasp.evaluation.protocols import error_from_object_pose
 from torchgrasp.evaluation.views import choose_rows
 from torchgrasp.files import write_file
-from torchgrasp.frames import apply, rigid, rotation_from_vector
-from torchgrasp.ik.sdf import SignedDistanceField, surface_field
+from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
+from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.surface import surface_field
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ContactSpec, SensorModel
 from torchgrasp.values import load_grasps

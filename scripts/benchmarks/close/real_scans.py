@@ -13,12 +13,12 @@ import torch
 
 from benchmarks.common import Row
 from torchgrasp.cloud.io.read import read_cloud
-from torchgrasp.datasets import read_mass, read_object_mesh
+from torchgrasp.data import read_mass, read_object_mesh
 from torchgrasp.errors import GraspError, Status
 from torchgrasp.evaluation import PERTURBATIONS, PROTOCOLS, close_hand, household_mass, perturb_trial, seed_of
+from torchgrasp.geometry.plane import move
 from torchgrasp.hand.load import load_hand
-from torchgrasp.pipeline import plan_grasps
-from torchgrasp.plane import move
+from torchgrasp.planner import plan_grasps
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Grasps, PointCloud

@@ -23,10 +23,10 @@ from torchgrasp import (
     surface_field,
 )
 from torchgrasp.control import GraspController, Observation
+from torchgrasp.data.shipped import GraspObject
 from torchgrasp.errors import Status
 from torchgrasp.evaluation import GraspTrial, TrialDriver
-from torchgrasp.objects import GraspObject
-from torchgrasp.pipeline.pool import run_tasks
+from torchgrasp.jobs import run_tasks
 
 SIMULATED = 5.0
 """Length of a trial [s]."""

@@ -18,7 +18,7 @@ from torchgrasp.control.adaptive.stability import StabilityModel, lengths_of, lo
 from torchgrasp.control.holding.force import ForceHold
 from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.views import choose_rows
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.sim.convex_parts import convex_parts
 
 FRICTION, STRENGTH = 0.6, (1.0, 8.0)

@@ -26,7 +26,7 @@ from torchgrasp import (
 from torchgrasp.control.holding.force import ForceHold
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver
 from torchgrasp.hand.hand import Actuator
-from torchgrasp.pipeline.pool import run_tasks
+from torchgrasp.jobs import run_tasks
 from torchgrasp.sim.mjcf import OBJECT
 from torchgrasp.sim.mujoco_scene import MujocoScene
 from torchgrasp.sim.open import open_scene

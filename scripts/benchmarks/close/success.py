@@ -13,7 +13,7 @@ from sklearn.preprocessing import StandardScaler
 from tqdm import tqdm
 
 from benchmarks.common import Row
-from torchgrasp.datasets import list_views, read_family, read_object_mesh, read_view
+from torchgrasp.data import list_views, read_family, read_object_mesh, read_view
 from torchgrasp.errors import Status
 from torchgrasp.evaluation import calibration
 from torchgrasp.evaluation.closing import GraspTrial
@@ -23,8 +23,8 @@ from torchgrasp.evaluation.views import choose_rows
 from torchgrasp.files import format_json, write_file
 from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.ranking import FEATURES, MODEL, success_features
-from torchgrasp.pipeline import plan_grasps
-from torchgrasp.pipeline.pool import run_tasks
+from torchgrasp.jobs import run_tasks
+from torchgrasp.planner import plan_grasps
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.sim.convex_parts import convex_parts

@@ -22,13 +22,13 @@ from torchgrasp import (
     plan_grasps,
     sample_configurations,
 )
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
 from torchgrasp.ik.refine import refine
 from torchgrasp.ik.rounds import assign
-from torchgrasp.ik.sdf import field_from_surface
-from torchgrasp.linalg import unit
 from torchgrasp.posture_model.em import expectation, maximisation
 from torchgrasp.posture_model.kmeans import start_components
 from torchgrasp.posture_model.shard import Shard

@@ -6,7 +6,7 @@ import coal
 import numpy as np
 import torch
 
-from torchgrasp.frames import rotation_from_rpy
+from torchgrasp.geometry.frames import rotation_from_rpy
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
 

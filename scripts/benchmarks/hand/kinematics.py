@@ -189,7 +189,7 @@ def bench_samples(n: int, threads: int) -> list[Row]:
 def _command(name: str, n: int, out: Path, workers: int) -> tuple[float, float]:
     """Run `torchgrasp hand sample`; return its time [s] and the peak of memory so far [GiB]."""
     arguments = ["hand", "sample", "--hand", name, "--n", str(n), "--out", str(out), "--workers", str(workers)]
-    code = f"import sys; from torchgrasp.cli import main; sys.exit(main({arguments!r}))"
+    code = f"import sys; from torchgrasp.app.cli import main; sys.exit(main({arguments!r}))"
     began = time.perf_counter()
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
     took = time.perf_counter() - began

@@ -12,8 +12,8 @@ from benchmarks.common import Row
 from torchgrasp import Hand, list_objects, load_hand, load_mixture, load_object, plan_grasps
 from torchgrasp.base import Batch
 from torchgrasp.errors import Status
-from torchgrasp.linalg import unit
-from torchgrasp.optim import LeastSquares, Residuals, levenberg_marquardt
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.optim import LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.posture_model.encoding import encode_fingertips
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture
 from torchgrasp.posture_model.sample import HandSamples, sample_configurations

@@ -28,9 +28,9 @@ from torchgrasp import (
     plan_contacts,
     plan_grasps,
 )
-from torchgrasp.border.tensors import Call
+from torchgrasp.checks.tensors import Call
 from torchgrasp.errors import Status
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.specs import Simulator
 
 SUBJECTS = ("plans", "trials", "points", "starts", "checks")
@@ -145,7 +145,7 @@ def _starts(n: int) -> list[Row]:
 def _checks(hand: str) -> list[Row]:
     """Plan, and measure what reading arguments at the border takes of it: binding, reading, finite numbers."""
     model, view, rows = load_hand(hand), load_object("jug").view, list[Row]()
-    border = importlib.import_module("torchgrasp.border.checked")  # the package has the function under the same name
+    border = importlib.import_module("torchgrasp.checks.checked")  # the package has the function under the same name
     spent = [0.0]
 
     def timed(function: Callable[..., Any]) -> Callable[..., Any]:

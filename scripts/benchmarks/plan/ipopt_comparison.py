@@ -11,7 +11,7 @@ from tqdm import tqdm
 from benchmarks.common import Row
 from benchmarks.plan.ipopt import Hessian, feasible, ipopt_planner
 from torchgrasp import ContactSpec, fit_shape, plan_contacts
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.gp import ShapeGP
 
 RADII = (0.1, 1.0)

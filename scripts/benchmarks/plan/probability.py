@@ -18,7 +18,7 @@ from benchmarks.ground_truth import read_views, sample_mesh
 from benchmarks.plan.true_surface import DEFAULT, FRICTION, closed_on_mesh
 from torchgrasp import ContactSpec, Status, closure_probability, fit_shape, plan_contacts
 from torchgrasp.columns import format_columns
-from torchgrasp.datasets import read_family, read_group
+from torchgrasp.data import read_family, read_group
 from torchgrasp.evaluation.calibration import BINS, judge
 from torchgrasp.evaluation.intervals import count_by, format_share, share_over
 from torchgrasp.plan.line_posterior import well_inside

@@ -16,15 +16,15 @@ from benchmarks.common import Row
 from benchmarks.plan.true_surface import DEFAULT, FRICTION, closed_on_mesh
 from torchgrasp import ContactPlan, Hand, Status, fit_shape, load_hand, plan_contacts
 from torchgrasp.base import join
+from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.joint import solve_joint
 from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
-from torchgrasp.ik.sdf import field_from_surface
-from torchgrasp.pipeline import spread_rows
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.starts import STARTS_PER_CHUNK, drawn_starts, settle_flatness
+from torchgrasp.planner import spread_rows
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
 

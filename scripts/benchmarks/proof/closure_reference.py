@@ -8,7 +8,7 @@ contact. The normal is that of the mean's gradient there, plus the deviation ove
 import torch
 from torch import Tensor
 
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.line_posterior import FOOTPRINT
 from torchgrasp.plan.round_cones import closed_exact
 from torchgrasp.plan.wrench import tangents

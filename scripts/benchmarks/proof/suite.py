@@ -13,8 +13,8 @@ from benchmarks.ground_truth import read_views
 from benchmarks.plan.true_surface import closed_on_mesh
 from benchmarks.proof.certificates import bench_certificates
 from benchmarks.proof.closure_reference import redrawn_closure
+from torchgrasp.data.shipped import list_objects, load_object
 from torchgrasp.errors import Status
-from torchgrasp.objects import list_objects, load_object
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure_probability import closure_probability
 from torchgrasp.plan.solve import plan_contacts

@@ -8,8 +8,8 @@ from torch import Tensor
 from benchmarks.common import Row
 from torchgrasp import ContactSpec, close_hand, list_objects, load_hand, load_object, plan_grasps
 from torchgrasp.base import named_tensors
-from torchgrasp.frames import inverse, rigid, rotation_from_vector
-from torchgrasp.plane import Plane, move
+from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
+from torchgrasp.geometry.plane import Plane, move
 
 STARTS = 25
 """Starts of each plan: fewer grasps to compare cost nothing in sharpness, as all stages run."""

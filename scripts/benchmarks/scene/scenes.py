@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgrasp.cloud.camera import look_at
 from torchgrasp.cloud.render import render_depth
-from torchgrasp.datasets import read_object_mesh
+from torchgrasp.data import read_object_mesh
 from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.arrange import scatter
 

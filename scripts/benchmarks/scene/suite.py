@@ -14,7 +14,7 @@ from benchmarks.scene.frames import measure_frames
 from benchmarks.scene.scenes import Picture, read_meshes, take_picture
 from torchgrasp.cloud.camera import INTRINSICS
 from torchgrasp.errors import BadArgument, NoSupport
-from torchgrasp.plane import Plane
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene import Scene
 
 SUBJECTS = ("plane", "clicked point", "frames")

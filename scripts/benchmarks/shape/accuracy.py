@@ -13,7 +13,7 @@ from torch import Tensor
 from benchmarks.ground_truth import nearest_on_mesh, read_views, sample_mesh
 from torchgrasp.columns import format_columns
 from torchgrasp.evaluation.intervals import mean_over
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
@@ -43,7 +43,7 @@ def measure_accuracy(objects: Path, camera: bool = True, table: bool = True) -> 
     """Return `measure_shape` of every noisy view of a folder, with "object" and "view".
 
     Args:
-        objects: a folder as `torchgrasp.datasets` reads it.
+        objects: a folder as `torchgrasp.data` reads it.
         camera: whether the camera's position is given.
         table: whether the table is given.
 

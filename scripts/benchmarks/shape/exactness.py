@@ -11,8 +11,8 @@ from benchmarks.common import Row, least_seconds, random_view
 from benchmarks.shape.gpytorch_peer import select_by_refitting
 from torchgrasp.base import join
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
-from torchgrasp.frames import rotation_from_vector
-from torchgrasp.linalg import cholesky, fibonacci_sphere
+from torchgrasp.geometry.frames import rotation_from_vector
+from torchgrasp.geometry.linalg import cholesky, fibonacci_sphere
 from torchgrasp.shape.condition import condition, longest_distance
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import Normalisation, ShapeGP

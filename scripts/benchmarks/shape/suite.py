@@ -20,7 +20,7 @@ from benchmarks.shape.speed import bench_growth, bench_memory, bench_queries, be
 from benchmarks.shape.walls import measure_walls
 from benchmarks.shape.weaker_inputs import bench_weaker
 from benchmarks.shape.worst_views import bench_worst
-from torchgrasp.datasets import read_family, read_group
+from torchgrasp.data import read_family, read_group
 from torchgrasp.evaluation.intervals import mean_over
 from torchgrasp.shape.fit import fit_shape
 

@@ -9,7 +9,7 @@ from benchmarks.common import Row
 from benchmarks.ground_truth import read_views
 from benchmarks.shape.accuracy import Row as View
 from benchmarks.shape.accuracy import measure_shape
-from torchgrasp.datasets import read_family, read_group
+from torchgrasp.data import read_family, read_group
 from torchgrasp.evaluation.intervals import mean_over
 from torchgrasp.evaluation.perturb import PERTURBATIONS, find_perturbation, perturb_view
 from torchgrasp.evaluation.protocols import seed_of

@@ -13,11 +13,11 @@ from tqdm import tqdm
 from benchmarks.common import Row
 from benchmarks.ground_truth import nearest_on_mesh, read_views
 from benchmarks.shape.accuracy import RESOLUTION, measure_shape
-from torchgrasp.datasets import read_group
+from torchgrasp.app.report.canvas import Canvas, draw_bar, map_colors
+from torchgrasp.app.report.palette import INK, PAPER
+from torchgrasp.app.report.pictures import rotated, view_of
+from torchgrasp.data import read_group
 from torchgrasp.files import write_file
-from torchgrasp.report.canvas import Canvas, draw_bar, map_colors
-from torchgrasp.report.palette import INK, PAPER
-from torchgrasp.report.pictures import rotated, view_of
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import Surface, extract_surface
 from torchgrasp.values import PointCloud

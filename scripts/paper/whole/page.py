@@ -12,8 +12,8 @@ from PIL import Image
 from paper.whole.parts import EVERY, FIGURES, FULL, TRIALS, Figure, Sizes, Trials
 from paper.whole.tables import HAND, TABLES, count_own
 from torchgrasp import __version__
+from torchgrasp.app.report.document import escape, format_document, format_html_table
 from torchgrasp.files import format_json, write_file
-from torchgrasp.report.document import escape, format_document, format_html_table
 
 TIMES = ("filter_s", "shape_s", "milliseconds", "seconds", "plan_cpu_s")
 """Names of the numbers that are times: they differ from run to run."""

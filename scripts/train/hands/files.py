@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchgrasp.frames import rotation_from_rpy
+from torchgrasp.geometry.frames import rotation_from_rpy
 
 DIGITS = 4
 """Significant digits of centres of mass and inertias, which the density of no real link justifies."""

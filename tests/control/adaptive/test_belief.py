@@ -11,8 +11,8 @@ from torchgrasp.control.adaptive.belief import FARTHEST, Belief
 from torchgrasp.control.closing import LawClosing
 from torchgrasp.control.controller import GraspController
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import rigid, rotation_from_vector
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.frames import rigid, rotation_from_vector
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.values import PointCloud
 
 EYE = torch.eye(4, dtype=torch.float64)

@@ -19,7 +19,7 @@ from torchgrasp.control.adaptive.impedance import (
 )
 from torchgrasp.control.adaptive.stability import PreferredForces, StabilityModel
 from torchgrasp.control.holding.force import RAMP, held_forces
-from torchgrasp.frames import rigid, rotation_from_vector, virtual_frame
+from torchgrasp.geometry.frames import rigid, rotation_from_vector, virtual_frame
 
 
 def triangles(count: int, seed: int = 0) -> torch.Tensor:

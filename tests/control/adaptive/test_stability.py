@@ -15,7 +15,7 @@ from torchgrasp.control.adaptive.stability import (
     state_of,
 )
 from torchgrasp.errors import BadArgument, ModelFileError
-from torchgrasp.frames import rotation_from_vector
+from torchgrasp.geometry.frames import rotation_from_vector
 from torchgrasp.hand.load import load_hand
 from torchgrasp.posture_model.compatibility import describe_compatibility
 from torchgrasp.posture_model.encoding import encode_fingertips

@@ -20,10 +20,10 @@ from torchgrasp.control.recovery.approach import (
     can_guard,
 )
 from torchgrasp.control.recovery.localization import FINER, TURNS
+from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.load import load_hand
-from torchgrasp.objects import load_shipped_grasp
-from torchgrasp.plane import Plane
 from torchgrasp.specs import SensorModel
 
 DOWN, LENGTH, TIP = real([0.0, -1.0, 0.0]), 0.08, 0.01

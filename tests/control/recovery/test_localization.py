@@ -17,10 +17,10 @@ from torchgrasp.control.recovery.localization import (
     Localization,
     Touches,
 )
-from torchgrasp.frames import rigid, rotation_from_vector
-from torchgrasp.ik.sdf import SignedDistanceField
-from torchgrasp.linalg import unit
-from torchgrasp.plane import Plane
+from torchgrasp.geometry.frames import rigid, rotation_from_vector
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.specs import SensorModel
 
 CENTER, RADIUS = TARGET.mean(0), 0.03

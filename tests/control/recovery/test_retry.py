@@ -11,7 +11,7 @@ from torchgrasp.control import GraspController, load_controller_state
 from torchgrasp.control.closing import PALM_SPEED
 from torchgrasp.control.controller import ATTEMPTS, CLOSING_TIME, PRESSING_TIME
 from torchgrasp.control.recovery.retry import ASIDE, OPENING, RESTING, PressCheck, Reopening
-from torchgrasp.plane import Plane
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.specs import SensorModel, closes_again
 
 STILL, PLACE = torch.zeros(3).double(), torch.zeros(6).double()

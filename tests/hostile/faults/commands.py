@@ -13,16 +13,16 @@ import torch
 
 from tests.campaign.cheap import records
 from torchgrasp import load_hand, load_object, plan_grasps
-from torchgrasp.cli import grasps as grasp_command
-from torchgrasp.cli import hand_train
-from torchgrasp.datasets.shards import JobRow, Shard, pack_shard
+from torchgrasp.app.cli import grasps as grasp_command
+from torchgrasp.app.cli import hand_train
+from torchgrasp.app.report import page
+from torchgrasp.data.shards import JobRow, Shard, pack_shard
+from torchgrasp.data.shipped import DATA
 from torchgrasp.errors import Status
 from torchgrasp.evaluation import campaign
 from torchgrasp.evaluation.protocols import Protocol
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore
 from torchgrasp.evaluation.views import EvaluationSpec, View
-from torchgrasp.objects import DATA
-from torchgrasp.report import page
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import load_grasps
@@ -93,7 +93,7 @@ def evaluate(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
         score = float(load_grasps(view.file)[row].score[0])
         return ProtocolResult(row, draw, True, Status.OK, 0.0, 0.0, score, 0.0, 0.0)
 
-    module = sys.modules["torchgrasp.cli.evaluate"]  # the package has the function under the same name
+    module = sys.modules["torchgrasp.app.cli.evaluate"]  # the package has the function under the same name
     monkeypatch.setattr(module, "import_simulator", lambda name: None)
     monkeypatch.setattr(campaign, "_plan", plan)
     monkeypatch.setattr(campaign, "_try", try_grasp)
@@ -113,7 +113,7 @@ def gather(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
         return pack_shard(Shard((row,), found), meta)
 
     monkeypatch.setattr("torchgrasp.campaign.run.run_job", work)
-    monkeypatch.setattr(sys.modules["torchgrasp.cli.campaign"], "import_simulator", lambda name: None)
+    monkeypatch.setattr(sys.modules["torchgrasp.app.cli.campaign"], "import_simulator", lambda name: None)
     words = ["campaign", str(folder), "--hand", "barrett", "--jobs-in-shard", "2", "--workers", "0"]
     return lambda out: [*words, "--out", str(out / "campaign")]
 

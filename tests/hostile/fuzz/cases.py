@@ -17,14 +17,14 @@ from torchgrasp import (
     read_cloud,
     read_scene,
 )
+from torchgrasp.app.author.draft import new_hand
 from torchgrasp.cloud.io.image import read_image, read_pose
 from torchgrasp.cloud.io.read import save_cloud
-from torchgrasp.datasets import list_objects, list_views, read_entry
+from torchgrasp.data import list_entries, list_views, read_entry
+from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.export import format_grasps, grasps_from_joints, read_foreign
-from torchgrasp.hand.draft import new_hand
+from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.mesh import read_mesh
-from torchgrasp.objects import load_shipped_grasp
 
 
 class Case(NamedTuple):
@@ -124,7 +124,7 @@ def manifests(folder: Path) -> list[Case]:
     (folder / "manifest.json").write_text(json.dumps({"objects": {"cup": cup | {"group": "shell"}, "jug": cup}}))
 
     def read(path: Path) -> None:
-        for name in list_objects(path.parent):
+        for name in list_entries(path.parent):
             read_entry(path.parent, name)
         list_views(path.parent)
 

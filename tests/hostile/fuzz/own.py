@@ -19,6 +19,9 @@ from torchgrasp import (
     load_hand,
     load_mixture,
 )
+from torchgrasp.app.report.turning.buffers import pack
+from torchgrasp.app.report.turning.contents import describe_grasps
+from torchgrasp.app.report.turning.shown import read_page, read_shown
 from torchgrasp.campaign.folder import carry_out
 from torchgrasp.control import (
     ClosingReference,
@@ -29,15 +32,12 @@ from torchgrasp.control import (
     observe,
 )
 from torchgrasp.control.adaptive.stability import load_stability
-from torchgrasp.datasets import read_shards
+from torchgrasp.data import read_shards
+from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.export import format_grasps, format_moveit
 from torchgrasp.hand.load import hands_folder
-from torchgrasp.objects import load_shipped_grasp
 from torchgrasp.posture_model import GraspMixture, SampleSpec, load_samples, write_samples
 from torchgrasp.posture_model.encoding import CODE_NAMES
-from torchgrasp.report.turning.buffers import pack
-from torchgrasp.report.turning.contents import describe_grasps
-from torchgrasp.report.turning.shown import read_page, read_shown
 from torchgrasp.sim.convex_parts import _load, _save  # pyright: ignore[reportPrivateUsage]
 from torchgrasp.values import Certificate, Contacts, Grasps
 

@@ -11,8 +11,8 @@ from tests.hostile.fuzz import cases as strange
 from tests.hostile.fuzz import own
 from tests.hostile.fuzz.limits import limited
 from tests.hostile.fuzz.mutations import edits, mutated
+from torchgrasp.app.author.draft import draft_hand
 from torchgrasp.errors import GraspError
-from torchgrasp.hand.draft import draft_hand
 
 KINDS = strange.KINDS | own.KINDS
 MOST_LETTERS = 2000

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchgrasp.frames import apply, rigid, rotate, rotation_from_vector
+from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vector
 from torchgrasp.shape.completion.axis import find_axis
 from torchgrasp.shape.completion.complete import complete_cloud
 from torchgrasp.shape.completion.symmetry import SymmetryScorer

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchgrasp.frames import apply, rotate
+from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.shape.completion.complete import (
     LEAST_NOISE,
     NEARBY,

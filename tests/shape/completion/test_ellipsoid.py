@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchgrasp.linalg import fibonacci_sphere, unit
+from torchgrasp.geometry.linalg import fibonacci_sphere, unit
 from torchgrasp.shape.completion.complete import complete_cloud
 from torchgrasp.shape.completion.ellipsoid import Ellipsoid, find_ellipsoid
 from torchgrasp.shape.completion.silhouette import silhouettes

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchgrasp.base import named_tensors
-from torchgrasp.border import check_tensor, checked
+from torchgrasp.checks import check_tensor, checked
 from torchgrasp.cloud.check import check_cloud
 from torchgrasp.cloud.io.arrays import MAX_BYTES, parse_npy, parse_npz
 from torchgrasp.cloud.io.pcd import parse_pcd

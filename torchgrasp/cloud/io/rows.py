@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.cloud.check import MIN_POINTS
 from torchgrasp.cloud.io.text import MAX_POINTS
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_planes

@@ -11,13 +11,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import settle
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.control.closing_law import position_gain, surface_covariance
 from torchgrasp.control.forces import desired_forces
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import FLAT_RADIUS, PLACE_NOISE
-from torchgrasp.frames import apply, inverse, rotate
+from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import newton_step
 from torchgrasp.values import ShapeEstimate
@@ -37,7 +37,7 @@ class Belief:
 
     >>> from torchgrasp import ClosingReference, fit_shape, load_hand, load_object
     >>> from torchgrasp.control import no_contact, observe
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp, hand = load_shipped_grasp("jug", "allegro"), load_hand("allegro")
     >>> reference, seen = ClosingReference.from_grasp(hand, grasp), observe(hand, grasp.joints[0], no_contact())
     >>> belief = Belief(fit_shape(load_object("jug").view), grasp.obj_from_hand[0])

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.border import checked
+from torchgrasp.checks import checked
 from torchgrasp.control.adaptive.stability import StabilityModel, lengths_of, state_of
 from torchgrasp.control.closing_law import damped_inverse
 from torchgrasp.control.holding.force import RAMP, held_forces, regulate
@@ -24,7 +24,7 @@ from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.state import Part
 from torchgrasp.control.stiffness import actuated_stiffness
 from torchgrasp.control.tactile import low_pass
-from torchgrasp.frames import degenerate, rigid, skew, virtual_frame
+from torchgrasp.geometry.frames import degenerate, rigid, skew, virtual_frame
 from torchgrasp.plan.internal_forces import internal_forces
 
 TRANSLATION_STIFFNESS, ROTATION_STIFFNESS = 1200.0, 4.0
@@ -111,7 +111,7 @@ class Impedance(Part):
 
     >>> from torchgrasp import ClosingReference, load_hand
     >>> from torchgrasp.control import no_contact, observe
-    >>> from torchgrasp.objects import load_shipped_grasp
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp, hand = load_shipped_grasp("jug", "allegro"), load_hand("allegro")
     >>> seen = observe(hand, grasp.joints[0], no_contact())
     >>> hold = Impedance(ClosingReference.from_grasp(hand, grasp), seen, seen.joints)

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import LEAST, Positive, Range, checked
+from torchgrasp.checks import LEAST, Positive, Range, checked
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.hand.hand import Hand

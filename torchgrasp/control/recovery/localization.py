@@ -12,8 +12,8 @@ from torch import Tensor
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.state import Part
-from torchgrasp.frames import apply, rotation_from_vector
-from torchgrasp.linalg import unit
+from torchgrasp.geometry.frames import apply, rotation_from_vector
+from torchgrasp.geometry.linalg import unit
 
 FARTHEST, PITCH = 0.032, 0.004
 """Largest displacement along each axis [m] that is tried, and the distance between two: the surface's own error."""

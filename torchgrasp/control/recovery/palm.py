@@ -5,8 +5,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.control.closing import PALM_SPEED
-from torchgrasp.linalg import limit_norm, unit
-from torchgrasp.plane import Plane
+from torchgrasp.geometry.linalg import limit_norm, unit
+from torchgrasp.geometry.plane import Plane
 
 
 def palm_goal(shift: Float[Tensor, "3"], table: Plane | None, reach: float) -> Float[Tensor, "3"]:

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.frames import apply, inverse, rigid, rotate
-from torchgrasp.linalg import farthest_points, fibonacci_sphere, unit
-from torchgrasp.plane import LEAST_TILT
+from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
+from torchgrasp.geometry.linalg import farthest_points, fibonacci_sphere, unit
+from torchgrasp.geometry.plane import LEAST_TILT
 from torchgrasp.shape.completion.revolution import BODY_SHARE, ONE_WAY, Revolution, lines_from_above, split_body
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 from torchgrasp.shape.completion.symmetry import PROBES, SymmetryScorer

@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value, join
-from torchgrasp.border import Count, Pose, checked
+from torchgrasp.checks import Count, Pose, checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import apply, inverse, rotate
-from torchgrasp.linalg import farthest_points, reflect, reflect_directions
+from torchgrasp.geometry.frames import apply, inverse, rotate
+from torchgrasp.geometry.linalg import farthest_points, reflect, reflect_directions
 from torchgrasp.shape.completion.axis import find_axis
 from torchgrasp.shape.completion.ellipsoid import Ellipsoid, find_ellipsoid
 from torchgrasp.shape.completion.revolution import Revolution, find_revolution
@@ -115,7 +115,7 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count 
     The cloud is clean, with outward normals and viewpoints; others raise `BadArgument`. The table has its height [m]
     and normal z.
 
-    >>> from torchgrasp.linalg import unit
+    >>> from torchgrasp.geometry.linalg import unit
     >>> eye = torch.tensor([0.0, 0.0, 1.0]).double()
     >>> cap = unit(torch.rand(300, 3).double() - torch.tensor([0.5, 0.5, 0.0]).double())
     >>> bool(complete_cloud(PointCloud(0.05 * cap, cap, eye)).points[:, 2].min() < -0.02)

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.linalg import farthest_points, fibonacci_sphere, unit
+from torchgrasp.geometry.linalg import farthest_points, fibonacci_sphere, unit
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 
 PROBES = 300

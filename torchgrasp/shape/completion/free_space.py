@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.linalg import farthest_points
+from torchgrasp.geometry.linalg import farthest_points
 from torchgrasp.shape.completion.silhouette import TIE, Outlines, Silhouette
 from torchgrasp.shape.gp import Normalisation, ShapeGP
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.linalg import solve_least_squares
+from torchgrasp.geometry.linalg import solve_least_squares
 
 STEEP = 0.3
 """Length of a normal's level part from which on it helps to find a vertical axis."""

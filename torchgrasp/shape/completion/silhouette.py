@@ -8,10 +8,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.border import Pose, checked
+from torchgrasp.checks import Pose, checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.frames import apply, rotate
-from torchgrasp.linalg import farthest_points, unit
+from torchgrasp.geometry.frames import apply, rotate
+from torchgrasp.geometry.linalg import farthest_points, unit
 from torchgrasp.values import PointCloud
 
 CELLS = 4.0

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.frames import apply, rotate
-from torchgrasp.linalg import farthest_points, fibonacci_sphere, reflect, reflect_directions, unit
-from torchgrasp.plane import Plane
+from torchgrasp.geometry.frames import apply, rotate
+from torchgrasp.geometry.linalg import farthest_points, fibonacci_sphere, reflect, reflect_directions, unit
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.shape.completion.silhouette import TIE, Outlines, silhouettes
 from torchgrasp.values import PointCloud
 

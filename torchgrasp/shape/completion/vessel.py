@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.linalg import solve_least_squares, unit
+from torchgrasp.geometry.linalg import solve_least_squares, unit
 from torchgrasp.shape.completion.revolution import fit_axis
 
 WALL = 0.5

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value, join
-from torchgrasp.linalg import farthest_points
+from torchgrasp.geometry.linalg import farthest_points
 from torchgrasp.shape.completion.complete import FRONT_MARGIN, HULL_MARGIN, NEW, SPACING
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 from torchgrasp.shape.completion.vessel import RIM, THICKNESS_ERROR, Vessel

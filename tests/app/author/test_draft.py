@@ -1,0 +1,253 @@
+"""A first hand.toml for a URDF, and a third hand on its whole way: URDF, hand.toml, model, grasps."""
+
+import pytest
+import torch
+import trimesh
+
+from tests.hostile.fuzz.limits import limited
+from torchgrasp import ContactSpec, Status, certify, fit_mixture, plan_grasps
+from torchgrasp.app.author.draft import draft_hand
+from torchgrasp.cloud.camera import look_at, partial_view
+from torchgrasp.errors import BadArgument, HandFileError
+from torchgrasp.geometry.frames import apply, rotate
+from torchgrasp.hand.collision_pairs import collision_pairs
+from torchgrasp.hand.hand_toml import read_hand_toml
+from torchgrasp.hand.load import hands_folder, load_hand
+from torchgrasp.hand.self_collision import SelfCollision
+from torchgrasp.hand.urdf import read_urdf
+from torchgrasp.posture_model.sample import sample_configurations
+from torchgrasp.testing import check_hand
+
+
+def drafted(urdf, *tips):
+    (urdf.parent / "hand.toml").write_text(draft_hand(urdf, tips))
+    return urdf.parent
+
+
+def test_a_draft_for_the_claw_passes_the_law(claw):
+    hand = check_hand(drafted(claw))
+    assert hand.joint_names == tuple(f"{f}_{j}" for f in ("left", "right", "thumb") for j in ("swivel", "bend"))
+    joints = torch.tensor([[0.1, 0.4, 0.2, 0.5, -0.1, 1.0]], dtype=torch.float64)
+    found = hand.expand(joints)
+    for finger in ("left", "right", "thumb"):
+        torch.testing.assert_close(found[f"{finger}_follow"], -0.7 * found[f"{finger}_bend"] + 0.1)
+    assert hand.tips.radius.tolist() == [0.011] * 3
+    assert hand.approach.tolist() == [0, 0, 1]
+    # hardly bent, each pad looks to the middle of the fingertips
+    points, normals = hand.fingertips(torch.tensor([[0.0, 0.1] * 3], dtype=torch.float64))
+    assert bool((((points.mean(1, keepdim=True) - points) * normals).sum(-1) > 0).all())
+
+
+@pytest.mark.parametrize(
+    ("name", "tips"), [("allegro", ("index_tip", "middle_tip", "thumb_tip", "ring_tip")), ("barrett", ())]
+)
+def test_a_draft_finds_what_the_shipped_hands_have(tmp_path, name, tips):
+    shipped = hands_folder() / name
+    (tmp_path / "hand.urdf").write_bytes((shipped / "hand.urdf").read_bytes())
+    (tmp_path / "hand.toml").write_text(draft_hand(tmp_path / "hand.urdf", tips))
+    ours, theirs = read_hand_toml(tmp_path / "hand.toml"), read_hand_toml(shipped / "hand.toml")
+    assert ours.coupling == theirs.coupling and ours.approach == theirs.approach
+    assert [f.joints for f in ours.fingers] == [f.joints for f in theirs.fingers]
+    pads = [torch.tensor([f.pad.normal for f in spec.fingers], dtype=torch.float64) for spec in (ours, theirs)]
+    assert float((pads[0] * pads[1]).sum(1).min()) > 0.95
+    assert [f.pad.radius for f in ours.fingers] == [f.pad.radius for f in theirs.fingers]
+    assert set(map(frozenset, theirs.pairs or ())) <= set(map(frozenset, ours.pairs or ()))
+    assert check_hand(tmp_path).joint_names == load_hand(name).joint_names
+
+
+@pytest.mark.parametrize("tip", ['<box size="0.02 0.018 0.03"/>', '<cylinder radius="0.008" length="0.03"/>'])
+def test_a_tip_that_is_not_round_gets_a_pad_on_its_side(claw, tip):
+    claw.write_text(claw.read_text().replace('<sphere radius="0.011"/>', tip))
+    hand = check_hand(drafted(claw))  # the contact is not inside the tip
+    depth = 0.01 if "box" in tip else 0.008
+    torch.testing.assert_close(
+        hand.tips.contact[0], torch.tensor([depth, 0, 0.015 - (0.009 if "box" in tip else 0.008)]).double()
+    )
+    assert hand.tips.normal[0].tolist() == [1, 0, 0] and hand.tips.radius[0] == 0
+    # what tells whether a tip is in the object reaches its contact and no farther
+    cover, first = hand.collision_spheres, hand.collision_spheres.link_index == hand.tips.index[0]
+    reach = (cover.center[first] @ hand.tips.normal[0] + cover.radius[first]).max()
+    assert depth - 0.002 < float(reach) <= depth + 1e-9
+
+
+def two_fingers(claw):
+    """Cut off the thumb."""
+    text = claw.read_text()
+    first, last = text.index('<link name="thumb_root">'), text.index("</robot>")
+    (claw.parent / "two.urdf").write_text(text[:first] + text[last:])
+    return claw.parent / "two.urdf"
+
+
+def write_with_frame(claw):
+    """Hang the claw on a frame without mass."""
+    frame = '<link name="world"/><joint name="w" type="fixed"><parent link="world"/><child link="base"/></joint>'
+    (claw.parent / "framed.urdf").write_text(claw.read_text().replace("</robot>", frame + "</robot>"))
+    return claw.parent / "framed.urdf"
+
+
+def test_of_four_fingers_those_grasp_that_face_each_other(tmp_path):
+    """Allegro's thumb faces its fingers; three fingers beside each other practically never do."""
+    (tmp_path / "hand.urdf").write_bytes((hands_folder() / "allegro" / "hand.urdf").read_bytes())
+    (tmp_path / "hand.toml").write_text(draft_hand(tmp_path / "hand.urdf"))
+    hand = check_hand(tmp_path)
+    assert "thumb" in hand.finger_names and hand.dof == 12
+
+
+def with_more_fingers(claw, *more):
+    """Give the claw further fingers like its left and right one, farther out."""
+    text, end = claw.read_text(), "</robot>"
+    for name, old, y in more:
+        start = text.index(f'<link name="{old}_root">')
+        finger = text[start : text.index(f'<link name="{ {"left": "right", "right": "thumb"}[old] }_root">')]
+        sign = "-" if old == "left" else ""
+        finger = finger.replace(f"{old}_", f"{name}_").replace(f'xyz="-0.045 {sign}0.03', f'xyz="-0.045 {y}')
+        text = text.replace(end, finger + end)
+    claw.write_text(text)
+    return claw
+
+
+@pytest.mark.parametrize("more", [(("ring", "left", -0.07),), (("ring", "left", -0.07), ("index", "right", 0.07))])
+def test_a_draft_declares_every_number_of_fingers(claw, more):
+    """Each set holds the smaller one, passes the law, and parks the joints of all other fingers."""
+    folder = drafted(with_more_fingers(claw, *more))
+    spec, before = read_hand_toml(folder / "hand.toml"), set[str]()
+    assert list(spec.options) == ["default", "four", "five"][: 1 + len(more)]
+    for count, name in enumerate(spec.options, 3):
+        hand, option = check_hand(folder, name), spec.options[name]
+        names = {finger.name for finger in option.fingers}
+        assert len(names) == count and before < names
+        idle = [finger for finger in spec.all_fingers if finger.name not in names]
+        assert set(option.parked) == {j for f in idle for j in f.joints if not j.endswith("follow")}
+        assert hand.dof == 2 * count and load_hand(folder, count).finger_names == hand.finger_names
+        assert hand.source.options == tuple(spec.options)
+        before = names
+    assert "thumb" in {finger.name for finger in spec.fingers}
+
+
+def test_named_tips_are_taken_in_their_order(claw):
+    tips = ("thumb_tip", "ring_tip", "left_tip", "right_tip")
+    spec = read_hand_toml(drafted(with_more_fingers(claw, ("ring", "left", -0.07)), *tips) / "hand.toml", "four")
+    assert [f.name for f in spec.options["default"].fingers] == ["thumb", "ring", "left"]
+    assert [f.name for f in spec.fingers] == ["thumb", "ring", "left", "right"]
+    with pytest.raises(BadArgument, match="three to five"):
+        draft_hand(claw, ("left_tip", "right_tip", "thumb_tip", "ring_tip", "left_far", "right_far"))
+
+
+def test_what_cannot_be_guessed_is_asked_for(claw, tmp_path):
+    with pytest.raises(BadArgument, match="left_tip"):
+        draft_hand(claw, ("left_tip", "right_tip"))
+    with pytest.raises(BadArgument, match="left_tip"):
+        draft_hand(claw, ("left_tip", "right_tip", "nose"))
+    with pytest.raises(BadArgument, match="base"):
+        draft_hand(claw, ("left_tip", "right_tip", "base"))
+    with pytest.raises(BadArgument, match="three to five"):
+        draft_hand(two_fingers(claw))
+    with pytest.raises(HandFileError, match="hand new"):
+        draft_hand(write_with_frame(claw))
+    with pytest.raises(HandFileError, match="no file"):
+        draft_hand(tmp_path / "none.urdf")
+
+
+def test_more_pairs_of_shapes_than_can_be_tested_are_refused_in_little_memory(claw):
+    """210 links have 21,945 pairs; their frames in all postures would take a gigabyte."""
+    box = '<collision><geometry><box size="0.01 0.01 0.01"/></geometry></collision>'
+    many = "".join(
+        f'<link name="x{k}">{box}</link>'
+        f'<joint name="jx{k}" type="fixed"><parent link="base"/><child link="x{k}"/></joint>'
+        for k in range(210)
+    )
+    claw.write_text(claw.read_text().replace("</robot>", many + "</robot>"))
+    with limited(2**29), pytest.raises(HandFileError, match="pairs of shapes to test for collisions"):
+        draft_hand(claw)
+
+
+def test_links_are_tested_until_they_are_settled(claw, monkeypatch):
+    urdf = read_urdf(claw)
+    coupling = {j.name: j.mimic for j in urdf.movable if j.mimic is not None}
+    always = claw.read_text().replace("</robot>", OVERLAPPING + "</robot>")
+    claw.write_text(always)
+    crowded, tested = read_urdf(claw), []
+
+    def count(self, frames, below, real=SelfCollision.separations):
+        tested.append(len(self.pairs))
+        return real(self, frames, below)
+
+    monkeypatch.setattr(SelfCollision, "separations", count)
+    found = collision_pairs(crowded, coupling, n=3000)
+    assert tested[0] > tested[-1] + 1  # the two in one place, and links that have met and been apart
+    monkeypatch.setattr("torchgrasp.hand.collision_pairs.FIRST_LOOK", 3000)
+    assert collision_pairs(crowded, coupling, n=3000) == found  # in one look nothing is settled early
+    assert found and ("one", "two") not in found
+    monkeypatch.setattr("torchgrasp.hand.collision_pairs.FIRST_LOOK", 1000)
+    monkeypatch.setattr("torchgrasp.hand.collision_pairs.MOST_TESTS", 100)
+    with pytest.raises(HandFileError, match="separations are to be measured"):
+        collision_pairs(crowded, coupling, n=3000)
+
+
+def test_too_many_shapes_in_one_place_are_refused_before_any_is_measured(tmp_path, monkeypatch):
+    rods = [
+        f'<link name="x{k}"><collision><geometry><box size="0.1 0.004 0.004"/></geometry></collision></link>'
+        f'<joint name="jx{k}" type="revolute"><parent link="base"/><child link="x{k}"/>'
+        f'<origin rpy="0 0 {0.02 * k}"/><axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/>'
+        "</joint>"
+        for k in range(150)
+    ]
+    path = tmp_path / "rods.urdf"
+    path.write_text(f'<robot name="rods"><link name="base"/>{"".join(rods)}</robot>')
+    urdf, measured = read_urdf(path), []
+    monkeypatch.setattr(SelfCollision, "separations", lambda *arguments: measured.append(arguments))
+    with limited(2**28), pytest.raises(HandFileError, match="11175000 separations are to be measured"):
+        collision_pairs(urdf, {})
+    assert not measured
+
+
+OVERLAPPING = "".join(
+    f'<link name="{name}"><collision><geometry><sphere radius="0.001"/></geometry></collision></link>'
+    f'<joint name="to_{name}" type="fixed"><parent link="base"/><child link="{name}"/><origin xyz="1 0 0"/></joint>'
+    for name in ("one", "two")
+)
+
+
+def test_names_of_the_urdf_cannot_break_the_toml(claw):
+    text = claw.read_text().replace("left_", "le&quot;ft # \\_")
+    claw.write_text(text)
+    assert check_hand(drafted(claw)).joint_names[0] == 'le"ft # \\_swivel'
+
+
+def rests_on(shape: trimesh.Trimesh):
+    shape.apply_translation([0, 0, -shape.bounds[0, 2]])
+    return partial_view(shape, look_at(20.0, 40.0, target=shape), noise=False), shape
+
+
+@pytest.mark.parametrize("mode", ["joint", "contact_first"])
+def test_a_third_hand_goes_the_whole_way(claw, mode):
+    """From the URDF to grasps of a ball or a box, each checked again by what it says of itself."""
+    folder = drafted(claw)
+    hand = check_hand(folder)
+    done: list[int] = []
+    samples = sample_configurations(hand, 4000, seed=3, observer=done.append, sampling="grasping")
+    assert sum(done) == 4000
+    mixture = fit_mixture(samples, components=8, iterations=30)
+    mixture.save(folder / "mixture.safetensors")
+    assert float((mixture.joints(samples.q) - samples.joints).abs().mean()) < 0.35
+    spec = ContactSpec(table=0.0)
+    view, shape = rests_on(
+        trimesh.creation.icosphere(3, 0.035) if mode == "joint" else trimesh.creation.box((0.06, 0.05, 0.09))
+    )
+    found = plan_grasps(view, hand, spec, starts=50 if mode == "joint" else 300, seed=0, mode=mode)
+    good = found[found.status == Status.OK]
+    assert len(good) >= 3
+    hand.check_joints(good.joints)
+    centres = apply(good.obj_from_hand, hand.tip_centres(good.joints))
+    outward = good.contacts.normals
+    miss = (centres - hand.tips.radius[:, None] * outward - good.contacts.points).norm(dim=-1)
+    assert float(miss.max()) <= 1e-3
+    pads = rotate(good.obj_from_hand, hand.fingertips(good.joints)[1])
+    assert float((pads * outward).sum(-1).max()) < -0.4  # a pad faces the surface
+    assert bool((hand.self_clearance(good.joints) >= 0).all())
+    assert bool(certify(good.contacts, spec).closed.all())
+    surface_points = torch.from_numpy(trimesh.sample.sample_surface(shape, 4000, seed=0)[0])
+    cover = hand.collision_spheres
+    spheres = apply(good.obj_from_hand, hand.sphere_centres(good.joints))[:, ~cover.touching]
+    gap = torch.cdist(spheres, surface_points.expand(len(good), -1, 3)).amin(2) - cover.radius[~cover.touching]
+    assert float(gap.min()) > -0.012  # of the true surface, whose far side the planner did not see

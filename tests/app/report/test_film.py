@@ -1,0 +1,181 @@
+"""A ball in three fingertips that rise: where the film says that it was lost is where it was made to be lost."""
+
+import dataclasses
+import io
+import math
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from torchgrasp.app.report.closing.film import ALARM, STILL, TITLE, WIDTH, describe_film, draw_film
+from torchgrasp.app.report.closing.moments import explain_loss, find_loss, moments_of, moved_in_hand
+from torchgrasp.app.report.closing.panels import BOTTOM, HEAD, LEFT, RIGHT, TOP, Line, Panel, draw_panels
+from torchgrasp.app.report.palette import rgb
+from torchgrasp.closure import ClosingTrace
+from torchgrasp.errors import Status
+
+F64, TICKS = torch.float64, 100
+NAMES = ("index", "middle", "thumb")
+CENTRE = torch.zeros(3, dtype=F64)
+
+
+@pytest.fixture
+def closing(run):
+    """Touches at 0.2, 0.3 and 0.4 s, pressed at 0.5 s, then a rise of 0.2 m/s with the object, held to the end."""
+    rise = 0.2 * (torch.arange(TICKS, dtype=F64) / 100 - 0.5).clamp(min=0.0)
+    lifted = torch.eye(4, dtype=F64).repeat(TICKS, 1, 1)
+    lifted[:, 2, 3] = rise
+    touched = torch.arange(TICKS)[:, None] >= torch.tensor([20, 40, 30])
+    normal = torch.tensor([0.0, 0.0, 1.0], dtype=F64).expand(TICKS, 3, 3)
+    normals = torch.where(touched[..., None], normal, math.nan)
+    trace = ClosingTrace(
+        forces=torch.tensor([0.3, 0.0, -1.0], dtype=F64).expand(TICKS, 3, 3).clone(),
+        points=normals,
+        normals=normals,
+        sliding=torch.zeros(TICKS, 3, dtype=F64),
+        blend=torch.full((TICKS, 3), 0.5, dtype=F64),
+        friction=torch.full((TICKS,), math.nan, dtype=F64),
+        load=torch.full((TICKS,), math.nan, dtype=F64),
+    )
+    return dataclasses.replace(
+        run.closure,
+        time=torch.arange(TICKS, dtype=F64) / 100,
+        forces=touched.double(),
+        object_pose=lifted,
+        hand_pose=run.closure.hand_pose[:1].double() @ lifted,
+        joints=run.closure.joints[:1].expand(TICKS, -1).clone(),
+        contact_order=(0, 2, 1),
+        trace=trace,
+        phases=torch.tensor([0.1, 0.4, 0.5], dtype=F64),
+    )
+
+
+def lost(closing, status, **changes):
+    return dataclasses.replace(closing, held=False, status=status, **changes)
+
+
+def slipping(closing, begin):
+    """Leave the object behind from a tick on; the third finger slides, and lets go 20 ticks later."""
+    pose, trace = closing.object_pose.clone(), closing.trace
+    pose[begin:, 2, 3] = pose[begin, 2, 3]
+    sliding, normals = trace.sliding.clone(), trace.normals.clone()
+    sliding[begin:, 2], normals[begin + 20 :] = 0.2, math.nan
+    trace = dataclasses.replace(trace, sliding=sliding, normals=normals)
+    return lost(closing, Status.NOT_LIFTED, object_pose=pose, trace=trace)
+
+
+def test_a_held_closing_has_its_touches_and_phases_as_moments_and_no_loss(closing):
+    assert find_loss(closing, CENTRE) is None and explain_loss(closing, CENTRE, NAMES) == ""
+    names = ["open hand", "index touches first", "all touch", "pressed", "the end"]
+    moments = moments_of(closing, CENTRE, NAMES)
+    assert [moment.name for moment in moments] == names
+    assert [moment.tick for moment in moments] == [10, 20, 40, 50, 99]
+    assert all(float(part.max()) < 1e-7 for part in moved_in_hand(closing, CENTRE))
+
+
+def test_what_slides_out_is_lost_where_it_has_slipped_too_far(closing):
+    """At 0.2 m/s, 20 mm of slip take 10 ticks: the eleventh is beyond."""
+    out = slipping(closing, 60)
+    assert abs(find_loss(out, CENTRE) - 70) <= 1
+    why = explain_loss(out, CENTRE, NAMES)
+    assert "while the hand rose: thumb slid first, from 0.60 s on, under 0.3 N across at 1.0 N of normal force" in why
+    assert [m.name for m in moments_of(out, CENTRE, NAMES)][-2:] == ["lost", "the end"]
+
+
+def test_what_nobody_touches_is_lost_at_the_last_touch(closing):
+    normals = closing.trace.normals.clone()
+    normals[63:, 1], normals[66:, 0] = math.nan, math.nan
+    out = lost(closing, Status.DROPPED, trace=dataclasses.replace(closing.trace, normals=normals))
+    assert find_loss(out, CENTRE) == 66
+    assert "middle let go first, at 0.63 s" in explain_loss(out, CENTRE, NAMES)
+
+
+def test_a_finger_that_never_came_is_named(closing):
+    normals = closing.trace.normals.clone()
+    normals[:, 1:] = math.nan
+    trace = dataclasses.replace(closing.trace, normals=normals)
+    out = lost(closing, Status.NO_CONTACT, trace=trace, contact_order=(0,))
+    assert "middle and thumb never touched the object" in explain_loss(out, CENTRE, NAMES)
+
+
+def test_what_is_pushed_away_is_lost_where_it_has_gone_too_far(closing):
+    pose = torch.eye(4, dtype=F64).repeat(TICKS, 1, 1)
+    pose[:, 0, 3] = 0.01 * (torch.arange(TICKS, dtype=F64) - 40.5).clamp(min=0.0)
+    out = lost(closing, Status.EJECTED, object_pose=pose)
+    assert find_loss(out, CENTRE) == 46  # 55 mm, the first beyond 50 mm
+    assert "while the hand closed" in explain_loss(out, CENTRE, NAMES)
+
+
+def test_what_is_too_heavy_is_put_down_from_the_top(closing):
+    pose = closing.hand_pose.clone()
+    pose[80:, 2, 3] = pose[:20, 2, 3]
+    out = lost(closing, Status.TOO_HEAVY, hand_pose=pose)
+    assert find_loss(out, CENTRE) == 79
+    assert explain_loss(out, CENTRE, NAMES).startswith("Put down from 0.79 s")
+    assert Status.TOO_HEAVY.sentence in explain_loss(out, CENTRE, NAMES)
+
+
+def test_a_line_of_a_panel_is_where_its_values_are_and_broken_where_they_are_not():
+    time = np.linspace(0.0, 2.0, 201)
+    values = np.where(np.abs(time - 1.0) < 0.1, math.nan, 3.0)
+    panel = Panel("", 4.0, 200, [Line(values, "#ff0000", width=3.0)])
+    pixels = np.asarray(draw_panels([panel], time, [], 800)).astype(int)
+    rows, columns = np.nonzero((pixels[..., 0] > 200) & (pixels[..., 1] < 80))
+    top, low = HEAD + TOP, HEAD + 200 - BOTTOM
+    assert abs(rows.mean() - (low - 0.75 * (low - top))) < 1
+    scale = (800 - LEFT - RIGHT) / 2.0
+    assert abs(columns.min() - LEFT) < 3 and abs(columns.max() - (800 - RIGHT)) < 3
+    gap = np.diff(np.unique(columns)).argmax()
+    assert abs(np.unique(columns)[gap] - (LEFT + 0.9 * scale)) < 6
+    assert abs(np.diff(np.unique(columns)).max() - 0.2 * scale) < 10
+
+
+def picture(png):
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
+
+
+def near(pixels, color):
+    return np.abs(pixels - np.round(255 * np.array(rgb(color)))).max(-1) < 20
+
+
+def test_the_film_shows_the_loss_in_its_colour_and_the_object_falling_behind(run, closing):
+    held = picture(draw_film(run.mesh, run.hand, closing, (1.0, 0.0, 0.3)))
+    out = slipping(closing, 60)
+    gone = picture(draw_film(run.mesh, run.hand, out, (1.0, 0.0, 0.3)))
+    assert held.shape == gone.shape and held.shape[1] == WIDTH
+    assert not near(held[:TITLE], ALARM).any() and near(gone[:TITLE], ALARM).any()
+    assert near(gone[STILL:], ALARM).sum() > near(held[STILL:], ALARM).sum() + 300
+
+    def height(film, count, k):
+        """The middle row of the sand-coloured object in a still."""
+        tile = film[TITLE:STILL, k * WIDTH // count : (k + 1) * WIDTH // count]
+        sand = (tile[..., 0] > tile[..., 2] + 25) & (tile[..., 0] < tile[..., 1] + 45)
+        return np.nonzero(sand)[0].mean()
+
+    assert abs(height(held, 5, 4) - height(held, 5, 3)) < 2  # the film is taken from the hand
+    assert height(gone, 6, 5) > height(gone, 6, 3) + 10
+    assert "index, thumb, middle. The object was held." in describe_film(run.mesh, run.hand, closing)
+    assert "Lost at 0.7" in describe_film(run.mesh, run.hand, out)
+    again = describe_film(run.mesh, run.hand, dataclasses.replace(closing, halts=1, attempts=2))
+    assert "held. On its way the hand touched something once. The hand closed 2 times." in again
+
+
+def test_a_closing_without_the_law_has_no_panel_of_lambda(run, closing):
+    trace = dataclasses.replace(closing.trace, blend=torch.full_like(closing.trace.blend, math.nan))
+    other = dataclasses.replace(closing, trace=trace)
+    both = [picture(draw_film(run.mesh, run.hand, c, (1.0, 0.0, 0.3))) for c in (closing, other)]
+    assert both[1].shape[0] < both[0].shape[0]
+
+
+def test_trials_that_ended_at_once_or_diverged_have_a_film(run, closing):
+    first = {name: getattr(closing, name)[:1] for name in ("time", "forces", "object_pose", "hand_pose", "joints")}
+    trace = ClosingTrace(*(getattr(closing.trace, f.name)[:1] for f in dataclasses.fields(ClosingTrace)))
+    none = torch.full((3,), math.nan, dtype=F64)
+    stuck = lost(closing, Status.START_OVERLAP, **first, trace=trace, phases=none, contact_order=())
+    joints = closing.joints.clone()
+    joints[-1] = math.nan
+    for closure in (stuck, lost(closing, Status.UNSTABLE, joints=joints)):
+        assert draw_film(run.mesh, run.hand, closure, (1.0, 0.0, 0.3))
+        assert closure.status.sentence in describe_film(run.mesh, run.hand, closure)

@@ -1,0 +1,103 @@
+import base64
+import dataclasses
+import re
+from html.parser import HTMLParser
+
+import pytest
+
+from torchgrasp.app.report.page import format_page, grasp_rows, write_report
+from torchgrasp.app.report.run import closing_sentence, refusal, verdict
+from torchgrasp.errors import OutputError, Status
+from torchgrasp.planner import Explanation, Funnel, Losses, Trial
+from torchgrasp.specs import ContactSpec
+
+PNG = base64.b64decode("iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAQAAAC1HAwCAAAAC0lEQVR42mNkYAAAAAYAAjCB0C8AAAAASUVORK5CYII=")
+
+
+class Reader(HTMLParser):
+    """Collects tags with their attributes, and the text between them."""
+
+    def __init__(self):
+        super().__init__()
+        self.tags, self.words = [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+
+def read(page):
+    reader = Reader()
+    reader.feed(page)
+    return reader.tags, " ".join(reader.words)
+
+
+def test_page_is_self_contained_and_escapes_every_text(run):
+    tags, words = read(format_page(run, {"Some <i>pictures</i>": [("a 'caption' <b>", PNG)]}))
+    names = {tag for tag, _ in tags}
+    assert not names & {"script", "link", "iframe", "b", "i", "odd"}
+    sources = [value for _, attrs in tags for key, value in attrs.items() if key in ("src", "href")]
+    assert sources and all(s.startswith("data:image/png;base64,") for s in sources)
+    assert base64.b64decode(sources[0].split(",")[1]) == PNG
+    for text in ("<odd> & 'quoted'.ply", "a <b>bold</b> claim", "<script>alert(1)</script>", "a 'caption' <b>"):
+        assert text in words
+
+
+def test_page_shows_stages_grasps_statuses_seed_and_units(run):
+    _, words = read(format_page(run, {}))
+    for text in ("321 points", "1.2", "1.4", Status.TIP_ERROR.sentence, "tip_error", "seed", "7", "metre, radian"):
+        assert text in words
+    assert verdict(run) in words
+
+
+def test_report_is_written_whole_with_pictures(run, tmp_path):
+    path = write_report(tmp_path / "deep" / "report.html", run)
+    page = path.read_text(encoding="utf-8")
+    assert page.startswith("<!doctype html>") and page.endswith("</html>\n")
+    assert len(re.findall("data:image/png", page)) == 7
+    assert [p.name for p in path.parent.iterdir()] == ["report.html"]
+
+
+def test_report_into_a_file_as_folder_is_refused(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("torchgrasp.app.report.page.draw_pictures", lambda run: {})
+    (tmp_path / "taken").write_text("x")
+    with pytest.raises(OutputError):
+        write_report(tmp_path / "taken" / "report.html", run)
+
+
+def test_grasp_rows_are_in_millimetres_and_degrees(run):
+    (row,) = grasp_rows(run.executable)
+    assert row == ("1", "73%", "1.00", "4.0", "0", "0.0200", "1.0")
+
+
+def test_verdicts(run):
+    assert verdict(run) == "The allegro hand held the ball: lifted 0.10 m, moved 3 mm and 2 deg in the hand."
+    dropped = dataclasses.replace(run.closure, held=False, status=Status.DROPPED)
+    sentence = closing_sentence(dataclasses.replace(run, closure=dropped))
+    assert sentence.endswith(f"did not hold the ball: {Status.DROPPED.sentence}.")
+    planned = dataclasses.replace(run, closure=None)
+    assert verdict(planned) == "The allegro hand has 1 executable grasp of the ball."
+    none = dataclasses.replace(planned, grasps=run.grasps[1])
+    assert f"1 of 1 postures: {Status.TIP_ERROR.sentence}" in verdict(none)
+    unplanned = dataclasses.replace(none, grasps=run.grasps[:0])
+    assert f"2 of 2 starts: {Status.NOT_CLOSED.sentence}" in refusal(unplanned)
+    top = float(run.surface.vertices[:, 2].max())
+    flat, high = (dataclasses.replace(unplanned, spec=ContactSpec(table=top - h)) for h in (0.0101, 0.016))
+    assert refusal(flat).endswith("it is 10 mm high, and this hand needs 15 mm.") and "high" not in refusal(high)
+    assert Status.OUT_OF_REACH.sentence in refusal(dataclasses.replace(unplanned, plan=None))
+    _, words = read(format_page(none, {}))
+    assert "Best grasps" not in words
+
+
+def test_a_run_without_a_grasp_tells_what_would_help(run):
+    lost = Losses("contacts", "starts", 9, {Status.NOT_FLAT: 6, Status.TOO_CLOSE: 3})
+    trial = Trial("with <wider> limits", True, 4, 0.15, Funnel((dataclasses.replace(lost, lost={}),)))
+    explanation = Explanation(9, Funnel((lost,)), (trial,))
+    none = dataclasses.replace(run, closure=None, mesh=None, grasps=run.grasps[1], explanation=explanation)
+    assert verdict(none) == f"{refusal(none)} {explanation.advice}" and str(trial) in verdict(none)
+    tags, words = read(format_page(none, {}))
+    assert "wider" not in {tag for tag, _ in tags}
+    for text in ("0 of 9 starts", "6 not_flat, 3 too_close", "with <wider> limits", "15%"):
+        assert text in words

@@ -1,0 +1,165 @@
+import base64
+import dataclasses
+import hashlib
+import json
+import re
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from torchgrasp.app.report.page import format_page
+from torchgrasp.app.report.rounded import EDGE, round_shape
+from torchgrasp.app.report.solids import solids_from_hand, solids_of_links
+from torchgrasp.app.report.turning import VIEW, write_viewer
+from torchgrasp.app.report.turning.buffers import thin_mesh, unpack
+from torchgrasp.app.report.turning.contents import MOST_FACES, MOST_GRASPS, MOST_TICKS, POSTURES, describe
+from torchgrasp.app.report.turning.document import format_viewer, three
+from torchgrasp.errors import OutputError, Status
+from torchgrasp.hand.urdf import Shape
+from torchgrasp.ik.motion import APPROACH_DISTANCE
+
+
+def data_of(page):
+    (text,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
+    return json.loads(text)
+
+
+def posed(pieces, poses):
+    """The points of all pieces of a hand at the poses of its links, worked out as the page does."""
+    parts = [unpack(p["points"]) @ poses[p["link"], :3, :3].T + poses[p["link"], :3, 3] for p in pieces]
+    return np.concatenate(parts)
+
+
+def test_buffers_hold_the_surface_the_cloud_and_the_contacts_of_the_run(run):
+    seen, upright = data_of(format_viewer(run)), run.upright()
+    for name, expected in (
+        ("points", upright.surface.vertices),
+        ("normals", upright.surface.normals),
+        ("std", upright.surface.std_m),
+        ("faces", upright.surface.faces),
+    ):
+        np.testing.assert_allclose(unpack(seen["surface"][name]), expected, atol=1e-7)
+    np.testing.assert_allclose(unpack(seen["cloud"]), upright.cloud.points, atol=1e-7)
+    best = upright.executable
+    np.testing.assert_allclose(unpack(seen["grasps"]["points"]), best.contacts.points, atol=1e-7)
+    np.testing.assert_allclose(unpack(seen["grasps"]["normals"]), best.contacts.normals, atol=1e-7)
+    assert seen["grasps"]["rows"] == [["1", "73%", "0.0200", "4.0", "1.0"]]
+    colors, std = unpack(seen["surface"]["colors"]), unpack(seen["surface"]["std"])
+    darkest, brightest = colors[std.argmin()].astype(int), colors[std.argmax()].astype(int)
+    assert brightest.sum() > darkest.sum() + 100 and seen["surface"]["ramp"][-1] == brightest.tolist()
+
+
+def test_the_hand_stands_where_the_stills_draw_it_and_approaches_along_its_path(run):
+    upright, seen = run.upright(), describe(run)
+    poses, best = unpack(seen["grasps"]["links"]).astype(float)[0], upright.executable
+    joints = run.hand.expand_joints(best.joints[0].double())
+    solids = solids_from_hand(run.hand, joints, run.hand.tree.joint_names, best.obj_from_hand[0])
+    expected = np.concatenate([s.vertices for s in solids])
+    np.testing.assert_allclose(posed(seen["hand"], poses[POSTURES.index("grasp")]), expected, atol=1e-6)
+    approach, pregrasp = (posed(seen["hand"], poses[POSTURES.index(name)]) for name in ("approach", "pre-grasp"))
+    step = APPROACH_DISTANCE * best.approach[0].numpy()
+    np.testing.assert_allclose(pregrasp - approach, np.broadcast_to(step, approach.shape), atol=1e-6)
+    squeezed = posed(seen["hand"], poses[POSTURES.index("squeeze")])
+    assert 1e-4 < np.abs(squeezed - expected).max() < 0.1
+
+
+def test_the_replay_moves_the_true_object_as_the_closure_did(run):
+    replay, closure = describe(run)["replay"], run.upright().closure
+    ticks = unpack(replay["ticks"]).tolist()
+    np.testing.assert_allclose(unpack(replay["object"]), closure.object_pose[ticks], atol=1e-7)
+    np.testing.assert_allclose(unpack(replay["forces"]), closure.forces, atol=1e-6)
+    first, last = (posed(describe(run)["hand"], unpack(replay["links"])[k].astype(float)) for k in (0, -1))
+    np.testing.assert_allclose(last - first, np.broadcast_to([0.0, 0.0, 0.1], first.shape), atol=1e-6)
+
+
+def test_a_long_run_is_thinned_to_what_a_page_holds(run):
+    ticks = 1000
+    rows = torch.arange(ticks) % len(run.closure.time)
+    long = {name: getattr(run.closure, name)[rows] for name in ("forces", "object_pose", "hand_pose", "joints")}
+    closure = dataclasses.replace(run.closure, time=torch.arange(ticks).double(), **long)
+    many = run.grasps[torch.zeros(50, dtype=torch.int64)]
+    fine = trimesh.creation.icosphere(subdivisions=6, radius=0.03)
+    page = format_viewer(dataclasses.replace(run, closure=closure, grasps=many, mesh=fine))
+    seen = data_of(page)
+    assert seen["replay"]["ticks"]["shape"] == [MOST_TICKS] and unpack(seen["replay"]["ticks"])[-1] == ticks - 1
+    assert seen["replay"]["forces"]["shape"] == [ticks, 3] and len(seen["grasps"]["rows"]) == MOST_GRASPS
+    assert seen["replay"]["faces"]["shape"][0] <= MOST_FACES < len(fine.faces)
+    assert len(page) < 8 * 2**20
+
+
+def test_thinned_meshes_keep_their_shape():
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=1.0)
+    kept, faces = thin_mesh(ball.vertices, ball.faces, 2000)
+    thinned = trimesh.Trimesh(ball.vertices[kept], faces, process=False)
+    assert 500 < len(faces) <= 2000
+    assert thinned.area == pytest.approx(4 * np.pi, rel=0.1)
+    assert abs(thinned.volume) == pytest.approx(4 / 3 * np.pi, rel=0.1)
+    same, untouched = thin_mesh(ball.vertices, ball.faces, len(ball.faces))
+    assert np.array_equal(untouched, ball.faces) and len(same) == len(ball.vertices)
+
+
+def test_the_page_loads_nothing_and_runs_its_own_scripts_alone(run):
+    odd = dataclasses.replace(run, object_name="</script><b>jug</b><!--")
+    page = format_viewer(odd)
+    rest = page.replace(three(), "")
+    assert not re.findall(r"https?://|\bimport\(|@import|<b>jug", rest)
+    assert re.findall(r'(?:src|href)="([^"]*)"', rest) == ["data:,"]
+    (policy,) = re.findall(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)
+    assert policy.startswith("default-src 'none';") and "unsafe-eval" not in policy and "connect-src" not in policy
+    scripts = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
+    for script in scripts:
+        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+        assert f"'sha256-{digest}'" in policy
+    assert len(scripts) == 2 and "\r" not in page
+    assert data_of(page)["title"] == "Grasps of the </script><b>jug</b><!-- with the allegro hand"
+
+
+def test_a_run_without_grasps_or_closure_has_a_page(run):
+    failed = dataclasses.replace(run.grasps, status=torch.full((2,), int(Status.TIP_ERROR)))
+    seen = describe(dataclasses.replace(run, grasps=failed, closure=None, mesh=None))
+    assert seen["replay"] is None and seen["grasps"]["rows"] == [] and not seen["good"]
+
+
+def test_the_report_links_to_the_page_only_where_there_is_one(run):
+    assert f'href="{VIEW}"' in format_page(run, {}, VIEW) and VIEW not in format_page(run, {})
+
+
+def test_a_page_into_a_file_as_folder_is_refused(run, tmp_path):
+    (tmp_path / "taken").write_text("x")
+    with pytest.raises(OutputError):
+        write_viewer(tmp_path / "taken" / VIEW, run)
+
+
+@pytest.mark.parametrize(
+    ("kind", "size"), [("box", (0.02, 0.05, 0.1)), ("cylinder", (0.01, 0.04)), ("sphere", (0.012,))]
+)
+def test_rounded_shapes_fill_their_shape_but_for_the_edges(kind, size):
+    place = {"xyz": (0.1, -0.2, 0.3), "rpy": (0.4, 0.5, 0.6)}
+    solid = round_shape(Shape(kind, size, **place))
+    sharp = {
+        "box": lambda: trimesh.creation.box(size),
+        "cylinder": lambda: trimesh.creation.cylinder(*size, sections=40),
+        "sphere": lambda: trimesh.creation.icosphere(4, *size),
+    }[kind]()
+    matrix = trimesh.transformations.euler_matrix(*place["rpy"], axes="sxyz")
+    matrix[:3, 3] = place["xyz"]
+    local = (solid.vertices - matrix[:3, 3]) @ matrix[:3, :3]
+    mesh = trimesh.Trimesh(local, solid.faces, process=False)
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    assert 0.85 * sharp.volume < mesh.volume <= sharp.volume * 1.01
+    np.testing.assert_allclose(np.ptp(local, axis=0), sharp.extents, atol=1e-3 * EDGE)
+    np.testing.assert_allclose(np.linalg.norm(solid.normals, axis=1), 1.0, atol=1e-12)
+    faces = mesh.face_normals
+    inner = solid.normals[solid.faces] @ matrix[:3, :3]
+    assert (np.einsum("fci,fi->fc", inner, faces) > 0.8).all()
+
+
+def test_solids_of_links_are_those_of_the_hand_at_rest(run):
+    hand = run.hand
+    poses = hand.tree.poses(torch.zeros(1, len(hand.tree.joint_names), dtype=torch.float64))[0].numpy()
+    solids = solids_from_hand(hand, torch.zeros(len(hand.tree.joint_names)), hand.tree.joint_names, torch.eye(4))
+    for here, there in zip(solids_of_links(hand), solids, strict=True):
+        pose = poses[here.link]
+        np.testing.assert_allclose(here.vertices @ pose[:3, :3].T + pose[:3, 3], there.vertices, atol=1e-12)

@@ -1,0 +1,372 @@
+"""The commands for clouds, and what `grasp` and `cloud check` say of clouds as users bring them."""
+
+import functools
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from torchgrasp import cli
+from torchgrasp.app.cli import grasps
+from torchgrasp.app.cli.common import ViewOptions, table_plane
+from torchgrasp.cloud import look_at, partial_view, read_cloud, save_cloud
+from torchgrasp.cloud.camera import INTRINSICS
+from torchgrasp.cloud.filter import remove_outliers
+from torchgrasp.data.shipped import DATA, load_object, load_scene
+from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.plane import Plane, as_plane
+from torchgrasp.scene import read_scene
+from torchgrasp.shape.fit import fit_shape
+from torchgrasp.values import PointCloud
+
+VIEW = DATA / "jug" / "view.ply"
+POSE = look_at(30.0, 40.0, 0.6, torch.tensor([0.0, 0.0, 0.07], dtype=torch.float64))
+DOWN = [1, 0, 0], [0, -1, 0], [0, 0, -1]
+
+
+@functools.cache
+def jug():
+    return partial_view(load_object("jug").mesh, POSE, 1000)
+
+
+def turned(cloud, *rows):
+    """Return a cloud in a frame whose axes are the rows."""
+    assert cloud.viewpoint is not None
+    axes = torch.tensor(rows, dtype=torch.float64)
+    return PointCloud(cloud.points @ axes.T, None, cloud.viewpoint @ axes.T)
+
+
+def stack(*meshes):
+    """Return vertices and faces of several meshes."""
+    starts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
+    faces = [m.faces + k for m, k in zip(meshes, starts[:-1], strict=True)]
+    return np.concatenate([m.vertices for m in meshes]), np.concatenate(faces)
+
+
+def with_table(side=0.24):
+    """Return a view of the jug and of a patch of the table around it."""
+    mesh = load_object("jug").mesh
+    box = trimesh.creation.box((side, side, 0.01))
+    box.apply_translation((0, 0, -0.005))
+    return partial_view(trimesh.Trimesh(*stack(mesh, box)), POSE, 4000)
+
+
+def in_camera(cloud, pose=POSE):
+    """Return a cloud in the frame of its camera."""
+    return PointCloud((cloud.points - pose[:3, 3]) @ pose[:3, :3], None, torch.zeros(3, dtype=torch.float64))
+
+
+def mirrored():
+    """Return the jug with a camera on the other side, as far below it as the true one is above."""
+    centre = (jug().points.amax(0) + jug().points.amin(0)) / 2
+    return PointCloud(jug().points, None, 2 * centre - POSE[:3, 3])
+
+
+def unknown(cloud):
+    return PointCloud(cloud.points)
+
+
+def pcd(cloud):
+    """Write what drivers write: rows with NaN and the default viewpoint."""
+    rows = np.concatenate([cloud.points.numpy(), np.full((7, 3), np.nan)])
+    head = f"FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nWIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nDATA binary\n"
+    return head.encode() + rows.tobytes()
+
+
+def write(path, value):
+    if isinstance(value, PointCloud):
+        save_cloud(value, path)
+    elif isinstance(value, bytes):
+        path.write_bytes(value)
+    else:
+        np.save(path, value)
+    return path
+
+
+def moved(x):
+    return jug().points + torch.tensor([x, 0.0, 0.0], dtype=torch.float64)
+
+
+def seen_from(*eye):
+    return PointCloud(moved(0.5), None, torch.tensor(eye, dtype=torch.float64))
+
+
+def neighbours():
+    other = jug().points + torch.tensor([0.1, 0.18, 0.0], dtype=torch.float64)
+    return PointCloud(torch.cat([jug().points, other]), None, jug().viewpoint)
+
+
+def towards_inside():
+    away = jug().points - POSE[:3, 3]
+    return PointCloud(jug().points, away / away.norm(dim=1, keepdim=True), jug().viewpoint)
+
+
+REFUSED = {  # file, cloud, words of what was found, words of what mends it
+    "camera frame": ("a.npz", lambda: in_camera(jug()), "camera's frame", "--up 0 -1 0"),
+    "camera frame, camera not given": ("a.npz", lambda: unknown(in_camera(jug())), "camera's frame", "--camera-pose"),
+    "camera frame of a default PCD": ("a.pcd", lambda: pcd(in_camera(jug())), "camera's frame", "--up"),
+    "camera frame with a table": ("a.npz", lambda: in_camera(with_table()), "camera's frame", "normal of the plane"),
+    "upside down": ("a.npz", lambda: turned(jug(), *DOWN), "m below", "--up 0 0 -1"),
+    "camera below": ("a.npz", mirrored, "m below", "--viewpoint"),
+    "camera in the robot's base": ("a.npz", lambda: seen_from(0.0, 0.0, 0.1), "points contradict", "--no-viewpoint"),
+    "camera in the cloud": ("a.npz", lambda: seen_from(0.5, 0.0, 0.07), "points contradict", "--viewpoint"),
+    "normals away": ("a.npz", towards_inside, "point away", "--no-normals"),
+    "table": ("a.npz", with_table, "a table left in", "torchgrasp cloud cut"),
+    "table, no camera": ("a.npz", lambda: unknown(with_table()), "a table left in", "torchgrasp cloud cut"),
+    "two bodies": ("a.npz", neighbours, "two bodies", "cloud cut CLOUD --point"),
+    "millimetres": ("a.npy", lambda: 1000 * jug().points.numpy(), "extent of", "--unit mm"),
+    "centimetres": ("a.npy", lambda: 100 * jug().points.numpy(), "extent of", "--unit cm"),
+    "whole scene": ("a.npy", lambda: 20 * jug().points.numpy(), "extent of", "torchgrasp cloud cut"),
+}
+
+
+@pytest.fixture
+def planned(monkeypatch):
+    """Note what is planned with, and end there."""
+    seen = []
+
+    def note(cloud, hand, spec, *args, **kwargs):
+        seen.append((cloud, spec))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(grasps, "plan_grasps", note)
+    return seen
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_contradicts_itself_is_named_with_what_mends_it_and_refused(name, tmp_path, capsys, planned):
+    file, make, found, mend = REFUSED[name]
+    path = str(write(tmp_path / file, make()))
+    assert cli.main(["grasp", path, "--hand", "barrett", "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and not planned and not (tmp_path / "out").exists()
+    assert said.err.startswith("torchgrasp: CLOUD: found ") and said.err.count("\n") == 1
+    assert found in said.err.split(", allowed is ")[0] and mend in said.err.split(", allowed is ")[1]
+    unit = "extent" in found
+    assert cli.main(["cloud", "check", path]) == (2 if unit else 1)
+    checked = capsys.readouterr()
+    line = checked.err if unit else next(s for s in checked.out.splitlines() if s.startswith("refused"))
+    assert found in line and mend in line
+
+
+SAID = {  # file, cloud, options, words of note or advice
+    "as it is": ("a.npz", jug, [], ""),
+    "no camera": ("a.npz", lambda: unknown(jug()), [], "--viewpoint X Y Z"),
+    "a default PCD": ("a.pcd", lambda: pcd(unknown(PointCloud(moved(0.5)))), [], "the default viewpoint (0, 0, 0)"),
+    "NaN rows": ("a.pcd", lambda: pcd(jug()), [], "7 of 1007 rows with NaN"),
+    "colours": ("a.npy", lambda: np.tile(jug().points.numpy(), 2), [], "colours?"),
+    "upright by --up": (
+        "a.npz",
+        lambda: turned(jug(), [1, 0, 0], [0, -1, 0], [0, 0, -1]),
+        ["--up", "0", "0", "-3"],
+        "",
+    ),
+    "no table": ("a.npz", mirrored, ["--no-table"], ""),
+    "a part of many points": ("a.npy", lambda: np.repeat(jug().points.numpy(), 101, 0), [], "100000 of 101000 points"),
+}
+
+
+@pytest.mark.parametrize("name", SAID)
+def test_what_is_left_out_or_unsure_is_said_and_planned_with(name, tmp_path, capsys, planned):
+    file, make, options, words = SAID[name]
+    path = str(write(tmp_path / file, make()))
+    code = cli.main(["grasp", path, "--hand", "barrett", "--out", str(tmp_path / "out"), *options])
+    said = capsys.readouterr()
+    assert (code, said.err) == (130, "torchgrasp: interrupted\n") and len(planned) == 1
+    lines = [s for s in said.out.splitlines() if s.startswith(("note", "advice"))]
+    assert any(words in s for s in lines) if words else lines == []
+
+
+def test_a_surface_from_all_sides_is_refused_by_the_check_as_by_the_fit(tmp_path, capsys):
+    points, _ = trimesh.sample.sample_surface(load_object("jug").mesh, 1500, seed=0)
+    np.save(tmp_path / "merged.npy", np.asarray(points))
+    assert cli.main(["cloud", "check", str(tmp_path / "merged.npy")]) == 1
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("refused")]
+    assert "which no camera sees at once: a single view, the viewpoint of each point, or outward normals" in line
+    with pytest.raises(BadArgument, match="which no camera sees at once"):
+        fit_shape(read_cloud(tmp_path / "merged.npy"))
+
+
+def test_shipped_views_are_never_refused(capsys):
+    for name in ("cylinder", "jug"):
+        assert cli.main(["cloud", "check", str(DATA / name / "view.ply")]) == 0
+
+
+def test_the_camera_pose_moves_a_cloud_out_of_its_camera_s_frame(tmp_path, planned, capsys):
+    write(tmp_path / "a.npz", unknown(in_camera(jug())))
+    for file in ("pose.txt", "pose.npy"):
+        (np.savetxt if file.endswith("txt") else np.save)(tmp_path / file, POSE.numpy())
+        options = ["--camera-pose", str(tmp_path / file)]
+        cli.main(["grasp", str(tmp_path / "a.npz"), "--hand", "barrett", "--out", str(tmp_path / "out"), *options])
+        torch.testing.assert_close(planned[-1][0].points, jug().points)
+        torch.testing.assert_close(planned[-1][0].viewpoint, POSE[:3, 3])
+    assert cli.main(["cloud", "check", str(VIEW), *options]) == 2  # it is not in its camera's frame
+    assert "out of a camera's sight" in capsys.readouterr().err
+
+
+def test_the_vertical_and_the_table_become_a_plane(tmp_path, planned):
+    write(tmp_path / "a.npz", turned(jug(), [1, 0, 0], [0, 0, 1], [0, -1, 0]))  # y up
+    up, lowest = ["--up", "0", "2", "0"], float(remove_outliers(jug()).points[:, 2].min())
+    for options, height in (
+        (up, lowest),
+        ([*up, "--table", "-0.01"], -0.01),
+        (["--table", "0", "2", "0", "-0.02"], -0.01),
+    ):
+        cli.main(["grasp", str(tmp_path / "a.npz"), "--hand", "barrett", "--out", str(tmp_path / "out"), *options])
+        table = planned[-1][1].table
+        assert isinstance(table, Plane) and table.normal.tolist() == [0, 1, 0]
+        assert table.offset == pytest.approx(height, abs=1e-12)
+
+
+BAD = {
+    "up of zero": (["--up", "0", "0", "0"], "--up"),
+    "table of two numbers": (["--table", "0", "1"], "--table"),
+    "table without a normal": (["--table", "0", "0", "0", "1"], "--table"),
+    "NaN table": (["--table", "nan"], "--table"),
+    "two viewpoints": (["--viewpoint", "0", "0", "1", "--no-viewpoint"], "--viewpoint"),
+    "no pose": (["--camera-pose", "none.npy"], "--camera-pose"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_options_are_refused_in_one_sentence(name, capsys):
+    options, words = BAD[name]
+    assert cli.main(["cloud", "check", str(VIEW), *options]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.startswith(f"torchgrasp: {words}: found ") and said.err.count("\n") == 1
+
+
+def test_cut_leaves_the_thing_at_the_point_without_the_table(tmp_path, capsys):
+    mesh, box = load_object("jug").mesh, trimesh.creation.box((0.5, 0.4, 0.01))
+    box.apply_translation((0.1, 0, -0.005))
+    ball = trimesh.creation.icosphere(radius=0.03)
+    ball.apply_translation((0.2, 0.05, 0.03))
+    scene = partial_view(trimesh.Trimesh(*stack(mesh, box, ball)), POSE, 20000)
+    for name, cloud in (("z", scene), ("y", turned(scene, [1, 0, 0], [0, 0, 1], [0, -1, 0]))):
+        path, up = str(write(tmp_path / f"{name}.npz", cloud)), ["--up", "0", "1", "0"] * (name == "y")
+        at = ["0.2", "0.05", "0.03"] if name == "z" else ["0.2", "0.03", "-0.05"]
+        for options, wanted in (([], "jug"), (["--point", *at], "ball")):
+            assert cli.main(["cloud", "cut", path, "--out", str(tmp_path / "b.npz"), *up, *options]) == 0
+            thing = read_cloud(tmp_path / "b.npz").points
+            points = (
+                thing
+                if name == "z"
+                else turned(PointCloud(thing, None, thing[0]), [1, 0, 0], [0, 0, -1], [0, 1, 0]).points
+            )
+            of_ball = (points - torch.tensor([0.2, 0.05, 0.03]).double()).norm(dim=1) < 0.04
+            assert float((of_ball == (wanted == "ball")).double().mean()) > 0.99
+            assert len(thing) > 300 and float(points[:, 2].min()) < 0.03
+            assert cli.main(["cloud", "check", str(tmp_path / "b.npz"), *up]) == 0
+    assert "--table -0.0" in capsys.readouterr().out
+    assert cli.main(["cloud", "cut", path, "--out", str(tmp_path / "c.npz"), "--box", *"778899"]) == 2
+    assert "0 points in the box" in capsys.readouterr().err and not (tmp_path / "c.npz").exists()
+
+
+def test_scene_is_that_of_the_depth_image(tmp_path, capsys):
+    image = load_scene().image
+    np.save(tmp_path / "depth.npy", image.depth.numpy())
+    np.savetxt(tmp_path / "pose.txt", image.obj_from_camera.numpy())
+    k = image.intrinsics
+    numbers = [str(float(x)) for x in (k[0, 0], k[1, 1], k[0, 2], k[1, 2])]
+    words = ["cloud", "scene", str(tmp_path / "depth.npy"), "--intrinsics", *numbers, "--out", str(tmp_path / "s.npz")]
+    assert cli.main([*words, "--camera-pose", str(tmp_path / "pose.txt")]) == 0
+    found, said = read_scene(tmp_path / "s.npz"), capsys.readouterr().out
+    assert len(found.things) == len(load_scene().things) == said.count("thing ") and found.target is None
+    assert found.table is not None and abs(found.table.offset) < 0.002  # the shipped scene stands at z = 0
+    np.save(tmp_path / "mask.npy", load_scene().image.depth.numpy() < 0)
+    assert cli.main([*words, "--mask", str(tmp_path / "mask.npy")]) == 2
+    assert "--mask" in capsys.readouterr().err
+
+
+def test_thin_leaves_one_point_a_voxel_and_no_outliers(tmp_path, capsys):
+    rng = np.random.default_rng(0).normal(size=(60000, 3))
+    points = np.concatenate([0.04 * rng / np.linalg.norm(rng, axis=1, keepdims=True), [[0.3, 0, 0]]])
+    path = str(write(tmp_path / "a.npy", points))
+    assert cli.main(["cloud", "thin", path, "--voxel", "0.004", "--out", str(tmp_path / "b.ply")]) == 0
+    thin = read_cloud(tmp_path / "b.ply").points
+    assert 1000 < len(thin) < 4000 and float(thin.norm(dim=1).max()) < 0.041
+    assert "1 outliers removed" in capsys.readouterr().out
+
+
+def depth_image():
+    """Return the depth [m] of a plane 0.5 m away with a square of pixels 0.4 m away, and the square's mask."""
+    depth, mask = np.full((480, 640), 0.5), np.zeros((480, 640), dtype=np.uint8)
+    mask[200:280, 300:380] = 255
+    depth[mask > 0] = 0.4
+    depth[::50] = np.nan
+    return depth, mask
+
+
+K = ["--intrinsics", *(str(float(INTRINSICS[i, j])) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))]
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".png"])
+def test_depth_makes_a_cloud_of_the_mask(suffix, tmp_path, capsys):
+    depth, mask = depth_image()
+    mm = np.nan_to_num(1000 * depth).astype(np.uint16)
+    path = tmp_path / f"d{suffix}"
+    if suffix == ".npy":
+        np.save(path, depth.astype(np.float32))
+    elif suffix == ".npz":
+        np.savez(path, depth=mm)
+    else:
+        Image.fromarray(mm).save(path)
+    Image.fromarray(mask).save(tmp_path / "m.png")
+    np.savetxt(tmp_path / "pose.txt", POSE.numpy())
+    options = [*K, "--mask", str(tmp_path / "m.png"), "--out", str(tmp_path / "c.npz")]
+    assert cli.main(["cloud", "depth", str(path), *options]) == 0
+    still = read_cloud(tmp_path / "c.npz")
+    assert len(still) == 78 * 80 and bool((still.points[:, 2] - 0.4).abs().max() < 1e-6)
+    assert cli.main(["cloud", "depth", str(path), *options, "--camera-pose", str(tmp_path / "pose.txt")]) == 0
+    moved = read_cloud(tmp_path / "c.npz")
+    torch.testing.assert_close(moved.points, still.points @ POSE[:3, :3].T + POSE[:3, 3])
+    torch.testing.assert_close(moved.viewpoint, POSE[:3, 3])
+
+
+BAD_DEPTH = {  # depth, mask, options, words
+    "mask of another size": (lambda d, m: d, lambda d, m: m[::2], [], ["--mask", "(480, 640)"]),
+    "empty mask": (lambda d, m: d, lambda d, m: 0 * m, [], ["--mask", "no pixel"]),
+    "intrinsics of another resolution": (lambda d, m: d[:240, :320], None, [], ["--intrinsics", "same resolution"]),
+    "millimetres as floats": (lambda d, m: 1000 * d, None, [], ["DEPTH", "mm"]),
+    "negative": (lambda d, m: -d, None, [], ["DEPTH", "depths >= 0"]),
+    "nothing measured": (lambda d, m: 0 * m.astype(np.uint16), None, [], ["DEPTH", "0 measured pixels"]),
+    "a picture": (lambda d, m: np.stack([d, d, d], -1), None, [], ["DEPTH", "uint16"]),
+    "not a file": (None, None, [], ["DEPTH", "no file"]),
+    "no pose": (lambda d, m: d, None, ["--camera-pose", "none.txt"], ["--camera-pose", "no file"]),
+    "other output": (lambda d, m: d, None, ["--out", "c.pcd"], ["--out", ".npz or .ply"]),
+}
+
+
+@pytest.mark.parametrize("name", BAD_DEPTH)
+def test_bad_depth_is_refused_in_one_sentence(name, tmp_path, capsys):
+    depth, mask, options, words = BAD_DEPTH[name]
+    if depth is not None:
+        np.save(tmp_path / "d.npy", depth(*depth_image()))
+    if mask is not None:
+        np.save(tmp_path / "m.npy", mask(*depth_image()))
+        options = [*options, "--mask", str(tmp_path / "m.npy")]
+    options = options if "--out" in options else [*options, "--out", str(tmp_path / "c.npz")]
+    assert cli.main(["cloud", "depth", str(tmp_path / "d.npy"), *K, *options]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.startswith(f"torchgrasp: {words[0]}: found ") and said.err.count("\n") == 1
+    assert words[1] in said.err and not (tmp_path / "c.npz").exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\n", b"\x93NUMPY", b"x" * 99])
+@pytest.mark.parametrize("suffix", [".png", ".npy", ".npz"])
+def test_malformed_depth_files_are_refused_by_name(suffix, content, tmp_path, capsys):
+    (tmp_path / f"d{suffix}").write_bytes(content)
+    assert cli.main(["cloud", "depth", str(tmp_path / f"d{suffix}"), *K, "--out", str(tmp_path / "c.npz")]) == 2
+    assert capsys.readouterr().err.startswith("torchgrasp: DEPTH: found ")
+
+
+@pytest.mark.parametrize("up", [None, (0.0, 0.0, 1.0)])
+def test_a_flying_pixel_below_the_table_is_not_where_the_table_is(up):
+    seen = load_object("cylinder").view
+    flying = PointCloud(torch.cat([seen.points, torch.tensor([[0.0, 0.05, -0.03]])]), viewpoint=seen.viewpoint)
+    view = ViewOptions(up=up)
+    found = [as_plane(table_plane(cloud, view, None, False)) for cloud in (seen, flying)]
+    assert found[0].offset == found[1].offset and abs(found[0].offset) < 0.01
+    assert as_plane(table_plane(flying, view, (-0.03,), False)).offset == -0.03

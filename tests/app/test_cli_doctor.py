@@ -1,0 +1,85 @@
+"""What an installation is told of itself, whole or not, and the golden set."""
+
+import importlib.metadata
+import importlib.util
+
+import pytest
+
+from torchgrasp import cli
+from torchgrasp.data.shipped import load_object, load_shipped_grasp
+from torchgrasp.evaluation import golden
+
+
+def without(monkeypatch, *names):
+    """Hide packages from the import system."""
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name in names else find(name, *more))
+
+
+def test_the_doctor_names_what_is_there(capsys):
+    code, told = cli.main(["doctor"]), capsys.readouterr().out
+    for name in ("torch", "numpy", "scipy", "safetensors"):
+        assert importlib.metadata.version(name) in told
+    assert "allegro" in told and "GPU" in told and code in (0, 1)
+    assert (code == 0) == ("missing" not in told and "cannot be loaded" not in told)
+
+
+def test_what_one_command_needs_is_told_and_is_no_fault(monkeypatch, capsys):
+    code, version = cli.main(["doctor"]), importlib.metadata.version
+    capsys.readouterr()
+
+    def without_viser(name):
+        if name == "viser":
+            raise importlib.metadata.PackageNotFoundError(name)
+        return version(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", without_viser)
+    assert cli.main(["doctor"]) == code
+    assert "`torchgrasp view` needs it: pip install 'torchgrasp[view]'" in capsys.readouterr().out
+
+
+def test_the_doctor_names_what_is_missing_and_what_installs_it(monkeypatch, capsys):
+    without(monkeypatch, "sapien", "mujoco")
+    assert cli.main(["doctor"]) == 1
+    told = capsys.readouterr().out
+    assert "pip install 'torchgrasp[sim]'" in told and "pip install 'torchgrasp[mujoco]'" in told
+    assert "Traceback" not in told
+
+
+def test_without_a_simulator_the_selftest_says_so_and_fails(monkeypatch, capsys):
+    without(monkeypatch, "sapien", "mujoco")
+    assert cli.main(["selftest"]) == 1
+    told = capsys.readouterr().out
+    assert told.count("pip install") == 2 and "sapien" in told and "mujoco" in told
+
+
+def test_golden_grasps_fit_their_hands_and_objects():
+    for case in golden.GOLDEN:
+        grasp = load_shipped_grasp(case.object, case.hand).raise_for_status()
+        assert len(grasp) == 1 and bool(grasp.certificate.closed.all())
+        low, high = load_object(case.object).mesh.bounds
+        points = grasp.contacts.points[0].numpy()
+        assert (points > low - 0.01).all() and (points < high + 0.01).all()
+    assert {case.held for case in golden.GOLDEN} == {True, False}
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("simulator", ["sapien", "mujoco"])
+def test_every_simulator_finds_the_known_verdicts(simulator):
+    pytest.importorskip(simulator)
+    results = list(golden.run_golden(simulator))
+    assert [x.case for x in results] == list(golden.GOLDEN) and all(x.right for x in results)
+
+
+@pytest.mark.sim
+def test_the_selftest_passes_and_fails_where_a_verdict_is_another(monkeypatch, capsys):
+    pytest.importorskip("sapien")
+    without(monkeypatch, "mujoco")
+    monkeypatch.setattr(golden, "GOLDEN", golden.GOLDEN[:1])
+    assert cli.main(["selftest"]) == 0
+    assert "1 of 1 verdicts right" in capsys.readouterr().out
+    monkeypatch.setattr(golden, "GOLDEN", (golden.GOLDEN[0]._replace(hand="barrett", held=True),))
+    monkeypatch.setattr(golden, "OFF", 0.06)
+    monkeypatch.setattr(golden.GoldenResult, "right", property(lambda _: False))
+    assert cli.main(["selftest"]) == 1
+    assert "(wrong)" in capsys.readouterr().out

@@ -1,0 +1,125 @@
+"""`torchgrasp grasp` on scenes: what is taken, and one sentence for each bad input."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from torchgrasp import ScenePlan, Status, ThingPlan, load_grasps
+from torchgrasp.app.cli import main
+from torchgrasp.cloud.camera import INTRINSICS, look_at
+from torchgrasp.cloud.render import render_depth
+
+CAMERA = look_at(20.0, 45.0, 0.7)
+
+
+def boxes(lift: float = 0.0) -> list[trimesh.Trimesh]:
+    meshes = [trimesh.creation.box([0.06, 0.06, 0.12]), trimesh.creation.box([0.06, 0.06, 0.08])]
+    for mesh, (x, y, z) in zip(meshes, ((0.0, 0.0, 0.06), (0.02, 0.15, 0.04)), strict=True):
+        mesh.apply_translation([x, y, z + lift])
+    return meshes
+
+
+@pytest.fixture(scope="module")
+def seen():
+    depth, labels = render_depth(boxes(), CAMERA)
+    return {
+        "depth": np.round(1e3 * depth.numpy()).astype(np.uint16),
+        "intrinsics": INTRINSICS.numpy(),
+        "camera_pose": CAMERA.numpy(),
+        "labels": labels.numpy(),
+    }
+
+
+@pytest.fixture
+def grasp(tmp_path, capsys):
+    """Return a function that writes a scene, runs the command and returns its exit code and words."""
+
+    def run(arrays: dict[str, np.ndarray], *options: str) -> tuple[int, str]:
+        np.savez(tmp_path / "scene.npz", **arrays)
+        code = main(
+            ["grasp", str(tmp_path / "scene.npz"), "--hand", "barrett", "--out", str(tmp_path / "out"), *options]
+        )
+        said = capsys.readouterr()
+        return code, said.err if code == 2 else said.out
+
+    return run
+
+
+def middle(labels: np.ndarray, label: int) -> tuple[str, str]:
+    """Return column and row of a pixel inside a label."""
+    row, column = np.nonzero(labels == label)
+    return str(int(np.median(column))), str(int(np.median(row)))
+
+
+@pytest.fixture(autouse=True)
+def no_report(monkeypatch):
+    monkeypatch.setattr("torchgrasp.app.cli.results.write_report", lambda path, run, view: path)
+    monkeypatch.setattr("torchgrasp.app.cli.results.write_viewer", lambda path, run: path)
+
+
+@pytest.mark.parametrize("click", [True, False])
+def test_a_thing_is_grasped_by_click_or_mask(seen, grasp, tmp_path, click):
+    arrays, options = dict(seen), ["--point", *middle(seen["labels"], 1)]
+    if not click:  # and by metres with gaps
+        depth = seen["depth"] / 1e3
+        depth[::7, ::5], depth[3::11, ::3] = np.nan, 0.0
+        arrays |= {"depth": depth, "mask": (arrays.pop("labels") == 1).astype(np.uint8)}
+        options = []
+    code, words = grasp(arrays, "--starts", "10", *options)
+    assert code == 0 and "executable grasps" in words
+    best = load_grasps(tmp_path / "out" / "grasps.safetensors")[0]
+    assert int(best.status) == Status.OK
+    assert float(best.contacts.points[0, :, :2].abs().max()) < 0.05  # of the first box, not of the second
+
+
+def test_without_a_choice_the_easiest_thing_is_taken_and_all_are_listed(seen, grasp, monkeypatch):
+    thing, asked = ThingPlan(2, 0.5, reason="too heavy"), []
+
+    def note(scene, hand, *_, fingers, enough):
+        asked.append((hand.finger_names, fingers))
+        return ScenePlan((thing,))
+
+    monkeypatch.setattr("torchgrasp.app.cli.scene_grasps.plan_scene", note)
+    for wanted, passed in (("default", None), ("f3,f1,f2", None), ("auto", "auto")):
+        code, words = grasp(seen, "--fingers", wanted)
+        assert asked.pop() == (("f3", "f1", "f2") if "," in wanted else ("f1", "f2", "f3"), passed)
+    assert code == 1 and "thing 2" in words and "too heavy" in words and "no executable grasp of any thing" in words
+
+
+BAD = {
+    "no plane": (lambda a: {**a, "depth": a["depth"] * (a["labels"] == 1)}, [], "plane"),
+    "empty mask": (lambda a: {**a, "labels": None, "mask": 0 * a["labels"]}, [], "mask"),
+    "mask of another size": (lambda a: {**a, "labels": None, "mask": a["labels"][::2, ::2] > 0}, [], "mask"),
+    "labels of another size": (lambda a: {**a, "labels": a["labels"][::2, ::2]}, [], "labels"),
+    "intrinsics of another resolution": (lambda a: {**a, "intrinsics": 2 * a["intrinsics"]}, [], "intrinsics"),
+    "depth in mm, floating": (lambda a: {**a, "depth": a["depth"].astype(np.float32)}, [], "mm"),
+    "no depth": (lambda a: {**a, "depth": 0 * a["depth"]}, [], "depth"),
+    "a pose that is not rigid": (lambda a: {**a, "camera_pose": 2 * a["camera_pose"]}, [], "camera_pose"),
+    "a table above the camera": (lambda a: {**a, "table": np.array([0.0, 0.0, 1.0, 5.0])}, [], "table"),
+    "a target that is the table": (lambda a: a, ["--point", "320", "440"], "--point"),
+    "a pixel outside the image": (lambda a: a, ["--point", "900", "20"], "--point"),
+    "an unknown label": (lambda a: a, ["--label", "9"], "--label"),
+    "an option of clouds": (lambda a: a, ["--no-table"], "scene"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_scene_is_refused_in_one_sentence(seen, grasp, case):
+    change, options, word = BAD[case]
+    arrays = {name: array for name, array in change(dict(seen)).items() if array is not None}
+    code, words = grasp(arrays, *options)
+    assert code == 2, words
+    assert word in words and len(words.strip().splitlines()) == 1
+
+
+def test_a_label_needs_a_scene(grasp, tmp_path, capsys):
+    np.save(tmp_path / "cloud.npy", np.random.default_rng(0).random((50, 3)))
+    code = main(["grasp", str(tmp_path / "cloud.npy"), "--hand", "barrett", "--out", str(tmp_path), "--label", "1"])
+    assert code == 2 and "--label" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("data", [b"", b"PK\x03\x04", b"not a zip"])
+def test_a_broken_scene_file_is_refused(tmp_path, capsys, data):
+    (tmp_path / "scene.npz").write_bytes(data)
+    code = main(["grasp", str(tmp_path / "scene.npz"), "--hand", "barrett", "--out", str(tmp_path / "out")])
+    assert code == 2 and len(capsys.readouterr().err.strip().splitlines()) == 1

@@ -1,0 +1,110 @@
+"""Folders of objects: what the manifest says is what is read."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from torchgrasp import PointCloud
+from torchgrasp.cloud.io.read import save_cloud
+from torchgrasp.data import list_views, read_family, read_group, read_object_mesh, read_view, write_objects
+from torchgrasp.errors import BadArgument, MeshError
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A box of 0.2 m, to be halved, with two views and a whole cloud, and a torn mesh without views."""
+    box = trimesh.creation.box((0.2, 0.2, 0.2))
+    for name in ("box", "torn"):
+        (tmp_path / name).mkdir()
+    box.export(tmp_path / "box" / "mesh.ply")
+    trimesh.Trimesh(box.vertices, box.faces[:-1]).export(tmp_path / "torn" / "mesh.ply")
+    corners = torch.from_numpy(np.array(box.vertices))
+    for view in ("view0", "view1"):
+        save_cloud(PointCloud(corners), tmp_path / "box" / f"{view}_noisy.ply")
+    save_cloud(PointCloud(corners, corners / 0.1), tmp_path / "box" / "full_normals.ply")
+    pose = np.eye(4)
+    pose[:3, 3] = [0.0, 0.0, 2.0]
+    views = {view: {"T_object_camera": pose.tolist()} for view in ("view1", "view0")}
+    entries = {
+        "torn": {"views": {}},
+        "box": {"suggested_scale": 0.5, "family": "cuboid", "group": "solid", "views": views},
+    }
+    (tmp_path / "manifest.json").write_text(json.dumps({"objects": entries}))
+    return tmp_path
+
+
+def test_views_are_listed_in_order(folder: Path):
+    assert list_views(folder) == [("box", "view0"), ("box", "view1")]
+    assert list_views(folder, most=1) == [("box", "view0")]
+    assert list_views(folder, whole=True) == [("box", "whole"), ("torn", "whole")]
+    assert list_views(folder, only=["torn"]) == []
+
+
+def test_an_object_without_family_is_one_of_its_own(folder: Path):
+    assert (read_family(folder, "box"), read_group(folder, "box")) == ("cuboid", "solid")
+    assert (read_family(folder, "torn"), read_group(folder, "torn")) == ("torn", "")
+
+
+def test_views_and_meshes_come_at_the_suggested_scale(folder: Path):
+    cloud, mesh = read_view(folder, "box", "view0"), read_object_mesh(folder, "box")
+    assert cloud.normals is None
+    assert cloud.points.abs().max().item() == pytest.approx(0.05) and mesh.volume == pytest.approx(1e-3)
+    assert cloud.viewpoint is not None and cloud.viewpoint.tolist() == pytest.approx([0.0, 0.0, 1.0])
+    assert read_view(folder, "box", "view0", camera=False).viewpoint is None
+
+
+def test_a_whole_cloud_has_normals_and_no_camera(folder: Path):
+    cloud = read_view(folder, "box", "whole")
+    assert cloud.normals is not None and cloud.viewpoint is None
+    assert cloud.points.abs().max().item() == pytest.approx(0.05)
+
+
+def test_a_torn_mesh_is_refused(folder: Path):
+    with pytest.raises(MeshError, match="open surface"):
+        read_object_mesh(folder, "torn")
+
+
+def test_a_folder_without_a_manifest_or_the_object_is_refused(folder: Path, tmp_path: Path):
+    with pytest.raises(BadArgument, match="manifest"):
+        list_views(tmp_path / "empty")
+    with pytest.raises(BadArgument, match="asked for"):
+        list_views(folder, only=["jug"])
+
+
+def test_a_folder_of_meshes_becomes_objects_with_views_that_see_them(tmp_path: Path):
+    (tmp_path / "meshes").mkdir()
+    box = trimesh.creation.box((0.06, 0.08, 0.1))
+    box.apply_translation([0.4, 0.1, 0.3])
+    box.export(tmp_path / "meshes" / "carton.stl")
+    trimesh.creation.icosphere(subdivisions=2, radius=0.04).export(tmp_path / "meshes" / "ball.obj")
+    assert write_objects(tmp_path / "meshes", tmp_path / "out", views=2) == ["ball", "carton"]
+    assert list_views(tmp_path / "out") == [(name, f"view{k}") for name in ("ball", "carton") for k in (0, 1)]
+    mesh = read_object_mesh(tmp_path / "out", "carton")
+    np.testing.assert_allclose(mesh.bounds, [[-0.03, -0.04, 0.0], [0.03, 0.04, 0.1]], atol=1e-6)
+    cloud = read_view(tmp_path / "out", "carton", "view1")
+    gap = np.abs(trimesh.proximity.signed_distance(mesh, cloud.points.numpy()))
+    assert np.median(gap) < 0.002 and len(cloud) == 1000
+    assert cloud.viewpoint is not None and float((cloud.viewpoint - torch.tensor([0, 0, 0.05])).norm()) > 0.4
+    again = tmp_path / "again"
+    write_objects(tmp_path / "meshes", again, views=2)
+    for file in sorted(path.relative_to(again) for path in again.rglob("*") if path.is_file()):
+        assert (again / file).read_bytes() == (tmp_path / "out" / file).read_bytes()
+
+
+def test_no_meshes_two_of_a_name_and_an_open_one_are_refused(tmp_path: Path):
+    with pytest.raises(BadArgument, match="meshes"):
+        write_objects(tmp_path, tmp_path / "out")
+    box = trimesh.creation.box((0.06, 0.08, 0.1))
+    for suffix in ("stl", "ply"):
+        box.export(tmp_path / f"box.{suffix}")
+    with pytest.raises(BadArgument, match="two meshes"):
+        write_objects(tmp_path, tmp_path / "out")
+    (tmp_path / "box.ply").unlink()
+    trimesh.Trimesh(box.vertices, box.faces[:-1]).export(tmp_path / "torn.ply")
+    with pytest.raises(MeshError):
+        write_objects(tmp_path, tmp_path / "out")
+    assert not (tmp_path / "out" / "manifest.json").exists()

@@ -1,0 +1,203 @@
+"""Meshes: refusals, closest points of triangles against trimesh, and cuts against areas in closed form."""
+
+import contextlib
+import threading
+
+import numpy as np
+import pytest
+import trimesh
+
+from torchgrasp.errors import MeshError, SuspiciousScale
+from torchgrasp.geometry.mesh import MAX_BYTES, clip_mesh, closest_on_triangles, read_mesh
+from torchgrasp.sim.convex_parts import check_parts
+
+
+def open_box():
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    return trimesh.Trimesh(box.vertices, box.faces[:-1])
+
+
+def inside_out():
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    return trimesh.Trimesh(box.vertices, box.faces[:, ::-1], process=False)
+
+
+def flat():
+    """A closed surface around nothing."""
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    return trimesh.Trimesh(box.vertices * [1, 1, 0], box.faces, process=False)
+
+
+def one_face_turned():
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    faces = np.array(box.faces)
+    faces[0] = faces[0, ::-1]
+    return trimesh.Trimesh(box.vertices, faces, process=False)
+
+
+def one_body_turned():
+    """A box, and apart from it a smaller one inside out: the volume is positive, and the inertia is not."""
+    box, turned = trimesh.creation.box((0.1, 0.1, 0.1)), trimesh.creation.box((0.08, 0.08, 0.08))
+    turned.invert()
+    return trimesh.util.concatenate([box, turned.apply_translation((0.3, 0.0, 0.0))])
+
+
+def not_finite():
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    vertices = np.array(box.vertices)
+    vertices[0, 0] = np.nan
+    return trimesh.Trimesh(vertices, box.faces, process=False)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "reason"),
+    [
+        (open_box, "open surface"),
+        (inside_out, "volume"),
+        (not_finite, "non-finite"),
+        (flat, "volume"),
+        (one_face_turned, "volume"),
+        (one_body_turned, "without inertia"),
+        (lambda: trimesh.Trimesh(), "of 0 faces"),
+    ],
+)
+def test_bad_meshes_are_refused(mesh, reason):
+    with pytest.raises(MeshError, match=reason):
+        read_mesh(mesh())
+
+
+def test_a_mesh_of_a_plane_is_refused(tmp_path):
+    """Its surface is closed, but its corners have two numbers: the third of every `v` is missing."""
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    lines = [f"v {x} {y}" for x, y, _ in box.vertices] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in box.faces]
+    (tmp_path / "flat.obj").write_text("\n".join(lines) + "\n")
+    with pytest.raises(MeshError, match="allowed is"):
+        read_mesh(tmp_path / "flat.obj")
+
+
+def test_a_hollow_body_is_sound():
+    hole = trimesh.creation.box((0.08, 0.08, 0.08))
+    hole.invert()
+    assert read_mesh(trimesh.util.concatenate([trimesh.creation.box((0.1, 0.1, 0.1)), hole])).volume < 0.001
+
+
+def test_groups_and_materials_of_an_obj_are_left_out(tmp_path):
+    """Their reading took minutes; a corner with two textures made the surface open."""
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    corners = "".join(f"v {x} {y} {z}\n" for x, y, z in box.vertices) + "vt 0 0\nvt 1 0\nvt 0 1\n"
+    faces = "".join(f"o {k}\nusemtl {k}\nf {a + 1}/1 {b + 1}/2 {c + 1}/3\n" for k, (a, b, c) in enumerate(box.faces))
+    empty = "".join(f"g {k}\nusemtl {k}\n" for k in range(20_000))
+    (tmp_path / "box.obj").write_text(f"mtllib /dev/zero\n{corners}{faces}{empty}")
+    mesh = read_mesh(tmp_path / "box.obj")
+    assert mesh.volume == pytest.approx(0.001) and len(mesh.vertices) == 8
+
+
+@pytest.mark.promise("H2")
+@pytest.mark.parametrize("suffix", [".zip", ".3mf", ".dae", ".gltf", ".xyz", ""])
+def test_a_file_that_packs_or_names_others_is_no_mesh(tmp_path, suffix):
+    path = tmp_path / f"box{suffix}"
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(path, file_type="ply")
+    with pytest.raises(MeshError, match=r"no such file, allowed is a mesh file \(\.obj"):
+        read_mesh(path)
+
+
+@pytest.mark.parametrize("size", [1e-4, 10.0])
+def test_meshes_of_another_unit_are_refused(size):
+    with pytest.raises(SuspiciousScale, match="use metres"):
+        read_mesh(trimesh.creation.box((size, size, 2 * size)))
+
+
+def test_bad_files_are_refused(tmp_path):
+    with pytest.raises(MeshError, match="no file"):
+        read_mesh(tmp_path / "none.ply")
+    (tmp_path / "noise.ply").write_bytes(b"ply\nnonsense")
+    with pytest.raises(MeshError):
+        read_mesh(tmp_path / "noise.ply")
+    path = tmp_path / "box.ply"
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(path)
+    assert read_mesh(str(path)).volume == pytest.approx(1e-3)
+
+
+@pytest.mark.promise("H2")
+@pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj", ".off"])
+def test_a_box_of_every_format_is_read_and_opens_nothing_else(tmp_path, suffix):
+    path, opened = tmp_path / f"box{suffix}", []
+    content = trimesh.creation.box((0.1, 0.1, 0.1)).export(file_type=suffix[1:])
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    if suffix == ".obj":
+        path.write_text(f"mtllib ../secret.mtl\nusemtl a\n{path.read_text()}")
+        (tmp_path.parent / "secret.mtl").write_text("newmtl a\n")
+    read_mesh(path)  # what is imported late is imported now
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("builtins.open", lambda file, *at, **by: opened.append(str(file)) or open(file, *at, **by))
+        assert read_mesh(path).volume == pytest.approx(1e-3)
+    assert set(opened) <= {str(path)}
+
+
+def test_closest_points_of_triangles_are_those_of_trimesh():
+    rng = np.random.default_rng(0)
+    points, triangles = rng.normal(size=(500, 3)), rng.normal(size=(500, 3, 3))
+    found, feature = closest_on_triangles(points, triangles)
+    np.testing.assert_allclose(found, trimesh.triangles.closest_point(triangles, points), atol=1e-9)
+    assert set(feature.tolist()) == set(range(7))
+    for k in range(3):
+        np.testing.assert_allclose(found[feature == 4 + k], triangles[feature == 4 + k, k])
+
+
+@pytest.mark.parametrize("height", [-0.3, 0.0, 0.61])
+def test_a_ball_cut_by_a_plane_keeps_the_area_of_the_cap_and_its_winding(height: float):
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    vertices, faces, cut = clip_mesh(ball.vertices, ball.faces, ball.vertices[:, 2] - height)
+    kept = trimesh.Trimesh(vertices, faces, process=False)
+    assert kept.area == pytest.approx(2 * np.pi * (1 + height), rel=0.01)  # Archimedes
+    wide = kept.area_faces > 1e-9
+    assert (kept.face_normals * kept.triangles_center).sum(1)[wide].min() > 0.9
+    assert vertices[:, 2].max() < height + 1e-12
+    np.testing.assert_allclose(vertices[cut, 2], height, atol=1e-12)
+
+
+def test_nothing_and_all_of_a_mesh():
+    box = trimesh.creation.box()
+    vertices, faces, cut = clip_mesh(box.vertices, box.faces, -np.ones(8))
+    assert len(faces) == 12 and len(vertices) == 8 and not cut.any()
+    assert len(clip_mesh(box.vertices, box.faces, np.ones(8))[1]) == 0
+
+
+@pytest.mark.promise("H5")
+def test_a_mesh_beyond_the_limits_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    path = tmp_path / "big.ply"
+    with path.open("wb") as file:
+        file.truncate(MAX_BYTES + 1)
+    with pytest.raises(MeshError, match=f"at most {MAX_BYTES} bytes"):
+        read_mesh(path)
+    monkeypatch.setattr("torchgrasp.geometry.mesh.MAX_FACES", 11)
+    with pytest.raises(MeshError, match="of 12 faces"):
+        read_mesh(trimesh.creation.box((0.1, 0.1, 0.1)))
+
+
+def test_too_many_parts_are_refused_before_they_are_looked_at():
+    with pytest.raises(MeshError, match="at most 1000"):
+        check_parts([trimesh.Trimesh()] * 1001)
+
+
+def test_what_a_reader_logs_stays_with_it(tmp_path, caplog):
+    """A number too many on a line is no fault of the corners; trimesh tells of it with a traceback."""
+    text = trimesh.creation.box((0.1, 0.1, 0.1)).export(file_type="stl_ascii")
+    (tmp_path / "box.stl").write_text(text.replace("normal ", "normal x ", 1))
+    with contextlib.suppress(MeshError):
+        read_mesh(tmp_path / "box.stl")
+    assert not caplog.records
+
+
+def test_what_other_threads_log_meanwhile_is_kept(tmp_path, caplog, monkeypatch):
+    def read_beside_another(*arguments, **options):
+        thread = threading.Thread(target=trimesh.util.log.error, args=("of another",))
+        thread.start()
+        thread.join()
+        trimesh.util.log.error("of this")
+        return trimesh.creation.box((0.1, 0.1, 0.1))
+
+    monkeypatch.setattr(trimesh, "load_mesh", read_beside_another)
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "box.stl")
+    read_mesh(tmp_path / "box.stl")
+    assert [record.message for record in caplog.records] == ["of another"]

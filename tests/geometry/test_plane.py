@@ -1,0 +1,95 @@
+"""Planes and upright frames: they move with what they are made of."""
+
+import pytest
+import torch
+
+from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.plane import GRID, Plane, as_plane, cloud_to_upright, move, upright_frame
+from torchgrasp.shape.fit import fit_shape
+from torchgrasp.shape.surface import Surface
+from torchgrasp.specs import ContactSpec
+from torchgrasp.values import PointCloud
+
+F64 = torch.float64
+
+
+def random_pose(seed: int) -> torch.Tensor:
+    draw = torch.randn(2, 3, generator=torch.Generator().manual_seed(seed), dtype=F64)
+    return rigid(rotation_from_vector(3 * draw[0]), draw[1])
+
+
+def random_cloud(viewpoint: bool) -> PointCloud:
+    points = 0.1 * torch.rand(50, 3, generator=torch.Generator().manual_seed(1), dtype=F64)
+    return PointCloud(points, None, torch.tensor([0.5, 0.2, 0.4], dtype=F64) if viewpoint else None)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_heights_do_not_depend_on_the_frame(seed):
+    plane, pose, points = Plane.horizontal(0.3), random_pose(seed), random_cloud(False).points
+    torch.testing.assert_close(plane.moved(pose).height(apply(pose, points)), points[:, 2] - 0.3)
+
+
+@pytest.mark.parametrize("viewpoint", [True, False])
+@pytest.mark.parametrize("table", [Plane.horizontal(-0.1), None])
+def test_a_moved_cloud_is_the_same_to_the_last_bit_in_its_upright_frame(viewpoint, table):
+    cloud = random_cloud(viewpoint)
+    frame = upright_frame(cloud, table)
+    upright = cloud_to_upright(cloud, frame)
+    assert float((apply(frame, upright.points) - cloud.points).norm(dim=1).max()) <= 1.5 * GRID
+    for seed in range(20):
+        pose = random_pose(seed)
+        there = move(cloud, pose)
+        other = cloud_to_upright(there, upright_frame(there, None if table is None else table.moved(pose)))
+        assert torch.equal(other.points, upright.points)
+        assert viewpoint is False or torch.equal(other.viewpoint, upright.viewpoint)
+
+
+def test_an_upright_frame_stands_on_the_table_and_looks_at_the_camera():
+    cloud, pose = random_cloud(True), random_pose(3)
+    table = Plane.horizontal(-0.1).moved(pose)
+    frame = upright_frame(move(cloud, pose), table)
+    assert abs(float(table.height(frame[:3, 3]))) < 1e-12
+    torch.testing.assert_close(frame[:3, 2], table.normal)
+    eye = apply(inverse(frame), move(cloud, pose).viewpoint[None])[0]
+    assert abs(float(eye[1])) < 1e-12 and float(eye[0]) > 0
+
+
+def test_straight_down_the_azimuth_is_that_of_the_farthest_point():
+    points = torch.tensor([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0.2, 0.05]], dtype=F64)
+    cloud = PointCloud(points, None, points.mean(0) + torch.tensor([0.0, 0, 0.5], dtype=F64))
+    x = upright_frame(cloud, Plane.horizontal(0.0))[:3, 0]
+    assert float(x[2]) == 0.0 and float(x @ (points[3] - points.mean(0))) > 0.14
+
+
+@pytest.mark.parametrize("table", [float("nan"), float("inf")])
+def test_a_table_is_a_plane_a_height_or_nothing(table):
+    with pytest.raises(BadArgument, match="table"):
+        as_plane(table)
+    with pytest.raises(BadArgument, match="table"):
+        ContactSpec(table=table)
+
+
+def test_a_normal_has_unit_length():
+    with pytest.raises(BadArgument, match="normal"):
+        Plane(torch.tensor([0.0, 0, 2.0]), 0.0)
+
+
+def test_every_place_and_direction_of_a_surface_moves():
+    pose, points = random_pose(2), random_cloud(False).points
+    faces = torch.arange(48).view(-1, 3)
+    surface = Surface(points, faces, unit(points), points[:, 0])
+    there = move(surface, pose)
+    torch.testing.assert_close(there.vertices, apply(pose, points))
+    torch.testing.assert_close(there.normals, surface.normals @ pose[:3, :3].T)
+    assert torch.equal(there.std_m, surface.std_m) and torch.equal(there.faces, faces)
+
+
+def test_a_table_above_the_object_is_refused_before_any_work():
+    cloud = random_cloud(viewpoint=True)
+    above = 0.2 - cloud.points[:, 2].sort().values[24]
+    with pytest.raises(BadArgument, match=rf"^table: found a plane {above:.3g} m above the middle of the cloud"):
+        fit_shape(cloud, table=0.2)
+    tilted = Plane(unit(torch.tensor([0.02, 0.0, 1.0], dtype=F64)), 0.003)
+    assert upright_frame(cloud, tilted).isfinite().all()

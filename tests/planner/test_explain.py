@@ -1,0 +1,268 @@
+"""Constructed cases that lack one thing each: where grasps are lost is counted, and what is missing is named."""
+
+import dataclasses
+import functools
+
+import pytest
+import torch
+import trimesh
+
+import torchgrasp
+from torchgrasp import ContactSpec, PointCloud, Status, explain_empty, load_object, plan_grasps
+from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view
+from torchgrasp.cloud.render import render_depth
+from torchgrasp.errors import BadArgument
+from torchgrasp.planner.changes import list_changes, spec_of
+from torchgrasp.planner.explain import Explanation, Trial, order_changes
+from torchgrasp.planner.funnel import Funnel, Losses
+from torchgrasp.planner.task import Request
+from torchgrasp.scene import Scene
+from torchgrasp.values import Certificate, ContactPlan, Contacts, Grasps, IKSeeds
+
+TABLE = ContactSpec(table=0.0)
+VIEW = load_object("cylinder").view
+load_hand = functools.cache(torchgrasp.load_hand)
+
+
+@pytest.fixture(autouse=True)
+def hands_once(monkeypatch):
+    """Read each hand once for all tests."""
+    monkeypatch.setattr("torchgrasp.planner.changes.load_hand", load_hand)
+
+
+@pytest.fixture
+def first_only(monkeypatch):
+    """Try the change alone that comes first."""
+    monkeypatch.setattr("torchgrasp.planner.explain.MOST_TRIALS", 1)
+
+
+def view_of(mesh: trimesh.Trimesh) -> PointCloud:
+    """What a camera sees of a mesh that stands on the table."""
+    mesh.apply_translation([0, 0, -mesh.bounds[0, 2]])
+    return partial_view(mesh, look_at(20.0, 45.0, target=mesh), n=600, noise=False, seed=0)
+
+
+def see(*boxes: tuple[float, float, float, float]) -> Scene:
+    """A scene of boxes (width, low, high, x) one above or beside the other."""
+    meshes = [trimesh.creation.box([w, w, high - low]) for w, low, high, _ in boxes]
+    for mesh, (_, low, high, x) in zip(meshes, boxes, strict=True):
+        mesh.apply_translation([x, 0, (low + high) / 2])
+    camera = look_at(20.0, 45.0, 0.7)
+    depth, labels = render_depth(meshes, camera)
+    return Scene.from_depth(depth, INTRINSICS, camera, labels=labels).select(1)
+
+
+def told(plan: list[Status], tried: int, grasps: list[Status]) -> Funnel:
+    """The funnel of made-up rows."""
+    rows, k = torch.zeros(len(plan), 3, 3), len(grasps)
+    contacts = Contacts(rows, rows)
+    one = torch.ones(tried)
+    certificate = Certificate(one, one, one, one > 0, torch.zeros(tried, 6))
+    some, pose = torch.zeros(k, 3), torch.eye(4).repeat(k, 1, 1)
+    return Funnel.of(
+        ContactPlan(contacts, torch.zeros(len(plan), 3, 8), torch.zeros(len(plan)), torch.tensor(plan)),
+        certificate,
+        IKSeeds(some, pose, torch.arange(k), torch.zeros(k, 3).long(), some[:, 0], some),
+        Grasps(
+            some, some, some, pose, contacts[:k], torch.zeros(k, 3).long(), some, some[:, 0], some, certificate[:k],
+            some[:, 0], torch.tensor(grasps, dtype=torch.int64),
+        ),
+    )  # fmt: skip
+
+
+def test_a_funnel_counts_what_each_stage_was_given_and_lost():
+    ok, tip, flat = Status.OK, Status.TIP_ERROR, Status.NOT_FLAT
+    funnel = told([ok] * 7 + [flat] * 2 + [Status.NOT_CLOSED], tried=6, grasps=[tip, tip, Status.PREGRASP, ok])
+    assert [(s.given, s.kept) for s in funnel.stages] == [(10, 7), (6, 4), (4, 1)]
+    assert all(s.kept + sum(s.lost.values()) == s.given for s in funnel.stages)
+    assert list(funnel.stages[0].lost) == [flat, Status.NOT_CLOSED]
+    assert funnel.stages[1].lost == {Status.OUT_OF_REACH: 2}
+    assert funnel.executable == 1 and funnel.reason is tip and funnel.worst.stage == "grasps"
+    assert funnel.share(frozenset({flat, tip})) == pytest.approx(2 / 10 + 2 / 4)
+    assert str(funnel).splitlines()[2] == "grasps: 1 of 4 postures (2 tip_error, 1 pregrasp)"
+
+
+@pytest.mark.parametrize(
+    ("plan", "tried", "grasps", "stage", "reason"),
+    [
+        ([Status.BELOW_TABLE] * 4 + [Status.NOT_FLAT], 0, [], "contacts", Status.BELOW_TABLE),
+        ([Status.OK] * 3, 3, [], "postures", Status.OUT_OF_REACH),
+        ([Status.OK] * 3, 2, [Status.BURIED] * 2, "grasps", Status.BURIED),
+        ([Status.OK] * 3, 3, [Status.OK] * 3, "contacts", Status.OK),
+    ],
+)
+def test_the_stage_that_lost_all_gives_the_reason(plan, tried, grasps, stage, reason):
+    funnel = told(plan, tried, grasps)
+    assert (funnel.worst.stage, funnel.reason) == (stage, reason)
+
+
+def test_a_funnel_agrees_with_the_observed_run():
+    seen = {}
+    grasps = plan_grasps(VIEW, load_hand("barrett"), TABLE, 20, observer=lambda s, text, value: seen.update({s: value}))
+    funnel = Funnel.of(seen["plan"], seen["certify"], seen["query"], grasps)
+    assert funnel.stages[0].given == 20 and funnel.stages[1].given == len(seen["certify"])
+    assert funnel.stages[1].kept == len(grasps) and funnel.executable == int((grasps.status == Status.OK).sum()) > 0
+
+
+def changes(**options) -> dict[str, Request]:
+    """The changes of a request on the cylinder, by their words."""
+    hand, spec = options.pop("hand", load_hand("allegro")), options.pop("spec", TABLE)
+    return {change.words: change.request for change in list_changes(Request(VIEW, hand, spec, 20, 0, **options))}
+
+
+def test_every_change_changes_one_thing():
+    for words, task in changes().items():
+        fields = [f.name for f in dataclasses.fields(ContactSpec)]
+        other = [name for name in fields if getattr(task.spec, name) != getattr(TABLE, name)]
+        hand = task.hand.name != "allegro" or task.hand.finger_names != load_hand("allegro").finger_names
+        assert len(other) + hand == 1, words
+        assert task.seed == 0 and task.starts == 20 and task.cloud is VIEW
+
+
+def test_what_cannot_be_changed_is_not_offered():
+    def named(*parts: str, **options) -> list[str]:
+        return [words for words in changes(**options) if any(part in words for part in parts)]
+
+    assert not named("fingers=", hand=load_hand("barrett"))  # it declares one set
+    assert not named("fingers=", fingers="auto")
+    assert named("fingers='four'") and named("fingers='default'", fingers="four")
+    assert not named("allegro hand", "_left", "biotac") and named("leap hand")
+    assert not named("allegro hand", hand=load_hand("allegro_left"))
+    assert not named("friction were", spec=ContactSpec(friction=1.2))
+    assert not named("friction_margin", "flatness", spec=ContactSpec(friction_margin=1.0, flatness=None))
+    strict = ContactSpec(max_variance=1e-3, flatness=0.1, friction_margin=0.2, separation=0.1)
+    assert len(named("=0.03 ", "=0.44 ", "margin=0.5 ", "separation=0.026 ", spec=strict)) == 4  # the usual ones first
+    assert named("stood on a table", spec=ContactSpec()) and not named("no table", spec=ContactSpec())
+    assert not named("mode") and named("mode='joint'", mode="contact_first")
+    assert not named("arm") and named("arm", reachable=lambda poses: poses[:, 0, 0] > 0)
+    assert named("tip_radius", hand=load_hand("barrett")) and not named("tip_radius")  # its tips are smaller
+
+
+@pytest.mark.parametrize(
+    ("plan", "grasps", "first"),
+    [
+        ([Status.NOT_CLOSED] * 9, [], "fingers"),
+        ([Status.TOO_UNCERTAIN] * 9, [], "max_variance"),
+        ([Status.NOT_FLAT] * 9, [], "flatness"),
+        ([Status.TOO_CLOSE] * 9, [], "separation"),
+        ([Status.BELOW_TABLE] * 9, [], "no table"),
+        ([Status.OK] * 9, [Status.SELF_COLLISION] * 9, "fingers"),
+        ([Status.OK] * 9, [Status.TABLE_COLLISION] * 9, "no table"),
+    ],
+)
+def test_the_change_that_prevents_most_comes_first(plan, grasps, first):
+    task = Request(VIEW, load_hand("allegro"), TABLE, 20, 0)
+    ordered = order_changes(list_changes(task), told(plan, len(grasps), grasps))
+    assert first in ordered[0].words
+    assert len(ordered) < len(list_changes(task))  # what has to do with none of the losses is left out
+
+
+def test_nothing_lost_asks_for_no_change():
+    assert (
+        order_changes(list_changes(Request(VIEW, load_hand("barrett"), TABLE, 20, 0)), told([Status.OK], 0, [])) == []
+    )
+
+
+def test_fingers_without_a_thumb_are_told_to_take_it(monkeypatch):
+    monkeypatch.setattr("torchgrasp.planner.explain.MOST_TRIALS", 2)
+    hand = load_hand("allegro", "paper_literal")
+    explanation = explain_empty(VIEW, hand, TABLE, starts=15, seed=1)  # of some other seeds one grasp is executable
+    assert explanation.funnel.executable == 0 and explanation.best is not None
+    assert "fingers='default' (index, middle, thumb)" in explanation.best.words and explanation.best.choice
+    again = plan_grasps(VIEW, load_hand("allegro"), TABLE, 15, seed=1)
+    assert int((again.status == Status.OK).sum()) == explanation.best.executable > 0
+    assert str(explanation.best) in str(explanation) and "tip_error" in str(explanation)
+
+
+def test_a_disc_too_low_for_fingertips_needs_its_table_gone(first_only):
+    disc = view_of(trimesh.creation.cylinder(radius=0.03, height=0.01))
+    explanation = explain_empty(disc, load_hand("allegro"), TABLE, starts=20)
+    assert Status.BELOW_TABLE in explanation.funnel.stages[0].lost
+    assert explanation.best is not None and "no table" in explanation.best.words and not explanation.best.choice
+
+
+def test_an_arm_that_reaches_nothing_is_named(first_only):
+    nowhere = lambda poses: torch.zeros(len(poses), dtype=torch.bool)  # noqa: E731
+    explanation = explain_empty(VIEW, load_hand("barrett"), TABLE, starts=10, reachable=nowhere)
+    assert explanation.best is not None and explanation.best.words == "if the arm reached every pose"
+
+
+def test_a_thing_under_another_asks_for_that_to_be_taken_first(first_only):
+    scene, told_of = see((0.09, 0.0, 0.06, 0.0), (0.07, 0.06, 0.11, 0.0)), []
+    note = lambda stage, text, value: told_of.append((stage, text, value))  # noqa: E731
+    explanation = explain_empty(scene, load_hand("barrett"), starts=20, observer=note)
+    assert explanation.best is not None and "taken away first" in explanation.best.words
+    assert told_of == [("change", str(explanation.best), explanation.best)]
+
+
+def trial(words: str, choice: bool, count: int, expected: float) -> Trial:
+    return Trial(words, choice, count, expected, told([Status.OK], 1, [Status.OK]))
+
+
+@pytest.fixture
+def made_up(monkeypatch):
+    """Give each change the count and the expected success that a function of its task says; return what was tried."""
+    tried = []
+
+    def install(world):
+        def plan(task: Request):
+            count, expected = world(task)
+            tried.append(task)
+            lost = {} if count else {Status.TIP_ERROR: 5}
+            stages = (Losses("contacts", "starts", 5, {Status.NOT_CLOSED: 2}), Losses("grasps", "postures", 5, lost))
+            return Funnel((stages[0], dataclasses.replace(stages[1], given=5 if lost else count))), expected, None
+
+        monkeypatch.setattr("torchgrasp.planner.explain.try_request", plan)
+        return tried
+
+    return install
+
+
+def test_the_best_change_wins_and_a_choice_stands_beside_a_fact(made_up):
+    made_up(lambda t: (9, 0.5) if spec_of(t).friction > 1 else (3, 0.1) if len(t.hand.tips) == 4 else (0, 0.0))
+    explanation = explain_empty(VIEW, load_hand("allegro"), TABLE)
+    assert [t.executable for t in explanation.trials[:2]] == [9, 3]
+    assert explanation.advice.index("friction were 1.2") < explanation.advice.index("fingers='four'")
+
+
+def test_a_choice_that_solves_it_ends_the_search_and_a_fact_ends_that_for_facts(made_up):
+    tried = made_up(lambda t: (20, 0.95) if spec_of(t).table is None else (0, 0.0))
+    facts = [t.choice for t in explain_empty(VIEW, load_hand("barrett"), TABLE).trials]
+    assert facts.count(False) == 1 and facts.count(True) > 0
+    tried.clear()
+    made_up(lambda t: (20, 0.95) if len(t.hand.tips) == 4 else (0, 0.0))
+    explanation = explain_empty(VIEW, load_hand("allegro"), TABLE)
+    assert explanation.trials[0].executable == 20 and len(explanation.trials) < 5
+
+
+def test_more_starts_are_tried_where_nothing_helps_and_then_it_says_so(made_up):
+    tried = made_up(lambda t: (0, 0.0))
+    explanation = explain_empty(VIEW, load_hand("barrett"), TABLE, starts=300)
+    assert explanation.best is None and tried[-1].starts == 1200 and {t.starts for t in tried[:-1]} == {100}
+    assert explanation.advice.startswith("No single change helps")
+    assert Status.TIP_ERROR.sentence in explanation.advice
+    made_up(lambda t: (4, 0.2) if t.starts > 1000 else (0, 0.0))
+    explanation = explain_empty(VIEW, load_hand("barrett"), TABLE, starts=300)
+    assert explanation.best is not None and explanation.best.words == "with 1200 starts"
+
+
+def test_where_grasps_are_there_is_nothing_to_explain(made_up):
+    made_up(lambda t: (7, 0.3))
+    explanation = explain_empty(VIEW, load_hand("barrett"), TABLE)
+    assert explanation.trials == () and "7 of 100 starts" in explanation.advice
+
+
+def test_one_grasp_is_no_plural():
+    assert str(trial("with more", True, 1, 0.1)).endswith("1 executable grasp")
+    assert str(trial("with more", True, 0, 0.0)).endswith("no executable grasps")
+    lone = Explanation(10, told([Status.NOT_FLAT], 0, []), (trial("with more", True, 2, 0.1),))
+    assert "(1 change tried)" in lone.advice
+
+
+def test_bad_arguments_are_those_of_plan_grasps():
+    with pytest.raises((BadArgument, TypeError), match="hand"):
+        explain_empty(VIEW, "barrett")  # pyright: ignore[reportArgumentType]
+    with pytest.raises((BadArgument, TypeError), match="starts"):
+        explain_empty(VIEW, load_hand("barrett"), starts=0)
+    with pytest.raises(TypeError, match="beginning"):
+        explain_empty(VIEW, load_hand("barrett"), beginning=3)

@@ -1,0 +1,156 @@
+"""Four fingertips from the cloud to the held object, and the choice of fingers."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from tests.planner.test_grasps import closure_margin
+from torchgrasp import (
+    ContactSpec,
+    Status,
+    cli,
+    close_hand,
+    closing_gains,
+    hand_of,
+    load_grasps,
+    load_hand,
+    load_object,
+    load_scene,
+    plan_grasps,
+    plan_scene,
+)
+from torchgrasp.base import named_tensors
+from torchgrasp.data.shipped import DATA
+from torchgrasp.errors import BadArgument
+from torchgrasp.evaluation.lift import TrialSpec
+from torchgrasp.export import format_grasps
+from torchgrasp.geometry.frames import apply
+from torchgrasp.planner.fingers import expected_success, finger_sets
+
+SPEC = ContactSpec(table=0.0)
+ALL = ("index", "middle", "ring", "thumb")
+
+
+@pytest.fixture(scope="module")
+def grasps():
+    """Grasps of the shipped cylinder with all fingers of the Allegro."""
+    return plan_grasps(load_object("cylinder").view, load_hand("allegro"), SPEC, starts=40, seed=1, fingers=4)
+
+
+def test_four_fingers_touch_their_contacts_and_close(grasps):
+    hand, good = hand_of(grasps), grasps[grasps.status == Status.OK]
+    assert hand.finger_names == ALL and grasps.meta["finger_names"] == ",".join(ALL)
+    assert len(good) >= 10 and good.contacts.points.shape[1:] == (4, 3)
+    assert bool((good.success > 0.5).any())
+    tips = apply(good.obj_from_hand, hand.tip_centres(good.joints))
+    wanted = good.contacts.points + hand.tips.radius[:, None] * good.contacts.normals
+    assert float((tips - wanted).norm(dim=-1).max()) < 1e-3
+    assert bool((hand.self_clearance(good.joints) >= 0).all()) and bool((hand.self_clearance(good.pregrasp) >= 0).all())
+    assert bool((good.permutation.sort(1).values == torch.arange(4)).all())
+    for grasp in good:
+        points, normals = grasp.contacts.points[0].numpy(), grasp.contacts.normals[0].numpy()
+        margin, rank = closure_margin(points, normals, SPEC.planned_friction, 24)
+        assert margin > 1e-8 and rank == 6
+
+
+def test_a_file_keeps_the_fingers_and_the_same_seed_gives_the_same_bits(grasps, tmp_path):
+    grasps.save(tmp_path / "four.safetensors")
+    read = load_grasps(tmp_path / "four.safetensors")
+    again = plan_grasps(load_object("cylinder").view, load_hand("allegro", ALL), SPEC, starts=40, seed=1)
+    for name, value in named_tensors(grasps).items():
+        assert torch.equal(named_tensors(read)[name], value) and torch.equal(named_tensors(again)[name], value)
+    assert (
+        hand_of(read).joint_names
+        == hand_of(read, load_hand("allegro")).joint_names
+        == load_hand("allegro", 4).joint_names
+    )
+
+
+def test_another_hand_or_other_fingers_are_refused_by_name(grasps):
+    for hand in (load_hand("allegro"), load_hand("barrett")):
+        with pytest.raises(BadArgument, match=r"index, middle, ring, thumb.*hand_of"):
+            closing_gains(grasps[0], hand)
+    nameless = dataclasses.replace(grasps, meta={})
+    with pytest.raises(BadArgument, match="4 contacts"):
+        closing_gains(nameless[0], load_hand("allegro"))
+    with pytest.raises(BadArgument, match="no name of a hand"):
+        hand_of(nameless)
+    with pytest.raises(BadArgument, match="fingers"):
+        hand_of(grasps, "barrett")
+    for options in (
+        {"fingers": 4, "mode": "paper"},
+        {"fingers": 4, "mode": "contact_first"},
+        {"fingers": "auto", "mode": "paper"},
+    ):
+        with pytest.raises(BadArgument, match="mode"):
+            plan_grasps(load_object("cylinder").view, load_hand("allegro"), **options)
+    for spec, word in ((TrialSpec(closing="paper"), "closing"), (TrialSpec(holding="impedance"), "holding")):
+        pytest.importorskip("sapien")
+        with pytest.raises(BadArgument, match=f"{word}.*4 fingertips.*three"):
+            close_hand(grasps[0], hand_of(grasps), load_object("cylinder").mesh, spec)
+
+
+def test_forces_of_four_fingers_balance_in_the_exported_file(grasps):
+    content = json.loads(format_grasps(hand_of(grasps), grasps[:5], 4.0))
+    for row in content["grasps"]:
+        assert [contact["finger"] for contact in row["contacts"]] == list(ALL)
+        points, normals, forces = (np.array([c[key] for c in row["contacts"]]) for key in ("point", "normal", "force"))
+        push = -(forces * normals).sum(1)
+        assert push.min() > 0 and push.max() == pytest.approx(4.0, rel=1e-6)
+        np.testing.assert_allclose(forces.sum(0), 0, atol=1e-6)
+        np.testing.assert_allclose(np.cross(points, forces).sum(0), 0, atol=1e-7)
+
+
+def test_auto_takes_the_set_whose_best_grasps_are_likeliest_to_succeed():
+    view, hand, notes = load_object("cylinder").view, load_hand("allegro"), []
+    best = plan_grasps(view, hand, SPEC, 10, fingers="auto", observer=lambda *stage: notes.append(stage))
+    hands = finger_sets(hand, "auto")
+    assert [one.finger_names for one in hands] == [hand.finger_names, ALL, ("index", "middle", "ring")]
+    told = [text for stage, text, _ in notes if stage == "fingers"]
+    assert len(told) == 3 and all(", ".join(one.finger_names) in text for one, text in zip(hands, told, strict=True))
+    alone = [plan_grasps(view, one, SPEC, 10) for one in hands]
+    likeliest = max(alone, key=expected_success)
+    assert best.meta == likeliest.meta and torch.equal(best.joints, likeliest.joints)
+    stages = [stage for stage, _, _ in notes if stage != "fingers"]
+    assert stages == ["shape", "plan", "certify", "query", "refine"]
+
+
+def test_the_command_grasps_with_the_fingers_asked_for(tmp_path, capsys):
+    view = str(DATA / "cylinder" / "view.ply")
+    words = ["grasp", view, "--hand", "allegro", "--starts", "10", "--out", str(tmp_path)]
+    assert cli.main([*words, "--fingers", "4"]) == 0
+    assert load_grasps(tmp_path / "grasps.safetensors").meta["finger_names"] == ",".join(ALL)
+    assert "ring" in (tmp_path / "report.html").read_text()
+    assert cli.main(["export", str(tmp_path / "grasps.safetensors"), "--out", str(tmp_path / "a.json")]) == 0
+    assert len(json.loads((tmp_path / "a.json").read_text())["grasps"][0]["contacts"]) == 4
+    assert cli.main([*words, "--fingers", "index,thumb"]) == 2
+    assert "--fingers" in capsys.readouterr().err
+
+
+def test_a_thing_of_a_scene_is_grasped_with_the_fingers_asked_for(monkeypatch):
+    scene, hand, asked = load_scene(), load_hand("allegro"), []
+    best = plan_scene(scene, hand, starts=10, fingers=4, enough=0.0).things[0]
+    assert best.grasps is not None, best.reason
+    assert hand_of(best.grasps, hand).finger_names == ALL and best.grasps.joints.shape[1] == 16
+    with pytest.raises(BadArgument, match="fingers"):
+        plan_scene(scene, hand, fingers=("index", "thumb"))
+
+    def note(cloud, fingers, **_):
+        asked.append((cloud.target, fingers))
+        raise BadArgument("cloud", "seen", "nothing")
+
+    monkeypatch.setattr("torchgrasp.planner.things.plan_grasps", note)
+    plan_scene(scene, hand, fingers="auto")
+    assert sorted(asked) == [(label, "auto") for label in scene.things]
+
+
+@pytest.mark.sim
+def test_four_fingers_hold_the_cylinder(grasps):
+    pytest.importorskip("sapien")
+    body = load_object("cylinder")
+    result = close_hand(grasps[0], hand_of(grasps), body.mesh, parts=body.parts)
+    assert result.held and sorted(result.contact_order) == [0, 1, 2, 3]
+    assert result.forces.shape[1] == 4 and bool((result.forces[-1] > 0.1).all())

@@ -1,0 +1,104 @@
+"""The paper's chain from cloud to ranked grasps, judged by geometry of its own."""
+
+import pytest
+import torch
+
+from torchgrasp import ContactSpec, Status, load_hand, load_mixture, load_object, plan_grasps
+from torchgrasp.geometry.frames import apply, virtual_frame
+from torchgrasp.ik.checks import PAPER_TOLERANCE
+from torchgrasp.ik.ranking import rank_by_variance
+from torchgrasp.posture_model.encoding import encode
+from torchgrasp.posture_model.mixture import PAPER_ENERGY
+from torchgrasp.shape.surface import extract_surface
+from torchgrasp.values import Contacts
+
+SPEC = ContactSpec.paper(table=0.0)
+
+
+@pytest.fixture(scope="module")
+def run():
+    stages = {}
+    hand, view = load_hand("allegro"), load_object("jug").view
+    note = lambda stage, text, value: stages.update({stage: value})  # noqa: E731
+    return hand, plan_grasps(view, hand, SPEC, starts=300, mode="paper", observer=note), stages
+
+
+def test_shape_contacts_and_ranking_are_the_papers(run):
+    _, grasps, stages = run
+    shape = stages["shape"]
+    assert len(shape.x) == 70 and int((~shape.has_normal).sum()) == 21  # the centre and 20 points outside
+    assert grasps.meta["mode"] == "paper" and grasps.meta["ranking"] == "variance"
+    estimate = shape.predict(grasps.contacts.points)
+    assert float(estimate.variance.max()) < 0.03 + 1e-6  # Eq. (12)
+    assert bool(grasps.certificate.closed.all())  # Eq. (13) at the whole friction
+    good = grasps[grasps.status == Status.OK]
+    assert len(good) >= 1
+    assert bool((good.contacts.variance.sum(1).diff() >= 0).all())
+
+
+def test_eq21_seeds_are_below_the_papers_threshold(run):
+    hand, _, stages = run
+    seeds = stages["query"]
+    assert len(seeds) and float(seeds.energy.max()) < PAPER_ENERGY
+    assert bool((seeds.joints >= hand.lower).all()) and bool((seeds.joints <= hand.upper).all())
+
+
+def test_eq24_contact_points_meet_the_contacts_and_the_hand_is_clear(run):
+    hand, grasps, stages = run
+    good = grasps[grasps.status == Status.OK]
+    tips = hand.fingertips(good.joints)[0]
+    placed = apply(good.obj_from_hand, tips)
+    assert float((placed - good.contacts.points).norm(dim=-1).max()) <= PAPER_TOLERANCE
+    torch.testing.assert_close(
+        good.obj_from_hand @ virtual_frame(tips), virtual_frame(good.contacts.points), rtol=0, atol=1e-6
+    )
+    cover = hand.collision_spheres
+    for joints in (good.joints, good.pregrasp):
+        hand.check_joints(joints)
+        assert float(hand.self_clearance(joints).min()) >= 0
+        heights = apply(good.obj_from_hand, hand.sphere_centres(joints))[..., 2] - cover.radius
+        assert float(heights.min()) >= SPEC.table
+    surface = extract_surface(stages["shape"])
+    links = apply(good.obj_from_hand, hand.sphere_centres(good.joints))[:, ~cover.touching]
+    for centre, radius in zip(links.flatten(0, 1), cover.radius[~cover.touching].repeat(len(good)), strict=True):
+        away = centre - surface.vertices
+        nearest = int(away.norm(dim=-1).argmin())
+        # vertices are 4 mm apart, so their tangent planes tell the distance to a millimetre or two
+        assert float(away[nearest] @ surface.normals[nearest]) > 0
+        assert float(away[nearest].norm()) > float(radius) - 0.002
+
+
+def test_variance_ranks_and_scores_stay(run):
+    _, grasps, _ = run
+    mixed = grasps[torch.randperm(len(grasps), generator=torch.Generator().manual_seed(0))]
+    ranked = rank_by_variance(mixed)
+    assert torch.equal(ranked.status != Status.OK, (ranked.status != Status.OK).sort(stable=True).values)
+    good = ranked[ranked.status == Status.OK]
+    total = good.contacts.variance.sum(1)
+    assert torch.equal(total, total.sort().values)
+    assert sorted(ranked.score.tolist()) == sorted(mixed.score.tolist())
+
+
+def test_stages_can_be_exchanged_one_at_a_time(run):
+    hand, _, stages = run
+    view, said = load_object("jug").view, {}
+    grasps = plan_grasps(
+        view,
+        hand,
+        ContactSpec(table=0.0),
+        starts=40,
+        mode="joint",
+        ranking="variance",
+        shape=stages["shape"],
+        observer=lambda stage, text, value: said.update({stage: value}),
+    )
+    assert len(said["shape"].x) == 70  # the given shape
+    total = grasps[grasps.status == Status.OK].contacts.variance.sum(1)
+    assert bool((total.diff() >= 0).all())
+
+
+def test_codes_of_a_spread_that_no_hand_has_get_no_seed():
+    hand = load_hand("barrett")
+    points = 0.5 * torch.eye(3, dtype=torch.float64)[None]
+    energy = load_mixture(hand.name).energy(encode(Contacts(points, 2 * points)))
+    assert float(energy.min()) > PAPER_ENERGY

@@ -1,0 +1,162 @@
+"""Grasps that come in waves: what is yielded stays, and all together are those of one call."""
+
+import dataclasses
+from itertools import pairwise
+
+import pytest
+import torch
+
+from torchgrasp import ContactSpec, Status, load_hand, load_object, plan_grasps, stream_grasps
+from torchgrasp.base import join, named_tensors
+from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.frames import rigid
+from torchgrasp.ik.ranking import rank_by_variance
+from torchgrasp.planner.choice import LIKELY, Offer, Untried
+from torchgrasp.planner.waves import FIRST, schedule
+from torchgrasp.values import Certificate, Contacts, IKSeeds
+
+SPEC = ContactSpec(table=0.0)
+HAND, VIEW = load_hand("barrett"), load_object("cylinder").view
+
+
+def same(first, second):
+    """Tell whether two values hold the same bits."""
+    a, b = named_tensors(first), named_tensors(second)
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """All grasps of one call, and what an observer heard."""
+    heard = []
+    return plan_grasps(VIEW, HAND, SPEC, 150, observer=lambda *stage: heard.append(stage)), heard
+
+
+@pytest.fixture(scope="module")
+def parts():
+    """The same wave by wave."""
+    return list(stream_grasps(VIEW, HAND, SPEC, 150))
+
+
+def test_the_union_of_the_stream_is_the_batch_call(whole, parts):
+    grasps, _ = whole
+    assert len(parts) > 1
+    union = join(parts)
+    union = union[torch.argsort(-union.score, stable=True)]
+    assert same(union, grasps[grasps.status == Status.OK])
+    assert [int(part.meta["starts"]) for part in parts] == [32, 150, 150]
+    assert parts[-1].meta == grasps.meta
+
+
+def test_each_wave_holds_executable_grasps_best_first(parts):
+    for part in parts:
+        assert len(part) and bool((part.status == Status.OK).all()) and bool(part.certificate.closed.all())
+        assert bool((part.score.diff() <= 0).all())
+    points = join(parts).contacts.points.flatten(1)
+    assert len(points.unique(dim=0)) == len(points)  # no triple twice
+
+
+def test_a_budget_ends_after_the_wave_that_passes_it(parts):
+    heard = []
+    short = plan_grasps(VIEW, HAND, SPEC, 150, time_budget=1e-3, observer=lambda *stage: heard.append(stage))
+    assert same(short[short.status == Status.OK], parts[0])
+    assert short.meta["starts"] == "32"
+    stages = {stage: value for stage, _, value in heard}
+    assert list(stages) == ["shape", "wave", "plan", "certify", "query", "refine"] and len(heard) == 6
+    assert len(stages["plan"]) == 32  # what was not planned has no status
+    assert len(short) <= FIRST
+    assert same(plan_grasps(VIEW, HAND, SPEC, 20, time_budget=1e6), plan_grasps(VIEW, HAND, SPEC, 20))
+    for wrong in (0.0, -1.0, float("nan")):
+        with pytest.raises(BadArgument, match="time_budget"):
+            plan_grasps(VIEW, HAND, SPEC, 20, time_budget=wrong)
+
+
+def test_an_observer_hears_of_each_wave_and_of_the_stages_of_all(whole):
+    grasps, heard = whole
+    stages = [stage for stage, _, _ in heard]
+    assert stages == ["shape", "wave", "plan", "certify", "query", "wave", "refine"]
+    values = {stage: value for stage, _, value in heard}
+    assert len(values["plan"]) == 150 and bool(values["certify"].closed.all())
+    assert int(values["query"].row.max()) == len(values["certify"]) - 1  # rows of all waves
+    assert same(values["refine"], grasps)
+    waves = [value for stage, _, value in heard if stage == "wave"]
+    assert sum(len(wave) for wave in waves) < len(grasps) and len(waves[0]) <= FIRST
+
+
+def test_who_stops_listening_stops_the_work():
+    heard = []
+    stream = stream_grasps(VIEW, HAND, SPEC, 150, observer=lambda stage, text, value: heard.append(stage))
+    assert heard == []  # nothing is done before the first grasps are asked for
+    next(stream)
+    stream.close()
+    assert heard == ["shape", "wave"]
+
+
+def test_wrong_arguments_are_refused_before_the_first_wave():
+    for options, word in (({"starts": 0}, "starts"), ({"mode": "best"}, "mode"), ({"ranking": "best"}, "ranking")):
+        with pytest.raises((BadArgument, TypeError), match=word):
+            stream_grasps(VIEW, HAND, SPEC, **options)
+    with pytest.raises(TypeError, match="colour"):
+        stream_grasps(VIEW, HAND, SPEC, colour="red")
+
+
+def test_variance_ranks_the_union():
+    grasps = plan_grasps(VIEW, HAND, SPEC, 40, ranking="variance")
+    assert same(rank_by_variance(grasps), grasps)
+    assert bool((grasps[grasps.status == Status.OK].contacts.variance.sum(1).diff() >= 0).all())
+
+
+def test_waves_plan_all_starts_and_try_all_rows():
+    for starts in [*range(1, 300), 1000, 10_000]:
+        for most in (160, 250):
+            waves = schedule(starts, most)
+            assert sum(wave.starts for wave in waves) == starts
+            assert sum(wave.tried for wave in waves) == min(starts, most)
+            assert min(wave.tried for wave in waves) >= min(FIRST, starts)
+            assert all(b.tried >= a.tried for a, b in pairwise(waves))
+            assert waves[0].starts >= waves[0].tried and min(wave.starts for wave in waves) >= 0
+
+
+def offer(points, seeds_of):
+    """Contacts at the given points; row i has the seeds `seeds_of[i]`, each known by its energy."""
+    n, nan = len(points), torch.full((len(points),), torch.nan, dtype=torch.float64)
+    row = torch.tensor([i for i, found in enumerate(seeds_of) for _ in found])
+    energy = torch.tensor([e for found in seeds_of for e in found], dtype=torch.float64)
+    g = len(row)
+    pose = rigid(torch.eye(3, dtype=torch.float64).expand(g, 3, 3), torch.zeros(g, 3, dtype=torch.float64))
+    seeds = IKSeeds(torch.zeros(g, 4).double(), pose, row, torch.arange(3).repeat(g, 1), energy, torch.zeros(g, 3))
+    certificate = Certificate(nan, nan, nan, torch.ones(n, dtype=torch.bool), torch.zeros(n, 6).double())
+    return Offer(Contacts(points, torch.zeros_like(points)), certificate, dataclasses.replace(seeds, row=row))
+
+
+def test_the_likeliest_rows_are_taken_once_far_apart_with_their_own_seeds():
+    rng = torch.Generator().manual_seed(0)
+    points = torch.rand(30, 3, 3, generator=rng, dtype=torch.float64)
+    cost = torch.rand(30, generator=rng, dtype=torch.float64)
+    cost[4] = torch.inf  # no seed
+    seeds = [[] if i == 4 else [float(i), i + 0.5] for i in range(30)]
+    untried = Untried()
+    for rows in (range(12), range(12, 30)):
+        part = offer(points[list(rows)], [seeds[i] for i in rows])
+        untried.add(part, cost[list(rows)])
+    gone = []
+    for most in (4, 9, 40):
+        taken = untried.take(most)
+        rows = [int((points == one).flatten(1).all(1).nonzero()) for one in taken.contacts.points]
+        left = [i for i in range(30) if i not in gone and i != 4]
+        likely = sorted(left, key=lambda i: float(cost[i]))[: LIKELY * most]
+        assert set(rows) <= set(likely) and len(rows) == min(most, len(left))
+        assert taken.seeds.energy.tolist() == [e for i in rows for e in seeds[i]]
+        assert taken.seeds.row.tolist() == [k for k in range(len(rows)) for _ in range(2)]
+        gone += rows
+    assert sorted(gone) == [i for i in range(30) if i != 4]
+    assert len(untried.take(5).contacts) == 0
+
+
+def test_of_equal_costs_the_farthest_from_all_taken_comes_next():
+    points = torch.zeros(6, 3, 3, dtype=torch.float64)
+    points[:, :, 0] = torch.tensor([0.0, 1.0, 0.125, 0.875, 0.5, 0.375])[:, None]
+    untried = Untried()
+    untried.add(offer(points, [[0.0]] * 6), torch.zeros(6, dtype=torch.float64))
+    taken = [sorted(untried.take(most).contacts.points[:, 0, 0].tolist()) for most in (3, 1, 1, 1)]
+    assert taken == [[0.0, 0.5, 1.0], [0.125], [0.875], [0.375]]

@@ -1,0 +1,133 @@
+"""Things of a scene: which is easy, what its best grasp is, and why another cannot be had."""
+
+import dataclasses
+
+import pytest
+import torch
+import trimesh
+
+from torchgrasp import ContactSpec, Status, load_hand, load_scene, plan_grasps, plan_scene
+from torchgrasp.cloud.camera import INTRINSICS, look_at
+from torchgrasp.cloud.render import render_depth
+from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
+from torchgrasp.ik.configuration import Configuration, SpatialJacobian
+from torchgrasp.planner import TARGET_POINTS, take_target
+from torchgrasp.planner.things import order_by_ease
+from torchgrasp.scene import Scene
+
+HAND = load_hand("barrett")
+
+
+def see(*boxes: tuple[float, ...], pose: torch.Tensor | None = None) -> Scene:
+    """Return the scene of boxes (x, y, width, height) on the table, or (x, y, width, height, foot)."""
+    meshes = []
+    for x, y, width, height, *foot in boxes:
+        mesh = trimesh.creation.box([width, width, height])
+        mesh.apply_translation([x, y, height / 2 + (foot[0] if foot else 0.0)])
+        meshes.append(mesh)
+    camera = look_at(20.0, 45.0, 0.7)
+    depth, labels = render_depth(meshes, camera)
+    return Scene.from_depth(depth, INTRINSICS, camera if pose is None else pose @ camera, labels=labels)
+
+
+def test_room_and_height_are_easy_and_what_something_lies_on_is_not():
+    near, flat = (0.0, 0.0, 0.06, 0.1), (0.15, 0.0, 0.06, 0.015)
+    scene = see(near, (0.0, 0.07, 0.06, 0.1), flat, (-0.15, 0.1, 0.06, 0.1))
+    assert order_by_ease(scene)[0] == 4
+    covered = see((0.0, 0.0, 0.1, 0.05), (0.0, 0.0, 0.06, 0.06, 0.05), (0.2, 0.0, 0.04, 0.1))
+    assert order_by_ease(covered)[-1] == 1
+
+
+def test_the_order_does_not_depend_on_the_frame():
+    boxes = (0.0, 0.0, 0.06, 0.1), (0.0, 0.08, 0.06, 0.08), (0.14, 0.0, 0.05, 0.03), (-0.13, 0.1, 0.06, 0.1)
+    pose = rigid(rotation_from_vector(torch.tensor([2.0, -1.0, 0.5]).double()), torch.tensor([1.0, 2.0, -0.5]).double())
+    assert order_by_ease(see(*boxes)) == order_by_ease(see(*boxes, pose=pose))
+
+
+@pytest.fixture(scope="module")
+def crowded():
+    scene = see((0.0, 0.0, 0.06, 0.12), (0.0, -0.1, 0.06, 0.14), (0.1, 0.02, 0.05, 0.06)).select(1)
+    return scene, plan_grasps(scene, HAND, starts=60)
+
+
+def test_no_link_comes_into_a_neighbour_at_the_grasp(crowded):
+    _, grasps = crowded
+    good = grasps[grasps.status == Status.OK]
+    assert len(good) > 0
+    spheres = HAND.collision_spheres
+    at = SpatialJacobian.at(HAND, Configuration(good.joints, good.obj_from_hand))
+    centres = at.points(spheres.link_index, spheres.center)
+    for x, y, width, height in ((0.0, -0.1, 0.06, 0.14), (0.1, 0.02, 0.05, 0.06)):
+        half = torch.tensor([width / 2, width / 2, height / 2]).double()
+        beyond = (centres - torch.tensor([x, y, height / 2]).double()).abs() - half
+        distance = beyond.clamp_min(0).norm(dim=-1) + beyond.amax(-1).clamp_max(0)
+        assert float((distance - spheres.radius.to(distance)).min()) > -0.004  # noise of the camera
+
+
+def test_what_may_be_in_the_way_lowers_success_and_pushing_allows_more(crowded):
+    scene, grasps = crowded
+    lone = plan_grasps(take_target(scene, 0), HAND, ContactSpec(table=scene.table), starts=60)
+    pushing = plan_grasps(scene, HAND, ContactSpec(contact_allowed=True), starts=60)
+    count = [int((some.status == Status.OK).sum()) for some in (grasps, pushing, lone)]
+    assert count[0] <= count[1] <= count[2]
+    assert float(grasps.success.max()) <= float(lone.success.max()) + 1e-9
+    assert not bool((pushing.status == Status.NEIGHBOUR_COLLISION).any())
+
+
+def test_a_scene_in_another_frame_gives_the_same_grasps():
+    boxes = (0.0, 0.0, 0.06, 0.12), (0.0, -0.1, 0.06, 0.14)
+    pose = rigid(rotation_from_vector(torch.tensor([0.3, 1.0, -2.0]).double()), torch.tensor([0.5, -1.0, 2.0]).double())
+    here, there = see(*boxes).select(1), see(*boxes, pose=pose).select(1)
+    there = dataclasses.replace(there, table=here.table.moved(pose))  # a fit differs by rounding
+    first, second = (plan_grasps(scene, HAND, starts=25) for scene in (here, there))
+    assert torch.equal(first.status, second.status)
+    torch.testing.assert_close(inverse(pose) @ second.obj_from_hand, first.obj_from_hand, rtol=0, atol=1e-6)
+    torch.testing.assert_close(first.joints, second.joints, rtol=0, atol=1e-6)
+
+
+def test_reachable_is_asked_in_the_given_frame_and_its_word_counts():
+    scene, asked = see((0.0, 0.0, 0.06, 0.12)).select(1), []
+
+    def reachable(obj_from_hand):
+        asked.append(obj_from_hand)
+        return obj_from_hand[:, 0, 3] > 0.0
+
+    grasps = plan_grasps(scene, HAND, starts=40, reachable=reachable)
+    good = grasps[grasps.status == Status.OK]
+    assert len(good) and float(good.obj_from_hand[:, 0, 3].min()) > 0.0
+    places = torch.cat(asked)[:, :3, 3]
+    assert float(apply(torch.eye(4).double(), places)[:, 2].max()) < 0.6  # palms near the box, in the scene's frame
+
+
+def test_things_are_ranked_with_reasons():
+    plan = plan_scene(load_scene(), HAND, starts=40, enough=0.5)
+    successes = [thing.success for thing in plan.things]
+    assert successes == sorted(successes, reverse=True)
+    assert plan.best is plan.things[0] and plan.best.success >= 0.5
+    assert all((thing.grasps is None) == bool(thing.reason) for thing in plan.things)
+    assert {thing.label for thing in plan.things} == {1, 2, 3, 4}
+    assert "not tried" in plan.things[-1].reason
+
+
+def test_a_thing_under_another_is_named():
+    scene = see((0.0, 0.0, 0.09, 0.06), (0.0, 0.0, 0.07, 0.05, 0.06))
+    grasps = plan_grasps(scene.select(1), HAND, starts=40)
+    assert not bool((grasps.status == Status.OK).any())
+
+
+def test_targets_are_thinned_by_the_seed():
+    scene = load_scene().select(1)
+    first, again, other = (take_target(scene, seed) for seed in (0, 0, 1))
+    assert len(first) == TARGET_POINTS
+    assert torch.equal(first.points, again.points) and not torch.equal(first.points, other.points)
+
+
+def test_wrong_arguments_are_named():
+    scene = load_scene()
+    with pytest.raises(BadArgument, match="target"):
+        plan_grasps(scene, HAND)
+    with pytest.raises(BadArgument, match="scene"):
+        plan_scene(dataclasses.replace(scene, labels=torch.zeros_like(scene.labels)), HAND)
+    with pytest.raises(BadArgument, match="enough"):
+        plan_scene(scene, HAND, enough=1.5)

@@ -1,0 +1,1 @@
+"""Applications of the library: command line, reports, drafts of hands. Not public."""

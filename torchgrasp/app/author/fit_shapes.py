@@ -1,0 +1,252 @@
+"""Boxes, cylinders and balls for the meshes of a published hand: shapes that planner and simulators know.
+
+A mesh is sampled. Its points are boxed, and a box is cut in two wherever that saves most volume.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from torchgrasp.app.author.repair import place, pose_of
+from torchgrasp.files.meshes import MAX_FACES, load_triangles
+from torchgrasp.hand.hand_toml import Pad
+from torchgrasp.hand.safe_xml import read_bounded
+from torchgrasp.hand.urdf import MAX_SIZE, Shape, Urdf
+
+if TYPE_CHECKING:
+    import trimesh
+
+MAX_MESH = 50 * 1024 * 1024
+"""Largest mesh [bytes]."""
+MAX_MESHES = 4 * MAX_MESH
+"""Largest size of all meshes of a hand [bytes]."""
+MESH_KINDS = (".stl", ".obj", ".ply")
+"""Formats of meshes: those that are geometry alone."""
+SAMPLES = 4000
+"""Points on each shape: 1 mm apart on a finger's link, 2 mm on a palm."""
+SAVING = 0.12
+"""A box is cut in two if that saves this share of all boxes' volume; less is the corners of round bodies."""
+SMALL, MOST_SMALL, MOST = 0.08, 3, 8
+"""Up to this size [m] a mesh gets at most 3 boxes, above it 8: what is tested grows with the square."""
+THIN = 0.008
+"""No box is cut shorter than this [m]: a fingertip's radius."""
+ROUND = 0.9
+"""A cylinder is taken where its volume is less than this share of the boxes': pi / 4 of one box's."""
+TURNED = 0.85
+"""A box is turned out of the link's axes if it then has less than this share of the volume."""
+FLAT = 1e-7
+"""Points that spread by less [m], RMS, lie in a plane: far above what float32 rounds off 0.1 m, 6e-9."""
+WHOLE = 2.6
+"""A tip shorter than this many radii is a ball and nothing else, as Allegro's: a hemisphere with a foot."""
+MOST_TIP, SAVING_TIP = 4, 0.04
+"""Boxes of a fingertip, and what a further one must save: a bent tip in one box would touch before its ball."""
+
+Points = Float[np.ndarray, "_ 3"]
+"""Points, of any count in each use."""
+Corners = tuple[np.ndarray, np.ndarray]
+
+
+def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
+    """Return the file of a mesh, which must lie in `folder`; `package://` means a path inside it.
+
+    Raises:
+        HandFileError: the name is that of no file in the folder, or of one that is no mesh or too large.
+    """
+    base, allowed = (
+        folder.resolve(),
+        f"a {', '.join(MESH_KINDS)} (export others) of at most {MAX_MESH >> 20} MiB inside {folder}",
+    )
+    refusal = urdf.wrong(f"mesh {name[:80]!r}", allowed)
+    package = name.startswith("package://")
+    path = PurePosixPath(name.removeprefix("package://"))
+    if ":" in str(path) or "\\" in name or path.is_absolute() or path.suffix.lower() not in MESH_KINDS:
+        raise refusal
+    # the name of a package says nothing about where its files are: its first words may be left out
+    starts = range(len(path.parts) if package else 1)
+    places = [place.joinpath(*path.parts[k:]) for k in starts for place in (urdf.path.resolve().parent, base)]
+    for file in places:
+        try:
+            found = file.resolve()
+            if found.is_relative_to(base) and found.is_file() and found.stat().st_size <= MAX_MESH:
+                return found
+        except (OSError, RuntimeError, ValueError):  # a loop of links, a name that the file system does not take
+            continue
+    raise refusal
+
+
+def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
+    """Return points [m] on each shape of every link, in the link's frame; meshes must lie in `folder`.
+
+    Raises:
+        HandFileError: a mesh is missing, outside the folder, too large or none.
+    """
+    names = {shape.file for link in urdf.links for shape in link.shapes if shape.kind == "mesh"}
+    size = sum(mesh_file(urdf, name, folder).stat().st_size for name in names)
+    if size > MAX_MESHES:
+        raise urdf.wrong(f"meshes of {size} bytes", f"at most {MAX_MESHES >> 20} MiB in all")
+    meshes = {name: _read_points(urdf, name, folder) for name in sorted(names)}
+    found = {}
+    for link in urdf.links:
+        parts = []
+        for shape in link.shapes:
+            local = meshes[shape.file] * shape.size if shape.kind == "mesh" else _primitive_points(shape)
+            reach = float(np.abs(local).max())
+            if not reach <= MAX_SIZE:
+                wanted = f"at most {MAX_SIZE:g} m; a mesh in millimetres needs a scale of 0.001"
+                raise urdf.wrong(f"mesh {shape.file!r} that reaches {reach:.3g} m", wanted)
+            pose = pose_of(shape)
+            parts.append(local @ pose[:3, :3].T + pose[:3, 3])
+        found[link.name] = tuple(parts)
+    return found
+
+
+def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tuple[Urdf, list[str]]:
+    """Replace every mesh by a few boxes or a cylinder around its points; tell how many."""
+    links, count, made = [], 0, 0
+    for link in urdf.links:
+        shapes: list[Shape] = []
+        for shape, on_it in zip(link.shapes, points[link.name], strict=True):
+            fitted = fit_shapes(on_it) if shape.kind == "mesh" else [shape]
+            count, made = count + (shape.kind == "mesh"), made + (len(fitted) if shape.kind == "mesh" else 0)
+            shapes += fitted
+        links.append(dataclasses.replace(link, shapes=tuple(shapes)))
+    told = [f"{count} collision meshes became {made} boxes or cylinders around them"] if count else []
+    return dataclasses.replace(urdf, links=tuple(links)), told
+
+
+def ball_tip(urdf: Urdf, tip: str, ball: Pad, outward: np.ndarray, points: Points) -> Urdf:
+    """Give a tip a ball, and boxes up to the ball's centre, close to its surface where it is bent.
+
+    `outward` points to the finger's end, `points` lie on the tip. Ball and boxes may touch the object.
+    """
+    link = next(x for x in urdf.links if x.name == tip)
+    reach = (points - np.array(ball.center)) @ outward
+    shapes = [Shape("sphere", (ball.radius,), ball.center, (0.0, 0.0, 0.0))]
+    if np.ptp(reach) > WHOLE * ball.radius:
+        motion = np.array(ball.normal) - ball.normal @ outward * outward
+        motion /= np.linalg.norm(motion)
+        axes = np.stack([motion, outward, np.cross(motion, outward)], 1)
+        shapes += _boxes(_cut(points[reach < 0] @ axes, MOST_TIP, SAVING_TIP), axes)
+    ended = dataclasses.replace(link, shapes=tuple(shapes))
+    return dataclasses.replace(urdf, links=tuple(ended if x is link else x for x in urdf.links))
+
+
+def _read_points(urdf: Urdf, name: str, folder: Path) -> Points:
+    """Read a mesh, and nothing that its file names; return points on it."""
+    import trimesh
+
+    path = mesh_file(urdf, name, folder)
+    data = read_bounded("urdf", path, "a mesh", MAX_MESH)
+    allowed = f"a triangle mesh of at most {MAX_FACES} faces"
+    try:
+        mesh = load_triangles(data, path.suffix.lower(), process=False)
+    except Exception as error:  # the readers of trimesh raise whatever their format runs into
+        raise urdf.wrong(f"mesh {name!r}: {error}"[:300], allowed) from error
+    sound = isinstance(mesh, trimesh.Trimesh) and 0 < len(mesh.faces) <= MAX_FACES
+    if not sound or not np.isfinite(mesh.vertices).all():
+        raise urdf.wrong(f"mesh {name!r} without faces, or with vertices that are no numbers", allowed)
+    return _sample(mesh)
+
+
+def _primitive_points(shape: Shape) -> Points:
+    from trimesh import creation
+
+    if shape.kind == "box":
+        return _sample(creation.box(shape.size))
+    if shape.kind == "sphere":
+        return _sample(creation.icosphere(3, shape.size[0]))
+    return _sample(creation.cylinder(shape.size[0], shape.size[1], sections=48))
+
+
+def _sample(mesh: "trimesh.Trimesh") -> Points:
+    """Return points on a mesh, with its corners."""
+    from trimesh.sample import sample_surface
+
+    points = np.asarray(sample_surface(mesh, SAMPLES, seed=0)[0])
+    vertices = np.asarray(mesh.vertices)
+    return np.concatenate([points, vertices[:: len(vertices) // SAMPLES + 1]])
+
+
+def fit_shapes(points: Points) -> list[Shape]:
+    """Cover points on a body by a few boxes, or by a cylinder.
+
+    >>> corners = np.array([[x, y, z] for x in (0, 0.02) for y in (0, 0.03) for z in (0, 0.05)])
+    >>> [shape.size for shape in fit_shapes(corners)]
+    [(0.02, 0.03, 0.05)]
+    """
+    turn = _axes(points)
+    local = points @ turn
+    boxes = _cut(local, MOST_SMALL if float(np.ptp(local, axis=0).max()) < SMALL else MOST, SAVING)
+    volume = sum(float(np.prod(high - low)) for low, high in boxes)
+    low, high = local.min(0), local.max(0)
+    middle, sides = (low + high) / 2, high - low
+    for axis in range(3):
+        radius = float(np.linalg.norm(np.delete(local - middle, axis, 1), axis=1).max())
+        if math.pi * radius**2 * sides[axis] < ROUND * volume:
+            along = np.roll(np.eye(3), -axis - 1, 0).T  # its third column is the axis
+            return [_shape("cylinder", (radius, sides[axis]), turn @ along, turn @ middle)]
+    return _boxes(boxes, turn)
+
+
+def _axes(points: Points) -> Float[np.ndarray, "3 3"]:
+    """Return the axes of the boxes as columns: the link's, unless the body is flat or others fit much better."""
+    from trimesh.bounds import oriented_bounds
+
+    if np.linalg.matrix_rank(points - points.mean(0), tol=FLAT * math.sqrt(len(points))) < 3:  # it has no hull
+        return np.eye(3)
+    turned, sizes = oriented_bounds(points)
+    straight = np.prod(np.ptp(points, axis=0))
+    return turned[:3, :3].T if np.prod(sizes) < TURNED * straight else np.eye(3)
+
+
+def _boxes(corners: list[Corners], axes: np.ndarray) -> list[Shape]:
+    """Return boxes from their corners along axes, the columns."""
+    return [_shape("box", tuple(high - low), axes, axes @ (low + high) / 2) for low, high in corners]
+
+
+def _cut(points: Points, most: int, saving: float) -> list[Corners]:
+    """Return the lower and upper corners of boxes around points."""
+    cells = [(points.min(0), points.max(0), points)]
+    while len(cells) < most:
+        total = sum(float(np.prod(high - low)) for low, high, _ in cells)
+        cuts = [(gain, k, two) for k, cell in enumerate(cells) for gain, two in _halves(*cell)]
+        gain, k, two = max(cuts, key=lambda cut: cut[0], default=(0.0, 0, ()))
+        if gain <= saving * total:
+            break
+        cells[k : k + 1] = two
+    return [(low, high) for low, high, _ in cells]
+
+
+def _halves(low: np.ndarray, high: np.ndarray, points: Points) -> list[tuple[float, list]]:
+    """Return what is saved by each cut of a box in two, and the two."""
+    found = []
+    for axis in range(3):
+        for at in np.linspace(low[axis], high[axis], 12)[1:-1]:
+            if min(at - low[axis], high[axis] - at) < THIN:
+                continue
+            below = points[:, axis] < at
+            if not 20 < int(below.sum()) < len(points) - 20:
+                continue
+            two = []
+            for part, face, side in ((points[below], 1, at), (points[~below], 0, at)):
+                corners = [part.min(0), part.max(0)]
+                corners[face][axis] = side  # no gap between the two
+                two.append((corners[0], corners[1], part))
+            saved = np.prod(high - low) - sum(np.prod(h - b) for b, h, _ in two)
+            found.append((float(saved), two))
+    return found
+
+
+def _shape(kind: str, size: tuple[float, ...], turn: np.ndarray, center: np.ndarray) -> Shape:
+    """Return a shape with rounded numbers: micrometres, and angles to 1e-6."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, center
+    xyz, rpy = place(pose)
+    x, y, z = (round(v, 6) for v in xyz)
+    roll, pitch, yaw = (round(v, 6) for v in rpy)
+    return Shape(kind, tuple(max(round(float(v), 6), 1e-4) for v in size), (x, y, z), (roll, pitch, yaw))

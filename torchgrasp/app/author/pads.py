@@ -1,0 +1,198 @@
+"""Guessed pads of fingertips: where they touch, and which way they face.
+
+A URDF does not say where a finger's pad is. Here the pad faces where the finger's last joint bends. A joint bends to
+the side with most of its range; if both have as much, towards the other fingertips.
+"""
+
+import itertools
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.frames import rigid, rotation_from_rpy
+from torchgrasp.hand.hand_toml import Pad
+from torchgrasp.hand.kinematics import map_directions, map_points, pose_in_carrier
+from torchgrasp.hand.urdf import Joint, Link, Shape, Triple, Urdf
+
+MEETING_SHARE = 0.1
+"""Share of the postures that tells where the fingers meet: those with the nearest fingertips."""
+ONE_SIDED = 0.1
+"""A joint bends to one side if the middle of its range is farther off zero than this, over the range's length."""
+TILT = math.radians(30)
+"""A round tip touches this far from its direction of motion, towards its end: so the Allegro hand closes most often."""
+SHORT_ARM = 1e-3
+"""A joint whose axis passes a tip nearer than this [m] does not move it."""
+NEAR_END = 0.015
+"""How much of a finger's end [m] tells how thick it is."""
+LEAST_BALL, MOST_BALL = 0.003, 0.013
+"""Radii [m] between which the ball on a fingertip is chosen: the smallest that grips, a millimetre above Allegro's."""
+FACING, HELD = math.cos(math.radians(45)), (0.015, 0.08)
+"""Pads face the middle of three within 45 degrees, and are this far [m] from it: objects of 3 to 16 cm."""
+BESIDE = 0.003
+"""Points of a surface nearer than this [m] to a ray tell where it leaves the body."""
+
+Vector = Float[np.ndarray, "3"]
+Points = Float[np.ndarray, "_ 3"]
+"""Points, of any count in each use."""
+
+
+class Guess(NamedTuple):
+    """Pads of fingertips, the direction to each finger's end in its tip's frame, and the direction out of the palm."""
+
+    pads: tuple[Pad, ...]
+    outward: tuple[Vector, ...]
+    approach: Triple
+
+
+def guess_pads(
+    urdf: Urdf, frames: Float[Tensor, "3 4 _ n"], tips: Sequence[str], surfaces: Mapping[str, Points]
+) -> Guess:
+    """Guess the pads of the tips and the direction out of the palm, from frames of tips and palm in random postures.
+
+    A tip of one box, cylinder or sphere has its pad on that. Another gets a ball that touches its surface, of points
+    (n, 3) in `surfaces`, where the pad is.
+    """
+    links = {x.name: i for i, x in enumerate(urdf.links)}
+    cores = [_core(urdf, urdf.links[links[tip]], surfaces) for tip in tips]
+    tip_frames = frames[:, :, :-1]
+    centres = map_points(tip_frames, torch.tensor(np.stack(cores)))  # 3 f n
+    middle = centres[:, :3].mean(1, keepdim=True)
+    spread = torch.linalg.vector_norm(centres[:, :3] - middle, dim=0).sum(0)
+    near = spread.topk(max(1, int(MEETING_SHARE * len(spread))), largest=False).indices
+    inward = (tip_frames[:, :3] * (middle - centres)[:, None])[..., near].sum(0).mean(-1).T.numpy()  # tips' frames
+    pads, ends = [], []
+    for tip, core, closing in zip(tips, cores, inward, strict=True):
+        joint, motion, outward = _motion(urdf, tip, core)
+        middle_of_range = (joint.lower + joint.upper) / 2
+        one_sided = abs(middle_of_range) > ONE_SIDED * (joint.upper - joint.lower)
+        bending = math.copysign(1.0, middle_of_range if one_sided else motion @ closing)
+        link, way = urdf.links[links[tip]], bending * motion
+        single = is_primitive(link)
+        ends.append(outward)
+        pads.append(_pad(link.shapes[0], core, way, outward) if single else _ball(surfaces[tip], way, outward))
+    points = surfaces.get(palm_of(urdf, tips), np.zeros((1, 3)))
+    palm_centre = map_points(frames[:, :, -1:, :1], torch.tensor((points.min(0) + points.max(0))[None] / 2))
+    out = (middle[:, 0, near].mean(1) - palm_centre[:, 0, 0]).numpy()
+    axis = int(np.abs(out).argmax())
+    return Guess(tuple(pads), tuple(ends), _triple(np.sign(out[axis]) * np.eye(3)[axis]))
+
+
+def palm_of(urdf: Urdf, tips: Sequence[str]) -> str:
+    """Return the link that carries most of the fingers."""
+    bases = Counter(urdf.movers(tip)[-1].parent for tip in tips)
+    return max(bases, key=lambda name: bases[name])
+
+
+def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> list[int]:
+    """Return the tips, first the three whose pads most often face their middle, then one by one those that face best.
+
+    A pad faces the middle within 45 degrees; in between lies something of a size that a hand holds. `frames` are the
+    tips' frames in random postures.
+    """
+    contacts, normals = (torch.tensor([getattr(p, k) for p in pads]).double() for k in ("contact", "normal"))
+    points, directions = map_points(frames, contacts), map_directions(frames, normals)
+
+    def share(tips: tuple[int, ...]) -> float:
+        """Return the share of the postures in which all these pads face their middle."""
+        inward = points[:, tips].mean(1, keepdim=True) - points[:, tips]
+        length = torch.linalg.vector_norm(inward, dim=0)
+        facing = (directions[:, tips] * inward).sum(0) / length.clamp_min(1e-9)
+        apart = (length > HELD[0]) & (length < HELD[1])
+        return float(((facing > FACING) & apart).all(0).double().mean())
+
+    order = max(itertools.combinations(range(len(pads)), 3), key=share)
+    while len(order) < len(pads):
+        order = max(((*order, k) for k in range(len(pads)) if k not in order), key=share)
+    return list(order)
+
+
+def is_primitive(link: Link) -> bool:
+    """Tell whether a link is one box, cylinder or sphere."""
+    return len(link.shapes) == 1 and link.shapes[0].kind != "mesh"
+
+
+def _ball(points: Points, motion: Vector, outward: Vector) -> Pad:
+    """Return a ball inside the end of a body that touches the body's surface where the pad is."""
+    axes = np.stack([motion, outward, np.cross(motion, outward)], 1)
+    local = points @ axes
+    end = local[:, 1].max()
+    near = local[local[:, 1] > end - NEAR_END]
+    radius = round(float(np.clip(np.ptp(near[:, [0, 2]], axis=0).min() / 2, LEAST_BALL, MOST_BALL)), 4)
+    ring = local[np.abs(local[:, 1] - (end - radius)) < BESIDE]
+    low, high = ring.min(0), ring.max(0)
+    core = axes @ [(low[0] + high[0]) / 2, end - radius, (low[2] + high[2]) / 2]
+    normal = math.cos(TILT) * motion + math.sin(TILT) * outward
+    along = (points - core) @ normal
+    beside = np.linalg.norm(points - core - along[:, None] * normal, axis=1) < BESIDE
+    depth = float(along[beside].max(initial=radius))
+    center = _triple(np.round(core + (depth - radius) * normal, 6))
+    normal = np.array(_triple(normal / np.linalg.norm(normal)))
+    return Pad(_triple(center + radius * normal), _triple(normal), center, radius)
+
+
+def _motion(urdf: Urdf, tip: str, core: Vector) -> tuple[Joint, Vector, Vector]:
+    """Return the last joint that moves a tip, and the directions of motion and of the arm in the tip's frame."""
+    tip_from_above = np.eye(4)
+    for joint in urdf.joints_above(tip):
+        if joint.kind != "fixed":
+            axis, arm = tip_from_above[:3, :3] @ np.array(joint.axis), core - tip_from_above[:3, 3]
+            motion = axis if joint.kind == "prismatic" else np.cross(axis, arm)
+            length = float(np.linalg.norm(motion))
+            if length > SHORT_ARM:
+                arm = arm - (arm @ axis) * axis
+                return joint, motion / length, arm / max(float(np.linalg.norm(arm)), SHORT_ARM)
+        above_from_link = rigid(rotation_from_rpy(joint.rpy), torch.tensor(joint.xyz, dtype=torch.float64))
+        tip_from_above = tip_from_above @ np.linalg.inv(above_from_link.numpy())
+    raise BadArgument("tips", tip, "links that a joint moves")
+
+
+def _half(shape: Shape) -> Vector:
+    """Return the half sizes of a shape's bounding box."""
+    if shape.kind == "box":
+        return np.array(shape.size) / 2
+    radius = shape.size[0]
+    return np.array([radius, radius, radius if shape.kind == "sphere" else shape.size[1] / 2])
+
+
+def _core(urdf: Urdf, link: Link, surfaces: Mapping[str, Points]) -> Vector:
+    """Return a point at the far end of a tip, in its frame: half a thickness before the end where the tip is simple."""
+    if not is_primitive(link):
+        points, pose = surfaces[link.name], pose_in_carrier(urdf, link.name)[1].numpy()
+        reach = np.linalg.norm(points @ pose[:, :3].T + pose[:, 3], axis=1)
+        return points[reach > reach.max() - BESIDE].mean(0)
+    shape = link.shapes[0]
+    center, half = np.array(shape.xyz), _half(shape)
+    rotation, long = rotation_from_rpy(shape.rpy).numpy(), int(half.argmax())
+    inset = half[long] - np.delete(half, long).min()
+    return center + math.copysign(inset, rotation[:, long] @ center) * rotation[:, long]
+
+
+def _pad(shape: Shape, core: Vector, motion: Vector, outward: Vector) -> Pad:
+    """Return the pad of a tip that moves along `motion`; on a sphere it is tilted outward."""
+    if shape.kind == "sphere":
+        normal, radius = math.cos(TILT) * motion + math.sin(TILT) * outward, shape.size[0]
+        center, normal = np.array(shape.xyz), normal / np.linalg.norm(normal)
+        return Pad(_triple(center + radius * normal), _triple(normal), _triple(center), radius)
+    rotation, half = rotation_from_rpy(shape.rpy).numpy(), _half(shape)
+    side = rotation.T @ motion
+    side[int(half.argmax())] = 0.0  # along the tip's length there is no pad
+    if shape.kind == "box":
+        face = int(np.abs(side).argmax())
+        side, depth = np.sign(side[face]) * np.eye(3)[face], half[face]
+    else:
+        side, depth = side / np.linalg.norm(side), shape.size[0]
+    contact = core + depth * (rotation @ side)
+    return Pad(_triple(contact), _triple(rotation @ side), _triple(contact), 0.0)
+
+
+def _triple(x: Vector) -> Triple:
+    """Return an array as three numbers that print shortly."""
+    a, b, c = (round(float(v), 12) + 0.0 for v in x)
+    return a, b, c

@@ -1,0 +1,126 @@
+"""`torchgrasp doctor` and `torchgrasp selftest`: is this installation whole, and does it find what it should?"""
+
+import importlib.metadata
+import importlib.util
+import os
+import platform
+import sys
+from typing import NamedTuple
+
+import torch
+
+from torchgrasp import __version__
+from torchgrasp.app.cli.progress import Progress
+from torchgrasp.columns import format_columns
+from torchgrasp.errors import BadArgument, MissingExtra
+from torchgrasp.hand.load import hands_folder
+from torchgrasp.specs import Simulator
+
+CORE = ("torch", "numpy", "scipy", "trimesh", "pytorch-kinematics", "yourdfpy", "safetensors")
+"""Packages without which nothing runs."""
+SIMULATORS: dict[Simulator, str] = {"sapien": "sim", "mujoco": "mujoco"}
+"""Simulators, and the extra that installs each."""
+OPTIONAL = {"viser": ("view", "`torchgrasp view`"), "distributed": ("cluster", "`torchgrasp campaign --scheduler`")}
+"""Packages of one command each: the extra that installs it, and the command."""
+
+
+class Finding(NamedTuple):
+    """A part of the installation: what was found, and what mends it; "" where nothing needs to be."""
+
+    part: str
+    found: str
+    remedy: str = ""
+
+
+def doctor() -> int:
+    """Tell what is installed and what is missing, with the command that installs it.
+
+    The exit code is 1 if a simulator or a package is missing; planning needs no simulator, and what one command alone
+    needs is no fault.
+    """
+    findings = [
+        Finding(
+            "torchgrasp",
+            f"{__version__}, hands: {', '.join(sorted(p.parent.name for p in hands_folder().glob('*/hand.toml')))}",
+        ),
+        Finding("Python", f"{platform.python_version()} on {platform.system()} {platform.machine()}, {sys.executable}"),
+        *(_package(name) for name in CORE),
+        Finding("processor", f"{os.cpu_count()} cores; a command uses one, and --workers N uses N"),
+        _gpu(),
+        *(_simulator(name) for name in SIMULATORS),
+        *(_package(name, "pip install 'torchgrasp[sim]'") for name in ("coacd", "pebble")),
+        *(_option(name) for name in OPTIONAL),
+    ]
+    print(format_columns([(x.part, x.found) for x in findings], left={0, 1}))
+    missing = [x for x in findings if x.remedy]
+    for x in missing:
+        print(f"\n{x.part}: {x.remedy}")
+    print("\nall is there; `torchgrasp selftest` tries it" if not missing else "")
+    return 1 if missing else 0
+
+
+def selftest() -> int:
+    """Lift six shipped grasps in each simulator that is installed, and compare the verdicts with the known ones.
+
+    The exit code is 0 if all verdicts are right, and 1 if one is wrong or no simulator is installed.
+    """
+    from torchgrasp.evaluation.golden import GOLDEN, GoldenResult, run_golden
+
+    faults: dict[Simulator, str] = {name: _simulator(name).remedy for name in SIMULATORS}
+    for name, remedy in faults.items():
+        if remedy:
+            print(f"{name}: {remedy}")
+    there: list[Simulator] = [name for name in SIMULATORS if not faults[name]]
+    if not there:
+        return 1
+    progress, found = Progress(*there), dict[Simulator, list[GoldenResult]]()
+    with progress.bar:
+        for name in there:
+            found[name] = list(run_golden(name))
+            right = sum(x.right for x in found[name])
+            progress.end(name, f"{right} of {len(GOLDEN)} verdicts right")
+    rows = [("object", "hand", "expected", *found)]
+    for k, case in enumerate(GOLDEN):
+        told = [f"{_verdict(x[k].held)}{'' if x[k].right else ' (wrong)'}" for x in found.values()]
+        rows.append((case.object, case.hand, _verdict(case.held), *told))
+    print(f"\n{format_columns(rows, left=range(len(rows[0])))}")
+    return 0 if all(x.right for results in found.values() for x in results) else 1
+
+
+def _verdict(held: bool) -> str:
+    """Return a verdict in one word."""
+    return "held" if held else "lost"
+
+
+def _package(name: str, remedy: str = "pip install torchgrasp") -> Finding:
+    """Return the version of a package."""
+    try:
+        return Finding(name, importlib.metadata.version(name))
+    except importlib.metadata.PackageNotFoundError:
+        return Finding(name, "missing", remedy)
+
+
+def _option(name: str) -> Finding:
+    """Return the version of a package that one command needs; where it is not, what installs it is no remedy."""
+    extra, command = OPTIONAL[name]
+    found = _package(name)
+    return found if not found.remedy else Finding(name, f"none; {command} needs it: pip install 'torchgrasp[{extra}]'")
+
+
+def _gpu() -> Finding:
+    """Return the GPU that torch sees; none is no fault."""
+    if torch.cuda.is_available():
+        return Finding("GPU", f"{torch.cuda.get_device_name()}, CUDA {torch.version.cuda}")
+    return Finding("GPU", "none that torch sees; everything runs on the processor")
+
+
+def _simulator(name: Simulator) -> Finding:
+    """Return the version of a simulator that can be imported."""
+    from torchgrasp.app.cli.grasps import import_simulator
+
+    try:
+        import_simulator(name)
+    except (MissingExtra, BadArgument) as error:
+        missing = isinstance(error, MissingExtra)
+        return Finding(name, "missing" if missing else "cannot be loaded", str(error).partition(": ")[2] or str(error))
+    return Finding(name, importlib.metadata.version(name))

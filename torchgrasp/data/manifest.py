@@ -1,0 +1,280 @@
+"""Folders of objects: true meshes and views of them.
+
+`manifest.json` holds "objects" by name. An object has "views" by name, each with "T_object_camera" (4x4). Its folder
+has `mesh.ply` and `<view>_noisy.ply` [m], resting at z = 0. All readers apply the object's "suggested_scale"
+(default 1), at which a hand can grasp it. Optional are "mass_kg", the "family" of look-alikes that it belongs to, and
+its "group", such as "solid".
+
+The folder of a stranger may hold anything. A name of an object or a view is one part of a path, and no file outside
+the folder is read.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from torchgrasp.checks import Count, Seed, checked
+from torchgrasp.cloud.camera import look_at, partial_view
+from torchgrasp.cloud.io.read import read_cloud, save_cloud
+from torchgrasp.errors import DatasetError
+from torchgrasp.files import format_json, write_file
+from torchgrasp.geometry.mesh import read_mesh
+from torchgrasp.json_fields import Field, read_json
+from torchgrasp.values import PointCloud
+
+if TYPE_CHECKING:
+    import trimesh
+
+WHOLE = "whole"
+"""Name of the view that shows an object from all sides, with normals: `full_normals.ply`."""
+MOST_SCALE, MOST_METRES, MOST_MASS = 1e4, 1e4, 1e4
+"""Largest scale, its inverse being the least, largest coordinate [m] of a camera, and largest mass [kg]."""
+LONGEST_NAME = 100
+"""Most letters of a name: file names have 255 bytes."""
+MESHES = (".ply", ".stl", ".obj", ".off")
+"""Suffixes of the meshes that `write_objects` takes from a folder."""
+ELEVATION, DISTANCE = (25.0, 45.0), 0.5
+"""Of a rendered view: angle above the horizontal [deg], uniform, and distance [m], as of a camera on a robot's arm."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjectEntry:
+    """What the manifest says of an object.
+
+    Args:
+        views: the camera's position [m] of each view, by name, at scale 1.
+        scale: factor of mesh and clouds.
+        family: look-alikes that it belongs to; its own name if the manifest has none.
+        group: such as "solid", "thin" or "shell"; "" if the manifest has none.
+        mass: of the real object [kg], whatever its scale; None: the manifest has none.
+    """
+
+    views: dict[str, tuple[float, ...]]
+    scale: float
+    family: str
+    group: str
+    mass: float | None
+
+
+@checked
+def list_entries(objects: Path | str, only: Sequence[str] = ()) -> list[str]:
+    """Return the names of the objects of a folder, sorted; `only` selects some. Their entries may be bad.
+
+    Raises:
+        DatasetError: no manifest, or none of the objects in it.
+    """
+    return sorted(_read_fields(objects, only))
+
+
+@checked
+def read_entry(objects: Path | str, name: str) -> ObjectEntry:
+    """Return what the manifest says of an object.
+
+    Raises:
+        DatasetError: no such object, a field that is missing or of a wrong type or range, or a name that is no name of
+            a folder.
+    """
+    return _parse_entry(name, _read_fields(objects, [name])[name])
+
+
+def read_entries(objects: Path | str, only: Sequence[str] = ()) -> dict[str, ObjectEntry | DatasetError]:
+    """Return what the manifest says of each object, sorted by name, or what is wrong with its entry."""
+    found: dict[str, ObjectEntry | DatasetError] = {}
+    for name, field in sorted(_read_fields(objects, only).items()):
+        try:
+            found[name] = _parse_entry(name, field)
+        except DatasetError as error:
+            found[name] = error
+    return found
+
+
+def _parse_entry(name: str, field: Field) -> ObjectEntry:
+    """Return the entry of an object, checked."""
+    check_name(field, name)
+    fields, views = field.entries(), {}
+    if "views" not in fields:
+        raise field.wrong('an object with "views"')
+    for view, of_view in fields["views"].entries().items():
+        check_name(of_view, view)
+        pose = of_view.entries().get("T_object_camera")
+        if pose is None:
+            raise of_view.wrong('an object with "T_object_camera"')
+        rows = [[x.number(-MOST_METRES, MOST_METRES) for x in row.items(4)] for row in pose.items(4)]
+        if [len(row) for row in rows] != [4, 4, 4, 4]:
+            raise pose.wrong("4 rows of 4 numbers")
+        views[view] = tuple(row[3] for row in rows[:3])
+    scale, mass, family, group = (fields.get(key) for key in ("suggested_scale", "mass_kg", "family", "group"))
+    return ObjectEntry(
+        views,
+        1.0 if scale is None else scale.number(1 / MOST_SCALE, MOST_SCALE),
+        name if family is None else family.text(),
+        "" if group is None else group.text(),
+        None if mass is None or mass.value is None else mass.number(1e-6, MOST_MASS),
+    )
+
+
+@checked
+def write_objects(meshes: Path | str, out: Path | str, views: Count = 3, seed: Seed = 0) -> list[str]:
+    """Make a folder of objects from a folder of bare meshes; return the objects' names, those of the files.
+
+    Each mesh is set down: its lowest point at z = 0, the middle of its box above the origin. Each view is that of the
+    depth camera of `partial_view` from a random side. The manifest is written last, so that a folder that has one is
+    whole.
+
+    Args:
+        meshes: folder of closed meshes in metres, z up (.ply, .stl, .obj, .off).
+        out: folder to write.
+        views: of each object.
+        seed: of the cameras and of their noise.
+
+    Raises:
+        DatasetError: no meshes, or two of one name.
+        MeshError, SuspiciousScale: as `read_mesh`.
+        OutputError: the folder cannot be written.
+
+    >>> import tempfile, trimesh
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> _ = trimesh.creation.box((0.05, 0.06, 0.12)).export(folder / "carton.stl")
+    >>> write_objects(folder, folder / "objects", views=1)
+    ['carton']
+    """
+    files = sorted(path for path in Path(meshes).glob("*") if path.suffix.lower() in MESHES)
+    names = [path.stem for path in files]
+    if not files or len(set(names)) != len(names):
+        found = f"{meshes} without meshes" if not files else f"{meshes} with two meshes of one name"
+        raise DatasetError("meshes", found, f"a folder of files {', '.join(MESHES)}, each of its own name")
+    generator, entries = torch.Generator().manual_seed(seed), dict[str, object]()
+    for path in files:
+        mesh = read_mesh(path)
+        low, high = mesh.bounds
+        mesh = mesh.copy().apply_translation([-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]])
+        content = mesh.export(file_type="ply")
+        write_file(Path(out) / path.stem / "mesh.ply", content)
+        poses = dict[str, object]()
+        for k in range(views):
+            first, second = torch.rand(2, generator=generator).tolist()
+            elevation = ELEVATION[0] + (ELEVATION[1] - ELEVATION[0]) * second
+            camera = look_at(360.0 * first, elevation, DISTANCE, mesh)
+            noise = int(torch.randint(2**31, (1,), generator=generator))
+            save_cloud(partial_view(mesh, camera, seed=noise), Path(out) / path.stem / f"view{k}_noisy.ply")
+            poses[f"view{k}"] = {"T_object_camera": camera.tolist()}
+        entries[path.stem] = {"views": poses}
+    write_file(Path(out) / "manifest.json", format_json({"objects": entries}))
+    return names
+
+
+def check_name(field: Field, name: str) -> None:
+    """Refuse a name that is more than one part of a path, or that a terminal would not print."""
+    plain = name.isprintable() and not set(name) & set("/\\:") and name == name.strip(" .")
+    if not plain or not 0 < len(name.encode("utf-8", "surrogatepass")) <= LONGEST_NAME:
+        allowed = f"a printable name of 1 to {LONGEST_NAME} bytes without / \\ : or a dot or space at its ends"
+        raise field.refuse(f"{field.path}: the name {name[:LONGEST_NAME]!r}", allowed)
+
+
+@checked
+def list_views(
+    objects: Path | str, whole: bool = False, only: Sequence[str] = (), most: Count | None = None
+) -> list[tuple[str, str]]:
+    """Return sorted pairs of object and view, at most so many of an object; None: all.
+
+    `only` selects objects; with `whole` each has one view, `WHOLE`.
+
+    Raises:
+        DatasetError: no manifest, none of the objects in it, or a bad entry.
+
+    >>> import tempfile, trimesh
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> _ = trimesh.creation.box((0.05, 0.06, 0.12)).export(folder / "carton.stl")
+    >>> _ = write_objects(folder, folder / "objects", views=1)
+    >>> list_views(folder / "objects")
+    [('carton', 'view0')]
+    """
+    entries = {name: _parse_entry(name, field) for name, field in sorted(_read_fields(objects, only).items())}
+    return [(name, view) for name, x in entries.items() for view in ([WHOLE] if whole else sorted(x.views))[:most]]
+
+
+@checked
+def read_view(objects: Path | str, name: str, view: str, camera: bool = True) -> PointCloud:
+    """Return a noisy view without normals, with its viewpoint if `camera`.
+
+    Raises:
+        DatasetError: as `read_entry`, or no such view.
+        CloudFileError: a bad file.
+
+    >>> import tempfile, trimesh
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> _ = trimesh.creation.box((0.05, 0.06, 0.12)).export(folder / "carton.stl")
+    >>> _ = write_objects(folder, folder / "objects", views=1)
+    >>> len(read_view(folder / "objects", "carton", "view0"))
+    1000
+    """
+    entry = read_entry(objects, name)
+    if view == WHOLE:
+        cloud = read_cloud(_file(objects, name, "full_normals.ply"))
+        return PointCloud(cloud.points * entry.scale, cloud.normals)
+    if view not in entry.views:
+        raise DatasetError("objects", f"{objects}: view {view!r} of {name!r}", f"one of {sorted(entry.views)}")
+    cloud = read_cloud(_file(objects, name, f"{view}_noisy.ply"))
+    viewpoint = torch.tensor(entry.views[view], dtype=torch.float64)
+    return PointCloud(cloud.points * entry.scale, None, viewpoint * entry.scale if camera else None)
+
+
+@checked
+def read_object_mesh(objects: Path | str, name: str) -> "trimesh.Trimesh":
+    """Return the true mesh of an object; raises as `read_entry` and `read_mesh`.
+
+    >>> import tempfile, trimesh
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> _ = trimesh.creation.box((0.05, 0.06, 0.12)).export(folder / "carton.stl")
+    >>> _ = write_objects(folder, folder / "objects", views=1)
+    >>> round(float(read_object_mesh(folder / "objects", "carton").volume), 6)
+    0.00036
+    """
+    scale = read_entry(objects, name).scale
+    return read_mesh(_file(objects, name, "mesh.ply")).apply_scale(scale)
+
+
+@checked
+def read_family(objects: Path | str, name: str) -> str:
+    """Return the family of look-alikes of an object, see `ObjectEntry`."""
+    return read_entry(objects, name).family
+
+
+@checked
+def read_group(objects: Path | str, name: str) -> str:
+    """Return the group of an object, see `ObjectEntry`."""
+    return read_entry(objects, name).group
+
+
+@checked
+def read_mass(objects: Path | str, name: str) -> float | None:
+    """Return the mass [kg] of an object, see `ObjectEntry`."""
+    return read_entry(objects, name).mass
+
+
+def _file(objects: Path | str, name: str, file: str) -> Path:
+    """Return the path of an object's file, which may not be linked to one outside the folder."""
+    path, folder = Path(objects) / name / file, Path(objects).resolve()
+    if not path.resolve().is_relative_to(folder):
+        raise DatasetError("objects", f"{path}, which is {path.resolve()}", f"files within {folder}")
+    return path
+
+
+def _read_fields(objects: Path | str, only: Sequence[str]) -> dict[str, Field]:
+    """Return the entries of the objects asked for, all of them if `only` is empty."""
+
+    def refuse(found: str, allowed: str) -> DatasetError:
+        return DatasetError("objects", found, allowed)
+
+    path = Path(objects) / "manifest.json"
+    top = read_json(
+        path, refuse, "a folder with a manifest.json in UTF-8 (`torchgrasp cloud views` makes one of meshes)"
+    ).entries()
+    entries = top["objects"].entries() if "objects" in top else {}
+    chosen = {name: entries[name] for name in entries if not only or name in only}
+    if not chosen:
+        raise refuse(f"{path} with {sorted(entries)[:100]}", "a manifest with the objects asked for")
+    return chosen

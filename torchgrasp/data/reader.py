@@ -1,0 +1,198 @@
+"""The data set of a campaign, grasp by grasp for learning, or job by job."""
+
+import bisect
+import dataclasses
+import functools
+import itertools
+import operator
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from torchgrasp.checks import Count, Range, checked
+from torchgrasp.data.shards import MOST, JobRow, Shard, load_shard, read_row
+from torchgrasp.errors import ModelFileError
+from torchgrasp.files import Recent
+from torchgrasp.json_fields import Field, read_json
+from torchgrasp.values import Grasps, PointCloud
+
+CARD = "card.json"
+"""File that describes a data set; it is written last, so a folder that has one is whole."""
+MOST_CARD = 256 * 1024 * 1024
+"""Most bytes of a card: a million jobs take 250 each."""
+KEPT = 32
+"""Shards that stay in memory: of 64 jobs with 20 grasps each one takes 3 MB, mostly clouds."""
+
+
+class ShardJob(NamedTuple):
+    """A job of a data set: its row, the cloud (None: no view was read) and the grasps that were tried.
+
+    `passed` and `outcome` (a `Status`) have a row for each grasp, and a column for each try in the simulator.
+    """
+
+    row: JobRow
+    cloud: PointCloud | None
+    grasps: Grasps
+    passed: Bool[Tensor, "g d"]
+    outcome: Int[Tensor, "g d"]
+
+
+@dataclasses.dataclass(frozen=True)
+class GraspShards:
+    """A data set of grasps on disk, from `read_shards`; a map-style dataset for `torch.utils.data.DataLoader`.
+
+    `len` counts the grasps. Item i is a dict of tensors, float32 for learning, metres and radians in the object's
+    frame: `points` (n, 3) and `viewpoint` (3,) of the cloud; `joints` and `pregrasp` (h,), `approach` (3,),
+    `obj_from_hand` (4, 4); `contacts` and `normals` (f, 3), `std_m` (f,); `margin`, `witness` (6,) and `closed` of the
+    certificate; `clearance`; `predicted` and `simulated` success; `job`, the place in `jobs`. `simulated` is the share
+    of tries that passed.
+
+    Args:
+        folder: of the data set.
+        card: what `card.json` says of it.
+        jobs: one row for each object and view, those without a grasp too.
+        size: jobs of a shard.
+        points: of each item's cloud; None: all, and then items of one batch may differ.
+    """
+
+    folder: Path
+    card: dict[str, Any]
+    jobs: tuple[JobRow, ...]
+    size: int
+    points: int | None = None
+    recent: Recent[Any] = dataclasses.field(default_factory=lambda: Recent[Any](KEPT), repr=False, compare=False)
+
+    @functools.cached_property
+    def starts(self) -> list[int]:
+        """The place of each job's first grasp, and their number at the end."""
+        return list(itertools.accumulate((row.grasps for row in self.jobs), initial=0))
+
+    def __len__(self) -> int:
+        """Count the grasps."""
+        return self.starts[-1]
+
+    def __iter__(self) -> Iterator[dict[str, Tensor]]:
+        """Iterate over the grasps."""
+        return (self[i] for i in range(len(self)))
+
+    def __getitem__(self, i: int) -> dict[str, Tensor]:
+        """Return grasp i; raises `IndexError` beyond the last, `ModelFileError` if its shard is damaged."""
+        i = range(len(self))[operator.index(i)]
+        j = bisect.bisect_right(self.starts, i) - 1
+        shard, first = self._shard(j // self.size), j - j % self.size
+        g = i - self.starts[first]
+        p = sum(row.points for row in self.jobs[first:j])
+        records, grasps = shard.records, shard.records.grasps
+        contacts, certificate = grasps.contacts, grasps.certificate
+        item = {
+            "points": _choose(records.points[p : p + self.jobs[j].points], self.points, i),
+            "viewpoint": records.viewpoints[j - first],
+            "joints": grasps.joints[g],
+            "pregrasp": grasps.pregrasp[g],
+            "approach": grasps.approach[g],
+            "obj_from_hand": grasps.obj_from_hand[g],
+            "contacts": contacts.points[g],
+            "normals": contacts.normals[g],
+            "std_m": contacts.require_std()[g],
+            "margin": certificate.margin[g],
+            "witness": certificate.witness[g],
+            "clearance": grasps.clearance[g],
+            "predicted": torch.sigmoid(grasps.score[g]),
+            "simulated": records.passed[g].double().mean(),
+        }
+        single = {name: x.float() for name, x in item.items()}
+        return {**single, "closed": certificate.closed[g], "job": torch.tensor(j)}
+
+    @checked
+    def job(self, j: Annotated[int, Range(0, MOST)]) -> ShardJob:
+        """Read job j whole, in the precision of the file.
+
+        Raises:
+            IndexError: no such job.
+            ModelFileError: its shard is missing, damaged, or belongs to another campaign.
+        """
+        j = range(len(self.jobs))[j]
+        row, records = self._shard(j // self.size).take(j % self.size)
+        grasps = dataclasses.replace(records.grasps, meta=dict(row[0].meta))
+        eye = records.viewpoints[0] if bool(records.viewpoints.any()) else None
+        cloud = PointCloud(records.points, viewpoint=eye) if len(records.points) else None
+        return ShardJob(row[0], cloud, grasps, records.passed, records.outcome)
+
+    def _shard(self, k: int) -> Shard:
+        """Read shard k; the last few stay in memory."""
+        return self.recent.get(k, self._read)
+
+    def _read(self, k: int) -> Shard:
+        """Read a shard and compare its rows with the card's."""
+        path = shard_path(self.folder, k)
+        shard = load_shard(path, {"campaign": str(self.card["campaign"])})
+        bare = tuple(row._replace(meta={}) for row in shard.rows)
+        if bare != self.jobs[k * self.size : (k + 1) * self.size]:
+            raise ModelFileError("path", f"{path} of other jobs", f"those of {CARD}")
+        return shard
+
+
+def shard_path(folder: Path, k: int) -> Path:
+    """Return the file of shard k."""
+    return folder / f"shard-{k:06d}.safetensors"
+
+
+@checked
+def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
+    """Open the data set that a campaign wrote; shards are read on demand.
+
+    Args:
+        folder: of the data set.
+        points: draw so many points of each cloud, always the same for one grasp, so that clouds make a batch; from a
+            smaller cloud some are drawn twice. None: all of them.
+
+    Raises:
+        ModelFileError: the campaign is not finished, or its card is damaged.
+
+    >>> import tempfile, trimesh
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.campaign import CampaignSpec, run_campaign
+    >>> from torchgrasp.data import write_objects
+    >>> from torchgrasp.evaluation import EvaluationSpec
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> _ = trimesh.creation.box((0.05, 0.06, 0.12)).export(folder / "carton.ply")
+    >>> _ = write_objects(folder, folder / "objects", views=1)
+    >>> spec = CampaignSpec("dexgraspbench", EvaluationSpec(1, starts=20))
+    >>> _ = run_campaign(folder / "objects", load_hand("barrett"), folder / "data", spec)
+    >>> data = read_shards(folder / "data", points=100)
+    >>> data[0]["points"].shape, data.jobs[0].object, data.job(0).row.grasps
+    (torch.Size([100, 3]), 'carton', 1)
+    """
+    folder = Path(folder)
+
+    def refuse(found: str, allowed: str) -> ModelFileError:
+        return ModelFileError("folder", found, allowed)
+
+    card = read_json(folder / CARD, refuse, "a folder that `torchgrasp campaign` finished", MOST_CARD)
+    fields = card.entries()
+    if missing := {"campaign", "jobs_in_shard", "jobs"} - set(fields):
+        raise card.wrong(f"a file with {min(missing)!r}")
+    fields["campaign"].text()
+    jobs, size = _read_jobs(fields["jobs"]), fields["jobs_in_shard"].whole(1, MOST)
+    if lacking := sum(not shard_path(folder, k).is_file() for k in range(-(-len(jobs) // size))):
+        raise refuse(f"{folder} without {lacking} of its shards", "all shards: run the campaign again")
+    return GraspShards(folder, card.value, jobs, size, points)
+
+
+def _read_jobs(field: Field) -> tuple[JobRow, ...]:
+    """Read the rows of all jobs."""
+    return tuple(read_row(row, bare=True) for row in field.items(MOST))
+
+
+def _choose(points: Tensor, count: int | None, seed: int) -> Tensor:
+    """Draw so many points of a cloud."""
+    if count is None:
+        return points
+    generator = torch.Generator().manual_seed(seed)
+    if count <= len(points):
+        return points[torch.randperm(len(points), generator=generator)[:count]]
+    return points[torch.randint(len(points), (count,), generator=generator)]

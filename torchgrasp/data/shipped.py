@@ -1,0 +1,112 @@
+"""The library's own objects: meshes, convex parts and noisy views."""
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from torchgrasp.checks import checked
+from torchgrasp.cloud.io.read import read_cloud
+from torchgrasp.errors import BadArgument
+from torchgrasp.scene.file import read_scene
+from torchgrasp.scene.scene import Scene
+from torchgrasp.values import Grasps, PointCloud, load_grasps
+
+if TYPE_CHECKING:
+    import trimesh
+
+__all__ = ["GraspObject", "list_objects", "load_object", "load_scene", "load_shipped_grasp"]
+
+DATA = Path(__file__).parent / "assets"
+"""Folder of the objects: `<name>/mesh.ply`, `<name>/parts.npz` and `<name>/view.ply`."""
+
+SCENE = DATA / "scene.npz"
+"""A depth image of the objects on a table, with labels, camera and table."""
+
+MASSES = {"cylinder": 0.15, "jug": 0.20, "rabbit": 0.10, "spray": 0.15}
+"""Masses [kg]: a tin, a plastic jug, a plush rabbit, a bottle a third full."""
+
+GRASPED = {(name, hand) for name in ("cylinder", "jug") for hand in ("allegro", "barrett")}
+"""Objects and hands of which a grasp is shipped."""
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class GraspObject:
+    """An object in metres, z up, resting at z = 0, with its mass [kg].
+
+    `mesh` is the true, closed surface. The union of the convex `parts` replaces it in simulation. `view` is a noisy
+    cloud from one side, with its viewpoint.
+
+    >>> jug = load_object("jug")
+    >>> jug.mass, [f"{1000 * side:.0f} mm" for side in jug.mesh.extents], len(jug.parts)
+    (0.2, ['120 mm', '78 mm', '153 mm'], 43)
+    """
+
+    name: str
+    mesh: "trimesh.Trimesh"
+    parts: list["trimesh.Trimesh"]
+    view: PointCloud
+    mass: float
+
+
+def list_objects() -> tuple[str, ...]:
+    """Return the names that `load_object` knows.
+
+    >>> list_objects()
+    ('cylinder', 'jug', 'rabbit', 'spray')
+    """
+    return tuple(MASSES)
+
+
+@checked
+def load_object(name: str) -> GraspObject:
+    """Return one of the library's objects.
+
+    Raises:
+        BadArgument: no such object.
+
+    >>> jug = load_object("jug")
+    >>> jug.mesh.is_watertight, len(jug.view)
+    (True, 1000)
+    """
+    import trimesh
+
+    if name not in MASSES:
+        raise BadArgument("name", repr(name), f"one of {', '.join(MASSES)}")
+    mesh = trimesh.load_mesh(DATA / name / "mesh.ply")
+    with np.load(DATA / name / "parts.npz", allow_pickle=False) as file:
+        corners = np.split(file["corners"].astype(np.float64), np.cumsum(file["counts"])[:-1])
+    parts = [trimesh.convex.convex_hull(c) for c in corners]
+    return GraspObject(name, mesh, parts, read_cloud(DATA / name / "view.ply"), MASSES[name])
+
+
+@checked
+def load_shipped_grasp(name: str, hand: str) -> Grasps:
+    """Return one grasp that the library planned for its own object: something to close, draw and export at once.
+
+    Args:
+        name: "cylinder" or "jug".
+        hand: "allegro" or "barrett".
+
+    Raises:
+        BadArgument: no grasp of this object by this hand is shipped.
+
+    >>> grasp = load_shipped_grasp("jug", "barrett")
+    >>> grasp.joints.shape, grasp.certificate.closed
+    (torch.Size([1, 4]), tensor([True]))
+    """
+    if (name, hand) not in GRASPED:
+        allowed = " or ".join(f"{' by '.join(known)}" for known in sorted(GRASPED))
+        raise BadArgument("name and hand", f"{name} by {hand}", allowed)
+    return load_grasps(DATA / name / f"{hand}.safetensors")
+
+
+def load_scene() -> Scene:
+    """Return a rendered scene of the library's objects on a table, with noise and true labels; z is up.
+
+    >>> load_scene().things
+    (1, 2, 3, 4)
+    """
+    return read_scene(SCENE)

@@ -1,0 +1,1 @@
+"""Frames, planes, meshes, distance fields, linear algebra, least squares. Not public."""

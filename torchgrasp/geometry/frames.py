@@ -1,0 +1,154 @@
+"""Rigid transforms, and the virtual frame of three contacts (Eqs. 15-17).
+
+A transform `a_from_b` maps coordinates of frame b into frame a. So chains read by adjacency:
+`obj_from_hand = obj_from_vf @ vf_from_hand` (Eq. 24).
+"""
+
+import itertools
+import math
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchgrasp.errors import DegenerateContacts
+from torchgrasp.geometry.linalg import unit
+
+MIN_HEIGHT_RATIO = 1e-3
+"""Least height of the largest contact triangle over its longest side. At a height of 1e-4 m, noise of 1e-6 m turns the
+virtual frame by 0.01 rad."""
+
+ROUNDED = 1e-4
+"""Largest error of a rotation matrix that is given, that of float32 and of rounding in a text."""
+
+
+def rigid(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
+    """Return the homogeneous transform of a rotation and a translation [m].
+
+    >>> rigid(torch.eye(3), torch.ones(3))[:3, 3]
+    tensor([1., 1., 1.])
+    """
+    top = torch.cat([rotation, translation[..., None]], dim=-1)
+    bottom = torch.eye(4, dtype=top.dtype, device=top.device)[3]
+    return torch.cat([top, bottom.expand(*top.shape[:-2], 1, 4)], dim=-2)
+
+
+def inverse(a_from_b: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
+    """Return `b_from_a` of a rigid transform."""
+    rotation = a_from_b[..., :3, :3].transpose(-1, -2)
+    return rigid(rotation, -(rotation @ a_from_b[..., :3, 3:])[..., 0])
+
+
+def apply(a_from_b: Float[Tensor, "*#b 4 4"], points: Float[Tensor, "*#b n 3"]) -> Float[Tensor, "*#b n 3"]:
+    """Map points of frame b into frame a."""
+    return points @ a_from_b[..., :3, :3].transpose(-1, -2) + a_from_b[..., None, :3, 3]
+
+
+def rotate(a_from_b: Float[Tensor, "*#b 4 4"], directions: Float[Tensor, "*#b n 3"]) -> Float[Tensor, "*#b n 3"]:
+    """Map directions of frame b into frame a."""
+    return directions @ a_from_b[..., :3, :3].transpose(-1, -2)
+
+
+def is_rigid(a_from_b: Float[Tensor, "*b 4 4"]) -> Bool[Tensor, "*b"]:
+    """Tell which matrices are a right-handed rotation and a translation; one with NaN is none.
+
+    >>> is_rigid(torch.stack([torch.eye(4), -torch.eye(4), torch.zeros(4, 4)])).tolist()
+    [True, False, False]
+    """
+    x, y, z = a_from_b[..., :3, :3].double().unbind(-2)
+    rotation, eye = torch.stack([x, y, z], -2), torch.eye(4, dtype=torch.float64, device=a_from_b.device)
+    error = (rotation @ rotation.transpose(-1, -2) - eye[:3, :3]).abs().amax((-1, -2))
+    right_handed = (torch.linalg.cross(x, y) * z).sum(-1) > 0
+    return (error <= ROUNDED) & right_handed & (a_from_b[..., 3, :] == eye[3]).all(-1)
+
+
+def skew(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Return the matrix of the cross product: `skew(v) @ w == v x w`."""
+    x, y, z = v.unbind(-1)
+    o = torch.zeros_like(x)
+    rows = [torch.stack(row, -1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))]
+    return torch.stack(rows, -2)
+
+
+def rotation_from_vector(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Return the rotation by |v| radians about v (the exponential map), smooth at v = 0.
+
+    >>> torch.allclose(rotation_from_vector(torch.zeros(3)), torch.eye(3))
+    True
+    """
+    angle = torch.linalg.vector_norm(v, dim=-1)[..., None, None]
+    turn, half = skew(v), torch.sinc(angle / (2 * math.pi))  # Rodrigues: sin x / x, and (1 - cos x) / x^2 = half^2 / 2
+    identity = torch.eye(3, dtype=v.dtype, device=v.device)
+    return identity + torch.sinc(angle / math.pi) * turn + half * half / 2 * (turn @ turn)
+
+
+def rotation_from_rpy(rpy: tuple[float, float, float]) -> Float[Tensor, "3 3"]:
+    """Return the rotation of URDF's fixed-axis roll, pitch and yaw [rad].
+
+    >>> torch.round(rotation_from_rpy((0.0, 0.0, torch.pi / 2)))[0]
+    tensor([ 0., -1.,  0.], dtype=torch.float64)
+    """
+    (cr, cp, cy), (sr, sp, sy) = [math.cos(a) for a in rpy], [math.sin(a) for a in rpy]
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
+    """Return the angle [rad] of a rotation, accurate near 0 and near pi."""
+    axis = torch.stack(
+        [
+            rotation[..., 2, 1] - rotation[..., 1, 2],
+            rotation[..., 0, 2] - rotation[..., 2, 0],
+            rotation[..., 1, 0] - rotation[..., 0, 1],
+        ],
+        -1,
+    )
+    trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
+    return torch.atan2(torch.linalg.vector_norm(axis, dim=-1), trace - 1)
+
+
+def subsets(count: int, size: int, device: torch.device) -> Int[Tensor, "k s"]:
+    """Return all choices of `size` of the numbers below `count`, in their order.
+
+    >>> subsets(3, 2, torch.device("cpu")).tolist()
+    [[0, 1], [0, 2], [1, 2]]
+    """
+    return torch.tensor(list(itertools.combinations(range(count), size)), device=device)
+
+
+def degenerate(points: Float[Tensor, "*b f 3"]) -> Bool[Tensor, "*b"]:
+    """Tell which contacts lie too near to a line: their largest triangle is too flat, see `MIN_HEIGHT_RATIO`."""
+    corners = points[..., subsets(points.shape[-2], 3, points.device), :]  # (*b, k, 3, 3)
+    sides = corners - corners.roll(1, dims=-2)
+    longest = torch.linalg.vector_norm(sides, dim=-1).amax((-1, -2))
+    doubled_area = torch.linalg.vector_norm(torch.linalg.cross(sides[..., 0, :], sides[..., 1, :]), dim=-1).amax(-1)
+    return ~(doubled_area > MIN_HEIGHT_RATIO * longest**2)
+
+
+def virtual_frame(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4 4"]:
+    """Return the virtual frame of three contacts, Eqs. (15)-(17): `a_from_vf` for points given in frame a.
+
+    The origin is the centre of the contacts (Eq. 16). The x axis points from the first contact to the third. The z axis
+    is the normal of their plane.
+
+    Args:
+        points: contacts or fingertips [m] in the order of the fingers.
+
+    Raises:
+        DegenerateContacts: a triangle is flatter than `MIN_HEIGHT_RATIO`.
+
+    >>> virtual_frame(torch.tensor([[0.0, 0, 0], [0, 1, 0], [1, 0, 0]])).shape
+    torch.Size([4, 4])
+    """
+    flat = degenerate(points)
+    if bool(flat.any()):
+        raise DegenerateContacts(f"{int(flat.sum())} of {flat.numel()} contact triples lie on a line or in a point")
+    p1, p2, p3 = points.unbind(-2)
+    x_axis = unit(p3 - p1)
+    z_axis = unit(torch.linalg.cross(p2 - p1, x_axis))
+    y_axis = torch.linalg.cross(z_axis, x_axis)
+    return rigid(torch.stack([x_axis, y_axis, z_axis], dim=-1), points.mean(-2))

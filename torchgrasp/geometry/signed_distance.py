@@ -1,0 +1,232 @@
+"""A signed distance field of an object's surface, for collision."""
+
+import dataclasses
+from functools import cached_property
+from typing import Annotated
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchgrasp.base import Value
+from torchgrasp.checks import Range, check_tensor, checked
+from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.mesh import closest_on_triangles
+
+BAND = 0.026
+"""Distance [m] from the surface within which each second node is exact: that of a palm's spheres, with clearance."""
+NEAR, INWARD = 3, 5
+"""Spacings from the surface within which every node is exact, outside and inside, where distances have ridges; farther
+off cubics err by .1 mm (docs/speed.md)."""
+FAR_SHARE = 8
+"""Samples of the surface for each that serves nodes beyond the band, off by 1 mm, in a quarter of the time."""
+NEAREST_SAMPLES = 3
+"""Nearest samples whose triangles a node tries: with two, twice as many nodes are off by .1 mm; a third costs 5 %."""
+
+FIELD_SPACING = 0.004
+"""Distance [m] between nodes that tell touches where a surface is: they err by less than the surface itself."""
+
+LEAF = 32
+"""Samples in a leaf of their tree: a quarter less time than with SciPy's 10, the same distances."""
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class SignedDistanceField(Value):
+    """Signed distances [m] on a grid, negative inside; node i is at origin + i * spacing.
+
+    >>> nodes = torch.cartesian_prod(*[torch.linspace(-0.1, 0.1, 41)] * 3)
+    >>> ball = nodes.norm(dim=1).reshape(41, 41, 41) - 0.05
+    >>> field = SignedDistanceField(torch.full((3,), -0.1), 0.005, ball)
+    >>> distance, gradient = field.query(torch.tensor([0.0, 0.0, 0.08]))
+    >>> f"{distance:.3f}", gradient.round(), f"{field.nearest_node(torch.tensor([0.0, 0.0, 0.02])):.3f}"
+    ('0.030', tensor([0., 0., 1.]), '-0.030')
+    """
+
+    origin: Float[Tensor, "3"]
+    spacing: float
+    values: Float[Tensor, "x y z"]
+
+    @cached_property
+    def _last_node(self) -> Int[Tensor, "3"]:
+        """Index of the last node along each axis."""
+        return torch.tensor(self.values.shape, device=self.values.device) - 1
+
+    @checked(gradients=True)
+    def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+        """Return the value [m] at the nearest node, at most 0.87 spacings off; outside the grid it is too small."""
+        flat = 0
+        for x, low, count in zip(points.unbind(-1), self.origin.to(points), self.values.shape, strict=True):
+            node = torch.round((x - low) / self.spacing).clamp_(0, count - 1)
+            flat = node.long() if isinstance(flat, int) else flat * count + node.long()
+        return self.values.reshape(-1)[flat].to(points)
+
+    @checked(gradients=True)
+    def query(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
+        """Return the trilinear signed distance [m] and its gradient; beyond the grid the distance to it is added."""
+        _, ny, nz = self.values.shape
+        position = (points - self.origin.to(points)) / self.spacing
+        inside = torch.minimum(position.clamp_min(0), self._last_node.to(points))
+        cell = torch.minimum(inside.detach().long(), self._last_node - 1)
+        fx, fy, fz = (inside - cell).unbind(-1)
+        flat = (cell[..., 0] * ny + cell[..., 1]) * nz + cell[..., 2]
+        table, dx, dy = self.values.reshape(-1), ny * nz, nz
+        corner = [table[flat + i * dx + j * dy + k].to(points) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+        z = [torch.lerp(corner[2 * i], corner[2 * i + 1], fz) for i in range(4)]
+        y = [torch.lerp(z[0], z[1], fy), torch.lerp(z[2], z[3], fy)]
+        slope_z = [corner[2 * i + 1] - corner[2 * i] for i in range(4)]
+        slope_z = torch.lerp(torch.lerp(slope_z[0], slope_z[1], fy), torch.lerp(slope_z[2], slope_z[3], fy), fx)
+        slope_y = torch.lerp(z[1] - z[0], z[3] - z[2], fx)
+        slope = torch.stack([y[1] - y[0], slope_y, slope_z], -1) / self.spacing
+        beyond = (position - inside) * self.spacing
+        away = torch.linalg.vector_norm(beyond, dim=-1)
+        outward = beyond / away.clamp_min(1e-12)[..., None]
+        gradient = torch.where(beyond != 0, 0.0, slope) + outward
+        return torch.lerp(y[0], y[1], fx) + away, gradient
+
+
+@checked
+def field_from_surface(
+    vertices: Float[Tensor, "v 3"],
+    faces: Int[Tensor, "f 3"],
+    spacing: Annotated[float, Range(0.0001, 0.1)] = 0.003,
+    margin: Annotated[float, Range(0.0, 1.0)] = 0.08,
+) -> SignedDistanceField:
+    """Return the signed distance field of a triangle mesh [m], wound outward; it may be open.
+
+    The nodes are `spacing` [m] apart and reach to `margin` [m] around the mesh.
+
+    Raises:
+        BadArgument: wrong shapes, faces that name no vertex or have no area, or a grid of more than 2e7 nodes.
+
+    >>> from torchgrasp import load_object
+    >>> mesh = load_object("cylinder").mesh
+    >>> field = field_from_surface(torch.tensor(mesh.vertices), torch.tensor(mesh.faces), spacing=0.01)
+    >>> field.query(torch.tensor(mesh.center_mass))[0] < -0.02  # [m]: inside
+    tensor(True)
+    """
+    check_tensor("vertices", vertices, (None, 3))
+    if not 1e-4 <= spacing <= 0.1 or not 0 <= margin <= 1:
+        raise BadArgument("spacing, margin", (spacing, margin), "spacing in [1e-4, 0.1], margin in [0, 1]")
+    surface = _Surface(vertices, faces)
+    low, high = vertices.amin(0).double() - margin, vertices.amax(0).double() + margin
+    # the first nodes are every fourth of the finest
+    counts = [4 * max(1, int(c)) + 1 for c in torch.ceil((high - low) / (4 * spacing)).tolist()]
+    if np.prod(np.array(counts, dtype=float)) > 2e7:  # 160 MB
+        raise BadArgument("spacing", spacing, f"a coarser grid than {counts} nodes")
+    origin = low.cpu().numpy()
+    lines = [origin[k] + spacing * np.arange(counts[k]) for k in range(3)]
+    nodes = np.stack(np.meshgrid(*(line[::4] for line in lines), indexing="ij"), -1)
+    values = surface.distance(nodes.reshape(-1, 3), far=True).reshape(nodes.shape[:3])
+    known = np.zeros(values.shape, dtype=bool)
+    for step, inward, outward in ((2, np.inf, BAND), (1, INWARD * spacing, NEAR * spacing)):
+        values, known = _refine(values), _keep(known)
+        near = np.nonzero((-inward < values) & (values < outward) & ~known)
+        values[near] = surface.distance(np.stack([lines[k][::step][near[k]] for k in range(3)], -1))
+        known[near] = True
+    to = {"device": vertices.device, "dtype": torch.float64}
+    return SignedDistanceField(low.to(**to), float(spacing), torch.tensor(values, **to))
+
+
+def _keep(known: np.ndarray) -> np.ndarray:
+    """Return which nodes of a grid twice as fine are known: every second along each axis."""
+    fine = np.zeros([2 * count - 1 for count in known.shape], dtype=bool)
+    fine[::2, ::2, ::2] = known
+    return fine
+
+
+def _refine(values: np.ndarray) -> np.ndarray:
+    """Return values of a grid twice as fine: cubics through the distances, with the sign of the node before.
+
+    The sign of an open mesh jumps far from it, where a cubic through signed distances would err by centimetres.
+    """
+    sign, distance = values < 0, np.abs(values)
+    for axis in range(3):
+        sign, distance = _upsample(sign, axis), _upsample(distance, axis)
+    return np.where(sign, -distance, distance)
+
+
+def _upsample(values: np.ndarray, axis: int) -> np.ndarray:
+    """Return values with one more between each two along an axis: by a cubic, a sign that of the one before."""
+    known = np.moveaxis(values, axis, 0)
+    fine = np.empty((2 * len(known) - 1, *known.shape[1:]), dtype=known.dtype)
+    fine[::2] = known
+    if known.dtype == bool:
+        fine[1::2] = known[:-1]
+    else:
+        padded = np.concatenate([2 * known[:1] - known[1:2], known, 2 * known[-1:] - known[-2:-1]])
+        fine[1::2] = (9 * (known[:-1] + known[1:]) - padded[:-3] - padded[3:]) / 16
+    return np.ascontiguousarray(np.moveaxis(fine, 0, axis))  # queries would copy another layout each time
+
+
+class _Surface:
+    """A tree of samples of a mesh, by which near triangles are found."""
+
+    def __init__(self, vertices: Tensor, faces: Tensor):
+        from scipy.spatial import KDTree
+
+        if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0 or faces.is_floating_point():
+            raise BadArgument("faces", f"{faces.dtype} of shape {tuple(faces.shape)}", "integers (f, 3) with f >= 1")
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise BadArgument("faces", f"faces {int(faces.min())}..{int(faces.max())}", f"0..{len(vertices) - 1}")
+        corners = vertices.detach().cpu().double().numpy()[faces.cpu().numpy()]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+        corners, area = corners[area > 1e-14], area[area > 1e-14]
+        if len(area) == 0:
+            raise BadArgument("faces", "faces without area", "a surface")
+        rng, count = np.random.default_rng(0), int(np.clip(area.sum() / 0.002**2, 2000, 40_000))
+        owner = np.repeat(np.arange(len(area)), rng.multinomial(count, area / area.sum()))
+        u, v = np.sort(rng.random((2, len(owner))), axis=0)
+        weights = np.stack([u, v - u, 1 - v], 1)
+        samples = (corners[owner] * weights[:, :, None]).sum(1)
+        self.owner = np.concatenate([np.arange(len(area)), owner])
+        self.triangles, self.normals = corners, _pseudonormals(corners)
+        samples = np.concatenate([corners.mean(1), samples])
+        self.tree, self.few = KDTree(samples, leafsize=LEAF), KDTree(samples[::FAR_SHARE], leafsize=LEAF)
+
+    def distance(self, points: np.ndarray, far: bool = False) -> np.ndarray:
+        """Return the signed distances [m] of points (n, 3); `far` tries the nearest of few samples."""
+        parts, tree, owners = [], self.few if far else self.tree, self.owner[::FAR_SHARE] if far else self.owner
+        for part in (points[k : k + 8192] for k in range(0, max(1, len(points)), 8192)):
+            _, index = tree.query(part, k=1 if far else min(NEAREST_SAMPLES, len(owners)))
+            owner = owners[index.reshape(len(part), -1)]
+            feet, feature = closest_on_triangles(np.repeat(part, owner.shape[1], 0), self.triangles[owner.reshape(-1)])
+            gap = part[:, None] - feet.reshape(*owner.shape, 3)
+            squared = (gap * gap).sum(-1)
+            rows, best = np.arange(len(part)), squared.argmin(1)
+            normal = self.normals[owner[rows, best], feature.reshape(owner.shape)[rows, best]]
+            parts.append(np.copysign(np.sqrt(squared[rows, best]), (gap[rows, best] * normal).sum(1)))
+        return np.concatenate(parts)
+
+
+def _pseudonormals(corners: np.ndarray) -> np.ndarray:
+    """Return pseudonormals (f, 7, 3) of each triangle's face, sides and corners (Baerentzen and Aanaes, 2005).
+
+    Sides add up the normals of two faces, corners the normals of all faces, weighted by angle.
+    """
+    face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    face /= np.linalg.norm(face, axis=1, keepdims=True)
+    ids = _alike(np.round(corners.reshape(-1, 3), 9)).reshape(-1, 3)
+    ahead, back = np.roll(corners, -1, 1) - corners, np.roll(corners, 1, 1) - corners
+    cosine = (ahead * back).sum(-1) / (np.linalg.norm(ahead, axis=-1) * np.linalg.norm(back, axis=-1))
+    weighted = face[:, None] * np.arccos(np.clip(cosine, -1, 1))[..., None]
+    at_corner = _sum_by(ids.reshape(-1), weighted.reshape(-1, 3))
+    side = np.sort(np.stack([ids, np.roll(ids, -1, 1)], -1), -1)
+    side = np.unique(side[..., 0] * (ids.max() + 1) + side[..., 1], return_inverse=True)[1].reshape(-1, 3)
+    at_side = _sum_by(side.reshape(-1), np.repeat(face, 3, 0))
+    return np.concatenate([face[:, None], at_side[side], at_corner[ids]], 1)
+
+
+def _alike(points: np.ndarray) -> np.ndarray:
+    """Return the same number for equal points (n, 3), and no others."""
+    order = np.lexsort(points.T)
+    new = (points[order[1:]] != points[order[:-1]]).any(1)
+    number = np.empty(len(points), dtype=np.int64)
+    number[order] = np.concatenate([[0], np.cumsum(new)])
+    return number
+
+
+def _sum_by(number: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Return the sums of vectors (n, 3) of the same number."""
+    return np.stack([np.bincount(number, weights=column) for column in vectors.T], 1)

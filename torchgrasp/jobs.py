@@ -1,0 +1,184 @@
+"""Tasks on worker processes: a simulator that hangs or dies costs its own task alone."""
+
+import contextlib
+import functools
+import math
+import multiprocessing
+import os
+import queue
+import threading
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import Future, TimeoutError
+from concurrent.futures.process import BrokenProcessPool
+from typing import Annotated, Any, TypeVar
+
+import torch
+
+from torchgrasp.checks import Range, checked
+from torchgrasp.errors import MissingExtra, Status
+
+Result = TypeVar("Result")
+Task = tuple[Any, ...]
+
+JOIN_TIME = 10.0
+"""Longest time [s] for stopped workers to end: they are killed, which takes milliseconds."""
+AHEAD = 2
+"""Tasks of a worker that are handed over: one at which it works, and the next. Others can still be overtaken."""
+LOOK_AGAIN = 1.0
+"""Time [s] after which a pool that says nothing is asked whether it is broken: then some tasks never end in it."""
+
+
+@checked
+def run_tasks(
+    function: Callable[..., Result],
+    tasks: Iterable[Task],
+    workers: Annotated[int, Range(0, 1024)] = 1,
+    limit: Annotated[float, Range(0.001, math.inf)] = 60.0,
+) -> Generator[Result | Status, None, None]:
+    """Yield `function(*task)` for each task, in the order of the tasks.
+
+    A task runs on one thread, a worker is a fresh process. A late task gives `Status.TIMED_OUT`, a task whose process
+    dies twice `Status.WORKER_DIED`. All workers end when the caller stops listening.
+
+    Args:
+        function: of a module, so that a worker can import it.
+        tasks: arguments of the calls: paths, numbers, arrays and values of them, but no tensors, which would be shared.
+        workers: processes; 0: this one, without a limit of time.
+        limit: wall time of a task [s].
+
+    Raises:
+        BadArgument: workers outside [0, 1024], or a limit below 1 ms.
+        MissingExtra: pebble is not installed.
+        Exception: of a task, when its turn comes.
+
+    >>> list(run_tasks(pow, [(2, 3), (3, 2)], workers=0))
+    [8, 9]
+    """
+    return _in_order(function, tasks, workers, limit) if workers else _run_here(function, tasks)
+
+
+def run_as_they_end(
+    function: Callable[..., Result], tasks: Iterable[Task], workers: int, limit: float
+) -> Generator[tuple[int, Result | Status], None, None]:
+    """Yield the number of each task and its result as in `run_tasks`, in the order in which they end."""
+    if not workers:
+        yield from enumerate(_run_here(function, tasks))
+        return
+    with contextlib.closing(_run(function, tasks, workers, limit)) as results:
+        for number, ended in results:
+            yield number, ended if isinstance(ended, Status) else ended.result()
+
+
+def _run_here(function: Callable[..., Result], tasks: Iterable[Task]) -> Generator[Result, None, None]:
+    """Yield the results of this process, which has its threads again in between."""
+    for task in tasks:
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            result = function(*task)
+        finally:
+            torch.set_num_threads(threads)
+        yield result
+
+
+def _in_order(
+    function: Callable[..., Result], tasks: Iterable[Task], workers: int, limit: float
+) -> Generator[Result | Status, None, None]:
+    """Yield the results of workers in the order of the tasks; one that is early waits."""
+    early: dict[int, Future[Result] | Status] = {}
+    turn = 0
+    with contextlib.closing(_run(function, tasks, workers, limit)) as results:
+        for number, ended in results:
+            early[number] = ended
+            while turn in early:
+                ended = early.pop(turn)
+                turn += 1
+                yield ended if isinstance(ended, Status) else ended.result()
+
+
+def _run(
+    function: Callable[..., Result], tasks: Iterable[Task], workers: int, limit: float
+) -> Generator[tuple[int, Future[Result] | Status], None, None]:
+    """Yield what comes of each task, as it ends; where all workers die before they take one, others come."""
+    waiting, died = deque(enumerate(tasks)), set[int]()
+    broken = 0
+    while waiting:
+        before = len(waiting)
+        yield from _run_pool(function, waiting, died, workers, limit)
+        broken = broken + 1 if len(waiting) == before else 0
+        if broken == 2:
+            broken = 0
+            yield waiting.popleft()[0], Status.WORKER_DIED
+
+
+def _run_pool(
+    function: Callable[..., Result], waiting: deque[tuple[int, Task]], died: set[int], workers: int, limit: float
+) -> Generator[tuple[int, Future[Result] | Status], None, None]:
+    """Take tasks and yield what comes of them, until all have ended or the pool of workers is broken.
+
+    Args:
+        function: as in `run_tasks`.
+        waiting: number and task of each; what did not end is put back.
+        died: numbers of the tasks that died once; those that do so are added.
+        workers: processes.
+        limit: wall time of a task [s].
+    """
+    try:
+        from pebble import ProcessExpired, ProcessPool
+    except ImportError as error:
+        raise MissingExtra("pebble", "sim") from error
+    # The function goes along so that its module is imported before the first task's time begins to run.
+    pool = ProcessPool(workers, initializer=_begin, initargs=[function], context=multiprocessing.get_context("spawn"))
+    ended = queue.SimpleQueue[int]()
+    running: dict[int, tuple[Task, Future[Result]]] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < AHEAD * workers:
+                number, task = waiting[0]
+                try:
+                    future = pool.schedule(function, task, timeout=limit)
+                except RuntimeError:  # it broke meanwhile
+                    return
+                running[number] = waiting.popleft()[1], future
+                future.add_done_callback(functools.partial(_tell, ended, number))
+            try:
+                number = ended.get(timeout=LOOK_AGAIN)
+            except queue.Empty:
+                if pool.active:
+                    continue
+                return
+            error = running[number][1].exception()
+            if isinstance(error, BrokenProcessPool):
+                return
+            task, future = running.pop(number)
+            if isinstance(error, ProcessExpired) and number not in died:
+                died.add(number)  # a machine short of memory kills the innocent too: once more, before all others
+                waiting.appendleft((number, task))
+            elif isinstance(error, ProcessExpired):
+                yield number, Status.WORKER_DIED
+            else:
+                yield number, Status.TIMED_OUT if isinstance(error, TimeoutError) else future
+    finally:
+        waiting.extendleft((number, task) for number, (task, _) in sorted(running.items(), reverse=True))
+        pool.stop()
+        with contextlib.suppress(TimeoutError):  # a signal can leave pebble's threads waiting for each other
+            pool.join(JOIN_TIME)
+
+
+def _tell(ended: "queue.SimpleQueue[int]", number: int, _: "Future[Any]") -> None:
+    """Say which task ended."""
+    ended.put(number)
+
+
+def _begin(function: Callable[..., Any]) -> None:
+    """Prepare a worker: one thread, and an end with the parent."""
+    torch.set_num_threads(1)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def follow() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()

@@ -1,0 +1,152 @@
+"""The single changes that could give grasps: of the hand, of what is asked of contacts, and of the world."""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+from torchgrasp.errors import Status
+from torchgrasp.hand.load import hands_folder, load_hand
+from torchgrasp.planner.fingers import finger_sets
+from torchgrasp.planner.task import Request, take_target
+from torchgrasp.scene.scene import Scene
+from torchgrasp.specs import ContactSpec
+
+FRICTIONS = (0.4, 0.8, 1.2)
+"""Coefficients of friction that could be meant: of smooth plastic, of rubber, of soft silicone on dry things."""
+HIGHER = 1.4
+"""Least factor by which friction is raised: less gives hardly more contacts."""
+CERTAIN, FLAT, MARGIN = (0.03, 0.1), (0.44, 0.9), (0.5, 1.0)
+"""Limits of `ContactSpec` and wider ones: its own values, then the variance that costs two points of closed contacts
+(docs/planning.md), the bend of an edge of 50 degrees, and no margin of friction."""
+MORE_STARTS = 4
+"""Factor of the starts that are tried last."""
+
+UNKNOWN = frozenset({Status.OUT_OF_DOMAIN, Status.TOO_UNCERTAIN})
+AT_TABLE = frozenset({Status.BELOW_TABLE, Status.TABLE_COLLISION, Status.PREGRASP, Status.NO_APPROACH})
+OPEN = frozenset({Status.NOT_CLOSED, Status.DEGENERATE})
+OF_HAND = frozenset(status for status in Status if Status.OUT_OF_REACH <= status <= Status.NO_APPROACH)
+
+
+@dataclasses.dataclass(frozen=True)
+class Change:
+    """One thing that could be otherwise.
+
+    `words` name it in a sentence. It is a choice, or else a fact of the world, which only the user can know. `cures` is
+    what it could prevent. `refit` tells whether the estimated shape changes, too.
+    """
+
+    words: str
+    choice: bool
+    cures: frozenset[Status]
+    request: Request
+    refit: bool = False
+
+
+def spec_of(request: Request) -> ContactSpec:
+    """Return the specification of a request, or its mode's own."""
+    if request.spec is not None:
+        return request.spec
+    return ContactSpec.paper() if request.mode == "paper" else ContactSpec()
+
+
+def _with(request: Request, **fields: Any) -> Request:
+    """Return the request with other fields of its specification."""
+    return dataclasses.replace(request, spec=dataclasses.replace(spec_of(request), **fields))
+
+
+def list_changes(request: Request) -> list[Change]:
+    """Return every single change of a request that could give grasps, but more starts."""
+    kinds = (_surroundings, _fingers, _limits, _friction, _hands)
+    return [change for kind in kinds for change in kind(request)]
+
+
+def more_starts(request: Request) -> Change:
+    """Return the request with more starts."""
+    more = dataclasses.replace(request, starts=MORE_STARTS * request.starts)
+    return Change(f"with {more.starts} starts", True, frozenset(Status), more)
+
+
+def _fingers(request: Request) -> Iterator[Change]:
+    """Yield other sets of fingers that the hand declares, and the mode that knows them."""
+    mode, fingers = request.mode, request.fingers
+    if mode != "joint":
+        yield Change("with mode='joint'", True, OF_HAND | OPEN, dataclasses.replace(request, mode="joint"), refit=True)
+    elif fingers != "auto":
+        present = finger_sets(request.hand, fingers)[0]
+        for hand in finger_sets(request.hand, "auto"):
+            if hand.finger_names != present.finger_names:
+                words = f"with fingers={hand.source.option!r} ({', '.join(hand.finger_names)})"
+                other = dataclasses.replace(request, hand=hand, fingers=None)
+                yield Change(words, True, OF_HAND | OPEN, other)
+
+
+def _hands(request: Request) -> Iterator[Change]:
+    """Yield the other shipped hands, of variants such as the left one the first."""
+    if request.mode != "joint":
+        return
+    names = sorted(path.parent.name for path in hands_folder().glob("*/hand.toml"))
+    for name in names:
+        own, variant = f"{request.hand.name}_".startswith(f"{name}_"), any(name.startswith(f"{k}_") for k in names)
+        if not own and not variant:
+            other = dataclasses.replace(request, hand=load_hand(name), fingers=None)
+            yield Change(f"with the {name} hand", True, OF_HAND, other)
+
+
+def _limits(request: Request) -> Iterator[Change]:
+    """Yield wider limits of contacts: the usual ones, or beyond."""
+    spec, tips = spec_of(request), float(request.hand.tips.radius.max())
+    own = spec.for_fingertips(tips)
+    if (wider := _next(CERTAIN, spec.max_variance)) is not None:
+        words = f"with max_variance={wider:g} instead of {spec.max_variance:g} (contacts on a less certain surface)"
+        yield Change(words, True, UNKNOWN, _with(request, max_variance=wider))
+    if spec.flatness is not None and (wider := _next(FLAT, spec.flatness)) is not None:
+        words = f"with flatness={wider:g} instead of {spec.flatness:g} (contacts nearer to edges)"
+        yield Change(words, True, frozenset({Status.NOT_FLAT}), _with(request, flatness=wider))
+    if (least := own.least_separation) > 0:
+        usual = dataclasses.replace(own, separation=None).least_separation
+        nearer = usual if usual < least else least / 2
+        words = f"with separation={nearer:.3g} instead of {least:.3g} m (fingertips nearer to each other)"
+        yield Change(words, True, frozenset({Status.TOO_CLOSE}), _with(request, separation=nearer))
+    if 0 < tips < own.fingertip_radius:
+        words = f"with tip_radius={tips:.3g}, the hand's own, instead of {own.fingertip_radius:.3g} m"
+        cures = frozenset({Status.BELOW_TABLE, Status.TOO_CLOSE})
+        yield Change(words, True, cures, _with(request, tip_radius=tips))
+    if spec.friction > 0 and (wider := _next(MARGIN, spec.friction_margin)) is not None:
+        words = f"with friction_margin={wider:g} instead of {spec.friction_margin:g} (less room for errors)"
+        yield Change(words, True, OPEN, _with(request, friction_margin=wider))
+
+
+def _next(limits: tuple[float, ...], present: float) -> float | None:
+    """Return the first limit beyond the present one; None if it is beyond all."""
+    return next((limit for limit in limits if limit > present), None)
+
+
+def _friction(request: Request) -> Iterator[Change]:
+    """Yield higher friction."""
+    present = spec_of(request).friction
+    for friction in [f for f in FRICTIONS if f >= HIGHER * present][:2]:
+        words = f"if the friction were {friction:g} instead of {present:g}"
+        yield Change(words, False, OPEN, _with(request, friction=friction))
+
+
+def _surroundings(request: Request) -> Iterator[Change]:
+    """Yield another table, no neighbours, and an arm that reaches all."""
+    cloud, spec = request.cloud, spec_of(request)
+    if isinstance(cloud, Scene):
+        crowded = OF_HAND | {Status.NEIGHBOUR_COLLISION, Status.BURIED}
+        if not spec.contact_allowed:
+            words = "with contact_allowed=True (links may push the neighbours)"
+            yield Change(words, True, crowded - {Status.BURIED}, _with(request, contact_allowed=True))
+        table = cloud.table if spec.table is None else spec.table
+        alone = dataclasses.replace(_with(request, table=table), cloud=take_target(cloud, request.seed))
+        yield Change("if its neighbours were taken away first", False, crowded, alone)
+    elif spec.table is not None:
+        words = "if no table were in the way, as on a narrow stand"
+        yield Change(words, False, AT_TABLE | {Status.TIP_ERROR}, _with(request, table=None), refit=True)
+    else:
+        lowest = float(cloud.points[:, 2].min())
+        words = f"if it stood on a table at z = {lowest:.3f} m, its lowest point"
+        yield Change(words, False, UNKNOWN, _with(request, table=lowest), refit=True)
+    if request.reachable is not None:
+        cures = frozenset({Status.UNREACHABLE, Status.OUT_OF_REACH})
+        yield Change("if the arm reached every pose", False, cures, dataclasses.replace(request, reachable=None))

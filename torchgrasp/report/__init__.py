@@ -1,8 +1,0 @@
-"""Pages and pictures of runs, evaluations and hands. No OpenGL, no display."""
-
-from torchgrasp.report.evaluation import write_evaluation
-from torchgrasp.report.page import draw_pictures, write_report
-from torchgrasp.report.run import Run, Stage, verdict
-from torchgrasp.report.turning import write_viewer
-
-__all__ = ["Run", "Stage", "draw_pictures", "verdict", "write_evaluation", "write_report", "write_viewer"]
