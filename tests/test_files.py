@@ -212,7 +212,7 @@ def test_temporary_folders_of_dead_processes_are_removed_and_of_living_ones_are_
 def test_a_file_is_held_by_one_run_and_its_folder_left_as_it_was(tmp_path):
     path = tmp_path / "new" / "model.safetensors"
     with hold_file(path), hold_file(path.with_name("other")):
-        with pytest.raises(OutputError, match=r"path: found .*model\.safetensors, in use by"), hold_file(path):
+        with pytest.raises(OutputError, match=r"path: expected .*got .*model\.safetensors, in use by"), hold_file(path):
             pytest.fail("held twice")
     assert os.listdir(tmp_path) == []
 
@@ -233,7 +233,7 @@ def test_a_file_in_the_place_of_a_folder_is_named(tmp_path):
 @pytest.mark.promise("F7")
 def test_a_folder_is_held_by_one_run_and_left_as_it_was(tmp_path):
     with hold_folder(tmp_path / "new" / "deep"):
-        refused = rf"folder: found .*deep, in use by process {os.getpid()} on"
+        refused = rf"folder: expected .*got .*deep, in use by process {os.getpid()} on"
         with pytest.raises(OutputError, match=refused), hold_folder(tmp_path / "new" / "deep"):
             pytest.fail("held twice")
     assert os.listdir(tmp_path) == []

@@ -119,7 +119,7 @@ BROKEN = {
 
 @pytest.mark.parametrize("name", BROKEN)
 def test_a_kernel_is_told_which_law_it_breaks(name):
-    with pytest.raises(BrokenLaw, match=rf"^{name.split()[0]}: found") as broken:
+    with pytest.raises(BrokenLaw, match=rf"^{name.split()[0]}: expected .*got") as broken:
         check_kernel(BROKEN[name])
     assert broken.value.law == name.split()[0]
 
@@ -144,5 +144,5 @@ def test_a_simulator_is_told_which_law_it_breaks(name, wrong, law):
 
     right = getattr(MujocoScene, name)
     broken = type("Broken", (MujocoScene,), {name: lambda self, *at: wrong(self, right(self, *at))})
-    with pytest.raises(BrokenLaw, match=f"^{law}: found"):
+    with pytest.raises(BrokenLaw, match=rf"^{law}: expected .*got"):
         check_scene(broken)

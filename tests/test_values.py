@@ -35,7 +35,7 @@ def test_raise_for_status_counts_the_failures():
 def test_contacts_of_two_precisions_are_refused():
     single, double = torch.rand(2, 3, 3), torch.rand(2, 3, 3, dtype=torch.float64)
     for wrong in ((single, double), (double, single), (double, double, None, single[..., 0])):
-        with pytest.raises(BadArgument, match=r"contacts: found torch\.float32 beside torch\.float64"):
+        with pytest.raises(BadArgument, match=r"contacts: expected .*got torch\.float32 beside torch\.float64"):
             Contacts(*wrong)
 
 
@@ -86,7 +86,7 @@ def test_contacts_of_unknown_variance_are_batches_like_others():
     mixed = pick(torch.tensor([True, False, True]), contacts, contacts[[1, 1, 1]])
     assert torch.equal(mixed.points, contacts.points[[0, 1, 2]]) and mixed.std_m is None
     assert torch.equal(put(contacts, torch.tensor([2]), contacts[0]).points, contacts.points[[0, 1, 0]])
-    with pytest.raises(BadArgument, match="std_m: found None"):
+    with pytest.raises(BadArgument, match=r"std_m: expected .*got None"):
         contacts.require_std()
 
 
@@ -99,7 +99,7 @@ def test_known_and_unknown_variances_do_not_mix():
         lambda: pick(torch.tensor([True, False]), known, contacts),
         lambda: put(contacts, torch.tensor([0]), known[1]),
     ):
-        with pytest.raises(BadArgument, match="std_m: found None beside a tensor"):
+        with pytest.raises(BadArgument, match=r"std_m: expected .*got None beside a tensor"):
             action()
 
 
@@ -120,13 +120,13 @@ def test_to_returns_a_new_value_and_keeps_integers():
 
 @pytest.mark.parametrize("value", [8.5, "8", True, None, math.nan, 2], ids=repr)
 def test_what_is_no_whole_number_of_the_range_is_a_bad_argument(value):
-    with pytest.raises(BadArgument, match=r"^edges: found "):
+    with pytest.raises(BadArgument, match=r"^edges: expected .*got "):
         check_whole("edges", value, 3, 1024)
 
 
 @pytest.mark.parametrize("value", ["0.8", False, None, math.inf], ids=repr)
 def test_what_is_no_number_of_the_range_is_a_bad_argument(value):
-    with pytest.raises(BadArgument, match=r"^friction: found "):
+    with pytest.raises(BadArgument, match=r"^friction: expected .*got "):
         check_number("friction", value, 0.0, 10.0)
 
 
@@ -202,5 +202,5 @@ def test_none_is_refused_by_name_where_the_type_has_no_none(kind):
     lines = [f"from torchgrasp import {kind}, GraspError", "try:", f"    {kind}(friction=None)"]
     code = "\n".join([*lines, "except GraspError as error:", "    print(error)"])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("friction: found None")
+    assert done.stdout.startswith("friction: expected ")
     assert ContactSpec(flatness=None).flatness is None and TrialSpec(kp=None).kp is None

@@ -34,7 +34,7 @@ class BadArgument(GraspError, ValueError):
     def __init__(self, argument: str, found: object, allowed: str):
         parts = (argument, str(found), allowed)
         named, shown, wanted = (x if len(x) <= MOST_LETTERS else f"{x[:MOST_LETTERS]}..." for x in parts)
-        super().__init__(f"{named}: found {shown}, allowed is {wanted}")
+        super().__init__(f"{named}: expected {wanted}, got {shown}")
         self.argument, self.found, self.allowed = argument, found, allowed
 
 
@@ -99,11 +99,11 @@ class BrokenLaw(GraspError, AssertionError):
 
     >>> error = BrokenLaw("order", "2 nan", "finite numbers")
     >>> error.law, str(error)
-    ('order', 'order: found 2 nan, allowed is finite numbers')
+    ('order', 'order: expected finite numbers, got 2 nan')
     """
 
     def __init__(self, law: str, found: str, allowed: str):
-        super().__init__(f"{law}: found {found}, allowed is {allowed}")
+        super().__init__(f"{law}: expected {allowed}, got {found}")
         self.law = law
 
 

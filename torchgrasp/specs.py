@@ -218,7 +218,7 @@ class TrialSpec(Value):
     >>> TrialSpec(closing="open_loop", without=("palm",))
     Traceback (most recent call last):
         ...
-    torchgrasp.errors.BadArgument: without: found ('palm',) of 'open_loop', allowed is some of ()
+    torchgrasp.errors.BadArgument: without: expected some of (), got ('palm',) of 'open_loop'
     """
 
     closing: ClosingMode = "uncertainty"

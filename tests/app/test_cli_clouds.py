@@ -8,7 +8,7 @@ import torch
 import trimesh
 from PIL import Image
 
-from torchgrasp import cli
+from torchgrasp.app import cli
 from torchgrasp.app.cli import grasps
 from torchgrasp.app.cli.common import ViewOptions, table_plane
 from torchgrasp.cloud import look_at, partial_view, read_cloud, save_cloud
@@ -142,8 +142,9 @@ def test_what_contradicts_itself_is_named_with_what_mends_it_and_refused(name, t
     assert cli.main(["grasp", path, "--hand", "barrett", "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr()
     assert said.out == "" and not planned and not (tmp_path / "out").exists()
-    assert said.err.startswith("torchgrasp: CLOUD: found ") and said.err.count("\n") == 1
-    assert found in said.err.split(", allowed is ")[0] and mend in said.err.split(", allowed is ")[1]
+    assert said.err.startswith("torchgrasp: CLOUD: expected ") and said.err.count("\n") == 1
+    expected, got = said.err.split(", got ")
+    assert found in got and mend in expected
     unit = "extent" in found
     assert cli.main(["cloud", "check", path]) == (2 if unit else 1)
     checked = capsys.readouterr()
@@ -235,7 +236,7 @@ def test_bad_options_are_refused_in_one_sentence(name, capsys):
     options, words = BAD[name]
     assert cli.main(["cloud", "check", str(VIEW), *options]) == 2
     said = capsys.readouterr()
-    assert said.out == "" and said.err.startswith(f"torchgrasp: {words}: found ") and said.err.count("\n") == 1
+    assert said.out == "" and said.err.startswith(f"torchgrasp: {words}: expected ") and said.err.count("\n") == 1
 
 
 def test_cut_leaves_the_thing_at_the_point_without_the_table(tmp_path, capsys):
@@ -350,7 +351,7 @@ def test_bad_depth_is_refused_in_one_sentence(name, tmp_path, capsys):
     options = options if "--out" in options else [*options, "--out", str(tmp_path / "c.npz")]
     assert cli.main(["cloud", "depth", str(tmp_path / "d.npy"), *K, *options]) == 2
     said = capsys.readouterr()
-    assert said.out == "" and said.err.startswith(f"torchgrasp: {words[0]}: found ") and said.err.count("\n") == 1
+    assert said.out == "" and said.err.startswith(f"torchgrasp: {words[0]}: expected ") and said.err.count("\n") == 1
     assert words[1] in said.err and not (tmp_path / "c.npz").exists()
 
 
@@ -359,7 +360,7 @@ def test_bad_depth_is_refused_in_one_sentence(name, tmp_path, capsys):
 def test_malformed_depth_files_are_refused_by_name(suffix, content, tmp_path, capsys):
     (tmp_path / f"d{suffix}").write_bytes(content)
     assert cli.main(["cloud", "depth", str(tmp_path / f"d{suffix}"), *K, "--out", str(tmp_path / "c.npz")]) == 2
-    assert capsys.readouterr().err.startswith("torchgrasp: DEPTH: found ")
+    assert capsys.readouterr().err.startswith("torchgrasp: DEPTH: expected ")
 
 
 @pytest.mark.parametrize("up", [None, (0.0, 0.0, 1.0)])

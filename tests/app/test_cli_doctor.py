@@ -5,7 +5,7 @@ import importlib.util
 
 import pytest
 
-from torchgrasp import cli
+from torchgrasp.app import cli
 from torchgrasp.data.shipped import load_object, load_shipped_grasp
 from torchgrasp.evaluation import golden
 

@@ -92,7 +92,7 @@ def test_the_cameras_of_a_merged_cloud_are_kept_in_files_and_by_every_filter(two
 def test_a_merged_cloud_without_a_view_worth_the_name_is_refused(two_views):
     points = two_views[0].points
     each = points + 1.0  # a camera for each point
-    with pytest.raises(BadArgument, match="600 different cameras, allowed is at most 16"):
+    with pytest.raises(BadArgument, match=r"expected at most 16.*600 different cameras"):
         fit_shape(PointCloud(points, viewpoint=each))
     few = two_views[0].viewpoint.expand(600, 3).clone()
     few[:5] += 0.1
@@ -110,9 +110,9 @@ def test_one_view_keeps_its_viewpoint_and_given_normals_turn_along(motion):
 
 
 def test_refusals(two_views):
-    with pytest.raises(BadArgument, match="clouds: found none"):
+    with pytest.raises(BadArgument, match=r"clouds: expected .*got none"):
         merge_clouds([], [])
-    with pytest.raises(BadArgument, match="poses: found 1 for 2"):
+    with pytest.raises(BadArgument, match=r"poses: expected .*got 1 for 2"):
         merge_clouds(two_views, [EYE])
     with pytest.raises(BadArgument, match=r"poses\[1\].*rigid"):
         merge_clouds(two_views, [EYE, 2 * EYE])

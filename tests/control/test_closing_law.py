@@ -223,19 +223,19 @@ def test_compliance_is_what_the_drives_yield():
 def test_bad_arguments_are_named():
     hand = load_hand("allegro")
     grasp = grasp_of(hand)
-    with pytest.raises(BadArgument, match="grasp: found 0 rows"):
+    with pytest.raises(BadArgument, match=r"grasp: expected .*got 0 rows"):
         closing_gains(grasp[:0], hand)
-    with pytest.raises(BadArgument, match="grasps: found 12 joints"):
+    with pytest.raises(BadArgument, match=r"grasps: expected .*got 12 joints"):
         closing_gains(grasp, load_hand("barrett"))
-    with pytest.raises(BadArgument, match="obj_from_hand: found nan"):
+    with pytest.raises(BadArgument, match=r"obj_from_hand: expected .*got nan"):
         dataclasses.replace(grasp, obj_from_hand=grasp.obj_from_hand * float("nan"))
     spoilt = dataclasses.replace(
         grasp, contacts=dataclasses.replace(grasp.contacts, std_m=grasp.contacts.std_m * float("inf"))
     )
-    with pytest.raises(BadArgument, match="std_m: found inf"):
+    with pytest.raises(BadArgument, match=r"std_m: expected .*got inf"):
         closing_gains(spoilt, hand)
     unknown = dataclasses.replace(grasp, contacts=dataclasses.replace(grasp.contacts, std_m=None))
-    with pytest.raises(BadArgument, match="std_m: found None"):
+    with pytest.raises(BadArgument, match=r"std_m: expected .*got None"):
         closing_gains(unknown, hand)
     for force in (0.0, -1.0, float("nan")):
         with pytest.raises(BadArgument, match="force"):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.clutter import write_objects
-from torchgrasp import cli
+from torchgrasp.app import cli
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.clutter import ClutterResult
 from torchgrasp.evaluation.scenes import ClutterSpec, SceneScore, evaluate_scenes, scene_record, summarise_scenes

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.pinch import pinch
-from torchgrasp import cli
+from torchgrasp.app import cli
 from torchgrasp.control.forces import squeeze
 from torchgrasp.export import format_grasps, format_keyframes
 from torchgrasp.geometry.frames import apply

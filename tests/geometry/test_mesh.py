@@ -71,7 +71,7 @@ def test_a_mesh_of_a_plane_is_refused(tmp_path):
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     lines = [f"v {x} {y}" for x, y, _ in box.vertices] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in box.faces]
     (tmp_path / "flat.obj").write_text("\n".join(lines) + "\n")
-    with pytest.raises(MeshError, match="allowed is"):
+    with pytest.raises(MeshError, match="expected "):
         read_mesh(tmp_path / "flat.obj")
 
 
@@ -97,7 +97,7 @@ def test_groups_and_materials_of_an_obj_are_left_out(tmp_path):
 def test_a_file_that_packs_or_names_others_is_no_mesh(tmp_path, suffix):
     path = tmp_path / f"box{suffix}"
     trimesh.creation.box((0.1, 0.1, 0.1)).export(path, file_type="ply")
-    with pytest.raises(MeshError, match=r"no such file, allowed is a mesh file \(\.obj"):
+    with pytest.raises(MeshError, match=r"expected a mesh file \(\.obj.*no such file"):
         read_mesh(path)
 
 

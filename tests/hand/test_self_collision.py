@@ -130,9 +130,9 @@ def test_pairs_of_the_shipped_hands_are_the_learned_ones(name):
 def test_neighbours_and_links_that_always_or_never_meet_are_no_pairs(toy_hand):
     urdf = read_urdf(toy_hand / "hand.urdf")
     assert collision_pairs(urdf, {}, n=50) == [("t1", "t2"), ("t2", "t3")] or collision_pairs(urdf, {}, n=50) == []
-    with pytest.raises(BadArgument, match="coupling: found j9"):
+    with pytest.raises(BadArgument, match=r"coupling: expected .*got j9"):
         collision_pairs(urdf, {"j9": Mimic("j1", 1.0, 0.0)}, n=50)
-    with pytest.raises(BadArgument, match="n: found 0"):
+    with pytest.raises(BadArgument, match=r"n: expected .*got 0"):
         collision_pairs(urdf, {}, n=0)
 
 

@@ -12,7 +12,7 @@ import pytest
 WAITING = """
 import sys, time
 from pathlib import Path
-from torchgrasp import cli
+from torchgrasp.app import cli
 from torchgrasp.files import hold_folder
 
 def wait(out: Path) -> int:
@@ -45,7 +45,7 @@ def test_a_command_that_is_told_to_end_says_so_and_leaves_nothing(tmp_path: Path
 
 ENDING = """
 import atexit, sys, time
-from torchgrasp import cli
+from torchgrasp.app import cli
 
 def tell(word):
     print(word, flush=True)
@@ -92,7 +92,7 @@ def test_signals_do_not_disturb_an_end(command: str, code: int, words: list[str]
 WORKING = """
 import os, sys, time
 from pathlib import Path
-from torchgrasp import cli
+from torchgrasp.app import cli
 from torchgrasp.jobs import run_tasks
 
 def tell_and_sleep(path):

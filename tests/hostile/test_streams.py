@@ -25,7 +25,7 @@ def test_without_stdout_a_command_does_its_work():
 
 CLOSED = """
 import os, sys
-from torchgrasp import cli
+from torchgrasp.app import cli
 code = cli.main(["cloud", "check", "none.ply"])
 file = os.open(os.devnull, os.O_RDONLY)
 sys.exit(10 * code + (file > 2))

@@ -106,7 +106,7 @@ def test_a_small_library_gives_no_more_seeds_than_it_has(poses):
     library = PostureLibrary.of(load_hand("barrett"), 2, seed=3)
     contacts = touched(library, poses[:2])
     assert len(nearest_postures(library, contacts, CollisionWorld(NOTHING), n_seeds=12)) == 24
-    with pytest.raises(BadArgument, match=r"n_seeds: found 13, allowed is a whole number in \[1, 12\]"):
+    with pytest.raises(BadArgument, match=r"n_seeds: expected a whole number in \[1, 12\], got 13"):
         nearest_postures(library, contacts, CollisionWorld(NOTHING), n_seeds=13)
 
 

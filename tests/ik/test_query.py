@@ -114,11 +114,11 @@ def test_paper_coverage_accepts_fewer(motion):
 def test_bad_arguments():
     hand, samples, mixture = barrett()
     contacts = touched_contacts(hand, samples.joints[:2], torch.eye(4).double())
-    with pytest.raises(BadArgument, match="n_seeds: found 0"):
+    with pytest.raises(BadArgument, match=r"n_seeds: expected .*got 0"):
         query_mixture(hand, contacts, mixture, n_seeds=0)
-    with pytest.raises(BadArgument, match="max_energy: found nan"):
+    with pytest.raises(BadArgument, match=r"max_energy: expected .*got nan"):
         query_mixture(hand, contacts, mixture, max_energy=float("nan"))
-    with pytest.raises(BadArgument, match="mixture: found joints"):
+    with pytest.raises(BadArgument, match=r"mixture: expected .*got joints"):
         query_mixture(load_hand("allegro"), contacts, mixture)
 
 
@@ -132,10 +132,10 @@ def test_a_mixture_of_other_limits_fingers_or_fingertips_is_refused():
         dataclasses.replace(hand, actuated=dataclasses.replace(hand.actuated, coupling=hand.actuated.coupling * 1.001)),
     ]
     for other in others:
-        with pytest.raises(BadArgument, match=r"mixture: found a model of hand 'barrett'.*train it anew"):
+        with pytest.raises(BadArgument, match=r"mixture: expected .*got a model of hand 'barrett'.*train it anew"):
             query_mixture(other, contacts, mixture)
     spoilt = dataclasses.replace(mixture, meta=mixture.meta | {"hand_codes": "one two"})
-    with pytest.raises(BadArgument, match="mixture: found hand_codes"):
+    with pytest.raises(BadArgument, match=r"mixture: expected .*got hand_codes"):
         query_mixture(hand, contacts, spoilt)
     # What does not change the codes is no other hand, nor are single precision and samples that tell no hand.
     for same in (dataclasses.replace(hand, source=hand.source._replace(sha256="0" * 64)), hand.to(torch.float32)):

@@ -59,11 +59,11 @@ def test_bad_arguments_name_what_was_found(doubtful, generator):
     two = Contacts(contacts.points[:, :2], contacts.normals[:, :2])
     long = Contacts(contacts.points, 1.1 * contacts.normals)
     for action, match in (
-        (lambda: closure_probability(doubtful, contacts, n=0), "n: found 0"),
-        (lambda: closure_probability(doubtful, contacts, seed=-1), "seed: found -1"),
+        (lambda: closure_probability(doubtful, contacts, n=0), "n: expected .*got 0"),
+        (lambda: closure_probability(doubtful, contacts, seed=-1), "seed: expected .*got -1"),
         (lambda: closure_probability(doubtful, far), "domain"),
         (lambda: closure_probability(doubtful, long), "unit vectors"),
-        (lambda: closure_probability(doubtful, two), "found 2 contacts a row, allowed is 3 to 5"),
+        (lambda: closure_probability(doubtful, two), "expected 3 to 5, got 2 contacts a row"),
     ):
         with pytest.raises(BadArgument, match=match):
             action()

@@ -50,7 +50,7 @@ def test_a_folder_holds_what_sample_configurations_returns_for_any_number_of_wor
     assert everything.meta == truth.meta
     assert everything.joint_names == truth.joint_names
     assert torch.equal(result.read(600).joints, truth.joints[:600])
-    with pytest.raises(BadArgument, match="n: found 1701"):
+    with pytest.raises(BadArgument, match=r"n: expected .*got 1701"):
         result.read(1701)
 
 
@@ -151,7 +151,7 @@ def test_a_full_disk_leaves_nothing_half_written_and_the_run_goes_on_later(tmp_p
     write_samples(hand, SampleSpec(1100), tmp_path / "whole")
     assert contents(tmp_path / "small") == contents(tmp_path / "whole")
     monkeypatch.setattr("shutil.disk_usage", lambda _: type("Usage", (), {"free": 1000})())
-    with pytest.raises(OutputError, match="1000 bytes free, allowed is 88000 bytes"):
+    with pytest.raises(OutputError, match=r"expected 88000 bytes.*1000 bytes free"):
         write_samples(hand, SampleSpec(1100), tmp_path / "full")
 
 
@@ -181,7 +181,7 @@ def test_a_folder_of_other_samples_or_files_is_refused(tmp_path, small):
         write_samples(hand, SampleSpec(600), tmp_path / "b" / "thesis.tex")
     with pytest.raises((BadArgument, TypeError), match="sampling"):
         SampleSpec(600, 0, "thumbs")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(BadArgument, match="workers: found 0"):
+    with pytest.raises(BadArgument, match=r"workers: expected .*got 0"):
         write_samples(hand, SampleSpec(600), tmp_path / "a", workers=0)
 
 

@@ -105,7 +105,7 @@ def test_start_finds_separate_clusters(generator):
 
 def test_fewer_different_rows_than_components_are_named():
     rows = torch.tensor([[0.0, 1.0], [1.0, 0.0]], dtype=torch.float64).repeat(50, 1)
-    with pytest.raises(BadArgument, match="components: found 3, allowed is at most 2"):
+    with pytest.raises(BadArgument, match="components: expected at most 2, got 3"):
         start_components(Shard(rows), 3, 0, 1e-6)
 
 

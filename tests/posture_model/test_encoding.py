@@ -90,9 +90,9 @@ def test_empty_batch_and_float32(generator):
 
 def test_bad_arguments(generator):
     points, normals = triples(3, generator)
-    with pytest.raises(BadArgument, match="normals: found a normal of length 2"):
+    with pytest.raises(BadArgument, match=r"normals: expected .*got a normal of length 2"):
         encode((points, 2 * normals))
-    with pytest.raises(BadArgument, match="points: found nan"):
+    with pytest.raises(BadArgument, match=r"points: expected .*got nan"):
         encode((points * float("nan"), normals))
-    with pytest.raises(BadArgument, match="normals: found shape"):
+    with pytest.raises(BadArgument, match=r"normals: expected .*got shape"):
         encode((points, normals[:2]))

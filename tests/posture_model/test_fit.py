@@ -84,17 +84,17 @@ def test_the_likeliest_of_several_starts_goes_on():
 def test_bad_arguments():
     samples = banana(100)
     for components in (0, 50):
-        with pytest.raises(BadArgument, match=f"components: found {components}"):
+        with pytest.raises(BadArgument, match=rf"components: expected .*got {components}"):
             fit_mixture(samples, components)
-    with pytest.raises(BadArgument, match="samples: found 3 samples"):
+    with pytest.raises(BadArgument, match=r"samples: expected .*got 3 samples"):
         fit_mixture(samples[:3], 1)
-    with pytest.raises(BadArgument, match="regularisation: found nan"):
+    with pytest.raises(BadArgument, match=r"regularisation: expected .*got nan"):
         fit_mixture(samples, 1, regularisation=float("nan"))
     stiff = dataclasses.replace(samples, joints=samples.joints.index_fill(1, torch.tensor([0]), 0.5))
     with pytest.raises(BadArgument, match="no variation in a,"):
         fit_mixture(stiff, 2)
-    with pytest.raises(BadArgument, match="q: found nan"):
+    with pytest.raises(BadArgument, match=r"q: expected .*got nan"):
         dataclasses.replace(samples, q=samples.q * float("nan"))
     samples.q[0, 0] = float("nan")  # a value that is spoilt later
-    with pytest.raises(BadArgument, match=r"samples\.q: found nan"):
+    with pytest.raises(BadArgument, match=r"samples\.q: expected .*got nan"):
         fit_mixture(samples, 2)

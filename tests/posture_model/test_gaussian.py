@@ -123,14 +123,14 @@ def test_sampling_touches_no_global_generator():
 def test_bad_arguments():
     mixture = random_mixture()
     for call, match in [
-        (lambda: mixture.marginal(("a", "z")), "names: found \\['z'\\]"),
+        (lambda: mixture.marginal(("a", "z")), "names: expected .*got \\['z'\\]"),
         (lambda: mixture.marginal(("a", "a")), "names: found"),
         (lambda: mixture.marginal(()), "names: found"),
         (lambda: mixture.condition({"z": 1.0}), "names: found"),
-        (lambda: mixture.condition({"a": float("nan")}), "given.*: found nan"),
-        (lambda: mixture.condition(dict.fromkeys(NAMES, 0.0)), "given: found every dimension"),
-        (lambda: mixture.sample(-1), "n: found -1"),
-        (lambda: mixture.log_prob(torch.zeros(3, 3)), "x: found shape"),
+        (lambda: mixture.condition({"a": float("nan")}), "given.*: expected .*got nan"),
+        (lambda: mixture.condition(dict.fromkeys(NAMES, 0.0)), "given: expected .*got every dimension"),
+        (lambda: mixture.sample(-1), "n: expected .*got -1"),
+        (lambda: mixture.log_prob(torch.zeros(3, 3)), "x: expected .*got shape"),
     ]:
         with pytest.raises(BadArgument, match=match):
             call()

@@ -86,16 +86,16 @@ def test_a_judgement_is_what_it_says():
 
 def test_bad_arguments():
     samples = islands(100)
-    with pytest.raises(BadArgument, match="components: found none"):
+    with pytest.raises(BadArgument, match=r"components: expected .*got none"):
         bic_curve(samples, ())
-    with pytest.raises(BadArgument, match="components: found none"):
+    with pytest.raises(BadArgument, match=r"components: expected .*got none"):
         cross_validate(samples, ())
     for folds in (1, 51):
-        with pytest.raises(BadArgument, match=f"folds: found {folds}"):
+        with pytest.raises(BadArgument, match=rf"folds: expected .*got {folds}"):
             cross_validate(samples, (1,), folds=folds)
     mixture = fit_mixture(samples, 1)
-    with pytest.raises(BadArgument, match="samples: found 1 postures"):
+    with pytest.raises(BadArgument, match=r"samples: expected .*got 1 postures"):
         evaluate_mixture(mixture, samples[:1])
     other = HandSamples(samples.joints, samples.q, ("a", "c"))
-    with pytest.raises(BadArgument, match="samples: found joints"):
+    with pytest.raises(BadArgument, match=r"samples: expected .*got joints"):
         evaluate_mixture(mixture, other)

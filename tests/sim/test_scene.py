@@ -186,7 +186,7 @@ def test_joints_without_a_drive_are_named(simulator):
     setup = SceneSpec(hand.urdf_path, np.eye(4), {}, hand.actuators, hand.tips.links, mesh, [mesh], 0.1)
     with pytest.raises(BadArgument, match=r"no position or drive for .*spread"):
         open_scene(setup, simulator)
-    with pytest.raises(BadArgument, match="simulator: found 'bullet'"):
+    with pytest.raises(BadArgument, match=r"simulator: expected .*got 'bullet'"):
         open_scene(setup, "bullet")
 
 

@@ -45,7 +45,7 @@ def checked(thing: Any = None, *, gradients: bool = False) -> Any:
     ...     return 2 * n
     >>> double(0)
     Traceback (most recent call last):
-    torchgrasp.errors.BadArgument: n: found 0, allowed is a whole number in [1, 1000000]
+    torchgrasp.errors.BadArgument: n: expected a whole number in [1, 1000000], got 0
     """
     if thing is None:
         return functools.partial(_checked, gradients=gradients)

@@ -19,7 +19,7 @@ def check_path(name: str, path: Path | str) -> None:
     >>> check_path("out", "results/a")
     >>> check_path("out", "a" * 300)
     Traceback (most recent call last):
-    torchgrasp.errors.BadArgument: out: found a name of 300 bytes, allowed is a path with names of at most 255
+    torchgrasp.errors.BadArgument: out: expected a path with names of at most 255, got a name of 300 bytes
     """
     try:
         raw = os.fsencode(path)

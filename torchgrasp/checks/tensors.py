@@ -152,7 +152,7 @@ def check_tensor(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor
     >>> check_tensor("points", torch.zeros(5, 2), (None, 3))
     Traceback (most recent call last):
         ...
-    torchgrasp.errors.BadArgument: points: found shape (5, 2), allowed is shape _ x 3
+    torchgrasp.errors.BadArgument: points: expected shape _ x 3, got shape (5, 2)
     """
     call = Call(gradients=True)
     TensorHint("Float", " ".join("_" if s is None else str(s) for s in shape)).read(name, value, call)
@@ -168,7 +168,7 @@ def check_moved(*args: Any, **kwargs: Any) -> None:
     >>> check_moved(torch.int32)
     Traceback (most recent call last):
         ...
-    torchgrasp.errors.BadArgument: to: found torch.int32, allowed is a device, torch.float32 or torch.float64
+    torchgrasp.errors.BadArgument: to: expected a device, torch.float32 or torch.float64, got torch.int32
     """
     given = ", ".join([*map(repr, args), *(f"{key}={value!r}" for key, value in kwargs.items())])
     allowed = "a device, torch.float32 or torch.float64"

@@ -146,7 +146,7 @@ class Hand(Value):
         >>> load_hand("allegro", fingers=4).require_three("hand", "the mixture")
         Traceback (most recent call last):
             ...
-        torchgrasp.errors.BadArgument: hand: found the mixture for 4 fingertips, allowed is that for three ...
+        torchgrasp.errors.BadArgument: hand: expected that for three ..., got the mixture for 4 fingertips
         """
         if len(self.tips) != 3:
             found = f"{what} for {len(self.tips)} fingertips"
@@ -161,7 +161,7 @@ class Hand(Value):
         >>> hand.check_joints(hand.upper + 1)
         Traceback (most recent call last):
             ...
-        torchgrasp.errors.BadArgument: joints: found 4.14159 for spread, allowed is [0, 3.14159]
+        torchgrasp.errors.BadArgument: joints: expected [0, 3.14159], got 4.14159 for spread
         """
         self.actuated.check_limits(joints)
         return joints

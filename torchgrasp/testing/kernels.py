@@ -43,7 +43,7 @@ def check_kernel(kernel: Kernel, seed: Seed = 0) -> Kernel:
     >>> _ = check_kernel(matern52_kernel(1.5))
     >>> check_kernel(Kernel(lambda r: torch.exp(-r)))
     Traceback (most recent call last):
-    torchgrasp.errors.BrokenLaw: smooth: found k'(0) = -1, allowed is 0
+    torchgrasp.errors.BrokenLaw: smooth: expected 0, got k'(0) = -1
     """
     length = _length(kernel)
     _check_start(kernel, length)

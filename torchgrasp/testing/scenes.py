@@ -50,7 +50,7 @@ def check_scene(open_scene: Open, hand: Hand | None = None) -> None:
 
     >>> check_scene(lambda spec: None)
     Traceback (most recent call last):
-    torchgrasp.errors.BrokenLaw: scene: found NoneType, allowed is a torchgrasp.sim.Scene
+    torchgrasp.errors.BrokenLaw: scene: expected a torchgrasp.sim.Scene, got NoneType
     """
     hand = load_hand("barrett") if hand is None else hand
     law = _Laws(open_scene, _spec(hand), hand)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from torchgrasp import cli
+from torchgrasp.app import cli
 from torchgrasp.app.cli.results import write_results
 from torchgrasp.app.report.turning import write_viewer
 from torchgrasp.app.report.turning.buffers import pack

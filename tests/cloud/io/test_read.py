@@ -186,7 +186,7 @@ def test_compressed_pcd_is_read(tmp_path, points):
 )
 def test_malformed_compressed_data_are_refused_by_name(tmp_path, points, body):
     (tmp_path / "a.pcd").write_bytes(compressed_pcd(points)[0] + body)
-    with pytest.raises(CloudFileError, match=r"path: found .*a\.pcd"):
+    with pytest.raises(CloudFileError, match=r"path: expected .*got .*a\.pcd"):
         read_cloud(tmp_path / "a.pcd")
 
 
@@ -293,7 +293,7 @@ def test_arrays_and_text(tmp_path, points):
 )
 def test_malformed_content_is_refused_by_name(tmp_path, suffix, content):
     (tmp_path / f"a{suffix}").write_bytes(content)
-    with pytest.raises((CloudFileError, TooFewPoints), match="path: found"):
+    with pytest.raises((CloudFileError, TooFewPoints), match=r"path: expected .*got"):
         read_cloud(tmp_path / f"a{suffix}")
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torchgrasp import cli
+from torchgrasp.app import cli
 
 CALLS = ("mkdir", "open", "write", "fsync", "chmod", "replace", "unlink", "rmdir")
 """The calls of `os` that change a disk, and that the library's writing goes through."""

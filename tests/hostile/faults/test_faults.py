@@ -18,7 +18,7 @@ import pytest
 
 from tests.hostile.faults.commands import COMMANDS, Command
 from tests.hostile.faults.inject import Ended, Happening, contents, fail, kill, run, send
-from torchgrasp import cli
+from torchgrasp.app import cli
 from torchgrasp.data.shards import load_shard
 from torchgrasp.files import hold_file, hold_folder
 

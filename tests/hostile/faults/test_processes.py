@@ -26,7 +26,7 @@ import sys, time
 time.perf_counter = time.process_time = lambda: 0.0  # pages tell how long the work took
 import torchgrasp.posture_model.dataset, torchgrasp.posture_model.sample
 torchgrasp.posture_model.dataset.CHUNK_POSTURES = torchgrasp.posture_model.sample.CHUNK_POSTURES = 300
-from torchgrasp import cli
+from torchgrasp.app import cli
 
 if __name__ == "__main__":
     cli.run_and_exit()
@@ -36,7 +36,7 @@ if __name__ == "__main__":
 STUB = """
 import dataclasses, os, signal, sys, time
 from pathlib import Path
-from torchgrasp import cli
+from torchgrasp.app import cli
 from torchgrasp.errors import Status
 from torchgrasp.evaluation import campaign
 from torchgrasp.evaluation.score import ProtocolResult

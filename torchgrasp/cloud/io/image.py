@@ -25,7 +25,7 @@ def read_image(name: str, path: Path | str) -> np.ndarray:
 
     >>> read_image("depth", "none.png")
     Traceback (most recent call last):
-    torchgrasp.errors.BadArgument: depth: found none.png, which is no file, allowed is a .npy, .npz or .png file
+    torchgrasp.errors.BadArgument: depth: expected a .npy, .npz or .png file, got none.png, which is no file
     """
     data, suffix = _read_bytes(name, path, (".npy", ".npz", ".png"))
     try:

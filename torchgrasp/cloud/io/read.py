@@ -55,7 +55,7 @@ def read_cloud(
 
     >>> read_cloud("scan.docx")
     Traceback (most recent call last):
-    torchgrasp.errors.CloudFileError: path: found scan.docx, allowed is a file ending in .ply, .pcd, .npz, .npy or .xyz
+    torchgrasp.errors.CloudFileError: path: expected a file ending in .ply, .pcd, .npz, .npy or .xyz, got scan.docx
     """
     return check_cloud(read_cloud_file(path, viewpoint, unit).cloud)
 
@@ -74,7 +74,7 @@ def read_cloud_file(
 
     >>> read_cloud_file("none.ply")
     Traceback (most recent call last):
-    torchgrasp.errors.CloudFileError: path: found none.ply, which is no file, allowed is a .ply file
+    torchgrasp.errors.CloudFileError: path: expected a .ply file, got none.ply, which is no file
     """
     try:
         position = None if viewpoint is None else torch.as_tensor(viewpoint, dtype=torch.float64)
@@ -135,7 +135,7 @@ def save_cloud(cloud: PointCloud, path: Path | str) -> Path:
 
     >>> save_cloud(PointCloud(torch.rand(9, 3)), "cloud.txt")
     Traceback (most recent call last):
-    torchgrasp.errors.BadArgument: path: found cloud.txt, allowed is a file ending in .npz or .ply
+    torchgrasp.errors.BadArgument: path: expected a file ending in .npz or .ply, got cloud.txt
     """
     path, buffer = Path(path), io.BytesIO()
     arrays = {name: tensor.detach().cpu().numpy() for name, tensor in named_tensors(cloud).items()}
