@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from tests.campaign.conftest import LIFT, QUICK
-from torchgrasp import ContactSpec, Status, certify, cli, load_hand
+from torchgrasp import ContactSpec, Status, certify, load_hand
+from torchgrasp.app import cli
 from torchgrasp.campaign import CampaignSpec, run_campaign
 from torchgrasp.campaign import job as job_module
 from torchgrasp.data import read_shards, read_view

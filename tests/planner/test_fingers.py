@@ -11,7 +11,6 @@ from tests.planner.test_grasps import closure_margin
 from torchgrasp import (
     ContactSpec,
     Status,
-    cli,
     close_hand,
     closing_gains,
     hand_of,
@@ -22,6 +21,7 @@ from torchgrasp import (
     plan_grasps,
     plan_scene,
 )
+from torchgrasp.app import cli
 from torchgrasp.base import named_tensors
 from torchgrasp.data.shipped import DATA
 from torchgrasp.errors import BadArgument
