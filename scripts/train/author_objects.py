@@ -26,7 +26,7 @@ def objects() -> None:
 
 def scene() -> None:
     """Write the depth image of a scene of the library's objects, with labels, camera and table."""
-    from torchgrasp.evaluation.placed import drop  # needs SAPIEN, which the other trainings do not
+    from benchmarks.scene.drop import drop  # needs SAPIEN, which the other trainings do not
 
     count = len(list_objects())
     placed = drop(None, (count, count), SCENE_SEED)

@@ -28,7 +28,7 @@ from torchgrasp.cloud import (
     remove_duplicates,
     save_cloud,
 )
-from torchgrasp.evaluation import PERTURBATIONS, draw_object_poses, find_protocol, perturb_view
+from torchgrasp.evaluation import draw_object_poses, find_protocol
 from torchgrasp.export import (
     format_graspgen,
     format_grasps,
@@ -65,7 +65,6 @@ CLOUDS = {
     "prepare_cloud": lambda cloud: prepare_cloud(cloud, torch.Generator().manual_seed(0)),
     "cut_object": lambda cloud: cut_object(cloud, UP.to(cloud.points)),
     "cloud_from_depth": lambda cloud: cloud_from_depth(CLOSE.to(cloud.points), LENS.to(cloud.points)),
-    **{f"perturb_view, {name}": lambda cloud, x=x: perturb_view(cloud, x, 0) for name, x in PERTURBATIONS.items()},
 }
 TEXTS = {
     "grasps": lambda hand, grasps: format_grasps(hand, grasps),

@@ -131,34 +131,15 @@ def test_a_second_run_on_the_folder_is_refused_and_a_bad_input_leaves_none(tmp_p
     words = ["evaluate", "--objects", str(tmp_path / "none"), "--hand", "allegro", "--out", str(tmp_path / "out")]
     with hold_folder(tmp_path / "out"):
         assert cli.main(words) == 2
-        assert capsys.readouterr().err.startswith(f"torchgrasp: --out: found {tmp_path / 'out'}, in use by process")
+        assert capsys.readouterr().err.startswith("torchgrasp: --out: expected")
     assert cli.main(words) == 2
-    assert capsys.readouterr().err.startswith("torchgrasp: --objects: found")
+    assert capsys.readouterr().err.startswith("torchgrasp: --objects: expected")
     assert list(tmp_path.iterdir()) == []
 
 
 def without_times(scores):
     rows = [dataclasses.replace(x, seconds=0.0, attempts=()) for x in scores]
     return str([rows, *(dataclasses.replace(a, seconds=0.0) for x in scores for a in x.attempts)])  # NaN is not NaN
-
-
-@pytest.mark.sim
-@pytest.mark.filterwarnings("ignore")
-def test_a_robot_plans_on_what_it_believes_and_lifts_what_is(folder, tmp_path):
-    pytest.importorskip("sapien")
-    hand, quick = load_hand("allegro"), Protocol("quick", TrialSpec(hold_time=0.2))
-    spec = EvaluationSpec(1, starts=60, only=("tin",))
-    found = {}
-    for name in ("none", "friction", "table"):
-        asked = dataclasses.replace(spec, perturb=name)
-        (score,) = evaluate(folder, hand, quick, asked, folder=tmp_path / name)
-        grasps = load_grasps(tmp_path / name / "tin" / "view0.safetensors")
-        found[name] = grasps.obj_from_hand, score.attempts[0]
-    assert torch.equal(found["none"][0], found["friction"][0]) and found["none"][1] != found["friction"][1]
-    assert not torch.equal(found["none"][0][0], found["table"][0][0])
-    assert found["none"][1].passed and found["none"][1].slip < 0.005 and found["none"][1].slip_angle < 0.2
-    with pytest.raises(BadArgument, match=r"perturb: expected .*got 'table' with 'dexgraspbench'"):
-        evaluate(folder, hand, "dexgraspbench", asked)
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -8,13 +8,13 @@ import pytest
 import torch
 import trimesh
 from benchmarks.close import household, suite
+from benchmarks.perturb import PERTURBATIONS
 from paper.trials import TableSpec
 
 from tests.pinch import pinch
 from torchgrasp.base import join
 from torchgrasp.closure import ObjectMotion
 from torchgrasp.errors import Status, TooFewPoints
-from torchgrasp.evaluation import PERTURBATIONS
 
 
 @pytest.fixture

@@ -25,8 +25,8 @@ class CampaignSpec(Value):
         jobs_in_shard: objects and views whose records share a file.
 
     Raises:
-        BadArgument: an unknown protocol, a perturbation of one that pulls, or trials of whole clouds, of grasps that
-            were planned before, or of other fingers than the hand's.
+        BadArgument: an unknown protocol, or trials of whole clouds, of grasps that were planned before, or of other
+            fingers than the hand's.
 
     >>> CampaignSpec("dexgraspbench").test.trial.friction
     0.6
@@ -43,10 +43,6 @@ class CampaignSpec(Value):
         if trials.planned or trials.complete or trials.fingers is not None:
             found = next(name for name in ("planned", "complete", "fingers") if getattr(trials, name))
             raise BadArgument("trials", f"{found} = {getattr(trials, found)!r}", "views that are planned on anew")
-        if self.test.pull is not None and trials.perturb != "none":
-            raise BadArgument(
-                "trials", f"perturb = {trials.perturb!r} with {self.test.name!r}", "a protocol that lifts"
-            )
         if not self.licence.isprintable() or not 0 < len(self.licence) <= LONGEST_LICENCE:
             raise BadArgument("licence", repr(self.licence), f"a line of 1 to {LONGEST_LICENCE} letters")
 

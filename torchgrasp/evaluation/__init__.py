@@ -6,9 +6,6 @@ from torchgrasp.evaluation.campaign import evaluate
 from torchgrasp.evaluation.intervals import Share, contrast_over, count_by, difference_over, format_share, mean_over
 from torchgrasp.evaluation.intervals import share_over
 from torchgrasp.evaluation.lift import close_hand, lift_grasp
-from torchgrasp.evaluation.perturb import PERTURBATIONS, Perturbation, find_perturbation, household_mass
-from torchgrasp.evaluation.perturb import perturb_trial, perturb_view
-from torchgrasp.evaluation.placed import PlacedScene, drop
 from torchgrasp.jobs import run_tasks
 from torchgrasp.evaluation.protocols import PROTOCOLS, PoseNoise, Protocol, PullSpec, apply_error
 from torchgrasp.evaluation.protocols import draw_error, draw_hand_errors, draw_object_poses, find_protocol, seed_of
@@ -16,12 +13,9 @@ from torchgrasp.evaluation.pull import PullResult, pull_grasp, run_protocol
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore, most_certain_first, summarise
 
 __all__ = [
-    "PERTURBATIONS",
     "PROTOCOLS",
     "EvaluationSpec",
     "GraspTrial",
-    "Perturbation",
-    "PlacedScene",
     "PoseNoise",
     "Protocol",
     "ProtocolResult",
@@ -39,17 +33,12 @@ __all__ = [
     "draw_error",
     "draw_hand_errors",
     "draw_object_poses",
-    "drop",
     "evaluate",
-    "find_perturbation",
     "find_protocol",
     "format_share",
-    "household_mass",
     "lift_grasp",
     "mean_over",
     "most_certain_first",
-    "perturb_trial",
-    "perturb_view",
     "pull_grasp",
     "run_protocol",
     "run_tasks",

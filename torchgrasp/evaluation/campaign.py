@@ -10,7 +10,7 @@ from typing import Annotated
 
 from torchgrasp.checks import Range, checked
 from torchgrasp.data import list_entries, list_views
-from torchgrasp.errors import BadArgument, DatasetError, Status
+from torchgrasp.errors import DatasetError, Status
 from torchgrasp.evaluation.protocols import Protocol, find_protocol
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore
 from torchgrasp.evaluation.views import REFUSAL, EvaluationSpec, View, choose_rows, plan_view, try_grasp
@@ -46,7 +46,7 @@ def evaluate(
         workers: processes (`run_tasks`); the scores do not depend on their number.
 
     Raises:
-        BadArgument: an unknown protocol, no objects, or a perturbation of a protocol that pulls.
+        BadArgument: an unknown protocol, or no objects.
         OutputError: another run holds the folder, or it cannot be written.
         MissingExtra: the simulator, or pebble for workers, is not installed.
 
@@ -61,8 +61,6 @@ def evaluate(
     [True]
     """
     protocol, spec = find_protocol(protocol), EvaluationSpec() if spec is None else spec
-    if spec.perturb != "none" and protocol.pull is not None:
-        raise BadArgument("perturb", f"{spec.perturb!r} with {protocol.name!r}", "a protocol that lifts")
     views, refused = [], []
     for name in list_entries(objects, spec.only):
         try:

@@ -109,8 +109,7 @@ PROTOCOLS = {
 * pose-noise: the same with errors of the hand's pose.
 * paper: the paper's lift (Sec. 6.5) at friction 0.8; errors of the object's pose stand for a real robot's chance.
 * tabletop: a lift by 0.1 m at friction 0.6, held for 2 s while the hand shakes.
-* household: the same at friction 0.8 with a grip of 6 N, in which `torchgrasp.evaluation.perturb` withholds what a
-  robot does not know. Of 4 to 10 N the Allegro held most objects of eight families with it.
+* household: the same at friction 0.8 with a grip of 6 N.
 """
 
 

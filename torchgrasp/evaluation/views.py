@@ -11,7 +11,6 @@ from torchgrasp.checks import Count, Seed, checked
 from torchgrasp.data import read_entry, read_object_mesh, read_view
 from torchgrasp.errors import BadArgument, GraspError, MissingExtra, OutputError, Status
 from torchgrasp.evaluation.closing import GraspTrial
-from torchgrasp.evaluation.perturb import find_perturbation, household_mass, perturb_trial, perturb_view
 from torchgrasp.evaluation.protocols import Protocol, draw_error, seed_of
 from torchgrasp.evaluation.pull import run_protocol
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore
@@ -43,15 +42,21 @@ Ranks = Literal["best", "spread"]
 @checked
 @dataclasses.dataclass(frozen=True)
 class EvaluationSpec(Value):
-    """Which grasps of a folder of objects are evaluated: of each view at most `grasps`, by `ranks`.
+    """Which views of a folder of objects are planned on, and which of their grasps are tried.
 
-    `complete` plans on whole clouds with normals, as if the shape were known. `only` names objects; (): all. `planned`
-    takes the grasps that an earlier call left in its folder. `starts` are those of the contact planner. `perturb` names
-    what the robot does not know (`PERTURBATIONS`). At most `views` of each object are taken; None: all. `fingers` grasp
-    as in `plan_grasps`: "auto" takes the likeliest set for each view; None: the hand's own.
+    Args:
+        grasps: the most grasps of a view.
+        ranks: the best grasps, or as many spread over all ranks.
+        starts: of the contact planner.
+        complete: plan on whole clouds with normals, as if the shape were known.
+        only: names of objects; (): all objects.
+        planned: take the grasps that an earlier call left in its folder.
+        seed: of every random number.
+        views: the most views of an object; None: all views.
+        fingers: as in `plan_grasps`; None: the hand's own fingers.
 
     Raises:
-        BadArgument: no grasps, unknown ranks, or an unknown perturbation.
+        BadArgument: no grasps, or unknown ranks.
     """
 
     grasps: Count = 20
@@ -61,12 +66,8 @@ class EvaluationSpec(Value):
     only: tuple[str, ...] = ()
     planned: bool = False
     seed: Seed = 0
-    perturb: str = "none"
     views: Count | None = None
     fingers: Fingers | None = None
-
-    def __post_init__(self) -> None:
-        find_perturbation(self.perturb)
 
     @property
     def tried(self) -> str:
@@ -136,7 +137,7 @@ def plan_view(view: View, friction: float, spec: EvaluationSpec, planned: Path |
     cloud = grasps = None
     try:
         _read_solid(view.objects, view.object)  # a bad mesh is refused before any work; its parts are cached
-        seen, table = _see(view.objects, view.object, view.view, spec.perturb, spec.seed)
+        seen = read_view(view.objects, view.object, view.view)
         if planned is not None:
             grasps = load_grasps(planned)
             if (grasps.meta.get("cloud_sha256"), grasps.meta.get("hand_sha256")) != (digest(seen), hand.source.sha256):
@@ -147,7 +148,7 @@ def plan_view(view: View, friction: float, spec: EvaluationSpec, planned: Path |
             score = dataclasses.replace(score, executable=len(grasps), refusal=refusal, fingers=fingers)
             return PlannedView(score, seen, grasps)
         started = time.process_time()
-        contacts = ContactSpec(friction=min(friction, MOST_FRICTION), table=table)
+        contacts = ContactSpec(friction=min(friction, MOST_FRICTION), table=Plane.horizontal(0.0))
         stages: list[tuple[str, str, Any]] = []
         found = plan_grasps(
             seen, hand, contacts, spec.starts, spec.seed, fingers=spec.fingers, observer=lambda *x: stages.append(x)
@@ -173,29 +174,18 @@ def try_grasp(
     hand = hand_of(grasp, view.load_hand())
     mesh, parts = _read_solid(view.objects, view.object)
     seed = seed_of(spec.seed, view.object, view.view, *at)
-    perturbation = find_perturbation(spec.perturb)
-    mass = household_mass(float(mesh.volume), read_entry(view.objects, view.object).mass)
-    trial = perturb_trial(protocol.trial, perturbation, mass, seed)
-    noise = protocol.noise if spec.perturb == "none" else perturbation.pose
-    protocol = dataclasses.replace(protocol, trial=trial, noise=noise)
+    trial = protocol.trial
     error, surface = draw_error(protocol, grasp, mesh, seed), None
     if trial.table and needs_surface(trial.closing, trial.without):
-        surface = _fit_surface(view.objects, view.object, view.view, spec.perturb, spec.seed)
+        surface = _fit_surface(view.objects, view.object, view.view)
     attempt = GraspTrial(hand, grasp, mesh, seed_of(seed, "touch"), error, parts=parts, surface=surface)
     return dataclasses.replace(run_protocol(attempt, protocol, *at), predicted=float(grasp.success[0]))
 
 
-def _see(objects: Path, name: str, view: str, perturb: str, seed: int) -> tuple[PointCloud, Plane]:
-    """Return what a robot sees of a view, and the table."""
-    cloud = read_view(objects, name, view)
-    return perturb_view(cloud, find_perturbation(perturb), seed_of(seed, name, view))
-
-
 @functools.lru_cache(maxsize=2)
-def _fit_surface(objects: Path, name: str, view: str, perturb: str, seed: int) -> SignedDistanceField:
+def _fit_surface(objects: Path, name: str, view: str) -> SignedDistanceField:
     """Return the estimated surface of what a robot sees, by which touches tell it where the object is."""
-    cloud, table = _see(objects, name, view, perturb, seed)
-    return surface_field(fit_shape(cloud, table=table))
+    return surface_field(fit_shape(read_view(objects, name, view), table=Plane.horizontal(0.0)))
 
 
 @functools.lru_cache(maxsize=2)

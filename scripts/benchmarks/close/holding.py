@@ -7,16 +7,25 @@ Plans and lifts are kept as files.
 
 import dataclasses
 import json
+import math
 import statistics
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import numpy as np
 import torch
+import trimesh
+from jaxtyping import Float
 from paper.trials import CELL_SECONDS, Subject, TableSpec, subjects
+from scipy.optimize import linprog
+from torch import Tensor
 
 from benchmarks.close.household import HOUSEHOLD, plan_view, read_solid
 from benchmarks.common import Row
+from benchmarks.perturb import household_mass
+from torchgrasp.closure import ClosureResult
+from torchgrasp.control.observation import joint_jacobian
 from torchgrasp.data import list_views, read_mass
 from torchgrasp.errors import GraspError, Status
 from torchgrasp.evaluation import (
@@ -24,13 +33,13 @@ from torchgrasp.evaluation import (
     count_by,
     difference_over,
     format_share,
-    household_mass,
     run_tasks,
     seed_of,
 )
 from torchgrasp.evaluation.intervals import share_over
-from torchgrasp.evaluation.statics import least_grip_at
 from torchgrasp.files import format_json, write_file
+from torchgrasp.geometry.frames import apply, inverse
+from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 
 FRICTIONS = (0.4, 0.7, 1.0)
@@ -92,6 +101,72 @@ def _lift(spec: TableSpec, subject: Subject, hand_name: str) -> Iterator[dict[st
             for when, tick in (("pressed", pressed), ("end", len(done.time) - 1)):
                 told[when] = least_grip_at(done, tick, hand, mesh, mass, friction) if tick >= 0 else (None, 0.0)
             yield told
+
+
+EDGES = 16
+"""Edges of a linearised friction cone."""
+
+
+def least_grip(
+    points: Float[Tensor, "f 3"],
+    normals: Float[Tensor, "f 3"],
+    load: Float[Tensor, "6"],
+    friction: float,
+    torques: Float[Tensor, "f j 3"] | None = None,
+) -> Float[Tensor, "f 3"] | None:
+    """Return the forces with the least sum of normal forces that balance a load, or None where there are none.
+
+    Args:
+        points: contacts [m].
+        normals: outward unit normals.
+        load: force [N] and torque about the mean of the contacts [N m] that the forces must sum to.
+        friction: at every contact.
+        torques: joint torques, over their limits, of a force of 1 N along each axis; None: without limit.
+    """
+    p, n, f = points.double().numpy(), normals.double().numpy(), len(points)
+    side = np.cross(n, np.eye(3)[np.abs(n).argmin(1)])
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    angle = 2 * math.pi * np.arange(EDGES) / EDGES
+    around = np.cos(angle)[:, None] * side[:, None] + np.sin(angle)[:, None] * np.cross(n, side)[:, None]
+    edges = friction * around - n[:, None]  # (f, e, 3), each pushes with 1 N
+    columns = np.zeros((3 * f, f * EDGES))
+    for i in range(f):
+        columns[3 * i : 3 * i + 3, i * EDGES : (i + 1) * EDGES] = edges[i].T
+    arms = p - p.mean(0)
+    wrench = np.concatenate([np.tile(np.eye(3), f), np.concatenate([np.cross(arm, np.eye(3)).T for arm in arms], 1)])
+    size = np.repeat([1.0, 1 / max(float(np.ptp(p, axis=0).max()), 1e-6)], 3)  # forces and torques alike
+    limits = {}
+    if torques is not None:
+        share = np.concatenate(list(torques.double().numpy()), axis=1) @ columns
+        limits = {"A_ub": np.concatenate([share, -share]), "b_ub": np.ones(2 * len(share))}
+    balance, wanted = size[:, None] * (wrench @ columns), size * load.double().numpy()
+    found = linprog(np.ones(f * EDGES), A_eq=balance, b_eq=wanted, **limits)
+    return torch.from_numpy((columns @ found.x).reshape(f, 3)) if found.status == 0 else None
+
+
+def least_grip_at(
+    closure: ClosureResult, tick: int, hand: Hand, mesh: trimesh.Trimesh, mass: float, friction: float
+) -> tuple[float | None, float]:
+    """Return the least normal sum [N] that could hold the object at a tick of a trial, and the simulated sum.
+
+    None: the drives cannot hold the object, or fewer than two fingers touch it.
+    """
+    hand, trace = hand.to("cpu", torch.float64), closure.trace
+    touching = torch.isfinite(trace.points[tick]).all(-1)
+    spent = float(-(trace.forces[tick] * trace.normals[tick])[touching].sum())
+    if int(touching.sum()) < 2:
+        return None, spent
+    hand_from_object = inverse(closure.hand_pose[tick]) @ closure.object_pose[tick]
+    centre = apply(hand_from_object, torch.from_numpy(np.array(mesh.center_mass, dtype=np.float64))[None])[0]
+    places = [closure.joint_names.index(name) for name in hand.tree.joint_names]
+    points = torch.where(touching[:, None], trace.points[tick], 0.0)
+    jacobian = joint_jacobian(hand, closure.joints[tick][places], points)[touching]
+    effort = torch.tensor([hand.actuators[name].effort for name in hand.tree.joint_names], dtype=torch.float64)
+    force = mass * 9.81 * closure.hand_pose[tick][:3, :3].T @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    points, normals = points[touching], trace.normals[tick][touching]
+    load = torch.cat([force, torch.linalg.cross(centre - points.mean(0), force)])
+    forces = least_grip(points, normals, load, friction, jacobian.mT / effort[:, None])
+    return (None if forces is None else float(-(forces * normals).sum())), spent
 
 
 def _row(hand: str, name: str, lifts: Sequence[dict[str, Any]], base: Sequence[dict[str, Any]]) -> Row:

@@ -18,22 +18,24 @@ import torch
 from paper.trials import CELL_SECONDS, Subject, TableSpec, subjects
 
 from benchmarks.common import Row
+from benchmarks.perturb import (
+    PERTURBATIONS,
+    Perturbation,
+    find_perturbation,
+    household_mass,
+    perturb_trial,
+    perturb_view,
+)
 from torchgrasp.data import list_views, read_mass, read_object_mesh, read_view
 from torchgrasp.errors import GraspError, Status
 from torchgrasp.evaluation import (
-    PERTURBATIONS,
     PROTOCOLS,
-    Perturbation,
     PoseNoise,
     close_hand,
     count_by,
     difference_over,
     draw_error,
-    find_perturbation,
     format_share,
-    household_mass,
-    perturb_trial,
-    perturb_view,
     run_tasks,
     seed_of,
     share_over,

@@ -23,19 +23,17 @@ from benchmarks.close.conditions import BARS, CONDITIONS, DEFAULT, FRAGILE, IN_M
 from benchmarks.close.drawn import draw_solid
 from benchmarks.close.simulator_agreement import Verdicts, agreement_row
 from benchmarks.common import Row
+from benchmarks.perturb import PERTURBATIONS, household_mass, perturb_trial
 from torchgrasp import ClosureResult, Grasps, Status, TrialSpec, load_hand, plan_grasps
 from torchgrasp.data import list_views, read_mass, read_object_mesh, read_view
 from torchgrasp.errors import GraspError
 from torchgrasp.evaluation import (
-    PERTURBATIONS,
     PROTOCOLS,
     GraspTrial,
     count_by,
     difference_over,
     format_share,
-    household_mass,
     lift_grasp,
-    perturb_trial,
     pull_grasp,
     run_tasks,
     seed_of,

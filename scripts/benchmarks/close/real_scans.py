@@ -12,10 +12,11 @@ from typing import Any
 import torch
 
 from benchmarks.common import Row
+from benchmarks.perturb import PERTURBATIONS, household_mass, perturb_trial
 from torchgrasp.cloud.io.read import read_cloud
 from torchgrasp.data import read_mass, read_object_mesh
 from torchgrasp.errors import GraspError, Status
-from torchgrasp.evaluation import PERTURBATIONS, PROTOCOLS, close_hand, household_mass, perturb_trial, seed_of
+from torchgrasp.evaluation import PROTOCOLS, close_hand, seed_of
 from torchgrasp.geometry.plane import move
 from torchgrasp.hand.load import load_hand
 from torchgrasp.planner import plan_grasps

@@ -1,5 +1,6 @@
 """From a depth image to its table and to a clicked thing, beside the bars."""
 
+import dataclasses
 import math
 import time
 from pathlib import Path
@@ -10,6 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks.common import Row, measure
+from benchmarks.scene.clutter import Clutter, bench_clutter
 from benchmarks.scene.frames import measure_frames
 from benchmarks.scene.scenes import Picture, read_meshes, take_picture
 from torchgrasp.cloud.camera import INTRINSICS
@@ -17,7 +19,7 @@ from torchgrasp.errors import BadArgument, NoSupport
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene import Scene
 
-SUBJECTS = ("plane", "clicked point", "frames")
+SUBJECTS = ("plane", "clicked point", "frames", "clutter", "clear")
 TABLES = ("apart", "apart", "crowded", "boxes", "close")
 """Kinds of scenes with a table, in turn."""
 EMPTY = ("lone", "lone", "apart", "boxes")
@@ -32,26 +34,40 @@ def scene(
     scenes: int = 300,
     frames: int = 200,
     trials: int = 20,
+    hand: str = "allegro",
+    mask_error: int = 0,
+    starts: int = 1000,
+    workers: int = 1,
     seed: int = 0,
     out: Path = Path("out/bench_scene.json"),
 ) -> None:
-    """Measure how scenes are read from one depth image, and that results do not depend on the frame.
+    """Measure how scenes are read, that results do not depend on the frame, and lifts among neighbours.
 
     Args:
         objects: folder with manifest.json and a folder for each object.
-        only: subjects to measure: plane, clicked point, frames.
-        scenes: rendered scenes of the first two subjects. As many without a table as a third of these are refused.
+        only: subjects to measure: plane, clicked point, frames, clutter (the easiest object of dropped scenes is
+            lifted), clear (all of them, one after another).
+        scenes: rendered scenes of plane and clicked point; clutter and clear drop a tenth of them. A third of them is
+            rendered without a table.
         frames: random frames in which grasps are planned.
         trials: of these, frames in which the best grasp is closed in simulation.
+        hand: that lifts from clutter.
+        mask_error: pixels by which each mask in clutter is grown, or shrunk if negative.
+        starts: of the contact planner in clutter.
+        workers: processes in clutter.
         seed: of the scenes.
         out: where the numbers are written as JSON.
     """
     torch.set_num_threads(1)
-    meshes = read_meshes(objects) if set(only) - {"frames"} else []
+    meshes = read_meshes(objects) if set(only) & {"plane", "clicked point"} else []
+    clutter = Clutter(objects, hand, (5, 8), mask_error, starts=starts, seed=seed)
+    dropped = max(1, scenes // 10)
     subjects = {
         "plane": lambda: bench_plane(meshes, scenes, seed),
         "clicked point": lambda: bench_click(meshes, scenes, seed),
         "frames": lambda: measure_frames(frames, trials, seed),
+        "clutter": lambda: bench_clutter(clutter, dropped, workers),
+        "clear": lambda: bench_clutter(dataclasses.replace(clutter, clear=True), dropped, workers),
     }
     measure("scene", subjects, only, {"scenes": scenes, "seed": seed, "objects": len(meshes)}, out)
 

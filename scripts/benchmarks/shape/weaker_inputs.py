@@ -7,11 +7,11 @@ from tqdm import tqdm
 
 from benchmarks.common import Row
 from benchmarks.ground_truth import read_views
+from benchmarks.perturb import PERTURBATIONS, find_perturbation, perturb_view
 from benchmarks.shape.accuracy import Row as View
 from benchmarks.shape.accuracy import measure_shape
 from torchgrasp.data import read_family, read_group
 from torchgrasp.evaluation.intervals import mean_over
-from torchgrasp.evaluation.perturb import PERTURBATIONS, find_perturbation, perturb_view
 from torchgrasp.evaluation.protocols import seed_of
 from torchgrasp.shape.fit import fit_shape
 

@@ -7,26 +7,23 @@ from typing import Any, Literal
 
 from torchgrasp.app.cli.common import check_seed, load_fingers, naming
 from torchgrasp.app.cli.grasps import import_simulator
-from torchgrasp.app.cli.scenes import evaluate_clutter
 from torchgrasp.app.report.evaluation import SHARE_NAMES, write_evaluation
-from torchgrasp.base import check_whole
 from torchgrasp.columns import format_columns, format_line
 from torchgrasp.data import list_entries, list_views
-from torchgrasp.errors import BadArgument, DatasetError, Status
+from torchgrasp.errors import DatasetError, Status
 from torchgrasp.evaluation.campaign import evaluate as evaluate_views
 from torchgrasp.evaluation.intervals import format_share
 from torchgrasp.evaluation.protocols import find_protocol
-from torchgrasp.evaluation.scenes import ClutterSpec
 from torchgrasp.evaluation.score import ViewScore, summarise
 from torchgrasp.evaluation.views import EvaluationSpec, Ranks
 from torchgrasp.files import format_json, hold_folder, write_file
-from torchgrasp.specs import ClosingMode, HoldingMode, Simulator, TrialSpec
+from torchgrasp.specs import ClosingMode, HoldingMode, Simulator
 
 
 def evaluate(
+    objects: Path,
     hand: str,
     out: Path,
-    objects: Path | None = None,
     fingers: str = "default",
     protocol: Literal[
         "multidex", "dexgraspbench", "dexgraspbench-hard", "pose-noise", "paper", "tabletop", "household"
@@ -42,24 +39,16 @@ def evaluate(
     only: tuple[str, ...] = (),
     views: int | None = None,
     planned: Path | None = None,
-    perturb: Literal["none", "mass", "friction", "table", "up", "camera", "mask", "depth", "pose", "all"] = "none",
     workers: int = 1,
     seed: int = 0,
-    scenes: int = 0,
-    count: tuple[int, int] = (5, 8),
-    mask_error: int = 0,
-    clear: bool = False,
-    enough: float = 0.9,
 ) -> int:
     """Plan on each noisy view of a folder's objects and test the best grasps in simulation.
 
     Prints a line for each view, then shares with 95 % intervals over families of objects. Writes evaluate.json,
-    evaluate.html, and a folder of grasps. With --scenes objects are dropped on a table, and the easiest one is lifted
-    among its neighbours after one look: the trial of protocol "paper". Then only evaluate.json is written.
+    evaluate.html, and a folder of grasps.
 
     Args:
-        objects: folder with manifest.json, and for each object mesh.ply and noisy views. Scenes need mesh.ply only, and
-            take the library's own objects by default.
+        objects: folder with manifest.json, and for each object mesh.ply and noisy views.
         hand: name of a shipped hand, as allegro, barrett, leap or shadow, or the folder of another.
         fingers: which grasp: an option of the hand, a number of fingers, or their names as in index,middle,thumb;
             "auto": for each view the option whose best grasps are likeliest to succeed.
@@ -77,33 +66,20 @@ def evaluate(
         only: names of objects to keep; by default all.
         views: the most of each object; by default all.
         planned: folder "grasps" of an earlier run, whose grasps are tested.
-        perturb: what the robot does not know before a lift; see torchgrasp.evaluation.perturb.
         workers: processes; the results do not depend on their number.
         seed: of every random draw.
-        scenes: number of scenes in clutter; 0: single objects.
-        count: least and largest number of objects of a scene.
-        mask_error: pixels by which every object's mask is grown, or shrunk if negative.
-        clear: go on until the table is clear, with a new look after each try, at most two for an object.
-        enough: predicted success from which on no further object of a scene is planned.
     """
     check_seed(seed)
-    check_whole("--scenes", scenes, 0, 1_000_000)
     import_simulator(simulator)
     the_hand, among = load_fingers(hand, fingers)
     changes: dict[str, Any] = {"closing": closing, "force": force, "holding": holding, "simulator": simulator}
     changes = {name: x for name, x in changes.items() if x is not None}
-    if scenes:
-        with naming(force="--force", count="--count", mask_error="--mask-error", enough="--enough"):
-            spec = ClutterSpec(count, mask_error, clear, starts, enough, TrialSpec(**changes), seed, among)
-        return evaluate_clutter(objects, the_hand, out, scenes, spec, workers)
-    if objects is None:
-        raise BadArgument("--objects", "none", "a folder of objects, or --scenes")
-    with naming(force="--force", grasps="--grasps", perturb="--perturb", views="--views"):
+    with naming(force="--force", grasps="--grasps", views="--views"):
         test = find_protocol(protocol).with_trial(**changes)
-        spec = EvaluationSpec(grasps, ranks, starts, complete, only, planned is not None, seed, perturb, views, among)
+        spec = EvaluationSpec(grasps, ranks, starts, complete, only, planned is not None, seed, views, among)
     scores = []
     with naming(folder="--out", path="--out"), hold_folder(out):
-        with naming(objects="--objects", workers="--workers", perturb="--perturb"):
+        with naming(objects="--objects", workers="--workers"):
             found = evaluate_views(objects, the_hand, test, spec, folder=planned or out / "grasps", workers=workers)
             widths = name_widths(objects, spec)
             for score in found:
