@@ -8,8 +8,7 @@ import copyreg
 import enum
 from typing import Any
 
-MOST_LETTERS = 600
-"""Longest part of a message: errors of other libraries quote whole files, and names from files have any length."""
+from torchgrasp.limits import MESSAGE_LETTERS
 
 
 class GraspError(Exception):
@@ -33,7 +32,7 @@ class BadArgument(GraspError, ValueError):
 
     def __init__(self, argument: str, found: object, allowed: str):
         parts = (argument, str(found), allowed)
-        named, shown, wanted = (x if len(x) <= MOST_LETTERS else f"{x[:MOST_LETTERS]}..." for x in parts)
+        named, shown, wanted = (x if len(x) <= MESSAGE_LETTERS else f"{x[:MESSAGE_LETTERS]}..." for x in parts)
         super().__init__(f"{named}: expected {wanted}, got {shown}")
         self.argument, self.found, self.allowed = argument, found, allowed
 

@@ -16,10 +16,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import FINGERTIPS, Batch, Value, named_tensors, read_rows
-from torchgrasp.checks import ANY, Poses, Rows, checked
+from torchgrasp.checks import ANY, Poses, Rows, checked, is_rigid
 from torchgrasp.errors import BadArgument, ModelFileError, Status, TooFewPoints
 from torchgrasp.files import save_tensors
-from torchgrasp.geometry.frames import is_rigid
 from torchgrasp.value_files import read_value
 
 # ---------------------------------------------------------------------------------------------- what was seen

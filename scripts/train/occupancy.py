@@ -73,7 +73,8 @@ def make_scene(meshes: dict[str, trimesh.Trimesh], seed: int) -> tuple[Scene, li
     order = np.argsort([np.linalg.norm(mesh.bounds.mean(0)[:2]) for mesh in things])
     target = next(int(i) + 1 for i in order if int((seen == i + 1).sum()) > 400)
     scene = Scene(points, seen, DepthImage(depth, INTRINSICS, camera), pixels, Plane.horizontal(0.0), target)
-    frame = upright_frame(scene.cloud(), scene.table)
+    cloud = scene.cloud()
+    frame = upright_frame(cloud.points, cloud.viewpoint, scene.table)
     for mesh in things:
         mesh.apply_transform(inverse(frame).numpy())
     return scene.to_upright(frame), things, names

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.cups import cup_view
 from tests.devices.conftest import same, sent
+from tests.make import cup_view
 from tests.pinch import QUICK, cylinder, pinch
 from torchgrasp import ContactSpec, certify, fit_shape
 from torchgrasp.evaluation.lift import close_hand

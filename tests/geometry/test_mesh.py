@@ -8,7 +8,8 @@ import pytest
 import trimesh
 
 from torchgrasp.errors import MeshError, SuspiciousScale
-from torchgrasp.geometry.mesh import MAX_BYTES, clip_mesh, closest_on_triangles, read_mesh
+from torchgrasp.geometry.mesh import clip_mesh, closest_on_triangles, read_mesh
+from torchgrasp.limits import MESH_BYTES
 from torchgrasp.sim.convex_parts import check_parts
 
 
@@ -167,10 +168,10 @@ def test_nothing_and_all_of_a_mesh():
 def test_a_mesh_beyond_the_limits_is_refused_before_it_is_read(tmp_path, monkeypatch):
     path = tmp_path / "big.ply"
     with path.open("wb") as file:
-        file.truncate(MAX_BYTES + 1)
-    with pytest.raises(MeshError, match=f"at most {MAX_BYTES} bytes"):
+        file.truncate(MESH_BYTES + 1)
+    with pytest.raises(MeshError, match=f"at most {MESH_BYTES} bytes"):
         read_mesh(path)
-    monkeypatch.setattr("torchgrasp.geometry.mesh.MAX_FACES", 11)
+    monkeypatch.setattr("torchgrasp.geometry.mesh.MESH_FACES", 11)
     with pytest.raises(MeshError, match="of 12 faces"):
         read_mesh(trimesh.creation.box((0.1, 0.1, 0.1)))
 

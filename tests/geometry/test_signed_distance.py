@@ -4,7 +4,7 @@ import pytest
 import torch
 import trimesh
 
-from tests.reach import field_of_mesh
+from tests.make import field_of_mesh
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.hand.self_collision import box_distance

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from tests.reach import touched_contacts
+from tests.make import touched_contacts
 from torchgrasp.errors import Status
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.load import load_hand

@@ -6,7 +6,7 @@ import pytest
 import torch
 import trimesh
 
-from tests.reach import field_of_mesh
+from tests.make import field_of_mesh
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply
 from torchgrasp.hand.load import load_hand

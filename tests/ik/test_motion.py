@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
+from tests.make import field_of_mesh
 from tests.pinch import HEIGHT, RADIUS, cylinder, pinch
-from tests.reach import field_of_mesh
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.signed_distance import SignedDistanceField

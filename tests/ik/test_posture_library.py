@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.reach import touched_contacts
+from tests.make import touched_contacts
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
 from torchgrasp.geometry.signed_distance import SignedDistanceField

@@ -6,7 +6,7 @@ import functools
 import pytest
 import torch
 
-from tests.reach import touched_contacts
+from tests.make import touched_contacts
 from torchgrasp import load_object, plan_grasps
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate, virtual_frame

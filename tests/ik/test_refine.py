@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from tests.reach import touched_contacts
+from tests.make import touched_contacts
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vector
 from torchgrasp.geometry.plane import Plane

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.reach import touched_contacts
+from tests.make import touched_contacts
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vector, virtual_frame
 from torchgrasp.hand.load import load_hand

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.half_ball import ball
+from tests.make import half_ball as ball
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.posterior import SurfaceJet
 

@@ -7,7 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.cups import RADIUS, cup_view, ring
+from tests.make import CUP_RADIUS as RADIUS
+from tests.make import cup_view
+from tests.make import cylinder_points as ring
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.flatness import GUIDING_POINTS, INSIDE, flatness_constraint, normal_variation
 from torchgrasp.plan.problem import triple_jet

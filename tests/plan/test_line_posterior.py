@@ -5,7 +5,8 @@ import itertools
 import numpy as np
 import torch
 
-from tests.half_ball import RADIUS, contacts_on
+from tests.make import HALF_BALL_RADIUS as RADIUS
+from tests.make import contacts_on
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.line_posterior import FOOTPRINT, NODES, first_contact, grid, line_posterior
 from torchgrasp.shape.joint_posterior import combined_covariance, distance_covariance

@@ -97,7 +97,8 @@ def test_the_likelier_success_ranks_first_and_failures_stay_last(run):
 
 def test_success_is_what_the_model_says_of_the_surface_that_was_planned_on(run):
     hand, grasps, stages = run
-    upright_from_obj = inverse(upright_frame(load_object("cylinder").view, SPEC.plane))
+    view = load_object("cylinder").view
+    upright_from_obj = inverse(upright_frame(view.points, view.viewpoint, SPEC.plane))
     best = move(grasps[grasps.status == Status.OK][:5], upright_from_obj)
     shape = stages["shape"].moved(upright_from_obj)
     center = extract_surface(shape).vertices.mean(0)

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.rings import ring, run_python
+from tests.make import ring_samples as ring
+from tests.make import run_python
 from torchgrasp.errors import BadArgument, ModelFileError, OutputError
 from torchgrasp.files import load_tensors
 from torchgrasp.posture_model.checkpoint import Checkpoint
@@ -64,7 +65,7 @@ def test_a_fit_outlives_kill_9(tmp_path):
     script = f"""
 import os, signal
 import torch
-from tests.rings import ring
+from tests.make import ring_samples as ring
 from torchgrasp.posture_model.fit import fit_mixture
 torch.set_num_threads({torch.get_num_threads()})
 def kill(progress):
@@ -111,7 +112,7 @@ def test_two_processes_fit_what_one_does(tmp_path):
     script = tmp_path / "share.py"
     script.write_text(f"""
 import torch
-from tests.rings import ring
+from tests.make import ring_samples as ring
 from torchgrasp.posture_model.fit import fit_mixture
 torch.distributed.init_process_group("gloo")
 rank = torch.distributed.get_rank()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.covariance import covariance
+from tests.make import covariance
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure_lp import solve_closure_lp

@@ -5,7 +5,7 @@ import pytest
 import torch
 from benchmarks.close.drawn import GROUND, draw_solid
 
-from tests.cups import cup_view
+from tests.make import cup_view
 from torchgrasp import fit_shape, load_object
 from torchgrasp.errors import BadArgument
 from torchgrasp.shape.surface import extract_surface

@@ -8,7 +8,8 @@ import torch
 import trimesh
 from benchmarks.plan.probability import HARD, draw_contacts, format_reliability, judge_triples, planned_closed
 
-from tests.half_ball import RADIUS, ball
+from tests.make import HALF_BALL_RADIUS as RADIUS
+from tests.make import half_ball as ball
 from torchgrasp.plan.round_cones import closed_exact
 
 

@@ -4,7 +4,8 @@ import pytest
 import torch
 from benchmarks.shape.walls import estimated_thickness, measure_walls, true_wall
 
-from tests.cups import RADIUS, cup, cup_view
+from tests.make import CUP_RADIUS as RADIUS
+from tests.make import cup, cup_view
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.values import PointCloud

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.covariance import covariance
+from tests.make import covariance
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.condition import condition, longest_distance

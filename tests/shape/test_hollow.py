@@ -4,7 +4,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.cups import HEIGHT, RADIUS, cup, cup_view, ring
+from tests.make import CUP_HEIGHT as HEIGHT
+from tests.make import CUP_RADIUS as RADIUS
+from tests.make import cup, cup_view
+from tests.make import cylinder_points as ring
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.mesh import closest_on_triangles
 from torchgrasp.plan.line_posterior import line_posterior

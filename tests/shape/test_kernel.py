@@ -8,7 +8,7 @@ import torch
 from sklearn.gaussian_process.kernels import RBF
 from torch import Tensor
 
-from tests.covariance import covariance
+from tests.make import covariance
 from torchgrasp.shape.kernel import Profile, differentiate, thin_plate
 
 PSI = 3.6

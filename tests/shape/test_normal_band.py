@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from tests.half_ball import RADIUS, ball
+from tests.make import HALF_BALL_RADIUS as RADIUS
+from tests.make import half_ball as ball
 from torchgrasp import PointCloud, fit_shape
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.linalg import unit

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.covariance import covariance
+from tests.make import covariance
 from torchgrasp.base import join
 from torchgrasp.errors import IndefiniteCovariance
 from torchgrasp.geometry.linalg import unit

@@ -8,7 +8,7 @@ import pytest
 import torch
 import trimesh
 
-from tests.cups import cup_view
+from tests.make import cup_view
 from torchgrasp.errors import BadArgument
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP

@@ -9,7 +9,7 @@ from torchgrasp.checks.checked import checked
 from torchgrasp.checks.paths import check_path
 from torchgrasp.checks.ranges import ANY, FINITE, LEAST, RIGID, Count, Fraction, Length, Measured
 from torchgrasp.checks.ranges import Pose, Poses, Positive, Range, Rows, Seed
-from torchgrasp.checks.tensors import check_moved, check_tensor, show
+from torchgrasp.checks.tensors import check_moved, check_tensor, is_rigid, show
 
 __all__ = [
     "ANY",
@@ -27,6 +27,7 @@ __all__ = [
     "Rows",
     "Seed",
     "check_moved",
+    "is_rigid",
     "check_path",
     "check_tensor",
     "checked",

@@ -5,10 +5,10 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from jaxtyping import Bool, Float
 
 from torchgrasp.checks.ranges import RIGID
 from torchgrasp.errors import BadArgument
-from torchgrasp.geometry.frames import is_rigid
 
 DTYPES = {
     "Float": (torch.float32, torch.float64),
@@ -142,6 +142,19 @@ def _bind_many(axis: str, middle: tuple[int, ...], sizes: dict[str, Any]) -> boo
         return False
     sizes[axis.lstrip("*#")] = both
     return "#" in axis or known == middle
+
+
+def is_rigid(a_from_b: Float[Tensor, "*b 4 4"]) -> Bool[Tensor, "*b"]:
+    """Tell which matrices are a right-handed rotation and a translation; one with NaN is none.
+
+    >>> is_rigid(torch.stack([torch.eye(4), -torch.eye(4), torch.zeros(4, 4)])).tolist()
+    [True, False, False]
+    """
+    x, y, z = a_from_b[..., :3, :3].double().unbind(-2)
+    rotation, eye = torch.stack([x, y, z], -2), torch.eye(4, dtype=torch.float64, device=a_from_b.device)
+    error = (rotation @ rotation.transpose(-1, -2) - eye[:3, :3]).abs().amax((-1, -2))
+    right_handed = (torch.linalg.cross(x, y) * z).sum(-1) > 0
+    return (error <= 1e-4) & right_handed & (a_from_b[..., 3, :] == eye[3]).all(-1)
 
 
 def check_tensor(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:

@@ -6,10 +6,9 @@ from torch import Tensor
 
 from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument, SuspiciousScale, TooFewPoints
+from torchgrasp.limits import MAX_EXTENT, MIN_EXTENT
 from torchgrasp.values import PointCloud
 
-MIN_EXTENT, MAX_EXTENT = 0.005, 2.0
-"""Longest side [m] of an object's bounding box: smaller is no object for a hand, larger is a scene or not in metres."""
 LEAST_MM = 45.0
 """Extent from which a cloud is rather in mm than in cm: objects for a hand are 5 to 45 cm long."""
 MANY = 20_000

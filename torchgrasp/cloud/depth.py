@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.checks import RIGID, check_tensor, checked
+from torchgrasp.checks import RIGID, check_tensor, checked, is_rigid
 from torchgrasp.cloud.check import check_cloud
 from torchgrasp.errors import BadArgument, TooFewPoints
-from torchgrasp.geometry.frames import apply, is_rigid, rotate
+from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.values import PointCloud
 

@@ -8,14 +8,10 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
+from torchgrasp.limits import MESH_FACES, PLY_HEADER_BYTES, PLY_PROPERTIES
+
 SUFFIXES = (".obj", ".off", ".ply", ".stl")
 """Formats whose memory is bounded by the size of the file."""
-
-MAX_FACES = 500_000
-"""Most faces: scans of household things have at most 100,000. Ten million took 22 s and 3.7 GB."""
-MOST_PROPERTIES, MOST_HEADER = 256, 65_536
-"""Most properties of a .ply, and bytes of its header: 1500 lists took 10 s, the time grows with their square. Files of
-Gaussian splats, which have most, have 62."""
 
 _REFERENCE = re.compile(rb"/\S*")
 """Normal and texture of a corner in an .obj; a corner of two textures would be two, and the surface open there."""
@@ -30,13 +26,13 @@ def load_triangles(data: bytes, suffix: str, **options: Any) -> Any:
         options: of `trimesh.load_mesh`.
 
     Raises:
-        ValueError: more than `MAX_FACES`, or a header beyond `MOST_PROPERTIES` or `MOST_HEADER`.
+        ValueError: more than `MESH_FACES`, or a header beyond `PLY_PROPERTIES` or `PLY_HEADER_BYTES`.
     """
     import trimesh
 
     data = _geometry(data) if suffix == ".obj" else data
-    if (faces := _count_faces(data, suffix)) > MAX_FACES:
-        raise ValueError(f"a mesh of {faces} faces; at most {MAX_FACES}")
+    if (faces := _count_faces(data, suffix)) > MESH_FACES:
+        raise ValueError(f"a mesh of {faces} faces; at most {MESH_FACES}")
     # from memory and without a resolver: materials and textures beside it stay closed
     with _quiet(trimesh.util.log):
         return trimesh.load_mesh(io.BytesIO(data), file_type=suffix[1:], skip_materials=True, **options)
@@ -70,7 +66,7 @@ def _count_faces(data: bytes, suffix: str) -> int:
 def _read_header(data: bytes) -> int:
     """Return the faces of a .ply, by its header; as its reader does, take what only contains the words for them."""
     properties = faces = 0
-    for line in io.BytesIO(data[:MOST_HEADER]):
+    for line in io.BytesIO(data[:PLY_HEADER_BYTES]):
         words = line.split()
         if b"end_header" in words:
             break
@@ -78,9 +74,9 @@ def _read_header(data: bytes) -> int:
         if words and b"element" in words[0] and words[1:2] == [b"face"]:
             faces += int(words[-1])
     else:
-        raise ValueError(f"a header without an end in {MOST_HEADER} bytes")
-    if properties > MOST_PROPERTIES:
-        raise ValueError(f"a header of {properties} properties; at most {MOST_PROPERTIES}")
+        raise ValueError(f"a header without an end in {PLY_HEADER_BYTES} bytes")
+    if properties > PLY_PROPERTIES:
+        raise ValueError(f"a header of {properties} properties; at most {PLY_PROPERTIES}")
     return faces
 
 

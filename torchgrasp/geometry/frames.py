@@ -18,9 +18,6 @@ MIN_HEIGHT_RATIO = 1e-3
 """Least height of the largest contact triangle over its longest side. At a height of 1e-4 m, noise of 1e-6 m turns the
 virtual frame by 0.01 rad."""
 
-ROUNDED = 1e-4
-"""Largest error of a rotation matrix that is given, that of float32 and of rounding in a text."""
-
 
 def rigid(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
     """Return the homogeneous transform of a rotation and a translation [m].
@@ -47,19 +44,6 @@ def apply(a_from_b: Float[Tensor, "*#b 4 4"], points: Float[Tensor, "*#b n 3"]) 
 def rotate(a_from_b: Float[Tensor, "*#b 4 4"], directions: Float[Tensor, "*#b n 3"]) -> Float[Tensor, "*#b n 3"]:
     """Map directions of frame b into frame a."""
     return directions @ a_from_b[..., :3, :3].transpose(-1, -2)
-
-
-def is_rigid(a_from_b: Float[Tensor, "*b 4 4"]) -> Bool[Tensor, "*b"]:
-    """Tell which matrices are a right-handed rotation and a translation; one with NaN is none.
-
-    >>> is_rigid(torch.stack([torch.eye(4), -torch.eye(4), torch.zeros(4, 4)])).tolist()
-    [True, False, False]
-    """
-    x, y, z = a_from_b[..., :3, :3].double().unbind(-2)
-    rotation, eye = torch.stack([x, y, z], -2), torch.eye(4, dtype=torch.float64, device=a_from_b.device)
-    error = (rotation @ rotation.transpose(-1, -2) - eye[:3, :3]).abs().amax((-1, -2))
-    right_handed = (torch.linalg.cross(x, y) * z).sum(-1) > 0
-    return (error <= ROUNDED) & right_handed & (a_from_b[..., 3, :] == eye[3]).all(-1)
 
 
 def skew(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:

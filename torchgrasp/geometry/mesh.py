@@ -5,16 +5,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from torchgrasp.cloud.check import MAX_EXTENT, MIN_EXTENT
 from torchgrasp.errors import MeshError, SuspiciousScale
 from torchgrasp.files import is_file, read_bytes
-from torchgrasp.files.meshes import MAX_FACES, SUFFIXES, load_triangles
+from torchgrasp.files.meshes import SUFFIXES, load_triangles
+from torchgrasp.limits import MAX_EXTENT, MESH_BYTES, MESH_FACES, MIN_EXTENT
 
 if TYPE_CHECKING:
     import trimesh
 
-MAX_BYTES = 50 * 1024 * 1024
-"""Largest file of an object's mesh, as of a hand's."""
 MESH_FILE = f"a mesh file ({', '.join(SUFFIXES)})"
 LEAST_VOLUME = 1e-12
 """Volume [m^3] from which on a mesh is a body: a cube of 0.1 mm."""
@@ -24,7 +22,7 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
     """Return a closed mesh [m], checked and never repaired.
 
     Raises:
-        MeshError: no mesh in the file, another format than `SUFFIXES`, or more than `MAX_BYTES` or `MAX_FACES`;
+        MeshError: no mesh in the file, another format than `SUFFIXES`, or more than `MESH_BYTES` or `MESH_FACES`;
             non-finite vertices, an open surface, faces that are not all turned outward, or no volume.
         SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; most often the unit is mm.
 
@@ -39,8 +37,8 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
         if not is_file(mesh) or Path(mesh).suffix.lower() not in SUFFIXES:
             raise MeshError("mesh", f"{mesh}, which is no {'such ' * is_file(mesh)}file", MESH_FILE)
         path, name = Path(mesh), str(mesh)
-        if path.stat().st_size > MAX_BYTES:
-            raise MeshError("mesh", f"{path} of {path.stat().st_size} bytes", f"at most {MAX_BYTES} bytes")
+        if path.stat().st_size > MESH_BYTES:
+            raise MeshError("mesh", f"{path} of {path.stat().st_size} bytes", f"at most {MESH_BYTES} bytes")
         try:
             loaded = load_triangles(read_bytes(path), path.suffix.lower())
         except Exception as error:  # the readers of trimesh raise whatever their format runs into
@@ -57,8 +55,8 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
 
 def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
     """Raise `MeshError` unless a mesh bounds a volume."""
-    if not 0 < len(mesh.faces) <= MAX_FACES:
-        raise MeshError("mesh", f"{name} of {len(mesh.faces)} faces", f"a closed mesh of at most {MAX_FACES} triangles")
+    if not 0 < len(mesh.faces) <= MESH_FACES:
+        raise MeshError("mesh", f"{name} of {len(mesh.faces)} faces", f"a closed mesh of at most {MESH_FACES} triangles")
     if mesh.faces.shape[1] != 3 or mesh.vertices.shape[1] != 3:
         found = f"{name} of faces {mesh.faces.shape} and vertices {mesh.vertices.shape}"
         raise MeshError("mesh", found, "triangles in space")

@@ -1,7 +1,7 @@
-"""The plane that things stand on, and the upright frame in which everything is computed.
+"""The plane of support, and the upright frame in which the library computes.
 
-A stage that knew the camera's or the robot's frame would give other grasps in another frame. So public functions bring
-what they are given into a frame that only scene and camera determine, and their results back.
+Results must not depend on the frame of the camera or the robot. So public functions bring their arguments into a frame
+that only scene and camera determine, and bring the results back.
 """
 
 import dataclasses
@@ -18,36 +18,32 @@ from torchgrasp.checks import Pose, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.values import PointCloud
 
 GRID = 2.0**-20
-"""Spacing [m] to which points are rounded in an upright frame: a micrometre. Rounding errors of a transform, some
-1e-16 m, then leave no trace."""
-PHASE = 1 / math.pi
-"""Phase of the rounding: numbers from a file of float32 would often lie halfway between two multiples of `GRID`."""
+"""Spacing [m] of rounded points in an upright frame, a micrometre: far above the rounding errors of a transform."""
 POINTS, DIRECTIONS, POSES = (
     ("points", "viewpoint", "vertices"),
     ("normals", "approach", "witness", "frustum"),
     ("obj_from_hand", "obj_from_vf"),
 )
-"""Fields of values that change with the frame; the other fields do not."""
-DEPTH = 0.01
-"""Depth [m] under the table at which a cloud's middle point contradicts the table: several errors of calibration."""
+"""Fields of values that change with the frame; all other fields are invariant."""
+
+
 LEAST_TILT = 0.05
-"""Least sine of the angle between the vertical and the direction to the camera: steeper views have no azimuth."""
+"""Least sine of the angle between the vertical and the direction to the camera at which the camera has an azimuth."""
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class Plane(Value):
-    """A plane of support: the points p with normal . p = offset; things stand on the side of the normal.
+    """A plane of support: the points p with normal . p = offset. Objects stand on the side of the normal.
 
     Args:
         normal: unit vector that points up.
         offset: distance [m] of the plane from the origin along the normal.
 
     Raises:
-        BadArgument: a normal that is not of unit length, or numbers that are not finite.
+        BadArgument: the normal is not of unit length, or a number is not finite.
 
     >>> Plane.horizontal(0.1).height(torch.tensor([0.0, 0.0, 0.3]))
     tensor(0.2000)
@@ -57,10 +53,10 @@ class Plane(Value):
     offset: float
 
     def __post_init__(self) -> None:
-        """Check the length once, where the value is made."""
+        """Check the length of the normal."""
         length = float(torch.linalg.vector_norm(self.normal))
         if not abs(length - 1) < 1e-4:
-            raise BadArgument("normal", f"a length of {length:g}", "a unit vector")
+            raise BadArgument("normal", f"a vector of length {length:g}", "a unit vector")
 
     @classmethod
     @checked
@@ -70,7 +66,7 @@ class Plane(Value):
 
     @functools.cached_property
     def components(self) -> tuple[float, float, float]:
-        """The normal as numbers, read from its device once."""
+        """The normal as numbers of Python, read from its device once."""
         x, y, z = self.normal.tolist()
         return x, y, z
 
@@ -83,9 +79,9 @@ class Plane(Value):
     def moved(self, b_from_a: Pose) -> "Plane":
         """Return the plane in frame b; it is given in frame a.
 
-        >>> raised = torch.eye(4)
-        >>> raised[2, 3] = 0.5  # the table's frame stands 0.5 m above the floor
-        >>> Plane.horizontal(0.1).moved(raised).offset
+        >>> floor_from_table = torch.eye(4)
+        >>> floor_from_table[2, 3] = 0.5
+        >>> Plane.horizontal(0.1).moved(floor_from_table).offset
         0.6
         """
         normal = b_from_a[:3, :3].double() @ self.normal.double()
@@ -102,7 +98,7 @@ class Plane(Value):
 
 
 def as_plane(table: Plane | float | None) -> Plane | None:
-    """Return the plane of a table that is given as a plane, as a height [m] along z, or not at all."""
+    """Return the plane of a table that is given as a plane, as a height [m] along z, or as None."""
     if table is None or isinstance(table, Plane):
         return table
     if isinstance(table, bool) or not isinstance(table, int | float) or not math.isfinite(table):
@@ -110,23 +106,30 @@ def as_plane(table: Plane | float | None) -> Plane | None:
     return Plane.horizontal(table)
 
 
-def upright_frame(cloud: PointCloud, table: Plane | None = None) -> Float[Tensor, "4 4"]:
-    """Return `obj_from_upright`, a frame that moves with cloud, camera and table.
+def upright_frame(
+    points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "*v 3"] | None = None, table: Plane | None = None
+) -> Float[Tensor, "4 4"]:
+    """Return `obj_from_upright`, a frame that moves with points, camera and table.
 
-    Its z axis is the table's normal, else the direction to the camera, else the points' least principal axis. Its x
-    axis points level towards the camera, else to the point farthest from the vertical through the points' centre,
-    where the origin lies: on the table, if there is one.
+    The z axis is the table's normal, else the direction to the camera, else the least principal axis of the points.
+    The x axis points level towards the camera. A camera straight above has no level direction. Then x points to the
+    point farthest from the vertical through the points' centre. The origin is on this vertical, on the table if any.
+
+    Args:
+        points: of a cloud [m].
+        viewpoint: position of the camera [m], or one position for each point.
+        table: in the frame of the points.
 
     Raises:
-        BadArgument: a table with most points more than `DEPTH` under it.
+        BadArgument: most points are below the table.
     """
-    points, viewpoint = cloud.points.detach().cpu().double(), cloud.viewpoint
+    points = points.detach().cpu().double()
     centre = points.mean(0)
     offset = points - centre
     eye = None if viewpoint is None else viewpoint.detach().cpu().double().reshape(-1, 3).mean(0) - centre
     if table is not None:
         middle = float(table.height(points).median())
-        if middle < -DEPTH:
+        if middle < -0.01:  # several errors of a calibration
             raise BadArgument("table", f"a plane {-middle:.3g} m above the middle of the cloud", "one under the object")
         z = unit(table.normal.detach().cpu().double())
         centre = centre - table.height(centre) * z
@@ -150,21 +153,22 @@ def to_upright(points: Float[Tensor, "*b 3"], obj_from_upright: Float[Tensor, "4
     return _round(apply(inverse(obj_from_upright).to(points.device), points.double().reshape(-1, 3))).reshape_as(points)
 
 
+def round_upright(value: SomeValue, obj_from_upright: Float[Tensor, "4 4"]) -> SomeValue:
+    """Return a value, such as a cloud, in the upright frame, in float64 and with every number rounded to `GRID`."""
+    return map_tensors(_round, move(value.to(torch.float64), inverse(obj_from_upright)))
+
+
 def _round(x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Round to multiples of `GRID`; rounded numbers stay."""
-    return torch.round(x / GRID + PHASE) * GRID
-
-
-def cloud_to_upright(cloud: PointCloud, obj_from_upright: Float[Tensor, "4 4"]) -> PointCloud:
-    """Return a cloud in the upright frame, in float64 and rounded to `GRID`."""
-    return map_tensors(_round, move(cloud.to(torch.float64), inverse(obj_from_upright)))
+    """Round to multiples of `GRID`, with a phase: float32 numbers would often lie halfway between two multiples."""
+    return torch.round(x / GRID + 1 / math.pi) * GRID
 
 
 def move(value: SomeValue, b_from_a: Float[Tensor, "4 4"]) -> SomeValue:
     """Return a value of `torchgrasp.values` in frame b [m]; it is given in frame a.
 
+    >>> import torchgrasp
     >>> up = torch.eye(4).index_put((torch.tensor(2), torch.tensor(3)), torch.tensor(1.0))
-    >>> move(PointCloud(torch.zeros(4, 3)), up).points[0]
+    >>> move(torchgrasp.PointCloud(torch.zeros(4, 3)), up).points[0]
     tensor([0., 0., 1.])
     """
 

@@ -14,7 +14,7 @@ from torchgrasp.cloud.check import remove_duplicates
 from torchgrasp.errors import BadArgument
 from torchgrasp.files import sha256
 from torchgrasp.geometry.frames import inverse
-from torchgrasp.geometry.plane import cloud_to_upright, move, upright_frame
+from torchgrasp.geometry.plane import round_upright, move, upright_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.ik.candidates import Reachable
@@ -123,7 +123,7 @@ class Work:
         if request.mode != "joint":
             path = mixture_path(request.hand.urdf_path.parent)
             mixture, mixture_sha256 = load_mixture(path), sha256(path)
-        frame = upright_frame(cloud, spec.plane)
+        frame = upright_frame(cloud.points, cloud.viewpoint, spec.plane)
         level, reachable, observer = None if spec.table is None else 0.0, request.reachable, request.observer
 
         def tell(stage: str, message: str, value: Any) -> None:
@@ -131,7 +131,7 @@ class Work:
 
         if request.shape is None:
             support = "paper" if as_paper else "camera"
-            shape = fit_upright(cloud_to_upright(cloud, frame), request.seed, level, FitOptions(support=support))
+            shape = fit_upright(round_upright(cloud, frame), request.seed, level, FitOptions(support=support))
         else:
             shape = request.shape.moved(inverse(frame))
         task = Task(

@@ -20,7 +20,7 @@ from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec
-from torchgrasp.values import Grasps, PointCloud
+from torchgrasp.values import Grasps
 
 ROOM, HEIGHT = 0.06, 0.08
 """Gap [m] to the nearest neighbour and height [m] above the table beyond which more makes nothing easier: a finger's
@@ -143,7 +143,7 @@ def order_by_ease(scene: Scene) -> list[int]:
     """
     from scipy.spatial import KDTree
 
-    upright = scene.to_upright(upright_frame(PointCloud(scene.points, None, scene.viewpoint), scene.table))
+    upright = scene.to_upright(upright_frame(scene.points, scene.viewpoint, scene.table))
     points, labels, ease = upright.points.cpu().numpy(), upright.labels.cpu().numpy(), {}
     column = np.unique(np.floor(points[:, :2] / COLUMN), axis=0, return_inverse=True)[1].reshape(-1)
     for label in scene.things:

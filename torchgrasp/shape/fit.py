@@ -13,7 +13,7 @@ from torchgrasp.checks import LEAST, Range, Seed, checked
 from torchgrasp.cloud.check import remove_duplicates
 from torchgrasp.cloud.prepare import PreparedCloud, prepare_cloud
 from torchgrasp.geometry.linalg import fibonacci_sphere, unit
-from torchgrasp.geometry.plane import Plane, as_plane, cloud_to_upright, upright_frame
+from torchgrasp.geometry.plane import Plane, as_plane, round_upright, upright_frame
 from torchgrasp.shape.completion.complete import LEAST_NOISE, PART, Completion, Kind, complete_cloud
 from torchgrasp.shape.completion.doubt import warn_of_doubts
 from torchgrasp.shape.completion.free_space import free_space, free_space_violations
@@ -119,9 +119,9 @@ def fit_shape(
     tensor(True)
     """
     plane, cloud = as_plane(table), remove_duplicates(cloud)
-    frame = upright_frame(cloud, plane)
+    frame = upright_frame(cloud.points, cloud.viewpoint, plane)
     options = FitOptions(noise, budget, psi_scale, support, kernel, criterion)
-    return fit_upright(cloud_to_upright(cloud, frame), seed, None if plane is None else 0.0, options).moved(frame)
+    return fit_upright(round_upright(cloud, frame), seed, None if plane is None else 0.0, options).moved(frame)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,7 +4,9 @@ import pytest
 import torch
 import trimesh
 
-from tests.cups import HEIGHT, RADIUS, cup, cup_view
+from tests.make import CUP_HEIGHT as HEIGHT
+from tests.make import CUP_RADIUS as RADIUS
+from tests.make import cup, cup_view
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.prepare import prepare_cloud
 from torchgrasp.shape.completion.silhouette import silhouettes

@@ -13,10 +13,11 @@ import numpy as np
 from jaxtyping import Float
 
 from torchgrasp.app.author.repair import place, pose_of
-from torchgrasp.files.meshes import MAX_FACES, load_triangles
+from torchgrasp.files.meshes import load_triangles
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.safe_xml import read_bounded
 from torchgrasp.hand.urdf import MAX_SIZE, Shape, Urdf
+from torchgrasp.limits import MESH_FACES
 
 if TYPE_CHECKING:
     import trimesh
@@ -142,12 +143,12 @@ def _read_points(urdf: Urdf, name: str, folder: Path) -> Points:
 
     path = mesh_file(urdf, name, folder)
     data = read_bounded("urdf", path, "a mesh", MAX_MESH)
-    allowed = f"a triangle mesh of at most {MAX_FACES} faces"
+    allowed = f"a triangle mesh of at most {MESH_FACES} faces"
     try:
         mesh = load_triangles(data, path.suffix.lower(), process=False)
     except Exception as error:  # the readers of trimesh raise whatever their format runs into
         raise urdf.wrong(f"mesh {name!r}: {error}"[:300], allowed) from error
-    sound = isinstance(mesh, trimesh.Trimesh) and 0 < len(mesh.faces) <= MAX_FACES
+    sound = isinstance(mesh, trimesh.Trimesh) and 0 < len(mesh.faces) <= MESH_FACES
     if not sound or not np.isfinite(mesh.vertices).all():
         raise urdf.wrong(f"mesh {name!r} without faces, or with vertices that are no numbers", allowed)
     return _sample(mesh)

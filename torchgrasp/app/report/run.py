@@ -74,7 +74,7 @@ class Run:
 
     def upright(self) -> "Run":
         """Return the run in the upright frame of its cloud and table, where z is up."""
-        obj_from_upright = upright_frame(self.cloud, self.spec.plane)
+        obj_from_upright = upright_frame(self.cloud.points, self.cloud.viewpoint, self.spec.plane)
         upright_from_obj, mesh, closure = inverse(obj_from_upright), self.mesh, self.closure
         if mesh is not None:
             mesh = mesh.copy().apply_transform(upright_from_obj.numpy())

@@ -1,0 +1,168 @@
+"""Builders that several tests share: small clouds, meshes, shapes and contacts."""
+
+import functools
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from torchgrasp.cloud.camera import look_at, partial_view
+from torchgrasp.geometry.frames import apply, rotate
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.signed_distance import SignedDistanceField, field_from_surface
+from torchgrasp.hand.hand import Hand
+from torchgrasp.plan.round_cones import closed_exact
+from torchgrasp.posture_model.sample import HandSamples
+from torchgrasp.shape.condition import condition
+from torchgrasp.shape.gp import Normalisation, ShapeGP
+from torchgrasp.shape.gradient_kernel import cross_covariance
+from torchgrasp.shape.kernel import Kernel, Profile
+from torchgrasp.shape.observations import Observations
+from torchgrasp.values import Contacts, PointCloud
+
+ROOT = Path(__file__).parents[1]
+
+
+def real(values) -> Tensor:
+    """A tensor of float64."""
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def directions(n: int, seed: int = 0) -> Tensor:
+    """Random unit vectors (n, 3) in float64."""
+    return unit(torch.randn(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64))
+
+
+def ball(n: int = 300, radius: float = 0.04, centre=(0.0, 0.0, 0.0), seed: int = 0, viewpoint=None) -> PointCloud:
+    """Points all around a ball, with outward normals."""
+    normals = directions(n, seed)
+    return PointCloud(radius * normals + real(centre), normals, viewpoint)
+
+
+def ball_contacts(n: int, generator: torch.Generator, fingertips: int = 3, radius: float = 0.04) -> Contacts:
+    """Random contacts on a ball, some closed, some not."""
+    normals = unit(torch.randn(n, fingertips, 3, generator=generator, dtype=torch.float64))
+    return Contacts(radius * normals, normals)
+
+
+def box(size, place=(0.0, 0.0)) -> trimesh.Trimesh:
+    """A box with its centre at a place (x, y, z), or standing on z = 0 at (x, y)."""
+    return trimesh.creation.box(size).apply_translation([*place, size[2] / 2][:3])
+
+
+CUP_RADIUS, CUP_HEIGHT = 0.037, 0.075
+
+
+@functools.cache
+def cup(wall: float, radius: float = CUP_RADIUS, floor: float = 0.003) -> trimesh.Trimesh:
+    """A straight cup that stands at z = 0, open at the top."""
+    inside = radius - wall
+    profile = [[0, 0], [radius, 0], [radius, CUP_HEIGHT], [inside, CUP_HEIGHT], [inside, floor], [0, floor]]
+    return trimesh.creation.revolve(np.array(profile), sections=96)
+
+
+@functools.cache
+def cup_view(wall: float, elevation: float = 35.0, seed: int = 0, noise: bool = True) -> PointCloud:
+    """The view of a cup from a camera 0.5 m away."""
+    mesh = cup(wall)
+    return partial_view(mesh, look_at(20.0, elevation, target=mesh), n=1000, noise=noise, seed=seed)
+
+
+def cylinder_points(radius: float, low: float, high: float) -> tuple[Tensor, Tensor]:
+    """Points all around a vertical cylinder, and its outward normals."""
+    angle = torch.arange(24, dtype=torch.float64) * (2 * torch.pi / 24)
+    out = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], 1)
+    heights = torch.linspace(low, high, 6, dtype=torch.float64)
+    points = radius * out + heights[:, None, None] * real([0.0, 0.0, 1.0])
+    return points.flatten(0, 1), out.expand(6, -1, -1).flatten(0, 1)
+
+
+def write_objects(folder: Path) -> Path:
+    """Six convex objects as NAME/mesh.ply, standing at z = 0."""
+    shapes = {
+        "brick": trimesh.creation.box([0.05, 0.07, 0.09]),
+        "cube": trimesh.creation.box([0.05, 0.05, 0.05]),
+        "tin": trimesh.creation.cylinder(radius=0.03, height=0.09),
+        "disc": trimesh.creation.cylinder(radius=0.045, height=0.03),
+        "ball": trimesh.creation.icosphere(subdivisions=2, radius=0.03),
+        "slab": trimesh.creation.box([0.10, 0.06, 0.03]),
+    }
+    for name, mesh in shapes.items():
+        mesh.apply_translation([0, 0, -mesh.bounds[0, 2]])
+        (folder / name).mkdir(parents=True)
+        mesh.export(folder / name / "mesh.ply")
+    return folder
+
+
+def field_of_mesh(mesh: trimesh.Trimesh, margin: float = 0.08) -> SignedDistanceField:
+    """The signed distance field of a mesh [m]."""
+    vertices, faces = torch.tensor(np.asarray(mesh.vertices)), torch.tensor(np.asarray(mesh.faces))
+    return field_from_surface(vertices, faces, margin=margin)
+
+
+HALF_BALL_RADIUS = 0.04
+
+
+def half_ball(seen_from: float, std_factor: float, noise: float = 0.02) -> ShapeGP:
+    """The shape of a ball whose part above `seen_from` (in radii) was seen."""
+    generator = torch.Generator().manual_seed(0)
+    n = unit(torch.randn(120, 3, generator=generator, dtype=torch.float64))
+    n = n[n[:, 2] > seen_from]
+    outside = 1.2 * unit(torch.randn(40, 3, generator=generator)).double()
+    x = torch.cat([n, torch.zeros(1, 3, dtype=torch.float64), outside])
+    distance = torch.cat([torch.zeros(len(n)), torch.tensor([-1.0]), torch.full((40,), 0.2)]).double()
+    oriented = torch.arange(len(x)) < len(n)
+    sigma = torch.full_like(distance, noise)
+    observations = Observations(x, distance, torch.cat([n, torch.zeros_like(x[len(n) :])]), oriented, sigma, sigma)
+    normalisation = Normalisation(torch.zeros(3, dtype=torch.float64), HALF_BALL_RADIUS)
+    return condition(observations, normalisation, PointCloud(HALF_BALL_RADIUS * n, n), std_factor=std_factor)
+
+
+def contacts_on(shape: ShapeGP, generator: torch.Generator, count: int, fingertips: int = 3) -> Contacts:
+    """Random contacts on the mean surface with its normals, closed at friction 0.8."""
+    x = unit(torch.randn(20 * count, fingertips, 3, generator=generator, dtype=torch.float64))
+    for _ in range(8):
+        distance, slope = (t.unflatten(0, (len(x), -1)) for t in shape.mean_and_gradient(x.flatten(0, 1)))
+        x = x - (distance / (slope * slope).sum(-1))[..., None] * slope
+    normals = unit(shape.mean_and_gradient(x.flatten(0, 1))[1]).unflatten(0, (len(x), -1))
+    good = closed_exact(x, normals, 0.8) & (torch.linalg.vector_norm(x - x.roll(1, 1), dim=-1).amin(-1) > 0.3)
+    x, normals = x[good][:count], normals[good][:count]
+    return Contacts(shape.metres(x), normals)
+
+
+def touched_contacts(hand: Hand, joints: Tensor, obj_from_hand: Tensor | None = None) -> Contacts:
+    """Contacts at the middle of the fingertips' pads, in the hand's frame or at poses of the hand."""
+    points, normals = hand.fingertips(joints)
+    if obj_from_hand is not None:
+        points, normals = apply(obj_from_hand, points), rotate(obj_from_hand, normals)
+    return Contacts(points, -normals)
+
+
+def ring_samples(n: int = 3000) -> HandSamples:
+    """Postures of one joint that goes round, and a code that follows it."""
+    rng = np.random.default_rng(7)
+    angle = rng.uniform(0, 6, size=n)
+    lengths = 0.05 + 0.01 * np.stack([np.sin(angle), np.cos(angle), np.sin(2 * angle)], -1)
+    cosines = np.stack([np.cos(angle), np.sin(angle), np.cos(3 * angle)], -1)
+    q = np.concatenate([lengths, cosines], -1) + rng.normal(size=(n, 6)) * np.repeat([1e-3, 0.05], 3)
+    return HandSamples(torch.from_numpy(angle[:, None]), torch.from_numpy(q), ("turn",))
+
+
+def covariance(x: Tensor, other: Tensor, has_normal: Tensor, other_has_normal: Tensor, profile: Profile) -> Tensor:
+    """The covariance of observations by autograd, Eqs. (2)-(5): all d, then w1, w2, w3 of points with normals."""
+    blocks = cross_covariance(Kernel(profile), x.detach(), other.detach(), len(other)).flatten(0, 1)
+    rows, columns = (torch.cat([torch.ones_like(mask), mask.repeat(3)]) for mask in (has_normal, other_has_normal))
+    return blocks[rows][:, columns]
+
+
+def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run Python in a process of its own that can import the library and the helpers of the tests."""
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    environment = os.environ | {"PYTHONPATH": path}
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=600, env=environment)

@@ -1,0 +1,20 @@
+"""Limits of what the library reads from files that anyone may have written. Beyond them a file is refused by name."""
+
+MIN_EXTENT, MAX_EXTENT = 0.005, 2.0
+"""Smallest and largest object [m]: beyond them the unit is most likely wrong."""
+MESSAGE_LETTERS = 600
+"""Longest part of an error message: other libraries quote whole files."""
+SHOWN_LETTERS = 60
+"""Longest wrong value that an error message quotes."""
+PATH_BYTES, NAME_BYTES = 4095, 255
+"""Longest path and longest file name of Linux's file systems, which allow the longest."""
+TENSOR_FILE_BYTES = 1024**3
+"""Largest safetensors file."""
+LARGEST_NUMBER = 1e30
+"""Largest number in a safetensors file: beyond it squares overflow."""
+JSON_BYTES, JSON_LETTERS = 32 * 1024**2, 200
+"""Largest JSON file, and the longest text in it."""
+MESH_BYTES, MESH_FACES = 50 * 1024**2, 500_000
+"""Largest mesh file, and its most faces."""
+PLY_HEADER_BYTES, PLY_PROPERTIES = 65_536, 256
+"""Longest header of a .ply file, and its most properties: reading time grows with the square of their number."""
