@@ -6,7 +6,7 @@ import torch
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.geometry.plane import GRID, Plane, as_plane, round_upright, move, upright_frame
+from torchgrasp.geometry.plane import GRID, Plane, as_plane, move, round_upright, upright_frame
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import Surface
 from torchgrasp.specs import ContactSpec
@@ -41,7 +41,9 @@ def test_a_moved_cloud_is_the_same_to_the_last_bit_in_its_upright_frame(viewpoin
     for seed in range(20):
         pose = random_pose(seed)
         there = move(cloud, pose)
-        other = round_upright(there, upright_frame(there.points, there.viewpoint, None if table is None else table.moved(pose)))
+        other = round_upright(
+            there, upright_frame(there.points, there.viewpoint, None if table is None else table.moved(pose))
+        )
         assert torch.equal(other.points, upright.points)
         assert viewpoint is False or torch.equal(other.viewpoint, upright.viewpoint)
 

@@ -4,8 +4,8 @@ import dataclasses
 from typing import Any
 
 import torch
-from torch import Tensor
 from jaxtyping import Bool, Float
+from torch import Tensor
 
 from torchgrasp.checks.ranges import RIGID
 from torchgrasp.errors import BadArgument

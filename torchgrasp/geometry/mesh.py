@@ -56,7 +56,9 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
 def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
     """Raise `MeshError` unless a mesh bounds a volume."""
     if not 0 < len(mesh.faces) <= MESH_FACES:
-        raise MeshError("mesh", f"{name} of {len(mesh.faces)} faces", f"a closed mesh of at most {MESH_FACES} triangles")
+        raise MeshError(
+            "mesh", f"{name} of {len(mesh.faces)} faces", f"a closed mesh of at most {MESH_FACES} triangles"
+        )
     if mesh.faces.shape[1] != 3 or mesh.vertices.shape[1] != 3:
         found = f"{name} of faces {mesh.faces.shape} and vertices {mesh.vertices.shape}"
         raise MeshError("mesh", found, "triangles in space")

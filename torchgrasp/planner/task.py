@@ -14,7 +14,7 @@ from torchgrasp.cloud.check import remove_duplicates
 from torchgrasp.errors import BadArgument
 from torchgrasp.files import sha256
 from torchgrasp.geometry.frames import inverse
-from torchgrasp.geometry.plane import round_upright, move, upright_frame
+from torchgrasp.geometry.plane import move, round_upright, upright_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.ik.candidates import Reachable
