@@ -22,7 +22,7 @@ def run(code, folder):
 
 
 SIMULATORS = {"sapien", "mujoco", "coacd", "pebble"}
-DRAWERS = {"viser", "pyvista", "vtk", "vtkmodules", "matplotlib", "PIL"}
+DRAWERS = {"pyvista", "vtk", "vtkmodules", "matplotlib", "PIL"}
 SLOW = {"scipy", "trimesh", "yourdfpy", "pytorch_kinematics", "networkx", "lxml", "skimage", "sklearn", "embreex"}
 
 

@@ -303,6 +303,15 @@ def test_lines_of_an_evaluation_keep_their_columns_for_names_of_any_length(capsy
     assert short.index("view0") == long.index("view0") == 62 and len(short) == len(long)
 
 
+def test_view_opens_the_page_of_a_folder_or_names_what_is_missing(tmp_path, capsys, monkeypatch):
+    opened = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    assert cli.main(["view", str(tmp_path)]) == 2 and "FOLDER: expected" in capsys.readouterr().err
+    (tmp_path / "view.html").write_text("")
+    assert cli.main(["view", str(tmp_path), "--no-browser"]) == 0 and opened == []
+    assert cli.main(["view", str(tmp_path)]) == 0 and opened == [(tmp_path / "view.html").as_uri()]
+
+
 def test_the_bare_command_shows_where_to_begin(capsys):
     assert cli.main([]) == 0
     said = capsys.readouterr().out
@@ -319,7 +328,7 @@ def test_the_bare_command_shows_where_to_begin(capsys):
         (["cloud", ""], {"check", "cut", "depth", "scene", "thin", "render", "views"}),
         (["hand", "tr"], {"train"}),
         (["vi"], {"view"}),
-        (["view", "--n"], {"--no-browser", "--no-viewpoint", "--no-normals"}),
+        (["view", "--n"], {"--no-browser"}),
     ],
 )
 def test_the_shell_completes_commands_of_a_group(typed, offered, tmp_path, capsys):

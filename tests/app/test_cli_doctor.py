@@ -28,14 +28,14 @@ def test_what_one_command_needs_is_told_and_is_no_fault(monkeypatch, capsys):
     code, version = cli.main(["doctor"]), importlib.metadata.version
     capsys.readouterr()
 
-    def without_viser(name):
-        if name == "viser":
+    def without_distributed(name):
+        if name == "distributed":
             raise importlib.metadata.PackageNotFoundError(name)
         return version(name)
 
-    monkeypatch.setattr(importlib.metadata, "version", without_viser)
+    monkeypatch.setattr(importlib.metadata, "version", without_distributed)
     assert cli.main(["doctor"]) == code
-    assert "`torchgrasp view` needs it: pip install 'torchgrasp[view]'" in capsys.readouterr().out
+    assert "`torchgrasp campaign --scheduler` needs it: pip install 'torchgrasp[cluster]'" in capsys.readouterr().out
 
 
 def test_the_doctor_names_what_is_missing_and_what_installs_it(monkeypatch, capsys):

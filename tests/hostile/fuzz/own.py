@@ -1,10 +1,8 @@
 """Small good files of every kind that the library writes for itself, each with its reader."""
 
-import json
 import shutil
 from pathlib import Path
 
-import numpy as np
 import torch
 import trimesh
 
@@ -19,9 +17,6 @@ from torchgrasp import (
     load_hand,
     load_mixture,
 )
-from torchgrasp.app.report.turning.buffers import pack
-from torchgrasp.app.report.turning.contents import describe_grasps
-from torchgrasp.app.report.turning.shown import read_page, read_shown
 from torchgrasp.campaign.folder import carry_out
 from torchgrasp.control import (
     ClosingReference,
@@ -75,32 +70,8 @@ def shown(folder: Path) -> list[Case]:
     def read(path: Path) -> None:
         grasps = load_grasps(path)
         hand_of(grasps, "barrett"), format_grasps(hand, grasps), format_moveit(hand, grasps)
-        read_shown(describe_grasps("", hand, grasps))
 
     return [saved(folder / "grasps.safetensors", read)]
-
-
-def pages(folder: Path) -> list[Case]:
-    """Return a page that turns, with one grasp by two links."""
-    three, eye, faces = np.eye(3), np.eye(4), pack(np.array([[0, 1, 2]]), "u4")
-    mesh = {"points": pack(three), "faces": faces}
-    record = {"ticks": pack(np.arange(2), "u4"), "time": pack(np.arange(2.0)), "forces": pack(np.ones((2, 3)))}
-    poses = {"object": pack(np.stack([eye] * 2)), "links": pack(np.broadcast_to(eye, (2, 2, 4, 4)))}
-    contents = {
-        "title": "Grasps", "verdict": "held", "eye": [1.0, 0.0, 0.0], "table": "#eceae4", "cloud": pack(three),
-        "others": None, "fingers": [["index", "#2f6db5"], ["middle", "#23967f"], ["thumb", "#e0762f"]],
-        "hand": [mesh | {"link": 1, "color": "#a9b0ba"}],
-        "surface": mesh | {"normals": pack(three), "std": pack(np.ones(3)), "colors": pack(three, "u1"), "most_mm": 3},
-        "grasps": {
-            "heads": ["rank", "success", "closure margin", "clearance mm", "surface std mm"],
-            "rows": [["1", "97%", "0.02", "4.0", "1.0"]], "points": pack(three[None]), "normals": pack(three[None]),
-            "links": pack(np.broadcast_to(eye, (1, 4, 2, 4, 4))),
-        },
-        "replay": mesh | record | poses,
-    }  # fmt: skip
-    page = f'<p></p><script type="application/json" id="data">{json.dumps(contents)}</script>'
-    (folder / "view.html").write_text(page)
-    return [saved(folder / "view.html", read_page)]
 
 
 def samples(folder: Path) -> list[Case]:
@@ -165,5 +136,5 @@ def parts(folder: Path) -> list[Case]:
     return [saved(folder / "parts.safetensors", lambda x: _load(x, ball))]
 
 
-MAKERS = (models, shown, pages, samples, shards, controls, checkpoints, parts)
+MAKERS = (models, shown, samples, shards, controls, checkpoints, parts)
 KINDS = {make.__name__: make for make in MAKERS}

@@ -20,7 +20,7 @@ CORE = ("torch", "numpy", "scipy", "trimesh", "pytorch-kinematics", "yourdfpy", 
 """Packages without which nothing runs."""
 SIMULATORS: dict[Simulator, str] = {"sapien": "sim", "mujoco": "mujoco"}
 """Simulators, and the extra that installs each."""
-OPTIONAL = {"viser": ("view", "`torchgrasp view`"), "distributed": ("cluster", "`torchgrasp campaign --scheduler`")}
+OPTIONAL = {"distributed": ("cluster", "`torchgrasp campaign --scheduler`")}
 """Packages of one command each: the extra that installs it, and the command."""
 
 

@@ -56,23 +56,6 @@ def describe(run: Run) -> dict[str, Any]:
     }
 
 
-def describe_grasps(
-    title: str, hand: Hand, grasps: Grasps, points: Float[Tensor, "n 3"] | None = None
-) -> dict[str, Any]:
-    """Return what can be shown of the best of these grasps without their shape; `points` are those of their cloud."""
-    best = grasps[grasps.status == Status.OK][:MOST_GRASPS]
-    return {
-        "title": title,
-        "verdict": f"The {hand.name} hand has {len(best)} of the best executable grasps here.",
-        "eye": _eye(facing(best[0]) if len(best) else (1.0, -0.8, 0.6)),
-        "table": None,
-        "fingers": [list(pair) for pair in zip(hand.tips.names, FINGERS, strict=False)],
-        "cloud": None if points is None else _points(points),
-        "hand": _pieces(hand),
-        "grasps": _grasps(hand, best),
-    }
-
-
 def _eye(direction: Direction) -> list[float]:
     """Return the unit direction to the first camera, which looks from above."""
     x, y, z = direction
