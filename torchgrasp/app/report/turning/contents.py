@@ -16,7 +16,6 @@ from torchgrasp.app.report.solids import link_poses, solids_of_links
 from torchgrasp.app.report.turning.buffers import pack, thin_mesh, thin_rows
 from torchgrasp.closure import ClosureResult
 from torchgrasp.control.forces import squeeze
-from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.motion import APPROACH_DISTANCE
 from torchgrasp.values import Grasps
