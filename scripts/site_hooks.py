@@ -1,5 +1,6 @@
 """Hooks of the documentation site: pages from outside `docs/`, and examples of docstrings as code."""
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -9,15 +10,22 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTSIDE = {
-    "README.md": "measured.md",  # MkDocs takes README.md for the start page
+    "README.md": "readme.md",
     "CHANGELOG.md": "CHANGELOG.md",
     "CONTRIBUTING.md": "CONTRIBUTING.md",
     "SECURITY.md": "SECURITY.md",
     "LICENSE": "LICENSE.md",
     "hands/README.md": "hands_README.md",
-    **{f"examples/{path.name}": f"examples_{path.stem}.md" for path in sorted((ROOT / "examples").glob("*.py"))},
+    **{
+        f"examples/{path.name}": f"examples_{path.stem}.md"
+        for path in sorted((ROOT / "examples").iterdir())
+        if path.suffix in (".py", ".ipynb")
+    },
 }
 """Files of the project that are pages of the site, and their names there."""
+
+WORKER = "https://unpkg.com/iframe-worker/shim"
+"""The script that the offline plugin names, and `docs/assets/worker.js` replaces."""
 
 LINK = re.compile(r"\]\(([^)#:]+)(#[^)]*)?\)")
 """A link or a picture of this project; those with a colon lead elsewhere."""
@@ -29,6 +37,8 @@ def on_files(files: Files, config: Any) -> Files:
         text = (ROOT / path).read_text(encoding="utf-8")
         if path.endswith(".py"):
             text = f"# {path}\n\n```python\n{text}```\n"
+        elif path.endswith(".ipynb"):
+            text = _notebook(text)
         files.append(File.generated(config, name, content=_relink(text, Path(path).parent)))
     return files
 
@@ -37,11 +47,29 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Let links of the guides to files outside lead to their pages."""
     if page.file.generated_by:
         return markdown
-    return _relink(markdown, Path("docs"))
+    folder = Path("docs", page.file.src_uri).parent
+    return _relink(markdown, folder, "../" * (len(folder.parts) - 1))
 
 
-def _relink(text: str, folder: Path) -> str:
-    """Replace links from a file in a folder of the project by those of the site, whose pages lie in one folder."""
+def on_post_page(output: str, page: Any, **_: Any) -> str:
+    """Take the script with which the search works from a folder from the site itself."""
+    up = "../" * page.url.count("/")
+    return output.replace(WORKER, f"{up}assets/worker.js")
+
+
+def on_post_template(output_content: str, **_: Any) -> str:
+    """Do the same for the page of a dead link."""
+    return output_content.replace(WORKER, "/assets/worker.js")
+
+
+def _notebook(text: str) -> str:
+    """Return the cells of a notebook as Markdown, without their outputs."""
+    cells = [(cell["cell_type"], "".join(cell["source"])) for cell in json.loads(text)["cells"]]
+    return "\n\n".join(source if kind == "markdown" else f"```python\n{source}\n```" for kind, source in cells)
+
+
+def _relink(text: str, folder: Path, up: str = "") -> str:
+    """Replace links from a file in a folder of the project by links of the site; `up` leads to the site's root."""
 
     def replace(match: re.Match[str]) -> str:
         target = (ROOT / folder / match[1]).resolve()
@@ -50,8 +78,8 @@ def _relink(text: str, folder: Path) -> str:
         path = target.relative_to(ROOT).as_posix()
         inside = path.removeprefix("docs/") if path.startswith("docs/") else OUTSIDE.get(path)
         if inside is None and target.is_dir():  # the site has files alone
-            inside = OUTSIDE.get(f"{path}/README.md", "measured.md")
-        return match[0] if inside is None else f"]({inside}{match[2] or ''})"
+            inside = OUTSIDE.get(f"{path}/README.md", "readme.md")
+        return match[0] if inside is None else f"]({up}{inside}{match[2] or ''})"
 
     return LINK.sub(replace, text)
 

@@ -89,10 +89,5 @@ def test_commands_of_the_readme_exist_and_take_their_flags(line, capsys):
 
 def test_every_file_the_readme_names_exists():
     links = re.findall(r"\]\(([^)#:]+)\)", README)
-    folders = "cloud|shape|plan|hand|posture_model|ik|control|sim|evaluation|report|scripts|hands|tests"
-    modules = re.findall(rf"`((?:frames\.py|(?:{folders})/[\w./]+))`", README)
-    assert len(modules) > 20
-    missing = [p for p in links if not (ROOT / p).exists()]
-    missing += [p for p in modules if not (ROOT / p).exists() and not (ROOT / "torchgrasp" / p).exists()]
-    assert missing == []
+    assert [p for p in links if not (ROOT / p).exists()] == []
     assert "docs/overview.png" in links
