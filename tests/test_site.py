@@ -27,7 +27,9 @@ def test_every_public_name_has_its_entry(site: Path):
     pages = sorted((site / "api").glob("*.html"))
     entries = {last for page in pages for last in re.findall(r'id="torchgrasp[\w.]*\.(\w+)"', page.read_text())}
     for page in pages:
-        package = importlib.import_module("torchgrasp" if page.stem == "torchgrasp" else f"torchgrasp.{APART.get(page.stem, page.stem)}")
+        package = importlib.import_module(
+            "torchgrasp" if page.stem == "torchgrasp" else f"torchgrasp.{APART.get(page.stem, page.stem)}"
+        )
         # constants and aliases of types have no docstring that Python keeps
         named = {name for name in package.__all__ if getattr(getattr(package, name), "__doc__", None)}
         assert named <= entries, (page.stem, named - entries)
