@@ -47,6 +47,8 @@ CLOSINGS: dict[str, dict[str, Any]] = {
     "paper position": {"closing": "paper_position"},
     "open loop": {"closing": "open_loop"},
     "displaced": {"shift": 0.01},
+    "guarded": {"shift": 0.02, "seen": True},
+    "guarded, grip": {"shift": 0.02, "seen": True, "holding": "grip"},
 }
 """Ways to close, each tried with two hands on two objects."""
 COMMANDS = (
@@ -112,7 +114,7 @@ def plan(name: str, k: int, hand: str, mode: str) -> str:
 
 def close(name: str, hand: str, how: str) -> str:
     """Return the hash of a closing, a lift of 20 mm and what the simulator measured."""
-    from torchgrasp import SensorModel, TrialSpec, close_hand, load_hand, load_object
+    from torchgrasp import SensorModel, TrialSpec, close_hand, fit_shape, load_hand, load_object, surface_field
     from torchgrasp.data.shipped import load_shipped_grasp
 
     options = dict(CLOSINGS[how])
@@ -121,10 +123,10 @@ def close(name: str, hand: str, how: str) -> str:
     if "sensor" in options:
         options["sensor"] = SensorModel(options["sensor"])
     thing = load_object(name)
+    surface = surface_field(fit_shape(thing.view, table=0.0)) if options.pop("seen", False) else None
     spec = TrialSpec(lift_height=0.02, hold_time=0.1, **options)
-    found = close_hand(
-        load_shipped_grasp(name, hand), load_hand(hand), thing.mesh, spec, error=error, parts=thing.parts
-    )
+    grasp = load_shipped_grasp(name, hand)
+    found = close_hand(grasp, load_hand(hand), thing.mesh, spec, error=error, parts=thing.parts, surface=surface)
     return digest(found.status.name, found.time, found.forces, found.object_pose, found.hand_pose, found.joints)
 
 
