@@ -111,7 +111,16 @@ def cases(number: Number | None, objects: Path | None, names: list[str]) -> Iter
         yield "contact first", lambda: golden.plan("cylinder", 2, "barrett", "contact_first")
         yield "paper", lambda: golden.plan("jug", 0, "barrett", "paper")
     if number is None or folder in (*CLOSED, "ik", "plan", "geometry", "shape"):
-        for how in ("guarded, grip", "uncertainty", "impedance", "paper", "paper position", "torque", "binary", "mujoco"):
+        for how in (
+            "guarded, grip",
+            "uncertainty",
+            "impedance",
+            "paper",
+            "paper position",
+            "torque",
+            "binary",
+            "mujoco",
+        ):
             yield f"close {how}", lambda how=how: golden.close("jug", "allegro", how)
 
 
