@@ -6,7 +6,7 @@
 python scripts/train.py stability allegro --workers 2             which pulled grasps hold, for the impedance control
 python scripts/train.py success                                   the predicted success that ranks grasps
 python scripts/train.py occupancy DIR                             how likely hidden places of a scene are full
-python scripts/train.py bands DIR                                 how far off hidden sides and normals are
+python scripts/train.py bands DIR                                 how far off hidden sides are
 python scripts/train.py objects                                   meshes, convex parts and views of the own objects
 python scripts/train.py golden                                    grasps with known verdicts, for torchgrasp selftest
 python scripts/train.py hands                                     LEAP, Shadow and left hands from tables and mirrors

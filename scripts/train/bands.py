@@ -1,4 +1,4 @@
-"""Fit the factors of `std_m` and of the deviation of normals, and try them on families of objects left out.
+"""Fit the factors of `std_m`, and try them on families of objects left out.
 
 The posterior's own deviations are too wide where much is known, and too narrow where a wrong plane looks right. The
 factor of a kind is the one with which 1, 2 and 3 `std_m` hold what they say, in the mean over views.
@@ -17,7 +17,6 @@ from torchgrasp.columns import format_columns
 from torchgrasp.data import read_family
 from torchgrasp.evaluation.intervals import mean_over
 from torchgrasp.shape.fit import STD_FACTORS, VESSEL_STD_FACTOR, WHOLE_STD_FACTOR, fit_shape
-from train.normal_bands import measure_normals, report_normals
 
 NORMAL_SHARES = (0.683, 0.954, 0.997)
 """What a normal distribution holds within 1, 2 and 3 deviations."""
@@ -32,12 +31,11 @@ SHIPPED = {**STD_FACTORS, ("vessel", True): VESSEL_STD_FACTOR, ("whole", True): 
 """The factors in use, of each kind of hidden side."""
 
 Row = dict[str, Any]
-"""The family, the kind of hidden side with whether there was a table, errors over the posterior's deviations, and with
-a table the errors of normals (`normal_bands.Row`)."""
+"""The family, the kind of hidden side with whether there was a table, errors over the posterior's deviations."""
 
 
 def bands(objects: tyro.conf.Positional[Path], beside: Path | None = None, views: tuple[str, ...] = ()) -> None:
-    """Print the factors for `torchgrasp/shape/fit.py` and `normal_band.py`, and what bands hold on families left out.
+    """Print the factors for `torchgrasp/shape/fit.py`, and what bands hold on families left out.
 
     Args:
         objects: a folder of objects as `torchgrasp.data` reads it.
@@ -51,7 +49,6 @@ def bands(objects: tyro.conf.Positional[Path], beside: Path | None = None, views
         others = [r["ratio"] for r in rows if r["kind"] == row["kind"] and r["family"] != row["family"]]
         row["factor"] = fit_factor(others) if others else SHIPPED[row["kind"]]
     print(f"STD_FACTORS = {factors}\nfamilies left out\n{format_shares(rows)}")
-    print(report_normals([row for row in rows if "error" in row], fit_factor))
     if beside is not None:
         rows = measure_ratios(beside, views)
         for row in rows:
@@ -113,6 +110,5 @@ def measure_ratios(objects: Path, views: Sequence[str] = ()) -> list[Row]:
             estimate = shape.predict(hidden[inside])
             ratio = np.full(len(hidden), np.inf)
             ratio[inside.numpy()] = (estimate.distance.abs() / estimate.variance.sqrt()).numpy()
-            row = {"family": read_family(objects, name), "ratio": ratio, "kind": (shape.kind, table is not None)}
-            rows.append(row if table is None else row | measure_normals(shape, mesh, cloud))
+            rows.append({"family": read_family(objects, name), "ratio": ratio, "kind": (shape.kind, table is not None)})
     return rows

@@ -65,9 +65,7 @@ def test_grasps_are_solved_and_checked_where_their_contacts_are(device, hand, sh
 
 
 def test_a_shape_is_turned_where_it_is(device, shape):
-    x = shape.cloud.points[:9].double()
     same(sent(shape).moved(sent(TURNED)), shape.moved(TURNED))
-    same(sent(shape).normal_std(sent(x)), shape.normal_std(x))
 
 
 def test_both_walls_of_a_vessel_are_where_the_cloud_is(device):

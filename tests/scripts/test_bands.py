@@ -2,9 +2,7 @@
 
 import numpy as np
 import pytest
-import torch
 from train.bands import FACTORS, fit_factor, format_shares
-from train.normal_bands import fit_normals, ratios, report_normals
 
 
 def _views(spread: float, n: int = 12) -> list[np.ndarray]:
@@ -28,21 +26,3 @@ def test_surface_outside_the_domain_is_missed_with_every_factor():
     row = {"family": "tin", "kind": ("ball", True), "ratio": ratio, "factor": float(FACTORS[-1])}
     table = format_shares([row, row | {"family": "cup"}])
     assert "50.0 [50.0, 50.0]" in table and "0% of views" in table
-
-
-def test_factors_of_normals_are_those_of_the_errors():
-    generator, true = torch.Generator().manual_seed(0), (0.8, 1.2, 0.003, 0.04)
-    rows = []
-    for i in range(24):
-        size = torch.tensor([0.01, 0.01, 900.0], dtype=torch.float64)
-        parts = torch.rand(400, 2, 3, generator=generator, dtype=torch.float64) ** 3 * size
-        parts = torch.cat([parts, torch.ones(400, 2, 1, dtype=torch.float64)], -1)
-        std = (parts @ torch.tensor(true, dtype=torch.float64).square()).sqrt()
-        error = std * torch.randn(400, 2, generator=generator, dtype=torch.float64)
-        place = torch.rand(2, 400, generator=generator) < 0.5
-        rows.append({"family": f"tin {i}", "error": error, "parts": parts, "hidden": place[0], "edge": place[1]})
-    fitted = fit_normals(rows, fit_factor)
-    np.testing.assert_allclose(fitted, true, rtol=0.25)
-    held = torch.cat([ratios(row, fitted) for row in rows])
-    assert abs(float((held <= 1).double().mean()) - 0.683) < 0.03
-    assert "seen, edge" in report_normals(rows, fit_factor)

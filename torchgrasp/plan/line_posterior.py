@@ -25,10 +25,11 @@ from torchgrasp.plan.certify import check_contacts, check_unit
 from torchgrasp.plan.wrench import Vectors, tangents
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.joint_posterior import combined_covariance, symmetric_root
-from torchgrasp.shape.normal_band import FOOTPRINT
 from torchgrasp.shape.posterior import surface_deviation
 from torchgrasp.values import Contacts
 
+FOOTPRINT = 0.012
+"""Half the width [m] over which a fingertip senses the slope of the surface: the radius of its sphere."""
 NODES = (4.0, 1.5, 0.0, -1.5, -4.0)
 """Nodes of a line, in standard deviations of the surface at its contact: three err by 0.07, five by 0.02 at most."""
 OUTER_GRID = (12.0, 9.0, 6.5, 4.0, 3.375, 2.75, 2.125, 1.5, 1.125, 0.75, 0.375, 0.0)

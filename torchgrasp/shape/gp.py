@@ -15,7 +15,6 @@ from torchgrasp.geometry.linalg import cholesky, unit, unit_of_any
 from torchgrasp.geometry.plane import move
 from torchgrasp.shape.derivatives import ShapeDerivatives, carry_gradients
 from torchgrasp.shape.joint_posterior import JointEstimate, draw_samples, joint_estimate
-from torchgrasp.shape.normal_band import normal_parts
 from torchgrasp.shape.observations import Observations, on_surface
 from torchgrasp.shape.posterior import Posterior, surface_deviation
 from torchgrasp.shape.update import append_observations
@@ -149,25 +148,6 @@ class ShapeGP(Posterior, Normalisation):
         if not (points.requires_grad and torch.is_grad_enabled()):
             return estimate
         return carry_gradients(estimate, points, self.differentiate)
-
-    @checked(gradients=True)
-    def normal_std(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the calibrated standard deviation [rad] of the normal about one axis, at points [m] of the surface.
-
-        It grows at edges, which the kernel rounds, and where a wrong place has another normal. It is of the slope over
-        a fingertip's width (`torchgrasp.shape.normal_band`). Raises as `predict`.
-
-        >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
-        >>> from torchgrasp import fit_shape
-        >>> fit_shape(PointCloud(0.04 * ball, ball)).normal_std(torch.tensor([0.0, 0.0, 0.04])) < 0.2
-        tensor(True)
-        """
-        x = self._queries(points)
-        std = torch.empty_like(x[:, 0])
-        for wall, own in zip(self.walls, self.wall_at(x).T, strict=True):
-            parts = normal_parts(wall, x[own], self.scale, self.std_factor)
-            std[own] = parts.variance().mean(-1).sqrt()
-        return std.to(points).reshape(points.shape[:-1])
 
     @checked(gradients=True)
     def differentiate(self, points: Float[Tensor, "*b 3"]) -> ShapeDerivatives:
