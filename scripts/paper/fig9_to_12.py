@@ -36,7 +36,7 @@ from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.contact_first import rank_seeds, refine_on_contacts
 from torchgrasp.ik.query import query_mixture
-from torchgrasp.planner import spread_rows
+from torchgrasp.planner.contacts import spread_rows
 from torchgrasp.shape.surface import Surface, extract_surface
 
 SPEC = ContactSpec(table=0.0)

@@ -41,7 +41,8 @@ from torchgrasp.export import (
     save_surface,
 )
 from torchgrasp.ik import Obstacles, collision_probability, lift_clearance
-from torchgrasp.planner import spread_rows, take_target
+from torchgrasp.planner.contacts import spread_rows
+from torchgrasp.planner.problem import take_target
 from torchgrasp.scene import estimate_occupancy
 from torchgrasp.shape import extract_surface
 from torchgrasp.shape.completion import complete_cloud, silhouettes
@@ -83,7 +84,7 @@ def test_grasps_of_every_kind_are_where_the_cloud_is(device, hand, name):
 def test_a_worker_plans_where_its_cloud_is(device, hand, monkeypatch):
     """The workers are played by this process, which alone knows the pretended device."""
     serial = lambda function, tasks, workers, limit: [function(*task) for task in tasks]  # noqa: E731
-    monkeypatch.setattr("torchgrasp.planner.many.run_tasks", serial)
+    monkeypatch.setattr("torchgrasp.planner.grasps.run_tasks", serial)
     expected = plan_grasps([VIEW], hand, SPEC, 2)
     device.places.clear()
     same(plan_grasps([sent(VIEW)], hand, SPEC, 2, workers=1), expected)

@@ -28,7 +28,7 @@ from torchgrasp.errors import Status
 from torchgrasp.hand.urdf import Urdf, read_urdf
 from torchgrasp.ik import GraspProblem, PostureLibrary
 from torchgrasp.plan import Shape
-from torchgrasp.planner.funnel import Funnel, Losses
+from torchgrasp.planner.explain import Funnel, Losses
 from torchgrasp.posture_model import GaussianMixture, GraspMixture, SampleSpec, write_samples
 from torchgrasp.posture_model.dataset import SampleFolder
 from torchgrasp.posture_model.encoding import CODE_NAMES

@@ -12,10 +12,9 @@ from torchgrasp import ContactSpec, PointCloud, Status, explain_empty, load_obje
 from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view
 from torchgrasp.cloud.render import render_depth
 from torchgrasp.errors import BadArgument
-from torchgrasp.planner.changes import list_changes, spec_of
-from torchgrasp.planner.explain import Explanation, Trial, order_changes
-from torchgrasp.planner.funnel import Funnel, Losses
-from torchgrasp.planner.task import Request
+from torchgrasp.planner.changes import list_changes
+from torchgrasp.planner.explain import Explanation, Funnel, Losses, Trial, order_changes
+from torchgrasp.planner.problem import Request
 from torchgrasp.scene import Scene
 from torchgrasp.values import Certificate, ContactPlan, Contacts, Grasps, IKSeeds
 
@@ -219,14 +218,14 @@ def made_up(monkeypatch):
 
 
 def test_the_best_change_wins_and_a_choice_stands_beside_a_fact(made_up):
-    made_up(lambda t: (9, 0.5) if spec_of(t).friction > 1 else (3, 0.1) if len(t.hand.tips) == 4 else (0, 0.0))
+    made_up(lambda t: (9, 0.5) if t.contact_spec.friction > 1 else (3, 0.1) if len(t.hand.tips) == 4 else (0, 0.0))
     explanation = explain_empty(VIEW, load_hand("allegro"), TABLE)
     assert [t.executable for t in explanation.trials[:2]] == [9, 3]
     assert explanation.advice.index("friction were 1.2") < explanation.advice.index("fingers='four'")
 
 
 def test_a_choice_that_solves_it_ends_the_search_and_a_fact_ends_that_for_facts(made_up):
-    tried = made_up(lambda t: (20, 0.95) if spec_of(t).table is None else (0, 0.0))
+    tried = made_up(lambda t: (20, 0.95) if t.contact_spec.table is None else (0, 0.0))
     facts = [t.choice for t in explain_empty(VIEW, load_hand("barrett"), TABLE).trials]
     assert facts.count(False) == 1 and facts.count(True) > 0
     tried.clear()

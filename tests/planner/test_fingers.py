@@ -28,7 +28,8 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.lift import TrialSpec
 from torchgrasp.export import format_grasps
 from torchgrasp.geometry.frames import apply
-from torchgrasp.planner.fingers import expected_success, finger_sets
+from torchgrasp.planner.grasps import expected_success
+from torchgrasp.planner.problem import finger_sets
 
 SPEC = ContactSpec(table=0.0)
 ALL = ("index", "middle", "ring", "thumb")
@@ -142,7 +143,7 @@ def test_a_thing_of_a_scene_is_grasped_with_the_fingers_asked_for(monkeypatch):
         asked.append((cloud.target, fingers))
         raise BadArgument("cloud", "seen", "nothing")
 
-    monkeypatch.setattr("torchgrasp.planner.things.plan_grasps", note)
+    monkeypatch.setattr("torchgrasp.planner.scene.plan_grasps", note)
     plan_scene(scene, hand, fingers="auto")
     assert sorted(asked) == [(label, "auto") for label in scene.things]
 

@@ -14,8 +14,9 @@ from torchgrasp.errors import BadArgument, SuspiciousScale
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate, rotation_from_vector
 from torchgrasp.geometry.plane import Plane, move, upright_frame
 from torchgrasp.ik.ranking import FEATURES, MODEL, rank_by_success, success_features
-from torchgrasp.planner import describe, spread_rows
-from torchgrasp.planner.provenance import digest
+from torchgrasp.planner.batches import describe
+from torchgrasp.planner.contacts import spread_rows
+from torchgrasp.planner.problem import digest
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.values import ContactPlan, Contacts
 

@@ -11,8 +11,8 @@ from torchgrasp.base import join, named_tensors
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import rigid
 from torchgrasp.ik.ranking import rank_by_variance
-from torchgrasp.planner.choice import LIKELY, Offer, Untried
-from torchgrasp.planner.waves import FIRST, schedule
+from torchgrasp.planner.batches import FIRST, schedule
+from torchgrasp.planner.contacts import LIKELY, Pool, SeededContacts
 from torchgrasp.values import Certificate, Contacts, IKSeeds
 
 SPEC = ContactSpec(table=0.0)
@@ -126,7 +126,7 @@ def offer(points, seeds_of):
     pose = rigid(torch.eye(3, dtype=torch.float64).expand(g, 3, 3), torch.zeros(g, 3, dtype=torch.float64))
     seeds = IKSeeds(torch.zeros(g, 4).double(), pose, row, torch.arange(3).repeat(g, 1), energy, torch.zeros(g, 3))
     certificate = Certificate(nan, nan, nan, torch.ones(n, dtype=torch.bool), torch.zeros(n, 6).double())
-    return Offer(Contacts(points, torch.zeros_like(points)), certificate, dataclasses.replace(seeds, row=row))
+    return SeededContacts(Contacts(points, torch.zeros_like(points)), certificate, dataclasses.replace(seeds, row=row))
 
 
 def test_the_likeliest_rows_are_taken_once_far_apart_with_their_own_seeds():
@@ -135,7 +135,7 @@ def test_the_likeliest_rows_are_taken_once_far_apart_with_their_own_seeds():
     cost = torch.rand(30, generator=rng, dtype=torch.float64)
     cost[4] = torch.inf  # no seed
     seeds = [[] if i == 4 else [float(i), i + 0.5] for i in range(30)]
-    untried = Untried()
+    untried = Pool()
     for rows in (range(12), range(12, 30)):
         part = offer(points[list(rows)], [seeds[i] for i in rows])
         untried.add(part, cost[list(rows)])
@@ -156,7 +156,7 @@ def test_the_likeliest_rows_are_taken_once_far_apart_with_their_own_seeds():
 def test_of_equal_costs_the_farthest_from_all_taken_comes_next():
     points = torch.zeros(6, 3, 3, dtype=torch.float64)
     points[:, :, 0] = torch.tensor([0.0, 1.0, 0.125, 0.875, 0.5, 0.375])[:, None]
-    untried = Untried()
+    untried = Pool()
     untried.add(offer(points, [[0.0]] * 6), torch.zeros(6, dtype=torch.float64))
     taken = [sorted(untried.take(most).contacts.points[:, 0, 0].tolist()) for most in (3, 1, 1, 1)]
     assert taken == [[0.0, 0.5, 1.0], [0.125], [0.875], [0.375]]

@@ -12,8 +12,8 @@ from torchgrasp.cloud.render import render_depth
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
-from torchgrasp.planner import TARGET_POINTS, take_target
-from torchgrasp.planner.things import order_by_ease
+from torchgrasp.planner.problem import TARGET_POINTS, take_target
+from torchgrasp.planner.scene import order_by_ease
 from torchgrasp.scene import Scene
 
 HAND = load_hand("barrett")

@@ -1,4 +1,4 @@
-"""The single changes that could give grasps: of the hand, of what is asked of contacts, and of the world."""
+"""The single changes of a request that could give grasps: of the hand, of the constraints, and of the world."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -6,20 +6,11 @@ from typing import Any
 
 from torchgrasp.errors import Status
 from torchgrasp.hand.load import hands_folder, load_hand
-from torchgrasp.planner.fingers import finger_sets
-from torchgrasp.planner.task import Request, take_target
+from torchgrasp.planner.problem import Request, finger_sets, take_target
 from torchgrasp.scene.scene import Scene
-from torchgrasp.specs import ContactSpec
 
 FRICTIONS = (0.4, 0.8, 1.2)
-"""Coefficients of friction that could be meant: of smooth plastic, of rubber, of soft silicone on dry things."""
-HIGHER = 1.4
-"""Least factor by which friction is raised: less gives hardly more contacts."""
-CERTAIN, FLAT, MARGIN = (0.03, 0.1), (0.44, 0.9), (0.5, 1.0)
-"""Limits of `ContactSpec` and wider ones: its own values, then the variance that costs two points of closed contacts
-(docs/planning.md), the bend of an edge of 50 degrees, and no margin of friction."""
-MORE_STARTS = 4
-"""Factor of the starts that are tried last."""
+"""Coefficients of friction that are tried: of smooth plastic, of rubber, of soft silicone."""
 
 UNKNOWN = frozenset({Status.OUT_OF_DOMAIN, Status.TOO_UNCERTAIN})
 AT_TABLE = frozenset({Status.BELOW_TABLE, Status.TABLE_COLLISION, Status.PREGRASP, Status.NO_APPROACH})
@@ -29,10 +20,10 @@ OF_HAND = frozenset(status for status in Status if Status.OUT_OF_REACH <= status
 
 @dataclasses.dataclass(frozen=True)
 class Change:
-    """One thing that could be otherwise.
+    """A request with one change, which `words` describe.
 
-    `words` name it in a sentence. It is a choice, or else a fact of the world, which only the user can know. `cures` is
-    what it could prevent. `refit` tells whether the estimated shape changes, too.
+    A `choice` is up to the user; any other change is a fact of the world. `cures` are the failures that it could
+    prevent. `refit` means that the shape is estimated again.
     """
 
     words: str
@@ -42,32 +33,25 @@ class Change:
     refit: bool = False
 
 
-def spec_of(request: Request) -> ContactSpec:
-    """Return the specification of a request, or its mode's own."""
-    if request.spec is not None:
-        return request.spec
-    return ContactSpec.paper() if request.mode == "paper" else ContactSpec()
-
-
 def _with(request: Request, **fields: Any) -> Request:
-    """Return the request with other fields of its specification."""
-    return dataclasses.replace(request, spec=dataclasses.replace(spec_of(request), **fields))
+    """Return the request with other constraints on contacts."""
+    return dataclasses.replace(request, spec=dataclasses.replace(request.contact_spec, **fields))
 
 
 def list_changes(request: Request) -> list[Change]:
-    """Return every single change of a request that could give grasps, but more starts."""
+    """Return every single change of a request that could give grasps, except more starts."""
     kinds = (_surroundings, _fingers, _limits, _friction, _hands)
     return [change for kind in kinds for change in kind(request)]
 
 
 def more_starts(request: Request) -> Change:
-    """Return the request with more starts."""
-    more = dataclasses.replace(request, starts=MORE_STARTS * request.starts)
+    """Return the change to four times the starts."""
+    more = dataclasses.replace(request, starts=4 * request.starts)
     return Change(f"with {more.starts} starts", True, frozenset(Status), more)
 
 
 def _fingers(request: Request) -> Iterator[Change]:
-    """Yield other sets of fingers that the hand declares, and the mode that knows them."""
+    """Yield the other sets of fingers that the hand declares; in another mode, mode "joint"."""
     mode, fingers = request.mode, request.fingers
     if mode != "joint":
         yield Change("with mode='joint'", True, OF_HAND | OPEN, dataclasses.replace(request, mode="joint"), refit=True)
@@ -81,7 +65,7 @@ def _fingers(request: Request) -> Iterator[Change]:
 
 
 def _hands(request: Request) -> Iterator[Change]:
-    """Yield the other shipped hands, of variants such as the left one the first."""
+    """Yield the other shipped hands, without variants such as the left hand."""
     if request.mode != "joint":
         return
     names = sorted(path.parent.name for path in hands_folder().glob("*/hand.toml"))
@@ -93,13 +77,13 @@ def _hands(request: Request) -> Iterator[Change]:
 
 
 def _limits(request: Request) -> Iterator[Change]:
-    """Yield wider limits of contacts: the usual ones, or beyond."""
-    spec, tips = spec_of(request), float(request.hand.tips.radius.max())
+    """Yield wider limits of contacts: the default, or a limit beyond it."""
+    spec, tips = request.contact_spec, float(request.hand.tips.radius.max())
     own = spec.for_fingertips(tips)
-    if (wider := _next(CERTAIN, spec.max_variance)) is not None:
+    if (wider := _next((0.03, 0.1), spec.max_variance)) is not None:
         words = f"with max_variance={wider:g} instead of {spec.max_variance:g} (contacts on a less certain surface)"
         yield Change(words, True, UNKNOWN, _with(request, max_variance=wider))
-    if spec.flatness is not None and (wider := _next(FLAT, spec.flatness)) is not None:
+    if spec.flatness is not None and (wider := _next((0.44, 0.9), spec.flatness)) is not None:
         words = f"with flatness={wider:g} instead of {spec.flatness:g} (contacts nearer to edges)"
         yield Change(words, True, frozenset({Status.NOT_FLAT}), _with(request, flatness=wider))
     if (least := own.least_separation) > 0:
@@ -111,27 +95,27 @@ def _limits(request: Request) -> Iterator[Change]:
         words = f"with tip_radius={tips:.3g}, the hand's own, instead of {own.fingertip_radius:.3g} m"
         cures = frozenset({Status.BELOW_TABLE, Status.TOO_CLOSE})
         yield Change(words, True, cures, _with(request, tip_radius=tips))
-    if spec.friction > 0 and (wider := _next(MARGIN, spec.friction_margin)) is not None:
+    if spec.friction > 0 and (wider := _next((0.5, 1.0), spec.friction_margin)) is not None:
         words = f"with friction_margin={wider:g} instead of {spec.friction_margin:g} (less room for errors)"
         yield Change(words, True, OPEN, _with(request, friction_margin=wider))
 
 
 def _next(limits: tuple[float, ...], present: float) -> float | None:
-    """Return the first limit beyond the present one; None if it is beyond all."""
+    """Return the first limit above the present one, or None."""
     return next((limit for limit in limits if limit > present), None)
 
 
 def _friction(request: Request) -> Iterator[Change]:
-    """Yield higher friction."""
-    present = spec_of(request).friction
-    for friction in [f for f in FRICTIONS if f >= HIGHER * present][:2]:
+    """Yield the next two coefficients of friction that are clearly higher."""
+    present = request.contact_spec.friction
+    for friction in [f for f in FRICTIONS if f >= 1.4 * present][:2]:
         words = f"if the friction were {friction:g} instead of {present:g}"
         yield Change(words, False, OPEN, _with(request, friction=friction))
 
 
 def _surroundings(request: Request) -> Iterator[Change]:
-    """Yield another table, no neighbours, and an arm that reaches all."""
-    cloud, spec = request.cloud, spec_of(request)
+    """Yield another table, no neighbours, and an arm that reaches every pose."""
+    cloud, spec = request.cloud, request.contact_spec
     if isinstance(cloud, Scene):
         crowded = OF_HAND | {Status.NEIGHBOUR_COLLISION, Status.BURIED}
         if not spec.contact_allowed:

@@ -1,41 +1,120 @@
-"""Why there is no grasp, and the one change that would help most: every change is tried, not guessed."""
+"""Why there is no grasp: where the stages lose grasps, and which single change would help most.
+
+Every change is tried by planning with it.
+"""
 
 import dataclasses
 from typing import Any
 
-from torchgrasp.base import Value
+from jaxtyping import Int
+from torch import Tensor
+
+from torchgrasp.base import Value, count_status
 from torchgrasp.checks import Count, Seed, checked
 from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.changes import Change, list_changes, more_starts
-from torchgrasp.planner.fingers import expected_success
-from torchgrasp.planner.funnel import Funnel
-from torchgrasp.planner.grasps import plan_grasps
-from torchgrasp.planner.task import Request
+from torchgrasp.planner.grasps import expected_success, plan_grasps
+from torchgrasp.planner.problem import Request
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec
-from torchgrasp.values import PointCloud
+from torchgrasp.values import Certificate, ContactPlan, Grasps, IKSeeds, PointCloud
 
 TRIAL_STARTS = 100
-"""Starts with which a change is tried: two to four seconds of a busy core."""
+"""Starts with which a change is tried."""
 MOST_TRIALS = 8
-"""Changes that are tried at most, those that prevent most losses first."""
-BESIDE, RELEVANT = 0.2, 0.25
-"""Weight of what a stage lost for other reasons than a change prevents: a row names one of the constraints it fails.
-And the share of the greatest sum of weights from which on a change is tried."""
-SOLVED = 0.8
-"""Expected success (`expected_success`) with which a change leaves little for others to add."""
+"""Most changes that are tried."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Losses(Value):
+    """How many `things` a stage was given, and how many it lost for each reason, the most frequent first.
+
+    >>> lost = Losses("contacts", "starts", 50, {Status.NOT_CLOSED: 10})
+    >>> lost.kept, str(lost)
+    (40, 'contacts: 40 of 50 starts (10 not_closed)')
+    """
+
+    stage: str
+    things: str
+    given: int
+    lost: dict[Status, int]
+
+    @property
+    def kept(self) -> int:
+        """The number that the next stage gets."""
+        return self.given - sum(self.lost.values())
+
+    @property
+    def reasons(self) -> str:
+        """The reasons with their numbers."""
+        return ", ".join(f"{n} {status.name.lower()}" for status, n in self.lost.items())
+
+    def __str__(self) -> str:
+        return f"{self.stage}: {self.kept} of {self.given} {self.things}" + f" ({self.reasons})" * bool(self.lost)
+
+
+@dataclasses.dataclass(frozen=True)
+class Funnel(Value):
+    """The losses of each stage, from random starts to executable grasps.
+
+    "contacts" are planned from starts. "postures" are lost where no posture is near the contacts; of the rest the most
+    promising are tried. "grasps" are executable; each failure counts once, by the check that its best posture fails.
+    """
+
+    stages: tuple[Losses, ...]
+
+    @classmethod
+    @checked
+    def of(cls, plan: ContactPlan, closed: Certificate, seeds: IKSeeds, grasps: Grasps) -> "Funnel":
+        """Return the funnel of the values of the stages "plan", "certify", "query" and "refine"."""
+        far = len(closed) - len(seeds.row.unique())
+        stages = (
+            Losses("contacts", "starts", len(plan), _failures(plan.status)),
+            Losses("postures", "contacts", far + len(grasps), {Status.OUT_OF_REACH: far} if far else {}),
+            Losses("grasps", "postures", len(grasps), _failures(grasps.status)),
+        )
+        return cls(stages)
+
+    @property
+    def executable(self) -> int:
+        """The number of executable grasps."""
+        return self.stages[-1].kept
+
+    @property
+    def worst(self) -> Losses:
+        """The first stage that lost everything, or else the stage that lost the greatest share."""
+        empty = next((stage for stage in self.stages if stage.given and not stage.kept), None)
+        return empty or max(self.stages, key=lambda stage: 1 - stage.kept / max(stage.given, 1))
+
+    @property
+    def reason(self) -> Status:
+        """The most frequent reason of the worst stage; `Status.OK` if nothing was lost."""
+        return next(iter(self.worst.lost), Status.OK)
+
+    @checked
+    def share(self, reasons: frozenset[Status]) -> float:
+        """Return the share lost for some reasons, summed over the stages."""
+        shares = (n / stage.given for stage in self.stages for status, n in stage.lost.items() if status in reasons)
+        return sum(shares, 0.0)
+
+    def __str__(self) -> str:
+        return "\n".join(str(stage) for stage in self.stages if stage.given)
+
+
+def _failures(status: Int[Tensor, "b"]) -> dict[Status, int]:
+    """Count the rows of each status but OK, the most frequent first."""
+    return {name: n for name, n in count_status(status).items() if name is not Status.OK}
 
 
 @dataclasses.dataclass(frozen=True)
 class Trial(Value):
-    """What one change gave: the executable grasps, and the `expected_success` of the best ones.
+    """The result of one change: the number of executable grasps, and the `expected_success` of the best grasps.
 
-    `choice` tells whether a user can choose the change; else it is a fact of the world.
+    A `choice` is up to the user; any other change is a fact of the world.
 
-    >>> funnel = Funnel(())
-    >>> print(Trial("with friction 0.8", choice=False, executable=2, expected=1.7, funnel=funnel))
+    >>> print(Trial("with friction 0.8", choice=False, executable=2, expected=1.7, funnel=Funnel(())))
     with friction 0.8: 2 executable grasps
     """
 
@@ -46,17 +125,15 @@ class Trial(Value):
     funnel: Funnel
 
     def __str__(self) -> str:
-        """Return the change and what it gave."""
         return f"{self.words}: {self.executable or 'no'} executable grasp{'s' * (self.executable != 1)}"
 
 
 @dataclasses.dataclass(frozen=True)
 class Explanation(Value):
-    """Where the grasps were lost, and what single changes gave, the most helpful first; `starts` were tried of each.
+    """Where grasps were lost, and the results of single changes, the most helpful first; each had `starts` starts.
 
-    `str` is the whole answer: a line for each stage, and the best change in a sentence.
+    `str` gives a line for each stage, and a sentence about the best change.
 
-    >>> from torchgrasp.planner import Losses
     >>> funnel = Funnel((Losses("grasps", "postures", 40, {Status.TABLE_COLLISION: 40}),))
     >>> lower = Trial("if the table were 20 mm lower", choice=True, executable=9, expected=7.5, funnel=funnel)
     >>> print(Explanation(50, funnel, (lower,)))
@@ -70,12 +147,12 @@ class Explanation(Value):
 
     @property
     def best(self) -> Trial | None:
-        """The change that helped most; None if none did."""
+        """The most helpful change; None if no change gives a grasp."""
         return next((trial for trial in self.trials if trial.executable), None)
 
     @property
     def advice(self) -> str:
-        """The change that helped most, and the best one that the user can choose; or where most is lost."""
+        """A sentence about the best change, and the best choice; or about the worst stage if no change helps."""
         if self.funnel.executable:
             return f"There is a grasp: {self.funnel.executable} of {self.starts} starts ended in an executable one."
         tried = f"{len(self.trials)} change{'s' * (len(self.trials) != 1)} tried"
@@ -88,7 +165,6 @@ class Explanation(Value):
         return f"What would help most ({tried}): {helpful[0]}{second}, from {self.starts} starts."
 
     def __str__(self) -> str:
-        """Return the stages and the advice."""
         return f"{self.funnel}\n{self.advice}"
 
 
@@ -101,22 +177,22 @@ def explain_empty(
     seed: Seed = 0,
     **options: Any,
 ) -> Explanation:
-    """Tell why `plan_grasps` found no executable grasp, and which single change would give some.
+    """Explain why `plan_grasps` found no executable grasp, and find a single change that gives grasps.
 
-    Single changes are planned with at the same seed: other fingers, another shipped hand, wider limits of contacts,
-    higher friction, no table, no neighbours, a free arm. Where none of them helps, more starts are. Eight changes are
-    tried at most, with 100 starts each, those first that prevent most of what was lost. The rest is left out once the
-    20 best grasps of a change that the user can choose are likely to succeed.
+    Each change is planned with the same seed and at most 100 starts: other fingers, another shipped hand, wider limits
+    of contacts, higher friction, no table, no neighbours, an arm that reaches everything. At most eight changes are
+    tried, in the order of the losses that they could prevent. The search ends at a change that the user can choose and
+    whose 20 best grasps are likely to succeed. If no change helps, more starts are tried.
 
     Args:
-        cloud, hand, spec, starts, seed: as of `plan_grasps`.
-        options: its further ones. The `observer` is told of each change as "change", with its `Trial`.
+        cloud, hand, spec, starts, seed: as in `plan_grasps`.
+        options: the further arguments of `plan_grasps`. The `observer` hears "change" with the `Trial` of each change.
 
     Returns:
         The explanation; `print` shows it.
 
     Raises:
-        BadArgument: as of `plan_grasps`.
+        BadArgument: as `plan_grasps`.
 
     >>> from torchgrasp import load_hand, load_object
     >>> spec = ContactSpec(friction=0.0, table=0.0)
@@ -125,24 +201,23 @@ def explain_empty(
     'if the friction were 0.4 instead of 0'
     """
     request = Request(cloud, hand, spec, starts, seed, **options)
-    observer, few = request.observer, dataclasses.replace(request, starts=min(starts, TRIAL_STARTS))
+    few = dataclasses.replace(request, starts=min(starts, TRIAL_STARTS))
     funnel, _, shape = try_request(few)
-    changes = [] if funnel.executable else order_changes(list_changes(few), funnel)[:MOST_TRIALS]
     trials = list[Trial]()
 
-    def tell(change: Change) -> None:
-        """Try a change, and tell the observer."""
+    def try_change(change: Change) -> None:
         known = shape if request.shape is None and not change.refit else request.shape
         found, expected, _ = try_request(dataclasses.replace(change.request, shape=known))
         trials.append(Trial(change.words, change.choice, found.executable, expected, found))
-        observer("change", str(trials[-1]), trials[-1])
+        request.observer("change", str(trials[-1]), trials[-1])
 
+    changes = [] if funnel.executable else order_changes(list_changes(few), funnel)[:MOST_TRIALS]
     for change in changes:
-        solved = [trial.choice for trial in trials if trial.expected >= SOLVED]
+        solved = [trial.choice for trial in trials if trial.expected >= 0.8]  # little is left for other changes
         if not any(choice or not change.choice for choice in solved):
-            tell(change)
+            try_change(change)
     if not funnel.executable and not any(trial.executable for trial in trials):
-        tell(more_starts(request))
+        try_change(more_starts(request))
     trials.sort(
         key=lambda trial: (-round(trial.expected, 1), -bool(trial.executable), not trial.choice, -trial.expected)
     )
@@ -150,7 +225,10 @@ def explain_empty(
 
 
 def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
-    """Return the changes that could prevent much of what was lost, those that prevent most first."""
+    """Return the changes that could prevent many losses, the most helpful first.
+
+    A change counts a fifth for other losses of its stages, because a row names only one of the constraints it fails.
+    """
     contacts = frozenset(status for status in Status if status < Status.OUT_OF_REACH)
     weight = dict[int, float]()
     for k, change in enumerate(changes):
@@ -159,14 +237,14 @@ def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
             beside |= contacts
         if change.cures - contacts:
             beside |= frozenset(Status) - contacts
-        weight[k] = (1 - BESIDE) * funnel.share(change.cures) + BESIDE * funnel.share(beside)
-    least = RELEVANT * max(weight.values(), default=0.0)
+        weight[k] = (1 - 0.2) * funnel.share(change.cures) + 0.2 * funnel.share(beside)
+    least = 0.25 * max(weight.values(), default=0.0)
     return [changes[k] for k in sorted(weight, key=lambda k: -weight[k]) if 0 < weight[k] >= least]
 
 
 def try_request(request: Request) -> tuple[Funnel, float, ShapeGP]:
     """Plan; return the funnel, the expected success and the estimated shape."""
     told = dict[str, Any]()
-    quiet = dataclasses.replace(request, observer=lambda stage, message, value: told.update({stage: value}))
-    grasps = plan_grasps(**vars(quiet))
+    request = dataclasses.replace(request, observer=lambda stage, message, value: told.update({stage: value}))
+    grasps = plan_grasps(**vars(request))
     return Funnel.of(told["plan"], told["certify"], told["query"], grasps), expected_success(grasps), told["shape"]

@@ -1,19 +1,31 @@
-"""From a partial point cloud, or a thing of a scene, to ranked grasps: all at once, or wave by wave."""
+"""From a partial point cloud, or an object of a scene, to ranked grasps: all at once, or batch by batch."""
 
+import dataclasses
+import math
+import time
 from collections.abc import Iterator, Sequence
-from typing import Annotated, overload
+from pathlib import Path
+from typing import Annotated, Any, overload
 
+import numpy as np
+import torch
 from typing_extensions import Unpack
 
+from torchgrasp.base import count_status
 from torchgrasp.checks import Count, Range, Seed, checked
-from torchgrasp.errors import BadArgument
-from torchgrasp.hand.hand import Hand
-from torchgrasp.planner.chain import plan_request, stream_request
-from torchgrasp.planner.many import plan_many
-from torchgrasp.planner.task import Budget, PlanOptions, Request
+from torchgrasp.errors import BadArgument, GraspError, MissingExtra, Status
+from torchgrasp.files import temporary_folder
+from torchgrasp.hand.hand import Hand, HandSource
+from torchgrasp.hand.load import load_hand
+from torchgrasp.jobs import run_tasks
+from torchgrasp.planner.batches import describe, plan_batches, rank_together
+from torchgrasp.planner.problem import Budget, PlanOptions, Problem, Request
 from torchgrasp.scene.scene import Scene
 from torchgrasp.specs import ContactSpec
-from torchgrasp.values import Grasps, PointCloud
+from torchgrasp.values import Certificate, Contacts, Grasps, PointCloud, load_grasps
+
+BEST = 20
+"""Best grasps of a set of fingers by which the set is judged: the number that an evaluation tries of a view."""
 
 
 @overload
@@ -58,35 +70,38 @@ def plan_grasps(
     """Plan grasps of a hand on the object of a partial point cloud, or on the target of a scene.
 
     The result does not depend on the frame of cloud, camera and table. In a scene the hand keeps clear of the target's
-    neighbours and of space that may be full. The rest of that risk lowers `Grasps.success`.
+    neighbours and of space that is probably full. The remaining risk of collision lowers `Grasps.success`.
 
-    The starts are planned and tried in waves, each larger than the one before; `stream_grasps` yields them one by one.
+    Grasps are planned in batches, each larger than the one before. `stream_grasps` yields each batch when it ends.
 
     Args:
-        cloud: what the camera saw [m]; missing normals and viewpoint are estimated. A `Scene` has a target. A sequence
-            of clouds gives a list of results, see `plan_many`.
-        hand: from `load_hand`; it follows the shape, which is where the cloud is, to its device.
-        spec: the constraints on contacts, of which each finger gets one; None: `ContactSpec()`, in mode "paper"
+        cloud: points that a camera saw [m]; missing normals and viewpoint are estimated. Or a `Scene` with a target. A
+            sequence of clouds gives a list of results. The grasps of a bad cloud are none, and `meta["refused"]` holds
+            the reason.
+        hand: from `load_hand`; it is moved to the device of the cloud.
+        spec: the constraints on contacts; each finger gets one contact. None: `ContactSpec()`, in mode "paper"
             `ContactSpec.paper()`.
-        starts: random starts of the contact planner.
-        seed: of every random draw; on the CPU the same seed gives bitwise the same grasps.
-        time_budget: seconds of wall time; the wave that ends after them is the last, so the result depends on the
-            machine. `meta` counts the starts that were planned. None: all.
-        workers: processes for a sequence of clouds; 0: this one.
-        fingers: which grasp, as in `load_hand`; None: those of the hand. "auto": of the sets that the hand declares,
-            the one whose best grasps are likeliest to succeed. The result names them; `hand_of` loads their hand.
-        mode: see `Mode`. All but "joint" need the hand's learned model, and three fingers.
+        starts: random initial guesses of the contact planner.
+        seed: random seed; on the CPU the same seed gives bitwise the same grasps.
+        time_budget: wall time [s]. No batch begins after it, so the result depends on the machine. `meta["starts"]`
+            counts the starts that were planned. None: all.
+        workers: processes for a sequence of clouds; 0: this process.
+        fingers: the fingers that grasp, as in `load_hand`; None: the fingers of `hand`. "auto": of the sets that the
+            hand declares, the set with the greatest expected success. `hand_of` loads the hand of the result.
+        mode: see `Mode`. All modes but "joint" need the hand's learned model, and three fingers.
         ranking: see `Ranking`; None: "success", in mode "paper" "variance".
-        shape: the object's shape if more is known than the cloud shows, as after a touch (`ShapeGP.update`).
-        observer: called after each stage, see `Observer`.
-        reachable: tells which poses `obj_from_hand` (k, 4, 4) an arm can reach, in the given frame; None: all.
+        shape: the object's shape if it is known better than the cloud shows, as after a touch (`ShapeGP.update`).
+        observer: called after each stage with its name, a line of text and its value.
+        reachable: returns as booleans (k,) which poses `obj_from_hand` (k, 4, 4) an arm reaches, in the given frame;
+            None: all poses are reachable.
 
     Returns:
-        Grasps, those with `Status.OK` first, best first. There may be none: `explain_empty` tells why.
+        Grasps: the executable ones (`Status.OK`) first, best first. `explain_empty` explains an empty result.
 
     Raises:
-        BadArgument: an argument of the wrong type or range; a cloud that no object of graspable size gives; a scene
-            without a target.
+        BadArgument: an argument of the wrong type or range; a cloud of an object that is not of graspable size; a scene
+            without a target; `shape`, `observer` or `reachable` beside several clouds.
+        MissingExtra: pebble is not installed, for workers.
 
     >>> from torchgrasp import load_hand, load_object
     >>> view = load_object("cylinder").view
@@ -96,10 +111,10 @@ def plan_grasps(
     """
     given = {"hand": hand, "spec": spec, "starts": starts, "seed": seed, "time_budget": time_budget, **options}
     if isinstance(cloud, Sequence):
-        return plan_many(cloud, workers, given)
+        return _plan_many(cloud, workers, given)
     if workers:
-        raise BadArgument("workers", workers, "0 beside a single cloud")
-    return plan_request(Request(cloud, **given))
+        raise BadArgument("workers", workers, "0 for a single cloud")
+    return _plan(Request(cloud, **given))
 
 
 @checked
@@ -111,24 +126,170 @@ def stream_grasps(
     seed: Seed = 0,
     **options: Unpack[PlanOptions],
 ) -> Iterator[Grasps]:
-    """Yield executable grasps as soon as they are there: of each wave of `plan_grasps`, best first.
+    """Yield the executable grasps of each batch of `plan_grasps` when the batch ends, best first.
 
-    Each is certified, checked and scored; none is withdrawn. All together, ranked, they are the executable ones of
-    `plan_grasps` with the same arguments. Whoever stops listening stops the work. In other modes than "joint", and with
-    "auto" fingers, there is one wave.
+    Each grasp is certified, checked and scored. All batches together, ranked, are the executable grasps of
+    `plan_grasps` with the same arguments. The work stops when the caller stops iterating. In modes other than "joint",
+    and with "auto" fingers, there is one batch.
 
     Args:
-        cloud: this and all others: see `plan_grasps`.
+        cloud: this and all other arguments: see `plan_grasps`.
 
     Returns:
-        An iterator over `Grasps` of at least one row each. A later wave may have a better best one.
+        An iterator over `Grasps` of at least one row each. A later batch may have a better best grasp.
 
     Raises:
-        BadArgument: as `plan_grasps`; a wrong cloud when the first grasps are asked for.
+        BadArgument: as `plan_grasps`; for a wrong cloud it is raised at the first iteration.
 
     >>> from torchgrasp import load_hand, load_object
     >>> first = next(stream_grasps(load_object("cylinder").view, load_hand("barrett"), starts=40))
     >>> bool((first.status == 0).all())
     True
     """
-    return stream_request(Request(cloud, hand, spec, starts, seed, **options))
+    return _stream(Request(cloud, hand, spec, starts, seed, **options))
+
+
+def _plan(request: Request) -> Grasps:
+    """Return the grasps of all batches, best first, then the failures."""
+    return _finish(request, list(_plan_batches(request)))
+
+
+def _stream(request: Request) -> Iterator[Grasps]:
+    """Yield the executable grasps of each batch that has any, best first."""
+    batches = list[Grasps]()
+    for grasps in _plan_batches(request):
+        batches.append(grasps)
+        good = grasps[grasps.status == Status.OK]
+        if len(good):
+            yield good
+    _finish(request, batches)
+
+
+def _finish(request: Request, batches: list[Grasps]) -> Grasps:
+    """Return the grasps of all batches together, and report them."""
+    grasps = rank_together(batches, request.order)
+    request.observer("refine", f"{len(grasps)} refined: {describe(count_status(grasps.status))}", grasps)
+    return grasps
+
+
+def _plan_batches(request: Request) -> Iterator[Grasps]:
+    """Yield the grasps of each batch in the given frame; several sets of fingers are compared in one batch."""
+    deadline = math.inf if request.time_budget is None else time.monotonic() + request.time_budget
+    hands = request.hands
+    problem = Problem.of(request, hands[0])
+    if len(hands) == 1:
+        for grasps in plan_batches(problem, deadline):
+            yield problem.give_back(grasps)
+    else:
+        yield _plan_sets(problem, hands, deadline)
+
+
+def _plan_sets(problem: Problem, hands: tuple[Hand, ...], deadline: float) -> Grasps:
+    """Return the grasps of the set of fingers with the greatest `expected_success`.
+
+    The sets share the time that is left. The observer hears "fingers" after each set, then the stages of the best set.
+    """
+    best, observer = None, problem.request.observer
+    for left, hand in zip(range(len(hands), 0, -1), hands, strict=True):
+        stages = list[tuple[str, str, Any]]()
+        own = problem.for_hand(hand, lambda *stage: stages.append(stage))  # noqa: B023 called at once
+        now = time.monotonic()
+        batches = list(plan_batches(own, now + (deadline - now) / left))
+        grasps = own.give_back(rank_together(batches, problem.request.order))
+        expected, count = expected_success(grasps), int((grasps.status == Status.OK).sum())
+        observer("fingers", f"{', '.join(hand.finger_names)}: {count} executable, {expected:.0%} expected", grasps)
+        if best is None or expected > best[0]:
+            best = expected, grasps, stages
+    assert best is not None
+    for stage in best[2]:
+        observer(*stage)
+    return best[1]
+
+
+def expected_success(grasps: Grasps) -> float:
+    """Return the mean predicted success of the `BEST` likeliest grasps; missing grasps count as failures."""
+    return float(grasps.success.sort(descending=True).values[:BEST].sum()) / BEST
+
+
+def _plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any]) -> list[Grasps]:
+    """Plan for each cloud, on its device; a bad cloud does not affect the others.
+
+    A worker gives up a cloud after an hour. `given` are the other arguments of `Request`, for all clouds.
+    """
+    for name in ("shape", "observer", "reachable"):
+        if given.get(name) is not None:
+            raise BadArgument(name, "one for many clouds", "None for many clouds")
+    for k, cloud in enumerate(clouds):
+        if not isinstance(cloud, PointCloud):
+            raise BadArgument(f"cloud[{k}]", type(cloud).__name__, "a PointCloud")
+        _ = Request(cloud, **given).hands  # wrong fingers are refused
+    if not workers:
+        planned = [_plan_or_refuse(Request(cloud, **given)) for cloud in clouds]
+    else:
+        hand = given["hand"].source
+        source = HandSource(hand.option, hand.urdf_path, hand.sha256)
+        rest = {name: _with_arrays(value) for name, value in given.items() if name != "hand"}
+        with temporary_folder() as folder:
+            files = [folder / f"{k}.safetensors" for k in range(len(clouds))]
+            sent = [(_with_arrays(cloud), str(cloud.points.device)) for cloud in clouds]
+            tasks = [(*cloud, source, rest, file) for cloud, file in zip(sent, files, strict=True)]
+            planned = [
+                load_grasps(file) if end is None else _refused(given["hand"], end.sentence)
+                for file, end in zip(files, run_tasks(_plan_to_file, tasks, workers, 3600.0), strict=True)
+            ]
+    return [grasps.to(cloud.points.device) for cloud, grasps in zip(clouds, planned, strict=True)]
+
+
+def _plan_or_refuse(request: Request) -> Grasps:
+    """Return the grasps of a request, or none with the reason."""
+    try:
+        return _plan(request)
+    except MissingExtra:
+        raise
+    except GraspError as error:
+        return _refused(request.hand, " ".join(str(error).split()))
+
+
+def _refused(hand: Hand, reason: str) -> Grasps:
+    """Return no grasps, with the reason in `meta`."""
+    return dataclasses.replace(no_grasps(hand), meta={"hand": hand.name, "refused": reason})
+
+
+def no_grasps(hand: Hand) -> Grasps:
+    """Return no grasps of a hand."""
+    f = len(hand.tips)
+
+    def none(*shape: int) -> torch.Tensor:
+        return torch.zeros(0, *shape, dtype=torch.float64)
+
+    contacts = Contacts(none(f, 3), none(f, 3), none(f), none(f))
+    certificate = Certificate(none(), none(), none(), none().bool(), none(6))
+    return Grasps(
+        none(hand.dof), none(hand.dof), none(3), none(4, 4), contacts, none(f).long(), none(f), none(), none(f),
+        certificate, none(), none().long(),
+    )  # fmt: skip
+
+
+def _plan_to_file(cloud: Any, device: str, hand: HandSource, rest: dict[str, Any], file: Path) -> None:
+    """Plan in a worker, on a device."""
+    points = _with_tensors(cloud).to(torch.device(device))
+    given = {name: _with_tensors(value) for name, value in rest.items()}
+    _plan_or_refuse(Request(points, load_hand(hand.urdf_path.parent, hand.option), **given)).save(file)
+
+
+def _with_arrays(value: Any) -> Any:
+    """Return a value for another process: its class and fields, with arrays, because tensors would be shared."""
+    if isinstance(value, torch.Tensor):
+        return value.cpu().numpy()
+    if dataclasses.is_dataclass(value):
+        return type(value), {f.name: _with_arrays(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    return value
+
+
+def _with_tensors(sent: Any) -> Any:
+    """Return the value of `_with_arrays`."""
+    if isinstance(sent, np.ndarray):
+        return torch.from_numpy(sent)
+    if isinstance(sent, tuple) and isinstance(sent[0], type):
+        return sent[0](**{name: _with_tensors(field) for name, field in sent[1].items()})
+    return sent

@@ -9,11 +9,12 @@ import trimesh
 
 from benchmarks.common import Row, least_seconds
 from torchgrasp.geometry.signed_distance import field_from_surface
-from torchgrasp.planner.stages import COARSE, FINE
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import extract_mesh
 from torchgrasp.values import PointCloud
 
+FINE, COARSE = 0.003, 0.004
+"""Spacings [m] of the planner's fields of thin and of thick objects."""
 POINTS, NEAR = 2000, 0.006
 """Random points of each surface, and how far [m] they are from it at most: there fingers and links decide."""
 

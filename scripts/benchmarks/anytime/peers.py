@@ -17,8 +17,8 @@ from torchgrasp.ik.rounds import assign
 from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.solve import plan_contacts
 from torchgrasp.plan.solver import project
-from torchgrasp.planner.stages import Bench, spread_rows
-from torchgrasp.planner.task import Request, Work
+from torchgrasp.planner.contacts import find_seeds, spread_rows
+from torchgrasp.planner.problem import Problem, Request
 
 
 @dataclasses.dataclass
@@ -74,12 +74,12 @@ def starts_of(
     cloud: PointCloud, hand: Hand, spec: ContactSpec, tries: int
 ) -> tuple[GraspProblem, IKSeeds, ShapeGP, ContactSpec]:
     """Return what both refine: closed contacts with the postures nearest to them, the shape, the settled spec."""
-    bench = Bench(Work.of(Request(cloud, hand, spec)).task.of(hand, lambda stage, message, value: None))
-    plan = plan_contacts(bench.task.shape, bench.spec, 4 * tries)
+    problem = Problem.of(Request(cloud, hand, spec), hand)
+    plan = plan_contacts(problem.shape, problem.spec, 4 * tries)
     contacts = plan.contacts[spread_rows(plan, 2 * tries)]
-    certificate = certify(contacts, bench.spec)
+    certificate = certify(contacts, problem.spec)
     contacts, certificate = contacts[certificate.closed][:tries], certificate[certificate.closed][:tries]
-    return bench.problem(contacts, certificate), bench.seeds(contacts), bench.task.shape, bench.spec
+    return problem.reach(contacts, certificate), find_seeds(problem, contacts), problem.shape, problem.spec
 
 
 def start_of(problem: GraspProblem, seeds: IKSeeds, shape: ShapeGP, spec: ContactSpec, row: int) -> SingleStart:

@@ -24,7 +24,7 @@ from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.starts import STARTS_PER_CHUNK, drawn_starts, settle_flatness
-from torchgrasp.planner import spread_rows
+from torchgrasp.planner.contacts import spread_rows
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
 

@@ -8,7 +8,7 @@ import pytest
 from torchgrasp.app.report.page import format_page, grasp_rows, write_report
 from torchgrasp.app.report.run import closing_sentence, refusal, verdict
 from torchgrasp.errors import OutputError, Status
-from torchgrasp.planner import Explanation, Funnel, Losses, Trial
+from torchgrasp.planner.explain import Explanation, Funnel, Losses, Trial
 from torchgrasp.specs import ContactSpec
 
 PNG = base64.b64decode("iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAQAAAC1HAwCAAAAC0lEQVR42mNkYAAAAAYAAjCB0C8AAAAASUVORK5CYII=")

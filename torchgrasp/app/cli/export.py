@@ -21,7 +21,7 @@ from torchgrasp.export import (
 )
 from torchgrasp.files import write_file
 from torchgrasp.hand.load import hand_of, load_hand
-from torchgrasp.planner.provenance import digest
+from torchgrasp.planner.problem import digest
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import load_grasps
 

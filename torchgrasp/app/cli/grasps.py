@@ -41,7 +41,6 @@ from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surfac
 from torchgrasp.hand.load import hand_of
 from torchgrasp.planner.explain import explain_empty
 from torchgrasp.planner.grasps import plan_grasps
-from torchgrasp.planner.task import LEAST_BUDGET
 from torchgrasp.scene.file import is_scene
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ContactSpec, Mode, Simulator, TrialSpec
@@ -132,7 +131,7 @@ def grasp(
     check_whole("--starts", starts, 1, 1_000_000)
     check_seed(seed)
     if time_budget is not None:
-        check_number("--time-budget", time_budget, LEAST_BUDGET, math.inf)
+        check_number("--time-budget", time_budget, 1e-3, math.inf)
     the_hand, among = load_fingers(hand, fingers)
     file = read_view("CLOUD", cloud, view)
     partial, plane = file.cloud, table_plane(file.cloud, view, table, no_table)

@@ -16,8 +16,8 @@ from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.hand.load import hand_of
 from torchgrasp.planner.explain import explain_empty
 from torchgrasp.planner.grasps import plan_grasps
-from torchgrasp.planner.task import take_target
-from torchgrasp.planner.things import ThingPlan, plan_scene
+from torchgrasp.planner.problem import take_target
+from torchgrasp.planner.scene import ThingPlan, plan_scene
 from torchgrasp.scene.file import read_scene
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ContactSpec

@@ -1,4 +1,4 @@
-"""Which thing of a scene to take first: the things ranked by their best grasps, with reasons for those without."""
+"""The objects of a scene, ranked by their best grasps; an object without a grasp has a reason."""
 
 import dataclasses
 import functools
@@ -14,28 +14,21 @@ from torchgrasp.geometry.plane import upright_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.ik.candidates import Reachable
-from torchgrasp.planner.fingers import finger_sets
-from torchgrasp.planner.funnel import Funnel
+from torchgrasp.planner.explain import Funnel
 from torchgrasp.planner.grasps import plan_grasps
+from torchgrasp.planner.problem import finger_sets
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Grasps
 
-ROOM, HEIGHT = 0.06, 0.08
-"""Gap [m] to the nearest neighbour and height [m] above the table beyond which more makes nothing easier: a finger's
-width on both sides, a finger's length."""
-COLUMN, COVER = 0.01, 5.0
-"""Side [m] of the columns in which one thing may lie above another, and the weight of their share: of a fifth, no room
-at all is left."""
-
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class ThingPlan(Value):
-    """The executable grasps of one thing, best first, or the reason why there are none.
+    """The executable grasps of one object, best first, or the reason why there are none.
 
-    `success` is the predicted one of the best grasp, 0 without. `shape` is the estimated one, if it was planned on.
+    `success` is predicted for the best grasp; without grasps it is 0. `shape` is the estimated shape.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "allegro")
@@ -53,7 +46,7 @@ class ThingPlan(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ScenePlan(Value):
-    """The things of a scene, the likeliest success first; then those without a grasp, and those not tried.
+    """The objects of a scene, the likeliest success first; then objects without a grasp, and objects not tried.
 
     >>> empty = ThingPlan(1, success=0.0, reason="too flat")
     >>> ScenePlan((empty,)).best is None
@@ -64,7 +57,7 @@ class ScenePlan(Value):
 
     @property
     def best(self) -> ThingPlan | None:
-        """The thing to take first; None if no thing has a grasp."""
+        """The object to grasp first; None if no object has a grasp."""
         return next((thing for thing in self.things if thing.grasps is not None), None)
 
 
@@ -80,22 +73,22 @@ def plan_scene(
     enough: Fraction = 1.0,
     reachable: Reachable | None = None,
 ) -> ScenePlan:
-    """Plan grasps of the things of a scene, and rank the things by predicted success.
+    """Plan grasps of the objects of a scene, and rank the objects by predicted success.
 
-    Things with room around them and height above the table are planned first.
+    Tall objects with free space around them are planned first.
 
     Args:
-        scene: things on a table.
+        scene: objects on a table.
         hand: from `load_hand`.
         spec: the constraints on contacts; None: `ContactSpec()`.
-        starts: random starts of the contact planner for each thing.
-        seed: of every random draw.
-        fingers: see `plan_grasps`; with "auto" each thing has its own. `hand_of(grasps, hand)` has those of grasps.
-        enough: predicted success of a grasp from which on no further thing is planned; 1: all are.
+        starts: random starts of the contact planner for each object.
+        seed: random seed.
+        fingers: see `plan_grasps`; "auto" chooses fingers for each object. `hand_of` loads the hand of grasps.
+        enough: predicted success of a grasp, in [0, 1], at which the remaining objects are not planned.
         reachable: see `plan_grasps`.
 
     Raises:
-        BadArgument: a scene without things, or an argument of the wrong type or range.
+        BadArgument: a scene without objects, or an argument of the wrong type or range.
 
     >>> from torchgrasp import load_hand, load_scene
     >>> plan = plan_scene(load_scene(), load_hand("barrett"), starts=30, enough=0.5)
@@ -137,22 +130,23 @@ def _plan_thing(scene: Scene, plan: Callable[..., Grasps]) -> ThingPlan:
 
 
 def order_by_ease(scene: Scene) -> list[int]:
-    """Return the labels of a scene's things, the easiest first by a glance.
+    """Return the labels of a scene's objects, the easiest first.
 
-    Easy is what stands high, has room around it, and has nothing above it.
+    An object is easy if it is tall, has free space around it, and has nothing above it.
     """
     from scipy.spatial import KDTree
 
+    room, height, side = 0.06, 0.08, 0.01  # [m] more room or height makes nothing easier; side of a column of points
     upright = scene.to_upright(upright_frame(scene.points, scene.viewpoint, scene.table))
     points, labels, ease = upright.points.cpu().numpy(), upright.labels.cpu().numpy(), {}
-    column = np.unique(np.floor(points[:, :2] / COLUMN), axis=0, return_inverse=True)[1].reshape(-1)
+    column = np.unique(np.floor(points[:, :2] / side), axis=0, return_inverse=True)[1].reshape(-1)
     for label in scene.things:
         own, others = points[labels == label], (labels > 0) & (labels != label)
-        room = KDTree(points[others]).query(own)[0].min() if others.any() else ROOM
+        gap = KDTree(points[others]).query(own)[0].min() if others.any() else room
         top = np.full(column.max() + 1, np.inf)
         np.minimum.at(top, column[labels == label], own[:, 2])
-        above = np.unique(column[others & (points[:, 2] > top[column] + COLUMN)])
+        above = np.unique(column[others & (points[:, 2] > top[column] + side)])
         covered = len(above) / len(np.unique(column[labels == label]))
-        height = np.quantile(own[:, 2], 0.95) if scene.table is not None else HEIGHT
-        ease[label] = min(room / ROOM, 1.0) + min(height / HEIGHT, 1.0) - min(COVER * covered, 1.0)
+        own_height = np.quantile(own[:, 2], 0.95) if scene.table is not None else height
+        ease[label] = min(gap / room, 1.0) + min(own_height / height, 1.0) - min(5.0 * covered, 1.0)
     return sorted(ease, key=lambda label: -ease[label])

@@ -1,0 +1,242 @@
+"""Planning in batches, each larger than the one before, so that the first grasps come early."""
+
+import dataclasses
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import torch
+
+from torchgrasp.base import count_status, join
+from torchgrasp.errors import Status
+from torchgrasp.ik.cobyla import solve_as_paper
+from torchgrasp.ik.contact_first import solve_contact_first
+from torchgrasp.ik.joint import solve_fixed, solve_sliding
+from torchgrasp.ik.motion import collision_probability
+from torchgrasp.ik.ranking import (
+    lexical_order,
+    rank_by_success,
+    rank_by_variance,
+    success_features,
+    success_log_odds,
+)
+from torchgrasp.ik.refine import ITERATIONS
+from torchgrasp.ik.rounds import Attempts, best_grasps, executable
+from torchgrasp.plan.solve import plan_in_turn
+from torchgrasp.plan.starts import check_starts
+from torchgrasp.planner.contacts import Pool, SeededContacts, contact_costs, find_contacts, join_seeded
+from torchgrasp.planner.problem import Problem, ignore
+from torchgrasp.shape.posterior import surface_deviation
+from torchgrasp.specs import Ranking
+from torchgrasp.values import Grasps
+
+FIRST, GROWTH = 8, 6
+"""Rows of contacts that the hand tries in the first batch, and the ratio of the sizes of successive batches."""
+FIRST_STEPS = 8
+"""Most steps of the solver in the first batch; the second batch tries unsolved rows again with all steps."""
+TRIED, TRIED_IN_SCENE = 250, 160
+"""Most rows of contacts that the hand tries. In a scene more postures of each row are tried."""
+OFFERED = 4
+"""Planned rows for each row that the hand tries."""
+
+
+class Batch(NamedTuple):
+    """Numbers of further starts, and of rows of contacts that the hand tries."""
+
+    starts: int
+    tried: int
+
+
+def schedule(starts: int, most: int) -> list[Batch]:
+    """Return the batches in which `starts` are planned and `most` rows tried; a small rest joins the last batch.
+
+    >>> [tuple(batch) for batch in schedule(1000, 250)]
+    [(32, 8), (192, 48), (776, 194)]
+    """
+    batches, size, most = list[Batch](), FIRST, min(most, starts)
+    tried = planned = 0
+    while tried < most:
+        size = size if most - tried >= 2 * size else most - tried
+        tried += size
+        further = min(starts, max(OFFERED * tried, starts * tried // most)) - planned
+        batches.append(Batch(further, size))
+        planned, size = planned + further, GROWTH * size
+    return batches
+
+
+def plan_batches(problem: Problem, deadline: float) -> Iterator[Grasps]:
+    """Yield the grasps of each batch in the upright frame, the executable ones first; `meta` counts the starts so far.
+
+    No batch begins after `deadline`, of `time.monotonic`. Modes other than "joint" have one batch.
+    """
+    request, shape, joint = problem.request, problem.shape, problem.request.mode == "joint"
+    check_starts(shape, problem.given_spec, request.starts, request.seed)
+    most = TRIED if problem.scene is None else TRIED_IN_SCENE
+    batches = schedule(request.starts, most) if joint else [Batch(request.starts, most)]
+    sizes = [batch.starts for batch in batches if batch.starts]
+    plans, planned = plan_in_turn(shape, problem.flat, sizes, request.seed), 0
+    report, pool, refinement = Report(problem, len(batches), len(sizes)), Pool(), Refinement(problem)
+    report.shape()
+    for number, batch in enumerate(batches, start=1):
+        planned += batch.starts
+        if joint:
+            if batch.starts:
+                found = find_contacts(problem, next(plans), OFFERED * batch.tried, report.note)
+                pool.add(found, contact_costs(problem, found))
+            solved = refinement.solve(pool.take(batch.tried), last=number == len(batches))
+        else:
+            found = find_contacts(problem, next(plans), batch.tried, report.note)
+            solve = solve_as_paper if request.mode == "paper" else solve_contact_first
+            solved = solve(problem.reach(found.contacts, found.certificate), found.seeds)
+        grasps = rank(problem, solved)
+        late = time.monotonic() >= deadline
+        if late:
+            grasps = join([grasps, *refinement.failures()])
+        report.end_batch(grasps, last=late)
+        yield dataclasses.replace(grasps, meta={"starts": str(planned)})
+        if late:
+            return
+
+
+class Refinement:
+    """Moves the hand onto contacts, batch by batch.
+
+    The hand moves onto fixed contacts first. Where it fails, contacts and hand move together. These sliding contacts
+    are solved in the last batch, because every batch has a fixed cost, or in a batch without any grasp.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        """Begin without any grasps.
+
+        `unfinished` had few steps on fixed contacts, `unsolved` had all of them; each comes with its best failures.
+        """
+        self.problem, self.first = problem, True
+        self.unfinished, self.unsolved = (list[tuple[SeededContacts, Grasps]]() for _ in range(2))
+
+    def solve(self, found: SeededContacts, last: bool) -> Grasps:
+        """Return the grasps of further contacts, and of earlier ones that are solved now."""
+        first, self.first = self.first, False
+        if first and not last:
+            solved, rest, failed = self._on_fixed_contacts(found, FIRST_STEPS)
+            if len(solved):
+                self.unfinished.append((rest, failed))
+                return solved
+        found = join_seeded([*(rest for rest, _ in self.unfinished), found])
+        self.unfinished.clear()
+        solved, rest, failed = self._on_fixed_contacts(found, ITERATIONS)
+        self.unsolved.append((rest, failed))
+        if len(solved) and not last:
+            return solved
+        rests, failures = zip(*self.unsolved, strict=True)
+        self.unsolved.clear()
+        return join([solved, self._with_sliding_contacts(join_seeded(rests), join(failures))])
+
+    def failures(self) -> list[Grasps]:
+        """Return the failures of all contacts that were to be tried again."""
+        return [failed for _, failed in (*self.unfinished, *self.unsolved)]
+
+    def _on_fixed_contacts(self, found: SeededContacts, steps: int) -> tuple[Grasps, SeededContacts, Grasps]:
+        """Return grasps on fixed contacts, the contacts without a grasp, and the best failures of these."""
+        reach = self.problem.reach(found.contacts, found.certificate)
+        found = found._replace(seeds=reach.drop_unreachable(found.seeds))
+        grasps, row = best_grasps(solve_fixed(reach, found.seeds, steps))
+        solved = executable(grasps)
+        return grasps[solved], found.select(row[~solved]), grasps[~solved]
+
+    def _with_sliding_contacts(self, found: SeededContacts, failed: Grasps) -> Grasps:
+        """Return grasps with sliding contacts, or else the best failure of each row."""
+        attempts = Attempts(torch.ones_like(found.certificate.closed), executable)
+        attempts.add(failed, torch.arange(len(failed), device=failed.status.device))
+        reach = self.problem.reach(found.contacts, found.certificate)
+        solve_sliding(reach, found.seeds, self.problem.shape, self.problem.spec, attempts)
+        return best_grasps(attempts)[0]
+
+
+def rank(problem: Problem, solved: Grasps) -> Grasps:
+    """Return grasps in the order of the request's ranking, scored by the log-odds of success.
+
+    If the object cannot be lifted out of its surroundings, its grasps are buried.
+    """
+    request, hand = problem.request, problem.hand
+    if problem.buried:
+        buried = torch.where(solved.status == Status.OK, int(Status.BURIED), solved.status)
+        solved = dataclasses.replace(solved, status=buried)
+    good = solved[solved.status == Status.OK]
+    features = success_features(hand, problem.shape, good, problem.center, problem.spec.friction, request.seed)
+    log_odds = success_log_odds(features, hand.name)
+    if problem.obstacles is not None:
+        free = 1 - collision_probability(hand, good, problem.obstacles).to(log_odds)
+        log_odds = torch.logit(torch.sigmoid(log_odds) * free, eps=1e-6)
+    ranked = rank_by_success(solved, log_odds)
+    return ranked if request.order == "success" else rank_by_variance(ranked)
+
+
+def rank_together(batches: Sequence[Grasps], ranking: Ranking) -> Grasps:
+    """Return the grasps of all batches, the executable ones first, with the metadata of the last batch."""
+    grasps = join(batches)
+    ranked = grasps[lexical_order((grasps.status != Status.OK).int(), -grasps.score)]
+    ranked = ranked if ranking == "success" else rank_by_variance(ranked)
+    return dataclasses.replace(ranked, meta=batches[-1].meta)
+
+
+class Report:
+    """Reports each stage once, with the results of all batches, and each batch but the last when it ends."""
+
+    def __init__(self, problem: Problem, batches: int, planned: int) -> None:
+        """Take the number of batches, and the number of batches with further starts."""
+        self.problem, self.batches, self.planned = problem, batches, planned
+        self.parts: dict[str, list[Any]] = {"plan": [], "certify": [], "query": []}
+        self.ended = self.offered = self.closed = 0
+
+    def shape(self) -> None:
+        """Report the estimated shape, and the share of its surface that is known to 4 mm."""
+        if self.problem.request.observer is ignore:
+            return
+        shape, vertices = self.problem.shape, self.problem.surface.vertices
+        jet = shape.jet(shape.normalise(vertices[:: len(vertices) // 500 + 1]))
+        std_m = shape.std_factor * shape.scale * surface_deviation(jet.variance, jet.gradient)
+        certain = float((std_m < 0.004).double().mean())
+        self.problem.tell("shape", f"{len(shape.x)} points, {certain:.0%} of the surface certain to 4 mm", shape)
+
+    def note(self, stage: str, value: Any, offered: int = 0) -> None:
+        """Keep the result of a stage of one batch; `certify` was offered so many rows."""
+        if stage == "query":  # rows are counted through all batches
+            value = dataclasses.replace(value, row=value.row + self.closed - len(self.parts["certify"][-1]))
+        elif stage == "certify":
+            self.offered, self.closed = self.offered + offered, self.closed + len(value)
+        self.parts[stage].append(value)
+        if len(self.parts[stage]) == self.planned:
+            self._tell(stage)
+
+    def end_batch(self, grasps: Grasps, last: bool) -> None:
+        """Report a batch that is not the last one planned; after the `last` that is solved, all stages so far."""
+        self.ended += 1
+        if self.ended < self.batches:
+            good = int(executable(grasps).sum())
+            best = f", the best {float(grasps.success[0]):.0%} likely" if good else ""
+            text = f"{self.ended} of {self.batches}: {good} executable of {len(grasps)}{best}"
+            self.problem.tell("wave", text, grasps)
+        if last and len(self.parts["plan"]) < self.planned:
+            for stage in self.parts:
+                self._tell(stage)
+
+    def _tell(self, stage: str) -> None:
+        """Report a stage with the results of all batches so far."""
+        value = join(self.parts[stage])
+        if stage == "plan":
+            text = f"{len(value)} starts: {describe(count_status(value.status))}"
+        elif stage == "certify":
+            text = f"{self.closed} of {self.offered} closed at friction {self.problem.spec.planned_friction:g}"
+        else:
+            text = f"{len(value)} seeds for {len(torch.unique(value.row))} of {self.closed} triples"
+        self.problem.tell(stage, text, value)
+
+
+def describe(counts: dict[Status, int]) -> str:
+    """Return counts of statuses as one line, the successes first.
+
+    >>> describe({Status.NOT_CLOSED: 2, Status.OK: 1})
+    '1 ok, 2 not_closed'
+    """
+    ordered = sorted(counts.items(), key=lambda pair: pair[0] is not Status.OK)
+    return ", ".join(f"{n} {s.name.lower()}" for s, n in ordered) or "none"

@@ -1,0 +1,137 @@
+"""Contacts for the hand to try: planned, certified, with postures of the hand as seeds, the most promising first."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchgrasp.base import join
+from torchgrasp.checks import Count, checked
+from torchgrasp.errors import Status
+from torchgrasp.geometry.linalg import farthest_points
+from torchgrasp.ik.contact_first import seed_costs
+from torchgrasp.ik.posture_library import nearest_postures
+from torchgrasp.ik.query import query_mixture
+from torchgrasp.ik.ranking import LEAST_ARM, load_arm, rank_in_group
+from torchgrasp.plan.certify import certify
+from torchgrasp.planner.problem import Problem
+from torchgrasp.posture_model.mixture import PAPER_ENERGY
+from torchgrasp.values import Certificate, ContactPlan, Contacts, IKSeeds
+
+LIKELY = 2
+"""Size of the pool of cheapest rows, over the number of rows that are taken from it by farthest-point sampling."""
+
+
+class SeededContacts(NamedTuple):
+    """Closed contacts, their certificates, and the hand's seeds on them."""
+
+    contacts: Contacts
+    certificate: Certificate
+    seeds: IKSeeds
+
+    def select(self, rows: Int[Tensor, "k"]) -> "SeededContacts":
+        """Return some rows of contacts, with their seeds."""
+        number = rows.new_full((len(self.contacts),), -1)
+        number[rows] = torch.arange(len(rows), device=rows.device)
+        seeds = self.seeds[number[self.seeds.row] >= 0]
+        seeds = dataclasses.replace(seeds, row=number[seeds.row])
+        return SeededContacts(self.contacts[rows], self.certificate[rows], seeds)
+
+
+def join_seeded(parts: Sequence[SeededContacts]) -> SeededContacts:
+    """Return the contacts of all parts, one after the other."""
+    first, seeds = 0, list[IKSeeds]()
+    for part in parts:
+        seeds.append(dataclasses.replace(part.seeds, row=part.seeds.row + first))
+        first += len(part.contacts)
+    return SeededContacts(join([x.contacts for x in parts]), join([x.certificate for x in parts]), join(seeds))
+
+
+def find_contacts(problem: Problem, plan: ContactPlan, most: int, note: Callable[..., None]) -> SeededContacts:
+    """Return closed contacts with seeds: at most `most` rows, far apart; in mode "paper" all, the most certain first.
+
+    `note` is told of the stages "plan", "certify" and "query".
+    """
+    request = problem.request
+    note("plan", plan)
+    if request.mode == "paper" and request.order == "variance":
+        rows, variance = torch.nonzero(plan.status == Status.OK)[:, 0], plan.contacts.variance
+        assert variance is not None
+        rows = rows[torch.argsort(variance[rows].sum(1), stable=True)]
+    else:
+        rows = spread_rows(plan, most)
+    contacts = plan.contacts[rows]
+    certificate = certify(contacts, problem.spec)
+    contacts, certificate = contacts[certificate.closed], certificate[certificate.closed]
+    note("certify", certificate, offered=len(rows))
+    seeds = find_seeds(problem, contacts)
+    note("query", seeds)
+    return SeededContacts(contacts, certificate, seeds)
+
+
+@checked
+def spread_rows(plan: ContactPlan, most: Count) -> Int[Tensor, "k"]:
+    """Return at most `most` successful rows, far apart, in plan order.
+
+    >>> from torchgrasp import fit_shape, load_object, plan_contacts
+    >>> plan = plan_contacts(fit_shape(load_object("jug").view), starts=20)
+    >>> rows = spread_rows(plan, 3)
+    >>> len(rows), bool((plan.status[rows] == Status.OK).all())
+    (3, True)
+    """
+    rows = torch.nonzero(plan.status == Status.OK)[:, 0]
+    if len(rows) <= most:
+        return rows
+    first = int(plan.quality[rows].argmin())
+    return rows[farthest_points(sorted_points(plan.contacts[rows]), most, first=first).sort().values]
+
+
+def find_seeds(problem: Problem, contacts: Contacts) -> IKSeeds:
+    """Return postures near contacts: random ones in mode "joint", in the other modes those of the learned model."""
+    if problem.mixture is None:
+        return nearest_postures(problem.library, contacts, problem.world, reachable=problem.reachable)
+    if problem.request.mode == "paper":
+        return query_mixture(problem.hand, contacts, problem.mixture, n_seeds=1, max_energy=PAPER_ENERGY)
+    return query_mixture(problem.hand, contacts, problem.mixture)
+
+
+class Pool:
+    """The contacts of all batches so far; each row is taken at most once."""
+
+    def __init__(self) -> None:
+        self.parts, self.costs, self.taken = list[SeededContacts](), list[Tensor](), list[Tensor]()
+
+    def add(self, found: SeededContacts, cost: Float[Tensor, "n"]) -> None:
+        """Add contacts with the cost of each row, infinite for a row without seeds."""
+        self.parts.append(found)
+        self.costs.append(cost)
+
+    def take(self, most: int) -> SeededContacts:
+        """Return at most `most` of the cheapest rows, far from each other and from the rows taken before."""
+        found = join_seeded(self.parts)
+        points = sorted_points(found.contacts)
+        before = torch.cat(self.taken) if self.taken else points.new_zeros(0, dtype=torch.long)
+        cost = torch.cat(self.costs).index_fill(0, before, torch.inf)
+        likely = torch.argsort(cost, stable=True)[: min(LIKELY * most, int(torch.isfinite(cost).sum()))]
+        rows = likely[farthest_points(points[likely], most, before=points[before])].sort().values
+        self.taken.append(rows)
+        return found.select(rows)
+
+
+def contact_costs(problem: Problem, found: SeededContacts) -> Float[Tensor, "b"]:
+    """Return the cost of each row: the log of the least residual of its two first seeds, and of the load's arm."""
+    contacts, certificate, seeds = found
+    first = seeds[rank_in_group(seeds.row) < 2]
+    residual = seed_costs(problem.reach(contacts, certificate), first)
+    least = torch.full((len(contacts),), torch.inf, dtype=residual.dtype, device=residual.device)
+    least = least.scatter_reduce(0, first.row, residual, "amin")
+    return least.clamp_min(1e-3).log() + 0.3 * (load_arm(contacts.points, problem.center) + LEAST_ARM).log()
+
+
+def sorted_points(contacts: Contacts) -> Float[Tensor, "b d"]:
+    """Return the coordinates of each row's contacts, the lowest contact first."""
+    order = torch.argsort(contacts.points[..., 2], dim=1, stable=True)
+    return contacts.points.gather(1, order[..., None].expand(-1, -1, 3)).flatten(1)

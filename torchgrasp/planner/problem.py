@@ -1,0 +1,283 @@
+"""What grasps are planned from: the arguments of `plan_grasps`, and the planning problem in the upright frame."""
+
+import dataclasses
+import hashlib
+import math
+from collections.abc import Callable
+from functools import cached_property
+from typing import Annotated, Any, TypedDict
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.checks import Count, Range, Seed, checked
+from torchgrasp.cloud.check import remove_duplicates
+from torchgrasp.errors import BadArgument
+from torchgrasp.files import sha256
+from torchgrasp.geometry.frames import inverse
+from torchgrasp.geometry.plane import move, round_upright, upright_frame
+from torchgrasp.geometry.signed_distance import field_from_surface
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.hand_toml import Fingers
+from torchgrasp.hand.load import with_fingers
+from torchgrasp.ik.candidates import GraspProblem, Reachable
+from torchgrasp.ik.clearance import CollisionWorld
+from torchgrasp.ik.motion import lift_clearance
+from torchgrasp.ik.obstacles import Obstacles
+from torchgrasp.ik.posture_library import PostureLibrary
+from torchgrasp.plan.problem import walls_of
+from torchgrasp.plan.starts import Settled, settle_flatness
+from torchgrasp.posture_model.mixture import GraspMixture, load_mixture, mixture_path
+from torchgrasp.scene.occupancy import estimate_occupancy
+from torchgrasp.scene.scene import Scene
+from torchgrasp.shape.fit import FitOptions, fit_upright
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.surface import Mesh, extract_mesh
+from torchgrasp.specs import ContactSpec, Mode, Ranking
+from torchgrasp.values import Certificate, Contacts, Grasps, PointCloud
+
+TARGET_POINTS = 1000
+"""Most points of a scene's target that are used: they lie a few millimetres apart."""
+
+Budget = Annotated[float, Range(1e-3, math.inf)]
+"""A time budget [s]."""
+Observer = Callable[[str, str, Any], None]
+"""Called after each stage with the stage's name, a line of text, and the stage's value."""
+
+
+def ignore(stage: str, message: str, value: Any) -> None:
+    """Do nothing: the default observer."""
+
+
+class PlanOptions(TypedDict, total=False):
+    """The further arguments of `plan_grasps`, which explains them.
+
+    >>> options: PlanOptions = {"fingers": 4, "ranking": "success"}  # plan_grasps(cloud, hand, **options)
+    >>> sorted(options)
+    ['fingers', 'ranking']
+    """
+
+    fingers: Fingers | None
+    mode: Mode
+    ranking: Ranking | None
+    shape: ShapeGP | None
+    observer: Observer
+    reachable: Reachable | None
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class Request:
+    """The arguments of `plan_grasps`, checked; `plan_grasps` explains them."""
+
+    cloud: PointCloud | Scene
+    hand: Hand
+    spec: ContactSpec | None = None
+    starts: Count = 1000
+    seed: Seed = 0
+    fingers: Fingers | None = None
+    mode: Mode = "joint"
+    ranking: Ranking | None = None
+    shape: ShapeGP | None = None
+    observer: Observer = ignore
+    reachable: Reachable | None = None
+    time_budget: Budget | None = None
+
+    @property
+    def contact_spec(self) -> ContactSpec:
+        """The given constraints on contacts, or the default of the mode."""
+        if self.spec is not None:
+            return self.spec
+        return ContactSpec.paper() if self.mode == "paper" else ContactSpec()
+
+    @property
+    def order(self) -> Ranking:
+        """The given ranking, or the default of the mode."""
+        return self.ranking or ("variance" if self.mode == "paper" else "success")
+
+    @property
+    def hands(self) -> tuple[Hand, ...]:
+        """The hand with each set of fingers that may grasp."""
+        return finger_sets(self.hand, self.fingers, self.mode)
+
+
+def finger_sets(hand: Hand, fingers: Fingers | None, mode: Mode = "joint") -> tuple[Hand, ...]:
+    """Return the hand with each set of fingers: its own, another, or with "auto" all sets that the hand declares.
+
+    Raises:
+        BadArgument: fingers that the hand does not have, or more than three or "auto" in another mode than "joint".
+    """
+    if fingers == "auto":
+        if mode != "joint":
+            raise BadArgument("fingers", f"'auto' in mode {mode!r}", "mode 'joint'")
+        found = (hand, *(with_fingers(hand, option) for option in hand.source.options))
+        return tuple({one.finger_names: one for one in reversed(found)}.values())[::-1]
+    chosen = hand if fingers is None else with_fingers(hand, fingers)
+    if mode != "joint":
+        chosen.require_three("mode", repr(mode))
+    return (chosen,)
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """Everything that grasps of one hand are planned from, in the upright frame of table and camera.
+
+    `request`, `cloud` (of the object) and `given_spec` are in the given frame, all else is in the upright frame. What
+    several stages need is built when it is first used.
+    """
+
+    request: Request
+    hand: Hand
+    cloud: PointCloud
+    given_spec: ContactSpec
+    obj_from_upright: Float[Tensor, "4 4"]
+    shape: ShapeGP
+    scene: Scene | None
+    mixture: GraspMixture | None
+    mixture_sha256: str
+
+    @classmethod
+    def of(cls, request: Request, hand: Hand) -> "Problem":
+        """Find the object, its upright frame and its shape."""
+        cloud, spec, scene = request.cloud, request.contact_spec, None
+        if isinstance(cloud, Scene):
+            scene, cloud = cloud, take_target(cloud, request.seed)
+            spec = dataclasses.replace(spec, table=scene.table if spec.table is None else spec.table)
+        cloud = remove_duplicates(cloud)
+        mixture, mixture_sha256 = None, "none"
+        if request.mode != "joint":
+            path = mixture_path(request.hand.urdf_path.parent)
+            mixture, mixture_sha256 = load_mixture(path), sha256(path)
+        frame = upright_frame(cloud.points, cloud.viewpoint, spec.plane)
+        if request.shape is None:
+            options = FitOptions(support="paper" if request.mode == "paper" else "camera")
+            table = None if spec.table is None else 0.0
+            shape = fit_upright(round_upright(cloud, frame), request.seed, table, options)
+        else:
+            shape = request.shape.moved(inverse(frame))
+        scene = None if scene is None else scene.to_upright(frame)
+        mixture = None if mixture is None else mixture.to(shape.device)
+        return cls(request, hand.to(shape.device), cloud, spec, frame, shape, scene, mixture, mixture_sha256)
+
+    def for_hand(self, hand: Hand, observer: Observer) -> "Problem":
+        """Return the problem of another set of fingers, with another observer."""
+        request = dataclasses.replace(self.request, observer=observer)
+        return dataclasses.replace(self, request=request, hand=hand.to(self.shape.device))
+
+    @cached_property
+    def flat(self) -> Settled:
+        """The constraints on the hand's contacts with the radius of flatness, and candidates of contacts."""
+        spec = dataclasses.replace(self.given_spec, table=None if self.given_spec.table is None else 0.0)
+        tips = self.hand.tips
+        spec = dataclasses.replace(spec.for_fingertips(float(tips.radius.max())), fingertips=len(tips))
+        return settle_flatness(self.shape, spec, self.request.seed)
+
+    @property
+    def spec(self) -> ContactSpec:
+        """The constraints on the hand's contacts."""
+        return self.flat.spec
+
+    @cached_property
+    def surface(self) -> Mesh:
+        """The estimated surface."""
+        return extract_mesh(self.shape)
+
+    @property
+    def center(self) -> Float[Tensor, "3"]:
+        """The centre [m] of the estimated surface."""
+        return self.surface.vertices.mean(0)
+
+    @cached_property
+    def obstacles(self) -> Obstacles | None:
+        """The obstacles of a scene."""
+        scene = self.scene
+        if scene is None or scene.target is None:
+            return None
+        return Obstacles.of(estimate_occupancy(scene, scene.target), hard=not self.spec.contact_allowed)
+
+    @cached_property
+    def world(self) -> CollisionWorld:
+        """The object, table and obstacles that links must not touch. Thick solid objects have a coarser field."""
+        vertices, faces = self.surface.vertices, self.surface.faces
+        thick = float((vertices.amax(0) - vertices.amin(0)).min()) > 0.04 and len(walls_of(self.shape)) == 1
+        field = field_from_surface(vertices, faces, spacing=0.004 if thick else 0.003)
+        return CollisionWorld(field, self.spec.plane, self.obstacles)
+
+    @cached_property
+    def library(self) -> PostureLibrary:
+        """Random postures of the hand."""
+        return PostureLibrary.of(self.hand, seed=self.request.seed)
+
+    @cached_property
+    def buried(self) -> bool:
+        """Whether the lifted surface runs into obstacles more than 3 mm deeper than the standing surface."""
+        if self.obstacles is None or not self.obstacles.hard:
+            return False
+        standing = float(self.obstacles.field.query(self.surface.vertices)[0].min())
+        return lift_clearance(self.surface.vertices, self.obstacles) < min(standing, 0.0) - 0.003
+
+    @cached_property
+    def reachable(self) -> Reachable | None:
+        """The user's predicate of reachable poses, for poses in the upright frame."""
+        given, frame = self.request.reachable, self.obj_from_upright
+        return None if given is None else lambda poses: given(frame.to(poses) @ poses)
+
+    def reach(self, contacts: Contacts, certificate: Certificate) -> GraspProblem:
+        """Return the inverse kinematics of certified contacts."""
+        return GraspProblem(self.hand, contacts, certificate, self.world, self.center, self.reachable)
+
+    def tell(self, stage: str, message: str, value: Any) -> None:
+        """Report a stage to the observer, in the given frame."""
+        if self.request.observer is not ignore:
+            self.request.observer(stage, message, self._moved(value))
+
+    def give_back(self, grasps: Grasps) -> Grasps:
+        """Return grasps in the given frame, with their origin and units as metadata."""
+        hand, spec, request = self.hand, self.given_spec, self.request
+        meta = {
+            "hand": hand.name,
+            "hand_sha256": hand.source.sha256,
+            "cloud_sha256": digest(self.cloud),
+            "joint_names": ",".join(hand.joint_names),
+            "finger_names": ",".join(hand.finger_names),
+            "frames": "obj: the frame of the cloud; hand: the base link of the hand's URDF; a_from_b maps b into a",
+            "units": "metre, radian",
+            "friction": f"{spec.friction:g}",
+            "planned_friction": f"{spec.planned_friction:g}",
+            "table": "none" if spec.plane is None else spec.plane.describe(),
+            "mode": request.mode,
+            "ranking": request.order,
+            "mixture_sha256": self.mixture_sha256,
+            "seed": str(request.seed),
+        }
+        return dataclasses.replace(self._moved(grasps), meta=grasps.meta | meta)
+
+    def _moved(self, value: Any) -> Any:
+        """Return a value in the given frame."""
+        frame = self.obj_from_upright
+        return value.moved(frame) if isinstance(value, ShapeGP) else move(value, frame)
+
+
+@checked
+def take_target(scene: Scene, seed: Seed) -> PointCloud:
+    """Return the cloud of a scene's target, at most `TARGET_POINTS` random points of it.
+
+    Raises:
+        BadArgument: the scene has no target, or no object has the target's label.
+        TooFewPoints: fewer than 4 points.
+
+    >>> from torchgrasp import load_scene
+    >>> len(take_target(load_scene().select(2), seed=0)) <= TARGET_POINTS
+    True
+    """
+    if scene.target not in scene.things:
+        raise BadArgument("target", scene.target, f"one of the labels {list(scene.things)}: scene.select(label)")
+    cloud, generator = scene.cloud(), torch.Generator().manual_seed(seed)
+    rows = torch.randperm(len(cloud), generator=generator)[:TARGET_POINTS].sort().values
+    return cloud.select(rows.to(cloud.points.device))
+
+
+def digest(cloud: PointCloud) -> str:
+    """Return the SHA-256 of a cloud's points, by which results name their input."""
+    return hashlib.sha256(cloud.points.detach().cpu().double().contiguous().numpy().tobytes()).hexdigest()
