@@ -1,0 +1,139 @@
+#!/usr/bin/env python3
+"""Mutation tests: change one operator or number of the library, and see whether a test notices.
+
+    .venv/bin/python -m pip install cosmic-ray==8.7.0
+    .venv/bin/python scripts/mutants.py --folders shape plan control posture_model --each 50 --out mutants.json
+
+Cosmic Ray makes the mutants. Each runs in a copy of the repository: first the test file of the mutated module, then the
+other tests of its folder. A mutant that no test notices has survived. It needs a test, or it changes no behaviour.
+"""
+
+import argparse
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from queue import Queue
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+SWAPS = "Add_Sub Sub_Add Mul_Div Div_Mul Pow_Mul BitAnd_BitOr".split()
+COMPARISONS = "Lt_Gt Gt_Lt LtE_Gt GtE_Lt Eq_NotEq NotEq_Eq Is_IsNot IsNot_Is".split()
+OTHERS = "UnaryOperator_Delete_USub AndWithOr OrWithAnd TrueWithFalse FalseWithTrue".split()
+NAMES = (
+    *(f"core/ReplaceBinaryOperator_{name}" for name in SWAPS),
+    *(f"core/ReplaceComparisonOperator_{name}" for name in COMPARISONS),
+    *(f"core/Replace{name}" for name in OTHERS),
+    *("core/AddNot", "core/NumberReplacer", "core/ZeroIterationForLoop"),
+)
+"""Operators whose mutants seldom are the same program as before."""
+
+
+class Mutant(NamedTuple):
+    """A mutant: its module, the operator and which of its occurrences."""
+
+    module: str
+    operator: str
+    occurrence: int
+
+
+def all_mutants(folder: str) -> list[Mutant]:
+    """Return every mutant of a folder of the library."""
+    from cosmic_ray.ast import ast_nodes, get_ast
+    from cosmic_ray.plugins import get_operator
+
+    found = []
+    for path in sorted((ROOT / "torchgrasp" / folder).rglob("*.py")):
+        tree, module = get_ast(path.read_text()), path.relative_to(ROOT).as_posix()
+        for name in NAMES if path.name != "__init__.py" else ():
+            operator = get_operator(name)()
+            count = sum(len(list(operator.mutation_positions(node))) for node in ast_nodes(tree))
+            found += [Mutant(module, name, k) for k in range(count)]
+    return found
+
+
+def try_mutant(copy: Path, mutant: Mutant, limit: float) -> dict[str, object]:
+    """Return whether the tests notice a mutant, and the changed lines."""
+    from cosmic_ray.mutating import mutate_code
+    from cosmic_ray.plugins import get_operator
+
+    path = copy / mutant.module
+    before = path.read_text()
+    after = mutate_code(before, get_operator(mutant.operator)(), mutant.occurrence)
+    assert after is not None
+    lines = [
+        (k, old.strip(), new.strip())
+        for k, (old, new) in enumerate(zip(before.split("\n"), after.split("\n"), strict=False), start=1)
+        if old != new
+    ]
+    path.write_text(after)
+    try:
+        killed = run_tests(copy, mutant.module, limit)
+    finally:
+        path.write_text(before)
+    return {**mutant._asdict(), "line": lines[0] if lines else None, "killed": killed}
+
+
+def run_tests(copy: Path, module: str, limit: float) -> bool:
+    """Tell whether a test of the module's folder fails; the tests of the module run first."""
+    inner = Path(module).relative_to("torchgrasp")
+    own = copy / "tests" / inner.parent / f"test_{inner.name}"
+    folder = copy / "tests" / inner.parts[0]
+    environment = os.environ | {"PYTHONPATH": str(copy), "OMP_NUM_THREADS": "1"}
+    words = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", "not slow"]
+    for tests in [own] * own.is_file() + [folder]:
+        try:
+            done = subprocess.run([*words, str(tests)], cwd=copy, env=environment, capture_output=True, timeout=limit)
+        except subprocess.TimeoutExpired:
+            return True
+        if done.returncode:
+            return True
+    return False
+
+
+def main() -> int:
+    """Try a sample of the mutants of each folder; print the survivors."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--folders", nargs="+", default=["shape", "plan", "control", "posture_model"])
+    parser.add_argument("--each", type=int, default=50, help="mutants of each folder, drawn at random")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--limit", type=float, default=600.0, help="seconds for the tests of one mutant")
+    parser.add_argument("--out", type=Path, required=True, help="JSON file; mutants that it holds are not tried again")
+    given = parser.parse_args()
+    chosen = []
+    for folder in given.folders:
+        mutants = all_mutants(folder)
+        chosen += random.Random(given.seed).sample(mutants, min(given.each, len(mutants)))
+    done = json.loads(given.out.read_text()) if given.out.is_file() else []
+    tried = {(one["module"], one["operator"], one["occurrence"]) for one in done}
+    with tempfile.TemporaryDirectory() as scratch:
+        copies = Queue[Path]()
+        for k in range(given.workers):
+            ignore = shutil.ignore_patterns(".git", ".venv", "out", "__pycache__")
+            copies.put(Path(shutil.copytree(ROOT, Path(scratch, str(k)), ignore=ignore)))
+
+        def work(mutant: Mutant) -> dict[str, object]:
+            copy = copies.get()
+            try:
+                return try_mutant(copy, mutant, given.limit)
+            finally:
+                copies.put(copy)
+
+        with ThreadPoolExecutor(given.workers) as pool:
+            for result in pool.map(work, [mutant for mutant in chosen if mutant not in tried]):
+                done.append(result)
+                given.out.write_text(json.dumps(done, indent=1))
+                print("killed  " if result["killed"] else "SURVIVED", result["module"], result["line"], flush=True)
+    survivors = [one for one in done if not one["killed"]]
+    print(f"{len(survivors)} of {len(done)} mutants survived")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
