@@ -8,9 +8,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from paper.table3 import sample_whole
 from torchgrasp import PointCloud, ShapeGP, fit_shape, list_objects, load_object
-from torchgrasp.app.report.canvas import Canvas, draw_bar, map_colors
-from torchgrasp.app.report.palette import INK, PAPER
-from torchgrasp.app.report.pictures import rotated, view_of
+from torchgrasp.app.report.canvas import INK, PAPER, Canvas, draw_bar, map_colors
+from torchgrasp.app.report.stills import rotated, view_of
 from torchgrasp.files import write_file
 from torchgrasp.shape.surface import Surface, extract_surface
 

@@ -25,10 +25,9 @@ from torchgrasp import (
     plan_contacts,
     plan_grasps,
 )
-from torchgrasp.app.report.canvas import Canvas, Direction
-from torchgrasp.app.report.palette import AXES, FINGERS, INK, OBJECT, PAPER
-from torchgrasp.app.report.pictures import facing
+from torchgrasp.app.report.canvas import AXES, FINGERS, INK, OBJECT, PAPER, Canvas, Direction
 from torchgrasp.app.report.solids import solids_from_hand
+from torchgrasp.app.report.stills import facing
 from torchgrasp.files import write_file
 from torchgrasp.geometry.frames import virtual_frame
 from torchgrasp.geometry.signed_distance import field_from_surface

@@ -23,9 +23,8 @@ from torchgrasp import (
     load_object,
     plan_contacts,
 )
-from torchgrasp.app.report.canvas import Canvas, draw_bar, map_colors
-from torchgrasp.app.report.palette import INK, PAPER
-from torchgrasp.app.report.pictures import rotated
+from torchgrasp.app.report.canvas import INK, PAPER, Canvas, draw_bar, map_colors
+from torchgrasp.app.report.stills import rotated
 from torchgrasp.files import write_file
 from torchgrasp.geometry.linalg import farthest_points
 from torchgrasp.plan.closure_probability import closure_probability

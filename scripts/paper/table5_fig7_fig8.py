@@ -18,8 +18,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchgrasp import Hand, load_hand, load_mixture
-from torchgrasp.app.report.canvas import Canvas, Direction
-from torchgrasp.app.report.palette import FINGERS, GRID, INK, PAPER
+from torchgrasp.app.report.canvas import FINGERS, GRID, INK, PAPER, Canvas, Direction
 from torchgrasp.app.report.solids import solids_from_hand
 from torchgrasp.files import write_file
 from torchgrasp.posture_model.encoding import encode_fingertips

@@ -9,7 +9,6 @@ import pytest
 from PIL import Image
 
 from torchgrasp.app.cli import main
-from torchgrasp.app.report.hands import TILE
 from torchgrasp.hand.load import hands_folder
 
 
@@ -33,7 +32,7 @@ def test_new_writes_a_draft_that_check_takes_and_draws(barrett, capsys):
     for words in ("mine, option default: 4 actuated of 8 joints", "spread", "f1_distal = 0.3333 f1_flex", "none"):
         assert words in said
     with Image.open(picture) as image:
-        assert image.width == 2 * TILE[0] and len(np.unique(np.asarray(image).reshape(-1, 3), axis=0)) > 100
+        assert image.width == 1350 and len(np.unique(np.asarray(image).reshape(-1, 3), axis=0)) > 100
     assert main(["hand", "new", str(barrett / "hand.urdf")]) == 2  # what is there is not overwritten
     assert "exists" in capsys.readouterr().err
 
@@ -76,8 +75,8 @@ def test_a_posture_is_drawn_with_every_finger(barrett):
     import torch
 
     from torchgrasp import load_hand
-    from torchgrasp.app.report.hands import draw_posture
-    from torchgrasp.app.report.palette import FINGERS, rgb
+    from torchgrasp.app.report.canvas import FINGERS, rgb
+    from torchgrasp.app.report.stills import draw_posture
 
     hand = load_hand(barrett)
     image = Image.open(io.BytesIO(draw_posture(hand, torch.tensor([0.5, 0.8, 0.8, 0.8]).double(), (1.0, -0.8, 0.5))))

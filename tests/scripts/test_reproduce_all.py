@@ -14,7 +14,7 @@ from paper.whole.parts import FIGURES, FULL, QUICK, TRIALS, Sizes
 from paper.whole.run import Whole, reproduce
 
 from tests.pinch import pinch
-from torchgrasp.app.report.document import format_html_table
+from torchgrasp.app.report.page import format_table
 from torchgrasp.base import join
 from torchgrasp.closure import ObjectMotion
 from torchgrasp.errors import Status
@@ -161,7 +161,7 @@ def test_tables_are_as_wide_as_their_heads_and_name_the_best(tmp_path):
     row = {"object": "jug", "setting": "paper", "threshold": 0.03, "grasps": 0, "milliseconds": 1.0}
     found = tables.table4({"starts": 9, "rows": [row | {"quality": None, "spread": None, "probability": None}]})
     assert len(found.rows[0]) == len(found.heads) and found.rows[0][3:7] == ("0", "1.00", "-", "-")
-    assert "26.52 ± 13.58" in format_html_table(found.heads, found.rows)
+    assert "26.52 ± 13.58" in format_table(found.heads, found.rows)
 
 
 def test_workers_are_asked_for_what_is_missing_alone(monkeypatch, tmp_path):

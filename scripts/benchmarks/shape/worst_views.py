@@ -13,9 +13,8 @@ from tqdm import tqdm
 from benchmarks.common import Row
 from benchmarks.ground_truth import nearest_on_mesh, read_views
 from benchmarks.shape.accuracy import RESOLUTION, measure_shape
-from torchgrasp.app.report.canvas import Canvas, draw_bar, map_colors
-from torchgrasp.app.report.palette import INK, PAPER
-from torchgrasp.app.report.pictures import rotated, view_of
+from torchgrasp.app.report.canvas import INK, PAPER, Canvas, draw_bar, map_colors
+from torchgrasp.app.report.stills import rotated, view_of
 from torchgrasp.data import read_group
 from torchgrasp.files import write_file
 from torchgrasp.shape.fit import fit_shape

@@ -7,12 +7,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup, escape
 from PIL import Image
 
 from paper.whole.parts import EVERY, FIGURES, FULL, TRIALS, Figure, Sizes, Trials
 from paper.whole.tables import HAND, TABLES, count_own
 from torchgrasp import __version__
-from torchgrasp.app.report.document import escape, format_document, format_html_table
+from torchgrasp.app.report.page import format_table, render
 from torchgrasp.files import format_json, write_file
 
 TIMES = ("filter_s", "shape_s", "milliseconds", "seconds", "plan_cpu_s")
@@ -43,7 +44,8 @@ def write_pages(out: Path, sizes: Sizes, asked: dict[str, dict[str, Any]]) -> No
     write_file(out / "times.json", format_json(times))
     body = [f'<p class="source">torchgrasp {__version__}; {escape(describe(sizes))}</p>', f"<p>{NOTE}</p>"]
     body += [_section(out, parts[name], content) for name, content in found.items()]
-    write_file(out / "index.html", format_document("Dexterous grasping under shape uncertainty, reproduced", body))
+    title = "Dexterous grasping under shape uncertainty, reproduced"
+    write_file(out / "index.html", render("base.html", title=title, body=Markup("\n".join(body))))
 
 
 NOTE = (
@@ -116,7 +118,7 @@ def _section(out: Path, part: Figure | Trials, content: dict[str, Any] | None) -
         return "\n".join([*lines, "<p><strong>Not finished.</strong></p>"])
     if part.name in TABLES:
         table = TABLES[part.name](content["numbers"])
-        lines.append(format_html_table(table.heads, table.rows, numbers=table.numbers))
+        lines.append(format_table(table.heads, table.rows, numbers=table.numbers))
     else:
         lines += [f"<pre>{escape(chr(10).join(content['said']))}</pre>"] * bool(content["said"])
     lines += [_picture(out / f"{name}.png", name) for name in getattr(part, "pictures", ())]

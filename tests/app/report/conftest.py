@@ -7,7 +7,7 @@ import pytest
 import torch
 import trimesh
 
-from torchgrasp.app.report.run import Run, Stage
+from torchgrasp.app.report.run import Run
 from torchgrasp.closure import ClosingTrace, ClosureResult, Disturbance, ObjectMotion
 from torchgrasp.errors import Status
 from torchgrasp.hand.load import load_hand
@@ -89,6 +89,6 @@ def run() -> Run:
     cloud = PointCloud(vertices[vertices[:, 0] > 0], None, torch.tensor([0.5, 0.1, 0.3], dtype=F64))
     failed = torch.tensor([Status.NOT_CLOSED, Status.NOT_CLOSED])
     plan = ContactPlan(contacts, torch.ones(2, 3, 8, dtype=F64), one, failed)
-    stages = (Stage("cloud", "321 points", 0.1), Stage("shape", "a <b>bold</b> claim", 1.25))
+    stages = (("cloud", "321 points", 0.1), ("shape", "a <b>bold</b> claim", 1.25))
     source = Path("clouds/<odd> & 'quoted'.ply")
     return Run("ball", source, cloud, hand, ContactSpec(table=-0.03), surface, grasps, stages, plan, body, closure)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from torchgrasp.app.report.turning import write_viewer
+from torchgrasp.app.report.viewer import write_viewer
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 OPTIONS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking"]

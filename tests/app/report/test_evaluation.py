@@ -5,7 +5,7 @@ import re
 import pytest
 
 from tests.scores import SCORES
-from torchgrasp.app.report.evaluation import WIDTH, bar, format_evaluation, write_evaluation
+from torchgrasp.app.report.evaluation import draw_bar, format_evaluation, write_evaluation
 from torchgrasp.evaluation.intervals import share_over
 
 
@@ -20,7 +20,7 @@ def test_page_shows_shares_objects_and_reasons(tmp_path):
 
 def test_a_bar_ends_where_the_interval_does():
     found = share_over({"tin": (1, 4), "cup": (2, 6)})
-    ends = [float(x) for x in re.findall(r'x[12]="([\d.]+)"', bar(found))[2:]]
-    at = float(re.findall(r'cx="([\d.]+)"', bar(found))[0])
+    ends = [float(x) for x in re.findall(r'x[12]="([\d.]+)"', draw_bar(found, 180))[2:]]
+    at = float(re.findall(r'cx="([\d.]+)"', draw_bar(found, 180))[0])
     for drawn, value in zip((*ends, at), (found[1], found[2], found[0]), strict=True):
-        assert (drawn - 4) / (WIDTH - 8) == pytest.approx(value, abs=1e-3)
+        assert (drawn - 4) / (180 - 8) == pytest.approx(value, abs=1e-3)

@@ -9,10 +9,9 @@ import pytest
 import torch
 from PIL import Image
 
-from torchgrasp.app.report.closing.film import ALARM, STILL, TITLE, WIDTH, describe_film, draw_film
-from torchgrasp.app.report.closing.moments import explain_loss, find_loss, moments_of, moved_in_hand
-from torchgrasp.app.report.closing.panels import BOTTOM, HEAD, LEFT, RIGHT, TOP, Line, Panel, draw_panels
-from torchgrasp.app.report.palette import rgb
+from torchgrasp.app.report.canvas import ALARM, rgb
+from torchgrasp.app.report.film import STILL, TITLE, WIDTH, describe_film, draw_film
+from torchgrasp.app.report.moments import explain_loss, find_loss, moments_of, moved_in_hand
 from torchgrasp.closure import ClosingTrace
 from torchgrasp.errors import Status
 
@@ -115,21 +114,6 @@ def test_what_is_too_heavy_is_put_down_from_the_top(closing):
     assert find_loss(out, CENTRE) == 79
     assert explain_loss(out, CENTRE, NAMES).startswith("Put down from 0.79 s")
     assert Status.TOO_HEAVY.sentence in explain_loss(out, CENTRE, NAMES)
-
-
-def test_a_line_of_a_panel_is_where_its_values_are_and_broken_where_they_are_not():
-    time = np.linspace(0.0, 2.0, 201)
-    values = np.where(np.abs(time - 1.0) < 0.1, math.nan, 3.0)
-    panel = Panel("", 4.0, 200, [Line(values, "#ff0000", width=3.0)])
-    pixels = np.asarray(draw_panels([panel], time, [], 800)).astype(int)
-    rows, columns = np.nonzero((pixels[..., 0] > 200) & (pixels[..., 1] < 80))
-    top, low = HEAD + TOP, HEAD + 200 - BOTTOM
-    assert abs(rows.mean() - (low - 0.75 * (low - top))) < 1
-    scale = (800 - LEFT - RIGHT) / 2.0
-    assert abs(columns.min() - LEFT) < 3 and abs(columns.max() - (800 - RIGHT)) < 3
-    gap = np.diff(np.unique(columns)).argmax()
-    assert abs(np.unique(columns)[gap] - (LEFT + 0.9 * scale)) < 6
-    assert abs(np.diff(np.unique(columns)).max() - 0.2 * scale) < 10
 
 
 def picture(png):

@@ -4,7 +4,7 @@ import numpy as np
 from PIL import Image
 
 from torchgrasp.app.report.canvas import SIZE
-from torchgrasp.app.report.pictures import (
+from torchgrasp.app.report.stills import (
     draw_cloud,
     draw_contacts,
     draw_grasp,

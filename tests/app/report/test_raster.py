@@ -1,10 +1,7 @@
-import matplotlib
 import numpy as np
 import trimesh
 
-from torchgrasp.app.report import raster
-from torchgrasp.app.report.canvas import _sharp_normals, frame_camera, map_colors
-from torchgrasp.app.report.palette import RAMPS
+from torchgrasp.app.report.canvas import _sharp_normals, frame_camera
 from torchgrasp.app.report.raster import Camera, Triangles, concatenate, render
 
 WHITE, RED, BLUE = (1.0, 1.0, 1.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
@@ -112,18 +109,3 @@ def test_the_frame_holds_every_corner():
                 (local[:, 2] < 0).all() and (np.abs(side) < 1).all() and (up < 1).all() and (up > -1 + 2 * drop).all()
             )
             assert np.abs(np.concatenate([side, up])).max() > 0.6
-
-
-def test_a_picture_does_not_depend_on_the_bands_that_it_is_drawn_in(monkeypatch):
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.4)
-    corners = ball.vertices[ball.faces]
-    lit = Triangles(corners, corners / 0.4, np.full(corners.shape, 0.5), np.ones(len(corners), dtype=bool))
-    whole = render(lit, square(0.5, 0.3, BLUE), LOOK, (90, 70), WHITE)
-    monkeypatch.setattr(raster, "BAND", 14)
-    assert np.array_equal(render(lit, square(0.5, 0.3, BLUE), LOOK, (90, 70), WHITE), whole)
-
-
-def test_ramps_are_the_maps_of_their_names():
-    values = np.linspace(0.0, 1.0, 300)
-    for name in RAMPS:
-        np.testing.assert_allclose(map_colors(values, name), matplotlib.colormaps[name](values)[:, :3], atol=0.05)

@@ -9,9 +9,9 @@ import torch
 from PIL import Image
 
 from torchgrasp import load_scene
+from torchgrasp.app.report.canvas import rgb
 from torchgrasp.app.report.page import draw_pictures
-from torchgrasp.app.report.palette import THINGS, rgb
-from torchgrasp.app.report.scenes import draw_among, draw_depth
+from torchgrasp.app.report.stills import OBJECTS, draw_among, draw_depth
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def test_the_target_has_its_colour_and_missing_pixels_are_white(scene):
     row, column = scene.pixels[scene.rows_of()].T.numpy()
     target = pixels[row, column]
     hue = target / target.max(1, keepdims=True)
-    assert np.abs(hue - np.array(rgb(THINGS[3])) / max(rgb(THINGS[3]))).max() < 0.02
+    assert np.abs(hue - np.array(rgb(OBJECTS[3])) / max(rgb(OBJECTS[3]))).max() < 0.02
     assert (pixels[scene.image.depth.numpy() == 0] == 1).all()
     other = scene.pixels[scene.rows_of(1)].T.numpy()
     assert pixels[other[0], other[1]].min() > target.min()  # the others are pale
@@ -38,7 +38,7 @@ def test_neighbours_are_drawn_and_the_target_is_not_drawn_twice(run, scene):
     lone = dataclasses.replace(scene, labels=torch.where(scene.labels == 4, 4, 0))
     grasp = run.executable[:1]
     among, alone = (read(draw_among(s, run.surface, run.hand, grasp, (1.0, 0.5, 0.5))) for s in (scene, lone))
-    for color in THINGS[:3]:
+    for color in OBJECTS[:3]:
         hue = np.array(rgb(color)) / max(rgb(color))
         like = [(np.abs(p / p.max(2, keepdims=True).clip(1e-6) - hue).max(2) < 0.05).sum() for p in (among, alone)]
         assert like[0] > like[1] + 50

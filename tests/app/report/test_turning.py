@@ -10,15 +10,28 @@ import torch
 import trimesh
 
 from torchgrasp.app.report.page import format_page
-from torchgrasp.app.report.rounded import EDGE, round_shape
-from torchgrasp.app.report.solids import solids_from_hand, solids_of_links
-from torchgrasp.app.report.turning import VIEW, write_viewer
-from torchgrasp.app.report.turning.buffers import thin_mesh, unpack
-from torchgrasp.app.report.turning.contents import MOST_FACES, MOST_GRASPS, MOST_TICKS, POSTURES, describe
-from torchgrasp.app.report.turning.document import format_viewer, three
+from torchgrasp.app.report.solids import EDGE, round_shape, solids_from_hand, solids_of_links
+from torchgrasp.app.report.viewer import (
+    MOST_FACES,
+    MOST_GRASPS,
+    MOST_TICKS,
+    POSTURES,
+    VIEW,
+    describe,
+    format_viewer,
+    thin_mesh,
+    three,
+    write_viewer,
+)
 from torchgrasp.errors import OutputError, Status
 from torchgrasp.hand.urdf import Shape
 from torchgrasp.ik.motion import APPROACH_DISTANCE
+
+
+def unpack(buffer):
+    """Read a buffer as the page does."""
+    values = np.frombuffer(base64.b64decode(buffer["data"]), f"<{buffer['kind']}")
+    return values.reshape(buffer["shape"])
 
 
 def data_of(page):
@@ -137,7 +150,7 @@ def test_a_page_into_a_file_as_folder_is_refused(run, tmp_path):
 )
 def test_rounded_shapes_fill_their_shape_but_for_the_edges(kind, size):
     place = {"xyz": (0.1, -0.2, 0.3), "rpy": (0.4, 0.5, 0.6)}
-    solid = round_shape(Shape(kind, size, **place))
+    vertices, solid_faces, normals = round_shape(Shape(kind, size, **place))
     sharp = {
         "box": lambda: trimesh.creation.box(size),
         "cylinder": lambda: trimesh.creation.cylinder(*size, sections=40),
@@ -145,14 +158,14 @@ def test_rounded_shapes_fill_their_shape_but_for_the_edges(kind, size):
     }[kind]()
     matrix = trimesh.transformations.euler_matrix(*place["rpy"], axes="sxyz")
     matrix[:3, 3] = place["xyz"]
-    local = (solid.vertices - matrix[:3, 3]) @ matrix[:3, :3]
-    mesh = trimesh.Trimesh(local, solid.faces, process=False)
+    local = (vertices - matrix[:3, 3]) @ matrix[:3, :3]
+    mesh = trimesh.Trimesh(local, solid_faces, process=False)
     assert mesh.is_watertight and mesh.is_winding_consistent
     assert 0.85 * sharp.volume < mesh.volume <= sharp.volume * 1.01
     np.testing.assert_allclose(np.ptp(local, axis=0), sharp.extents, atol=1e-3 * EDGE)
-    np.testing.assert_allclose(np.linalg.norm(solid.normals, axis=1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-12)
     faces = mesh.face_normals
-    inner = solid.normals[solid.faces] @ matrix[:3, :3]
+    inner = normals[solid_faces] @ matrix[:3, :3]
     assert (np.einsum("fci,fi->fc", inner, faces) > 0.8).all()
 
 

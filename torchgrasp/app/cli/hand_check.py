@@ -7,7 +7,7 @@ import torch
 from tyro.conf import Positional, arg
 
 from torchgrasp.app.cli.common import check_folder, naming
-from torchgrasp.app.report.hands import draw_hand, opposed_posture
+from torchgrasp.app.report.stills import draw_hand, opposed_posture
 from torchgrasp.base import count_status
 from torchgrasp.columns import format_columns
 from torchgrasp.data.shipped import load_object

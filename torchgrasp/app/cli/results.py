@@ -8,7 +8,7 @@ from tyro.conf import Positional, arg
 
 from torchgrasp.app.report.page import write_report
 from torchgrasp.app.report.run import Run
-from torchgrasp.app.report.turning import VIEW, write_viewer
+from torchgrasp.app.report.viewer import VIEW, write_viewer
 from torchgrasp.errors import BadArgument
 
 GRASPS = "grasps.safetensors"

@@ -1,8 +1,8 @@
-"""Pages and pictures of runs, evaluations and hands. No OpenGL, no display."""
+"""Pages and pictures of runs and evaluations, drawn without a display and without OpenGL."""
 
 from torchgrasp.app.report.evaluation import write_evaluation
-from torchgrasp.app.report.page import draw_pictures, write_report
-from torchgrasp.app.report.run import Run, Stage, verdict
-from torchgrasp.app.report.turning import write_viewer
+from torchgrasp.app.report.page import write_report
+from torchgrasp.app.report.run import Run
+from torchgrasp.app.report.viewer import write_viewer
 
-__all__ = ["Run", "Stage", "draw_pictures", "verdict", "write_evaluation", "write_report", "write_viewer"]
+__all__ = ["Run", "write_evaluation", "write_report", "write_viewer"]

@@ -1,28 +1,28 @@
-"""Shapes to one still: a canvas frames and renders them."""
+"""Colours that all pictures share, and the canvas of a still, which collects shapes, frames them and renders them."""
 
 import io
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from torchgrasp.app.report.palette import INK, PAPER, RAMPS, TABLE, rgb
 from torchgrasp.app.report.raster import Camera, Triangles, concatenate, render
 
 Direction = tuple[float, float, float]
-Colors = tuple[str, ...]
 
+FINGERS = ("#2f6db5", "#23967f", "#e0762f", "#8a4f9e", "#c23b55")
+"""Colours of the fingers, in grasp order."""
+AXES = ("#d62728", "#2ca02c", "#1f4fd8")
+"""Colours of x, y and z of a frame."""
+HAND, OBJECT, TABLE = "#a9b0ba", "#e9d7b3", "#eceae4"
+"""Colours of the palm with parked fingers, of the object, and of the table."""
+PAPER, INK, GRID, ALARM = "#fcfcfa", "#22262b", "#dcdad3", "#c2452d"
+"""Colours of the background, of lines with text, of grid lines, and of the moment at which an object was lost."""
 SIZE = (720, 576)
-"""Width and height of a still [pixels]: twice what a page of three columns has."""
-
-VIEW_ANGLE = np.deg2rad(24.0)
-"""Vertical angle of view [rad]: of a long lens, which distorts little."""
-
-SHARP_ANGLE = np.deg2rad(40.0)
-"""Bend [rad] from which on an edge is sharp: those of boxes are, those of a cylinder of 40 sides are not."""
+"""Width and height of a still [pixels]: twice its size on a page of three columns."""
 
 
 class Canvas:
-    """What one still shows."""
+    """The shapes of one still."""
 
     def __init__(self) -> None:
         self.solid: list[Triangles] = []
@@ -36,27 +36,32 @@ class Canvas:
         normals: Float[np.ndarray, "v 3"] | None = None,
         transparent: bool = False,
     ) -> None:
-        """Add a mesh of one colour or of one a vertex; without `normals` its edges are sharp where it bends much."""
+        """Add a mesh with one colour, or one colour a vertex; without `normals`, edges with a large bend are sharp."""
         corners = vertices[faces]
         bent = _sharp_normals(vertices, faces) if normals is None else normals[faces]
         shade = np.broadcast_to(rgb(color), corners.shape) if isinstance(color, str) else color[faces]
-        (self.transparent if transparent else self.solid).append(_triangles(corners, bent, shade))
+        triangles = Triangles(corners, bent, shade, np.ones(len(corners), dtype=bool))
+        (self.transparent if transparent else self.solid).append(triangles)
 
     def add_points(self, points: Float[np.ndarray, "n 3"], colors: Float[np.ndarray, "n 3"]) -> None:
         """Add points as small balls, each in its colour."""
         from trimesh import creation
 
         size = 0.006 * float(np.linalg.norm(np.ptp(points, axis=0)))
-        ball = creation.icosphere(subdivisions=0, radius=1.0)  # so small that nobody counts its faces
+        ball = creation.icosphere(subdivisions=0, radius=1.0)  # too small on the page for its faces to show
         corners = (points[:, None, None] + size * ball.vertices[ball.faces]).reshape(-1, 3, 3)
         normals = np.tile(ball.vertices[ball.faces], (len(points), 1, 1))
         shades = np.broadcast_to(np.repeat(colors, len(ball.faces), 0)[:, None], corners.shape)
-        self.solid.append(_triangles(corners, normals, shades))
+        self.solid.append(Triangles(corners, normals, shades, np.ones(len(corners), dtype=bool)))
 
     def add_arrows(
-        self, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"], length: float, colors: Colors
+        self,
+        points: Float[np.ndarray, "n 3"],
+        directions: Float[np.ndarray, "n 3"],
+        length: float,
+        colors: tuple[str, ...],
     ) -> None:
-        """Add arrows of one length [m] in unit directions, each in its colour and from a small ball."""
+        """Add arrows of one length [m] in unit directions, each with its colour and a small ball at its start."""
         from trimesh import creation
 
         head = creation.cone(radius=0.1, height=0.35, sections=8)
@@ -74,7 +79,7 @@ class Canvas:
                 self.add_mesh(length * np.asarray(part.vertices) @ axes + start, np.asarray(part.faces), color)
 
     def add_table(self, corners: Float[np.ndarray, "n 3"], height: float | None) -> None:
-        """Add a round table top under `corners` at a height [m], without light and shade; None: no table."""
+        """Add an unlit round table top under `corners` at a height [m]; None: no table."""
         if height is None:
             return
         center = np.append((corners[:, :2].min(0) + corners[:, :2].max(0)) / 2, height - 1e-3)
@@ -83,10 +88,10 @@ class Canvas:
         rim = center + radius * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], 1)
         corners = np.stack([np.broadcast_to(center, (120, 3)), rim[:-1], rim[1:]], 1)
         normals, shade = (np.broadcast_to(row, corners.shape) for row in ((0.0, 0.0, 1.0), rgb(TABLE)))
-        self.solid.append(_triangles(corners, normals, shade, lit=False))
+        self.solid.append(Triangles(corners, normals, shade, np.zeros(len(corners), dtype=bool)))
 
     def render(self, camera: Camera, size: tuple[int, int] = SIZE) -> UInt8[np.ndarray, "h w 3"]:
-        """Return what a camera sees, in pixels."""
+        """Return the picture that a camera sees, in pixels."""
         return render(concatenate(self.solid), concatenate(self.transparent), camera, size, rgb(PAPER))
 
     def render_png(
@@ -94,22 +99,21 @@ class Canvas:
     ) -> bytes:
         """Return a PNG that shows all `corners` [m], seen from a direction between 15 and 40 degrees above the table.
 
-        `bar` is title, largest value and colour map of a bar at the bottom.
+        `bar` is the title, the largest value and the colour map of a colour bar at the bottom.
         """
         from PIL import Image
 
         image = Image.fromarray(self.render(frame_camera(corners, direction, 0.09 if bar else 0.0)))
         if bar:
             draw_bar(image, *bar)
-        buffer = io.BytesIO()
-        image.save(buffer, format="PNG", compress_level=4)  # 5 % larger than by 6, in two thirds of the time
-        return buffer.getvalue()
+        return encode_png(image)
 
 
 def frame_camera(
     corners: Float[np.ndarray, "n 3"], direction: Direction, drop: float = 0.0, size: tuple[int, int] = SIZE
 ) -> Camera:
-    """Return a camera that sees all `corners` and a `drop`, the empty share of the picture below."""
+    """Return a camera that sees all `corners`; `drop` is the share of the picture that stays empty at the bottom."""
+    angle = np.deg2rad(24.0)  # a long lens distorts little
     x, y, z = direction
     flat = float(np.hypot(x, y))
     if flat < 1e-9:
@@ -123,21 +127,16 @@ def frame_camera(
     local = corners @ frame.T
     middle, half = (local.min(0) + local.max(0)) / 2, np.ptp(local, axis=0) / 2
     # The nearest corners look largest, so the distance is counted from them.
-    reach = max(half[1] / (1.0 - 1.5 * drop), half[0] * size[1] / size[0]) / np.tan(VIEW_ANGLE / 2)
+    reach = max(half[1] / (1.0 - 1.5 * drop), half[0] * size[1] / size[0]) / np.tan(angle / 2)
     distance = half[2] + 1.12 * reach
-    center = middle @ frame - frame[1] * drop * distance * np.tan(VIEW_ANGLE / 2)
-    return Camera(center + back * distance, frame, float(VIEW_ANGLE))
-
-
-def _triangles(corners: np.ndarray, normals: np.ndarray, colors: np.ndarray, lit: bool = True) -> Triangles:
-    """Return triangles that the lamps light or not."""
-    return Triangles(corners, normals, colors, np.full(len(corners), lit))
+    center = middle @ frame - frame[1] * drop * distance * np.tan(angle / 2)
+    return Camera(center + back * distance, frame, float(angle))
 
 
 def _sharp_normals(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> Float[np.ndarray, "f 3 3"]:
-    """Return for each corner of a face the mean normal of the faces there, up to `SHARP_ANGLE`."""
+    """Return for each corner of a face the mean normal of the faces there that bend by less than 40 degrees."""
     a, b, c = vertices[faces].transpose(1, 0, 2)
-    weighted = np.cross(b - a, c - a)  # as long as twice the face's area
+    weighted = np.cross(b - a, c - a)  # its length is twice the area of the face
     flat = weighted / np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-300)
     # Pair each corner with all corners at the same place, by the order of the places.
     _, place = np.unique(np.round(vertices / 1e-7).astype(np.int64), axis=0, return_inverse=True)
@@ -148,16 +147,23 @@ def _sharp_normals(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> Flo
     corner = np.repeat(np.arange(len(at)), counts[at])
     offset = np.arange(len(corner)) - np.repeat(np.cumsum(counts[at]) - counts[at], counts[at])
     other = order[start[at[corner]] + offset]
-    near = (flat[corner // 3] * flat[other // 3]).sum(1) > np.cos(SHARP_ANGLE)
+    near = (flat[corner // 3] * flat[other // 3]).sum(1) > np.cos(np.deg2rad(40.0))
     sums = np.zeros((len(at), 3))
     np.add.at(sums, corner[near], weighted[other[near] // 3])
     return (sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-300)).reshape(-1, 3, 3)
 
 
-def map_colors(values: Float[np.ndarray, " n"], colors: str) -> Float[np.ndarray, "n 3"]:
-    """Return the colours of values in [0, 1] by one of the `RAMPS`, blended between its steps."""
-    ramp = np.array([rgb(f"#{color}") for color in RAMPS[colors].split()])
-    return np.stack([np.interp(values, np.linspace(0.0, 1.0, len(ramp)), part) for part in ramp.T], -1)
+def rgb(color: str) -> tuple[float, float, float]:
+    """Return red, green and blue of "#rrggbb" in [0, 1]."""
+    red, green, blue = (int(color[i : i + 2], 16) / 255 for i in (1, 3, 5))
+    return red, green, blue
+
+
+def map_colors(values: Float[np.ndarray, " n"], name: str) -> Float[np.ndarray, "n 3"]:
+    """Return the colours of values in [0, 1] by a colour map of matplotlib."""
+    import matplotlib
+
+    return matplotlib.colormaps[name](values)[:, :3]
 
 
 def draw_bar(image: object, title: str, most: float, colors: str) -> None:
@@ -174,3 +180,13 @@ def draw_bar(image: object, title: str, most: float, colors: str) -> None:
     for i in range(4):
         draw.text((left + i * (right - left) / 3, top - 4), f"{most * i / 3:.1f}", INK, font, anchor="ms")
     draw.text(((left + right) / 2, top - 29), title, INK, font, anchor="ms")
+
+
+def encode_png(image: object) -> bytes:
+    """Return a picture of Pillow as a PNG."""
+    from PIL import Image
+
+    assert isinstance(image, Image.Image)
+    buffer = io.BytesIO()
+    image.save(buffer, format="PNG", compress_level=4)
+    return buffer.getvalue()

@@ -1,4 +1,4 @@
-"""Triangles to pixels in numpy: stills without OpenGL and its system libraries, the same bytes on every machine."""
+"""A software renderer in NumPy: triangles to pixels without OpenGL and its system libraries."""
 
 from typing import NamedTuple
 
@@ -6,19 +6,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 SAMPLES = 2
-"""Samples of a pixel along each axis: enough for smooth edges."""
-
-BAND = 96
-"""Rows of samples that are drawn at once: what they take fits a processor's cache (48 to 192 are as fast)."""
-
-AMBIENT, KEY, FILL, SHINE = 0.52, 0.50, 0.22, 0.08
-"""Strengths of the ambient light, the two lamps and the highlight: chosen by eye."""
-LAMPS = ((-0.45, 0.65, 0.62), (0.70, 0.10, 0.60))
-"""Directions to the two lamps in the camera's frame (right, up, back): chosen by eye."""
+"""Samples of a pixel along each axis; the mean of the samples gives smooth edges."""
 
 
 class Triangles(NamedTuple):
-    """Corners of triangles, with their normals and colours in [0, 1]; unlit ones keep their colours."""
+    """Corners of triangles with normals and colours in [0, 1]; unlit triangles keep their colours."""
 
     corners: Float[np.ndarray, "t 3 3"]
     normals: Float[np.ndarray, "t 3 3"]
@@ -27,7 +19,7 @@ class Triangles(NamedTuple):
 
 
 class Camera(NamedTuple):
-    """A pinhole camera: rows of `frame` are right, up and back; `angle` is the vertical view [rad]."""
+    """A pinhole camera: the rows of `frame` are right, up and back; `angle` is the vertical field of view [rad]."""
 
     position: Float[np.ndarray, "3"]
     frame: Float[np.ndarray, "3 3"]
@@ -37,9 +29,9 @@ class Camera(NamedTuple):
 class _Screen(NamedTuple):
     """Triangles on the screen [samples].
 
-    `start` is the first corner; `first` and `last` bound the rows whose centres are covered. `edges` are the long side,
-    the upper and the lower one: the upper end, and the slope over the rows. `planes` are the inverse distance and the
-    colour over the distance: at the first corner, and their gradients.
+    `start` is the first corner. Sample centres are covered in the rows from `first` to before `last`. `edges` are
+    the long, the upper and the lower side, each by its upper end and its slope over the rows. `planes` are the inverse
+    distance and the colour over the distance: the values at the first corner, and their gradients.
     """
 
     start: Float[np.ndarray, "t 2"]
@@ -49,16 +41,8 @@ class _Screen(NamedTuple):
     planes: Float[np.ndarray, "t 3 4"]
 
 
-class _Hits(NamedTuple):
-    """The samples that are covered, the inverse distance there, and the colour."""
-
-    sample: Int[np.ndarray, " k"]
-    near: Float[np.ndarray, " k"]
-    color: Float[np.ndarray, "k 3"]
-
-
 def concatenate(parts: list[Triangles]) -> Triangles:
-    """Return all triangles of several sets, or of none, as one."""
+    """Return the triangles of several sets, or of none, as one set."""
     empty = np.zeros((0, 3, 3))
     none = Triangles(empty, empty, empty, np.zeros(0, dtype=bool))
     return Triangles(*(np.concatenate(column) for column in zip(none, *parts, strict=True)))
@@ -71,36 +55,21 @@ def render(
     size: tuple[int, int],
     background: tuple[float, float, float],
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the picture of opaque triangles under the nearest layer of transparent ones, which hides half of them."""
+    """Return the picture of opaque triangles under the nearest layer of half-transparent triangles."""
     width, height = size[0] * SAMPLES, size[1] * SAMPLES
-    opaque, sheer = (_project(triangles, camera, width, height) for triangles in (solid, transparent))
-    bands = [
-        _draw_band(opaque, sheer, (top, min(top + BAND, height)), width, background) for top in range(0, height, BAND)
-    ]
-    return np.concatenate(bands)
-
-
-def _draw_band(
-    opaque: _Screen, sheer: _Screen, rows: tuple[int, int], width: int, background: tuple[float, float, float]
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the pixels of some rows of samples."""
-    count = (rows[1] - rows[0]) * width
-    image = np.tile(np.array(background, dtype=np.float32), (count, 1))
-    hits, veil = (_cast(part, rows, width) for part in (opaque, sheer))
-    image[hits.sample] = hits.color
-    if len(veil.sample):
-        near = np.zeros(count, dtype=np.float32)
-        near[hits.sample] = hits.near
-        front = veil.near > near[veil.sample]
-        at = veil.sample[front]
-        image[at] += 0.5 * (veil.color[front] - image[at])
-    grid = image.reshape(-1, SAMPLES, width // SAMPLES, SAMPLES, 3)
-    boxes = sum(grid[:, i, :, j] for i in range(SAMPLES) for j in range(SAMPLES)) / np.float32(SAMPLES**2)
-    return (255.0 * np.clip(boxes, 0.0, 1.0) + 0.5).astype(np.uint8)
+    image = np.tile(np.array(background, dtype=np.float32), (height * width, 1))
+    near = np.zeros(height * width, dtype=np.float32)
+    sample, inverse_distance, color = _cast(_project(solid, camera, width, height), width, height)
+    image[sample], near[sample] = color, inverse_distance
+    sample, inverse_distance, color = _cast(_project(transparent, camera, width, height), width, height)
+    front = inverse_distance > near[sample]
+    image[sample[front]] += 0.5 * (color[front] - image[sample[front]])
+    pixels = image.reshape(size[1], SAMPLES, size[0], SAMPLES, 3).mean((1, 3))
+    return (255.0 * np.clip(pixels, 0.0, 1.0) + 0.5).astype(np.uint8)
 
 
 def _project(triangles: Triangles, camera: Camera, width: int, height: int) -> _Screen:
-    """Return where triangles are on the screen, and how bright."""
+    """Return the places of triangles on the screen, and their lit colours."""
     local = (triangles.corners - camera.position) @ camera.frame.T
     near = 1.0 / np.maximum(-local[..., 2], 1e-6)  # the scene is framed in front of the camera
     focal = height / 2 / np.tan(camera.angle / 2)
@@ -109,7 +78,7 @@ def _project(triangles: Triangles, camera: Camera, width: int, height: int) -> _
     # Sample centres lie at integers + 0.5; a triangle covers the rows whose centres lie between its ends.
     first, last = (np.clip(np.ceil(end - 0.5), 0, height).astype(np.int64) for end in (y.min(1), y.max(1)))
 
-    # From the upper end to the lower, so that triangles that share an edge agree to the last bit: no cracks.
+    # Edges run from the upper end to the lower, so triangles that share an edge agree to the last bit: no cracks.
     order = np.argsort(y, axis=1)
     sorted_x, sorted_y = np.take_along_axis(x, order, 1), np.take_along_axis(y, order, 1)
     upper, lower = [0, 0, 1], [2, 1, 2]
@@ -117,7 +86,7 @@ def _project(triangles: Triangles, camera: Camera, width: int, height: int) -> _
     slope = (sorted_x[:, lower] - sorted_x[:, upper]) / np.where(high > 0.0, high, 1.0)
     edges = np.stack([sorted_x[:, upper], sorted_y[:, upper], slope], -1)
 
-    # What is linear in space is, over its distance, linear on the screen.
+    # A value that is linear in space is, divided by its distance, linear on the screen.
     values = np.concatenate([near[..., None], _shade(triangles, camera) * near[..., None]], -1)
     ab, ac = values[:, 1] - values[:, 0], values[:, 2] - values[:, 0]
     bx, cx, by, cy = (column[:, None] for side in (x, y) for column in (side[:, 1:] - side[:, :1]).T)
@@ -127,9 +96,9 @@ def _project(triangles: Triangles, camera: Camera, width: int, height: int) -> _
     return _Screen(np.stack([x[:, 0], y[:, 0]], 1), first, last, edges, planes.astype(np.float32))
 
 
-def _cast(screen: _Screen, rows: tuple[int, int], width: int) -> _Hits:
-    """Return the nearest triangle at each sample of some rows."""
-    owner, row = _ranges(np.clip(screen.first, *rows), np.clip(screen.last, *rows))
+def _cast(screen: _Screen, width: int, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the covered samples, and the inverse distance (k,) and colour (k, 3) of the nearest triangle there."""
+    owner, row = _ranges(screen.first, screen.last)
     middle = row + 0.5
     short = np.where(middle < screen.edges[owner, 2, 1], 1, 2)
     ends = [x + slope * (middle - y) for x, y, slope in (screen.edges[owner, side].T for side in (0, short))]
@@ -137,14 +106,14 @@ def _cast(screen: _Screen, rows: tuple[int, int], width: int) -> _Hits:
     some = np.flatnonzero(end > begin)
     owner, row, begin, end = owner[some], row[some], begin[some], end[some]
 
-    # The inverse distance by its step from where the row of a triangle begins.
+    # The inverse distance: its value where the row of a triangle begins, and its step along the row.
     x, y = (np.stack([begin, row], 1) + 0.5 - screen.start[owner]).astype(np.float32).T
     value, step, down = screen.planes[owner, :, 0].T
     value = value + step * x + down * y
     span, column = _ranges(begin, end)
     near = value[span] + step[span] * (column - begin[span]).astype(np.float32)
-    sample = ((row - rows[0]) * width)[span] + column
-    nearest = np.zeros((rows[1] - rows[0]) * width, dtype=np.float32)
+    sample = (row * width)[span] + column
+    nearest = np.zeros(height * width, dtype=np.float32)
     np.maximum.at(nearest, sample, near)
     seen = np.flatnonzero(near == nearest[sample])
 
@@ -152,11 +121,11 @@ def _cast(screen: _Screen, rows: tuple[int, int], width: int) -> _Hits:
     x, y = x[span] + (column[seen] - begin[span]).astype(np.float32), y[span]
     planes = screen.planes[owner[span], :, 1:]
     color = planes[:, 0] + x[:, None] * planes[:, 1] + y[:, None] * planes[:, 2]
-    return _Hits(sample, near, color / near[:, None])
+    return sample, near, color / near[:, None]
 
 
 def _ranges(begin: np.ndarray, end: np.ndarray) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Return the integers of the ranges [begin, end) with their ranges."""
+    """Return for each integer of the ranges [begin, end) the index of its range, and the integer."""
     counts = np.maximum(end - begin, 0)
     owner = np.repeat(np.arange(len(begin)), counts)
     start = np.cumsum(counts) - counts
@@ -164,13 +133,14 @@ def _ranges(begin: np.ndarray, end: np.ndarray) -> tuple[Int[np.ndarray, " k"], 
 
 
 def _shade(triangles: Triangles, camera: Camera) -> Float[np.ndarray, "t 3 3"]:
-    """Light the corners by two lamps fixed to the camera, on the side of each triangle that is seen."""
+    """Light the corners by two lamps fixed to the camera, on the side of each triangle that the camera sees."""
+    ambient, key_strength, fill_strength, shine_strength = 0.52, 0.50, 0.22, 0.08  # chosen by eye, as are the lamps
+    key, fill = (np.array(lamp) / np.linalg.norm(lamp) for lamp in ((-0.45, 0.65, 0.62), (0.70, 0.10, 0.60)))
     normal = triangles.normals @ camera.frame.T
     normal = normal / np.maximum(np.sqrt(np.einsum("tci,tci->tc", normal, normal)), 1e-12)[..., None]
     normal = np.where(normal[..., 2].sum(1)[:, None, None] < 0.0, -normal, normal)
-    key, fill = (np.array(lamp) / np.linalg.norm(lamp) for lamp in LAMPS)
     half = key + np.array([0.0, 0.0, 1.0])
-    light = AMBIENT + KEY * np.maximum(normal @ key, 0.0) + FILL * np.maximum(normal @ fill, 0.0)
-    shine = SHINE * np.maximum(normal @ (half / np.linalg.norm(half)), 0.0) ** 40
+    light = ambient + key_strength * np.maximum(normal @ key, 0.0) + fill_strength * np.maximum(normal @ fill, 0.0)
+    shine = shine_strength * np.maximum(normal @ (half / np.linalg.norm(half)), 0.0) ** 40
     lit = triangles.lit[:, None]
     return triangles.colors * np.where(lit, light, 1.0)[..., None] + np.where(lit, shine, 0.0)[..., None]

@@ -1,9 +1,9 @@
-"""A run from cloud to grasps and closure, and its verdict in words."""
+"""A run from cloud to grasps and closing, and its verdict in words."""
 
 import dataclasses
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -24,33 +24,33 @@ if TYPE_CHECKING:
     import trimesh
 
 
-class Stage(NamedTuple):
-    """A finished stage, its result and wall time [s].
-
-    >>> Stage("fit", "1000 points, scale 0.12 m", seconds=0.3).name
-    'fit'
-    """
-
-    name: str
-    message: str
-    seconds: float
-
-
 @checked
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """Everything that a report shows; `closure` is that on the true `mesh`, or both are None.
+    """Everything that a report shows.
 
-    The cloud is that of the target of `scene`, if there is one. `explanation` tells why no grasp is executable.
+    Args:
+        object_name: name of the object in titles and sentences.
+        source: file of the cloud or the scene.
+        cloud: points of the object.
+        hand: the hand that grasps.
+        spec: what was asked of the contacts.
+        surface: the estimated surface.
+        grasps: the planned grasps, best first.
+        stages: name, result and wall time [s] of each stage.
+        plan: planned contacts.
+        mesh: the true object [m], in the frame of the cloud.
+        closure: the closing on the true object; with a mesh only.
+        scene: the scene that the cloud was cut from.
+        explanation: why no grasp is executable.
 
     >>> from torchgrasp import fit_shape, load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> from torchgrasp.shape import extract_surface
     >>> view, hand, grasp = load_object("jug").view, load_hand("barrett"), load_shipped_grasp("jug", "barrett")
     >>> surface = extract_surface(fit_shape(view), 24)
-    >>> run = Run("jug", Path("jug.ply"), view, hand, ContactSpec(), surface, grasp, ())
-    >>> len(run.executable), len(run.upright().cloud)
-    (1, 1000)
+    >>> verdict(Run("jug", Path("jug.ply"), view, hand, ContactSpec(), surface, grasp).upright())
+    'The barrett hand has 1 executable grasp of the jug.'
     """
 
     object_name: str
@@ -60,7 +60,7 @@ class Run:
     spec: ContactSpec
     surface: Surface
     grasps: Grasps
-    stages: tuple[Stage, ...]
+    stages: tuple[tuple[str, str, float], ...] = ()
     plan: ContactPlan | None = None
     mesh: "trimesh.Trimesh | None" = None
     closure: ClosureResult | None = None
@@ -93,27 +93,18 @@ class Run:
         )
 
 
-@checked
 def verdict(run: Run) -> str:
-    """Say in one sentence what the run ended with.
-
-    >>> from torchgrasp import fit_shape, load_hand, load_object
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> from torchgrasp.shape import extract_surface
-    >>> view, hand, grasp = load_object("jug").view, load_hand("barrett"), load_shipped_grasp("jug", "barrett")
-    >>> surface = extract_surface(fit_shape(view), 24)
-    >>> verdict(Run("jug", Path("jug.ply"), view, hand, ContactSpec(), surface, grasp, ()))
-    'The barrett hand has 1 executable grasp of the jug.'
-    """
+    """Return the result of a run in one sentence."""
+    hand, name = run.hand.name, run.object_name
     if run.closure is not None:
         return closing_sentence(run)
     if count := len(run.executable):
-        return f"The {run.hand.name} hand has {count} executable grasp{'s' * (count > 1)} of the {run.object_name}."
+        return f"The {hand} hand has {count} executable grasp{'s' * (count > 1)} of the {name}."
     return refusal(run) + ("" if run.explanation is None else f" {run.explanation.advice}")
 
 
 def closing_sentence(run: Run) -> str:
-    """Say whether the object was held, the rise of its mass centre, and its motion in the hand."""
+    """Say whether the object was held, the rise of its centre of mass, and its motion in the hand."""
     upright = run.upright()
     closure, mesh = upright.closure, upright.mesh
     assert closure is not None and mesh is not None
@@ -129,7 +120,7 @@ def closing_sentence(run: Run) -> str:
 
 
 def refusal(run: Run) -> str:
-    """Say why no grasp is executable, with the number of postures or starts for each reason."""
+    """Say why no grasp is executable: each reason with its number of postures or initial guesses."""
     head = f"The {run.hand.name} hand has no executable grasp of the {run.object_name}"
     if len(run.grasps):
         failed, total = run.grasps.status, f"{len(run.grasps)} postures"
@@ -138,11 +129,11 @@ def refusal(run: Run) -> str:
     else:
         return f"{head}: {Status.OUT_OF_REACH.sentence}."
     reasons = "; ".join(f"{n} of {total}: {status.sentence}" for status, n in count_status(failed).items())
-    return f"{head} ({reasons}){too_low(run)}."
+    return f"{head} ({reasons}){_too_low(run)}."
 
 
-def too_low(run: Run) -> str:
-    """Say how high an object must be for the hand's fingertips on its table, if it is lower."""
+def _too_low(run: Run) -> str:
+    """Return the height that the hand's fingertips need on the table, if the object is lower."""
     spec = run.spec.for_fingertips(float(run.hand.tips.radius.max()))
     if spec.plane is None or not len(run.surface.vertices):
         return ""

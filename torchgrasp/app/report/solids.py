@@ -1,25 +1,25 @@
-"""A hand as solids to draw: the collision shapes of its URDF with rounded edges, each with its finger."""
+"""A hand as meshes to draw: the collision shapes of its URDF with rounded edges, each in the colour of its finger."""
 
+import functools
+import itertools
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.app.report.palette import FINGERS, HAND
-from torchgrasp.app.report.rounded import round_shape
+from torchgrasp.app.report.canvas import FINGERS, HAND
 from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.urdf import read_urdf
+from torchgrasp.hand.urdf import Shape, read_urdf
 
 PARKED = -1
-"""Finger of a link that no grasping finger owns, such as the palm."""
+"""Finger index of a link that no grasping finger owns, such as the palm."""
+EDGE = 0.004
+"""Largest radius of a rounded edge [m], about that of a robot finger."""
 
 
 class Solid(NamedTuple):
-    """A triangle mesh with normals, of a link and of a grasping finger (from 0) or `PARKED`.
-
-    `link` is its index in the hand's tree.
-    """
+    """A mesh with vertex normals, the index of its link in the hand's tree, and its finger or `PARKED`."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: np.ndarray
@@ -29,7 +29,7 @@ class Solid(NamedTuple):
 
     @property
     def color(self) -> str:
-        """The finger's colour, or that of the palm."""
+        """The colour of the finger or of the palm."""
         return HAND if self.finger == PARKED else FINGERS[self.finger]
 
 
@@ -47,7 +47,7 @@ def solids_of_links(hand: Hand) -> list[Solid]:
 def link_poses(
     hand: Hand, joints: Float[Tensor, "n j"], names: tuple[str, ...], obj_from_hand: Float[Tensor, "n 4 4"]
 ) -> Float[Tensor, "n l 4 4"]:
-    """Return the poses of all links, at all movable joints [rad] of its URDF in the order of `names`."""
+    """Return the poses of all links, at all movable joints [rad] of the URDF in the order of `names`."""
     values = joints[:, [names.index(n) for n in hand.tree.joint_names]].double()
     return obj_from_hand.double()[:, None] @ hand.tree.poses(values)
 
@@ -67,10 +67,55 @@ def solids_from_hand(
 
 
 def finger_of_links(hand: Hand) -> dict[str, int]:
-    """Return each link's finger: all joints that move the link move this fingertip alone."""
+    """Return the finger of each link: the only finger whose tip all joints of the link move, else `PARKED`."""
     moves = hand.tree.moves.bool().cpu()
     finger_of = {}
     for mine, name in zip(moves, hand.tree.link_names, strict=True):
         owners = [f for f in range(len(hand.tips)) if bool(mine.any()) and bool(moves[hand.tips.index[f]][mine].all())]
         finger_of[name] = owners[0] if len(owners) == 1 else PARKED
     return finger_of
+
+
+@functools.lru_cache(maxsize=512)  # a hand is drawn many times
+def round_shape(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return vertices, faces and normals of a box, cylinder or sphere with rounded edges, in the frame of its link.
+
+    The solid is the convex hull of balls, so its normals are the directions from the centres of the balls.
+    """
+    from scipy.spatial import ConvexHull
+    from trimesh import creation
+    from trimesh.transformations import euler_matrix
+
+    if shape.kind == "sphere":
+        ball = creation.icosphere(subdivisions=3, radius=1.0)
+        normals, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
+        points = shape.size[0] * normals
+    else:
+        centres, normals, radius = _box(shape.size) if shape.kind == "box" else _cylinder(*shape.size)
+        points = centres + radius * normals
+        faces = np.asarray(ConvexHull(points).simplices)
+        a, b, c = points[faces].transpose(1, 0, 2)
+        inward = (np.cross(b - a, c - a) * normals[faces].sum(1)).sum(1) < 0.0
+        faces[inward] = faces[inward, ::-1]
+    place = euler_matrix(*shape.rpy, axes="sxyz")
+    return points @ place[:3, :3].T + np.array(shape.xyz), faces, normals @ place[:3, :3].T
+
+
+def _box(size: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the centres, directions and radius of the balls at the corners of a box."""
+    radius = min(EDGE, min(size) / 4)  # thin plates stay plates
+    grid = [ij for ij in itertools.product(range(4), repeat=3) if sum(ij) == 3]  # an octant in steps of 30 degrees
+    octant = np.array(grid) / np.linalg.norm(grid, axis=1, keepdims=True)
+    signs = np.repeat(list(itertools.product((-1.0, 1.0), repeat=3)), len(octant), axis=0)
+    return signs * (np.array(size) / 2 - radius), signs * np.tile(octant, (8, 1)), radius
+
+
+def _cylinder(radius: float, length: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the centres, directions and radius of the balls along the rims of a cylinder."""
+    edge = min(EDGE, min(2.0 * radius, length) / 4)
+    turn, tilt, side = np.meshgrid(
+        np.linspace(0.0, 2 * np.pi, 40, endpoint=False), np.linspace(0.0, np.pi / 2, 4), (-1.0, 1.0)
+    )
+    around = np.stack([np.cos(turn), np.sin(turn), 0.0 * turn], -1).reshape(-1, 3)
+    tilt, up = tilt.reshape(-1, 1), side.reshape(-1, 1) * np.array([0.0, 0.0, 1.0])
+    return (radius - edge) * around + (length / 2 - edge) * up, np.cos(tilt) * around + np.sin(tilt) * up, edge

@@ -1,4 +1,4 @@
-"""The moments of a closing: touches, the end of each phase, and for a lost object when it was lost and why."""
+"""Moments of a closing: first touch, the end of each phase, and when and why an object was lost."""
 
 from typing import NamedTuple
 
@@ -11,23 +11,19 @@ from torchgrasp.errors import Status
 from torchgrasp.evaluation.lift import LIFT_TIME, PUSHED_DISTANCE, SLIP_ANGLE, SLIP_DISTANCE
 from torchgrasp.geometry.frames import apply, inverse, rotation_angle
 
-SLIDING = 0.01
-"""Speed of a fingertip along the surface [m/s] from which on it slides: sticking ones creep by a tenth of that."""
-
-
 LOST = "lost"
 """Name of the moment at which an object was lost."""
 
 
 class Moment(NamedTuple):
-    """A tick, and what happened there."""
+    """A tick and the name of what happened then."""
 
     tick: int
     name: str
 
 
 def touching(closure: ClosureResult) -> Bool[Tensor, "t f"]:
-    """Return which fingertips are on the object."""
+    """Return which fingertips touch the object."""
     return closure.trace.normals.isfinite().all(-1)
 
 
@@ -40,7 +36,7 @@ def first_touches(closure: ClosureResult) -> list[int]:
 def moved_in_hand(
     closure: ClosureResult, centre: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, " t"], Float[Tensor, " t"]]:
-    """Return how far [m] the mass centre is from where it was in the hand when it had pressed, and the turn [rad]."""
+    """Return how far the centre of mass moved [m] and turned [rad] in the hand since all fingers pressed."""
     hand_from_object = inverse(closure.hand_pose.double()) @ closure.object_pose.double()
     start = hand_from_object[tick_of(closure, 2)]
     centres = apply(hand_from_object, centre.double().expand(len(hand_from_object), 1, 3))[:, 0]
@@ -49,7 +45,7 @@ def moved_in_hand(
 
 
 def tick_of(closure: ClosureResult, phase: int) -> int:
-    """Return the tick at which a phase ended, or the last one if it never did."""
+    """Return the tick at which a phase ended, or the last tick if the phase never ended."""
     end = closure.phases[phase]
     return int((closure.time - end).abs().argmin()) if bool(end.isfinite()) else len(closure.time) - 1
 
@@ -57,8 +53,8 @@ def tick_of(closure: ClosureResult, phase: int) -> int:
 def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
     """Return the tick at which the object was lost; None if it was held.
 
-    It is the first of two: fewer than two fingertips touch from then on; the object has moved in the hand by more than
-    a slip. One that was pushed away was lost when it had gone that far, and one that was too heavy at the turn.
+    EJECTED: the first tick at which the object is too far from its place. TOO_HEAVY: the highest tick. Otherwise the
+    earlier of two ticks: from then on fewer than two fingertips touch, or the object has slipped too far in the hand.
     """
     if closure.held:
         return None
@@ -80,7 +76,7 @@ def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
 
 
 def explain_loss(closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tuple[str, ...]) -> str:
-    """Say when the object was lost, in which phase, and what the fingers did before; "" if it was held."""
+    """Say when the object was lost, in which phase, and which finger failed first; "" if it was held."""
     tick = find_loss(closure, centre)
     if tick is None:
         return ""
@@ -100,10 +96,10 @@ def _never_touched(closure: ClosureResult, fingers: tuple[str, ...]) -> str:
 
 
 def _first_to_go(closure: ClosureResult, tick: int, fingers: tuple[str, ...]) -> str:
-    """Name the finger that slid or let go first, and for good, before a tick."""
+    """Name the finger that was the first to slide or let go for good before a tick."""
     touched, sliding = touching(closure)[: tick + 1], closure.trace.sliding[: tick + 1].nan_to_num(0.0)
-    firm = touched & (sliding < SLIDING)
-    # The last tick at which each finger was firm; the finger whose is earliest gave way first.
+    firm = touched & (sliding < 0.01)  # [m/s]: fingertips that stick creep more slowly
+    # The first tick after which each finger was never firm again; the finger with the earliest gave way first.
     since = [int(torch.nonzero(column)[-1]) + 1 if bool(column.any()) else 0 for column in firm.T]
     finger = min(range(len(since)), key=since.__getitem__)
     begin = since[finger]
@@ -119,7 +115,7 @@ def _first_to_go(closure: ClosureResult, tick: int, fingers: tuple[str, ...]) ->
 
 
 def moments_of(closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tuple[str, ...]) -> list[Moment]:
-    """Return the moments that a film of a closing shows, in order: four to six, where all happened."""
+    """Return the moments that a film of a closing shows, in order."""
     found = [Moment(tick_of(closure, 0), "open hand")]
     if closure.contact_order:
         found.append(Moment(first_touches(closure)[0], f"{fingers[closure.contact_order[0]]} touches first"))
@@ -130,6 +126,6 @@ def moments_of(closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tupl
     if lost is not None:
         found.append(Moment(lost, LOST))
     found.append(Moment(len(closure.time) - 1, "the end"))
-    found.sort(key=lambda moment: (moment.tick, moment.name == LOST))  # of two at one tick the later in the list stays
+    found.sort(key=lambda moment: (moment.tick, moment.name == LOST))  # of two at one tick, the later is kept
     later = [*(moment.tick for moment in found[1:]), len(closure.time)]
     return [m for m, tick in zip(found, later, strict=True) if m.tick < tick]

@@ -1,0 +1,193 @@
+"""A film strip of a closing as one PNG: stills of its moments above plots of forces, sliding and motion over time."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from torchgrasp.app.report.canvas import (
+    ALARM,
+    FINGERS,
+    GRID,
+    INK,
+    OBJECT,
+    PAPER,
+    Canvas,
+    Direction,
+    encode_png,
+    frame_camera,
+)
+from torchgrasp.app.report.moments import LOST, Moment, explain_loss, first_touches, moments_of, moved_in_hand, tick_of
+from torchgrasp.app.report.solids import link_poses, solids_of_links
+from torchgrasp.app.report.stills import to_array
+from torchgrasp.closure import ClosureResult
+from torchgrasp.geometry.frames import apply
+from torchgrasp.hand.hand import Hand
+
+if TYPE_CHECKING:
+    import trimesh
+    from PIL.Image import Image
+
+WIDTH, STILL, TITLE = 1680, 340, 44
+"""Width of the strip, height of its stills with titles, and height of a title [pixels]."""
+LETTERS = "abcdef"
+"""Names of the moments in stills and plots."""
+
+
+def draw_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, direction: Direction) -> bytes:
+    """Draw a closing on the true object; all stills are in the frame of the hand.
+
+    Args:
+        mesh: the true object [m], in the frame of the grasp, where z is up.
+        hand: the hand that closed.
+        closure: the result of the closing.
+        direction: from the object to the camera.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    moments = moments_of(closure, _centre(mesh), hand.tips.names)
+    plots = _draw_plots(mesh, hand, closure, moments)
+    sheet = Image.new("RGB", (WIDTH, STILL + plots.height), PAPER)
+    pen, font, width = ImageDraw.Draw(sheet), ImageFont.load_default(20), WIDTH // len(moments)
+    stills = _draw_stills(mesh, hand, closure, [m.tick for m in moments], direction, (width, STILL - TITLE))
+    for k, (still, moment) in enumerate(zip(stills, moments, strict=True)):
+        sheet.paste(Image.fromarray(still), (k * width, TITLE))
+        title = f"{LETTERS[k]}  {float(closure.time[moment.tick]):.2f} s  {moment.name}"
+        pen.text((k * width + 14, 12), title, _color(moment), font)
+    sheet.paste(plots, (0, STILL))
+    return encode_png(sheet)
+
+
+def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -> str:
+    """Return the caption of a film: the order of touch, and when and why the object was lost."""
+
+    def times(count: int) -> str:
+        return "once" if count == 1 else f"{count} times"
+
+    order = ", ".join(hand.tips.names[finger] for finger in closure.contact_order) or "none"
+    lost = explain_loss(closure, _centre(mesh), hand.tips.names)
+    halts, attempts = closure.halts, closure.attempts
+    on_its_way = f" On its way the hand touched something {times(halts)}." if halts else ""
+    again = f" The hand closed {times(attempts)}." if attempts > 1 else ""
+    end = (lost or "The object was held.") + on_its_way + again
+    return f"In the order of touch: {order}. {end} Each picture is taken from the hand."
+
+
+def _color(moment: Moment) -> str:
+    """Return the colour of a moment."""
+    return ALARM if moment.name == LOST else INK
+
+
+def _centre(mesh: "trimesh.Trimesh") -> torch.Tensor:
+    """Return the centre of mass [m]."""
+    return torch.tensor(np.array(mesh.center_mass), dtype=torch.float64)
+
+
+def _draw_stills(
+    mesh: "trimesh.Trimesh",
+    hand: Hand,
+    closure: ClosureResult,
+    ticks: list[int],
+    direction: Direction,
+    size: tuple[int, int],
+) -> list[np.ndarray]:
+    """Return the pictures at some ticks, all at one scale."""
+    finite = torch.nonzero(closure.joints.isfinite().all(-1) & closure.object_pose.isfinite().all(-1).all(-1))[:, 0]
+    at = torch.stack([finite[finite <= tick][-1] for tick in ticks])
+    links = to_array(link_poses(hand, closure.joints[at], closure.joint_names, closure.hand_pose[at]))
+    vertices = torch.tensor(np.array(mesh.vertices), dtype=torch.float64)
+    places = to_array(apply(closure.object_pose[at].double(), vertices))
+    solids, faces = solids_of_links(hand), np.asarray(mesh.faces)
+    base = to_array(closure.hand_pose[at, :3, 3])
+    # The table is fixed, so it sinks in the pictures while the hand rises.
+    table = float(apply(closure.object_pose[0].double(), vertices)[:, 2].min())
+    postures = [[s.vertices @ poses[s.link, :3, :3].T + poses[s.link, :3, 3] for s in solids] for poses in links]
+    inside = [place - b for place, b in zip(places, base, strict=True)]
+    near = [x for x in inside if np.abs(x.mean(0) - inside[0].mean(0)).max() < 0.25]  # a lost object is not framed
+    seen = np.concatenate([*near, *(x - b for parts, b in zip(postures, base, strict=True) for x in parts)])
+    pictures = []
+    for place, parts, poses, b in zip(places, postures, links, base, strict=True):
+        canvas = Canvas()
+        canvas.add_mesh(place, faces, OBJECT)
+        for solid, points in zip(solids, parts, strict=True):
+            canvas.add_mesh(points, solid.faces, solid.color, solid.normals @ poses[solid.link, :3, :3].T)
+        canvas.add_table(seen + b, table)
+        pictures.append(canvas.render(frame_camera(seen + b, direction, size=size), size))
+    return pictures
+
+
+def _draw_plots(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, moments: list[Moment]) -> "Image":
+    """Draw forces, blends and sliding of the fingertips, and motions, over the same time."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from PIL import Image
+
+    plots, time = _list_plots(mesh, hand, closure), to_array(closure.time)
+    heights = [200 if title.endswith(":") else 110 for title, *_ in plots]
+    height = sum(heights) + 50 * len(plots) + 76
+    figure = Figure((WIDTH / 100, height / 100), dpi=100, facecolor=PAPER)
+    figure.subplots_adjust(0.05, 60 / height, 0.985, 1 - 62 / height, hspace=50 / float(np.mean(heights)))
+    axes = figure.subplots(len(plots), sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    for axis, plot in zip(axes, plots, strict=True):
+        _draw_plot(axis, time, *plot)
+    for finger, tick in zip(closure.contact_order, first_touches(closure), strict=True):
+        axes[0].plot(time[tick], 0.0, "^", color=FINGERS[finger], markersize=12, clip_on=False, zorder=3)
+    for letter, moment in zip(LETTERS, moments, strict=False):
+        at, color = float(closure.time[moment.tick]), _color(moment)
+        for axis in axes:
+            axis.axvline(at, color=color, linewidth=2 if color == ALARM else 1, clip_on=False)
+        place = {"xy": (at, 1.0), "xycoords": axes[0].get_xaxis_transform(), "ha": "center"}
+        axes[0].annotate(letter, xytext=(0, 30), textcoords="offset points", color=color, fontsize=14, **place)
+    axes[-1].set_xlabel("time [s]", fontsize=13, color=INK)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+
+
+def _draw_plot(axis: Any, time: np.ndarray, title: str, top: float, lines: list[Any]) -> None:
+    """Draw lines in axes from 0 to `top`; the title of a plot with a legend ends with a colon."""
+    axis.set(xlim=(time[0], max(time[-1], time[0] + 0.1)), ylim=(0.0, top), facecolor=PAPER)
+    axis.set_title(title, loc="left", color=INK, fontsize=13, pad=9)
+    axis.grid(axis="y", color=GRID)
+    axis.locator_params(axis="y", nbins=3)
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.tick_params(labelsize=13, labelcolor=INK, color=INK)
+    for values, color, label in lines:
+        wide = 4.0 if label == "hand above its lowest" else 1.8  # a held object would cover this line
+        axis.plot(time, values, color=color, label=label, linewidth=wide)
+    if title.endswith(":"):
+        style = {"labelcolor": "linecolor", "fontsize": 13, "handlelength": 1.2, "frameon": False}
+        axis.legend(loc="lower right", bbox_to_anchor=(1.0, 0.96), ncols=len(lines), borderaxespad=0.0, **style)
+
+
+def _list_plots(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -> list[tuple[str, float, list[Any]]]:
+    """Return title, upper end of the axis and lines of each plot; a title with a colon has a legend."""
+    trace, names, order = closure.trace, hand.tips.names, closure.contact_order
+    ranks = [f"{order.index(k) + 1}. {name}" if k in order else f"never: {name}" for k, name in enumerate(names)]
+    distance, turn = moved_in_hand(closure, _centre(mesh))
+    before = torch.arange(len(closure.time)) < tick_of(closure, 2)
+    slip, degrees = (to_array(x.masked_fill(before, torch.nan)) for x in (1e3 * distance, torch.rad2deg(turn)))
+    centres = apply(closure.object_pose.double(), _centre(mesh).expand(len(closure.time), 1, 3))[:, 0]
+    moved = 1e3 * to_array(torch.linalg.vector_norm(centres - centres[0], dim=-1))
+    height = 1e3 * to_array(closure.hand_pose[:, 2, 3])
+    height = height - np.nanmin(height)
+    forces, blend, sliding = to_array(closure.forces), to_array(trace.blend), 1e3 * to_array(trace.sliding)
+
+    def of_fingers(values: np.ndarray) -> list[Any]:
+        return list(zip(values.T, FINGERS, ranks, strict=False))
+
+    return [
+        ("normal force [N], in the order of touch:", max(1.0, 1.1 * float(np.nanmax(forces))), of_fingers(forces)),
+        *[("lambda: 0 by position, 1 by force", 1.0, of_fingers(blend))] * bool(np.isfinite(blend).any()),
+        ("sliding of the fingertips [mm/s]", 100.0, of_fingers(sliding)),  # a lost object slides faster
+        (
+            "motion [mm]:",
+            1.1 * max(20.0, *(float(np.nanmax(x, initial=0.0)) for x in (moved, height))),
+            [
+                (height, "#9aa2ac", "hand above its lowest"),
+                (moved, "#b5792a", "object from its place"),
+                (slip, "#8a4f9e", "object in the hand since pressed"),
+                (degrees, "#c77cba", "its turn in the hand [deg]"),
+            ],
+        ),
+    ]

@@ -1,0 +1,232 @@
+"""Stills as PNGs: of a cloud, an estimated surface, contacts, a grasp, a scene and a hand."""
+
+import io
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.app.report.canvas import (
+    AXES,
+    FINGERS,
+    GRID,
+    HAND,
+    INK,
+    OBJECT,
+    PAPER,
+    TABLE,
+    Canvas,
+    Direction,
+    encode_png,
+    map_colors,
+    rgb,
+)
+from torchgrasp.app.report.solids import PARKED, Solid, finger_of_links, solids_from_hand
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.hand.hand import Hand
+from torchgrasp.scene.scene import Scene
+from torchgrasp.shape.surface import Surface
+from torchgrasp.values import Contacts, Grasps, PointCloud
+
+OBJECTS = ("#d98f5c", "#6f9fd8", "#7fb77e", "#c77cba", "#d8c25a", "#6bbdb7", "#e08a8a", "#9a8fd1")
+"""Colours of the objects of a scene in the order of their labels, again from the first."""
+
+
+def draw_cloud(cloud: PointCloud, table: float | None = None) -> bytes:
+    """Draw a cloud from its camera, coloured by height."""
+    points = _thinned(to_array(cloud.points), 3000)
+    height = points[:, 2] - points[:, 2].min()
+    canvas = Canvas()
+    canvas.add_points(points, map_colors(height / max(float(height.max()), 1e-12), "cividis"))
+    canvas.add_table(points, table)
+    return canvas.render_png(points, view_of(cloud))
+
+
+def draw_surface(surface: Surface, direction: Direction, table: float | None = None) -> bytes:
+    """Draw the estimated surface, coloured by its standard deviation [mm]."""
+    vertices, std_mm = to_array(surface.vertices), 1e3 * to_array(surface.std_m)
+    most = max(float(np.quantile(std_mm, 0.99)), 1e-3)
+    canvas = Canvas()
+    faces, colors = surface.faces.cpu().numpy(), map_colors(std_mm / most, "viridis")
+    canvas.add_mesh(vertices, faces, colors, to_array(surface.normals))
+    canvas.add_table(vertices, table)
+    return canvas.render_png(vertices, direction, bar=("standard deviation of the surface [mm]", most, "viridis"))
+
+
+def draw_contacts(surface: Surface, contacts: Contacts, direction: Direction, table: float | None = None) -> bytes:
+    """Draw the first row's contacts with normals on the estimated surface."""
+    vertices = to_array(surface.vertices)
+    canvas = Canvas()
+    canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, to_array(surface.normals), transparent=True)
+    _add_contacts(canvas, contacts)
+    canvas.add_table(vertices, table)
+    return canvas.render_png(vertices, direction)
+
+
+def draw_grasp(surface: Surface, hand: Hand, grasp: Grasps, direction: Direction, table: float | None = None) -> bytes:
+    """Draw the first row's hand on the estimated surface."""
+    canvas, corners = _grasp(surface, hand, grasp)
+    canvas.add_table(corners, table)
+    return canvas.render_png(corners, direction)
+
+
+def draw_among(scene: Scene, surface: Surface, hand: Hand, grasp: Grasps, direction: Direction) -> bytes:
+    """Draw the first row's hand on the target, among the measured points of its neighbours; all in an upright frame."""
+    canvas, corners = _grasp(surface, hand, grasp)
+    others = (scene.labels > 0) & ~scene.rows_of()
+    points, labels = to_array(scene.points[others]), scene.labels[others].cpu().numpy()
+    corners = np.concatenate([corners, points])
+    if len(points):
+        canvas.add_points(_thinned(points, 4000), _label_colors(_thinned(labels, 4000)))
+    canvas.add_table(corners, None if scene.table is None else 0.0)
+    return canvas.render_png(corners, direction)
+
+
+def draw_depth(scene: Scene) -> bytes:
+    """Draw the depth image with a colour for each object; the target is bright, and unmeasured pixels are white."""
+    from PIL import Image
+
+    depth, labels = to_array(scene.image.depth), np.zeros(scene.image.depth.shape, dtype=int)
+    row, column = scene.pixels.cpu().numpy().T
+    labels[row, column] = scene.labels.cpu().numpy()
+    seen = depth > 0
+    near, far = np.quantile(depth[seen], [0.01, 0.99])
+    light = 1.0 - 0.6 * np.clip((depth - near) / max(far - near, 1e-6), 0.0, 1.0)
+    pixels = light[..., None] * _label_colors(labels)
+    if scene.target is not None:
+        pixels = np.where((labels != scene.target)[..., None], 0.4 * pixels + 0.55, pixels)
+    pixels[~seen] = 1.0
+    return encode_png(Image.fromarray(np.uint8(255 * np.clip(pixels, 0.0, 1.0))))
+
+
+def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
+    """Draw a hand at a posture from two sides, at both ends of its joint limits, and the limits themselves.
+
+    An arrow on each fingertip is its normal. The palm's x, y and z are red, green and blue.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    font, eye, width, height, bar = ImageFont.load_default(20), (1.0, -0.9, 0.5), 675, 540, 30
+    views = [
+        ("a posture with the pads face to face", joints, eye),
+        ("the same from another side", joints, rotated(eye, 110.0)),
+        ("every joint at its lower limit", hand.lower.to(joints), eye),
+        ("every joint at its upper limit", hand.upper.to(joints), eye),
+    ]
+    sheet = Image.new("RGB", (2 * width, 2 * height + bar * (hand.dof + 2)), PAPER)
+    pen = ImageDraw.Draw(sheet)
+    for k, (title, posture, direction) in enumerate(views):
+        picture = Image.open(io.BytesIO(draw_posture(hand, posture, direction)))
+        x, y = k % 2 * width, k // 2 * height
+        sheet.paste(picture.resize((width, height), Image.Resampling.LANCZOS), (x, y))
+        pen.text((x + 16, y + 12), title, INK, font)
+
+    low, high = float(hand.lower.min()), float(hand.upper.max())
+    left, right, y = 380, 2 * width - 260, 2 * height + bar // 2
+    pen.text((16, y), "joint [degrees], the posture as a mark", INK, font)
+    for name, color, *angles in zip(
+        hand.joint_names, _joint_colors(hand), hand.lower.tolist(), hand.upper.tolist(), joints.tolist(), strict=True
+    ):
+        y += bar
+        first, last, at = (left + (right - left) * (q - low) / (high - low) for q in angles)
+        pen.text((16, y), name[:34], INK, font)
+        pen.line([(left, y + 12), (right, y + 12)], GRID, 1)
+        pen.rounded_rectangle([first, y + 6, last, y + 18], 5, color)
+        pen.line([(at, y), (at, y + 24)], INK, 3)
+        pen.text((right + 20, y), " to ".join(f"{np.rad2deg(q):.0f}" for q in angles[:2]), INK, font)
+    return encode_png(sheet)
+
+
+def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> bytes:
+    """Draw a hand with its fingertip normals and its palm frame, in the palm frame."""
+    solids = solids_from_hand(hand, hand.expand_joints(joints), hand.tree.joint_names, torch.eye(4).to(joints))
+    points, normals = (x.cpu().numpy() for x in hand.fingertips(joints[None].double()))
+    arrow, axis = 0.03, 0.6 * float(np.linalg.norm(np.ptp(solids[0].vertices, axis=0)))
+    canvas = Canvas()
+    _add_solids(canvas, solids)
+    canvas.add_arrows(points[0], normals[0], arrow, FINGERS[: len(hand.tips)])
+    canvas.add_arrows(np.zeros((3, 3)), np.eye(3), axis, AXES)
+    corners = [points[0], points[0] + arrow * normals[0], axis * np.eye(3), *(s.vertices for s in solids)]
+    return canvas.render_png(np.concatenate(corners), eye)
+
+
+def opposed_posture(hand: Hand, joints: Float[Tensor, "n h"]) -> Float[Tensor, "h"]:
+    """Return the posture whose pads best face their middle, without self-collision where possible."""
+    points, normals = hand.fingertips(joints)
+    inward = points.mean(1, keepdim=True) - points
+    facing = (normals * unit(inward)).sum(-1).amin(1) - 10.0 * torch.linalg.vector_norm(inward, dim=-1).amax(1)
+    return joints[(facing + (hand.self_clearance(joints) > 0).to(facing) * 10.0).argmax()]
+
+
+def view_of(cloud: PointCloud) -> Direction:
+    """Return the direction from a cloud to its camera, or a fixed one where the camera is not known."""
+    first = cloud.split_views()[0].viewpoint
+    if first is None:
+        return (1.0, -0.8, 0.6)
+    x, y, z = (first - cloud.points.mean(0)).tolist()
+    return (x, y, z)
+
+
+def facing(grasp: Grasps) -> Direction:
+    """Return a direction from which all fingers of the first row are visible: across the horizontal normals."""
+    normals = grasp.contacts.normals[0, :, :2].detach().cpu().double()
+    press = torch.linalg.eigh(normals.T @ normals).eigenvectors[:, 1]
+    across = torch.stack([-press[1], press[0]])
+    from_palm = grasp.contacts.points[0].mean(0).cpu().double() - grasp.obj_from_hand[0, :3, 3].cpu().double()
+    x, y = (across if float(across @ from_palm[:2]) >= 0.0 else -across).tolist()
+    return (x, y, 0.4)
+
+
+def rotated(direction: Direction, degrees: float) -> Direction:
+    """Return a direction rotated about z."""
+    x, y, z = direction
+    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    return (float(c * x - s * y), float(s * x + c * y), z)
+
+
+def to_array(value: Float[Tensor, "*b"]) -> np.ndarray:
+    """Return a tensor as an array of doubles."""
+    return value.detach().cpu().double().numpy()
+
+
+def _grasp(surface: Surface, hand: Hand, grasp: Grasps) -> tuple[Canvas, Float[np.ndarray, "n 3"]]:
+    """Return a canvas with the surface, the first row's hand and its contacts, and the corners to frame."""
+    joints, vertices = hand.expand_joints(grasp.joints[0].double()), to_array(surface.vertices)
+    solids = solids_from_hand(hand, joints, hand.tree.joint_names, grasp.obj_from_hand[0])
+    canvas = Canvas()
+    canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, to_array(surface.normals))
+    _add_contacts(canvas, grasp.contacts)
+    _add_solids(canvas, solids)
+    return canvas, np.concatenate([vertices, *(s.vertices for s in solids)])
+
+
+def _add_contacts(canvas: Canvas, contacts: Contacts) -> None:
+    """Add an arrow of 45 mm along the normal of each contact of the first row, in the colour of its finger."""
+    points, normals = to_array(contacts.points[0]), to_array(contacts.normals[0])
+    canvas.add_arrows(points, normals, 0.045, FINGERS[: len(points)])
+
+
+def _add_solids(canvas: Canvas, solids: list[Solid]) -> None:
+    """Add the links of a hand."""
+    for solid in solids:
+        canvas.add_mesh(solid.vertices, solid.faces, solid.color, solid.normals)
+
+
+def _joint_colors(hand: Hand) -> list[str]:
+    """Return for each actuated joint the colour of its finger, or that of the palm where it moves several fingers."""
+    finger_of_link = finger_of_links(hand)
+    finger_of_joint = [finger_of_link[hand.tree.link_names[k]] for k in hand.tree.child.tolist()]
+    moved = [{finger_of_joint[j] for j in torch.nonzero(row)[:, 0].tolist()} for row in hand.actuated.coupling.T]
+    return [HAND if len(fingers) != 1 or fingers == {PARKED} else FINGERS[fingers.pop()] for fingers in moved]
+
+
+def _label_colors(labels: np.ndarray) -> Float[np.ndarray, "*b 3"]:
+    """Return the colour of each label; 0 is the table."""
+    palette = np.stack([rgb(name) for name in (TABLE, *OBJECTS)])
+    return palette[np.where(labels > 0, 1 + (labels - 1) % len(OBJECTS), 0)]
+
+
+def _thinned(rows: np.ndarray, most: int) -> np.ndarray:
+    """Return every k-th row, at most so many: more points would hide each other."""
+    return rows[:: -(-len(rows) // most)]

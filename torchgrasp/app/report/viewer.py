@@ -1,0 +1,213 @@
+"""A 3D page of one run as one HTML file that loads nothing: shape, contacts, postures, and the closing replayed."""
+
+import base64
+import functools
+import hashlib
+import json
+import re
+import zipfile
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchgrasp.app.report.canvas import FINGERS, OBJECT, TABLE, Direction, map_colors
+from torchgrasp.app.report.page import GRASP_COLUMNS, grasp_rows, render
+from torchgrasp.app.report.run import Run, verdict
+from torchgrasp.app.report.solids import link_poses, solids_of_links
+from torchgrasp.app.report.stills import facing, to_array, view_of
+from torchgrasp.checks import checked
+from torchgrasp.closure import ClosureResult
+from torchgrasp.control.forces import squeeze
+from torchgrasp.files import write_file
+from torchgrasp.hand.hand import Hand
+from torchgrasp.ik.motion import APPROACH_DISTANCE
+from torchgrasp.values import Grasps
+
+VIEW = "view.html"
+"""Name of the page beside the report."""
+MOST_GRASPS, MOST_FACES, MOST_TICKS = 20, 40_000, 120
+"""Most grasps, faces of a mesh and ticks of a replay, so that a page has a few megabytes."""
+POSTURES = ("approach", "pre-grasp", "grasp", "squeeze")
+"""Postures of the hand in the order of its motion; the last is the target of its drives."""
+
+
+@checked
+def write_viewer(path: Path | str, run: Run) -> Path:
+    """Write a run as a 3D page in one HTML file, atomically. The page needs WebGL, but no network.
+
+    The page shows the cloud, the surface by its standard deviation with a shell at k deviations, contacts, four
+    postures of the hand for each of the best 20 grasps, and the closing with its forces. The address may name a
+    state, as in `view.html#grasp=3&posture=squeeze&sigma=2` or `view.html#tick=50`.
+
+    Returns:
+        The path of the file.
+
+    Raises:
+        OutputError: the file cannot be written.
+
+    >>> import tempfile
+    >>> from torchgrasp import ContactSpec, fit_shape, load_hand, load_object
+    >>> from torchgrasp.shape import extract_surface
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
+    >>> jug, hand = load_object("jug"), load_hand("barrett")
+    >>> surface, grasps = extract_surface(fit_shape(jug.view), 24), load_shipped_grasp("jug", "barrett")
+    >>> run = Run("jug", Path("jug.ply"), jug.view, hand, ContactSpec(), surface, grasps)
+    >>> write_viewer(Path(tempfile.mkdtemp(), "view.html"), run).stat().st_size < 8 * 2**20
+    True
+    """
+    return write_file(path, format_viewer(run))
+
+
+def format_viewer(run: Run) -> str:
+    """Return the 3D page of a run as text."""
+    contents, folder = describe(run), Path(__file__).with_name("templates")
+    # The two files are one function, so that no name of theirs meets a name of the library.
+    parts = "".join((folder / name).read_text(encoding="utf-8") for name in ("scene.js", "panel.js"))
+    # "<" would end the block of data early; within JSON it is only in texts.
+    data = json.dumps(contents, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    scripts = (three(), f'(() => {{\n"use strict";\n{parts}}})();\n')
+    digests = [base64.b64encode(hashlib.sha256(x.encode("utf-8")).digest()).decode("ascii") for x in scripts]
+    return render("view.html", title=contents["title"], data=data, scripts=scripts, digests=digests)
+
+
+@functools.cache
+def three() -> str:
+    """Return three.js with its trackball from the viewer in trimesh, without the call that starts trimesh's viewer."""
+    archive = resources.files("trimesh") / "resources" / "templates" / "viewer.zip"
+    with archive.open("rb") as file, zipfile.ZipFile(file) as opened:
+        template = opened.read("viewer.html.template").decode("utf-8")
+    scripts = "\n".join(re.findall(r"<script[^>]*>(.*?)</script>", template, re.DOTALL))
+    # Browsers read line ends as \n before they compare a script with its digest.
+    library = re.sub(r"init\(\);\s*$", "", re.sub(r"\r\n?", "\n", scripts))
+    if "TrackballControls" not in library or "init();" in library[-100:]:
+        raise RuntimeError("the installed trimesh has another viewer than trimesh 4.5 to 5.2")
+    return library
+
+
+def describe(run: Run) -> dict[str, Any]:
+    """Return the contents of the page in an upright frame, as JSON with buffers."""
+    sentence, run = verdict(run), run.upright()
+    best, scene = run.executable[:MOST_GRASPS], run.scene
+    return {
+        "title": f"Grasps of the {run.object_name} with the {run.hand.name} hand",
+        "source": str(run.source),
+        "verdict": sentence,
+        "good": bool(run.closure.held if run.closure is not None else len(best) > 0),
+        "eye": _eye(facing(best[0]) if len(best) else view_of(run.cloud)),
+        "table": None if run.spec.table is None else TABLE,
+        "object": OBJECT,
+        "fingers": [list(pair) for pair in zip(run.hand.tips.names, FINGERS, strict=False)],
+        "cloud": _points(run.cloud.points),
+        "others": None if scene is None else _points(scene.points[(scene.labels > 0) & ~scene.rows_of()]),
+        "surface": _surface(run),
+        "hand": [
+            {
+                "link": solid.link,
+                "color": solid.color,
+                "points": pack(solid.vertices),
+                "normals": pack(solid.normals),
+                "faces": pack(solid.faces, "u4"),
+            }
+            for solid in solids_of_links(run.hand)
+        ],
+        "postures": POSTURES,
+        "grasps": _grasps(run.hand, best),
+        "replay": None if run.closure is None or run.mesh is None else _replay(run, run.closure),
+    }
+
+
+def _eye(direction: Direction) -> list[float]:
+    """Return the unit direction to the first camera, which looks from above."""
+    x, y, z = direction
+    eye = np.array([x, y, max(z, 0.35 * float(np.hypot(x, y)))])
+    return (eye / np.linalg.norm(eye)).tolist()
+
+
+def _points(points: Float[Tensor, "n 3"]) -> dict[str, object]:
+    """Return at most 10,000 points of a cloud."""
+    return pack(to_array(points)[thin_rows(len(points), 10_000)])
+
+
+def _surface(run: Run) -> dict[str, object]:
+    """Return the estimated surface, its standard deviation and its colours."""
+    surface, std_m = run.surface, to_array(run.surface.std_m)
+    kept, faces = thin_mesh(to_array(surface.vertices), surface.faces.cpu().numpy(), MOST_FACES)
+    most = max(float(np.quantile(std_m, 0.99)), 1e-6) if len(std_m) else 1e-6
+    return {
+        "points": pack(to_array(surface.vertices)[kept]),
+        "normals": pack(to_array(surface.normals)[kept]),
+        "faces": pack(faces, "u4"),
+        "std": pack(std_m[kept]),
+        "colors": pack(np.round(255 * map_colors(std_m[kept] / most, "viridis")), "u1"),
+        "most_mm": 1e3 * most,
+        "ramp": np.round(255 * map_colors(np.linspace(0.0, 1.0, 17), "viridis")).astype(int).tolist(),
+    }
+
+
+def _grasps(hand: Hand, grasps: Grasps) -> dict[str, object]:
+    """Return the rows of the list, contacts, and the poses of all links in each of the `POSTURES`."""
+    columns = (0, 1, 5, 3, 6)  # rank, success, margin, clearance and standard deviation
+    pose, opened = grasps.obj_from_hand.double(), grasps.pregrasp.double()
+    away = pose.clone()
+    away[:, :3, 3] -= APPROACH_DISTANCE * grasps.approach.double()
+    squeezed = squeeze(hand, grasps).joints if len(grasps) else opened
+    motion = [(opened, away), (opened, pose), (grasps.joints.double(), pose), (squeezed, pose)]
+    poses = [link_poses(hand, hand.expand_joints(q), hand.tree.joint_names, p) for q, p in motion]
+    return {
+        "heads": [GRASP_COLUMNS[k] for k in columns],
+        "rows": [[row[k] for k in columns] for row in grasp_rows(grasps, MOST_GRASPS)],
+        "points": pack(to_array(grasps.contacts.points)),
+        "normals": pack(to_array(grasps.contacts.normals)),
+        "links": pack(to_array(torch.stack(poses, 1))),
+    }
+
+
+def _replay(run: Run, closure: ClosureResult) -> dict[str, object]:
+    """Return the true object, its poses and those of all links at some ticks, and the forces at all ticks."""
+    assert run.mesh is not None
+    ticks = thin_rows(len(closure.time), MOST_TICKS)
+    kept, faces = thin_mesh(np.asarray(run.mesh.vertices), np.asarray(run.mesh.faces), MOST_FACES)
+    links = link_poses(run.hand, closure.joints[ticks], closure.joint_names, closure.hand_pose[ticks])
+    return {
+        "points": pack(np.asarray(run.mesh.vertices)[kept]),
+        "faces": pack(faces, "u4"),
+        "ticks": pack(ticks, "u4"),
+        "object": pack(to_array(closure.object_pose[ticks])),
+        "links": pack(to_array(links)),
+        "time": pack(to_array(closure.time)),
+        "forces": pack(to_array(closure.forces)),
+    }
+
+
+def pack(values: np.ndarray, kind: str = "f4") -> dict[str, object]:
+    """Return an array as a buffer: its kind (f4, u4 or u1, little-endian), its shape, and its bytes in base64."""
+    data = np.ascontiguousarray(values).astype(f"<{kind}").tobytes()
+    return {"kind": kind, "shape": list(values.shape), "data": base64.b64encode(data).decode("ascii")}
+
+
+def thin_mesh(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], most: int
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, "g 3"]]:
+    """Return which vertices to keep, and at most so many faces between them.
+
+    The vertices in a cell of a grid become its first vertex; the cells grow until the faces are few enough.
+    """
+    kept, thinned = np.arange(len(vertices)), faces
+    cell = float(np.linalg.norm(np.ptp(vertices, axis=0))) / 256 if len(vertices) else 0.0
+    while len(thinned) > most:
+        _, kept, group = np.unique(np.round(vertices / cell), axis=0, return_index=True, return_inverse=True)
+        thinned = group.reshape(-1)[faces]
+        a, b, c = thinned.T
+        thinned = thinned[(a != b) & (b != c) & (c != a)]
+        cell *= 1.2
+    return kept, thinned
+
+
+def thin_rows(count: int, most: int) -> Int[np.ndarray, " k"]:
+    """Return at most so many rows, evenly from the first to the last."""
+    return np.arange(count) if count <= most else np.round(np.linspace(0, count - 1, most)).astype(np.int64)
