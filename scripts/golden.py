@@ -93,8 +93,7 @@ def see(name: str, k: int) -> Any:
     import trimesh
 
     from torchgrasp import cloud_from_depth, load_object
-    from torchgrasp.cloud.camera import INTRINSICS, look_at
-    from torchgrasp.cloud.render import render_depth
+    from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 
     shipped = load_object(name)
     if k == 0:

@@ -18,3 +18,17 @@ MESH_BYTES, MESH_FACES = 50 * 1024**2, 500_000
 """Largest mesh file, and its most faces."""
 PLY_HEADER_BYTES, PLY_PROPERTIES = 65_536, 256
 """Longest header of a .ply file, and its most properties: reading time grows with the square of their number."""
+CLOUD_BYTES, CLOUD_POINTS = 512 * 1024**2, 5_000_000
+"""Largest file of a cloud, a scene or an image, packed and unpacked, and its most points."""
+TEXT_COLUMNS, LINE_LETTERS = 16, 4096
+"""Most numbers of a point in a text file, and the longest line."""
+TEXT_MESH_BYTES = 64 * 1024**2
+"""Largest mesh in text from which a cloud is drawn: it needs many times its size of memory."""
+URDF_BYTES, TOML_BYTES = 4 * 1024**2, 1024**2
+"""Largest URDF and largest hand.toml."""
+XML_DEPTH, XML_ELEMENTS, XML_LETTERS = 64, 50_000, 200
+"""Deepest nesting of a URDF's elements, their most, and the longest name."""
+HAND_LINKS, HAND_SHAPES, HAND_SHAPE_PAIRS = 512, 1000, 20_000
+"""Most links of a hand, most collision shapes, and most pairs of shapes that are tested for self-collision."""
+HAND_SEPARATIONS = 20_000_000
+"""Most separations of near shapes that are measured to find the pairs of links that can meet."""

@@ -6,9 +6,8 @@ Run it after a change of `train/object_shapes.py` or of the virtual camera; it n
 import numpy as np
 import trimesh
 
-from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view
-from torchgrasp.cloud.io.read import save_cloud
-from torchgrasp.cloud.render import render_depth
+from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view, render_depth
+from torchgrasp.cloud.read import save_cloud
 from torchgrasp.data.shipped import DATA, SCENE, list_objects
 from torchgrasp.files import write_file
 

@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 
 from torchgrasp.cloud.camera import look_at, partial_view
-from torchgrasp.cloud.io.read import save_cloud
+from torchgrasp.cloud.read import save_cloud
 from torchgrasp.data.shipped import list_objects, load_object
 from torchgrasp.files import write_file
 

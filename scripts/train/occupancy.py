@@ -13,9 +13,8 @@ import trimesh
 import tyro
 from benchmarks.scene.scenes import scatter
 
-from torchgrasp.cloud.camera import INTRINSICS, look_at
+from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.cloud.depth import cloud_from_depth
-from torchgrasp.cloud.render import render_depth
 from torchgrasp.errors import BadArgument
 from torchgrasp.files import format_json, write_file
 from torchgrasp.geometry.frames import inverse

@@ -13,7 +13,7 @@ from torchgrasp.app.cli import grasps
 from torchgrasp.app.cli.common import ViewOptions, table_plane
 from torchgrasp.cloud import look_at, partial_view, read_cloud, save_cloud
 from torchgrasp.cloud.camera import INTRINSICS
-from torchgrasp.cloud.filter import remove_outliers
+from torchgrasp.cloud.check import remove_outliers
 from torchgrasp.data.shipped import DATA, load_object, load_scene
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.plane import Plane, as_plane

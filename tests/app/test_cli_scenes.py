@@ -6,8 +6,7 @@ import trimesh
 
 from torchgrasp import ScenePlan, Status, ThingPlan, load_grasps
 from torchgrasp.app.cli import main
-from torchgrasp.cloud.camera import INTRINSICS, look_at
-from torchgrasp.cloud.render import render_depth
+from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 
 CAMERA = look_at(20.0, 45.0, 0.7)
 

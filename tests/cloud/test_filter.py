@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from torchgrasp.cloud.filter import remove_outliers, voxel_downsample
+from torchgrasp.cloud.check import remove_outliers, voxel_downsample
 from torchgrasp.data.shipped import list_objects, load_object
 from torchgrasp.errors import BadArgument, TooFewPoints
 from torchgrasp.values import PointCloud

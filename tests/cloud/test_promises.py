@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from torchgrasp.cloud import check, diagnose, filter, merge, orientation, prepare
+from torchgrasp.cloud import check, diagnose, merge, prepare
 from torchgrasp.errors import BadArgument, GraspError, SuspiciousScale, TooFewPoints
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.fit import fit_shape
@@ -15,13 +15,11 @@ from torchgrasp.values import PointCloud
 FUNCTIONS = {
     "check_cloud": check.check_cloud,
     "remove_duplicates": check.remove_duplicates,
-    "voxel_downsample": lambda cloud: filter.voxel_downsample(cloud, 0.004),
-    "remove_outliers": filter.remove_outliers,
+    "voxel_downsample": lambda cloud: check.voxel_downsample(cloud, 0.004),
+    "remove_outliers": check.remove_outliers,
     "estimate_normals": prepare.estimate_normals,
     "clean_cloud": prepare.clean_cloud,
     "prepare_cloud": lambda cloud: prepare.prepare_cloud(cloud, torch.Generator()),
-    "estimate_viewpoint": orientation.estimate_viewpoint,
-    "check_normals": lambda cloud: orientation.check_normals(cloud),
     "merge_clouds": lambda cloud: merge.merge_clouds([cloud, cloud], [torch.eye(4).double()] * 2),
     "diagnose_cloud": diagnose.diagnose_cloud,
     "fit_shape": fit_shape,
@@ -136,7 +134,7 @@ def test_results_scale_with_the_cloud(factor):
     assert other.density == pytest.approx(one.density / factor**2, rel=1e-9) and other.outliers == one.outliers
     a, b = prepare.clean_cloud(cloud), prepare.clean_cloud(large)
     torch.testing.assert_close(b.points, factor * a.points, rtol=1e-9, atol=1e-12)
-    small, big = filter.voxel_downsample(cloud, 0.01), filter.voxel_downsample(large, 0.01 * factor)
+    small, big = check.voxel_downsample(cloud, 0.01), check.voxel_downsample(large, 0.01 * factor)
     torch.testing.assert_close(big.points, factor * small.points, rtol=1e-9, atol=1e-12)
 
 
@@ -187,7 +185,7 @@ def test_outliers_go_lengths_do_not_matter_and_zero_is_refused():
     clean = prepare.clean_cloud(dirty)
     assert float(torch.linalg.vector_norm(clean.points, dim=-1).max()) < 0.06
     long = PointCloud(cloud.points, 7 * cloud.normals)
-    assert orientation.check_normals(long).scaled == 400
+    assert diagnose.diagnose_cloud(long).normals.scaled == 400
     one, other = (fit_shape(PointCloud(c.points, c.normals), support="paper") for c in (cloud, long))
     torch.testing.assert_close(one.predict(cloud.points).distance, other.predict(cloud.points).distance)
     zero = cloud.normals.clone()
@@ -198,10 +196,10 @@ def test_outliers_go_lengths_do_not_matter_and_zero_is_refused():
 def test_every_function_on_clouds_is_in_the_table():
     public = {
         name
-        for module in (check, filter, merge, prepare, orientation, diagnose)
+        for module in (check, merge, prepare, diagnose)
         for name, function in inspect.getmembers(module, inspect.isfunction)
         if function.__module__ == module.__name__ and not name.startswith("_")
         if "cloud" in str(inspect.signature(function))
     }
-    assert public - {"format_report", "compare_normals"} <= set(FUNCTIONS)
+    assert public - {"format_report"} <= set(FUNCTIONS)
     assert issubclass(BadArgument, GraspError)

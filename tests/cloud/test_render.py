@@ -3,9 +3,8 @@ import pytest
 import torch
 import trimesh
 
-from torchgrasp.cloud.camera import INTRINSICS, add_noise, cast_mesh, look_at, partial_view
+from torchgrasp.cloud.camera import INTRINSICS, add_noise, cast_mesh, look_at, partial_view, render_depth
 from torchgrasp.cloud.depth import cloud_from_depth
-from torchgrasp.cloud.render import render_depth
 from torchgrasp.errors import BadArgument
 
 

@@ -9,7 +9,7 @@ import torch
 import trimesh
 
 from torchgrasp import PointCloud
-from torchgrasp.cloud.io.read import save_cloud
+from torchgrasp.cloud.read import save_cloud
 from torchgrasp.data import list_views, read_family, read_group, read_object_mesh, read_view, write_objects
 from torchgrasp.errors import BadArgument, MeshError
 

@@ -24,13 +24,8 @@ from torchgrasp import (
     sample_configurations,
     solve_ik,
 )  # fmt: skip
-from torchgrasp.cloud import (
-    clean_cloud,
-    estimate_normals,
-    estimate_viewpoint,
-    remove_outliers,
-    voxel_downsample,
-)
+from torchgrasp.cloud import estimate_normals, remove_outliers, voxel_downsample
+from torchgrasp.cloud.prepare import clean_cloud
 from torchgrasp.control import ClosingReference, GraspController, measure, no_contact, observe, squeeze
 from torchgrasp.control.tactile import TipContact
 from torchgrasp.errors import BadArgument
@@ -53,7 +48,6 @@ CLOUDS = {
     "remove_outliers": remove_outliers,
     "voxel_downsample": lambda cloud: voxel_downsample(cloud, 0.005),
     "estimate_normals": estimate_normals,
-    "estimate_viewpoint": estimate_viewpoint,
     "PointCloud.select": lambda cloud: cloud.select(torch.arange(5)),
 }
 SHAPES = {

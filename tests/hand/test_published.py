@@ -274,7 +274,7 @@ def test_a_broken_mesh_is_refused_by_name(claw, name):
 
 
 def test_too_many_bytes_of_meshes_are_refused(claw, monkeypatch):
-    monkeypatch.setattr(sys.modules["torchgrasp.app.author.fit_shapes"], "MAX_MESHES", 1000)
+    monkeypatch.setattr(sys.modules["torchgrasp.app.author.fit_shapes"], "MESH_BYTES", 500)
     with pytest.raises(HandFileError, match="in all"):
         new_hand(mesh_claw(claw))
 

@@ -6,7 +6,7 @@ import torch
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import rotation_from_vector
-from torchgrasp.hand.collision_pairs import MEETING_DISTANCE, collision_pairs, self_collision_from_urdf
+from torchgrasp.hand.collision_shapes import MEETING_DISTANCE, collision_pairs, self_collision_from_urdf
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.kinematics import tree_from_urdf

@@ -9,7 +9,7 @@ from train.hands.files import format_toml, format_urdf
 
 from torchgrasp.data.shipped import load_object
 from torchgrasp.evaluation import close_hand
-from torchgrasp.hand.collision_pairs import collision_pairs
+from torchgrasp.hand.collision_shapes import collision_pairs
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.load import hands_folder, load_hand
 from torchgrasp.hand.urdf import read_urdf

@@ -8,7 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from torchgrasp.errors import HandFileError
-from torchgrasp.hand.urdf import MAX_BYTES, read_urdf
+from torchgrasp.hand.urdf import read_urdf
+from torchgrasp.limits import URDF_BYTES
 
 LINKS = '<link name="a"/><link name="b"/>'
 JOINT = (
@@ -141,7 +142,7 @@ def test_joints_above_a_link_lead_to_the_root(tmp_path):
 
 def test_too_large_and_missing_files_are_refused(tmp_path):
     with pytest.raises(HandFileError, match="bytes"):
-        read_urdf(write(tmp_path, GOOD + " " * MAX_BYTES))
+        read_urdf(write(tmp_path, GOOD + " " * URDF_BYTES))
     with pytest.raises(HandFileError, match="no file"):
         read_urdf(tmp_path / "none.urdf")
     with pytest.raises(HandFileError, match="no file"):

@@ -12,7 +12,7 @@ import torch
 import trimesh
 
 from torchgrasp import PointCloud
-from torchgrasp.cloud.io.read import save_cloud
+from torchgrasp.cloud.read import save_cloud
 from torchgrasp.data import list_entries, list_views, read_entry, read_object_mesh, read_view
 from torchgrasp.errors import BadArgument, CloudFileError, DatasetError, MeshError, Status
 from torchgrasp.evaluation import EvaluationSpec, evaluate

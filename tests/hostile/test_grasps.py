@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 from torchgrasp import load_grasps, load_object, plan_grasps
 from torchgrasp.app import cli
 from torchgrasp.base import named_tensors
-from torchgrasp.cloud.io.read import read_cloud
+from torchgrasp.cloud.read import read_cloud
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.hand.load import load_hand

@@ -9,8 +9,7 @@ import trimesh
 
 import torchgrasp
 from torchgrasp import ContactSpec, PointCloud, Status, explain_empty, load_object, plan_grasps
-from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view
-from torchgrasp.cloud.render import render_depth
+from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view, render_depth
 from torchgrasp.errors import BadArgument
 from torchgrasp.planner.changes import list_changes
 from torchgrasp.planner.explain import Explanation, Funnel, Losses, Trial, order_changes

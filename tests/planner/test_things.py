@@ -7,8 +7,7 @@ import torch
 import trimesh
 
 from torchgrasp import ContactSpec, Status, load_hand, load_scene, plan_grasps, plan_scene
-from torchgrasp.cloud.camera import INTRINSICS, look_at
-from torchgrasp.cloud.render import render_depth
+from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian

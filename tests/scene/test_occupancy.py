@@ -7,9 +7,8 @@ import pytest
 import torch
 import trimesh
 
-from torchgrasp.cloud.camera import INTRINSICS, look_at
+from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.cloud.depth import cloud_from_depth
-from torchgrasp.cloud.render import render_depth
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene import DepthImage, Scene, estimate_occupancy

@@ -3,8 +3,7 @@ import pytest
 import torch
 import trimesh
 
-from torchgrasp.cloud.camera import INTRINSICS, look_at
-from torchgrasp.cloud.render import render_depth
+from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.errors import BadArgument, NoSupport
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
 from torchgrasp.geometry.plane import Plane

@@ -2,8 +2,7 @@ import pytest
 import torch
 import trimesh
 
-from torchgrasp.cloud.camera import INTRINSICS, look_at
-from torchgrasp.cloud.render import render_depth
+from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.segment import on_surface, segment

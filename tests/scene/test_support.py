@@ -4,9 +4,8 @@ import pytest
 import torch
 import trimesh
 
-from torchgrasp.cloud.camera import INTRINSICS, look_at
+from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.cloud.depth import cloud_from_depth
-from torchgrasp.cloud.render import render_depth
 from torchgrasp.errors import BadArgument, NoSupport
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
 from torchgrasp.scene.support import fit_support

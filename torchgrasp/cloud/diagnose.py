@@ -12,8 +12,7 @@ from torchgrasp.checks import check_tensor, checked
 from torchgrasp.cloud.advice import Advice, judge_pixels, judge_view
 from torchgrasp.cloud.check import check_cloud, distinct_exactly, remove_duplicates
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_planes, nearest
-from torchgrasp.cloud.orientation import NormalCheck, compare_normals, share_facing
-from torchgrasp.cloud.prepare import MAX_POINTS, clean_cloud
+from torchgrasp.cloud.prepare import MAX_POINTS, NormalCheck, clean_cloud, compare_normals, share_facing
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane

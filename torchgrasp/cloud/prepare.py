@@ -1,18 +1,18 @@
 """From what the camera saw to what a shape is fitted to."""
 
 import dataclasses
+import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.checks import checked
 from torchgrasp.cloud.check import remove_duplicates
-from torchgrasp.cloud.neighbours import find_inliers, fit_planes, fit_quadrics
-from torchgrasp.cloud.orientation import compare_normals, guess_viewpoint, orient_normals, share_facing
+from torchgrasp.cloud.neighbours import find_inliers, fit_planes, fit_quadrics, nearest
 from torchgrasp.errors import BadArgument, TooFewPoints
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import fibonacci_sphere, unit
 from torchgrasp.values import PointCloud
 
 FACING = 0.9
@@ -21,6 +21,23 @@ MAX_POINTS = 2000
 """Most points that a shape is fitted to: they bound the time of its selection."""
 MAX_VIEWS, MIN_VIEW_POINTS = 16, 10
 """Most cameras of a merged cloud, each of which costs an outline, and fewest points that give one."""
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class NormalCheck(Value):
+    """What given normals are worth.
+
+    >>> ball = unit(torch.randn(500, 3)).double()
+    >>> found = compare_normals(0.05 * ball, 2 * ball)
+    >>> found.oriented, found.scaled, int(found.flipped.sum())
+    (True, 500, 0)
+    """
+
+    flipped: Bool[Tensor, "n"]  # which normals oppose most of their neighbours'
+    opposed: float  # share of opposite normals among pairs of neighbours
+    oriented: bool  # whether the signs can be trusted
+    scaled: int  # number of normals not of unit length; their users normalise them
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +111,7 @@ def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = T
 def estimate_normals(cloud: PointCloud) -> PointCloud:
     """Return a cloud without copies, with outward normals of local quadrics.
 
-    Outward is towards the viewpoint (by default that of `estimate_viewpoint`), or else the side of given normals.
+    Outward is towards the viewpoint (by default an estimate), or else the side of given normals.
 
     Raises:
         BadArgument, TooFewPoints, SuspiciousScale: see `check_cloud`.
@@ -140,3 +157,58 @@ def _fit_normals(cloud: PointCloud, clean: bool) -> PointCloud:
         outward = viewpoint.double() - points.double()
     normals = orient_normals(normals, outward).to(points.dtype)
     return dataclasses.replace(cloud, points=points, normals=normals, viewpoint=viewpoint)
+
+
+def compare_normals(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> NormalCheck:
+    """Compare the normals of neighbouring points."""
+    distance, index = nearest(points, 9)  # the point itself and eight neighbours: enough for a majority
+    directions = unit(normals)
+    cosine = (directions[:, None] * directions[index[:, 1:]]).sum(-1)
+    height = ((points[index[:, 1:]] - points[:, None]) * directions[:, None]).sum(-1).abs()
+    # Across an edge of 45 degrees signs say nothing; a point far over the tangent plane may be behind a thin wall.
+    compared = (cosine.abs() > 0.7) & (height <= 0.3 * distance[:, 1:])
+    against = compared & (cosine < 0)
+    pairs = int(compared.sum())
+    opposed = int(against.sum()) / pairs if pairs >= 20 else 0.0  # of fewer pairs any share may be chance
+    scaled = (torch.linalg.vector_norm(normals, dim=-1) - 1).abs() > 1e-3  # text files round to three digits
+    flipped = 2 * against.sum(-1) > compared.sum(-1)
+    # Random signs oppose half of the pairs.
+    return NormalCheck(flipped, opposed, oriented=opposed < 0.35, scaled=int(scaled.sum()))
+
+
+def guess_viewpoint(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
+    """Return a camera position [m] that explains a single view, for normals of unknown sign.
+
+    Normals of a view face the camera, and objects bulge. The direction v maximises sum_i w_i tanh(n_i.v / 0.3),
+    where w_i = n_i.(p_i - centre) makes the sign of n_i irrelevant. The centre is that of the principal box. The
+    camera is 4 radii away. The origin is preferred if it scores 0.8 of the best and the cloud looks like a cloud in
+    its camera's frame: within 45 degrees of z, more than 2 radii away. The sides of a flat face or a bowl look alike.
+    """
+    axes = torch.linalg.svd(points - points.mean(0), full_matrices=False).Vh  # independent of the frame
+    along = points @ axes.T
+    centre = (along.amax(0) + along.amin(0)) / 2 @ axes
+    radius = torch.linalg.vector_norm(points - centre, dim=-1).max()
+    bulge = (normals * (points - centre)).sum(-1)
+    directions = fibonacci_sphere(400).to(points)  # about 10 degrees apart
+    away = torch.linalg.vector_norm(centre)
+    origin = -centre / away.clamp_min(1e-300)
+    pieces = torch.cat([directions, origin[None]]).split(64)  # bounds the memory for whole depth images
+    score = torch.cat([(bulge[:, None] * torch.tanh(normals @ piece.T / 0.3)).mean(0) for piece in pieces])
+    best = score[:-1].argmax()
+    in_camera_frame = (centre[2] > math.cos(math.pi / 4) * away) & (away > 2 * radius)
+    if bool(in_camera_frame & (score[-1] >= 0.8 * score[best])):
+        return torch.zeros_like(centre)
+    return centre + 4 * radius * directions[best]
+
+
+def orient_normals(normals: Float[Tensor, "n 3"], outward: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Return unit normals on the side of `outward` directions."""
+    sign = torch.where((outward * normals).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+    return unit(sign * normals)
+
+
+def share_facing(
+    points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "*views 3"]
+) -> float:
+    """Return the share of normals that face the camera. A view has nearly 1, a whole surface half."""
+    return float((((viewpoint - points) * normals).sum(-1) > 0).double().mean())

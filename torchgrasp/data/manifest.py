@@ -18,7 +18,7 @@ import torch
 
 from torchgrasp.checks import Count, Seed, checked
 from torchgrasp.cloud.camera import look_at, partial_view
-from torchgrasp.cloud.io.read import read_cloud, save_cloud
+from torchgrasp.cloud.read import read_cloud, save_cloud
 from torchgrasp.errors import DatasetError
 from torchgrasp.files import format_json, write_file
 from torchgrasp.geometry.mesh import read_mesh

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from torchgrasp.checks import checked
-from torchgrasp.cloud.io.read import read_cloud
+from torchgrasp.cloud.read import read_cloud
 from torchgrasp.errors import BadArgument
 from torchgrasp.scene.file import read_scene
 from torchgrasp.scene.scene import Scene

@@ -15,12 +15,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.checks import checked
-from torchgrasp.cloud.io.arrays import MAX_BYTES, parse_npz
+from torchgrasp.cloud.tables import parse_npz
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.export.benchmark_files import BENCH_HANDS, rotation_of
 from torchgrasp.files import is_file, read_bytes
 from torchgrasp.hand.hand import Hand
 from torchgrasp.json_fields import Field, read_json
+from torchgrasp.limits import CLOUD_BYTES
 
 MOST_GRASPS = 100_000
 """Most grasps of a file: more are no plan of one object."""
@@ -146,7 +147,7 @@ def _read_bench(path: Path, hand: Hand, order: tuple[str, ...], quaternion: Quat
         raise _refuse(f"{path}, which is no file", "an .npz with 'grasp_qpos'")
     allowed = "an .npz of at most 512 MiB with 'grasp_qpos'"
     try:
-        if path.stat().st_size > MAX_BYTES:
+        if path.stat().st_size > CLOUD_BYTES:
             raise ValueError("a larger file")
         tables = parse_npz(read_bytes(path), ("grasp_qpos", "pregrasp_qpos"), "grasp_qpos")
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError) as error:

@@ -1,13 +1,11 @@
 """The robot model: a hand's URDF and hand.toml, its kinematics and its collision shapes."""
 
-from torchgrasp.hand.collision_spheres import CollisionSpheres
-from torchgrasp.hand.fingertips import Fingertips
+from torchgrasp.hand.collision_shapes import CollisionSpheres
+from torchgrasp.hand.fingers import ActuatedJoints, Fingertips
 from torchgrasp.hand.hand import Actuator, Hand, HandSource
-from torchgrasp.hand.joints import ActuatedJoints
 from torchgrasp.hand.kinematics import KinematicTree
-from torchgrasp.hand.self_collision import SelfCollision
 from torchgrasp.hand.load import find_hand, hand_of, hands_folder, load_hand, with_fingers
-from torchgrasp.hand.urdf import Joint, Link, Mimic, Shape, Urdf, read_urdf
+from torchgrasp.hand.self_collision import SelfCollision
 
 __all__ = [
     "ActuatedJoints",
@@ -16,17 +14,11 @@ __all__ = [
     "Fingertips",
     "Hand",
     "HandSource",
-    "Joint",
     "KinematicTree",
-    "Link",
-    "Mimic",
     "SelfCollision",
-    "Shape",
-    "Urdf",
     "find_hand",
     "hand_of",
     "hands_folder",
     "load_hand",
-    "read_urdf",
     "with_fingers",
 ]

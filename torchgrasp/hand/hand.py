@@ -13,10 +13,9 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.checks import Count, Range, checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.hand.collision_spheres import CollisionSpheres
-from torchgrasp.hand.fingertips import Fingertips
-from torchgrasp.hand.joints import ActuatedJoints, FreeMotion
-from torchgrasp.hand.kinematics import KinematicTree, chain_from_urdf, map_directions, map_points
+from torchgrasp.hand.collision_shapes import CollisionSpheres
+from torchgrasp.hand.fingers import ActuatedJoints, Fingertips
+from torchgrasp.hand.kinematics import FreeMotion, KinematicTree, chain_from_urdf, map_directions, map_points
 from torchgrasp.hand.self_collision import SelfCollision
 from torchgrasp.hand.urdf import read_urdf
 
@@ -28,8 +27,8 @@ class Actuator(NamedTuple):
     """Drive of one joint: effort [N m], velocity [rad/s], stiffness [N m/rad], damping [N m s/rad].
 
     >>> from torchgrasp import load_hand
-    >>> load_hand("barrett").actuators["f1_flex"]
-    Actuator(effort=4.7, velocity=2.0, kp=10.0, kd=0.3)
+    >>> load_hand("barrett").actuators["f1_flex"].effort
+    4.7
     """
 
     effort: float
@@ -39,12 +38,11 @@ class Actuator(NamedTuple):
 
 
 class HandSource(NamedTuple):
-    """Origin of a hand: finger option or names of its fingers, URDF, SHA-256 of both files, all options.
+    """Origin of a hand: its option or the names of its fingers, its URDF, SHA-256 of both files, all options.
 
     >>> from torchgrasp import load_hand
-    >>> source = load_hand("allegro").source
-    >>> source.option, source.options, source.urdf_path.name
-    ('default', ('default', 'four', 'paper_literal'), 'hand.urdf')
+    >>> load_hand("allegro").source.options
+    ('default', 'four', 'paper_literal')
     """
 
     option: str
@@ -57,22 +55,21 @@ class HandSource(NamedTuple):
 class Hand(Value):
     """A robot hand with three to five grasping fingers, in grasp order.
 
-    Positions [m] are in the palm's frame, the URDF's root.
+    Positions [m] are in the frame of the palm, the URDF's root. `approach` points out of the palm.
 
     `joints` (.., h) are the actuated joints of the grasping fingers, in the order of `joint_names`. Every method raises
-    `BadArgument` for joints of a wrong count or dtype, and for NaN or infinity. `approach` points out of the palm.
+    `BadArgument` for joints of a wrong count or dtype, and for NaN or infinity.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
-    >>> hand.joint_names, hand.dof
-    (('spread', 'f1_flex', 'f2_flex', 'f3_flex'), 4)
+    >>> hand.require_three("hand", "a model")
     >>> q = (hand.lower + hand.upper) / 2
-    >>> hand.tip_centres(q).shape, hand.link_poses(q).shape, hand.sphere_centres(q).shape
-    (torch.Size([3, 3]), torch.Size([12, 4, 4]), torch.Size([117, 3]))
-    >>> hand.jacobian(q).shape  # of the pads' contact points
-    torch.Size([3, 3, 4])
-    >>> bool(hand.self_clearance(q) > 0), hand.expand_joints(q).shape
-    (True, torch.Size([8]))
+    >>> hand.fingertips(q)[0].shape, hand.tip_centres(q).shape, hand.jacobian(q).shape
+    (torch.Size([3, 3]), torch.Size([3, 3]), torch.Size([3, 3, 4]))
+    >>> hand.link_poses(q).shape, hand.sphere_centres(q).shape, hand.expand_joints(q).shape
+    (torch.Size([12, 4, 4]), torch.Size([117, 3]), torch.Size([8]))
+    >>> len(hand.expand(q)), bool(hand.self_clearance(q) > 0)
+    (8, True)
     """
 
     name: str
@@ -92,21 +89,22 @@ class Hand(Value):
 
     @functools.cached_property
     def chain(self) -> "Chain":
-        """The hand's tree as pytorch-kinematics' chain, for use with that library; every movable joint is free in it.
+        """The hand's tree as a chain of pytorch-kinematics, in which every movable joint is free.
 
-        >>> from torchgrasp.hand.load import load_hand
+        >>> from torchgrasp import load_hand
         >>> hand, joints = load_hand("barrett"), torch.zeros(1, 4, dtype=torch.float64)
-        >>> pose = hand.chain.forward_kinematics(hand.expand(joints))["f3_tip"].get_matrix()
-        >>> torch.allclose(pose[0], hand.link_poses(joints)[0, hand.tree.link_names.index("f3_tip")])
-        True
+        >>> hand.chain.forward_kinematics(hand.expand(joints))["f3_tip"].get_matrix().shape
+        torch.Size([1, 4, 4])
         """
         chain = chain_from_urdf(read_urdf(self.urdf_path))
         return chain.to(dtype=self.lower.dtype, device=self.lower.device)
 
     @functools.cached_property
     def motion(self) -> FreeMotion:
-        """How links move with the pose and the actuated joints: tables for refinement."""
-        return FreeMotion.of(self)
+        """How links, collision spheres, tips' centres and pads move with the pose and the actuated joints."""
+        spheres, tips = self.collision_spheres, self.tips
+        points = (spheres.link_index, spheres.center, 1.0), (tips.index, tips.center, 1.0)
+        return FreeMotion.of(self.tree, self.actuated.coupling, [*points, (tips.index, tips.normal, 0.0)])
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -140,17 +138,9 @@ class Hand(Value):
 
     @checked
     def require_three(self, argument: str, what: str) -> None:
-        """Refuse another number of fingertips than the three of the paper; raise `BadArgument` for an argument.
-
-        >>> from torchgrasp import load_hand
-        >>> load_hand("allegro", fingers=4).require_three("hand", "the mixture")
-        Traceback (most recent call last):
-            ...
-        torchgrasp.errors.BadArgument: hand: expected that for three ..., got the mixture for 4 fingertips
-        """
+        """Raise `BadArgument` for an argument if the hand has another number of fingertips than the paper's three."""
         if len(self.tips) != 3:
-            found = f"{what} for {len(self.tips)} fingertips"
-            raise BadArgument(argument, found, "that for three fingertips alone, as in the paper")
+            raise BadArgument(argument, f"{what} for {len(self.tips)} fingertips", "three fingertips, as in the paper")
 
     @checked(gradients=True)
     def check_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b h"]:
@@ -161,7 +151,7 @@ class Hand(Value):
         >>> hand.check_joints(hand.upper + 1)
         Traceback (most recent call last):
             ...
-        torchgrasp.errors.BadArgument: joints: expected [0, 3.14159], got 4.14159 for spread
+        torchgrasp.errors.BadArgument: joints: expected a number in [0, 3.14159], got 4.14159 for spread
         """
         self.actuated.check_limits(joints)
         return joints
@@ -185,13 +175,7 @@ class Hand(Value):
 
     @checked(gradients=True)
     def fingertips(self, joints: Float[Tensor, "*b h"]) -> tuple[Float[Tensor, "*b f 3"], Float[Tensor, "*b f 3"]]:
-        """Return the pads' contact points [m] and outward unit normals.
-
-        >>> from torchgrasp.hand.load import load_hand
-        >>> points, normals = load_hand("allegro").fingertips(torch.zeros(5, 12))
-        >>> points.shape, normals.shape
-        (torch.Size([5, 3, 3]), torch.Size([5, 3, 3]))
-        """
+        """Return the pads' contact points [m] and outward unit normals."""
         _, carriers = self.tips.frames(self._columns(joints))
         contact, normal, _ = self.tips.in_carriers
         return _rows(map_points(carriers, contact), joints), _rows(map_directions(carriers, normal), joints)
@@ -208,7 +192,7 @@ class Hand(Value):
     ) -> Float[Tensor, "*b f 3 h"]:
         """Return the derivative [m/rad] of the contact points (finger, coordinate) by the actuated joints.
 
-        `at` are the points [m] that the fingertips carry, such as where round ones touch; None: those of the pads.
+        `at` are points [m] that the fingertips carry, such as where round tips touch; None: the pads' contact points.
         """
         chains = self.tips.chains
         frames, carriers = self.tips.frames(self._columns(joints))
@@ -243,11 +227,15 @@ class Hand(Value):
         below: Annotated[float, Range(-math.inf, math.inf)] = math.inf,
         chunk: Count = 1000,
     ) -> Float[Tensor, "*b"]:
-        """Return the signed least separation [m] of links that can meet; negative: they overlap.
+        """Return the signed least separation [m] of the pairs of links that hand.toml lists; negative: they overlap.
 
-        hand.toml lists the pairs. An overlap is the least translation that parts two links. Apart, the value is a lower
-        bound of the distance, exact where a face is nearest. Values above `below` [m] are any lower bounds; 0, for a
-        verdict alone, is twice as fast. `chunk` rows at a time bound the memory and stay in the cache.
+        An overlap is the least translation that parts two links. Apart, the value is a lower bound of the distance,
+        exact where a face is nearest.
+
+        Args:
+            joints: (.., h).
+            below: separations above it [m] may be replaced by other lower bounds, which is faster.
+            chunk: postures that are computed at a time; it bounds the memory.
         """
         self.actuated.check(joints)
         rows = joints.reshape(-1, joints.shape[-1])

@@ -12,6 +12,7 @@ from torchgrasp.base import FINGERTIPS
 from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.safe_xml import read_bounded
 from torchgrasp.hand.urdf import Mimic, Triple
+from torchgrasp.limits import TOML_BYTES, XML_LETTERS
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -20,9 +21,6 @@ else:
 
 SUPPORTED = "three to five different fingers"
 """What a hand grasps with (`FINGERTIPS`): fewer tips cannot hold a thing, and no hand has more fingers."""
-
-MAX_BYTES = 1024 * 1024
-"""Largest hand.toml; those of the shipped hands have about 5 kB."""
 
 
 _DOTTED = re.compile(
@@ -104,7 +102,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _is_word(value: Any) -> bool:
-    return isinstance(value, str) and 0 < len(value) <= 200 and value.isprintable()
+    return isinstance(value, str) and 0 < len(value) <= XML_LETTERS and value.isprintable()
 
 
 def _is_texts(value: Any) -> bool:
@@ -130,7 +128,7 @@ class _Table:
         return self.table[key]
 
     def text(self, key: str) -> str:
-        return self.value(key, _is_word, "a text of 1 to 200 letters")
+        return self.value(key, _is_word, f"a text of 1 to {XML_LETTERS} characters")
 
     def texts(self, key: str) -> tuple[str, ...]:
         return tuple(self.value(key, _is_texts, "a list of texts"))
@@ -165,7 +163,7 @@ class _Table:
 def read_hand_toml(path: Path | str, fingers: Fingers = "default") -> HandSpec:
     """Read and check a hand.toml with its fingers; raises `HandFileError`, or `BadArgument` for others."""
     path = Path(path)
-    data = read_bounded("hand.toml", path, "a hand.toml", MAX_BYTES)
+    data = read_bounded("hand.toml", path, "a hand.toml", TOML_BYTES)
     try:
         text = data.decode("utf-8")
         if _DOTTED.search(text):

@@ -102,24 +102,48 @@ class KinematicTree(Value):
 
 
 @dataclasses.dataclass(frozen=True)
-class Markers(Value):
-    """Points and directions that links carry, in groups of `sizes`: one product maps all of them."""
+class FreeMotion(Value):
+    """How the links of a hand with a free pose move, and what moves with them: tables for refinement.
 
-    product: Float[Tensor, "k q"]
+    The q motions are three translations along the root's axes, three rotations about them, and the joints that an
+    actuated joint moves. `moves[l, q]` is 1 if a motion moves link l. `coupling` gives the motions by the six numbers
+    of a step of the pose and by the actuated joints; None: it is the identity.
+
+    `product` maps the markers with all frames in one product, in groups of `sizes`. The markers are the given ones,
+    then the motions' origins, axes of turns and axes of slides. Of the two axes one is zero.
+    """
+
+    product: Float[Tensor, "m k"]
     sizes: tuple[int, ...]
+    moves: Float[Tensor, "l q"]
+    coupling: Float[Tensor, "q d"] | None
 
     @classmethod
     def of(
-        cls, links: int, groups: Sequence[tuple[Int[Tensor, "_"], Float[Tensor, "_ 3"], Float[Tensor, "_"]]]
-    ) -> "Markers":
-        """Return groups of markers: the link of each, its coordinates there, 1 for a point and 0 for a direction."""
-        link, local, point = (torch.cat(parts) for parts in zip(*groups, strict=True))
-        product = local.new_zeros(len(link), 4, links)
-        product[torch.arange(len(link), device=link.device), :, link] = torch.cat([local, point[:, None]], 1)
-        return cls(product.flatten(1), tuple(len(group[0]) for group in groups))
+        cls,
+        tree: KinematicTree,
+        coupling: Float[Tensor, "j h"],
+        markers: Sequence[tuple[Int[Tensor, "_"], Float[Tensor, "_ 3"], float]],
+    ) -> "FreeMotion":
+        """Tabulate motions and groups of markers: their links, their coordinates, 1 for points or 0 for directions."""
+        own = torch.nonzero((coupling != 0).any(1))[:, 0]
+        axes, slides = torch.eye(3).to(tree.axis), tree.prismatic[own]
+        root = torch.nonzero(tree.places == 0)[:, 0].expand(6)
+        link = torch.cat([root, tree.child[own]])
+        turning = torch.cat([0 * axes, axes, tree.axis[own] * (1 - slides[:, None])])
+        sliding = torch.cat([axes, 0 * axes, tree.axis[own] * slides[:, None]])
+        groups = [*markers, (link, torch.zeros_like(turning), 1.0), (link, turning, 0.0), (link, sliding, 0.0)]
+        at = torch.cat([links for links, _, _ in groups])
+        local = [torch.cat([x, torch.full_like(x[:, :1], kind)], 1).to(axes) for _, x, kind in groups]
+        product = axes.new_zeros(len(at), 4, len(tree.link_names))
+        product[torch.arange(len(at), device=at.device), :, at] = torch.cat(local)
+        moves = torch.cat([axes.new_ones(len(tree.moves), 6), tree.moves[:, own]], 1)
+        whole = torch.block_diag(torch.eye(6).to(axes), coupling[own])
+        same = whole.shape[0] == whole.shape[1] and torch.equal(whole, torch.eye(len(whole)).to(whole))
+        return cls(product.flatten(1), tuple(len(x) for x in local), moves, None if same else whole)
 
     def place(self, frames: Float[Tensor, "3 4 l n"]) -> tuple[Float[Tensor, "3 p n"], ...]:
-        """Return the coordinates of each group in the frame of `frames`."""
+        """Return the coordinates of each group of markers in the frame of `frames`."""
         product = self.product.to(frames).expand(3, -1, -1)
         return torch.bmm(product, frames.flatten(1, 2)).split(self.sizes, 1)
 

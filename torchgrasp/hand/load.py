@@ -7,12 +7,10 @@ import torch
 
 from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument, HandFileError
-from torchgrasp.hand.collision_pairs import self_collision_from_urdf
-from torchgrasp.hand.collision_spheres import spheres_from_urdf
-from torchgrasp.hand.fingertips import tips_from_files
+from torchgrasp.hand.collision_shapes import self_collision_from_urdf, spheres_from_urdf
+from torchgrasp.hand.fingers import joints_from_files, tips_from_files
 from torchgrasp.hand.hand import Actuator, Hand, HandSource
 from torchgrasp.hand.hand_toml import Fingers, HandSpec, read_hand_toml
-from torchgrasp.hand.joints import joints_from_files
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.urdf import Urdf, read_urdf
 from torchgrasp.values import Grasps

@@ -11,17 +11,12 @@ from typing import Any
 
 from torchgrasp.errors import HandFileError
 from torchgrasp.files import is_file, read_bytes
+from torchgrasp.limits import XML_DEPTH, XML_ELEMENTS, XML_LETTERS
 
-MAX_DEPTH = 64
-"""Deepest nesting of elements; a URDF needs six."""
-MAX_ELEMENTS = 50_000
-"""Most elements: about 100 for each of 512 links."""
 IGNORED = {"material", "transmission", "gazebo", "ros2_control", "mujoco", "sensor"}
 """Elements of a robot, besides links and joints, that a hand can do without."""
 NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
 """A decimal number. Python alone also reads 1_0, digits other than ASCII's, and nan."""
-MAX_WORD = 200
-"""Longest name [letters]."""
 SHAPES = ("box", "cylinder", "sphere", "mesh")
 """Collision shapes of a URDF."""
 PARTS = {
@@ -81,8 +76,9 @@ class _BoundedBuilder(ET.TreeBuilder):
 
     def start(self, tag: Any, attrs: Any) -> Any:
         self.depth, self.count = self.depth + 1, self.count + 1
-        if self.depth > MAX_DEPTH or self.count > MAX_ELEMENTS:
-            raise HandFileError("urdf", "a too large XML tree", f"depth {MAX_DEPTH}, {MAX_ELEMENTS} elements at most")
+        if self.depth > XML_DEPTH or self.count > XML_ELEMENTS:
+            allowed = f"at most {XML_ELEMENTS} elements, nested at most {XML_DEPTH} deep"
+            raise HandFileError("urdf", "a larger XML tree", allowed)
         return super().start(tag, attrs)
 
     def end(self, tag: Any) -> Any:
@@ -122,12 +118,12 @@ def _clean(path: Path, where: str, element: ET.Element) -> ET.Element:
     """Copy what is known of an element; refuse it where something is missing or no number."""
     tag = str(element.tag)
     clean = ET.Element(tag)
-    where = "" if tag == "robot" else f"{where} {tag} {(element.get('name') or '')[:MAX_WORD]}".strip()
+    where = "" if tag == "robot" else f"{where} {tag} {(element.get('name') or '')[:XML_LETTERS]}".strip()
     for key in WORDS.get(tag, ()):
         word = element.get(key, "")
-        if not 0 < len(word) <= MAX_WORD:
+        if not 0 < len(word) <= XML_LETTERS:
             found = "without one" if not word else f"of {len(word)} letters"
-            raise HandFileError("urdf", f"{path}: {where}: a {key} {found}", f"a {key} of 1 to {MAX_WORD} letters")
+            raise HandFileError("urdf", f"{path}: {where}: a {key} {found}", f"a {key} of 1 to {XML_LETTERS} letters")
         clean.set(key, word)
     for key, (count, default) in NUMBERS.get(tag, {}).items():
         text = element.get(key, default)

@@ -14,15 +14,8 @@ from torchgrasp.checks import checked
 from torchgrasp.errors import HandFileError
 from torchgrasp.geometry.frames import rotation_from_rpy
 from torchgrasp.hand.safe_xml import parse_urdf, read_bounded
+from torchgrasp.limits import HAND_LINKS, HAND_SHAPES, MAX_EXTENT, URDF_BYTES
 
-MAX_BYTES = 4 * 1024 * 1024
-"""Largest URDF; those of the shipped hands have about 12 kB."""
-MAX_LINKS = 512
-"""Most links: the pairs of them are tested for collisions."""
-MAX_SHAPES = 1000
-"""Most collision shapes, for the same reason; a hand has up to 100."""
-MAX_SIZE = 2.0
-"""Largest collision shape [m]: a hand is smaller, and its cover of spheres grows with the surface."""
 SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "mesh": ("scale",)}
 """The numbers of each kind of shape."""
 MEND = "torchgrasp hand new writes a clean copy"
@@ -159,7 +152,7 @@ def read_published(path: Path | str) -> Urdf:
         HandFileError: the file is missing, too large or hostile, or no tree of bodies.
     """
     path = Path(path)
-    data = read_bounded("urdf", path, "a URDF file", MAX_BYTES)
+    data = read_bounded("urdf", path, "a URDF file", URDF_BYTES)
     robot = parse_urdf(path, data)  # links and joints alone, each with all of its names and with finite numbers
     links, joints = tuple(map(_link, robot.findall("link"))), tuple(map(_joint, robot.findall("joint")))
     urdf = Urdf(path, robot.attrib["name"], "", links, joints, data, ET.tostring(robot))
@@ -240,8 +233,8 @@ def _is_unit(length: float) -> bool:
 
 def _check_names(urdf: Urdf) -> None:
     """Refuse too many links, names and children that come twice, and joints of unknown links."""
-    if not 0 < len(urdf.links) <= MAX_LINKS:
-        raise urdf.wrong(f"{len(urdf.links)} links", f"1 to {MAX_LINKS} links")
+    if not 0 < len(urdf.links) <= HAND_LINKS:
+        raise urdf.wrong(f"{len(urdf.links)} links", f"1 to {HAND_LINKS} links")
     names = [x.name for x in urdf.links]
     lists = {"link": names, "joint": [j.name for j in urdf.joints], "child": [j.child for j in urdf.joints]}
     for what, listed in lists.items():
@@ -256,12 +249,12 @@ def _check_names(urdf: Urdf) -> None:
 def _check_shapes(urdf: Urdf) -> None:
     """Refuse too many shapes, and sizes that are not positive or no hand's."""
     count = sum(len(link.shapes) for link in urdf.links)
-    if count > MAX_SHAPES:
-        raise urdf.wrong(f"{count} collision shapes", f"at most {MAX_SHAPES}")
+    if count > HAND_SHAPES:
+        raise urdf.wrong(f"{count} collision shapes", f"at most {HAND_SHAPES}")
     for link, shape in ((x, shape) for x in urdf.links for shape in x.shapes):
-        if shape.kind != "mesh" and not 0 < min(shape.size) <= max(shape.size) <= MAX_SIZE:
+        if shape.kind != "mesh" and not 0 < min(shape.size) <= max(shape.size) <= MAX_EXTENT:
             found = f"link {link.name} collision of size {shape.size}"
-            raise urdf.wrong(found, f"positive lengths, at most {MAX_SIZE:g} m")
+            raise urdf.wrong(found, f"positive lengths, at most {MAX_EXTENT:g} m")
 
 
 def _check_joints(urdf: Urdf) -> None:

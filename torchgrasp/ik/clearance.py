@@ -12,7 +12,7 @@ from torchgrasp.base import Value, settle
 from torchgrasp.checks import checked
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
-from torchgrasp.hand.collision_spheres import CollisionSpheres
+from torchgrasp.hand.collision_shapes import CollisionSpheres
 from torchgrasp.ik.configuration import Rows, SpatialJacobian
 from torchgrasp.ik.obstacles import Obstacles
 

@@ -59,7 +59,7 @@ class Rows(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class SpatialJacobian(Value):
-    """Frames of the links, `FreeMotion`'s markers and the twists of its motions, in the object's frame."""
+    """Frames of the links, the markers and the twists of its motions, in the object's frame."""
 
     hand: Hand
     obj_from_link: Float[Tensor, "3 4 l g"]
@@ -73,7 +73,7 @@ class SpatialJacobian(Value):
         """Evaluate the forward kinematics once."""
         root = configuration.obj_from_hand[:, :3].permute(1, 2, 0)
         frames = hand.tree.frames(hand.actuated.couple(configuration.joints).T.contiguous(), root)
-        spheres, tips, pads, origins, turning, sliding = hand.motion.markers.place(frames)
+        spheres, tips, pads, origins, turning, sliding = hand.motion.place(frames)
         twists = torch.cat([torch.linalg.cross(origins, turning, dim=0) + sliding, turning])
         return cls(hand, frames, spheres, tips, pads, twists)
 

@@ -7,10 +7,11 @@ import numpy as np
 import torch
 
 from torchgrasp.checks import checked
-from torchgrasp.cloud.io.arrays import MAX_BYTES, parse_npz
+from torchgrasp.cloud.tables import parse_npz
 from torchgrasp.errors import BadArgument, CloudFileError
 from torchgrasp.files import is_file, read_bytes, write_file
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.limits import CLOUD_BYTES
 from torchgrasp.scene.scene import Scene
 
 NAMES = ("depth", "intrinsics", "camera_pose", "labels", "mask", "table")
@@ -37,8 +38,8 @@ def read_scene(path: Path | str) -> Scene:
     path = Path(path)
     if path.suffix.lower() != ".npz" or not is_file(path):
         raise CloudFileError("path", path, "a .npz file with depth and intrinsics")
-    if path.stat().st_size > MAX_BYTES:
-        raise CloudFileError("path", f"{path} of {path.stat().st_size} bytes", f"at most {MAX_BYTES} bytes")
+    if path.stat().st_size > CLOUD_BYTES:
+        raise CloudFileError("path", f"{path} of {path.stat().st_size} bytes", f"at most {CLOUD_BYTES} bytes")
     try:
         arrays = parse_npz(read_bytes(path), NAMES, "depth")
         depth, intrinsics, table = arrays.pop("depth"), arrays.pop("intrinsics"), arrays.pop("table", None)

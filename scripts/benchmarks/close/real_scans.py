@@ -13,7 +13,7 @@ import torch
 
 from benchmarks.common import Row
 from benchmarks.perturb import PERTURBATIONS, household_mass, perturb_trial
-from torchgrasp.cloud.io.read import read_cloud
+from torchgrasp.cloud import read_cloud
 from torchgrasp.data import read_mass, read_object_mesh
 from torchgrasp.errors import GraspError, Status
 from torchgrasp.evaluation import PROTOCOLS, close_hand, seed_of

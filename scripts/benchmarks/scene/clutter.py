@@ -15,8 +15,7 @@ from torch import Tensor
 
 from benchmarks.common import Row
 from benchmarks.scene.drop import PlacedScene, aim, drop, settle
-from torchgrasp.cloud.camera import INTRINSICS
-from torchgrasp.cloud.render import render_depth
+from torchgrasp.cloud.camera import INTRINSICS, render_depth
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation import GraspTrial, Share, count_by, format_share, lift_grasp, run_tasks, share_over
 from torchgrasp.geometry.plane import Plane

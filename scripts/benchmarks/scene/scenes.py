@@ -11,8 +11,7 @@ import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.cloud.camera import look_at
-from torchgrasp.cloud.render import render_depth
+from torchgrasp.cloud.camera import look_at, render_depth
 from torchgrasp.data import read_object_mesh
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import rigid, rotation_from_vector

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from torchgrasp.files import write_file
-from torchgrasp.hand.collision_pairs import collision_pairs
+from torchgrasp.hand.collision_shapes import collision_pairs
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.load import hands_folder
 from torchgrasp.hand.urdf import read_urdf

@@ -10,7 +10,7 @@ from torchgrasp.app.author.draft import draft_hand
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.geometry.frames import apply, rotate
-from torchgrasp.hand.collision_pairs import collision_pairs
+from torchgrasp.hand.collision_shapes import collision_pairs
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.load import hands_folder, load_hand
 from torchgrasp.hand.self_collision import SelfCollision
@@ -175,11 +175,11 @@ def test_links_are_tested_until_they_are_settled(claw, monkeypatch):
     monkeypatch.setattr(SelfCollision, "separations", count)
     found = collision_pairs(crowded, coupling, n=3000)
     assert tested[0] > tested[-1] + 1  # the two in one place, and links that have met and been apart
-    monkeypatch.setattr("torchgrasp.hand.collision_pairs.FIRST_LOOK", 3000)
+    monkeypatch.setattr("torchgrasp.hand.collision_shapes.FIRST_LOOK", 3000)
     assert collision_pairs(crowded, coupling, n=3000) == found  # in one look nothing is settled early
     assert found and ("one", "two") not in found
-    monkeypatch.setattr("torchgrasp.hand.collision_pairs.FIRST_LOOK", 1000)
-    monkeypatch.setattr("torchgrasp.hand.collision_pairs.MOST_TESTS", 100)
+    monkeypatch.setattr("torchgrasp.hand.collision_shapes.FIRST_LOOK", 1000)
+    monkeypatch.setattr("torchgrasp.hand.collision_shapes.MOST_TESTS", 100)
     with pytest.raises(HandFileError, match="separations are to be measured"):
         collision_pairs(crowded, coupling, n=3000)
 

@@ -18,8 +18,8 @@ from torchgrasp import (
     read_scene,
 )
 from torchgrasp.app.author.draft import new_hand
-from torchgrasp.cloud.io.image import read_image, read_pose
-from torchgrasp.cloud.io.read import save_cloud
+from torchgrasp.cloud.depth import read_image, read_pose
+from torchgrasp.cloud.read import save_cloud
 from torchgrasp.data import list_entries, list_views, read_entry
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.export import format_grasps, grasps_from_joints, read_foreign

@@ -20,7 +20,7 @@ from torchgrasp.app.author.repair import fix_wrist, keep_below, mend_bodies, men
 from torchgrasp.base import FINGERTIPS
 from torchgrasp.checks import Seed, checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.hand.collision_pairs import ROWS_PER_CHUNK, collision_pairs, draw_postures
+from torchgrasp.hand.collision_shapes import collision_pairs, draw_postures
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.urdf import MEND, Mimic, Triple, Urdf, read_published
@@ -150,7 +150,7 @@ def _frames(urdf: Urdf, links: tuple[str, ...], seed: int) -> Float[Tensor, "3 4
     """Return the frames of some links in random postures; a part at a time, since those of all links are many."""
     tree, at = tree_from_urdf(urdf), [[x.name for x in urdf.links].index(link) for link in links]
     values = draw_postures(urdf, _coupling(urdf), DRAFT_POSTURES, seed)
-    return torch.cat([tree.frames(part)[:, :, at] for part in values.split(ROWS_PER_CHUNK, 1)], -1)
+    return torch.cat([tree.frames(part)[:, :, at] for part in values.split(1000, 1)], -1)
 
 
 def _checked_tips(urdf: Urdf, tips: tuple[str, ...]) -> tuple[str, ...]:

@@ -16,16 +16,12 @@ from torchgrasp.app.author.repair import place, pose_of
 from torchgrasp.files.meshes import load_triangles
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.safe_xml import read_bounded
-from torchgrasp.hand.urdf import MAX_SIZE, Shape, Urdf
-from torchgrasp.limits import MESH_FACES
+from torchgrasp.hand.urdf import Shape, Urdf
+from torchgrasp.limits import MAX_EXTENT, MESH_BYTES, MESH_FACES
 
 if TYPE_CHECKING:
     import trimesh
 
-MAX_MESH = 50 * 1024 * 1024
-"""Largest mesh [bytes]."""
-MAX_MESHES = 4 * MAX_MESH
-"""Largest size of all meshes of a hand [bytes]."""
 MESH_KINDS = (".stl", ".obj", ".ply")
 """Formats of meshes: those that are geometry alone."""
 SAMPLES = 4000
@@ -60,7 +56,7 @@ def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
     """
     base, allowed = (
         folder.resolve(),
-        f"a {', '.join(MESH_KINDS)} (export others) of at most {MAX_MESH >> 20} MiB inside {folder}",
+        f"a {', '.join(MESH_KINDS)} (export others) of at most {MESH_BYTES >> 20} MiB inside {folder}",
     )
     refusal = urdf.wrong(f"mesh {name[:80]!r}", allowed)
     package = name.startswith("package://")
@@ -73,7 +69,7 @@ def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
     for file in places:
         try:
             found = file.resolve()
-            if found.is_relative_to(base) and found.is_file() and found.stat().st_size <= MAX_MESH:
+            if found.is_relative_to(base) and found.is_file() and found.stat().st_size <= MESH_BYTES:
                 return found
         except (OSError, RuntimeError, ValueError):  # a loop of links, a name that the file system does not take
             continue
@@ -88,8 +84,8 @@ def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
     """
     names = {shape.file for link in urdf.links for shape in link.shapes if shape.kind == "mesh"}
     size = sum(mesh_file(urdf, name, folder).stat().st_size for name in names)
-    if size > MAX_MESHES:
-        raise urdf.wrong(f"meshes of {size} bytes", f"at most {MAX_MESHES >> 20} MiB in all")
+    if size > 4 * MESH_BYTES:
+        raise urdf.wrong(f"meshes of {size} bytes", f"at most {4 * MESH_BYTES >> 20} MiB in all")
     meshes = {name: _read_points(urdf, name, folder) for name in sorted(names)}
     found = {}
     for link in urdf.links:
@@ -97,8 +93,8 @@ def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
         for shape in link.shapes:
             local = meshes[shape.file] * shape.size if shape.kind == "mesh" else _primitive_points(shape)
             reach = float(np.abs(local).max())
-            if not reach <= MAX_SIZE:
-                wanted = f"at most {MAX_SIZE:g} m; a mesh in millimetres needs a scale of 0.001"
+            if not reach <= MAX_EXTENT:
+                wanted = f"at most {MAX_EXTENT:g} m; a mesh in millimetres needs a scale of 0.001"
                 raise urdf.wrong(f"mesh {shape.file!r} that reaches {reach:.3g} m", wanted)
             pose = pose_of(shape)
             parts.append(local @ pose[:3, :3].T + pose[:3, 3])
@@ -142,7 +138,7 @@ def _read_points(urdf: Urdf, name: str, folder: Path) -> Points:
     import trimesh
 
     path = mesh_file(urdf, name, folder)
-    data = read_bounded("urdf", path, "a mesh", MAX_MESH)
+    data = read_bounded("urdf", path, "a mesh", MESH_BYTES)
     allowed = f"a triangle mesh of at most {MESH_FACES} faces"
     try:
         mesh = load_triangles(data, path.suffix.lower(), process=False)

@@ -17,13 +17,13 @@ from torchgrasp.cloud import (
     format_report,
     look_at,
     partial_view,
-    prepare_cloud,
     remove_outliers,
     save_cloud,
     voxel_downsample,
 )
-from torchgrasp.cloud.io.image import read_image, read_pose
+from torchgrasp.cloud.depth import read_image, read_pose
 from torchgrasp.cloud.neighbours import draw_rows
+from torchgrasp.cloud.prepare import prepare_cloud
 from torchgrasp.data import write_objects
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.mesh import read_mesh

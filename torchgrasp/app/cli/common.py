@@ -15,7 +15,7 @@ from tyro.conf import arg
 from torchgrasp.base import check_whole
 from torchgrasp.checks import check_tensor
 from torchgrasp.cloud import Advice, CloudFile, check_cloud, diagnose_cloud, read_cloud_file
-from torchgrasp.cloud.io.image import read_pose
+from torchgrasp.cloud.depth import read_pose
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers
 from torchgrasp.errors import BadArgument, OutputError
 from torchgrasp.files import hold_folder

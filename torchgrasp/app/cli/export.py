@@ -109,7 +109,7 @@ def import_grasps(
         friction: of the certificates.
         std: standard deviation of the surface [m] that a closing under uncertainty shall assume at each contact.
     """
-    from torchgrasp.cloud.io import read_cloud
+    from torchgrasp.cloud import read_cloud
 
     with naming(name_or_path="--hand", hand="--hand", fingers="--fingers"):
         robot = load_hand(hand, fingers)

@@ -1,14 +1,11 @@
-"""The PCD format of the Point Cloud Library."""
+"""The PCD format of the Point Cloud Library, and its LZF compression."""
 
 from typing import Any
 
 import numpy as np
 
-from torchgrasp.cloud.io.lzf import decompress
-from torchgrasp.cloud.io.text import MAX_POINTS, read_table
-
-MAX_UNPACKED = 512 * 2**20
-"""Most bytes of the unpacked rows: some 100 for each of `MAX_POINTS`."""
+from torchgrasp.cloud.tables import read_table
+from torchgrasp.limits import CLOUD_BYTES, CLOUD_POINTS
 
 
 def parse_pcd(data: bytes) -> dict[str, Any]:
@@ -29,8 +26,8 @@ def parse_pcd(data: bytes) -> dict[str, Any]:
     if not len(names) == len(counts) == len(sizes) == len(kinds) or min(counts) < 1 or max(counts) > 4096:
         raise ValueError("FIELDS, SIZE, TYPE and COUNT that do not match")
     count = int(header["POINTS"][0]) if "POINTS" in header else int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
-    if not 0 <= count <= MAX_POINTS:
-        raise ValueError(f"{count} points, not up to {MAX_POINTS}")
+    if not 0 <= count <= CLOUD_POINTS:
+        raise ValueError(f"{count} points, not up to {CLOUD_POINTS}")
     encoding = header["DATA"][0].lower()
     wanted = ("x", "y", "z", "normal_x", "normal_y", "normal_z")
     if encoding == "ascii":
@@ -77,12 +74,55 @@ def _decompress(body: bytes, kinds: list[np.dtype[Any]], count: int) -> bytes:
     """Return compressed rows as rows: the file holds one field after the other."""
     packed, unpacked = (int(n) for n in np.frombuffer(body, dtype="<u4", count=2))
     wanted = count * sum(kind.itemsize for kind in kinds)
-    if unpacked != wanted or wanted > MAX_UNPACKED or packed > len(body) - 8:
+    if unpacked != wanted or wanted > CLOUD_BYTES or packed > len(body) - 8:
         sizes = f"{packed} bytes for {unpacked}"
-        raise ValueError(
-            f"compressed data of {sizes}, not at most {len(body) - 8} for {wanted}, {MAX_UNPACKED} at most"
-        )
+        raise ValueError(f"compressed data of {sizes}, not at most {len(body) - 8} for {wanted}, {CLOUD_BYTES} at most")
     data = decompress(body[8 : 8 + packed], unpacked)
     starts = np.cumsum([0, *(count * kind.itemsize for kind in kinds)])
     fields = [np.frombuffer(data, np.uint8, count * k.itemsize, s) for k, s in zip(kinds, starts[:-1], strict=True)]
     return np.concatenate([field.reshape(count, -1) for field in fields], axis=1).tobytes()
+
+
+def decompress(data: bytes, size: int) -> bytes:
+    r"""Return the `size` bytes that LZF data holds.
+
+    A byte c < 32 is followed by c + 1 literal bytes. Any other gives a copy of (c >> 5) + 2 earlier bytes, of which
+    a length of 9 takes one more byte into account; the distance has 13 bits.
+
+    Raises:
+        ValueError: data that end early, hold more or fewer bytes, or copy bytes from before their start.
+
+    >>> decompress(b"\x01ab\x60\x01", 7)
+    b'abababa'
+    """
+    out, i, end = bytearray(), 0, len(data)
+    while i < end:
+        control = data[i]
+        i += 1
+        if control < 32:
+            length = control + 1
+            if i + length > end:
+                raise ValueError("LZF data that end early")
+            out += data[i : i + length]
+            i += length
+        else:
+            length = control >> 5
+            if i + 1 + (length == 7) > end:
+                raise ValueError("LZF data that end early")
+            if length == 7:
+                length += data[i]
+                i += 1
+            length += 2
+            start = len(out) - ((control & 31) << 8) - data[i] - 1
+            i += 1
+            if start < 0:
+                raise ValueError("LZF data that copy bytes from before their start")
+            piece = out[start : start + length]
+            while len(piece) < length:  # the copy overlaps what it writes
+                piece += piece[: length - len(piece)]
+            out += piece
+        if len(out) > size:
+            raise ValueError(f"LZF data of more than {size} bytes")
+    if len(out) < size:
+        raise ValueError(f"LZF data of {len(out)} bytes, not {size}")
+    return bytes(out)

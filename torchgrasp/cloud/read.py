@@ -1,25 +1,27 @@
-"""From the arrays of a file to a cloud, and notes on what was left out."""
+"""Point clouds from and to files. A malformed file is refused by name, and no file runs code."""
 
 import dataclasses
-from typing import Any
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.checks import checked
-from torchgrasp.cloud.check import MIN_POINTS
-from torchgrasp.cloud.io.text import MAX_POINTS
+from torchgrasp.base import Value, named_tensors
+from torchgrasp.checks import check_tensor, checked
+from torchgrasp.cloud.check import MIN_POINTS, check_cloud
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_planes
-from torchgrasp.cloud.orientation import guess_viewpoint
+from torchgrasp.cloud.pcd import parse_pcd
+from torchgrasp.cloud.ply import format_ply, parse_ply
+from torchgrasp.cloud.prepare import guess_viewpoint
+from torchgrasp.cloud.tables import parse_npy, parse_npz, read_lines
 from torchgrasp.errors import BadArgument, CloudFileError, TooFewPoints
+from torchgrasp.files import is_file, read_bytes, write_file
+from torchgrasp.limits import CLOUD_BYTES, CLOUD_POINTS
 from torchgrasp.values import PointCloud
-
-UNIT_LENGTH, MOST_UNIT = 0.05, 0.9
-"""Three further columns are normals if so large a share of them has unit length to within 5 %; else they are not."""
-FEW = 2000
-"""Points that are asked whether they face a default viewpoint."""
 
 
 @checked
@@ -38,6 +40,130 @@ class CloudFile(Value):
 
     cloud: PointCloud
     notes: tuple[str, ...]
+
+
+@checked
+def read_cloud(
+    path: Path | str, viewpoint: Sequence[float | int] | Tensor | None = None, unit: Literal["m", "cm", "mm"] = "m"
+) -> PointCloud:
+    """Read the point cloud of one object, in float64; `read_cloud_file` also tells what was left out.
+
+    * `.ply`, ascii or binary: x y z, optionally nx ny nz; header lines `comment viewpoint x y z` and
+      `comment frustum` with 12 numbers give the camera.
+      A mesh gives 2000 surface points, with normals if closed.
+    * `.pcd`, ascii, binary or compressed: x y z, optionally normal_x normal_y normal_z; the viewpoint from VIEWPOINT.
+      Its default `0 0 0 1 0 0 0` counts only if the points look like those of a camera in the origin.
+    * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,) and `frustum` (4, 3);
+      of several views `viewpoint` (n, 3) and `frustum` (n, 4, 3).
+    * `.npy`, `.xyz`, `.txt`, `.csv` (text): an (n, 3) array, or (n, 6) with normals; colours are left out.
+
+    Arrays (h, w, 3) of an image are taken, too. Rows with NaN, infinity or, more than once, (0, 0, 0) are left out.
+
+    Args:
+        path: the file.
+        viewpoint: the camera's position (3,) [m] in the cloud's frame, instead of the file's.
+        unit: of the file's points and viewpoint.
+
+    Raises:
+        CloudFileError: no such file; an unknown suffix; malformed content; more than 512 MB or 5 million points.
+        BadArgument: a viewpoint other than three numbers; points on one line.
+        TooFewPoints: fewer than 4 distinct points.
+        SuspiciousScale: an extent outside [5 mm, 2 m].
+
+    >>> read_cloud("scan.docx")
+    Traceback (most recent call last):
+    torchgrasp.errors.CloudFileError: path: expected a file ending in .ply, .pcd, .npz, .npy or .xyz, got scan.docx
+    """
+    return check_cloud(read_cloud_file(path, viewpoint, unit).cloud)
+
+
+@checked
+def read_cloud_file(
+    path: Path | str, viewpoint: Sequence[float | int] | Tensor | None = None, unit: Literal["m", "cm", "mm"] = "m"
+) -> CloudFile:
+    """Read a cloud of any size, such as a whole scene, with notes on what was left out.
+
+    Args:
+        path, viewpoint, unit: as of `read_cloud`.
+
+    Raises:
+        CloudFileError, BadArgument, TooFewPoints: see `read_cloud`.
+
+    >>> read_cloud_file("none.ply")
+    Traceback (most recent call last):
+    torchgrasp.errors.CloudFileError: path: expected a .ply file, got none.ply, which is no file
+    """
+    try:
+        position = None if viewpoint is None else torch.as_tensor(viewpoint, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise BadArgument("viewpoint", repr(viewpoint), "three numbers [m]") from error
+    if position is not None:
+        check_tensor("viewpoint", position, (3,))
+    path, suffix = Path(path), Path(path).suffix.lower()
+    parsers = {
+        ".ply": parse_ply,
+        ".pcd": parse_pcd,
+        ".npz": lambda data: parse_npz(data, ("points", "normals", "viewpoint", "frustum"), "points"),
+        ".npy": lambda data: {"table": parse_npy(data)},
+        **dict.fromkeys((".xyz", ".txt", ".csv"), lambda data: {"table": read_lines(data)}),
+    }
+    if suffix not in parsers:
+        # Text may also be called .txt and .csv.
+        raise CloudFileError("path", path, "a file ending in .ply, .pcd, .npz, .npy or .xyz")
+    if not is_file(path):
+        raise CloudFileError("path", f"{path}, which is no file", f"a {suffix} file")
+    if path.stat().st_size > CLOUD_BYTES:
+        raise CloudFileError("path", f"{path} of {path.stat().st_size} bytes", f"at most {CLOUD_BYTES} bytes")
+    try:
+        arrays = parsers[suffix](read_bytes(path))
+    except Exception as error:  # zlib, zipfile, numpy and trimesh each raise their own
+        raise CloudFileError("path", f"{path}: {error!r}", f"a well-formed {suffix} file") from error
+    return make_cloud(str(path), arrays, position, {"m": 1.0, "cm": 0.01, "mm": 0.001}[unit])
+
+
+@checked
+def cloud_from_array(
+    points: np.ndarray, normals: np.ndarray | None = None, viewpoint: np.ndarray | Sequence[float | int] | None = None
+) -> PointCloud:
+    """Return the cloud of NumPy arrays [m] by the rules of `read_cloud`: missing rows and colours are left out.
+
+    Args:
+        points: (n, 3), (h, w, 3) of an image, or with three more columns of normals.
+        normals: of the same shape as points, or None.
+        viewpoint: the camera (3,), or None.
+
+    Raises:
+        BadArgument, TooFewPoints, SuspiciousScale: see `read_cloud`.
+
+    >>> len(cloud_from_array(np.random.default_rng(0).random((6, 8, 3))))
+    48
+    """
+    arrays = {"table" if normals is None else "points": points, "normals": normals, "viewpoint": viewpoint}
+    return check_cloud(make_cloud("an array", arrays).cloud)
+
+
+@checked
+def save_cloud(cloud: PointCloud, path: Path | str) -> Path:
+    """Write a cloud as `.npz` (exact) or binary `.ply` (float32), atomically.
+
+    Raises:
+        BadArgument: another suffix; several views for `.ply`, which has one viewpoint.
+        OutputError: the file cannot be written.
+
+    >>> save_cloud(PointCloud(torch.rand(9, 3)), "cloud.txt")
+    Traceback (most recent call last):
+    torchgrasp.errors.BadArgument: path: expected a file ending in .npz or .ply, got cloud.txt
+    """
+    path, buffer = Path(path), io.BytesIO()
+    arrays = {name: tensor.detach().cpu().numpy() for name, tensor in named_tensors(cloud).items()}
+    if path.suffix.lower() not in (".npz", ".ply"):
+        raise BadArgument("path", path, "a file ending in .npz or .ply")
+    if path.suffix.lower() == ".npz":
+        np.savez_compressed(buffer, **arrays)  # pyright: ignore[reportArgumentType]
+        return write_file(path, buffer.getvalue())
+    if cloud.viewpoint is not None and cloud.viewpoint.ndim == 2:
+        raise BadArgument("path", path, "a file ending in .npz, for a cloud of several views")
+    return write_file(path, format_ply(**arrays))
 
 
 def make_cloud(source: str, arrays: dict[str, Any], viewpoint: Tensor | None = None, scale: float = 1.0) -> CloudFile:
@@ -105,8 +231,8 @@ def _as_rows(source: str, name: str, array: Any) -> Tensor:
         raise CloudFileError("path", f"{source}: {name} of type {array.dtype}", "real numbers")
     if array.ndim not in ((1, 2, 3) if name == "viewpoint" else (2, 3)) or array.shape[-1] != 3:
         raise CloudFileError("path", f"{source}: {name} of shape {array.shape}", "(n, 3), or (h, w, 3) of an image")
-    if array.size > 3 * MAX_POINTS:
-        raise CloudFileError("path", f"{source} with {array.size // 3} points", f"at most {MAX_POINTS} points")
+    if array.size > 3 * CLOUD_POINTS:
+        raise CloudFileError("path", f"{source} with {array.size // 3} points", f"at most {CLOUD_POINTS} points")
     # A copy: owned, writable, native bytes. What double precision cannot hold becomes infinite, as of no point.
     with np.errstate(invalid="ignore", over="ignore"):
         rows = np.array(array, dtype=np.float64, order="C")
@@ -124,7 +250,7 @@ def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dic
         more = table[..., 3:].reshape(-1, 3).astype(np.float64)
         more = more[np.isfinite(more).all(1) & more.any(1)]
         length = np.linalg.norm(more.clip(-2, 2), axis=1)  # no unit vector has more, and squares would overflow
-        if len(more) and np.mean(np.abs(length - 1) < UNIT_LENGTH) >= MOST_UNIT:
+        if len(more) and np.mean(np.abs(length - 1) < 0.05) >= 0.9:
             split["normals"] = table[..., 3:]
         else:
             notes.append("columns 4 to 6 are no unit vectors (colours?) and were left out")
@@ -154,7 +280,7 @@ def _find_measured(points: Tensor, normals: Tensor | None, notes: list[str]) -> 
 
 def _judge_default(cloud: PointCloud, notes: list[str]) -> PointCloud:
     """Keep the viewpoint (0, 0, 0) only if the points look like seen from there."""
-    points = cloud.points[draw_rows(len(cloud), FEW)]
+    points = cloud.points[draw_rows(len(cloud), 2000)]
     if bool(points.ne(points[0]).any()):  # else all coincide, which is refused later
         points = points[find_inliers(points)]
         if not bool(guess_viewpoint(points, fit_planes(points)[0]).any()):

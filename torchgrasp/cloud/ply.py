@@ -4,13 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from torchgrasp.cloud.io.text import MAX_POINTS, read_table
+from torchgrasp.cloud.tables import read_table
 from torchgrasp.files.meshes import load_triangles
+from torchgrasp.limits import CLOUD_POINTS, TEXT_MESH_BYTES
 
-MAX_MESH_TEXT = 64 * 2**20
-"""Most bytes of a mesh in text: the parser needs 20 times the memory."""
-MESH_POINTS = 2000
-"""Points drawn from the surface of a mesh: as many as a shape is fitted to."""
 TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2"},
     **{"uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
@@ -50,12 +47,12 @@ def parse_ply(data: bytes) -> dict[str, Any]:
     if encoding not in ("ascii", "binary_little_endian", "binary_big_endian"):
         raise ValueError(f"the encoding {encoding!r}")
     # Before the body is parsed: a mesh has twice as many faces as corners.
-    if any(not 0 <= count <= 2 * MAX_POINTS for _, count, _ in elements):
-        raise ValueError(f"elements {[(name, count) for name, count, _ in elements]}; at most {MAX_POINTS} points")
+    if any(not 0 <= count <= 2 * CLOUD_POINTS for _, count, _ in elements):
+        raise ValueError(f"elements {[(name, count) for name, count, _ in elements]}; at most {CLOUD_POINTS} points")
     faces = sum(count for name, count, _ in elements if name == "face")
     if faces:
-        if encoding == "ascii" and len(body) > MAX_MESH_TEXT:
-            raise ValueError(f"a mesh of {len(body)} bytes of text, more than {MAX_MESH_TEXT}; a binary one may have")
+        if encoding == "ascii" and len(body) > TEXT_MESH_BYTES:
+            raise ValueError(f"a mesh of {len(body)} bytes of text, which may have {TEXT_MESH_BYTES}")
         points, normals = _sample_mesh(data)
         return {"points": points, "normals": normals, "viewpoint": viewpoint}
     if not elements or elements[0][0] != "vertex" or any(kind == "list" for _, kind in elements[0][2]):
@@ -97,7 +94,7 @@ def _split_header(data: bytes) -> tuple[list[str], bytes]:
 def _read_columns(body: bytes, encoding: str, count: int, properties: list[tuple[str, str]]) -> dict[str, np.ndarray]:
     """Return the columns of the vertex element by name."""
     names = [name for name, _ in properties]
-    if len(set(names)) != len(names) or not 0 <= count <= MAX_POINTS:
+    if len(set(names)) != len(names) or not 0 <= count <= CLOUD_POINTS:
         raise ValueError(f"the properties {names} of {count} vertices")
     if encoding == "ascii":
         table = read_table(body, count, len(names))
@@ -118,6 +115,6 @@ def _sample_mesh(data: bytes) -> tuple[np.ndarray, np.ndarray | None]:
         raise ValueError(f"a mesh that cannot be parsed ({error})") from error
     if not isinstance(mesh, trimesh.Trimesh) or not mesh.area > 0 or not np.isfinite(mesh.vertices).all():
         raise ValueError("a mesh without a surface")
-    points, faces = trimesh.sample.sample_surface(mesh, MESH_POINTS, seed=0)[:2]
+    points, faces = trimesh.sample.sample_surface(mesh, 2000, seed=0)[:2]
     mesh.merge_vertices()
     return np.asarray(points), np.asarray(mesh.face_normals[faces]) if mesh.is_volume else None

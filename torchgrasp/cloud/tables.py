@@ -1,0 +1,108 @@
+"""Tables of numbers from strangers' files: NumPy's formats, none of which runs code, and text."""
+
+import io
+import math
+import warnings
+import zipfile
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from torchgrasp.limits import CLOUD_BYTES, CLOUD_POINTS, LINE_LETTERS, TEXT_COLUMNS
+
+
+def parse_npy(data: bytes) -> np.ndarray:
+    """Return the array of a .npy file, which must hold what its header promises.
+
+    Raises:
+        ValueError: objects, another version, or fewer bytes than promised.
+    """
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"version {version} of the npy format")
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(stream)
+    if dtype.hasobject or dtype.itemsize * math.prod(shape) > len(data):
+        raise ValueError(f"an array of shape {shape} and type {dtype}, which the file cannot hold")
+    stream.seek(0)
+    return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+def parse_npz(data: bytes, names: Sequence[str], required: str) -> dict[str, np.ndarray]:
+    """Return the arrays of these names in a .npz file, after a check of their unpacked size.
+
+    Raises:
+        ValueError: no array of the `required` name, arrays that are too large, or what `parse_npy` refuses.
+    """
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = [info for info in archive.infolist() if info.filename.removesuffix(".npy") in names]
+        if f"{required}.npy" not in [info.filename for info in members]:
+            found = [info.filename.removesuffix(".npy") for info in archive.infolist()][:8]
+            raise ValueError(f"no array named {required!r}, but {found}")
+        if sum(info.file_size for info in members) > CLOUD_BYTES:
+            raise ValueError(f"arrays of more than {CLOUD_BYTES} bytes")
+        return {info.filename.removesuffix(".npy"): parse_npy(archive.read(info)) for info in members}
+
+
+def read_table(data: bytes, rows: int, columns: int) -> Float[np.ndarray, "rows columns"]:
+    r"""Return the first rows of a table separated by white space.
+
+    Raises:
+        ValueError: too many rows or columns; too few numbers; a word that is no number.
+
+    >>> read_table(b"1 2\n3 4\n5 6", 2, 2).tolist()
+    [[1.0, 2.0], [3.0, 4.0]]
+    """
+    if not (0 <= rows <= CLOUD_POINTS and 1 <= columns <= TEXT_COLUMNS):
+        raise ValueError(f"{rows} points of {columns} numbers, not up to {CLOUD_POINTS} of {TEXT_COLUMNS}")
+    wanted = rows * columns
+    if 2 * wanted > len(data) + 1:  # a number is a digit and a space at least
+        raise ValueError(f"fewer numbers than {rows} points have")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # at a word that is no number; the count tells
+        numbers = np.fromstring(data, dtype=np.float64, count=wanted, sep=" ") if wanted else np.zeros(0)
+    if len(numbers) < wanted:
+        raise ValueError(f"fewer numbers than {rows} points have, or a word that is none")
+    return numbers.reshape(rows, columns)
+
+
+def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
+    r"""Return lines of numbers, separated by blanks, commas or semicolons.
+
+    `#` starts a comment. A first line that begins with the words x y z names the columns.
+
+    Raises:
+        ValueError: no numbers; lines of different length; a line or file that is too long or too wide.
+
+    >>> read_lines(b"# x y z\n1, 2, 3\n").tolist()
+    [[1.0, 2.0, 3.0]]
+    """
+
+    def lines() -> Iterator[str]:
+        stream = io.TextIOWrapper(io.BytesIO(data), encoding="ascii")
+        all_lines = count = 0
+        while line := stream.readline(LINE_LETTERS + 1):
+            all_lines += 1
+            if len(line) > LINE_LETTERS:
+                raise ValueError(f"a line of more than {LINE_LETTERS} characters")
+            if all_lines > 2 * CLOUD_POINTS:
+                raise ValueError(f"more than {2 * CLOUD_POINTS} lines")
+            line = line.split("#")[0].replace(",", " ").replace(";", " ")
+            if not line.isspace() and line:
+                count += 1
+                if count == 1 and line.lower().replace('"', "").split()[:3] == ["x", "y", "z"]:
+                    continue
+                if count > CLOUD_POINTS:
+                    raise ValueError(f"more than {CLOUD_POINTS} lines of numbers")
+                if count <= 2 and len(line.split()) > TEXT_COLUMNS:  # the others have as many, or are refused
+                    raise ValueError(f"more than {TEXT_COLUMNS} numbers in a line")
+                yield line
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of a file without numbers, which has its own sentence here
+        table = np.loadtxt(lines(), ndmin=2)
+    if not table.size:
+        raise ValueError("no numbers")
+    return table

@@ -1,0 +1,204 @@
+"""Collision shapes of a hand's links: covering spheres, exact boxes, and the pairs of links that can meet.
+
+Spheres serve the clearance from object and table. Each collision shape is cut into cells, with one sphere each. No
+surface with a radius of curvature above 25 mm reaches a face between the spheres. Exact boxes and spheres serve
+self-collision; there a cylinder becomes a prism of twelve sides.
+"""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchgrasp.base import Value, check_whole
+from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.frames import rotation_from_rpy
+from torchgrasp.hand.hand_toml import HandSpec
+from torchgrasp.hand.kinematics import tree_from_urdf
+from torchgrasp.hand.self_collision import SelfCollision
+from torchgrasp.hand.urdf import Mimic, Shape, Triple, Urdf
+from torchgrasp.limits import HAND_SEPARATIONS, HAND_SHAPE_PAIRS
+
+FINGER_CELL, PALM_CELL = 0.015, 0.022
+"""Edge of the cells of fingers and palm [m]; edges and corners stick farther out of the spheres of larger cells."""
+SINGLE_LAYER = 0.025
+"""A shape thinner than this [m] has one layer of cells across."""
+BULGE = 0.004
+"""How far a sphere may stand out of a shape's faces [m], other than a fingertip's."""
+MEETING_DISTANCE = 0.002
+"""Links that come nearer than this [m] in some posture are a pair to test."""
+ALWAYS = 0.98
+"""Links that overlap in a larger share of the postures overlap by construction: they are no pair to test."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CollisionSpheres(Value):
+    """Spheres [m] fixed to links. `finger`: index in grasp order, -1 palm, -2 parked; `touching`: of fingertips.
+
+    >>> from torchgrasp import load_hand
+    >>> load_hand("barrett").collision_spheres.center.shape
+    torch.Size([117, 3])
+    """
+
+    link_index: Int[Tensor, " s"]
+    center: Float[Tensor, "s 3"]
+    radius: Float[Tensor, " s"]
+    finger: Int[Tensor, " s"]
+    touching: Bool[Tensor, " s"]
+
+
+def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
+    """Cover every collision shape of a URDF with spheres."""
+    owner = {joint: i for i, f in enumerate(spec.fingers) for joint in f.joints}
+    tips = [f.tip_link for f in spec.fingers]
+    rows: list[tuple[int, Triple, float, int, bool]] = []
+    for index, link in enumerate(urdf.links):
+        movers, touching = urdf.movers(link.name), link.name in tips
+        finger = owner.get(movers[0].name, -2) if movers else -1
+        cell = PALM_CELL if finger == -1 else FINGER_CELL
+        for shape in link.shapes:
+            # a tip's contact is known exactly: no sphere may touch before it
+            centers, radius = _cover(shape, cell, 0.0 if touching else BULGE)
+            rows += [(index, center, radius, finger, touching) for center in centers]
+    link_index, center, radius, finger, touching = zip(*rows, strict=True)
+    center, radius = torch.tensor(center, dtype=torch.float64), torch.tensor(radius, dtype=torch.float64)
+    return CollisionSpheres(torch.tensor(link_index), center, radius, torch.tensor(finger), torch.tensor(touching))
+
+
+def _cover(shape: Shape, cell: float, bulge: float) -> tuple[list[Triple], float]:
+    """Return centres and radius of the spheres that cover a shape."""
+    if shape.kind == "sphere":
+        return [shape.xyz], shape.size[0]
+    cylinder = shape.kind == "cylinder"
+    # a cylinder is cut as its bounding box
+    size = (2 * shape.size[0], 2 * shape.size[0], shape.size[1]) if cylinder else shape.size
+    counts = [1 if x == min(size) and x < SINGLE_LAYER else max(1, round(x / cell)) for x in size]
+    half = [x / n / 2 for x, n in zip(size, counts, strict=True)]
+    thinnest = min((x / 2 for x, n in zip(size, counts, strict=True) if n == 1), default=math.inf)
+    radius = min(math.hypot(*half) - 0.001, thinnest + bulge)
+    centers = []
+    for place in itertools.product(*(range(n) for n in counts)):
+        if all(0 < c < n - 1 for c, n in zip(place, counts, strict=True)):
+            continue  # an inner cell: the outer ones meet the object first
+        center = [(2 * c + 1 - n) * h for c, n, h in zip(place, counts, half, strict=True)]
+        # a sphere is pulled in until it stands out of a face by no more than the bulge
+        reach = [max(0.0, s / 2 + bulge - radius) for s in size]
+        center = [math.copysign(min(abs(c), r), c) for c, r in zip(center, reach, strict=True)]
+        if cylinder:
+            rim, out = max(0.0, shape.size[0] + bulge - radius), math.hypot(center[0], center[1])
+            if out > rim:
+                center[:2] = [center[0] * rim / out, center[1] * rim / out]
+        centers.append(center)
+    rotated = torch.tensor(centers, dtype=torch.float64) @ rotation_from_rpy(shape.rpy).T
+    placed = rotated + torch.tensor(shape.xyz, dtype=torch.float64)
+    return [(x, y, z) for x, y, z in placed.tolist()], radius
+
+
+def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None) -> SelfCollision:
+    """Return the exact shapes of a URDF with the `pairs` of links to test; None: all pairs but neighbours."""
+    names = [x.name for x in urdf.links]
+    tested = {frozenset(pair) for pair in (itertools.combinations(names, 2) if pairs is None else pairs)}
+    if pairs is None:
+        tested -= {frozenset((j.parent, j.child)) for j in urdf.joints}
+    shapes = [(i, *part) for i, link in enumerate(urdf.links) for shape in link.shapes for part in _parts(shape)]
+    link, rotation, center, half, radius = zip(*shapes, strict=True)
+    places = {i: list(of) for i, of in itertools.groupby(range(len(shapes)), link.__getitem__)}
+    meeting = [(i, j) for i in places for j in places if j >= i and frozenset((names[i], names[j])) in tested]
+    if (many := sum(len(places[i]) * len(places[j]) for i, j in meeting)) > HAND_SHAPE_PAIRS:
+        found = f"{many} pairs of shapes to test for collisions"
+        raise urdf.wrong(found, f"at most {HAND_SHAPE_PAIRS} pairs, where a cylinder counts as six shapes")
+    kinds: tuple[list[tuple[int, int]], ...] = ([], [], [])
+    for one, two in sorted((one, two) for i, j in meeting for one in places[i] for two in places[j] if two > one):
+        spheres = radius[one] > 0, radius[two] > 0
+        kinds[sum(spheres)].append((two, one) if spheres == (False, True) else (one, two))
+    return SelfCollision(
+        link=torch.tensor(link),
+        rotation=torch.stack(rotation, -1),
+        center=torch.tensor(center, dtype=torch.float64),
+        half=torch.tensor(half, dtype=torch.float64),
+        radius=torch.tensor(radius, dtype=torch.float64),
+        pairs=torch.tensor([pair for kind in kinds for pair in kind], dtype=torch.long).reshape(-1, 2),
+        kinds=(len(kinds[0]), len(kinds[1]), len(kinds[2])),
+    )
+
+
+def _parts(shape: Shape) -> list[tuple[Float[Tensor, "3 3"], Triple, Triple, float]]:
+    """Return the boxes or the sphere of a shape: rotation, centre, half sizes, radius.
+
+    The prism of a cylinder is the union of six boxes, each of which reaches from one side to the opposite side.
+    """
+    rotation = rotation_from_rpy(shape.rpy)
+    if shape.kind == "sphere":
+        return [(rotation, shape.xyz, (0.0, 0.0, 0.0), shape.size[0])]
+    if shape.kind == "box":
+        x, y, z = shape.size
+        return [(rotation, shape.xyz, (x / 2, y / 2, z / 2), 0.0)]
+    boxes = 6
+    step = math.pi / boxes
+    corner = 2 * shape.size[0] / (1 + math.cos(step / 2))  # as far outside the circle as the sides are inside
+    half = (corner * math.cos(step / 2), corner * math.sin(step / 2), shape.size[1] / 2)
+    return [(rotation @ rotation_from_rpy((0.0, 0.0, k * step)), shape.xyz, half, 0.0) for k in range(boxes)]
+
+
+def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, seed: int = 0) -> list[tuple[str, str]]:
+    """Return the pairs of links that meet in some of n random postures, but not in nearly all, without neighbours.
+
+    Every joint is uniform within its limits, so that the pairs serve all finger options.
+
+    Raises:
+        BadArgument: n outside [1, 10^7]; a coupling with joints that the URDF lacks.
+        HandFileError: too many shapes so near each other that the test would take too long.
+    """
+    check_whole("n", n, 1, 10**7)
+    tree, shapes = tree_from_urdf(urdf), self_collision_from_urdf(urdf, None)
+    if not len(shapes.pairs):
+        return []
+    links, owner = torch.unique(shapes.link[shapes.pairs].sort(1).values, dim=0, return_inverse=True)
+    met, near = torch.zeros(2, len(links))
+    done = 0
+    for look in draw_postures(urdf, coupling, n, seed).split(1000, 1):
+        if not len(owner):
+            break
+        chunks = [tree.frames(chunk) for chunk in look.split(max(1, 100_000 // len(owner)), 1)]  # bounds the memory
+        if not done:
+            _limit_near(urdf, shapes, chunks[0], look.shape[1], HAND_SEPARATIONS // 10)
+        for frames in chunks:
+            apart = shapes.separations(frames, MEETING_DISTANCE)
+            least = apart.new_full((len(links), apart.shape[1]), torch.inf)
+            least.scatter_reduce_(0, owner[:, None].expand_as(apart), apart, "amin")
+            met += (least < 0).sum(1)
+            near += (least < MEETING_DISTANCE).sum(1)
+        done += look.shape[1]
+        met[met >= done] = torch.inf  # links that overlapped in every posture so far
+        settled = (met == torch.inf) | ((near > 0) & (met + (n - done) <= ALWAYS * n))  # whatever the rest shows
+        kept = ~settled[owner]
+        shapes, owner = shapes.only(kept), owner[kept]
+        _limit_near(urdf, shapes, chunks[0], n - done, HAND_SEPARATIONS)
+    meeting = links[(near > 0) & (met <= ALWAYS * n)]
+    return [(tree.link_names[i], tree.link_names[j]) for i, j in meeting.tolist()]
+
+
+def _limit_near(urdf: Urdf, shapes: SelfCollision, frames: Float[Tensor, "3 4 l n"], ahead: int, most: int) -> None:
+    """Refuse shapes with too many separations to measure, if the postures ahead are like those of `frames`."""
+    left = shapes.count_near(frames, MEETING_DISTANCE) * ahead // frames.shape[3]
+    if left > most:
+        found = f"{len(shapes.pairs)} pairs of shapes so near each other that {left} separations must be measured"
+        raise urdf.wrong(found, f"at most {most} separations: fewer shapes in one place")
+
+
+def draw_postures(urdf: Urdf, coupling: Mapping[str, Mimic], n: int, seed: int) -> Float[Tensor, "j n"]:
+    """Draw every movable joint uniformly within its limits; coupled joints follow."""
+    movable = {j.name: j for j in urdf.movable}
+    unknown = sorted(({*coupling} | {mimic.source for mimic in coupling.values()}) - set(movable))
+    if unknown:
+        raise BadArgument("coupling", unknown[0], f"joints of the URDF: {sorted(movable)}")
+    share = np.random.default_rng(seed).random((len(movable), n))
+    drawn = {name: j.lower + (j.upper - j.lower) * share[k] for k, (name, j) in enumerate(movable.items())}
+    for joint, mimic in coupling.items():
+        drawn[joint] = mimic.ratio * drawn[mimic.source] + mimic.offset
+    return torch.from_numpy(np.stack([drawn[name] for name in movable]))

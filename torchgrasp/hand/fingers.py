@@ -1,0 +1,167 @@
+"""The fingers of a hand: the actuated joints with the joints that follow them, and the fingertips with their pads."""
+
+import dataclasses
+import functools
+import math
+from typing import Annotated
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchgrasp.base import Value, check_device
+from torchgrasp.checks import ANY, checked
+from torchgrasp.errors import BadArgument
+from torchgrasp.hand.hand_toml import HandSpec
+from torchgrasp.hand.kinematics import KinematicTree, map_directions, map_points, pose_in_carrier, tree_from_urdf
+from torchgrasp.hand.urdf import Mimic, Urdf
+
+ROUND_PAD, FLAT_PAD = math.radians(60), math.radians(40)
+"""Half angles [rad] of the cone about the pad's axis in which a round and a flat fingertip may touch."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ActuatedJoints(Value):
+    """Joints [rad or m] that move the grasping fingers. The URDF's movable joints are `coupling @ joints + offset`.
+
+    >>> from torchgrasp import load_hand
+    >>> actuated = load_hand("barrett").actuated
+    >>> actuated.check(actuated.lower), actuated.check_limits(actuated.upper)
+    (None, None)
+    >>> torch.equal(actuated.couple(actuated.lower), actuated.expand(actuated.lower))
+    True
+    """
+
+    names: tuple[str, ...]
+    lower: Float[Tensor, " h"]
+    upper: Float[Tensor, " h"]
+    coupling: Float[Tensor, "j h"]
+    offset: Float[Tensor, " j"]
+
+    @checked(gradients=True)
+    def expand(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
+        """Check the joints and return every movable joint of the URDF."""
+        self.check(joints)
+        return self.couple(joints)
+
+    @checked(gradients=True)
+    def couple(self, joints: Annotated[Float[Tensor, "*b h"], ANY]) -> Float[Tensor, "*b j"]:
+        """Return every movable joint of the URDF without a check, for which the host would wait for a GPU."""
+        return joints @ self.coupling.to(joints).T + self.offset.to(joints)
+
+    @checked(gradients=True)
+    def check(self, joints: Tensor, name: str = "joints") -> None:
+        """Refuse joints of a wrong count, dtype or device, NaN and infinity."""
+        if joints.ndim < 1 or joints.shape[-1] != len(self.names):
+            raise BadArgument(
+                name, f"shape {tuple(joints.shape)}", f"{len(self.names)} joints in the last axis: {self.names}"
+            )
+        if joints.dtype not in (torch.float32, torch.float64):
+            raise BadArgument(name, str(joints.dtype), "torch.float32 or torch.float64")
+        check_device(name, joints.device, "the hand", self.lower.device)
+        self._refuse(name, joints, ~torch.isfinite(joints), "finite numbers")
+
+    @checked(gradients=True)
+    def check_limits(self, joints: Tensor, name: str = "joints") -> None:
+        """Refuse what `check` refuses, and joints beyond their limits by more than rounding to float32."""
+        self.check(joints, name)
+        low, high = self.lower.to(joints) - 1e-6, self.upper.to(joints) + 1e-6
+        self._refuse(name, joints, (joints < low) | (joints > high), None)
+
+    def _refuse(self, name: str, joints: Tensor, wrong: Tensor, allowed: str | None) -> None:
+        """Raise `BadArgument` with the first wrong joint; `allowed` is by default the range of the joint."""
+        if bool(wrong.any()):
+            *batch, k = torch.nonzero(wrong)[0].tolist()
+            limits = f"a number in [{self.lower[k].item():.6g}, {self.upper[k].item():.6g}]"
+            raise BadArgument(name, f"{joints[(*batch, k)].item():.6g} for {self.names[k]}", allowed or limits)
+
+
+def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
+    """Return the joints of the grasping fingers; refuse joints without a range, and joints without a role.
+
+    A joint of another finger is among them if a joint of a grasping finger follows it.
+    """
+    movable = {j.name: j for j in urdf.movable}
+    own = [j for f in spec.fingers for j in f.joints]
+    leaders = [spec.coupling[j].source for j in own if j in spec.coupling]
+    names = tuple(dict.fromkeys([*(j for j in own if j not in spec.coupling), *leaders]))
+    limits = torch.tensor([[movable[n].lower, movable[n].upper] for n in names], dtype=torch.float64)
+    limits = limits + torch.tensor([spec.limit_margin, -spec.limit_margin], dtype=torch.float64)
+    for name, (low, high) in zip(names, limits.tolist(), strict=True):
+        if not low < high:
+            found = f"limit_margin {spec.limit_margin:g}, which leaves [{low:g}, {high:g}] to joint {name}"
+            raise spec.wrong(found, "lower < upper")
+    coupling = torch.zeros(len(movable), len(names), dtype=torch.float64)
+    offset = torch.zeros(len(movable), dtype=torch.float64)
+    for row, joint in enumerate(movable):
+        source, ratio, shift = spec.coupling.get(joint, Mimic(joint, 1.0, 0.0))
+        if source in names:
+            coupling[row, names.index(source)] = ratio
+            offset[row] = shift
+        elif source in spec.parked or spec.option not in spec.options:
+            opened = min(max(0.0, movable[source].lower), movable[source].upper)
+            offset[row] = ratio * spec.parked.get(source, opened) + shift
+        else:
+            raise spec.wrong(f"joint {joint}, which does neither", "every joint to grasp or to be parked")
+    return ActuatedJoints(names, limits[:, 0].clone(), limits[:, 1].clone(), coupling, offset)
+
+
+@dataclasses.dataclass(frozen=True)
+class Fingertips(Value):
+    """Names and links of the fingers in grasp order, with the `Pad` of each in the link's frame.
+
+    `index` locates the links in the whole tree. Each tip is fixed to a carrier, the last link that a joint moves.
+    `chains` is the part of the tree that leads to the carriers, and `carrier` locates them in it.
+
+    >>> from torchgrasp import load_hand
+    >>> hand = load_hand("allegro")
+    >>> hand.tips.names, hand.tips.frames(hand.expand_joints(hand.lower[None]).T)[1].shape
+    (('index', 'middle', 'thumb'), torch.Size([3, 4, 3, 1]))
+    """
+
+    names: tuple[str, ...]
+    links: tuple[str, ...]
+    index: Int[Tensor, "f"]
+    contact: Float[Tensor, "f 3"]
+    normal: Float[Tensor, "f 3"]
+    center: Float[Tensor, "f 3"]
+    radius: Float[Tensor, "f"]
+    chains: KinematicTree
+    carrier: Int[Tensor, "f"]
+    carrier_from_tip: Float[Tensor, "3 4 f 1"]
+
+    def __len__(self) -> int:
+        """Count the fingertips, f."""
+        return len(self.names)
+
+    @property
+    def cone(self) -> Float[Tensor, "f"]:
+        """Half angle [rad] of the cone about each pad's axis in which the tip may touch."""
+        return torch.where(self.radius > 0, ROUND_PAD, FLAT_PAD).to(self.radius)
+
+    @functools.cached_property
+    def in_carriers(self) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
+        """`contact`, `normal` and `center` in the frames of the carriers."""
+        pose = self.carrier_from_tip
+        contact, center = (map_points(pose, x)[..., 0].T for x in (self.contact, self.center))
+        return contact, map_directions(pose, self.normal)[..., 0].T, center
+
+    @checked(gradients=True)
+    def frames(self, values: Float[Tensor, "j n"]) -> tuple[Float[Tensor, "3 4 l n"], Float[Tensor, "3 4 f n"]]:
+        """Return the frames of all links of `chains` and of the carriers."""
+        if len(values) != len(self.chains.joint_names):
+            raise BadArgument("values", f"{len(values)} joints", f"all {len(self.chains.joint_names)} of the URDF")
+        frames = self.chains.frames(values)
+        return frames, frames.index_select(2, self.carrier)
+
+
+def tips_from_files(spec: HandSpec, urdf: Urdf) -> Fingertips:
+    """Return the fingertips of the chosen fingers."""
+    links, tips = [x.name for x in urdf.links], tuple(f.tip_link for f in spec.fingers)
+    pads = (torch.tensor(x, dtype=torch.float64) for x in zip(*(f.pad for f in spec.fingers), strict=True))
+    carriers, poses = zip(*(pose_in_carrier(urdf, tip) for tip in tips), strict=True)
+    chains = tree_from_urdf(urdf, carriers)
+    carrier = torch.tensor([chains.link_names.index(name) for name in carriers])
+    index = torch.tensor([links.index(tip) for tip in tips])
+    names = tuple(f.name for f in spec.fingers)
+    return Fingertips(names, tips, index, *pads, chains, carrier, torch.stack(poses, -1)[..., None])
