@@ -18,11 +18,10 @@ from torchgrasp.geometry.signed_distance import SignedDistanceField, field_from_
 from torchgrasp.hand.hand import Hand
 from torchgrasp.plan.round_cones import closed_exact
 from torchgrasp.posture_model.sample import HandSamples
-from torchgrasp.shape.condition import condition
-from torchgrasp.shape.gp import Normalisation, ShapeGP
-from torchgrasp.shape.gradient_kernel import cross_covariance
-from torchgrasp.shape.kernel import Kernel, Profile
-from torchgrasp.shape.observations import Observations
+from torchgrasp.shape.fit import condition
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.kernel import Kernel, Profile, cross_covariance
+from torchgrasp.shape.values import Normalisation, Observations
 from torchgrasp.values import Contacts, PointCloud
 
 ROOT = Path(__file__).parents[1]

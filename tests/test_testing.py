@@ -9,7 +9,8 @@ import torch
 from torchgrasp.errors import BrokenLaw, HandFileError
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hands_folder
-from torchgrasp.shape import Kernel, kernel_by_name, matern52_kernel, rbf_kernel, thin_plate_kernel
+from torchgrasp.shape import Kernel, matern52_kernel, rbf_kernel, thin_plate_kernel
+from torchgrasp.shape.kernel import kernel_by_name
 from torchgrasp.testing import check_hand, check_kernel, check_scene
 
 

@@ -16,7 +16,8 @@ from benchmarks.ground_truth import read_views, sample_mesh
 from torchgrasp.columns import format_columns
 from torchgrasp.data import read_family
 from torchgrasp.evaluation.intervals import mean_over
-from torchgrasp.shape.fit import STD_FACTORS, VESSEL_STD_FACTOR, WHOLE_STD_FACTOR, fit_shape
+from torchgrasp.shape.fit import fit_shape
+from torchgrasp.shape.support import STD_FACTORS
 
 NORMAL_SHARES = (0.683, 0.954, 0.997)
 """What a normal distribution holds within 1, 2 and 3 deviations."""
@@ -27,15 +28,12 @@ FACTORS = np.arange(0.2, 1.5, 0.01)
 HIDDEN, TABLE_FACE, SAMPLES = 0.006, 0.002, 1500
 """Distance [m] of hidden surface from the cloud; height [m] of the face on the table, which is left out; points."""
 
-SHIPPED = {**STD_FACTORS, ("vessel", True): VESSEL_STD_FACTOR, ("whole", True): WHOLE_STD_FACTOR}
-"""The factors in use, of each kind of hidden side."""
-
 Row = dict[str, Any]
 """The family, the kind of hidden side with whether there was a table, errors over the posterior's deviations."""
 
 
 def bands(objects: tyro.conf.Positional[Path], beside: Path | None = None, views: tuple[str, ...] = ()) -> None:
-    """Print the factors for `torchgrasp/shape/fit.py`, and what bands hold on families left out.
+    """Print the factors for `torchgrasp/shape/support.py`, and what bands hold on families left out.
 
     Args:
         objects: a folder of objects as `torchgrasp.data` reads it.
@@ -47,12 +45,12 @@ def bands(objects: tyro.conf.Positional[Path], beside: Path | None = None, views
     factors = {kind: fit_factor([row["ratio"] for row in rows if row["kind"] == kind]) for kind in kinds}
     for row in rows:
         others = [r["ratio"] for r in rows if r["kind"] == row["kind"] and r["family"] != row["family"]]
-        row["factor"] = fit_factor(others) if others else SHIPPED[row["kind"]]
+        row["factor"] = fit_factor(others) if others else STD_FACTORS[row["kind"]]
     print(f"STD_FACTORS = {factors}\nfamilies left out\n{format_shares(rows)}")
     if beside is not None:
         rows = measure_ratios(beside, views)
         for row in rows:
-            row["factor"] = factors.get(row["kind"], SHIPPED[row["kind"]])
+            row["factor"] = factors.get(row["kind"], STD_FACTORS[row["kind"]])
         print(f"{beside.name}, which chose nothing\n{format_shares(rows)}")
 
 

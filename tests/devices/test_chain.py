@@ -38,7 +38,8 @@ from torchgrasp.planner.contacts import spread_rows
 from torchgrasp.planner.problem import take_target
 from torchgrasp.scene import estimate_occupancy
 from torchgrasp.shape import extract_surface
-from torchgrasp.shape.completion import complete_cloud, silhouettes
+from torchgrasp.shape.completion.complete import complete_cloud
+from torchgrasp.shape.completion.silhouette import silhouettes
 from torchgrasp.testing.hands import random_joints
 
 SPEC, CPU = ContactSpec(table=0.0), torch.device("cpu")

@@ -20,10 +20,10 @@ from torchgrasp.plan.solver import Stage, descend, start_state
 from torchgrasp.posture_model.em import expectation, expectation_maximisation
 from torchgrasp.posture_model.kmeans import start_components
 from torchgrasp.posture_model.shard import Shard
+from torchgrasp.shape.conditioning import select_points
 from torchgrasp.shape.kernel import kernel_by_name
-from torchgrasp.shape.observations import off_surface, on_surface
-from torchgrasp.shape.select import select_points
 from torchgrasp.shape.surface import extract_surface
+from torchgrasp.shape.values import off_surface, on_surface
 
 
 def waits_of_a_step(waits: Waits, run: Callable[[int], object], few: int, more: int) -> dict[str, float]:

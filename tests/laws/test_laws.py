@@ -17,9 +17,8 @@ from torchgrasp import (
     plan_contacts,
 )
 from torchgrasp.geometry.frames import apply, rotate
-from torchgrasp.shape.condition import condition
-from torchgrasp.shape.gp import Normalisation
-from torchgrasp.shape.observations import Observations
+from torchgrasp.shape.fit import condition
+from torchgrasp.shape.values import Normalisation, Observations
 from torchgrasp.values import Contacts
 
 

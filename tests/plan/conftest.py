@@ -8,7 +8,7 @@ from torch import Tensor
 
 from tests.make import half_ball as ball
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.posterior import SurfaceJet
+from torchgrasp.shape.values import SurfaceJet
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,7 +9,7 @@ from tests.make import HALF_BALL_RADIUS as RADIUS
 from tests.make import contacts_on
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.line_posterior import FOOTPRINT, NODES, first_contact, grid, line_posterior
-from torchgrasp.shape.joint_posterior import combined_covariance, distance_covariance
+from torchgrasp.shape.posterior import combined_covariance, distance_covariance
 
 
 def test_a_finger_stops_where_the_drawn_distance_turns_negative_nearest_to_its_contact(doubtful, generator):

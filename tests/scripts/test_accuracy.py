@@ -22,9 +22,9 @@ from benchmarks.shape.weaker_inputs import bench_weaker
 from benchmarks.shape.worst_views import bench_worst
 from PIL import Image
 
-from torchgrasp.shape.condition import condition
-from torchgrasp.shape.gp import Normalisation, ShapeGP
-from torchgrasp.shape.observations import Observations
+from torchgrasp.shape.fit import condition
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.values import Normalisation, Observations
 from torchgrasp.values import PointCloud
 
 RADIUS = 0.04

@@ -13,9 +13,9 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure_lp import solve_closure_lp
 from torchgrasp.plan.wrench import wrenches
+from torchgrasp.shape.conditioning import select_points
 from torchgrasp.shape.kernel import kernel_by_name, thin_plate
-from torchgrasp.shape.observations import on_surface
-from torchgrasp.shape.select import select_points
+from torchgrasp.shape.values import on_surface
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts
 

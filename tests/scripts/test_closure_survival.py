@@ -7,9 +7,9 @@ import torch
 import trimesh
 from benchmarks.plan.closure_survival import closure_survival
 
-from torchgrasp.shape.condition import condition
-from torchgrasp.shape.gp import Normalisation, ShapeGP
-from torchgrasp.shape.observations import Observations
+from torchgrasp.shape.fit import condition
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.values import Normalisation, Observations
 from torchgrasp.values import PointCloud
 
 RADIUS = 0.04

@@ -9,12 +9,12 @@ from torch import Tensor
 from tests.make import covariance
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.shape.condition import condition, longest_distance
-from torchgrasp.shape.fit import fit_shape
-from torchgrasp.shape.gp import Normalisation, ShapeGP
+from torchgrasp.shape.conditioning import longest_distance
+from torchgrasp.shape.fit import condition, fit_shape
+from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.kernel import thin_plate
-from torchgrasp.shape.observations import Observations
 from torchgrasp.shape.surface import extract_surface
+from torchgrasp.shape.values import Normalisation, Observations
 from torchgrasp.values import PointCloud
 
 NOISE = 0.01

@@ -12,9 +12,8 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.mesh import closest_on_triangles
 from torchgrasp.plan.line_posterior import line_posterior
 from torchgrasp.shape.fit import fit_shape
-from torchgrasp.shape.hollow import HollowShape
+from torchgrasp.shape.hollow import HollowShape, Middle, tie_walls
 from torchgrasp.shape.surface import extract_surface
-from torchgrasp.shape.wall_observations import Middle, tie_walls
 from torchgrasp.values import Contacts
 
 WALL = 0.003
@@ -59,8 +58,8 @@ def test_without_a_table_and_of_a_closed_body_there_is_one_surface(seen_cylinder
 
 def test_the_greater_distance_counts_with_its_own_normal_and_covariance(vessel: HollowShape, generator):
     x = 0.8 * unit(torch.randn(60, 3, generator=generator, dtype=torch.float64))
-    outer, lining = vessel.walls
-    a, b = outer.estimate(x), lining.estimate(x)
+    outer, inner = vessel.walls
+    a, b = outer.estimate(x), inner.estimate(x)
     inner = b[0][:, 0] > a[0][:, 0]
     assert 5 < int(inner.sum()) < 55
     mean, covariance = vessel.estimate(x)
@@ -101,7 +100,7 @@ def test_a_touch_moves_the_wall_that_it_meets(vessel: HollowShape):
     assert isinstance(touched, HollowShape)
     assert touched.predict(point).distance.abs() * vessel.scale < 0.001
     inside = vessel.normalise(ring(RADIUS - WALL, 0.03, 0.05)[0])
-    torch.testing.assert_close(touched.lining.mean(inside), vessel.lining.mean(inside))
+    torch.testing.assert_close(touched.inner.mean(inside), vessel.inner.mean(inside))
 
 
 def test_the_mesh_has_both_walls_and_the_volume_of_the_material(vessel: HollowShape):
@@ -131,8 +130,8 @@ def test_a_fingers_line_meets_the_wall_of_its_contact(vessel: HollowShape):
     lines = line_posterior(vessel, Contacts(points[None], normals[None]))
     covariance = (lines.root @ lines.root).reshape(3, 20, 3, 20)
     assert covariance[0, :, 1].abs().max() < 1e-9 and covariance[2, :, 1].abs().max() < 1e-9
-    outer, lining = vessel.walls
-    alone = [line_posterior(wall, Contacts(points[None], normals[None])) for wall in (outer, lining)]
+    outer, inner = vessel.walls
+    alone = [line_posterior(wall, Contacts(points[None], normals[None])) for wall in (outer, inner)]
     for k, whole in ((0, alone[0]), (1, alone[1]), (2, alone[0])):
         torch.testing.assert_close(lines.distance[0, k], whole.distance[0, k])
         torch.testing.assert_close(lines.slope[0, k], whole.slope[0, k])
@@ -143,13 +142,13 @@ def test_walls_are_tied_at_their_thickness_and_floors_only_where_they_are_thinne
     every, thickness = torch.ones(len(places), dtype=torch.bool), 0.005 / vessel.scale
 
     def sum_of(shape: HollowShape) -> Tensor:
-        return shape.outer.mean(places) + shape.lining.mean(places)
+        return shape.outer.mean(places) + shape.inner.mean(places)
 
     tied = tie_walls(vessel, Middle(places, every, thickness))
     assert (sum_of(vessel) + thickness).abs().median() * vessel.scale > 0.001
     assert (sum_of(tied) + thickness).abs().median() * vessel.scale < 0.0006
     thin = tie_walls(vessel, Middle(places, ~every, 0.0005 / vessel.scale))
-    assert len(thin.lining.x) == len(vessel.lining.x) and len(thin.x) == len(vessel.x)
+    assert len(thin.inner.x) == len(vessel.inner.x) and len(thin.x) == len(vessel.x)
 
 
 @pytest.mark.parametrize("seed", range(4))

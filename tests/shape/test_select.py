@@ -11,10 +11,9 @@ from tests.make import covariance
 from torchgrasp.base import join
 from torchgrasp.errors import IndefiniteCovariance
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.shape.condition import posterior_given
+from torchgrasp.shape.conditioning import Criterion, Selection, posterior_given, select_points
 from torchgrasp.shape.kernel import kernel_by_name, thin_plate
-from torchgrasp.shape.observations import Observations, on_surface
-from torchgrasp.shape.select import Criterion, Selection, select_points
+from torchgrasp.shape.values import Observations, on_surface
 
 PSI = 3.6
 PLATE = kernel_by_name("thin_plate", PSI)

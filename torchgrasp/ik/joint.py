@@ -28,7 +28,7 @@ from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.flatness import FlatnessConstraint, flatness_constraint
 from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet, triple_mean_jet, with_variance
 from torchgrasp.plan.solver import equal_tensions, normalise_tensions, project
-from torchgrasp.shape.posterior import SurfaceJet
+from torchgrasp.shape.values import SurfaceJet
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts, Grasps, IKSeeds
 

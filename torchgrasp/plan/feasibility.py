@@ -10,7 +10,7 @@ from torchgrasp.plan.closure_lp import solve_closure_lp
 from torchgrasp.plan.flatness import normal_variation
 from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet
 from torchgrasp.plan.wrench import BALANCED, MIN_MARGIN, MIN_RANK_RATIO, Vectors, rank_ratio, wrenches
-from torchgrasp.shape.posterior import surface_deviation
+from torchgrasp.shape.values import surface_deviation
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan, Contacts
 

@@ -24,8 +24,8 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import check_contacts, check_unit
 from torchgrasp.plan.wrench import Vectors, tangents
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.joint_posterior import combined_covariance, symmetric_root
-from torchgrasp.shape.posterior import surface_deviation
+from torchgrasp.shape.posterior import combined_covariance, symmetric_root
+from torchgrasp.shape.values import surface_deviation
 from torchgrasp.values import Contacts
 
 FOOTPRINT = 0.012

@@ -21,7 +21,7 @@ from torch import Tensor
 from torchgrasp.base import Batch, map_tensors
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.plan.wrench import Vectors
-from torchgrasp.shape.posterior import MeanJet, SurfaceJet
+from torchgrasp.shape.values import MeanJet, SurfaceJet
 from torchgrasp.specs import ContactSpec
 
 INSIDE = 0.99

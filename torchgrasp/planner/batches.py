@@ -26,7 +26,7 @@ from torchgrasp.plan.solve import plan_in_turn
 from torchgrasp.plan.starts import check_starts
 from torchgrasp.planner.contacts import Pool, SeededContacts, contact_costs, find_contacts, join_seeded
 from torchgrasp.planner.problem import Problem, ignore
-from torchgrasp.shape.posterior import surface_deviation
+from torchgrasp.shape.values import surface_deviation
 from torchgrasp.specs import Ranking
 from torchgrasp.values import Grasps
 

@@ -20,7 +20,8 @@ from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.scene.scene import DepthImage, Scene
+from torchgrasp.scene.image import DepthImage
+from torchgrasp.scene.scene import Scene
 
 SPACING = 0.005
 """Spacing [m] of the voxels: a third of a finger's width."""

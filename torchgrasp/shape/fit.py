@@ -2,72 +2,47 @@
 
 import dataclasses
 import math
+import sys
+import warnings
 from typing import Annotated, Literal
 
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
 
 from torchgrasp.base import join
-from torchgrasp.checks import LEAST, Range, Seed, checked
+from torchgrasp.checks import LEAST, Positive, Range, Seed, checked
 from torchgrasp.cloud.check import remove_duplicates
+from torchgrasp.cloud.neighbours import nearest
+from torchgrasp.cloud.parts import find_second_body
 from torchgrasp.cloud.prepare import PreparedCloud, prepare_cloud
-from torchgrasp.geometry.linalg import fibonacci_sphere, unit
+from torchgrasp.errors import CutOff, Gap, TwoBodies
 from torchgrasp.geometry.plane import Plane, as_plane, round_upright, upright_frame
-from torchgrasp.shape.completion.complete import LEAST_NOISE, PART, Completion, Kind, complete_cloud
-from torchgrasp.shape.completion.doubt import warn_of_doubts
-from torchgrasp.shape.completion.free_space import free_space, free_space_violations
-from torchgrasp.shape.completion.silhouette import silhouettes
-from torchgrasp.shape.completion.vessel import Vessel, find_vessel
-from torchgrasp.shape.condition import check_kernel, longest_distance
-from torchgrasp.shape.gp import Normalisation, ShapeGP
-from torchgrasp.shape.hollow import HollowShape
-from torchgrasp.shape.kernel import Kernel, KernelName, kernel_by_name
-from torchgrasp.shape.observations import Observations, off_surface, on_surface
-from torchgrasp.shape.select import Criterion, select_points
-from torchgrasp.shape.update import append_observations
-from torchgrasp.shape.wall_observations import (
-    OUTER_POINTS,
-    OUTER_RADIUS,
-    RIM_NOISE,
-    Middle,
-    WallObservations,
-    observe_walls,
-    tie_walls,
+from torchgrasp.shape.completion.complete import complete_cloud
+from torchgrasp.shape.completion.silhouette import Outlines, silhouettes
+from torchgrasp.shape.completion.vessel import find_vessel
+from torchgrasp.shape.conditioning import (
+    Criterion,
+    append_observations,
+    check_kernel,
+    longest_distance,
+    posterior_given,
+    select_points,
 )
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.hollow import HollowShape, tie_walls, vessel_supports
+from torchgrasp.shape.kernel import Kernel, KernelName, kernel_by_name
+from torchgrasp.shape.support import (
+    FREE_NOISE,
+    OUTER_POINTS,
+    Support,
+    camera_support,
+    free_space_violations,
+    paper_support,
+)
+from torchgrasp.shape.values import Normalisation, Observations, off_surface, on_surface
 from torchgrasp.values import PointCloud
 
-OUTER_NOISE = 0.3
-"""Standard deviation, normalised, of a distance outside: the nearest of sparse points is too far. The hidden side of a
-ball lies 3 mm inside with .01 as with .1, but not with .3 to 1."""
-NORMAL_NOISE = 0.05
-"""Standard deviation of a seen normal: 3 degrees."""
-RIM_NORMAL_NOISE = 0.5
-"""Standard deviation of a rim normal; a smaller one bends the seen side."""
-MIRROR_NORMAL_NOISE = 0.25
-"""Standard deviation of a mirrored normal: 14 degrees, the median error of the hidden side."""
-STD_FACTORS: dict[tuple[Kind, bool], float] = {
-    ("ball", True): 0.5,
-    ("revolution", True): 0.56,
-    ("mirrored", True): 0.59,
-    ("ball", False): 0.56,
-    ("revolution", False): 0.59,
-    ("mirrored", False): 0.75,
-    ("guess", True): 1.0,
-    ("guess", False): 1.0,
-    ("cut off", True): 2.0,
-    ("cut off", False): 2.0,
-}
-"""Real deviations over the posterior's, by what the hidden side follows from and whether the table is known: fitted by
-`scripts/train.py bands DIR`, tried on families left out. A guess keeps the posterior's own; half a can needs twice."""
-WHOLE_STD_FACTOR, VESSEL_STD_FACTOR = 0.5, 0.58
-"""The same where all sides were seen; of a vessel: families left out lie to 76, 94 and 100 % within 1, 2 and 3."""
-FREE_NOISE, FREE_ROUNDS = 0.003, 3
-"""Standard deviation [m] of a least distance in free space, a bound; times that a shape is pushed out of it."""
-BUDGETS = {"camera": 85, "paper": 70}
-"""Points observed by default: fewer lose accuracy on the seen side, more cost planning time."""
 MAX_BUDGET = 1000
-"""Greatest budget, and the limit of "sure": its factor has 4000 rows."""
+"""Greatest number of observed points: their factor has 4000 rows."""
 
 
 @checked
@@ -86,10 +61,9 @@ def fit_shape(
     """Return the posterior of an object's shape given a partial cloud, Eqs. (2)-(9).
 
     "camera" cleans the cloud and observes metric distances. It adds the outline and the mirrored cloud as noisier
-    observations. It pushes the shape out of free space and out of the table.
+    observations. It keeps the shape out of free space and out of the table.
 
-    "paper" observes the cloud's centre at d = -1 and 20 random points around it at d = +1. Its `std_m` is wide: it
-    holds 81 % of the hidden surface.
+    "paper" observes the cloud's centre at d = -1 and 20 random points around it at d = +1.
 
     Args:
         cloud: points [m] of one object, of one view or of several (`merge_clouds`), prepared by `prepare_cloud`. Given
@@ -97,16 +71,16 @@ def fit_shape(
             but an open vessel seen from above on a `table` has two walls (`HollowShape`).
         noise: standard deviation of an observed signed distance, normalised; for "paper" of normals too.
         budget: number of observed points: 1 inside, 20 outside, the rest the most informative of the cloud. None:
-            85 for "camera", besides rim and mirrored points, and 70 for "paper". "sure": until no point's variance
-            exceeds `noise`, the paper's rule, 1000 at most.
+            85 for "camera", besides outline and mirrored points, and 70 for "paper". "sure": until no point's
+            variance exceeds `noise`, the paper's rule, 1000 at most.
         psi_scale: psi over the longest distance of the observations; below 1.34 the covariance may be indefinite.
         support: "camera" or "paper".
         seed: of the random draws.
         table: the table's plane, or its height [m] along z; only "camera" uses it.
         kernel: "thin_plate", "matern52" or "rbf" with the length of psi (`kernel_by_name`); or a `Kernel` of
             normalised distances.
-        criterion: what the most informative point has most of: "variance"; "error", the mean's distance from 0;
-            "both", |error| + 2 sqrt(variance).
+        criterion: the most informative point has the greatest "variance"; the greatest "error", |mean distance|; or
+            the greatest sum of "both", |error| + 2 sqrt(variance).
 
     Raises:
         BadArgument: an argument out of range; a cloud that `prepare_cloud` refuses; a view that is not wholly in
@@ -114,6 +88,7 @@ def fit_shape(
         TooFewPoints: see `prepare_cloud`.
         IndefiniteCovariance: `psi_scale` is too small, or the kernel too long for the noise.
 
+    >>> from torchgrasp.geometry.linalg import unit
     >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
     >>> fit_shape(PointCloud(0.04 * ball, ball)).predict(torch.tensor([0.0, 0.0, 0.04])).distance.abs() < 0.02
     tensor(True)
@@ -135,53 +110,56 @@ class FitOptions:
     kernel: KernelName | Kernel = "thin_plate"
     criterion: Criterion = "variance"
 
-    @property
-    def most(self) -> int:
-        """The greatest number of observed points."""
-        return MAX_BUDGET if self.budget == "sure" else self.budget or BUDGETS[self.support]
-
-    @property
-    def stop(self) -> float:
-        """The score that no point has where selection ends."""
-        return self.noise if self.budget == "sure" else -math.inf
-
 
 def fit_upright(cloud: PointCloud, seed: int, table: float | None, options: FitOptions) -> ShapeGP:
     """Return `fit_shape` of a cloud without duplicates in its `upright_frame`, with the height of the table there."""
-    generator, as_paper = torch.Generator().manual_seed(seed), options.support == "paper"
-    seen, noise = prepare_cloud(cloud, generator, clean=not as_paper), options.noise
-    supports = (_paper_support(seen, noise, generator),) if as_paper else _camera_supports(seen, noise, table)
-    walls = [_fit_surface(seen, beside, options) for beside in supports]
-    shape, middle = walls[0], supports[0].middle
-    return shape if middle is None else tie_walls(HollowShape.join(shape, walls[1], seen.cloud), middle)
+    generator, noise = torch.Generator().manual_seed(seed), options.noise
+    seen = prepare_cloud(cloud, generator, clean=options.support == "camera")
+    if options.support == "paper":
+        return _fit_surface(seen, paper_support(seen, noise, generator), options)
+    if not seen.one_sided:
+        return _fit_surface(seen, camera_support(seen, None, noise, table), options)
+    view = PointCloud(seen.points, seen.normals, seen.viewpoint, seen.frustum)
+    vessel = None if table is None else find_vessel(seen.points.cpu(), seen.normals.cpu())
+    if vessel is None or table is None:
+        completion = complete_cloud(view, table)
+        _warn_of_ambiguity(view, completion.outline, table is not None)
+        return _fit_surface(seen, camera_support(seen, completion, noise, table), options)
+    outline = silhouettes(view.to("cpu"))
+    _warn_of_ambiguity(view, outline, on_table=True)
+    *supports, middle = vessel_supports(view, vessel, outline, table, noise)
+    outer, inner = (_fit_surface(seen, support, options) for support in supports)
+    return tie_walls(HollowShape.join(outer, inner, seen.cloud), middle)
 
 
-def _fit_surface(seen: PreparedCloud, beside: "_Support", options: FitOptions) -> ShapeGP:
+def _fit_surface(seen: PreparedCloud, support: Support, options: FitOptions) -> ShapeGP:
     """Return the posterior of one surface, in the upright frame."""
     cloud, points, normals = seen.cloud, seen.points, seen.normals
-    if beside.rows is not None:
-        points, normals = points[beside.rows], normals[beside.rows]
+    if support.rows is not None:
+        points, normals = points[support.rows], normals[support.rows]
         cloud = PointCloud(points.to(cloud.points), normals.to(cloud.points))
-    x = beside.frame.normalise(points)
-    candidates = on_surface(x, normals, torch.full_like(x[:, 0], options.noise), beside.normal_noise)
+    x = support.frame.normalise(points)
+    candidates = on_surface(x, normals, torch.full_like(x[:, 0], options.noise), support.normal_noise)
 
     # The kernel's length is that of all candidates, so that one factor grows from the first to the last.
-    every = join([beside.anchors, candidates, *(part for part, _ in beside.parts)])
+    every = join([support.anchors, candidates, *(part for part, _ in support.parts)])
     psi = options.psi_scale * longest_distance(every.x)
     kernel = kernel_by_name(options.kernel, psi) if isinstance(options.kernel, str) else options.kernel
-    most = max(options.most - len(beside.anchors.x), 1)
-    posterior = select_points(
-        candidates, beside.anchors, kernel, most, criterion=options.criterion, stop=options.stop
-    ).posterior
-    for part, shared in beside.parts:
+    usual, stop = 85 if options.support == "camera" else 70, -math.inf
+    budget = options.budget or usual
+    if budget == "sure":
+        budget, stop = MAX_BUDGET, options.noise
+    budget = max(budget - len(support.anchors), 1)
+    posterior = select_points(candidates, support.anchors, kernel, budget, options.criterion, stop).posterior
+    for part, shared in support.parts:
         posterior = append_observations(posterior, part, shared)
     check_kernel(posterior, every.least_noise)
-    shape = ShapeGP.of(posterior, beside.frame, cloud, psi, beside.std_factor)
-    shape = dataclasses.replace(shape, kind=beside.kind)
-    if beside.free is None:
+    shape = ShapeGP.of(posterior, support.frame, cloud, psi, support.std_factor)
+    shape = dataclasses.replace(shape, kind=support.kind)
+    if support.free is None:
         return shape
-    free, least = beside.free
-    for _ in range(FREE_ROUNDS):
+    free, least = support.free
+    for _ in range(3):
         rows = free_space_violations(shape, free, least)
         if not len(rows):
             break
@@ -189,98 +167,62 @@ def _fit_surface(seen: PreparedCloud, beside: "_Support", options: FitOptions) -
     return shape
 
 
-@dataclasses.dataclass(frozen=True)
-class _Support:
-    """The normalised frame, and what is observed beside the cloud.
+@checked
+def condition(
+    observations: Observations,
+    normalisation: Normalisation,
+    cloud: PointCloud,
+    psi_scale: Positive = 1.5,
+    std_factor: Positive = 1.0,
+    kernel: KernelName | Kernel = "thin_plate",
+) -> ShapeGP:
+    """Return the shape given normalised observations, Eqs. (7)-(9).
 
-    `anchors` are points inside and outside; `normal_noise` is the cloud's. `parts` are rim and mirrored
-    points, with the errors that their distances share. `free` holds points of free space and least distances there.
-    `rows` are the points of the cloud that lie on this surface; None: all. `kind` is the shape's, `middle` a wall.
+    Args:
+        observations: distances and normals, with their noise.
+        normalisation: the frame of the observations.
+        cloud: what the camera saw [m].
+        psi_scale: psi over the longest distance of the observations; the paper's 1 makes the covariance indefinite.
+        std_factor: real deviations over the posterior's.
+        kernel: a name (see `kernel_by_name`), or any `Kernel` of normalised distances.
+
+    Raises:
+        BadArgument: an unknown kernel.
+        IndefiniteCovariance: psi is too small for these observations.
+
+    >>> x, noise = torch.cat([torch.eye(3), -torch.eye(3)]).double() / 2, torch.full((6,), 0.01).double()
+    >>> seen = Observations(x, 0 * noise, 2 * x, noise > 0, noise, noise)
+    >>> shape = condition(seen, Normalisation(torch.zeros(3).double(), 0.05), PointCloud(0.05 * x))
+    >>> shape.predict(0.05 * x[:2]).distance.abs() < 0.01
+    tensor([True, True])
     """
-
-    frame: Normalisation
-    anchors: Observations
-    normal_noise: float
-    std_factor: float = 1.0
-    parts: tuple[tuple[Observations, Tensor | None], ...] = ()
-    free: tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]] | None = None
-    rows: Bool[Tensor, "rows"] | None = None
-    kind: str = "guess"
-    middle: Middle | None = None
+    observations = observations.to(normalisation.center)
+    psi = psi_scale * longest_distance(observations.x)
+    kernel = kernel_by_name(kernel, psi) if isinstance(kernel, str) else kernel
+    posterior = posterior_given(observations, kernel)
+    check_kernel(posterior, observations.least_noise)
+    return ShapeGP.of(posterior, normalisation, cloud, psi, std_factor)
 
 
-def _paper_support(seen: PreparedCloud, noise: float, generator: torch.Generator) -> _Support:
-    """Return the paper's support: the centre, and random points outside (Sec. 3.1)."""
-    center = seen.points.mean(0)
-    scale = float(torch.linalg.vector_norm(seen.points - center, dim=-1).max())
-    sphere = unit(torch.randn(OUTER_POINTS, 3, dtype=torch.float64, generator=generator)).to(center)
-    anchors = off_surface(
-        torch.cat([torch.zeros_like(center)[None], OUTER_RADIUS * sphere]),
-        torch.cat([-torch.ones_like(center[:1]), torch.ones_like(sphere[:, 0])]),
-        noise,
-    )
-    return _Support(Normalisation(center, scale), anchors, noise)
+def _warn_of_ambiguity(cloud: PointCloud, outline: Outlines, on_table: bool) -> None:
+    """Warn of a view that is cut off, has a gap, or shows two bodies on a table with normal z."""
+    if outline.cut:
+        _warn(CutOff, "the border of the image cuts the object off: the part beyond it is a guess; turn the camera")
+    if outline.gap > 0.025:  # [m]; a narrower gap, such as a handle's, does not mislead a fingertip
+        width = f"a gap of {1e3 * outline.gap:.0f} mm in the view"
+        _warn(Gap, f"{width}: a hole, or a patch that was not measured; the surface there is a guess")
+    if on_table:
+        points = cloud.points.double().cpu()
+        up, spacing = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), float(nearest(points, 2)[0][:, -1].median())
+        body = find_second_body(points, up, spacing)
+        if body is not None:
+            share = float(body.double().mean())
+            _warn(TwoBodies, f"two bodies that stand apart, the second of {share:.0%} of the points: give one of them")
 
 
-def _camera_supports(seen: PreparedCloud, noise: float, table: float | None) -> tuple[_Support, ...]:
-    """Return metric distances; of a view also outline, mirrored points and free space. A vessel has two surfaces."""
-    completion, surface = None, seen.points
-    if seen.one_sided:
-        cloud = PointCloud(seen.points, seen.normals, seen.viewpoint, seen.frustum)
-        vessel = None if table is None else find_vessel(seen.points.cpu(), seen.normals.cpu())
-        if vessel is not None and table is not None:
-            return _vessel_supports(cloud, vessel, table, noise)
-        completion = complete_cloud(cloud, table)
-        warn_of_doubts(cloud, completion.outline, table is not None)
-        surface = torch.cat([surface, completion.points.to(surface)])
-    # The domain holds the whole of a ball. Of others the hidden side is not sure enough to set the scale.
-    extent = surface if completion is not None and completion.kind == "ball" else seen.points
-    center = (extent.amin(0) + extent.amax(0)) / 2
-    frame = Normalisation(center, float(torch.linalg.vector_norm(extent - center, dim=-1).max()))
-    inside, parts, free, factor, kind = True, (), None, WHOLE_STD_FACTOR, "whole"
-    if completion is not None:
-        parts, kind = _observe_completion(completion, frame), completion.kind
-        factor = STD_FACTORS[completion.kind, table is not None]
-        free = free_space(completion.outline, frame, table)
-        inside = float(completion.outline.violation(center.cpu())) == 0.0  # not so for an arch or a bowl
-    sphere = OUTER_RADIUS * fibonacci_sphere(OUTER_POINTS).to(center)
-    x = torch.cat([torch.zeros_like(center)[None], sphere]) if inside else sphere
-    distance = torch.cdist(x, frame.normalise(surface)).amin(1)
-    distance = torch.cat([-distance[:1], distance[1:]]) if inside else distance
-    outer = int(inside)
-    anchors = join(
-        [off_surface(x[:outer], distance[:outer], noise), off_surface(x[outer:], distance[outer:], OUTER_NOISE)]
-    )
-    return (_Support(frame, anchors, NORMAL_NOISE, factor, parts, free, kind=kind),)
-
-
-def _vessel_supports(cloud: PointCloud, vessel: Vessel, table: float, noise: float) -> tuple[_Support, ...]:
-    """Return the supports of an open vessel's outer body and of its inner wall."""
-    center = (cloud.points.amin(0) + cloud.points.amax(0)) / 2
-    frame = Normalisation(center, float(torch.linalg.vector_norm(cloud.points - center, dim=-1).max()))
-    cloud, device = cloud.to("cpu"), frame.center.device
-    outline = silhouettes(cloud)
-    warn_of_doubts(cloud, outline, on_table=True)
-    outer, inner, middle = observe_walls(cloud, vessel, outline, frame.to("cpu"), table, noise)
-
-    def support(wall: WallObservations, free: tuple[Tensor, Tensor] | None) -> _Support:
-        parts = tuple((part.to(device), None if shared is None else shared.to(device)) for part, shared in wall.parts)
-        anchors, rows, amid = wall.anchors.to(device), wall.rows.to(device), middle.to(device)
-        return _Support(frame, anchors, NORMAL_NOISE, VESSEL_STD_FACTOR, parts, free, rows, "vessel", amid)
-
-    return support(outer, free_space(outline, frame, table)), support(inner, None)
-
-
-def _observe_completion(completion: Completion, frame: Normalisation) -> tuple[tuple[Observations, Tensor | None], ...]:
-    """Return rim and mirrored points as observations of the surface."""
-
-    def observe(points: Tensor, normals: Tensor, noise: float, normal_noise: float) -> Observations:
-        x = frame.normalise(points.to(frame.center))
-        return on_surface(x, normals.to(x), torch.full_like(x[:, 0], noise / frame.scale), normal_noise)
-
-    outline = completion.outline
-    mirrored = observe(completion.points, completion.normals, LEAST_NOISE, MIRROR_NORMAL_NOISE)
-    tilt = (completion.asymmetry / PART).to(frame.center)  # slope of a field with that deviation and length
-    mirrored = dataclasses.replace(mirrored, normal_noise=torch.hypot(mirrored.normal_noise, tilt))
-    rim = observe(outline.rim, outline.rim_normals, RIM_NOISE, RIM_NORMAL_NOISE)
-    return (rim, None), (mirrored, completion.deviations.to(frame.center) / frame.scale)
+def _warn(kind: type[Warning], sentence: str) -> None:
+    """Show a warning at the first caller outside of the library."""
+    level, frame = 2, sys._getframe(1)
+    while frame.f_back is not None and frame.f_back.f_globals.get("__name__", "").startswith("torchgrasp."):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(sentence, kind, stacklevel=level)

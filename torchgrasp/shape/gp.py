@@ -7,56 +7,41 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Value, map_tensors
+from torchgrasp.base import Value
 from torchgrasp.checks import Pose, Positive, Range, Seed, check_moved, check_tensor, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply
 from torchgrasp.geometry.linalg import cholesky, unit, unit_of_any
 from torchgrasp.geometry.plane import move
-from torchgrasp.shape.derivatives import ShapeDerivatives, carry_gradients
-from torchgrasp.shape.joint_posterior import JointEstimate, draw_samples, joint_estimate
-from torchgrasp.shape.observations import Observations, on_surface
-from torchgrasp.shape.posterior import Posterior, surface_deviation
-from torchgrasp.shape.update import append_observations
+from torchgrasp.shape.conditioning import append_observations
+from torchgrasp.shape.posterior import Posterior, symmetric_root
+from torchgrasp.shape.values import (
+    JointEstimate,
+    Normalisation,
+    Observations,
+    ShapeDerivatives,
+    on_surface,
+    pass_gradients,
+    surface_deviation,
+)
 from torchgrasp.values import PointCloud, ShapeEstimate
 
 MAX_JOINT = 1000
-"""Points of one joint posterior, at most: its memory grows with their square."""
-REACH = 1.25
-"""Radius of the domain over that of the observations, at most: further out the posterior says nothing."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Normalisation(Value):
-    """A frame without units: points [m] minus `center` [m], divided by `scale` [m].
-
-    >>> frame = Normalisation(torch.tensor([0.0, 0.0, 0.1]), scale=0.05)
-    >>> frame.normalise(torch.tensor([0.0, 0.0, 0.15])), frame.metres(torch.tensor([0.0, 0.0, 1.0]))
-    (tensor([0.0000, 0.0000, 1.0000]), tensor([0.0000, 0.0000, 0.1500]))
-    """
-
-    center: Float[Tensor, "3"]
-    scale: float
-
-    @checked(gradients=True)
-    def normalise(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        """Map points [m] to the normalised frame."""
-        return (points - self.center.to(points)) / self.scale
-
-    @checked(gradients=True)
-    def metres(self, x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        """Map normalised points to the cloud's frame [m]."""
-        return x * self.scale + self.center.to(x)
+"""Most points of one joint posterior: its memory grows with the square of their number."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ShapeGP(Posterior, Normalisation):
     """The posterior of an object's shape: g of Eq. (1), conditioned on observations. `fit_shape` makes it.
 
+    `predict`, `mean`, `mean_and_gradient`, `normalise` and `metres` are differentiable. Other methods refuse points
+    that require a gradient.
+
     Args:
         psi: length of the kernel, normalised: the thin plate's parameter.
         domain_radius: radius, normalised, of the ball in which the posterior is valid.
-        std_factor: ratio of the surface's real deviations to the posterior's, from hidden sides of known objects.
+        std_factor: ratio of the surface's real deviations to the posterior's, measured on hidden sides of known
+            objects.
         cloud: what the camera saw, after cleaning.
         kind: what the hidden side follows from: "ball", "revolution", "mirrored", "vessel", "guess" (the outline
             alone), "cut off" by the image's border, or "whole" without a hidden side.
@@ -64,17 +49,8 @@ class ShapeGP(Posterior, Normalisation):
     >>> from torchgrasp import fit_shape, load_object
     >>> view = load_object("jug").view
     >>> shape, points = fit_shape(view), view.points[:4]
-    >>> bool(shape.contains(points).all()), shape.differentiate(points).distance.shape
-    (True, torch.Size([4, 3]))
-    >>> shape.joint(points).covariance.shape, shape.sample(points, n=10).shape
-    (torch.Size([16, 16]), torch.Size([10, 4, 4]))
-    >>> x, few = shape.normalise(points), torch.full((4,), 0.01).double()
-    >>> shape.joint_at(x).mean.shape, shape.wall_at(x).shape, ShapeGP.of(shape, shape, shape.cloud, 2.0).psi
-    (torch.Size([4, 4]), torch.Size([4, 1]), 2.0)
-    >>> len(shape.append(Observations(x, few, x, few < 0, few, few)).x) - len(shape.x)
-    4
-    >>> shape.moved(torch.eye(4)).to(torch.float32).predict(points.float()).distance.dtype
-    torch.float32
+    >>> bool(shape.contains(points).all()), shape.joint(points).covariance.shape, shape.sample(points, n=10).shape
+    (True, torch.Size([16, 16]), torch.Size([10, 4, 4]))
     """
 
     psi: float
@@ -94,7 +70,8 @@ class ShapeGP(Posterior, Normalisation):
         std_factor: Positive = 1.0,
     ) -> "ShapeGP":
         """Return the shape of a posterior, with its domain."""
-        reach = REACH * float(torch.linalg.vector_norm(posterior.x, dim=-1).max())
+        # Far from all observations the posterior has no information.
+        reach = 1.25 * float(torch.linalg.vector_norm(posterior.x, dim=-1).max())
         return cls(
             **_fields(posterior, Posterior),
             **_fields(normalisation, Normalisation),
@@ -105,7 +82,7 @@ class ShapeGP(Posterior, Normalisation):
         )
 
     def to(self, *args: Any, **kwargs: Any) -> "ShapeGP":
-        """Return the shape on another device. Its condition number of 1e7 needs float64."""
+        """Return the shape on another device. It stays in float64, which its condition number needs."""
         check_moved(*args, **kwargs)
         device = torch.empty(0, device=self.x.device).to(*args, **kwargs).device
         return super().to(device)
@@ -122,36 +99,52 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked(gradients=True)
     def wall_at(self, x: Float[Tensor, "q 3"]) -> Bool[Tensor, "q walls"]:
-        """Tell which wall is the surface at normalised points."""
+        """Return which wall is the surface at normalised points."""
         return torch.ones(len(x), 1, dtype=torch.bool, device=x.device)
 
     @checked(gradients=True)
     def contains(self, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
-        """Tell which points [m] lie in the domain."""
+        """Return which points [m] lie in the domain."""
         return torch.linalg.vector_norm(self.normalise(points), dim=-1) <= self.domain_radius
 
     @checked(gradients=True)
     def predict(self, points: Float[Tensor, "*b 3"]) -> ShapeEstimate:
         """Return signed distance, normal and their covariance at points [m] in the cloud's frame, Eqs. (7)-(8).
 
-        The estimate has the dtype of `points`. If they require a gradient, all but `covariance` pass it to them, once:
-        the closed form of `differentiate`.
+        The estimate has the dtype of `points`. It passes first derivatives to points that require a gradient, except
+        from `covariance`.
 
         Raises:
-            BadArgument: non-finite numbers, or a point outside the domain: there a thin plate's variance turns
-                negative and would pass for certainty.
+            BadArgument: non-finite numbers, or a point outside the domain, where a thin plate's variance is negative.
         """
-        mean, covariance = self.estimate(self._queries(points))
-        variance = covariance[:, 0, 0]
-        std_m = self.std_factor * self.scale * surface_deviation(variance, mean[:, 1:])
-        estimate = _reshape(ShapeEstimate(mean[:, 0], unit(mean[:, 1:]), variance, covariance, std_m), points)
-        if not (points.requires_grad and torch.is_grad_enabled()):
-            return estimate
-        return carry_gradients(estimate, points, self.differentiate)
+        covariance = points.new_empty(0)
 
-    @checked(gradients=True)
+        def evaluate(points: Tensor) -> tuple[Tensor, ...]:
+            nonlocal covariance
+            mean, spread = self.estimate(self._queries(points))
+            variance = spread[:, 0, 0]
+            std_m = self.std_factor * self.scale * surface_deviation(variance, mean[:, 1:])
+            distance, normal, variance, std_m, covariance = (
+                _reshape(part, points) for part in (mean[:, 0], unit(mean[:, 1:]), variance, std_m, spread)
+            )
+            return distance, normal, variance, std_m
+
+        def differentiate(points: Tensor) -> tuple[Tensor, ...]:
+            slopes = self.differentiate(points)
+            return slopes.distance, slopes.normal, slopes.variance, slopes.std_m
+
+        distance, normal, variance, std_m = pass_gradients(points, evaluate, differentiate)
+        return ShapeEstimate(distance, normal, variance, covariance, std_m)
+
+    @checked
     def differentiate(self, points: Float[Tensor, "*b 3"]) -> ShapeDerivatives:
-        """Return distance, normal, variance and std_m differentiated by the query points [m]. Raises as `predict`."""
+        """Return distance, normal, variance and std_m differentiated by the query points [m]. Raises as `predict`.
+
+        >>> from torchgrasp import fit_shape, load_object
+        >>> view = load_object("jug").view
+        >>> fit_shape(view).differentiate(view.points[:4]).normal.shape
+        torch.Size([4, 3, 3])
+        """
         jet = self.jet(self._queries(points))
         length = torch.linalg.vector_norm(jet.gradient, dim=-1)[:, None, None]
         normal = jet.gradient[:, :, None] / length
@@ -159,15 +152,14 @@ class ShapeGP(Posterior, Normalisation):
         along = normal @ steeper
         std = surface_deviation(jet.variance, jet.gradient)[:, None]
         relative = jet.variance_gradient / (2 * jet.variance[:, None]) - steeper[:, 0] / length[:, 0]
-        rows = ShapeDerivatives(
-            distance=jet.gradient / self.scale,
-            normal=(jet.hessian - along) / (length * self.scale),
-            variance=jet.variance_gradient / self.scale,
-            std_m=self.std_factor * std * relative,
+        return ShapeDerivatives(
+            distance=_reshape(jet.gradient / self.scale, points),
+            normal=_reshape((jet.hessian - along) / (length * self.scale), points),
+            variance=_reshape(jet.variance_gradient / self.scale, points),
+            std_m=_reshape(self.std_factor * std * relative, points),
         )
-        return _reshape(rows, points)
 
-    @checked(gradients=True)
+    @checked
     def joint(self, points: Float[Tensor, "k 3"]) -> JointEstimate:
         """Return the joint posterior of (d, w) at up to 1000 points [m], normalised. Raises as `predict`."""
         x = self._queries(points)
@@ -175,18 +167,16 @@ class ShapeGP(Posterior, Normalisation):
             raise BadArgument("points", f"{len(x)} points", f"at most {MAX_JOINT} points at once")
         return self.joint_at(x).to(points.dtype)
 
-    @checked(gradients=True)
-    def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of (d, w) at normalised points, of any number."""
-        return joint_estimate(self, x)
-
     @checked
     def sample(
         self, points: Float[Tensor, "k 3"], n: Annotated[int, Range(0, 1_000_000)], seed: Seed = 0
     ) -> Float[Tensor, "n k 4"]:
         """Draw (d, w) jointly at up to 1000 points [m], n times, normalised. Raises as `predict`."""
         joint = self.joint(points.double())
-        return draw_samples(joint, float(self.prior_block()[0, 0]), n, seed).to(points)
+        root = symmetric_root(joint.covariance, float(self.prior_block()[0, 0]), "query points within the domain")
+        generator = torch.Generator().manual_seed(seed)
+        draws = torch.randn(n, len(root), dtype=torch.float64, generator=generator).to(root)
+        return (joint.mean + (draws @ root).reshape(n, *joint.mean.shape)).to(points)
 
     @checked
     def update(
@@ -199,12 +189,12 @@ class ShapeGP(Posterior, Normalisation):
     ) -> "ShapeGP":
         """Return the shape given further points, too: a finger's touch, a second view.
 
-        Equals the posterior of all observations at once. Kernel, domain and `cloud` stay.
+        Equals the posterior of all observations at once. Kernel, domain and `cloud` do not change.
 
         Args:
             points: on the surface [m], in the cloud's frame.
-            normals: outward, of any length; None: not known.
-            noise: standard deviation of a point [m] across the surface.
+            normals: outward, of any length; None: unknown.
+            noise: standard deviation of a point [m] along the normal.
             normal_noise: standard deviation of the components of a unit normal.
 
         Raises:
@@ -231,11 +221,11 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked
     def moved(self, b_from_a: Pose) -> "ShapeGP":
-        """Return the shape in frame b [m]; it is given in frame a. Its normalised frame turns along."""
+        """Return the shape in frame b [m]; it is given in frame a. Its normalised frame is rotated, too."""
         rotation, n = b_from_a[:3, :3].to(self.x), len(self.x)
 
         def turn(rows: Float[Tensor, "rows c"]) -> Float[Tensor, "rows c"]:
-            """Turn the rows of normals."""
+            """Rotate the rows of normals."""
             normals = rows[n:].reshape(3, self.n_oriented * rows.shape[1])
             return torch.cat([rows[:n], (rotation @ normals).reshape(rows[n:].shape)])
 
@@ -253,8 +243,8 @@ class ShapeGP(Posterior, Normalisation):
 
     def _queries(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "q 3"]:
         """Return normalised query points as a list; refuse points outside the domain."""
-        flat = points.reshape(-1, 3)
-        x = self.normalise(flat.detach().double().to(self.device))
+        flat = points.detach().reshape(-1, 3)
+        x = self.normalise(flat.double().to(self.device))
         radius = torch.linalg.vector_norm(x, dim=-1)
         outside = radius > self.domain_radius
         if bool(outside.any()):
@@ -268,9 +258,9 @@ class ShapeGP(Posterior, Normalisation):
         return x
 
 
-def _reshape(rows: Any, points: Float[Tensor, "*b 3"]) -> Any:
+def _reshape(rows: Float[Tensor, "q *c"], points: Float[Tensor, "*b 3"]) -> Tensor:
     """Return rows in the dtype, on the device and with the batch shape of the points."""
-    return map_tensors(lambda t: t.to(points).reshape(points.shape[:-1] + t.shape[1:]), rows)
+    return rows.to(points).reshape(points.shape[:-1] + rows.shape[1:])
 
 
 def _fields(value: Value, kind: type[Value]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""An open vessel: an outer body, and the space within its inner wall cut out of it."""
+"""An open vessel: an outer body, and the space within its inner surface cut out of it."""
 
 import dataclasses
 from collections.abc import Callable
@@ -9,23 +9,39 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.base import Value, join
 from torchgrasp.checks import Pose, checked
+from torchgrasp.geometry.linalg import farthest_points, fibonacci_sphere
+from torchgrasp.shape.completion.complete import LEAST_NOISE, correlated_errors
+from torchgrasp.shape.completion.silhouette import TIE, Outlines
+from torchgrasp.shape.completion.vessel import FORM_ERROR, RIM, HiddenWall, Vessel, Wall, complete_walls, lid
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.joint_posterior import JointEstimate
-from torchgrasp.shape.observations import Observations
-from torchgrasp.shape.posterior import MeanJet, SurfaceJet
+from torchgrasp.shape.support import (
+    HIDDEN_NORMAL_NOISE,
+    NORMAL_NOISE,
+    OUTER_POINTS,
+    OUTER_RADIUS,
+    RIM_NOISE,
+    STD_FACTORS,
+    Part,
+    Support,
+    frame_around,
+    free_space,
+    observe,
+)
+from torchgrasp.shape.values import JointEstimate, MeanJet, Normalisation, Observations, SurfaceJet, off_surface
 from torchgrasp.values import PointCloud
 
 
 @dataclasses.dataclass(frozen=True)
 class HollowShape(ShapeGP):
-    """The material within two surfaces, each with a posterior of its own: the distance is the greater one.
+    """The material between two surfaces, each with a posterior of its own: the distance is the greater one.
 
-    No single smooth field turns its sign twice within a thin wall. At every point the surface with the greater mean
-    gives distance, normal and covariance; errors of different surfaces are independent.
+    A single smooth field cannot change its sign twice within a thin wall. At every point the surface with the greater
+    mean gives distance, normal and covariance. Errors of different surfaces are independent.
 
     Args:
-        lining: the inner wall, positive inside the vessel and negative all around.
+        inner: the inner surface, positive inside the vessel and negative around it.
 
     >>> import trimesh
     >>> from torchgrasp import fit_shape
@@ -35,40 +51,38 @@ class HollowShape(ShapeGP):
     >>> shape = fit_shape(partial_view(cup, look_at(0.0, 35.0, target=cup)), table=0.0)
     >>> shape.predict(torch.tensor([[0.0, 0.0, 0.06], [0.037, 0.0, 0.06]]).double()).distance > 0
     tensor([ True, False])
-    >>> HollowShape.join(shape.outer, shape.lining, shape.cloud).kind
-    'vessel'
     """
 
-    lining: ShapeGP
+    inner: ShapeGP
 
     @classmethod
     @checked
-    def join(cls, outer: ShapeGP, lining: ShapeGP, cloud: PointCloud) -> "HollowShape":
-        """Return the vessel of two walls in the same normalised frame; `cloud` is what was seen of both."""
+    def join(cls, outer: ShapeGP, inner: ShapeGP, cloud: PointCloud) -> "HollowShape":
+        """Return the vessel of two surfaces in the same normalised frame; `cloud` is what was seen of both."""
         fields = {f.name: getattr(outer, f.name) for f in dataclasses.fields(ShapeGP)}
-        fields |= {"cloud": cloud, "domain_radius": min(outer.domain_radius, lining.domain_radius)}
-        return cls(**fields, lining=lining)
+        fields |= {"cloud": cloud, "domain_radius": min(outer.domain_radius, inner.domain_radius)}
+        return cls(**fields, inner=inner)
 
     @cached_property
     def outer(self) -> ShapeGP:
-        """The outer wall alone: the body as if it were full."""
+        """The outer surface alone: the body as if it were full."""
         return ShapeGP(**{f.name: getattr(self, f.name) for f in dataclasses.fields(ShapeGP)})
 
     @property
     def walls(self) -> tuple[ShapeGP, ...]:
-        """The outer and the inner wall."""
-        return self.outer, self.lining
+        """The outer and the inner surface."""
+        return self.outer, self.inner
 
     @checked(gradients=True)
     def wall_at(self, x: Float[Tensor, "q 3"]) -> Bool[Tensor, "q walls"]:
-        """Tell which wall is the surface at normalised points."""
-        inner = self.lining.mean(x) > self.outer.mean(x)
+        """Return which wall is the surface at normalised points."""
+        inner = self.inner.mean(x) > self.outer.mean(x)
         return torch.stack([~inner, inner], 1)
 
     @checked(gradients=True)
     def mean(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q"]:
         """Return the mean signed distance at normalised points."""
-        return torch.maximum(self.outer.mean(x), self.lining.mean(x))
+        return torch.maximum(self.outer.mean(x), self.inner.mean(x))
 
     @checked(gradients=True)
     def mean_and_gradient(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]:
@@ -76,22 +90,22 @@ class HollowShape(ShapeGP):
         (a, slope_a), (b, slope_b) = (wall.mean_and_gradient(x) for wall in self.walls)
         return torch.maximum(a, b), torch.where((b > a)[:, None], slope_b, slope_a)
 
-    @checked(gradients=True)
+    @checked
     def estimate(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
         """Return the mean and the covariance of (d, w) at normalised points."""
         return self._by_wall(x, lambda wall, own: wall.estimate(own))  # pyright: ignore[reportReturnType]
 
-    @checked(gradients=True)
+    @checked
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
         """Return mean and variance with derivatives at normalised points."""
         return SurfaceJet(*self._by_wall(x, lambda wall, own: _fields(wall.jet(own))))
 
-    @checked(gradients=True)
+    @checked
     def mean_jet(self, x: Float[Tensor, "q 3"]) -> MeanJet:
         """Return the mean with its derivatives at normalised points."""
         return MeanJet(*self._by_wall(x, lambda wall, own: _fields(wall.mean_jet(own))))
 
-    @checked(gradients=True)
+    @checked
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
         """Return the joint posterior of (d, w) at normalised points."""
         parts, owner = [wall.joint_at(x) for wall in self.walls], self.wall_at(x)
@@ -105,13 +119,13 @@ class HollowShape(ShapeGP):
     def append(self, new: Observations) -> "HollowShape":
         """Return the shape given further observations, normalised, each of the wall at its point."""
         outer, inner = self.wall_at(new.x).T
-        return self.join(self.outer.append(new[outer]), self.lining.append(new[inner]), self.cloud)
+        return self.join(self.outer.append(new[outer]), self.inner.append(new[inner]), self.cloud)
 
     @checked
     def moved(self, b_from_a: Pose) -> "HollowShape":
         """Return the shape in frame b [m]; it is given in frame a."""
         outer = self.outer.moved(b_from_a)
-        return self.join(outer, self.lining.moved(b_from_a), outer.cloud)
+        return self.join(outer, self.inner.moved(b_from_a), outer.cloud)
 
     def _by_wall(
         self, x: Float[Tensor, "q 3"], evaluate: Callable[[ShapeGP, Tensor], tuple[Any, ...]]
@@ -130,3 +144,121 @@ class HollowShape(ShapeGP):
 def _fields(jet: MeanJet) -> tuple[Tensor, ...]:
     """Return the fields in their order."""
     return tuple(getattr(jet, f.name) for f in dataclasses.fields(jet))
+
+
+@dataclasses.dataclass(frozen=True)
+class Middle(Value):
+    """Places amid the material of a vessel, normalised, and its thickness there.
+
+    Args:
+        x: the places.
+        side: which are as thick as `thickness`; others are at least as thick.
+        thickness: of the wall, normalised.
+    """
+
+    x: Float[Tensor, "n 3"]
+    side: Bool[Tensor, "n"]
+    thickness: float
+
+
+def vessel_supports(
+    cloud: PointCloud, vessel: Vessel, outline: Outlines, table: float, noise: float
+) -> tuple[Support, Support, Middle]:
+    """Return what is observed of the outer and of the inner surface of a vessel, and the places between them.
+
+    Distances are negative in the material. So the inner surface's are positive around the axis, and negative outside.
+
+    Args:
+        cloud: the view [m] with normals, in float64.
+        vessel: found in it.
+        outline: of its views.
+        table: the table's height [m].
+        noise: standard deviation of an anchor's distance, normalised.
+    """
+    device, cloud = cloud.points.device, cloud.to("cpu")
+    frame = frame_around(cloud.points)
+    outer, inner = complete_walls(cloud, vessel, outline, table)
+    hidden = join([outer.hidden, lid(vessel)])
+    axis = torch.cat([vessel.center, torch.zeros(1, dtype=torch.float64)])
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    sphere = frame.metres(OUTER_RADIUS * fibonacci_sphere(OUTER_POINTS))
+
+    def anchors(points: Float[Tensor, "n 3"], distance: Float[Tensor, "n"]) -> Observations:
+        return off_surface(frame.normalise(points), distance / frame.scale, noise)
+
+    surface = torch.cat([cloud.points[outer.seen], hidden.points])
+    middle = (axis + 0.5 * (table + vessel.rim) * up)[None]
+    depth = torch.minimum(torch.cdist(middle, surface).amin(1), middle[:, 2] - table)
+    body = anchors(torch.cat([middle, sphere]), torch.cat([-depth, torch.cdist(sphere, surface).amin(1)]))
+    rim = observe(frame, outline.rim, outline.rim_normals, RIM_NOISE, 2 * HIDDEN_NORMAL_NOISE)
+
+    surface = torch.cat([cloud.points[inner.seen], inner.hidden.points])
+    bottom = float(surface[:, 2].min())
+    over = vessel.rim + 0.5 * vessel.radius  # there the inner surface still surrounds free space: it has no lid
+    inside = axis + torch.tensor([0.5 * (bottom + vessel.rim), vessel.rim, over]).double()[:, None] * up
+    around = sphere[sphere[:, 2] < vessel.rim]
+    clear = torch.cat([torch.cdist(inside, surface).amin(1), -torch.cdist(around, surface).amin(1)])
+    space = anchors(torch.cat([inside, around]), clear)
+
+    def support(anchors: Observations, parts: list[Part], free: Any, rows: Tensor) -> Support:
+        on_device = tuple((part.to(device), None if errors is None else errors.to(device)) for part, errors in parts)
+        factor = STD_FACTORS["vessel", True]
+        return Support(
+            frame.to(device), anchors.to(device), NORMAL_NOISE, factor, on_device, free, rows.to(device), "vessel"
+        )
+
+    free = free_space(outline, frame.to(device), table)
+    return (
+        support(body, [(rim, None), _observe_hidden(frame, hidden)], free, outer.seen),
+        support(space, [_observe_hidden(frame, inner.hidden)], None, inner.seen),
+        _middle(cloud, vessel, (outer, inner), frame).to(device),
+    )
+
+
+def tie_walls(shape: HollowShape, middle: Middle) -> HollowShape:
+    """Return the vessel with the known thickness of its wall.
+
+    Two independent posteriors let the surfaces touch, which tears holes. Amid the material the sum of both distances
+    is minus the thickness. Where it is not, the more certain surface gives an observation of the other one.
+    """
+    x, thickness, noise = middle.x, middle.thickness, 0.0007 / shape.scale
+    for _ in range(3):
+        distance = torch.stack([wall.mean(x) for wall in shape.walls])
+        short = distance.sum(0) + thickness
+        off = torch.where(middle.side, short.abs(), short)
+        rows = torch.nonzero(off > 0.0005 / shape.scale)[:, 0]
+        if not len(rows):
+            break
+        rows = rows[torch.argsort(off[rows], descending=True, stable=True)]
+        rows = rows[farthest_points(x[rows], 24, tie=TIE)]
+        variance = torch.stack([wall.estimate(x[rows])[1][:, 0, 0] for wall in shape.walls])
+        walls = []
+        for number, wall in enumerate(shape.walls):
+            own, other = variance[number], variance[1 - number]
+            known = off_surface(x[rows], -thickness - distance[1 - number, rows], noise)
+            spread = torch.sqrt(shape.std_factor**2 * other + noise**2)
+            known = dataclasses.replace(known, distance_noise=spread)[own >= other]
+            walls.append(wall.append(known) if len(known.x) else wall)
+        shape = HollowShape.join(walls[0], walls[1], shape.cloud)
+    return shape
+
+
+def _middle(cloud: PointCloud, vessel: Vessel, walls: tuple[Wall, Wall], frame: Normalisation) -> Middle:
+    """Return places half a thickness behind both walls, without ears, handles and rim."""
+    assert cloud.normals is not None
+    points, normals = [], []
+    for wall, seen in zip(walls, (vessel.body & ~vessel.inner, vessel.inner), strict=True):
+        points += [cloud.points[seen], wall.hidden.points]
+        normals += [cloud.normals[seen], wall.hidden.normals]
+    at, out = torch.cat(points), torch.cat(normals)
+    below = at[:, 2] < vessel.rim - RIM
+    at, out = at[below], out[below]
+    rows = farthest_points(at, 150, tie=TIE)
+    x = frame.normalise(at[rows] - 0.5 * vessel.thickness * out[rows])
+    return Middle(x, out[rows, 2].abs() < 0.8, vessel.thickness / frame.scale)  # a floor may be thicker
+
+
+def _observe_hidden(frame: Normalisation, wall: HiddenWall) -> Part:
+    """Return hidden points with their shared errors."""
+    errors = correlated_errors(wall.points, wall.shared, FORM_ERROR)
+    return observe(frame, wall.points, wall.normals, LEAST_NOISE, HIDDEN_NORMAL_NOISE), errors / frame.scale

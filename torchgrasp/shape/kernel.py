@@ -1,6 +1,6 @@
-"""Radial kernels k(r): the paper's thin plate, Matern 5/2, the squared exponential, or your own.
+"""Radial kernels k(r), and the covariances of signed distances and normals that follow from them, Eqs. (2)-(6).
 
-Autograd of the scalar profile gives the derivatives. A closed form may be registered as a speed-up.
+Autograd of the scalar profile k(r) defines all derivatives. A kernel may add a closed form as a speed-up.
 """
 
 import dataclasses
@@ -18,15 +18,11 @@ from torchgrasp.checks import LEAST, Positive, Range, checked
 Profile = Callable[[Tensor], Tensor]
 """A radial kernel k(r), elementwise and three times differentiable where r > 0, with k'(0) = 0."""
 KernelName = Literal["thin_plate", "matern52", "rbf"]
-
-NEAR = 1e-5
-"""Below this distance k'(r)/r is k''(r/2), its midpoint rule: exact for the thin plate, and no 0/0."""
-LEAST_PSI = 4.0 / 3.0
-"""psi over the diameter of a ball in which the thin plate kernel is positive definite (dense limit: 1.313)."""
-
-
 Orders = Annotated[int, Range(1, 4)]
-"""How many of k and its derivatives: three derivatives are the most that are used."""
+"""How many of k and its derivatives."""
+
+NEAR_ZERO = 1e-5
+"""Below this distance k'(r) / r is taken as k''(r / 2), which avoids 0 / 0 and is exact for the thin plate."""
 
 
 @checked
@@ -35,9 +31,9 @@ class Kernel:
     """A radial kernel k(r) of normalised distances.
 
     Args:
-        profile: k(r); the covariances of distances and normals follow from it by autograd.
-        diameter: of the ball, normalised, within which k is a covariance; infinite if it is one everywhere.
-        remedy: what to do when the covariance is not positive definite.
+        profile: k(r).
+        diameter: of the ball, normalised, within which k is a covariance; infinite if it is a covariance everywhere.
+        remedy: what the error says when the covariance is not positive definite.
         closed_form: a faster `differentiate` of this profile, called with `r` and `count`; None: autograd.
 
     >>> kernel = Kernel(lambda r: (1 + r) * torch.exp(-r))
@@ -50,7 +46,7 @@ class Kernel:
     remedy: str = "use more noise, or a shorter length of the kernel"
     closed_form: Callable[[Tensor, int], tuple[Tensor, ...]] | None = None
 
-    @checked(gradients=True)
+    @checked
     def derivatives(self, r: Float[Tensor, "*s"], count: Orders) -> tuple[Float[Tensor, "*s"], ...]:
         """Return the first `count` of k and its derivatives in r^2 / 2; see `differentiate`."""
         return differentiate(self.profile, r, count) if self.closed_form is None else self.closed_form(r, count)
@@ -59,8 +55,8 @@ class Kernel:
 def differentiate(profile: Profile, r: Float[Tensor, "*s"], count: int) -> tuple[Float[Tensor, "*s"], ...]:
     """Return k and its derivatives in u = r^2 / 2 by autograd, `count` in all, at most 4.
 
-    dk/du is k'(r)/r, which tends to k''(0). Higher derivatives are 0 at r = 0, where they may be infinite. In every
-    covariance a factor vanishes faster.
+    dk/du is k'(r) / r, whose limit at r = 0 is k''(0). Higher derivatives are set to 0 at r = 0, where they may be
+    infinite: covariances multiply them by a power of r.
 
     >>> differentiate(lambda r: torch.exp(-(r**2)), torch.zeros(1), 2)
     (tensor([1.]), tensor([-2.]))
@@ -68,20 +64,31 @@ def differentiate(profile: Profile, r: Float[Tensor, "*s"], count: int) -> tuple
     k, *by_r = _differentiate_by_distance(profile, r, max(count - 1, 1))
     *_, midpoint = _differentiate_by_distance(profile, r / 2, 2)
     positive = torch.where(r > 0, r, 1.0)
-    values = [k, torch.where(r < NEAR, midpoint, by_r[0] / positive)]
+    values = [k, torch.where(r < NEAR_ZERO, midpoint, by_r[0] / positive)]
     if count > 2:
         values.append(torch.where(r > 0, (by_r[1] - values[1]) / positive**2, 0.0))
     if count > 3:
         third = (by_r[2] / positive - 3.0 * values[2]) / positive**2
-        values.append(torch.where(r < NEAR, 0.0, third))
+        values.append(torch.where(r < NEAR_ZERO, 0.0, third))
     return tuple(values[:count])
+
+
+def _differentiate_by_distance(profile: Profile, r: Tensor, order: int) -> list[Tensor]:
+    """Return the profile and its derivatives in r up to an order, elementwise."""
+    with torch.enable_grad():
+        r = r.detach().requires_grad_()
+        values = [profile(r)]
+        for _ in range(order):
+            value = values[-1] + 0.0 * r  # a constant would have no graph
+            values += torch.autograd.grad(value.sum(), r, create_graph=True)
+    return [value.detach() for value in values]
 
 
 def thin_plate(r: Float[Tensor, "*s"], psi: float) -> Float[Tensor, "*s"]:
     """Return the thin plate kernel 2 r^3 - 3 psi r^2 + psi^3, Eq. (6).
 
-    The kernel and its slope vanish at r = psi. It is a covariance only within a ball of diameter 3/4 psi. With the
-    paper's psi, the longest distance of the data, three points and two normals may have a negative eigenvalue.
+    The kernel and its slope vanish at r = psi. It is a covariance only within a ball of diameter 3/4 psi. The paper's
+    psi, the longest distance of the data, is too small for this.
 
     >>> thin_plate(torch.tensor([0.0, 2.0]), psi=2.0)
     tensor([8., 0.])
@@ -99,7 +106,18 @@ def thin_plate_kernel(psi: Positive) -> Kernel:
     1.5
     """
     remedy = "use a psi_scale of at least 1.34: the thin plate kernel is a covariance only within 3/4 psi"
-    return Kernel(partial(thin_plate, psi=psi), psi / LEAST_PSI, remedy, partial(_differentiate_thin_plate, psi))
+    return Kernel(partial(thin_plate, psi=psi), psi / (4.0 / 3.0), remedy, partial(_differentiate_thin_plate, psi))
+
+
+def _differentiate_thin_plate(psi: float, r: Tensor, count: int) -> tuple[Tensor, ...]:
+    """Return `differentiate` of the thin plate in closed form."""
+    values = [(2.0 * r).sub_(3.0 * psi).mul_(r).mul_(r).add_(psi**3), (6.0 * r).sub_(6.0 * psi)]
+    if count > 2:
+        inverse = torch.reciprocal(r).masked_fill_(r == 0, 0.0)
+        values.append(6.0 * inverse)
+        if count > 3:
+            values.append((inverse * inverse).mul_(inverse).mul_(-6.0))
+    return tuple(values)
 
 
 @checked
@@ -129,9 +147,7 @@ def rbf_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
 
 @checked
 def kernel_by_name(name: KernelName, psi: Positive) -> Kernel:
-    """Return "thin_plate", "matern52" or "rbf" with k(0) = psi^3 and k''(0) = -6 psi, as the thin plate has.
-
-    The lengths are psi / sqrt(6) for "rbf" and sqrt(5/18) psi for "matern52".
+    """Return "thin_plate", "matern52" or "rbf" with the thin plate's prior variances, psi^3 and 6 psi.
 
     Raises:
         BadArgument: another name.
@@ -147,23 +163,54 @@ def kernel_by_name(name: KernelName, psi: Positive) -> Kernel:
     return rbf_kernel(psi / math.sqrt(6.0), psi**3)
 
 
-def _differentiate_by_distance(profile: Profile, r: Tensor, order: int) -> list[Tensor]:
-    """Return the profile and its derivatives in r up to an order, elementwise."""
-    with torch.enable_grad():
-        r = r.detach().requires_grad_()
-        values = [profile(r)]
-        for _ in range(order):
-            value = values[-1] + 0.0 * r  # a constant would have no graph
-            values += torch.autograd.grad(value.sum(), r, create_graph=True)
-    return [value.detach() for value in values]
+def cross_covariance(
+    kernel: Kernel, x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"], n_oriented: int
+) -> Float[Tensor, "4 q rows"]:
+    """Return the covariance of each component of (d, w) at x with observations at y, Eqs. (2)-(5).
+
+    The blocks are k, k' d, -k' d^T and -k' I - k'' d d^T. Here d = x - y, and k', k'' are derivatives in r^2 / 2.
+    Eq. (5) takes one derivative in each argument: two in one argument would make the matrix indefinite.
+
+    The first `n_oriented` of y have normals. Columns go by component: d of all, then w1, w2, w3 of those with normals.
+    """
+    n = len(y)
+    d, r = separations(x, y)
+    k, first, second = kernel.derivatives(r, 3)
+    out = x.new_empty(4, len(x), n + 3 * n_oriented)
+    out[0, :, :n] = k
+    for m in range(3):
+        torch.mul(first, d[m], out=out[m + 1, :, :n])
+    if not n_oriented:
+        return out
+    d, first, second = [part[:, :n_oriented] for part in d], -first[:, :n_oriented], -second[:, :n_oriented]
+    for m in range(3):
+        columns = slice(n + m * n_oriented, n + (m + 1) * n_oriented)
+        torch.mul(first, d[m], out=out[0, :, columns])
+        tilted = second * d[m]
+        torch.addcmul(first, tilted, d[m], out=out[m + 1, :, columns])
+        for p in range(m):
+            block = out[m + 1, :, n + p * n_oriented : n + (p + 1) * n_oriented]
+            torch.mul(tilted, d[p], out=block)
+            out[p + 1, :, columns] = block
+    return out
 
 
-def _differentiate_thin_plate(psi: float, r: Tensor, count: int) -> tuple[Tensor, ...]:
-    """Return what `differentiate` does for the thin plate, in closed form."""
-    values = [(2.0 * r).sub_(3.0 * psi).mul_(r).mul_(r).add_(psi**3), (6.0 * r).sub_(6.0 * psi)]
-    if count > 2:
-        inverse = torch.reciprocal(r).masked_fill_(r == 0, 0.0)
-        values.append(6.0 * inverse)
-        if count > 3:
-            values.append((inverse * inverse).mul_(inverse).mul_(-6.0))
-    return tuple(values)
+def separations(x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"]) -> tuple[list[Tensor], Float[Tensor, "q n"]]:
+    """Return the components of x - y and its length, without cancellation."""
+    d = [x[:, m, None] - y[None, :, m] for m in range(3)]
+    return d, (d[0] * d[0]).addcmul_(d[1], d[1]).addcmul_(d[2], d[2]).sqrt_()
+
+
+def covariance_rows(
+    kernel: Kernel, x: Float[Tensor, "n 3"], n_oriented: int, y: Float[Tensor, "m 3"], other_oriented: int
+) -> Float[Tensor, "rows columns"]:
+    """Return the covariance of two lists of observations. Points with normals are first."""
+    block = cross_covariance(kernel, x, y, other_oriented)
+    if n_oriented == len(x):
+        return block.flatten(0, 1)
+    return torch.cat([block[0], block[1:, :n_oriented].flatten(0, 1)])
+
+
+def gram(kernel: Kernel, x: Float[Tensor, "n 3"], n_oriented: int) -> Float[Tensor, "rows rows"]:
+    """Return the covariance of observations, of which the first `n_oriented` have normals."""
+    return covariance_rows(kernel, x, n_oriented, x, n_oriented)

@@ -7,69 +7,18 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from torchgrasp.base import Batch, Value, in_chunks
+from torchgrasp.base import Value, in_chunks
 from torchgrasp.checks import checked
-from torchgrasp.geometry.linalg import unit
-from torchgrasp.shape.gradient_kernel import cross_covariance, separations
-from torchgrasp.shape.kernel import Kernel
-
-CACHED_POINTS, GPU_POINTS = 256, 16384
-"""Points of one chunk: on a CPU its temporaries stay in the cache of a core, on an accelerator they fill it."""
-GPU_BYTES = 2**27
-"""Largest temporary of a chunk with covariances on an accelerator."""
-WIDTH = 24
-"""Blocks of the inverse factor have a multiple of so many columns: 72 are a fifth faster than 70 at 280 rows."""
-
-
-@dataclasses.dataclass(frozen=True)
-class MeanJet(Batch):
-    """The mean to second order; gradients do not have unit length.
-
-    >>> from torchgrasp import fit_shape, load_object
-    >>> shape = fit_shape(load_object("jug").view)
-    >>> jet = shape.mean_jet(shape.normalise(shape.cloud.points[:5]))
-    >>> jet.normals.norm(dim=1), jet.hessian.shape
-    (tensor([1.0000, 1.0000, 1.0000, 1.0000, 1.0000], dtype=torch.float64), torch.Size([5, 3, 3]))
-    """
-
-    distance: Float[Tensor, "*b"]
-    gradient: Float[Tensor, "*b 3"]
-    hessian: Float[Tensor, "*b 3 3"]
-
-    @property
-    def normals(self) -> Float[Tensor, "*b 3"]:
-        """The outward unit normals, Eq. (11)."""
-        return unit(self.gradient)
-
-    @property
-    def normal_jacobian(self) -> Float[Tensor, "*b 3 3"]:
-        """The derivatives of the normals by their points, (1 - n n^T) H / |g|."""
-        n, steep = self.normals, torch.linalg.vector_norm(self.gradient, dim=-1)[..., None, None]
-        return (self.hessian - n[..., :, None] * (n[..., None, :] @ self.hessian)) / steep
-
-
-@dataclasses.dataclass(frozen=True)
-class SurfaceJet(MeanJet):
-    """The mean to second order and the variance to first."""
-
-    variance: Float[Tensor, "*b"]
-    variance_gradient: Float[Tensor, "*b 3"]
-
-
-def surface_deviation(variance: Float[Tensor, "*b"], gradient: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-    """Return the standard deviation of the zero level across itself, to first order in that of the distance.
-
-    A level moves by the error of the distance over the slope of the mean, which is steeper than 1 on the paper's data.
-
-    >>> surface_deviation(torch.tensor([0.04]), torch.tensor([[0.0, 0.0, 2.0]]))
-    tensor([0.1000])
-    """
-    return variance.sqrt() / torch.linalg.vector_norm(gradient, dim=-1)
+from torchgrasp.errors import IndefiniteCovariance
+from torchgrasp.shape.kernel import Kernel, cross_covariance, gram, separations
+from torchgrasp.shape.values import JointEstimate, MeanJet, SurfaceJet, pass_gradients
 
 
 @dataclasses.dataclass(frozen=True)
 class Posterior(Value):
     """A Gaussian process given observations of distances and normals; normalised, in float64.
+
+    `mean` and `mean_and_gradient` are differentiable once. All other methods refuse points that require a gradient.
 
     Args:
         x: observed points, those with normals first.
@@ -96,15 +45,11 @@ class Posterior(Value):
 
     @cached_property
     def whiteners(self) -> list[Float[Tensor, "columns width"]]:
-        """L^-T in about four blocks of columns, without the zeros below.
-
-        Products with them take five eighths of a dense one's arithmetic. They are faster than a triangular solve.
-        """
-        rows = len(self.factor)
-        inverse = torch.linalg.solve_triangular(
-            self.factor, torch.eye(rows, dtype=self.x.dtype, device=self.x.device), upper=False
-        )
-        width = max(WIDTH * round(rows / (4 * WIDTH)), WIDTH)
+        """L^-T of the factor L in about four blocks of columns, without the zeros below."""
+        rows, tile = len(self.factor), 24  # matrix products are fastest with a multiple of so many columns
+        one = torch.eye(rows, dtype=self.x.dtype, device=self.x.device)
+        inverse = torch.linalg.solve_triangular(self.factor, one, upper=False)
+        width = max(tile * round(rows / (4 * tile)), tile)
         return [inverse[i : i + width, : i + width].T.contiguous() for i in range(0, rows, width)]
 
     @cached_property
@@ -112,7 +57,7 @@ class Posterior(Value):
         """Number of observed points with normals."""
         return int(self.has_normal.sum())
 
-    @checked(gradients=True)
+    @checked
     def ordered(self, rows: Shaped[Tensor, "rows *c"]) -> Shaped[Tensor, "rows *c"]:
         """Bring rows from the order of `gram` into that of the factor."""
         return rows if self.order is None else rows[self.order]
@@ -127,7 +72,7 @@ class Posterior(Value):
             along = x @ b.T - (self.x[: len(b)] * b).sum(-1)
             return (k @ a - (first[:, : len(b)] * along).sum(1),)
 
-        return in_chunks(evaluate, x, 2048)[0]
+        return pass_gradients(x, lambda x: in_chunks(evaluate, x, 2048), lambda x: (self.mean_and_gradient(x)[1],))[0]
 
     @checked(gradients=True)
     def mean_and_gradient(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]:
@@ -143,35 +88,36 @@ class Posterior(Value):
             c[:, : len(b)].addcmul_(second[:, : len(b)], along, value=-1.0)
             return distance, _sum_differences(c, x, self.x) - near @ b
 
-        return in_chunks(evaluate, x, 2 * CACHED_POINTS if x.device.type == "cpu" else GPU_POINTS)  # pyright: ignore[reportReturnType]
+        def differentiate(x: Tensor) -> tuple[Tensor, Tensor]:
+            jet = self.mean_jet(x)
+            return jet.gradient, jet.hessian
 
-    @checked(gradients=True)
+        size = 512 if x.device.type == "cpu" else 16384
+        return pass_gradients(x, lambda x: in_chunks(evaluate, x, size), differentiate)  # pyright: ignore[reportReturnType]
+
+    @checked
     def estimate(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
         """Return the mean and the covariance of (d, w) at normalised points, Eqs. (7)-(8)."""
         prior, rows = self.prior_block(), len(self.factor)
-        size = CACHED_POINTS if x.device.type == "cpu" else max(GPU_BYTES // (32 * rows), 64)
-        # Written again for every chunk: on a CPU new memory costs more than the arithmetic.
-        spaces = x.new_empty(2, 4 * min(size, len(x)) * rows)
 
         def evaluate(x: Tensor) -> tuple[Tensor, Tensor]:
-            source, target = (space[: 4 * len(x) * rows].view(4, len(x), rows) for space in spaces)
-            cross_covariance(self.kernel, x, self.x, self.n_oriented, source)
-            mean = (source @ self.weights).T
-            if self.order is not None:
-                source, target = torch.index_select(source, 2, self.order, out=target), source
-            self._whiten(source.view(-1, rows), target.view(-1, rows))
+            cross = self.cross(x)
+            mean = (cross @ self.weights).T
+            whitened = self.whiten(cross.view(-1, rows)).view(4, len(x), rows)
             spread = prior.repeat(len(x), 1, 1)
             for m in range(4):
                 for p in range(m, 4):
-                    explained = torch.linalg.vecdot(target[m], target[p])
+                    explained = torch.linalg.vecdot(whitened[m], whitened[p])
                     spread[:, m, p] -= explained
                     if p > m:
                         spread[:, p, m] -= explained
             return mean, spread
 
+        # On a CPU the temporaries of a chunk stay in the cache. On an accelerator they take at most 128 MiB.
+        size = 256 if x.device.type == "cpu" else max(2**27 // (32 * rows), 64)
         return in_chunks(evaluate, x, size)  # pyright: ignore[reportReturnType]
 
-    @checked(gradients=True)
+    @checked
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
         """Return mean and variance with derivatives at normalised points, without autograd.
 
@@ -183,41 +129,45 @@ class Posterior(Value):
         * Hessian: sum_j (k'' a_j - k''' d.b_j) d d^T - k'' (b_j d^T + d b_j^T) + c_j I
         * gradient of the variance k0 - k*^T A k*: -2 times the gradient of the mean with the weights A k*
         """
-        chunk = CACHED_POINTS if x.device.type == "cpu" else GPU_POINTS
-        return SurfaceJet(*in_chunks(partial(_jet, self), x, chunk))
+        return SurfaceJet(*in_chunks(partial(_jet, self), x, 256 if x.device.type == "cpu" else 16384))
 
-    @checked(gradients=True)
+    @checked
     def mean_jet(self, x: Float[Tensor, "q 3"]) -> MeanJet:
-        """Return the mean's part of `jet`: without the variance it costs less than half."""
-        chunk = CACHED_POINTS if x.device.type == "cpu" else GPU_POINTS
-        return MeanJet(*in_chunks(lambda part: _mean_jet(self, part)[0], x, chunk))
+        """Return the mean's part of `jet`, which costs much less than the variance's."""
+        size = 256 if x.device.type == "cpu" else 16384
+        return MeanJet(*in_chunks(lambda part: _mean_jet(self, part)[0], x, size))
+
+    @checked
+    def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
+        """Return the joint posterior of (d, w) at normalised points, of any number, Eqs. (7)-(8)."""
+        k = len(x)
+        cross = self.cross(x)
+        mean = (cross @ self.weights).T
+        by_point = self.ordered(cross.transpose(0, 1).flatten(0, 1).T)
+        whitened = torch.linalg.solve_triangular(self.factor, by_point, upper=False)
+        prior = gram(self.kernel, x, k)
+        prior = prior.reshape(4, k, 4, k).permute(1, 0, 3, 2).reshape(4 * k, 4 * k)
+        return JointEstimate(mean, prior - whitened.T @ whitened)
 
     def prior_block(self) -> Float[Tensor, "4 4"]:
         """Return the prior covariance of (d, w) at any one point."""
         here = self.x.new_zeros(1, 3)
         return cross_covariance(self.kernel, here, here, 1)[:, 0]
 
-    @checked(gradients=True)
+    @checked
     def distance_rows(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q rows"]:
         """Return the covariance of the distances at points with the observations, the first block of `cross`."""
         d, r = separations(x, self.x)
         k, first = self.kernel.derivatives(r, 2)
         return _distance_rows(d, k, first, self.n_oriented)
 
-    @checked(gradients=True)
+    @checked
     def whiten(self, rows: Float[Tensor, "q rows"]) -> Float[Tensor, "q rows"]:
         """Return covariances with the observations times L^-T: their products are what the observations explain."""
         rows = rows if self.order is None else rows[:, self.order]
-        return self._whiten(rows, torch.empty_like(rows))
+        return torch.cat([rows[:, : len(block)] @ block for block in self.whiteners], 1)
 
-    def _whiten(self, source: Float[Tensor, "q rows"], out: Float[Tensor, "q rows"]) -> Float[Tensor, "q rows"]:
-        """Write the same of rows in the factor's order."""
-        for block in self.whiteners:
-            end, start = len(block), len(block) - block.shape[1]
-            torch.mm(source[:, :end], block, out=out[:, start:end])
-        return out
-
-    @checked(gradients=True)
+    @checked
     def cross(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "4 q rows"]:
         """Return the covariance of (d, w) at points with the observations."""
         return cross_covariance(self.kernel, x, self.x, self.n_oriented)
@@ -273,12 +223,7 @@ def _distance_rows(
     d: list[Tensor], k: Float[Tensor, "q n"], first: Float[Tensor, "q n"], near: int
 ) -> Float[Tensor, "q rows"]:
     """Return k and -k' d, the latter of the first observations, which have normals."""
-    n = k.shape[1]
-    row = k.new_empty(len(k), n + 3 * near)
-    row[:, :n] = k
-    for m in range(3):
-        torch.mul(d[m][:, :near], first[:, :near], out=row[:, n + m * near : n + (m + 1) * near]).neg_()
-    return row
+    return torch.cat([k, *(-(part[:, :near] * first[:, :near]) for part in d)], 1)
 
 
 def _sum_differences(c: Float[Tensor, "q n"], x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"]) -> Float[Tensor, "q 3"]:
@@ -289,3 +234,34 @@ def _sum_differences(c: Float[Tensor, "q n"], x: Float[Tensor, "q 3"], y: Float[
 def _distances(x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"]) -> Float[Tensor, "q n"]:
     """Return distances without the cancellation of |x|^2 - 2 x.y + |y|^2."""
     return torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def distance_covariance(posterior: Posterior, x: Float[Tensor, "b k 3"]) -> Float[Tensor, "b k k"]:
+    """Return the covariance of the distances within sets of normalised points, Eq. (8)."""
+    return combined_covariance(posterior, x[:, :, None], x.new_ones(1, 1, 1, 1))
+
+
+def combined_covariance(
+    posterior: Posterior, x: Float[Tensor, "b g p 3"], weights: Float[Tensor, "#b #g m p"]
+) -> Float[Tensor, "b v v"]:
+    """Return the covariance, within sets, of m weighted sums of the distances of each group of p points: v = g m."""
+    (b, g, p), rows = x.shape[:3], len(posterior.factor)
+    v, points = g * weights.shape[2], x.flatten(1, 2)
+    cross = posterior.distance_rows(points.flatten(0, 1)).view(b, g, p, rows)
+    whitened = posterior.whiten((weights @ cross).view(b * v, rows)).view(b, v, rows)  # the sums: they are fewer
+    prior = posterior.kernel.profile(torch.linalg.vector_norm(points[:, :, None] - points[:, None], dim=-1))
+    prior = weights @ prior.view(b, g, p, g * p)  # (b, g, m, g p)
+    prior = weights @ prior.view(b, v, g, p).permute(0, 2, 3, 1)  # (b, g, m, v)
+    return torch.baddbmm(prior.reshape(b, v, v), whitened, whitened.mT, alpha=-1.0)
+
+
+def symmetric_root(covariance: Float[Tensor, "*b k k"], prior: float, remedy: str) -> Float[Tensor, "*b k k"]:
+    """Return the symmetric root of covariances, unique even with equal eigenvalues.
+
+    Coinciding points leave eigenvalues of zero, which rounding makes negative. Negative eigenvalues far below the
+    `prior` variance count as zero. Others raise `IndefiniteCovariance` with the `remedy`.
+    """
+    values, vectors = torch.linalg.eigh(covariance)
+    if values.numel() and not float(values.min()) >= -1e-8 * prior:
+        raise IndefiniteCovariance("the joint covariance", float(values.min()), remedy)
+    return (vectors * torch.where(values > 0, values, 0.0).sqrt()[..., None, :]) @ vectors.mT

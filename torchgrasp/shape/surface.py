@@ -17,7 +17,7 @@ from torchgrasp.geometry.linalg import limit_norm, unit
 from torchgrasp.geometry.mesh import clip_mesh
 from torchgrasp.geometry.signed_distance import FIELD_SPACING, SignedDistanceField, field_from_surface
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.posterior import surface_deviation
+from torchgrasp.shape.values import surface_deviation
 
 if TYPE_CHECKING:
     import trimesh

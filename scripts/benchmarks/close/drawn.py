@@ -7,7 +7,7 @@ from scipy.interpolate import RBFInterpolator
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.linalg import farthest_points
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.joint_posterior import distance_covariance, symmetric_root
+from torchgrasp.shape.posterior import distance_covariance, symmetric_root
 from torchgrasp.shape.surface import extract_surface
 
 ANCHORS = 600

@@ -32,10 +32,9 @@ from torchgrasp.ik.rounds import assign
 from torchgrasp.posture_model.em import expectation, maximisation
 from torchgrasp.posture_model.kmeans import start_components
 from torchgrasp.posture_model.shard import Shard
-from torchgrasp.shape.condition import condition
-from torchgrasp.shape.gp import Normalisation
-from torchgrasp.shape.observations import on_surface
+from torchgrasp.shape.fit import condition
 from torchgrasp.shape.surface import extract_surface
+from torchgrasp.shape.values import Normalisation, on_surface
 from torchgrasp.testing.hands import random_joints
 from torchgrasp.values import PointCloud
 

@@ -13,7 +13,7 @@ from torchgrasp.plan.line_posterior import FOOTPRINT
 from torchgrasp.plan.round_cones import closed_exact
 from torchgrasp.plan.wrench import tangents
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.joint_posterior import distance_covariance
+from torchgrasp.shape.posterior import distance_covariance
 from torchgrasp.values import Contacts
 
 GRID_POINTS = 37

@@ -13,13 +13,11 @@ from torchgrasp.base import join
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.geometry.frames import rotation_from_vector
 from torchgrasp.geometry.linalg import cholesky, fibonacci_sphere
-from torchgrasp.shape.condition import condition, longest_distance
-from torchgrasp.shape.fit import fit_shape
-from torchgrasp.shape.gp import Normalisation, ShapeGP
-from torchgrasp.shape.gradient_kernel import gram
-from torchgrasp.shape.kernel import kernel_by_name
-from torchgrasp.shape.observations import Observations, off_surface, on_surface
-from torchgrasp.shape.select import select_points
+from torchgrasp.shape.conditioning import longest_distance, select_points
+from torchgrasp.shape.fit import condition, fit_shape
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.kernel import gram, kernel_by_name
+from torchgrasp.shape.values import Normalisation, Observations, off_surface, on_surface
 from torchgrasp.values import PointCloud
 
 PSI_SCALE = 1.5

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchgrasp.shape.observations import Observations
+from torchgrasp.shape.values import Observations
 
 
 def gpytorch_posterior(x: Tensor, y: Tensor, noise: float, dense: bool) -> Callable[[Tensor], tuple[Tensor, Tensor]]:

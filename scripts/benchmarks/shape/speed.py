@@ -12,8 +12,8 @@ from torch import Tensor
 from benchmarks.common import Row, least_seconds, peak_mib, random_view
 from benchmarks.shape.exactness import NOISE, PSI_SCALE, observe, posterior, queries_in
 from benchmarks.shape.gpytorch_peer import gpytorch_posterior, product_floor
-from torchgrasp.shape.condition import condition
-from torchgrasp.shape.gp import Normalisation
+from torchgrasp.shape.fit import condition
+from torchgrasp.shape.values import Normalisation
 from torchgrasp.values import PointCloud
 
 CHUNKS = (30, 100, 300)

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchgrasp.shape.completion.axis import find_revolution
 from torchgrasp.shape.completion.complete import complete_cloud
-from torchgrasp.shape.completion.revolution import find_revolution
 from torchgrasp.values import PointCloud
 
 CAMERA = torch.tensor([0.45, 0.0, 0.3], dtype=torch.float64)

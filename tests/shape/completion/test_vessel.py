@@ -10,8 +10,7 @@ from tests.make import cup, cup_view
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.prepare import prepare_cloud
 from torchgrasp.shape.completion.silhouette import silhouettes
-from torchgrasp.shape.completion.vessel import Vessel, find_vessel
-from torchgrasp.shape.completion.walls import complete_walls
+from torchgrasp.shape.completion.vessel import Vessel, complete_walls, find_vessel
 from torchgrasp.values import PointCloud
 
 

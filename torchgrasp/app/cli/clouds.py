@@ -29,7 +29,7 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import as_plane
 from torchgrasp.scene import Scene, save_scene
-from torchgrasp.shape.completion import silhouettes
+from torchgrasp.shape.completion.silhouette import silhouettes
 from torchgrasp.values import PointCloud
 
 IMAGE_OPTIONS = {

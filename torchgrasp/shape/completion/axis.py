@@ -1,46 +1,53 @@
-"""An axis of revolution of any direction: the line that the normals of most points meet.
+"""Bodies of revolution: their axis is the line that the normals of most points meet.
 
 The lines along the normals of a surface of revolution meet its axis: they lie in a linear line complex of pitch 0
 (Pottmann and Wallner, Computational Line Geometry, 2001). A miss, moment times direction, is linear in each of the two.
 """
 
+import dataclasses
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
-from torchgrasp.geometry.linalg import farthest_points, fibonacci_sphere, unit
+from torchgrasp.geometry.linalg import farthest_points, fibonacci_sphere, solve_least_squares, unit
 from torchgrasp.geometry.plane import LEAST_TILT
-from torchgrasp.shape.completion.revolution import BODY_SHARE, ONE_WAY, Revolution, lines_from_above, split_body
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 from torchgrasp.shape.completion.symmetry import PROBES, SymmetryScorer
 
-STARTS, ITERATIONS = 12, 12
-"""Directions from which a fit starts, and its steps: with 60 and 40 the axes of 70 of 71 views are the same."""
-HALF_WEIGHT, WIDE, NARROWING = 0.004, 0.02, 0.6
-"""Miss [m] of half the weight in the end and at first, and by how much each step narrows what the first adds."""
-MAX_TURN = 0.3
-"""Greatest turn [rad] of one step: misses are linear in smaller ones."""
-DAMPING = 1e-6
-"""Relative damping of a step: a ball leaves the direction free, and a prism the place along a side."""
-MAX_COST = 1.0
-"""Greatest mean of log(1 + (miss / HALF_WEIGHT)^2): bodies with a handle have 0.8, without one 0.1 to 0.4."""
+HALF_WEIGHT = 0.004
+"""Distance [m] of a normal's line from the axis at which it has half the weight in the fit."""
+STEEP = 0.3
+"""Least length of the level part of the normals that fit a vertical axis."""
+MISS, LEAST_RADIUS = 0.2, 0.01
+"""A normal meets the axis if its line passes it within this share of the point's radius, at least of this one [m]."""
 ROUNDNESS, ROUND_ERROR = 0.055, 0.0018
-"""Usual miss of a body's normals, a share of the radius and an error [m]. In units of both its RMS is below 1 for
-bodies of revolution from 8 to 45 mm radius; a tub and an oval tin have more (docs/shape.md)."""
-TURNS = 12
-"""Steps of a full turn at which the body is tried against free space."""
-MAX_FREE, FREE = 0.12, 0.003
-"""Share of the turned body that may lie this deep [m] in free space: bottles have 0.08, toys and tools from 0.13."""
+"""Usual miss of a body's normals: a share of the radius and an error [m]."""
+MAX_SPREAD = 0.075
+"""Greatest RMS of the relative misses of an upright body's normals."""
+BODY_SHARE = 0.6
+"""Least share of the cloud on the body; other points are an attached part."""
+MAX_COST = 1.0
+"""Greatest mean of log(1 + (miss / HALF_WEIGHT)^2) of an axis."""
+MAX_FREE = 0.12
+"""Greatest share of the rotated body in free space."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Revolution:
+    """A body of revolution about the vertical axis at `center` [m]; `body` masks its points."""
+
+    center: Float[Tensor, "2"]
+    body: Bool[Tensor, "n"]
 
 
 def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution] | None:
     """Return the frame of an axis of revolution, and the body about its z axis; None: there is none.
 
     The frame is `axis_from_cloud`; its x axis points towards the cameras. The axis is fitted to the scorer's probes.
-    Turned about it, those of the body must keep out of free space and of the table.
+    The body rotated about it must keep out of free space and of the table.
 
     >>> from torchgrasp.values import PointCloud
     >>> angle, along = torch.rand(2, 900, generator=torch.Generator().manual_seed(0)).double()
@@ -57,19 +64,102 @@ def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution]
         return None
     axis_from_cloud = _frame(center, direction, scorer.outline)
     points = apply(axis_from_cloud, scorer.points)
-    lines = lines_from_above(points, rotate(axis_from_cloud, scorer.normals))
+    lines = _lines_from_above(points, rotate(axis_from_cloud, scorer.normals))
     origin = torch.zeros(2, dtype=torch.float64)
-    body = split_body(points, lines, origin)
+    body = _split_body(points, lines, origin)
     allowed = torch.hypot(ROUNDNESS * body.typical, torch.full_like(body.typical, ROUND_ERROR))
     rms = (body.miss / allowed)[body.side].square().mean().sqrt()
-    if not bool((body.mask.double().mean() > BODY_SHARE) & (rms < 1.0) & (body.one_way < ONE_WAY)):
+    if not body.is_round(rms < 1.0):
         return None
     spread = farthest_points(points[body.mask], PROBES, tie=TIE)
     turned = apply(inverse(axis_from_cloud), _turn(points[body.mask][spread]))
-    excluded = scorer.outline.violation(turned) > FREE
+    excluded = scorer.outline.violation(turned) > 0.003
     if scorer.table is not None:
-        excluded |= scorer.table.height(turned) < -FREE
+        excluded |= scorer.table.height(turned) < -0.003
     return (axis_from_cloud, Revolution(origin, body.mask)) if excluded.double().mean() < MAX_FREE else None
+
+
+def find_revolution(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Revolution | None:
+    """Return the upright body of revolution that most points belong to; None: there is none.
+
+    >>> angle = torch.linspace(-1.5, 1.5, 200).double()
+    >>> level = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], 1)
+    >>> find_revolution(0.03 * level + torch.tensor([0.1, 0.2, 0.0]).double(), level).center
+    tensor([0.1000, 0.2000], dtype=torch.float64)
+    """
+    lines = _lines_from_above(points, normals)
+    center = _fit_to_lines(points, lines)
+    body = _split_body(points, lines, center)
+    spread = (body.miss / body.radius.clamp_min(LEAST_RADIUS))[body.side].square().mean().sqrt()
+    return Revolution(center, body.mask) if body.is_round(spread < MAX_SPREAD) else None
+
+
+def fit_axis(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, "2"]:
+    """Return the vertical axis [m] that most lines along the normals meet."""
+    return _fit_to_lines(points, _lines_from_above(points, normals))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Lines:
+    """The lines across . x = offset along normals: their level part `slope` is steep, and of unit length `level`."""
+
+    slope: Float[Tensor, "n"]
+    steep: Bool[Tensor, "n"]
+    level: Float[Tensor, "n 2"]
+    across: Float[Tensor, "n 2"]
+    offset: Float[Tensor, "n"]
+
+
+def _lines_from_above(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> _Lines:
+    """Return the lines along the normals, seen from above."""
+    slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
+    steep = slope > STEEP
+    level = torch.where(steep[:, None], normals[:, :2] / slope[:, None], 0.0)
+    across = torch.stack([-level[:, 1], level[:, 0]], 1)
+    return _Lines(slope, steep, level, across, (across * points[:, :2]).sum(1))
+
+
+def _fit_to_lines(points: Float[Tensor, "n 3"], lines: _Lines) -> Float[Tensor, "2"]:
+    """Return the point that most lines meet; reweighted least squares (Cauchy)."""
+    miss, center = torch.zeros_like(lines.offset), points[:, :2].mean(0)
+    for _ in range(30):
+        weight = lines.slope / (1.0 + (miss / HALF_WEIGHT) ** 2)
+        center = solve_least_squares(weight[:, None].sqrt() * lines.across, weight.sqrt() * lines.offset)
+        miss = lines.offset - lines.across @ center
+    return center
+
+
+@dataclasses.dataclass(frozen=True)
+class _Body:
+    """The part of a cloud about a vertical axis: `mask` of all its points, `side` of those with steep normals.
+
+    Each point has the distance [m] by which its normal's line misses the axis, its radius, and that of its slice. The
+    mean level normal of the side has the length `one_way`.
+    """
+
+    mask: Bool[Tensor, "n"]
+    side: Bool[Tensor, "n"]
+    miss: Float[Tensor, "n"]
+    radius: Float[Tensor, "n"]
+    typical: Float[Tensor, "n"]
+    one_way: Float[Tensor, ""]
+
+    def is_round(self, fits: Bool[Tensor, ""]) -> bool:
+        """Return whether the body is most of the cloud, fits, and is no flat side."""
+        return bool((self.mask.double().mean() > BODY_SHARE) & fits & (self.one_way < 0.95))
+
+
+def _split_body(points: Float[Tensor, "n 3"], lines: _Lines, center: Float[Tensor, "2"]) -> _Body:
+    """Return the points whose normals meet the vertical axis at `center`, and whose radius is that of their slice."""
+    miss = lines.offset - lines.across @ center
+    radius = torch.linalg.vector_norm(points[:, :2] - center, dim=1)
+    meets = lines.steep & (miss.abs() / radius.clamp_min(LEAST_RADIUS) < MISS)
+    near = 0.004  # [m], of a point's slice in height and of its median in radius
+    slices = ((points[:, 2:] - points[:, 2]).abs() < near) & meets
+    typical = torch.where(slices, radius, torch.nan).nanmedian(1).values
+    mask = torch.where(lines.steep, meets & ((radius - typical).abs() < near), radius < typical + near)
+    side = mask & lines.steep
+    return _Body(mask, side, miss, radius, typical, torch.linalg.vector_norm(lines.level[side].mean(0)))
 
 
 def _fit_axis(
@@ -77,25 +167,26 @@ def _fit_axis(
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"], float]:
     """Return a point of the axis [m] that most lines along the normals meet, its direction and its cost.
 
-    Gauss-Newton steps with weights (Cauchy) from several directions at once. A line along the axis misses by less than
-    its distance, and parallel ones not at all.
+    Gauss-Newton steps with weights (Cauchy) from several directions at once. Each step narrows the weights.
     """
-    direction = fibonacci_sphere(2 * STARTS)[:STARTS]
-    center, cost = points.mean(0).expand_as(direction), torch.zeros(STARTS, dtype=torch.float64)
-    for step in range(ITERATIONS):
+    starts = 12
+    direction = fibonacci_sphere(2 * starts)[:starts]
+    center, cost = points.mean(0).expand_as(direction), torch.zeros(starts, dtype=torch.float64)
+    for step in range(12):
         across = torch.stack(_across(direction), 1)
         arm = points - center[:, None]
         moment = torch.linalg.cross(arm, normals.expand_as(arm))
         miss = (moment * direction[:, None]).sum(-1)
         lever = torch.linalg.cross(direction[:, None].expand_as(arm), normals.expand_as(arm))
         slope = torch.cat([lever @ across.mT, moment @ across.mT], 2)
-        scale = HALF_WEIGHT + (WIDE - HALF_WEIGHT) * NARROWING**step
+        scale = HALF_WEIGHT + (0.02 - HALF_WEIGHT) * 0.6**step
         weighted = slope / (1.0 + (miss / scale) ** 2)[..., None]
         system = slope.mT @ weighted
-        system = system + DAMPING * torch.diag_embed(system.diagonal(dim1=1, dim2=2).clamp_min(1e-9))
+        # Damping: a ball leaves the direction free, and a prism the place along a side.
+        system = system + 1e-6 * torch.diag_embed(system.diagonal(dim1=1, dim2=2).clamp_min(1e-9))
         found = -torch.linalg.solve(system, (weighted * miss[..., None]).sum(1))
         length = torch.linalg.vector_norm(found[:, 2:], dim=1, keepdim=True)
-        turn = found[:, 2:] * (MAX_TURN / length.clamp_min(MAX_TURN))
+        turn = found[:, 2:] * (0.3 / length.clamp_min(0.3))  # [rad], misses are linear in small turns only
         center = center + (found[:, None, :2] @ across)[:, 0]
         direction = unit(direction + (turn[:, None] @ across)[:, 0])
         center = center + ((points.mean(0) - center) * direction).sum(1, keepdim=True) * direction
@@ -122,8 +213,8 @@ def _frame(center: Float[Tensor, "3"], direction: Float[Tensor, "3"], outline: O
 
 
 def _turn(points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 3"]:
-    """Return points turned about z, at each step of a turn but none."""
-    angle = 2 * math.pi / TURNS * torch.arange(1, TURNS, dtype=torch.float64)
+    """Return points rotated about z by multiples of 30 degrees."""
+    angle = 2 * math.pi / 12 * torch.arange(1, 12, dtype=torch.float64)
     x, y, z = points.unbind(1)
     cos, sin = angle.cos()[:, None], angle.sin()[:, None]
     return torch.stack([cos * x - sin * y, sin * x + cos * y, z.expand(len(angle), -1)], -1).reshape(-1, 3)

@@ -14,9 +14,8 @@ from torchgrasp.checks import Count, Pose, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.geometry.linalg import farthest_points, reflect, reflect_directions
-from torchgrasp.shape.completion.axis import find_axis
+from torchgrasp.shape.completion.axis import Revolution, find_axis, find_revolution
 from torchgrasp.shape.completion.ellipsoid import Ellipsoid, find_ellipsoid
-from torchgrasp.shape.completion.revolution import Revolution, find_revolution
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 from torchgrasp.shape.completion.symmetry import (
     SymmetryScorer,
@@ -24,7 +23,7 @@ from torchgrasp.shape.completion.symmetry import (
     find_planes,
     planes_near,
 )
-from torchgrasp.shape.joint_posterior import symmetric_root
+from torchgrasp.shape.posterior import symmetric_root
 from torchgrasp.values import PointCloud
 
 HULL_MARGIN, FRONT_MARGIN, TABLE_MARGIN = 0.001, 0.002, 0.002
@@ -48,7 +47,7 @@ NEARBY, NEARBY_ANGLE, NEARBY_SHIFT = 5, 0.15, 0.045
 PENALTY = 0.05
 """Score that an image of an image loses: of two equal points the one mirrored once is kept."""
 
-Kind = Literal["ball", "revolution", "mirrored", "guess", "cut off"]
+Kind = Literal["ball", "revolution", "mirrored", "guess", "cut off", "vessel", "whole"]
 """What a hidden side follows from: an ellipsoid, an axis, mirror planes, or nothing but the outline."""
 
 
@@ -97,9 +96,19 @@ class Completion(Value):
 
         The errors by plane are local, too: they also count in the smooth field.
         """
-        local = torch.sqrt(self.asymmetry**2 + (self.shared**2).sum(1))
-        alike = torch.exp(-0.5 * (torch.cdist(self.points, self.points) / PART) ** 2)
-        return torch.cat([self.shared, local[:, None] * symmetric_root(alike, 1.0, "keep mirrored points apart")], 1)
+        return correlated_errors(self.points, self.shared, self.asymmetry)
+
+
+def correlated_errors(
+    points: Float[Tensor, "m 3"], shared: Float[Tensor, "m c"], local: Float[Tensor, "m"] | float
+) -> Float[Tensor, "m k"]:
+    """Return errors [m], a column for each independent cause: the shared ones, and a smooth field of length `PART`.
+
+    The field has the deviation of the local and of the shared errors.
+    """
+    deviation = torch.sqrt(local**2 + (shared**2).sum(1))
+    alike = torch.exp(-0.5 * (torch.cdist(points, points) / PART) ** 2)
+    return torch.cat([shared, deviation[:, None] * symmetric_root(alike, 1.0, "keep hidden points apart")], 1)
 
 
 @checked

@@ -7,40 +7,23 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.geometry.linalg import solve_least_squares, unit
-from torchgrasp.shape.completion.revolution import fit_axis
+from torchgrasp.base import Batch, Value, join
+from torchgrasp.geometry.linalg import farthest_points, solve_least_squares, unit
+from torchgrasp.shape.completion.axis import fit_axis
+from torchgrasp.shape.completion.complete import FRONT_MARGIN, HULL_MARGIN, NEW, SPACING
+from torchgrasp.shape.completion.silhouette import TIE, Outlines
+from torchgrasp.values import PointCloud
 
-WALL = 0.5
-"""Length of a normal's level part from which on it belongs to a wall; below it are rim, floor and noise."""
-DEGREE = 3
-"""Degree of the polynomial of the wall's radius in the height: a bowl bends once, a foot or a lip once more."""
-NOISE, START = 0.006, 4.0
-"""Miss [m] of half the weight in the last fit, and how much more the first allows: 3 mm give cups' walls 40 % worse."""
-ITERATIONS = 30
-"""Fits with new weights: the miss then counts by `NOISE` to 0.5 %."""
-FITS = 0.002
-"""A point belongs to the body if its radius misses the fit by less [m]: twice a camera's noise."""
-BODY_SHARE = 0.65
-"""Share of the walls' points on the body: 0.75 to 1.0 of 21 views of open vessels, at most 0.4 of loops and straps."""
-INNER_SHARE, OUTER_SHARE = 0.09, 0.07
-"""Least shares of the cloud on the inner and the outer wall: without both nothing tells the thickness. Views of open
-vessels have 0.12 and 0.09. Of 201 other views those with a body have 0.06 and 0.09, or 0.82 and 0.05, at most."""
-DEPTH = 0.012
-"""Depth [m] below the rim to which the inside must be seen: the recess of a lid is no cavity."""
-MIN_THICKNESS, MAX_THICKNESS = 0.0003, 0.012
-"""Thickness [m] of a wall: beyond it a body with a hollow needs no two surfaces."""
+LEVEL = 0.5
+"""Least length of the horizontal part of a wall's normals: others are of rim, floor and noise."""
+BODY_SHARE, INNER_SHARE, OUTER_SHARE = 0.65, 0.09, 0.07
+"""Least share of the walls' points on the body, and of the cloud on the inner and on the outer wall."""
 USUAL, SPREAD, THICKNESS_ERROR = 0.0035, 0.0015, 0.0012
-"""Assumed thickness [m] of household vessels and its standard deviation; that of one fit, rms on 40 noisy views of
-authored cups. A wall is their mean by weight. Authored cups are within 2 mm on 94 instead of 86 %, tuning cups on 79
-instead of 81 % (docs/shape.md)."""
-RIM_QUANTILE = 0.98
-"""Share of the body below its rim: noise lifts some points over it."""
-RIM, EDGE = 0.003, 0.002
-"""Points so near [m] below the rim's height belong to no wall when they are completed and when walls are fitted: their
-normals know both walls, which makes walls 0.8 mm too thin."""
-FLAT = 0.7
-"""Upward part of a normal from which on a point inside the mouth belongs to the floor."""
+"""Usual thickness [m] of household vessels, its standard deviation, and the standard deviation of one fit."""
+RIM = 0.003
+"""Points so near [m] below the rim belong to no wall: their normals depend on both walls."""
+CENTER_ERROR, FORM_ERROR, FLOOR_ERROR = 0.0006, 0.001, 0.003
+"""Standard deviations [m] of the axis, of real walls about a surface of revolution, and of an unseen floor."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +32,7 @@ class Vessel(Value):
 
     Args:
         center: of the axis.
-        thickness: of the wall, across it; what was seen, weighted with what is usual.
+        thickness: of the wall: the fitted one, weighted with the usual one.
         radius: outer radius of the mouth.
         rim: height of the mouth.
         inner: points seen through the mouth.
@@ -67,8 +50,8 @@ class Vessel(Value):
 def find_vessel(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Vessel | None:
     """Return the open vessel that the cloud shows; None: there is none.
 
-    Normals of an inner wall point to the axis. Both walls are fitted at once: the radius is a polynomial in the
-    height, less thickness / slope of the normal inside. Reweighted least squares (Cauchy) ignore ears and handles.
+    Normals of an inner wall point to the axis. Both walls are fitted at once: the radius is a cubic in the height,
+    less thickness / slope of the normal inside. Reweighted least squares (Cauchy) ignore ears and handles.
 
     >>> angle, height = torch.rand(2, 900, generator=torch.Generator().manual_seed(0)).double()
     >>> level = torch.stack([(6.3 * angle).cos(), (6.3 * angle).sin(), torch.zeros_like(angle)], 1)
@@ -80,38 +63,148 @@ def find_vessel(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> 
     slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
     level = normals[:, :2] / slope[:, None].clamp_min(1e-9)
     middle, spread = points[:, 2].mean(), points[:, 2].std().clamp_min(1e-6)
-    powers = ((points[:, 2:] - middle) / spread) ** torch.arange(DEGREE + 1).to(points)
-    below = points[:, 2] < points[:, 2].quantile(RIM_QUANTILE) - EDGE
+    exponents, top = torch.arange(4).to(points), 0.98  # noise lifts some points above the rim
+    powers = ((points[:, 2:] - middle) / spread) ** exponents
+    below = points[:, 2] < points[:, 2].quantile(top) - 0.002
     center = fit_axis(points, normals)
     miss, found, radius, facing = torch.zeros_like(slope), torch.zeros_like(slope), slope, slope
-    for k in range(ITERATIONS):
+    for k in range(30):
         arm = points[:, :2] - center
         radius, out = torch.linalg.vector_norm(arm, dim=1), unit(arm)
         facing = (out * level).sum(1)
-        wall = below & (slope > WALL) & (facing.abs() > WALL)
-        scale = NOISE * (1.0 + START * 0.8**k)
+        wall = below & (slope > LEVEL) & (facing.abs() > LEVEL)
+        scale = 0.006 * (1.0 + 4.0 * 0.8**k)  # miss [m] of half the weight
         weight = (wall / (1.0 + (miss / scale) ** 2)).sqrt()[:, None]
-        inside = (facing < 0) / slope.clamp_min(WALL)
+        inside = (facing < 0) / slope.clamp_min(LEVEL)
         terms = torch.cat([powers, -inside[:, None], out], 1)  # the last two columns move the axis
         if not bool((weight > 0).sum() > 2 * terms.shape[1]):
             return None
         found = solve_least_squares(weight * terms, weight[:, 0] * radius)
         miss, center = radius - terms @ found, center + found[-2:]
-    thickness = float(found[DEGREE + 1])
+    thickness = float(found[4])
 
-    wall = (slope > WALL) & (facing.abs() > WALL)
-    body = wall & (miss.abs() < FITS)
+    wall = (slope > LEVEL) & (facing.abs() > LEVEL)
+    body = wall & (miss.abs() < 0.002)  # [m], twice a camera's noise
     within = (points[:, :2].amin(0) < center) & (center < points[:, :2].amax(0))
-    if not bool(within.all() & body.any()) or not MIN_THICKNESS < thickness < MAX_THICKNESS:
+    if not bool(within.all() & body.any()) or not 0.0003 < thickness < 0.012:
         return None
-    rim = float(points[body, 2].quantile(RIM_QUANTILE))
-    mouth = float(((rim - middle) / spread) ** torch.arange(DEGREE + 1).to(points) @ found[: DEGREE + 1])
-    towards = ((facing < 0) & (slope > 1.0 - FLAT)) | (normals[:, 2] > FLAT)
-    inner = towards & (radius < mouth) & (points[:, 2] < rim - RIM)
+    rim = float(points[body, 2].quantile(top))
+    mouth = float(((rim - middle) / spread) ** exponents @ found[:4])
+    floor = 0.7  # vertical part of a normal from which a point inside the mouth belongs to the floor
+    inward = ((facing < 0) & (slope > 1.0 - floor)) | (normals[:, 2] > floor)
+    inner = inward & (radius < mouth) & (points[:, 2] < rim - RIM)
     shares = ((body & inner).double().mean(), (body & ~inner).double().mean(), body.sum() / wall.sum())
     enough = all(float(s) > least for s, least in zip(shares, (INNER_SHARE, OUTER_SHARE, BODY_SHARE), strict=True))
-    if not enough or not math.isfinite(mouth) or float(rim - points[inner, 2].min()) < DEPTH:
+    # The recess of a lid is no cavity: the inside must be seen 12 mm below the rim.
+    if not enough or not math.isfinite(mouth) or float(rim - points[inner, 2].min()) < 0.012:
         return None
     usual = 1.0 / (1.0 + (SPREAD / THICKNESS_ERROR) ** 2)
     thickness = usual * USUAL + (1.0 - usual) * thickness
     return Vessel(center, thickness, mouth, rim, inner, body & (points[:, 2] < rim - RIM))
+
+
+@dataclasses.dataclass(frozen=True)
+class HiddenWall(Batch):
+    """Points of a wall that the camera did not see [m], with outward normals.
+
+    `shared` holds errors [m] for one standard deviation of axis (two), thickness and floor.
+    """
+
+    points: Float[Tensor, "m 3"]
+    normals: Float[Tensor, "m 3"]
+    shared: Float[Tensor, "m 4"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Wall(Value):
+    """One wall of a vessel: `seen` selects its points of the cloud, `hidden` holds estimated points."""
+
+    seen: Bool[Tensor, "n"]
+    hidden: HiddenWall
+
+
+def complete_walls(cloud: PointCloud, vessel: Vessel, outline: Outlines, table: float) -> tuple[Wall, Wall]:
+    """Return the outer and the inner wall of a vessel that stands on a table of this height [m].
+
+    The other side of a seen wall is a thickness away. Parts seen on neither side come from rotation about the axis.
+    """
+    points, normals = cloud.points, cloud.normals
+    assert normals is not None
+    every = HiddenWall(points, normals, torch.zeros(len(points), 4, dtype=points.dtype))
+    outside, inside = every[vessel.body & ~vessel.inner], every[vessel.body & vessel.inner]
+    seen_floor = vessel.inner & (normals[:, 2] > 0.9)
+    has_floor = int(seen_floor.sum()) > 10
+    floor = float(points[seen_floor, 2].median()) if has_floor else table + vessel.thickness
+
+    outer = _merge(points[~vessel.inner], outline, [_across(inside, vessel), _turn(outside, vessel)], vessel, table)
+    parts = [_across(outside, vessel), _turn(inside, vessel), _across(_turn(outside, vessel), vessel)]
+    if not has_floor:
+        radius = float(torch.linalg.vector_norm(points[vessel.inner, :2] - vessel.center, dim=1).min())
+        parts.append(_disc(vessel, floor, radius, ((0.0, 1), (0.4, 5), (0.75, 8))))
+    inner = _merge(points[vessel.inner], outline, parts, vessel, floor)
+    return Wall(~vessel.inner, outer), Wall(vessel.inner, inner)
+
+
+def lid(vessel: Vessel) -> HiddenWall:
+    """Return points of the flat lid that closes the outer body at the rim."""
+    return _disc(vessel, vessel.rim, vessel.radius, ((0.0, 1), (0.5, 6)))
+
+
+def _across(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
+    """Return the other side of a wall."""
+    shared = wall.shared.clone()
+    shared[:, 2] += THICKNESS_ERROR
+    return HiddenWall(wall.points - vessel.thickness * wall.normals, -wall.normals, shared)
+
+
+def _turn(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
+    """Return 80 points of a wall rotated about the axis by 23 angles, with the errors of the axis."""
+    wall = wall[farthest_points(wall.points, 80, tie=TIE)]
+    turn = rotations_about_z(24)
+    axis = torch.cat([vessel.center, torch.zeros(1, dtype=torch.float64)])
+    points = (wall.points - axis) @ turn.mT + axis
+    normals = wall.normals @ turn.mT
+    moved = (torch.eye(3, dtype=torch.float64) - turn)[:, None] * CENTER_ERROR  # of a turned point with the axis
+    shared = wall.shared.expand(len(turn), -1, -1).clone()
+    shared[..., :2] += (normals[..., None, :] @ moved)[..., 0, :2]
+    return HiddenWall(points.flatten(0, 1), normals.flatten(0, 1), shared.flatten(0, 1))
+
+
+def rotations_about_z(n: int) -> Float[Tensor, "m 3 3"]:
+    """Return the rotations by k / n of a full turn about z, with k from 1 to n - 1."""
+    angle = torch.arange(1, n, dtype=torch.float64) * (2 * math.pi / n)
+    turn = torch.zeros(n - 1, 3, 3, dtype=torch.float64)
+    turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1] = angle.cos(), -angle.sin(), angle.sin(), angle.cos()
+    turn[:, 2, 2] = 1.0
+    return turn
+
+
+def _disc(vessel: Vessel, height: float, radius: float, rings: tuple[tuple[float, int], ...]) -> HiddenWall:
+    """Return level points with normals up, on rings about the axis given by relative radius and number of points."""
+    places = []
+    for share, count in rings:
+        angle = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
+        places.append(share * radius * torch.stack([angle.cos(), angle.sin()], 1) + vessel.center)
+    level = torch.cat(places)
+    points = torch.cat([level, torch.full_like(level[:, :1], height)], 1)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(points)
+    shared = torch.zeros(len(points), 4, dtype=torch.float64)
+    shared[:, 3] = FLOOR_ERROR
+    return HiddenWall(points, up, shared)
+
+
+def _merge(
+    seen: Float[Tensor, "n 3"], outline: Outlines, parts: list[HiddenWall], vessel: Vessel, least: float
+) -> HiddenWall:
+    """Return points of the parts, the first parts first, that are new, hidden, below the rim and above `least`."""
+    from scipy.spatial import KDTree
+
+    tree, merged = KDTree(seen.numpy()), parts[0][:0]
+    for part in parts:
+        part = part[(part.points[:, 2] < vessel.rim - RIM) & (part.points[:, 2] >= least)]
+        allowed = (outline.hull_distance(part.points) < HULL_MARGIN) & (outline.violation(part.points) < FRONT_MARGIN)
+        new = part[allowed & torch.from_numpy(tree.query(part.points.numpy())[0] > NEW)]
+        if len(merged) and len(new):
+            new = new[torch.from_numpy(KDTree(merged.points.numpy()).query(new.points.numpy())[0] > SPACING)]
+        merged = join([merged, new[farthest_points(new.points, 4 * 50, tie=TIE)]]) if len(new) else merged
+    return merged[farthest_points(merged.points, 50, tie=TIE)]

@@ -1,0 +1,193 @@
+"""From observations to a posterior, Eqs. (7)-(8): all at once, later ones, and the most informative ones.
+
+Each way makes one Cholesky factor L of K + noise. Further observations append rows to it.
+"""
+
+import dataclasses
+import math
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchgrasp.base import Value
+from torchgrasp.geometry.linalg import cholesky
+from torchgrasp.shape.kernel import Kernel, covariance_rows, cross_covariance, gram
+from torchgrasp.shape.posterior import Posterior
+from torchgrasp.shape.values import Observations
+
+Criterion = Literal["variance", "error", "both"]
+
+
+def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
+    """Return the posterior given observations, by one Cholesky factorisation of their covariance."""
+    observations = observations.with_normals_first()
+    y, noise = observations.rows()
+    matrix = gram(kernel, observations.x, int(observations.has_normal.sum()))
+    matrix.diagonal().add_(noise)
+    factor = cholesky(matrix, "the covariance K + sigma^2 I", kernel.remedy)
+    weights = torch.cholesky_solve(y[:, None], factor)[:, 0]
+    return Posterior(observations.x, observations.has_normal, weights, factor, None, kernel)
+
+
+def check_kernel(posterior: Posterior, least_noise: float) -> None:
+    """Refuse observations beyond the kernel's diameter, unless K is positive definite.
+
+    Generous noise on some rows can hide an indefinite K, so K is factored again with the least noise on all rows.
+    """
+    kernel = posterior.kernel
+    if longest_distance(posterior.x) > kernel.diameter:
+        matrix = gram(kernel, posterior.x, posterior.n_oriented)
+        matrix.diagonal().add_(least_noise**2)
+        cholesky(matrix, "the covariance K", kernel.remedy)
+
+
+def longest_distance(x: Float[Tensor, "n 3"]) -> float:
+    """Return the longest distance between two of the points."""
+    return float(torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist").max())
+
+
+def append_observations(
+    posterior: Posterior, new: Observations, shared: Float[Tensor, "n c"] | None = None
+) -> Posterior:
+    """Return the posterior given `new` observations, too: equal to the posterior given all of them at once.
+
+    The factor L grows by the rows [B^T, C] with B = L^-1 K(old, new). C is the factor of K(new, new) + noise - B^T B.
+
+    `shared` holds correlated errors of the new distances, a column of deviations for each independent cause. They add
+    shared shared^T to the noise.
+    """
+    kernel = posterior.kernel
+    if shared is not None:
+        shared = shared[torch.argsort(~new.has_normal, stable=True)]
+    new = new.with_normals_first()
+    y, noise = new.rows()
+    fresh = int(new.has_normal.sum())
+    cross = covariance_rows(kernel, posterior.x, posterior.n_oriented, new.x, fresh)
+    own = gram(kernel, new.x, fresh) + torch.diag_embed(noise)
+    if shared is not None:
+        own[: len(new.x), : len(new.x)] += shared @ shared.T
+    before = torch.linalg.solve_triangular(posterior.factor, posterior.ordered(cross), upper=False)
+    corner = cholesky(own - before.T @ before, "the covariance of new observations", kernel.remedy)
+    factor = torch.cat([torch.cat([posterior.factor, torch.zeros_like(before)], 1), torch.cat([before.T, corner], 1)])
+
+    # L^-1 y of the old rows is L^T times their weights; the observed numbers themselves need not be kept.
+    whitened = posterior.factor.T @ posterior.ordered(posterior.weights)
+    rest = torch.linalg.solve_triangular(corner, (y - before.T @ whitened)[:, None], upper=False)[:, 0]
+    return _extend(posterior, new, factor, torch.cat([whitened, rest]))
+
+
+@dataclasses.dataclass(frozen=True)
+class Selection(Value):
+    """Rows of the picked candidates, in order, and the posterior given them."""
+
+    picks: Int[Tensor, "picks"]
+    posterior: Posterior
+
+
+def select_points(
+    candidates: Observations,
+    known: Observations,
+    kernel: Kernel,
+    budget: int,
+    criterion: Criterion = "variance",
+    stop: float = -math.inf,
+) -> Selection:
+    """Pick candidates to observe, each the most informative given those before it.
+
+    The factor grows by four rows with each pick (pivoted Cholesky), and becomes the posterior's own.
+
+    Args:
+        candidates: points of the surface, all with normals.
+        known: what is observed already, such as points inside and outside.
+        criterion: greatest posterior variance; greatest |mean distance| ("error"); |mean| + 2 sqrt(variance) ("both").
+        stop: the selection ends when no candidate has a greater variance.
+    """
+    x, start = candidates.x, posterior_given(known, kernel)
+    n, budget = len(x), min(budget, len(x))
+    old, rows = len(start.factor), len(start.factor) + 4 * budget
+    factor = x.new_zeros(rows, rows).T  # by columns, as the solver wants it: it copies any other matrix
+    factor[:old, :old] = start.factor
+    with_known = start.cross(x)
+    whitened = x.new_empty(rows, n + 1)  # L^-1 [K(observed, distances of candidates), y]
+    whitened[:old, :n] = torch.linalg.solve_triangular(start.factor, with_known[0].T, upper=False)
+    whitened[:old, n] = start.factor.T @ start.weights
+    variance = kernel.profile(x.new_zeros(())) - (whitened[:old, :n] ** 2).sum(0)
+    error = whitened[:old, n] @ whitened[:old, :n]
+    prior = start.prior_block()
+    noise = torch.stack([candidates.distance_noise] + 3 * [candidates.normal_noise], 1) ** 2
+    values = torch.cat([candidates.distance[:, None], candidates.normal], 1)
+
+    picks = torch.empty(budget, dtype=torch.long, device=x.device)
+    free = torch.zeros_like(error)  # minus infinity for the picks
+    count = 0
+    while count < budget:
+        if stop > -math.inf and float((free + variance).max()) <= stop:
+            break
+        p = torch.argmax(free + _score(criterion, variance, error), keepdim=True)
+        end, new = old + 4 * count, slice(old + 4 * count, old + 4 * count + 4)
+        # (d, w) of the pick with (d, w) of every candidate; rows of the factor go pick by pick
+        with_all = cross_covariance(kernel, x[p], x, n).view(4, 4, n)
+        with_picks = with_all[:, :, picks[:count]].permute(2, 1, 0).reshape(4 * count, 4)
+        cross = torch.cat([with_known[:, p].squeeze(1).T, with_picks])
+        before = torch.linalg.solve_triangular(factor[:end, :end], cross, upper=False)
+        own = prior + torch.diag(noise[p][0])
+        corner = cholesky(own - before.T @ before, "the covariance of a picked point", kernel.remedy)
+        left = torch.cat([with_all[:, 0], values[p].T], 1).addmm_(before.T, whitened[:end], alpha=-1.0)
+        factor[new, :end], factor[new, new] = before.T, corner
+        whitened[new] = torch.linalg.solve_triangular(corner, left, upper=False)
+        variance -= (whitened[new, :n] ** 2).sum(0)
+        error += whitened[new, n] @ whitened[new, :n]
+        picks[count] = p[0]
+        free.index_fill_(0, p, -math.inf)
+        count += 1
+    picks, rows = picks[:count], old + 4 * count
+    by_pick = torch.arange(4 * count, device=x.device).reshape(4, count).T.flatten()
+    return Selection(picks, _extend(start, candidates[picks], factor[:rows, :rows], whitened[:rows, n], by_pick))
+
+
+def _score(criterion: Criterion, variance: Float[Tensor, "n"], error: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """Return how informative the candidates are."""
+    if criterion == "variance":
+        return variance
+    if criterion == "error":
+        return error.abs()
+    return error.abs() + 2.0 * torch.sqrt(variance.clamp_min(0.0))  # negative by rounding alone
+
+
+def _extend(
+    posterior: Posterior,
+    new: Observations,
+    factor: Float[Tensor, "rows rows"],
+    whitened: Float[Tensor, "rows"],
+    new_order: Int[Tensor, "fresh"] | None = None,
+) -> Posterior:
+    """Return the posterior given `new` observations, too, from the factor of all rows.
+
+    In `new` points with normals are first. `whitened` is L^-1 y. `new_order` gives the row of `Observations.rows` for
+    each new row of the factor; None: the same.
+    """
+    old, total = len(posterior.factor), len(factor)
+    solved = torch.linalg.solve_triangular(factor.T, whitened[:, None], upper=True)[:, 0]
+    line = torch.arange(total, device=factor.device)
+    later = line[old:] if new_order is None else old + new_order
+    order = _row_of_each(posterior.has_normal, new.has_normal)[torch.cat([posterior.ordered(line[:old]), later])]
+    weights = torch.empty_like(solved)
+    weights[order] = solved
+    has = torch.cat([posterior.has_normal, new.has_normal])
+    points = torch.argsort(~has, stable=True)
+    x = torch.cat([posterior.x, new.x])[points]
+    return Posterior(x, has[points], weights, factor, order, posterior.kernel)
+
+
+def _row_of_each(old: Bool[Tensor, "n"], new: Bool[Tensor, "m"]) -> Int[Tensor, "rows"]:
+    """Return the row in the joint order of each old and each new row."""
+    n, m, near, fresh = len(old), len(new), int(old.sum()), int(new.sum())
+    total, oriented = n + m, near + fresh
+    line = torch.arange(total, device=old.device)
+    moved = torch.cat([line[:near], oriented + line[: n - near]])  # of old points: those with normals stay first
+    added = torch.cat([near + line[:fresh], oriented + (n - near) + line[: m - fresh]])
+    before = [moved] + [total + c * oriented + line[:near] for c in range(3)]
+    after = [added] + [total + c * oriented + near + line[:fresh] for c in range(3)]
+    return torch.cat(before + after)

@@ -1,0 +1,190 @@
+"""What is observed of a surface beside the seen points: points inside and outside, the hidden side, free space."""
+
+import dataclasses
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.base import Value, join
+from torchgrasp.cloud.prepare import PreparedCloud
+from torchgrasp.geometry.linalg import farthest_points, fibonacci_sphere, unit
+from torchgrasp.shape.completion.complete import LEAST_NOISE, PART, Completion, Kind
+from torchgrasp.shape.completion.silhouette import TIE, Outlines, Silhouette
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.values import Normalisation, Observations, off_surface, on_surface
+
+OUTER_POINTS, OUTER_RADIUS = 20, 1.2
+"""Number of points outside, and the radius, normalised, of the sphere on which they lie (Sec. 3.1)."""
+OUTER_NOISE = 0.3
+"""Standard deviation, normalised, of a distance outside: the nearest of sparse points is too far away."""
+NORMAL_NOISE, RIM_NORMAL_NOISE, HIDDEN_NORMAL_NOISE = 0.05, 0.5, 0.25
+"""Standard deviations of normals: of a seen one, of one on the outline, and of one on the hidden side."""
+RIM_NOISE = 0.002
+"""Standard deviation [m] of a point of the outline."""
+FREE_NOISE = 0.003
+"""Standard deviation [m] of a distance observed in free space: it is only a lower bound."""
+OUTLINE_ERROR = 0.005
+"""The object may reach this far [m] beyond its outline: a camera loses rims."""
+MAX_RADIUS = 1.15
+"""Radius, normalised, within which free space is probed: inside the sphere of the points outside."""
+STD_FACTORS: dict[tuple[Kind, bool], float] = {
+    ("ball", True): 0.5,
+    ("revolution", True): 0.56,
+    ("mirrored", True): 0.59,
+    ("ball", False): 0.56,
+    ("revolution", False): 0.59,
+    ("mirrored", False): 0.75,
+    ("guess", True): 1.0,
+    ("guess", False): 1.0,
+    ("cut off", True): 2.0,
+    ("cut off", False): 2.0,
+    ("vessel", True): 0.58,
+    ("whole", True): 0.5,
+    ("whole", False): 0.5,
+}
+"""Real deviations over the posterior's, by the kind of the hidden side and whether the table is known.
+
+`scripts/train.py bands DIR` fits them."""
+
+Part = tuple[Observations, Tensor | None]
+"""Observations, and the errors that their distances share."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Support(Value):
+    """The normalised frame of a surface, and what is observed beside the cloud.
+
+    Args:
+        frame: to normalise with.
+        anchors: points inside and outside, without normals.
+        normal_noise: standard deviation of the cloud's normals.
+        std_factor: real deviations over the posterior's.
+        parts: points of the outline and of the hidden side.
+        free: points of free space and least distances there, normalised; None: not used.
+        rows: the points of the cloud that lie on this surface; None: all.
+        kind: see `ShapeGP`.
+    """
+
+    frame: Normalisation
+    anchors: Observations
+    normal_noise: float
+    std_factor: float = 1.0
+    parts: tuple[Part, ...] = ()
+    free: tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]] | None = None
+    rows: Bool[Tensor, "rows"] | None = None
+    kind: Kind = "guess"
+
+
+def paper_support(seen: PreparedCloud, noise: float, generator: torch.Generator) -> Support:
+    """Return the paper's support: the centre, and random points outside (Sec. 3.1)."""
+    center = seen.points.mean(0)
+    scale = float(torch.linalg.vector_norm(seen.points - center, dim=-1).max())
+    sphere = unit(torch.randn(OUTER_POINTS, 3, dtype=torch.float64, generator=generator)).to(center)
+    anchors = off_surface(
+        torch.cat([torch.zeros_like(center)[None], OUTER_RADIUS * sphere]),
+        torch.cat([-torch.ones_like(center[:1]), torch.ones_like(sphere[:, 0])]),
+        noise,
+    )
+    return Support(Normalisation(center, scale), anchors, noise)
+
+
+def frame_around(points: Float[Tensor, "n 3"]) -> Normalisation:
+    """Return the frame with the centre of the points' box at 0 and the farthest point at distance 1."""
+    center = (points.amin(0) + points.amax(0)) / 2
+    return Normalisation(center, float(torch.linalg.vector_norm(points - center, dim=-1).max()))
+
+
+def camera_support(seen: PreparedCloud, completion: Completion | None, noise: float, table: float | None) -> Support:
+    """Return metric distances; of a view also outline, hidden points and free space.
+
+    Args:
+        seen: the cloud.
+        completion: its hidden side; None: all sides were seen.
+        noise: standard deviation of the distance inside, normalised.
+        table: the table's height [m]; None: unknown.
+    """
+    hidden = seen.points[:0] if completion is None else completion.points.to(seen.points)
+    surface = torch.cat([seen.points, hidden])
+    # The domain holds the whole of a ball. Of others the hidden side is too uncertain to set the scale.
+    frame = frame_around(surface if completion is not None and completion.kind == "ball" else seen.points)
+    center, kind, parts, free, inside = frame.center, "whole", (), None, True
+    if completion is not None:
+        parts, kind = _observe_completion(completion, frame), completion.kind
+        free = free_space(completion.outline, frame, table)
+        inside = float(completion.outline.violation(center.cpu())) == 0.0  # not so for an arch or a bowl
+    sphere = OUTER_RADIUS * fibonacci_sphere(OUTER_POINTS).to(center)
+    x = torch.cat([torch.zeros_like(center)[None], sphere]) if inside else sphere
+    distance = torch.cdist(x, frame.normalise(surface)).amin(1)
+    inner = int(inside)
+    anchors = join(
+        [off_surface(x[:inner], -distance[:inner], noise), off_surface(x[inner:], distance[inner:], OUTER_NOISE)]
+    )
+    return Support(frame, anchors, NORMAL_NOISE, STD_FACTORS[kind, table is not None], parts, free, kind=kind)
+
+
+def _observe_completion(completion: Completion, frame: Normalisation) -> tuple[Part, ...]:
+    """Return points of the outline and of the hidden side as observations."""
+    outline = completion.outline
+    hidden = observe(frame, completion.points, completion.normals, LEAST_NOISE, HIDDEN_NORMAL_NOISE)
+    tilt = (completion.asymmetry / PART).to(frame.center)  # slope of a field with that deviation and length
+    hidden = dataclasses.replace(hidden, normal_noise=torch.hypot(hidden.normal_noise, tilt))
+    rim = observe(frame, outline.rim, outline.rim_normals, RIM_NOISE, RIM_NORMAL_NOISE)
+    return (rim, None), (hidden, completion.deviations.to(frame.center) / frame.scale)
+
+
+def observe(
+    frame: Normalisation, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], noise: float, normal_noise: float
+) -> Observations:
+    """Return observations of points [m] of the surface with a noise [m]."""
+    x = frame.normalise(points.to(frame.center))
+    return on_surface(x, normals.to(x), torch.full_like(x[:, 0], noise / frame.scale), normal_noise)
+
+
+def free_space(
+    outline: Outlines, frame: Normalisation, table: float | None = None
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+    """Return points of free space and their least signed distance, both normalised.
+
+    The points lie beside the outline and below the table of this height [m]. The distances are lower bounds: observed
+    everywhere, they would inflate the object to its visual hull.
+    """
+    origin, scale = frame.center.double().cpu(), frame.scale
+    points = torch.cat([_points_beside(view, origin, scale) for view in outline.views])
+    least = outline.hull_distance(points) - OUTLINE_ERROR
+    if table is not None:
+        side = scale * torch.linspace(-0.9, 0.9, 9, dtype=torch.float64)
+        ground = torch.cartesian_prod(side, side) + origin[:2]
+        for below in (0.003, 0.012):  # [m]
+            height = torch.full_like(ground[:, :1], table - below)
+            points = torch.cat([points, torch.cat([ground, height], 1)])
+            least = torch.cat([least, torch.full_like(ground[:, 0], below)])
+    x = (points - origin) / scale
+    keep = (torch.linalg.vector_norm(x, dim=-1) < MAX_RADIUS) & (least > 0.001)  # a smaller one says nothing
+    return x[keep].to(frame.center), least[keep].to(frame.center) / scale
+
+
+def free_space_violations(shape: ShapeGP, x: Float[Tensor, "n 3"], least: Float[Tensor, "n"]) -> Tensor:
+    """Return at most 16 rows of free space that the shape reaches into by 2 mm, the worst first."""
+    short = shape.mean(x) - least
+    rows = torch.nonzero(short < -0.002 / shape.scale)[:, 0]
+    rows = rows[torch.argsort(short[rows], stable=True)]
+    return rows[farthest_points(x[rows], 16, tie=TIE)]
+
+
+def _points_beside(outline: Silhouette, origin: Float[Tensor, "3"], scale: float) -> Float[Tensor, "n 3"]:
+    """Return points [m] on rays 8 and 16 mm beside an outline, over the object's depth."""
+    depth = float(outline.depth[outline.depth > 0].median())  # 0 beyond the image
+    rays = [_rays_beside(outline, offset / depth) for offset in (0.008, 0.016)]
+    middle = float((origin - outline.viewpoint) @ outline.axes[2])
+    depths = middle + scale * torch.linspace(-1.0, 1.0, 13, dtype=torch.float64)
+    return (torch.cat(rays)[:, None] * depths[:, None]).reshape(-1, 3) @ outline.axes + outline.viewpoint
+
+
+def _rays_beside(outline: Silhouette, offset: float) -> Float[Tensor, "k 3"]:
+    """Return 32 rays at an offset from the outline, in the camera's frame and up to depth 1."""
+    near = (outline.outside - offset).abs() <= 0.75 * outline.cell
+    row, column = torch.nonzero(near, as_tuple=True)
+    position = outline.corner + outline.cell * torch.stack([column, row], -1).double()
+    rays = torch.cat([position, torch.ones_like(position[:, :1])], -1)
+    return rays[farthest_points(rays, 32, tie=TIE)]

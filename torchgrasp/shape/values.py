@@ -1,0 +1,205 @@
+"""The values of a shape: its frame, what is observed of it, and what is estimated of it."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.base import Batch, Value
+from torchgrasp.checks import checked
+from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.linalg import unit
+
+
+@dataclasses.dataclass(frozen=True)
+class Normalisation(Value):
+    """A frame without units: points [m] minus `center` [m], divided by `scale` [m].
+
+    >>> frame = Normalisation(torch.tensor([0.0, 0.0, 0.1]), scale=0.05)
+    >>> frame.normalise(torch.tensor([0.0, 0.0, 0.15])), frame.metres(torch.tensor([0.0, 0.0, 1.0]))
+    (tensor([0.0000, 0.0000, 1.0000]), tensor([0.0000, 0.0000, 0.1500]))
+    """
+
+    center: Float[Tensor, "3"]
+    scale: float
+
+    @checked(gradients=True)
+    def normalise(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+        """Map points [m] to the normalised frame."""
+        return (points - self.center.to(points)) / self.scale
+
+    @checked(gradients=True)
+    def metres(self, x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+        """Map normalised points to the cloud's frame [m]."""
+        return x * self.scale + self.center.to(x)
+
+
+@dataclasses.dataclass(frozen=True)
+class Observations(Batch):
+    """Observed signed distances at points, and observed normals where `has_normal`; all is normalised.
+
+    The noises are standard deviations.
+
+    >>> some, outward = torch.ones(3), torch.eye(3)
+    >>> oriented = torch.tensor([False, True, True])
+    >>> seen = Observations(outward, 0 * some, outward, oriented, 0.01 * some, 0.05 * some)
+    >>> len(seen.rows()[0]), seen.with_normals_first().has_normal
+    (9, tensor([ True,  True, False]))
+    """
+
+    x: Float[Tensor, "n 3"]
+    distance: Float[Tensor, "n"]
+    normal: Float[Tensor, "n 3"]
+    has_normal: Bool[Tensor, "n"]
+    distance_noise: Float[Tensor, "n"]
+    normal_noise: Float[Tensor, "n"]
+
+    def rows(self) -> tuple[Float[Tensor, "rows"], Float[Tensor, "rows"]]:
+        """Return the observed numbers and their noise variances: distances, then normals by component."""
+        y = torch.cat([self.distance, self.normal[self.has_normal].T.reshape(-1)])
+        noise = torch.cat([self.distance_noise, self.normal_noise[self.has_normal].repeat(3)])
+        return y, noise * noise
+
+    @property
+    def least_noise(self) -> float:
+        """The least standard deviation of all observed numbers."""
+        return float(torch.cat([self.distance_noise, self.normal_noise[self.has_normal]]).min())
+
+    def with_normals_first(self) -> "Observations":
+        """Return the observations, those with normals first."""
+        return self[torch.argsort(~self.has_normal, stable=True)]
+
+
+def on_surface(
+    x: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], noise: Float[Tensor, "n"], normal_noise: float
+) -> Observations:
+    """Return observations of points on the surface with their normals."""
+    yes = torch.ones(len(x), dtype=torch.bool, device=x.device)
+    return Observations(x, torch.zeros_like(noise), normals, yes, noise, torch.full_like(noise, normal_noise))
+
+
+def off_surface(x: Float[Tensor, "n 3"], distance: Float[Tensor, "n"], noise: float) -> Observations:
+    """Return observations of points off the surface, without normals."""
+    no = torch.zeros(len(x), dtype=torch.bool, device=x.device)
+    sigma = torch.full_like(distance, noise)
+    return Observations(x, distance, torch.zeros_like(x), no, sigma, sigma)
+
+
+@dataclasses.dataclass(frozen=True)
+class MeanJet(Batch):
+    """The posterior mean with its first and second derivatives; gradients do not have unit length."""
+
+    distance: Float[Tensor, "*b"]
+    gradient: Float[Tensor, "*b 3"]
+    hessian: Float[Tensor, "*b 3 3"]
+
+    @property
+    def normals(self) -> Float[Tensor, "*b 3"]:
+        """The outward unit normals, Eq. (11)."""
+        return unit(self.gradient)
+
+    @property
+    def normal_jacobian(self) -> Float[Tensor, "*b 3 3"]:
+        """The derivatives of the normals by their points, (1 - n n^T) H / |g|."""
+        n, steep = self.normals, torch.linalg.vector_norm(self.gradient, dim=-1)[..., None, None]
+        return (self.hessian - n[..., :, None] * (n[..., None, :] @ self.hessian)) / steep
+
+
+@dataclasses.dataclass(frozen=True)
+class SurfaceJet(MeanJet):
+    """The mean to second order, and the variance of the distance to first order."""
+
+    variance: Float[Tensor, "*b"]
+    variance_gradient: Float[Tensor, "*b 3"]
+
+
+@dataclasses.dataclass(frozen=True)
+class JointEstimate(Value):
+    """The joint posterior of (d, w) at k points, point by point and normalised.
+
+    The gradient w does not have unit length. Points i and j have the block
+    `covariance.reshape(k, 4, k, 4)[i, :, j]`.
+    """
+
+    mean: Float[Tensor, "k 4"]
+    covariance: Float[Tensor, "rows rows"]
+
+
+@dataclasses.dataclass(frozen=True)
+class ShapeDerivatives(Value):
+    """Derivatives of a `ShapeEstimate` by the query point, per metre: `normal[i, j]` is d normal_i / d point_j."""
+
+    distance: Float[Tensor, "*b 3"]
+    normal: Float[Tensor, "*b 3 3"]
+    variance: Float[Tensor, "*b 3"]
+    std_m: Float[Tensor, "*b 3"]
+
+
+def surface_deviation(variance: Float[Tensor, "*b"], gradient: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+    """Return the standard deviation of the surface along its normal, to first order in that of the distance.
+
+    >>> surface_deviation(torch.tensor([0.04]), torch.tensor([[0.0, 0.0, 2.0]]))
+    tensor([0.1000])
+    """
+    return variance.sqrt() / torch.linalg.vector_norm(gradient, dim=-1)
+
+
+def pass_gradients(
+    x: Float[Tensor, "*b 3"],
+    evaluate: Callable[[Tensor], tuple[Tensor, ...]],
+    differentiate: Callable[[Tensor], tuple[Tensor, ...]],
+) -> tuple[Tensor, ...]:
+    """Return outputs (*b, ...) of points; if these require a gradient, with the given derivatives (*b, ..., 3).
+
+    Second derivatives are refused.
+    """
+    if not (x.requires_grad and torch.is_grad_enabled()):
+        return evaluate(x)
+    found = _Known.apply(x, evaluate, differentiate)
+    return found[: len(found) // 2]  # pyright: ignore[reportOptionalSubscript, reportArgumentType]
+
+
+class _Known(torch.autograd.Function):
+    """Outputs, and their known derivatives by the points."""
+
+    @staticmethod
+    def forward(x: Tensor, evaluate: Any, differentiate: Any) -> tuple[Tensor, ...]:
+        return *evaluate(x.detach()), *differentiate(x.detach())
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        derivatives = output[len(output) // 2 :]
+        ctx.mark_non_differentiable(*derivatives)
+        ctx.save_for_backward(inputs[0], *derivatives)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        x, *derivatives = ctx.saved_tensors
+        total = torch.zeros_like(x)
+        for gradient, derivative in zip(gradients, derivatives, strict=False):
+            product = gradient[..., None] * derivative
+            while product.ndim > x.ndim:
+                product = product.sum(-2)
+            total = total + product
+        return _Final.apply(x, total), None, None
+
+
+class _Final(torch.autograd.Function):
+    """A gradient by the points that refuses to be differentiated by them."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(x: Tensor, gradient: Tensor) -> Tensor:
+        return gradient.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        """Save nothing."""
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        raise BadArgument("points", "a second derivative of a shape", "first derivatives only")
