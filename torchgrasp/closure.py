@@ -96,7 +96,7 @@ class ClosureResult(Value):
     reach is NaN. `start_overlap` [m] is the depth of the
     opened hand in object or table at the start. `held` tells whether the object is up with the hand at the end and
     slipped little; `seconds` is wall time. Poses are in the frame of the grasp. `phases` [s] are the times at which the
-    hand had arrived, all fingers had touched, and the hand had pressed; NaN if it never did. `halts` counts how often
+    hand had arrived, all fingers had touched, and the hand had pressed; NaN if it never did. `stops` counts how often
     the hand stopped on its way because it touched something, `attempts` how often it closed.
     """
 
@@ -118,6 +118,6 @@ class ClosureResult(Value):
     disturbance: Disturbance
     trace: ClosingTrace
     phases: Annotated[Float[Tensor, "3"], ANY]
-    halts: int
+    stops: int
     attempts: int
     seconds: float

@@ -1,7 +1,7 @@
 """Options of contacts and of simulated trials, with units, ranges and defaults."""
 
 import dataclasses
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
 from torchgrasp.base import FINGERTIPS, Value
 from torchgrasp.checks import Range, checked
@@ -136,25 +136,69 @@ ClosingMode = Literal["open_loop", "position", "paper_position", "fixed", "paper
 HoldingMode = Literal["force", "grip", "impedance", "position", "law"]
 """How a closed hand presses, see `TrialSpec`."""
 
-ClosingPart = Literal["wait", "pace", "switch", "place", "palm", "guard", "retry"]
-"""What the closing law has beyond the paper's, see `torchgrasp.control.closing.LawClosing`."""
-
-
 SensorKind = Literal["tactile", "torque", "binary"]
-"""What senses a fingertip's contact, see `SensorModel`."""
+"""Kinds of fingertip sensors, see `SensorModel`."""
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class ClosingOptions(Value):
+    """Components that the closings "uncertainty" and "fixed" add to the paper's control law.
+
+    Args:
+        wait: a finger that touches waits for the others; then all press together.
+        pose_estimate: touches that come early or late estimate the object's pose, and all contacts move with it.
+        palm_reach: largest displacement [m] of the palm that follows the estimated object; 0: the arm does not yield.
+        stops: how often the approaching hand stops where it touches something, to go around it; 0: never.
+        attempts: how often the hand closes. On a known table it closes again if the grasp seems too weak to lift.
+
+    Raises:
+        BadArgument: a number outside its range; a palm that moves or a second attempt without `pose_estimate`; stops
+            of a palm that does not move.
+
+    >>> ClosingOptions(palm_reach=0.0, stops=0).attempts  # an arm that cannot yield
+    2
+    """
+
+    wait: bool = True
+    pose_estimate: bool = True
+    palm_reach: Annotated[float, Range(0.0, 0.1)] = 0.02
+    stops: Annotated[int, Range(0, 100)] = 3
+    attempts: Annotated[int, Range(1, 100)] = 2
+
+    def __post_init__(self) -> None:
+        """Check which components need each other."""
+        if not self.pose_estimate and (self.palm_reach or self.attempts > 1):
+            found = f"a reach of {self.palm_reach:g} m and {self.attempts} attempts without pose_estimate"
+            raise BadArgument("palm_reach", found, "0 m and 1 attempt")
+        if self.stops and not self.palm_reach:
+            raise BadArgument("stops", f"{self.stops} with a reach of 0 m", "0")
+
+
+NO_OPTIONS = ClosingOptions(wait=False, pose_estimate=False, palm_reach=0.0, stops=0, attempts=1)
+"""No component: the paper's own control law."""
+
+
+def choose_options(closing: str, options: ClosingOptions | None) -> ClosingOptions:
+    """Return the components of a closing: given ones, or all that it has; raise `BadArgument` if it has none."""
+    if closing in ("uncertainty", "fixed"):
+        return ClosingOptions() if options is None else options
+    if options is not None:
+        raise BadArgument("options", f"components for {closing!r}", "None, or closing 'uncertainty' or 'fixed'")
+    return NO_OPTIONS
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class SensorModel(Value):
-    """What the fingertips of a hand tell, and so what its controller relies on; `FingertipSensor` simulates it.
+    """The sensors of a hand's fingertips; `FingertipSensor` simulates them.
 
     Args:
-        kind: "tactile": force, place and sliding of each contact, as a BioTac tells them. "torque": the force alone,
-            by the torques of the finger's joints. "binary": whether the fingertip touches.
-        delay: age [s] of what is told, in whole samples of the sensor.
-        noise: multiple of the usual noise.
-        dead: fingers whose sensor is known to tell nothing, by their names.
+        kind: "tactile": force, place and sliding of each contact, as of a BioTac. "torque": the force alone, from
+            the torques of the finger's joints. "binary": whether the fingertip touches.
+        delay: age [s] of the readings, in whole samples of the sensor.
+        noise: factor on the usual noise.
+        dead: names of the fingers whose sensor is known to be broken.
 
     Raises:
         BadArgument: a number outside its range, an unknown kind.
@@ -170,7 +214,7 @@ class SensorModel(Value):
 
     @property
     def full(self) -> bool:
-        """Whether all fingers tell force, place and sliding."""
+        """Whether all fingers sense force, place and sliding."""
         return self.kind == "tactile" and not self.dead
 
 
@@ -181,44 +225,40 @@ class TrialSpec(Value):
 
     Args:
         closing: how the hand closes. "paper": Eqs. 25-28 as written, with forces of the hand's stability model.
-            "uncertainty": the same law with seven further parts. "fixed": the same with constant gains.
+            "uncertainty": the same law with further components (`ClosingOptions`). "fixed": the same with equal gains.
             "paper_position": PI control to the contacts until 0.5 N, the paper's baseline. "position": the same, aimed
             behind the contacts. "open_loop": pre-grasp, grasp, squeeze.
-        holding: how the closed hand presses: "force" (balanced forces), "grip" (as the felt load asks),
-            "impedance" (the grasp is a spring in the hand), "position" (joints stay at their targets) or "law" (Eq. 25
-            goes on). In open loop the squeeze stays.
-        without: parts that "uncertainty" or "fixed" leaves out.
-        sensor: what the fingertips tell; the hand knows it.
-        max_force: largest normal force [N] of a fingertip that the object bears; None: any.
+        holding: how the closed hand presses: "force" (balanced forces), "grip" (least forces for the felt load),
+            "impedance" (the grasp is a spring in the hand), "position" (joint targets are kept) or "law" (Eq. 25
+            continues). In open loop the squeeze is kept.
+        options: components of "uncertainty" or "fixed"; None: all that the closing has.
+        sensor: sensors of the fingertips, which the controller knows.
+        max_force: largest normal force [N] of a fingertip; None: no limit.
         mass: mass of the object [kg].
         friction: coefficient of friction of every contact.
-        gravity: [m/s^2].
+        gravity: gravity [m/s^2].
         approach: length [m] of the straight path to the pre-grasp; 0: the hand starts there.
-        lift_height: [m].
+        lift_height: height of the lift [m].
         hold_time: time [s] after the lift.
         shake: amplitude [m] of a vertical sinusoid of 5 Hz during the hold.
         force: desired normal force of the strongest finger [N].
         noise: whether the sensor is noisy; a tactile one: 0.1 N normal, 0.3 N tangential, 1.5 mm of contact position.
-        timestep: of the simulator [s].
-        control_rate: of the controller [Hz].
+        timestep: timestep of the simulator [s].
+        control_rate: rate of the controller [Hz].
         simulator: "sapien" or "mujoco".
         density: density of the object [kg/m^3]; it replaces `mass` unless None.
         patch: radius [m] of the contact patch of a fingertip; torsional friction is friction x force x patch.
         kp: stiffness of all joint drives [N m/rad]; None: the hand's own.
-        overlap: largest overlap [m] at the start, because convex parts bulge a little.
+        overlap: largest overlap [m] at the start; convex parts bulge a little.
         table: whether the object stands on a table.
         self_collision: whether links of the hand collide with each other, in the pairs that the hand names.
 
     Raises:
-        BadArgument: a number outside its range, an unknown closing, holding, part or simulator, parts of a closing
-            that has none, or a control period below one timestep.
+        BadArgument: a number outside its range, an unknown closing, holding or simulator, options of a closing that
+            has none, a sensor or force that the closing cannot use, or a control period below one timestep.
 
     >>> TrialSpec(closing="open_loop", mass=0.3).holding
     'force'
-    >>> TrialSpec(closing="open_loop", without=("palm",))
-    Traceback (most recent call last):
-        ...
-    torchgrasp.errors.BadArgument: without: expected some of (), got ('palm',) of 'open_loop'
     """
 
     closing: ClosingMode = "uncertainty"
@@ -241,57 +281,36 @@ class TrialSpec(Value):
     overlap: Annotated[float, Range(0.0, 1.0)] = 1e-3
     table: bool = True
     self_collision: bool = True
-    without: tuple[ClosingPart, ...] = ()
+    options: ClosingOptions | None = None
     sensor: SensorModel = dataclasses.field(default_factory=SensorModel)
     max_force: Annotated[float, Range(0.1, 1000.0)] | None = None
 
     def __post_init__(self) -> None:
-        """Check what depends on two fields."""
-        check_closing_parts(self.closing, self.without)
+        """Check fields against each other."""
+        choose_options(self.closing, self.options)
         check_sensor(self.sensor, self.closing, self.holding)
         check_force(self.force, self.max_force)
         if not self.control_rate * self.timestep < 1 + 1e-9:
             found = f"{self.control_rate:g} Hz with a timestep of {self.timestep:g} s"
             raise BadArgument("control_rate", found, "a period of at least one timestep")
 
-
-def moves_palm(closing: str, without: tuple[str, ...]) -> bool:
-    """Return whether a closing moves the palm."""
-    return closing in ("uncertainty", "fixed") and not {"place", "palm"} & set(without)
-
-
-def guards_approach(closing: str, without: tuple[str, ...]) -> bool:
-    """Return whether a hand stops where it touches something on its way to the pre-grasp."""
-    return moves_palm(closing, without) and "guard" not in without
-
-
-def needs_surface(closing: str, without: tuple[str, ...]) -> bool:
-    """Return whether a hand over a table finds an object by its estimated surface."""
-    return guards_approach(closing, without) or closes_again(closing, without)
-
-
-def closes_again(closing: str, without: tuple[str, ...]) -> bool:
-    """Return whether a hand that closed in vain closes once more."""
-    return closing in ("uncertainty", "fixed") and not {"place", "retry"} & set(without)
-
-
-def check_closing_parts(closing: str, without: tuple[str, ...]) -> None:
-    """Raise `BadArgument` for unknown parts, or parts of a closing that has none."""
-    known = get_args(ClosingPart) if closing in ("uncertainty", "fixed") else ()
-    if not set(without) <= set(known):
-        raise BadArgument("without", f"{without} of {closing!r}", f"some of {known}")
+    @property
+    def components(self) -> ClosingOptions:
+        """The components of the closing."""
+        return choose_options(self.closing, self.options)
 
 
 def check_sensor(sensor: SensorModel, closing: str, holding: str) -> None:
-    """Raise `BadArgument` for a closing or holding that needs what the sensor does not tell."""
+    """Raise `BadArgument` for a closing or holding that needs more than the sensor measures."""
     poor = f"one of kind {sensor.kind!r}" + (f" with {', '.join(sensor.dead)} dead" if sensor.dead else "")
+    allowed = "kind 'tactile' with no finger dead for {}"
     if not sensor.full and closing in ("position", "paper_position", "paper"):
-        raise BadArgument("sensor", poor, f"for closing {closing!r}: kind 'tactile', all of its fingertips alive")
+        raise BadArgument("sensor", poor, allowed.format(f"closing {closing!r}"))
     if not sensor.full and closing != "open_loop" and holding not in ("force", "position"):
-        raise BadArgument("sensor", poor, f"for holding {holding!r}: kind 'tactile', all of its fingertips alive")
+        raise BadArgument("sensor", poor, allowed.format(f"holding {holding!r}"))
 
 
 def check_force(force: float, max_force: float | None) -> None:
-    """Raise `BadArgument` for a force [N] that the object does not bear."""
+    """Raise `BadArgument` for a desired force [N] above the largest allowed one."""
     if max_force is not None and force > max_force:
-        raise BadArgument("force", force, f"at most {max_force:g}, the largest that the object bears")
+        raise BadArgument("force", force, f"at most max_force, {max_force:g}")

@@ -9,13 +9,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.control.closing import LawClosing
-from torchgrasp.control.observation import Observation
+from torchgrasp.control.observation import Observation, Targets
 from torchgrasp.control.reference import ClosingReference
-from torchgrasp.control.targets import Targets
+from torchgrasp.control.uncertainty_closing import UncertaintyClosing
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
 from torchgrasp.geometry.frames import rotation_angle
-from torchgrasp.specs import TrialSpec
+from torchgrasp.specs import ClosingOptions, TrialSpec
 
 Step = Callable[[Observation, float], Float[Tensor, " j"]]
 """Joint targets from an observation and the period [s]."""
@@ -125,7 +124,7 @@ def _pull(run: TrialRun, holding: Holding, pull: RisingPull) -> list[tuple[Tenso
 def _close(run: TrialRun, holding: Holding) -> tuple[Observation, Step]:
     """Close under the law, and return the last observation and what holds from then on."""
     robot, targets = run.robot, run.controller.targets.joints
-    observation, closing = robot.tick(Targets(targets)), LawClosing(robot.reference)
+    observation, closing = robot.tick(Targets(targets)), UncertaintyClosing(robot.reference, ClosingOptions())
     for _ in range(robot.ticks(CLOSING_TIME)):
         targets = closing(observation, robot.period)
         observation = robot.tick(Targets(targets))

@@ -30,8 +30,8 @@ from torchgrasp import (
 )
 from torchgrasp.base import Batch
 from torchgrasp.control import ClosingReference
-from torchgrasp.control.adaptive.impedance import Impedance
-from torchgrasp.control.adaptive.stability import FILE, NAMES, StabilityModel, lengths_of, state_of
+from torchgrasp.control.paper.impedance import Impedance
+from torchgrasp.control.paper.stability import FILE, NAMES, StabilityModel, lengths_of, state_of
 from torchgrasp.errors import BadArgument, GraspError
 from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.files import load_tensors, save_tensors

@@ -80,10 +80,10 @@ def test_a_hand_that_touches_something_on_its_way_goes_round_it(aside):
         close("allegro", cylinder(aside), dataclasses.replace(still, without=part), surface=seen)
         for part in (("guard",), ())
     )
-    assert (swept.halts, swept.held) == (0, False)
-    assert guarded.halts >= 1 and guarded.held
+    assert (swept.stops, swept.held) == (0, False)
+    assert guarded.stops >= 1 and guarded.held
     assert guarded.before_lift.distance < 0.005 < 0.1 < swept.before_lift.distance
-    assert close("allegro", spec=still, surface=seen).halts == 0  # where it was seen
+    assert close("allegro", spec=still, surface=seen).stops == 0  # where it was seen
 
 
 @pytest.mark.parametrize("closing", ["paper", "paper_position"])

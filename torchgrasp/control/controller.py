@@ -1,7 +1,8 @@
 """The controller of a grasp, from the approach to the end of the hold; it needs no simulator."""
 
 import functools
-from typing import Annotated, Any
+from collections.abc import Callable
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -9,79 +10,58 @@ from torch import Tensor
 
 from torchgrasp.base import check_device, settle
 from torchgrasp.checks import Range, checked
-from torchgrasp.control.closing import PALM_REACH, LawClosing, OpenLoopClosing
-from torchgrasp.control.holding.grip import GripHold
-from torchgrasp.control.modes import Closing, Step, check_modes, choose_holding, make_closing
-from torchgrasp.control.observation import Observation
-from torchgrasp.control.recovery.approach import GuardedApproach, can_guard
-from torchgrasp.control.recovery.retry import PressCheck, Reopening
+from torchgrasp.control.grip import GripHold
+from torchgrasp.control.holding import ForceHold, PositionHold
+from torchgrasp.control.observation import Observation, Targets
+from torchgrasp.control.paper.closings import OpenLoopClosing, PaperClosing, PositionClosing
+from torchgrasp.control.recovery import PRESSING_TIME, GraspCheck, GuardedApproach, Reopening, can_guard
 from torchgrasp.control.reference import ClosingReference
-from torchgrasp.control.state import ControllerState, Part, gather, go_on, pack, unpack
-from torchgrasp.control.tactile import no_contact
-from torchgrasp.control.targets import Targets
+from torchgrasp.control.uncertainty_closing import UncertaintyClosing, with_equal_gains
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.specs import ClosingMode, ClosingPart, HoldingMode, check_sensor, closes_again, moves_palm
+from torchgrasp.specs import ClosingMode, ClosingOptions, HoldingMode, check_sensor, choose_options
 
-Tick = Annotated[float, Range(1e-5, 1.0)]
-"""Time [s] from one tick to the next: drives are asked at 10 Hz to 1 kHz, and time does not go back."""
+Step = Callable[[Observation, float], Float[Tensor, " j"]]
+"""Maps an observation and the time to the next tick [s] to the targets of all joints [rad]."""
+
+Closing = OpenLoopClosing | PositionClosing | PaperClosing | UncertaintyClosing
+"""What moves the fingers to the object."""
+
+Period = Annotated[float, Range(1e-5, 1.0)]
+"""Time [s] from one tick to the next."""
 
 CLOSING_TIME = 4.0
-"""Longest time [s] of closing before the hand presses with what it has: a fingertip travels 0.16 m in it."""
-
-PRESSING_TIME = 0.5
-"""Time [s] from the end of closing until the hand counts as closed: the forces have risen (`RAMP`)."""
-
-IN_THE_AIR, PHASES = "in the air", {"guard": "approaching", "reopening": "opening", "hold": "pressing"}
-"""What a controller is at: its fingers close, or it has one of these parts."""
-
-STAGE, COUNTED = (*PHASES, "check"), ("time", "pressed", "attempts", "halts")
-"""Attributes of a controller: parts that are there in some phases, and numbers of its own."""
-
-ATTEMPTS = 2
-"""Most times that a hand closes (`PressCheck`)."""
+"""Longest time [s] of closing before the hand presses with the contacts that it has."""
 
 
 class GraspController:
     """Close a hand and hold the object: observations in, `Targets` out, all on the CPU.
 
-    A closing brings the fingers to the object, then a holding presses. `closed` turns true `PRESSING_TIME` later:
-    then the hand may be lifted, with further steps. The open loop keeps its squeeze. On a table that the reference
-    knows, a hand that feels no grasp to lift opens again instead, and closes where touches say that the object is.
+    A closing brings the fingers to the object, then a holding presses. `closed` turns true `PRESSING_TIME` later: then
+    the hand may be lifted, with further steps. On a table that the reference knows, a hand whose grasp seems too weak
+    to lift opens instead, and closes again where touches locate the object; `attempts` counts the closings.
 
     With an `approach` the controller begins before the pre-grasp. While it is `approaching` the arm brings the opened
-    hand to where `Targets.left` says. Where a fingertip touches, the hand stops, draws back and goes to where the touch
-    says that the object is (`GuardedApproach`); `halts` counts how often.
+    hand to the distance `Targets.left` of its pre-grasp (`GuardedApproach`); `stops` counts how often the hand stopped.
 
     Args:
-        reference: what the hand follows.
-        closing, holding: as in `TrialSpec`.
-        belief: the shape that the grasp was planned on, which touches revise under the law (Eq. 25); None: they do not.
-        without: parts that the closing leaves out, as in `TrialSpec`.
-        approach: length [m] of the approach that is still before the hand; 0: it is at its pre-grasp.
+        reference: plan of the closing.
+        closing, holding, options: as in `TrialSpec`.
+        approach: remaining length [m] of the approach; 0: the hand is at its pre-grasp.
 
     Raises:
-        BadArgument: unknown names; a belief, parts or "law" for a closing that has none; "impedance" for more than
-            three fingertips; a closing or holding that needs what the sensor does not tell.
-        BadArgument: an approach without the part "guard", or whose touches would tell nothing (`can_guard`).
+        BadArgument: unknown names; options or the holding "law" for a closing that has none; "impedance" for more than
+            three fingertips; a closing or holding that needs more than the sensor measures.
+        BadArgument: an approach without stops, or without a table, a surface and tactile fingertips (`can_guard`).
 
-    A hand that is driven at 200 Hz; here joints follow at once and the object yields by 1 mm for 2 N:
-
-    >>> from torchgrasp import ContactSpec, load_hand, load_object, plan_grasps
-    >>> from torchgrasp.control import ClosingReference, TipContact, measure, no_contact, observe
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.control import ClosingReference, no_contact, observe
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand = load_hand("allegro")
-    >>> grasp = plan_grasps(load_object("cylinder").view, hand, ContactSpec(table=0.0), starts=20)[0]
-    >>> reference = ClosingReference.from_grasp(hand, grasp)
-    >>> controller, tactile, joints = GraspController(reference), no_contact(), reference.pregrasp
-    >>> normals, radius = reference.normals, hand.tips.radius.double()
-    >>> while not controller.closed:
-    ...     points = reference.contact_points(hand.tip_centres(joints))
-    ...     push = 2e3 * ((reference.gains.target - points) * normals).sum(-1).clamp_min(0.0)
-    ...     contact = TipContact(push, -push[:, None] * normals, points, normals)
-    ...     tactile = measure(tactile, contact, normals, radius, 1 / 200)
-    ...     joints = reference.pick(controller.step(observe(hand, joints, tactile), 1 / 200).joints)
-    >>> bool(tactile.contact.all())
-    True
+    >>> controller = GraspController(ClosingReference.from_grasp(hand, load_shipped_grasp("jug", "allegro")))
+    >>> joints = controller.reference.pregrasp  # of a robot: read its encoders and fingertips at each tick
+    >>> targets = controller.step(observe(hand, joints, no_contact()), period=1 / 200)
+    >>> targets.joints.shape, controller.closed
+    (torch.Size([16]), False)
     """
 
     @checked
@@ -90,42 +70,34 @@ class GraspController:
         reference: ClosingReference,
         closing: ClosingMode = "uncertainty",
         holding: HoldingMode = "force",
-        belief: ShapeGP | None = None,
-        without: tuple[ClosingPart, ...] = (),
+        options: ClosingOptions | None = None,
         approach: Annotated[float, Range(0.0, 1.0)] = 0.0,
     ) -> None:
-        check_modes(closing, holding, belief, without)
+        self.options = choose_options(closing, options)
+        check_holding(closing, holding)
         check_sensor(reference.sensor, closing, holding)
-        if approach and not can_guard(reference, closing, without):
-            allowed = "0 without the part 'guard', or without a table, a surface and a direction in the reference"
+        if approach and not (self.options.stops and can_guard(reference)):
+            allowed = "0 without stops, or without a table, a surface and a direction in the reference"
             raise BadArgument("approach", approach, allowed)
-        self.modes = (
-            f"closing {closing}, holding {holding}, without {', '.join(without) or 'nothing'}, {approach:g} m off"
-        )
         self.reference = reference = settle(reference, torch.device("cpu"))
-        self.length, self.halts = approach, 0
-        self.guard = self._guard()
-        self._close = functools.partial(make_closing, reference, closing, belief, without)
-        self._choose, self._law = functools.partial(choose_holding, mode=holding), holding == "law"
-        self._begin(self._close())
+        self.guard = GuardedApproach(reference, self.options, approach) if approach else None
+        self._make_closing = functools.partial(make_closing, reference, closing, self.options)
+        self._choose_holding = functools.partial(choose_holding, mode=holding)
+        self.attempts, self.stops = 0, 0
+        self._begin(self._make_closing())
         self.targets = Targets(reference.expand(reference.pregrasp), left=approach)
-        self.most = ATTEMPTS if closes_again(closing, without) and reference.table is not None else 1
-        self.attempts, self._reach = 1, PALM_REACH if moves_palm(closing, without) else 0.0
 
-    def _guard(self) -> GuardedApproach | None:
-        """Return what brings the hand along its approach; None: it has none."""
-        return GuardedApproach(self.reference, self.length) if self.length else None
+    def _begin(self, closing: Closing) -> None:
+        """Begin to close."""
+        self.closing, self.hold, self.check, self.reopening = closing, None, None, None
+        self._make_hold = self._choose_holding(closing)
+        self.time, self.pressed = 0.0, 0.0
+        self.attempts += 1
 
     @property
     def approaching(self) -> bool:
         """Whether the hand is still on its way to the pre-grasp."""
         return self.guard is not None
-
-    def _begin(self, closing: Closing) -> None:
-        """Begin to close."""
-        self.closing, self.hold, self.check, self.reopening = closing, None, None, None
-        self._hold = self._choose(closing)
-        self.time, self.pressed = 0.0, 0.0
 
     @property
     def closed(self) -> bool:
@@ -136,24 +108,25 @@ class GraspController:
 
     @property
     def status(self) -> Status:
-        """`OK`, or `TOO_HEAVY` once the holding "grip" feels more than the hand can hold: put the object down."""
+        """`OK`, or `TOO_HEAVY` if the holding "grip" feels more load than the hand can hold: put the object down."""
         return self.hold.status if isinstance(self.hold, GripHold) else Status.OK
 
     @property
     def blend(self) -> Float[Tensor, " f"]:
-        """Lambda of each finger (Eq. 26) at the last tick; NaN before it and without the law."""
-        nothing = torch.full_like(self.reference.normals[:, 0], torch.nan)
+        """Lambda of each finger (Eq. 26) at the last tick; NaN before it and without the control law."""
         acts = self.hold is None and self.reopening is None and self.time > 0.0
-        return self.closing.share if acts and isinstance(self.closing, LawClosing) else nothing
+        if acts and isinstance(self.closing, PaperClosing | UncertaintyClosing):
+            return self.closing.share
+        return torch.full_like(self.reference.normals[:, 0], torch.nan)
 
     @checked
-    def step(self, observation: Observation, period: Tick) -> Targets:
+    def step(self, observation: Observation, period: Period) -> Targets:
         """Return the targets of joints and palm for the next tick, a period [s] later.
 
-        In the tick in which the closing ends its targets stay: the holding's forces are sought instead.
+        The targets do not change in the tick in which the closing ends: that tick computes the forces of the holding.
 
         Raises:
-            BadArgument: an observation of another hand, or on another device than the CPU; a period outside `Tick`.
+            BadArgument: an observation of another hand, or on another device than the CPU; a period outside `Period`.
         """
         shape = len(self.reference.normals), 3, len(self.targets.joints)
         found = tuple(observation.jacobian.shape)
@@ -162,138 +135,91 @@ class GraspController:
         check_device("observation", observation.joints.device, "the controller", self.targets.joints.device)
         if self.guard is not None:
             self.targets = self._approach(self.guard, observation, period)
-            return self.targets
-        if self.reopening is not None:
+        elif self.reopening is not None:
             self.targets = self._reopen(self.reopening, period)
-            return self.targets
-        over = self.closing.done or self.time >= CLOSING_TIME
-        if self.hold is None and over and not isinstance(self.closing, OpenLoopClosing):
-            self.hold, joints = self._hold(self.reference, observation, self.targets.joints), self.targets.joints
-            self.check = self._check()
-        elif self.hold is None:
-            self.time += period
-            joints = self.closing(observation, period)
         else:
-            self.pressed += period
-            joints = self.hold(observation, period)
-        self.targets = Targets(joints, self.closing.palm)
-        self._judge(observation)
+            self.targets = Targets(self._close_or_hold(observation, period), self.closing.palm)
+            self._judge(observation)
         return self.targets
 
     def _approach(self, guard: GuardedApproach, observation: Observation, period: float) -> Targets:
-        """Return the targets of the approaching hand; at its end expect the object where it was touched."""
+        """Return the targets of the approaching hand; at the end expect the object where it was touched."""
         guard(observation, period)
         if guard.done:
-            self.guard, self.halts = None, round(guard.halts)
-            if self.halts and isinstance(self.closing, LawClosing):
+            self.guard, self.stops = None, guard.stops
+            if self.stops and isinstance(self.closing, UncertaintyClosing):
                 self.closing.begin_at(guard.displacement, guard.palm)
         return Targets(self.targets.joints, guard.palm, guard.left)
 
-    def _check(self) -> PressCheck | None:
-        """Return what judges the pressing hand; None: the closing has no further attempt in any case."""
-        if self.most == 1 or not isinstance(self.closing, LawClosing):
-            return None
-        last = self.attempts >= self.most
-        return PressCheck(self.reference, self.closing.believed, self.closing.palm, last)
+    def _close_or_hold(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
+        """Return the joint targets of the closing, or of the holding once the closing is over."""
+        over = self.closing.done or self.time >= CLOSING_TIME
+        if self.hold is not None:
+            self.pressed += period
+            return self.hold(observation, period)
+        if not over or isinstance(self.closing, OpenLoopClosing):
+            self.time += period
+            return self.closing(observation, period)
+        self.hold = self._make_hold(self.reference, observation, self.targets.joints)
+        if self.options.attempts > 1 and self.reference.table is not None:
+            assert isinstance(self.closing, UncertaintyClosing)
+            last = self.attempts >= self.options.attempts
+            self.check = GraspCheck(self.reference, self.closing.displacement, self.closing.palm, last)
+        return self.targets.joints
 
     def _judge(self, observation: Observation) -> None:
-        """Open the hand again once it is known that a lift would fail."""
+        """Open the hand again once the check has found that a lift would fail."""
         if self.check is None:
             return
-        self.check(observation, self.pressed, PRESSING_TIME - 1e-9)
+        self.check(observation, self.pressed)
         if self.check.judged and not self.check.secure:
-            self.reopening = self._reopening(self.check.displacement)
+            reach, targets = self.options.palm_reach, self.targets
+            self.reopening = Reopening(self.reference, self.check.displacement, targets.joints, targets.palm, reach)
             self.hold, self.check, self.pressed = None, None, 0.0
 
-    def _reopening(self, displacement: Float[Tensor, "6"]) -> Reopening:
-        """Return what opens the hand from where it is, and follows a displacement of the object [m, rad]."""
-        return Reopening(self.reference, displacement, self.targets.joints, self.targets.palm, self._reach)
-
     def _reopen(self, reopening: Reopening, period: float) -> Targets:
-        """Return the targets of the opening hand; at its end begin to close once more."""
+        """Return the targets of the opening hand; at the end begin to close again."""
         targets = Targets(reopening(period), reopening.palm)
         if reopening.done:
-            closing = self._close()
-            assert isinstance(closing, LawClosing)
+            closing = self._make_closing()
+            assert isinstance(closing, UncertaintyClosing)
             self._begin(closing.begin_at(reopening.displacement, reopening.palm))
-            self.attempts += 1
         return targets
 
-    @checked
-    def state(self) -> ControllerState:
-        """Return what changes from tick to tick, to be saved: `restore` goes on from it.
 
-        Raises:
-            BadArgument: a controller with a belief, whose shape is none of its numbers.
-        """
-        if isinstance(self.closing, LawClosing) and self.closing.revise is not None:
-            raise BadArgument("state", "that of a controller with a belief", "that of one without")
-        parts = self._parts({name: getattr(self, name) for name in STAGE})
-        return pack(f"{self.modes}, {self._phase}", self._numbers(parts))
+def check_holding(closing: str, holding: str) -> None:
+    """Raise `BadArgument` for the holding "law" after a closing without the control law."""
+    if holding == "law" and closing not in ("fixed", "uncertainty", "paper"):
+        raise BadArgument("holding", f"'law' after {closing!r}", "another holding, or a closing under Eq. (25)")
 
-    @checked
-    def restore(self, state: ControllerState) -> None:
-        """Go on from a state as the controller of it would have: the same observations give the same bits.
 
-        The controller has to be made of the same grasp and modes.
+def make_closing(reference: ClosingReference, mode: ClosingMode, options: ClosingOptions) -> Closing:
+    """Return the closing of a mode."""
+    match mode:
+        case "open_loop":
+            return OpenLoopClosing(reference)
+        case "position":
+            return PositionClosing(reference)
+        case "paper_position":
+            return PositionClosing(reference, depth=0.0)
+        case "paper":
+            return PaperClosing(reference)
+        case "fixed":
+            return UncertaintyClosing(with_equal_gains(reference), options)
+        case "uncertainty":
+            return UncertaintyClosing(reference, options)
 
-        Raises:
-            BadArgument: the state of another hand or of other modes, or one that was changed.
 
-        >>> from torchgrasp import load_hand, load_object, plan_grasps
-        >>> from torchgrasp.control import ClosingReference, no_contact, observe
-        >>> hand = load_hand("allegro")
-        >>> grasp = plan_grasps(load_object("cylinder").view, hand, starts=20)[0]
-        >>> reference = ClosingReference.from_grasp(hand, grasp)
-        >>> one, other, seen = GraspController(reference), GraspController(reference), None
-        >>> for _ in range(3):
-        ...     targets = one.step(observe(hand, reference.pregrasp, no_contact()), 0.01)
-        >>> other.restore(one.state())
-        >>> bool((other.targets.joints == targets.joints).all())
-        True
-        """
-        phases = (x for x in PHASES.values() if state.layout.startswith(f"{self.modes}, {x}"))
-        phase = next(phases, IN_THE_AIR)
-        stage: dict[str, Any] = dict.fromkeys(STAGE)
-        if phase == PHASES["guard"]:
-            stage["guard"] = self._guard()
-        elif phase == PHASES["hold"]:
-            stage["hold"], stage["check"] = self._blank(), self._check()
-        elif phase == PHASES["reopening"]:
-            stage["reopening"] = self._reopening(torch.zeros(6, dtype=torch.float64))
-        parts = self._parts(stage)
-        numbers = unpack(f"{self.modes}, {phase}", self._numbers(parts), state)
-        if numbers is None:
-            raise BadArgument("state", state.layout[:80], f"one of {self.modes}, {phase}, and of this hand's fingers")
-        self.time, self.pressed, attempts, halts = (float(numbers[f"controller.{name}"]) for name in COUNTED)
-        self.attempts, self.halts = round(attempts), round(halts)
-        joints, palm, left = (numbers[f"controller.{name}"] for name in Targets._fields)
-        self.targets = Targets(joints, palm, float(left))
-        for name, part in stage.items():
-            setattr(self, name, part)
-        for name, part in parts.items():
-            go_on(part, name, numbers)
+def choose_holding(
+    closing: Closing, mode: HoldingMode
+) -> Callable[[ClosingReference, Observation, Float[Tensor, " j"]], Step]:
+    """Return the constructor of a holding; only "impedance" reads the stability model."""
+    if mode == "impedance":
+        closing.reference.hand.require_three("holding", "'impedance', whose virtual frame is of three,")
+        from torchgrasp.control.paper.impedance import Impedance
+        from torchgrasp.control.paper.stability import load_stability
 
-    def _blank(self) -> Step:
-        """Return the holding as after touching nothing."""
-        if self._law:
-            return self.closing
-        reference = self.reference
-        target, joints = reference.gains.target, self.targets.joints
-        jacobian = torch.zeros(*target.shape, len(joints), dtype=torch.float64)
-        return self._hold(reference, Observation(joints, target, jacobian, no_contact(fingers=len(target))), joints)
-
-    @property
-    def _phase(self) -> str:
-        """The phase in words."""
-        return next((phase for part, phase in PHASES.items() if getattr(self, part) is not None), IN_THE_AIR)
-
-    def _parts(self, stage: dict[str, Any]) -> dict[str, Part]:
-        """Return the parts whose numbers are the controller's, by name; a law that goes on is no second one."""
-        found = {name: x for name, x in stage.items() if isinstance(x, Part) and x is not self.closing}
-        return {"closing": self.closing, **found}
-
-    def _numbers(self, parts: dict[str, Part]) -> dict[str, Tensor]:
-        """Return every number of the controller and of parts of it."""
-        mine = {name: getattr(self, name) for name in COUNTED} | self.targets._asdict()
-        return gather(mine, parts)
+        return functools.partial(Impedance, stability=load_stability(closing.reference.hand))
+    if mode == "law" and isinstance(closing, PaperClosing | UncertaintyClosing):
+        return lambda *_: closing.press()
+    return {"force": ForceHold, "grip": GripHold}.get(mode, PositionHold)

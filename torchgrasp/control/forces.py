@@ -1,4 +1,4 @@
-"""Desired forces of the fingers, their covariance (Eq. 28), and the joint targets that exert them."""
+"""Desired forces of the fingers, and the joint targets that exert them with position-controlled drives."""
 
 from typing import Annotated, NamedTuple
 
@@ -8,15 +8,11 @@ from torch import Tensor
 
 from torchgrasp.base import settle
 from torchgrasp.checks import Positive, Range, checked
-from torchgrasp.control.stiffness import joint_stiffness
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.plan.internal_forces import least_friction_forces
 from torchgrasp.values import Grasps
-
-FORCE_SPREAD = 0.1
-"""Relative standard deviation of the desired normal force: a stand-in for the learned one of Eq. (28)."""
 
 
 def desired_forces(
@@ -30,21 +26,6 @@ def desired_forces(
     return torch.where(torch.isfinite(balanced), balanced, -strongest * normals)
 
 
-def force_covariance(
-    forces: Float[Tensor, "*b 3"],
-    normals: Float[Tensor, "*b 3"],
-    floor: float,
-    deviation: Float[Tensor, "*b"] | None = None,
-) -> Float[Tensor, "*b 3 3"]:
-    """Return Sigma_fd of Eq. (28) [N^2]: the normal force's variance along the normal, plus an isotropic floor.
-
-    `floor` and `deviation` are standard deviations [N]; without `deviation` the normal force's is proportional to it.
-    """
-    deviation = FORCE_SPREAD * (forces * normals).sum(-1) if deviation is None else deviation
-    along = normals[..., :, None] * normals[..., None, :] * deviation[..., None, None] ** 2
-    return along + floor**2 * torch.eye(3, dtype=forces.dtype, device=forces.device)
-
-
 def contacts_in_hand(grasps: Grasps) -> tuple[Float[Tensor, "g f 3"], Float[Tensor, "g f 3"]]:
     """Return planned contact points [m] and normals in the hand's frame."""
     hand_from_obj = inverse(grasps.obj_from_hand.double())
@@ -53,16 +34,7 @@ def contacts_in_hand(grasps: Grasps) -> tuple[Float[Tensor, "g f 3"], Float[Tens
 
 
 class Squeeze(NamedTuple):
-    """The third pose of a grasp: joint targets [rad], forces on the object [N], torques [N m].
-
-    >>> from torchgrasp import load_hand
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> pressed = squeeze(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
-    >>> pressed.forces.norm(dim=-1).round(decimals=1)  # [N] of each finger
-    tensor([[2., 2., 4.]], dtype=torch.float64)
-    >>> pressed.forces.sum(1).norm() < 1e-6  # they balance
-    tensor(True)
-    """
+    """Joint targets [rad] that press, the forces on the object [N] and the joint torques [N m]."""
 
     joints: Float[Tensor, "g h"]
     forces: Float[Tensor, "g f 3"]
@@ -75,22 +47,21 @@ def squeeze(
 ) -> Squeeze:
     """Return joint targets with which position-controlled fingers press at their planned contacts.
 
-    The targets solve J^T f = kp (target - q) for the `desired_forces` f; they may exceed a joint's limits.
+    The targets solve J^T f = kp (target - q) for the `desired_forces` f. They may exceed a joint's limits.
 
     Args:
         hand: the hand; it follows the grasps to their device.
-        grasps: g rows, planned for it.
+        grasps: g rows, planned for this hand.
         force: normal force of the strongest finger [N].
         kp: stiffness of every joint's drive [N m/rad]; None: the hand's own.
 
     Raises:
         BadArgument: joints or fingers of another hand, or a force or stiffness that is not positive.
 
-    >>> from torchgrasp import load_hand, load_object, plan_grasps
-    >>> hand = load_hand("allegro")
-    >>> grasps = plan_grasps(load_object("cylinder").view, hand, starts=20)
-    >>> squeeze(hand, grasps).joints.shape == grasps.joints.shape
-    True
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
+    >>> squeeze(load_hand("barrett"), load_shipped_grasp("jug", "barrett")).forces.norm(dim=-1).round(decimals=1)
+    tensor([[2., 2., 4.]], dtype=torch.float64)
     """
     check_squeeze(hand, grasps, force, kp)
     hand, joints = settle(hand.to(torch.float64), grasps.joints.device), grasps.joints.double()
@@ -100,10 +71,10 @@ def squeeze(
 
 
 def check_squeeze(hand: Hand, grasps: Grasps, force: float, kp: float | None) -> None:
-    """Refuse joints or fingers of another hand, and a force or stiffness that is not positive."""
+    """Refuse joints or fingers of another hand, and a force or stiffness out of range."""
     check_fingers(hand, grasps)
     if grasps.joints.shape[-1] != hand.dof:
-        raise BadArgument("grasps", f"{grasps.joints.shape[-1]} joints", f"the {hand.dof} of {hand.name}")
+        raise BadArgument("grasps", f"{grasps.joints.shape[-1]} joints", f"the {hand.dof} joints of {hand.name}")
     if not 0.0 < force < 1e3:
         raise BadArgument("force", force, "a number in (0, 1000) [N]")
     if kp is not None and not 0.0 < kp < 1e6:
@@ -111,7 +82,7 @@ def check_squeeze(hand: Hand, grasps: Grasps, force: float, kp: float | None) ->
 
 
 def check_fingers(hand: Hand, grasps: Grasps) -> None:
-    """Refuse grasps that were planned for other fingers of a hand; those that name none may be of any."""
+    """Refuse grasps of other fingers than the hand's; grasps without finger names pass."""
     names = grasps.meta.get("finger_names", ",".join(hand.finger_names)).split(",")
     if tuple(names) != hand.finger_names or grasps.contacts.fingertips != len(names):
         found = f"{grasps.contacts.fingertips} contacts a row, of the fingers {', '.join(names)}"
@@ -128,3 +99,28 @@ def press(
     """Return the `Squeeze` with which joints of a stiffness [N m/rad] exert forces [N]."""
     torques = torch.einsum("gcih,gci->gh", jacobian, forces)
     return Squeeze(joints + torques / stiffness, forces, torques)
+
+
+def drive_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, " j"]:
+    """Return the stiffness [N m/rad] of every joint of the URDF: `kp`, or the hand's own."""
+    kps = [hand.actuators[name].kp if kp is None else kp for name in hand.tree.joint_names]
+    return torch.tensor(kps, dtype=torch.float64)
+
+
+def actuated_stiffness(coupling: Float[Tensor, "j h"], kp: Float[Tensor, " j"]) -> Float[Tensor, "h"]:
+    """Return the stiffness [N m/rad] of each actuated joint, coupled joints included."""
+    return (coupling**2 * kp[:, None]).sum(0)
+
+
+def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
+    """Return the `actuated_stiffness` of a hand; all drives have `kp` [N m/rad], or their own stiffness."""
+    coupling = hand.actuated.coupling
+    return actuated_stiffness(coupling, drive_stiffness(hand, kp).to(coupling))
+
+
+def tip_compliance(
+    jacobian: Float[Tensor, "*b f 3 h"], normals: Float[Tensor, "*b f 3"], stiffness: Float[Tensor, "h"]
+) -> Float[Tensor, "*b f"]:
+    """Return the compliance [m/N] of each fingertip along its normal, given the joint stiffness [N m/rad]."""
+    along = torch.einsum("...cih,...ci->...ch", jacobian, normals)
+    return (along**2 / stiffness).sum(-1)

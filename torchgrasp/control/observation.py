@@ -1,6 +1,7 @@
-"""What a robot knows of itself at a control tick."""
+"""Inputs and outputs of the controller at a tick: `Observation` and `Targets`."""
 
 import dataclasses
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -11,6 +12,26 @@ from torchgrasp.checks import checked
 from torchgrasp.control.tactile import TactileState
 from torchgrasp.hand.hand import Hand
 
+STILL = torch.zeros(3, dtype=torch.float64)
+"""Displacement of a palm that stays on its path."""
+
+
+class Targets(NamedTuple):
+    """Commands until the next tick.
+
+    Args:
+        joints: targets of all joints of the URDF, in the order of `hand.tree.joint_names` [rad].
+        palm: displacement of the palm [m] from its path, in the axes of the hand. The wrist does not turn.
+        left: remaining length [m] of the approach; 0: the hand is at its pre-grasp.
+
+    >>> Targets(torch.zeros(16)).palm
+    tensor([0., 0., 0.], dtype=torch.float64)
+    """
+
+    joints: Float[Tensor, " j"]
+    palm: Float[Tensor, "3"] = STILL
+    left: float = 0.0
+
 
 @checked
 @dataclasses.dataclass(frozen=True)
@@ -20,15 +41,14 @@ class Observation(Value):
     Args:
         joints: all joints of the URDF, in the order of `hand.tree.joint_names` [rad].
         tips: centres of the fingertips [m].
-        jacobian: of these centres, by all joints [m/rad].
-        tactile: what the fingertips report.
+        jacobian: of these centres by all joints [m/rad].
+        tactile: readings of the fingertips.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.control import no_contact
     >>> hand = load_hand("barrett")
-    >>> seen = observe(hand, (hand.lower + hand.upper) / 2, no_contact())
-    >>> seen.joints.shape, seen.tips.shape, seen.jacobian.shape
-    (torch.Size([8]), torch.Size([3, 3]), torch.Size([3, 3, 8]))
+    >>> observe(hand, (hand.lower + hand.upper) / 2, no_contact()).jacobian.shape
+    torch.Size([3, 3, 8])
     """
 
     joints: Float[Tensor, " j"]
@@ -39,7 +59,7 @@ class Observation(Value):
 
 @checked
 def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> Observation:
-    """Return the observation of a robot with actuated joints [rad] and fingertips as read.
+    """Return the observation of a robot with measured actuated joints [rad] and fingertip readings.
 
     Raises:
         BadArgument: joints or fingertips on another device than the hand.

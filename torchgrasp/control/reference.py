@@ -1,4 +1,4 @@
-"""What a closing hand follows: poses, contacts and gains, derived once."""
+"""The plan of one closing: poses, contacts and gains of a grasp, derived once in the hand's frame."""
 
 import dataclasses
 import functools
@@ -12,15 +12,25 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.checks import ANY, Pose, Positive, Range, check_tensor, checked
 from torchgrasp.closure import ClosingGains
-from torchgrasp.control.closing_law import (
+from torchgrasp.control.forces import (
+    check_squeeze,
+    contacts_in_hand,
+    desired_forces,
+    drive_stiffness,
+    joint_stiffness,
+    press,
+    tip_compliance,
+)
+from torchgrasp.control.law import (
     FORCE_BANDWIDTH,
     FORCE_FLOOR,
+    force_covariance,
     force_gain,
+    joint_step,
     position_gain,
     surface_covariance,
 )
-from torchgrasp.control.forces import check_squeeze, contacts_in_hand, desired_forces, force_covariance, press
-from torchgrasp.control.stiffness import drive_stiffness, joint_stiffness, tip_compliance
+from torchgrasp.control.observation import Observation
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import inverse, rotate
 from torchgrasp.geometry.linalg import unit
@@ -31,40 +41,37 @@ from torchgrasp.specs import SensorModel
 from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
-    from torchgrasp.control.adaptive.stability import StabilityModel
+    from torchgrasp.control.paper.stability import StabilityModel
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosingReference(Value):
-    """What a closing hand follows, in its frame; joints are actuated [rad].
+    """What a closing hand follows, in the hand's frame; joints are actuated [rad].
 
     Args:
         hand: the hand, in float64.
         kp: stiffness of every joint's drive [N m/rad], in the order of `hand.tree.joint_names`.
-        obj_from_hand: its planned pose in the frame of the grasp.
+        obj_from_hand: planned pose of the hand in the frame of the grasp.
         pregrasp: joints of the opened hand.
         joints: joints of the grasp.
         squeeze: joint targets that press in open loop (`squeeze`).
         normals: outward normals of the planned contacts.
-        gains: targets, gains and desired forces (Eqs. 26-28).
-        approach: unit vector along which the opened hand comes to its pre-grasp; None: it has no approach.
-        table: into which no fingertip presses while it searches; None: none is known.
-        surface: estimated surface of the object in the frame of the grasp (`surface_field`), by which touches tell
-            where the object is; None: tangent planes of the contacts stand for it.
-        sensor: what the fingertips tell.
-        max_force: largest normal force [N] of a fingertip that the object bears; None: any.
+        gains: contacts, gains and desired forces (Eqs. 26-28).
+        approach: unit vector along which the opened hand moves to its pre-grasp; None: no approach.
+        table: no fingertip presses into this plane while it searches; None: unknown.
+        surface: estimated surface of the object in the frame of the grasp (`surface_field`), which locates the object
+            from touches; None: the tangent planes of the contacts are used.
+        sensor: sensors of the fingertips.
+        max_force: largest normal force [N] of a fingertip; None: no limit.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> reference = ClosingReference.from_grasp(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
-    >>> every = reference.expand(reference.joints)  # followers, too
-    >>> every.shape, torch.equal(reference.pick(every), reference.joints)
-    (torch.Size([8]), True)
-    >>> torch.equal(reference.clamp(reference.joints + 9), reference.hand.upper)
+    >>> torch.equal(reference.pick(reference.expand(reference.joints)), reference.joints)
     True
-    >>> reference.contact_points(reference.gains.target).shape  # on the pads, from the tips' centres
-    torch.Size([3, 3])
+    >>> reference.clamp(reference.joints).shape, reference.contact_points(reference.gains.target).shape
+    (torch.Size([4]), torch.Size([3, 3]))
     """
 
     hand: Hand
@@ -91,15 +98,15 @@ class ClosingReference(Value):
         kp: Positive | None = None,
         stability: "StabilityModel | None" = None,
     ) -> "ClosingReference":
-        """Derive the reference of one grasp, on the CPU: a tick has too little work for a GPU.
+        """Derive the reference of one grasp, on the CPU.
 
         Args:
             hand: the hand.
-            grasp: one row, planned for it.
+            grasp: one row, planned for the hand.
             force: normal force of the strongest finger [N].
             kp: stiffness of every joint's drive [N m/rad]; None: the hand's own.
-            stability: chooses among balanced forces of nearly equal friction, and gives their covariance; the force
-                loop of the most certain finger is then the fastest. None: the covariance grows with the force.
+            stability: model that chooses among balanced forces of nearly equal friction, and gives their covariance;
+                None: the covariance grows with the force.
 
         Raises:
             BadArgument: not exactly one row, joints or fingers of another hand, a force or stiffness that is not
@@ -132,7 +139,7 @@ class ClosingReference(Value):
             target=points[0],
             covariance=covariance[0],
             position_gain=position_gain(covariance)[0],
-            force_gain=force_gain(force_covariance(forces, normals, FORCE_FLOOR, deviation), alpha_f)[0],
+            force_gain=force_gain(force_covariance(forces, normals, deviation), alpha_f)[0],
             desired_force=forces[0],
             force_source="analytic" if stability is None else "stability",
         )
@@ -150,44 +157,62 @@ class ClosingReference(Value):
 
     @checked
     def expand(self, actuated: Annotated[Float[Tensor, " h"], ANY]) -> Float[Tensor, " j"]:
-        """Return all joints of the URDF; NaN, as of a diverged simulation, may pass."""
+        """Return all joints of the URDF; NaN is allowed."""
         return self.hand.actuated.coupling @ actuated + self.hand.actuated.offset
 
     @checked
     def pick(self, joints: Annotated[Float[Tensor, " j"], ANY]) -> Float[Tensor, " h"]:
-        """Return the actuated joints out of all joints of the URDF; NaN may pass."""
+        """Return the actuated joints out of all joints of the URDF; NaN is allowed."""
         return joints[self._actuated]
 
     @functools.cached_property
     def _actuated(self) -> list[int]:
-        """Places of the actuated joints among all."""
+        """Indices of the actuated joints among all joints."""
         return [self.hand.tree.joint_names.index(name) for name in self.hand.joint_names]
 
     @property
     def alive(self) -> Bool[Tensor, "f"]:
-        """Which fingertips tell anything.
+        """Which fingertips have a working sensor.
 
         Raises:
-            BadArgument: a dead fingertip that the hand has not.
+            BadArgument: the sensor names a dead finger that the hand does not have.
         """
         names, dead = self.hand.finger_names, self.sensor.dead
         if not set(dead) <= set(names):
-            raise BadArgument("sensor", f"dead fingers {dead}", f"some of {names}")
+            raise BadArgument("sensor", f"dead fingers {dead}", f"dead fingers among {names}")
         return torch.tensor([name not in dead for name in names])
 
     @checked
     def clamp(self, actuated: Float[Tensor, " h"]) -> Float[Tensor, " h"]:
-        """Return joints within their limits."""
+        """Return the joints clamped to their limits."""
         return torch.minimum(torch.maximum(actuated, self.hand.lower), self.hand.upper)
 
     @checked
     def contact_points(self, tips: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
-        """Return the first points to touch [m] of fingertips with given centres [m]."""
+        """Return the points [m] of fingertips with given centres [m] that touch first."""
         return tips - self.hand.tips.radius[:, None] * self.normals
 
 
+def next_target(
+    reference: ClosingReference,
+    target: Float[Tensor, " h"],
+    velocity: Float[Tensor, "f 3"],
+    observation: Observation,
+    lead: Float[Tensor, " h"] | float,
+    period: float,
+) -> Float[Tensor, " h"]:
+    """Return the joint target [rad] one tick later, for fingertip velocities [m/s] (Eq. 25).
+
+    The target leads the measured joints by at most `lead` [rad], and stays within the joint limits.
+    """
+    jacobian = observation.jacobian @ reference.hand.actuated.coupling
+    step = joint_step(jacobian, velocity, period, reference.joints - target)
+    joints = reference.pick(observation.joints)
+    return reference.clamp(torch.minimum(torch.maximum(target + step, joints - lead), joints + lead))
+
+
 def _approach_in_hand(grasp: Grasps) -> Float[Tensor, "3"] | None:
-    """Return the direction in which the hand of one grasp approaches, in its own axes."""
+    """Return the approach direction of one grasp in the hand's axes."""
     direction = rotate(inverse(grasp.obj_from_hand), grasp.approach[:, None])[0, 0]
     return unit(direction) if bool((direction != 0.0).any()) else None
 
@@ -199,7 +224,7 @@ def closing_gains(
     force: Annotated[float, Range(0.01, 100.0)] = 4.0,
     stability: "StabilityModel | None" = None,
 ) -> ClosingGains:
-    """Return target, gains and desired force of each finger for one grasp, in the hand's frame (Eqs. 26-28).
+    """Return contact, gains and desired force of each finger for one grasp, in the hand's frame (Eqs. 26-28).
 
     Arguments and errors are those of `ClosingReference.from_grasp`.
 

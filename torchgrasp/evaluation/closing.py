@@ -12,11 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.checks import Pose, Seed, checked
-from torchgrasp.control.closing import PALM_REACH
-from torchgrasp.control.controller import GraspController
-from torchgrasp.control.holding.grip import GripHold
-from torchgrasp.control.modes import check_modes
-from torchgrasp.control.recovery.approach import can_guard
+from torchgrasp.control.controller import GraspController, check_holding
+from torchgrasp.control.grip import GripHold
+from torchgrasp.control.recovery import can_guard
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.protocols import apply_error
@@ -26,12 +24,11 @@ from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import GRID, Plane, to_upright
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
-from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.sim.convex_parts import check_parts, convex_parts
 from torchgrasp.sim.hand import SimulatedHand
 from torchgrasp.sim.open import open_scene
 from torchgrasp.sim.scene import Body, Neighbour, SceneSpec
-from torchgrasp.specs import TrialSpec, moves_palm
+from torchgrasp.specs import TrialSpec
 from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
@@ -59,7 +56,6 @@ class GraspTrial:
     mesh: "trimesh.Trimesh | Path | str"
     seed: Seed = 0
     error: Pose | None = None
-    belief: ShapeGP | None = None
     parts: "Sequence[trimesh.Trimesh] | None" = None
     table: Plane | None = None
     neighbours: Sequence[Neighbour] = ()
@@ -85,7 +81,7 @@ class TrialDriver:
     """
 
     def __init__(self, trial: GraspTrial, spec: TrialSpec, reference: ClosingReference | None = None) -> None:
-        check_modes(spec.closing, spec.holding, trial.belief, spec.without)
+        check_holding(spec.closing, spec.holding)
         self.trial, self.spec = trial, spec
         hand, grasp = trial.hand.to("cpu", torch.float64), trial.grasp.to("cpu", torch.float64)
         self.reference = reference or derive_reference(hand, grasp, spec)
@@ -129,7 +125,7 @@ class TrialDriver:
             height=None if trial.table is None else 0.0,
             neighbours=tuple(self._body(neighbour) for neighbour in trial.neighbours),
             self_pairs=hand.self_pairs if spec.self_collision else (),
-            yields=PALM_REACH if moves_palm(spec.closing, spec.without) else 0.0,
+            yields=spec.components.palm_reach,
         )
 
     def _body(self, given: Neighbour) -> Body:
@@ -161,7 +157,7 @@ def derive_reference(hand: Hand, grasp: Grasps, spec: TrialSpec) -> ClosingRefer
     """
     stability = None
     if spec.closing == "paper":
-        from torchgrasp.control.adaptive.stability import load_stability
+        from torchgrasp.control.paper.stability import load_stability
 
         hand.require_three("closing", "'paper', whose model of stability is of three,")
         stability = load_stability(hand)
@@ -189,9 +185,9 @@ class TrialRun:
         self.scene = open_scene(driver.scene_spec, spec.simulator)
         generator = torch.Generator().manual_seed(trial.seed) if spec.noise else None
         self.robot = SimulatedHand(self.scene, driver.reference, spec.control_rate, generator)
-        reference, parts = self.robot.reference, spec.without
-        guarded = spec.approach if can_guard(reference, spec.closing, parts) else 0.0
-        self.controller = GraspController(reference, spec.closing, spec.holding, trial.belief, parts, guarded)
+        reference = self.robot.reference
+        guarded = spec.approach if spec.components.stops and can_guard(reference) else 0.0
+        self.controller = GraspController(reference, spec.closing, spec.holding, spec.options, guarded)
         self.overlap = self.scene.penetration()
 
     @property

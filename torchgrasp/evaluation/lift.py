@@ -17,7 +17,6 @@ from torchgrasp.geometry.frames import apply, inverse, rotation_angle
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
-from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.sim.scene import Neighbour
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import Grasps
@@ -48,7 +47,6 @@ def close_hand(
     seed: Seed = 0,
     *,
     error: Pose | None = None,
-    belief: ShapeGP | None = None,
     parts: "Sequence[trimesh.Trimesh] | None" = None,
     table: Plane | None = None,
     neighbours: Sequence[Neighbour] = (),
@@ -68,7 +66,6 @@ def close_hand(
         spec: of the trial; None: `TrialSpec()`.
         seed: of the tactile sensor's noise.
         error: true pose of the hand in its planned frame, unknown to the hand; None: the planned pose.
-        belief: the shape that the grasp was planned on, revised by touches while the hand closes; None: no revision.
         parts: convex bodies that stand for the mesh; None: its own decomposition (`convex_parts`).
         table: what the object stands on, in the frame of the grasp; None: level, at the mesh's lowest point.
         neighbours: further bodies on the table, which the hand may push.
@@ -78,7 +75,7 @@ def close_hand(
     Raises:
         BadArgument: not exactly one row, joints of another hand, or a pre-grasp outside the joint limits.
         BadArgument: an approach that is no unit vector, or an error that is no finite (4, 4).
-        BadArgument: a belief or the holding "law" for a closing that does not follow the law (Eq. 25).
+        BadArgument: the holding "law" for a closing that does not follow the law (Eq. 25).
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
 
@@ -89,7 +86,7 @@ def close_hand(
     >>> result.held, result.slip.distance < 0.01, result.disturbance.early, result.trace.forces.shape[1:]
     (True, True, tensor([False, False, False]), torch.Size([3, 3]))
     """
-    return lift_grasp(GraspTrial(hand, grasp, mesh, seed, error, belief, parts, table, neighbours, surface), spec)
+    return lift_grasp(GraspTrial(hand, grasp, mesh, seed, error, parts, table, neighbours, surface), spec)
 
 
 @checked
@@ -288,7 +285,7 @@ class _Lift:
                 *contact[..., :9].unflatten(-1, (3, 3)).unbind(-2), *contact[..., 9:].unbind(-1), *felt.T
             ),
             phases=torch.tensor(reached, dtype=torch.float64),
-            halts=self.run.controller.halts,
+            stops=self.run.controller.stops,
             attempts=self.run.controller.attempts,
             seconds=seconds,
         )

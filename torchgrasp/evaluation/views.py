@@ -24,7 +24,7 @@ from torchgrasp.planner.problem import digest
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import surface_field
 from torchgrasp.sim.convex_parts import convex_parts
-from torchgrasp.specs import ContactSpec, needs_surface
+from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Grasps, PointCloud, load_grasps
 
 if TYPE_CHECKING:
@@ -176,7 +176,7 @@ def try_grasp(
     seed = seed_of(spec.seed, view.object, view.view, *at)
     trial = protocol.trial
     error, surface = draw_error(protocol, grasp, mesh, seed), None
-    if trial.table and needs_surface(trial.closing, trial.without):
+    if trial.table and (trial.components.stops or trial.components.attempts > 1):
         surface = _fit_surface(view.objects, view.object, view.view)
     attempt = GraspTrial(hand, grasp, mesh, seed_of(seed, "touch"), error, parts=parts, surface=surface)
     return dataclasses.replace(run_protocol(attempt, protocol, *at), predicted=float(grasp.success[0]))

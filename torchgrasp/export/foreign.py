@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.checks import Length, Poses, checked
-from torchgrasp.control.closing_law import damped_inverse
+from torchgrasp.control.law import damped_inverse
 from torchgrasp.errors import Status
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.hand.hand import Hand

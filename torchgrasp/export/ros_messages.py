@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.checks import Positive, Range, checked
-from torchgrasp.control.closing import POSE_TIME
+from torchgrasp.control.paper.closings import POSE_TIME
 from torchgrasp.control.forces import squeeze
 from torchgrasp.export.grasp_json import quaternion
 from torchgrasp.hand.hand import Hand

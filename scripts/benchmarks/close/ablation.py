@@ -7,7 +7,7 @@ import statistics
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 import torch
 
@@ -28,19 +28,18 @@ from torchgrasp.evaluation import (
 from torchgrasp.evaluation.intervals import RESAMPLES
 from torchgrasp.evaluation.views import choose_rows
 from torchgrasp.sim.convex_parts import convex_parts
-from torchgrasp.specs import ClosingPart, ContactSpec
+from torchgrasp.specs import NO_OPTIONS, ClosingOptions, ContactSpec
 
 PAPER = PROTOCOLS["paper"]
 
 
 class Part(NamedTuple):
-    """A row: how the hand closes and holds, whether touches revise the shape, and whether the deviations are swapped.
+    """A row: how the hand closes and holds, and whether the deviations are swapped.
 
     Swapped, the most certain finger has the largest deviation and the other way round: a control experiment.
     """
 
     spec: TrialSpec
-    revises: bool = False
     swapped: bool = False
 
 
@@ -52,13 +51,10 @@ PARTS = {
     "paper, deviations swapped": Part(TrialSpec(closing="paper"), swapped=True),
     DEFAULT: Part(TrialSpec()),
     "uncertainty, deviations swapped": Part(TrialSpec(), swapped=True),
-    "uncertainty without wait": Part(TrialSpec(without=("wait",))),
-    "uncertainty without pace": Part(TrialSpec(without=("pace",))),
-    "uncertainty without switch": Part(TrialSpec(without=("switch",))),
-    "uncertainty without place": Part(TrialSpec(without=("place",))),
-    "uncertainty without palm": Part(TrialSpec(without=("palm",))),
-    "uncertainty without all parts": Part(TrialSpec(without=get_args(ClosingPart))),
-    "uncertainty with belief": Part(TrialSpec(), revises=True),
+    "uncertainty without wait": Part(TrialSpec(options=ClosingOptions(wait=False))),
+    "uncertainty without place": Part(TrialSpec(options=dataclasses.replace(NO_OPTIONS, wait=True))),
+    "uncertainty without palm": Part(TrialSpec(options=ClosingOptions(palm_reach=0.0, stops=0))),
+    "uncertainty without all components": Part(TrialSpec(options=NO_OPTIONS)),
     "fixed": Part(TrialSpec(closing="fixed")),
     "position": Part(TrialSpec(closing="position")),
     "paper_position": Part(TrialSpec(closing="paper_position")),
@@ -166,11 +162,11 @@ def _close_view(objects: Path, name: str, view: str, hand_name: str, tries: int,
     for row in choose_rows(len(grasps), tries, "spread"):
         drawn = seed_of(seed, name, view, row, 0)
         error = draw_error(PAPER, grasps[row], mesh, drawn)
-        for part, (spec, revises, swapped) in PARTS.items():
-            grasp, belief = grasps[row], shape if revises else None
+        for part, (spec, swapped) in PARTS.items():
+            grasp = grasps[row]
             followed = swap_deviations(grasp) if swapped else grasp
             began = time.process_time()
-            result = close(followed, spec=spec, seed=seed_of(drawn, "touch"), error=error, belief=belief)
+            result = close(followed, spec=spec, seed=seed_of(drawn, "touch"), error=error)
             spent = time.process_time() - began
             first = most_certain_first(result.contact_order, grasp)
             moved = (1e3 * result.pushed.distance, 1e3 * result.slip.distance)

@@ -1,9 +1,10 @@
 """What closings are put to: where the object is, what it is like, how the hand closes, and what its fingertips tell."""
 
+import dataclasses
 import math
 from typing import Any, NamedTuple
 
-from torchgrasp.specs import SensorModel
+from torchgrasp.specs import NO_OPTIONS, ClosingOptions, SensorModel
 
 
 class Condition(NamedTuple):
@@ -61,16 +62,19 @@ class Law(NamedTuple):
 DEFAULT = "uncertainty"
 """The law that the others are compared with."""
 
+WAIT_ALONE = dataclasses.replace(NO_OPTIONS, wait=True)
+"""No component but the waiting."""
+
 LAWS = {
     DEFAULT: Law({}),
     "uncertainty, deviations swapped": Law({}, swapped=True),
-    "uncertainty without retry": Law({"without": ("retry",)}),
-    "uncertainty without guard": Law({"without": ("guard",)}),
-    "uncertainty without palm": Law({"without": ("palm",)}),
-    "uncertainty without place": Law({"without": ("place",)}),
-    "uncertainty without wait": Law({"without": ("wait",)}),
+    "uncertainty without retry": Law({"options": ClosingOptions(attempts=1)}),
+    "uncertainty without guard": Law({"options": ClosingOptions(stops=0)}),
+    "uncertainty without palm": Law({"options": ClosingOptions(palm_reach=0.0, stops=0)}),
+    "uncertainty without place": Law({"options": WAIT_ALONE}),
+    "uncertainty without wait": Law({"options": ClosingOptions(wait=False)}),
     "fixed": Law({"closing": "fixed"}),
-    "fixed without place": Law({"closing": "fixed", "without": ("place",)}),
+    "fixed without place": Law({"closing": "fixed", "options": WAIT_ALONE}),
     "position": Law({"closing": "position"}),
     "paper_position": Law({"closing": "paper_position"}),
     "open_loop": Law({"closing": "open_loop"}),

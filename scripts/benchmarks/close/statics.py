@@ -23,7 +23,7 @@ from torchgrasp import (
     load_object,
     plan_grasps,
 )
-from torchgrasp.control.holding.force import ForceHold
+from torchgrasp.control.holding import ForceHold
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.jobs import run_tasks

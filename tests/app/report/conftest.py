@@ -82,7 +82,7 @@ def run() -> Run:
             *torch.full((2, steps), math.nan, dtype=F64),
         ),
         phases=torch.tensor([0.0, 0.5, 0.75], dtype=F64),
-        halts=0,
+        stops=0,
         attempts=1,
         seconds=1.0,
     )

@@ -142,7 +142,7 @@ def test_the_film_shows_the_loss_in_its_colour_and_the_object_falling_behind(run
     assert height(gone, 6, 5) > height(gone, 6, 3) + 10
     assert "index, thumb, middle. The object was held." in describe_film(run.mesh, run.hand, closing)
     assert "Lost at 0.7" in describe_film(run.mesh, run.hand, out)
-    again = describe_film(run.mesh, run.hand, dataclasses.replace(closing, halts=1, attempts=2))
+    again = describe_film(run.mesh, run.hand, dataclasses.replace(closing, stops=1, attempts=2))
     assert "held. On its way the hand touched something once. The hand closed 2 times." in again
 
 

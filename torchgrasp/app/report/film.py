@@ -66,8 +66,8 @@ def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -
 
     order = ", ".join(hand.tips.names[finger] for finger in closure.contact_order) or "none"
     lost = explain_loss(closure, _centre(mesh), hand.tips.names)
-    halts, attempts = closure.halts, closure.attempts
-    on_its_way = f" On its way the hand touched something {times(halts)}." if halts else ""
+    stops, attempts = closure.stops, closure.attempts
+    on_its_way = f" On its way the hand touched something {times(stops)}." if stops else ""
     again = f" The hand closed {times(attempts)}." if attempts > 1 else ""
     end = (lost or "The object was held.") + on_its_way + again
     return f"In the order of touch: {order}. {end} Each picture is taken from the hand."

@@ -1,4 +1,4 @@
-"""How a closed hand presses: with balanced forces at the sensed contacts."""
+"""How a closed hand presses: with balanced forces at the sensed contacts, or by keeping its joint targets."""
 
 import torch
 from jaxtyping import Float
@@ -6,25 +6,24 @@ from torch import Tensor
 
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
-from torchgrasp.control.state import Part
 from torchgrasp.plan.internal_forces import least_friction_forces
 
-MOST_FACTOR = 1.5
-"""Largest factor of the forces: a sensor that reads too little does not crush what is held."""
+MAX_FACTOR = 1.5
+"""Largest factor on the forces; it bounds the force if a sensor reads too little."""
 
 RAMP = 0.4
-"""Time [s] in which the forces rise to the desired ones: the sensor lags by 8 ms only."""
+"""Time [s] in which the forces rise to the desired forces."""
 
 
-class ForceHold(Part):
+class ForceHold:
     """Press with forces that are balanced at the sensed contacts; the joints stay compliant.
 
-    One common factor keeps the sum of the forces. A loop for each finger would drift and push the object.
+    One common factor regulates the sum of the forces. A loop for each finger would drift and push the object.
 
     Args:
-        reference: of the closing.
-        observation: at the end of the closing.
-        start: the last targets of all joints [rad].
+        reference: plan of the closing.
+        observation: observation at the end of the closing.
+        start: last targets of all joints [rad].
     """
 
     def __init__(self, reference: ClosingReference, observation: Observation, start: Float[Tensor, " j"]) -> None:
@@ -32,20 +31,20 @@ class ForceHold(Part):
         forces, self.strength = held_forces(reference, observation)
         self.lead = torch.einsum("cij,ci->j", observation.jacobian, forces) / reference.kp
         largest = float(torch.linalg.vector_norm(forces, dim=-1).max())
-        self.most = MOST_FACTOR if reference.max_force is None else min(MOST_FACTOR, reference.max_force / largest)
+        self.most = MAX_FACTOR if reference.max_force is None else min(MAX_FACTOR, reference.max_force / largest)
         self.factor, self.time = min(1.0, self.most), 0.0
-        self.told = reference.sensor.kind != "binary"
+        self.senses_force = reference.sensor.kind != "binary"
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets of all joints for the next tick."""
         self.time += period
         share = min(self.time / RAMP, 1.0)
-        if share == 1.0 and self.told:
+        if share == 1.0 and self.senses_force:
             self.factor = min(regulate(self.factor, observation, self.strength, period), self.most)
         return self.start + share * (self.rest + self.factor * self.lead - self.start)
 
 
-class PositionHold(Part):
+class PositionHold:
     """Keep the joint targets of the closing's end; arguments as for `ForceHold`."""
 
     def __init__(self, reference: ClosingReference, observation: Observation, start: Float[Tensor, " j"]) -> None:
@@ -57,15 +56,15 @@ class PositionHold(Part):
 
 
 def regulate(factor: float, observation: Observation, strength: float, period: float) -> float:
-    """Return the common factor of the forces a tick later; it integrates the missing share of their sum."""
+    """Return the common factor of the forces a tick later: the integral of the lacking share of `strength` [N]."""
     lacking = 1 - float(observation.tactile.reading.sum()) / strength
-    return min(max(factor + period * lacking, 0.5), MOST_FACTOR)
+    return min(max(factor + period * lacking, 0.5), MAX_FACTOR)
 
 
 def held_forces(reference: ClosingReference, observation: Observation) -> tuple[Float[Tensor, "f 3"], float]:
-    """Return forces [N] that are balanced at the sensed contacts, and the normal sum of those that are felt.
+    """Return forces [N] that are balanced at the sensed contacts, and the sum [N] of the normal forces with a sensor.
 
-    The planned forces stay where a finger is in the air or no balanced set presses.
+    The planned forces are kept if a finger does not touch or no balanced forces press.
     """
     gains, normals = reference.gains, reference.normals
     forces = gains.desired_force

@@ -1,10 +1,10 @@
-"""The least forces of fingertips that carry a load: a barrier method in NumPy, a few Newton steps a tick.
+"""The least fingertip forces that carry a load, by a barrier method with a few Newton steps a tick.
 
-With normal forces n_i, tangential forces t_i and torques of the joints tau_j this minimises
+With normal forces n_i, tangential forces t_i and joint torques tau_j the method minimises
 
     sum n_i + PENALTY sum max(|tau_j| / effort_j - KNEE, 0)^2 - eps sum [log(mu^2 n_i^2 - |t_i|^2) + log(n_i - floor_i)]
 
-over all forces that balance the load. Tensors of 3 x 3 cost more in calls than in arithmetic, so torch is left out.
+over all forces that balance the load. It is written in NumPy, whose calls cost less than torch's for small matrices.
 """
 
 import math
@@ -13,38 +13,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from torchgrasp.control.state import Part
-
 Array = np.ndarray
 
-STEPS, NEAR, LENGTHS = 8, 0.3, 2.0 ** np.arange(8)
-"""Newton's steps a call at most, from the forces of the tick before, and the decrement below which no further one is
-made. The lengths that are tried, over that of a step which is safe for every self-concordant function."""
-
-GAP = 0.01
-"""eps over the size of load and floors: three fingers press with 9 % more than the least sum, at a distance
-from the cones that the noise of the load does not cross."""
-
 PENALTY, KNEE = 500.0, 0.9
-"""Weight [N] of joint torques and normal forces over their limits, and the share of the limits where it sets in: at the
-limit a newton more costs 14 N. A quadratic needs one step of Newton's."""
-
-GROWTH = np.concatenate([[0.0], 0.02 * 2.0 ** np.arange(9)])
-"""Multiples of the first internal forces that are added where a load that grew leaves the friction cones."""
-
-BEYOND = 1.05
-"""Where no multiple reaches the cones, they are widened to this over the ratio needed; later ticks narrow them."""
-
-
-CROSS = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float)
-"""Rows of the matrices of the cross products with x, y and z, one a row."""
-
-FLAT = 1e-12
-"""Singular value of a grasp map, over its largest, below which forces cannot bear the load: contacts on one line."""
+"""Weight [N] of joint torques and normal forces near their limits, and the share of the limits where it begins."""
 
 
 class Balance(NamedTuple):
-    """How forces at contacts sum up: the grasp map, its pseudo-inverse, and k directions of forces that cancel."""
+    """The grasp map of contacts, its pseudo-inverse, and k directions of internal forces."""
 
     wrench: Float[Array, "6 n"]
     inverse: Float[Array, "n 6"]
@@ -52,13 +28,10 @@ class Balance(NamedTuple):
 
 
 def grasp_map(points: Float[Array, "f 3"]) -> Float[Array, "6 n"]:
-    """Return the map from forces at points [m], one after the other, to force and torque about their centre.
-
-    >>> grasp_map(np.eye(3)).shape
-    (6, 9)
-    """
+    """Return the map from the stacked forces at points [m] to force and torque about their centre."""
     count = len(points)
-    cross = ((points - points.sum(0) / count) @ CROSS).reshape(count, 3, 3)
+    cross = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float)
+    cross = ((points - points.sum(0) / count) @ cross).reshape(count, 3, 3)
     return np.concatenate([np.tile(np.eye(3), count), cross.transpose(1, 0, 2).reshape(3, -1)])
 
 
@@ -66,23 +39,20 @@ def balance(points: Float[Array, "f 3"]) -> Balance:
     """Return grasp map, its pseudo-inverse and its null space at points [m], by one decomposition."""
     wrench = grasp_map(points)
     left, values, right = np.linalg.svd(wrench)
-    inverse = np.where(values > FLAT * values[0], 1 / np.maximum(values, FLAT * values[0]), 0.0)
+    least = 1e-12 * values[0]  # contacts on one line have no greater singular value
+    inverse = np.where(values > least, 1 / np.maximum(values, least), 0.0)
     return Balance(wrench, (right[:6].T * inverse) @ left.T, right[6:].T)
 
 
 def friction_ratios(forces: Float[Array, "f 3"], normals: Float[Array, "f 3"]) -> Float[Array, "f"]:
-    """Return tangential over normal force, infinite where a finger does not press.
-
-    >>> friction_ratios(np.array([[0.5, 0.0, -1.0]]), np.array([[0.0, 0.0, 1.0]])).tolist()
-    [0.5]
-    """
+    """Return tangential over normal force, infinite where a finger does not press."""
     push = -(forces * normals).sum(-1)
     slide = np.linalg.norm(forces + push[:, None] * normals, axis=-1)
     return np.where(push > 0, slide / np.maximum(push, 1e-12), np.inf)
 
 
-class LeastForces(Part):
-    """Find least forces, each time from those found before.
+class LeastForces:
+    """A solver of the least forces that starts from the forces of its last call.
 
     Args:
         start: forces on the object to start from [N]; they press at every contact.
@@ -102,41 +72,43 @@ class LeastForces(Part):
         friction: float,
         floor: Float[Array, "f"],
     ) -> Float[Array, "f 3"]:
-        """Return forces [N] with the sum and torque of the load, inside cones of a friction, above the floors [N].
+        """Return forces [N] that carry the load, within the friction cones, with normal forces above the floors [N].
 
-        Where none are found, those of the least friction so far.
+        If the cones cannot be reached, they are widened to the least friction that was found.
         """
         count = len(normals)
         limits = np.concatenate([jacobian.reshape(3 * count, -1).T / self.effort[:, None], self._normal(normals)])
-        gap = GAP * (float(np.linalg.norm(load[:3])) + float(floor.sum()))
+        gap = 0.01 * (float(np.linalg.norm(load[:3])) + float(floor.sum()))  # distance from the cones beyond the noise
         barrier = _Barrier(contacts, normals, limits, load, gap)
-        tried = barrier.place(self.forces) + GROWTH[:, None] * barrier.place(self.start, 0.0)
+        growth = np.concatenate([[0.0], 0.02 * 2.0 ** np.arange(9)])  # added internal forces, if the load has grown
+        tried = barrier.place(self.forces) + growth[:, None] * barrier.place(self.start, 0.0)
         z = barrier.choose(tried, friction, floor)
-        for _ in range(STEPS if math.isfinite(barrier.slack) else 0):  # no cone holds a finger that does not press
+        lengths = 2.0 ** np.arange(8)  # multiples of a step that is safe for every self-concordant function
+        for _ in range(8 if math.isfinite(barrier.slack) else 0):  # no cone contains a finger that does not press
             step, decrement = barrier.newton(z)
-            trial = z + np.minimum(LENGTHS / (1 + decrement), 1.0)[:, None] * step
+            trial = z + np.minimum(lengths / (1 + decrement), 1.0)[:, None] * step
             value = barrier.value(trial)
             if not np.isfinite(value).any():
                 break
             z = trial[int(value.argmin())]
-            if decrement < NEAR:
+            if decrement < 0.3:
                 break
         self.forces = barrier.forces(z)
         return self.forces
 
     def share(self, normals: Float[Array, "f 3"], jacobian: Float[Array, "f 3 j"]) -> float:
-        """Return the largest of joint torques and normal forces, over its limit."""
+        """Return the largest ratio of a joint torque or normal force to its limit."""
         torque = np.abs(np.einsum("nij,ni->j", jacobian, self.forces)) / self.effort
         return max(float(torque.max()), float((-(self.forces * normals).sum(-1)).max()) / self.most)
 
     def _normal(self, normals: Float[Array, "f 3"]) -> Float[Array, "f n"]:
-        """Return the map from forces, one after the other, to normal forces over their limit."""
+        """Return the map from stacked forces to normal forces over their limit."""
         count = len(normals)
         return -(np.eye(count)[:, :, None] * normals / self.most).reshape(count, -1)
 
 
 class _Barrier:
-    """What is minimised, over the coordinates z of the k dimensions of forces that balance."""
+    """The objective, over k coordinates z of the forces that balance the load."""
 
     def __init__(
         self,
@@ -155,7 +127,7 @@ class _Barrier:
         self.push_0 = -(normals * self.carried.reshape(self.count, 3)).sum(-1)
 
     def place(self, forces: Float[Array, "f 3"], share: float = 1.0) -> Float[Array, " k"]:
-        """Return the coordinates of the forces nearest to given ones, less a share of those that carry the load."""
+        """Return the coordinates nearest to given forces, less a share of the forces that carry the load."""
         return self.basis.T @ (forces.ravel() - share * self.carried)
 
     def forces(self, z: Float[Array, "*g k"]) -> Float[Array, "*g f 3"]:
@@ -163,19 +135,19 @@ class _Barrier:
         return (self.carried + z @ self.basis.T).reshape(*z.shape[:-1], self.count, 3)
 
     def choose(self, tried: Float[Array, "g k"], friction: float, floor: Float[Array, "f"]) -> Float[Array, " k"]:
-        """Return the best of several starts, having widened the cones and lowered the floors for it as needed."""
+        """Return the best of several starts; widen the cones and lower the floors as it needs."""
         push, forces = tried @ self.push.T + self.push_0, self.forces(tried)
         across = np.sqrt(((forces**2).sum(-1) - push**2).clip(min=0.0))
         ratio = np.where(push > 0, across / np.maximum(push, 1e-12), np.inf).max(-1)
         above = (push > floor).all(-1)
         self.floor = floor if above.any() else np.minimum(floor, 0.5 * push[-1]).clip(min=0.0)
         ratio = np.where(above if above.any() else np.arange(len(tried)) == len(tried) - 1, ratio, np.inf)
-        self.slack = 1.0 + max(friction, BEYOND * float(ratio.min()) if ratio.min() >= friction else 0.0) ** 2
+        self.slack = 1.0 + max(friction, 1.05 * float(ratio.min()) if ratio.min() >= friction else 0.0) ** 2
         value = self.value(tried)
         return tried[int((value if np.isfinite(value).any() else ratio).argmin())]
 
     def value(self, z: Float[Array, "g k"]) -> Float[Array, " g"]:
-        """Return what is minimised, infinite outside."""
+        """Return the objective; infinite outside of the cones."""
         n, t = z @ self.push.T + self.push_0, z @ self.tau.T + self.tau_0
         cone = self.slack * n * n - (self.forces(z) ** 2).sum(-1)
         inside = ((cone > 0) & (n > self.floor)).all(-1)

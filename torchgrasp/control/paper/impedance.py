@@ -16,13 +16,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.checks import checked
-from torchgrasp.control.adaptive.stability import StabilityModel, lengths_of, state_of
-from torchgrasp.control.closing_law import damped_inverse
-from torchgrasp.control.holding.force import RAMP, held_forces, regulate
+from torchgrasp.control.paper.stability import StabilityModel, lengths_of, state_of
+from torchgrasp.control.law import damped_inverse
+from torchgrasp.control.forces import actuated_stiffness
+from torchgrasp.control.holding import RAMP, held_forces, regulate
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
-from torchgrasp.control.state import Part
-from torchgrasp.control.stiffness import actuated_stiffness
 from torchgrasp.control.tactile import low_pass
 from torchgrasp.geometry.frames import degenerate, rigid, skew, virtual_frame
 from torchgrasp.plan.internal_forces import internal_forces
@@ -97,7 +96,7 @@ def side_lengths(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
     return torch.linalg.vector_norm(points.roll(-1, dims=-2) - points, dim=-1)
 
 
-class Impedance(Part):
+class Impedance:
     """Hold the object as a spring in the hand, by joint targets q + J^T f / kp.
 
     At rest the forces are the desired ones, balanced at the sensed contacts. Joint motions that move no fingertip are

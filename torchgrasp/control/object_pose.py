@@ -1,0 +1,184 @@
+"""The object-pose estimate from touches: by how much the object is displaced from where the grasp was planned.
+
+`ContactPlanes` serves while the fingers close: it knows the tangent plane of each contact. `Localization` serves a hand
+that stands still: it compares touched points and normals with the estimated surface (tactile localization), so that it
+also finds displacements along the object's own surface.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.control.observation import Observation
+from torchgrasp.control.reference import ClosingReference
+from torchgrasp.geometry.frames import apply, rotation_from_vector
+from torchgrasp.geometry.linalg import unit
+
+TURNS, FINE_TURNS = (-0.24, -0.12, 0.0, 0.12, 0.24), (-0.06, 0.0, 0.06)
+"""Turns [rad] of the object that `Localization` tries, and turns about the best of them."""
+
+PITCH = 0.004
+"""Distance [m] between the displacements that `Localization` tries."""
+
+SURFACE_STD = 0.004
+"""Standard deviation [m] of a touched point's distance from the estimated surface."""
+
+
+class ContactPlanes:
+    """The displacement of the object, from the tangent planes of its contacts, in the frame of the undisplaced hand.
+
+    A fingertip that touches measures the offset of its plane, with the variance of the shape (Sigma_cov). A fingertip
+    that is beyond its plane without a touch bounds the offset. The estimate is the likeliest displacement, given a
+    Gaussian prior.
+
+    Args:
+        reference: contacts of the closing.
+        expected: mean [m, rad] of the prior; None: the object is where it was seen.
+    """
+
+    def __init__(self, reference: ClosingReference, expected: Float[Tensor, "6"] | None = None) -> None:
+        gains, normals = reference.gains, reference.normals
+        self.target, self.normals, self.alive = gains.target, normals, reference.alive
+        self.arms = gains.target - gains.target.mean(0)
+        self.rows = torch.cat([normals, torch.linalg.cross(self.arms, normals)], -1)
+        self.weight = 1 / torch.einsum("fi,fij,fj->f", normals, gains.covariance, normals)
+        self.prior = _prior(reference)
+        self.expected = torch.zeros_like(self.prior[0]) if expected is None else expected
+
+    def displacement(self, points: Float[Tensor, "f 3"], touching: Bool[Tensor, "f"]) -> Float[Tensor, "6"]:
+        """Return the likeliest displacement of the contacts' centre [m] and rotation about it [rad].
+
+        Args:
+            points: points [m] of the fingertips that touch first.
+            touching: fingertips that touch.
+        """
+        off = ((points - self.target) * self.normals).sum(-1)
+        beyond = (off - self.rows @ self.expected).clamp_min(-0.025)  # a finger farther on has missed the object
+        touching = touching & self.alive
+        active, found = touching, self.expected
+        for _ in range(len(off)):
+            weight = self.weight * active
+            found = self.expected + torch.linalg.solve(
+                self.prior + self.rows.T @ (weight[:, None] * self.rows), self.rows.T @ (weight * beyond)
+            )
+            missed = touching | active | (self.alive & (off < self.rows @ found))
+            if torch.equal(missed, active):
+                break
+            active = missed
+        return found
+
+    def moved(self, displacement: Float[Tensor, "6"]) -> Float[Tensor, "f 3"]:
+        """Return the contacts of the displaced object [m]."""
+        shift, turn = displacement[:3], displacement[3:]
+        return self.target + shift + torch.linalg.cross(turn.expand_as(self.arms), self.arms)
+
+
+def _prior(reference: ClosingReference) -> Float[Tensor, "6 6"]:
+    """Return the inverse covariance of displacements: an object on a table moves along it and turns about its normal."""
+    shift_std, height_std, turn_std, tilt_std = 0.01, 0.001, 0.09, 0.01  # [m, m, rad, rad]
+    eye = torch.eye(3, dtype=reference.normals.dtype)
+    place, turn = eye / shift_std**2, eye / turn_std**2
+    if reference.table is not None:
+        up = unit(reference.table.normal)
+        across = up[:, None] * up
+        place = place + across * (height_std**-2 - shift_std**-2)
+        turn = eye / tilt_std**2 + across * (turn_std**-2 - tilt_std**-2)
+    return torch.block_diag(place, turn)
+
+
+class Touches:
+    """Averages of the contacts of a hand that stands still, in the frame of the undisplaced hand.
+
+    `known` are fingertips with a working sensor, `felt` those that reported the place of a contact.
+    """
+
+    def __init__(self, reference: ClosingReference) -> None:
+        self.points, self.normals = torch.zeros(2, *reference.normals.shape, dtype=torch.float64)
+        self.count = torch.zeros(len(reference.normals), dtype=torch.int64)
+        self.tips, self.known = reference.gains.target, reference.alive
+        self.contact = torch.zeros_like(self.known)
+
+    def add(self, observation: Observation, palm: Float[Tensor, "3"]) -> None:
+        """Add one observation to the averages; `palm` is the displacement [m] of the palm."""
+        sensed = observation.tactile
+        placed = torch.isfinite(sensed.points).all(-1) & torch.isfinite(sensed.normals).all(-1) & sensed.contact
+        self.points = self.points + torch.where(placed[:, None], sensed.points + palm, 0.0)
+        self.normals = self.normals + torch.where(placed[:, None], sensed.normals, 0.0)
+        self.count = self.count + placed
+        self.tips, self.contact = observation.tips + palm, sensed.contact
+
+    @property
+    def felt(self) -> Bool[Tensor, "f"]:
+        """Fingertips that still touch and reported the place of their contact."""
+        return self.contact & (self.count > 0)
+
+    def means(self) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
+        """Return mean points [m] and normals of the contacts; zero where nothing was felt."""
+        return self.points / self.count.clamp_min(1)[:, None], unit(self.normals)
+
+
+class Localization:
+    """A search for the displacement at which the touches fit the estimated surface best; each call tries one turn.
+
+    `displacement` is the motion of the contacts' centre [m] and the rotation about it [rad], as of `ContactPlanes`.
+    """
+
+    def __init__(self, reference: ClosingReference) -> None:
+        assert reference.surface is not None and reference.table is not None
+        self.surface, self.obj_from_hand = reference.surface, reference.obj_from_hand.double()
+        self.center, self.radius = reference.gains.target.mean(0), reference.hand.tips.radius.double()
+        self.up = unit(reference.table.normal.double())
+        across = torch.eye(3, dtype=torch.float64)[int(self.up.abs().argmin())]
+        first = unit(torch.linalg.cross(self.up, across))
+        self.axes = torch.stack([first, torch.linalg.cross(self.up, first)])
+        self.step, self.cost = 0, torch.inf
+        self.shift, self.turn = torch.zeros(2, dtype=torch.float64), 0.0
+        self.coarse = self.shift, self.turn
+
+    @property
+    def done(self) -> bool:
+        """Whether all turns were tried."""
+        return self.step >= len(TURNS) + len(FINE_TURNS)
+
+    @property
+    def displacement(self) -> Float[Tensor, "6"]:
+        """The best displacement so far [m, rad]."""
+        return torch.cat([self.shift @ self.axes, self.turn * self.up])
+
+    def __call__(self, touches: Touches) -> None:
+        """Try one turn; the last calls try turns and displacements close to the best."""
+        if self.step < len(TURNS):
+            shifts, turn = _square(0.032, PITCH), TURNS[self.step]
+        else:
+            if self.step == len(TURNS):
+                self.coarse = self.shift, self.turn
+            middle, facing = self.coarse
+            fine = PITCH / 4
+            shifts, turn = middle + _square(PITCH - fine, fine), facing + FINE_TURNS[self.step - len(TURNS)]
+        costs = self._costs(touches, shifts, turn)
+        best = int(costs.argmin())
+        if float(costs[best]) < self.cost:
+            self.cost, self.shift, self.turn = float(costs[best]), shifts[best].clone(), turn
+        self.step += 1
+
+    def _costs(self, touches: Touches, shifts: Float[Tensor, "m 2"], turn: float) -> Float[Tensor, "m"]:
+        """Return the negative logarithms of the likelihoods of displacements."""
+        normal_std, shift_std, turn_std = 0.3, 0.02, 0.15  # [1, m, rad]
+        gap, worst = 0.001, 20.0  # least distance [m] of a tip in the air; bound on the cost of one tip
+        felt, (points, normals) = touches.felt, touches.means()
+        rotation = rotation_from_vector(turn * self.up)
+        there = torch.where(felt[:, None], points, touches.tips) - self.center
+        before = (there - (shifts @ self.axes)[:, None]) @ rotation + self.center
+        distance, gradient = self.surface.query(apply(self.obj_from_hand, before))
+        outward = unit(gradient @ self.obj_from_hand[:3, :3] @ rotation.T)
+        place = (distance / SURFACE_STD).square().clamp_max(2 * worst)
+        facing = ((outward - normals) / normal_std).square().sum(-1)
+        inside = ((self.radius + gap - distance).clamp_min(0.0) / SURFACE_STD).square().clamp_max(2 * worst)
+        fit = torch.where(felt, place + facing, torch.where(touches.contact | ~touches.known, 0.0, inside)).sum(-1)
+        return 0.5 * (fit + (shifts / shift_std).square().sum(-1) + (turn / turn_std) ** 2)
+
+
+def _square(half: float, pitch: float) -> Float[Tensor, "m 2"]:
+    """Return points of a square grid from -half to half along both axes."""
+    line = torch.arange(-round(half / pitch), round(half / pitch) + 1, dtype=torch.float64) * pitch
+    return torch.cartesian_prod(line, line)

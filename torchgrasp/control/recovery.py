@@ -1,0 +1,207 @@
+"""Recovery from a wrong object pose: the guarded approach stops at a touch, and the regrasp closes a second time.
+
+Both locate the object from touches (`Localization`) and move the palm to it.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.control.object_pose import Localization, Touches
+from torchgrasp.control.observation import STILL, Observation
+from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.uncertainty_closing import PALM_SPEED
+from torchgrasp.geometry.linalg import limit_norm, unit
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.plan.internal_forces import least_friction_forces, tangential_ratio
+from torchgrasp.specs import ClosingOptions
+
+SPEED, CAREFUL_SPEED, ACCELERATION = 0.2, 0.08, 1.0
+"""Largest speed [m/s] of the approach, largest speed [m/s] after a touch, and acceleration [m/s^2]."""
+
+BACK = 0.02
+"""Distance [m] that the hand draws back after a touch."""
+
+FEELING = 0.06
+"""Time [s] for which the approaching hand averages a touch."""
+
+PRESSING_TIME = 0.5
+"""Time [s] from the end of closing until the hand counts as closed, and is judged."""
+
+MAX_FRICTION = 0.6
+"""Largest ratio of tangential to normal force at which a grasp is lifted."""
+
+MISPLACED = 0.008
+"""Distance [m] between object and palm from which the hand closes again: twice the error of `Localization`."""
+
+OPENING_TIME = 0.5
+"""Time [s] in which the fingers open."""
+
+
+def can_guard(reference: ClosingReference) -> bool:
+    """Return whether touches during the approach locate the object: by their places, table and surface."""
+    known = reference.approach is not None and reference.table is not None and reference.surface is not None
+    return known and reference.sensor.kind == "tactile"
+
+
+class GuardedApproach:
+    """A guarded move of the opened hand to its pre-grasp: it stops when a fingertip touches.
+
+    The hand averages the touch, locates the object, draws back, displaces its palm and goes on. After the last allowed
+    stop the hand goes on regardless of touches.
+
+    `left` [m] is the remaining approach, `palm` [m] the displacement of the palm, `stops` the number of stops, and
+    `displacement` [m, rad] the object's, as the last touch located it.
+
+    Args:
+        reference: plan of a closing for which `can_guard` holds.
+        options: how often the hand stops, and how far its palm moves.
+        length: length [m] of the approach.
+    """
+
+    def __init__(self, reference: ClosingReference, options: ClosingOptions, length: float) -> None:
+        assert reference.approach is not None
+        self.reference, self.options, self.length, self.direction = reference, options, length, reference.approach
+        self.left, self.speed, self.retreat, self.stops = length, 0.0, 0.0, 0
+        self.palm, self.goal, self.displacement = STILL, STILL, torch.zeros(6, dtype=torch.float64)
+        self.time, self.feeling = 0.0, False
+        self.touches, self.search = Touches(reference), Localization(reference)
+
+    @property
+    def done(self) -> bool:
+        """Whether the hand is at its pre-grasp."""
+        return self.left <= 0.0
+
+    def __call__(self, observation: Observation, period: float) -> None:
+        """Update `left` and `palm` for the next tick."""
+        if self.feeling:
+            self._feel(observation, period)
+        elif self.left < self.retreat:
+            self.speed = min(self.speed + ACCELERATION * period, SPEED)
+            self.left = min(self.left + self.speed * period, self.retreat)
+            if self.left >= self.retreat:
+                self.speed = self.retreat = 0.0
+        elif not torch.equal(self.palm, self.goal):
+            self.palm = next_palm(self.palm, self.goal, period)
+        elif self.stops < self.options.stops and bool(observation.tactile.contact.any()):
+            self.speed, self.time, self.feeling = 0.0, 0.0, True
+            self.touches, self.search = Touches(self.reference), Localization(self.reference)
+        else:
+            braking = math.sqrt(2 * ACCELERATION * self.left)  # the speed from which the hand just stops in time
+            fastest = CAREFUL_SPEED if self.stops else SPEED
+            self.speed = min(self.speed + ACCELERATION * period, fastest, max(braking, ACCELERATION * period))
+            self.left = max(self.left - self.speed * period, 0.0)
+
+    def _feel(self, observation: Observation, period: float) -> None:
+        """Average the touch, then locate the object; finally choose where the palm goes."""
+        if self.time < FEELING:
+            self.time += period
+            self.touches.add(observation, self.palm - self.left * self.direction)
+        elif not self.search.done and bool(self.touches.felt.any()):
+            self.search(self.touches)
+        else:
+            self.feeling, self.stops = False, self.stops + 1
+            if self.search.done:
+                self.displacement = self.search.displacement
+                self.goal = palm_goal(self.displacement[:3], self.reference.table, self.options.palm_reach)
+            self.retreat = min(self.left + BACK, self.length)
+
+
+class GraspCheck:
+    """The judgement of a pressing hand: `judged` tells whether it is made, `secure` whether the hand may be lifted.
+
+    `displacement` [m, rad] is the object's. Without an estimated surface it stays the closing's.
+
+    Args:
+        reference: plan of the closing.
+        displacement: displacement of the object [m, rad] that the closing estimated.
+        palm: displacement of the palm [m].
+        last: whether no attempt is left; then every grasp counts as secure.
+    """
+
+    def __init__(
+        self, reference: ClosingReference, displacement: Float[Tensor, "6"], palm: Float[Tensor, "3"], last: bool
+    ) -> None:
+        self.palm, self.displacement = palm, displacement
+        self.touches = Touches(reference)
+        self.search = None if reference.surface is None or reference.table is None else Localization(reference)
+        self.judged = self.secure = last
+
+    def __call__(self, observation: Observation, pressed: float) -> None:
+        """Average the contacts, locate the object, and judge once the hand has `pressed` [s] long enough."""
+        if self.judged or pressed < 0.1:
+            return
+        if pressed < 0.3:
+            self.touches.add(observation, self.palm)
+        elif self.search is not None and not self.search.done and bool(self.touches.felt.any()):
+            self.search(self.touches)
+            self.displacement = self.search.displacement
+        elif pressed >= PRESSING_TIME - 1e-9:
+            self.touches.contact = observation.tactile.contact
+            self.judged, self.secure = True, self._is_secure()
+
+    def _is_secure(self) -> bool:
+        """Return whether all fingers touch, their forces balance within friction, and the object is at the palm."""
+        touches = self.touches
+        if not bool((touches.contact | ~touches.known).all()):
+            return False
+        if float(torch.linalg.vector_norm(self.displacement[:3] - self.palm)) > MISPLACED:
+            return False
+        if not bool(touches.felt.all()):
+            return True  # without all places of contacts the forces cannot be judged
+        points, normals = touches.means()
+        ratio = tangential_ratio(least_friction_forces(points, normals), normals)
+        return bool((ratio <= MAX_FRICTION).all())  # false for NaN, where no forces balance
+
+
+class Reopening:
+    """Open the hand and move its palm to the object; `done` when the hand may close again.
+
+    Args:
+        reference: plan of the closing.
+        displacement: displacement of the object [m, rad].
+        joints: present targets of all joints [rad].
+        palm: present displacement of the palm [m].
+        reach: farthest displacement of the palm [m]; 0: the arm does not yield.
+    """
+
+    def __init__(
+        self,
+        reference: ClosingReference,
+        displacement: Float[Tensor, "6"],
+        joints: Float[Tensor, " j"],
+        palm: Float[Tensor, "3"],
+        reach: float,
+    ) -> None:
+        self.displacement, self.start, self.opened = displacement, joints, reference.expand(reference.pregrasp)
+        self.palm, self.time = palm, 0.0
+        self.goal = palm_goal(displacement[:3], reference.table, reach) if reach else palm
+
+    @property
+    def done(self) -> bool:
+        """Whether the hand is open and has come to rest."""
+        return self.time >= OPENING_TIME + 0.1
+
+    def __call__(self, period: float) -> Float[Tensor, " j"]:
+        """Return the targets of all joints for the next tick: first the fingers open, then the palm moves."""
+        if self.time >= OPENING_TIME and not torch.equal(self.palm, self.goal):
+            self.palm = next_palm(self.palm, self.goal, period)
+        else:
+            self.time += period
+        return torch.lerp(self.start, self.opened, min(self.time / OPENING_TIME, 1.0))
+
+
+def palm_goal(shift: Float[Tensor, "3"], table: Plane | None, reach: float) -> Float[Tensor, "3"]:
+    """Return where a palm follows an object displaced by `shift`: along the table, at most `reach` [m] away."""
+    if table is not None:
+        up = unit(table.normal)
+        shift = shift - (shift @ up) * up
+    return limit_norm(shift, reach)
+
+
+def next_palm(palm: Float[Tensor, "3"], goal: Float[Tensor, "3"], period: float) -> Float[Tensor, "3"]:
+    """Return the displacement of a palm [m] a period [s] later, on its straight way to a goal."""
+    way, longest = goal - palm, PALM_SPEED * period
+    return goal if float(torch.linalg.vector_norm(way)) <= longest else palm + limit_norm(way, longest)

@@ -1,1 +1,0 @@
-"""A hand that touches something on its way, or closed in vain, finds the object and goes there. Not public."""

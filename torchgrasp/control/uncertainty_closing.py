@@ -1,0 +1,163 @@
+"""The default closing: the paper's control law (Eqs. 25-28), extended where the object is not where it was seen."""
+
+import dataclasses
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.control.law import POSITION_FLOOR, POSITION_RATE, blend, stay_above, tip_velocity
+from torchgrasp.control.object_pose import ContactPlanes
+from torchgrasp.control.observation import STILL, Observation
+from torchgrasp.control.paper.closings import SETTLED, Settled, strongest_lead
+from torchgrasp.control.reference import ClosingReference, next_target
+from torchgrasp.control.sensing import WAITING_FORCE, DriveFeel
+from torchgrasp.geometry.linalg import limit_norm
+from torchgrasp.specs import ClosingOptions
+
+PATIENCE = 2.5
+"""Longest time [s] from the first touch until the closing ends, even if some finger has not touched."""
+
+QUICK_TOUCH = 0.45
+"""Reading [N] of a tactile fingertip that counts as a touch before the contact flag turns on."""
+
+PALM_SPEED = 0.04
+"""Largest speed [m/s] of the palm that follows the object."""
+
+STALLED = 0.25
+"""Force [N] of its drives at which a finger without a sensor counts as touching."""
+
+LEAD = 0.04
+"""Largest lead [rad] of a waiting finger's target over its joint: it bounds the force of a link that is blocked."""
+
+
+class UncertaintyClosing:
+    """Close under the paper's control law, with these extensions:
+
+    * A finger in the air searches along its contact's normal, even beyond the contact, but not below the table. A
+      finger that touches is force-controlled, whatever its position error.
+    * Before the first touch the fingers keep pace: all reach their contacts at the same time.
+    * A finger without a working sensor rests at its estimated contact until the others touch. Then it searches until
+      its drives feel a contact, or until it is three standard deviations beyond the contact.
+    * The components of `ClosingOptions` that act while the fingers close: `wait`, `pose_estimate` and `palm_reach`.
+
+    Args:
+        reference: contacts, gains and sensors.
+        options: components of the closing.
+    """
+
+    def __init__(self, reference: ClosingReference, options: ClosingOptions) -> None:
+        self.reference, self.waits, self.reach = reference, options.wait, options.palm_reach
+        self.planes = ContactPlanes(reference) if options.pose_estimate else None
+        self.palm, self.displacement = STILL, torch.zeros(6, dtype=torch.float64)  # of palm [m] and object [m, rad]
+        self.touched = torch.zeros_like(reference.normals[:, 0], dtype=torch.bool)
+        self.alive, self.quick = reference.alive, reference.sensor.kind == "tactile" and reference.sensor.noise <= 1.0
+        self.drives = None if bool(self.alive.all()) else DriveFeel(reference)
+        self.strongest, self.target = strongest_lead(reference), reference.pregrasp
+        self.share = torch.zeros_like(reference.normals[:, 0])
+        self.waiting, self.settled = 0.0, Settled(reference)
+
+    @property
+    def done(self) -> bool:
+        """Whether the closing has ended."""
+        return self.settled.time >= SETTLED or (self.waits and self.waiting >= PATIENCE)
+
+    def begin_at(self, displacement: Float[Tensor, "6"], palm: Float[Tensor, "3"]) -> "UncertaintyClosing":
+        """Start with a displaced palm [m], and expect the object displaced [m, rad] from where it was seen."""
+        self.planes, self.palm = ContactPlanes(self.reference, displacement), palm
+        self.displacement = displacement
+        return self
+
+    def press(self) -> "UncertaintyClosing":
+        """Let waiting fingers press with their desired forces, and keep the palm where it is."""
+        self.waits, self.reach = False, 0.0
+        return self
+
+    def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
+        """Return the targets of all joints for the next tick."""
+        reference, gains, normals = self.reference, self.reference.gains, self.reference.normals
+        contact, reading = observation.tactile.contact, observation.tactile.reading
+        tips = observation.tips + self.palm
+        if self.waits:
+            contact = self.touched | contact | (reading >= QUICK_TOUCH if self.quick else contact)
+        points = reference.contact_points(tips)
+        planned, drift = self._follow(points, contact)
+        error = planned - points
+        ahead = -(error * normals).sum(-1)  # how far [m] each planned contact still lies ahead of its fingertip
+        touches, rests = self._without_sensor(observation, ahead, contact, period)
+        contact = contact | touches
+        if self.waits:
+            self.touched = self.touched | contact
+            contact = self.touched
+        error = error + ahead.clamp_max(0.0)[:, None] * normals
+        share = torch.where(contact | rests, 1.0, blend(error, gains.covariance))
+        self._count(observation, contact, share, period)
+        desired = self._desired(reading, contact, rests)
+        force_error = -(desired - reading)[:, None] * normals
+        velocity = tip_velocity(error, force_error, share, gains.position_gain, gains.force_gain)
+        if not bool(contact.any()):
+            left = ahead.clamp_min(0.0) + POSITION_FLOOR
+            velocity = velocity * (left / left.max())[:, None]
+        if reference.table is not None:
+            height = reference.table.height(tips) - reference.hand.tips.radius
+            velocity = stay_above(velocity, height, reference.table.normal)
+        self.palm = self.palm + period * drift
+        lead = LEAD * (1 + self.waiting / 0.25) if self.waits else self.strongest  # grows while others are awaited
+        self.target = next_target(reference, self.target, velocity - drift, observation, lead, period)
+        return reference.expand(self.target)
+
+    def _follow(self, points: Float[Tensor, "f 3"], contact: Bool[Tensor, "f"]) -> tuple[Tensor, Tensor]:
+        """Return the contacts [m] of the estimated object (f, 3), and the velocity [m/s] of the palm that follows it."""
+        if self.planes is None:
+            return self.reference.gains.target, STILL
+        self.displacement = self.planes.displacement(points, contact)
+        drift = STILL
+        if self.reach:
+            goal = limit_norm(self.displacement[:3], self.reach)
+            drift = limit_norm(6.0 * (goal - self.palm), PALM_SPEED)
+        return self.planes.moved(self.displacement), drift
+
+    def _without_sensor(
+        self, observation: Observation, ahead: Float[Tensor, "f"], contact: Bool[Tensor, "f"], period: float
+    ) -> tuple[Bool[Tensor, "f"], Bool[Tensor, "f"]]:
+        """Return which fingers without a sensor probably touch, and which rest until the others touch."""
+        blind = ~self.alive
+        if self.drives is None:
+            return blind, blind
+        normals, covariance = self.reference.normals, self.reference.gains.covariance
+        deviation = torch.einsum("fi,fij,fj->f", normals, covariance, normals).sqrt()
+        pushes = self.drives(observation, self.reference.expand(self.target), period)
+        touches = blind & ((pushes >= STALLED) | (ahead <= -3.0 * deviation))
+        others = bool((contact | blind).all())
+        return touches, blind & (ahead <= 0.0) & (not others)
+
+    def _desired(
+        self, reading: Float[Tensor, "f"], contact: Bool[Tensor, "f"], rests: Bool[Tensor, "f"]
+    ) -> Float[Tensor, "f"]:
+        """Return the desired normal forces [N]; fingers without a sensor get their reading: no force error."""
+        desired = -(self.reference.gains.desired_force * self.reference.normals).sum(-1)
+        if self.waits:
+            rest = WAITING_FORCE if bool(contact.all()) else reading.clamp_max(WAITING_FORCE)
+            desired = torch.where(contact, rest, desired)
+        return torch.where(~self.alive & (contact | rests), reading, desired)
+
+    def _count(
+        self, observation: Observation, touched: Bool[Tensor, "f"], share: Float[Tensor, "f"], period: float
+    ) -> None:
+        """Count the time since the first touch, and the time for which the fingers have settled."""
+        self.share = share
+        self.waiting = self.waiting + period if bool(touched.any()) else 0.0
+        touching = observation.tactile.contact | (touched & ~self.alive)
+        self.settled.update(observation, touching, share, period, pressing=not self.waits)
+
+
+def with_equal_gains(reference: ClosingReference) -> ClosingReference:
+    """Return a reference with equal gains for every contact and direction: the closing "fixed" ignores uncertainty."""
+    gains = reference.gains
+    isotropic = dataclasses.replace(
+        gains,
+        covariance=POSITION_FLOOR**2 * torch.eye(3, dtype=gains.covariance.dtype).expand_as(gains.covariance),
+        position_gain=torch.full_like(gains.position_gain, POSITION_RATE),
+        force_gain=gains.force_gain.amax(-1, keepdim=True).expand_as(gains.force_gain),
+    )
+    return dataclasses.replace(reference, gains=isotropic)
