@@ -6,7 +6,7 @@ import torch
 
 from torchgrasp.closure import ClosingGains
 from torchgrasp.control import ClosingReference, Observation, no_contact
-from torchgrasp.control.closing_law import surface_covariance
+from torchgrasp.control.law import surface_covariance
 from torchgrasp.hand.fingers import ActuatedJoints
 from torchgrasp.hand.load import load_hand
 

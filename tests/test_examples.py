@@ -14,7 +14,6 @@ SHOWN_BY = {
     "torchgrasp.closure.ClosingTrace": "torchgrasp.evaluation.lift.close_hand",
     "torchgrasp.closure.ClosureResult": "torchgrasp.evaluation.lift.close_hand",
     "torchgrasp.closure.Disturbance": "torchgrasp.evaluation.lift.close_hand",
-    "torchgrasp.control.log.ControlLog": "torchgrasp.control.log.load_control_log",
     "torchgrasp.data.reader.GraspShards": "torchgrasp.data.reader.read_shards",
     "torchgrasp.data.reader.ShardJob": "torchgrasp.data.reader.read_shards",
     "torchgrasp.hand.urdf.Joint": "torchgrasp.hand.urdf.read_urdf",

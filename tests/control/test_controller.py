@@ -6,28 +6,20 @@ import pytest
 import torch
 
 from tests.point_fingers import FREE, GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
-from torchgrasp.control.closing import (
-    AIM_DEPTH,
-    FELT,
-    LEAD,
-    PATIENCE,
-    POSE_TIME,
-    SETTLED,
-    STOP_FORCE,
-    WAITING_FORCE,
-    FixedGainClosing,
-    LawClosing,
-    PositionClosing,
-)
-from torchgrasp.control.closing_law import MAX_SPEED, POSITION_FLOOR, POSITION_RATE
-from torchgrasp.control.controller import CLOSING_TIME, PRESSING_TIME, GraspController
-from torchgrasp.control.holding.force import RAMP, ForceHold, held_forces
+from torchgrasp.control.controller import CLOSING_TIME, GraspController
+from torchgrasp.control.holding import RAMP, ForceHold, held_forces
+from torchgrasp.control.law import MAX_SPEED, POSITION_FLOOR, POSITION_RATE
 from torchgrasp.control.observation import Observation
+from torchgrasp.control.paper.closings import POSE_TIME, SETTLED, STOP_FORCE, PositionClosing
+from torchgrasp.control.recovery import PRESSING_TIME
+from torchgrasp.control.sensing import WAITING_FORCE
+from torchgrasp.control.uncertainty_closing import LEAD, PATIENCE, QUICK_TOUCH, UncertaintyClosing, with_equal_gains
 from torchgrasp.errors import BadArgument
+from torchgrasp.specs import ClosingOptions
 
 
 def test_eq25_free_fingers_approach_their_contacts():
-    step = LawClosing(reference())(observation(), PERIOD).reshape(3, 3)
+    step = UncertaintyClosing(reference(), ClosingOptions())(observation(), PERIOD).reshape(3, 3)
     assert ((step * NORMALS).sum(-1) < 0).all()
     assert step.norm(dim=-1).max() <= MAX_SPEED * PERIOD + 1e-12
     assert step[:, 1:].abs().max() < 1e-9
@@ -35,34 +27,34 @@ def test_eq25_free_fingers_approach_their_contacts():
 
 def test_a_finger_that_has_touched_rests_and_gives_way_to_more_than_the_waiting_force():
     one = torch.tensor([True, False, False])
-    law = LawClosing(reference(), without=("palm",))
+    law = UncertaintyClosing(reference(), ClosingOptions(palm_reach=0.0, stops=0))
     for reading in (WAITING_FORCE, 0.1, 0.0, -0.1):
         step = law(observation(0.02, (reading, 0, 0), one), PERIOD).reshape(3, 3)
         assert step[0].abs().max() < 1e-12
         one = FREE  # it stays where it touched once
     step = law(observation(0.02, (1.0, 0, 0)), PERIOD).reshape(3, 3)
     assert float((step[0] * NORMALS[0]).sum()) > 0
-    last = law(observation(0.02, (0.0, FELT, FELT)), PERIOD).reshape(3, 3)
+    last = law(observation(0.02, (0.0, QUICK_TOUCH, QUICK_TOUCH)), PERIOD).reshape(3, 3)
     assert float((last[0] * NORMALS[0]).sum()) < float((step[0] * NORMALS[0]).sum())  # all have: now all press
 
 
 def test_closing_ends_when_all_touch_or_patience_is_over():
-    controller = LawClosing(reference())
+    controller = UncertaintyClosing(reference(), ClosingOptions())
     for contact, wait in ((TOUCHING, SETTLED), (torch.tensor([True, False, False]), PATIENCE)):
-        controller = LawClosing(reference())
+        controller = UncertaintyClosing(reference(), ClosingOptions())
         ticks = 0
         while not controller.done:
             controller(observation(contact=contact), PERIOD)
             ticks += 1
         assert ticks * PERIOD == pytest.approx(wait, abs=1.5 * PERIOD)
-    controller = LawClosing(reference())
+    controller = UncertaintyClosing(reference(), ClosingOptions())
     for _ in range(300):
         controller(observation(), PERIOD)
     assert not controller.done
 
 
 def test_targets_stay_within_limits_and_near_the_joints():
-    controller = LawClosing(reference())
+    controller = UncertaintyClosing(reference(), ClosingOptions())
     for _ in range(500):
         targets = controller(observation(0.5), PERIOD)
     assert targets.abs().max() == pytest.approx(LEAD)
@@ -82,7 +74,7 @@ def test_the_baseline_stops_each_finger_by_itself_and_for_good():
     assert not controller.done
     controller(observation(), PERIOD)  # at the planned contacts nothing is felt: it goes on
     assert not controller.done
-    controller(observation(0.0005 - AIM_DEPTH), PERIOD)
+    controller(observation(0.0005 - 0.02), PERIOD)
     assert controller.done
 
 
@@ -169,7 +161,7 @@ def test_the_first_targets_are_the_opened_hand_and_unknown_names_are_refused():
 
 def test_fixed_gains_know_nothing_of_the_surface():
     """Eq. 27 without uncertainty: each contact and each direction has the rate of the floor alone."""
-    gains = FixedGainClosing(reference()).reference.gains
+    gains = with_equal_gains(reference()).gains
     assert torch.allclose(gains.position_gain, real(POSITION_RATE))
     assert torch.allclose(gains.covariance, POSITION_FLOOR**2 * torch.eye(3).double())
     assert (gains.force_gain == gains.force_gain[:, :1]).all()
@@ -179,7 +171,7 @@ def test_fixed_gains_know_nothing_of_the_surface():
 def test_fingers_in_the_air_arrive_together():
     seen = observation(0.2)
     near = dataclasses.replace(seen, tips=TARGET + 0.01 * NORMALS + real([[0.2], [0.1], [0.2]]) * NORMALS)
-    step = LawClosing(reference())(near, PERIOD).reshape(3, 3)
+    step = UncertaintyClosing(reference(), ClosingOptions())(near, PERIOD).reshape(3, 3)
     speed = -(step * NORMALS).sum(-1)
     assert float(speed[1] / speed[0]) == pytest.approx((0.1 + POSITION_FLOOR) / (0.2 + POSITION_FLOOR), rel=1e-3)
     assert float(speed[2]) == pytest.approx(float(speed[0]))
@@ -188,7 +180,7 @@ def test_fingers_in_the_air_arrive_together():
 def test_a_late_finger_searches_on_beyond_its_planned_contact_and_presses_harder():
     two = torch.tensor([True, True, False])
     seen = observation(-0.03, (0.3, 0.3, 0.0), two)
-    controller = LawClosing(reference())
+    controller = UncertaintyClosing(reference(), ClosingOptions())
     first = controller(seen, PERIOD).reshape(3, 3)
     assert float(first[2] @ NORMALS[2]) < -0.5 * MAX_SPEED * PERIOD
     for _ in range(250):

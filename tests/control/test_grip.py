@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
-from torchgrasp.control.holding.friction import PRIOR_STD, FrictionBelief
-from torchgrasp.control.holding.grip import LEAST_PUSH, GripHold
-from torchgrasp.control.holding.least_forces import LeastForces, balance, friction_ratios, grasp_map
+from torchgrasp.control.grip import MIN_PUSH, PRIOR_STD, FrictionEstimate, GripHold
+from torchgrasp.control.least_forces import LeastForces, balance, friction_ratios, grasp_map
 from torchgrasp.control.observation import Observation
 from torchgrasp.errors import Status
 from torchgrasp.geometry.plane import Plane
@@ -79,14 +78,14 @@ def test_floors_are_kept():
     assert (push > floor).all() and push.sum() == pytest.approx(4.0, rel=0.15)
 
 
-def test_friction_belief_is_the_posterior_of_a_gaussian():
-    belief = FrictionBelief(0.8)
-    belief.slides(0.5, 4.0)
+def test_friction_estimate_is_the_posterior_of_a_gaussian():
+    estimate = FrictionEstimate()
+    estimate.update(0.5, 4.0)
     noise = 0.4 * math.hypot(1.0, 0.5) / 4.0
     precision = PRIOR_STD**-2 + noise**-2
-    assert belief.mean == pytest.approx((0.8 * PRIOR_STD**-2 + 0.5 * noise**-2) / precision)
-    assert belief.std == pytest.approx(precision**-0.5)
-    assert belief.low < belief.mean < belief.high
+    assert estimate.mean == pytest.approx((0.8 * PRIOR_STD**-2 + 0.5 * noise**-2) / precision)
+    assert estimate.std == pytest.approx(precision**-0.5)
+    assert estimate.low < estimate.mean < estimate.high
 
 
 def carried(
@@ -129,7 +128,7 @@ def test_a_heavy_block_is_gripped_harder_before_it_slides_and_a_light_one_is_rel
         hold, _, sums = carried(weight, 0.8)
         needed = 4 * weight / 3 / 0.8  # each finger bears a third; the thumb presses as hard as two
         assert hold.status is Status.OK
-        assert needed < sums[-1] < 1.15 * max(needed, 4 * LEAST_PUSH)
+        assert needed < sums[-1] < 1.15 * max(needed, 4 * MIN_PUSH)
         assert sums[95] == pytest.approx(8.0, rel=0.2)  # on the table it presses as planned
     assert carried(1.0, 0.8)[0].weight == pytest.approx(1.0, rel=0.05)
 
@@ -146,9 +145,9 @@ def test_what_exceeds_the_torques_is_too_heavy():
     assert hold.status is Status.TOO_HEAVY and hold.weight > 5.0
 
 
-def test_what_the_limits_cannot_carry_by_belief_is_not_too_heavy_while_nothing_slides():
+def test_what_the_limits_cannot_carry_by_estimate_is_not_too_heavy_while_nothing_slides():
     weight, most = 5.0, 2.0
-    believed = FrictionBelief(0.8).high * 2 * most  # the thumb presses with 2 N, the others with the half
+    believed = FrictionEstimate().high * 2 * most  # the thumb presses with 2 N, the others with the half
     assert believed < weight
     assert carried(weight, 3.0, max_force=most)[0].status is Status.OK
     assert carried(weight, 0.8, max_force=most)[0].status is Status.TOO_HEAVY
@@ -173,4 +172,4 @@ def test_a_finger_whose_planned_force_is_along_the_surface_leaves_floors(sideway
     known, seen = dataclasses.replace(reference(), max_force=max_force), dataclasses.replace(seen, tactile=tactile)
     floor = GripHold(known, seen, torch.zeros(9).double())._floor()
     assert np.isfinite(floor).all() and (floor > 0).all()
-    assert max_force is not None or (floor >= LEAST_PUSH).all()
+    assert max_force is not None or (floor >= MIN_PUSH).all()

@@ -8,12 +8,13 @@ import torch
 
 from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
 from torchgrasp.control import FingertipSensor, GraspController, TipContact, feel_flags, feel_torques, no_contact
-from torchgrasp.control.closing import OVERDUE, STALLED, LawClosing
-from torchgrasp.control.holding.force import MOST_FACTOR, ForceHold
-from torchgrasp.control.sensing import FLAGGED, TORQUE_NOISE, DriveFeel
+from torchgrasp.control.holding import MAX_FACTOR, ForceHold
+from torchgrasp.control.sensing import TORQUE_NOISE, WAITING_FORCE, DriveFeel
+from torchgrasp.control.uncertainty_closing import STALLED, UncertaintyClosing
 from torchgrasp.errors import BadArgument
-from torchgrasp.specs import SensorModel, TrialSpec
+from torchgrasp.specs import NO_OPTIONS, ClosingOptions, SensorModel, TrialSpec
 
+WAIT_ALONE = dataclasses.replace(NO_OPTIONS, wait=True)
 JACOBIAN = torch.eye(9).double().reshape(3, 3, 9)
 FINGERS = reference().hand.finger_names
 
@@ -76,7 +77,7 @@ def test_a_binary_fingertip_tells_the_same_of_every_force():
     assert weak.contact.tolist() == [True, False, False]
     for name in ("reading", "forces", "contact", "average", "sliding"):
         assert torch.equal(getattr(weak, name), getattr(strong, name))
-    assert torch.equal(feel_flags(weak, weak.contact).reading, real([FLAGGED, 0.0, 0.0]))
+    assert torch.equal(feel_flags(weak, weak.contact).reading, real([WAITING_FORCE, 0.0, 0.0]))
 
 
 def test_a_dead_fingertip_is_silent_and_the_others_are_as_ever():
@@ -88,10 +89,10 @@ def test_a_dead_fingertip_is_silent_and_the_others_are_as_ever():
         FingertipSensor(having(dead=("little_toe",)))
 
 
-def closes(sensor: SensorModel, contact, off: float, ticks: int = 12, joints=None) -> tuple[LawClosing, torch.Tensor]:
+def closes(sensor: SensorModel, contact, off: float, ticks=12) -> tuple[UncertaintyClosing, torch.Tensor]:
     """How far the last finger's target comes on while the others touch as given, its tip off its contact [m]."""
-    law = LawClosing(dataclasses.replace(reference(), sensor=sensor), without=("place",))
-    seen = observation(off, (0.3, 0.3, 0.0), contact, joints)
+    law = UncertaintyClosing(dataclasses.replace(reference(), sensor=sensor), WAIT_ALONE)
+    seen = observation(off, (0.3, 0.3, 0.0), contact)
     targets = torch.stack([law(seen, PERIOD).reshape(3, 3)[2] for _ in range(ticks)])
     return law, -((targets - targets[0]) * NORMALS[2]).sum(-1)
 
@@ -110,18 +111,18 @@ def test_a_finger_without_a_sensor_rests_at_its_contact_until_the_others_touch_a
 
 def test_a_finger_without_a_sensor_is_no_longer_waited_for_once_no_surface_is_left_to_meet():
     deviation = float((NORMALS[2] @ GAINS.covariance[2] @ NORMALS[2]).sqrt())
-    for off, done in ((-0.9 * OVERDUE * deviation, False), (-1.1 * OVERDUE * deviation, True)):
+    for off, done in ((-0.9 * 3.0 * deviation, False), (-1.1 * 3.0 * deviation, True)):
         assert closes(DEAD, TWO, off)[0].done == done
-    assert not closes(SensorModel(), TWO, -1.1 * OVERDUE * deviation)[0].done  # one that could tell searches on
+    assert not closes(SensorModel(), TWO, -1.1 * 3.0 * deviation)[0].done  # one that could tell searches on
 
 
 def test_a_finger_without_a_sensor_stands_where_its_drives_push_against_something():
     joints = torch.zeros(9).double()  # something keeps it where it is
     known = dataclasses.replace(reference(), kp=torch.full((9,), 100.0).double(), sensor=DEAD)
-    law, seen = LawClosing(known, without=("place",)), observation(-0.001, (0.3, 0.3, 0.0), TWO, joints)
+    law, seen = UncertaintyClosing(known, WAIT_ALONE), observation(-0.001, (0.3, 0.3, 0.0), TWO, joints)
     targets = torch.stack([law(seen, PERIOD).reshape(3, 3)[2] for _ in range(120)])
     ahead = -(targets * NORMALS[2]).sum(-1)
-    assert law.done and bool(law.felt.all())
+    assert law.done and bool(law.touched.all())
     assert STALLED < 100.0 * float(ahead[-1]) < 3 * STALLED  # it stands, the lag of the average later
     assert torch.allclose(ahead[-20:], ahead[-1:], atol=1e-9)
 
@@ -141,7 +142,7 @@ def test_drives_feel_what_keeps_a_joint_from_its_target_and_not_that_it_moves():
 def test_a_dead_finger_in_the_air_says_nothing_of_where_the_object_is():
     moved = {}
     for name, known in (("dead", having(dead=FINGERS[2:])), ("alive", reference())):
-        law = LawClosing(known)
+        law = UncertaintyClosing(known, ClosingOptions())
         tips = TARGET + 0.01 * NORMALS - 0.01 * NORMALS * real([[0.0], [0.0], [1.0]])  # the last is beyond its contact
         law(dataclasses.replace(observation(), tips=tips), PERIOD)
         moved[name] = float(law.palm.norm())
@@ -150,7 +151,7 @@ def test_a_dead_finger_in_the_air_says_nothing_of_where_the_object_is():
 
 def test_without_forces_the_squeeze_is_not_regulated_and_with_some_by_those_alone():
     start, silent = torch.zeros(9).double(), observation(0.0, (0.0, 0.0, 0.0), TOUCHING)
-    for known, factor in ((having(kind="binary"), 1.0), (reference(), MOST_FACTOR)):
+    for known, factor in ((having(kind="binary"), 1.0), (reference(), MAX_FACTOR)):
         hold = ForceHold(known, silent, start)
         for _ in range(150):
             hold(silent, PERIOD)

@@ -187,8 +187,7 @@ def test_the_squeeze_follows_the_grasps(device, hand, grasps):
 @pytest.mark.parametrize("closing", ["uncertainty", "fixed", "paper", "position", "open_loop"])
 def test_a_controller_runs_on_the_cpu(device, hand, grasps, shape, closing):
     reference = sent(ClosingReference.from_grasp(hand, grasps[0]))
-    belief = sent(shape) if closing in ("uncertainty", "fixed") else None
-    controller = GraspController(reference, closing=closing, belief=belief)
+    controller = GraspController(reference, closing=closing)
     reference, tactile = controller.reference, no_contact()
     point = reference.gains.target
     truth = TipContact(torch.ones(3).double(), -reference.normals, point, reference.normals)

@@ -17,7 +17,7 @@ from torchgrasp.evaluation.lift import LIFT_TIME
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.hand.load import load_hand
-from torchgrasp.specs import TrialSpec
+from torchgrasp.specs import ClosingOptions, TrialSpec
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 
@@ -50,7 +50,8 @@ def test_same_seed_same_bits_here_and_in_another_process():
 def test_waiting_keeps_the_object_still(name, aside):
     """The object stands 8 mm off: the finger that meets it first must not push it away before the others touch."""
     mesh, still = cylinder((0.0, aside)), dataclasses.replace(QUICK, noise=False)
-    waiting, pressing = (close(name, mesh, dataclasses.replace(still, without=part)) for part in ((), ("wait",)))
+    hasty = ClosingOptions(wait=False)
+    waiting, pressing = (close(name, mesh, dataclasses.replace(still, options=x)) for x in (None, hasty))
     assert waiting.held and pressing.held
     assert waiting.pushed.distance < 0.5 * pressing.pushed.distance
 
@@ -62,8 +63,8 @@ def test_a_hand_that_closed_beside_the_object_closes_once_more(aside):
     seen = field_from_surface(torch.tensor(planned.vertices), torch.tensor(planned.faces), 0.004)
     still = dataclasses.replace(QUICK, noise=False)
     once, again = (
-        close("allegro", cylinder((aside, 0.0)), dataclasses.replace(still, without=part), surface=seen)
-        for part in (("retry",), ())
+        close("allegro", cylinder((aside, 0.0)), dataclasses.replace(still, options=options), surface=seen)
+        for options in (ClosingOptions(attempts=1), None)
     )
     assert (once.attempts, once.held) == (1, False)
     assert (again.attempts, again.held) == (2, True)
@@ -77,8 +78,8 @@ def test_a_hand_that_touches_something_on_its_way_goes_round_it(aside):
     seen = field_from_surface(torch.tensor(planned.vertices), torch.tensor(planned.faces), 0.004)
     still = dataclasses.replace(QUICK, noise=False)
     swept, guarded = (
-        close("allegro", cylinder(aside), dataclasses.replace(still, without=part), surface=seen)
-        for part in (("guard",), ())
+        close("allegro", cylinder(aside), dataclasses.replace(still, options=options), surface=seen)
+        for options in (ClosingOptions(stops=0), None)
     )
     assert (swept.stops, swept.held) == (0, False)
     assert guarded.stops >= 1 and guarded.held
@@ -100,7 +101,7 @@ def test_the_papers_forces_are_those_of_the_stability_model():
 
 
 def test_pushes_and_slips_are_parts_of_the_motion():
-    spec = dataclasses.replace(QUICK, hold_time=0.5, without=("palm",))
+    spec = dataclasses.replace(QUICK, hold_time=0.5, options=ClosingOptions(palm_reach=0.0, stops=0))
     result = close("allegro", cylinder((0.0, 0.008)), spec)
     centre = torch.tensor([0.0, 0.008, HEIGHT / 2]).double()
     centres = (inverse(result.hand_pose) @ result.object_pose)[:, :3] @ torch.cat([centre, torch.ones(1).double()])
@@ -122,7 +123,8 @@ def test_pushes_and_slips_are_parts_of_the_motion():
 def test_the_palm_follows_an_object_that_stands_elsewhere():
     """The hand's own motion is not the object's: `pushed` is small while the hand follows by most of the way."""
     mesh, still = cylinder((0.0, 0.012)), dataclasses.replace(QUICK, noise=False)
-    following, resting = (close("allegro", mesh, dataclasses.replace(still, without=x)) for x in ((), ("palm",)))
+    rigid = ClosingOptions(palm_reach=0.0, stops=0)
+    following, resting = (close("allegro", mesh, dataclasses.replace(still, options=x)) for x in (None, rigid))
     _, grasp = pinch("allegro")
     shifts = []
     for result in (following, resting):
@@ -157,7 +159,7 @@ def test_the_hand_may_be_beside_its_planned_pose_and_may_be_shaken():
 
 def test_the_hand_comes_straight_to_where_it_was_planned():
     _, grasp = pinch("allegro")
-    result = close("allegro", spec=dataclasses.replace(QUICK, without=("palm",)))
+    result = close("allegro", spec=dataclasses.replace(QUICK, options=ClosingOptions(palm_reach=0.0, stops=0)))
     path = result.hand_pose[:, :3, 3] - grasp.obj_from_hand[0, :3, 3]
     along = path @ grasp.approach[0]
     coming = int(along.argmax())

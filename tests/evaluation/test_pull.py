@@ -6,16 +6,14 @@ import math
 import pytest
 import torch
 
-from tests.pinch import HEIGHT, RADIUS, cylinder, pinch
-from torchgrasp import fit_shape
+from tests.pinch import cylinder, pinch
 from torchgrasp.control import squeeze
-from torchgrasp.control.stiffness import joint_stiffness
+from torchgrasp.control.forces import joint_stiffness
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.protocols import PROTOCOLS, PullSpec
-from torchgrasp.evaluation.pull import DIRECTIONS, pull_grasp
+from torchgrasp.evaluation.pull import pull_grasp
 from torchgrasp.geometry.frames import apply, inverse
-from torchgrasp.values import PointCloud
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 MASS = 0.05
@@ -23,12 +21,12 @@ PULL = PullSpec(10.0, 0.2, 0.05, math.radians(15))
 QUICK = dataclasses.replace(PROTOCOLS["dexgraspbench"].with_trial(mass=MASS, force=5.0), pull=PULL)
 
 
-def pull(name, pull=PULL, belief=None, **changes):
+def pull(name, pull=PULL, **changes):
     """The quick test with some of its numbers changed, on the pinched cylinder."""
     pytest.importorskip("sapien")
     hand, grasp = pinch(name)
     protocol = dataclasses.replace(QUICK, pull=pull).with_trial(**changes)
-    return pull_grasp(GraspTrial(hand, grasp, cylinder(), belief=belief), protocol)
+    return pull_grasp(GraspTrial(hand, grasp, cylinder()), protocol)
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
@@ -77,23 +75,6 @@ def test_more_pull_than_friction_can_hold_moves_the_object():
 def test_a_controller_closes_and_holds(closing):
     result = pull("allegro", dataclasses.replace(PULL, acceleration=2.0), force=4.0, closing=closing)
     assert result.passed and 1.0 < result.force < 5.0
-
-
-def test_touches_revise_a_shape_that_was_believed_thinner_in_each_direction_anew(monkeypatch):
-    angle, height = torch.rand(2, 400, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    normals = torch.cat([torch.cos(2 * math.pi * angle), torch.sin(2 * math.pi * angle), 0 * angle], 1)
-    points = (RADIUS - 0.008) * normals + HEIGHT * height * normals.new_tensor([0.0, 0.0, 1.0])
-    shape, down = fit_shape(PointCloud(points, normals), seed=0), DIRECTIONS[4]
-
-    def pull_down(times, belief):
-        monkeypatch.setattr("torchgrasp.evaluation.pull.DIRECTIONS", times * (down,))
-        return pull("allegro", belief=belief, force=4.0, closing="uncertainty")
-
-    once, twice, unaware = pull_down(1, shape), pull_down(2, shape), pull_down(1, None)
-    assert once.passed and 1.0 < once.force < 5.0 and once.force != unaware.force
-    assert dataclasses.replace(twice, directions=1, seconds=once.seconds) == once
-    with pytest.raises(BadArgument, match=r"belief: expected .*got one for 'open_loop'"):
-        pull("allegro", belief=shape)
 
 
 def test_a_hand_inside_the_object_is_refused():

@@ -19,10 +19,9 @@ import torchgrasp
 from torchgrasp import PointCloud, fit_shape, load_hand, load_object, load_scene
 from torchgrasp.checks import Range
 from torchgrasp.cloud import estimate_normals
-from torchgrasp.control import ClosingReference, ControlRecorder, GraspController, no_contact, observe
-from torchgrasp.control.adaptive.belief import Belief
-from torchgrasp.control.adaptive.impedance import Impedance
-from torchgrasp.control.adaptive.stability import NAMES, StabilityModel
+from torchgrasp.control import ClosingReference, GraspController, no_contact, observe
+from torchgrasp.control.paper.impedance import Impedance
+from torchgrasp.control.paper.stability import NAMES, StabilityModel
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.errors import Status
 from torchgrasp.hand.urdf import Urdf, read_urdf
@@ -71,8 +70,6 @@ def special(kind: type) -> Any:
         Certificate: lambda: special(Grasps).certificate,
         ClosingReference: lambda: ClosingReference.from_grasp(special(torchgrasp.Hand), special(Grasps)),
         GraspController: lambda: GraspController(special(ClosingReference)),
-        ControlRecorder: ControlRecorder,
-        Belief: lambda: Belief(special(torchgrasp.ShapeGP), torch.eye(4, dtype=torch.float64)),
         GraspProblem: grasp_problem,
         PostureLibrary: lambda: PostureLibrary.of(special(torchgrasp.Hand), 100),
         Impedance: impedance,

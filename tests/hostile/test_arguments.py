@@ -16,7 +16,7 @@ MADE_INSIDE = {
     "ActuatedJoints", "CollisionSpheres", "Completion", "Components", "Fingertips", "Hand", "HollowShape", "Joint",
     "JointEstimate", "KinematicTree", "Link", "Normalisation", "Observations", "Outlines", "PreparedCloud", "Progress",
     "SampleFolder", "SceneSpec", "SelfCollision", "Shape", "ShapeDerivatives", "ShapeGP", "Silhouette", "StepContacts",
-    "SurfaceJet", "MeanJet", "ClosingTrace", "ControlLog", "Urdf", "Advice", "Explanation", "Funnel", "Losses", "Trial",
+    "SurfaceJet", "MeanJet", "ClosingTrace", "Urdf", "Advice", "Explanation", "Funnel", "Losses", "Trial",
     "GraspShards",
 }  # fmt: skip
 """Values that only the library makes, many of them in each step of a loop."""

@@ -8,8 +8,8 @@ from train.pull_trials import PullRecord, RisingPull, pull_until_lost
 
 from tests.pinch import cylinder, pinch
 from torchgrasp.control import ClosingReference, closing_gains
-from torchgrasp.control.adaptive.impedance import Impedance
-from torchgrasp.control.adaptive.stability import lengths_of, load_stability, state_of
+from torchgrasp.control.paper.impedance import Impedance
+from torchgrasp.control.paper.stability import lengths_of, load_stability, state_of
 from torchgrasp.evaluation.closing import GraspTrial
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]

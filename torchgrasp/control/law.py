@@ -40,7 +40,8 @@ def force_covariance(
 
     `deviation` [N] is the standard deviation of each normal force; None: a tenth of the force.
     """
-    return _normal_covariance(normals, 0.1 * (forces * normals).sum(-1) if deviation is None else deviation, FORCE_FLOOR)
+    std = 0.1 * (forces * normals).sum(-1) if deviation is None else deviation
+    return _normal_covariance(normals, std, FORCE_FLOOR)
 
 
 def _normal_covariance(normals: Float[Tensor, "*b 3"], std: Float[Tensor, "*b"], floor: float) -> Tensor:

@@ -74,7 +74,7 @@ class ContactPlanes:
 
 
 def _prior(reference: ClosingReference) -> Float[Tensor, "6 6"]:
-    """Return the inverse covariance of displacements: an object on a table moves along it and turns about its normal."""
+    """Return the inverse covariance of displacements: an object moves along its table and turns about its normal."""
     shift_std, height_std, turn_std, tilt_std = 0.01, 0.001, 0.09, 0.01  # [m, m, rad, rad]
     eye = torch.eye(3, dtype=reference.normals.dtype)
     place, turn = eye / shift_std**2, eye / turn_std**2

@@ -1,6 +1,6 @@
 """Fingertips with poorer sensors than tactile ones: binary contacts, joint torques, delays, noise and dead sensors.
 
-A robot with such sensors makes its `TactileState` by `feel_flags` or `feel_torques`, as `measure` does for tactile ones.
+A robot with such sensors makes its `TactileState` by `feel_flags` or `feel_torques`, instead of `measure`.
 """
 
 import dataclasses
@@ -138,7 +138,7 @@ class FingertipSensor:
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> reference = ClosingReference.from_grasp(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
-    >>> push, here, normals = torch.tensor([1.0, 0.0, 0.0]).double(), reference.gains.target, reference.normals
+    >>> push, here, normals = torch.tensor([2.0, 0.0, 0.0]).double(), reference.gains.target, reference.normals
     >>> sensor, jacobian = FingertipSensor(reference), torch.zeros(3, 3, 8).double()
     >>> sensor(TipContact(push, -push[:, None] * normals, here, normals), jacobian, 0.01).contact
     tensor([ True, False, False])

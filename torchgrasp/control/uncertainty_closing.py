@@ -32,7 +32,7 @@ LEAD = 0.04
 
 
 class UncertaintyClosing:
-    """Close under the paper's control law, with these extensions:
+    """The paper's control law with extensions.
 
     * A finger in the air searches along its contact's normal, even beyond the contact, but not below the table. A
       finger that touches is force-controlled, whatever its position error.
@@ -107,7 +107,7 @@ class UncertaintyClosing:
         return reference.expand(self.target)
 
     def _follow(self, points: Float[Tensor, "f 3"], contact: Bool[Tensor, "f"]) -> tuple[Tensor, Tensor]:
-        """Return the contacts [m] of the estimated object (f, 3), and the velocity [m/s] of the palm that follows it."""
+        """Return the contacts [m] of the estimated object (f, 3), and the velocity [m/s] of the palm."""
         if self.planes is None:
             return self.reference.gains.target, STILL
         self.displacement = self.planes.displacement(points, contact)

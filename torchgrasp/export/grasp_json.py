@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.checks import Positive, Range, checked
-from torchgrasp.control.paper.closings import POSE_TIME
 from torchgrasp.control.forces import squeeze
+from torchgrasp.control.paper.closings import POSE_TIME
 from torchgrasp.errors import Status
 from torchgrasp.files import format_json
 from torchgrasp.geometry.frames import rotate

@@ -13,9 +13,9 @@ from benchmarks.common import Row
 from benchmarks.ground_truth import read_views
 from torchgrasp import ContactSpec, Grasps, Hand, Status, load_hand, plan_grasps
 from torchgrasp.control import ClosingReference
+from torchgrasp.control.holding import ForceHold
 from torchgrasp.control.paper.impedance import GRASP_STIFFNESS, Impedance
 from torchgrasp.control.paper.stability import StabilityModel, lengths_of, load_stability, state_of
-from torchgrasp.control.holding import ForceHold
 from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.views import choose_rows
 from torchgrasp.geometry.linalg import unit

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import torch
 import trimesh
+from torchgrasp.control.paper.stability import load_stability
 
 from tests.campaign.cheap import campaign, work_on
 from tests.hostile.fuzz.cases import Case, saved
 from torchgrasp import (
-    GraspController,
     HandSamples,
     fit_mixture,
     hand_of,
@@ -18,15 +18,6 @@ from torchgrasp import (
     load_mixture,
 )
 from torchgrasp.campaign.folder import carry_out
-from torchgrasp.control import (
-    ClosingReference,
-    ControlRecorder,
-    load_control_log,
-    load_controller_state,
-    no_contact,
-    observe,
-)
-from torchgrasp.control.adaptive.stability import load_stability
 from torchgrasp.data import read_shards
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.export import format_grasps, format_moveit
@@ -99,24 +90,6 @@ def shards(folder: Path) -> list[Case]:
     return [saved(folder / name, reader) for name, reader in readers.items()]
 
 
-def controls(folder: Path) -> list[Case]:
-    """Return the state of a controller, with which another goes on, and the log of a closing."""
-    hand = load_hand("barrett")
-    reference = ClosingReference.from_grasp(hand, load_shipped_grasp("jug", "barrett"))
-    controller, recorder = GraspController(reference, holding="grip"), ControlRecorder()
-    seen = observe(hand, reference.pregrasp, no_contact())
-    while controller.pressed < 0.1:
-        recorder.add(seen, 0.1, controller.step(seen, 0.1))
-    controller.state().save(folder / "state.safetensors"), recorder.log().save(folder / "log.safetensors")
-
-    def go_on(path: Path) -> None:
-        controller.restore(load_controller_state(path))
-        controller.step(seen, 0.01)
-
-    readers = {"state": go_on, "log": lambda x: list(load_control_log(x).ticks())}
-    return [saved(folder / f"{name}.safetensors", reader) for name, reader in readers.items()]
-
-
 def checkpoints(folder: Path) -> list[Case]:
     """Return the checkpoint of a fit, which goes on from it."""
     rows = torch.rand(40, 7, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -136,5 +109,5 @@ def parts(folder: Path) -> list[Case]:
     return [saved(folder / "parts.safetensors", lambda x: _load(x, ball))]
 
 
-MAKERS = (models, shown, samples, shards, controls, checkpoints, parts)
+MAKERS = (models, shown, samples, shards, checkpoints, parts)
 KINDS = {make.__name__: make for make in MAKERS}

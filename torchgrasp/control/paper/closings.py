@@ -1,7 +1,7 @@
 """Closings to compare with: the paper's control law (Eqs. 25-28), its position controller, and the open loop."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.control.law import POSITION_RATE, blend, joint_step, tip_velocity
@@ -66,7 +66,12 @@ class Settled:
         self.time, self.steady = 0.0, torch.zeros_like(reference.normals[:, 0])
 
     def update(
-        self, observation: Observation, touching: Tensor, share: Float[Tensor, "f"], period: float, pressing: bool = True
+        self,
+        observation: Observation,
+        touching: Bool[Tensor, "f"],
+        share: Float[Tensor, "f"],
+        period: float,
+        pressing: bool = True,
     ) -> None:
         """Count a tick; without `pressing` the touches alone count."""
         average = observation.tactile.average

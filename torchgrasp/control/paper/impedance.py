@@ -16,11 +16,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.checks import checked
-from torchgrasp.control.paper.stability import StabilityModel, lengths_of, state_of
-from torchgrasp.control.law import damped_inverse
 from torchgrasp.control.forces import actuated_stiffness
 from torchgrasp.control.holding import RAMP, held_forces, regulate
+from torchgrasp.control.law import damped_inverse
 from torchgrasp.control.observation import Observation
+from torchgrasp.control.paper.stability import StabilityModel, lengths_of, state_of
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import low_pass
 from torchgrasp.geometry.frames import degenerate, rigid, skew, virtual_frame

@@ -9,11 +9,12 @@ from scipy.optimize import minimize
 
 from tests.point_fingers import NORMALS, PERIOD, TARGET, observation, real, reference
 from torchgrasp.control import GraspController, TipContact, measure, no_contact
-from torchgrasp.control.closing import PALM_REACH, PALM_SPEED
-from torchgrasp.control.closing_law import surface_covariance
-from torchgrasp.control.placement import FARTHEST, HEIGHT_SPREAD, SPREAD, TILT, TURN, Placement
+from torchgrasp.control.law import surface_covariance
+from torchgrasp.control.object_pose import ContactPlanes
+from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.specs import ClosingOptions
 
 AROUND = unit(real([[1, 0.3, 0.1], [-0.4, 1, 0], [-0.5, -0.9, 0.2]]))
 """Normals that span the plane across z, and a little more."""
@@ -37,8 +38,8 @@ def test_the_displacement_is_the_likeliest_one(table, touching, off_mm):
     normals, off, felt = AROUND.numpy(), 1e-3 * np.array(off_mm), np.array(touching, dtype=bool)
     target = held.gains.target.numpy()
     arms = target - target.mean(0)
-    place = np.array([SPREAD, SPREAD, HEIGHT_SPREAD if table else SPREAD])
-    turn = np.array([TILT, TILT, TURN]) if table else np.full(3, TURN)
+    place = np.array([0.01, 0.01, 0.001 if table else 0.01])
+    turn = np.array([0.01, 0.01, 0.09]) if table else np.full(3, 0.09)
     variance = np.array([n @ c @ n for n, c in zip(normals, held.gains.covariance.numpy(), strict=True)])
 
     def cost(scaled):
@@ -48,7 +49,7 @@ def test_the_displacement_is_the_likeliest_one(table, touching, off_mm):
         return 0.5 * (scaled**2).sum() + 0.5 * (miss**2 / variance).sum()
 
     best = minimize(cost, np.zeros(6), method="BFGS", options={"gtol": 1e-10}).x
-    found = Placement(held).displacement(held.gains.target + real(off)[:, None] * AROUND, torch.tensor(felt))
+    found = ContactPlanes(held).displacement(held.gains.target + real(off)[:, None] * AROUND, torch.tensor(felt))
     assert np.allclose(found.numpy(), best * np.concatenate([place, turn]), atol=2e-6)
 
 
@@ -56,10 +57,10 @@ def test_certain_contacts_are_believed_and_leave_the_object_on_the_table():
     flat = unit(AROUND * real([1, 1, 0]))
     held, shift = known(flat, std_mm=(0.0, 0.0, 0.0)), real([0.006, -0.004, 0.0])
     sure = dataclasses.replace(held.gains, covariance=held.gains.covariance / 1e4)
-    placement = Placement(dataclasses.replace(held, gains=sure))
+    planes = ContactPlanes(dataclasses.replace(held, gains=sure))
     off = (shift * flat).sum(-1)
-    found = placement.displacement(held.gains.target + off[:, None] * flat, torch.ones(3, dtype=torch.bool))
-    moved = placement.moved(found) - held.gains.target
+    found = planes.displacement(held.gains.target + off[:, None] * flat, torch.ones(3, dtype=torch.bool))
+    moved = planes.moved(found) - held.gains.target
     assert torch.allclose((moved * flat).sum(-1), off, atol=5e-5)
     assert float(found[2].abs()) < 1e-6 and float(moved[:, 2].abs().max()) < 1e-4
 
@@ -69,15 +70,13 @@ def test_the_surer_of_two_touches_that_disagree_is_believed_more():
     felt = torch.tensor([True, True, False])
     for std_mm, sign in (((1.0, 9.0, 1.0), 1.0), ((9.0, 1.0, 1.0), -1.0)):
         held = known(opposed, std_mm)
-        found = Placement(held).displacement(held.gains.target + 0.008 * opposed, felt)
+        found = ContactPlanes(held).displacement(held.gains.target + 0.008 * opposed, felt)
         assert float(found[0]) * sign > 1e-3
 
 
 def test_a_finger_that_has_missed_the_object_does_not_move_it_for_ever():
     held, touching = known(), torch.tensor([False, False, False])
-    near, far = (
-        Placement(held).displacement(held.gains.target - off * AROUND, touching) for off in (FARTHEST, 10 * FARTHEST)
-    )
+    near, far = (ContactPlanes(held).displacement(held.gains.target - off * AROUND, touching) for off in (0.025, 0.25))
     assert torch.allclose(near, far)
 
 
@@ -107,7 +106,7 @@ def test_the_palm_follows_a_block_that_stands_elsewhere_and_the_fingers_come_to_
     assert (palms[1:] - palms[:-1]).norm(dim=-1).max() <= PALM_SPEED * PERIOD + 1e-9
     posture = joints[-1] + 0.02 * NORMALS  # zero where each tip is at its planned contact
     assert (posture * NORMALS).sum(-1).abs().max() < 3e-3
-    still, moved = close(GraspController(reference(), closing, without=("palm",)), 0.01)
+    still, moved = close(GraspController(reference(), closing, options=ClosingOptions(palm_reach=0.0, stops=0)), 0.01)
     assert still.abs().max() == 0
     assert ((moved[-1] + 0.02 * NORMALS) * NORMALS).sum(-1).abs().max() > 8e-3
 
@@ -115,7 +114,7 @@ def test_the_palm_follows_a_block_that_stands_elsewhere_and_the_fingers_come_to_
 def test_the_palm_stays_where_the_object_is_in_its_place_and_goes_no_farther_than_it_may():
     assert close(GraspController(reference()), 0.0)[0].norm(dim=-1).max() < 1e-3
     far = close(GraspController(reference()), 0.018)[0].norm(dim=-1)
-    assert 0.01 < float(far.max()) <= PALM_REACH + 1e-9
+    assert 0.01 < float(far.max()) <= ClosingOptions().palm_reach + 1e-9
 
 
 @pytest.mark.parametrize("closing", ["paper", "position", "open_loop"])

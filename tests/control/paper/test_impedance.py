@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from tests.point_fingers import PERIOD, TOUCHING, observation, real, reference
-from torchgrasp.control.adaptive.impedance import (
+from torchgrasp.control.holding import RAMP, held_forces
+from torchgrasp.control.paper.impedance import (
     MOST_RAISE,
     MOST_SHARE,
     ROTATION_STIFFNESS,
@@ -17,8 +18,7 @@ from torchgrasp.control.adaptive.impedance import (
     side_lengths,
     spring_forces,
 )
-from torchgrasp.control.adaptive.stability import PreferredForces, StabilityModel
-from torchgrasp.control.holding.force import RAMP, held_forces
+from torchgrasp.control.paper.stability import PreferredForces, StabilityModel
 from torchgrasp.geometry.frames import rigid, rotation_from_vector, virtual_frame
 
 

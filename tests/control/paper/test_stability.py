@@ -6,7 +6,7 @@ import pytest
 import torch
 from train.stability import fit_stability
 
-from torchgrasp.control.adaptive.stability import (
+from torchgrasp.control.paper.stability import (
     LEAST_FORCE,
     NAMES,
     StabilityModel,

@@ -5,27 +5,19 @@ import dataclasses
 import pytest
 import torch
 
-from tests.control.recovery.test_localization import CENTER, RADIUS, ball, field
+from tests.control.test_localization import CENTER, RADIUS, ball, field
 from tests.point_fingers import PERIOD, observation, real, reference
-from torchgrasp.control import ClosingReference, GraspController, load_controller_state
-from torchgrasp.control.closing import PALM_REACH, PALM_SPEED
-from torchgrasp.control.recovery.approach import (
-    ACCELERATION,
-    BACK,
-    CAREFUL,
-    FEELING,
-    HALTS,
-    SPEED,
-    GuardedApproach,
-    can_guard,
-)
-from torchgrasp.control.recovery.localization import FINER, TURNS
+from torchgrasp.control import ClosingReference, GraspController
+from torchgrasp.control.object_pose import FINE_TURNS, TURNS
+from torchgrasp.control.recovery import ACCELERATION, BACK, CAREFUL_SPEED, FEELING, SPEED, GuardedApproach
+from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.load import load_hand
-from torchgrasp.specs import SensorModel
+from torchgrasp.specs import ClosingOptions, SensorModel
 
+ALL = ClosingOptions()
 DOWN, LENGTH, TIP = real([0.0, -1.0, 0.0]), 0.08, 0.01
 OPEN = real([[0.052, 0, 0.02], [0.052, 0, -0.02], [-0.036, 0, 0]])
 """Tips of the opened hand [m]: 6 mm beside the ball in its place."""
@@ -63,10 +55,10 @@ def come(hand, shift, ticks=3000):
 
 
 def test_an_object_in_its_place_does_not_stop_the_hand():
-    hand = GuardedApproach(above(), LENGTH)
+    hand = GuardedApproach(above(), ALL, LENGTH)
     lefts, palms = come(hand, real([0, 0, 0]))
     speeds = -lefts.diff() / PERIOD
-    assert hand.halts == 0 and lefts[-1] == 0.0 and not palms.any()
+    assert hand.stops == 0 and lefts[-1] == 0.0 and not palms.any()
     assert (speeds > 0).all() and speeds.max() <= SPEED * (1 + 1e-9)
     changes = speeds.diff().abs() / PERIOD
     assert changes[:-1].max() <= ACCELERATION * 1.2  # braking is sampled
@@ -76,9 +68,9 @@ def test_an_object_in_its_place_does_not_stop_the_hand():
 @pytest.mark.parametrize("shift", [(0.016, 0, 0), (-0.015, 0, 0.004), (0.012, 0, 0.014)])
 def test_a_touch_tells_where_the_palm_has_to_go(shift):
     shift = real(shift)
-    hand = GuardedApproach(above(), LENGTH)
+    hand = GuardedApproach(above(), ALL, LENGTH)
     _, palms = come(hand, shift)
-    assert 1 <= hand.halts < HALTS
+    assert 1 <= hand.stops < ALL.stops
     assert (hand.displacement[:3] - shift).norm() < 0.005
     assert (hand.palm - shift).norm() < 0.005 and hand.palm[1] == 0.0
     assert not feel(hand, shift).tactile.contact.any()
@@ -86,33 +78,33 @@ def test_a_touch_tells_where_the_palm_has_to_go(shift):
 
 
 def test_the_hand_rests_while_it_feels_and_draws_back_before_its_palm_moves():
-    shift, hand = real([0.016, 0, 0]), GuardedApproach(above(), LENGTH)
+    shift, hand = real([0.016, 0, 0]), GuardedApproach(above(), ALL, LENGTH)
     lefts, palms = come(hand, shift)
     stopped = int((lefts.diff() == 0).int().argmax())
     rest = lefts[stopped:].eq(lefts[stopped]).int().cumprod(0).sum()
-    assert abs(int(rest) * PERIOD - (FEELING + (len(TURNS) + len(FINER) + 2) * PERIOD)) <= 2 * PERIOD
+    assert abs(int(rest) * PERIOD - (FEELING + (len(TURNS) + len(FINE_TURNS) + 2) * PERIOD)) <= 2 * PERIOD
     first = int((palms.abs().sum(-1) > 0).int().argmax())
     assert lefts[first] == pytest.approx(float(lefts[stopped]) + BACK)
-    assert (-lefts[first:].diff()).max() <= CAREFUL * PERIOD * (1 + 1e-9)  # it comes slowly then
+    assert (-lefts[first:].diff()).max() <= CAREFUL_SPEED * PERIOD * (1 + 1e-9)  # it comes slowly then
     assert lefts.max() <= LENGTH
 
 
 def test_the_palm_goes_no_farther_than_the_arm_yields():
-    hand = GuardedApproach(above(), LENGTH)
+    hand = GuardedApproach(above(), ALL, LENGTH)
     for _ in range(2000):
         hand(feel(hand, real([0.03, 0, 0])), PERIOD)
-        assert hand.palm.norm() <= PALM_REACH * (1 + 1e-9)
+        assert hand.palm.norm() <= ALL.palm_reach * (1 + 1e-9)
 
 
 def test_after_the_last_halt_the_hand_goes_on_whatever_it_feels():
-    hand, everywhere = GuardedApproach(above(), LENGTH), observation(contact=torch.ones(3, dtype=torch.bool))
+    hand, everywhere = GuardedApproach(above(), ALL, LENGTH), observation(contact=torch.ones(3, dtype=torch.bool))
     for _ in range(3000):
         hand(everywhere, PERIOD)
-    assert hand.done and hand.halts == HALTS
+    assert hand.done and hand.stops == ALL.stops
 
 
 def test_a_touch_without_a_place_moves_no_palm():
-    hand, touching = GuardedApproach(above(), LENGTH), observation(contact=torch.ones(3, dtype=torch.bool))
+    hand, touching = GuardedApproach(above(), ALL, LENGTH), observation(contact=torch.ones(3, dtype=torch.bool))
     nowhere = torch.full((3, 3), torch.nan).double()
     tactile = dataclasses.replace(touching.tactile, points=nowhere, normals=nowhere)
     for _ in range(3000):
@@ -131,64 +123,32 @@ def approach(controller, shift):
 def test_the_controller_begins_to_close_where_the_object_was_touched():
     shift, controller = real([0.016, 0, 0]), GraspController(above(), approach=LENGTH)
     commanded = approach(controller, shift)
-    assert commanded[0].left == LENGTH and commanded[-1].left == 0.0 and controller.halts >= 1
+    assert commanded[0].left == LENGTH and commanded[-1].left == 0.0 and controller.stops >= 1
     opened = controller.reference.expand(controller.reference.pregrasp)
     assert all(torch.equal(x.joints, opened) for x in commanded)
     assert torch.equal(controller.closing.palm, commanded[-1].palm)
-    assert (controller.closing.believed[:3] - shift).norm() < 0.005
+    assert (controller.closing.displacement[:3] - shift).norm() < 0.005
     after = controller.step(observation(0.02), PERIOD)
     assert after.left == 0.0 and (after.palm - shift).norm() < 0.005
 
 
-@pytest.mark.parametrize("ticks", [3, 40, 75, 90, 110])
-def test_an_approach_goes_on_from_its_state_to_the_bit(tmp_path, ticks):
-    shift = real([0.016, 0, 0])
-    one, other = (GraspController(above(), approach=LENGTH) for _ in range(2))
-    for _ in range(ticks):
-        one.step(feel(one.guard, shift), PERIOD)
-    one.state().save(tmp_path / "state.safetensors")
-    other.restore(load_controller_state(tmp_path / "state.safetensors"))
-    assert other.approaching
-    for first, second in zip(approach(one, shift), approach(other, shift), strict=True):
-        assert torch.equal(first.palm, second.palm) and first.left == second.left
-    assert torch.equal(one.closing.believed, other.closing.believed) and one.halts == other.halts
-
-
-def test_a_state_of_the_closing_ends_the_approach():
-    one, other = (GraspController(above(), approach=LENGTH) for _ in range(2))
-    approach(one, real([0, 0, 0]))
-    one.step(observation(0.02), PERIOD)
-    other.restore(one.state())
-    assert not other.approaching and other.targets.left == 0.0
-
-
 @pytest.mark.parametrize(
-    ("closing", "without", "missing"),
+    ("closing", "options", "missing"),
     [
-        ("uncertainty", ("guard",), {}),
-        ("uncertainty", ("palm",), {}),
-        ("position", (), {}),
-        ("open_loop", (), {}),
-        ("uncertainty", (), {"table": None}),
-        ("uncertainty", (), {"surface": None}),
-        ("uncertainty", (), {"approach": None}),
-        ("uncertainty", (), {"sensor": SensorModel("binary")}),
+        ("uncertainty", ClosingOptions(stops=0), {}),
+        ("position", None, {}),
+        ("open_loop", None, {}),
+        ("uncertainty", None, {"table": None}),
+        ("uncertainty", None, {"surface": None}),
+        ("uncertainty", None, {"approach": None}),
+        ("uncertainty", None, {"sensor": SensorModel("binary")}),
     ],
 )
-def test_what_cannot_be_guarded_is_refused(closing, without, missing):
+def test_guarded_approach_refuses_closings_and_references_without_it(closing, options, missing):
     held = above(**missing)
-    assert not can_guard(held, closing, without)
     with pytest.raises(BadArgument, match="approach"):
-        GraspController(held, closing, without=without, approach=LENGTH)
-    assert not GraspController(held, closing, without=without).approaching
-
-
-@pytest.mark.parametrize(("length", "missing"), [(0.0, {}), (0.0, {"table": None}), (0.05, {})])
-def test_a_state_of_another_approach_is_refused(length, missing):
-    one, other = GraspController(above(), approach=LENGTH), GraspController(above(**missing), approach=length)
-    with pytest.raises(BadArgument, match="state"):
-        other.restore(one.state())
-    assert other.approaching is (length > 0) and other.targets.left == length
+        GraspController(held, closing, options=options, approach=LENGTH)
+    assert not GraspController(held, closing, options=options).approaching
 
 
 @pytest.mark.parametrize("length", ["0.1", float("nan"), -0.1, 1.1, None])

@@ -7,16 +7,7 @@ import pytest
 import torch
 
 from tests.point_fingers import GAINS, TARGET, observation, real, reference
-from torchgrasp.control.recovery.localization import (
-    FINER,
-    FINEST,
-    NORMAL_STD,
-    SPREAD,
-    SURFACE_STD,
-    TURNS,
-    Localization,
-    Touches,
-)
+from torchgrasp.control.object_pose import FINE_TURNS, PITCH, SURFACE_STD, TURNS, Localization, Touches
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
@@ -86,7 +77,7 @@ def test_a_ball_is_found_again_from_three_touches(shift):
     wanted = real([shift[0], 0.0, shift[1]])
     there = known(field(ball))
     found = locate(there, touch(there, CENTER + RADIUS * BALL_POINTS + wanted, BALL_POINTS))
-    assert (found[:3] - wanted).norm() < 2 * FINEST
+    assert (found[:3] - wanted).norm() < PITCH / 2
 
 
 def test_one_touch_tells_where_a_ball_is_as_far_as_its_normal_is_known():
@@ -96,8 +87,8 @@ def test_one_touch_tells_where_a_ball_is_as_far_as_its_normal_is_known():
     tips = CENTER + real([[0, 0, 0], [0, 0.2, 0], [0, -0.2, 0]])  # the others are far off
     touches = touch(there, CENTER + RADIUS * normal + wanted, normal, (True, False, False), tips)
     along = torch.linalg.cross(normal[0], real([0, 1, 0]))
-    known_by = {0: SURFACE_STD, 1: NORMAL_STD * RADIUS}  # across the surface, and along it
-    shares = [SPREAD**2 / (SPREAD**2 + known_by[k] ** 2) for k in (0, 1)]  # of Gaussians
+    known_by = {0: SURFACE_STD, 1: 0.3 * RADIUS}  # across the surface, and along it
+    shares = [0.02**2 / (0.02**2 + known_by[k] ** 2) for k in (0, 1)]  # of Gaussians
     found = locate(there, touches)[:3]
     for axis, share in zip((normal[0], along), shares, strict=True):
         assert abs(float(found @ axis) - share * float(wanted @ axis)) < 2e-3
@@ -109,7 +100,7 @@ def test_a_block_is_found_again_with_its_turn(turn):
     normals, wanted = real([[1, 0, 0], [1, 0, 0], [0, 0, 1]]), real([0.008, 0.0, -0.014])
     there, (place, direct) = known(field(block)), displaced(wanted, turn)
     found = locate(there, touch(there, place(points), direct(normals)))
-    assert (found[:3] - wanted).norm() < 3e-3 and abs(float(found[4]) - turn) <= FINER[-1]
+    assert (found[:3] - wanted).norm() < 3e-3 and abs(float(found[4]) - turn) <= FINE_TURNS[-1]
 
 
 def test_the_search_does_not_depend_on_the_objects_frame():
@@ -117,7 +108,7 @@ def test_the_search_does_not_depend_on_the_objects_frame():
     wanted = real([0.01, 0.0, -0.017])
     one, other = known(field(ball)), known(field(ball, pose), pose)
     found = [locate(x, touch(x, CENTER + RADIUS * BALL_POINTS + wanted, BALL_POINTS)) for x in (one, other)]
-    assert (found[0] - found[1]).norm() < 2 * FINEST
+    assert (found[0] - found[1]).norm() < PITCH / 2
 
 
 def test_a_fingertip_in_the_air_is_outside_of_the_object():
@@ -164,7 +155,7 @@ def test_noise_moves_the_place_by_less_than_it_is_itself():
 def test_a_call_tries_one_turn():
     there = known(field(ball))
     search, touches = Localization(there), touch(there, CENTER + RADIUS * BALL_POINTS, BALL_POINTS)
-    for k in range(len(TURNS) + len(FINER)):
-        assert not search.done and search.steps == k
+    for k in range(len(TURNS) + len(FINE_TURNS)):
+        assert not search.done and search.step == k
         search(touches)
     assert search.done and math.isfinite(search.cost)

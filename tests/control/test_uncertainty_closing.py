@@ -1,7 +1,6 @@
 """The closing law with each of its parts left out: without all of them it is the paper's, and the surest is first."""
 
 import dataclasses
-from typing import get_args
 
 import numpy as np
 import pytest
@@ -9,14 +8,14 @@ import torch
 
 from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
 from torchgrasp.control import ClosingReference, GraspController, TipContact, measure, no_contact
-from torchgrasp.control.closing import STOP_DISTANCE, LawClosing, PositionClosing
-from torchgrasp.control.closing_law import MAX_SPEED, position_gain, surface_covariance
+from torchgrasp.control.law import MAX_SPEED, position_gain, surface_covariance
 from torchgrasp.control.observation import Observation
+from torchgrasp.control.paper.closings import PaperClosing, PositionClosing
+from torchgrasp.control.uncertainty_closing import UncertaintyClosing
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.specs import ClosingPart, TrialSpec
+from torchgrasp.specs import NO_OPTIONS, ClosingOptions, TrialSpec
 
-ALL = get_args(ClosingPart)
 SPRING = 2e3
 """Stiffness of the block [N/m]."""
 
@@ -55,14 +54,6 @@ def order(controller: GraspController) -> list[int]:
     return (forces > 0).double().argmax(0).argsort().tolist()
 
 
-def test_eqs_25_to_28_as_written_are_the_law_without_its_parts():
-    paper = press(GraspController(uncertain(2, 4, 6), "paper"), 1.0)
-    bare = press(GraspController(uncertain(2, 4, 6), "uncertainty", without=ALL), 1.0)
-    assert all(torch.equal(a, b) for (_, a), (_, b) in zip(paper, bare, strict=True))
-    whole = press(GraspController(uncertain(2, 4, 6)), 1.0)
-    assert not torch.equal(paper[-1][1], whole[-1][1])
-
-
 @pytest.mark.parametrize("up", [1.0, -1.0])
 def test_fingers_that_search_in_vain_do_not_sink_below_the_table_but_move_freely_along_and_off_it(up):
     """The fingers search along x, beyond their contacts; the table is across x, 5 mm behind those above it."""
@@ -71,7 +62,7 @@ def test_fingers_that_search_in_vain_do_not_sink_below_the_table_but_move_freely
     low, free = (dataclasses.replace(reference(), table=t) for t in (table, None))
     tips = {}
     for name, known in (("low", low), ("free", free)):
-        law, joints = LawClosing(known, without=("palm",)), torch.zeros(9).double()
+        law, joints = UncertaintyClosing(known, ClosingOptions(palm_reach=0.0, stops=0)), torch.zeros(9).double()
         for _ in range(400):
             at = TARGET + 0.02 * NORMALS + joints.reshape(3, 3)
             joints = law(dataclasses.replace(observation(joints=joints), tips=at), PERIOD)
@@ -87,7 +78,7 @@ def test_eq25_of_the_paper_by_matrices(contact):
     """One tick by NumPy, whether something is touched or not; three sliding joints a finger: J is the identity."""
     known, reading = uncertain(2, 4, 6, force=0.01), np.array([0.5, 0.0, 1.0])
     seen = observation(0.004, tuple(reading), TOUCHING if contact else ~TOUCHING)
-    found = LawClosing(known, without=ALL)(seen, PERIOD).reshape(3, 3).numpy()
+    found = PaperClosing(known)(seen, PERIOD).reshape(3, 3).numpy()
     bracket = np.zeros((3, 3))
     for i, normal in enumerate(NORMALS.numpy()):
         error = -0.004 * normal
@@ -103,7 +94,6 @@ def test_eq25_of_the_paper_by_matrices(contact):
 def test_the_more_certain_finger_touches_first_as_the_paper_says(std_mm):
     certain_first = np.argsort(std_mm).tolist()
     assert order(GraspController(uncertain(*std_mm), "paper")) == certain_first
-    assert order(GraspController(uncertain(*std_mm), without=("pace",))) == certain_first
 
 
 def test_a_fast_force_loop_turns_that_order_round():
@@ -114,16 +104,16 @@ def test_a_fast_force_loop_turns_that_order_round():
 def test_without_waiting_a_finger_presses_at_once():
     one = torch.tensor([True, False, False])
     seen = observation(0.0, (1.0, 0.0, 0.0), one)
-    for without, sign in (((), 1), (("wait",), -1)):  # 1 N is more than the waiting force and less than the desired one
-        step = LawClosing(reference(), without=without)(seen, PERIOD).reshape(3, 3)
+    for wait, sign in ((True, 1), (False, -1)):  # 1 N is more than the waiting force and less than the desired one
+        step = UncertaintyClosing(reference(), ClosingOptions(wait=wait))(seen, PERIOD).reshape(3, 3)
         assert float(step[0] @ NORMALS[0]) * sign > 0
 
 
 def test_without_the_switch_a_position_error_is_not_forgotten_at_a_touch():
     seen = observation(0.03, (2.0, 2.0, 4.0), TOUCHING)  # the forces are as desired, the contacts 30 mm early
-    still = LawClosing(reference(), without=("wait", "place"))(seen, PERIOD)
+    still = UncertaintyClosing(reference(), NO_OPTIONS)(seen, PERIOD)
     assert still.abs().max() < 1e-9
-    going = LawClosing(reference(), without=("wait", "switch", "place"))(seen, PERIOD).reshape(3, 3)
+    going = PaperClosing(reference())(seen, PERIOD).reshape(3, 3)
     assert ((going * NORMALS).sum(-1) < -1e-4).all()
 
 
@@ -132,7 +122,7 @@ def test_the_papers_closing_ends_when_fingers_are_there_and_forces_are_steady():
     far = observation(0.03, contact=TOUCHING)
 
     def ticks(*, seen: Observation, rising: float = 0.0) -> int:
-        closing = LawClosing(reference(), without=ALL)
+        closing = PaperClosing(reference())
         for k in range(100):
             average = torch.full((3,), rising * k).double()
             closing(dataclasses.replace(seen, tactile=dataclasses.replace(seen.tactile, average=average)), PERIOD)
@@ -158,17 +148,15 @@ def test_the_papers_baseline_aims_at_the_contacts():
     controller = GraspController(reference(), "paper_position")
     assert isinstance(controller.closing, PositionClosing)
     assert torch.equal(controller.closing.aim, TARGET)
-    controller.step(observation(0.5 * STOP_DISTANCE), PERIOD)
+    controller.step(observation(0.5e-3), PERIOD)
     assert controller.closing.done
 
 
 def test_parts_and_laws_of_closings_without_any_are_refused():
     for closing in ("paper", "position", "open_loop"):
-        with pytest.raises(BadArgument, match="without"):
-            GraspController(reference(), closing, without=("wait",))
-        with pytest.raises(BadArgument, match="without"):
-            TrialSpec(closing=closing, without=("pace",))
-    with pytest.raises((BadArgument, TypeError), match="speed"):
-        TrialSpec(without=("speed",))  # pyright: ignore[reportArgumentType]
+        with pytest.raises(BadArgument, match="options"):
+            GraspController(reference(), closing, options=ClosingOptions())
+        with pytest.raises(BadArgument, match="options"):
+            TrialSpec(closing=closing, options=ClosingOptions())
     with pytest.raises(BadArgument, match="law"):
         GraspController(reference(), "position", "law")
