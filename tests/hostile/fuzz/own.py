@@ -5,7 +5,6 @@ from pathlib import Path
 
 import torch
 import trimesh
-from torchgrasp.control.paper.stability import load_stability
 
 from tests.campaign.cheap import campaign, work_on
 from tests.hostile.fuzz.cases import Case, saved
@@ -18,6 +17,7 @@ from torchgrasp import (
     load_mixture,
 )
 from torchgrasp.campaign.folder import carry_out
+from torchgrasp.control.paper.stability import load_stability
 from torchgrasp.data import read_shards
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.export import format_grasps, format_moveit
