@@ -36,9 +36,8 @@ from torchgrasp.shape.completion.complete import Completion, complete_cloud
 from torchgrasp.shape.completion.silhouette import Outlines, Silhouette, silhouettes
 from torchgrasp.shape.hollow import HollowShape
 from torchgrasp.shape.posterior import Posterior
-from torchgrasp.sim.hand import SimulatedHand
-from torchgrasp.sim.scene import Scene
-from torchgrasp.sim.step_contacts import StepContacts
+from torchgrasp.sim.scene import Scene, StepContacts
+from torchgrasp.sim.simulated_hand import SimulatedHand
 from torchgrasp.values import Certificate, Contacts, Grasps
 
 LENGTHS = {"b": 1, "n": 6, "g": 1, "f": 3, "t": 4, "k": 2, "v": 5, "q": 6, "c": 3}

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.load import load_hand
 from torchgrasp.sim.mount import APPROACH_JOINT, LIFT_JOINT, euler_from_rotation, mounted_urdf
-from torchgrasp.sim.scene import SHIFT_JOINTS, SceneSpec
+from torchgrasp.sim.scene_spec import SHIFT_JOINTS, SceneSpec
 from torchgrasp.testing import check_scene
 
 
@@ -54,8 +54,8 @@ SIMULATORS = ["sapien", "mujoco"]
 def build(name, mesh, simulator="sapien", **options):
     """A scene with the hand half a metre above the object."""
     pytest.importorskip(simulator)
-    from torchgrasp.sim.open import open_scene
-    from torchgrasp.sim.scene import SceneSpec
+    from torchgrasp.sim.scene import open_scene
+    from torchgrasp.sim.scene_spec import SceneSpec
 
     hand = load_hand(name)
     joints = 0.5 * (hand.lower + hand.upper)
@@ -115,7 +115,7 @@ def test_object_has_the_mass_centre_and_inertia_of_its_mesh(simulator):
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
 def test_simulators_obey_the_law(name, simulator):
     pytest.importorskip(simulator)
-    from torchgrasp.sim.open import open_scene
+    from torchgrasp.sim.scene import open_scene
 
     check_scene(lambda spec: open_scene(spec, simulator), load_hand(name))
 
@@ -134,8 +134,8 @@ BODY = """<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iy
 def test_sliding_joints_move_their_tips_along_their_axes(tmp_path, simulator):
     pytest.importorskip(simulator)
     from torchgrasp.hand.hand import Actuator
-    from torchgrasp.sim.open import open_scene
-    from torchgrasp.sim.scene import SceneSpec
+    from torchgrasp.sim.scene import open_scene
+    from torchgrasp.sim.scene_spec import SceneSpec
 
     kinds = [("prismatic", "1 0 0"), ("prismatic", "0 0 1"), ("revolute", "0 1 0")]
     fingers = "".join(SLIDER.format(k=k, kind=d, axis=x, body=BODY) for k, (d, x) in enumerate(kinds, start=1))
@@ -179,8 +179,8 @@ def test_a_force_pulls_at_the_mass_centre_and_the_lift_follows_a_speed(simulator
 @pytest.mark.parametrize("simulator", SIMULATORS)
 def test_joints_without_a_drive_are_named(simulator):
     pytest.importorskip(simulator)
-    from torchgrasp.sim.open import open_scene
-    from torchgrasp.sim.scene import SceneSpec
+    from torchgrasp.sim.scene import open_scene
+    from torchgrasp.sim.scene_spec import SceneSpec
 
     mesh, hand = standing(), load_hand("barrett")
     setup = SceneSpec(hand.urdf_path, np.eye(4), {}, hand.actuators, hand.tips.links, mesh, [mesh], 0.1)

@@ -12,9 +12,9 @@ from tests.pinch import QUICK, close, cylinder, pinch
 from torchgrasp.errors import HandFileError, Status
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver
 from torchgrasp.hand.load import load_hand
-from torchgrasp.sim.collision_masks import pair_masks
-from torchgrasp.sim.open import open_scene
-from torchgrasp.sim.scene import SceneSpec
+from torchgrasp.sim.mount import pair_masks
+from torchgrasp.sim.scene import open_scene
+from torchgrasp.sim.scene_spec import SceneSpec
 
 HANDS = ("allegro", "barrett", "allegro_biotac")
 

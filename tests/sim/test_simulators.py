@@ -96,7 +96,7 @@ def test_the_scene_as_mjcf_is_a_model_of_its_own():
     import mujoco
 
     from torchgrasp.sim.mjcf import scene_mjcf
-    from torchgrasp.sim.scene import SceneSpec
+    from torchgrasp.sim.scene_spec import SceneSpec
 
     hand, grasp = pinch("allegro")
     start = {k: float(v) for k, v in hand.expand(grasp.pregrasp[0]).items()}

@@ -25,9 +25,9 @@ from torchgrasp.geometry.plane import GRID, Plane, to_upright
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
 from torchgrasp.sim.convex_parts import check_parts, convex_parts
-from torchgrasp.sim.hand import SimulatedHand
-from torchgrasp.sim.open import open_scene
-from torchgrasp.sim.scene import Body, Neighbour, SceneSpec
+from torchgrasp.sim.scene import open_scene
+from torchgrasp.sim.scene_spec import Body, Neighbour, SceneSpec
+from torchgrasp.sim.simulated_hand import SimulatedHand
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import Grasps
 

@@ -17,7 +17,7 @@ from torchgrasp.geometry.frames import apply, inverse, rotation_angle
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
-from torchgrasp.sim.scene import Neighbour
+from torchgrasp.sim.scene_spec import Neighbour
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import Grasps
 

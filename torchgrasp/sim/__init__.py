@@ -1,9 +1,8 @@
 """The simulated world: table, object and mounted hand in SAPIEN or MuJoCo."""
 
 from torchgrasp.sim.convex_parts import convex_parts
-from torchgrasp.sim.hand import SimulatedHand
-from torchgrasp.sim.open import open_scene
-from torchgrasp.sim.scene import Body, Neighbour, Scene, SceneSpec
-from torchgrasp.sim.step_contacts import StepContacts
+from torchgrasp.sim.scene import Scene, open_scene
+from torchgrasp.sim.scene_spec import Neighbour, SceneSpec
+from torchgrasp.sim.simulated_hand import SimulatedHand
 
-__all__ = ["Body", "Neighbour", "Scene", "SceneSpec", "SimulatedHand", "StepContacts", "convex_parts", "open_scene"]
+__all__ = ["Neighbour", "Scene", "SceneSpec", "SimulatedHand", "convex_parts", "open_scene"]

@@ -1,7 +1,6 @@
 """Convex parts of a mesh for the simulator, decomposed once and cached.
 
-A simulator replaces a mesh by its convex hull: a jug would be solid. CoACD cuts it into convex parts, always the same.
-For scans of 800 to 16000 faces that takes 1 to 22 s.
+A simulator replaces a mesh by its convex hull: a jug would be solid. CoACD cuts the mesh into convex parts.
 """
 
 import hashlib
@@ -23,14 +22,11 @@ from torchgrasp.sim.decompose import decompose
 if TYPE_CHECKING:
     import trimesh
 
-THRESHOLD = 0.05
-"""Concavity at which CoACD stops cutting (0.01-1; its own default)."""
-
 MAX_PARTS = 1000
-"""Most parts that a caller gives: CoACD makes tens, and checking 3000 took a minute."""
+"""Most parts that a caller may give."""
 
 _SEARCH: dict[str, Any] = {"mcts_iterations": 60, "mcts_max_depth": 2, "mcts_nodes": 10}
-"""A narrower search for the cuts than CoACD's own, for speed; the parts' volumes sum to 1.03 of the mesh's at most."""
+"""CoACD's search for cuts, narrower and faster than its default."""
 
 _log = logging.getLogger(__name__)
 
@@ -39,11 +35,11 @@ _log = logging.getLogger(__name__)
 def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None = None) -> "list[trimesh.Trimesh]":
     """Return convex parts that fill a closed mesh, one if it is convex.
 
-    `cache` is by default `$XDG_CACHE_HOME/torchgrasp` or `~/.cache/torchgrasp`. A damaged file there is replaced. A
-    folder that cannot be written costs a warning.
+    The parts are kept in the folder `cache`, by default `$XDG_CACHE_HOME/torchgrasp` or `~/.cache/torchgrasp`. A folder
+    that cannot be written costs a warning.
 
     Raises:
-        MeshError, SuspiciousScale: as `read_mesh`, or a mesh that takes more time or memory than its size allows.
+        MeshError, SuspiciousScale: as `read_mesh`, or a mesh whose decomposition takes too much time or memory.
         MissingExtra: the mesh is not convex and CoACD is not installed.
 
     >>> import trimesh
@@ -62,7 +58,7 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
             return _filled(_load(path, mesh))
         except (ModelFileError, ValueError):
             _log.warning("%s is damaged and will be made anew", path)
-    pieces = decompose(mesh, {"threshold": THRESHOLD, **_SEARCH})
+    pieces = decompose(mesh, {"threshold": 0.05, **_SEARCH})
     parts = [trimesh.Trimesh(vertices, faces).convex_hull for vertices, faces in pieces]
     try:
         _save(parts, path)
@@ -72,21 +68,21 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
 
 
 def hull(corners: np.ndarray) -> "trimesh.Trimesh":
-    """Return the convex hull of corners; Qhull may leave one open whose faces are flat but for rounding errors."""
+    """Return the convex hull of corners; rounded corners where Qhull returns an open hull."""
     import trimesh
 
-    with np.errstate(divide="ignore", invalid="ignore"):  # of corners in a plane, by their volume: zero
+    with np.errstate(divide="ignore", invalid="ignore"):
         body = trimesh.convex.convex_hull(corners)
         return body if body.is_watertight else trimesh.convex.convex_hull(np.round(corners, 6))
 
 
 def _filled(parts: "list[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
-    """Return the parts without CoACD's occasional slivers of no volume."""
+    """Return the parts without slivers of no volume."""
     return [part for part in parts if part.volume > LEAST_VOLUME]
 
 
 def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
-    """Return the caller's own parts, refusing any that is not convex, and too many."""
+    """Return the caller's parts; refuse parts that are not convex, and too many parts."""
     if len(parts) > MAX_PARTS:
         raise MeshError("parts", f"{len(parts)} parts", f"at most {MAX_PARTS}")
     for index, part in enumerate(parts):
@@ -100,7 +96,7 @@ def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
 
 def _fingerprint(mesh: "trimesh.Trimesh") -> str:
     """Return the SHA-256 of the mesh and the settings of the decomposition."""
-    digest = hashlib.sha256(f"coacd {THRESHOLD} {sorted(_SEARCH.items())}".encode())
+    digest = hashlib.sha256(f"coacd 0.05 {sorted(_SEARCH.items())}".encode())
     digest.update(np.ascontiguousarray(mesh.vertices, dtype="<f8").tobytes())
     digest.update(np.ascontiguousarray(mesh.faces, dtype="<i8").tobytes())
     return digest.hexdigest()
@@ -116,7 +112,7 @@ def _save(parts: "list[trimesh.Trimesh]", path: Path) -> None:
 
 
 def _load(path: Path, mesh: "trimesh.Trimesh") -> "list[trimesh.Trimesh]":
-    """Read parts of a mesh that `_save` wrote, as hulls of their corners; none is far outside the mesh."""
+    """Read parts that `_save` wrote, as hulls of their corners; refuse corners far outside the mesh."""
     from scipy.spatial import QhullError
 
     tensors, _ = load_tensors(path, "parts", {"vertices", "counts"})

@@ -13,21 +13,20 @@ import numpy as np
 from torchgrasp.geometry.frames import rotation_from_rpy
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.urdf import Link, Urdf, read_urdf
-from torchgrasp.sim.collision_masks import pair_masks
-from torchgrasp.sim.mount import MOUNT_DRIVE, mount_slides
-from torchgrasp.sim.scene import ARMATURE, Body, SceneSpec
+from torchgrasp.sim.mount import MOUNT_DRIVE, mount_slides, pair_masks
+from torchgrasp.sim.scene_spec import ARMATURE, Body, SceneSpec
 
 OBJECT, TABLE, NEIGHBOUR = "torchgrasp_object", "torchgrasp_table", "torchgrasp_neighbour_{}"
 """Names of the object (its body and its free joint), of the table, and of the neighbours by number."""
 
 HAND_BIT, OBJECT_BIT, TABLE_BIT, FREE_BIT = 1, 2, 4, 3
-"""Collision groups: any two of them collide, but not the hand with itself. The number of the first bit after them."""
+"""Collision groups, all of which collide except the hand with itself, and the first bit after them."""
 
 OPTION = {"integrator": "implicitfast", "cone": "elliptic", "impratio": "10", "noslip_iterations": "2"}
 """Of the solver, from DexGraspBench (arXiv 2412.16490)."""
 
 SOLREF, SOLIMP = "0.005 1", "0.5 0.99 0.0001"
-"""Contact springs: time constant [s] and damping ratio, and the impedance over depth, as in DexGraspBench."""
+"""Contact springs: time constant [s] and damping ratio, and impedance over depth, as in DexGraspBench."""
 
 
 def scene_mjcf(spec: SceneSpec) -> str:
@@ -37,7 +36,7 @@ def scene_mjcf(spec: SceneSpec) -> str:
 
     Raises:
         BadArgument: a joint of the hand without a position or drive.
-        HandFileError: the URDF is no sound one (`read_urdf`).
+        HandFileError: the URDF is not valid (`read_urdf`).
     """
     urdf = read_urdf(spec.urdf_path)
     movable = [joint.name for joint in urdf.joints if joint.kind != "fixed"]

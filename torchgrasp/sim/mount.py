@@ -1,21 +1,20 @@
-"""The mount of a simulated hand: prismatic joints that lift it, move it along its approach, and let it yield.
-
-Also the hand's URDF on this mount, for SAPIEN.
-"""
+"""The hand in a scene: on a mount of prismatic joints, with bit masks that let only some of its links collide."""
 
 import math
 import xml.etree.ElementTree as ET
+from collections.abc import Iterable
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from torchgrasp.errors import HandFileError
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.sim.scene import APPROACH_JOINT, LIFT_JOINT, SHIFT_JOINTS, SceneSpec
+from torchgrasp.sim.scene_spec import APPROACH_JOINT, LIFT_JOINT, SHIFT_JOINTS, SceneSpec
 
 MOUNT_DRIVE = Actuator(effort=1e4, velocity=10.0, kp=1e4, kd=1e3)
-"""Motor of a slide: force [N], speed [m/s], stiffness [N/m], damping [N s/m]. It carries any hand without sagging."""
+"""Motor of a slide: force [N], speed [m/s], stiffness [N/m], damping [N s/m]."""
 
 WRIST_JOINT = "torchgrasp_wrist"
 """Name of the fixed joint between mount and hand."""
@@ -48,11 +47,11 @@ def mount_slides(spec: SceneSpec) -> list[Slide]:
 def mounted_urdf(spec: SceneSpec) -> str:
     """Return the URDF of the hand on its mount.
 
-    Only links and joints are in it, without `<visual>`, which needs a render device. `<mimic>` is left out: SAPIEN's
-    mimic joints transmit wrong forces. Coupled joints get targets of their own.
+    It has no `<visual>`, which needs a render device, and no `<mimic>`: SAPIEN's mimic joints transmit wrong forces, so
+    coupled joints get their own targets.
 
     Raises:
-        HandFileError: the file is no sound URDF (`read_urdf`).
+        HandFileError: the file is not a valid URDF (`read_urdf`).
     """
     urdf = read_urdf(spec.urdf_path)
     robot = ET.fromstring(urdf.xml)
@@ -83,10 +82,7 @@ def mounted_urdf(spec: SceneSpec) -> str:
 def euler_from_rotation(rotation: np.ndarray) -> tuple[float, float, float]:
     """Return a URDF's roll, pitch, yaw [rad]: R = Rz(yaw) Ry(pitch) Rx(roll).
 
-    At a pitch of 90 degrees only yaw - roll is fixed; roll is 0 there.
-
-    >>> euler_from_rotation(np.eye(3))
-    (0.0, 0.0, 0.0)
+    At a pitch of 90 degrees only yaw - roll is determined; roll is 0 there.
     """
     sine = -float(rotation[2, 0])
     cosine = math.hypot(float(rotation[0, 0]), float(rotation[1, 0]))
@@ -95,3 +91,36 @@ def euler_from_rotation(rotation: np.ndarray) -> tuple[float, float, float]:
         return 0.0, pitch, math.atan2(-float(rotation[0, 1]), float(rotation[1, 1]))
     roll = math.atan2(float(rotation[2, 1]), float(rotation[2, 2]))
     return roll + 0.0, pitch + 0.0, math.atan2(float(rotation[1, 0]), float(rotation[0, 0]))
+
+
+def pair_masks(pairs: Iterable[tuple[str, str]], first: int) -> dict[str, tuple[int, int]]:
+    """Return for each link of the pairs its own bits, and the bits that it collides with.
+
+    Two links collide if the bits of one share a bit with those that the other collides with, as in PhysX and MuJoCo.
+    Only one link of each pair needs a bit of its own.
+
+    Args:
+        pairs: names of links.
+        first: first free bit.
+
+    Raises:
+        HandFileError: the pairs need more bits than the masks have.
+    """
+    bits = 31  # MuJoCo's masks are signed numbers of 32 bits
+    left = [tuple(pair) for pair in pairs]
+    kinds, hits = (dict.fromkeys((name for pair in left for name in pair), 0) for _ in range(2))
+    for bit in range(first, bits):
+        if not left:
+            break
+        names = [name for pair in left for name in pair]
+        owner = max(kinds, key=names.count)  # the first of equals
+        kinds[owner] = 1 << bit
+        for one, two in left:
+            if owner in (one, two):
+                hits[two if one == owner else one] |= 1 << bit
+        left = [pair for pair in left if owner not in pair]
+    if left:
+        raise HandFileError(
+            "self_collision", f"{len(left)} pairs too many", f"pairs that {bits - first} bits distinguish"
+        )
+    return {name: (kinds[name], hits[name]) for name in kinds}

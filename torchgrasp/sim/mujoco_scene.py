@@ -8,14 +8,14 @@ from torchgrasp.errors import HandFileError, MissingExtra
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.sim.mjcf import NEIGHBOUR, OBJECT, scene_mjcf
 from torchgrasp.sim.mount import MOUNT_DRIVE, mount_slides
-from torchgrasp.sim.scene import NEIGHBOURS, STILL, TABLETOP, TARGET, Scene, SceneSpec
-from torchgrasp.sim.step_contacts import StepContacts
+from torchgrasp.sim.scene import NEIGHBOURS, STILL, TABLETOP, TARGET, Scene, StepContacts
+from torchgrasp.sim.scene_spec import SceneSpec
 
 
 class MujocoScene(Scene):
     """Table, object and hand in one MuJoCo model.
 
-    A step is MuJoCo's second half (forces to state), then its first (state to poses and contacts). Poses are therefore
+    A step runs MuJoCo's second half (forces to state) before its first (state to poses and contacts), so that poses are
     current between steps.
     """
 
@@ -46,7 +46,7 @@ class MujocoScene(Scene):
         mujoco.mj_step1(model, data)
 
     def _map_contacts(self) -> None:
-        """Map shapes to bodies, tips and their parent bodies to fingers, and what is no link to its kind."""
+        """Map shapes to bodies, tips and their parent bodies to fingers, and other bodies to their kind."""
         model = self.model
         self._body_of = model.geom_bodyid.tolist()
         self._kind_of = {0: TABLETOP, self.body: TARGET} | dict.fromkeys(self.neighbours, NEIGHBOURS)
@@ -86,7 +86,7 @@ class MujocoScene(Scene):
         self.data.ctrl[self._motors] = targets
 
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
-        """Apply a force [N] and a torque [N m] to the object from now on."""
+        """Apply a force [N] and a torque [N m] to the object, in this and all later steps."""
         self.data.xfrc_applied[self.body] = [*force, *torque]
 
     def joints(self) -> np.ndarray:
@@ -127,7 +127,7 @@ class MujocoScene(Scene):
 
 
 def _import_mujoco() -> Any:
-    """Import MuJoCo; its warnings are counted (`_diverged`), not written to a file."""
+    """Import MuJoCo, whose warnings are counted (`_diverged`) instead of written to a file."""
     try:
         import mujoco
     except ImportError as error:

@@ -1,26 +1,146 @@
-"""A scene that SAPIEN simulates."""
+"""A scene that SAPIEN simulates.
 
-from typing import Any
+Settings that differ from SAPIEN's defaults:
+
+* Joints get an armature: without it the implicit drives lose torque in a contact.
+* The hand's links feel no gravity, and collide with each other only in the pairs that the scene names.
+* Sleeping is off, because a sleeping body keeps stale contacts.
+* The object's inertia is set with its mass.
+* Penetrations are resolved at 1 m/s at most.
+
+PhysX keeps 255 faces of a convex part.
+"""
+
+import warnings
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchgrasp.sim.mount import WRIST_JOINT
-from torchgrasp.sim.sapien_build import build
-from torchgrasp.sim.scene import (
-    APPROACH_JOINT,
-    LIFT_JOINT,
-    NEIGHBOURS,
-    SHIFT_JOINTS,
-    STILL,
-    TABLETOP,
-    TARGET,
-    Scene,
-    SceneSpec,
-)
-from torchgrasp.sim.step_contacts import StepContacts
+from torchgrasp.errors import MissingExtra
+from torchgrasp.files import temporary_folder, write_file
+from torchgrasp.sim.mount import MOUNT_DRIVE, WRIST_JOINT, mount_slides, mounted_urdf, pair_masks
+from torchgrasp.sim.scene import NEIGHBOURS, STILL, TABLETOP, TARGET, Scene, StepContacts
+from torchgrasp.sim.scene_spec import APPROACH_JOINT, ARMATURE, LIFT_JOINT, SHIFT_JOINTS, TABLE, Body, SceneSpec
 
-_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
-"""Coordinates after and before each one, in a vector product: `np.cross` takes five times as long."""
+
+class Built(NamedTuple):
+    """SAPIEN's objects of a scene."""
+
+    system: Any
+    scene: Any
+    body: Any
+    hand: Any
+    neighbours: list[Any]
+
+
+def build(spec: SceneSpec) -> Built:
+    """Return a scene with table, object and hand at their start.
+
+    Raises:
+        BadArgument: a joint of the hand without a position or drive.
+        MissingExtra: SAPIEN is not installed.
+    """
+    sapien, physx = import_sapien()
+    system, scene = open_world(sapien, physx, spec.gravity, spec.timestep)
+    material = physx.PhysxMaterial(spec.friction, spec.friction, 0.0)
+    if spec.table:
+        place(sapien, scene, "table", table(physx, material), spec.table_height - TABLE[2] / 2)
+    bodies = [rigid_body(sapien, physx, material, body, spec.patch) for body in (spec.body, *spec.neighbours)]
+    for k, body in enumerate(bodies):
+        place(sapien, scene, "neighbour" if k else "object", body)
+    return Built(system, scene, bodies[0], _hand(scene, material, spec), bodies[1:])
+
+
+def open_world(sapien: Any, physx: Any, gravity: float, timestep: float) -> tuple[Any, Any]:
+    """Return an empty physics system and its scene; gravity [m/s^2], timestep [s]."""
+    physx.set_scene_config(gravity=np.array([0, 0, -gravity], np.float32), enable_tgs=True, enable_pcm=True)
+    physx.set_shape_config(contact_offset=0.002, rest_offset=0.0)
+    physx.set_body_config(solver_position_iterations=10, solver_velocity_iterations=1, sleep_threshold=0.0)
+    system = physx.PhysxCpuSystem()
+    scene = sapien.Scene([system])
+    scene.timestep = timestep
+    return system, scene
+
+
+def place(sapien: Any, scene: Any, name: str, body: Any, height: float = 0.0) -> None:
+    """Add an entity of one body to the scene, at a height [m]."""
+    entity = sapien.Entity()
+    entity.name = name
+    entity.add_component(body)
+    entity.set_pose(sapien.Pose([0.0, 0.0, height]))
+    scene.add_entity(entity)
+
+
+def table(physx: Any, material: Any) -> Any:
+    """Return a box to put under the object."""
+    body = physx.PhysxRigidStaticComponent()
+    body.attach(physx.PhysxCollisionShapeBox(np.array(TABLE, np.float32) / 2, material))
+    return body
+
+
+def rigid_body(sapien: Any, physx: Any, material: Any, spec: Body, patch: float) -> Any:
+    """Return a body with the mass centre and inertia of an even filling, and soft contacts of a radius [m]."""
+    body = physx.PhysxRigidDynamicComponent()
+    for part in spec.parts:
+        vertices = np.asarray(part.vertices, np.float32)
+        shape = physx.PhysxCollisionShapeConvexMesh(vertices, np.ones(3, np.float32), material)
+        shape.min_patch_radius = patch
+        body.attach(shape)
+    moments, axes = np.linalg.eigh(spec.inertia)
+    axes = axes * np.array([1.0, 1.0, np.sign(np.linalg.det(axes))])
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = axes, spec.mesh.center_mass
+    body.mass = spec.mass
+    body.cmass_local_pose = sapien.Pose(frame)
+    body.inertia = moments.astype(np.float32)
+    body.max_depenetration_velocity = 1.0
+    body.linear_damping = body.angular_damping = 0.0
+    return body
+
+
+def _hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
+    """Load the hand on its mount and set it to its start."""
+    loader = scene.create_urdf_loader()
+    loader.fix_root_link = True
+    loader.set_material(material.static_friction, material.dynamic_friction, 0.0)
+    with temporary_folder() as folder:
+        hand = loader.load(str(write_file(folder / "hand.urdf", mounted_urdf(spec))))
+    slides = {slide.name: slide for slide in mount_slides(spec)}
+    spec.check_drives([j.name for j in hand.active_joints if j.name not in slides])
+    start = []
+    for joint in hand.active_joints:
+        joint.set_friction(0.0)
+        if joint.name in slides:
+            drive, position = MOUNT_DRIVE, slides[joint.name].start
+        else:
+            drive, position = spec.drives[joint.name], float(spec.joints[joint.name])
+            joint.set_armature(np.array([ARMATURE], np.float32))
+        joint.set_drive_properties(drive.kp, drive.kd, force_limit=drive.effort)
+        joint.set_drive_target(position)
+        start.append(position)
+    hand.set_qpos(np.array(start, np.float32))
+    everything_else = 1  # SAPIEN's default collision group, the first bit
+    masks = pair_masks(spec.self_pairs, first=1)
+    for link in hand.links:
+        link.disable_gravity = True
+        for shape in link.collision_shapes:
+            kind, hits = masks.get(link.name, (0, 0))
+            shape.set_collision_groups([kind, everything_else | hits, 0, 0])
+            if link.name in spec.tip_links:
+                shape.min_patch_radius = spec.patch
+    return hand
+
+
+def import_sapien() -> tuple[Any, Any]:
+    """Import SAPIEN, silencing its warning about a missing Vulkan: physics needs none."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            import sapien
+            import sapien.physx as physx
+    except ImportError as error:
+        raise MissingExtra("sapien", "sim") from error
+    return sapien, physx
 
 
 class SapienScene(Scene):
@@ -42,7 +162,7 @@ class SapienScene(Scene):
         self._map_joints()
 
     def _map_contacts(self) -> None:
-        """Map tips and their parent links to fingers, and what is no link to its column of `Disturbance`."""
+        """Map tips and their parent links to fingers, and other bodies to their place in `StepContacts.stray`."""
         self._links = set(self.hand.links)
         self._finger_of = {link: i for i, link in enumerate(self.tips)}
         self._place_of = {self.body: TARGET} | dict.fromkeys(self.neighbours, NEIGHBOURS)
@@ -95,8 +215,7 @@ class SapienScene(Scene):
     def _add_forces(self, contacts: StepContacts) -> None:
         """Add the force of each touching fingertip, as a sensor at its base measures it.
 
-        SAPIEN reports contacts without friction. The wrench of an incoming joint is complete; its axes are
-        the joint's in the child.
+        SAPIEN reports contacts without friction, but complete wrenches of incoming joints, in the child's joint frame.
         """
         touching = [i for i, weight in enumerate(contacts.weight.tolist()) if weight > 0.0]
         if touching:
@@ -111,7 +230,7 @@ class SapienScene(Scene):
             joint.set_drive_target(float(target))
 
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
-        """Apply a force [N] and a torque [N m] to the object from now on."""
+        """Apply a force [N] and a torque [N m] to the object, in this and all later steps."""
         self._force, self._torque = np.asarray(force, np.float32), np.asarray(torque, np.float32)
         self._pulled = bool(self._force.any() or self._torque.any())
 
@@ -123,7 +242,8 @@ class SapienScene(Scene):
         """Return the geometric Jacobian (f, 3, j) of points on the fingertips."""
         frames = np.array([_matrix(link.entity_pose) for link in self._children]) @ self._frames
         axes, arms = frames[:, :3, 0], points[:, None, :] - frames[:, :3, 3]
-        turned = axes.take(_NEXT, -1) * arms.take(_LAST, -1) - axes.take(_LAST, -1) * arms.take(_NEXT, -1)
+        following, last = [1, 2, 0], [2, 0, 1]  # coordinates of a cross product; np.cross takes much longer
+        turned = axes.take(following, -1) * arms.take(last, -1) - axes.take(last, -1) * arms.take(following, -1)
         columns = np.where(self._slides[:, None], axes, turned) * self._moves[..., None]
         return columns.transpose(0, 2, 1)
 
@@ -157,6 +277,6 @@ def _matrix(pose: Any) -> np.ndarray:
 
 
 def _length(impulse: np.ndarray) -> float:
-    """Return the length of a vector as `np.linalg.norm` does, to the bit, in less than half of its time."""
+    """Return the length of a vector, faster than `np.linalg.norm`."""
     squared = impulse.dot(impulse)
-    return float(np.sqrt(squared)) if squared else 0.0  # most points of a contact press nothing
+    return float(np.sqrt(squared)) if squared else 0.0

@@ -1,160 +1,78 @@
-"""The simulated scene of one trial: table, object and a hand on a mount.
+"""A simulated scene of one trial: table, object and a hand on a mount.
 
 Every trial opens a fresh scene: only then do two runs give equal bits. The world's frame is that of the grasp.
 """
 
 import abc
 import dataclasses
-from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from torchgrasp.checks import checked
+from torchgrasp.checks import Count, Range, checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.hand.hand import Actuator
-from torchgrasp.sim.step_contacts import StepContacts, check_vector
-
-if TYPE_CHECKING:
-    import trimesh
-
-PATCH_RADIUS = 0.005
-"""Radius [m] of the patch in which a soft fingertip touches."""
-
-ARMATURE = 1e-3
-"""Inertia [kg m^2] that each motor's rotor adds to its joint; PhysX's implicit drives need one (`sapien_build`)."""
-
-TABLE = (2.0, 2.0, 0.1)
-"""Size of the table [m]."""
-
-LIFT_JOINT, APPROACH_JOINT = "torchgrasp_lift", "torchgrasp_approach"
-"""Prismatic joints of the mount: along the world's z axis, and along the approach, 0 where the hand has arrived."""
-
-SHIFT_JOINTS = ("torchgrasp_shift_x", "torchgrasp_shift_y", "torchgrasp_shift_z")
-"""Prismatic joints of a mount that yields, along the world's axes."""
+from torchgrasp.sim.scene_spec import APPROACH_JOINT, LIFT_JOINT, SHIFT_JOINTS, SceneSpec
+from torchgrasp.specs import Simulator
 
 STILL = np.zeros(3)
 """No force, no torque."""
 
-
 NEIGHBOURS, TABLETOP, TARGET = range(3)
-"""What a hand may touch otherwise than with a finger on the object: the places in `StepContacts.stray`."""
+"""Places in `StepContacts.stray`: contacts of the hand that are not a finger's with the object."""
 
 
-@checked
 @dataclasses.dataclass(frozen=True)
-class Neighbour:
-    """A body that stands or lies beside the object.
+class StepContacts:
+    """True contacts of f fingers with the object, summed over a step.
 
     Args:
-        mesh: closed [m], where it lies, in the frame of the grasp.
-        parts: convex bodies that make up its surface; None: its own decomposition (`convex_parts`).
-        mass: [kg]; None: as the object's, by `TrialSpec.mass` or `TrialSpec.density`.
+        impulse: normal impulse on the object (f, 3) [N s], without friction.
+        moment: contact points weighted by the size of their impulse (f, 3) [N s m].
+        weight: sum of these sizes (f,) [N s]; `moment / weight` is the mean contact point.
+        finger: fingers that touch (f,), with the tip or with the link that carries the tip.
+        force: force of each fingertip on the object (f, 3) [N], friction included.
+        stray: sums of normal impulses (3,) [N s] of the hand on neighbours, on the table, and of links other than
+            the fingers' on the object.
 
-    >>> import trimesh
-    >>> box = trimesh.creation.box([0.05, 0.05, 0.1])
-    >>> Neighbour(box.apply_translation([0.2, 0.0, 0.05]), parts=[box]).mass is None  # as the object's
-    True
+    >>> tick, step = StepContacts.none(), StepContacts.none()
+    >>> step.add(1, np.array([0.0, 0.0, 0.02]), 0.02, np.array([0.0, 0.0, 0.1]))
+    >>> tick.accumulate(step, count=5)
+    >>> tick.impulse[1]
+    array([0.  , 0.  , 0.02])
     """
 
-    mesh: "trimesh.Trimesh"
-    parts: "Sequence[trimesh.Trimesh] | None" = None
-    mass: float | None = None
+    impulse: np.ndarray
+    moment: np.ndarray
+    weight: np.ndarray
+    finger: np.ndarray
+    force: np.ndarray
+    stray: np.ndarray
 
-
-@checked
-@dataclasses.dataclass(frozen=True)
-class Body:
-    """A rigid body of the simulator: its mesh, convex parts that make up its surface, and its mass [kg].
-
-    >>> import trimesh
-    >>> box = trimesh.creation.box([0.1, 0.1, 0.1])
-    >>> Body(box, [box], mass=0.6).inertia.diagonal().round(6)  # m a^2 / 6
-    array([0.001, 0.001, 0.001])
-    """
-
-    mesh: "trimesh.Trimesh"
-    parts: "Sequence[trimesh.Trimesh]"
-    mass: float
-
-    @property
-    def inertia(self) -> np.ndarray:
-        """The inertia (3, 3) [kg m^2] of an even filling about the mass centre."""
-        return np.asarray(self.mesh.moment_inertia) * (self.mass / self.mesh.volume)
-
-
-@dataclasses.dataclass(frozen=True)
-class SceneSpec:
-    """What a scene is made of.
-
-    Args:
-        urdf_path: of the hand.
-        world_from_hand: pose of the hand (4, 4).
-        joints: start position of every joint of the URDF by name [rad].
-        drives: of every joint by name.
-        tip_links: the f fingertips' links, in grasp order.
-        mesh: the closed object, for its table height, mass centre and inertia.
-        parts: convex bodies that make up its surface.
-        mass: of the object [kg].
-        friction: of every contact.
-        gravity: [m/s^2].
-        timestep: [s].
-        travel: how far the hand can be lifted [m].
-        approach: displacement [m] from the hand's start to its pose.
-        table: whether there is one.
-        patch: radius [m] of a fingertip's contact patch; torsional friction is friction x force x patch.
-        height: of the table [m]; None: the lowest point of the mesh.
-        neighbours: further bodies.
-        self_pairs: names of the links of the hand that collide with each other.
-        yields: how far [m] the mount can be displaced along each axis of the world; 0: not at all.
-
-    >>> from torchgrasp import load_hand, load_object
-    >>> jug, hand = load_object("jug"), load_hand("barrett")
-    >>> start = dict.fromkeys(hand.tree.joint_names, 0.1)
-    >>> drives, tips = hand.actuators, hand.tips.links
-    >>> spec = SceneSpec(hand.urdf_path, np.eye(4), start, drives, tips, jug.mesh, jug.parts, mass=0.2)
-    >>> spec.check_drives(list(hand.tree.joint_names))
-    >>> spec.body.mass, round(spec.table_height, 3)
-    (0.2, 0.0)
-    """
-
-    urdf_path: Path | str
-    world_from_hand: np.ndarray
-    joints: dict[str, float]
-    drives: dict[str, Actuator]
-    tip_links: tuple[str, ...]
-    mesh: "trimesh.Trimesh"
-    parts: "list[trimesh.Trimesh]"
-    mass: float
-    friction: float = 0.8
-    gravity: float = 9.81
-    timestep: float = 1 / 500
-    travel: float = 0.1
-    approach: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    table: bool = True
-    patch: float = PATCH_RADIUS
-    height: float | None = None
-    neighbours: tuple[Body, ...] = ()
-    self_pairs: tuple[tuple[str, str], ...] = ()
-    yields: float = 0.0
-
-    @property
-    def body(self) -> Body:
-        """The object as a body."""
-        return Body(self.mesh, self.parts, self.mass)
-
-    @property
-    def table_height(self) -> float:
-        """The height [m] of the table."""
-        return float(self.mesh.bounds[0, 2]) if self.height is None else self.height
+    @classmethod
+    @checked
+    def none(cls, fingers: Annotated[int, Range(1, 1000)] = 3) -> "StepContacts":
+        """Return empty sums."""
+        impulse, moment, force = np.zeros((3, fingers, 3))
+        return cls(impulse, moment, np.zeros(fingers), np.zeros(fingers, dtype=bool), force, np.zeros(3))
 
     @checked
-    def check_drives(self, names: list[str]) -> None:
-        """Refuse joints without a start or a drive."""
-        missing = [name for name in names if name not in self.joints or name not in self.drives]
-        if missing:
-            raise BadArgument("joints", f"no position or drive for {missing}", "one for every joint of the URDF")
+    def add(self, finger: Annotated[int, Range(0, 1000)], impulse: np.ndarray, size: float, point: np.ndarray) -> None:
+        """Add a contact of a fingertip: impulse [N s], size of the impulse, and place [m]."""
+        if finger >= len(self.weight):
+            raise BadArgument("finger", finger, f"one of {len(self.weight)}")
+        check_vector("impulse", impulse)
+        check_vector("point", point)
+        self.impulse[finger] += impulse
+        self.moment[finger] += size * point
+        self.weight[finger] += size
+
+    @checked
+    def accumulate(self, step: "StepContacts", count: Count) -> None:
+        """Add one of `count` steps: impulses are summed, forces are averaged."""
+        np.add(self.impulse, step.impulse, out=self.impulse)
+        np.add(self.moment, step.moment, out=self.moment)
+        np.add(self.weight, step.weight, out=self.weight)
+        np.add(self.force, step.force / count, out=self.force)
 
 
 class Scene(abc.ABC):
@@ -164,13 +82,11 @@ class Scene(abc.ABC):
     and its handles of bodies.
 
     >>> from torchgrasp import load_hand, load_object
-    >>> from torchgrasp.evaluation import GraspTrial, TrialDriver
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> from torchgrasp.sim import open_scene
-    >>> from torchgrasp.specs import TrialSpec
-    >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
-    >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
-    >>> scene = open_scene(TrialDriver(trial, TrialSpec()).scene_spec)
+    >>> jug, hand, pose = load_object("jug"), load_hand("barrett"), np.eye(4)
+    >>> pose[2, 3] = 1.0  # [m] above the jug
+    >>> start, tips = dict.fromkeys(hand.tree.joint_names, 0.1), hand.tips.links
+    >>> spec = SceneSpec(hand.urdf_path, pose, start, hand.actuators, tips, jug.mesh, jug.parts, 0.2, yields=0.02)
+    >>> scene = open_scene(dataclasses.replace(spec, approach=(0.0, 0.0, -0.1)))
     >>> scene.penetration(), scene.neighbour_poses().shape
     (0.0, (0, 4, 4))
     >>> scene.drive(scene.joints() + 0.1)
@@ -203,7 +119,7 @@ class Scene(abc.ABC):
 
     @abc.abstractmethod
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
-        """Apply a force [N] at the object's mass centre and a torque [N m] from now on."""
+        """Apply a force [N] at the object's mass centre and a torque [N m], in this and all later steps."""
 
     @abc.abstractmethod
     def joints(self) -> np.ndarray:
@@ -258,3 +174,34 @@ class Scene(abc.ABC):
     def tip_poses(self) -> np.ndarray:
         """Return the poses (f, 4, 4) of the fingertips' links."""
         return np.array([self._pose(tip) for tip in self.tips])
+
+
+@checked
+def open_scene(spec: SceneSpec, simulator: Simulator = "sapien") -> Scene:
+    """Return a fresh scene at its start.
+
+    Raises:
+        BadArgument: an unknown simulator, or a joint of the hand without a position or drive.
+        HandFileError: the hand's URDF is not valid.
+        MissingExtra: the simulator is not installed.
+
+    >>> from torchgrasp import load_hand, load_object
+    >>> jug, hand = load_object("jug"), load_hand("barrett")
+    >>> start, tips = dict.fromkeys(hand.tree.joint_names, 0.1), hand.tips.links
+    >>> spec = SceneSpec(hand.urdf_path, np.eye(4), start, hand.actuators, tips, jug.mesh, jug.parts, mass=0.2)
+    >>> open_scene(spec).object_pose().shape
+    (4, 4)
+    """
+    if simulator == "mujoco":
+        from torchgrasp.sim.mujoco_scene import MujocoScene
+
+        return MujocoScene(spec)
+    from torchgrasp.sim.sapien_scene import SapienScene
+
+    return SapienScene(spec)
+
+
+def check_vector(name: str, vector: np.ndarray) -> None:
+    """Refuse an array of another shape than (3,), or of what is no number."""
+    if vector.shape != (3,) or vector.dtype.kind not in "iuf":
+        raise BadArgument(name, f"shape {vector.shape} of {vector.dtype}", "shape (3,) of numbers")

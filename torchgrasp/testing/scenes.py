@@ -11,7 +11,8 @@ from torchgrasp.errors import BrokenLaw
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
-from torchgrasp.sim.scene import Scene, SceneSpec
+from torchgrasp.sim.scene import Scene
+from torchgrasp.sim.scene_spec import SceneSpec
 
 Open = Callable[[SceneSpec], Scene]
 """Opens a fresh scene, as `open_scene` and a class of scenes do."""

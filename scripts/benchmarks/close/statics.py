@@ -29,9 +29,9 @@ from torchgrasp.hand.hand import Actuator
 from torchgrasp.jobs import run_tasks
 from torchgrasp.sim.mjcf import OBJECT
 from torchgrasp.sim.mujoco_scene import MujocoScene
-from torchgrasp.sim.open import open_scene
 from torchgrasp.sim.sapien_scene import SapienScene
-from torchgrasp.sim.scene import Scene, SceneSpec
+from torchgrasp.sim.scene import Scene, open_scene
+from torchgrasp.sim.scene_spec import SceneSpec
 
 SIMULATORS = ("sapien", "mujoco")
 FRICTION, PUSH, SIZE, CONE = 0.8, 5.0, 0.05, 0.02

@@ -23,7 +23,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of, load_hand
 from torchgrasp.planner import ScenePlan, plan_scene
 from torchgrasp.scene import Scene
-from torchgrasp.sim.scene import Neighbour
+from torchgrasp.sim.scene_spec import Neighbour
 from torchgrasp.specs import ContactSpec, TrialSpec
 from torchgrasp.values import Grasps
 

@@ -21,8 +21,8 @@ from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vect
 from torchgrasp.geometry.linalg import farthest_points
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.sim.convex_parts import convex_parts, hull
-from torchgrasp.sim.sapien_build import import_sapien, open_world, place, rigid_body, table
-from torchgrasp.sim.scene import PATCH_RADIUS, TABLE, Body
+from torchgrasp.sim.sapien_scene import import_sapien, open_world, place, rigid_body, table
+from torchgrasp.sim.scene_spec import TABLE, Body
 from torchgrasp.specs import TrialSpec
 
 MASS = 0.1
@@ -65,7 +65,7 @@ class SettlingTable:
 
     def add(self, body: Body, pose: np.ndarray) -> None:
         """Add a body at rest at a pose (4, 4) of its mesh's frame."""
-        self._bodies.append(rigid_body(self._sapien, self._physx, self._material, body, PATCH_RADIUS))
+        self._bodies.append(rigid_body(self._sapien, self._physx, self._material, body, 0.005))
         self._bodies[-1].angular_damping = self._damping
         place(self._sapien, self._scene, "neighbour", self._bodies[-1])
         self.move(len(self._bodies) - 1, pose)

@@ -9,34 +9,32 @@ import torch
 from torchgrasp.checks import Range, checked
 from torchgrasp.control import ClosingReference, FingertipSensor, Observation, Targets, TipContact
 from torchgrasp.errors import BadArgument
-from torchgrasp.sim.scene import Scene
-from torchgrasp.sim.step_contacts import StepContacts
+from torchgrasp.sim.scene import Scene, StepContacts
 
 
 class SimulatedHand:
-    """The hand of a scene, with tactile fingertips.
+    """The hand of a scene, with sensors in its fingertips.
 
-    `truth` are the contacts of the last tick. `force` (f,) are the true normal forces [N], averaged over it,
-    `pushes` (f, 3) the full ones. `finger` flags contacts in its last step. `steps` counts steps of the simulator.
-    `first_touch` is the step of each fingertip's first contact, infinite before.
-    `first_stray` is that of each kind in `StepContacts.stray`, whose impulses [N s] are summed in `stray`. `most_stray`
-    [N] is its largest force over a tick.
+    `truth` holds the contacts of the last tick. `force` (f,) are the true normal forces [N], averaged over the tick,
+    `pushes` (f, 3) the full forces. `finger` flags contacts in the last step. `steps` counts steps of the simulator.
+    `first_touch` is the step of each fingertip's first contact, infinite before. `first_stray` is the step of the first
+    contact of each kind in `StepContacts.stray`, `stray` the sum of their impulses [N s], and `most_stray` their
+    largest force [N] over a tick.
 
     Args:
-        scene: at its start.
+        scene: a scene at its start.
         reference: what the hand follows.
         control_rate: ticks a second [Hz].
         generator: draws the noise of the fingertips; None: no noise.
 
     >>> from torchgrasp import load_hand, load_object
-    >>> from torchgrasp.evaluation import GraspTrial, TrialDriver
     >>> from torchgrasp.data.shipped import load_shipped_grasp
+    >>> from torchgrasp.evaluation import GraspTrial, TrialDriver
     >>> from torchgrasp.specs import TrialSpec
     >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
     >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
-    >>> run = TrialDriver(trial, TrialSpec()).open()  # a fresh scene
-    >>> seen = run.robot.tick(run.controller.targets)
-    >>> seen.tactile.contact, run.robot.ticks(0.5), run.robot.unbalanced()
+    >>> run = TrialDriver(trial, TrialSpec()).open()
+    >>> run.robot.tick(run.controller.targets).tactile.contact, run.robot.ticks(0.5), run.robot.unbalanced()
     (tensor([False, False, False]), 50, nan)
     """
 
@@ -62,7 +60,7 @@ class SimulatedHand:
 
     @checked
     def tick(self, targets: Targets) -> Observation:
-        """Drive joints and palm for one control period; return what the robot knows."""
+        """Drive joints and palm for one control period; return the observation at its end."""
         if len(targets.joints) != len(self._to_scene):
             raise BadArgument("targets", f"{len(targets.joints)} joints", f"all {len(self._to_scene)} of the URDF")
         self.scene.drive(targets.joints.numpy()[self._to_scene])
@@ -88,17 +86,17 @@ class SimulatedHand:
         return self._observe(contacts)
 
     def unbalanced(self) -> float:
-        """Return the sum of the fingertips' forces over the sum of their sizes; NaN without a force."""
+        """Return the size of the sum of the fingertips' forces over the sum of their sizes; NaN without forces."""
         sizes = float(np.linalg.norm(self.pushes, axis=-1).sum())
         return float(np.linalg.norm(self.pushes.sum(0))) / sizes if sizes > 0.0 else math.nan
 
     @checked
     def ticks(self, seconds: Annotated[float, Range(0.0, 1e6)]) -> int:
-        """Return the control ticks in a time [s], at least one."""
+        """Return the number of control ticks in a time [s], at least one."""
         return max(1, round(seconds / self.period))
 
     def _observe(self, contacts: StepContacts) -> Observation:
-        """Return the hand's own knowledge: contacts only as the fingertips sense them."""
+        """Return the observation of the hand: its joints, and contacts as its fingertips sense them."""
         world_from_hand = self.scene.hand_pose()
         rotation, origin = world_from_hand[:3, :3], world_from_hand[:3, 3]
         tips = self.scene.tip_poses()
