@@ -19,7 +19,8 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.files import format_json, write_file
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import Plane, upright_frame
-from torchgrasp.scene import DepthImage, Scene
+from torchgrasp.scene import Scene
+from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.occupancy import (
     ABOVE,
     MODEL,

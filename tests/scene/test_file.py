@@ -7,7 +7,7 @@ import torch
 from torchgrasp import load_scene, read_scene, save_scene
 from torchgrasp.base import named_tensors
 from torchgrasp.errors import BadArgument, CloudFileError
-from torchgrasp.scene.file import is_scene
+from torchgrasp.scene.image import is_scene
 
 
 def test_a_saved_scene_comes_back(tmp_path):

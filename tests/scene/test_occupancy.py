@@ -11,7 +11,8 @@ from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.scene import DepthImage, Scene, estimate_occupancy
+from torchgrasp.scene import Scene, estimate_occupancy
+from torchgrasp.scene.image import DepthImage
 
 BOXES = {  # size and position of the lower face's middle
     1: ((0.06, 0.06, 0.08), (0.0, 0.0)),

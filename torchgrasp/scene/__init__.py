@@ -1,7 +1,6 @@
-"""What one camera saw of a table: things, their support, free and hidden space."""
+"""What one camera saw of a table: objects, their support, free and hidden space."""
 
 from torchgrasp.scene.occupancy import Occupancy, estimate_occupancy
-from torchgrasp.scene.file import read_scene, save_scene
-from torchgrasp.scene.scene import DepthImage, Scene
+from torchgrasp.scene.scene import Scene, read_scene, save_scene
 
-__all__ = ["DepthImage", "Occupancy", "Scene", "read_scene", "save_scene", "estimate_occupancy"]
+__all__ = ["Occupancy", "Scene", "estimate_occupancy", "read_scene", "save_scene"]

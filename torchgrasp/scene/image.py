@@ -1,16 +1,29 @@
-"""What a pinhole depth camera measured."""
+"""What a pinhole depth camera measured: from arrays, files and clouds."""
 
 import dataclasses
+import math
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.checks import Pose, checked
-from torchgrasp.cloud.depth import frustum_of_image
-from torchgrasp.geometry.frames import apply, inverse, rotate
+from torchgrasp.cloud.depth import check_rigid, frustum_of_image, read_depth
+from torchgrasp.cloud.tables import parse_npz
+from torchgrasp.errors import BadArgument, CloudFileError
+from torchgrasp.files import is_file, read_bytes
+from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import GRID
+from torchgrasp.limits import CLOUD_BYTES
+
+LEAST_PIXELS = 30
+"""Fewest pixels of an object: fewer do not show its shape."""
 
 
 @checked
@@ -24,8 +37,6 @@ class DepthImage(Value):
     >>> image = DepthImage(torch.full((4, 4), 0.5), camera, torch.eye(4))
     >>> image.points()[0, 0]  # [m]
     tensor([-0.0075, -0.0075,  0.5000], dtype=torch.float64)
-    >>> image.frustum.shape, image.to_upright(torch.eye(4)).obj_from_camera.shape
-    (torch.Size([4, 3]), torch.Size([4, 4]))
     """
 
     depth: Float[Tensor, "h w"]
@@ -53,3 +64,108 @@ class DepthImage(Value):
         column = torch.arange(z.shape[1], dtype=z.dtype, device=z.device)
         camera = torch.stack([z * (column - k[0, 2]) / k[0, 0], z * (row - k[1, 2]) / k[1, 1], z], -1)
         return apply(self.obj_from_camera.double(), camera.reshape(-1, 3)).reshape(*z.shape, 3)
+
+    def without_speckle(self) -> "DepthImage":
+        """Return the image with the median of the measured pixels of each 3 x 3 square where most are measured."""
+        depth = self.depth.numpy()
+        padded = np.pad(np.where(depth > 0, depth, np.nan), 1, constant_values=np.nan)
+        squares = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(*depth.shape, 9)
+        ranked = np.sort(squares, axis=-1)  # NaN last
+        count = np.isfinite(squares).sum(-1)
+        middle = np.take_along_axis(ranked, np.maximum(count - 1, 0)[..., None] // 2, -1)[..., 0]
+        found = np.where((count >= 3) & (depth > 0), np.nan_to_num(middle), depth)
+        return dataclasses.replace(self, depth=torch.from_numpy(found))
+
+
+def read_image(
+    depth: Tensor | np.ndarray,
+    intrinsics: Tensor | np.ndarray | Sequence[float | int],
+    camera_pose: Tensor | np.ndarray | None,
+) -> DepthImage:
+    """Return a checked depth image in float64 [m]; a missing pose is the camera's own frame."""
+    z, k, _ = read_depth(depth, intrinsics)
+    pose = torch.eye(4, dtype=torch.float64)
+    if camera_pose is not None:
+        pose = check_rigid("camera_pose", torch.as_tensor(camera_pose).double()).cpu()
+    if int((z > 0).sum()) < LEAST_PIXELS:
+        raise BadArgument("depth", f"{int((z > 0).sum())} measured pixels", f"at least {LEAST_PIXELS}")
+    return DepthImage(z.cpu(), k.cpu(), pose)
+
+
+def read_labels(labels: Tensor | np.ndarray, shape: tuple[int, ...]) -> Int[Tensor, "..."]:
+    """Return checked labels: whole numbers >= 0 of the depth's or the cloud's shape."""
+    read = torch.as_tensor(np.asarray(labels).astype(np.int64) if isinstance(labels, np.ndarray) else labels)
+    if tuple(read.shape) != tuple(shape) or read.is_floating_point() or read.dtype == torch.bool:
+        found = f"shape {tuple(read.shape)}, {read.dtype}"
+        raise BadArgument("labels", found, f"whole numbers of shape {tuple(shape)}, one for each pixel or point")
+    if bool((read < 0).any()):
+        raise BadArgument("labels", int(read.min()), "labels >= 0; 0 is the table and all that is no object")
+    return read.long().cpu()
+
+
+def image_of_cloud(
+    points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"], up: Float[Tensor, "3"]
+) -> tuple[DepthImage, Int[Tensor, "n 2"]]:
+    """Return the depth image that a pinhole camera at the viewpoint takes of a cloud, and each point's row and column.
+
+    The camera looks at the middle of the points, upright. A pixel holds about two points and the nearest depth.
+    """
+    forward = unit(unit(points - viewpoint).mean(0))
+    down = -up + (up @ forward) * forward
+    if float(torch.linalg.vector_norm(down)) < 0.01:  # straight from above, any direction will do
+        side = points[(points - points.mean(0)).norm(dim=-1).argmax()] - viewpoint
+        down = side - (side @ forward) * forward
+    down = unit(down)
+    pose = rigid(torch.stack([torch.linalg.cross(down, forward), down, forward], -1), viewpoint)
+    camera = apply(inverse(pose), points)
+    flat, widest = camera[:, :2] / camera[:, 2:], 75.0  # [deg]
+    if not bool((camera[:, 2] > 0).all()) or float(flat.norm(dim=-1).max()) > math.tan(math.radians(widest)):
+        raise BadArgument("cloud", "points all around the camera", f"a view within {widest:g} degrees of its middle")
+    low, high = flat.amin(0), flat.amax(0)
+    extent = (high - low).clamp_min(1e-6)
+    cells = ((flat - low) / extent * 63.999).long()
+    filled = len((cells[:, 0] * 64 + cells[:, 1]).unique()) / 64**2
+    pixel = math.sqrt(2 * float(extent.prod()) * filled / len(points))
+    pixel = max(pixel, float(extent.max()) / 1023)  # an image of at most 1024 pixels
+    width, height = (int(side) + 1 for side in (extent / pixel).tolist())
+    middle = (low + high) / 2
+    centre = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=points.dtype) - middle / pixel
+    k = torch.tensor([[1 / pixel, 0, centre[0]], [0, 1 / pixel, centre[1]], [0, 0, 1]], dtype=torch.float64)
+    column, row = torch.round(flat / pixel + centre).long().unbind(-1)
+    pixels = torch.stack([row.clamp(0, height - 1), column.clamp(0, width - 1)], -1)
+    depth = torch.full((height * width,), torch.inf, dtype=torch.float64)
+    depth.scatter_reduce_(0, pixels[:, 0] * width + pixels[:, 1], camera[:, 2], "amin")
+    depth = torch.where(torch.isfinite(depth), depth, 0.0).reshape(height, width)
+    return DepthImage(depth, k, pose, bounded=False), pixels
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of a scene's .npz file; the table as 4 floats.
+
+    Raises:
+        CloudFileError: no such file, or malformed content.
+    """
+    names = ("depth", "intrinsics", "camera_pose", "labels", "mask", "table")  # the first two are required
+    allowed = "a .npz file with depth and intrinsics"
+    if path.suffix.lower() != ".npz" or not is_file(path):
+        raise CloudFileError("path", path, allowed)
+    if path.stat().st_size > CLOUD_BYTES:
+        raise CloudFileError("path", f"{path} of {path.stat().st_size} bytes", f"at most {CLOUD_BYTES} bytes")
+    try:
+        arrays = parse_npz(read_bytes(path), names, "depth")
+        found = {name: arrays[name] for name in ("depth", "intrinsics")} | arrays
+        if "table" in found:
+            found["table"] = found["table"].astype(float).reshape(4)
+    except BadArgument:
+        raise
+    except Exception as error:  # zlib, zipfile and numpy each raise their own
+        raise CloudFileError("path", f"{path}: {error!r}", allowed) from error
+    return found
+
+
+def is_scene(path: Path) -> bool:
+    """Return whether a file holds a scene: a .npz file with a depth image."""
+    if path.suffix.lower() != ".npz" or not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return "depth.npy" in archive.namelist()

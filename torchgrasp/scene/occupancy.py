@@ -1,7 +1,7 @@
-"""What may be in the way: how likely each place around the target is full of something else.
+"""What may be in the way: the probability that each place around the target is full of something else.
 
-A camera sees the front of things. In front of what it measured, space is free. Behind, a thing goes on for about as
-far as it is wide, down to the table under what was seen of it. `scripts/train.py occupancy` fits how likely that is.
+Space in front of a measured depth is free. Behind an object's surface, the probability follows from its visible size
+and from the depth below it. `scripts/train.py occupancy` fits the model.
 """
 
 import dataclasses
@@ -26,21 +26,11 @@ from torchgrasp.scene.scene import Scene
 SPACING = 0.005
 """Spacing [m] of the voxels: a third of a finger's width."""
 SIDEWAYS, ABOVE = 0.25, 0.04
-"""How far [m] voxels reach around the target's points and above everything: a hand's length, two fingertips."""
+"""How far [m] voxels extend around the target's points, and above everything."""
 NOISE = 0.004
-"""Depth [m] in front of a measured one at which space counts as free: three standard deviations of the noise."""
-FILLED = 8
-"""Pixels without a depth take that of the nearest pixel with one, up to this distance: rims and dropouts."""
+"""Space this far [m] in front of a measured depth is free: three standard deviations of the noise."""
 LOW = 0.01
 """Height [m] above the table below which unlabelled pixels show the table."""
-RIM, RIM_DEPTH = 6, 0.02
-"""Unlabelled pixels this near to the target's, in pixels and metres of depth, are its own: masks are never exact."""
-LEAST_PIXELS = 20
-"""Fewer pixels without label are no thing: flying pixels."""
-LEAST_SIZE = 0.005
-"""Least size [m] of a thing, by which depths in its shadow are measured: a voxel."""
-LEAST = 0.002
-"""Least probability of a hidden place: the model has seen some thousand places of a kind, no more."""
 MODEL = Path(__file__).with_name("occupancy.json")
 """Knots and weights of the model of occupancy, and what they were fitted on."""
 
@@ -48,7 +38,7 @@ MODEL = Path(__file__).with_name("occupancy.json")
 @checked
 @dataclasses.dataclass(frozen=True)
 class Occupancy(Value):
-    """How likely each voxel is full of something that is neither the target nor the table.
+    """The probability that each voxel is full of something that is neither the target nor the table.
 
     The centre of voxel (i, j, k) is at `origin` + (i, j, k) * `spacing` [m].
 
@@ -70,10 +60,10 @@ class Occupancy(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Shadows(Value):
-    """A depth image [m] without small gaps, and whose shadow begins at each pixel.
+    """A depth image [m] with small gaps filled, and the object in whose shadow the space behind each pixel is.
 
-    `owner` is 0 for the table, -1 where nothing was measured, a thing's label, or another negative number for each
-    thing without label. `points` [m] are the pixels' (not a number where nothing was measured).
+    `owner` is 0 for the table, -1 where nothing was measured, an object's label, or another negative number for each
+    object without label. `points` [m] are NaN where nothing was measured.
     """
 
     image: DepthImage
@@ -82,7 +72,7 @@ class Shadows(Value):
     points: Float[Tensor, "h w 3"]
 
     def look(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
-        """Return how far [m] points lie behind what was measured, along the ray, and whose shadow that is."""
+        """Return how far [m] points are behind the measured depth, along the ray, and the owner of the shadow."""
         camera = apply(inverse(self.image.obj_from_camera.double()), points.double())
         x, y, z = camera.unbind(-1)
         (fx, _, cx), (_, fy, cy), _ = self.image.intrinsics.tolist()
@@ -98,7 +88,7 @@ class Shadows(Value):
 
 
 def cast_shadows(scene: Scene, target: int) -> Shadows:
-    """Return whose shadow begins at each pixel; scene and target in the upright frame."""
+    """Return the shadows of a scene in the upright frame."""
     from scipy.ndimage import label
 
     image, (row, column) = scene.image, scene.pixels.unbind(-1)
@@ -110,13 +100,14 @@ def cast_shadows(scene: Scene, target: int) -> Shadows:
     if scene.table is not None:
         loose = (owner == 0) & (points[..., 2] > LOW)
         gap, nearest = find_nearest(own)
-        rim = loose & (gap <= RIM) & ((depth - depth.reshape(-1)[nearest]).abs() <= RIM_DEPTH)
+        # Masks are off by some pixels: unlabelled pixels near the target's, in the image and in depth, are its own.
+        rim = loose & (gap <= 6) & ((depth - depth.reshape(-1)[nearest]).abs() <= 0.02)
         numbered: Any = label((loose & ~rim).numpy())
         parts = torch.from_numpy(numbered[0]).long()
-        large = (torch.bincount(parts.reshape(-1)) >= LEAST_PIXELS)[parts]
+        large = (torch.bincount(parts.reshape(-1)) >= 20)[parts]  # fewer are flying pixels
         owner = torch.where(rim, target, torch.where(loose, torch.where(large, -1 - parts, -1), owner))
     gap, nearest = find_nearest(owner != -1)
-    depth, owner = (torch.where(gap <= FILLED, x.reshape(-1)[nearest], x) for x in (depth, owner))
+    depth, owner = (torch.where(gap <= 8, x.reshape(-1)[nearest], x) for x in (depth, owner))  # rims and dropouts
     return Shadows(image, depth, owner, points)
 
 
@@ -130,13 +121,13 @@ def find_nearest(pixels: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Int
 
 
 def shadow_features(shadows: Shadows, owner: int, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 6"]:
-    """Return what tells whether points [m] in the shadow of a thing are full.
+    """Return the features from which the model estimates whether points [m] in the shadow of an object are full.
 
-    These are, in order:
+    They are, in order:
 
     * the depth behind its surface over its width,
-    * the depth [m] under its seen points in the same column,
-    * how deep [m] the mirrored point lies behind what was measured, for two guesses of the middle,
+    * the depth [m] below its seen points in the same column,
+    * how deep [m] the mirrored point is behind the measured depth, for two guesses of the object's middle,
     * the distance from its front over its seen depth, and from its middle over its width.
     """
     from scipy.ndimage import maximum_filter
@@ -146,7 +137,7 @@ def shadow_features(shadows: Shadows, owner: int, points: Float[Tensor, "n 3"]) 
     axes = torch.stack([toward, torch.stack([-toward[1], toward[0]])], -1)
     seen, level = own[:, :2] @ axes, points[:, :2].double() @ axes
     low, high = torch.quantile(seen, seen.new_tensor([0.02, 0.98]), dim=0)
-    (deep, wide), front = (high - low + LEAST_SIZE).tolist(), high[0]
+    (deep, wide), front = (high - low + SPACING).tolist(), high[0]
 
     corner = torch.floor(own[:, :2].amin(0) / SPACING).long() - 1
     count = torch.floor(own[:, :2].amax(0) / SPACING).long() - corner + 2
@@ -178,19 +169,19 @@ def load_model() -> dict[str, Any]:
 
 
 def probability(kind: str, features: Float[Tensor, "n f"]) -> Float[Tensor, "n"]:
-    """Return the probability that places of a kind are full: their log-odds are a sum of piecewise linear functions."""
+    """Return the probability that places of a kind are full; the log-odds are a sum of piecewise linear functions."""
     model, odds = load_model()[kind], torch.full_like(features[:, 0], load_model()[kind]["bias"])
     for x, knots, values in zip(features.unbind(-1), model["knots"], model["values"], strict=True):
         odds += torch.from_numpy(np.interp(x.numpy(), knots, values)).to(odds)
-    return torch.sigmoid(odds).clamp_min(LEAST)
+    return torch.sigmoid(odds).clamp_min(0.002)
 
 
 @checked
 def estimate_occupancy(scene: Scene, target: int) -> Occupancy:
     """Return how likely places around the target are full of something else; the scene is in its upright frame.
 
-    Free is what lies in front of a measured depth, and the table is no obstacle. In the shadow of a thing the model
-    tells how likely, in that of the target and outside the picture little is known. It is computed on the CPU.
+    Space in front of a measured depth is free, and the table is no obstacle. In the shadow of an object the model gives
+    the probability. In the shadow of the target and outside the picture little is known. It is computed on the CPU.
 
     Raises:
         BadArgument: a target without points.

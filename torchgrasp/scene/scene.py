@@ -1,7 +1,9 @@
-"""What one camera saw: things on a table."""
+"""A scene: objects on a table, as one camera saw them; from images and clouds, from and to files."""
 
 import dataclasses
+import io
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,39 +14,31 @@ from torchgrasp.base import Value
 from torchgrasp.checks import Pose, checked
 from torchgrasp.cloud.depth import read_depth
 from torchgrasp.errors import BadArgument
+from torchgrasp.files import write_file
 from torchgrasp.geometry.plane import Plane, to_upright
-from torchgrasp.scene.build import find_table, image_of_cloud, label_image, read_image, read_labels
-from torchgrasp.scene.image import DepthImage
+from torchgrasp.scene.image import DepthImage, image_of_cloud, read_arrays, read_image, read_labels
+from torchgrasp.scene.segment import label_image
+from torchgrasp.scene.support import find_table
 from torchgrasp.values import PointCloud
-
-CLICK_PIXELS, CLICK_METRES = 3.0, 0.01
-"""Farthest measured pixel, and point [m], that a click can mean: a hundredth of the pixels are missing."""
-HIDDEN = 0.01
-"""Depth [m] behind the nearest point of its pixel at which a point belongs to what is hidden there."""
-CUT_OFF = 5
-"""Pixels of a target at the image's border that say it is cut off: fewer are noise."""
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class Scene(Value):
-    """Things on a table, as one camera saw them, in the frame that was given ("obj").
+    """Objects on a table, as one camera saw them, in the given frame ("obj").
 
     Args:
         points: every measured point [m].
-        labels: 0 for the table and all that is no thing; 1, 2, ... for the things.
-        image: what the camera measured: it tells free space from hidden space.
+        labels: 0 for the table and all that is no object; 1, 2, ... for the objects.
+        image: what the camera measured: it shows free space and hidden space.
         pixels: row and column of each point in the image.
-        table: the plane that things stand on; None: unknown.
-        target: label of the thing to be grasped; None: not chosen.
+        table: the plane that the objects stand on; None: unknown.
+        target: label of the object to be grasped; None: not chosen.
 
     >>> from torchgrasp import load_scene
-    >>> scene = load_scene()
-    >>> target = scene.select([394, 312])  # a clicked pixel: column, row
-    >>> target.target in scene.things, len(target.cloud()) == int(target.rows_of().sum())
+    >>> target = load_scene().select([394, 312])  # a clicked pixel: column, row
+    >>> target.target in target.things, len(target.cloud()) == int(target.rows_of().sum())
     (True, True)
-    >>> scene.to_upright(torch.eye(4)).things
-    (1, 2, 3, 4)
     """
 
     points: Float[Tensor, "n 3"]
@@ -70,7 +64,7 @@ class Scene(Value):
     ) -> "Scene":
         """Return the scene in a pinhole camera's depth image.
 
-        Pixels on the table and flying pixels at rims get the label 0. Without labels the things are the connected
+        Pixels on the table and flying pixels at rims get the label 0. Without labels the objects are the connected
         components above the table.
 
         Args:
@@ -78,7 +72,7 @@ class Scene(Value):
             intrinsics: (3, 3) or (fx, fy, cx, cy) [pixels].
             camera_pose: obj_from_camera (4, 4), rigid; None: results are in the camera's frame.
             mask: (h, w) of bool or uint8, pixels of the target; it may be off by a few pixels.
-            labels: (h, w) of whole numbers; 0 is no thing.
+            labels: (h, w) of whole numbers; 0 is no object.
             point: of the target: a pixel (u, v), or a point (x, y, z) [m].
             table: a plane, or its height z [m]; None: it is fitted.
             up: (3,), against gravity, for the fit; None: any direction.
@@ -86,25 +80,23 @@ class Scene(Value):
         Raises:
             BadArgument: what `read_depth` refuses; mask or labels of another size; a target that is the table; a
                 point where nothing was measured; a camera below the table.
-            NoSupport: no plane that things stand on.
+            NoSupport: no plane that objects stand on.
 
         >>> from torchgrasp import load_scene
         >>> image = load_scene().image
-        >>> scene = Scene.from_depth(image.depth, image.intrinsics, image.obj_from_camera)
-        >>> len(scene.things) > 1, scene.table is not None
-        (True, True)
+        >>> len(Scene.from_depth(image.depth, image.intrinsics, image.obj_from_camera).things) > 1
+        True
         """
         if sum(given is not None for given in (mask, labels, point)) > 1 and mask is not None:
             raise BadArgument("mask", "a mask beside labels or a point", "one of them")
         image = read_image(depth, intrinsics, camera_pose)
-        inside = None if mask is None else read_depth(depth, intrinsics, mask)[2]
+        inside = None if mask is None else read_depth(depth, intrinsics, mask)[2].cpu()
         given = None if labels is None else read_labels(labels, tuple(image.depth.shape))
         points, measured = image.points(), image.depth > 0
         plane = find_table(points[measured], image.obj_from_camera[:3, 3], table, up)
-        found = label_image(image, plane, given, None if inside is None else inside.cpu())
-        scene = cls(
-            points[measured], found[measured], image, torch.nonzero(measured), plane, 1 if mask is not None else None
-        )
+        found = label_image(image, plane, given, inside)
+        target = None if mask is None else 1
+        scene = cls(points[measured], found[measured], image, torch.nonzero(measured), plane, target)
         return scene if point is None else scene.select(point)
 
     @classmethod
@@ -120,14 +112,11 @@ class Scene(Value):
         table: Plane | float | None = None,
         up: Sequence[float | int] | Tensor | np.ndarray | None = None,
     ) -> "Scene":
-        """Return the scene in a cloud of one view.
-
-        A pinhole image stands for the camera: the points are projected at the viewpoint, about two to a pixel. It
-        tells free space from hidden space, and things from each other.
+        """Return the scene in a cloud of one view, projected to a pinhole image at its viewpoint.
 
         Args:
             cloud: everything that the camera saw [m], with its viewpoint.
-            labels: (n,) of whole numbers; 0 is no thing.
+            labels: (n,) of whole numbers; 0 is no object.
             mask: (n,) of bool, points of the target.
             box: two corners (2, 3) [m] of a box along the axes, which holds the target.
             point: a point (x, y, z) [m] of the target.
@@ -135,15 +124,14 @@ class Scene(Value):
 
         Raises:
             BadArgument: no viewpoint, or several; labels or mask of another size; and as `from_depth`.
-            NoSupport: no plane that things stand on.
+            NoSupport: no plane that objects stand on.
 
         >>> from torchgrasp import PointCloud, load_scene
         >>> seen = load_scene()
-        >>> scene = Scene.from_cloud(PointCloud(seen.points, viewpoint=seen.viewpoint))
-        >>> len(scene.things) > 1
+        >>> len(Scene.from_cloud(PointCloud(seen.points, viewpoint=seen.viewpoint)).things) > 1
         True
         """
-        if sum(given is not None for given in (mask, labels, box)) > 1:
+        if sum(given is not None for given in (labels, mask, box)) > 1:
             raise BadArgument("mask", "several of mask, labels and box", "one of them")
         if cloud.viewpoint is None or cloud.viewpoint.ndim != 1:
             found = "none" if cloud.viewpoint is None else "one for each point"
@@ -162,16 +150,16 @@ class Scene(Value):
         image, pixels = image_of_cloud(points, viewpoint, plane.normal.double())
         row, column = pixels.unbind(-1)
         depth = ((points - viewpoint) @ image.obj_from_camera[:3, 2]) - image.depth[row, column]
-        front = depth < HIDDEN
+        front = depth < 0.01  # [m]; other points belong to something hidden behind the pixel
 
-        def to_image(values: Tensor) -> Tensor:
+        def to_image(values: Tensor | None) -> Tensor | None:
+            if values is None:
+                return None
             whole = torch.zeros(image.depth.shape, dtype=values.dtype)
             whole[row[front], column[front]] = values[front]
             return whole
 
-        found = label_image(
-            image, plane, None if given is None else to_image(given), None if inside is None else to_image(inside)
-        )
+        found = label_image(image, plane, to_image(given), to_image(inside))
         own = torch.where(front, found[row, column], 0)
         scene = cls(points, own, image, pixels, plane, None if inside is None else 1)
         return scene if point is None else scene.select(point)
@@ -188,34 +176,33 @@ class Scene(Value):
         """
         if isinstance(target, int) and not isinstance(target, bool):
             if target not in self.things:
-                raise BadArgument("target", target, f"a label of a thing: {list(self.things)}")
+                raise BadArgument("target", target, f"a label of an object: {list(self.things)}")
             return dataclasses.replace(self, target=target)
         place = torch.as_tensor(np.asarray(target), dtype=torch.float64)
         if place.shape not in ((2,), (3,)) or not bool(torch.isfinite(place).all()):
             raise BadArgument("point", repr(target), "a pixel (u, v) or a point (x, y, z)")
         if len(place) == 2:
-            distance = torch.linalg.vector_norm(self.pixels.double() - place.flip(0), dim=-1)
-            text, reach = f"pixel ({place[0]:g}, {place[1]:g})", CLICK_PIXELS
+            distance, reach = torch.linalg.vector_norm(self.pixels.double() - place.flip(0), dim=-1), 3.0  # pixels
+            text = f"pixel ({place[0]:g}, {place[1]:g})"
         else:
-            distance = torch.linalg.vector_norm(self.points.double() - place, dim=-1)
-            text, reach = f"point ({', '.join(f'{x:.3f}' for x in place.tolist())}) m", CLICK_METRES
+            distance, reach = torch.linalg.vector_norm(self.points.double() - place, dim=-1), 0.01  # [m]
+            text = f"point ({', '.join(f'{x:.3f}' for x in place.tolist())}) m"
         nearest = int(distance.argmin())
         if float(distance[nearest]) > reach:
-            raise BadArgument("point", f"nothing measured at {text}", "a place on a thing")
+            raise BadArgument("point", f"nothing measured at {text}", "a place on an object")
         label = int(self.labels[nearest])
         if label == 0:
-            raise BadArgument("point", f"{text} on the table, or on no thing", "a place on a thing")
+            raise BadArgument("point", f"{text} on the table, or on no object", "a place on an object")
         return dataclasses.replace(self, target=label)
 
     @property
     def advice(self) -> tuple[str, ...]:
-        """What speaks against the picture, a sentence each: a target that the border of the image cuts off."""
+        """Problems of the picture, a sentence each: a target that the border of the image cuts off."""
         if self.target is None:
             return ()
         pixels = self.pixels[self.rows_of()]
         last = torch.tensor(self.image.depth.shape) - 1
-        cut = int(((pixels <= 1) | (pixels >= last - 1)).any(-1).sum())
-        if cut < CUT_OFF:
+        if int(((pixels <= 1) | (pixels >= last - 1)).any(-1).sum()) < 5:  # fewer are noise
             return ()
         return ("the target is cut off at the border of the image: its other part is unknown; turn the camera to it",)
 
@@ -226,21 +213,21 @@ class Scene(Value):
 
     @property
     def things(self) -> tuple[int, ...]:
-        """The labels of the things, ascending."""
+        """The labels of the objects, ascending."""
         return tuple(k for k in self.labels.unique().tolist() if k > 0)
 
     @checked
     def rows_of(self, label: int | None = None) -> Bool[Tensor, "n"]:
-        """Tell which points are a thing's, by default the target's: none where there is no target."""
+        """Return which points belong to an object, by default the target; none where there is no target."""
         label = self.target if label is None else label
         return torch.zeros_like(self.labels, dtype=torch.bool) if label is None else self.labels == label
 
     @checked
     def cloud(self, label: int | None = None) -> PointCloud:
-        """Return the points of a thing, by default the target, with the camera as viewpoint.
+        """Return the points of an object, by default the target, with the camera as viewpoint.
 
         Raises:
-            BadArgument: a label of nothing, or no target.
+            BadArgument: a label without points, or no target.
             TooFewPoints: fewer than 4 points.
         """
         rows, frustum = self.rows_of(label), self.image.frustum
@@ -260,3 +247,52 @@ class Scene(Value):
             image=self.image.to_upright(obj_from_upright),
             table=None if self.table is None else Plane.horizontal(0.0),
         )
+
+
+@checked
+def read_scene(path: Path | str) -> Scene:
+    """Read a scene from a .npz file, as `Scene.from_depth` does.
+
+    Its arrays are `depth` (h, w) in metres or integer millimetres, `intrinsics` (3, 3) or (4,), and optionally
+    `camera_pose` (4, 4), `labels` (h, w) of objects or `mask` (h, w) of the target, and `table` (4,): normal and
+    offset.
+
+    Raises:
+        CloudFileError: no such file, or malformed content.
+        BadArgument: what `Scene.from_depth` refuses.
+    """
+    arrays = read_arrays(Path(path))
+    table, pose = arrays.pop("table", None), arrays.pop("camera_pose", None)
+    plane = None if table is None else Plane(torch.tensor(table[:3]), float(table[3]))
+    return Scene.from_depth(arrays.pop("depth"), arrays.pop("intrinsics"), pose, **arrays, table=plane)
+
+
+@checked
+def save_scene(scene: Scene, path: Path | str) -> Path:
+    """Write a scene as .npz, atomically: depth in float32, labels, camera and table; `read_scene` reads it.
+
+    Raises:
+        BadArgument: another suffix.
+        OutputError: the file cannot be written.
+
+    >>> import tempfile
+    >>> from torchgrasp import load_scene
+    >>> read_scene(save_scene(load_scene(), Path(tempfile.mkdtemp(), "scene.npz"))).things
+    (1, 2, 3, 4)
+    """
+    path, buffer = Path(path), io.BytesIO()
+    if path.suffix.lower() != ".npz":
+        raise BadArgument("path", path, "a file ending in .npz")
+    labels = np.zeros(scene.image.depth.shape, dtype=np.int32)
+    row, column = scene.pixels.cpu().numpy().T
+    labels[row, column] = scene.labels.cpu().numpy()
+    arrays = {
+        "depth": scene.image.depth.cpu().numpy().astype(np.float32),
+        "intrinsics": scene.image.intrinsics.cpu().numpy(),
+        "camera_pose": scene.image.obj_from_camera.cpu().numpy(),
+        "labels": labels,
+    }
+    if scene.table is not None:
+        arrays["table"] = np.array([*scene.table.normal.tolist(), scene.table.offset])
+    np.savez_compressed(buffer, **arrays)  # pyright: ignore[reportArgumentType]
+    return write_file(path, buffer.getvalue())

@@ -1,48 +1,43 @@
-"""The things in a depth image: what rises above the table, divided where the depth jumps."""
+"""The objects in a depth image: what rises above the table, divided where the depth jumps, and merged again.
 
-import dataclasses
+Pieces are parts of one object if they nearly touch, if one stands above the footprint of the other, or if one floats
+beside the other.
+"""
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.frames import inverse, rotate
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.scene.image import DepthImage
-from torchgrasp.scene.merge import merge_pieces
+from torchgrasp.scene.image import LEAST_PIXELS, DepthImage
 
 BAND = 0.010
 """Heights [m] below this, of either sign, measure the noise of the table."""
-SIGMAS, LEAST_HEIGHT = 2.5, 0.002
-"""A thing's pixels rise this many deviations of the smoothed table, and this much [m], above it."""
-SMOOTHING = 5
-"""Side [px] of the square whose mean height tells a foot from the table."""
-JUMP, JUMP_SPACINGS = 0.006, 2.0
-"""Difference of depth of two pixels of one surface: this [m] and so many spacings of pixels there, at most."""
-RIM = 1
-"""Pixels about a jump that are no surface for certain: a camera's rim pixels fly."""
-NEAR, PASSES = 0.005, 12
-"""Distance [m] within which a rim's pixel belongs to a thing, and passes of this: thin parts are rim throughout."""
+LEAST_HEIGHT = 0.002
+"""Least height [m] of an object's pixels above the table."""
+NEAR = 0.005
+"""Distance [m] within which a pixel at a depth jump belongs to an object."""
 FEW = 6
-"""Pixels of a piece that are too few to say anything."""
-OWN = 0.6
-"""Share of that height that a pixel itself has: the mean is raised beside a thing, too."""
-LEAST_TOP, LEAST_FLOOR = 0.0035, 0.001
-"""Smoothed height [m] that a tenth of a thing's pixels have: waves of the table do not. Median height [m] of pixels
-within a thing that are its floor, such as a pan's."""
-SPECK = 40
-"""Least pixels of a thing: 6 mm x 6 mm at 0.6 m."""
+"""Pieces with fewer pixels are noise."""
+GAP, TOUCH, FLOATING_GAP = 0.008, 3, 0.013
+"""Pieces touch where TOUCH pixels are within GAP [m]; a floating piece belongs to one within FLOATING_GAP [m]."""
+MASK_SHARE = 0.05
+"""Least share of a mask's pixels on the target: a third of a box drawn around an object are."""
 
 
 def segment(image: DepthImage, table: Plane) -> Int[Tensor, "h w"]:
-    """Return the label of each pixel: 0 for table, flying pixels and nothing; 1, 2, ... for things, largest first.
+    """Return the label of each pixel: 0 for the table, flying pixels and nothing; 1, 2, ... for objects by size.
 
-    A thing is a connected component of the pixels above the table, in which depth has no jump. Pixels at jumps go to
-    the thing whose surface they lie on, if there is one. Pieces that nearly touch are one thing.
+    An object is a connected component of the pixels above the table, in which depth has no jump. Pixels at jumps go to
+    the object whose surface they lie on, if there is one.
 
     Args:
         image: one view of the scene.
-        table: the plane that the things stand on, in the frame of the image.
+        table: the plane that the objects stand on, in the frame of the image.
 
     >>> k = torch.tensor([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]]).double()
     >>> depth = torch.full((48, 64), 0.5).double()
@@ -50,7 +45,7 @@ def segment(image: DepthImage, table: Plane) -> Int[Tensor, "h w"]:
     >>> segment(DepthImage(depth, k, torch.eye(4).double()), Plane(torch.tensor([0, 0, -1.0]), -0.5)).unique()
     tensor([0, 1])
     """
-    measured, smooth = image.depth > 0, dataclasses.replace(image, depth=torch.from_numpy(_median(image.depth.numpy())))
+    measured, smooth = image.depth > 0, image.without_speckle()
     mean, threshold = _smoothed(image, table)
     risen = _risen(smooth, table, mean, threshold)
     core, jump = _core(smooth, risen)
@@ -58,71 +53,95 @@ def segment(image: DepthImage, table: Plane) -> Int[Tensor, "h w"]:
     thin = _components(risen & (pieces == 0), smooth.depth, jump)
     pieces = torch.where((pieces == 0) & (thin > 0), pieces.max() + thin, pieces)
     sure = core | (thin > 0)
-    high = _counts(torch.where(mean > LEAST_TOP, pieces, 0), len(_counts(pieces))) >= 0.1 * _counts(pieces)
+    # A tenth of an object's pixels are 3.5 mm high; an uneven table is not.
+    high = _counts(torch.where(mean > 0.0035, pieces, 0), len(_counts(pieces))) >= 0.1 * _counts(pieces)
     few = _counts(torch.where(sure, pieces, 0), len(high)) < FEW
-    pieces = _without(pieces, few | ~high)
-    group = merge_pieces(smooth, torch.where(sure, pieces, 0), table, jump)
+    pieces = torch.where((few | ~high)[pieces], 0, pieces)
+    group = _merge(smooth, torch.where(sure, pieces, 0), table, jump)
     return _numbered(_filled(group[pieces], measured, table.height(image.points())))
 
 
 def on_surface(image: DepthImage, table: Plane) -> Bool[Tensor, "h w"]:
-    """Tell which pixels rise above the table and lie on a surface; flying pixels do not."""
-    smooth = dataclasses.replace(image, depth=torch.from_numpy(_median(image.depth.numpy())))
+    """Return which pixels rise above the table and lie on a surface; flying pixels do not."""
+    smooth = image.without_speckle()
     risen = _risen(smooth, table, *_smoothed(image, table))
     return _grown(image.points(), _core(smooth, risen)[0].long(), risen) > 0
 
 
+def label_image(
+    image: DepthImage, table: Plane, labels: Int[Tensor, "h w"] | None, mask: Bool[Tensor, "h w"] | None
+) -> Int[Tensor, "h w"]:
+    """Return the label of each pixel: the given ones without table and flying pixels, or those of `segment`.
+
+    A mask becomes label 1. It loses the table and strips of neighbours. Other parts of its object just outside of it
+    belong to nothing.
+
+    Raises:
+        BadArgument: nothing but the table is left of a mask, or nothing of all labels.
+    """
+    if labels is not None:
+        kept = torch.where(on_surface(image, table), labels, 0)
+        if not bool((kept > 0).any()):
+            raise BadArgument("labels", "none that rises above the table", "labels of objects on the table")
+        return kept
+    objects = segment(image, table)
+    if mask is None:
+        return objects
+    inside = mask & on_surface(image, table)
+    pieces, length = torch.where(inside, objects, 0), int(objects.max()) + 1
+    whole, part = _counts(objects, length), _counts(pieces, length)
+    belongs = (part >= 0.5 * whole) | (part >= 0.3 * max(1, int(inside.sum())))
+    belongs[0] = True
+    target = inside & belongs[objects]
+    seen = int((mask & (image.depth > 0)).sum())
+    if int(target.sum()) < max(LEAST_PIXELS, MASK_SHARE * seen):
+        found = f"{int(target.sum())} of {seen} measured pixels above the table"
+        least = f"at least {LEAST_PIXELS}, and a {1 / MASK_SHARE:.0f}th: this target is the table"
+        raise BadArgument("mask", found, least)
+    from scipy.ndimage import binary_dilation
+
+    about = torch.from_numpy(binary_dilation(mask.numpy(), iterations=4))  # masks are off by a few pixels
+    rest = torch.where(target | (about & belongs[objects]), 0, objects)
+    few = _counts(rest, length) < LEAST_PIXELS
+    rest = torch.where(few[rest], 0, rest)
+    _, number = torch.cat([torch.zeros(1, dtype=torch.long), rest.reshape(-1)]).unique(return_inverse=True)
+    rest = number[1:].reshape(rest.shape)
+    return torch.where(target, 1, torch.where(rest > 0, rest + 1, 0))
+
+
 def _smoothed(image: DepthImage, table: Plane) -> tuple[Tensor, Tensor]:
-    """Return the mean height about each pixel, and the least that is no noise, which grows with the squared depth."""
+    """Return the mean height of the 5 x 5 pixels about each, and the least height of an object there."""
     from scipy.ndimage import uniform_filter
 
     measured, height = image.depth > 0, table.height(image.points())
-    near = measured & (height.abs() < 3 * BAND)  # a foot has distant neighbours, too
-    share = torch.from_numpy(uniform_filter(near.double().numpy(), SMOOTHING))
-    total = torch.from_numpy(uniform_filter(torch.where(near, height, 0.0).numpy(), SMOOTHING))
+    near = measured & (height.abs() < 3 * BAND)  # at an object's foot, without its distant neighbours
+    share = torch.from_numpy(uniform_filter(near.double().numpy(), 5))
+    total = torch.from_numpy(uniform_filter(torch.where(near, height, 0.0).numpy(), 5))
     mean = torch.where(near, total / share.clamp_min(1e-9), height)
     squared = image.depth.square()
     flat = measured & (mean.abs() < BAND)
     noise = 1.4826 * float((mean.abs() / squared)[flat].median()) if bool(flat.any()) else 0.0
-    return mean, (SIGMAS * noise * squared).clamp_min(LEAST_HEIGHT)
+    return mean, (2.5 * noise * squared).clamp_min(LEAST_HEIGHT)
 
 
 def _risen(smooth: DepthImage, table: Plane, mean: Tensor, threshold: Tensor) -> Bool[Tensor, "h w"]:
-    """Tell which pixels rise above the table, with their neighbours and by themselves."""
-    return (smooth.depth > 0) & (mean > threshold) & (table.height(smooth.points()) > OWN * threshold)
+    """Return which pixels rise above the table, with their neighbours and by themselves."""
+    return (smooth.depth > 0) & (mean > threshold) & (table.height(smooth.points()) > 0.6 * threshold)
 
 
 def _core(smooth: DepthImage, risen: Tensor) -> tuple[Tensor, Tensor]:
     """Return the risen pixels away from jumps, and the difference of depth [m] that is a jump."""
-    jump = JUMP + JUMP_SPACINGS * smooth.depth / float(smooth.intrinsics[0, 0])
-    return risen & ~_at_jump(smooth.depth, jump), jump
-
-
-def _median(depth: np.ndarray) -> np.ndarray:
-    """Return the median of the measured pixels of each 3 x 3 square; 0 where most are missing."""
-    padded = np.pad(np.where(depth > 0, depth, np.nan), 1, constant_values=np.nan)
-    squares = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(*depth.shape, 9)
-    ranked = np.sort(squares, axis=-1)  # NaN last
-    count = np.isfinite(squares).sum(-1)
-    middle = np.take_along_axis(ranked, np.maximum(count - 1, 0)[..., None] // 2, -1)[..., 0]
-    return np.where((count >= 3) & (depth > 0), np.nan_to_num(middle), depth)
-
-
-def _at_jump(depth: Tensor, jump: Tensor) -> Bool[Tensor, "h w"]:
-    """Tell which pixels have, within `RIM` pixels, a depth that differs by more than a jump."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
-    size, measured = 2 * RIM + 1, depth > 0
-    farthest = torch.from_numpy(maximum_filter(torch.where(measured, depth, 0.0).numpy(), size))
-    nearest = torch.from_numpy(minimum_filter(torch.where(measured, depth, 100.0).numpy(), size))
-    return (farthest - depth > RIM * jump) | (depth - nearest > RIM * jump)
+    depth = smooth.depth
+    jump = 0.006 + 2.0 * depth / float(smooth.intrinsics[0, 0])
+    farthest = torch.from_numpy(maximum_filter(torch.where(depth > 0, depth, 0.0).numpy(), 3))
+    nearest = torch.from_numpy(minimum_filter(torch.where(depth > 0, depth, 100.0).numpy(), 3))
+    return risen & ~((farthest - depth > jump) | (depth - nearest > jump)), jump
 
 
 def _components(core: Tensor, depth: Tensor, jump: Tensor) -> Int[Tensor, "h w"]:
     """Return the number of the connected component of each core pixel, from 1; 0 elsewhere."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     h, w = core.shape
     index = torch.arange(h * w).reshape(h, w)
     edges = []
@@ -131,20 +150,27 @@ def _components(core: Tensor, depth: Tensor, jump: Tensor) -> Int[Tensor, "h w"]
         b = (slice(down, h), slice(max(0, right), w - max(0, -right)))
         joined = core[a] & core[b] & ((depth[a] - depth[b]).abs() < jump[a])
         edges.append(torch.stack([index[a][joined], index[b][joined]]))
-    i, j = torch.cat(edges, 1).numpy()
-    graph = coo_matrix((np.ones(len(i), dtype=bool), (i, j)), shape=(h * w, h * w))
-    number = torch.from_numpy(connected_components(graph, directed=False)[1].astype(np.int64)).reshape(h, w)
+    number = _connected(torch.cat(edges, 1).numpy(), h * w).reshape(h, w)
     return torch.where(core, number + 1, 0)
+
+
+def _connected(edges: np.ndarray, count: int) -> Int[Tensor, "n"]:
+    """Return the component of each of `count` nodes, given edges (2, e)."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_matrix((np.ones(edges.shape[1], dtype=bool), tuple(edges)), shape=(count, count))
+    return torch.from_numpy(connected_components(graph, directed=False)[1].astype(np.int64))
 
 
 def _grown(points: Tensor, labels: Tensor, risen: Tensor) -> Int[Tensor, "h w"]:
     """Give risen pixels without a label, pass by pass, that of the nearest labelled point within `NEAR`."""
     from scipy.spatial import KDTree
 
-    labels = _without(labels, _counts(labels) < FEW).reshape(-1).clone()
+    labels = torch.where((_counts(labels) < FEW)[labels], 0, labels).reshape(-1)
     place, loose = points.reshape(-1, 3).numpy(), torch.nonzero(risen.reshape(-1) & (labels == 0))[:, 0]
     new = torch.nonzero(labels)[:, 0]
-    for _ in range(PASSES):
+    for _ in range(12):
         if not len(new) or not len(loose):
             break
         distance, index = KDTree(place[new.numpy()]).query(place[loose.numpy()], distance_upper_bound=NEAR)
@@ -155,7 +181,7 @@ def _grown(points: Tensor, labels: Tensor, risen: Tensor) -> Int[Tensor, "h w"]:
 
 
 def _filled(labels: Tensor, measured: Tensor, height: Tensor) -> Int[Tensor, "h w"]:
-    """Give the floor within a thing, enclosed and a little above the table, the label of the thing."""
+    """Give the floor within an object, such as a pan's, the object's label: it is enclosed and above the table."""
     from scipy.ndimage import binary_dilation, find_objects, label
 
     holes = np.empty(labels.shape, dtype=np.int32)
@@ -170,7 +196,7 @@ def _filled(labels: Tensor, measured: Tensor, height: Tensor) -> Int[Tensor, "h 
         around = labels[row, column][torch.from_numpy(binary_dilation(hole.numpy(), iterations=2)) & ~hole]
         names = around[around > 0].unique()
         edge = bool(hole[0].any() | hole[-1].any() | hole[:, 0].any() | hole[:, -1].any())
-        if len(names) == 1 and not edge and float(height[row, column][hole].median()) > LEAST_FLOOR:
+        if len(names) == 1 and not edge and float(height[row, column][hole].median()) > 0.001:
             whole[row, column] = torch.where(hole, names, whole[row, column])
     return whole
 
@@ -180,17 +206,95 @@ def _counts(labels: Tensor, length: int = 0) -> Int[Tensor, "k"]:
     return torch.bincount(labels.reshape(-1), minlength=length)
 
 
-def _without(labels: Tensor, dropped: Bool[Tensor, "k"]) -> Int[Tensor, "h w"]:
-    """Return labels without some of them."""
-    return torch.where(dropped[labels], 0, labels)
-
-
 def _numbered(labels: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
-    """Return labels 1, 2, ... by falling size, without specks."""
+    """Return labels 1, 2, ... by falling size, without objects of fewer than 40 pixels."""
     count = _counts(labels)
     count[0] = 0
     order = torch.argsort(count, descending=True, stable=True)
-    order = order[count[order] >= SPECK]
+    order = order[count[order] >= 40]
     new = torch.zeros_like(count)
     new[order] = torch.arange(1, len(order) + 1)
     return new[labels]
+
+
+def _merge(image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, jump: Float[Tensor, "h w"]) -> Tensor:
+    """Return the number of the object of each piece, 0 for the piece 0."""
+    from scipy.spatial import KDTree
+
+    rows = pieces > 0
+    new = torch.zeros(int(pieces.max()) + 1, dtype=torch.long)
+    names, number, count = pieces[rows].unique(return_inverse=True, return_counts=True)
+    large = count >= 30  # smaller pieces go to the nearest large one
+    if not bool(large.any()):
+        return new
+    place = image.points()[rows]
+    parts = [place[number == k] for k in torch.nonzero(large)[:, 0].tolist()]
+    floating = _floating(image, pieces, table, jump)[names[large]].tolist()
+    joined = _join(parts, table, floating)
+    new[names[large]] = _connected(np.array(joined, dtype=int).reshape(-1, 2).T, len(parts)) + 1
+    tree, owner = KDTree(torch.cat(parts).numpy()), np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    for k in torch.nonzero(~large)[:, 0].tolist():
+        distance, index = tree.query(place[number == k].numpy(), distance_upper_bound=GAP)
+        if np.isfinite(distance).sum() >= TOUCH:
+            new[names[k]] = new[names[large]][int(owner[np.asarray(index)[distance.argmin()]])]
+    return new
+
+
+def _join(parts: list[Tensor], table: Plane, floating: list[bool]) -> list[tuple[int, int]]:
+    """Return the pairs of pieces that are parts of one object."""
+    from scipy.spatial import KDTree
+
+    trees: list[KDTree] = [KDTree(part.numpy()) for part in parts]
+    low, high = np.stack([tree.mins for tree in trees]), np.stack([tree.maxes for tree in trees])
+    joined: list[tuple[int, int]] = []
+    for a in range(len(parts)):
+        between = np.linalg.norm(np.maximum(0, np.maximum(low[a] - high, low - high[a])), axis=-1)
+        nearest, least = -1, FLOATING_GAP
+        for b in np.nonzero(between < FLOATING_GAP)[0].tolist():
+            if b == a:
+                continue
+            small, large = (a, b) if len(parts[a]) < len(parts[b]) else (b, a)
+            distance = trees[large].query(trees[small].data, distance_upper_bound=FLOATING_GAP)[0]
+            if distance.min() < least:
+                nearest, least = b, float(distance.min())
+            touches = (distance < GAP).sum() >= TOUCH
+            if b < a and (touches or _stand_over(parts[small], parts[large], table)):
+                joined.append((a, b))
+        if floating[a] and nearest >= 0:
+            joined.append((a, nearest))
+    return joined
+
+
+def _stand_over(part: Float[Tensor, "n 3"], other: Float[Tensor, "m 3"], table: Plane) -> bool:
+    """Return whether a fifth of a part's points stand over the convex footprint of the other part."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    normal = table.normal.double()
+    x = unit(torch.linalg.cross(normal, torch.eye(3, dtype=torch.float64)[int(normal.abs().argmin())]))
+    axes = torch.stack([x, torch.linalg.cross(normal, x)], -1)
+    try:
+        sides = torch.from_numpy(ConvexHull((other @ axes).numpy()).equations)
+    except QhullError:  # all on a line
+        return False
+    return float((part @ axes @ sides[:, :2].T + sides[:, 2] < 0).all(-1).double().mean()) > 0.2
+
+
+def _floating(image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, jump: Float[Tensor, "h w"]) -> Tensor:
+    """Return which pieces float: the table is seen below most of their lower edge, and that edge is high."""
+    floating = torch.zeros(int(pieces.max()) + 1, dtype=torch.bool)
+    down = -rotate(inverse(image.obj_from_camera), table.normal.double()[None])[0, :2]
+    if float(torch.linalg.vector_norm(down)) < 0.2:  # seen from above, no edge is the lower one
+        return floating
+    column, row = torch.round(4 * unit(down)).long().tolist()
+    below, depth_below = (torch.roll(x, (-row, -column), (0, 1)) for x in (pieces, image.depth))
+    edge = (pieces > 0) & (below != pieces) & (depth_below > 0)
+    hidden = edge & (below > 0) & (depth_below < image.depth - jump)
+    free = edge & (below == 0)
+    height = table.height(image.points())
+    for k in pieces[free].unique().tolist():
+        mine = free & (pieces == k)
+        count = int(mine.sum())
+        if count >= TOUCH and count >= 0.7 * (count + int((hidden & (pieces == k)).sum())):
+            low, top = float(height[mine].quantile(0.1)), float(height[pieces == k].quantile(0.9))
+            floating[k] = low > max(0.006, 0.4 * top)
+    return floating

@@ -1,52 +1,50 @@
-"""The plane that things stand on, found in points of any frame."""
+"""The plane that objects stand on, found in points of any frame."""
 
 import dataclasses
+import math
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.checks import check_tensor
-from torchgrasp.errors import NoSupport
+from torchgrasp.errors import BadArgument, NoSupport
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.plane import Plane, as_plane
 
-SAMPLE = 20_000
-"""Points that are looked at: with 5 % of them on a plane, its normal is still certain to a tenth of a degree."""
-TRIPLES = 4000
-"""Triples of points that propose planes: of a table with 10 % of the points, four lie wholly on it."""
-SCORED = 2000
-"""Points that score each proposal: enough to tell 5 % from 4 %."""
 NOISE, NOISE_GROWTH = 0.001, 0.0035
-"""Noise [m] of a depth camera that is assumed until it is measured, and its growth with the squared distance [1/m]:
-0.12 px of a stereo camera's disparity."""
-FAR = 0.7
-"""Distance [m] from the camera that is assumed where it is unknown."""
+"""Assumed noise [m] of a depth camera, and its growth with the squared distance [1/m]."""
 LEAST_SHARE = 0.05
 """Least share of the points on the plane."""
 MOST_BELOW = 0.06
 """Greatest number of points below, over the number on the plane: flying pixels at rims are fewer."""
 LEAST_STANDING = 0.001
-"""Least share of the points that stand on the plane, over its own part of the picture: a table carries something."""
+"""Least share of the points that stand on the plane, over its own part of the picture."""
 LEAST_WIDTH = 0.04
-"""Least spread [m] of the points on the plane, as a standard deviation along its narrower side: a patch 0.14 m wide."""
+"""Least spread [m] of the points on the plane along its narrower side, as a standard deviation."""
 REACH = 0.30
-"""Height [m] of things, above or below a plane: a floor lies deeper below a table than this, and a wall goes on."""
+"""Height [m] of objects, above or below a plane: a floor is deeper below a table, and a wall extends farther."""
 MOST_TILT = 30.0
 """Greatest angle [deg] between the normal and `up`."""
-LEAST_TILT = 5.0
-"""Least angle [deg] between the plane and the line of sight of the middle of its points: flatter ones are grazed."""
-ROUGH = 0.9
-"""Greatest noise about the plane, over the assumed one: points that are no plane spread farther."""
-PLANES = 8
-"""Planes that are looked at, those with the most points first."""
-LOW, LEAST_OVER = 0.06, 0.05
-"""Of the points lower than this [m], the least share that lies over the plane's own part of the picture. The rim of a
-pan stands about its floor; a wall behind a table has most of its points higher up."""
 RIVAL = 0.15
-"""A second plane with this share of the points of the first, at more than 15 degrees from it, makes both doubtful."""
-SUPPORT = "one plane with things on it and nothing below it, or a table that is given"
+"""A second plane with this share of the points of the first, at more than 15 degrees from it, makes both ambiguous."""
+SUPPORT = "one plane with objects on it and nothing below it, or a table that is given"
 """What a scene must show."""
+
+
+def find_table(
+    points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"], table: Plane | float | None, up: object
+) -> Plane:
+    """Return the given plane, or the fitted one, with the camera above it."""
+    plane = as_plane(table)
+    direction = None if up is None else torch.as_tensor(up).double().cpu()
+    if plane is None:
+        return fit_support(points, viewpoint, direction)
+    if direction is not None and float(unit(direction) @ plane.normal.double()) < 0.5:
+        raise BadArgument("up", direction.tolist(), "a direction within 60 degrees of the table's normal")
+    if float(plane.height(viewpoint)) <= 0:
+        raise BadArgument("table", f"the camera {-float(plane.height(viewpoint)):.3g} m below it", "a table below it")
+    return plane
 
 
 def fit_support(
@@ -56,11 +54,11 @@ def fit_support(
     *,
     seed: int = 0,
 ) -> Plane:
-    """Return the plane that the things in a cloud stand on, whatever the frame.
+    """Return the plane that the objects in a cloud stand on, whatever the frame.
 
-    Triples of points propose planes. The plane taken holds the most points, has things on its upper side and next
-    to nothing below. An iterated fit with Tukey's weights refines it; the noise grows with the squared distance from
-    the camera and is measured. A rigid motion of all arguments moves the plane alike.
+    Triples of points propose planes. The chosen plane holds the most points, has objects on its upper side and few
+    points below. An iterated fit with Tukey's weights refines it; the noise is measured. A rigid motion of all
+    arguments moves the plane alike.
 
     Args:
         points: everything that was seen [m].
@@ -70,7 +68,7 @@ def fit_support(
 
     Raises:
         BadArgument: a wrong shape or type, or points that are not finite.
-        NoSupport: no plane holds enough points; things lie on both sides of each; the camera lies below; two planes
+        NoSupport: no plane holds enough points; objects are on both sides of each; the camera is below; two planes
             could be the table.
 
     >>> x, y = torch.rand(2, 3000, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
@@ -85,17 +83,19 @@ def fit_support(
     if len(points) < 50:
         raise NoSupport("table", f"{len(points)} points", SUPPORT)
     generator = torch.Generator().manual_seed(seed)
-    points = points[torch.randperm(len(points), generator=generator)[:SAMPLE]]
+    points = points[torch.randperm(len(points), generator=generator)[:20_000]]
     centre = points.mean(0)
     points = points - centre  # so that distant origins cost no digits
     eye = None if eye is None else eye - centre
-    noise = _noise(points, eye)
+    squared = torch.full((len(points),), 0.7**2, dtype=points.dtype)  # an assumed distance [m]
+    noise = NOISE + NOISE_GROWTH * (squared if eye is None else (points - eye).square().sum(-1))
     normals, offsets = _propose(points, noise, sky, generator)
-    held = _held(points[:SCORED], noise[:SCORED], normals, offsets)
+    scored = 2000  # points that score the proposals
+    held = _held(points[:scored], noise[:scored], normals, offsets)
     good: list[_Fit] = []
     reasons: list[str] = []
-    least = 0.5 * LEAST_SHARE * min(len(points), SCORED)
-    for _ in range(PLANES):
+    least = 0.5 * LEAST_SHARE * min(len(points), scored)
+    for _ in range(8):
         counts = held.sum(-1)
         i = int(counts.argmax()) if len(counts) else 0
         if not len(counts) or int(counts[i]) < least:
@@ -107,14 +107,14 @@ def fit_support(
             least = max(least, 0.5 * RIVAL * int(counts[i]))
         else:
             reasons.append(reason)
-        rest = (points[:SCORED] @ fit.normal - fit.offset).abs() > 3 * noise[:SCORED]
+        rest = (points[:scored] @ fit.normal - fit.offset).abs() > 3 * noise[:scored]
         held = held & rest & ~held[i]
     if not good:
         raise NoSupport("table", reasons[0] if reasons else "no plane with enough points", SUPPORT)
     first = max(good, key=lambda fit: fit.count)
     rivals = [fit for fit in good if fit.count > RIVAL * first.count and float(fit.normal @ first.normal) < 0.966]
     if rivals:
-        raise NoSupport("table", "two planes that could be the table, and no `up` that tells which", SUPPORT)
+        raise NoSupport("table", "two planes that could be the table, and no `up` to choose by", SUPPORT)
     return Plane(first.normal, first.offset + float(first.normal @ centre))
 
 
@@ -128,17 +128,11 @@ class _Fit:
     count: int
 
 
-def _noise(points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None) -> Float[Tensor, "n"]:
-    """Return the assumed noise [m] of each point, that of a stereo camera."""
-    squared = torch.full((len(points),), FAR**2, dtype=points.dtype) if eye is None else (points - eye).square().sum(-1)
-    return NOISE + NOISE_GROWTH * squared
-
-
 def _propose(
     points: Float[Tensor, "n 3"], noise: Float[Tensor, "n"], sky: Float[Tensor, "3"] | None, generator: torch.Generator
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
     """Return unit normals and offsets of planes through triples of points."""
-    a, b, c = points[torch.randint(len(points), (3, TRIPLES), generator=generator)]
+    a, b, c = points[torch.randint(len(points), (3, 4000), generator=generator)]
     normal = torch.linalg.cross(b - a, c - a)
     double_area = torch.linalg.vector_norm(normal, dim=-1)
     longest = torch.stack([(b - a).norm(dim=-1), (c - a).norm(dim=-1), (c - b).norm(dim=-1)]).amax(0)
@@ -154,7 +148,7 @@ def _propose(
 def _held(
     points: Float[Tensor, "n 3"], noise: Float[Tensor, "n"], normals: Float[Tensor, "m 3"], offsets: Float[Tensor, "m"]
 ) -> Bool[Tensor, "m n"]:
-    """Tell which points lie within twice the noise of each plane."""
+    """Return which points are within twice the noise of each plane."""
     held = torch.empty(len(normals), len(points), dtype=torch.bool)
     for rows in torch.arange(len(normals)).split(500):
         held[rows] = (normals[rows] @ points.T - offsets[rows, None]).abs_() < 2 * noise
@@ -187,7 +181,7 @@ def _refine(points: Float[Tensor, "n 3"], noise: Float[Tensor, "n"], normal: Flo
 def _turned_up(
     points: Float[Tensor, "n 3"], fit: _Fit, eye: Float[Tensor, "3"] | None, sky: Float[Tensor, "3"] | None
 ) -> _Fit:
-    """Return the plane with its normal along `up`, else towards the camera, else towards the more points."""
+    """Return the plane with its normal along `up`, else towards the camera, else towards the side with more points."""
     if sky is not None:
         side = float(fit.normal @ sky)
     elif eye is not None:
@@ -204,13 +198,13 @@ def _objection(
     eye: Float[Tensor, "3"] | None,
     sky: Float[Tensor, "3"] | None,
 ) -> str | None:
-    """Tell why a plane is no support, or None."""
+    """Return why a plane is no support, or None."""
     n, height = len(points), points @ fit.normal - fit.offset
     tolerance = 4 * fit.scale * noise + 0.001
     share = fit.count / n
     if share < LEAST_SHARE:
         return f"no plane with more than {share:.1%} of the points"
-    if fit.scale > ROUGH:
+    if fit.scale > 0.9:  # points of no plane spread farther than the assumed noise
         return "no flat plane"
     if sky is not None and float(fit.normal @ sky) < float(torch.cos(torch.deg2rad(torch.tensor(MOST_TILT)))):
         return f"no plane within {MOST_TILT:g} degrees of level"
@@ -218,22 +212,21 @@ def _objection(
     width = float(torch.linalg.svdvals(points[on] - points[on].mean(0))[1]) / int(on.sum()) ** 0.5
     if width < LEAST_WIDTH:
         return f"a flat face about {3.5 * width:.2f} m wide"
-    if eye is not None:
-        towards = unit(eye - points[on].mean(0))
-        if float(towards @ fit.normal) < float(torch.sin(torch.deg2rad(torch.tensor(LEAST_TILT)))):
-            return "a plane that the camera does not see from above"
+    if eye is not None and float(unit(eye - points[on].mean(0)) @ fit.normal) < math.sin(math.radians(5.0)):
+        return "a plane that the camera does not see from above"
     below = int(((height < -tolerance) & (height > -REACH)).sum())
     if below > MOST_BELOW * fit.count:
         return f"a plane with {share:.0%} of the points, but {below / n:.0%} of them below it"
     above = (height > tolerance) & (height < REACH)
-    low, over = height[above] < LOW, _over(points[above], points[on], fit.normal)
-    if int(over.sum()) < LEAST_STANDING * n or int((over & low).sum()) < LEAST_OVER * int(low.sum()):
+    low, over = height[above] < 0.06, _over(points[above], points[on], fit.normal)
+    # Low points of an object are over the plane's own part of the picture. A pan's rim is not over its floor.
+    if int(over.sum()) < LEAST_STANDING * n or int((over & low).sum()) < 0.05 * int(low.sum()):
         return f"a plane with {share:.0%} of the points and nothing that stands on it"
     return None
 
 
 def _over(points: Float[Tensor, "n 3"], ground: Float[Tensor, "m 3"], normal: Float[Tensor, "3"]) -> Bool[Tensor, "n"]:
-    """Tell which points lie over the convex hull of the ground, shrunk by a twentieth."""
+    """Return which points are over the convex hull of the ground, shrunk by a twentieth."""
     from scipy.spatial import ConvexHull
 
     side = ground[0] - ground.mean(0)

@@ -41,7 +41,7 @@ from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surfac
 from torchgrasp.hand.load import hand_of
 from torchgrasp.planner.explain import explain_empty
 from torchgrasp.planner.grasps import plan_grasps
-from torchgrasp.scene.file import is_scene
+from torchgrasp.scene.image import is_scene
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ContactSpec, Mode, Simulator, TrialSpec
 

@@ -18,7 +18,7 @@ from torchgrasp.planner.explain import explain_empty
 from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.planner.problem import take_target
 from torchgrasp.planner.scene import ThingPlan, plan_scene
-from torchgrasp.scene.file import read_scene
+from torchgrasp.scene.scene import read_scene
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ContactSpec
 
