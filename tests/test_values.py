@@ -152,7 +152,7 @@ def test_bad_clouds_are_refused(points, error):
     with pytest.raises((error, TypeError)) as caught:  # TypeError: the annotation check that runs in tests only
         PointCloud(points)
     if isinstance(caught.value, GraspError):
-        assert "points" in str(caught.value) and "allowed" in str(caught.value)
+        assert "points" in str(caught.value) and "expected" in str(caught.value)
 
 
 def test_the_first_bad_index_is_named():

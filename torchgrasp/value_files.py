@@ -9,7 +9,6 @@ from jaxtyping import AbstractArray, jaxtyped
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.checks.hints import is_subclass
 from torchgrasp.errors import ModelFileError
 from torchgrasp.files import load_tensors
 
@@ -47,9 +46,9 @@ def _tensor_fields(of: type[Value], prefix: str = "") -> dict[str, tuple[Any, ..
     fields: dict[str, tuple[Any, ...]] = {}
     for name, hint in _hints(of).items():
         kinds = typing.get_args(hint) if typing.get_origin(hint) not in (None, dict) else (hint,)
-        if is_subclass(hint, Value):
+        if isinstance(hint, type) and typing.get_origin(hint) is None and issubclass(hint, Value):
             fields |= _tensor_fields(hint, f"{prefix}{name}.")
-        elif is_subclass(kinds[0], AbstractArray):
+        elif isinstance(kinds[0], type) and typing.get_origin(kinds[0]) is None and issubclass(kinds[0], AbstractArray):
             fields[prefix + name] = kinds
     return fields
 
@@ -59,7 +58,7 @@ def _build(of: type[SomeValue], tensors: dict[str, Tensor], prefix: str, rest: d
     values: dict[str, Any] = dict(rest)
     own = _tensor_fields(of)
     for name, hint in _hints(of).items():
-        if is_subclass(hint, Value):
+        if isinstance(hint, type) and typing.get_origin(hint) is None and issubclass(hint, Value):
             values[name] = _build(hint, tensors, f"{prefix}{name}.", {})
         elif name in own and name not in rest:
             values[name] = tensors.get(prefix + name)

@@ -20,8 +20,7 @@ from torch import Tensor
 
 import torchgrasp
 from tests.hostile.samples import Lengths, hints_of, sample, sample_tensor
-from torchgrasp.checks import ANY, RIGID, Range
-from torchgrasp.checks.checked import lengths_of
+from torchgrasp.checks import ANY, RIGID, Range, _lengths
 from torchgrasp.errors import Status
 
 NAN, INF = float("nan"), float("inf")
@@ -161,7 +160,7 @@ def public() -> dict[str, Any]:
 
 def behind(thing: Any) -> bool:
     """Tell whether a function is behind the border."""
-    return hasattr(thing, "__border__")
+    return hasattr(thing, "__checked__")
 
 
 def methods_of(kind: type) -> dict[str, tuple[Any, Any]]:
@@ -226,7 +225,7 @@ def wrong_arguments(thing: Any, call: Any) -> Iterator[tuple[str, Any]]:
 
 def own_lengths(call: Any) -> dict[str, int]:
     """Return the lengths that the letters of a method have in its value."""
-    return lengths_of(getattr(call, "__self__", None))
+    return _lengths(getattr(call, "__self__", None))
 
 
 def wrong_values(hint: Any, own: Lengths) -> list[Any]:

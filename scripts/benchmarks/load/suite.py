@@ -28,7 +28,6 @@ from torchgrasp import (
     plan_contacts,
     plan_grasps,
 )
-from torchgrasp.checks.tensors import Call
 from torchgrasp.errors import Status
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.specs import Simulator
@@ -145,7 +144,7 @@ def _starts(n: int) -> list[Row]:
 def _checks(hand: str) -> list[Row]:
     """Plan, and measure what reading arguments at the border takes of it: binding, reading, finite numbers."""
     model, view, rows = load_hand(hand), load_object("jug").view, list[Row]()
-    border = importlib.import_module("torchgrasp.checks.checked")  # the package has the function under the same name
+    checks = importlib.import_module("torchgrasp.checks")
     spent = [0.0]
 
     def timed(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -160,8 +159,8 @@ def _checks(hand: str) -> list[Row]:
 
     plan_grasps(view, model, SPEC, STARTS)  # what is read once is read now
     with (
-        patch.object(border, "_read", timed(getattr(border, "_read"))),  # noqa: B009
-        patch.object(Call, "check_numbers", timed(Call.check_numbers)),
+        patch.object(checks, "_read", timed(checks._read)),
+        patch.object(checks._Call, "check_numbers", timed(checks._Call.check_numbers)),
         patch.object(inspect.Signature, "bind", timed(inspect.Signature.bind)),
     ):
         for starts in (100, 1000):

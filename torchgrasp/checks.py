@@ -1,0 +1,295 @@
+"""Argument validation: public functions and values check their arguments by annotations, with jaxtyping and beartype.
+
+`checked` decorates a public function or the class of a value. A call from outside the library is compared with the
+signature: type, shape, dtype, finite numbers, range. Calls that the library makes itself are not checked again.
+"""
+
+import collections.abc
+import dataclasses
+import functools
+import importlib
+import importlib.util
+import inspect
+import threading
+import types
+import typing
+from collections.abc import Callable
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, overload
+
+import numpy as np
+import torch
+from beartype.door import is_bearable
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.errors import BadArgument
+from torchgrasp.marks import (  # noqa: F401
+    ANY, DTYPES, FINITE, LEAST, MOST, NUMBERS, RIGID, Count, Fraction, Length, Measured, Pose, Poses, Positive,
+    Range, Rows, Seed, check_dense, check_moved, check_path, describe, fits, is_rigid, is_tensor, show,
+)  # fmt: skip
+
+Checked = TypeVar("Checked", bound=Callable[..., Any])
+_thread = threading.local()
+"""`inside` is True while this thread is in a checked function."""
+
+
+@dataclasses.dataclass
+class _Call:
+    """One checked call. `deep` checks the fields of values again, `strict` ignores `ANY`; `sizes` are of letters."""
+
+    gradients: bool
+    deep: bool = True
+    strict: bool = False
+    sizes: dict[str, Any] = dataclasses.field(default_factory=dict[str, Any])
+    finite: dict[str, Tensor] = dataclasses.field(default_factory=dict[str, Tensor])
+    rigid: dict[str, Tensor] = dataclasses.field(default_factory=dict[str, Tensor])
+
+    def check_numbers(self) -> None:
+        """Refuse NaN, infinity and transforms that are not rigid."""
+        for tensors, test, allowed in (
+            (self.finite, torch.isfinite, "finite numbers"),
+            (self.rigid, is_rigid, RIGID),
+        ):
+            for name, x in tensors.items():
+                if not bool((good := test(x)).all()):
+                    first = tuple(torch.nonzero(~good)[0].tolist())
+                    place = f" at index {list(first)}" if first else ""
+                    raise BadArgument(name, f"{x[first].tolist()}{place}", allowed)
+
+
+@overload
+def checked(thing: Checked) -> Checked: ...
+@overload
+def checked(*, gradients: bool) -> Callable[[Checked], Checked]: ...
+def checked(thing: Any = None, *, gradients: bool = False) -> Any:
+    """Check the arguments of a function, or of a dataclass where it is made, by their annotations.
+
+    Numbers of NumPy become Python's. The fields of a value that is an argument are checked again. In a method the
+    letters of shapes have the lengths of the value's fields. A value without `__post_init__` that the library makes
+    itself from tensors is not checked.
+
+    Args:
+        thing: a function, a method, or a dataclass.
+        gradients: whether tensors may require a gradient.
+
+    Raises:
+        BadArgument: when called: an argument of another type, shape, dtype or range, or a number that is not finite.
+
+    >>> @checked
+    ... def double(n: Count) -> int:
+    ...     return 2 * n
+    >>> double(0)
+    Traceback (most recent call last):
+    torchgrasp.errors.BadArgument: n: expected a whole number in [1, 1000000], got 0
+    """
+    if thing is None:
+        return functools.partial(checked, gradients=gradients)
+    if not isinstance(thing, type):
+        return _guard(thing, thing, gradients, lambda: False)
+    setattr(thing, "__init__", _guard(thing.__init__, thing, True, lambda: _always(thing)))  # noqa: B010
+    setattr(thing, "__checked__", True)  # noqa: B010
+    return thing
+
+
+def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool]) -> Any:
+    """Return a function that checks its arguments; if `always`, also those that the library gives it."""
+    signature = inspect.signature(function)
+    is_method = next(iter(signature.parameters), "") == "self" and not isinstance(owner, type)
+    several = {p.name: p.kind for p in signature.parameters.values() if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        inside = getattr(_thread, "inside", False)
+        if inside and not always():
+            return function(*args, **kwargs)
+        bound, shared, hints = signature.bind(*args, **kwargs), _Call(gradients, deep=not inside), _hints(owner)
+        if is_method:
+            shared.sizes.update(_lengths(bound.arguments["self"]))
+        for name, value in bound.arguments.items():
+            if several.get(name) == inspect.Parameter.VAR_KEYWORD and name in hints:
+                bound.arguments[name] = {key: _read(key, x, hints[name], shared) for key, x in value.items()}
+            elif name in hints:
+                hint = tuple[hints[name], ...] if name in several else hints[name]
+                bound.arguments[name] = _read(name, value, hint, shared)
+        shared.check_numbers()
+        _thread.inside = True
+        try:
+            return function(*bound.args, **bound.kwargs)
+        finally:
+            _thread.inside = inside
+
+    setattr(call, "__checked__", True)  # noqa: B010
+    return call
+
+
+def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:
+    """Return a value that an annotation allows, its numbers as Python's own; raise `BadArgument` for any other."""
+    origin, inside = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Annotated:
+        return _read_marked(name, value, inside[0], inside[1], call)
+    if origin in (typing.Union, types.UnionType):
+        return _read_union(name, value, hint, inside, call)
+    if hint in (int, float, bool):
+        return _read_number(name, value, hint, NUMBERS.get(hint))
+    if is_tensor(hint):
+        return _read_tensor(name, value, hint, call)
+    if isinstance(origin, type) and origin not in (type, collections.abc.Callable):
+        return _read_container(name, value, origin, inside, call)
+    if not is_bearable(value, hint):
+        raise BadArgument(name, show(value), describe(hint))
+    if hint is Path:
+        check_path(name, value)
+    elif isinstance(value, Tensor) and hint not in (object, Any):
+        check_dense(name, value, call.gradients)
+    elif call.deep and hasattr(type(value), "__checked__") and dataclasses.is_dataclass(value):
+        inner = dataclasses.replace(call, sizes={})  # the letters of a value are its own
+        for field, of_field in _fields(type(value)).items():
+            _read(f"{name}.{field}", getattr(value, field), of_field, inner)
+    return value
+
+
+def _read_number(name: str, value: Any, kind: type, allowed: Range | None) -> Any:
+    """Return a number in a range, or a truth value, as Python's own."""
+    if kind is bool:
+        good = isinstance(value, bool | np.bool_)
+    else:
+        good = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
+    if good and allowed is not None:  # huge whole numbers are compared as they are
+        good = allowed.low <= value <= allowed.high and (abs(value) <= MOST or isinstance(value, float))
+    if not good:
+        raise BadArgument(name, show(value), describe(Annotated[kind, allowed] if allowed else kind))
+    return kind(value)
+
+
+def _read_marked(name: str, value: Any, hint: Any, mark: Any, call: _Call) -> Any:
+    """Return a value whose annotation has a mark."""
+    if isinstance(mark, Range):
+        return _read_number(name, value, hint, mark)
+    if mark == ANY and hint is float and isinstance(value, float):
+        return value
+    if mark == ANY and not call.strict:
+        call = dataclasses.replace(call, finite={})
+    result = _read(name, value, hint, dataclasses.replace(call, strict=True) if mark == FINITE else call)
+    if mark == RIGID:
+        call.rigid[name] = result
+    if isinstance(mark, Rows) and (wanted := call.sizes.setdefault(mark.letter, len(result))) != len(result):
+        raise BadArgument(name, f"{len(result)} rows", f"{wanted} rows, as many as the others have")
+    return result
+
+
+def _read_union(name: str, value: Any, hint: Any, options: tuple[Any, ...], call: _Call) -> Any:
+    """Return what any option allows; otherwise raise the error of the option that comes nearest."""
+    errors: list[BadArgument] = []
+    for option in (x for x in options if x is not int or float not in options):
+        try:
+            result = _read(name, value, option, call)
+        except BadArgument as error:
+            errors.append(error)
+            continue
+        if option is str and Path in options:
+            check_path(name, result)
+        return result
+    near = [x for x in errors if x.argument != name or x.found != show(value)]
+    shapes = [x for x in near if str(x.found).startswith("shape")]
+    if near and len(near) == len(shapes):
+        raise BadArgument(near[0].argument, near[0].found, " or ".join(x.allowed for x in near))
+    raise next(x for x in near if x not in shapes) if near else BadArgument(name, show(value), describe(hint))
+
+
+def _read_tensor(name: str, value: Any, hint: Any, call: _Call) -> Tensor:
+    """Return a tensor of the annotated shape and dtype; bind the letters of the shape."""
+    axes, sizes, kind = hint.dim_str.split(), dict(call.sizes), hint.dtype.__name__
+    if not isinstance(value, Tensor):
+        raise BadArgument(name, show(value), f"a torch {describe(hint)[2:]}")
+    check_dense(name, value, gradients=True)
+    if not fits(axes, tuple(value.shape), sizes):
+        known = [f"{axis} = {call.sizes[axis]}" for axis in dict.fromkeys(axes) if axis in call.sizes]
+        allowed = ", ".join([describe(hint).removeprefix("a tensor of ") if axes else "shape ()", *known])
+        raise BadArgument(name, f"shape {tuple(value.shape)}", allowed)
+    if value.dtype not in (dtypes := DTYPES.get(kind) or sum(DTYPES.values(), ())):
+        raise BadArgument(name, str(value.dtype), " or ".join(map(str, dtypes)))
+    check_dense(name, value, call.gradients)
+    call.sizes.update(sizes)
+    if kind == "Float":
+        call.finite[name] = value
+    return value
+
+
+def _read_container(name: str, value: Any, origin: type, inside: tuple[Any, ...], call: _Call) -> Any:
+    """Return a tuple, a sequence or a mapping with its items read; a stream is read as it comes."""
+    fixed = origin is tuple and inside[-1:] != (...,)
+    wrong = not isinstance(value, origin) or isinstance(value, str | bytes | Tensor | np.ndarray)
+    if wrong or (fixed and len(value) != len(inside)):
+        raise BadArgument(name, show(value), f"a tuple of {len(inside)}" if fixed else f"a {origin.__name__.lower()}")
+    if isinstance(value, collections.abc.Mapping):
+        items = {_read(name, k, inside[0], call): _read(f"{name}[{k!r}]", x, inside[1], call) for k, x in value.items()}
+        return items if type(value) is dict else value
+    if not inside or not isinstance(value, collections.abc.Iterable):
+        return value
+    parts = (_read(f"{name}[{i}]", x, inside[i if fixed else 0], call) for i, x in enumerate(value))
+    if not isinstance(value, collections.abc.Sized):
+        return parts
+    read = list(parts)
+    return (read if isinstance(value, list) else tuple(read)) if isinstance(value, collections.abc.Sequence) else value
+
+
+def _has_tensor(hint: Any) -> bool:
+    """Return whether an annotation names a tensor anywhere."""
+    inner = () if typing.get_origin(hint) is collections.abc.Callable else typing.get_args(hint)
+    return hint is Tensor or is_tensor(hint) or any(map(_has_tensor, inner))
+
+
+@functools.cache
+def _always(kind: type) -> bool:
+    """Return whether a value is checked even if the library makes it: its numbers may come from files."""
+    return hasattr(kind, "__post_init__") or not any(map(_has_tensor, _fields(kind).values()))
+
+
+@functools.cache
+def _fields(kind: type) -> dict[str, Any]:
+    """Return the annotations of a dataclass's fields."""
+    fields = dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ()
+    return {field.name: _hints(kind)[field.name] for field in fields}
+
+
+def _lengths(value: Any) -> dict[str, int]:
+    """Return the lengths of the letters in the annotations of a value's tensors."""
+    tensors = {field: hint.dim_str.split() for field, hint in _fields(type(value)).items() if is_tensor(hint)}
+    simple = {field: axes for field, axes in tensors.items() if not any(axis[0] in "*.#" for axis in axes)}
+    pairs = (pair for field, axes in simple.items() for pair in zip(axes, getattr(value, field).shape, strict=False))
+    return {axis: n for axis, n in pairs if axis.isalpha()}
+
+
+@functools.cache
+def _hints(thing: Any) -> dict[str, Any]:
+    """Return the annotations of a function or class, with names that are imported for type checkers alone."""
+    late: dict[str, Any] = {}
+    while True:
+        try:
+            return typing.get_type_hints(thing, localns=late, include_extras=True)
+        except NameError as error:
+            name = str(error.name)
+            late[name] = importlib.import_module(name) if importlib.util.find_spec(name) else _ByName(name, (), {})
+
+
+class _ByName(type):
+    """Stands for a class that is not loaded yet: any class of this name counts as it."""
+
+    def __instancecheck__(cls, instance: Any) -> bool:
+        return cls.__name__ in {base.__name__ for base in type(instance).__mro__}
+
+
+def check_tensor(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
+    """Return a finite floating tensor of a shape (None: any length); raise `BadArgument` otherwise.
+
+    >>> check_tensor("points", torch.zeros(5, 2), (None, 3))
+    Traceback (most recent call last):
+        ...
+    torchgrasp.errors.BadArgument: points: expected shape _ x 3, got shape (5, 2)
+    """
+    call = _Call(gradients=True)
+    _read_tensor(name, value, Float[Tensor, " ".join("_" if s is None else str(s) for s in shape)], call)
+    call.check_numbers()
+    return value

@@ -1,0 +1,192 @@
+"""Marks of annotations, such as ranges, and the rules that argument validation (`torchgrasp.checks`) follows."""
+
+import collections.abc
+import os
+import sys
+import types
+import typing
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import torch
+from jaxtyping import AbstractArray, Bool, Float
+from torch import Tensor
+
+from torchgrasp.errors import BadArgument
+from torchgrasp.limits import NAME_BYTES, PATH_BYTES, SHOWN_LETTERS
+
+
+class Range(NamedTuple):
+    """The numbers from `low` to `high`, both allowed: `Annotated[float, Range(0.0, 1.0)]`. An error shows `words`."""
+
+    low: float
+    high: float
+    words: str = ""
+
+
+class Rows(NamedTuple):
+    """The mark of a batch in a value, `Annotated[Contacts, Rows("g")]`: its length is that of the letter."""
+
+    letter: str
+
+
+ANY, FINITE = "any number, NaN and infinity too", "finite numbers in every field"
+"""Marks of annotations. Tensors must be finite, unless marked `ANY`; `FINITE` asks so of all fields of a value."""
+RIGID = "a rigid transform: a right-handed rotation, and the row 0 0 0 1"
+"""The mark of transforms: a matrix that scales or mirrors would give wrong results without an error."""
+LEAST, MOST = sys.float_info.min, sys.float_info.max
+"""Least positive and largest finite number."""
+Seed = Annotated[int, Range(0, 2**63 - 1, "a whole number from 0 to 2**63 - 1")]
+"""A seed of random draws."""
+Count = Annotated[int, Range(1, 1_000_000)]
+"""A number of objects that are kept in memory."""
+Positive = Annotated[float, Range(LEAST, MOST, "a positive number")]
+"""A number above zero."""
+Fraction = Annotated[float, Range(0.0, 1.0)]
+"""A share or a probability."""
+Measured = Annotated[float, ANY]
+"""A number that is NaN if nothing was measured."""
+Pose = Annotated[Float[Tensor, "4 4"], RIGID]
+"""A rigid transform."""
+Poses = Annotated[Float[Tensor, "g 4 4"], RIGID]
+"""A rigid transform for each row."""
+Length = Annotated[float, Range(0.0, 10.0)]
+"""A length [m] within reach."""
+DTYPES = {"Float": (torch.float32, torch.float64), "Int": (torch.int64, torch.int32), "Bool": (torch.bool,)}
+"""The dtypes that each kind of annotation allows."""
+NUMBERS = {int: Range(-(2**63), 2**63 - 1, "a whole number"), float: Range(-MOST, MOST, "a finite number")}
+"""The ranges of numbers whose annotation has none."""
+
+
+def describe(hint: Any) -> str:
+    """Return what an annotation allows, in words."""
+    origin, inside = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Annotated and isinstance(inside[1], Range):
+        kind, (low, high, words) = "a whole number" if inside[0] is int else "a number", inside[1]
+        return words or f"{kind} in [{low:.12g}, {high:.12g}]"
+    if origin is Annotated:
+        return describe(inside[0])
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(dict.fromkeys(describe(x) for x in inside if x is not int or float not in inside))
+    if origin is typing.Literal:
+        return "one of " * (len(inside) > 1) + ", ".join(map(repr, inside))
+    if is_tensor(hint):
+        axes = (axis.lstrip("*#") if axis[0] not in "*." else "..." for axis in hint.dim_str.split())
+        return f"a tensor of shape {' x '.join(axes)}"
+    if hint in NUMBERS:
+        return NUMBERS[hint].words
+    named = {bool: "True or False", type(None): "None", str: "a text", collections.abc.Callable: "a function"}
+    name = getattr(origin or hint, "__name__", "value")
+    return named.get(origin or hint, f"a {name if origin is None else name.lower()}")
+
+
+def is_tensor(hint: Any) -> bool:
+    """Return whether an annotation is that of a tensor, such as `Float[Tensor, "n 3"]`."""
+    is_array = typing.get_origin(hint) is None and isinstance(hint, type) and issubclass(hint, AbstractArray)
+    return is_array and hint.array_type is Tensor
+
+
+def fits(axes: list[str], shape: tuple[int, ...], sizes: dict[str, Any]) -> bool:
+    """Return whether a shape has the axes of a jaxtyping annotation, and bind their letters.
+
+    This is jaxtyping's own rule. Its bindings end with each function that is type-checked, so they serve no helper.
+    """
+    for k in [k for k, axis in enumerate(axes) if axis[0] in "*."]:
+        letter, end = axes[k].lstrip("*#"), len(shape) - (len(axes) - k - 1)
+        if end < k:
+            return False
+        middle = shape[k:end]
+        known = middle if axes[k] == "..." else sizes.get(letter, middle)
+        try:
+            sizes[letter] = tuple(torch.broadcast_shapes(known, middle)) if "#" in axes[k] else middle
+        except RuntimeError:
+            return False
+        if "#" not in axes[k] and known != middle:
+            return False
+        axes, shape = axes[:k] + axes[k + 1 :], shape[:k] + shape[end:]
+    if len(axes) != len(shape):
+        return False
+    for axis, n in zip(axes, shape, strict=True):
+        letter = axis.lstrip("#")
+        if letter == "_" or (axis != letter and n == 1):
+            continue
+        if n != (int(letter) if letter.isdigit() else sizes.setdefault(letter, n)):
+            return False
+    return True
+
+
+def check_dense(name: str, value: Tensor, gradients: bool) -> None:
+    """Refuse a tensor whose numbers are not simply there, or one that requires gradients where none may."""
+    if value.layout is not torch.strided or value.is_nested or value.is_meta:
+        found = "no numbers (meta)" if value.is_meta else f"a layout of {value.layout}"
+        raise BadArgument(name, found, "a dense tensor with numbers")
+    if value.is_neg():
+        raise BadArgument(name, "a tensor with the negative bit", f"one without: {name}.resolve_neg()")
+    if value.requires_grad and not gradients:
+        raise BadArgument(name, "a tensor that requires a gradient", f"a tensor without one: {name}.detach()")
+
+
+def show(value: Any) -> str:
+    """Describe a wrong value: numbers and texts as they are, tensors by shape, others by their type.
+
+    >>> show("x" * 100)[-6:], show([1]), show(None)
+    ('xxx...', 'list', 'None')
+    """
+    if isinstance(value, Tensor):
+        return f"a tensor of shape {tuple(value.shape)} and {value.dtype}"
+    if value is None or isinstance(value, str | int | float):
+        huge = isinstance(value, int) and abs(value) >= 10**SHOWN_LETTERS
+        text = "a huge number" if huge else repr(value)
+        return text if len(text) <= SHOWN_LETTERS else f"{text[:SHOWN_LETTERS]}..."
+    return type(value).__name__
+
+
+def is_rigid(a_from_b: Float[Tensor, "*b 4 4"]) -> Bool[Tensor, "*b"]:
+    """Return which matrices are a right-handed rotation, up to rounding in float32 or in a text, and a translation.
+
+    >>> is_rigid(torch.stack([torch.eye(4), -torch.eye(4), torch.zeros(4, 4)])).tolist()
+    [True, False, False]
+    """
+    x, y, z = a_from_b[..., :3, :3].double().unbind(-2)
+    rotation, eye = torch.stack([x, y, z], -2), torch.eye(4, dtype=torch.float64, device=a_from_b.device)
+    error = (rotation @ rotation.transpose(-1, -2) - eye[:3, :3]).abs().amax((-1, -2))
+    right_handed = (torch.linalg.cross(x, y) * z).sum(-1) > 0
+    return (error <= 1e-4) & right_handed & (a_from_b[..., 3, :] == eye[3]).all(-1)
+
+
+def check_moved(*args: Any, **kwargs: Any) -> None:
+    """Raise `BadArgument` for arguments that `Tensor.to` does not take, and for other devices or dtypes than ours.
+
+    >>> check_moved(torch.int32)
+    Traceback (most recent call last):
+        ...
+    torchgrasp.errors.BadArgument: to: expected a device, torch.float32 or torch.float64, got torch.int32
+    """
+    given = ", ".join([*map(repr, args), *(f"{key}={value!r}" for key, value in kwargs.items())])
+    allowed = "a device, torch.float32 or torch.float64"
+    try:
+        moved = torch.empty(0, dtype=torch.float32).to(*args, **kwargs)
+    except (RuntimeError, TypeError, ValueError, AssertionError) as error:
+        raise BadArgument("to", given, allowed) from error
+    if moved.is_meta or moved.dtype not in DTYPES["Float"]:
+        raise BadArgument("to", given, allowed)
+
+
+def check_path(name: str, path: Path | str) -> None:
+    """Raise `BadArgument` for a path that no file can have: a NUL, half a character, names or paths that are too long.
+
+    >>> check_path("out", "a" * 300)
+    Traceback (most recent call last):
+    torchgrasp.errors.BadArgument: out: expected a path with names of at most 255 bytes, got a name of 300 bytes
+    """
+    try:
+        raw = os.fsencode(path)
+    except UnicodeEncodeError as error:
+        raise BadArgument(name, f"{show(str(path))}, with half a character", "a path of whole characters") from error
+    if b"\0" in raw:
+        raise BadArgument(name, f"{show(str(path))}, with a NUL", "a path without NUL")
+    if len(raw) > PATH_BYTES:
+        raise BadArgument(name, f"a path of {len(raw)} bytes", f"a path of at most {PATH_BYTES} bytes")
+    longest = max(map(len, map(os.fsencode, Path(path).parts)), default=0)
+    if longest > NAME_BYTES:
+        raise BadArgument(name, f"a name of {longest} bytes", f"a path with names of at most {NAME_BYTES} bytes")
