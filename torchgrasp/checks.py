@@ -25,10 +25,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument
+
+# isort: off
 from torchgrasp.marks import (  # noqa: F401
     ANY, DTYPES, FINITE, LEAST, MOST, NUMBERS, RIGID, Count, Fraction, Length, Measured, Pose, Poses, Positive,
     Range, Rows, Seed, check_dense, check_moved, check_path, describe, fits, is_rigid, is_tensor, show,
 )  # fmt: skip
+# isort: on
 
 Checked = TypeVar("Checked", bound=Callable[..., Any])
 _thread = threading.local()
