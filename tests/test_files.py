@@ -1,11 +1,9 @@
 """Safetensors files: round trip, refusals, atomic writes."""
 
 import dataclasses
-import fcntl
 import os
 import resource
 import sys
-import tempfile
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -16,18 +14,16 @@ from torchgrasp.base import named_tensors
 from torchgrasp.errors import ModelFileError, OutputError
 from torchgrasp.files import (
     LOCK,
-    MOST_BYTES,
     hold_file,
     hold_folder,
     load_tensors,
     read_bytes,
     save_tensors,
     sha256,
-    temporary_folder,
     write_file,
 )
-from torchgrasp.files.hold import TEMPORARY
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
+from torchgrasp.limits import TENSOR_FILE_BYTES
 from torchgrasp.values import Certificate, Contacts, Grasps, load_grasps
 
 
@@ -166,15 +162,15 @@ def test_a_file_may_be_written_by_a_function(tmp_path):
     assert (tmp_path / "f").read_bytes() == b"some bytes"
 
 
-def test_only_what_dead_processes_left_is_removed(tmp_path):
-    """What another thread or process is writing now stays, and so do files of other names."""
-    dead, alive, other = (tmp_path / name for name in (".f.dead.part", ".f.alive.part", ".g.dead.part"))
-    for path in (dead, alive, other):
+def test_a_held_folder_or_file_loses_what_a_killed_run_left_half_written(tmp_path):
+    parts = [tmp_path / ".f.dead.part", tmp_path / ".g.dead.part", tmp_path / "deep" / ".h.dead.part"]
+    (tmp_path / "deep").mkdir()
+    for path in parts:
         path.write_bytes(b"half")
-    with alive.open("rb") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        write_file(tmp_path / "f", "whole")
-    assert {path.name for path in tmp_path.iterdir()} == {"f", alive.name, other.name}
+    with hold_file(tmp_path / "f"):
+        assert [path.exists() for path in parts] == [False, True, True]
+    with hold_folder(tmp_path):
+        assert not any(path.exists() for path in parts)
 
 
 def test_many_writers_of_one_file_leave_one_of_theirs_whole(tmp_path):
@@ -182,31 +178,6 @@ def test_many_writers_of_one_file_leave_one_of_theirs_whole(tmp_path):
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda content: write_file(tmp_path / "f", content), contents))
     assert (tmp_path / "f").read_bytes() in contents and os.listdir(tmp_path) == ["f"]
-
-
-def test_a_temporary_folder_that_is_taken_before_it_is_locked_is_made_anew(tmp_path, monkeypatch):
-    made, make = [], tempfile.mkdtemp
-
-    def make_and_lose(**options) -> str:
-        made.append(make(**options))
-        if len(made) == 1:  # another process sweeps it away as abandoned
-            os.rmdir(made[0])
-        return made[-1]
-
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    monkeypatch.setattr(tempfile, "mkdtemp", make_and_lose)
-    with temporary_folder() as folder:
-        assert folder.is_dir() and str(folder) == made[1]
-    assert len(made) == 2 and not any(tmp_path.iterdir())
-
-
-def test_temporary_folders_of_dead_processes_are_removed_and_of_living_ones_are_not(tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    (tmp_path / f"{TEMPORARY}dead").mkdir()
-    (tmp_path / f"{TEMPORARY}dead" / "hand.urdf").write_text("<robot/>")
-    with temporary_folder() as one, temporary_folder() as two:
-        assert {path.name for path in tmp_path.iterdir()} == {one.name, two.name}
-    assert os.listdir(tmp_path) == []
 
 
 def test_a_file_is_held_by_one_run_and_its_folder_left_as_it_was(tmp_path):
@@ -219,7 +190,7 @@ def test_a_file_is_held_by_one_run_and_its_folder_left_as_it_was(tmp_path):
 
 def test_a_file_of_no_reasonable_size_is_refused_unread(tmp_path):
     with save_tensors(tmp_path / "f", "toy", {"a": torch.zeros(1)}, {}).open("ab") as file:
-        file.truncate(3 * MOST_BYTES)
+        file.truncate(3 * TENSOR_FILE_BYTES)
     with pytest.raises(ModelFileError, match="at most"):
         load_tensors(tmp_path / "f", "toy", {"a"})
 

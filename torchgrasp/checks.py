@@ -23,6 +23,7 @@ import torch
 from beartype.door import is_bearable
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import Unpack
 
 from torchgrasp.errors import BadArgument
 
@@ -112,7 +113,8 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
             shared.sizes.update(_lengths(bound.arguments["self"]))
         for name, value in bound.arguments.items():
             if several.get(name) == inspect.Parameter.VAR_KEYWORD and name in hints:
-                bound.arguments[name] = {key: _read(key, x, hints[name], shared) for key, x in value.items()}
+                read = {key: _read(key, x, _option(hints[name], key), shared) for key, x in value.items()}
+                bound.arguments[name] = read
             elif name in hints:
                 hint = tuple[hints[name], ...] if name in several else hints[name]
                 bound.arguments[name] = _read(name, value, hint, shared)
@@ -275,6 +277,11 @@ def _hints(thing: Any) -> dict[str, Any]:
         except NameError as error:
             name = str(error.name)
             late[name] = importlib.import_module(name) if importlib.util.find_spec(name) else _ByName(name, (), {})
+
+
+def _option(hint: Any, key: str) -> Any:
+    """Return the annotation of one of `**options`, which have one annotation or those of an unpacked `TypedDict`."""
+    return _hints(typing.get_args(hint)[0]).get(key, Any) if typing.get_origin(hint) is Unpack else hint
 
 
 class _ByName(type):

@@ -18,8 +18,7 @@ from torch import Tensor
 from torchgrasp.base import FINGERTIPS, Batch, Value, named_tensors, read_rows
 from torchgrasp.checks import ANY, Poses, Rows, checked, is_rigid
 from torchgrasp.errors import BadArgument, ModelFileError, Status, TooFewPoints
-from torchgrasp.files import save_tensors
-from torchgrasp.value_files import read_value
+from torchgrasp.files import read_value, save_tensors
 
 # ---------------------------------------------------------------------------------------------- what was seen
 

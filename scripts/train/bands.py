@@ -13,9 +13,9 @@ import torch
 import tyro
 from benchmarks.ground_truth import read_views, sample_mesh
 
-from torchgrasp.columns import format_columns
 from torchgrasp.data import read_family
 from torchgrasp.evaluation.intervals import mean_over
+from torchgrasp.files import format_columns
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.support import STD_FACTORS
 

@@ -20,9 +20,8 @@ from torchgrasp.checks import Count, Seed, checked
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.read import read_cloud, save_cloud
 from torchgrasp.errors import DatasetError
-from torchgrasp.files import format_json, write_file
+from torchgrasp.files import Field, format_json, read_json, write_file
 from torchgrasp.geometry.mesh import read_mesh
-from torchgrasp.json_fields import Field, read_json
 from torchgrasp.values import PointCloud
 
 if TYPE_CHECKING:

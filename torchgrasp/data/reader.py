@@ -16,8 +16,7 @@ from torch import Tensor
 from torchgrasp.checks import Count, Range, checked
 from torchgrasp.data.shards import MOST, JobRow, Shard, load_shard, read_row
 from torchgrasp.errors import ModelFileError
-from torchgrasp.files import Recent
-from torchgrasp.json_fields import Field, read_json
+from torchgrasp.files import Field, Recent, read_json
 from torchgrasp.values import Grasps, PointCloud
 
 CARD = "card.json"

@@ -13,9 +13,8 @@ from torch import Tensor
 
 from torchgrasp.base import Value, map_tensors, named_tensors
 from torchgrasp.errors import ModelFileError, Status
-from torchgrasp.files import pack_tensors
-from torchgrasp.json_fields import MOST_LETTERS, Field
-from torchgrasp.value_files import read_value
+from torchgrasp.files import Field, pack_tensors, read_value
+from torchgrasp.limits import JSON_LETTERS
 from torchgrasp.values import Grasps, check_grasps
 
 KIND = "grasp-shard"
@@ -158,4 +157,4 @@ def _long_text(field: Field) -> str:
 def short(text: str) -> str:
     """Return a text as it is kept in a row: on one line, cut to what its reader takes."""
     line = " ".join(text.split())
-    return line if len(line) <= MOST_LETTERS else f"{line[: MOST_LETTERS - 3]}..."
+    return line if len(line) <= JSON_LETTERS else f"{line[: JSON_LETTERS - 3]}..."

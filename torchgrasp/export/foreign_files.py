@@ -18,9 +18,8 @@ from torchgrasp.checks import checked
 from torchgrasp.cloud.tables import parse_npz
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.export.benchmark_files import BENCH_HANDS, rotation_of
-from torchgrasp.files import is_file, read_bytes
+from torchgrasp.files import Field, is_file, read_bytes, read_json
 from torchgrasp.hand.hand import Hand
-from torchgrasp.json_fields import Field, read_json
 from torchgrasp.limits import CLOUD_BYTES
 
 MOST_GRASPS = 100_000

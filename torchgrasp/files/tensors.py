@@ -1,29 +1,32 @@
-"""Tensors and metadata as one safetensors file, which is checked when it is read."""
+"""Values and tensors, with metadata, as one safetensors file that is checked when it is read."""
 
+import dataclasses
 import json
-from collections.abc import Collection
+import typing
+from collections.abc import Callable, Collection
 from pathlib import Path
+from typing import Any, Generic, TypeVar
 
 import torch
+from jaxtyping import jaxtyped
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from torchgrasp.base import Value
+from torchgrasp.checks import is_tensor
 from torchgrasp.errors import ModelFileError
-from torchgrasp.files.read import is_file
-from torchgrasp.files.write import write_file
+from torchgrasp.files.write import is_file, write_file
+from torchgrasp.limits import LARGEST_NUMBER, TENSOR_FILE_BYTES
+
+Item = TypeVar("Item")
+SomeValue = TypeVar("SomeValue", bound=Value)
 
 VERSION = "1"
-"""Version of the file layout; readers refuse any other."""
+"""Version of the file layout; readers refuse all others."""
 
 DTYPES = (torch.float32, torch.float64, torch.int64, torch.bool)
-"""Types of numbers in our files. Of others, such as float8, torch cannot even tell which are finite."""
-
-MOST_BYTES = 1024**3
-"""Largest file [bytes]: hundreds of times the largest of ours, a chunk of samples."""
-
-LARGEST = 1e30
-"""Largest number: beyond it float32 and squares in float64 overflow. No length, angle, force or score comes near."""
+"""Dtypes in our files."""
 
 
 def save_tensors(path: Path | str, kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) -> Path:
@@ -50,14 +53,16 @@ def load_tensors(
     """Read a safetensors file of a `kind` that holds the tensors `names`, and of others at most the `optional`.
 
     Raises:
-        ModelFileError: the file is missing, malformed or larger than `MOST_BYTES`, has another kind, version or
-            tensors, or a number is not finite or beyond `LARGEST`.
+        ModelFileError: the file is missing, malformed or larger than `TENSOR_FILE_BYTES`, has another kind, version or
+            tensors, or a number is not finite or beyond `LARGEST_NUMBER`.
     """
     allowed = names.union(optional)
     if not is_file(path):
         raise ModelFileError("path", f"{path}, which is no file", f"a safetensors file of kind {kind!r}")
-    if Path(path).stat().st_size > MOST_BYTES:
-        raise ModelFileError("path", f"{path} of {Path(path).stat().st_size} bytes", f"at most {MOST_BYTES} bytes")
+    if Path(path).stat().st_size > TENSOR_FILE_BYTES:
+        raise ModelFileError(
+            "path", f"{path} of {Path(path).stat().st_size} bytes", f"at most {TENSOR_FILE_BYTES} bytes"
+        )
     try:
         with safe_open(path, framework="pt") as file:
             meta = json.loads((file.metadata() or {}).get("torchgrasp", "{}"))
@@ -76,7 +81,93 @@ def load_tensors(
     for name, t in tensors.items():
         if t.dtype not in DTYPES:
             raise ModelFileError("path", f"{path}: {name} of {t.dtype}", f"one of {', '.join(map(str, DTYPES))}")
-        if t.is_floating_point() and not bool((t.abs() <= LARGEST).all()):
-            found = f"{path}: a number beyond {LARGEST:g} or a non-finite number in {name}"
+        if t.is_floating_point() and not bool((t.abs() <= LARGEST_NUMBER).all()):
+            found = f"{path}: a number beyond {LARGEST_NUMBER:g} or a non-finite number in {name}"
             raise ModelFileError("path", found, "finite numbers")
     return tensors, meta
+
+
+def read_value(path: Path | str, kind: str, of: type[SomeValue], **rest: Any) -> tuple[SomeValue, dict[str, str]]:
+    """Read a value that `save_tensors` wrote under the names of its fields, and the metadata.
+
+    The annotations of its fields say which tensors there are, which may be missing, and their shapes. A letter in them
+    has one size in all fields.
+
+    Args:
+        path: of the file.
+        kind: of the file, such as "grasps".
+        of: class of the value.
+        rest: fields that are no tensors; others keep their defaults.
+
+    Raises:
+        ModelFileError: a file as in `load_tensors`, or a tensor of another shape or type.
+    """
+    fields = _tensor_fields(of)
+    optional = {name for name, kinds in fields.items() if type(None) in kinds}
+    tensors, meta = load_tensors(path, kind, set(fields) - optional, optional)
+    with jaxtyped("context"):  # binds the letters of the annotations
+        for name, tensor in tensors.items():
+            if not isinstance(tensor, fields[name][0]):
+                found = f"{path}: {name} of shape {tuple(tensor.shape)} and {tensor.dtype}"
+                raise ModelFileError("path", found, f"{fields[name][0]}, and one size for each letter")
+    return _build(of, tensors, "", rest), {k: v for k, v in meta.items() if k not in ("kind", "version")}
+
+
+def _tensor_fields(of: type[Value], prefix: str = "") -> dict[str, tuple[Any, ...]]:
+    """Return the annotation of each tensor inside a value by its dotted name; with NoneType if it may be missing."""
+    fields: dict[str, tuple[Any, ...]] = {}
+    for name, hint in _hints(of).items():
+        kinds = typing.get_args(hint) if typing.get_origin(hint) not in (None, dict) else (hint,)
+        if _is_value(hint):
+            fields |= _tensor_fields(hint, f"{prefix}{name}.")
+        elif is_tensor(kinds[0]):
+            fields[prefix + name] = kinds
+    return fields
+
+
+def _build(of: type[SomeValue], tensors: dict[str, Tensor], prefix: str, rest: dict[str, Any]) -> SomeValue:
+    """Return a value of tensors by dotted name; a missing one is None."""
+    values: dict[str, Any] = dict(rest)
+    own = _tensor_fields(of)
+    for name, hint in _hints(of).items():
+        if _is_value(hint):
+            values[name] = _build(hint, tensors, f"{prefix}{name}.", {})
+        elif name in own and name not in rest:
+            values[name] = tensors.get(prefix + name)
+    return of(**values)
+
+
+def _hints(of: type[Value]) -> dict[str, Any]:
+    """Return the types of a dataclass's fields."""
+    hints = typing.get_type_hints(of)
+    return {field.name: hints[field.name] for field in dataclasses.fields(of)}  # pyright: ignore[reportArgumentType]
+
+
+def _is_value(hint: Any) -> bool:
+    """Return whether an annotation is that of a value."""
+    return typing.get_origin(hint) is None and isinstance(hint, type) and issubclass(hint, Value)
+
+
+class Recent(Generic[Item]):
+    """Keeps the last few items that were read, by number; a copy in another process begins empty.
+
+    >>> recent = Recent(1)
+    >>> recent.get(3, str), recent.get(3, hex), recent.get(4, str), recent.get(3, hex)
+    ('3', '3', '4', '0x3')
+    """
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+        self.kept: dict[int, Item] = {}
+
+    def get(self, number: int, read: Callable[[int], Item]) -> Item:
+        """Return the item of a number, read if it is not kept."""
+        item = self.kept.pop(number, None)
+        item = read(number) if item is None else item
+        self.kept[number] = item  # now the last one
+        for oldest in list(self.kept)[: -self.most]:
+            self.kept.pop(oldest, None)
+        return item
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Recent, (self.most,)

@@ -14,9 +14,8 @@ from torch import Tensor
 from torchgrasp.base import check_whole, join
 from torchgrasp.checks import Count, Range, checked
 from torchgrasp.errors import BadArgument, ModelFileError, OutputError
-from torchgrasp.files import Recent, begin_folder, hold_folder, load_tensors, save_tensors
+from torchgrasp.files import Field, Recent, begin_folder, hold_folder, load_tensors, read_json, save_tensors
 from torchgrasp.hand.hand import Hand
-from torchgrasp.json_fields import Field, read_json
 from torchgrasp.posture_model.sample import (
     CHUNK_POSTURES,
     MAX_SAMPLES,

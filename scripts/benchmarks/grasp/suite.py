@@ -11,9 +11,8 @@ import trimesh
 
 from torchgrasp import ContactSpec, PointCloud, Status, TrialSpec, close_hand, load_hand, plan_grasps
 from torchgrasp.base import count_status
-from torchgrasp.columns import format_line
 from torchgrasp.data import list_views, read_object_mesh, read_view
-from torchgrasp.files import write_file
+from torchgrasp.files import format_line, write_file
 
 
 def bench_one(

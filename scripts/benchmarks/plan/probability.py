@@ -17,10 +17,10 @@ from benchmarks.common import Row
 from benchmarks.ground_truth import read_views, sample_mesh
 from benchmarks.plan.true_surface import DEFAULT, FRICTION, closed_on_mesh
 from torchgrasp import ContactSpec, Status, closure_probability, fit_shape, plan_contacts
-from torchgrasp.columns import format_columns
 from torchgrasp.data import read_family, read_group
 from torchgrasp.evaluation.calibration import BINS, judge
 from torchgrasp.evaluation.intervals import count_by, format_share, share_over
+from torchgrasp.files import format_columns
 from torchgrasp.plan.line_posterior import well_inside
 from torchgrasp.plan.round_cones import closed_exact
 from torchgrasp.shape.gp import ShapeGP

@@ -10,11 +10,11 @@ from torchgrasp.app.cli.grasps import import_simulator
 from torchgrasp.base import check_whole
 from torchgrasp.campaign import CampaignSpec, run_campaign
 from torchgrasp.campaign.folder import FAILED
-from torchgrasp.columns import format_line
 from torchgrasp.data import JobRow
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.protocols import find_protocol
 from torchgrasp.evaluation.views import EvaluationSpec, Ranks
+from torchgrasp.files import format_line
 from torchgrasp.hand.load import load_hand
 from torchgrasp.specs import ClosingMode, Simulator
 

@@ -11,8 +11,8 @@ import torch
 
 from torchgrasp import __version__
 from torchgrasp.app.cli.progress import Progress
-from torchgrasp.columns import format_columns
 from torchgrasp.errors import BadArgument, MissingExtra
+from torchgrasp.files import format_columns
 from torchgrasp.hand.load import hands_folder
 from torchgrasp.specs import Simulator
 

@@ -8,7 +8,6 @@ from typing import Any, Literal
 from torchgrasp.app.cli.common import check_seed, load_fingers, naming
 from torchgrasp.app.cli.grasps import import_simulator
 from torchgrasp.app.report.evaluation import SHARE_NAMES, write_evaluation
-from torchgrasp.columns import format_columns, format_line
 from torchgrasp.data import list_entries, list_views
 from torchgrasp.errors import DatasetError, Status
 from torchgrasp.evaluation.campaign import evaluate as evaluate_views
@@ -16,7 +15,7 @@ from torchgrasp.evaluation.intervals import format_share
 from torchgrasp.evaluation.protocols import find_protocol
 from torchgrasp.evaluation.score import ViewScore, summarise
 from torchgrasp.evaluation.views import EvaluationSpec, Ranks
-from torchgrasp.files import format_json, hold_folder, write_file
+from torchgrasp.files import format_columns, format_json, format_line, hold_folder, write_file
 from torchgrasp.specs import ClosingMode, HoldingMode, Simulator
 
 

@@ -31,11 +31,10 @@ from torchgrasp.app.cli.scene_grasps import Wanted, grasp_scene
 from torchgrasp.app.report.page import GRASP_COLUMNS, grasp_rows
 from torchgrasp.app.report.run import Run, verdict
 from torchgrasp.base import check_number, check_whole
-from torchgrasp.columns import format_columns
 from torchgrasp.data.shipped import DATA, MASSES, list_objects, load_object
 from torchgrasp.errors import BadArgument, MissingExtra, Status
 from torchgrasp.evaluation.lift import close_hand
-from torchgrasp.files import sha256
+from torchgrasp.files import format_columns, sha256
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surface
 from torchgrasp.hand.load import hand_of

@@ -9,10 +9,9 @@ from tyro.conf import Positional, arg
 from torchgrasp.app.cli.common import check_folder, naming
 from torchgrasp.app.report.stills import draw_hand, opposed_posture
 from torchgrasp.base import count_status
-from torchgrasp.columns import format_columns
 from torchgrasp.data.shipped import load_object
 from torchgrasp.errors import BadArgument, GraspError, Status
-from torchgrasp.files import write_file
+from torchgrasp.files import format_columns, write_file
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.load import find_hand

@@ -9,8 +9,8 @@ from torchgrasp.app.cli.progress import Progress
 from torchgrasp.app.cli.results import write_results
 from torchgrasp.app.report.page import GRASP_COLUMNS, grasp_rows
 from torchgrasp.app.report.run import Run, verdict
-from torchgrasp.columns import format_columns, format_line
 from torchgrasp.errors import Status
+from torchgrasp.files import format_columns, format_line
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.hand.load import hand_of

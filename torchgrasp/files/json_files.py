@@ -1,6 +1,6 @@
-"""JSON files of strangers: bounded in size, and read field by field, each with its type.
+"""JSON files within limits, read field by field with the type of each field.
 
-An error names the file and the field, such as `objects.cup.views.front`, what was found, and what is allowed.
+An error names the file and the field, such as `objects.cup.views.front`.
 """
 
 import json
@@ -10,21 +10,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.files import is_file, read_bytes
+from torchgrasp.files.write import is_file, read_bytes
+from torchgrasp.limits import JSON_BYTES, JSON_LETTERS, SHOWN_LETTERS
 
 Refuse = Callable[[str, str], BadArgument]
-"""Makes the error of a reader of what was found and what is allowed."""
-
-MOST_BYTES = 32 * 1024 * 1024
-"""Largest file [bytes]: a manifest of 100,000 objects with three views each is smaller."""
-MOST_LETTERS = 200
-"""Longest text: file names may have 255 bytes, and some of them are ours."""
-SHOWN = 60
-"""Letters of a wrong value that an error shows."""
+"""Makes an error of what was found and what is allowed."""
 
 
 class Field(NamedTuple):
-    """A value of a JSON file with its place; `refuse` makes the error that is raised for it."""
+    """A value in a JSON file with its place; `refuse` makes its error."""
 
     path: Path
     place: str
@@ -33,8 +27,8 @@ class Field(NamedTuple):
 
     def wrong(self, allowed: str) -> BadArgument:
         """Return the error of this field."""
-        text = repr(self.value)[: SHOWN + 1]
-        shown = text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
+        text = repr(self.value)[: SHOWN_LETTERS + 1]
+        shown = text if len(text) <= SHOWN_LETTERS else f"{text[:SHOWN_LETTERS]}..."
         return self.refuse(f"{self.path}: {self.place or 'the file'} = {shown}", allowed)
 
     def entries(self) -> "dict[str, Field]":
@@ -45,13 +39,13 @@ class Field(NamedTuple):
         return {key: Field(self.path, f"{within}{key}", value, self.refuse) for key, value in self.value.items()}
 
     def items(self, most: int = 1000) -> "list[Field]":
-        """Return the fields of a list of at most so many."""
+        """Return the fields of a list of at most `most` items."""
         if not isinstance(self.value, list) or len(self.value) > most:
             raise self.wrong(f"a list of at most {most}")
         return [Field(self.path, f"{self.place}[{i}]", x, self.refuse) for i, x in enumerate(self.value)]
 
-    def text(self, most: int = MOST_LETTERS) -> str:
-        """Return a text of at most so many letters."""
+    def text(self, most: int = JSON_LETTERS) -> str:
+        """Return a text of at most `most` letters."""
         if not isinstance(self.value, str) or len(self.value) > most:
             raise self.wrong(f"a text of at most {most} letters")
         return self.value
@@ -72,8 +66,8 @@ class Field(NamedTuple):
         return self.value
 
 
-def read_json(path: Path, refuse: Refuse, allowed: str, most: int = MOST_BYTES) -> Field:
-    """Read a JSON file in UTF-8 of at most so many bytes; raise the error of `refuse` for any other file.
+def read_json(path: Path, refuse: Refuse, allowed: str, most: int = JSON_BYTES) -> Field:
+    """Read a JSON file in UTF-8 of at most `most` bytes; raise the error of `refuse` for any other file.
 
     NaN and Infinity are no JSON, and no number of more than 4300 digits is read.
     """
