@@ -1,0 +1,62 @@
+"""One thread of torch within a call: on busy cores several threads wait for each other most of the time."""
+
+import contextlib
+import functools
+import inspect
+import threading
+from collections.abc import Callable, Generator, Iterator
+from typing import Any, TypeVar
+
+import torch
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+_lock = threading.Lock()
+_here = threading.local()
+"""`inside` is True in a thread that is within `one_thread`."""
+_state = {"calls": 0, "before": 1}
+"""How many threads are within `one_thread`, and the number of torch's threads before the first of them."""
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch use one thread within the context; afterwards it uses as many as before."""
+    if getattr(_here, "inside", False):
+        yield
+        return
+    with _lock:
+        if not _state["calls"]:
+            _state["before"] = torch.get_num_threads()
+        _state["calls"] += 1
+    _here.inside = True
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        with _lock:
+            _state["calls"] -= 1
+        _here.inside = False
+        torch.set_num_threads(_state["before"])
+
+
+def single_threaded(function: Function) -> Function:
+    """Return a function that runs within `one_thread`; a generator does so each time that it computes an item."""
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        with one_thread():
+            result = function(*args, **kwargs)
+        return _each(result) if inspect.isgenerator(result) else result
+
+    return call  # pyright: ignore[reportReturnType]
+
+
+def _each(items: Generator[Any, Any, Any]) -> Iterator[Any]:
+    """Yield the items of a generator, each computed within `one_thread`."""
+    with contextlib.closing(items):
+        while True:
+            with one_thread():
+                try:
+                    item = next(items)
+                except StopIteration:
+                    return
+            yield item
