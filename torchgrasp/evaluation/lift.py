@@ -19,6 +19,7 @@ from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
 from torchgrasp.sim.scene_spec import Neighbour
 from torchgrasp.specs import TrialSpec
+from torchgrasp.threads import single_threaded
 from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ SLIP_DISTANCE, SLIP_ANGLE = 0.02, math.radians(30)
 
 
 @checked
+@single_threaded
 def close_hand(
     grasp: Grasps,
     hand: Hand,
@@ -90,6 +92,7 @@ def close_hand(
 
 
 @checked
+@single_threaded
 def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResult:
     """Run a trial; see `close_hand`.
 

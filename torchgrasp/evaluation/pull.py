@@ -17,6 +17,7 @@ from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.protocols import Protocol, PullSpec, find_protocol
 from torchgrasp.evaluation.score import ProtocolResult
 from torchgrasp.geometry.frames import rotation_angle
+from torchgrasp.threads import single_threaded
 
 DIRECTIONS = tuple(np.array(sign) * axis for axis in np.eye(3) for sign in (-1.0, 1.0))
 """-x, +x, -y, +y, -z, +z of the world."""
@@ -46,6 +47,7 @@ class PullResult(Value):
 
 
 @checked
+@single_threaded
 def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") -> PullResult:
     """Close a hand on the true object and pull along the world's axes, each in a fresh scene until one fails.
 
@@ -111,6 +113,7 @@ def _look(run: TrialRun, spec: PullSpec, start: np.ndarray) -> tuple[Status, np.
 
 
 @checked
+@single_threaded
 def run_protocol(
     trial: GraspTrial,
     protocol: Protocol,

@@ -26,6 +26,7 @@ from torchgrasp.ik.ranking import rank_in_group
 from torchgrasp.ik.refine import refine
 from torchgrasp.ik.rounds import Attempts, assign
 from torchgrasp.posture_model.mixture import GraspMixture
+from torchgrasp.threads import single_threaded
 from torchgrasp.values import Contacts, IKSeeds
 
 Method = Literal["levenberg_marquardt", "cobyla"]
@@ -63,6 +64,7 @@ class IKSolution(Batch):
 
 
 @checked
+@single_threaded
 def solve_ik(
     hand: Hand,
     contacts: Contacts,

@@ -17,6 +17,7 @@ from torchgrasp.geometry.frames import degenerate
 from torchgrasp.plan.closure_lp import solve_closure_lp
 from torchgrasp.plan.wrench import MIN_MARGIN, MIN_RANK_RATIO, Vectors, rank_ratio, wrenches
 from torchgrasp.specs import ContactSpec
+from torchgrasp.threads import single_threaded
 from torchgrasp.values import Certificate, Contacts
 
 EXACT = 1e-13
@@ -32,6 +33,7 @@ UNIT_TOLERANCE = 1e-3
 
 
 @checked
+@single_threaded
 def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     """Prove in float64 that the contacts of a row have frictional form closure, Eq. (13), or that they have not.
 

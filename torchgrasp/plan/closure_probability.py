@@ -17,6 +17,7 @@ from torchgrasp.plan.line_posterior import LinePosterior, first_contact, line_po
 from torchgrasp.plan.round_cones import closed_exact, first_balance
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec
+from torchgrasp.threads import single_threaded
 from torchgrasp.values import Contacts
 
 DRAWS_PER_CHUNK = 8192
@@ -39,6 +40,7 @@ class ClosureProbability(Batch):
 
 
 @checked
+@single_threaded
 def closure_probability(
     shape: ShapeGP,
     contacts: Annotated[Contacts, FINITE],

@@ -18,6 +18,7 @@ from torchgrasp.plan.solver import FINISH, Stage, descend, project, start_state
 from torchgrasp.plan.starts import Settled, check_starts, chunk_sizes, drawn_starts, given_starts, settle_flatness
 from torchgrasp.plan.wrench import Vectors
 from torchgrasp.specs import ContactSpec
+from torchgrasp.threads import single_threaded
 from torchgrasp.values import ContactPlan
 
 SEARCH = (Stage(centre=3.0, cones=0.3, steps=10), Stage(centre=1.0, cones=3.0, steps=6)) * 4 + (
@@ -35,6 +36,7 @@ Chunk = tuple[Float[Tensor, "_ f 3"], tuple[Stage, ...]]
 
 
 @checked
+@single_threaded
 def plan_contacts(
     shape: Shape,
     spec: ContactSpec | None = None,

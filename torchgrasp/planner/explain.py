@@ -19,6 +19,7 @@ from torchgrasp.planner.problem import Request
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec
+from torchgrasp.threads import single_threaded
 from torchgrasp.values import Certificate, ContactPlan, Grasps, IKSeeds, PointCloud
 
 TRIAL_STARTS = 100
@@ -169,6 +170,7 @@ class Explanation(Value):
 
 
 @checked
+@single_threaded
 def explain_empty(
     cloud: PointCloud | Scene,
     hand: Hand,

@@ -22,6 +22,7 @@ from torchgrasp.planner.batches import describe, plan_batches, rank_together
 from torchgrasp.planner.problem import Budget, PlanOptions, Problem, Request
 from torchgrasp.scene.scene import Scene
 from torchgrasp.specs import ContactSpec
+from torchgrasp.threads import single_threaded
 from torchgrasp.values import Certificate, Contacts, Grasps, PointCloud, load_grasps
 
 BEST = 20
@@ -56,6 +57,7 @@ def plan_grasps(
 
 
 @checked
+@single_threaded
 def plan_grasps(
     cloud: PointCloud | Scene | Sequence[PointCloud],
     hand: Hand,
@@ -118,6 +120,7 @@ def plan_grasps(
 
 
 @checked
+@single_threaded
 def stream_grasps(
     cloud: PointCloud | Scene,
     hand: Hand,

@@ -20,6 +20,7 @@ from torchgrasp.planner.problem import finger_sets
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec
+from torchgrasp.threads import single_threaded
 from torchgrasp.values import Grasps
 
 
@@ -62,6 +63,7 @@ class ScenePlan(Value):
 
 
 @checked
+@single_threaded
 def plan_scene(
     scene: Scene,
     hand: Hand,

@@ -39,6 +39,7 @@ from torchgrasp.shape.support import (
     paper_support,
 )
 from torchgrasp.shape.values import Normalisation, Observations, off_surface, on_surface
+from torchgrasp.threads import single_threaded
 from torchgrasp.values import PointCloud
 
 MAX_BUDGET = 1000
@@ -46,6 +47,7 @@ MAX_BUDGET = 1000
 
 
 @checked
+@single_threaded
 def fit_shape(
     cloud: PointCloud,
     noise: Annotated[float, Range(LEAST, 1.0)] = 0.01,

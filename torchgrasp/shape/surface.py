@@ -18,6 +18,7 @@ from torchgrasp.geometry.mesh import clip_mesh
 from torchgrasp.geometry.signed_distance import FIELD_SPACING, SignedDistanceField, field_from_surface
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.values import surface_deviation
+from torchgrasp.threads import single_threaded
 
 if TYPE_CHECKING:
     import trimesh
@@ -62,6 +63,7 @@ class Surface(Value):
 
 
 @checked
+@single_threaded
 def extract_surface(shape: ShapeGP, resolution: Annotated[int, Range(8, 256)] = RESOLUTION) -> Surface:
     """Return the zero level of the mean, Eq. (9), within the domain, by marching cubes and Newton steps.
 
@@ -210,6 +212,7 @@ def _carry_cloud(corners: np.ndarray, faces: np.ndarray, shape: ShapeGP) -> np.n
 
 
 @checked
+@single_threaded
 def surface_field(shape: ShapeGP, spacing: Annotated[float, Range(0.001, 0.02)] = FIELD_SPACING) -> SignedDistanceField:
     """Return the signed distance field of a shape's estimated surface: by it touches tell where the object is.
 
