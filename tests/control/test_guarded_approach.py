@@ -9,7 +9,7 @@ from tests.control.test_localization import CENTER, RADIUS, ball, field
 from tests.point_fingers import PERIOD, observation, real, reference
 from torchgrasp.control import ClosingReference, GraspController
 from torchgrasp.control.object_pose import FINE_TURNS, TURNS
-from torchgrasp.control.recovery import ACCELERATION, BACK, CAREFUL_SPEED, FEELING, SPEED, GuardedApproach
+from torchgrasp.control.recovery import ACCELERATION, CAREFUL_SPEED, SPEED, GuardedApproach
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.errors import BadArgument
@@ -82,9 +82,9 @@ def test_the_hand_rests_while_it_feels_and_draws_back_before_its_palm_moves():
     lefts, palms = come(hand, shift)
     stopped = int((lefts.diff() == 0).int().argmax())
     rest = lefts[stopped:].eq(lefts[stopped]).int().cumprod(0).sum()
-    assert abs(int(rest) * PERIOD - (FEELING + (len(TURNS) + len(FINE_TURNS) + 2) * PERIOD)) <= 2 * PERIOD
+    assert abs(int(rest) * PERIOD - (0.06 + (len(TURNS) + len(FINE_TURNS) + 2) * PERIOD)) <= 2 * PERIOD
     first = int((palms.abs().sum(-1) > 0).int().argmax())
-    assert lefts[first] == pytest.approx(float(lefts[stopped]) + BACK)
+    assert lefts[first] == pytest.approx(float(lefts[stopped]) + 0.02)
     assert (-lefts[first:].diff()).max() <= CAREFUL_SPEED * PERIOD * (1 + 1e-9)  # it comes slowly then
     assert lefts.max() <= LENGTH
 

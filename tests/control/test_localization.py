@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.point_fingers import GAINS, TARGET, observation, real, reference
-from torchgrasp.control.object_pose import FINE_TURNS, PITCH, SURFACE_STD, TURNS, Localization, Touches
+from torchgrasp.control.object_pose import FINE_TURNS, PITCH, TURNS, Localization, Touches
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
@@ -87,7 +87,7 @@ def test_one_touch_tells_where_a_ball_is_as_far_as_its_normal_is_known():
     tips = CENTER + real([[0, 0, 0], [0, 0.2, 0], [0, -0.2, 0]])  # the others are far off
     touches = touch(there, CENTER + RADIUS * normal + wanted, normal, (True, False, False), tips)
     along = torch.linalg.cross(normal[0], real([0, 1, 0]))
-    known_by = {0: SURFACE_STD, 1: 0.3 * RADIUS}  # across the surface, and along it
+    known_by = {0: 0.004, 1: 0.3 * RADIUS}  # across the surface, and along it
     shares = [0.02**2 / (0.02**2 + known_by[k] ** 2) for k in (0, 1)]  # of Gaussians
     found = locate(there, touches)[:3]
     for axis, share in zip((normal[0], along), shares, strict=True):
@@ -119,7 +119,7 @@ def test_a_fingertip_in_the_air_is_outside_of_the_object():
     free = locate(there, touch(there, point, normal, (True, False, False), tips + real([0, 0, 0.05])))
     stopped = locate(there, touch(there, point, normal, (True, False, False), tips))
     assert abs(float(free[2])) < 2e-3
-    assert stopped[2] <= -0.008 + SURFACE_STD  # a tip of 10 mm, 3 mm from the end of the slab
+    assert stopped[2] <= -0.008 + 0.004  # a tip of 10 mm, 3 mm from the end of the slab
 
 
 def test_a_finger_that_is_dead_or_tells_no_place_says_nothing():

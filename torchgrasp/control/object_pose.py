@@ -20,9 +20,6 @@ TURNS, FINE_TURNS = (-0.24, -0.12, 0.0, 0.12, 0.24), (-0.06, 0.0, 0.06)
 PITCH = 0.004
 """Distance [m] between the displacements that `Localization` tries."""
 
-SURFACE_STD = 0.004
-"""Standard deviation [m] of a touched point's distance from the estimated surface."""
-
 
 class ContactPlanes:
     """The displacement of the object, from the tangent planes of its contacts, in the frame of the undisplaced hand.
@@ -163,7 +160,7 @@ class Localization:
 
     def _costs(self, touches: Touches, shifts: Float[Tensor, "m 2"], turn: float) -> Float[Tensor, "m"]:
         """Return the negative logarithms of the likelihoods of displacements."""
-        normal_std, shift_std, turn_std = 0.3, 0.02, 0.15  # [1, m, rad]
+        surface_std, normal_std, shift_std, turn_std = 0.004, 0.3, 0.02, 0.15  # [m, 1, m, rad]
         gap, worst = 0.001, 20.0  # least distance [m] of a tip in the air; bound on the cost of one tip
         felt, (points, normals) = touches.felt, touches.means()
         rotation = rotation_from_vector(turn * self.up)
@@ -171,9 +168,9 @@ class Localization:
         before = (there - (shifts @ self.axes)[:, None]) @ rotation + self.center
         distance, gradient = self.surface.query(apply(self.obj_from_hand, before))
         outward = unit(gradient @ self.obj_from_hand[:3, :3] @ rotation.T)
-        place = (distance / SURFACE_STD).square().clamp_max(2 * worst)
+        place = (distance / surface_std).square().clamp_max(2 * worst)
         facing = ((outward - normals) / normal_std).square().sum(-1)
-        inside = ((self.radius + gap - distance).clamp_min(0.0) / SURFACE_STD).square().clamp_max(2 * worst)
+        inside = ((self.radius + gap - distance).clamp_min(0.0) / surface_std).square().clamp_max(2 * worst)
         fit = torch.where(felt, place + facing, torch.where(touches.contact | ~touches.known, 0.0, inside)).sum(-1)
         return 0.5 * (fit + (shifts / shift_std).square().sum(-1) + (turn / turn_std) ** 2)
 

@@ -21,17 +21,8 @@ from torchgrasp.specs import ClosingOptions
 SPEED, CAREFUL_SPEED, ACCELERATION = 0.2, 0.08, 1.0
 """Largest speed [m/s] of the approach, largest speed [m/s] after a touch, and acceleration [m/s^2]."""
 
-BACK = 0.02
-"""Distance [m] that the hand draws back after a touch."""
-
-FEELING = 0.06
-"""Time [s] for which the approaching hand averages a touch."""
-
 PRESSING_TIME = 0.5
 """Time [s] from the end of closing until the hand counts as closed, and is judged."""
-
-MAX_FRICTION = 0.6
-"""Largest ratio of tangential to normal force at which a grasp is lifted."""
 
 MISPLACED = 0.008
 """Distance [m] between object and palm from which the hand closes again: twice the error of `Localization`."""
@@ -96,7 +87,7 @@ class GuardedApproach:
 
     def _feel(self, observation: Observation, period: float) -> None:
         """Average the touch, then locate the object; finally choose where the palm goes."""
-        if self.time < FEELING:
+        if self.time < 0.06:  # [s]
             self.time += period
             self.touches.add(observation, self.palm - self.left * self.direction)
         elif not self.search.done and bool(self.touches.felt.any()):
@@ -106,7 +97,7 @@ class GuardedApproach:
             if self.search.done:
                 self.displacement = self.search.displacement
                 self.goal = palm_goal(self.displacement[:3], self.reference.table, self.options.palm_reach)
-            self.retreat = min(self.left + BACK, self.length)
+            self.retreat = min(self.left + 0.02, self.length)
 
 
 class GraspCheck:
@@ -152,8 +143,8 @@ class GraspCheck:
         if not bool(touches.felt.all()):
             return True  # without all places of contacts the forces cannot be judged
         points, normals = touches.means()
-        ratio = tangential_ratio(least_friction_forces(points, normals), normals)
-        return bool((ratio <= MAX_FRICTION).all())  # false for NaN, where no forces balance
+        ratio, friction = tangential_ratio(least_friction_forces(points, normals), normals), 0.6  # of many objects
+        return bool((ratio <= friction).all())  # false for NaN, where no forces balance
 
 
 class Reopening:

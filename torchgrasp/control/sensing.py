@@ -17,14 +17,12 @@ from torchgrasp.control.tactile import (
     NOISE,
     SAMPLING_RATE,
     TOUCH_ON,
-    Noise,
     TactileState,
     TipContact,
     flag,
     low_pass,
     measure,
     no_contact,
-    sample,
 )
 from torchgrasp.errors import BadArgument
 
@@ -146,7 +144,7 @@ class FingertipSensor:
 
     def __init__(self, reference: ClosingReference, generator: torch.Generator | None = None) -> None:
         self.reference, self.model = reference, reference.sensor
-        self.noise = None if generator is None else Noise(generator, self.model.noise)
+        self.generator = generator
         fingers = len(reference.normals)
         self.sensed = no_contact(fingers=fingers)
         self.switched = torch.zeros(fingers, dtype=torch.bool)
@@ -165,7 +163,8 @@ class FingertipSensor:
         if self.model.kind == "torque":
             self.sensed = feel_torques(before, reference, jacobian, self._torques(truth, jacobian), period)
         else:
-            self.sensed = sample(before, truth, reference.normals, reference.hand.tips.radius, period, self.noise)
+            radius, noise = reference.hand.tips.radius, self.model.noise
+            self.sensed = measure(before, truth, reference.normals, radius, period, self.generator, noise)
         report = self.sensed
         if self.model.kind == "binary":  # a switch closes at 0.45 N and opens at TOUCH_ON
             self.switched = torch.where(self.switched, report.reading > TOUCH_ON, report.reading >= 0.45)
@@ -180,9 +179,9 @@ class FingertipSensor:
     def _torques(self, truth: TipContact, jacobian: Float[Tensor, "f 3 j"]) -> Float[Tensor, " j"]:
         """Return the torques [N m] that contacts cause at all joints, with the noise of the sensors."""
         torques = torch.einsum("fcj,fc->j", jacobian, truth.forces)
-        if self.noise is not None:
-            drawn = torch.randn(len(torques), generator=self.noise.generator, dtype=torques.dtype)
-            torques = torques + self.noise.scale * TORQUE_NOISE * drawn
+        if self.generator is not None:
+            drawn = torch.randn(len(torques), generator=self.generator, dtype=torques.dtype)
+            torques = torques + self.model.noise * TORQUE_NOISE * drawn
         return torques
 
 

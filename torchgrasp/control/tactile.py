@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
@@ -96,6 +96,7 @@ def measure(
     radius: Float[Tensor, "f"],
     period: Annotated[float, Range(1e-06, 1.0)],
     generator: torch.Generator | None = None,
+    noise: Annotated[float, Range(0.0, 100.0)] = 1.0,
 ) -> TactileState:
     """Return the readings of the fingertips one tick later.
 
@@ -106,6 +107,7 @@ def measure(
         radius: radius of the tips [m]; 0: not round, 12 mm is assumed.
         period: period of the tick [s].
         generator: draws the noise; None: no noise.
+        noise: factor on the standard deviation of the noise.
 
     Raises:
         BadArgument: true contacts on another device than the state.
@@ -116,25 +118,6 @@ def measure(
     >>> felt.contact, felt.reading  # behind the low-pass
     (tensor([ True, False, False]), tensor([1.4308, 0.0000, 0.7154], dtype=torch.float64))
     """
-    return sample(tactile, truth, pads, radius, period, None if generator is None else Noise(generator))
-
-
-class Noise(NamedTuple):
-    """A generator of noise, and a factor on its standard deviation."""
-
-    generator: torch.Generator
-    scale: float = 1.0
-
-
-def sample(
-    tactile: TactileState,
-    truth: TipContact,
-    pads: Float[Tensor, "*#b f 3"],
-    radius: Float[Tensor, "f"],
-    period: float,
-    noise: Noise | None,
-) -> TactileState:
-    """Return the readings one tick later, as `measure` does."""
     check_device("truth", truth.forces.device, "the tactile state", tactile.lagged.device)
     sliding = torch.zeros_like(truth.normal_force) if truth.sliding is None else truth.sliding
     force = torch.cat([truth.normal_force[..., None], truth.forces, sliding[..., None]], dim=-1)
@@ -144,10 +127,10 @@ def sample(
         return dataclasses.replace(tactile, lagged=lagged, age=age)
     reading, forces, sliding = lagged[..., 0], lagged[..., 1:4], lagged[..., 4]
     points, normals = truth.points, truth.normals
-    if noise is not None:
+    if generator is not None:
         place_noise, tangential_noise, slide_noise = 1.5e-3, 0.3, 2e-3  # [m, N, m/s]
         along = torch.where(torch.isfinite(normals), normals, pads)
-        drawn = noise.scale * torch.randn(2, *forces.shape, generator=noise.generator, dtype=forces.dtype)
+        drawn = noise * torch.randn(2, *forces.shape, generator=generator, dtype=forces.dtype)
         normal_part = (drawn * along).sum(-1, keepdim=True)
         push, across = normal_part[0], drawn - normal_part * along
         reading = reading + NOISE * push[..., 0]
@@ -157,7 +140,7 @@ def sample(
         normals = unit(truth.normals + place_noise / curvature_radius * across[1])
         points = truth.points + curvature_radius * (truth.normals - normals)
     average = tactile.average + low_pass(FLAG_CUTOFF, max(period, interval)) * (reading - tactile.average)
-    contact = flag(tactile.contact, average, 1.0 if noise is None else max(noise.scale, 1.0))
+    contact = flag(tactile.contact, average, 1.0 if generator is None else max(noise, 1.0))
     age = min(max(age - interval, 0.0), interval)
     return TactileState(reading, forces, contact, points, normals, lagged, average, sliding, age)
 

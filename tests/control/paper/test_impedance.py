@@ -6,10 +6,7 @@ import torch
 from tests.point_fingers import PERIOD, TOUCHING, observation, real, reference
 from torchgrasp.control.holding import RAMP, held_forces
 from torchgrasp.control.paper.impedance import (
-    MOST_RAISE,
-    MOST_SHARE,
     ROTATION_STIFFNESS,
-    SETTLING,
     TRANSLATION_STIFFNESS,
     Impedance,
     grasp_map,
@@ -103,7 +100,7 @@ def test_a_shifted_or_turned_grasp_is_pulled_back_and_stays_pressed():
     torque = torch.linalg.cross(there - centre, hold.forces(there)).sum(0)
     assert float(torque[2]) == pytest.approx(-ROTATION_STIFFNESS * 0.05, rel=0.01)
     far = hold.forces(tips + 100 * shift) - rest
-    assert float(far.norm(dim=-1).max()) == pytest.approx(MOST_SHARE * float(rest.norm(dim=-1).max()))
+    assert float(far.norm(dim=-1).max()) == pytest.approx(float(rest.norm(dim=-1).max()))
 
 
 def test_forces_turn_with_the_hand_frame():
@@ -141,13 +138,13 @@ def test_a_grasp_that_feels_unstable_becomes_firmer_and_another_does_not():
     def held(reading: tuple[float, float, float], **options) -> Impedance:
         seen = observation(0.0, contact=TOUCHING, reading=reading)
         hold = Impedance(reference(), seen, torch.zeros(9).double(), **options)
-        for _ in range(round((RAMP + SETTLING + 1.0) / PERIOD)):
+        for _ in range(round((RAMP + 1.3) / PERIOD)):
             hold(seen, PERIOD)
         return hold
 
     firm, weak = held((2.0, 2.0, 4.0), stability=Model()), held((1.0, 1.0, 2.0), stability=Model())
     assert firm.raised == 1.0
-    assert weak.raised == pytest.approx(MOST_RAISE, rel=0.01)
+    assert weak.raised == pytest.approx(2.0, rel=0.01)
     assert weak.springs.tolist() == pytest.approx([300.0] * 3, rel=0.01)
     assert weak.forces(observation(0.0).tips).norm() > 1.9 * firm.forces(observation(0.0).tips).norm()
     kept = held((1.0, 1.0, 2.0), springs=torch.full((3,), 50.0).double())

@@ -12,9 +12,6 @@ from torchgrasp.control.tactile import NOISE
 SETTLED = 0.1
 """Time [s] for which a closing's end must hold before the closing is done."""
 
-ARRIVED = 0.5
-"""Blend (Eq. 26) of a fingertip that is at its desired position."""
-
 POSE_TIME = 0.4
 """Time [s] from pre-grasp to grasp in open loop, and again from grasp to squeeze."""
 
@@ -26,7 +23,7 @@ class PaperClosing:
     """The paper's control law as written, and what it needs to run: a damped inverse and limits of gain and speed.
 
     A target leads its joint by no more than the drive can exert. The closing ends when all fingers touch, each blend
-    is at least `ARRIVED`, and the forces have been steady for `SETTLED` seconds.
+    (Eq. 26) is at least 0.5, and the forces have been steady for `SETTLED` seconds.
     """
 
     palm = STILL
@@ -77,7 +74,7 @@ class Settled:
         average = observation.tactile.average
         settled = bool(touching.all())
         if pressing:
-            settled = settled and bool((share >= ARRIVED).all() & ((average - self.steady).abs() < NOISE).all())
+            settled = settled and bool((share >= 0.5).all() & ((average - self.steady).abs() < NOISE).all())
         self.time = self.time + period if settled else 0.0
         if not settled:
             self.steady = average

@@ -1,9 +1,8 @@
 """Object-level impedance [6]: the grasp is a spring in the hand, with springs between the fingers.
 
-The virtual frame of the three fingertips (Eqs. 15-17) stands for the object, which no sensor sees. A wrench restores
-the frame to its pose at the grasp. Internal forces press at the same time: the desired forces, which turn with the
-frame, and springs along the sides of the triangle of fingertips, which span the null space of the grasp map. Springs to
-the frame's origin, as in [6], would press two fingers and a thumb 30 to 45 degrees off their normals.
+The virtual frame of the three fingertips (Eqs. 15-17) represents the object. A wrench restores the frame to its pose at
+the grasp. Internal forces press: the desired forces, which turn with the frame, and springs along the sides of the
+triangle of fingertips. Springs to the frame's origin, as in [6], would press off the contact normals.
 
 [6] M. Li, H. Yin, K. Tahara and A. Billard, "Learning object-level impedance control for robust grasping and dexterous
 manipulation", ICRA 2014.
@@ -27,58 +26,34 @@ from torchgrasp.geometry.frames import degenerate, rigid, skew, virtual_frame
 from torchgrasp.plan.internal_forces import internal_forces
 
 TRANSLATION_STIFFNESS, ROTATION_STIFFNESS = 1200.0, 4.0
-"""Of the virtual frame [N/m, N m/rad]: 0.1 kg sags by 1 mm."""
+"""Stiffness of the virtual frame [N/m, N m/rad]."""
 
 GRASP_STIFFNESS = 100.0
-"""Of the spring along each side of the triangle of fingertips [N/m]: soft beside the desired forces."""
-
-MOST_SHARE = 1.0
-"""Largest force of a finger for the wrench, as a share of the strongest desired force: it stays pressed."""
-
-SURE = math.log(3)
-"""Log-odds of stability above which a grasp is left as it is: a lost object costs more than a firmer grasp."""
-
-MOST_RAISE, ADAPTATION_RATE = 2.0, 8.0
-"""Largest multiple of the desired forces of an unstable grasp (docs/closing.md), and the rate [1/s] of the change."""
-
-READING_CUTOFF, SETTLING = 2.0, 0.3
-"""Stability is judged by readings below this cut-off [Hz], since noise must not look like a slip, and from this time
-[s] after the forces have risen, when the filtered readings have followed."""
+"""Stiffness [N/m] of the spring along each side of the triangle of fingertips."""
 
 
 def grasp_map(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 6 9"]:
-    """Return the map from three forces at `points` to force and torque about their centre.
-
-    >>> (grasp_map(torch.eye(3)) @ internal_forces(torch.eye(3)).flatten(1).T).abs().max()
-    tensor(0.)
-    """
+    """Return the map from three forces at `points` to force and torque about their centre."""
     arms = points - points.mean(-2, keepdim=True)
     eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*arms.shape[:-2], 3, 3)
     return torch.cat([torch.cat([eye] * 3, -1), torch.cat(skew(arms).unbind(-3), -1)], -2)
 
 
-def restoring_wrench(
-    hand_from_vf: Float[Tensor, "*b 4 4"],
-    rest: Float[Tensor, "*b 4 4"],
-    translation: float = TRANSLATION_STIFFNESS,
-    rotation: float = ROTATION_STIFFNESS,
-) -> Float[Tensor, "*b 6"]:
-    """Return force [N] and torque [N m] that restore the virtual frame to `rest`.
+def restoring_wrench(hand_from_vf: Float[Tensor, "*b 4 4"], rest: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 6"]:
+    """Return force [N] and torque [N m] that restore the virtual frame to its pose at rest.
 
     The torque is proportional to the sine of the rotation error.
-
-    >>> restoring_wrench(torch.eye(4), torch.eye(4))
-    tensor([0., 0., 0., 0., 0., 0.])
     """
     axes, desired = hand_from_vf[..., :3, :3].mT, rest[..., :3, :3].mT
     error = 0.5 * torch.linalg.cross(axes, desired).sum(-2)
-    return torch.cat([translation * (rest[..., :3, 3] - hand_from_vf[..., :3, 3]), rotation * error], -1)
+    force = TRANSLATION_STIFFNESS * (rest[..., :3, 3] - hand_from_vf[..., :3, 3])
+    return torch.cat([force, ROTATION_STIFFNESS * error], -1)
 
 
 def shared_forces(
     points: Float[Tensor, "*b 3 3"], wrench: Float[Tensor, "*b 6"], most: Float[Tensor, "*b"]
 ) -> Float[Tensor, "*b 3 3"]:
-    """Return the smallest forces that sum to a wrench, scaled down to `most` [N]."""
+    """Return the smallest forces that exert a wrench, scaled so that none exceeds `most` [N]."""
     forces = (torch.linalg.pinv(grasp_map(points)) @ wrench[..., None])[..., 0].unflatten(-1, (3, 3))
     largest = torch.linalg.vector_norm(forces, dim=-1).amax(-1)
     return forces * (most / torch.maximum(largest, most))[..., None, None]
@@ -99,23 +74,13 @@ def side_lengths(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
 class Impedance:
     """Hold the object as a spring in the hand, by joint targets q + J^T f / kp.
 
-    At rest the forces are the desired ones, balanced at the sensed contacts. Joint motions that move no fingertip are
-    held. A grasp that a `stability` model judges unstable becomes firmer and stiffer. It never loosens again: the
-    object may still be heavy.
+    At rest the forces are the desired ones, balanced at the sensed contacts. Null-space motions of the joints are
+    suppressed. A grasp that the stability model judges unstable becomes firmer and stiffer, and stays so.
 
     Args:
         reference, observation, start: as for `ForceHold`.
         springs: stiffness [N/m] along the `side_lengths`; None: `GRASP_STIFFNESS`.
-        stability: of the hand's grasps; None: the grasp does not adapt.
-
-    >>> from torchgrasp import ClosingReference, load_hand
-    >>> from torchgrasp.control import no_contact, observe
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> grasp, hand = load_shipped_grasp("jug", "allegro"), load_hand("allegro")
-    >>> seen = observe(hand, grasp.joints[0], no_contact())
-    >>> hold = Impedance(ClosingReference.from_grasp(hand, grasp), seen, seen.joints)
-    >>> hold.forces(seen.tips).norm(dim=1).round(decimals=1)  # [N] of each finger
-    tensor([2.8000, 1.2000, 4.0000], dtype=torch.float64)
+        stability: model of the hand's stable grasps; None: the grasp does not adapt.
     """
 
     def __init__(
@@ -142,7 +107,7 @@ class Impedance:
         """Return the targets of all joints for the next tick."""
         self.time += period
         share = min(self.time / RAMP, 1.0)
-        self.reading = self.reading + low_pass(READING_CUTOFF, period) * (observation.tactile.reading - self.reading)
+        self.reading = self.reading + low_pass(2.0, period) * (observation.tactile.reading - self.reading)
         if share == 1.0:
             self.factor = regulate(self.factor, observation, self.raised * self.strength, period)
             self._adapt(observation, period)
@@ -155,13 +120,13 @@ class Impedance:
 
     def _adapt(self, observation: Observation, period: float) -> None:
         """Make an unstable grasp firmer, and as stiff as stable grasps of these lengths."""
-        if self.stability is None or self.time < RAMP + SETTLING:
+        if self.stability is None or self.time < RAMP + 0.3:  # the filtered readings must have followed the forces
             return
         state = state_of(self.springs, lengths_of(observation.tips), self.reading)
-        if float(self.stability.log_odds(state)) > SURE:
+        if float(self.stability.log_odds(state)) > math.log(3):
             return
-        preferred, share = self.stability.preferred_forces(observation.tips), min(ADAPTATION_RATE * period, 1.0)
-        self.raised += share * (MOST_RAISE - self.raised)
+        preferred, share = self.stability.preferred_forces(observation.tips), min(8.0 * period, 1.0)
+        self.raised += share * (2.0 - self.raised)
         self.springs = self.springs * (preferred.springs / self.springs) ** share
 
     @checked
@@ -169,12 +134,12 @@ class Impedance:
         """Return the fingertips' forces on the object [N]."""
         frame = self._frame(tips)
         desired = self.raised * self.factor * self.desired @ frame[:3, :3].T
-        most = MOST_SHARE * torch.linalg.vector_norm(desired, dim=-1).amax()
+        most = torch.linalg.vector_norm(desired, dim=-1).amax()  # the wrench lifts no finger
         springs = spring_forces(tips, self.lengths, self.springs)
         return desired + springs + shared_forces(tips, restoring_wrench(frame, self.rest), most)
 
     def _frame(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "4 4"]:
-        """Return the virtual frame, or the last one where the tips are on a line."""
+        """Return the virtual frame, or the last frame if the tips are on a line."""
         if not bool(degenerate(tips)):
             self.frame = virtual_frame(tips)
         return self.frame

@@ -1,8 +1,8 @@
-"""Which grasps are stable [6]: Gaussian mixtures over stiffness, lengths and tactile forces.
+"""The stability model [6]: Gaussian mixtures over stiffness, lengths and tactile forces of grasps.
 
-`scripts/train.py stability` learns them from simulated pulls. One mixture tells how stable grasps press,
-Sigma_fd of Eq. (28) included. Stability itself follows from Bayes' rule with a second mixture, of
-unstable grasps. The density of stable grasps alone, as in [6], is low for rare objects, too.
+`scripts/train.py stability` fits them to simulated pulls. The mixture of stable grasps gives their forces, Sigma_fd of
+Eq. (28) included. The stability of a grasp follows from Bayes' rule with a second mixture, of unstable grasps: the
+density of stable grasps alone, as in [6], is low for rare objects, too.
 """
 
 import dataclasses
@@ -27,23 +27,22 @@ STIFFNESS, LENGTHS, FORCES = ("logK1", "logK2", "logK3"), ("logL1", "logL2", "lo
 """Logarithms of spring stiffness [N/m], of the tips' distances from their virtual frame [m], of normal forces [N]."""
 
 NAMES = (*STIFFNESS, *LENGTHS, *FORCES)
-"""The state of a grasp; by logarithms twice as strong is as far as half as strong."""
+"""Components of the state of a grasp."""
 
 LEAST_FORCE = 0.05
-"""Normal force [N] below which a finger counts as pressing with this: half the sensor's noise."""
+"""Least normal force [N] of a finger in a state."""
 
 FILE = "stability.safetensors"
 """Name of the model in the hand's folder."""
+
+PARTS = [(kind, part) for kind in ("stable", "others") for part in ("weights", "means", "covariances")]
+"""Tensors of a model file."""
 
 
 def state_of(
     springs: Float[Tensor, "*b 3"], lengths: Float[Tensor, "*b 3"], forces: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 9"]:
-    """Return the state (`NAMES`) of springs [N/m], `lengths_of` tips [m] and forces [N].
-
-    >>> state_of(torch.ones(3), torch.ones(3), torch.ones(3))
-    tensor([0., 0., 0., 0., 0., 0., 0., 0., 0.])
-    """
+    """Return the state (`NAMES`) of springs [N/m], `lengths_of` tips [m] and forces [N]."""
     return torch.cat([springs, lengths, forces.clamp_min(LEAST_FORCE)], -1).log()
 
 
@@ -55,14 +54,7 @@ def lengths_of(tips: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
 @checked
 @dataclasses.dataclass(frozen=True)
 class PreferredForces(Value):
-    """How stable grasps press: normal forces [N], covariance [N^2], spring stiffness [N/m].
-
-    >>> from torchgrasp import load_hand
-    >>> tips = torch.tensor([[0.03, 0, 0], [0, 0.03, 0], [-0.03, 0, 0]]).double()
-    >>> wanted = load_stability(load_hand("allegro")).preferred_forces(tips, force=2.0)
-    >>> wanted.forces.max(), bool((wanted.springs > 0).all())
-    (tensor(2., dtype=torch.float64), True)
-    """
+    """Normal forces of stable grasps [N], their covariance [N^2], and spring stiffness [N/m]."""
 
     forces: Float[Tensor, "3"]
     covariance: Float[Tensor, "3 3"]
@@ -72,23 +64,22 @@ class PreferredForces(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class StabilityModel(Value):
-    """What the trials of a hand tell of its grasps.
+    """Densities of the states of stable and of all other grasps of a hand.
 
     Args:
         stable: density of the states of stable grasps.
         others: density of the states of all other grasps.
-        share: of the trials that were stable.
-        meta: hand, bodies, trials, seed, and the scores on bodies left out.
+        share: share of the trials that were stable.
+        meta: hand, bodies, trials, seed, and the scores on held-out bodies.
 
     Raises:
         BadArgument: other names, or a share outside (0, 1).
 
     >>> from torchgrasp import load_hand
     >>> model = load_stability(load_hand("allegro"))
-    >>> firm = model.stable.mean().repeat(2, 1)
-    >>> firm[1, 6:] /= 8  # forces come last
-    >>> better, worse = model.log_odds(firm)
-    >>> bool(better > worse)
+    >>> firm = model.stable.mean()
+    >>> weak = torch.cat([firm[:6], firm[6:] / 8])  # forces are last
+    >>> bool(model.log_odds(firm) > model.log_odds(weak))
     True
     """
 
@@ -98,18 +89,18 @@ class StabilityModel(Value):
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
 
     def __post_init__(self) -> None:
-        """Check everything once, where the value is made."""
+        """Check the names."""
         for mixture in (self.stable, self.others):
             if mixture.names != NAMES:
                 raise BadArgument("names", mixture.names, ", ".join(NAMES))
 
     @checked
     def preferred_forces(self, tips: Float[Tensor, "3 3"], force: Positive | None = None) -> PreferredForces:
-        """Return how stable grasps of the same lengths press [6].
+        """Return the forces of stable grasps of the same lengths [6].
 
         Args:
             tips: centres of the fingertips [m], in any frame.
-            force: given force [N] of the finger that is expected to press hardest; None: none is given.
+            force: force [N] of the finger that presses hardest; None: the model's own.
 
         Raises:
             BadArgument: numbers that are not finite.
@@ -132,10 +123,7 @@ class StabilityModel(Value):
 
     @checked(gradients=True)
     def log_odds(self, state: Float[Tensor, "*b 9"]) -> Float[Tensor, "*b"]:
-        """Return the log-odds that a grasp is stable, by Bayes' rule.
-
-        Only stiffness and forces count. The lengths tell more of the body than of the grasp.
-        """
+        """Return the log-odds that a grasp is stable, by Bayes' rule on stiffness and forces."""
         stable, others = self._without_lengths
         judged = torch.cat([state[..., :3], state[..., 6:]], -1)
         return stable.log_prob(judged) - others.log_prob(judged) + math.log(self.share / (1 - self.share))
@@ -147,24 +135,13 @@ class StabilityModel(Value):
 
     @checked
     def save(self, path: Path | str) -> Path:
-        """Write the model as safetensors, atomically; `load_stability` reads it back.
+        """Write the model as safetensors, atomically; `load_stability` reads it.
 
         Raises:
             OutputError: the file cannot be written.
-
-        >>> import tempfile
-        >>> from torchgrasp import load_hand
-        >>> hand = load_hand("allegro")
-        >>> file = load_stability(hand).save(Path(tempfile.mkdtemp(), "stability.safetensors"))
-        >>> load_stability(hand, file).meta["hand"]
-        'allegro'
         """
         tensors = {f"{kind}.{part}": getattr(getattr(self, kind), part) for kind, part in PARTS}
         return save_tensors(path, "stability", tensors, {**self.meta, "share": repr(self.share)})
-
-
-PARTS = [(kind, part) for kind in ("stable", "others") for part in ("weights", "means", "covariances")]
-"""The tensors of a file: each mixture's."""
 
 
 @checked
@@ -173,7 +150,7 @@ def load_stability(hand: Hand, path: Path | str | None = None) -> StabilityModel
 
     Args:
         hand: the hand.
-        path: of the file; None: `FILE` in the hand's folder, and no model where there is none.
+        path: the file; None: `FILE` in the hand's folder, and no model if the file does not exist.
 
     Raises:
         ModelFileError: the file is missing or malformed.
