@@ -28,7 +28,7 @@ from torchgrasp.planner.contacts import Pool, SeededContacts, contact_costs, fin
 from torchgrasp.planner.problem import Problem, ignore
 from torchgrasp.shape.values import surface_deviation
 from torchgrasp.specs import Ranking
-from torchgrasp.values import Grasps
+from torchgrasp.values import ContactPlan, Grasps
 
 FIRST, GROWTH = 8, 6
 """Rows of contacts that the hand tries in the first batch, and the ratio of the sizes of successive batches."""
@@ -64,57 +64,65 @@ def schedule(starts: int, most: int) -> list[Batch]:
     return batches
 
 
-def plan_batches(problem: Problem, deadline: float) -> Iterator[Grasps]:
-    """Yield the grasps of each batch in the upright frame, the executable ones first; `meta` counts the starts so far.
+class Planner:
+    """Plans grasps in batches.
 
-    No batch begins after `deadline`, of `time.monotonic`. Modes other than "joint" have one batch.
-    """
-    request, shape, joint = problem.request, problem.shape, problem.request.mode == "joint"
-    check_starts(shape, problem.given_spec, request.starts, request.seed)
-    most = TRIED if problem.scene is None else TRIED_IN_SCENE
-    batches = schedule(request.starts, most) if joint else [Batch(request.starts, most)]
-    sizes = [batch.starts for batch in batches if batch.starts]
-    plans, planned = plan_in_turn(shape, problem.flat, sizes, request.seed), 0
-    report, pool, refinement = Report(problem, len(batches), len(sizes)), Pool(), Refinement(problem)
-    report.shape()
-    for number, batch in enumerate(batches, start=1):
-        planned += batch.starts
-        if joint:
-            if batch.starts:
-                found = find_contacts(problem, next(plans), OFFERED * batch.tried, report.note)
-                pool.add(found, contact_costs(problem, found))
-            solved = refinement.solve(pool.take(batch.tried), last=number == len(batches))
-        else:
-            found = find_contacts(problem, next(plans), batch.tried, report.note)
-            solve = solve_as_paper if request.mode == "paper" else solve_contact_first
-            solved = solve(problem.reach(found.contacts, found.certificate), found.seeds)
-        grasps = rank(problem, solved)
-        late = time.monotonic() >= deadline
-        if late:
-            grasps = join([grasps, *refinement.failures()])
-        report.end_batch(grasps, last=late)
-        yield dataclasses.replace(grasps, meta={"starts": str(planned)})
-        if late:
-            return
-
-
-class Refinement:
-    """Moves the hand onto contacts, batch by batch.
-
-    The hand moves onto fixed contacts first. Where it fails, contacts and hand move together. These sliding contacts
-    are solved in the last batch, because every batch has a fixed cost, or in a batch without any grasp.
+    In mode "joint" the hand moves onto fixed contacts first. Where it fails, contacts and hand move together. These
+    sliding contacts are solved in the last batch, because every batch has a fixed cost, or in a batch without any
+    grasp. Other modes have one batch.
     """
 
     def __init__(self, problem: Problem) -> None:
         """Begin without any grasps.
 
-        `unfinished` had few steps on fixed contacts, `unsolved` had all of them; each comes with its best failures.
+        `unfinished` contacts had few steps while they were fixed, `unsolved` contacts had all steps. Each part comes
+        with the best failures.
         """
-        self.problem, self.first = problem, True
+        self.problem, self.pool, self.first = problem, Pool(), True
         self.unfinished, self.unsolved = (list[tuple[SeededContacts, Grasps]]() for _ in range(2))
 
-    def solve(self, found: SeededContacts, last: bool) -> Grasps:
-        """Return the grasps of further contacts, and of earlier ones that are solved now."""
+    def run(self, deadline: float) -> Iterator[Grasps]:
+        """Yield the grasps of each batch in the upright frame, executable ones first; `meta` counts the starts so far.
+
+        No batch begins after `deadline`, of `time.monotonic`.
+        """
+        problem, request = self.problem, self.problem.request
+        check_starts(problem.shape, problem.given_spec, request.starts, request.seed)
+        most = TRIED if problem.scene is None else TRIED_IN_SCENE
+        batches = schedule(request.starts, most) if request.mode == "joint" else [Batch(request.starts, most)]
+        sizes = [batch.starts for batch in batches if batch.starts]
+        plans, planned = plan_in_turn(problem.shape, problem.flat, sizes, request.seed), 0
+        report = Report(problem, len(batches), len(sizes))
+        report.shape()
+        for number, batch in enumerate(batches, start=1):
+            planned += batch.starts
+            plan = next(plans) if batch.starts else None
+            if request.mode == "joint":
+                solved = self._solve_joint(plan, batch.tried, report, last=number == len(batches))
+            else:
+                assert plan is not None
+                solved = self._solve_contact_first(plan, batch.tried, report)
+            grasps = rank(problem, solved)
+            late = time.monotonic() >= deadline
+            if late:
+                grasps = join([grasps, *(failed for _, failed in (*self.unfinished, *self.unsolved))])
+            report.end_batch(grasps, last=late)
+            yield dataclasses.replace(grasps, meta={"starts": str(planned)})
+            if late:
+                return
+
+    def _solve_contact_first(self, plan: ContactPlan, tried: int, report: "Report") -> Grasps:
+        """Return grasps on fixed contacts, from the seeds of the learned model."""
+        found = find_contacts(self.problem, plan, tried, report.note)
+        solve = solve_as_paper if self.problem.request.mode == "paper" else solve_contact_first
+        return solve(self.problem.reach(found.contacts, found.certificate), found.seeds)
+
+    def _solve_joint(self, plan: ContactPlan | None, tried: int, report: "Report", last: bool) -> Grasps:
+        """Return the grasps of the most promising contacts so far, and of earlier ones that are solved now."""
+        if plan is not None:
+            found = find_contacts(self.problem, plan, OFFERED * tried, report.note)
+            self.pool.add(found, contact_costs(self.problem, found))
+        found = self.pool.take(tried)
         first, self.first = self.first, False
         if first and not last:
             solved, rest, failed = self._on_fixed_contacts(found, FIRST_STEPS)
@@ -130,10 +138,6 @@ class Refinement:
         rests, failures = zip(*self.unsolved, strict=True)
         self.unsolved.clear()
         return join([solved, self._with_sliding_contacts(join_seeded(rests), join(failures))])
-
-    def failures(self) -> list[Grasps]:
-        """Return the failures of all contacts that were to be tried again."""
-        return [failed for _, failed in (*self.unfinished, *self.unsolved)]
 
     def _on_fixed_contacts(self, found: SeededContacts, steps: int) -> tuple[Grasps, SeededContacts, Grasps]:
         """Return grasps on fixed contacts, the contacts without a grasp, and the best failures of these."""

@@ -18,7 +18,7 @@ from torchgrasp.files import temporary_folder
 from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.load import load_hand
 from torchgrasp.jobs import run_tasks
-from torchgrasp.planner.batches import describe, plan_batches, rank_together
+from torchgrasp.planner.batches import Planner, describe, rank_together
 from torchgrasp.planner.problem import Budget, PlanOptions, Problem, Request
 from torchgrasp.scene.scene import Scene
 from torchgrasp.specs import ContactSpec
@@ -181,7 +181,7 @@ def _plan_batches(request: Request) -> Iterator[Grasps]:
     hands = request.hands
     problem = Problem.of(request, hands[0])
     if len(hands) == 1:
-        for grasps in plan_batches(problem, deadline):
+        for grasps in Planner(problem).run(deadline):
             yield problem.give_back(grasps)
     else:
         yield _plan_sets(problem, hands, deadline)
@@ -197,7 +197,7 @@ def _plan_sets(problem: Problem, hands: tuple[Hand, ...], deadline: float) -> Gr
         stages = list[tuple[str, str, Any]]()
         own = problem.for_hand(hand, lambda *stage: stages.append(stage))  # noqa: B023 called at once
         now = time.monotonic()
-        batches = list(plan_batches(own, now + (deadline - now) / left))
+        batches = list(Planner(own).run(now + (deadline - now) / left))
         grasps = own.give_back(rank_together(batches, problem.request.order))
         expected, count = expected_success(grasps), int((grasps.status == Status.OK).sum())
         observer("fingers", f"{', '.join(hand.finger_names)}: {count} executable, {expected:.0%} expected", grasps)
@@ -222,9 +222,7 @@ def _plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any]
     for name in ("shape", "observer", "reachable"):
         if given.get(name) is not None:
             raise BadArgument(name, "one for many clouds", "None for many clouds")
-    for k, cloud in enumerate(clouds):
-        if not isinstance(cloud, PointCloud):
-            raise BadArgument(f"cloud[{k}]", type(cloud).__name__, "a PointCloud")
+    for cloud in clouds:
         _ = Request(cloud, **given).hands  # wrong fingers are refused
     if not workers:
         planned = [_plan_or_refuse(Request(cloud, **given)) for cloud in clouds]
@@ -283,7 +281,7 @@ def _plan_to_file(cloud: Any, device: str, hand: HandSource, rest: dict[str, Any
 def _with_arrays(value: Any) -> Any:
     """Return a value for another process: its class and fields, with arrays, because tensors would be shared."""
     if isinstance(value, torch.Tensor):
-        return value.cpu().numpy()
+        return value.detach().cpu().numpy()
     if dataclasses.is_dataclass(value):
         return type(value), {f.name: _with_arrays(getattr(value, f.name)) for f in dataclasses.fields(value)}
     return value
