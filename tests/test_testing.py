@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from tests.laws.kernels import check_kernel
+from tests.laws.scenes import check_scene
 from torchgrasp.errors import BrokenLaw, HandFileError
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hands_folder
 from torchgrasp.shape import Kernel, matern52_kernel, rbf_kernel, thin_plate_kernel
 from torchgrasp.shape.kernel import kernel_by_name
-from torchgrasp.testing import check_hand, check_kernel, check_scene
+from torchgrasp.testing import check_hand
 
 
 @pytest.mark.promise("N13")

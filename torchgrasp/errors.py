@@ -94,7 +94,7 @@ class DegenerateContacts(GraspError, ValueError):
 
 
 class BrokenLaw(GraspError, AssertionError):
-    """A kernel, a hand or a simulator breaks a law of `torchgrasp.testing`; `law` is its name.
+    """A hand breaks a law of `torchgrasp.testing`; `law` is its name.
 
     >>> error = BrokenLaw("order", "2 nan", "finite numbers")
     >>> error.law, str(error)

@@ -9,11 +9,11 @@ import trimesh
 from benchmarks.close import statics
 from scipy.spatial.transform import Rotation
 
+from tests.laws.scenes import check_scene
 from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.load import load_hand
 from torchgrasp.sim.mount import APPROACH_JOINT, LIFT_JOINT, euler_from_rotation, mounted_urdf
 from torchgrasp.sim.scene_spec import SHIFT_JOINTS, SceneSpec
-from torchgrasp.testing import check_scene
 
 
 def test_euler_angles_rebuild_the_rotation():

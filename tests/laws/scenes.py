@@ -1,4 +1,4 @@
-"""The public law for simulators: what a trial needs of a scene of your own."""
+"""The laws of simulators: what a trial needs of a scene."""
 
 import dataclasses
 from collections.abc import Callable
@@ -6,7 +6,6 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from torchgrasp.checks import checked
 from torchgrasp.errors import BrokenLaw
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.hand.hand import Hand
@@ -25,7 +24,6 @@ POSE, MOVED = 1e-4, 5e-4
 """Errors [m, and entries of rotations] of poses that are set, and of those that motors or forces lead to."""
 
 
-@checked
 def check_scene(open_scene: Open, hand: Hand | None = None) -> None:
     """Check a simulator of your own: every call of `open_scene` returns a fresh `Scene` of a `SceneSpec`.
 
@@ -48,10 +46,6 @@ def check_scene(open_scene: Open, hand: Hand | None = None) -> None:
 
     Raises:
         BrokenLaw: the first law that is broken, what was found, and what is allowed.
-
-    >>> check_scene(lambda spec: None)
-    Traceback (most recent call last):
-    torchgrasp.errors.BrokenLaw: scene: expected a torchgrasp.sim.Scene, got NoneType
     """
     hand = load_hand("barrett") if hand is None else hand
     law = _Laws(open_scene, _spec(hand), hand)
