@@ -30,5 +30,7 @@ XML_DEPTH, XML_ELEMENTS, XML_LETTERS = 64, 50_000, 200
 """Deepest nesting of a URDF's elements, their most, and the longest name."""
 HAND_LINKS, HAND_SHAPES, HAND_SHAPE_PAIRS = 512, 1000, 20_000
 """Most links of a hand, most collision shapes, and most pairs of shapes that are tested for self-collision."""
+HAND_MESH_BYTES = 4 * MESH_BYTES
+"""Largest size of all meshes of a hand."""
 HAND_SEPARATIONS = 20_000_000
 """Most separations of near shapes that are measured to find the pairs of links that can meet."""

@@ -98,7 +98,7 @@ def test_new_mends_a_published_urdf_and_leaves_it_as_it_is(claw, capsys, tmp_pat
     published.write_text(text)
     assert main(["hand", "new", str(published)]) == 0
     said = capsys.readouterr().out
-    assert "mended: 3 collision meshes" in said and "hand_clean.urdf" in said
+    assert "repaired: 3 collision meshes" in said and "hand_clean.urdf" in said
     assert published.read_text() == text and "mesh" not in (claw.parent / "hand_clean.urdf").read_text()
     out = tmp_path / "other"
     assert main(["hand", "new", str(published), "--out", str(out), "--tips", "left_tip", "thumb_tip", "right_tip"]) == 0

@@ -37,33 +37,20 @@ def test_fk_float32_within_a_micrometre(hand):
     torch.testing.assert_close(normals32.double(), normals, atol=2e-6, rtol=0)
 
 
-def test_jacobian_equals_finite_differences(hand):
-    joints = random_joints(hand, 20)
-    jacobian, step = hand.jacobian(joints), 1e-5
-    for j in range(hand.dof):
-        shift = torch.zeros(hand.dof, dtype=torch.float64)
-        shift[j] = step
-        difference = (hand.fingertips(joints + shift)[0] - hand.fingertips(joints - shift)[0]) / (2 * step)
-        torch.testing.assert_close(jacobian[..., j], difference, atol=1e-7, rtol=1e-6)
-
-
-def test_jacobian_of_given_points_equals_finite_differences_of_points_fixed_to_the_tips(hand):
-    joints, step = random_joints(hand, 20).reshape(4, 5, hand.dof), 1e-5
-    offset = torch.tensor([0.003, -0.006, 0.01], dtype=torch.float64)
+@pytest.mark.parametrize("given", [False, True], ids=["pads", "given points"])
+def test_jacobian_equals_finite_differences_of_points_fixed_to_the_tips(hand, given):
+    joints, steps = random_joints(hand, 20).reshape(4, 5, hand.dof), 1e-5 * torch.eye(hand.dof, dtype=torch.float64)
 
     def carried(joints):
-        return map_points_of_links(hand.link_poses(joints)[..., hand.tips.index, :, :], hand.tips.center + offset)
+        if not given:
+            return hand.fingertips(joints)[0]
+        poses, local = hand.link_poses(joints)[..., hand.tips.index, :, :], hand.tips.center + 0.01
+        return (poses[..., :3, :3] @ local[..., None])[..., 0] + poses[..., :3, 3]
 
-    jacobian = hand.jacobian(joints, carried(joints))
-    for j in range(hand.dof):
-        shift = torch.zeros(hand.dof, dtype=torch.float64)
-        shift[j] = step
-        difference = (carried(joints + shift) - carried(joints - shift)) / (2 * step)
+    jacobian = hand.jacobian(joints, carried(joints) if given else None)
+    for j, step in enumerate(steps):
+        difference = (carried(joints + step) - carried(joints - step)) / 2e-5
         torch.testing.assert_close(jacobian[..., j], difference, atol=1e-7, rtol=1e-6)
-
-
-def map_points_of_links(poses, points):
-    return (poses[..., :3, :3] @ points[..., None])[..., 0] + poses[..., :3, 3]
 
 
 def test_joint_axes_and_origins_give_the_derivative_of_any_point_of_a_link(hand):
@@ -182,7 +169,7 @@ def test_joints_outside_the_limits_are_named():
     joints[:, 8:] = 0.3
     assert hand.check_joints(joints) is joints
     joints[1, 9] = 2.0
-    with pytest.raises(BadArgument, match=r"joint_13.*1\.163"):
+    with pytest.raises(BadArgument, match=r"1\.163.*joint_13"):
         hand.check_joints(joints)
     joints[1, 9] = torch.nan
     with pytest.raises(BadArgument, match=r"joints: expected .*got nan at index \[1, 9\]"):
@@ -192,15 +179,6 @@ def test_joints_outside_the_limits_are_named():
     for method in (hand.fingertips, hand.jacobian, hand.self_clearance, hand.expand):
         with pytest.raises(BadArgument, match=r"joints: expected .*got nan at index \[1, 9\]"):
             method(joints)
-
-
-def test_to_moves_every_tensor_and_leaves_the_hand_as_it_was():
-    hand = load_hand("allegro")
-    moved = hand.to(torch.float32)
-    assert moved.lower.dtype == moved.collision_spheres.radius.dtype == torch.float32
-    assert hand.lower.dtype == torch.float64
-    assert moved.tree.child.dtype == torch.int64
-    assert moved.fingertips(torch.zeros(1, 12))[0].shape == (1, 3, 3)
 
 
 def test_tactile_fingertips_reach_23_mm_farther_and_change_nothing_else():

@@ -9,7 +9,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.testing.hands import largest_fk_error, random_joints, reference_poses
+from torchgrasp.testing.hands import random_joints, reference_poses
 
 BRANCHED = """<robot name="branched">
   <link name="tip"/><link name="base"/><link name="slider"/><link name="arm"/><link name="side"/><link name="bolt"/>
@@ -31,22 +31,12 @@ def hand(request) -> Hand:
 
 
 def assert_same_poses(found: torch.Tensor, truth: torch.Tensor) -> None:
-    assert float((found - truth)[..., :3, 3].abs().max()) < 1e-6  # [m]
-    turn = found[..., :3, :3].mT @ truth[..., :3, :3]
-    sine = torch.stack([turn[..., 2, 1], turn[..., 0, 2], turn[..., 1, 0]], -1) - torch.stack(
-        [turn[..., 1, 2], turn[..., 2, 0], turn[..., 0, 1]], -1
-    )
-    assert float(sine.norm(dim=-1).max()) / 2 < 1e-6  # [rad]
-    assert float((turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 3).abs().max()) < 1e-6
-
-
-def test_fk_equals_pytorch_kinematics_and_yourdfpy(hand):
-    assert largest_fk_error(hand, random_joints(hand, 1000))[0] < 1e-8
+    torch.testing.assert_close(found, truth, atol=1e-6, rtol=0)  # [m], and entries of rotations
 
 
 def test_fk_equals_pytorch_kinematics_reading_the_file_itself(hand):
     """Its own reader keeps seven digits of an angle."""
-    joints, chain = random_joints(hand, 1000), build_chain_from_urdf(hand.urdf_path.read_bytes()).to(torch.float64)
+    joints, chain = random_joints(hand, 100), build_chain_from_urdf(hand.urdf_path.read_bytes()).to(torch.float64)
     poses = chain.forward_kinematics(hand.expand(joints))
     assert_same_poses(hand.link_poses(joints), torch.stack([poses[n].get_matrix() for n in hand.tree.link_names], 1))
 
@@ -65,19 +55,19 @@ def test_the_chain_is_pytorch_kinematics_own_and_goes_where_the_hand_goes(hand):
 def test_fk_and_jacobian_equal_pinocchios_by_joint_name(hand):
     pin = pytest.importorskip("pinocchio")
     model = pin.buildModelFromUrdf(str(hand.urdf_path))
-    data, joints = model.createData(), random_joints(hand, 1000)
+    data, joints = model.createData(), random_joints(hand, 100)
     every = {name: values.tolist() for name, values in hand.expand(joints).items()}
     order = [every[name] for name in list(model.names)[1:]]
     frames = [model.getFrameId(name) for name in hand.tree.link_names]
-    truth = torch.zeros(1000, len(frames), 4, 4, dtype=torch.float64)
+    truth = torch.zeros(100, len(frames), 4, 4, dtype=torch.float64)
     column = [hand.tree.joint_names.index(name) for name in list(model.names)[1:]]
     found, at = hand.jacobian(joints), [frames[k] for k in hand.tips.index.tolist()]
-    for row in range(1000):
+    for row in range(100):
         q = np.array([values[row] for values in order])
         pin.framesForwardKinematics(model, data, q)
         for k, frame in enumerate(frames):
             truth[row, k] = torch.from_numpy(data.oMf[frame].homogeneous)
-        if row % 20:
+        if row % 5:
             continue
         for finger, frame in enumerate(at):
             twist = torch.from_numpy(pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED))
@@ -88,10 +78,10 @@ def test_fk_and_jacobian_equal_pinocchios_by_joint_name(hand):
     assert float((hand.link_poses(joints) - truth).abs().max()) < 1e-12
 
 
-def test_fk_is_differentiable_twice(hand):
+def test_fk_is_differentiable_twice():
+    hand = load_hand("barrett")
     joints = random_joints(hand, 1).requires_grad_()
     for action in (hand.link_poses, hand.fingertips, hand.jacobian):
-        assert torch.autograd.gradcheck(action, joints)
         assert torch.autograd.gradgradcheck(action, joints)
 
 

@@ -44,7 +44,7 @@ HOSTILE = {
     "empty": ("", "XML"),
     "not xml": ("hello", "XML"),
     "cut short": (GOOD[:-9], "XML"),
-    "deep": ("<robot name='r'>" + "<link name='x'>" * 5000 + "</link>" * 5000 + "</robot>", "depth"),
+    "deep": ("<robot name='r'>" + "<link name='x'>" * 5000 + "</link>" * 5000 + "</robot>", "deep"),
     "not a robot": ("<sdf/>", "<robot>"),
     "unknown tag": (GOOD.replace("</robot>", "<plugin/></robot>"), "plugin"),
     "no links": ("<robot name='r'/>", "links"),

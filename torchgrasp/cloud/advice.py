@@ -1,4 +1,4 @@
-"""What is wrong with a cloud, what is right instead, and the command that mends it."""
+"""What is wrong with a cloud, what is right instead, and the command that fixes it."""
 
 import dataclasses
 
@@ -14,19 +14,10 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values import PointCloud
 
-MAX_EDGE_ON = 0.15
-"""Largest share of a view's points on surfaces that the camera sees edge-on: 222 views have .10 at most."""
-MAX_BEHIND = 0.2
-"""Largest share of a view's points behind others: 222 views have .14 at most. Wrong cameras exceed one of the two in
-.85 of all cases."""
-MAX_DOWN = 0.15
-"""Largest share of points whose normals point down: 222 views from above have .08 at most."""
-DOWN = -0.5
-"""A normal points down when it is more than 30 degrees below the horizontal."""
-MIN_FLYING = 0.02
-"""Share of flying pixels that is worth a word."""
+MAX_EDGE_ON, MAX_BEHIND = 0.15, 0.2
+"""Largest shares of a view's points that its camera sees edge-on, and that lie behind others."""
 FEWEST = 50
-"""Fewest points of one of several views that tell whether its camera can be right."""
+"""Fewest points that show whether a camera is right, or whether pixels fly off rims."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,12 +29,12 @@ class Advice(Value):
     """
 
     found: str
-    mend: str
+    fix: str
     refused: bool
 
     def __str__(self) -> str:
         """Return the advice as one sentence."""
-        return f"{self.found}: {self.mend}"
+        return f"{self.found}: {self.fix}"
 
 
 def judge_view(
@@ -52,7 +43,7 @@ def judge_view(
     """Return what contradicts a cloud's viewpoint, vertical and table, the worst first.
 
     Args:
-        cloud: distinct points [m], with the normals and the viewpoint that were given, if any.
+        cloud: distinct points [m], with the given normals and viewpoint, if any.
         clean: the same cloud cleaned, with outward normals and perhaps an estimated viewpoint.
         up: the vertical, of unit length.
         table: None: at the lowest point.
@@ -60,44 +51,46 @@ def judge_view(
     """
     assert clean.normals is not None
     points, normals = clean.points.double(), clean.normals.double()
-    advice: list[Advice] = []
-    given = cloud.viewpoint is not None
-    eye = None if clean.viewpoint is None else clean.viewpoint.double()
+    given, eye = cloud.viewpoint is not None, None if clean.viewpoint is None else clean.viewpoint.double()
     facing = 1.0
-    if given and cloud.normals is not None:
-        facing = share_facing(cloud.points, cloud.normals, cloud.viewpoint)  # pyright: ignore[reportArgumentType]
-    if facing < 1 - FACING:
-        found = f"normals of which {1 - facing:.0%} point away from the camera"
-        mend = "outward normals, or none (--no-normals), or the true --viewpoint X Y Z"
-        advice.append(Advice(found, mend, True))
-    elif facing < FACING:
-        found = f"a viewpoint that {facing:.0%} of the normals face: it is ignored, the cloud taken for a whole surface"
-        advice.append(Advice(found, "the true --viewpoint X Y Z of a single view, or --no-viewpoint", False))
-    elif eye is not None:
-        advice += _judge_camera(clean, given)
-    # An estimate may be on the wrong side of a table; the origin of a camera's frame is none.
+    if cloud.viewpoint is not None and cloud.normals is not None:
+        facing = share_facing(cloud.points, cloud.normals, cloud.viewpoint)
+    advice = _judge_facing(facing)
+    if not advice and eye is not None:
+        advice = _judge_camera(clean, given)
+    # An estimate may be on the wrong side of a table, but not where it is the origin of a camera's frame.
     trusted = eye is not None and facing >= FACING and (given or not bool(eye.any()))
     support = find_support(points, normals, up, eye.reshape(-1, 3).mean(0) if trusted and eye is not None else None)
     if stands and eye is not None and facing >= FACING:
         advice += _judge_height(points, eye, given, up, table, support)
-        down = float((normals @ up < DOWN).double().mean())
-        if given and not any(a.refused for a in advice) and down > MAX_DOWN:
+        down = float((normals @ up < -0.5).double().mean())
+        if given and not any(a.refused for a in advice) and down > 0.15:  # a camera above a table sees fewer
             found = f"a vertical {_triple(up)} that {down:.0%} of the visible normals contradict: they point down"
             advice.append(Advice(found, "the vertical of the cloud's frame: --up X Y Z", False))
     if support is not None:
         advice.append(_describe_support(*support, up))
-    spacing = float(nearest(points, 2)[0][:, -1].median())
-    body = find_second_body(points, up, spacing)
+    body = find_second_body(points, up, float(nearest(points, 2)[0][:, -1].median()))
     if body is not None:
         found = f"two bodies that stand apart, the second of {float(body.double().mean()):.0%} of the points"
         x, y, z = points[~body].mean(0).tolist()
-        mend = f"one thing: torchgrasp cloud cut CLOUD --point {x:.3f} {y:.3f} {z:.3f} --out FILE"
-        advice.append(Advice(found, mend, True))
+        fix = f"one object: torchgrasp cloud cut CLOUD --point {x:.3f} {y:.3f} {z:.3f} --out FILE"
+        advice.append(Advice(found, fix, True))
     return sorted(advice, key=lambda a: not a.refused)
 
 
+def _judge_facing(facing: float) -> list[Advice]:
+    """Judge the share of given normals that face the given camera: a view has nearly 1, a whole surface half."""
+    if facing < 1 - FACING:
+        fix = "outward normals, or none (--no-normals), or the true --viewpoint X Y Z"
+        return [Advice(f"normals of which {1 - facing:.0%} point away from the camera", fix, True)]
+    if facing < FACING:
+        found = f"a viewpoint that {facing:.0%} of the normals face: it is ignored, the cloud taken for a whole surface"
+        return [Advice(found, "the true --viewpoint X Y Z of a single view, or --no-viewpoint", False)]
+    return []
+
+
 def _judge_camera(clean: PointCloud, given: bool) -> list[Advice]:
-    """Tell whether the camera of each view can have seen its points."""
+    """Judge whether the camera of each view can have seen its points."""
     worst = (0.0, 0.0)
     for view in clean.split_views():
         if view.viewpoint is not None and view.normals is not None and len(view) >= FEWEST:
@@ -106,11 +99,9 @@ def _judge_camera(clean: PointCloud, given: bool) -> list[Advice]:
     edge_on, behind = worst
     if edge_on <= MAX_EDGE_ON and behind <= MAX_BEHIND:
         return []
-    what = (
-        f"sees {edge_on:.0%} of them edge-on"
-        if edge_on / MAX_EDGE_ON > behind / MAX_BEHIND
-        else (f"has {behind:.0%} of them behind others")
-    )
+    what = f"has {behind:.0%} of them behind others"
+    if edge_on / MAX_EDGE_ON > behind / MAX_BEHIND:
+        what = f"sees {edge_on:.0%} of them edge-on"
     if given:
         found = f"a viewpoint that the points contradict: a camera there {what}"
         return [Advice(found, "the true camera, --viewpoint X Y Z, or an estimate, --no-viewpoint", True)]
@@ -126,7 +117,7 @@ def _judge_height(
     table: Plane | None,
     support: tuple[Plane, float] | None,
 ) -> list[Advice]:
-    """Tell whether the camera is above the table."""
+    """Judge whether the camera is above the table."""
     lowest = float((points @ up).min()) if table is None else table.offset
     normal = up if table is None else table.normal.double()
     below = lowest - float((eye @ normal).min())
@@ -138,29 +129,28 @@ def _judge_height(
     far = 2 * float(torch.linalg.vector_norm(points - centre, dim=-1).max())
     forward = float(centre[2]) > max(far, 0.7 * float(torch.linalg.vector_norm(centre))) and float(up[2]) > 0.9
     if forward and not bool(eye.any()):
-        axis = torch.tensor([0.0, -1.0, 0.0]) if support is None else support[0].normal
+        axis, why = torch.tensor([0.0, -1.0, 0.0]), "for a level camera"
+        if support is not None:
+            axis, why = support[0].normal, "the normal of the plane in it"
         found = f"a cloud in its camera's frame, whose z axis points forward: the camera is {place}"
-        why = "the normal of the plane in it" if support is not None else "for a level camera"
-        mend = f"a vertical that points up: --up {_triple(axis, ' ')} ({why}), or --camera-pose FILE"
-        return [Advice(found, mend, True)]
+        return [
+            Advice(found, f"a vertical that points up: --up {_triple(axis, ' ')} ({why}), or --camera-pose FILE", True)
+        ]
     if not given:
-        found = f"an estimated camera {place}"
-        return [Advice(found, "the true camera: --viewpoint X Y Z", False)]
-    mend = f"a camera above it: --viewpoint X Y Z; or, if {_triple(up)} points down, --up {_triple(-up, ' ')}"
-    return [Advice(f"a camera {place}", mend, True)]
+        return [Advice(f"an estimated camera {place}", "the true camera: --viewpoint X Y Z", False)]
+    fix = f"a camera above it: --viewpoint X Y Z; or, if {_triple(up)} points down, --up {_triple(-up, ' ')}"
+    return [Advice(f"a camera {place}", fix, True)]
 
 
 def _describe_support(plane: Plane, share: float, up: Float[Tensor, "3"]) -> Advice:
-    """Name the plane that was left in."""
-    axis = _triple(plane.normal, " ")
-    tilted = float(plane.normal @ up) < LEVEL
-    turn = f" --up {axis}, its normal," if tilted else ""
+    """Describe the table that was left in the cloud."""
+    turn = f" --up {_triple(plane.normal, ' ')}, its normal," if float(plane.normal @ up) < LEVEL else ""
     found = f"a plane under the object, a table left in, with {share:.0%} of the points"
     return Advice(found, f"the object alone: torchgrasp cloud cut CLOUD{turn} --out FILE", True)
 
 
 def judge_pixels(cloud: PointCloud, viewpoint: Float[Tensor, "3"]) -> list[Advice]:
-    """Tell whether pixels fly off rims: outliers that lie behind or before others on their rays."""
+    """Judge whether pixels fly off rims: outliers that lie behind or before other points on their rays."""
     points = cloud.points.double()
     inlier = find_inliers(points)
     if bool(inlier.all()) or int(inlier.sum()) < FEWEST:
@@ -172,7 +162,7 @@ def judge_pixels(cloud: PointCloud, viewpoint: Float[Tensor, "3"]) -> list[Advic
     away = stray - points[inlier][torch.from_numpy(index)]
     along = (unit(away) * unit(stray - viewpoint.double())).sum(-1).abs()
     flying = float((along > 0.8).double().sum()) / len(points)
-    if flying < MIN_FLYING:
+    if flying < 0.02:
         return []
     found = f"flying pixels at rims, {flying:.0%} of the points"
     return [Advice(found, "none, for a sharper outline: torchgrasp cloud thin CLOUD --voxel 0.001 --out FILE", False)]
@@ -187,7 +177,7 @@ def _triple(vector: Tensor, between: str = ", ") -> str:
 def share_unseen(
     points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]
 ) -> tuple[float, float]:
-    """Return the shares of points that a camera would see edge-on, and of those behind others or the camera.
+    """Return the shares of points that a camera would see edge-on, and of points behind others or behind the camera.
 
     Args:
         points: without outliers [m].
@@ -197,7 +187,7 @@ def share_unseen(
     from scipy.spatial import KDTree
 
     ray = unit(points - viewpoint)
-    edge_on = float(((ray * normals).sum(-1).abs() < 0.17).double().mean())
+    edge_on = float(((ray * normals).sum(-1).abs() < 0.17).double().mean())  # the cosine of 80 degrees
     middle = (points.amax(0) + points.amin(0)) / 2
     forward = middle - viewpoint
     if not bool(forward.any()) or bool(((points - viewpoint) @ forward <= 0).any()):
@@ -207,6 +197,7 @@ def share_unseen(
     depth = local[:, 0].abs()
     pixels = local[:, 1:] / depth[:, None]
     apart, index = KDTree(pixels.numpy()).query(pixels.numpy(), k=min(6, len(pixels)))
+    # a point lies behind a neighbour if it is deeper by more than a slope explains
     step = (depth[:, None] - depth[torch.from_numpy(index)]).abs() - 2 * torch.from_numpy(apart) * depth[:, None]
     radius = torch.linalg.vector_norm(points - middle, dim=-1).max()
     return edge_on, float((step.amax(1) > 0.1 * radius).double().mean())

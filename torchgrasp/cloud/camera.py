@@ -19,10 +19,8 @@ from torchgrasp.values import PointCloud
 if TYPE_CHECKING:
     import trimesh
 
-WIDTH, HEIGHT = 640, 480
-"""Pixels of the default camera, as of common stereo cameras."""
-FOCAL = 616.0
-"""Focal length [px] of the default camera: a horizontal view of 55 degrees."""
+WIDTH, HEIGHT, FOCAL = 640, 480, 616.0
+"""Columns, rows and focal length [px] of the default camera."""
 INTRINSICS = torch.tensor([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]], dtype=torch.float64)
 """Intrinsics [px] of the default camera."""
 
@@ -71,16 +69,17 @@ def partial_view(
     noise: bool = True,
     seed: Seed = 0,
 ) -> PointCloud:
-    """Return n points [m] that the default camera sees of a mesh. They have a viewpoint and no normals.
+    """Return n points [m] of a mesh that the default camera sees, with a viewpoint and without normals.
 
-    The noise is that of an active stereo camera. Disparities have white noise of 0.12 px and steps of 1/32 px: 0.9 mm
-    at 0.5 m. A smooth bias has 0.8 mm rms over 12 px. At rims a quarter of the pixels fly off backwards by 8 mm on
-    average, and a third is missing. Of all pixels 1 % is missing. Surfaces fade out between 72.5 and 87 degrees.
+    The noise is that of an active stereo camera: noise and steps of the disparity, a smooth bias, flying and missing
+    pixels at rims, and surfaces that fade out at grazing angles.
 
     Args:
         mesh: in the object frame [m].
         camera_pose: obj_from_camera, see `look_at`.
         n: points drawn from the pixels; all pixels if there are fewer.
+        noise: False: exact depths.
+        seed: of noise and choice of points.
 
     Raises:
         BadArgument: fewer than 4 points; a pose that is not rigid.
@@ -105,7 +104,7 @@ def partial_view(
 def cast_mesh(
     mesh: "trimesh.Trimesh", obj_from_camera: Float[Tensor, "4 4"]
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """Return depth [m] and |cosine| of ray and face normal, both 0 where nothing is."""
+    """Return depth [m] and |cosine| of ray and face normal, both 0 where the ray meets nothing."""
     if not len(mesh.faces):
         raise MeshError("mesh", "no faces", "a mesh with a surface")
     row, column = torch.meshgrid(torch.arange(HEIGHT).double(), torch.arange(WIDTH).double(), indexing="ij")
@@ -130,7 +129,7 @@ def cast_mesh(
 def _in_image_box(
     mesh: "trimesh.Trimesh", obj_from_camera: Float[Tensor, "4 4"], x: Float[Tensor, "h w"], y: Float[Tensor, "h w"]
 ) -> Bool[Tensor, "h w"]:
-    """Tell which rays (x, y, 1) may meet the mesh."""
+    """Mark the rays (x, y, 1) that may meet the mesh."""
     vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
     u, v, depth = apply(inverse(obj_from_camera), vertices).unbind(-1)
     if float(depth.min()) <= 1e-3:
@@ -171,16 +170,16 @@ def render_depth(
     noise: bool = True,
     seed: int = 0,
 ) -> tuple[Float[Tensor, "h w"], Int[Tensor, "h w"]]:
-    """Return what the default camera measures of meshes on a table: depths [m] and true labels.
+    """Return a depth image [m] of meshes on a table, as the default camera measures it, and exact labels.
 
-    Depth is 0 where nothing was measured or nothing is. The noise is that of `partial_view`. Labels have none: 0 is
-    the table or nothing, k is mesh k - 1. The table is a disc of radius 0.6 m about the origin, with nothing beyond.
+    Depth is 0 where nothing was measured. Label 0 is the table or nothing, label k is mesh k - 1. The table is a disc
+    of radius 0.6 m about the origin.
 
     Args:
-        meshes: in the world frame [m], already placed.
-        camera_pose: obj_from_camera in the world frame, see `look_at`.
+        meshes: in the world frame [m].
+        camera_pose: world_from_camera, see `look_at`.
         table: height z of the table [m]; None: no table.
-        noise: that of a real camera; False: exact depths.
+        noise: add the noise of `partial_view` to the depths.
         seed: of the noise.
 
     Raises:
@@ -209,7 +208,7 @@ def render_depth(
 def _cast_table(
     height: float, obj_from_camera: Float[Tensor, "4 4"]
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """Return depth [m] of the table and |cosine| of ray and normal, both 0 where it is not."""
+    """Return depth [m] of the table and |cosine| of ray and normal, both 0 where the ray misses the table."""
     row, column = torch.meshgrid(torch.arange(HEIGHT).double(), torch.arange(WIDTH).double(), indexing="ij")
     rays = torch.stack([column, row, torch.ones_like(row)], -1) @ torch.linalg.inv(INTRINSICS).T
     direction, origin = rotate(obj_from_camera, rays), obj_from_camera[:3, 3]

@@ -1,4 +1,4 @@
-"""Refusals of clouds that no grasp can be planned on."""
+"""Refusals of clouds that no grasp can be planned on, and removal of points: copies, outliers, dense points."""
 
 from typing import Annotated
 
@@ -12,21 +12,17 @@ from torchgrasp.errors import BadArgument, SuspiciousScale, TooFewPoints
 from torchgrasp.limits import MAX_EXTENT, MIN_EXTENT
 from torchgrasp.values import PointCloud
 
-LEAST_MM = 45.0
-"""Extent from which a cloud is rather in mm than in cm: objects for a hand are 5 to 45 cm long."""
-MANY = 20_000
-"""Points of a cloud that are looked at for copies when only their presence matters."""
 MIN_POINTS = 4
-"""Fewest distinct points: a quadric or a posterior of fewer says nothing."""
+"""Fewest distinct points from which a surface can be estimated."""
 
 
 @checked
 def check_cloud(cloud: PointCloud) -> PointCloud:
-    """Return the cloud itself, or raise what is wrong with it. A flat cloud, as of one face, is accepted.
+    """Return the cloud itself, or refuse it. A flat cloud, such as a view of one face, is accepted.
 
     Raises:
-        BadArgument: not a `PointCloud`; a non-finite number; a tensor that requires a gradient; points that all
-            coincide or lie on a line; a normal of length zero.
+        BadArgument: a number that is not finite; a tensor that requires a gradient; points that all coincide or lie
+            on a line; a normal of length zero.
         TooFewPoints: fewer than 4 distinct points.
         SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; the unit is often mm.
 
@@ -34,22 +30,16 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
     True
     """
     points = _check(cloud)
-    rows = _distinct_rows(points[:: max(1, len(points) // MANY)])
+    rows = _distinct_rows(points[:: max(1, len(points) // 20_000)])  # a sample mostly suffices
     _check_distinct(points, rows if len(rows) >= MIN_POINTS else _distinct_rows(points))
     return cloud
 
 
 @checked
 def remove_duplicates(cloud: PointCloud) -> PointCloud:
-    """Check a cloud and return it without copies of its points.
+    """Check a cloud and return it without copies of its points, which would count as independent measurements.
 
-    Copies would count as independent measurements. Points closer than 1e-9 of the extent are copies; the first stays.
-
-    Raises:
-        BadArgument, TooFewPoints, SuspiciousScale: see `check_cloud`.
-
-    >>> len(remove_duplicates(PointCloud(torch.rand(10, 3).repeat(3, 1))))
-    10
+    Of points closer than 1e-9 of the extent the first stays. Raises the errors of `check_cloud`.
     """
     points = _check(cloud)
     rows = _distinct_rows(points)
@@ -59,13 +49,16 @@ def remove_duplicates(cloud: PointCloud) -> PointCloud:
 
 @checked
 def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)]) -> PointCloud:
-    """Return one point a voxel, the nearest to its centre, for voxels of a side [m] in [1e-5, 1].
+    """Return one point a voxel, the nearest to its centre, in the order of the cloud.
 
-    The grid starts at the cloud's lowest corner and moves with it. Points are not averaged, as a mean may lie
-    inside a thin wall. Their order is kept.
+    The grid starts at the cloud's lowest corner. Points are not averaged, since a mean may lie inside a thin wall.
+
+    Args:
+        cloud: points [m].
+        voxel: side of a voxel [m].
 
     Raises:
-        BadArgument, SuspiciousScale: see `check_cloud`; a voxel outside its range.
+        BadArgument, SuspiciousScale: see `check_cloud`.
         TooFewPoints: fewer than 4 voxels hold points.
 
     >>> len(voxel_downsample(PointCloud(0.1 * torch.rand(5000, 3)), 0.05)) <= 27
@@ -79,7 +72,7 @@ def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)
     order = torch.argsort(torch.linalg.vector_norm(place - cell - 0.5, dim=-1), stable=True)
     rows = order[first_of_each(group[order])].sort().values
     if len(rows) < MIN_POINTS:
-        raise TooFewPoints("points", f"{len(rows)} voxels of {voxel:g} m", f"at least {MIN_POINTS}")
+        raise TooFewPoints("points", f"{len(rows)} voxels of {voxel:g} m", f"points in at least {MIN_POINTS} voxels")
     return cloud.select(rows)
 
 
@@ -87,11 +80,7 @@ def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)
 def remove_outliers(cloud: PointCloud) -> PointCloud:
     """Return a cloud without copies and outliers, such as flying pixels.
 
-    Outliers have a mean distance to 8 neighbours above 2.5 times the median.
-
-    Raises:
-        BadArgument, SuspiciousScale: see `check_cloud`.
-        TooFewPoints: fewer than 4 points, before or after.
+    Outliers have a mean distance to 8 neighbours above 2.5 times the median. Raises the errors of `check_cloud`.
 
     >>> points = torch.cat([0.1 * torch.rand(500, 3), torch.ones(1, 3)])
     >>> bool(remove_outliers(PointCloud(points)).points.max() < 0.2)
@@ -111,14 +100,14 @@ def _check_distinct(points: Float[Tensor, "n 3"], rows: Int[Tensor, "m"]) -> Non
 
 
 def _check(cloud: PointCloud) -> Float[Tensor, "n 3"]:
-    """Return the points, or raise what is wrong with the cloud, copies aside."""
+    """Return the points, or refuse the cloud for its extent or its normals."""
     points = cloud.points
     extent = float((points.amax(0) - points.amin(0)).max())
     if extent == 0.0:
         raise BadArgument("points", f"{len(points)} points that all coincide", "points of a surface")
     if not MIN_EXTENT <= extent <= MAX_EXTENT:
-        allowed = f"{MIN_EXTENT:g} m to {MAX_EXTENT:g} m: lengths are metres; is this cloud {_guess_unit(extent)}?"
-        raise SuspiciousScale("points", f"an extent of {extent:.4g} m", allowed)
+        allowed = f"an extent of {MIN_EXTENT:g} to {MAX_EXTENT:g} metres"
+        raise SuspiciousScale("points", f"{extent:.4g} m; is this cloud {_guess_unit(extent)}?", allowed)
     if cloud.normals is not None:
         zero = int((torch.linalg.vector_norm(cloud.normals, dim=-1) == 0).sum())
         if zero:
@@ -127,12 +116,12 @@ def _check(cloud: PointCloud) -> Float[Tensor, "n 3"]:
 
 
 def _guess_unit(extent: float) -> str:
-    """Name the unit in which an extent of no object in metres is one of an object."""
+    """Name the unit of an extent that no object has in metres; objects for a hand are 5 to 45 cm long."""
     if extent < MIN_EXTENT:
         return "normalised"
     if extent < 10:
         return f"a whole scene (torchgrasp cloud cut), or in cm ({extent / 100:.3g} m: --unit cm)"
-    unit, scale = ("cm", 100) if extent < LEAST_MM else ("mm", 1000)
+    unit, scale = ("cm", 100) if extent < 45 else ("mm", 1000)
     return f"in {unit} ({extent / scale:.3g} m: --unit {unit})"
 
 
@@ -150,11 +139,6 @@ def _distinct_rows(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:
     keep = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
     keep[torch.from_numpy(pairs[:, 1]).to(rows.device)] = False  # the first index of a pair is the smaller one
     return rows[keep]
-
-
-def distinct_exactly(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:
-    """Return the ascending indices of the first of all rows with equal numbers."""
-    return first_of_each(torch.unique(points.detach(), dim=0, return_inverse=True)[1]).sort().values
 
 
 def first_of_each(group: Int[Tensor, "n"]) -> Int[Tensor, "groups"]:

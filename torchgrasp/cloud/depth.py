@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.checks import RIGID, check_tensor, checked, is_rigid
-from torchgrasp.cloud.check import check_cloud
+from torchgrasp.cloud.check import MIN_POINTS, check_cloud
 from torchgrasp.cloud.tables import parse_npy, parse_npz, read_lines
 from torchgrasp.errors import BadArgument, TooFewPoints
 from torchgrasp.files import is_file, read_bytes
@@ -20,11 +20,9 @@ from torchgrasp.limits import CLOUD_BYTES
 from torchgrasp.values import PointCloud
 
 MAX_SHIFT = 0.15
-"""Farthest principal point from the image's middle, in sides: cameras have .03, another resolution's is .16 or more."""
+"""Largest distance of the principal point from the image's middle, in sides of the image."""
 MAX_DEPTH = 50.0
-"""Largest median depth [m]: no depth camera sees so far, and 50 mm is nearer than any sees."""
-MIN_PIXELS = 4
-"""Fewest measured pixels: as many as the points of a cloud."""
+"""Largest median depth [m]; no depth camera sees so far."""
 
 
 @checked
@@ -38,7 +36,7 @@ def cloud_from_depth(
 
     A pixel (row v, column u) of depth z is the point z ((u - cx) / fx, (v - cy) / fy, 1). The camera's frame has x
     right, y down and z forward. Depths of 0, NaN or infinity are not measured. The camera is the viewpoint, and the
-    cloud knows where its image ends.
+    sides of the image give the frustum.
 
     Args:
         depth: (h, w), distance along the optical axis: floats in metres, or integers (such as uint16) in millimetres.
@@ -47,7 +45,8 @@ def cloud_from_depth(
         camera_pose: obj_from_camera (4, 4), rigid; None: the result is in the camera's frame.
 
     Raises:
-        BadArgument: what `read_depth` refuses; a pose that is not rigid.
+        BadArgument: depth that is negative, or in millimetres though floating; intrinsics of another resolution; a
+            mask of another size or without pixels; a pose that is not rigid.
         TooFewPoints: fewer than 4 measured pixels.
         SuspiciousScale: an extent outside [5 mm, 2 m], as of a scene without a mask.
 
@@ -56,8 +55,8 @@ def cloud_from_depth(
     """
     z_image, k, inside = read_depth(depth, intrinsics, mask)
     measured = z_image > 0 if inside is None else (z_image > 0) & inside
-    if int(measured.sum()) < MIN_PIXELS:
-        allowed = f"at least {MIN_PIXELS} measured pixels in the mask"
+    if int(measured.sum()) < MIN_POINTS:
+        allowed = f"at least {MIN_POINTS} measured pixels in the mask"
         raise TooFewPoints("depth", f"{int(measured.sum())} measured pixels", allowed)
     row, column = torch.nonzero(measured, as_tuple=True)
     z = z_image[measured]
@@ -75,10 +74,6 @@ def frustum_of_image(intrinsics: Float[Tensor, "3 3"], size: Sequence[int]) -> F
     """Return the inward unit normals of the sides of a camera's view, in its frame.
 
     The sides go through the outermost pixels: left, right, top, bottom. `size` is (h, w).
-
-    >>> k = torch.tensor([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
-    >>> frustum_of_image(k, (101, 101))[0] * 2 ** 0.5 * torch.tensor([1.0, 1, 2])  # half a field of 53 degrees
-    tensor([1.2649, 0.0000, 1.2649])
     """
     (fx, _, cx), (_, fy, cy) = intrinsics[0].tolist(), intrinsics[1].tolist()
     height, width = size
@@ -92,19 +87,7 @@ def read_depth(
     intrinsics: Tensor | np.ndarray | Sequence[float | int],
     mask: Tensor | np.ndarray | None = None,
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "3 3"], Bool[Tensor, "h w"] | None]:
-    """Check a depth image; return depth [m] (0: not measured), the matrix of intrinsics and the mask.
-
-    Args:
-        depth, intrinsics, mask: as `cloud_from_depth` takes them.
-
-    Raises:
-        BadArgument: a wrong shape or type; depth that is negative, or in millimetres though floating; intrinsics of
-            no pinhole camera or of another resolution; a mask of another size or without pixels.
-
-    >>> depth, k, mask = read_depth(np.full((48, 64), 500, dtype=np.uint16), (600.0, 600.0, 32.0, 24.0))
-    >>> float(depth[0, 0]), k[0].tolist(), mask
-    (0.5, [600.0, 0.0, 32.0], None)
-    """
+    """Check the arguments of `cloud_from_depth`; return depth [m] (0: not measured), intrinsics and mask."""
     image = _as_tensor("depth", depth)
     if (
         image.ndim != 2
@@ -117,11 +100,11 @@ def read_depth(
     metres = image.double() if image.is_floating_point() else image.double() / 1000
     metres = torch.where(torch.isfinite(metres), metres, 0.0)
     if bool((metres < 0).any()):
-        raise BadArgument("depth", f"{float(metres.min()):.4g} m", "depths >= 0; 0 and NaN are not measured")
+        raise BadArgument("depth", f"{float(metres.min()):.4g} m", "depths >= 0, where 0 and NaN mean not measured")
     measured = metres[metres > 0]
     if len(measured) and float(measured.median()) > MAX_DEPTH:
-        allowed = f"at most {MAX_DEPTH:g} m: floats are metres; are these mm? Divide them by 1000, or give uint16"
-        raise BadArgument("depth", f"a median of {float(measured.median()):.4g} m", allowed)
+        found = f"{float(measured.median()):.4g} m; are these mm? Divide them by 1000, or give uint16"
+        raise BadArgument("depth", found, f"a median depth of at most {MAX_DEPTH:g} metres")
     k = _read_intrinsics(intrinsics, image.shape).to(image.device)
     if mask is None:
         return metres, k, None
@@ -143,7 +126,7 @@ def _read_intrinsics(
         fx, fy, cx, cy = k.tolist()
         k = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     if k.shape != (3, 3):
-        raise BadArgument("intrinsics", f"shape {tuple(k.shape)}", "(fx, fy, cx, cy), or a matrix 3x3")
+        raise BadArgument("intrinsics", f"shape {tuple(k.shape)}", "(fx, fy, cx, cy), or a 3 x 3 matrix")
     check_tensor("intrinsics", k, (3, 3))
     if not (k[0, 0] > 0 and k[1, 1] > 0) or k[0, 1] != 0 or k[1, 0] != 0 or k[2].tolist() != [0, 0, 1]:
         raise BadArgument("intrinsics", k.tolist(), "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0")
@@ -151,17 +134,19 @@ def _read_intrinsics(
     shift = [abs(float(k[0, 2]) / width - 0.5), abs(float(k[1, 2]) / height - 0.5)]
     if max(shift) > MAX_SHIFT:
         found = f"a principal point ({float(k[0, 2]):.1f}, {float(k[1, 2]):.1f}) px in an image of {width} x {height}"
-        raise BadArgument("intrinsics", found, "one near the image's middle: intrinsics of the same resolution")
+        raise BadArgument(
+            "intrinsics", found, "a principal point near the image's middle, from intrinsics of the same resolution"
+        )
     return k
 
 
 def _as_tensor(name: str, value: Tensor | np.ndarray | Sequence[float | int]) -> Tensor:
-    """Return an array of any kind as a tensor, or refuse it."""
+    """Return an array of numbers as a tensor, or refuse it."""
     if isinstance(value, Tensor):
         return value
     try:
         array = np.array(value)
-        return torch.from_numpy(array.astype(array.dtype.newbyteorder("=")))  # big-endian files keep theirs
+        return torch.from_numpy(array.astype(array.dtype.newbyteorder("=")))  # some files are big-endian
     except (TypeError, ValueError) as error:  # text, objects, rows of different length
         raise BadArgument(name, _describe(value), "an array of numbers") from error
 
@@ -184,14 +169,11 @@ def read_image(name: str, path: Path | str) -> np.ndarray:
     """Return the numbers of an image file: .npy, .npz with an array `depth` or `mask`, or .png of one channel.
 
     Args:
-        name: "depth" or "mask"; errors and .npz files have this name.
+        name: "depth" or "mask", the name in errors and in .npz files.
+        path: the file.
 
     Raises:
         BadArgument: no such file, another suffix, malformed content, or a picture of several channels.
-
-    >>> read_image("depth", "none.png")
-    Traceback (most recent call last):
-    torchgrasp.errors.BadArgument: depth: expected a .npy, .npz or .png file, got none.png, which is no file
     """
     data, suffix = _read_bytes(name, path, (".npy", ".npz", ".png"))
     try:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.checks import check_tensor, checked
 from torchgrasp.cloud.advice import Advice, judge_pixels, judge_view
-from torchgrasp.cloud.check import check_cloud, distinct_exactly, remove_duplicates
+from torchgrasp.cloud.check import remove_duplicates
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_planes, nearest
 from torchgrasp.cloud.prepare import MAX_POINTS, NormalCheck, clean_cloud, compare_normals, share_facing
 from torchgrasp.errors import BadArgument
@@ -19,15 +19,13 @@ from torchgrasp.geometry.plane import Plane
 from torchgrasp.values import PointCloud
 
 MEASURED = 50_000
-"""Most points that spacing, noise and outliers are measured at."""
-VIEWED = 5000
-"""Most points that tell about camera, vertical, table and bodies: twice as many change no share by more than .01."""
+"""Most points at which spacing, noise and outliers are measured."""
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class CloudReport(Value):
-    """What a cloud is like, and what could be better.
+    """The properties of a cloud, with advice for a better one.
 
     >>> from torchgrasp import load_object
     >>> report = diagnose_cloud(load_object("jug").view)
@@ -36,7 +34,7 @@ class CloudReport(Value):
     """
 
     points: int
-    measured: int  # how many of them the figures are taken from
+    measured: int  # how many of them are measured
     size: tuple[float, float, float]  # sides of the box along the axes [m]
     spacing: float  # median distance to the nearest point [m]
     density: float  # median number of points per square metre
@@ -56,7 +54,7 @@ def diagnose_cloud(
 ) -> CloudReport:
     """Measure a cloud, and advise what would improve it.
 
-    Of large clouds 50 000 points are measured, and 5000 tell about camera, vertical, table and bodies; on the CPU.
+    Of large clouds 50 000 points are measured, and 5000 serve the advice on camera, vertical, table and bodies.
 
     Args:
         cloud: points of one object [m].
@@ -74,19 +72,17 @@ def diagnose_cloud(
     cloud, table = cloud.to("cpu"), None if table is None else table.to("cpu")
     if not bool(vertical.any()):
         raise BadArgument("up", "a vector of length zero", "the direction that points up")
-    check_cloud(cloud)
-    # Of large clouds only exact copies are removed; in the part that tells about the view, all.
-    whole = remove_duplicates(cloud) if len(cloud) <= MEASURED else cloud.select(distinct_exactly(cloud.points))
+    whole = remove_duplicates(cloud)
     points, rows = whole.points.double(), draw_rows(len(whole), MEASURED)
     distance, _ = nearest(points, 9, rows)  # the point itself and a raster's eight neighbours
     area = math.pi * distance[:, -1] ** 2  # of the disc that holds the neighbours
-    distinct = remove_duplicates(whole.select(rows))
-    view = distinct.select(draw_rows(len(distinct), VIEWED))
+    some = whole.select(rows)
+    view = some.select(draw_rows(len(some), 5000))
     check = None if view.normals is None else compare_normals(view.points.double(), view.normals.double())
     if check is not None and not check.oriented:
         view = PointCloud(view.points, None, view.viewpoint)
     clean = clean_cloud(view)
-    # Clean normals face the viewpoint by construction; given ones tell a whole surface.
+    # Clean normals face the viewpoint by construction; given normals may be those of a whole surface.
     judged = clean if view.normals is None else view
     viewpoint = clean.viewpoint if judged.viewpoint is None else judged.viewpoint
     assert judged.normals is not None
@@ -149,7 +145,7 @@ def format_report(report: CloudReport) -> str:
 
 
 def _advise(report: CloudReport, clean: PointCloud) -> list[Advice]:
-    """Return a sentence for each thing that could be better."""
+    """Return advice on size, density, noise, outliers, flatness, normals and a missing viewpoint."""
     longest, outliers, given = max(report.size), report.outliers / report.points, report.viewpoint_given
     voxel = 1.0 / math.sqrt(max(report.density * MAX_POINTS / report.points, 1e-12))
     thickness, _, length = torch.linalg.svdvals((clean.points - clean.points.mean(0)).double()).sort().values.tolist()
@@ -159,7 +155,7 @@ def _advise(report: CloudReport, clean: PointCloud) -> list[Advice]:
     many = f"{report.points} points, of which {MAX_POINTS} are used"
     sparse = f"{1e3 * report.spacing:.0f} mm between points, so that the shape is mostly guessed"
     rules = [
-        (longest > 0.4, f"a length of {longest:.2f} m, large for a hand, as of a whole scene", f"one thing: {cut}"),
+        (longest > 0.4, f"a length of {longest:.2f} m, large for a hand, as of a whole scene", f"one object: {cut}"),
         (report.points > 2 * MAX_POINTS, many, f"as many: {thin}"),
         (outliers > 0.05, f"{outliers:.0%} of the points far from the others", f"none: {thin}"),
         (report.spacing > 0.1 * longest, sparse, "a denser cloud"),
@@ -169,4 +165,4 @@ def _advise(report: CloudReport, clean: PointCloud) -> list[Advice]:
         (bool(check and not check.oriented), "normals of random signs, which are ignored", "none: --no-normals"),
         (report.viewpoint is not None and not given, "a camera whose position is a guess", "--viewpoint X Y Z"),
     ]
-    return [Advice(found, mend, False) for applies, found, mend in rules if applies]
+    return [Advice(found, fix, False) for applies, found, fix in rules if applies]

@@ -1,4 +1,4 @@
-"""From several views of one object to one cloud."""
+"""Several views of one object as one cloud."""
 
 from collections.abc import Sequence
 
@@ -22,8 +22,8 @@ def merge_clouds(
 ) -> PointCloud:
     """Return several views in one frame, with normals and the camera of each point.
 
-    `estimate_normals` gives normals to a view without them. A view with normals but without viewpoint leaves the
-    result without viewpoint. Overlaps stay twice as dense; `voxel_downsample` evens them.
+    `estimate_normals` gives normals to a view without normals. A view with normals but without viewpoint leaves the
+    result without viewpoint. Overlaps are twice as dense; `voxel_downsample` evens them.
 
     Args:
         clouds: points [m] of the views, each in its own frame.
@@ -40,7 +40,7 @@ def merge_clouds(
     if not len(clouds):
         raise BadArgument("clouds", "none", "at least one PointCloud")
     if len(poses) != len(clouds):
-        raise BadArgument("poses", f"{len(poses)} for {len(clouds)} clouds", "one pose a cloud")
+        raise BadArgument("poses", f"{len(poses)} for {len(clouds)} clouds", "one pose for each cloud")
     for i, (cloud, pose) in enumerate(zip(clouds, poses, strict=True)):
         check_cloud(cloud)
         check_rigid(f"poses[{i}]", pose)

@@ -7,9 +7,6 @@ from torch import Tensor
 
 from torchgrasp.geometry.linalg import unit
 
-BLOCK = 1 << 14
-"""Points about which quadrics are fitted at once: in some 100 MiB, whatever the size of the cloud."""
-
 
 def draw_rows(count: int, most: int) -> Int[Tensor, "m"]:
     """Return the indices of at most so many points, drawn with a fixed seed, ascending."""
@@ -21,7 +18,7 @@ def draw_rows(count: int, most: int) -> Int[Tensor, "m"]:
 def nearest(
     points: Float[Tensor, "n 3"], k: int, rows: Int[Tensor, "m"] | None = None
 ) -> tuple[Float[Tensor, "m k"], Int[Tensor, "m k"]]:
-    """Return distances and indices of the k points nearest to some (None: to all), itself first.
+    """Return distances and indices of the k points nearest to some points (None: to all), itself first.
 
     A small cloud has fewer neighbours.
     """
@@ -34,27 +31,28 @@ def nearest(
 
 
 def find_inliers(points: Float[Tensor, "n 3"], rows: Int[Tensor, "m"] | None = None) -> Bool[Tensor, "m"]:
-    """Tell which points, by default of all, are no outliers; see `remove_outliers`."""
+    """Mark the points, by default of all, that are no outliers; see `remove_outliers`."""
     spacing = nearest(points, 9, rows)[0][:, 1:].mean(-1)  # to eight: more than fly off a rim together
-    return spacing <= 2.5 * spacing.median()  # real views, whose spacing varies with depth and slope, stay below
+    return spacing <= 2.5 * spacing.median()  # the spacing of real views varies less, with depth and slope
 
 
 def fit_planes(
     points: Float[Tensor, "n 3"], rows: Int[Tensor, "m"] | None = None
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
-    """Return normals of local planes about points, by default all, of unknown sign, and weighted rms [m]."""
+    """Return normals, of unknown sign, and weighted rms [m] of local planes about points, by default all."""
     near, weight = _neighbourhood(points, 25, rows)  # about eight for each of a plane's three unknowns
     mean_squares, axes = _principal_axes(near, weight)
     return axes[..., 0], mean_squares[:, 0].clamp_min(0).sqrt()
 
 
 def fit_quadrics(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"]]:
-    """Return feet on local quadrics, unit normals there, and weighted rms [m].
+    """Return the feet of all points on local quadrics, unit normals there, and weighted rms [m].
 
     Planes would move points of a ball of radius r inward by s^2 / 2r, where s is the neighbours' spread.
     """
+    block = 1 << 14  # bounds the memory for clouds of any size
     distance, index = nearest(points, 30)  # five for each of a quadric's six unknowns
-    blocks = zip(points.split(BLOCK), distance.split(BLOCK), index.split(BLOCK), strict=True)
+    blocks = zip(points.split(block), distance.split(block), index.split(block), strict=True)
     feet, normals, rms = zip(*(_fit_block(at, points[rows], _weigh(d)) for at, d, rows in blocks), strict=True)
     return torch.cat(feet), torch.cat(normals), torch.cat(rms)
 
@@ -62,7 +60,7 @@ def fit_quadrics(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Fl
 def _fit_block(
     points: Float[Tensor, "m 3"], near: Float[Tensor, "m k 3"], weight: Float[Tensor, "m k"]
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"], Float[Tensor, "m"]]:
-    """Return the same about some points, given the points near each."""
+    """Return the results of `fit_quadrics` for some points, given the points near each."""
     _, axes = _principal_axes(near, weight)
     height, u, v = ((near - points[:, None]) @ axes).unbind(-1)
     size = torch.stack([u, v], -1).norm(dim=-1).amax(-1, keepdim=True)

@@ -1,4 +1,4 @@
-"""The parts of a cloud: a piece of the support, and bodies that lie apart."""
+"""The parts of a cloud: the support that an object stands on, and bodies that lie apart."""
 
 import math
 from typing import Annotated
@@ -15,30 +15,16 @@ from torchgrasp.errors import TooFewPoints
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values import PointCloud
 
-CANDIDATES = 200
-"""Planes that are tried, each through a point with its normal: a support of 15 % of the points is hit 30 times."""
 LAYER = 0.004
-"""Half thickness [m] of a support's layer: noise and bias of a depth camera at half a metre."""
-TURNED = math.cos(math.radians(25))
-"""Least cosine between a layer's normal and those of its points: noise turns them by 13 degrees."""
+"""Half thickness [m] of a support's layer, for the noise of a depth camera at half a metre."""
 LEVEL = math.cos(math.radians(15))
 """Least cosine between the vertical and the normal of a level plane."""
-MIN_SUPPORT, MIN_ALOFT = 0.15, 0.02
-"""Least shares of the points in a support's layer, as less does little harm, and above it, as else all is flat."""
-MAX_BELOW = 0.02
-"""Largest share of points below a support: strays."""
-MIN_SPREAD = 1.3
-"""Least area of a support for that of what lies above it: the bottom of a bowl is less than its rim."""
+MIN_SUPPORT, STRAYS = 0.15, 0.02
+"""Least share of the points in a support's layer; share of stray points, of which more lie above it and fewer below."""
 MIN_WIDTH = 0.05
-"""Least width [m] of a support: a pen's side is narrower."""
+"""Least width [m] of a support; the side of a pen is narrower."""
 GAP = 0.04
-"""Least distance [m] between bodies. A bent or hidden surface of one body leaves gaps, too."""
-AROUND = 0.5
-"""Distance [m] from a point on the thing within which its support is sought."""
-FEW = 5000
-"""Points that a support is sought in."""
-MIN_BODY, FOOT = 0.1, 0.015
-"""Least share of the points in a second body, and how near [m] its lowest points are to the cloud's: it stands, too."""
+"""Least distance [m] between bodies; a bent or hidden surface of one body leaves smaller gaps."""
 
 
 def find_support(
@@ -46,31 +32,32 @@ def find_support(
     normals: Float[Tensor, "n 3"],
     up: Float[Tensor, "3"],
     viewpoint: Float[Tensor, "3"] | None,
-    spread: float = MIN_SPREAD,
+    spread: float = 1.3,
 ) -> tuple[Plane, float] | None:
-    """Return the largest plane on which all else seems to stand, and its share of the points; None: there is none.
+    """Return the largest plane on which the other points seem to stand, and its share of the points, if any.
 
     Args:
         points: of a view [m].
         normals: of unit length and any sign.
         up: the vertical, of unit length.
         viewpoint: the camera [m], which sees the upper side; None: only level planes are found.
-        spread: least area of the support for that of what lies above it.
+        spread: least area of the support over the area above it; the bottom of a bowl is smaller than its rim.
     """
-    rows = torch.linspace(0, len(points) - 1, min(CANDIDATES, len(points))).long()
+    rows = torch.linspace(0, len(points) - 1, min(200, len(points))).long()  # planes through points with normals
     normal, foot = normals[rows], points[rows]
+    turned = math.cos(math.radians(25))  # noise turns normals
     for _ in range(3):
         side = up.expand_as(foot) if viewpoint is None else viewpoint - foot
         normal = torch.where(((normal * side).sum(-1) < 0)[:, None], -normal, normal)
         height = points @ normal.T - (normal * foot).sum(-1)
-        layer = (height.abs() < LAYER) & ((normals @ normal.T).abs() > TURNED)
+        layer = (height.abs() < LAYER) & ((normals @ normal.T).abs() > turned)
         share = layer.double().mean(0)
         order = share.argsort(descending=True)[:40]
         fitted = [_fit(points[layer[:, k]]) for k in order.tolist() if int(layer[:, k].sum()) >= 3]
         if not fitted:
             return None
-        found = (share >= MIN_SUPPORT) & ((height < -2 * LAYER).double().mean(0) <= MAX_BELOW)
-        found &= (height > 2 * LAYER).double().mean(0) >= MIN_ALOFT
+        found = (share >= MIN_SUPPORT) & ((height < -2 * LAYER).double().mean(0) <= STRAYS)
+        found &= (height > 2 * LAYER).double().mean(0) >= STRAYS
         if viewpoint is None:
             found &= normal @ up > LEVEL
         for k in order.tolist():
@@ -84,7 +71,7 @@ def find_support(
 
 
 def _measure(points: Float[Tensor, "n 3"], normal: Float[Tensor, "3"]) -> tuple[float, float]:
-    """Return the area [m2] of the convex hull of points, seen along a normal, and its lesser width [m]."""
+    """Return the area [m2] of the convex hull of points, seen along a normal, and its smaller width [m]."""
     from scipy.spatial import ConvexHull, QhullError
 
     flat = points @ torch.linalg.svd(normal[None]).Vh[1:].T
@@ -103,11 +90,7 @@ def _fit(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor
 
 
 def label_bodies(points: Float[Tensor, "n 3"], gap: float = GAP) -> Int[Tensor, "n"]:
-    """Number the groups of points [m] that a gap [m] separates, the largest first.
-
-    >>> label_bodies(torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0.11, 0, 0]]).double()).tolist()
-    [1, 0, 0]
-    """
+    """Number the groups of points [m] that a gap [m] separates, the largest first."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
@@ -126,13 +109,13 @@ def label_bodies(points: Float[Tensor, "n 3"], gap: float = GAP) -> Int[Tensor, 
 
 
 def find_second_body(points: Float[Tensor, "n 3"], up: Float[Tensor, "3"], spacing: float) -> Bool[Tensor, "n"] | None:
-    """Tell which points [m] stand apart from the largest body, on the same ground; None: there are none."""
+    """Mark the points [m] of a second body that stands apart on the same ground, if there is one."""
     label = label_bodies(points, max(GAP, 4 * spacing))
     height = points @ up
     for k in range(1, int(label.max()) + 1):
         body = label == k
         low = height[body].quantile(0.02) - height.min(), height[label == 0].quantile(0.02) - height.min()
-        if float(body.double().mean()) >= MIN_BODY and max(float(x) for x in low) < FOOT:
+        if float(body.double().mean()) >= 0.1 and max(float(x) for x in low) < 0.015:
             return body
     return None
 
@@ -145,23 +128,23 @@ def cut_object(
     box: Float[Tensor, "2 3"] | None = None,
     gap: Annotated[float, Range(0.001, 1.0)] = GAP,
 ) -> tuple[PointCloud, Plane | None]:
-    """Return the points of one thing that stands on a plane, and the plane; None: none was found.
+    """Return the points of one object that stands on a plane, and the plane if one was found.
 
     Args:
         cloud: points [m] of a scene.
         up: the vertical, of unit length.
-        point: on or near the thing [m]; all farther than 0.5 m from it is left out. None: the largest thing.
-        box: two corners [m]; all outside is left out first.
-        gap: least distance [m] between things.
+        point: on or near the object [m]; points farther than 0.5 m from it are left out. None: the largest object.
+        box: two corners [m]; points outside are left out first.
+        gap: least distance [m] between objects.
 
     Raises:
-        TooFewPoints: fewer than 4 points in the box, near the point or of the thing.
+        TooFewPoints: fewer than 4 points in the box, near the point or of the object.
 
     >>> from torchgrasp import load_scene
     >>> seen = PointCloud(load_scene().points.double())
-    >>> thing, table = cut_object(seen, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
-    >>> len(seen) > 2 * len(thing), f"{abs(table.offset):.3f}"
-    (True, '0.001')
+    >>> found, table = cut_object(seen, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    >>> len(seen) > 2 * len(found), abs(table.offset) < 0.002
+    (True, True)
     """
     points = cloud.points.double()
     up, (point, box) = up.to(points), (None if x is None else x.to(points) for x in (point, box))
@@ -169,10 +152,10 @@ def cut_object(
     if box is not None:
         keep &= ((points >= box.amin(0)) & (points <= box.amax(0))).all(1)
     if point is not None:
-        keep &= torch.linalg.vector_norm(points - point, dim=-1) < AROUND
+        keep &= torch.linalg.vector_norm(points - point, dim=-1) < 0.5
     cloud = _select(cloud, keep, "points in the box and near the point")
     points = cloud.points.double()
-    rows = draw_rows(len(points), FEW)
+    rows = draw_rows(len(points), 5000)
     eye = cloud.viewpoint if cloud.viewpoint is None or cloud.viewpoint.ndim == 1 else cloud.viewpoint.mean(0)
     some = points[rows]
     normals = fit_planes(some)[0]
@@ -185,11 +168,11 @@ def cut_object(
         points = cloud.points.double()
     label = label_bodies(points, gap)
     wanted = 0 if point is None else int(label[torch.linalg.vector_norm(points - point, dim=-1).argmin()])
-    return _select(cloud, label == wanted, "points of the thing"), plane
+    return _select(cloud, label == wanted, "points of the object"), plane
 
 
 def _select(cloud: PointCloud, keep: Bool[Tensor, "n"], what: str) -> PointCloud:
-    """Select points, or say what there is too little of."""
+    """Select points; refuse too few."""
     if int(keep.sum()) < MIN_POINTS:
-        raise TooFewPoints("cloud", f"{int(keep.sum())} {what}", f"at least {MIN_POINTS}")
+        raise TooFewPoints("cloud", f"{int(keep.sum())} {what}", f"at least {MIN_POINTS} {what}")
     return cloud.select(keep)

@@ -9,15 +9,12 @@ from torchgrasp.limits import CLOUD_BYTES, CLOUD_POINTS
 
 
 def parse_pcd(data: bytes) -> dict[str, Any]:
-    r"""Return points, normals and viewpoint of a PCD file, or None, and whether the viewpoint is the default.
+    """Return points, normals and viewpoint of a PCD file, or None, and whether the viewpoint is the default.
 
     Many writers fill VIEWPOINT with the default `0 0 0 1 0 0 0`, wherever the camera was.
 
     Raises:
         ValueError: no PCD file; fewer bytes than the header promises; malformed compressed data.
-
-    >>> parse_pcd(b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 1\nDATA ascii\n1 2 3\n")["points"]
-    array([[1., 2., 3.]])
     """
     header, body = _split_header(data)
     names = header["FIELDS"]
@@ -75,8 +72,8 @@ def _decompress(body: bytes, kinds: list[np.dtype[Any]], count: int) -> bytes:
     packed, unpacked = (int(n) for n in np.frombuffer(body, dtype="<u4", count=2))
     wanted = count * sum(kind.itemsize for kind in kinds)
     if unpacked != wanted or wanted > CLOUD_BYTES or packed > len(body) - 8:
-        sizes = f"{packed} bytes for {unpacked}"
-        raise ValueError(f"compressed data of {sizes}, not at most {len(body) - 8} for {wanted}, {CLOUD_BYTES} at most")
+        limits = f"at most {len(body) - 8} for {wanted}, and at most {CLOUD_BYTES}"
+        raise ValueError(f"compressed data of {packed} bytes for {unpacked}, not of {limits}")
     data = decompress(body[8 : 8 + packed], unpacked)
     starts = np.cumsum([0, *(count * kind.itemsize for kind in kinds)])
     fields = [np.frombuffer(data, np.uint8, count * k.itemsize, s) for k, s in zip(kinds, starts[:-1], strict=True)]
@@ -84,16 +81,13 @@ def _decompress(body: bytes, kinds: list[np.dtype[Any]], count: int) -> bytes:
 
 
 def decompress(data: bytes, size: int) -> bytes:
-    r"""Return the `size` bytes that LZF data holds.
+    """Return the `size` bytes that LZF data holds.
 
-    A byte c < 32 is followed by c + 1 literal bytes. Any other gives a copy of (c >> 5) + 2 earlier bytes, of which
-    a length of 9 takes one more byte into account; the distance has 13 bits.
+    A byte c < 32 is followed by c + 1 literal bytes. Any other gives a copy of (c >> 5) + 2 earlier bytes, where a
+    length of 9 is extended by one more byte; the distance has 13 bits.
 
     Raises:
         ValueError: data that end early, hold more or fewer bytes, or copy bytes from before their start.
-
-    >>> decompress(b"\x01ab\x60\x01", 7)
-    b'abababa'
     """
     out, i, end = bytearray(), 0, len(data)
     while i < end:

@@ -1,4 +1,4 @@
-"""The PLY format; of meshes, points of the surface are read."""
+"""The PLY format; a mesh gives points of its surface."""
 
 from typing import Any
 
@@ -13,17 +13,14 @@ TYPES = {
     **{"uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
     **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
 }
-"""NumPy's types of PLY's, by the format's old and new names."""
+"""NumPy's types by the old and new names of the PLY format."""
 
 
 def parse_ply(data: bytes) -> dict[str, Any]:
-    """Return points, normals, viewpoint and frustum of a PLY file, or None.
+    """Return points, normals, viewpoint and frustum of a PLY file, or None for what it lacks.
 
     Raises:
         ValueError: no PLY file; fewer bytes than the header promises.
-
-    >>> parse_ply(format_ply(np.ones((5, 3)), viewpoint=np.zeros(3)))["viewpoint"].tolist()
-    [0.0, 0.0, 0.0]
     """
     header, body = _split_header(data)
     encoding, viewpoint, frustum = "", None, None
@@ -70,7 +67,7 @@ def format_ply(
     viewpoint: np.ndarray | None = None,
     frustum: np.ndarray | None = None,
 ) -> bytes:
-    """Return a binary PLY file. A comment line holds the viewpoint, another the sides of its view."""
+    """Return a binary PLY file. Comment lines hold the viewpoint and the sides of its view."""
     lines = ["ply", "format binary_little_endian 1.0"]
     for name, numbers in (("viewpoint", viewpoint), ("frustum", frustum)):
         if numbers is not None:

@@ -1,4 +1,4 @@
-"""From what the camera saw to what a shape is fitted to."""
+"""Clouds with outward normals and without outliers, to which a shape is fitted."""
 
 import dataclasses
 import math
@@ -16,17 +16,15 @@ from torchgrasp.geometry.linalg import fibonacci_sphere, unit
 from torchgrasp.values import PointCloud
 
 FACING = 0.9
-"""Least share of a view's normals that face the camera: noise turns some at the rim."""
+"""Least share of a view's normals that face the camera; noise turns some at the rim."""
 MAX_POINTS = 2000
-"""Most points that a shape is fitted to: they bound the time of its selection."""
-MAX_VIEWS, MIN_VIEW_POINTS = 16, 10
-"""Most cameras of a merged cloud, each of which costs an outline, and fewest points that give one."""
+"""Most points to which a shape is fitted: they bound the time of the selection."""
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class NormalCheck(Value):
-    """What given normals are worth.
+    """Consistency of the given normals.
 
     >>> ball = unit(torch.randn(500, 3)).double()
     >>> found = compare_normals(0.05 * ball, 2 * ball)
@@ -34,26 +32,21 @@ class NormalCheck(Value):
     (True, 500, 0)
     """
 
-    flipped: Bool[Tensor, "n"]  # which normals oppose most of their neighbours'
+    flipped: Bool[Tensor, "n"]  # whether a normal opposes most of its neighbours' normals
     opposed: float  # share of opposite normals among pairs of neighbours
     oriented: bool  # whether the signs can be trusted
-    scaled: int  # number of normals not of unit length; their users normalise them
+    scaled: int  # number of normals that are not of unit length
 
 
 @dataclasses.dataclass(frozen=True)
 class PreparedCloud(Value):
-    """A cloud that `prepare_cloud` has checked: later stages check nothing.
-
-    >>> from torchgrasp import load_object
-    >>> prepare_cloud(load_object("jug").view, torch.Generator().manual_seed(0)).one_sided
-    True
-    """
+    """A cloud that `prepare_cloud` has checked."""
 
     cloud: PointCloud  # distinct points [m] with outward normals, in the given dtype
     points: Float[Tensor, "n 3"]  # at most 2000 of them, in float64
-    normals: Float[Tensor, "n 3"]  # theirs, of unit length
-    viewpoint: Float[Tensor, "*views 3"] | None  # the camera [m] of all `points`, or of each; None: unknown
-    frustum: Float[Tensor, "*views 4 3"] | None  # normals of the sides of its view; None: unknown
+    normals: Float[Tensor, "n 3"]  # at `points`, of unit length
+    viewpoint: Float[Tensor, "*views 3"] | None  # the camera [m] of all `points`, or of each, if known
+    frustum: Float[Tensor, "*views 4 3"] | None  # normals of the sides of the camera's view, if known
 
     @property
     def one_sided(self) -> bool:
@@ -63,10 +56,10 @@ class PreparedCloud(Value):
 
 @checked
 def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = True) -> PreparedCloud:
-    """Check a cloud, and return what a shape is fitted to.
+    """Check a cloud, and return the points and normals to which a shape is fitted.
 
-    Normals of random signs are ignored: they make a view look whole. The viewpoint is ignored if `clean` and the
-    given normals do not face it: the surface is whole.
+    Normals of random signs are ignored, since they make a view look whole. If `clean`, a viewpoint that the given
+    normals do not face is ignored, since the surface is whole.
 
     Args:
         cloud: points [m] of one or several views of one object.
@@ -74,22 +67,18 @@ def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = T
         clean: remove outliers, fit all normals anew and estimate a missing viewpoint; else fit missing normals only.
 
     Raises:
-        BadArgument, SuspiciousScale: see `check_cloud`; more than 16 cameras.
+        BadArgument, SuspiciousScale: see `check_cloud`; more than 16 cameras, each of which costs an outline.
         TooFewPoints: see `check_cloud`; fewer than 10 points of one camera of several.
-
-    >>> from torchgrasp import load_object
-    >>> prepared = prepare_cloud(load_object("jug").view, torch.Generator().manual_seed(0))
-    >>> prepared.normals.dtype, prepared.viewpoint is not None
-    (torch.float64, True)
     """
+    max_views, min_points = 16, 10
     cloud = remove_duplicates(cloud)
     points, normals, viewpoint = cloud.points, cloud.normals, cloud.viewpoint
     if viewpoint is not None and viewpoint.ndim == 2:
         _, count = viewpoint.unique(dim=0, return_counts=True)
-        if len(count) > MAX_VIEWS:
-            raise BadArgument("viewpoint", f"{len(count)} different cameras", f"at most {MAX_VIEWS}")
-        if int(count.min()) < MIN_VIEW_POINTS:
-            raise TooFewPoints("points", f"{count.min()} points of one view", f"at least {MIN_VIEW_POINTS} of each")
+        if len(count) > max_views:
+            raise BadArgument("viewpoint", f"{len(count)} different cameras", f"at most {max_views} cameras")
+        if int(count.min()) < min_points:
+            raise TooFewPoints("points", f"{count.min()} points of one view", f"at least {min_points} of each view")
     if normals is not None and not compare_normals(points.double(), normals.double()).oriented:
         normals = None
     if clean and normals is not None and viewpoint is not None and share_facing(points, normals, viewpoint) < FACING:
@@ -111,7 +100,8 @@ def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = T
 def estimate_normals(cloud: PointCloud) -> PointCloud:
     """Return a cloud without copies, with outward normals of local quadrics.
 
-    Outward is towards the viewpoint (by default an estimate), or else the side of given normals.
+    Outward is towards the viewpoint. Without a viewpoint it is the side of the given normals. Without normals, too, the
+    viewpoint is estimated.
 
     Raises:
         BadArgument, TooFewPoints, SuspiciousScale: see `check_cloud`.
@@ -126,14 +116,8 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
 def clean_cloud(cloud: PointCloud) -> PointCloud:
     """Return the points without outliers, on their local quadrics, with outward normals.
 
-    Outliers are those of `remove_outliers`, and points over 4.5 median rms from their quadric.
-
-    Raises:
-        BadArgument, SuspiciousScale: see `check_cloud`.
-        TooFewPoints: fewer than 4 points, before or after cleaning.
-
-    >>> len(clean_cloud(PointCloud(torch.rand(500, 3), viewpoint=torch.tensor([0.5, 0.5, 9.0])))) <= 500
-    True
+    Outliers are those of `remove_outliers`, and points over 4.5 median rms from their quadric. Raises the errors of
+    `check_cloud`.
     """
     return _fit_normals(remove_duplicates(cloud), clean=True)
 

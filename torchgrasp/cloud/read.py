@@ -27,7 +27,7 @@ from torchgrasp.values import PointCloud
 @checked
 @dataclasses.dataclass(frozen=True)
 class CloudFile(Value):
-    """A cloud as it was read, and a sentence for each thing that was left out.
+    """A cloud as it was read, and a sentence for each kind of data that was left out.
 
     >>> import tempfile
     >>> from pathlib import Path
@@ -46,18 +46,18 @@ class CloudFile(Value):
 def read_cloud(
     path: Path | str, viewpoint: Sequence[float | int] | Tensor | None = None, unit: Literal["m", "cm", "mm"] = "m"
 ) -> PointCloud:
-    """Read the point cloud of one object, in float64; `read_cloud_file` also tells what was left out.
+    """Read the point cloud of one object, in float64; `read_cloud_file` also reports what was left out.
 
     * `.ply`, ascii or binary: x y z, optionally nx ny nz; header lines `comment viewpoint x y z` and
       `comment frustum` with 12 numbers give the camera.
-      A mesh gives 2000 surface points, with normals if closed.
-    * `.pcd`, ascii, binary or compressed: x y z, optionally normal_x normal_y normal_z; the viewpoint from VIEWPOINT.
+      A mesh gives 2000 surface points, with normals if it is closed.
+    * `.pcd`, ascii, binary or compressed: x y z, optionally normal_x normal_y normal_z; VIEWPOINT gives the camera.
       Its default `0 0 0 1 0 0 0` counts only if the points look like those of a camera in the origin.
     * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,) and `frustum` (4, 3);
       of several views `viewpoint` (n, 3) and `frustum` (n, 4, 3).
     * `.npy`, `.xyz`, `.txt`, `.csv` (text): an (n, 3) array, or (n, 6) with normals; colours are left out.
 
-    Arrays (h, w, 3) of an image are taken, too. Rows with NaN, infinity or, more than once, (0, 0, 0) are left out.
+    Images (h, w, 3) of points are accepted. Rows with NaN, infinity or, more than once, (0, 0, 0) are left out.
 
     Args:
         path: the file.
@@ -72,7 +72,7 @@ def read_cloud(
 
     >>> read_cloud("scan.docx")
     Traceback (most recent call last):
-    torchgrasp.errors.CloudFileError: path: expected a file ending in .ply, .pcd, .npz, .npy or .xyz, got scan.docx
+    torchgrasp.errors.CloudFileError: path: expected a file ending in .ply, ..., got scan.docx
     """
     return check_cloud(read_cloud_file(path, viewpoint, unit).cloud)
 
@@ -81,10 +81,7 @@ def read_cloud(
 def read_cloud_file(
     path: Path | str, viewpoint: Sequence[float | int] | Tensor | None = None, unit: Literal["m", "cm", "mm"] = "m"
 ) -> CloudFile:
-    """Read a cloud of any size, such as a whole scene, with notes on what was left out.
-
-    Args:
-        path, viewpoint, unit: as of `read_cloud`.
+    """Read a cloud of any size, such as a whole scene, with notes on what was left out; see `read_cloud`.
 
     Raises:
         CloudFileError, BadArgument, TooFewPoints: see `read_cloud`.
@@ -108,8 +105,7 @@ def read_cloud_file(
         **dict.fromkeys((".xyz", ".txt", ".csv"), lambda data: {"table": read_lines(data)}),
     }
     if suffix not in parsers:
-        # Text may also be called .txt and .csv.
-        raise CloudFileError("path", path, "a file ending in .ply, .pcd, .npz, .npy or .xyz")
+        raise CloudFileError("path", path, "a file ending in .ply, .pcd, .npz, .npy, .xyz, .txt or .csv")
     if not is_file(path):
         raise CloudFileError("path", f"{path}, which is no file", f"a {suffix} file")
     if path.stat().st_size > CLOUD_BYTES:
@@ -125,7 +121,7 @@ def read_cloud_file(
 def cloud_from_array(
     points: np.ndarray, normals: np.ndarray | None = None, viewpoint: np.ndarray | Sequence[float | int] | None = None
 ) -> PointCloud:
-    """Return the cloud of NumPy arrays [m] by the rules of `read_cloud`: missing rows and colours are left out.
+    """Return the cloud of NumPy arrays [m]; missing rows and colours are left out as by `read_cloud`.
 
     Args:
         points: (n, 3), (h, w, 3) of an image, or with three more columns of normals.
@@ -167,18 +163,14 @@ def save_cloud(cloud: PointCloud, path: Path | str) -> Path:
 
 
 def make_cloud(source: str, arrays: dict[str, Any], viewpoint: Tensor | None = None, scale: float = 1.0) -> CloudFile:
-    """Return the cloud of arrays without missing rows.
-
-    Rows with NaN or infinity are left out, and so are rows at exactly (0, 0, 0) if there are several: depth cameras
-    mark missing pixels by them. Normals of length zero count as missing. The default viewpoint of a PCD file is left
-    out unless the points look like those of a camera in the origin.
+    """Return the cloud of arrays without missing rows; normals of length zero count as missing.
 
     Args:
-        source: what errors name.
+        source: name of the file in errors.
         arrays: "points" (n, 3) or (h, w, 3), or "table" with 3 or 6 columns; optionally "normals", "viewpoint" and
             its "frustum".
-        viewpoint: the camera [m], instead of the arrays'.
-        scale: metres in a unit of points and of the arrays' viewpoint.
+        viewpoint: the camera [m], instead of the arrays' viewpoint.
+        scale: metres in a unit of the arrays.
 
     Raises:
         CloudFileError: arrays of another shape or type; more than 5 million points.
@@ -191,16 +183,18 @@ def make_cloud(source: str, arrays: dict[str, Any], viewpoint: Tensor | None = N
     points = scale * _as_rows(source, "points", arrays["points"])
     normals = None if arrays.get("normals") is None else _as_rows(source, "normals", arrays["normals"])
     default = bool(arrays.get("default")) and viewpoint is None
-    frustum = None if viewpoint is not None else arrays.get("frustum")  # that of another camera says nothing
+    frustum = None if viewpoint is not None else arrays.get("frustum")  # it belongs to the arrays' camera
     if viewpoint is None and arrays.get("viewpoint") is not None:
         viewpoint = scale * _as_rows(source, "viewpoint", arrays["viewpoint"])
         if not bool(torch.isfinite(viewpoint).all()):
-            raise BadArgument("path", f"{source}: a viewpoint with NaN or infinity", "finite numbers")
+            raise BadArgument("path", f"{source}: a viewpoint with NaN or infinity", "a viewpoint of finite numbers")
     if normals is not None and len(normals) != len(points):
-        raise CloudFileError("path", f"{source}: {len(normals)} normals of {len(points)} points", "one normal a point")
+        raise CloudFileError(
+            "path", f"{source}: {len(normals)} normals of {len(points)} points", "one normal for each point"
+        )
     if viewpoint is not None and viewpoint.ndim == 2 and len(viewpoint) != len(points):
         found = f"{source}: {len(viewpoint)} viewpoints of {len(points)} points"
-        raise CloudFileError("path", found, "one viewpoint, or one a point")
+        raise CloudFileError("path", found, "one viewpoint, or one for each point")
     keep, normals = _find_measured(points, normals, notes)
     if int(keep.sum()) < MIN_POINTS:
         found = f"{source} with {int(keep.sum())} points" + "".join(f" ({note})" for note in notes)
@@ -217,10 +211,12 @@ def make_cloud(source: str, arrays: dict[str, Any], viewpoint: Tensor | None = N
 
 
 def _as_sides(source: str, array: Any, n: int) -> Tensor:
-    """Return a frustum's normals, or refuse its file."""
+    """Return the normals of a frustum, or refuse its file."""
     array = np.asarray(array)
     if array.dtype.kind not in "fiu" or array.shape not in ((4, 3), (n, 4, 3)) or not np.isfinite(array).all():
-        raise CloudFileError("path", f"{source}: a frustum of shape {array.shape}", "finite numbers of shape (4, 3)")
+        raise CloudFileError(
+            "path", f"{source}: a frustum of shape {array.shape}", "finite numbers of shape (4, 3), or (n, 4, 3)"
+        )
     return torch.from_numpy(array.astype(np.float64))
 
 
@@ -233,14 +229,14 @@ def _as_rows(source: str, name: str, array: Any) -> Tensor:
         raise CloudFileError("path", f"{source}: {name} of shape {array.shape}", "(n, 3), or (h, w, 3) of an image")
     if array.size > 3 * CLOUD_POINTS:
         raise CloudFileError("path", f"{source} with {array.size // 3} points", f"at most {CLOUD_POINTS} points")
-    # A copy: owned, writable, native bytes. What double precision cannot hold becomes infinite, as of no point.
+    # A copy is owned, writable and of native bytes. Numbers beyond double precision become infinite, as if missing.
     with np.errstate(invalid="ignore", over="ignore"):
         rows = np.array(array, dtype=np.float64, order="C")
     return torch.from_numpy(rows if array.ndim < 3 else rows.reshape(-1, 3))
 
 
 def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dict[str, Any]:
-    """Split a table of 3 or 6 columns into points and normals; colours are no normals."""
+    """Split a table of 3 or 6 columns into points and normals; columns of colours are left out."""
     table = np.asarray(arrays["table"])
     if table.ndim not in (2, 3) or table.shape[-1] not in (3, 6) or table.dtype.kind not in "fiu":
         found = f"{source}: an array of shape {table.shape} and type {table.dtype}"
@@ -249,7 +245,7 @@ def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dic
     if table.shape[-1] == 6:
         more = table[..., 3:].reshape(-1, 3).astype(np.float64)
         more = more[np.isfinite(more).all(1) & more.any(1)]
-        length = np.linalg.norm(more.clip(-2, 2), axis=1)  # no unit vector has more, and squares would overflow
+        length = np.linalg.norm(more.clip(-2, 2), axis=1)  # squares of larger numbers would overflow
         if len(more) and np.mean(np.abs(length - 1) < 0.05) >= 0.9:
             split["normals"] = table[..., 3:]
         else:
@@ -258,7 +254,7 @@ def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dic
 
 
 def _find_measured(points: Tensor, normals: Tensor | None, notes: list[str]) -> tuple[Tensor, Tensor | None]:
-    """Tell which rows were measured, and return the normals, or None where most are missing."""
+    """Return which rows were measured, and the normals, or None if most normals are missing."""
     finite = torch.isfinite(points).all(1)
     if not bool(finite.all()):
         notes.append(f"{int((~finite).sum())} of {len(points)} rows with NaN or infinity were left out")
@@ -279,7 +275,7 @@ def _find_measured(points: Tensor, normals: Tensor | None, notes: list[str]) -> 
 
 
 def _judge_default(cloud: PointCloud, notes: list[str]) -> PointCloud:
-    """Keep the viewpoint (0, 0, 0) only if the points look like seen from there."""
+    """Keep the viewpoint (0, 0, 0) only if the points look as if seen from the origin."""
     points = cloud.points[draw_rows(len(cloud), 2000)]
     if bool(points.ne(points[0]).any()):  # else all coincide, which is refused later
         points = points[find_inliers(points)]

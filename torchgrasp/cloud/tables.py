@@ -13,11 +13,7 @@ from torchgrasp.limits import CLOUD_BYTES, CLOUD_POINTS, LINE_LETTERS, TEXT_COLU
 
 
 def parse_npy(data: bytes) -> np.ndarray:
-    """Return the array of a .npy file, which must hold what its header promises.
-
-    Raises:
-        ValueError: objects, another version, or fewer bytes than promised.
-    """
+    """Return the array of a .npy file; raise `ValueError` for objects and for fewer bytes than its header promises."""
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
     if version not in ((1, 0), (2, 0)):
@@ -31,10 +27,10 @@ def parse_npy(data: bytes) -> np.ndarray:
 
 
 def parse_npz(data: bytes, names: Sequence[str], required: str) -> dict[str, np.ndarray]:
-    """Return the arrays of these names in a .npz file, after a check of their unpacked size.
+    """Return the arrays of these names in a .npz file.
 
     Raises:
-        ValueError: no array of the `required` name, arrays that are too large, or what `parse_npy` refuses.
+        ValueError: no array of the `required` name, arrays that are too large unpacked, or what `parse_npy` refuses.
     """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = [info for info in archive.infolist() if info.filename.removesuffix(".npy") in names]
@@ -47,37 +43,31 @@ def parse_npz(data: bytes, names: Sequence[str], required: str) -> dict[str, np.
 
 
 def read_table(data: bytes, rows: int, columns: int) -> Float[np.ndarray, "rows columns"]:
-    r"""Return the first rows of a table separated by white space.
+    """Return the first rows of a table separated by white space, with little more memory than the numbers need.
 
     Raises:
         ValueError: too many rows or columns; too few numbers; a word that is no number.
-
-    >>> read_table(b"1 2\n3 4\n5 6", 2, 2).tolist()
-    [[1.0, 2.0], [3.0, 4.0]]
     """
     if not (0 <= rows <= CLOUD_POINTS and 1 <= columns <= TEXT_COLUMNS):
         raise ValueError(f"{rows} points of {columns} numbers, not up to {CLOUD_POINTS} of {TEXT_COLUMNS}")
     wanted = rows * columns
-    if 2 * wanted > len(data) + 1:  # a number is a digit and a space at least
+    if 2 * wanted > len(data) + 1:  # a number has at least a digit and a space
         raise ValueError(f"fewer numbers than {rows} points have")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # at a word that is no number; the count tells
+        warnings.simplefilter("ignore", DeprecationWarning)  # at a word that is no number; the count shows it
         numbers = np.fromstring(data, dtype=np.float64, count=wanted, sep=" ") if wanted else np.zeros(0)
     if len(numbers) < wanted:
-        raise ValueError(f"fewer numbers than {rows} points have, or a word that is none")
+        raise ValueError(f"fewer numbers than {rows} points have, or a word that is no number")
     return numbers.reshape(rows, columns)
 
 
 def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
-    r"""Return lines of numbers, separated by blanks, commas or semicolons.
+    """Return lines of numbers, separated by blanks, commas or semicolons.
 
     `#` starts a comment. A first line that begins with the words x y z names the columns.
 
     Raises:
         ValueError: no numbers; lines of different length; a line or file that is too long or too wide.
-
-    >>> read_lines(b"# x y z\n1, 2, 3\n").tolist()
-    [[1.0, 2.0, 3.0]]
     """
 
     def lines() -> Iterator[str]:
@@ -96,12 +86,12 @@ def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
                     continue
                 if count > CLOUD_POINTS:
                     raise ValueError(f"more than {CLOUD_POINTS} lines of numbers")
-                if count <= 2 and len(line.split()) > TEXT_COLUMNS:  # the others have as many, or are refused
+                if count <= 2 and len(line.split()) > TEXT_COLUMNS:  # the other lines have as many, or are refused
                     raise ValueError(f"more than {TEXT_COLUMNS} numbers in a line")
                 yield line
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of a file without numbers, which has its own sentence here
+        warnings.simplefilter("ignore", UserWarning)  # of a file without numbers, which is refused below
         table = np.loadtxt(lines(), ndmin=2)
     if not table.size:
         raise ValueError("no numbers")

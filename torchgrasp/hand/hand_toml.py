@@ -1,4 +1,4 @@
-"""Reading of hand.toml: fingers, pads, coupled and parked joints, pairs of links that can meet."""
+"""Reader of hand.toml: fingers, pads, coupled and parked joints, pairs of links that can meet."""
 
 import dataclasses
 import math
@@ -20,17 +20,16 @@ else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 SUPPORTED = "three to five different fingers"
-"""What a hand grasps with (`FINGERTIPS`): fewer tips cannot hold a thing, and no hand has more fingers."""
-
+"""Fingers of a grasp, see `FINGERTIPS`."""
 
 _DOTTED = re.compile(
     r"""(?<![\w"'-])(?:[\w-]+|"[^"\n]*"|'[^'\n]*')(?:[ \t]*\.[ \t]*(?:[\w-]+|"[^"\n]*"|'[^'\n]*')){16}"""
 )
-"""A key of more than 16 parts: the reader of TOML takes memory by their square, 2 GB for 20,000. Ours have two."""
+"""A key of more than 16 parts: the memory of the TOML reader grows with the square of their number."""
 
 
 class Pad(NamedTuple):
-    """Where a tip touches, in its link's frame [m]: on a sphere about `center`, or in `contact` alone (radius 0)."""
+    """The surface of a tip that touches, in its link's frame [m]: a sphere about `center`, or a point (radius 0)."""
 
     contact: Triple
     normal: Triple
@@ -51,14 +50,11 @@ Grasping = tuple[Finger, ...]
 """The grasping fingers, three to five, in grasp order."""
 
 Fingers = str | int | tuple[str, ...]
-"""Which fingers grasp: an option of hand.toml, the first option with so many fingers, or fingers by name.
-
-Names may also stand in one text, as "index,middle,thumb".
-"""
+"""The grasping fingers: an option of hand.toml, a number of fingers, or names, also as "index,middle,thumb"."""
 
 
 class Option(NamedTuple):
-    """Which fingers grasp, and where other joints are parked [rad]."""
+    """The fingers that grasp, and the positions [rad] of parked joints."""
 
     fingers: Grasping
     parked: dict[str, float]
@@ -66,11 +62,7 @@ class Option(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class HandSpec:
-    """A hand.toml with its grasping `fingers` chosen; `option` names them.
-
-    Fingers that were chosen by name may leave joints that no option parks. Those are parked at zero, which opens a hand
-    by convention, or at their limit next to it.
-    """
+    """The values of a hand.toml, with the grasping `fingers` of `option`."""
 
     path: Path
     name: str
@@ -110,11 +102,11 @@ def _is_texts(value: Any) -> bool:
 
 
 class _Table:
-    """A table that names itself in complaints and records the keys read."""
+    """A table that knows its name, for errors, and the keys that were read."""
 
     def __init__(self, path: Path, name: str, table: Any):
         if not isinstance(table, dict):
-            raise HandFileError("hand.toml", f"{path}: {name} is {type(table).__name__}", "a table")
+            raise HandFileError("hand.toml", f"{path}: {name.rstrip('.')} = {str(table)[:80]}", "a table")
         self.path, self.name, self.table, self.read = path, name, table, set[str]()
 
     def wrong(self, key: str, allowed: str) -> HandFileError:
@@ -154,20 +146,20 @@ class _Table:
         return [_Table(self.path, f"{self.name}{key}[{i}].", v) for i, v in enumerate(value)]
 
     def done(self) -> None:
-        """Refuse keys that nobody read: they are most often misspelt."""
+        """Refuse unknown keys: they are most often misspelt."""
         unknown = sorted(set(self.table) - self.read)
         if unknown:
             raise self.wrong(unknown[0], f"one of {sorted(self.read)}")
 
 
 def read_hand_toml(path: Path | str, fingers: Fingers = "default") -> HandSpec:
-    """Read and check a hand.toml with its fingers; raises `HandFileError`, or `BadArgument` for others."""
+    """Read and check a hand.toml; raise `HandFileError`, or `BadArgument` for fingers that it does not have."""
     path = Path(path)
     data = read_bounded("hand.toml", path, "a hand.toml", TOML_BYTES)
     try:
         text = data.decode("utf-8")
         if _DOTTED.search(text):
-            raise HandFileError("hand.toml", f"{path}: a key of more than 16 parts", "keys of one or two")
+            raise HandFileError("hand.toml", f"{path}: a key of more than 16 parts", "keys of at most 16 parts")
         top = _Table(path, "", tomllib.loads(text))
     except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
         raise HandFileError("hand.toml", f"{path}: {error}", "valid TOML in UTF-8") from error
@@ -180,7 +172,7 @@ def read_hand_toml(path: Path | str, fingers: Fingers = "default") -> HandSpec:
     actuators.done()
     known = tuple(_finger(t) for t in top.tables("finger"))
     if len({f.name for f in known}) < len(known):
-        raise HandFileError("hand.toml", f"{path}: fingers {[f.name for f in known]}", "every name once")
+        raise HandFileError("hand.toml", f"{path}: fingers {[f.name for f in known]}", "different names")
     options, coupling, pairs = _options(top, known), _coupling(top), _pairs(top)
     top.done()
     option, (chosen, parked) = _choose(options, {f.name: f for f in known}, coupling, fingers)
@@ -209,7 +201,7 @@ def _finger(table: _Table) -> Finger:
 
 
 def _options(top: _Table, known: tuple[Finger, ...]) -> dict[str, Option]:
-    """Read the grasping fingers of every option, and the joints that it parks."""
+    """Read the grasping fingers and the parked joints of every option."""
     table, by_name, options = top.inner("options"), {f.name: f for f in known}, dict[str, Option]()
     for name in table.table:
         option = table.inner(name)
@@ -223,15 +215,18 @@ def _options(top: _Table, known: tuple[Finger, ...]) -> dict[str, Option]:
 
 
 def _is_graspable(names: tuple[str, ...], known: Collection[str]) -> bool:
-    """Tell whether fingers are known, different, and of a number that is supported."""
+    """Return whether fingers are known, different, and of a supported number."""
     return FINGERTIPS[0] <= len(names) <= FINGERTIPS[1] and len(set(names)) == len(names) and set(names) <= set(known)
 
 
 def _choose(
     options: dict[str, Option], known: dict[str, Finger], coupling: dict[str, Mimic], wanted: Fingers
 ) -> tuple[str, Option]:
-    """Return the fingers that are wanted, and what names them: an option, or the fingers themselves."""
-    declared = f"one of the options {sorted(options)}, {SUPPORTED} of {sorted(known)}, or their number in an option"
+    """Return the wanted fingers and the name of their option; for fingers without an option it is their names.
+
+    Joints that no option parks stay at zero, or at the limit next to zero.
+    """
+    declared = f"one of the options {sorted(options)}, their number of fingers, or {SUPPORTED} of {sorted(known)}"
     if isinstance(wanted, str) and wanted in options:
         return wanted, options[wanted]
     names = tuple(wanted.split(",")) if isinstance(wanted, str) else wanted
@@ -248,7 +243,7 @@ def _choose(
 
 
 def _coupling(top: _Table) -> dict[str, Mimic]:
-    """Read which joint follows which."""
+    """Read the coupled joints."""
     table, coupling = top.inner("coupling", optional=True), dict[str, Mimic]()
     for joint in table.table:
         row = table.inner(joint)
@@ -256,7 +251,7 @@ def _coupling(top: _Table) -> dict[str, Mimic]:
         row.done()
     for joint, mimic in coupling.items():
         if mimic.source in coupling:
-            raise table.wrong(joint, "a source that follows no other joint")
+            raise table.wrong(joint, "a source that is not coupled itself")
     return coupling
 
 

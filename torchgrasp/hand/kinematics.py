@@ -1,4 +1,4 @@
-"""Forward kinematics of a URDF's tree, level by level, for all postures at once.
+"""Forward kinematics of the tree of a URDF, level by level, for all postures at once.
 
 The child's frame in its parent is `constant + sine sin q + cosine cos q + slide q`, with four tables made once.
 """
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 class KinematicTree(Value):
     """The links and movable joints of a URDF in the order of the file, or a part of the tree.
 
-    `child[j]` is the link that joint j moves, or 0 outside this part; `axis` is in its frame. `prismatic` is 1 for a
-    joint that slides, `moves[l, j]` if joint j moves link l.
+    `child[j]` is the link that joint j moves, or 0 outside this part; `axis` is in the frame of that link. `prismatic`
+    is 1 for a sliding joint, and `moves[l, j]` is 1 if joint j moves link l.
 
-    The links of `tables` are sorted by level; `level_sizes` counts them. `joint` moves each, 0 if it is fixed. `parent`
-    indexes the level above; in a `straight` level it counts 0, 1, 2 up to that level's size. `places` is where those
-    of `link_names` are.
+    `tables` has the links sorted by level; `level_sizes` counts them. `joint` is the index of the joint that moves a
+    link, 0 for a fixed link. `parent` indexes the level above; in a `straight` level it is 0, 1, 2 up to the size of
+    that level. `places` has the places of `link_names` among the sorted links.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
@@ -60,9 +60,9 @@ class KinematicTree(Value):
     def frames(
         self, values: Float[Tensor, "j n"], root: Float[Tensor, "3 4 n"] | None = None
     ) -> Float[Tensor, "3 4 l n"]:
-        """Return three rows of `root_from_link` of every link, postures last: the fast layout.
+        """Return three rows of `root_from_link` of every link, with the postures in the last axis, which is fast.
 
-        With `root`, poses of the root in another frame, the links' are in that frame, too.
+        With `root`, poses of the root in another frame, the poses of the links are in that frame, too.
         """
         constant, sine, cosine, slide = self.tables.to(values).unbind()
         local = torch.addcmul(constant, sine, values.sin().index_select(0, self.joint))
@@ -192,7 +192,7 @@ def tree_from_urdf(urdf: Urdf, ends: Collection[str] | None = None) -> Kinematic
 def chain_from_urdf(urdf: Urdf, dtype: torch.dtype = torch.float64) -> "Chain":
     """Return the tree of a URDF as pytorch-kinematics' chain; `<mimic>` joints are free in it.
 
-    It is built from the values of the URDF: that library's own reader keeps seven digits of an angle.
+    It is built from the values of the URDF, since the library's own reader rounds angles to seven digits.
     """
     from pytorch_kinematics.chain import Chain
     from pytorch_kinematics.frame import Frame, Link

@@ -1,4 +1,4 @@
-"""Loading of a hand from its folder; refuses two files that do not fit each other."""
+"""Loading of a hand from its folder, with checks that hand.toml and URDF fit each other."""
 
 import hashlib
 from pathlib import Path
@@ -32,7 +32,7 @@ def find_hand(name_or_path: str | Path) -> Path:
     """Return the folder of a hand, given a shipped name, a folder or a hand.toml.
 
     Raises:
-        HandFileError: no such hand, or a shipped name that is a folder here, too.
+        HandFileError: no such hand, or a shipped name that is also a folder here.
 
     >>> find_hand("allegro").name
     'allegro'
@@ -42,7 +42,7 @@ def find_hand(name_or_path: str | Path) -> Path:
     if isinstance(name_or_path, str) and name_or_path in names:
         here = Path(name_or_path)
         if (here / "hand.toml").is_file() and here.resolve() != (shipped / name_or_path).resolve():
-            found = f"{name_or_path!r}, a shipped hand and a folder here"
+            found = f"{name_or_path!r}, which is a shipped hand and a folder here"
             raise HandFileError("hand", found, f"'./{name_or_path}' for the folder, or a folder of another name")
         return shipped / name_or_path
     path = Path(name_or_path)
@@ -57,17 +57,16 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     """Load a hand from its hand.toml and URDF, with the fingers that grasp.
 
     Args:
-        name_or_path: a shipped hand, as "allegro", "barrett", "leap" or "shadow", or the folder of another one.
+        name_or_path: a shipped hand, such as "allegro", "barrett", "leap" or "shadow", or the folder of another hand.
         fingers: an option of hand.toml: "default", or for the Allegro "four" (all) or "paper_literal" (index, middle
-            and ring). Or a number, for the first option with so many; or three to five fingers by name, in grasp order.
-            Joints of the other fingers are parked where an option parks them, else at zero, or at the limit next to it.
+            and ring). Or a number, for the first option with so many fingers. Or names of three to five fingers, in
+            grasp order. Joints of the other fingers are parked where an option parks them, else at zero or the limit
+            next to zero.
 
     Raises:
-        HandFileError: a file is missing or malformed, or the two do not fit each other.
+        HandFileError: a file is missing or malformed, or the two files do not fit each other.
         BadArgument: the hand has no such option or fingers.
 
-    >>> load_hand("barrett").joint_names
-    ('spread', 'f1_flex', 'f2_flex', 'f3_flex')
     >>> load_hand("allegro", ("index", "ring", "thumb")).finger_names
     ('index', 'ring', 'thumb')
     """
@@ -90,7 +89,7 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
 
 @checked
 def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
-    """Return the same hand, where it is, grasping with other fingers; see `load_hand`.
+    """Return the same hand, on its device, grasping with other fingers; see `load_hand`.
 
     >>> with_fingers(load_hand("allegro"), 4).finger_names
     ('index', 'middle', 'ring', 'thumb')
@@ -101,24 +100,23 @@ def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
 
 @checked
 def hand_of(grasps: Grasps, hand: Hand | str | Path | None = None) -> Hand:
-    """Return the hand with the fingers that grasps were planned for, by which to close it or to export them.
+    """Return the hand with the fingers for which grasps were planned.
 
     Args:
         grasps: of `plan_grasps`, or a file of them.
         hand: the same hand with any fingers, its name or its folder; None: the shipped hand that the grasps name.
 
     Raises:
-        BadArgument: grasps that name no hand, those of another hand, or fingers that it does not have.
-        HandFileError: as `load_hand`.
+        BadArgument: grasps that name no hand, another hand, or fingers that the hand does not have.
+        HandFileError: see `load_hand`.
 
     >>> from torchgrasp import load_object, plan_grasps
-    >>> grasps = plan_grasps(load_object("cylinder").view, load_hand("allegro", 4), starts=20)
-    >>> hand_of(grasps).finger_names
-    ('index', 'middle', 'ring', 'thumb')
+    >>> hand_of(plan_grasps(load_object("cylinder").view, load_hand("barrett"), starts=20)).name
+    'barrett'
     """
     name, names = grasps.meta.get("hand"), grasps.meta.get("finger_names")
     if name is None:
-        raise BadArgument("grasps", "no name of a hand in `meta`", "grasps of plan_grasps")
+        raise BadArgument("grasps", "grasps without a hand in `meta`", "grasps of plan_grasps")
     fingers = "default" if names is None else tuple(names.split(","))
     known = name if hand is None else hand
     found = with_fingers(known, fingers) if isinstance(known, Hand) else load_hand(known, fingers)
@@ -133,10 +131,10 @@ def _digest(spec: HandSpec, urdf: Urdf) -> str:
 
 
 def _check_names(spec: HandSpec, urdf: Urdf) -> None:
-    """Refuse names in hand.toml that the URDF does not have, and parked joints that grasp or follow."""
+    """Refuse names in hand.toml that the URDF lacks, and parked joints that grasp, lead or follow."""
     movable, links = {j.name for j in urdf.movable}, {x.name for x in urdf.links}
     if spec.base_link != urdf.root:
-        raise spec.wrong(f"base_link {spec.base_link!r}", f"the URDF's root {urdf.root!r}")
+        raise spec.wrong(f"base_link {spec.base_link!r}", f"the URDF's root {urdf.root!r} as base_link")
     sources = {joint: mimic.source for joint, mimic in spec.coupling.items()}
     joints = {j for f in spec.all_fingers for j in f.joints} | {*spec.parked, *sources, *sources.values()}
     named = {f.tip_link for f in spec.all_fingers} | {x for pair in spec.pairs or () for x in pair}
@@ -147,17 +145,17 @@ def _check_names(spec: HandSpec, urdf: Urdf) -> None:
     moved = grasping | {sources[joint] for joint in grasping if joint in sources}
     both = set(spec.parked) & (moved | set(sources))
     if both:
-        raise spec.wrong(f"parked joint {min(both)!r}", "joints that neither grasp nor follow another")
+        raise spec.wrong(f"parked joint {min(both)!r}", "parked joints that neither grasp nor follow another joint")
 
 
 def _check_mimics_and_shapes(spec: HandSpec, urdf: Urdf) -> None:
-    """Refuse mimic joints that hand.toml contradicts, a fingertip without a shape, and shapes on fingertips alone."""
+    """Refuse mimic joints that hand.toml contradicts, a fingertip without a shape, and hands of fingertips alone."""
     for joint in urdf.joints:
         if joint.mimic is not None and spec.coupling.get(joint.name) != joint.mimic:
             found = f"joint {joint.name} follows {spec.coupling.get(joint.name, 'nothing')}"
             raise spec.wrong(found, f"the coupling of the URDF: {joint.mimic}")
     tips, bare = {f.tip_link for f in spec.fingers}, {x.name for x in urdf.links if not x.shapes}
     if tips & bare:
-        raise urdf.wrong(f"link {min(tips & bare)} without collision", "a shape for every fingertip")
+        raise urdf.wrong(f"link {min(tips & bare)} without collision shapes", "a collision shape for every fingertip")
     if len(tips | bare) == len(urdf.links):
-        raise urdf.wrong("collision of fingertips alone", "shapes for palm and fingers too")
+        raise urdf.wrong("collision shapes of fingertips alone", "shapes for palm and fingers, too")

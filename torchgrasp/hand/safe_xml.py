@@ -1,6 +1,6 @@
 """The gate in front of every reader of a URDF: bounded XML, without declarations, of known words and finite numbers.
 
-What passes is written anew from the elements below, so that no reader sees anything else. It opens no other file.
+The gate writes the XML anew from the elements below, so that no reader sees anything else. It opens no other file.
 """
 
 import math
@@ -14,9 +14,9 @@ from torchgrasp.files import is_file, read_bytes
 from torchgrasp.limits import XML_DEPTH, XML_ELEMENTS, XML_LETTERS
 
 IGNORED = {"material", "transmission", "gazebo", "ros2_control", "mujoco", "sensor"}
-"""Elements of a robot, besides links and joints, that a hand can do without."""
+"""Elements of a robot, besides links and joints, that are left out."""
 NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
-"""A decimal number. Python alone also reads 1_0, digits other than ASCII's, and nan."""
+"""A decimal number; Python also reads 1_0, digits outside ASCII, and nan."""
 SHAPES = ("box", "cylinder", "sphere", "mesh")
 """Collision shapes of a URDF."""
 PARTS = {
@@ -27,22 +27,14 @@ PARTS = {
     "geometry": SHAPES,
     "joint": ("origin", "parent", "child", "axis", "limit", "mimic"),
 }
-"""The elements that are read, by the element around them. `<visual>` is not: nobody opens its mesh."""
-NEEDED = {
-    "inertial": ("mass", "inertia"),
-    "collision": ("geometry",),
-    "joint": ("parent", "child"),
-}
-"""Elements that another cannot do without."""
+"""The elements that are read, by the element around them. `<visual>` is left out, with its mesh."""
+REQUIRED = {"inertial": ("mass", "inertia"), "collision": ("geometry",), "joint": ("parent", "child")}
+"""Elements that an element must have."""
 WORDS = {
-    "link": ("name",),
-    "joint": ("name", "type"),
-    "parent": ("link",),
-    "child": ("link",),
-    "mimic": ("joint",),
-    "mesh": ("filename",),
+    **{"link": ("name",), "joint": ("name", "type"), "mesh": ("filename",)},
+    **{"parent": ("link",), "child": ("link",), "mimic": ("joint",)},
 }
-"""Attributes that are names; an element with one needs it."""
+"""Attributes that are names; all are required."""
 NUMBERS: dict[str, dict[str, tuple[int, str | None]]] = {
     "origin": {"xyz": (3, "0 0 0"), "rpy": (3, "0 0 0")},
     "mass": {"value": (1, None)},
@@ -55,20 +47,20 @@ NUMBERS: dict[str, dict[str, tuple[int, str | None]]] = {
     "limit": {"lower": (1, ""), "upper": (1, ""), "effort": (1, "0"), "velocity": (1, "0")},
     "mimic": {"multiplier": (1, "1"), "offset": (1, "0")},
 }
-"""Attributes that are numbers: how many, and what stands for a missing one; None: it is needed, "": it stays away."""
+"""Attributes that are numbers: their count and default. None: required; "": omitted."""
 
 
 def read_bounded(source: str, path: Path, wanted: str, most: int) -> bytes:
-    """Read a file of at most `most` bytes; `source` and `wanted` describe it in the error."""
+    """Read a file of at most `most` bytes; `source` and `wanted` describe the file in errors."""
     if not is_file(path):
         raise HandFileError(source, f"{path}, which is no file", wanted)
     if path.stat().st_size > most:
-        raise HandFileError(source, f"{path}: {path.stat().st_size} bytes", f"at most {most} bytes")
+        raise HandFileError(source, f"{path} of {path.stat().st_size} bytes", f"{wanted} of at most {most} bytes")
     return read_bytes(path)
 
 
 class _BoundedBuilder(ET.TreeBuilder):
-    """A tree builder that refuses too deep or too many elements."""
+    """A tree builder that refuses too many elements and too deep nesting."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -87,17 +79,17 @@ class _BoundedBuilder(ET.TreeBuilder):
 
 
 def parse_urdf(path: Path, data: bytes) -> ET.Element:
-    """Parse a URDF's bytes; return links and joints alone, with each number checked. Raises `HandFileError`."""
-    # anywhere, comments included: what looks like a comment may be hidden in a processing instruction
+    """Parse the bytes of a URDF; return links and joints alone, with each number checked. Raises `HandFileError`."""
+    # also within comments: a declaration may be hidden by a processing instruction that looks like a comment
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-        raise HandFileError("urdf", f"{path}: a DOCTYPE or ENTITY declaration", "no declarations")
+        raise HandFileError("urdf", f"{path}: a DOCTYPE or ENTITY declaration", "a URDF without declarations")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise HandFileError("urdf", f"{path}: {error.reason} at byte {error.start}", "UTF-8 text") from error
     declared = re.match(r"""\s*<\?xml[^>]*encoding\s*=\s*["']([^"']*)""", text)
     if "\0" in text or (declared and declared.group(1).lower() not in ("utf-8", "us-ascii", "ascii")):
-        raise HandFileError("urdf", f"{path}: another encoding", "UTF-8 text")
+        raise HandFileError("urdf", f"{path} in another encoding", "UTF-8 text")
     try:
         robot = ET.fromstring(data, ET.XMLParser(target=_BoundedBuilder()))
     except (ET.ParseError, ValueError) as error:
@@ -105,7 +97,7 @@ def parse_urdf(path: Path, data: bytes) -> ET.Element:
             raise
         raise HandFileError("urdf", f"{path}: {error}", "well-formed XML") from error
     if robot.tag != "robot":
-        raise HandFileError("urdf", f"{path}: <{robot.tag}>", "<robot>")
+        raise HandFileError("urdf", f"{path}: <{robot.tag}>", "<robot> as the root element")
     for element in robot:
         if element.tag not in {"link", "joint"} | IGNORED:
             raise HandFileError("urdf", f"{path}: <{element.tag}>", f"<link>, <joint> or one of {sorted(IGNORED)}")
@@ -115,7 +107,7 @@ def parse_urdf(path: Path, data: bytes) -> ET.Element:
 
 
 def _clean(path: Path, where: str, element: ET.Element) -> ET.Element:
-    """Copy what is known of an element; refuse it where something is missing or no number."""
+    """Copy the known parts of an element; refuse a missing part, and words that are not numbers."""
     tag = str(element.tag)
     clean = ET.Element(tag)
     where = "" if tag == "robot" else f"{where} {tag} {(element.get('name') or '')[:XML_LETTERS]}".strip()
@@ -133,12 +125,14 @@ def _clean(path: Path, where: str, element: ET.Element) -> ET.Element:
             clean.set(key, " ".join(words))
         elif text != "" or key in element.attrib:
             found = f"{where} {key} {(text or 'nothing')[:80]!r}"
-            raise HandFileError("urdf", f"{path}: {found}", f"{count} finite number(s)")
+            raise HandFileError(
+                "urdf", f"{path}: {found}", f"{count} finite numbers" if count > 1 else "a finite number"
+            )
     if tag == "geometry" and (len(element) != 1 or element[0].tag not in SHAPES):
         found = f"{where} <{element[0].tag}>" if len(element) == 1 else f"{where} without one shape"
         raise HandFileError("urdf", f"{path}: {found}", "box, cylinder or sphere")
     kept = PARTS.get(tag, ())
-    for need in NEEDED.get(tag, ()):
+    for need in REQUIRED.get(tag, ()):
         if element.find(need) is None:
             raise HandFileError("urdf", f"{path}: {where} without <{need}>", f"a <{need}> in every <{tag}>")
     clean.extend([_clean(path, where, part) for part in element if part.tag in kept])

@@ -1,4 +1,4 @@
-"""Signed separations of a hand's links, by their collision shapes: boxes and spheres, which are exact."""
+"""Exact signed separations of a hand's links, by their collision shapes: boxes and spheres."""
 
 import dataclasses
 import itertools
@@ -15,22 +15,19 @@ from torchgrasp.checks import Range, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.kinematics import map_points
 
-PARALLEL = 1e-10
-"""Squared sine below which two edges count as parallel; the faces' normals then cover their product."""
-
 Bound = Annotated[float, Range(-torch.inf, torch.inf, "a number")]
-"""Separations [m] above it are not needed; infinite: all are."""
+"""Largest separation [m] that is needed exactly."""
 Placed = tuple[Float[Tensor, "3 3 s n"], Float[Tensor, "3 s n"]]
 """Axes and centres of shapes in the palm's frame."""
 Push = Callable[[Int[Tensor, " c"]], tuple[Float[Tensor, "3 c"], Float[Tensor, "3 c"]]]
-"""Gives the directions in which second shapes leave the first, and points on which these pushes act."""
+"""Function of pairs: the directions in which second shapes leave the first, and points on which the pushes act."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SelfCollision(Value):
     """Boxes (`radius` 0) and spheres (`half` sizes 0) fixed to links, in link frames [m], and the pairs to test.
 
-    `pairs` lists box and box, sphere and box, sphere and sphere. `kinds` counts each.
+    `pairs` lists box and box, sphere and box, sphere and sphere; `kinds` counts each kind.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
@@ -38,7 +35,7 @@ class SelfCollision(Value):
     >>> pairs, pushed = links.separations(frames, torch.inf), links.pushes(frames, below=0.01)[0]
     >>> torch.allclose(links.clearance(frames), pairs.amin(0)), len(links.link_pairs()) <= len(pushed)
     (True, True)
-    >>> near = links.only(pairs.amin(1) < 0.01)  # those of its pairs that come this near
+    >>> near = links.only(pairs.amin(1) < 0.01)
     >>> near.count_near(frames, 0.01) == len(near.pairs) <= links.count_near(frames, 0.01)
     True
     """
@@ -53,15 +50,12 @@ class SelfCollision(Value):
 
     @checked(gradients=True)
     def clearance(self, frames: Float[Tensor, "3 4 l n"], below: Bound = torch.inf) -> Float[Tensor, " n"]:
-        """Return the signed least separation [m]; infinite without pairs.
-
-        Values above `below` are some larger number: pairs are skipped by their bounding and inscribed spheres.
-        """
+        """Return the signed least separation [m]; infinite without pairs, and any larger number above `below`."""
         least = frames.new_full(frames.shape[3:], torch.inf)
         if not len(self.pairs):
             return least
         shapes = self._place(frames)
-        with torch.no_grad():
+        with torch.no_grad():  # the spheres show which pairs can be the nearest
             distance = self._distances(shapes[1])
             inscribed = self.half.amin(1) + self.radius
             limit = (distance - self._sums(inscribed, distance)).amin(0).clamp_max(below)
@@ -71,24 +65,19 @@ class SelfCollision(Value):
     @checked(gradients=True)
     def separations(self, frames: Float[Tensor, "3 4 l n"], below: Bound) -> Float[Tensor, "p n"]:
         """Return the separation [m] of each pair; above `below`, that of the bounding spheres."""
-        shapes = self._place(frames)
-        distance = self._distances(shapes[1])
-        apart = distance - self._sums(self._bounding, distance)
-        pair, row = torch.nonzero(apart < below, as_tuple=True)
+        shapes, apart, pair, row = self._near(frames, below)
         return apart.index_put((pair, row), self._separations(shapes, pair, row))
 
     @checked(gradients=True)
     def pushes(
         self, frames: Float[Tensor, "3 4 l n"], below: Bound
     ) -> tuple[Float[Tensor, "p n"], Int[Tensor, "p n"], Float[Tensor, "6 k"]]:
-        """Return `separations`, and wrenches: their derivatives by a twist (translation, rotation) of the second shape.
+        """Return `separations`, the index of each pair's wrench, and the wrenches.
 
-        The integers tell which wrench is a pair's. It is zero for separations above `below`: that of the last column.
+        A wrench is the derivative of a separation by a twist (translation, rotation) of the second shape. The last
+        wrench is zero, for separations above `below`.
         """
-        shapes = self._place(frames)
-        distance = self._distances(shapes[1])
-        apart = distance - self._sums(self._bounding, distance)
-        pair, row = torch.nonzero(apart < below, as_tuple=True)
+        shapes, apart, pair, row = self._near(frames, below)
         separation, wrench = apart.new_zeros(len(pair)), apart.new_zeros(6, len(pair) + 1)
         for kind, at in self._split(pair):
             separation[at], push = self._of_kind(kind, shapes, pair[at], row[at])
@@ -103,8 +92,7 @@ class SelfCollision(Value):
     @checked(gradients=True)
     def count_near(self, frames: Float[Tensor, "3 4 l n"], below: Bound) -> int:
         """Return how many pairs, over all rows, have bounding spheres nearer than `below`."""
-        distance = self._distances(self._place(frames)[1])
-        return int((distance - self._sums(self._bounding, distance) < below).sum())
+        return len(self._near(frames, below)[2])
 
     @checked
     def only(self, kept: Bool[Tensor, " p"]) -> "SelfCollision":
@@ -124,6 +112,15 @@ class SelfCollision(Value):
         links, rotation = frames.index_select(2, self.link), self.rotation.to(frames)[..., None]
         axes = links[:, 0, None] * rotation[0] + links[:, 1, None] * rotation[1] + links[:, 2, None] * rotation[2]
         return axes, map_points(links, self.center)
+
+    def _near(
+        self, frames: Float[Tensor, "3 4 l n"], below: float
+    ) -> tuple[Placed, Float[Tensor, "p n"], Int[Tensor, " k"], Int[Tensor, " k"]]:
+        """Return the shapes, the separations of their bounding spheres, and the pairs and rows of those below."""
+        shapes = self._place(frames)
+        distance = self._distances(shapes[1])
+        apart = distance - self._sums(self._bounding, distance)
+        return shapes, apart, *torch.nonzero(apart < below, as_tuple=True)
 
     def _distances(self, center: Float[Tensor, "3 s n"]) -> Float[Tensor, "p n"]:
         """Return the distance between the centres of each pair."""
@@ -160,7 +157,7 @@ class SelfCollision(Value):
     def _of_kind(
         self, kind: int, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]
     ) -> tuple[Float[Tensor, " k"], Push]:
-        """Return the separation of pairs of one kind, and what gives the pushes of some of them."""
+        """Return the separation of pairs of one kind, and a function of the pushes of some of them."""
         (first, second), (one, two), place, gap = self._meet(shapes, pair, row)
         half, radius, bounding = (x.to(gap) for x in (self.half.T, self.radius, self._bounding))
         if kind == 1:
@@ -191,7 +188,7 @@ class SelfCollision(Value):
     def _meet(
         self, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]
     ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor], Float[Tensor, "3 k"], Float[Tensor, "3 k"]]:
-        """Return the shapes of chosen pairs, their axes, the second ones' centres, and these from the first ones'."""
+        """Return the shapes of chosen pairs, their axes, the second centres, and the gaps from the first centres."""
         rotation, center, n = shapes[0].flatten(2), shapes[1].flatten(1), shapes[1].shape[2]
         first, second = self.pairs[pair].unbind(1)
         one, two = first * n + row, second * n + row
@@ -226,13 +223,9 @@ class BoxPairs(NamedTuple):
     def along_axes(self) -> Float[Tensor, "15 k"]:
         """Return the separations [m] along 15 axes, the largest of which is the boxes' (Gottschalk et al., 1996).
 
-        The axes are those of both boxes, then their crossings. Overlap is negative: the least translation that parts
-        the boxes. Apart, the value is a lower bound of the distance, exact where a face or two crossing edges are
+        The axes are those of both boxes, then their cross products. Overlap is negative: the least translation that
+        parts the boxes. Apart, the value is a lower bound of the distance, exact where a face or two crossing edges are
         nearest.
-
-        >>> still, x = torch.eye(3)[..., None], torch.tensor([[3.0], [0.0], [0.0]])
-        >>> BoxPairs(still, still, x, torch.ones(3, 1), torch.ones(3, 1)).along_axes().amax(0)
-        tensor([1.])
         """
         a, b, gap, half_a, half_b = self
         rotation = (a[:, :, None] * b[:, None]).sum(0)  # b's axes in the frame of a
@@ -246,7 +239,7 @@ class BoxPairs(NamedTuple):
         reach = next_a * size.roll(1, 0) + last_a * size.roll(-1, 0)
         reach = reach + half_b.roll(-1, 0) * size.roll(1, 1) + half_b.roll(1, 0) * size.roll(-1, 1)
         sine = 1 - rotation * rotation
-        crossing = sine > PARALLEL
+        crossing = sine > 1e-10  # the normals of the faces cover parallel edges
         by_edges = (along.abs() - reach) * torch.rsqrt(torch.where(crossing, sine, 1.0))
         return torch.cat([by_a, by_b, torch.where(crossing, by_edges, -torch.inf).flatten(0, 1)])
 
@@ -270,11 +263,7 @@ class BoxPairs(NamedTuple):
 
 
 def box_distance(points: Float[Tensor, "*b 3"], half: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-    """Return the distance of points from boxes about the origin, negative inside.
-
-    >>> box_distance(torch.tensor([[2.0, 0, 0], [0.0, 0, 0.5]]), torch.ones(2, 3))
-    tensor([ 1.0000, -0.5000])
-    """
+    """Return the distance of points from boxes about the origin, negative inside."""
     ox, oy, oz = (points.abs() - half).unbind(-1)
     px, py, pz = ox.clamp_min(0), oy.clamp_min(0), oz.clamp_min(0)
     squared = px * px + py * py + pz * pz

@@ -17,15 +17,15 @@ from torchgrasp.hand.safe_xml import parse_urdf, read_bounded
 from torchgrasp.limits import HAND_LINKS, HAND_SHAPES, MAX_EXTENT, URDF_BYTES
 
 SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "mesh": ("scale",)}
-"""The numbers of each kind of shape."""
-MEND = "torchgrasp hand new writes a clean copy"
-"""What helps against what a published URDF may hold, and a clean one may not."""
+"""The attributes with the numbers of each kind of shape."""
+REPAIR = "torchgrasp hand new writes a clean copy"
+"""The fix for what a published URDF may contain, and a clean URDF may not."""
 
 Triple = tuple[float, float, float]
 
 
 class Mimic(NamedTuple):
-    """The value of a coupled joint: `ratio * source + offset`."""
+    """The position of a coupled joint: `ratio * source + offset`."""
 
     source: str
     ratio: float
@@ -59,7 +59,7 @@ class Link:
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """A joint of the tree; a fixed one has limits of 0, one without limits infinite ones."""
+    """A joint of the tree; the limits are 0 for a fixed joint, and infinite where the URDF has none."""
 
     name: str
     kind: str
@@ -79,14 +79,7 @@ class Joint:
 class Urdf:
     """A checked URDF: one tree of links, finite numbers throughout.
 
-    `data` are the bytes of the file, `xml` those of its links and joints alone.
-
-    >>> from torchgrasp.hand import hands_folder
-    >>> urdf = read_urdf(hands_folder() / "barrett" / "hand.urdf")
-    >>> [joint.name for joint in urdf.movers("f1_tip")], len(urdf.joints_above("f1_tip"))
-    (['f1_distal', 'f1_flex', 'spread'], 4)
-    >>> type(urdf.wrong("a knot", "a tree")).__name__
-    'HandFileError'
+    `data` are the bytes of the file, `xml` the bytes of its checked links and joints alone.
     """
 
     path: Path
@@ -124,32 +117,29 @@ class Urdf:
 
 @checked
 def read_urdf(path: Path | str) -> Urdf:
-    """Read and check a URDF file of at most 4 MiB; raises `HandFileError`.
+    """Read and check a clean URDF file.
 
-    It has to be a clean one: no meshes as collision shapes, no joint without limits, none that follows a follower.
-
-    >>> from torchgrasp.hand import hands_folder
-    >>> urdf = read_urdf(hands_folder() / "barrett" / "hand.urdf")
-    >>> urdf.root, urdf.links[0].mass, urdf.links[0].shapes[0].kind, urdf.movable[1].mimic.ratio
-    ('palm', 0.6086, 'cylinder', 1.0)
+    Raises:
+        HandFileError: the file is missing, too large, hostile or no tree of bodies; a mesh as a collision shape; a
+            joint without limits, or one that follows a coupled joint.
     """
     urdf = read_published(path)
     for link in urdf.links:
         if any(shape.kind == "mesh" for shape in link.shapes):
-            raise urdf.wrong(f"link {link.name} collision <mesh>", f"box, cylinder or sphere; {MEND}")
+            raise urdf.wrong(f"link {link.name} collision <mesh>", f"box, cylinder or sphere; {REPAIR}")
     for j in urdf.movable:
         if math.isinf(j.upper - j.lower):
-            raise urdf.wrong(f"joint {j.name} without a limit", f"lower and upper; {MEND}")
+            raise urdf.wrong(f"joint {j.name} without a limit", f"lower and upper; {REPAIR}")
         if j.mimic and any(other.mimic for other in urdf.movable if other.name == j.mimic.source):
-            raise urdf.wrong(f"joint {j.name} mimics a coupled joint", f"an independent joint; {MEND}")
+            raise urdf.wrong(f"joint {j.name} mimics a coupled joint", f"an independent joint; {REPAIR}")
     return urdf
 
 
 def read_published(path: Path | str) -> Urdf:
-    """Read a URDF as it is published: with meshes, without limits, with joints that follow a follower.
+    """Read a URDF as it is published: with meshes, without limits, with joints that follow coupled joints.
 
     Raises:
-        HandFileError: the file is missing, too large or hostile, or no tree of bodies.
+        HandFileError: the file is missing, too large, hostile or no tree of bodies.
     """
     path = Path(path)
     data = read_bounded("urdf", path, "a URDF file", URDF_BYTES)
@@ -163,12 +153,12 @@ def read_published(path: Path | str) -> Urdf:
 
 
 def _part(element: ET.Element, tag: str) -> ET.Element:
-    """Return the first part of a name; the gate refused an element without it."""
+    """Return the first part with a tag; the gate refused an element without it."""
     return next(element.iter(tag))
 
 
 def _floats(element: ET.Element, *keys: str) -> list[float]:
-    """Read the numbers of attributes that the gate checked; no zero is negative."""
+    """Read the numbers of attributes that the gate checked; adding 0.0 makes a negative zero positive."""
     return [float(word) + 0.0 for key in keys for word in element.attrib[key].split()]
 
 
@@ -199,7 +189,7 @@ def _shape(collision: ET.Element) -> Shape:
 
 
 def _joint(joint: ET.Element) -> Joint:
-    """Read a joint. Without an axis it is about x, as ROS has it; a continuous one has no limits."""
+    """Read a joint. Its default axis is x, as in ROS; a continuous joint has no limits."""
     name, kind, (xyz, rpy) = joint.attrib["name"], joint.attrib["type"], _origin(joint)
     parent, child = (_part(joint, tag).attrib["link"] for tag in ("parent", "child"))
     if kind == "fixed":
@@ -227,12 +217,12 @@ def _joint(joint: ET.Element) -> Joint:
 
 
 def _is_unit(length: float) -> bool:
-    """Tell whether an axis has length 1; a longer one has been used to hide a ratio, which readers then lose."""
+    """Return whether an axis has length 1."""
     return 0.999 < length < 1.001
 
 
 def _check_names(urdf: Urdf) -> None:
-    """Refuse too many links, names and children that come twice, and joints of unknown links."""
+    """Refuse too many links, names and children that occur twice, and joints of unknown links."""
     if not 0 < len(urdf.links) <= HAND_LINKS:
         raise urdf.wrong(f"{len(urdf.links)} links", f"1 to {HAND_LINKS} links")
     names = [x.name for x in urdf.links]
@@ -243,14 +233,14 @@ def _check_names(urdf: Urdf) -> None:
             raise urdf.wrong(f"{what} {twice[0]!r} twice", f"every {what} once")
     for j in urdf.joints:
         for link in {j.parent, j.child} - set(names):
-            raise urdf.wrong(f"joint {j.name} names link {link!r}", "a link of the file")
+            raise urdf.wrong(f"joint {j.name} of link {link!r}", "joints of links in the file")
 
 
 def _check_shapes(urdf: Urdf) -> None:
-    """Refuse too many shapes, and sizes that are not positive or no hand's."""
+    """Refuse too many shapes, and sizes that are not positive or too large for a hand."""
     count = sum(len(link.shapes) for link in urdf.links)
     if count > HAND_SHAPES:
-        raise urdf.wrong(f"{count} collision shapes", f"at most {HAND_SHAPES}")
+        raise urdf.wrong(f"{count} collision shapes", f"at most {HAND_SHAPES} collision shapes")
     for link, shape in ((x, shape) for x in urdf.links for shape in x.shapes):
         if shape.kind != "mesh" and not 0 < min(shape.size) <= max(shape.size) <= MAX_EXTENT:
             found = f"link {link.name} collision of size {shape.size}"
@@ -258,7 +248,7 @@ def _check_shapes(urdf: Urdf) -> None:
 
 
 def _check_joints(urdf: Urdf) -> None:
-    """Refuse unknown kinds of joints, axes and limits that are none, and mimics in a circle."""
+    """Refuse unknown kinds of joints, wrong axes and limits, and coupled joints in a circle."""
     movable = {j.name: j for j in urdf.movable}
     for j in urdf.movable:
         if j.kind not in ("revolute", "prismatic", "continuous"):
@@ -270,7 +260,7 @@ def _check_joints(urdf: Urdf) -> None:
         passed = [j.name]
         while mimic := movable[passed[-1]].mimic:
             if mimic.source not in movable:
-                raise urdf.wrong(f"joint {passed[-1]} mimics {mimic.source!r}", "a movable joint of the file")
+                raise urdf.wrong(f"joint {passed[-1]} mimics {mimic.source!r}", "a movable joint of the file to follow")
             if mimic.source in passed:
                 raise urdf.wrong(f"joint {passed[-1]} mimics a coupled joint in a circle", "an independent joint")
             passed.append(mimic.source)

@@ -10,8 +10,9 @@ from torchgrasp.app.author.draft import draft_hand
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.geometry.frames import apply, rotate
-from torchgrasp.hand.collision_shapes import collision_pairs
+from torchgrasp.hand.collision_shapes import collision_pairs, draw_postures, self_collision_from_urdf
 from torchgrasp.hand.hand_toml import read_hand_toml
+from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.load import hands_folder, load_hand
 from torchgrasp.hand.self_collision import SelfCollision
 from torchgrasp.hand.urdf import read_urdf
@@ -162,26 +163,25 @@ def test_more_pairs_of_shapes_than_can_be_tested_are_refused_in_little_memory(cl
 
 
 def test_links_are_tested_until_they_are_settled(claw, monkeypatch):
-    urdf = read_urdf(claw)
+    claw.write_text(claw.read_text().replace("</robot>", OVERLAPPING + "</robot>"))
+    urdf, tested = read_urdf(claw), []
     coupling = {j.name: j.mimic for j in urdf.movable if j.mimic is not None}
-    always = claw.read_text().replace("</robot>", OVERLAPPING + "</robot>")
-    claw.write_text(always)
-    crowded, tested = read_urdf(claw), []
+    tree, shapes = tree_from_urdf(urdf), self_collision_from_urdf(urdf, None)
+    apart = shapes.separations(tree.frames(draw_postures(urdf, coupling, 3000, 0)), 0.002)
+    near, met = (apart < 0.002).any(1), (apart < 0).double().mean(1)  # each link has one shape
+    names = [[tree.link_names[int(k)] for k in shapes.link[pair]] for pair in shapes.pairs[near & (met <= 0.98)]]
 
     def count(self, frames, below, real=SelfCollision.separations):
         tested.append(len(self.pairs))
         return real(self, frames, below)
 
     monkeypatch.setattr(SelfCollision, "separations", count)
-    found = collision_pairs(crowded, coupling, n=3000)
+    found = collision_pairs(urdf, coupling, n=3000)
     assert tested[0] > tested[-1] + 1  # the two in one place, and links that have met and been apart
-    monkeypatch.setattr("torchgrasp.hand.collision_shapes.FIRST_LOOK", 3000)
-    assert collision_pairs(crowded, coupling, n=3000) == found  # in one look nothing is settled early
-    assert found and ("one", "two") not in found
-    monkeypatch.setattr("torchgrasp.hand.collision_shapes.FIRST_LOOK", 1000)
-    monkeypatch.setattr("torchgrasp.hand.collision_shapes.MOST_TESTS", 100)
-    with pytest.raises(HandFileError, match="separations are to be measured"):
-        collision_pairs(crowded, coupling, n=3000)
+    assert found and {frozenset(pair) for pair in found} == {frozenset(pair) for pair in names}
+    monkeypatch.setattr("torchgrasp.hand.collision_shapes.HAND_SEPARATIONS", 10_000)
+    with pytest.raises(HandFileError, match="separations must be measured"):
+        collision_pairs(urdf, coupling, n=3000)
 
 
 def test_too_many_shapes_in_one_place_are_refused_before_any_is_measured(tmp_path, monkeypatch):
@@ -196,7 +196,7 @@ def test_too_many_shapes_in_one_place_are_refused_before_any_is_measured(tmp_pat
     path.write_text(f'<robot name="rods"><link name="base"/>{"".join(rods)}</robot>')
     urdf, measured = read_urdf(path), []
     monkeypatch.setattr(SelfCollision, "separations", lambda *arguments: measured.append(arguments))
-    with limited(2**28), pytest.raises(HandFileError, match="11175000 separations are to be measured"):
+    with limited(2**28), pytest.raises(HandFileError, match="11175000 separations must be measured"):
         collision_pairs(urdf, {})
     assert not measured
 

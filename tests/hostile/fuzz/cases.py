@@ -104,7 +104,7 @@ def urdfs(folder: Path) -> list[Case]:
 
 
 def published(folder: Path) -> list[Case]:
-    """Return a URDF that is mended, with a mesh."""
+    """Return a URDF that is repaired, with a mesh."""
     text = (folder / "claw.urdf").read_text()
     trimesh.creation.icosahedron().apply_scale(0.011).export(folder / "tip.stl")
     mesh = '<mesh filename="package://claw/tip.stl" scale="1 1 1"/>'

@@ -1,7 +1,7 @@
 """A first hand.toml for a URDF, and a clean copy of the URDF: fingers, pads, coupling, pairs of links.
 
-What a published URDF says is mended (`mend`), its meshes become simple shapes (`fit_shapes`), its pads are guessed
-(`pads`). Every guess is marked.
+A published URDF is repaired (`repair`), its meshes become simple shapes (`fit_shapes`), its pads are guessed (`pads`).
+Every guess is marked.
 """
 
 import json
@@ -16,49 +16,35 @@ from torch import Tensor
 
 from torchgrasp.app.author.fit_shapes import ball_tip, replace_meshes, shape_points
 from torchgrasp.app.author.pads import guess_pads, is_primitive, order_by_facing, palm_of
-from torchgrasp.app.author.repair import fix_wrist, keep_below, mend_bodies, mend_joints, merge_frames, urdf_text
+from torchgrasp.app.author.repair import fix_wrist, keep_below, merge_frames, repair_bodies, repair_joints, urdf_text
 from torchgrasp.base import FINGERTIPS
 from torchgrasp.checks import Seed, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.collision_shapes import collision_pairs, draw_postures
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import tree_from_urdf
-from torchgrasp.hand.urdf import MEND, Mimic, Triple, Urdf, read_published
-
-DRAFT_POSTURES = 20_000
-"""Random postures from which pads and approach are guessed."""
-STIFFNESS, DAMPING = 4.0, 0.03
-"""Drive [rad^-1] per N m of the weakest joint's effort, and its damping [s]: about those of the shipped hands."""
-MOST_STIFFNESS = 10.0
-"""Stiffest drive [N m/rad]: the Barrett's, which is the strongest of the shipped hands."""
-ROTOR = 1e-3
-"""Inertia [kg m2] that simulations add to every joint for its motor."""
+from torchgrasp.hand.urdf import REPAIR, Mimic, Triple, Urdf, read_published
 
 OPTIONS = {"default": 3, "four": 4, "five": 5}
-"""Sets of fingers that a draft declares, as far as the hand has as many."""
-
-Chosen = dict[str, Pad]
-"""Pads by the links that touch."""
-Sets = dict[str, list[str]]
-"""Links that touch by the option of hand.toml in which their fingers grasp."""
+"""Sets of fingers that a draft declares if the hand has as many."""
 
 
 class Draft(NamedTuple):
-    """A first hand.toml, the clean URDF that it speaks of, and sentences on what was mended.
+    """A first hand.toml, the clean URDF that it names, and a sentence for each repair.
 
-    `urdf` is empty where the URDF is clean as it is.
+    `urdf` is empty if the published URDF is clean.
 
-    >>> Draft('name = "mine"', urdf="", mended=()).toml
+    >>> Draft('name = "mine"', urdf="", repairs=()).toml
     'name = "mine"'
     """
 
     toml: str
     urdf: str
-    mended: tuple[str, ...]
+    repairs: tuple[str, ...]
 
 
 class Wish(NamedTuple):
-    """What a user may say of a hand: the links of its tips, its name, the root below an arm, the folder of meshes.
+    """A user's choices for a hand: the links of its tips, its name, the root below an arm, the folder of meshes.
 
     >>> Wish(tips=("thumb_tip", "index_tip", "ring_tip"), name="mine").root
     ''
@@ -72,18 +58,18 @@ class Wish(NamedTuple):
 
 @checked
 def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = None, seed: Seed = 0) -> str:
-    """Write the text of a hand.toml for a clean URDF, to be looked over and checked by `check_hand`.
+    """Return the text of a hand.toml for a clean URDF, to be reviewed by the user and checked by `check_hand`.
 
     Args:
         path: of the URDF.
         tips: links of the fingertips in grasp order, first the three of option "default"; "four" and "five" add the
-            next. By default the ends of the tree's branches, in the order in which their pads best face each other.
-        name: of the hand; by default the robot's.
+            next tips. By default the ends of the branches, in the order in which their pads best face each other.
+        name: of the hand; by default the name of the robot.
         seed: of the random postures.
 
     Raises:
-        HandFileError: the URDF is missing or malformed, or needs mending: `new_hand` does that.
-        BadArgument: fewer than three tips, more than five, or one without a collision shape or a joint that moves it.
+        HandFileError: the URDF is missing or malformed, or needs repair by `new_hand`.
+        BadArgument: fewer than three tips, more than five, or a tip without a collision shape or a movable joint.
 
     >>> from torchgrasp.hand.load import find_hand
     >>> text = draft_hand(find_hand("barrett") / "hand.urdf")
@@ -92,36 +78,38 @@ def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = No
     """
     draft = new_hand(path, Wish(tuple(tips), name or ""), seed)
     if draft.urdf:
-        raise read_published(path).wrong("; ".join(draft.mended)[:1000], f"a clean URDF; {MEND}")
+        raise read_published(path).wrong("; ".join(draft.repairs)[:1000], f"a clean URDF; {REPAIR}")
     return draft.toml
 
 
 @checked
 def new_hand(path: Path | str, wish: Wish = Wish(), seed: Seed = 0, file: str = "hand.urdf") -> Draft:  # noqa: B008
-    """Mend a published URDF, and draft a hand.toml for the clean copy, which is to be called `file`.
+    """Repair a published URDF, and draft a hand.toml for the clean copy, which the user saves as `file`.
+
+    Args:
+        path: of the URDF.
+        wish: the user's choices.
+        seed: of the random postures.
+        file: name of the clean copy.
 
     Raises:
-        HandFileError: the URDF or a mesh of it is missing, malformed or hostile, or nothing can mend it.
-        BadArgument: fewer than three tips, more than five, or one without a collision shape or a joint that moves it.
+        HandFileError: the URDF or one of its meshes is missing, malformed or hostile, or cannot be repaired.
+        BadArgument: fewer than three tips, more than five, or a tip without a collision shape or a movable joint.
 
     >>> from torchgrasp import load_hand
     >>> draft = new_hand(load_hand("barrett").urdf_path, Wish(name="mine"))
-    >>> 'name = "mine"' in draft.toml, draft.mended
+    >>> 'name = "mine"' in draft.toml, draft.repairs
     (True, ())
     """
     published = read_published(path)
-    urdf, told = keep_below(published, wish.root or published.root)
-    urdf, more, taken = merge_frames(urdf)
-    told += more
-    urdf, more = fix_wrist(urdf, fingertip_links(urdf) or [urdf.root])
+    urdf, below = keep_below(published, wish.root or published.root)
+    urdf, merged, taken = merge_frames(urdf)
+    urdf, fixed = fix_wrist(urdf, fingertip_links(urdf) or [urdf.root])
     urdf, again, taken_again = merge_frames(urdf)
-    told += more + again
-    urdf, more = mend_joints(urdf)
-    told += more
+    urdf, joints = repair_joints(urdf)
     points = shape_points(urdf, wish.meshes or published.path.parent)
     surfaces = {name: np.concatenate(parts) for name, parts in points.items() if parts}
-    urdf, more = mend_bodies(urdf, surfaces)
-    told += more
+    urdf, bodies = repair_bodies(urdf, surfaces)
     tips = tuple(taken_again.get(x, x) for x in (taken.get(tip, tip) for tip in wish.tips))
     tips = _checked_tips(urdf, tips)
     frames = _frames(urdf, (*tips, palm_of(urdf, tips)), seed)
@@ -131,30 +119,30 @@ def new_hand(path: Path | str, wish: Wish = Wish(), seed: Seed = 0, file: str = 
         order = order_by_facing(frames[:, :, :-1], guess.pads)
     sets = {name: [tips[k] for k in sorted(order[:n])] for name, n in OPTIONS.items() if n <= len(tips)}
     simple = {x.name for x in urdf.links if is_primitive(x)}
-    clean, more = replace_meshes(urdf, points)
-    told += more
-    chosen: Chosen = {}
-    balls = list[str]()
+    clean, fitted = replace_meshes(urdf, points)
+    chosen, balls = dict[str, Pad](), list[str]()
     for tip, pad, outward in zip(tips, guess.pads, guess.outward, strict=True):
         if tip not in simple:
             balls.append(f"{tip} {1e3 * pad.radius:.1f} mm")
             clean = ball_tip(clean, tip, pad, outward, surfaces[tip])
         chosen[tip] = pad
-    told += [f"fingertips touch by a ball in their end, of radius: {', '.join(balls)}"] if balls else []
-    name, mended = wish.name or urdf.name, bool(told)
-    toml = _toml_text(clean, chosen, sets, guess.approach, (name, file if mended else published.path.name), seed)
-    return Draft(toml, urdf_text(clean) if mended else "", tuple(told))
+    repairs = [*below, *merged, *fixed, *again, *joints, *bodies, *fitted]
+    if balls:
+        repairs.append(f"fingertips touch with a ball in their end, of radius: {', '.join(balls)}")
+    names = wish.name or urdf.name, file if repairs else published.path.name
+    toml = _toml_text(clean, chosen, sets, guess.approach, names, seed)
+    return Draft(toml, urdf_text(clean) if repairs else "", tuple(repairs))
 
 
 def _frames(urdf: Urdf, links: tuple[str, ...], seed: int) -> Float[Tensor, "3 4 _ n"]:
-    """Return the frames of some links in random postures; a part at a time, since those of all links are many."""
+    """Return the frames of some links in random postures, in chunks that bound the memory."""
     tree, at = tree_from_urdf(urdf), [[x.name for x in urdf.links].index(link) for link in links]
-    values = draw_postures(urdf, _coupling(urdf), DRAFT_POSTURES, seed)
+    values = draw_postures(urdf, _coupling(urdf), 20_000, seed)
     return torch.cat([tree.frames(part)[:, :, at] for part in values.split(1000, 1)], -1)
 
 
 def _checked_tips(urdf: Urdf, tips: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the links of the fingertips, given or found; refuse too few, and links that cannot touch."""
+    """Return the given or found links of the fingertips; refuse too few or too many, and links that cannot touch."""
     ends = fingertip_links(urdf)
     chosen = tips or ends
     if not FINGERTIPS[0] <= len(chosen) <= FINGERTIPS[1] or len(set(chosen)) < len(chosen):
@@ -163,7 +151,7 @@ def _checked_tips(urdf: Urdf, tips: tuple[str, ...]) -> tuple[str, ...]:
     shaped = {x.name for x in urdf.links if x.shapes}
     for tip in chosen:
         if tip not in shaped or not urdf.movers(tip):
-            raise BadArgument("tips", tip, f"links with a collision shape that joints move, as {list(ends)}")
+            raise BadArgument("tips", tip, f"links with a collision shape that joints move, such as {list(ends)}")
     return chosen
 
 
@@ -172,9 +160,13 @@ def _coupling(urdf: Urdf) -> dict[str, Mimic]:
 
 
 def _gains(urdf: Urdf) -> tuple[float, float]:
-    """Return stiffness and damping of the drives: of the weakest joint's effort, and no less than critical damping."""
+    """Return stiffness [N m/rad] and damping [N m s/rad] of the drives, similar to those of the shipped hands.
+
+    The stiffness follows from the effort of the weakest joint. The damping is at least critical, where simulations add
+    a rotor's inertia of 1e-3 kg m2 to each joint.
+    """
     free = [j for j in urdf.movable if j.mimic is None]
-    kp = min(STIFFNESS * min(j.effort for j in free), MOST_STIFFNESS)
+    kp = min(4.0 * min(j.effort for j in free), 10.0)
     poses = tree_from_urdf(urdf).poses(torch.zeros(1, len(urdf.movable), dtype=torch.float64))[0].numpy()
     names = [x.name for x in urdf.links]
     centres = np.array([p[:3, :3] @ x.com + p[:3, 3] for p, x in zip(poses, urdf.links, strict=True)])
@@ -186,11 +178,13 @@ def _gains(urdf: Urdf) -> tuple[float, float]:
         moved = [k for k, name in enumerate(names) if j in urdf.joints_above(name)]
         arms = np.cross(pose[:3, :3] @ j.axis, centres[moved] - pose[:3, 3])
         heaviest = max(heaviest, float(np.array([urdf.links[k].mass for k in moved]) @ (arms**2).sum(1)))
-    return kp, max(DAMPING * kp, 2 * np.sqrt(kp * (heaviest + ROTOR)))
+    return kp, max(0.03 * kp, 2 * np.sqrt(kp * (heaviest + 1e-3)))
 
 
-def _toml_text(urdf: Urdf, pads: Chosen, sets: Sets, approach: Triple, names: tuple[str, str], seed: int) -> str:
-    """Write a hand.toml; `names` are those of the hand and of its URDF's file."""
+def _toml_text(
+    urdf: Urdf, pads: dict[str, Pad], sets: dict[str, list[str]], approach: Triple, names: tuple[str, str], seed: int
+) -> str:
+    """Write a hand.toml, with pads by links, links by options, and the names of the hand and of its URDF file."""
     coupling = _coupling(urdf)
     chains = {tip: [j.name for j in urdf.movers(tip)[::-1]] for tip in pads}
     kp, kd = _gains(urdf)
@@ -232,7 +226,7 @@ def _toml_text(urdf: Urdf, pads: Chosen, sets: Sets, approach: Triple, names: tu
 
 
 def _parked(urdf: Urdf, grasping: set[str]) -> dict[str, float]:
-    """Return where the joints are that neither grasp nor lead nor follow another: at zero, or the limit next to it."""
+    """Return the positions of joints that neither grasp nor lead nor follow: zero, or the limit next to zero."""
     coupling = _coupling(urdf)
     moved = grasping | {coupling[j].source for j in grasping if j in coupling}
     free = (j for j in urdf.movable if j.name not in coupling and j.name not in moved)
@@ -240,7 +234,7 @@ def _parked(urdf: Urdf, grasping: set[str]) -> dict[str, float]:
 
 
 def fingertip_links(urdf: Urdf) -> tuple[str, ...]:
-    """Return every movable branch's last link with a collision shape."""
+    """Return the last link with a collision shape of every movable branch."""
     parents, shaped = {j.parent for j in urdf.joints}, {x.name for x in urdf.links if x.shapes}
     ends = []
     for link in (x.name for x in urdf.links if x.name not in parents):

@@ -1,6 +1,6 @@
-"""Boxes, cylinders and balls for the meshes of a published hand: shapes that planner and simulators know.
+"""Boxes, cylinders and balls in place of the meshes of a published hand.
 
-A mesh is sampled. Its points are boxed, and a box is cut in two wherever that saves most volume.
+A mesh is sampled. Its points get a bounding box, and a box is cut in two where the cut saves most volume.
 """
 
 import dataclasses
@@ -17,31 +17,21 @@ from torchgrasp.files.meshes import load_triangles
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.safe_xml import read_bounded
 from torchgrasp.hand.urdf import Shape, Urdf
-from torchgrasp.limits import MAX_EXTENT, MESH_BYTES, MESH_FACES
+from torchgrasp.limits import HAND_MESH_BYTES, MAX_EXTENT, MESH_BYTES, MESH_FACES
 
 if TYPE_CHECKING:
     import trimesh
 
 MESH_KINDS = (".stl", ".obj", ".ply")
-"""Formats of meshes: those that are geometry alone."""
+"""Formats of meshes that contain only geometry."""
 SAMPLES = 4000
-"""Points on each shape: 1 mm apart on a finger's link, 2 mm on a palm."""
-SAVING = 0.12
-"""A box is cut in two if that saves this share of all boxes' volume; less is the corners of round bodies."""
-SMALL, MOST_SMALL, MOST = 0.08, 3, 8
-"""Up to this size [m] a mesh gets at most 3 boxes, above it 8: what is tested grows with the square."""
-THIN = 0.008
-"""No box is cut shorter than this [m]: a fingertip's radius."""
+"""Points on each shape."""
+SAVING, SAVING_TIP = 0.12, 0.04
+"""A box of a link or of a fingertip is cut in two if the cut saves this share of the volume of all boxes."""
 ROUND = 0.9
-"""A cylinder is taken where its volume is less than this share of the boxes': pi / 4 of one box's."""
+"""A cylinder replaces boxes if its volume is less than this share of their volume."""
 TURNED = 0.85
-"""A box is turned out of the link's axes if it then has less than this share of the volume."""
-FLAT = 1e-7
-"""Points that spread by less [m], RMS, lie in a plane: far above what float32 rounds off 0.1 m, 6e-9."""
-WHOLE = 2.6
-"""A tip shorter than this many radii is a ball and nothing else, as Allegro's: a hemisphere with a foot."""
-MOST_TIP, SAVING_TIP = 4, 0.04
-"""Boxes of a fingertip, and what a further one must save: a bent tip in one box would touch before its ball."""
+"""Boxes are turned out of the link's axes if one box then has less than this share of its volume."""
 
 Points = Float[np.ndarray, "_ 3"]
 """Points, of any count in each use."""
@@ -49,21 +39,18 @@ Corners = tuple[np.ndarray, np.ndarray]
 
 
 def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
-    """Return the file of a mesh, which must lie in `folder`; `package://` means a path inside it.
+    """Return the file of a mesh, which must lie in `folder`; `package://` means a path inside the folder.
 
     Raises:
-        HandFileError: the name is that of no file in the folder, or of one that is no mesh or too large.
+        HandFileError: no such file in the folder, a file of another format, or one that is too large.
     """
-    base, allowed = (
-        folder.resolve(),
-        f"a {', '.join(MESH_KINDS)} (export others) of at most {MESH_BYTES >> 20} MiB inside {folder}",
-    )
-    refusal = urdf.wrong(f"mesh {name[:80]!r}", allowed)
+    base, kinds = folder.resolve(), ", ".join(MESH_KINDS)
+    refusal = urdf.wrong(f"mesh {name[:80]!r}", f"a mesh ({kinds}) of at most {MESH_BYTES >> 20} MiB inside {folder}")
     package = name.startswith("package://")
     path = PurePosixPath(name.removeprefix("package://"))
     if ":" in str(path) or "\\" in name or path.is_absolute() or path.suffix.lower() not in MESH_KINDS:
         raise refusal
-    # the name of a package says nothing about where its files are: its first words may be left out
+    # the files of a package may lie anywhere in the folder: the first parts of the path may be left out
     starts = range(len(path.parts) if package else 1)
     places = [place.joinpath(*path.parts[k:]) for k in starts for place in (urdf.path.resolve().parent, base)]
     for file in places:
@@ -71,7 +58,7 @@ def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
             found = file.resolve()
             if found.is_relative_to(base) and found.is_file() and found.stat().st_size <= MESH_BYTES:
                 return found
-        except (OSError, RuntimeError, ValueError):  # a loop of links, a name that the file system does not take
+        except (OSError, RuntimeError, ValueError):  # a loop of links, or a name that the file system refuses
             continue
     raise refusal
 
@@ -80,12 +67,12 @@ def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
     """Return points [m] on each shape of every link, in the link's frame; meshes must lie in `folder`.
 
     Raises:
-        HandFileError: a mesh is missing, outside the folder, too large or none.
+        HandFileError: a mesh is missing, outside the folder, too large or malformed.
     """
     names = {shape.file for link in urdf.links for shape in link.shapes if shape.kind == "mesh"}
     size = sum(mesh_file(urdf, name, folder).stat().st_size for name in names)
-    if size > 4 * MESH_BYTES:
-        raise urdf.wrong(f"meshes of {size} bytes", f"at most {4 * MESH_BYTES >> 20} MiB in all")
+    if size > HAND_MESH_BYTES:
+        raise urdf.wrong(f"meshes of {size} bytes", f"meshes of at most {HAND_MESH_BYTES >> 20} MiB in all")
     meshes = {name: _read_points(urdf, name, folder) for name in sorted(names)}
     found = {}
     for link in urdf.links:
@@ -94,7 +81,7 @@ def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
             local = meshes[shape.file] * shape.size if shape.kind == "mesh" else _primitive_points(shape)
             reach = float(np.abs(local).max())
             if not reach <= MAX_EXTENT:
-                wanted = f"at most {MAX_EXTENT:g} m; a mesh in millimetres needs a scale of 0.001"
+                wanted = f"shapes that reach at most {MAX_EXTENT:g} m; a mesh in millimetres needs a scale of 0.001"
                 raise urdf.wrong(f"mesh {shape.file!r} that reaches {reach:.3g} m", wanted)
             pose = pose_of(shape)
             parts.append(local @ pose[:3, :3].T + pose[:3, 3])
@@ -103,7 +90,7 @@ def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
 
 
 def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tuple[Urdf, list[str]]:
-    """Replace every mesh by a few boxes or a cylinder around its points; tell how many."""
+    """Replace every mesh by a few boxes or a cylinder around its points; report their number."""
     links, count, made = [], 0, 0
     for link in urdf.links:
         shapes: list[Shape] = []
@@ -112,29 +99,29 @@ def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tupl
             count, made = count + (shape.kind == "mesh"), made + (len(fitted) if shape.kind == "mesh" else 0)
             shapes += fitted
         links.append(dataclasses.replace(link, shapes=tuple(shapes)))
-    told = [f"{count} collision meshes became {made} boxes or cylinders around them"] if count else []
-    return dataclasses.replace(urdf, links=tuple(links)), told
+    done = [f"{count} collision meshes became {made} boxes or cylinders around them"] if count else []
+    return dataclasses.replace(urdf, links=tuple(links)), done
 
 
 def ball_tip(urdf: Urdf, tip: str, ball: Pad, outward: np.ndarray, points: Points) -> Urdf:
-    """Give a tip a ball, and boxes up to the ball's centre, close to its surface where it is bent.
+    """Give a tip a ball, and boxes close to its surface up to the centre of the ball.
 
-    `outward` points to the finger's end, `points` lie on the tip. Ball and boxes may touch the object.
+    `outward` points to the finger's end, `points` lie on the tip. A tip shorter than 2.6 radii gets the ball alone.
     """
     link = next(x for x in urdf.links if x.name == tip)
     reach = (points - np.array(ball.center)) @ outward
     shapes = [Shape("sphere", (ball.radius,), ball.center, (0.0, 0.0, 0.0))]
-    if np.ptp(reach) > WHOLE * ball.radius:
+    if np.ptp(reach) > 2.6 * ball.radius:
         motion = np.array(ball.normal) - ball.normal @ outward * outward
         motion /= np.linalg.norm(motion)
         axes = np.stack([motion, outward, np.cross(motion, outward)], 1)
-        shapes += _boxes(_cut(points[reach < 0] @ axes, MOST_TIP, SAVING_TIP), axes)
+        shapes += _boxes(_cut(points[reach < 0] @ axes, 4, SAVING_TIP), axes)
     ended = dataclasses.replace(link, shapes=tuple(shapes))
     return dataclasses.replace(urdf, links=tuple(ended if x is link else x for x in urdf.links))
 
 
 def _read_points(urdf: Urdf, name: str, folder: Path) -> Points:
-    """Read a mesh, and nothing that its file names; return points on it."""
+    """Read a mesh without the files that it names; return points on it."""
     import trimesh
 
     path = mesh_file(urdf, name, folder)
@@ -142,11 +129,11 @@ def _read_points(urdf: Urdf, name: str, folder: Path) -> Points:
     allowed = f"a triangle mesh of at most {MESH_FACES} faces"
     try:
         mesh = load_triangles(data, path.suffix.lower(), process=False)
-    except Exception as error:  # the readers of trimesh raise whatever their format runs into
+    except Exception as error:  # the readers of trimesh raise errors of many kinds
         raise urdf.wrong(f"mesh {name!r}: {error}"[:300], allowed) from error
     sound = isinstance(mesh, trimesh.Trimesh) and 0 < len(mesh.faces) <= MESH_FACES
     if not sound or not np.isfinite(mesh.vertices).all():
-        raise urdf.wrong(f"mesh {name!r} without faces, or with vertices that are no numbers", allowed)
+        raise urdf.wrong(f"mesh {name!r} without faces, or with vertices that are not finite", allowed)
     return _sample(mesh)
 
 
@@ -178,7 +165,7 @@ def fit_shapes(points: Points) -> list[Shape]:
     """
     turn = _axes(points)
     local = points @ turn
-    boxes = _cut(local, MOST_SMALL if float(np.ptp(local, axis=0).max()) < SMALL else MOST, SAVING)
+    boxes = _cut(local, 3 if float(np.ptp(local, axis=0).max()) < 0.08 else 8, SAVING)
     volume = sum(float(np.prod(high - low)) for low, high in boxes)
     low, high = local.min(0), local.max(0)
     middle, sides = (low + high) / 2, high - low
@@ -191,10 +178,10 @@ def fit_shapes(points: Points) -> list[Shape]:
 
 
 def _axes(points: Points) -> Float[np.ndarray, "3 3"]:
-    """Return the axes of the boxes as columns: the link's, unless the body is flat or others fit much better."""
+    """Return the axes of the boxes as columns: the link's axes, unless others fit much better."""
     from trimesh.bounds import oriented_bounds
 
-    if np.linalg.matrix_rank(points - points.mean(0), tol=FLAT * math.sqrt(len(points))) < 3:  # it has no hull
+    if np.linalg.matrix_rank(points - points.mean(0), tol=1e-7 * math.sqrt(len(points))) < 3:  # a flat body has no hull
         return np.eye(3)
     turned, sizes = oriented_bounds(points)
     straight = np.prod(np.ptp(points, axis=0))
@@ -220,11 +207,11 @@ def _cut(points: Points, most: int, saving: float) -> list[Corners]:
 
 
 def _halves(low: np.ndarray, high: np.ndarray, points: Points) -> list[tuple[float, list]]:
-    """Return what is saved by each cut of a box in two, and the two."""
+    """Return the volume that each cut of a box saves, and the two boxes; none is shorter than 8 mm."""
     found = []
     for axis in range(3):
         for at in np.linspace(low[axis], high[axis], 12)[1:-1]:
-            if min(at - low[axis], high[axis] - at) < THIN:
+            if min(at - low[axis], high[axis] - at) < 0.008:
                 continue
             below = points[:, axis] < at
             if not 20 < int(below.sum()) < len(points) - 20:
@@ -240,7 +227,7 @@ def _halves(low: np.ndarray, high: np.ndarray, points: Points) -> list[tuple[flo
 
 
 def _shape(kind: str, size: tuple[float, ...], turn: np.ndarray, center: np.ndarray) -> Shape:
-    """Return a shape with rounded numbers: micrometres, and angles to 1e-6."""
+    """Return a shape with numbers rounded to 1e-6."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn, center
     xyz, rpy = place(pose)

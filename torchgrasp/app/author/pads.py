@@ -1,7 +1,7 @@
-"""Guessed pads of fingertips: where they touch, and which way they face.
+"""Guessed pads of fingertips: their contact points and normals.
 
-A URDF does not say where a finger's pad is. Here the pad faces where the finger's last joint bends. A joint bends to
-the side with most of its range; if both have as much, towards the other fingertips.
+A URDF does not define the pads. Here a pad faces the direction in which the finger's last joint bends. A joint bends to
+the side with most of its range; if both sides have as much, it bends towards the other fingertips.
 """
 
 import itertools
@@ -21,22 +21,12 @@ from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import map_directions, map_points, pose_in_carrier
 from torchgrasp.hand.urdf import Joint, Link, Shape, Triple, Urdf
 
-MEETING_SHARE = 0.1
-"""Share of the postures that tells where the fingers meet: those with the nearest fingertips."""
-ONE_SIDED = 0.1
-"""A joint bends to one side if the middle of its range is farther off zero than this, over the range's length."""
 TILT = math.radians(30)
-"""A round tip touches this far from its direction of motion, towards its end: so the Allegro hand closes most often."""
+"""Angle [rad] between the direction of motion and the contact of a round tip, towards the finger's end."""
 SHORT_ARM = 1e-3
 """A joint whose axis passes a tip nearer than this [m] does not move it."""
-NEAR_END = 0.015
-"""How much of a finger's end [m] tells how thick it is."""
-LEAST_BALL, MOST_BALL = 0.003, 0.013
-"""Radii [m] between which the ball on a fingertip is chosen: the smallest that grips, a millimetre above Allegro's."""
-FACING, HELD = math.cos(math.radians(45)), (0.015, 0.08)
-"""Pads face the middle of three within 45 degrees, and are this far [m] from it: objects of 3 to 16 cm."""
 BESIDE = 0.003
-"""Points of a surface nearer than this [m] to a ray tell where it leaves the body."""
+"""Distance [m] from a ray or a plane within which points of a surface count."""
 
 Vector = Float[np.ndarray, "3"]
 Points = Float[np.ndarray, "_ 3"]
@@ -56,8 +46,8 @@ def guess_pads(
 ) -> Guess:
     """Guess the pads of the tips and the direction out of the palm, from frames of tips and palm in random postures.
 
-    A tip of one box, cylinder or sphere has its pad on that. Another gets a ball that touches its surface, of points
-    (n, 3) in `surfaces`, where the pad is.
+    A tip of one box, cylinder or sphere has its pad on that shape. Another tip gets a ball that touches its surface,
+    of points (n, 3) in `surfaces`.
     """
     links = {x.name: i for i, x in enumerate(urdf.links)}
     cores = [_core(urdf, urdf.links[links[tip]], surfaces) for tip in tips]
@@ -65,13 +55,14 @@ def guess_pads(
     centres = map_points(tip_frames, torch.tensor(np.stack(cores)))  # 3 f n
     middle = centres[:, :3].mean(1, keepdim=True)
     spread = torch.linalg.vector_norm(centres[:, :3] - middle, dim=0).sum(0)
-    near = spread.topk(max(1, int(MEETING_SHARE * len(spread))), largest=False).indices
+    # the fingers meet in the postures with the nearest fingertips
+    near = spread.topk(max(1, int(0.1 * len(spread))), largest=False).indices
     inward = (tip_frames[:, :3] * (middle - centres)[:, None])[..., near].sum(0).mean(-1).T.numpy()  # tips' frames
     pads, ends = [], []
     for tip, core, closing in zip(tips, cores, inward, strict=True):
         joint, motion, outward = _motion(urdf, tip, core)
         middle_of_range = (joint.lower + joint.upper) / 2
-        one_sided = abs(middle_of_range) > ONE_SIDED * (joint.upper - joint.lower)
+        one_sided = abs(middle_of_range) > 0.1 * (joint.upper - joint.lower)
         bending = math.copysign(1.0, middle_of_range if one_sided else motion @ closing)
         link, way = urdf.links[links[tip]], bending * motion
         single = is_primitive(link)
@@ -93,8 +84,8 @@ def palm_of(urdf: Urdf, tips: Sequence[str]) -> str:
 def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> list[int]:
     """Return the tips, first the three whose pads most often face their middle, then one by one those that face best.
 
-    A pad faces the middle within 45 degrees; in between lies something of a size that a hand holds. `frames` are the
-    tips' frames in random postures.
+    A pad faces the middle within 45 degrees, from 1.5 to 8 cm away, as for an object. `frames` are the frames of the
+    tips in random postures.
     """
     contacts, normals = (torch.tensor([getattr(p, k) for p in pads]).double() for k in ("contact", "normal"))
     points, directions = map_points(frames, contacts), map_directions(frames, normals)
@@ -104,8 +95,8 @@ def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> li
         inward = points[:, tips].mean(1, keepdim=True) - points[:, tips]
         length = torch.linalg.vector_norm(inward, dim=0)
         facing = (directions[:, tips] * inward).sum(0) / length.clamp_min(1e-9)
-        apart = (length > HELD[0]) & (length < HELD[1])
-        return float(((facing > FACING) & apart).all(0).double().mean())
+        apart = (length > 0.015) & (length < 0.08)
+        return float(((facing > math.cos(math.radians(45))) & apart).all(0).double().mean())
 
     order = max(itertools.combinations(range(len(pads)), 3), key=share)
     while len(order) < len(pads):
@@ -114,7 +105,7 @@ def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> li
 
 
 def is_primitive(link: Link) -> bool:
-    """Tell whether a link is one box, cylinder or sphere."""
+    """Return whether a link is one box, cylinder or sphere."""
     return len(link.shapes) == 1 and link.shapes[0].kind != "mesh"
 
 
@@ -123,8 +114,8 @@ def _ball(points: Points, motion: Vector, outward: Vector) -> Pad:
     axes = np.stack([motion, outward, np.cross(motion, outward)], 1)
     local = points @ axes
     end = local[:, 1].max()
-    near = local[local[:, 1] > end - NEAR_END]
-    radius = round(float(np.clip(np.ptp(near[:, [0, 2]], axis=0).min() / 2, LEAST_BALL, MOST_BALL)), 4)
+    near = local[local[:, 1] > end - 0.015]  # half the thickness of the finger's end is the radius
+    radius = round(float(np.clip(np.ptp(near[:, [0, 2]], axis=0).min() / 2, 0.003, 0.013)), 4)
     ring = local[np.abs(local[:, 1] - (end - radius)) < BESIDE]
     low, high = ring.min(0), ring.max(0)
     core = axes @ [(low[0] + high[0]) / 2, end - radius, (low[2] + high[2]) / 2]
@@ -162,7 +153,7 @@ def _half(shape: Shape) -> Vector:
 
 
 def _core(urdf: Urdf, link: Link, surfaces: Mapping[str, Points]) -> Vector:
-    """Return a point at the far end of a tip, in its frame: half a thickness before the end where the tip is simple."""
+    """Return a point at the far end of a tip, in its frame; in a simple shape half a thickness before the end."""
     if not is_primitive(link):
         points, pose = surfaces[link.name], pose_in_carrier(urdf, link.name)[1].numpy()
         reach = np.linalg.norm(points @ pose[:, :3].T + pose[:, 3], axis=1)
@@ -182,7 +173,7 @@ def _pad(shape: Shape, core: Vector, motion: Vector, outward: Vector) -> Pad:
         return Pad(_triple(center + radius * normal), _triple(normal), _triple(center), radius)
     rotation, half = rotation_from_rpy(shape.rpy).numpy(), _half(shape)
     side = rotation.T @ motion
-    side[int(half.argmax())] = 0.0  # along the tip's length there is no pad
+    side[int(half.argmax())] = 0.0  # the pad is beside the tip, not at its end
     if shape.kind == "box":
         face = int(np.abs(side).argmax())
         side, depth = np.sign(side[face]) * np.eye(3)[face], half[face]
@@ -193,6 +184,6 @@ def _pad(shape: Shape, core: Vector, motion: Vector, outward: Vector) -> Pad:
 
 
 def _triple(x: Vector) -> Triple:
-    """Return an array as three numbers that print shortly."""
+    """Return an array as three rounded numbers."""
     a, b, c = (round(float(v), 12) + 0.0 for v in x)
     return a, b, c

@@ -1,6 +1,6 @@
-"""Mending of published URDFs: frames without mass, wrists, masses, limits, followers; and the clean copy's text.
+"""Repair of published URDFs: frames without mass, wrists, masses, limits, followers; and the text of the clean copy.
 
-Every step returns the mended URDF and sentences that tell what it did.
+Every step returns the repaired URDF and a sentence for each repair.
 """
 
 import dataclasses
@@ -13,16 +13,10 @@ import numpy as np
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.urdf import SIZES, Joint, Link, Mimic, Shape, Triple, Urdf
 
-MANY = 3
-"""A hand has at most this many joints that move all its fingertips, a wrist; an arm has more."""
 EFFORT, VELOCITY = 1.0, 3.0
-"""Drive [N m, rad/s] of a joint for which the URDF declares none: between those of small hands' motors."""
-DENSITY = 1000.0
-"""Mass over the volume of the bounding box [kg/m3]: plastic and metal, half of it air."""
+"""Drive [N m, rad/s] of a joint for which the URDF declares none, typical of small hands."""
 LEAST_MASS, LEAST_SIZE = 1e-3, 5e-3
-"""Mass [kg] and edge [m] of a body for which there is nothing to go by: a gram, which no simulator trips over."""
-FAR_OUT = 2.0
-"""A mass centre or a radius of gyration farther out than this, in half diagonals of a body, is a slip of the pen."""
+"""Least mass [kg] and edge [m] of a body without mass, so that simulators remain stable."""
 
 Step = tuple[Urdf, list[str]]
 
@@ -38,7 +32,7 @@ def place(pose: np.ndarray) -> tuple[Triple, Triple]:
     """Return translation [m] and fixed-axis angles [rad] of a 4 x 4 pose."""
     from trimesh.transformations import euler_from_matrix
 
-    # of the two triples the smaller one, to the digits that a rotation keeps: so short numbers stay short
+    # the smaller of the two triples, rounded to the digits of a rotation, so that short numbers remain short
     one = [float(angle) for angle in euler_from_matrix(pose)]
     two = [math.copysign(math.pi, angle) - angle for angle in one]
     angles = min((one, (-two[0], two[1], -two[2])), key=lambda triple: sum(map(abs, triple)))
@@ -47,7 +41,7 @@ def place(pose: np.ndarray) -> tuple[Triple, Triple]:
 
 
 def keep_below(urdf: Urdf, root: str) -> Step:
-    """Keep the links below a link, and that link: the hand on an arm."""
+    """Keep a link and the links below it: the hand on an arm."""
     names = {x.name for x in urdf.links}
     if root not in names:
         raise BadArgument("root", repr(root), f"a link of {urdf.path}: {sorted(names)}")
@@ -60,14 +54,14 @@ def keep_below(urdf: Urdf, root: str) -> Step:
         if j.mimic and j.mimic.source not in inside:
             raise urdf.wrong(f"joint {j.name} follows {j.mimic.source!r} above {root!r}", "a root above both")
     links = tuple(x for x in urdf.links if x.name in kept)
-    told = f"{len(names) - len(kept)} links that do not hang from {root} are left out"
-    return dataclasses.replace(urdf, root=root, links=links, joints=joints), [told]
+    done = f"{len(names) - len(kept)} links that are not below {root} are left out"
+    return dataclasses.replace(urdf, root=root, links=links, joints=joints), [done]
 
 
 def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
-    """Merge frames without mass into the body they are fixed to; tell which link took which.
+    """Merge frames without mass into the body to which they are fixed; also return the body of each merged link.
 
-    A root without mass takes the body that is fixed to it. An end with a shape stays: it may be a fingertip.
+    A root without mass takes the body that is fixed to it. An end with a shape remains, since it may be a fingertip.
     """
     taken: dict[str, str] = {}
     while True:
@@ -112,11 +106,11 @@ def _moved(link: Link, pose: np.ndarray) -> Link:
 
 
 def fix_wrist(urdf: Urdf, tips: Sequence[str]) -> Step:
-    """Fix the joints that move all fingertips, a wrist; cut off an arm. `tips` are the ends of all fingers."""
+    """Fix the joints of a wrist, which move all fingertips `tips`; cut off an arm, which has more than three."""
     common = [j for j in urdf.movers(tips[0]) if all(j in urdf.movers(tip) for tip in tips)] if len(tips) > 2 else []
-    if len(common) > MANY:
-        urdf, told = keep_below(urdf, common[0].child)
-        return urdf, [f"{len(common)} joints above {urdf.root} move all fingertips, an arm: {told[0]}"]
+    if len(common) > 3:
+        urdf, done = keep_below(urdf, common[0].child)
+        return urdf, [f"{len(common)} joints above {urdf.root} move all fingertips, an arm: {done[0]}"]
     if not common:
         return urdf, []
     at = {j.name: min(max(0.0, j.lower), j.upper) for j in common}
@@ -124,8 +118,8 @@ def fix_wrist(urdf: Urdf, tips: Sequence[str]) -> Step:
         if j.mimic and j.mimic.source in at:
             at[j.name] = j.mimic.ratio * at[j.mimic.source] + j.mimic.offset
     joints = tuple(_fixed(j, at[j.name]) if j.name in at else j for j in urdf.joints)
-    told = ", ".join(f"{name} at {value:.4g}" for name, value in at.items())
-    return dataclasses.replace(urdf, joints=joints), [f"joints that move all fingertips, a wrist, are fixed: {told}"]
+    places = ", ".join(f"{name} at {value:.4g}" for name, value in at.items())
+    return dataclasses.replace(urdf, joints=joints), [f"joints that move all fingertips, a wrist, are fixed: {places}"]
 
 
 def _fixed(joint: Joint, value: float) -> Joint:
@@ -138,51 +132,55 @@ def _fixed(joint: Joint, value: float) -> Joint:
     return Joint(joint.name, "fixed", joint.parent, joint.child, xyz, rpy)
 
 
-def mend_joints(urdf: Urdf) -> Step:
-    """Give limits and drives where there are none; let followers follow a leader, within the limits of both."""
-    told, joints, idle = [], {j.name: j for j in urdf.joints}, list[str]()
+def repair_joints(urdf: Urdf) -> Step:
+    """Add missing limits and drives; let coupled joints follow an independent joint, within the limits of both."""
+    done, joints, idle = [], {j.name: j for j in urdf.joints}, list[str]()
     for name, j in joints.items():
         if j.kind == "fixed":
             continue
         if math.isinf(j.upper - j.lower):
             if j.kind == "prismatic":
-                raise urdf.wrong(f"joint {name} without a limit", "lower and upper of a joint that slides")
+                raise urdf.wrong(f"joint {name} without a limit", "lower and upper limits of a sliding joint")
             j = dataclasses.replace(j, kind="revolute", lower=-math.pi, upper=math.pi)
-            told.append(f"joint {name} has no limits: it turns by up to half a turn either way")
+            done.append(f"joint {name} has no limits: they are set to half a turn either way")
         drive = (j.effort if j.effort > 0 else EFFORT, j.velocity if j.velocity > 0 else VELOCITY)
         if drive != (j.effort, j.velocity):
             idle.append(name)
             j = dataclasses.replace(j, effort=drive[0], velocity=drive[1])
         joints[name] = j
     if idle:
-        told.append(f"without effort or velocity are {', '.join(idle)}: taken {EFFORT:g} N m, {VELOCITY:g} rad/s")
+        done.append(f"{', '.join(idle)} without effort or velocity get {EFFORT:g} N m, {VELOCITY:g} rad/s")
     for name, j in joints.items():
         mimic = j.mimic
         while mimic and (above := joints[mimic.source].mimic):
             mimic = Mimic(above.source, mimic.ratio * above.ratio, mimic.ratio * above.offset + mimic.offset)
         if mimic != j.mimic:
-            told.append(f"joint {name} follows a follower of {mimic and mimic.source}: it follows that directly")
+            leader = mimic and mimic.source
+            done.append(f"joint {name} follows a follower of {leader}: it follows {leader} directly")
             joints[name] = dataclasses.replace(j, mimic=mimic)
     for name, j in joints.items():
         if j.mimic and not j.mimic.ratio:
-            raise urdf.wrong(f"joint {name} follows by a ratio of 0", "a fixed joint, or another ratio")
+            raise urdf.wrong(f"joint {name} that follows with a ratio of 0", "a fixed joint, or another ratio")
         if j.mimic:
             source = joints[j.mimic.source]
             ends = sorted((end - j.mimic.offset) / j.mimic.ratio for end in (j.lower, j.upper))
             low, high = max(source.lower, ends[0]), min(source.upper, ends[1])
             if not low < high:
-                raise urdf.wrong(f"joint {name} follows {source.name} outside its own limits", "limits that overlap")
+                raise urdf.wrong(
+                    f"joint {name} that follows {source.name} outside its own limits", "limits that overlap"
+                )
             if (low, high) != (source.lower, source.upper):
                 joints[source.name] = dataclasses.replace(source, lower=low, upper=high)
-                told.append(
+                done.append(
                     f"joint {source.name} is limited to [{low:.6g}, {high:.6g}] instead of [{source.lower:.6g}, "
                     f"{source.upper:.6g}]: {name}, which follows it, would leave its own limits"
                 )
-    return dataclasses.replace(urdf, joints=tuple(joints.values())), told
+    return dataclasses.replace(urdf, joints=tuple(joints.values())), done
 
 
-def mend_bodies(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Step:
-    """Give masses and inertias where there are none, or none that a body can have; `surfaces` are points (n, 3)."""
+def repair_bodies(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Step:
+    """Add masses and inertias where they are missing or impossible for a body; `surfaces` are points (n, 3)."""
+    far_out = 2.0  # farthest mass centre and radius of gyration, in half diagonals of the bounding box
     links, weightless, absurd = [], list[str](), list[str]()
     for link in urdf.links:
         points = surfaces.get(link.name, np.zeros((1, 3)))
@@ -190,26 +188,28 @@ def mend_bodies(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Step:
         size = np.maximum(high - low, LEAST_SIZE)
         reach, middle, mass = float(np.linalg.norm(size)) / 2, (low + high) / 2, link.mass
         if not mass > 0:
-            mass = max(LEAST_MASS, DENSITY / 2 * float(np.prod(high - low)))
+            mass = max(LEAST_MASS, 500.0 * float(np.prod(high - low)))  # half of the box is filled with 1000 kg/m3
             weightless.append(f"{link.name} ({1e3 * mass:.3g} g)")
         principal = np.linalg.eigvalsh(_matrix(link.inertia))
         sound = principal[0] > 0 and principal[0] + principal[1] >= principal[2] * (1 - 1e-6)
         known = link.name in surfaces
-        off = known and math.dist(link.com, middle) > FAR_OUT * reach
-        wide = known and principal[2] > mass * (FAR_OUT * reach) ** 2
+        off = known and math.dist(link.com, middle) > far_out * reach
+        wide = known and principal[2] > mass * (far_out * reach) ** 2
         if not link.mass > 0 or not sound or off or wide:
             absurd += [link.name] if link.mass > 0 else []
             x, y, z = middle.tolist() if off or not link.mass > 0 else link.com
             inertia = mass / 12 * np.diag(size @ size - size**2)
             link = Link(link.name, mass, (x, y, z), _triangle(inertia), link.shapes)
         links.append(link)
-    told = [f"links without mass get that of half their bounding box: {', '.join(weightless)}"] if weightless else []
+    done = (
+        [f"links without mass get the mass of half their bounding box: {', '.join(weightless)}"] if weightless else []
+    )
     if absurd:
-        told.append(
-            f"no body of its size and mass has the inertia or mass centre of {', '.join(absurd)}: taken those of the "
-            "bounding box"
+        done.append(
+            f"{', '.join(absurd)} with an inertia or mass centre that is impossible for their size and mass get those "
+            "of their bounding box"
         )
-    return dataclasses.replace(urdf, links=tuple(links)), told
+    return dataclasses.replace(urdf, links=tuple(links)), done
 
 
 def _matrix(inertia: Collection[float]) -> np.ndarray:

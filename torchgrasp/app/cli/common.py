@@ -129,7 +129,7 @@ def judge_cloud(option: str, cloud: PointCloud, view: ViewOptions, table: Plane 
         advice = diagnose_cloud(cloud, up, plane, stands=plane is not None).advice
     for bad in advice:
         if bad.refused:
-            raise BadArgument(option, bad.found, bad.mend)
+            raise BadArgument(option, bad.found, bad.fix)
     return advice
 
 

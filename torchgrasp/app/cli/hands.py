@@ -28,7 +28,7 @@ def new(
     out: Path | None = None,
     seed: int = 0,
 ) -> int:
-    """Write a first hand.toml for a URDF as it is published, and a clean copy of the URDF where it needs mending.
+    """Write a first hand.toml for a URDF as it is published, and a clean copy of the URDF where it needs repair.
 
     Args:
         urdf: the hand, with or without meshes.
@@ -57,12 +57,12 @@ def new(
         for file, text in ({urdf.name: urdf.read_text(encoding="utf-8")} | texts).items():
             write_file(trial / file, text)
         if print_faults(trial):
-            print(f"nothing is written; mend {urdf} and try again")
+            print(f"nothing is written; repair {urdf} and try again")
             return 2
         hand = check_hand(trial)
         sets = describe_sets(hand)
-    for sentence in draft.mended:
-        print(f"mended: {sentence}")
+    for sentence in draft.repairs:
+        print(f"repaired: {sentence}")
     for file, text in texts.items():
         write_file(folder / file, text)
         print(f"written: {folder / file}")

@@ -1,4 +1,4 @@
-"""Published URDFs: what they hold is mended, told, and the clean copy means the same hand."""
+"""Published URDFs: what they hold is repaired, reported, and the clean copy means the same hand."""
 
 import sys
 
@@ -35,7 +35,7 @@ def made(urdf, **wish):
     folder.mkdir()
     (folder / "hand.toml").write_text(draft.toml)
     (folder / "hand.urdf").write_text(draft.urdf)
-    return check_hand(folder), "\n".join(draft.mended)
+    return check_hand(folder), "\n".join(draft.repairs)
 
 
 def assert_same_links(hand, published, above=""):
@@ -274,7 +274,7 @@ def test_a_broken_mesh_is_refused_by_name(claw, name):
 
 
 def test_too_many_bytes_of_meshes_are_refused(claw, monkeypatch):
-    monkeypatch.setattr(sys.modules["torchgrasp.app.author.fit_shapes"], "MESH_BYTES", 500)
+    monkeypatch.setattr(sys.modules["torchgrasp.app.author.fit_shapes"], "HAND_MESH_BYTES", 1000)
     with pytest.raises(HandFileError, match="in all"):
         new_hand(mesh_claw(claw))
 
@@ -310,5 +310,5 @@ def test_the_clean_copy_reads_as_the_same_values(claw):
     first = new_hand(claw)
     (claw.parent / "hand.urdf").write_text(first.urdf)
     again = new_hand(claw.parent / "hand.urdf")
-    assert again.urdf == "" and again.mended == () and again.toml == first.toml
+    assert again.urdf == "" and again.repairs == () and again.toml == first.toml
     assert read_published(claw).joints == read_urdf(claw.parent / "hand.urdf").joints
