@@ -10,9 +10,9 @@ import torch
 import trimesh
 
 from torchgrasp.app import cli
-from torchgrasp.app.cli import grasps
-from torchgrasp.app.cli.common import check_folder
+from torchgrasp.app.cli import grasps, inputs
 from torchgrasp.app.cli.evaluate import print_score
+from torchgrasp.app.cli.inputs import check_folder
 from torchgrasp.data.shipped import DATA
 from torchgrasp.errors import MissingExtra
 from torchgrasp.evaluation.score import ViewScore
@@ -122,7 +122,7 @@ def test_what_no_file_can_be_called_is_refused_by_the_option(
     monkeypatch.chdir(tmp_path)
     assert cli.main([name if word == "NAME" else word for word in words]) == 2
     said = capsys.readouterr().err
-    assert said.startswith(f"torchgrasp: {option}: found") and said.count("\n") == 1 and len(said) < 300
+    assert said.startswith(f"torchgrasp: {option}: expected") and said.count("\n") == 1 and len(said) < 300
     assert list(tmp_path.iterdir()) == []
 
 
@@ -131,7 +131,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_work(out, tmp_pat
     (tmp_path / "file").write_text("x")
     assert cli.main(["grasp", VIEW, "--hand", "allegro", "--out", str(tmp_path / out)]) == 2
     said = capsys.readouterr().err
-    assert said.startswith("torchgrasp: --out: found") and said.count("\n") == 1
+    assert said.startswith("torchgrasp: --out: expected") and said.count("\n") == 1
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
@@ -146,7 +146,7 @@ def test_check_folder_leaves_a_folder_as_it_was(tmp_path):
 
 @pytest.mark.promise("F9")
 def test_a_missing_simulator_is_named_before_the_work(tmp_path, capsys, monkeypatch, refuse_work):
-    monkeypatch.setattr(grasps.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(inputs.importlib.util, "find_spec", lambda name: None)
     arguments = [VIEW, "--hand", "allegro", "--mesh", MESH, "--close", "--out", str(tmp_path / "out")]
     assert cli.main(["grasp", *arguments]) == 2
     assert capsys.readouterr().err == f"torchgrasp: {MissingExtra('sapien', 'sim')}\n"
@@ -156,8 +156,8 @@ def test_a_simulator_without_its_libraries_is_named_before_the_work(tmp_path, ca
     def fail(name):
         raise ImportError("libX11.so.6: cannot open shared object file")
 
-    monkeypatch.setattr(grasps.importlib.util, "find_spec", lambda name: "found")
-    monkeypatch.setattr(grasps.importlib, "import_module", fail)
+    monkeypatch.setattr(inputs.importlib.util, "find_spec", lambda name: "found")
+    monkeypatch.setattr(inputs.importlib, "import_module", fail)
     arguments = [VIEW, "--hand", "allegro", "--mesh", MESH, "--close", "--out", str(tmp_path / "out")]
     assert cli.main(["grasp", *arguments]) == 2
     said = capsys.readouterr().err
@@ -317,7 +317,7 @@ def test_the_bare_command_shows_where_to_begin(capsys):
     said = capsys.readouterr().out
     shown = [line.strip() for line in said.splitlines() if line.startswith("  torchgrasp")]
     named = {line.removeprefix("torchgrasp ") for line in shown}
-    assert len(named) == 3 and all(any(words.startswith(name) for name in cli.COMMANDS) for words in named)
+    assert len(named) == 4 and all(any(words.startswith(name) for name in cli.COMMANDS) for words in named)
 
 
 @pytest.mark.parametrize(
@@ -363,7 +363,7 @@ def test_cloud_check_refuses_by_name(name, tmp_path, capsys):
     path = bad_inputs(tmp_path)[name][0][0]
     assert cli.main(["cloud", "check", str(path)]) == 2
     said = capsys.readouterr()
-    assert said.out == "" and said.err.startswith("torchgrasp: FILE: found") and said.err.count("\n") == 1
+    assert said.out == "" and said.err.startswith("torchgrasp: FILE: expected") and said.err.count("\n") == 1
 
 
 def test_cloud_render_writes_what_cloud_check_and_shape_surface_read(tmp_path, capsys):

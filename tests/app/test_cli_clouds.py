@@ -10,7 +10,7 @@ from PIL import Image
 
 from torchgrasp.app import cli
 from torchgrasp.app.cli import grasps
-from torchgrasp.app.cli.common import ViewOptions, table_plane
+from torchgrasp.app.cli.inputs import CloudOptions
 from torchgrasp.cloud import look_at, partial_view, read_cloud, save_cloud
 from torchgrasp.cloud.camera import INTRINSICS
 from torchgrasp.cloud.check import remove_outliers
@@ -274,7 +274,7 @@ def test_scene_is_that_of_the_depth_image(tmp_path, capsys):
     words = ["cloud", "scene", str(tmp_path / "depth.npy"), "--intrinsics", *numbers, "--out", str(tmp_path / "s.npz")]
     assert cli.main([*words, "--camera-pose", str(tmp_path / "pose.txt")]) == 0
     found, said = read_scene(tmp_path / "s.npz"), capsys.readouterr().out
-    assert len(found.things) == len(load_scene().things) == said.count("thing ") and found.target is None
+    assert len(found.things) == len(load_scene().things) == said.count("object ") and found.target is None
     assert found.table is not None and abs(found.table.offset) < 0.002  # the shipped scene stands at z = 0
     np.save(tmp_path / "mask.npy", load_scene().image.depth.numpy() < 0)
     assert cli.main([*words, "--mask", str(tmp_path / "mask.npy")]) == 2
@@ -367,7 +367,7 @@ def test_malformed_depth_files_are_refused_by_name(suffix, content, tmp_path, ca
 def test_a_flying_pixel_below_the_table_is_not_where_the_table_is(up):
     seen = load_object("cylinder").view
     flying = PointCloud(torch.cat([seen.points, torch.tensor([[0.0, 0.05, -0.03]])]), viewpoint=seen.viewpoint)
-    view = ViewOptions(up=up)
-    found = [as_plane(table_plane(cloud, view, None, False)) for cloud in (seen, flying)]
+    view = CloudOptions(up=up)
+    found = [as_plane(view.plane(cloud)) for cloud in (seen, flying)]
     assert found[0].offset == found[1].offset and abs(found[0].offset) < 0.01
-    assert as_plane(table_plane(flying, view, (-0.03,), False)).offset == -0.03
+    assert as_plane(CloudOptions(up=up, table=(-0.03,)).plane(flying)).offset == -0.03

@@ -131,7 +131,7 @@ def test_every_set_of_fingers_is_checked_and_tried(tmp_path, capsys, monkeypatch
     assert main(words) == 0
     said = capsys.readouterr().out
     assert "default on the shipped cylinder: " in said and "four on the shipped cylinder: " in said
-    monkeypatch.setattr("torchgrasp.app.cli.hand_check._try_objects", lambda hand: True)
+    monkeypatch.setattr("torchgrasp.app.cli.hand_check._try_objects", lambda hand, bar: True)
     assert main([*words, "--fingers", "4"]) == 0
     said = capsys.readouterr().out
     assert "option four: 16 actuated" in said and "16 actuated of 16" in said

@@ -52,8 +52,8 @@ def middle(labels: np.ndarray, label: int) -> tuple[str, str]:
 
 @pytest.fixture(autouse=True)
 def no_report(monkeypatch):
-    monkeypatch.setattr("torchgrasp.app.cli.results.write_report", lambda path, run, view: path)
-    monkeypatch.setattr("torchgrasp.app.cli.results.write_viewer", lambda path, run: path)
+    monkeypatch.setattr("torchgrasp.app.cli.grasps.write_report", lambda path, run, view: path)
+    monkeypatch.setattr("torchgrasp.app.cli.grasps.write_viewer", lambda path, run: path)
 
 
 @pytest.mark.parametrize("click", [True, False])
@@ -78,11 +78,11 @@ def test_without_a_choice_the_easiest_thing_is_taken_and_all_are_listed(seen, gr
         asked.append((hand.finger_names, fingers))
         return ScenePlan((thing,))
 
-    monkeypatch.setattr("torchgrasp.app.cli.scene_grasps.plan_scene", note)
+    monkeypatch.setattr("torchgrasp.app.cli.grasps.plan_scene", note)
     for wanted, passed in (("default", None), ("f3,f1,f2", None), ("auto", "auto")):
         code, words = grasp(seen, "--fingers", wanted)
         assert asked.pop() == (("f3", "f1", "f2") if "," in wanted else ("f1", "f2", "f3"), passed)
-    assert code == 1 and "thing 2" in words and "too heavy" in words and "no executable grasp of any thing" in words
+    assert code == 1 and "object 2" in words and "too heavy" in words and "no executable grasp of any object" in words
 
 
 BAD = {

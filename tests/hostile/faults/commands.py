@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,9 @@ import torch
 
 from tests.campaign.cheap import records
 from torchgrasp import load_hand, load_object, plan_grasps
+from torchgrasp.app.cli import evaluate as evaluate_command
 from torchgrasp.app.cli import grasps as grasp_command
-from torchgrasp.app.cli import hand_train
+from torchgrasp.app.cli import hands as hand_commands
 from torchgrasp.app.report import page
 from torchgrasp.data.shards import JobRow, Shard, pack_shard
 from torchgrasp.data.shipped import DATA
@@ -42,8 +42,8 @@ def sample(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
 
 def train(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
     """A mixture of one Gaussian, with a checkpoint after every step."""
-    monkeypatch.setattr(hand_train, "check_hand", load_hand)
-    monkeypatch.setattr(hand_train, "STARTS", 1)
+    monkeypatch.setattr(hand_commands, "check_hand", load_hand)
+    monkeypatch.setattr(hand_commands, "STARTS", 1)
     words = ["hand", "train", "barrett", "--n", "100", "--held-out", "20", "--components", "1"]
     return lambda out: [
         *words,
@@ -93,8 +93,7 @@ def evaluate(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
         score = float(load_grasps(view.file)[row].score[0])
         return ProtocolResult(row, draw, True, Status.OK, 0.0, 0.0, score, 0.0, 0.0)
 
-    module = sys.modules["torchgrasp.app.cli.evaluate"]  # the package has the function under the same name
-    monkeypatch.setattr(module, "import_simulator", lambda name: None)
+    monkeypatch.setattr(evaluate_command, "import_simulator", lambda name: None)
     monkeypatch.setattr(campaign, "_plan", plan)
     monkeypatch.setattr(campaign, "_try", try_grasp)
     words = ["evaluate", "--objects", str(folder), "--hand", "barrett", "--grasps", "2", "--workers", "0"]
@@ -113,7 +112,7 @@ def gather(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
         return pack_shard(Shard((row,), found), meta)
 
     monkeypatch.setattr("torchgrasp.campaign.run.run_job", work)
-    monkeypatch.setattr(sys.modules["torchgrasp.app.cli.campaign"], "import_simulator", lambda name: None)
+    monkeypatch.setattr(evaluate_command, "import_simulator", lambda name: None)
     words = ["campaign", str(folder), "--hand", "barrett", "--jobs-in-shard", "2", "--workers", "0"]
     return lambda out: [*words, "--out", str(out / "campaign")]
 

@@ -58,7 +58,7 @@ def attempt(view, protocol, spec, row, draw):
 campaign._plan, campaign._try, campaign.TRIAL_LIMIT = plan, attempt, float(os.environ.get("LIMIT", "3600"))
 
 if __name__ == "__main__":
-    sys.modules["torchgrasp.app.cli.evaluate"].import_simulator = lambda name: None
+    cli.evaluate.import_simulator = lambda name: None
     cli.run_and_exit()
 """
 """`evaluate` without planning and simulation; the second grasp of the view "left" meets with something."""

@@ -1,18 +1,20 @@
-"""`torchgrasp doctor` and `torchgrasp selftest`: is this installation whole, and does it find what it should?"""
+"""`torchgrasp doctor` and `torchgrasp selftest`: is the installation complete, and are its results right?"""
 
 import importlib.metadata
 import importlib.util
 import os
 import platform
 import sys
+import time
 from typing import NamedTuple
 
 import torch
 
 from torchgrasp import __version__
-from torchgrasp.app.cli.progress import Progress
-from torchgrasp.errors import BadArgument, MissingExtra
+from torchgrasp.app.cli.command import Command, arguments, make_bar
+from torchgrasp.app.cli.inputs import import_simulator
 from torchgrasp.files import format_columns
+from torchgrasp.errors import BadArgument, MissingExtra
 from torchgrasp.hand.load import hands_folder
 from torchgrasp.specs import Simulator
 
@@ -25,20 +27,35 @@ OPTIONAL = {"distributed": ("cluster", "`torchgrasp campaign --scheduler`")}
 
 
 class Finding(NamedTuple):
-    """A part of the installation: what was found, and what mends it; "" where nothing needs to be."""
+    """A part of the installation, its state, and the fix of a fault; "" without a fault."""
 
     part: str
     found: str
     remedy: str = ""
 
 
-def doctor() -> int:
-    """Tell what is installed and what is missing, with the command that installs it.
+@arguments()
+class Doctor(Command):
+    """List installed and missing packages, with the command that installs each.
 
-    The exit code is 1 if a simulator or a package is missing; planning needs no simulator, and what one command alone
-    needs is no fault.
+    The exit code is 1 if a simulator or a package is missing. Planning needs no simulator, and a package that only one
+    command needs may be missing.
     """
-    findings = [
+
+    def run(self) -> int:
+        """Print what was found."""
+        findings = find_parts()
+        print(format_columns([(x.part, x.found) for x in findings], left={0, 1}))
+        missing = [x for x in findings if x.remedy]
+        for x in missing:
+            print(f"\n{x.part}: {x.remedy}")
+        print("\neverything is installed; `torchgrasp selftest` tries it" if not missing else "")
+        return 1 if missing else 0
+
+
+def find_parts() -> list[Finding]:
+    """Return the state of every part."""
+    return [
         Finding(
             "torchgrasp",
             f"{__version__}, hands: {', '.join(sorted(p.parent.name for p in hands_folder().glob('*/hand.toml')))}",
@@ -51,40 +68,40 @@ def doctor() -> int:
         *(_package(name, "pip install 'torchgrasp[sim]'") for name in ("coacd", "pebble")),
         *(_option(name) for name in OPTIONAL),
     ]
-    print(format_columns([(x.part, x.found) for x in findings], left={0, 1}))
-    missing = [x for x in findings if x.remedy]
-    for x in missing:
-        print(f"\n{x.part}: {x.remedy}")
-    print("\nall is there; `torchgrasp selftest` tries it" if not missing else "")
-    return 1 if missing else 0
 
 
-def selftest() -> int:
-    """Lift six shipped grasps in each simulator that is installed, and compare the verdicts with the known ones.
+@arguments()
+class Selftest(Command):
+    """Lift six shipped grasps in each installed simulator, and compare the verdicts with the known ones.
 
     The exit code is 0 if all verdicts are right, and 1 if one is wrong or no simulator is installed.
     """
-    from torchgrasp.evaluation.golden import GOLDEN, GoldenResult, run_golden
 
-    faults: dict[Simulator, str] = {name: _simulator(name).remedy for name in SIMULATORS}
-    for name, remedy in faults.items():
-        if remedy:
-            print(f"{name}: {remedy}")
-    there: list[Simulator] = [name for name in SIMULATORS if not faults[name]]
-    if not there:
-        return 1
-    progress, found = Progress(*there), dict[Simulator, list[GoldenResult]]()
-    with progress.bar:
-        for name in there:
-            found[name] = list(run_golden(name))
-            right = sum(x.right for x in found[name])
-            progress.end(name, f"{right} of {len(GOLDEN)} verdicts right")
-    rows = [("object", "hand", "expected", *found)]
-    for k, case in enumerate(GOLDEN):
-        told = [f"{_verdict(x[k].held)}{'' if x[k].right else ' (wrong)'}" for x in found.values()]
-        rows.append((case.object, case.hand, _verdict(case.held), *told))
-    print(f"\n{format_columns(rows, left=range(len(rows[0])))}")
-    return 0 if all(x.right for results in found.values() for x in results) else 1
+    def run(self) -> int:
+        """Lift, compare and print."""
+        from torchgrasp.evaluation.golden import GOLDEN, GoldenResult, run_golden
+
+        faults: dict[Simulator, str] = {name: _simulator(name).remedy for name in SIMULATORS}
+        for name, remedy in faults.items():
+            if remedy:
+                print(f"{name}: {remedy}")
+        found: dict[Simulator, list[GoldenResult]] = {name: [] for name in SIMULATORS if not faults[name]}
+        if not found:
+            return 1
+        with make_bar(len(GOLDEN) * len(found), "lift") as bar:
+            for name, results in found.items():
+                begin = time.perf_counter()
+                for result in run_golden(name):
+                    results.append(result)
+                    bar.update()
+                right, seconds = sum(x.right for x in results), time.perf_counter() - begin
+                bar.write(f"{name:8}{seconds:6.1f} s  {right} of {len(GOLDEN)} verdicts right")
+        rows = [("object", "hand", "expected", *found)]
+        for k, case in enumerate(GOLDEN):
+            verdicts = [f"{_verdict(x[k].held)}{'' if x[k].right else ' (wrong)'}" for x in found.values()]
+            rows.append((case.object, case.hand, _verdict(case.held), *verdicts))
+        print(f"\n{format_columns(rows, left=range(len(rows[0])))}")
+        return 0 if all(x.right for results in found.values() for x in results) else 1
 
 
 def _verdict(held: bool) -> str:
@@ -101,23 +118,21 @@ def _package(name: str, remedy: str = "pip install torchgrasp") -> Finding:
 
 
 def _option(name: str) -> Finding:
-    """Return the version of a package that one command needs; where it is not, what installs it is no remedy."""
+    """Return the version of a package that only one command needs; a missing one is no fault."""
     extra, command = OPTIONAL[name]
     found = _package(name)
     return found if not found.remedy else Finding(name, f"none; {command} needs it: pip install 'torchgrasp[{extra}]'")
 
 
 def _gpu() -> Finding:
-    """Return the GPU that torch sees; none is no fault."""
+    """Return the GPU that torch sees; a missing one is no fault."""
     if torch.cuda.is_available():
         return Finding("GPU", f"{torch.cuda.get_device_name()}, CUDA {torch.version.cuda}")
-    return Finding("GPU", "none that torch sees; everything runs on the processor")
+    return Finding("GPU", "none visible to torch; everything runs on the processor")
 
 
 def _simulator(name: Simulator) -> Finding:
     """Return the version of a simulator that can be imported."""
-    from torchgrasp.app.cli.grasps import import_simulator
-
     try:
         import_simulator(name)
     except (MissingExtra, BadArgument) as error:

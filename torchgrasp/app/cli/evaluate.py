@@ -1,111 +1,120 @@
-"""`torchgrasp evaluate`: the library's grasps under published protocols, in simulation."""
+"""`torchgrasp evaluate` and `torchgrasp campaign`: grasps tried in simulation, for shares or for a data set."""
 
 import contextlib
 import dataclasses
+import sys
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from torchgrasp.app.cli.common import check_seed, load_fingers, naming
-from torchgrasp.app.cli.grasps import import_simulator
+from torchgrasp.app.cli.command import Command, arguments, make_bar, naming, option, positional, required
+from torchgrasp.app.cli.inputs import FINGERS_HELP, HAND_HELP, SEED_HELP, STARTS_HELP, import_simulator, load_fingers
 from torchgrasp.app.report.evaluation import SHARE_NAMES, write_evaluation
-from torchgrasp.data import list_entries, list_views
-from torchgrasp.errors import DatasetError, Status
-from torchgrasp.evaluation.campaign import evaluate as evaluate_views
+from torchgrasp.campaign import CampaignSpec, run_campaign
+from torchgrasp.campaign.folder import FAILED
+from torchgrasp.checks import Count, Range, Seed
+from torchgrasp.files import format_columns, format_line
+from torchgrasp.data import JobRow, list_entries, list_views
+from torchgrasp.errors import BadArgument, DatasetError, Status
+from torchgrasp.evaluation.campaign import evaluate
 from torchgrasp.evaluation.intervals import format_share
 from torchgrasp.evaluation.protocols import find_protocol
 from torchgrasp.evaluation.score import ViewScore, summarise
 from torchgrasp.evaluation.views import EvaluationSpec, Ranks
-from torchgrasp.files import format_columns, format_json, format_line, hold_folder, write_file
+from torchgrasp.files import format_json, hold_folder, write_file
 from torchgrasp.specs import ClosingMode, HoldingMode, Simulator
 
+OBJECTS_HELP = "folder with manifest.json, and for each object mesh.ply and noisy views; see docs/data.md"
+PROTOCOL_HELP = "the test that decides on success; see torchgrasp.evaluation.protocols"
+Protocol = Literal["multidex", "dexgraspbench", "dexgraspbench-hard", "pose-noise", "paper", "tabletop", "household"]
 
-def evaluate(
-    objects: Path,
-    hand: str,
-    out: Path,
-    fingers: str = "default",
-    protocol: Literal[
-        "multidex", "dexgraspbench", "dexgraspbench-hard", "pose-noise", "paper", "tabletop", "household"
-    ] = "dexgraspbench",
-    closing: ClosingMode | None = None,
-    holding: HoldingMode = "force",
-    simulator: Simulator = "sapien",
-    force: float | None = None,
-    grasps: int = 20,
-    ranks: Ranks = "best",
-    starts: int = 1000,
-    complete: bool = False,
-    only: tuple[str, ...] = (),
-    views: int | None = None,
-    planned: Path | None = None,
-    workers: int = 1,
-    seed: int = 0,
-) -> int:
-    """Plan on each noisy view of a folder's objects and test the best grasps in simulation.
+
+@arguments(folder="out", path="out")
+class _Trials(Command):
+    """Arguments of trials on a folder of objects."""
+
+    hand: str = required(HAND_HELP)
+    out: Path = required("folder of the results; no other run may use it at the same time")
+    fingers: str = option("default", FINGERS_HELP)
+    closing: ClosingMode | None = option(None, "how the hand closes; by default as the protocol says")
+    simulator: Simulator = option("sapien", "physics simulator")
+    grasps: int = option(20, "most grasps that are tried of each view")
+    ranks: Ranks = option("best", "the grasps that are tried: the best, or grasps spread over all ranks")
+    starts: Count = option(1000, STARTS_HELP)
+    only: tuple[str, ...] = option((), "names of objects to use; by default all")
+    views: int | None = option(None, "most views of each object; by default all")
+    seed: Seed = option(0, SEED_HELP)
+
+    def trial(self, **changes: Any) -> dict[str, Any]:
+        """Return the changes to the trial of a protocol that were asked for."""
+        changes |= {"closing": self.closing, "simulator": self.simulator}
+        return {name: value for name, value in changes.items() if value is not None}
+
+
+@arguments()
+class Evaluate(_Trials):
+    """Plan on each noisy view of a folder's objects, and test the best grasps in simulation.
 
     Prints a line for each view, then shares with 95 % intervals over families of objects. Writes evaluate.json,
     evaluate.html, and a folder of grasps.
-
-    Args:
-        objects: folder with manifest.json, and for each object mesh.ply and noisy views.
-        hand: name of a shipped hand, as allegro, barrett, leap or shadow, or the folder of another.
-        fingers: which grasp: an option of the hand, a number of fingers, or their names as in index,middle,thumb;
-            "auto": for each view the option whose best grasps are likeliest to succeed.
-        out: folder of the results; it is made where it does not exist, and no other run may use it meanwhile.
-        protocol: which test; see torchgrasp.evaluation.protocols.
-        closing: how the hand closes; by default in open loop before a pull, under uncertainty before a lift.
-        holding: how the hand presses from then on.
-        simulator: sapien or mujoco.
-        force: normal force of the strongest finger [N]; by default 7 before a pull, 4 before a lift, 6 in
-            protocol "household".
-        grasps: the most that are tried of each view.
-        ranks: which of them: the best, or as many spread over all ranks.
-        starts: random starts of the contact planner.
-        complete: plan on the whole cloud instead of each view.
-        only: names of objects to keep; by default all.
-        views: the most of each object; by default all.
-        planned: folder "grasps" of an earlier run, whose grasps are tested.
-        workers: processes; the results do not depend on their number.
-        seed: of every random draw.
     """
-    check_seed(seed)
-    import_simulator(simulator)
-    the_hand, among = load_fingers(hand, fingers)
-    changes: dict[str, Any] = {"closing": closing, "force": force, "holding": holding, "simulator": simulator}
-    changes = {name: x for name, x in changes.items() if x is not None}
-    with naming(force="--force", grasps="--grasps", views="--views"):
-        test = find_protocol(protocol).with_trial(**changes)
-        spec = EvaluationSpec(grasps, ranks, starts, complete, only, planned is not None, seed, views, among)
-    scores = []
-    with naming(folder="--out", path="--out"), hold_folder(out):
-        with naming(objects="--objects", workers="--workers"):
-            found = evaluate_views(objects, the_hand, test, spec, folder=planned or out / "grasps", workers=workers)
-            widths = name_widths(objects, spec)
-            for score in found:
-                print_score(score, widths)
-                scores.append(score)
-        summary = summarise(scores)
-        print_summary(protocol, spec.tried, summary)
-        asked = {"hand": hand, "tried": spec.tried, "hand_sha256": the_hand.source.sha256, **dataclasses.asdict(spec)}
-        asked["fingers"] = among or the_hand.source.option
-        asked["protocol"] = dataclasses.asdict(test)
-        content = {"asked": asked, "summary": summary, "views": [dataclasses.asdict(score) for score in scores]}
-        write_file(out / "evaluate.json", format_json(content))
-        write_evaluation(out / "evaluate.html", f"Grasps of the {hand} hand under {protocol}", asked, scores)
-    return 0
+
+    objects: Path = required(OBJECTS_HELP)
+    fingers: str = option("default", f'{FINGERS_HELP}; "auto" takes for each view the most likely option to succeed')
+    protocol: Protocol = option("dexgraspbench", PROTOCOL_HELP)
+    holding: HoldingMode = option("force", "how the hand presses after closing")
+    force: float | None = option(
+        None, "normal force of the strongest finger [N]; by default 7 before a pull, 4 before a lift, 6 for household"
+    )
+    complete: bool = option(False, "plan on the whole cloud instead of each view")
+    planned: Path | None = option(None, 'folder "grasps" of an earlier run, whose grasps are tested')
+    workers: int = option(1, "processes; the results do not depend on their number")
+
+    def run(self) -> int:
+        """Evaluate, and write the results."""
+        import_simulator(self.simulator)
+        hand, among = load_fingers(self.hand, self.fingers)
+        test = find_protocol(self.protocol).with_trial(**self.trial(force=self.force, holding=self.holding))
+        spec = EvaluationSpec(
+            self.grasps, self.ranks, self.starts, self.complete, self.only, self.planned is not None, self.seed,
+            self.views, among,
+        )  # fmt: skip
+        scores = []
+        with hold_folder(self.out):
+            folder = self.planned or self.out / "grasps"
+            found = evaluate(self.objects, hand, test, spec, folder=folder, workers=self.workers)
+            names = list_names(self.objects, spec)
+            widths = max(len(ascii(name)) for name, _ in names), max(len(view) for _, view in names)
+            with make_bar(sum(view != "" for _, view in names), "view") as bar:
+                for score in found:
+                    with bar.external_write_mode(sys.stdout):
+                        print_score(score, widths)
+                    bar.update()
+                    scores.append(score)
+            summary = summarise(scores)
+            print_summary(self.protocol, spec.tried, summary)
+            asked: dict[str, Any] = {"hand": self.hand, "tried": spec.tried, "hand_sha256": hand.source.sha256}
+            asked |= dataclasses.asdict(spec) | {"fingers": among or hand.source.option}
+            asked["protocol"] = dataclasses.asdict(test)
+            content = {"asked": asked, "summary": summary, "views": [dataclasses.asdict(score) for score in scores]}
+            write_file(self.out / "evaluate.json", format_json(content))
+            title = f"Grasps of the {self.hand} hand under {self.protocol}"
+            write_evaluation(self.out / "evaluate.html", title, asked, scores)
+        return 0
 
 
-def name_widths(objects: Path, spec: EvaluationSpec) -> tuple[int, int]:
-    """Return the letters of the longest names of objects, as they are printed, and of views."""
-    names, views = list_entries(objects, spec.only), [""]
-    for name in names:
-        with contextlib.suppress(DatasetError):  # a bad entry is refused when it is its turn
-            views += [view for _, view in list_views(objects, spec.complete, [name], spec.views)]
-    return max(len(ascii(name)) for name in names), max(map(len, views))
+def list_names(objects: Path, spec: EvaluationSpec) -> list[tuple[str, str]]:
+    """Return the object and the name of each view; an object without views has the view ""."""
+    names = []
+    for name in list_entries(objects, spec.only):
+        views = [""]
+        with contextlib.suppress(DatasetError):  # a bad entry is refused when it is evaluated
+            views = [view for _, view in list_views(objects, spec.complete, [name], spec.views)] or views
+        names += [(name, view) for view in views]
+    return names
 
 
 def print_score(score: ViewScore, widths: tuple[int, int] = (12, 6)) -> None:
-    """Print the line of a view, its names in columns so wide."""
+    """Print the line of a view, with columns of these widths for its names."""
     failed = [attempt.status for attempt in score.attempts if attempt.status is not Status.OK]
     reasons = ", ".join(f"{failed.count(status)} {status.name.lower()}" for status in dict.fromkeys(failed))
     reasons = reasons if score.attempts else score.note or score.refusal.sentence
@@ -120,9 +129,8 @@ def print_summary(protocol: str, tried: str, summary: dict[str, Any]) -> None:
     for name, group in summary["by_group"].items():
         rows += [(f"{name}: {text}", format_share(group[key])) for key, text in SHARE_NAMES.items()]
     if summary["refused"]:
-        rows.append(
-            ("views without a grasp", f"{summary['refused']}: a failure of the best one, not in the grasps tried")
-        )
+        refused = f"{summary['refused']}: a failure of the best grasp, not of the grasps tried"
+        rows.append(("views without a grasp", refused))
     if len(summary["fingers"]) > 1:
         rows.append(("views by fingers", "; ".join(f"{n} {names}" for names, n in summary["fingers"].items())))
     for stage, reasons in summary["failures"].items():
@@ -133,6 +141,63 @@ def print_summary(protocol: str, tried: str, summary: dict[str, Any]) -> None:
     if summary["slip_mm"]:
         (slip, farthest), (turn, widest) = summary["slip_mm"], summary["slip_deg"]
         held = f"median {slip:.1f} mm and {turn:.1f} deg, 95 % below {farthest:.1f} mm and {widest:.1f} deg"
-        print(f"slip of what held: {held}")
+        print(f"slip of held objects: {held}")
     print(f"mean normal force of a finger {force} N, overlap at the grasp {overlap} mm (most {most} mm)")
-    print(f"CPU time {plan} s to plan on a view, {trial} s for an attempt, {total} s in all")
+    print(f"CPU time {plan} s to plan on a view, {trial} s for a trial, {total} s in all")
+
+
+@arguments()
+class Campaign(_Trials):
+    """Write a data set: for each view its cloud, grasps, certificates, predicted and simulated success.
+
+    Prints a line for each job, one object and view. Writes shards of safetensors with README.md and card.json, which
+    torchgrasp.data.read_shards reads. The same command continues a run that was interrupted or killed, and tries
+    failed jobs again: worker_died, timed_out, and broken, an error of the library. The exit code is 1 while some are
+    left.
+    """
+
+    objects: Path = positional(OBJECTS_HELP)
+    protocol: Protocol = option("tabletop", PROTOCOL_HELP)
+    licence: str = option("unknown", "licence of the data set, for its card, as CC-BY-4.0")
+    jobs_in_shard: int = option(64, "number of jobs whose records share a file")
+    workers: Annotated[int, Range(0, 1024)] = option(
+        1, "processes on this machine, 0: this process; the data do not depend on their number"
+    )
+    scheduler: str | None = option(
+        None, "address of a Dask scheduler, as tcp://10.0.0.1:8786, whose workers do the jobs instead"
+    )
+
+    def run(self) -> int:
+        """Run the campaign and print its counts."""
+        import_simulator(self.simulator)
+        if self.fingers == "auto":
+            raise BadArgument("--fingers", "auto", "one set of fingers for all records")
+        hand, _ = load_fingers(self.hand, self.fingers)
+        trials = EvaluationSpec(self.grasps, self.ranks, self.starts, only=self.only, seed=self.seed, views=self.views)
+        test = find_protocol(self.protocol).with_trial(**self.trial())
+        spec = CampaignSpec(test, trials, self.licence, self.jobs_in_shard)
+        source, name = (self.workers, "--workers") if self.scheduler is None else (self.scheduler, "--scheduler")
+        with naming(workers=name), make_bar(len(list_names(self.objects, trials)), "job") as bar:
+
+            def show(row: JobRow) -> None:
+                with bar.external_write_mode(sys.stdout):
+                    print_job(row)
+                bar.update()
+
+            data = run_campaign(self.objects, hand, self.out, spec, source, show)
+        counts = data.card["counts"]
+        print(f"{counts['jobs']} jobs: {', '.join(f'{n} {name.lower()}' for name, n in counts['status'].items())}")
+        print(f"{len(data)} grasps, {counts['passed']} of {counts['tries']} tries passed: {self.out}")
+        failed = [row for row in data.jobs if row.status in FAILED]
+        if failed:
+            reasons = ", ".join(sorted({row.status.name.lower() for row in failed}))
+            jobs = "1 job" if len(failed) == 1 else f"{len(failed)} jobs"
+            print(f"{jobs} failed by no fault of the object ({reasons}): the same command tries again")
+        return 1 if failed else 0
+
+
+def print_job(row: JobRow) -> None:
+    """Print the line of a finished job."""
+    reason = "" if row.status is Status.OK else row.note or row.status.sentence
+    numbers = row.executable, f"{row.passed}/{row.grasps}"
+    print(format_line((row.object, row.view, *numbers, reason), (-12, -6, 5, 7, -1)), flush=True)

@@ -1,216 +1,266 @@
-"""`torchgrasp grasp`: from a cloud to a held object; `torchgrasp objects` lists examples."""
+"""`torchgrasp grasp`, which plans grasps of an object in a cloud or a scene; `objects` and `view`."""
 
 import dataclasses
-import importlib
-import importlib.util
-import math
-import re
-import warnings
+import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Literal
 
-from tyro.conf import Positional, arg
-
-from torchgrasp.app.cli.common import (
-    AS_IT_IS,
-    ViewOptions,
+from torchgrasp.app.cli.command import Command, Progress, arguments, naming, nested, option, positional
+from torchgrasp.app.cli.inputs import (
+    CLOUD_HELP,
+    FINGERS_HELP,
+    HAND_HELP,
+    STARTS_HELP,
+    CloudOptions,
     check_folder,
-    check_seed,
     describe_table,
+    find_cloud,
     holding,
-    judge_cloud,
+    import_simulator,
     load_fingers,
-    naming,
+    object_name,
     print_notes,
-    read_view,
-    table_plane,
 )
-from torchgrasp.app.cli.progress import Progress
-from torchgrasp.app.cli.results import write_results
-from torchgrasp.app.cli.scene_grasps import Wanted, grasp_scene
-from torchgrasp.app.report.page import GRASP_COLUMNS, grasp_rows
+from torchgrasp.app.report.page import GRASP_COLUMNS, grasp_rows, write_report
 from torchgrasp.app.report.run import Run, verdict
-from torchgrasp.base import check_number, check_whole
+from torchgrasp.app.report.viewer import VIEW, write_viewer
+from torchgrasp.checks import Count, Seed
+from torchgrasp.files import format_columns, format_line
 from torchgrasp.data.shipped import DATA, MASSES, list_objects, load_object
-from torchgrasp.errors import BadArgument, MissingExtra, Status
+from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.lift import close_hand
-from torchgrasp.files import format_columns, sha256
+from torchgrasp.files import sha256
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surface
+from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
 from torchgrasp.planner.explain import explain_empty
 from torchgrasp.planner.grasps import plan_grasps
+from torchgrasp.planner.problem import take_target
+from torchgrasp.planner.scene import plan_scene
 from torchgrasp.scene.image import is_scene
+from torchgrasp.scene.scene import Scene, read_scene
 from torchgrasp.shape.surface import extract_surface
-from torchgrasp.specs import ContactSpec, Mode, Simulator, TrialSpec
+from torchgrasp.specs import ContactSpec, Mode, TrialSpec
 
 if TYPE_CHECKING:
     import trimesh
 
-
-def objects() -> int:
-    """List the shipped objects, each with a noisy view and a true mesh."""
-    for name in list_objects():
-        print(f"{name} ({MASSES[name]:g} kg)\n  view: {DATA / name / 'view.ply'}\n  mesh: {DATA / name / 'mesh.ply'}")
-    return 0
+Among = Literal["auto"] | None
 
 
-def grasp(
-    cloud: Annotated[Positional[Path], arg(metavar="CLOUD")],
-    /,
-    hand: str,
-    out: Path,
-    mesh: Path | None = None,
-    close: bool = False,
-    seed: int = 0,
-    starts: int = 1000,
-    time_budget: float | None = None,
-    view: Annotated[ViewOptions, arg(name="")] = AS_IT_IS,
-    table: tuple[float, ...] | None = None,
-    no_table: bool = False,
-    friction: float = 0.8,
-    fingers: str = "default",
-    mode: Mode = "joint",
-    label: int | None = None,
-    point: tuple[float, float] | None = None,
-    no_report: bool = False,
-) -> int:
-    """Plan grasps of the object in a partial cloud, and close on it in simulation; or of a thing in a scene.
+@arguments(points="cloud", normals="cloud", path="out", target="label")
+class Grasp(Command):
+    """Plan grasps of the object in a partial cloud, and close on it in simulation; or of an object in a scene.
 
-    Writes grasps.safetensors, report.html and view.html, which turns, into the output folder. Where no grasp is
-    executable, single changes are tried, and the one that helps most is named. The cloud is checked as by `cloud
-    check`. Refused are: a camera below the table or that the points contradict, a plane left in, two bodies, and
-    another unit. Other findings are printed as advice.
-
-    Args:
-        cloud: point cloud of one object (.ply, .pcd, .npy, .npz, .xyz, .txt, .csv), or a scene (.npz with depth and
-            intrinsics; see docs/scenes.md).
-        hand: name of a shipped hand, as allegro, barrett, leap or shadow, or the folder of another.
-        out: folder of the results; it is made where it does not exist.
-        mesh: true mesh of the object [m] in the frame of the cloud; only the simulator sees it.
-        close: close the best grasp on the mesh, lift it and hold it (needs the extra "sim").
-        seed: of every random draw; the same seed gives the same grasps.
-        starts: random starts of the contact planner.
-        time_budget: seconds for planning; the wave of starts that ends after them is the last. By default all starts.
-        view: how the file of the cloud is meant.
-        table: height of the table along the vertical, or four numbers nx ny nz d of the plane n . p = d, in metres; by
-            default the table is at the lowest point of the cloud that is no outlier.
-        no_table: there is no table.
-        friction: coefficient of friction between fingertips and object.
-        fingers: which grasp: an option of the hand, a number of fingers, or their names as in index,middle,thumb;
-            "auto" tries the options, and takes the one whose best grasps are likeliest to succeed.
-        mode: contacts, pose and joints together; contacts first and the learned model after; or the paper as written.
-        label: of the thing to grasp in a scene; by default the easiest.
-        point: column and row of a pixel on the thing to grasp in a scene.
-        no_report: write the grasps alone, without the pages.
+    Writes grasps.safetensors, report.html and the 3D page view.html into the output folder. If no grasp is executable,
+    single changes are tried, and the change that helps most is named. The cloud is checked as by `cloud check`. Refused
+    are a camera below the table, a camera that the points contradict, a plane left in, two bodies and another unit.
+    Other findings are printed as advice.
     """
-    with naming(path="--out"):
-        check_folder(out)
-    if is_scene(cloud):
-        if label is not None and point is not None:
-            raise BadArgument("--point", "--label beside it", "one of the two")
-        if mesh is not None or view != AS_IT_IS or table is not None or no_table or mode != "joint" or time_budget:
-            found = "an option of clouds beside a scene"
-            raise BadArgument(
-                "CLOUD", found, "--label or --point, --hand, --fingers, --out, --seed, --starts, --friction"
-            )
-        the_hand, among = load_fingers(hand, fingers)
-        with naming(friction="--friction"):
-            spec = ContactSpec(friction=friction)
-        check_whole("--starts", starts, 1, 1_000_000)
-        check_seed(seed)
-        wanted = Wanted(the_hand, spec, starts, seed, among)
-        return grasp_scene(cloud, wanted, point if label is None else label, out, no_report)
-    if label is not None or point is not None:
-        raise BadArgument("--label, --point", f"{cloud}, which is no scene", "a .npz file with depth and intrinsics")
-    if close:
-        if mesh is None:
-            raise BadArgument("--close", "no --mesh", "--close together with --mesh")
-        import_simulator()
-    check_whole("--starts", starts, 1, 1_000_000)
-    check_seed(seed)
-    if time_budget is not None:
-        check_number("--time-budget", time_budget, 1e-3, math.inf)
-    the_hand, among = load_fingers(hand, fingers)
-    file = read_view("CLOUD", cloud, view)
-    partial, plane = file.cloud, table_plane(file.cloud, view, table, no_table)
-    with naming(mesh="--mesh", friction="--friction", table="--table"):
-        true_mesh, parts = (None, None) if mesh is None else read_true_mesh(mesh)
-        spec = (ContactSpec.paper if mode == "paper" else ContactSpec)(friction=friction, table=plane)
-        trial = TrialSpec(friction=friction)
-    print_notes(file.notes, judge_cloud("CLOUD", partial, view, plane))
 
-    names = [
-        *["fingers"] * (among is not None),
-        "shape",
-        "plan",
-        "certify",
-        "query",
-        "refine",
-        *["closing"] * close,
-        "report",
-    ]
-    progress = Progress(*names)
-    with progress.bar, holding("--out", out):
-        origin = "no table" if plane is None else describe_table(plane)
-        origin += " (lowest point)" * (plane is not None and table is None)
-        camera = "camera known" if partial.viewpoint is not None else "camera estimated"
-        progress.end("cloud", f"{len(partial)} points, {camera}, {origin}")
-        grasps = plan_grasps(
-            partial, the_hand, spec, starts, seed, fingers=among, mode=mode, observer=progress.end,
-            time_budget=time_budget,
-        )  # fmt: skip
-        explanation = None
-        if not bool((grasps.status == Status.OK).any()):
-            options = {"fingers": among, "mode": mode, "observer": progress.end}
-            explanation = explain_empty(partial, the_hand, spec, starts, seed, **options)
-        the_hand = hand_of(grasps, the_hand)
-        surface, plan = extract_surface(progress.values["shape"]), progress.values["plan"]
-        name = object_name(cloud if mesh is None else mesh)
-        stages = tuple(progress.stages)
-        run = Run(name, cloud, partial, the_hand, spec, surface, grasps, stages, plan, explanation=explanation)
-        if close and true_mesh is not None and len(run.executable):
-            felt = field_from_surface(surface.vertices, surface.faces, FIELD_SPACING)
-            closure = close_hand(run.executable[0], the_hand, true_mesh, trial, seed=seed, parts=parts, surface=felt)
-            progress.end("closing", f"{closure.time[-1]:.1f} s simulated, {closure.status.name.lower()}")
-            run = dataclasses.replace(run, stages=tuple(progress.stages), mesh=true_mesh, closure=closure)
-        with naming(path="--out"):
-            progress.end("report", write_results(out, run, no_report))
+    cloud: Path = positional(
+        f"{CLOUD_HELP}, a scene (.npz with depth and intrinsics; see docs/scenes.md), or the name of a shipped object, "
+        "as jug"
+    )
+    hand: str = option("allegro", HAND_HELP)
+    out: Path | None = option(None, "folder of the results; by default out/ and the name of the object")
+    mesh: Path | None = option(
+        None,
+        "true mesh of the object [m] in the frame of the cloud, for the simulator; a shipped object has one",
+    )
+    close: bool = option(False, 'close the best grasp on the mesh, lift it and hold it (needs the extra "sim")')
+    seed: Seed = option(0, "random seed; the same seed gives the same grasps")
+    starts: Count = option(1000, STARTS_HELP)
+    time_budget: float | None = option(
+        None,
+        "seconds for planning; the batch that ends after them is the last. By default there is no limit",
+    )
+    view: CloudOptions = nested(CloudOptions())
+    friction: float = option(0.8, "coefficient of friction between fingertips and object")
+    fingers: str = option(
+        "default", f'{FINGERS_HELP}; "auto" tries the options of the hand and takes the most likely to succeed'
+    )
+    mode: Mode = option(
+        "joint",
+        "contacts, pose and joints together; contacts first, then the learned model; or the paper as written",
+    )
+    label: int | None = option(None, "label of the object to grasp in a scene; by default the easiest")
+    point: tuple[float, float] | None = option(None, "column and row of a pixel on the object to grasp in a scene")
+    no_report: bool = option(False, "write the grasps without the pages")
+
+    def run(self) -> int:
+        """Plan, close if asked, and write the results."""
+        path = find_cloud(self.cloud)
+        out = Path("out") / object_name(path) if self.out is None else self.out
+        check_folder(out)
+        scene = is_scene(path)
+        self._check_choice(scene)
+        hand, among = load_fingers(self.hand, self.fingers)
+        return self._grasp_scene(path, out, hand, among) if scene else self._grasp_cloud(path, out, hand, among)
+
+    def _check_choice(self, scene: bool) -> None:
+        """Refuse options that do not fit a cloud or a scene."""
+        if scene:
+            if self.label is not None and self.point is not None:
+                raise BadArgument("--point", "--label beside it", "one of the two")
+            if self.mesh or self.view != CloudOptions() or self.mode != "joint" or self.time_budget:
+                options = "--label or --point, --hand, --fingers, --out, --seed, --starts, --friction"
+                raise BadArgument("CLOUD", "an option of clouds beside a scene", options)
+        elif self.label is not None or self.point is not None:
+            wanted = "a .npz file with depth and intrinsics"
+            raise BadArgument("--label, --point", f"{self.cloud}, which is no scene", wanted)
+        elif self.time_budget is not None and not self.time_budget >= 1e-3:
+            raise BadArgument("--time-budget", self.time_budget, "at least 0.001 seconds")
+
+    def _grasp_cloud(self, path: Path, out: Path, hand: Hand, among: Among) -> int:
+        """Plan on a cloud."""
+        mesh = self._true_mesh(path)
+        file = self.view.read("CLOUD", path)
+        cloud, table = file.cloud, self.view.plane(file.cloud)
+        make = ContactSpec.paper if self.mode == "paper" else ContactSpec
+        spec, trial = make(friction=self.friction, table=table), TrialSpec(friction=self.friction)
+        true_mesh, parts = (None, None) if mesh is None else read_true_mesh(mesh)
+        print_notes(file.notes, self.view.judge(cloud, table))
+        progress = Progress(*["fingers"] * (among is not None), *STAGES, *["closing"] * self.close, "report")
+        with progress.bar, holding("--out", out):
+            origin = "no table" if table is None else describe_table(table)
+            origin += " (lowest point)" * (table is not None and self.view.table is None)
+            camera = "camera known" if cloud.viewpoint is not None else "camera estimated"
+            progress.end("cloud", f"{len(cloud)} points, {camera}, {origin}")
+            options = {"fingers": among, "mode": self.mode, "observer": progress.end}
+            grasps = plan_grasps(cloud, hand, spec, self.starts, self.seed, **options, time_budget=self.time_budget)
+            explanation = None
+            if not bool((grasps.status == Status.OK).any()):
+                explanation = explain_empty(cloud, hand, spec, self.starts, self.seed, **options)
+            hand, name = hand_of(grasps, hand), object_name(path if mesh is None else mesh)
+            surface, plan = extract_surface(progress.values["shape"]), progress.values["plan"]
+            stages = tuple(progress.stages)
+            run = Run(name, path, cloud, hand, spec, surface, grasps, stages, plan, explanation=explanation)
+            if self.close and true_mesh is not None and len(run.executable):
+                felt = field_from_surface(surface.vertices, surface.faces, FIELD_SPACING)
+                closure = close_hand(
+                    run.executable[0], hand, true_mesh, trial, seed=self.seed, parts=parts, surface=felt
+                )
+                progress.end("closing", f"{closure.time[-1]:.1f} s simulated, {closure.status.name.lower()}")
+                run = dataclasses.replace(run, stages=tuple(progress.stages), mesh=true_mesh, closure=closure)
+            progress.end("report", write_results(out, run, self.no_report))
+        executable = print_grasps(run)
+        return 0 if (run.closure is not None and run.closure.held if self.close else executable) else 1
+
+    def _true_mesh(self, path: Path) -> Path | None:
+        """Return the mesh to close on; a shipped object has one. Check that the simulator can be loaded."""
+        shipped = path != self.cloud  # the cloud is given by name
+        mesh = path.with_name("mesh.ply") if shipped and self.close and self.mesh is None else self.mesh
+        if self.close and mesh is None:
+            raise BadArgument("--close", "no --mesh", "--close together with --mesh")
+        if self.close:
+            import_simulator()
+        return mesh
+
+    def _grasp_scene(self, path: Path, out: Path, hand: Hand, among: Among) -> int:
+        """Plan for an object in a scene: the chosen one, or the easiest."""
+        spec, choice = ContactSpec(friction=self.friction), self.point if self.label is None else self.label
+        names = {name: f"CLOUD: {name}" for name in ("depth", "intrinsics", "mask", "labels", "camera_pose", "table")}
+        with naming(path="CLOUD", points="CLOUD", target="--label", point="--point", **names):
+            scene = read_scene(path)
+            scene = scene if choice is None else scene.select(choice)
+        progress = Progress("scene", *["fingers"] * (among is not None), *STAGES, "report")
+        with progress.bar, holding("--out", out):
+            progress.end("scene", f"{len(scene.things)} objects, labels {', '.join(map(str, scene.things))}")
+            for sentence in scene.advice:
+                print(f"advice  {sentence}")
+            options = {"fingers": among, "observer": progress.end}
+            explanation = None
+            if scene.target is not None:
+                grasps = plan_grasps(scene, hand, spec, self.starts, self.seed, **options)
+                shape = progress.values["shape"]
+                if not bool((grasps.status == Status.OK).any()):
+                    explanation = explain_empty(scene, hand, spec, self.starts, self.seed, **options)
+            else:
+                best = self._find_easiest(scene, hand, spec, among, progress)
+                if best is None:
+                    return 1
+                scene, grasps, shape = best
+            spec, hand = dataclasses.replace(spec, table=scene.table), hand_of(grasps, hand)
+            cloud, name, surface = take_target(scene, self.seed), f"object {scene.target}", extract_surface(shape)
+            stages, plan = tuple(progress.stages), progress.values.get("plan")
+            run = Run(name, path, cloud, hand, spec, surface, grasps, stages, plan, None, None, scene, explanation)
+            progress.end("report", write_results(out, run, self.no_report))
+        return 0 if print_grasps(run) else 1
+
+    def _find_easiest(self, scene: Scene, hand: Hand, spec: ContactSpec, among: Among, progress: Progress):
+        """Plan for the objects of a scene until one is easy; return the scene with it as target, grasps and shape."""
+        # An object with this predicted success is easy enough: the others are not tried.
+        plan = plan_scene(scene, hand, spec, self.starts, self.seed, fingers=among, enough=0.9)
+        for thing in plan.things:
+            text = thing.reason or f"{0 if thing.grasps is None else len(thing.grasps)} executable grasps"
+            print(format_line((f"object {thing.label}", f"{thing.success:.0%}", text), (-10, 5, -1)), flush=True)
+        progress.end("objects", f"{sum(thing.grasps is not None for thing in plan.things)} with a grasp")
+        if plan.best is None or plan.best.grasps is None or plan.best.shape is None:
+            print(f"The {hand.name} hand has no executable grasp of any object in the scene.")
+            print("With --label or --point, changes that would help are tried for one of them.")
+            return None
+        return dataclasses.replace(scene, target=plan.best.label), plan.best.grasps, plan.best.shape
+
+
+STAGES = ("shape", "plan", "certify", "query", "refine")
+"""Stages of planning, as the planner reports them."""
+
+
+def write_results(out: Path, run: Run, no_report: bool) -> str:
+    """Write the grasps of a run, and its pages if wanted; return the paths as text."""
+    paths = [out / "grasps.safetensors"]
+    run.grasps.save(paths[0])
+    if not no_report:
+        paths += [write_report(out / "report.html", run, VIEW), write_viewer(out / VIEW, run)]
+    return ", ".join(map(str, paths))
+
+
+def print_grasps(run: Run) -> bool:
+    """Print the five best grasps and the verdict; return whether any grasp is executable."""
     if len(run.executable):
         print(f"\n{format_columns([GRASP_COLUMNS, *grasp_rows(run.executable, 5)])}\n")
     print(verdict(run))
-    done = run.closure is not None and run.closure.held if close else len(run.executable) > 0
-    return 0 if done else 1
+    return len(run.executable) > 0
 
 
-def import_simulator(name: Simulator = "sapien") -> None:
-    """Import a simulator; refuse one that cannot be loaded."""
-    if importlib.util.find_spec(name) is None:
-        raise MissingExtra(name, "sim" if name == "sapien" else name)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a missing Vulkan does not concern physics
-            importlib.import_module(name)
-    except ImportError as error:
-        allowed = "one whose libraries are there (Debian and Ubuntu: apt-get install libx11-6)"
-        raise BadArgument("--close", f"a {name} that cannot be loaded ({error})", allowed) from error
+@arguments()
+class View(Command):
+    """Open the 3D page of a folder that `torchgrasp grasp` wrote, view.html, in the browser."""
+
+    folder: Path = positional("folder that `torchgrasp grasp` wrote")
+    no_browser: bool = option(False, "only print the address")
+
+    def run(self) -> int:
+        """Print the address of the page and open it."""
+        page = (self.folder if self.folder.is_dir() else self.folder.parent) / VIEW
+        if not page.is_file():
+            wanted = "a folder that `torchgrasp grasp` wrote with a report"
+            raise BadArgument("FOLDER", f"{self.folder} without {VIEW}", wanted)
+        print(page.resolve().as_uri())
+        if not self.no_browser:
+            webbrowser.open(page.resolve().as_uri())
+        return 0
+
+
+@arguments()
+class Objects(Command):
+    """List the shipped objects, each with a noisy view and a true mesh."""
+
+    def run(self) -> int:
+        """Print names, masses and files."""
+        for name in list_objects():
+            folder = DATA / name
+            print(f"{name} ({MASSES[name]:g} kg)\n  view: {folder / 'view.ply'}\n  mesh: {folder / 'mesh.ply'}")
+        return 0
 
 
 def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] | None]":
-    """Read a closed mesh, with the convex parts of a shipped object."""
-    mesh, digest = read_mesh(path), sha256(path)
+    """Read the closed mesh of --mesh, with the convex parts of a shipped object."""
+    with naming(path="--mesh", mesh="--mesh"):
+        mesh, digest = read_mesh(path), sha256(path)
     for name in list_objects():
         if sha256(DATA / name / "mesh.ply") == digest:
             return mesh, load_object(name).parts
     return mesh, None
-
-
-def object_name(path: Path) -> str:
-    """Name an object by its file, or by its folder where files have the names of docs/data.md.
-
-    >>> object_name(Path("objects/jug/view0_noisy.ply")), object_name(Path("mug.pcd")), object_name(Path("cloud.ply"))
-    ('jug', 'mug', 'object in cloud.ply')
-    """
-    if re.fullmatch(r"(mesh|view\d*)(_noisy)?", path.stem):
-        return path.resolve().parent.name or "object"
-    return f"object in {path.name}" if path.stem in ("cloud", "model", "points", "scan") else path.stem

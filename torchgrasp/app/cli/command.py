@@ -1,0 +1,146 @@
+"""Commands as frozen values: each field is an argument with its default and its help, and `run` does the work."""
+
+import contextlib
+import dataclasses
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_origin
+
+import tyro
+from tqdm import tqdm
+
+from torchgrasp.checks import Range, check_path
+from torchgrasp.errors import BadArgument
+
+T = TypeVar("T")
+
+
+class Command:
+    """A command of the command line; `names` are fields by the names that errors of the library use for them."""
+
+    names: ClassVar[dict[str, str]] = {}
+
+    def run(self) -> int:
+        """Do the work; return the exit code."""
+        raise NotImplementedError
+
+
+def option(default: Any, help: str) -> Any:
+    """Return a field that is an option, `--its-name`."""
+    return dataclasses.field(default=default, metadata={"help": help})
+
+
+def required(help: str) -> Any:
+    """Return a field that is an option without a default."""
+    return dataclasses.field(metadata={"help": help})
+
+
+def positional(help: str) -> Any:
+    """Return a field that is a positional argument."""
+    return dataclasses.field(metadata={"help": help, "positional": True})
+
+
+def nested(default: Any) -> Any:
+    """Return a field whose own fields are options of the command."""
+    return dataclasses.field(default=default, metadata={"nested": True})
+
+
+def arguments(**names: str) -> Callable[[type[T]], type[T]]:
+    """Return a decorator that makes a frozen dataclass whose fields are arguments, as tyro shows them.
+
+    `names` are fields by the names that errors of the library use for them.
+    """
+
+    def make(cls: type[T]) -> type[T]:
+        made: Any = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+        made.__annotations__ = {f.name: _annotate(f) for f in dataclasses.fields(made)}
+        made.names = getattr(cls, "names", {}) | names
+        return made
+
+    return make
+
+
+def _annotate(field: dataclasses.Field) -> Any:
+    """Return the annotation of a field with its help; the help does not show the defaults None, False and ()."""
+    if field.metadata.get("nested"):
+        return Annotated[field.type, tyro.conf.arg(name="")]
+    text = field.metadata["help"]
+    if field.metadata.get("positional"):
+        return Annotated[tyro.conf.Positional[field.type], tyro.conf.arg(help=text, metavar=field.name.upper())]
+    if not any(field.default is empty for empty in (None, False, ())):
+        return Annotated[field.type, tyro.conf.arg(help=text)]
+    kinds = [kind for kind in get_args(field.type) if kind is not type(None)]
+    metavar = _metavar(kinds[0]) if type(None) in get_args(field.type) and len(kinds) == 1 else None
+    return Annotated[field.type, tyro.conf.arg(help=text, metavar=metavar, help_behavior_hint="")]
+
+
+def _metavar(kind: Any) -> str:
+    """Return the placeholder of a value in the help, as "FLOAT FLOAT" or "{a,b}"."""
+    parts = get_args(kind)
+    if get_origin(kind) is Annotated:
+        return _metavar(parts[0])
+    if get_origin(kind) is Literal:
+        return f"{{{','.join(map(str, parts))}}}"
+    if get_origin(kind) is tuple:
+        return f"{_metavar(parts[0])} [{_metavar(parts[0])} ...]" if ... in parts else " ".join(map(_metavar, parts))
+    return "PATH" if kind is Path else kind.__name__.upper()
+
+
+def execute(command: Command) -> int:
+    """Check paths and ranges of numbers, and run a command; errors name its options."""
+    fields = {f.name: f for f in dataclasses.fields(command) if "help" in f.metadata}  # pyright: ignore[reportArgumentType]
+    options = {
+        name: name.upper() if field.metadata.get("positional") else f"--{name.replace('_', '-')}"
+        for name, field in fields.items()
+    }
+    for name, field in fields.items():
+        value: Any = getattr(command, name)
+        for limits in get_args(field.type):
+            if isinstance(limits, Range) and not limits.low <= value <= limits.high:
+                raise BadArgument(options[name], value, limits.describe("a whole number"))
+        if isinstance(value, Path):
+            check_path(options[name], value)
+    with naming(**options | {argument: options[name] for argument, name in command.names.items()}):
+        return command.run()
+
+
+@contextlib.contextmanager
+def naming(**options: str) -> Iterator[None]:
+    """Name options in errors, by the argument for which each is given."""
+    try:
+        yield
+    except BadArgument as error:
+        argument = error.argument.split("[")[0]  # an item of a list has its place in brackets
+        if argument not in options:
+            raise
+        raise type(error)(options[argument], error.found, error.allowed) from error
+
+
+class Progress:
+    """A printed line for each stage that ended; on a terminal, a bar names the current stage."""
+
+    def __init__(self, *names: str) -> None:
+        self.next = dict(zip(names, (*names[1:], "done"), strict=True))
+        self.stages: list[tuple[str, str, float]] = []
+        self.values: dict[str, Any] = {}
+        self.began = time.perf_counter()
+        self.bar = make_bar(len(names), "stage", desc=names[0], delay=1)
+
+    def end(self, name: str, message: str, value: Any = None) -> None:
+        """Note the end of a stage."""
+        now = time.perf_counter()
+        self.stages.append((name, message, now - self.began))
+        self.values[name] = value
+        with self.bar.external_write_mode(sys.stdout):
+            print(f"{name:8}{now - self.began:6.1f} s  {message}", flush=True)
+        self.began = now
+        if name in self.next:
+            self.bar.update()
+            self.bar.set_description(self.next[name])
+
+
+def make_bar(total: int | None, unit: str, **options: Any) -> tqdm:
+    """Return a bar with the estimated end; it is silent where stderr is no terminal."""
+    return tqdm(total=total, unit=unit, disable=None, leave=False, **options)

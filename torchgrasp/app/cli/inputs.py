@@ -1,0 +1,231 @@
+"""Arguments that several commands share: how a file of a cloud is read, the table, the hand, and output folders."""
+
+import contextlib
+import importlib
+import importlib.util
+import re
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from torchgrasp.app.cli.command import arguments, naming, option
+from torchgrasp.checks import check_tensor
+from torchgrasp.cloud import Advice, CloudFile, check_cloud, diagnose_cloud, read_cloud_file
+from torchgrasp.cloud.depth import read_pose
+from torchgrasp.cloud.neighbours import draw_rows, find_inliers
+from torchgrasp.data.shipped import DATA, list_objects
+from torchgrasp.errors import BadArgument, MissingExtra, OutputError
+from torchgrasp.files import hold_folder
+from torchgrasp.geometry.frames import apply, rotate
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.plane import Plane, as_plane
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import load_hand
+from torchgrasp.specs import Simulator
+from torchgrasp.values import PointCloud
+
+MOST_POINTS = 100_000
+"""Most points of a file that are used; a shape is fitted to fewer."""
+CLOUD_HELP = "point cloud of one object (.ply, .pcd, .npy, .npz, .xyz, .txt, .csv)"
+OUT_CLOUD_HELP = "point cloud to write (.npz or .ply), in metres"
+HAND_HELP = "name of a shipped hand (allegro, barrett, leap, shadow), or the folder of another hand"
+FINGERS_HELP = "fingers that grasp: an option of the hand, a number of fingers, or names as in index,middle,thumb"
+STARTS_HELP = "random initial guesses of the contact planner"
+SEED_HELP = "random seed"
+
+
+@arguments()
+class ViewOptions:
+    """How the file of a cloud is read."""
+
+    viewpoint: tuple[float, float, float] | None = option(
+        None, "position of the camera [m] in the frame of the cloud; by default the file's, else an estimate"
+    )
+    no_viewpoint: bool = option(False, "estimate the camera's position instead of using the file's")
+    no_normals: bool = option(False, "fit normals instead of using the file's")
+    unit: Literal["m", "cm", "mm"] = option("m", "unit of the numbers in the file; options and results are in metres")
+    up: tuple[float, float, float] | None = option(
+        None, "vertical direction in the frame of the cloud, of any length; by default z"
+    )
+    camera_pose: Path | None = option(
+        None,
+        "file with frame_from_camera, 4 x 4 (.npy or .txt), for a cloud in the camera's frame (x right, y down, z "
+        "forward). The cloud is moved into the pose's frame; results are in this frame, and the camera is known",
+    )
+
+    @property
+    def vertical(self) -> Tensor | None:
+        """The vertical, of unit length; None: z."""
+        if self.up is None:
+            return None
+        vector = check_tensor("--up", torch.tensor(self.up, dtype=torch.float64), (3,))
+        if not bool(vector.any()):
+            raise BadArgument("--up", "a vector of length zero", "the direction that points up")
+        return unit(vector)
+
+    def read(self, name: str, path: Path, whole: bool = False) -> CloudFile:
+        """Read the cloud of an argument; `whole` accepts scenes of any size and keeps all points."""
+        if self.viewpoint is not None and (self.no_viewpoint or self.camera_pose is not None):
+            raise BadArgument("--viewpoint", "--no-viewpoint or --camera-pose beside it", "one of them")
+        with naming(path=name, points=name, normals=name, viewpoint="--viewpoint"):
+            file = read_cloud_file(path, self.viewpoint, self.unit)
+            cloud, notes = file.cloud, file.notes
+            if self.no_viewpoint:
+                cloud = PointCloud(cloud.points, cloud.normals)
+            if self.no_normals:
+                cloud = PointCloud(cloud.points, None, cloud.viewpoint, cloud.frustum)
+            if self.camera_pose is not None:
+                cloud = _move(name, cloud, read_pose("--camera-pose", self.camera_pose))
+                notes = tuple(note for note in notes if "default viewpoint" not in note)
+            if not whole:
+                check_cloud(cloud)
+                if len(cloud) > MOST_POINTS:
+                    notes = (*notes, f"{MOST_POINTS} of {len(cloud)} points, drawn at random, are used")
+                    cloud = cloud.select(draw_rows(len(cloud), MOST_POINTS))
+        return CloudFile(cloud, notes)
+
+
+@arguments()
+class CloudOptions(ViewOptions):
+    """How the file of a cloud is read, and where the table is."""
+
+    table: tuple[float, ...] | None = option(
+        None,
+        "height of the table along the vertical, or four numbers nx ny nz d of the plane n . p = d [m]; by default the "
+        "table is at the lowest point of the cloud that is no outlier",
+    )
+    no_table: bool = option(False, "there is no table")
+
+    def plane(self, cloud: PointCloud) -> Plane | float | None:
+        """Return the table: a plane, or its height [m] along z."""
+        table = self.table
+        if table is not None and self.no_table:
+            raise BadArgument("--table", f"{' '.join(f'{x:g}' for x in table)} and --no-table", "one of the two")
+        if self.no_table:
+            return None
+        if table is not None and len(table) not in (1, 4):
+            raise BadArgument("--table", f"{len(table)} numbers", "a height, or four: a normal and its distance")
+        numbers = (
+            None if table is None else check_tensor("--table", torch.tensor(table, dtype=torch.float64), (len(table),))
+        )
+        if numbers is not None and len(numbers) == 4:
+            length = torch.linalg.vector_norm(numbers[:3])
+            if not bool(length > 0):
+                raise BadArgument("--table", "a normal of length zero", "the direction that points up")
+            return Plane(numbers[:3] / length, float(numbers[3] / length))
+        up = self.vertical
+        if numbers is None:
+            seen = cloud.points[find_inliers(cloud.points.double())]
+            height = float((seen[:, 2] if up is None else seen.double() @ up).min())
+        else:
+            height = float(numbers[0])
+        return height if up is None else Plane(up, height)
+
+    def judge(self, cloud: PointCloud, table: Plane | float | None) -> tuple[Advice, ...]:
+        """Return advice on the cloud of CLOUD; refuse a cloud on which no grasp should be planned."""
+        plane = as_plane(table)
+        up = self.vertical if self.up is not None or plane is None else plane.normal
+        with naming(points="CLOUD", normals="CLOUD"):
+            advice = diagnose_cloud(cloud, up, plane, stands=plane is not None).advice
+        for bad in advice:
+            if bad.refused:
+                raise BadArgument("CLOUD", bad.found, bad.mend)
+        return advice
+
+
+def _move(name: str, cloud: PointCloud, pose: Tensor) -> PointCloud:
+    """Move a cloud out of its camera's frame."""
+    widest = 1.5  # tangent of half an angle of view wider than that of depth cameras
+    unseen = float((cloud.points[:, :2].abs().amax(1) >= widest * cloud.points[:, 2]).double().mean())
+    if unseen > 0.01:
+        allowed = "a cloud in the camera's frame (z forward) for --camera-pose; in another frame, --viewpoint X Y Z"
+        raise BadArgument(name, f"{unseen:.0%} of the points out of a camera's sight", allowed)
+    normals = None if cloud.normals is None else rotate(pose, cloud.normals)
+    frustum = None if cloud.frustum is None else rotate(pose, cloud.frustum)
+    return PointCloud(apply(pose, cloud.points), normals, pose[:3, 3].clone(), frustum)
+
+
+def find_cloud(path: Path, name: str = "CLOUD") -> Path:
+    """Return the file of a cloud; the name of a shipped object stands for its noisy view."""
+    names = list_objects()
+    if path.exists() or path.suffix or len(path.parts) != 1:
+        return path
+    if str(path) not in names:
+        raise BadArgument(name, f"{str(path)!r}", f"a file, or one of the shipped objects {', '.join(names)}")
+    return DATA / path / "view.ply"
+
+
+def print_notes(notes: tuple[str, ...], advice: tuple[Advice, ...] = ()) -> None:
+    """Print notes on how a file was read, and advice."""
+    for name, sentence in [*(("note", n) for n in notes), *(("advice", str(a)) for a in advice)]:
+        print(f"{name:8}{sentence}")
+
+
+def check_folder(path: Path) -> None:
+    """Refuse a folder that cannot be written, by writing a temporary file."""
+    made: list[Path] = []
+    try:
+        for folder in reversed([path, *path.parents]):
+            if not folder.exists():
+                folder.mkdir()
+                made.append(folder)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise OutputError("--out", f"{path} ({error.strerror or error})", "a folder that can be written") from error
+    finally:
+        with contextlib.suppress(OSError):  # an empty folder may stay
+            for folder in reversed(made):
+                folder.rmdir()
+
+
+@contextlib.contextmanager
+def holding(
+    name: str, path: Path | None, hold: Callable[[Path], AbstractContextManager[None]] = hold_folder
+) -> Iterator[None]:
+    """Hold the folder, or file, of an option against other runs; None: nothing."""
+    with contextlib.ExitStack() as held:
+        if path is not None:
+            with naming(folder=name, path=name):
+                held.enter_context(hold(path))
+        yield
+
+
+def load_fingers(hand: str, fingers: str) -> tuple[Hand, Literal["auto"] | None]:
+    """Load the hand of --hand with --fingers; return the hand, and "auto" if its sets of fingers are to be compared."""
+    with naming(hand="--hand", name="--hand", name_or_path="--hand", fingers="--fingers"):
+        return (load_hand(hand), "auto") if fingers == "auto" else (load_hand(hand, fingers), None)
+
+
+def describe_table(table: Plane | float) -> str:
+    """Say where the table is."""
+    if isinstance(table, Plane):
+        x, y, z = (0.0 + round(n, 3) for n in table.normal.tolist())
+        return f"table at {table.offset:.3f} m along ({x:g}, {y:g}, {z:g})"
+    return f"table at z = {table:.3f} m"
+
+
+def object_name(path: Path) -> str:
+    """Return the name of an object: that of its file, or of its folder where the file has a name of docs/data.md."""
+    if re.fullmatch(r"(mesh|view\d*)(_noisy)?", path.stem):
+        return path.resolve().parent.name or "object"
+    return f"object in {path.name}" if path.stem in ("cloud", "model", "points", "scan") else path.stem
+
+
+def import_simulator(name: Simulator = "sapien") -> None:
+    """Import a simulator; refuse one that cannot be loaded."""
+    if importlib.util.find_spec(name) is None:
+        raise MissingExtra(name, "sim" if name == "sapien" else name)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a missing Vulkan does not concern physics
+            importlib.import_module(name)
+    except ImportError as error:
+        allowed = "a simulator with its system libraries (Debian and Ubuntu: apt-get install libx11-6)"
+        raise BadArgument("--close", f"a {name} that cannot be loaded ({error})", allowed) from error
