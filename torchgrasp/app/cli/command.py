@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from torchgrasp.checks import Range, check_path
 from torchgrasp.errors import BadArgument
+from torchgrasp.marks import describe
 
 T = TypeVar("T")
 
@@ -99,7 +100,7 @@ def execute(command: Command) -> int:
         value: Any = getattr(command, name)
         for limits in get_args(field.type):
             if isinstance(limits, Range) and not limits.low <= value <= limits.high:
-                raise BadArgument(options[name], value, limits.describe("a whole number"))
+                raise BadArgument(options[name], value, describe(field.type))
         if isinstance(value, Path):
             check_path(options[name], value)
     with naming(**options | {argument: options[name] for argument, name in command.names.items()}):
