@@ -13,8 +13,8 @@ import torch
 from torchgrasp import __version__
 from torchgrasp.app.cli.command import Command, arguments, make_bar
 from torchgrasp.app.cli.inputs import import_simulator
-from torchgrasp.files import format_columns
 from torchgrasp.errors import BadArgument, MissingExtra
+from torchgrasp.files import format_columns
 from torchgrasp.hand.load import hands_folder
 from torchgrasp.specs import Simulator
 

@@ -12,7 +12,6 @@ from torchgrasp.app.report.evaluation import SHARE_NAMES, write_evaluation
 from torchgrasp.campaign import CampaignSpec, run_campaign
 from torchgrasp.campaign.folder import FAILED
 from torchgrasp.checks import Count, Range, Seed
-from torchgrasp.files import format_columns, format_line
 from torchgrasp.data import JobRow, list_entries, list_views
 from torchgrasp.errors import BadArgument, DatasetError, Status
 from torchgrasp.evaluation.campaign import evaluate
@@ -20,7 +19,7 @@ from torchgrasp.evaluation.intervals import format_share
 from torchgrasp.evaluation.protocols import find_protocol
 from torchgrasp.evaluation.score import ViewScore, summarise
 from torchgrasp.evaluation.views import EvaluationSpec, Ranks
-from torchgrasp.files import format_json, hold_folder, write_file
+from torchgrasp.files import format_columns, format_json, format_line, hold_folder, write_file
 from torchgrasp.specs import ClosingMode, HoldingMode, Simulator
 
 OBJECTS_HELP = "folder with manifest.json, and for each object mesh.ply and noisy views; see docs/data.md"

@@ -25,11 +25,10 @@ from torchgrasp.app.report.page import GRASP_COLUMNS, grasp_rows, write_report
 from torchgrasp.app.report.run import Run, verdict
 from torchgrasp.app.report.viewer import VIEW, write_viewer
 from torchgrasp.checks import Count, Seed
-from torchgrasp.files import format_columns, format_line
 from torchgrasp.data.shipped import DATA, MASSES, list_objects, load_object
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.lift import close_hand
-from torchgrasp.files import sha256
+from torchgrasp.files import format_columns, format_line, sha256
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surface
 from torchgrasp.hand.hand import Hand
