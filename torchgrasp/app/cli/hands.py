@@ -61,7 +61,7 @@ class HandNew(Command):
                 return 2
             hand = check_hand(trial)
             sets = describe_sets(hand)
-        for sentence in draft.mended:
+        for sentence in draft.repairs:
             print(f"repaired: {sentence}")
         for file, text in texts.items():
             write_file(folder / file, text)

@@ -135,7 +135,7 @@ class CloudOptions(ViewOptions):
             advice = diagnose_cloud(cloud, up, plane, stands=plane is not None).advice
         for bad in advice:
             if bad.refused:
-                raise BadArgument("CLOUD", bad.found, bad.mend)
+                raise BadArgument("CLOUD", bad.found, bad.fix)
         return advice
 
 
