@@ -109,6 +109,6 @@ def test_a_second_run_on_what_another_writes_is_refused_by_name(
     with hold_file(out / "model.safetensors") if name == "train" else hold_folder(out / HELD[name]):
         assert cli.main(command(out)) == 2
         said = capsys.readouterr().err
-        assert said.startswith("torchgrasp: --out: found") and f"in use by process {os.getpid()} on" in said
+        assert said.startswith("torchgrasp: --out: expected") and f"in use by process {os.getpid()} on" in said
         assert not [file for file in contents(out) if not Path(file).name.startswith(".")]
     assert cli.main(command(out)) == 0
