@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from torchgrasp import ScenePlan, Status, ThingPlan, load_grasps
+from torchgrasp import Status, load_grasps
 from torchgrasp.app.cli import main
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
+from torchgrasp.planner import ScenePlan, ThingPlan
 
 CAMERA = look_at(20.0, 45.0, 0.7)
 

@@ -32,10 +32,10 @@ class SerialPool:
 
 @pytest.fixture
 def device(monkeypatch):
-    """The pretended device, and a count of the waits for it."""
+    """The pretended device."""
     monkeypatch.setattr("torchgrasp.posture_model.sample.ThreadPoolExecutor", SerialPool)
-    with pretend() as waits:
-        yield waits
+    with pretend():
+        yield
 
 
 def sent(value: Any) -> Any:

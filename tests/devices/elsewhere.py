@@ -1,13 +1,10 @@
-"""A second device for tests: CPU tensors that say they are elsewhere, and break or wait where a GPU's would.
+"""A second device for tests: CPU tensors that say they are elsewhere, and break where a GPU's would.
 
 `Elsewhere` behaves like a tensor of `DEVICE`. An operation on tensors of both devices is an error, as is
 `numpy()`, a draw there by a generator of the CPU, or an index from there into a tensor of the CPU. `pretend` makes
-`device=DEVICE` work, and lists where the host would wait for the device.
+`device=DEVICE` work.
 """
 
-import contextlib
-import traceback
-from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
@@ -21,9 +18,6 @@ MAKERS = {
     for name in "tensor as_tensor zeros ones full empty eye arange linspace rand randn randint randperm".split()
 } | {torch.triu_indices, torch.tril_indices}
 """Functions that make tensors where they are told to."""
-READERS = {"item", "tolist", "__bool__", "__float__", "__int__", "__index__", "nonzero", "masked_select", "equal"}
-READERS |= {"unique", "allclose", "bincount", "svdvals", "svd", "eigh", "eigvalsh", "matrix_exp"}
-"""Functions whose result depends on numbers that the host must read first."""
 DATA = {"item", "tolist", "__bool__", "__float__", "__int__", "__index__", "__repr__", "__format__", "__len__"}
 DATA |= {"dim", "size", "stride", "numel", "is_contiguous", "is_floating_point", "data_ptr", "backward"}
 """Functions that return no tensor."""
@@ -85,39 +79,6 @@ def _target(arguments: list[Any]) -> torch.device | None:
     return None
 
 
-def _is_mask(value: Any) -> bool:
-    """Tell whether an index has a mask on the device, or numbers that must be brought there."""
-    parts = value if isinstance(value, tuple) else (value,)
-    return any(
-        (isinstance(x, Tensor) and (x.dtype == torch.bool or (x.dim() == 0 and isinstance(x, Elsewhere))))
-        or (isinstance(x, Tensor) and not isinstance(x, Elsewhere))
-        or isinstance(x, list)
-        for x in parts
-    )
-
-
-class Waits:
-    """Where the host waited for the device, by file and line in the package."""
-
-    def __init__(self) -> None:
-        self.places: Counter[str] = Counter()
-
-    def note(self) -> None:
-        """Count a wait at the innermost line of the package."""
-        for frame in reversed(traceback.extract_stack()):
-            if "/torchgrasp/" in frame.filename:
-                self.places[f"{frame.filename.rsplit('/torchgrasp/', 1)[1]}:{frame.line}"] += 1
-                return
-
-
-_ACTIVE: list[Waits] = []
-
-
-def _wait() -> None:
-    for waits in _ACTIVE:
-        waits.note()
-
-
 class Elsewhere(Tensor):
     """A tensor that says it is on `DEVICE`."""
 
@@ -132,14 +93,11 @@ class Elsewhere(Tensor):
                 return True
             if name == "__get__" or name == "__set__":
                 return _moved(func(*args, **kwargs))
-            if name in READERS:
-                _wait()
             if name in DATA:
                 return func(*args, **kwargs)
             if func in (Tensor.numpy, Tensor.__array__):
                 raise TypeError(f"can't convert {DEVICE} device type tensor to numpy")
             if func is Tensor.cpu:
-                _wait()
                 return _plain(args[0]).clone()
             if func is Tensor.to:
                 return _to(args, kwargs)
@@ -156,12 +114,11 @@ def _all_home(kwargs: dict[str, Any]) -> dict[str, Any]:
 
 
 def _to(args: Any, kwargs: dict[str, Any]) -> Tensor:
-    """Run `Tensor.to`; a move between the devices waits."""
+    """Run `Tensor.to`; a move between the devices copies."""
     target = _target([*args[1:], *kwargs.values()]) or _device(args[0])
     rest = [_home(_plain(x)) for x in args[1:]]
     result = Tensor.to(_plain(args[0]), *rest, **{key: _home(_plain(value)) for key, value in kwargs.items()})
     if target.type != _device(args[0]).type:
-        _wait()
         result = result.clone() if result is _plain(args[0]) else result
     elif args[0].dtype == result.dtype:
         return args[0]
@@ -176,17 +133,11 @@ def _refuse_mixes(func: Any, name: str, args: Any, kwargs: dict[str, Any]) -> No
     generator = kwargs.get("generator")
     if generator is not None and there and generator.device.type == "cpu":
         raise RuntimeError(f"Expected a '{DEVICE.type}' device type for generator but found 'cpu'")
-    if name in ("__getitem__", "__setitem__"):
-        if _is_mask(args[1]) and isinstance(args[0], Elsewhere):
-            _wait()
-        if name == "__setitem__" and isinstance(args[0], Elsewhere) and not isinstance(args[2], Elsewhere):
-            if any(isinstance(x, Tensor | list) for x in (args[1] if isinstance(args[1], tuple) else (args[1],))):
-                _wait()  # a number that is put at indices is brought there first
     if not there or not here:
         return
     if name == "copy_":
-        _wait()
-    elif name in INTO and isinstance(args[0], Elsewhere):
+        return
+    if name in INTO and isinstance(args[0], Elsewhere):
         values = list(_tensors(args[2:3]))
         if any(not isinstance(x, Elsewhere) and x.dim() > 0 for x in values):
             raise RuntimeError(f"{name}: expected all tensors to be on the same device")
@@ -203,8 +154,6 @@ class _Makers(TorchFunctionMode):
         if func in MAKERS and kwargs.get("device") is not None and torch.device(kwargs["device"]).type == DEVICE.type:
             if kwargs.get("generator") is not None:
                 raise RuntimeError(f"Expected a '{DEVICE.type}' device type for generator but found 'cpu'")
-            if func in (torch.tensor, torch.as_tensor):
-                _wait()
             return _moved(func(*args, **_all_home(kwargs)))
         if func is Tensor.to and type(args[0]) is Tensor:
             target = _target([*args[1:], *kwargs.values()])
@@ -214,13 +163,6 @@ class _Makers(TorchFunctionMode):
         return func(*args, **kwargs)
 
 
-@contextlib.contextmanager
-def pretend() -> Iterator[Waits]:
-    """Make the pretended device known; the value counts where the host waits for it."""
-    waits = Waits()
-    _ACTIVE.append(waits)
-    try:
-        with _Makers():
-            yield waits
-    finally:
-        _ACTIVE.remove(waits)
+def pretend() -> TorchFunctionMode:
+    """Return a context in which the pretended device is known."""
+    return _Makers()

@@ -7,7 +7,6 @@ from tests.devices.conftest import same, sent
 from tests.devices.elsewhere import DEVICE
 from torchgrasp import (
     ContactSpec,
-    IKSolution,
     PointCloud,
     certify,
     closing_gains,
@@ -29,7 +28,7 @@ from torchgrasp.cloud.prepare import clean_cloud
 from torchgrasp.control import ClosingReference, GraspController, measure, no_contact, observe, squeeze
 from torchgrasp.control.tactile import TipContact
 from torchgrasp.errors import BadArgument
-from torchgrasp.ik import CollisionWorld, Obstacles, PostureLibrary, nearest_postures, query_mixture
+from torchgrasp.ik import CollisionWorld, IKSolution, Obstacles, PostureLibrary, nearest_postures, query_mixture
 from torchgrasp.plan import least_friction_forces
 from torchgrasp.scene import estimate_occupancy
 from torchgrasp.shape import extract_surface

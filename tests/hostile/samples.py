@@ -62,7 +62,7 @@ def special(kind: type) -> Any:
     made = {
         torchgrasp.Hand: lambda: load_hand("barrett"),
         torchgrasp.Scene: load_scene,
-        torchgrasp.GraspObject: lambda: load_object("cylinder"),
+        torchgrasp.data.GraspObject: lambda: load_object("cylinder"),
         PointCloud: few_points,
         Grasps: lambda: load_shipped_grasp("jug", "barrett"),
         Contacts: lambda: special(Grasps).contacts,

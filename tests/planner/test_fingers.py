@@ -13,7 +13,6 @@ from torchgrasp import (
     Status,
     close_hand,
     closing_gains,
-    hand_of,
     load_grasps,
     load_hand,
     load_object,
@@ -28,6 +27,7 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.lift import TrialSpec
 from torchgrasp.export import format_grasps
 from torchgrasp.geometry.frames import apply
+from torchgrasp.hand import hand_of
 from torchgrasp.planner.grasps import expected_success
 from torchgrasp.planner.problem import finger_sets
 

@@ -1,5 +1,6 @@
 """The controller of a hand, real or simulated: grasp and sensor readings in, targets of joints and palm out."""
 
+from torchgrasp.closure import ClosingGains
 from torchgrasp.control.controller import GraspController
 from torchgrasp.control.forces import squeeze
 from torchgrasp.control.observation import Observation, Targets, observe
@@ -9,6 +10,7 @@ from torchgrasp.control.tactile import TactileState, TipContact, measure, no_con
 from torchgrasp.specs import ClosingOptions
 
 __all__ = [
+    "ClosingGains",
     "ClosingOptions",
     "ClosingReference",
     "FingertipSensor",

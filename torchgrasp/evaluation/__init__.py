@@ -1,5 +1,6 @@
 """What is asked of a grasp: trials in simulation, published protocols, campaigns and their scores."""
 
+from torchgrasp.closure import ClosingTrace, Disturbance, ObjectMotion
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
 from torchgrasp.evaluation.views import EvaluationSpec
 from torchgrasp.evaluation.campaign import evaluate
@@ -13,6 +14,9 @@ from torchgrasp.evaluation.pull import PullResult, pull_grasp, run_protocol
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore, most_certain_first, summarise
 
 __all__ = [
+    "ClosingTrace",
+    "Disturbance",
+    "ObjectMotion",
     "PROTOCOLS",
     "EvaluationSpec",
     "GraspTrial",

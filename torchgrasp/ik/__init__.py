@@ -1,5 +1,6 @@
 """Inverse kinematics: hand configurations that reach planned contacts."""
 
+from torchgrasp.values import IKSeeds
 from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates
 from torchgrasp.ik.checks import GraspErrors, measure_errors
 from torchgrasp.ik.clearance import CollisionWorld
@@ -15,6 +16,8 @@ from torchgrasp.shape.surface import surface_field
 from torchgrasp.ik.solve import IKSolution, solve_ik
 
 __all__ = [
+    "IKSeeds",
+
     "CollisionWorld", "Configuration", "GraspCandidates", "GraspErrors", "GraspProblem", "IKSolution",
     "Obstacles", "PostureLibrary", "SignedDistanceField", "check_candidates", "collision_probability",
     "field_from_surface", "lift_clearance", "measure_errors", "nearest_postures", "query_mixture",

@@ -35,7 +35,8 @@ class GraspProblem(Value):
     Raises:
         BadArgument: contacts without `std_m`, by which the pre-grasp opens.
 
-    >>> from torchgrasp import PostureLibrary, load_hand
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.ik import PostureLibrary
     >>> from torchgrasp.ik import nearest_postures
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")

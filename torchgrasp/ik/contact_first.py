@@ -48,7 +48,8 @@ def refine_on_contacts(problem: GraspProblem, seeds: IKSeeds, steps: int = ITERA
 def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
     """Return a checked grasp on fixed contacts for each triple that has seeds, best first.
 
-    >>> from torchgrasp import PostureLibrary, load_hand
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.ik import PostureLibrary
     >>> from torchgrasp.ik import CollisionWorld, nearest_postures
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")

@@ -199,7 +199,8 @@ def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: Conta
 
     Seeds are tried in their order. Slid contacts are certified anew; their failures have a planning `Status`.
 
-    >>> from torchgrasp import PostureLibrary, fit_shape, load_hand, load_object
+    >>> from torchgrasp import fit_shape, load_hand, load_object
+    >>> from torchgrasp.ik import PostureLibrary
     >>> from torchgrasp.ik import CollisionWorld, nearest_postures
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")

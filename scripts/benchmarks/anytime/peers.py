@@ -7,7 +7,8 @@ import time
 from benchmarks.anytime.course import Course
 from benchmarks.anytime.single_start import SingleStart
 from benchmarks.common import Row
-from torchgrasp import ContactSpec, Hand, IKSeeds, PointCloud, ShapeGP, Status, certify
+from torchgrasp import ContactSpec, Hand, PointCloud, ShapeGP, Status, certify
+from torchgrasp.ik import IKSeeds
 from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates
 from torchgrasp.ik.checks import measure_errors
 from torchgrasp.ik.configuration import Configuration

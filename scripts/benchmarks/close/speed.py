@@ -11,21 +11,12 @@ from pathlib import Path
 from unittest import mock
 
 from benchmarks.common import Row, least_seconds
-from torchgrasp import (
-    ContactSpec,
-    TrialSpec,
-    close_hand,
-    fit_shape,
-    load_grasps,
-    load_hand,
-    load_object,
-    plan_grasps,
-    surface_field,
-)
+from torchgrasp import ContactSpec, TrialSpec, close_hand, fit_shape, load_grasps, load_hand, load_object, plan_grasps
 from torchgrasp.control import GraspController, Observation
 from torchgrasp.data.shipped import GraspObject
 from torchgrasp.errors import Status
 from torchgrasp.evaluation import GraspTrial, TrialDriver
+from torchgrasp.ik import surface_field
 from torchgrasp.jobs import run_tasks
 
 SIMULATED = 5.0
