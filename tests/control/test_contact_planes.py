@@ -32,7 +32,7 @@ def known(normals=AROUND, std_mm=(1.0, 3.0, 6.0), table=True):
 @pytest.mark.parametrize("table", [True, False])
 @pytest.mark.parametrize("touching", [(1, 0, 0), (0, 1, 1), (1, 1, 1), (0, 0, 0)])
 @pytest.mark.parametrize("off_mm", [(8.0, 2.0, 9.0), (-3.0, 5.0, -6.0), (4.0, -9.0, -8.0)])
-def test_the_displacement_is_the_likeliest_one(table, touching, off_mm):
+def test_displacement_is_the_likeliest(table, touching, off_mm):
     """The posterior by SciPy: a touch measures a plane, a finger in the air costs only where the plane passes it."""
     held = known(table=table)
     normals, off, felt = AROUND.numpy(), 1e-3 * np.array(off_mm), np.array(touching, dtype=bool)
@@ -53,7 +53,7 @@ def test_the_displacement_is_the_likeliest_one(table, touching, off_mm):
     assert np.allclose(found.numpy(), best * np.concatenate([place, turn]), atol=2e-6)
 
 
-def test_certain_contacts_are_believed_and_leave_the_object_on_the_table():
+def test_displacement_by_certain_contacts_stays_on_the_table():
     flat = unit(AROUND * real([1, 1, 0]))
     held, shift = known(flat, std_mm=(0.0, 0.0, 0.0)), real([0.006, -0.004, 0.0])
     sure = dataclasses.replace(held.gains, covariance=held.gains.covariance / 1e4)
@@ -65,7 +65,7 @@ def test_certain_contacts_are_believed_and_leave_the_object_on_the_table():
     assert float(found[2].abs()) < 1e-6 and float(moved[:, 2].abs().max()) < 1e-4
 
 
-def test_the_surer_of_two_touches_that_disagree_is_believed_more():
+def test_displacement_follows_the_more_certain_of_two_touches():
     opposed = real([[1, 0, 0], [-1, 0, 0], [0, 1, 0]])
     felt = torch.tensor([True, True, False])
     for std_mm, sign in (((1.0, 9.0, 1.0), 1.0), ((9.0, 1.0, 1.0), -1.0)):
@@ -74,7 +74,7 @@ def test_the_surer_of_two_touches_that_disagree_is_believed_more():
         assert float(found[0]) * sign > 1e-3
 
 
-def test_a_finger_that_has_missed_the_object_does_not_move_it_for_ever():
+def test_displacement_by_a_finger_in_the_air_is_bounded():
     held, touching = known(), torch.tensor([False, False, False])
     near, far = (ContactPlanes(held).displacement(held.gains.target - off * AROUND, touching) for off in (0.025, 0.25))
     assert torch.allclose(near, far)
@@ -100,7 +100,7 @@ def close(controller: GraspController, away: float, seconds: float = 3.5) -> tup
 
 
 @pytest.mark.parametrize("closing", ["uncertainty", "fixed"])
-def test_the_palm_follows_a_block_that_stands_elsewhere_and_the_fingers_come_to_the_planned_posture(closing):
+def test_palm_follows_a_displaced_block(closing):
     palms, joints = close(GraspController(reference(), closing), 0.01)
     assert palms[-1].numpy() == pytest.approx([0.01, 0, 0], abs=2.5e-3)
     assert (palms[1:] - palms[:-1]).norm(dim=-1).max() <= PALM_SPEED * PERIOD + 1e-9
@@ -111,12 +111,12 @@ def test_the_palm_follows_a_block_that_stands_elsewhere_and_the_fingers_come_to_
     assert ((moved[-1] + 0.02 * NORMALS) * NORMALS).sum(-1).abs().max() > 8e-3
 
 
-def test_the_palm_stays_where_the_object_is_in_its_place_and_goes_no_farther_than_it_may():
+def test_palm_stays_or_moves_within_its_reach():
     assert close(GraspController(reference()), 0.0)[0].norm(dim=-1).max() < 1e-3
     far = close(GraspController(reference()), 0.018)[0].norm(dim=-1)
     assert 0.01 < float(far.max()) <= ClosingOptions().palm_reach + 1e-9
 
 
 @pytest.mark.parametrize("closing", ["paper", "position", "open_loop"])
-def test_other_closings_leave_the_palm_to_the_arm(closing):
+def test_palm_stays_under_other_closings(closing):
     assert close(GraspController(reference(), closing), 0.01)[0].abs().max() == 0

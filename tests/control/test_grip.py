@@ -48,7 +48,7 @@ def least_sum(load: np.ndarray, friction: float) -> float:
 
 @pytest.mark.parametrize("friction", [0.4, 0.8])
 @pytest.mark.parametrize("load", [[0, 1, 0, 0, 0, 0], [0.5, 2, 1, 0, 0, 0.02], [0, 3, 0, 0.01, 0, 0]])
-def test_forces_carry_the_load_within_the_cones_with_little_more_than_the_least_sum(load, friction):
+def test_least_forces_carry_the_load_within_the_cones_at_nearly_the_least_sum(load, friction):
     forces = solve(load, friction)
     assert np.allclose(grasp_map(POINTS) @ forces.ravel(), load, atol=1e-9)
     assert (friction_ratios(forces, OUTWARD) < friction).all()
@@ -59,7 +59,7 @@ def test_forces_carry_the_load_within_the_cones_with_little_more_than_the_least_
 
 
 @pytest.mark.parametrize("fingertips", [3, 4, 5])
-def test_one_decomposition_gives_grasp_map_inverse_and_null_space(fingertips):
+def test_balance_gives_grasp_map_inverse_and_null_space(fingertips):
     generator = np.random.default_rng(fingertips)
     points, forces = generator.normal(size=(2, fingertips, 3))
     found, arms = balance(points), points - points.mean(0)
@@ -72,13 +72,13 @@ def test_one_decomposition_gives_grasp_map_inverse_and_null_space(fingertips):
     assert np.isfinite(line.inverse).all() and abs(line.inverse).max() < 1e3
 
 
-def test_floors_are_kept():
+def test_least_forces_keep_the_floors():
     floor = np.array([1.0, 1.0, 2.0])
     push = -(solve([0, 0, 0, 0, 0, 0], 0.5, floor) * OUTWARD).sum(-1)
     assert (push > floor).all() and push.sum() == pytest.approx(4.0, rel=0.15)
 
 
-def test_friction_estimate_is_the_posterior_of_a_gaussian():
+def test_friction_estimate_is_a_gaussian_posterior():
     estimate = FrictionEstimate()
     estimate.update(0.5, 4.0)
     noise = 0.4 * math.hypot(1.0, 0.5) / 4.0
@@ -123,7 +123,7 @@ def carried(
     return hold, seen, sums
 
 
-def test_a_heavy_block_is_gripped_harder_before_it_slides_and_a_light_one_is_released():
+def test_grip_carries_a_heavy_block_harder_and_releases_a_light_one():
     for weight in (0.5, 1.5):
         hold, _, sums = carried(weight, 0.8)
         needed = 4 * weight / 3 / 0.8  # each finger bears a third; the thumb presses as hard as two
@@ -133,19 +133,19 @@ def test_a_heavy_block_is_gripped_harder_before_it_slides_and_a_light_one_is_rel
     assert carried(1.0, 0.8)[0].weight == pytest.approx(1.0, rel=0.05)
 
 
-def test_fingers_that_slide_teach_the_friction_and_press_harder():
+def test_grip_learns_friction_from_sliding_and_presses_harder():
     slippery, _, hard = carried(2.0, 0.35)
     sticky, _, soft = carried(2.0, 2.0)
     assert slippery.friction.mean < 0.7 and sticky.friction.mean == 0.8
     assert hard[-1] > 1.2 * soft[-1]
 
 
-def test_what_exceeds_the_torques_is_too_heavy():
+def test_grip_reports_a_load_beyond_the_torques_as_too_heavy():
     hold, _, _ = carried(40.0, 0.8)
     assert hold.status is Status.TOO_HEAVY and hold.weight > 5.0
 
 
-def test_what_the_limits_cannot_carry_by_estimate_is_not_too_heavy_while_nothing_slides():
+def test_grip_reports_too_heavy_only_if_a_finger_slides():
     weight, most = 5.0, 2.0
     believed = FrictionEstimate().high * 2 * most  # the thumb presses with 2 N, the others with the half
     assert believed < weight
@@ -153,7 +153,7 @@ def test_what_the_limits_cannot_carry_by_estimate_is_not_too_heavy_while_nothing
     assert carried(weight, 0.8, max_force=most)[0].status is Status.TOO_HEAVY
 
 
-def test_a_fragile_block_is_carried_by_what_it_bears():
+def test_grip_carries_a_fragile_block_within_its_largest_force():
     hold, seen, sums = carried(1.0, 0.8, max_force=2.0)
     assert hold.status is Status.OK and hold.weight == pytest.approx(1.0, rel=0.05)
     assert max(sums) < 1.05 * 4.0  # the thumb presses with 2 N, the others with the half
@@ -163,7 +163,7 @@ def test_a_fragile_block_is_carried_by_what_it_bears():
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("sideways", [slice(0, 1), slice(0, 3)])
 @pytest.mark.parametrize("max_force", [None, 2.0])
-def test_a_finger_whose_planned_force_is_along_the_surface_leaves_floors(sideways, max_force):
+def test_grip_floors_stay_finite_for_a_planned_force_along_the_surface(sideways, max_force):
     """A finger in the air keeps the planned forces; the sensed normals of the others may be across them."""
     normals, points = NORMALS.clone(), TARGET.clone()
     normals[sideways], points[2] = real([0, 1, 0]), torch.nan

@@ -54,7 +54,7 @@ def come(hand, shift, ticks=3000):
     raise AssertionError("the hand never arrived")
 
 
-def test_an_object_in_its_place_does_not_stop_the_hand():
+def test_guarded_approach_passes_an_object_in_its_place():
     hand = GuardedApproach(above(), ALL, LENGTH)
     lefts, palms = come(hand, real([0, 0, 0]))
     speeds = -lefts.diff() / PERIOD
@@ -66,7 +66,7 @@ def test_an_object_in_its_place_does_not_stop_the_hand():
 
 
 @pytest.mark.parametrize("shift", [(0.016, 0, 0), (-0.015, 0, 0.004), (0.012, 0, 0.014)])
-def test_a_touch_tells_where_the_palm_has_to_go(shift):
+def test_guarded_approach_moves_the_palm_to_the_touched_object(shift):
     shift = real(shift)
     hand = GuardedApproach(above(), ALL, LENGTH)
     _, palms = come(hand, shift)
@@ -77,7 +77,7 @@ def test_a_touch_tells_where_the_palm_has_to_go(shift):
     assert palms.diff(dim=0).norm(dim=-1).max() <= PALM_SPEED * PERIOD * (1 + 1e-9)
 
 
-def test_the_hand_rests_while_it_feels_and_draws_back_before_its_palm_moves():
+def test_guarded_approach_rests_and_draws_back_before_its_palm_moves():
     shift, hand = real([0.016, 0, 0]), GuardedApproach(above(), ALL, LENGTH)
     lefts, palms = come(hand, shift)
     stopped = int((lefts.diff() == 0).int().argmax())
@@ -89,21 +89,21 @@ def test_the_hand_rests_while_it_feels_and_draws_back_before_its_palm_moves():
     assert lefts.max() <= LENGTH
 
 
-def test_the_palm_goes_no_farther_than_the_arm_yields():
+def test_guarded_approach_keeps_the_palm_within_its_reach():
     hand = GuardedApproach(above(), ALL, LENGTH)
-    for _ in range(2000):
-        hand(feel(hand, real([0.03, 0, 0])), PERIOD)
+    for _ in range(500):
+        hand(feel(hand, real([0.03, 0, 0])), 4 * PERIOD)
         assert hand.palm.norm() <= ALL.palm_reach * (1 + 1e-9)
 
 
-def test_after_the_last_halt_the_hand_goes_on_whatever_it_feels():
+def test_guarded_approach_continues_after_the_last_stop():
     hand, everywhere = GuardedApproach(above(), ALL, LENGTH), observation(contact=torch.ones(3, dtype=torch.bool))
     for _ in range(3000):
         hand(everywhere, PERIOD)
     assert hand.done and hand.stops == ALL.stops
 
 
-def test_a_touch_without_a_place_moves_no_palm():
+def test_guarded_approach_without_places_moves_no_palm():
     hand, touching = GuardedApproach(above(), ALL, LENGTH), observation(contact=torch.ones(3, dtype=torch.bool))
     nowhere = torch.full((3, 3), torch.nan).double()
     tactile = dataclasses.replace(touching.tactile, points=nowhere, normals=nowhere)
@@ -120,7 +120,7 @@ def approach(controller, shift):
     return commanded
 
 
-def test_the_controller_begins_to_close_where_the_object_was_touched():
+def test_controller_closes_where_the_approach_found_the_object():
     shift, controller = real([0.016, 0, 0]), GraspController(above(), approach=LENGTH)
     commanded = approach(controller, shift)
     assert commanded[0].left == LENGTH and commanded[-1].left == 0.0 and controller.stops >= 1
@@ -144,7 +144,7 @@ def test_the_controller_begins_to_close_where_the_object_was_touched():
         ("uncertainty", None, {"sensor": SensorModel("binary")}),
     ],
 )
-def test_guarded_approach_refuses_closings_and_references_without_it(closing, options, missing):
+def test_controller_refuses_an_approach_that_it_cannot_guard(closing, options, missing):
     held = above(**missing)
     with pytest.raises(BadArgument, match="approach"):
         GraspController(held, closing, options=options, approach=LENGTH)
@@ -152,12 +152,12 @@ def test_guarded_approach_refuses_closings_and_references_without_it(closing, op
 
 
 @pytest.mark.parametrize("length", ["0.1", float("nan"), -0.1, 1.1, None])
-def test_a_length_that_is_none_is_refused(length):
+def test_controller_refuses_a_bad_length_of_approach(length):
     with pytest.raises(BadArgument, match="approach"):
         GraspController(above(), approach=length)
 
 
-def test_the_reference_knows_the_direction_in_the_hands_axes():
+def test_reference_has_the_approach_in_the_hands_axes():
     grasp = load_shipped_grasp("jug", "allegro")
     found = ClosingReference.from_grasp(load_hand("allegro"), grasp).approach
     back = grasp.obj_from_hand[0, :3, :3].double() @ found

@@ -17,6 +17,7 @@ from torchgrasp.control.law import (
     POSITION_RATE,
     blend,
     damped_inverse,
+    force_covariance,
     force_gain,
     joint_step,
     position_gain,
@@ -111,6 +112,15 @@ def test_eq28_gain_is_inverse_to_the_force_variance():
     assert torch.allclose(force_gain(covariance, alpha)[3], alpha[3] / covariance[3].diagonal())
 
 
+def test_eq28_force_covariance_grows_with_the_force():
+    normals = directions(3)
+    forces = torch.tensor([3.0, 3.0, 6.0]).double()[:, None] * -normals
+    along = torch.einsum("fi,fij,fj->f", normals, force_covariance(forces, normals), normals)
+    assert along.tolist() == pytest.approx([0.09 + 0.09, 0.09 + 0.09, 0.09 + 0.36])
+    least = torch.linalg.eigvalsh(force_covariance(forces, normals))[:, 0]
+    assert least.tolist() == pytest.approx([0.09] * 3)
+
+
 def test_eq25_is_the_papers_law_for_square_jacobians():
     """One finger of three joints a contact, small errors: J^-1 [(1-l) K (xd-xc) + l C (fd-fc)]."""
     jacobian = torch.zeros(3, 3, 9, dtype=torch.float64)
@@ -166,7 +176,7 @@ def test_eq25_posture_moves_no_fingertip():
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
-def test_gains_are_those_of_the_grasp_in_the_hands_frame(name):
+def test_closing_gains_are_in_the_hands_frame(name):
     hand = load_hand(name)
     grasp = grasp_of(hand)
     gains = closing_gains(grasp, hand, 5.0)
@@ -181,7 +191,7 @@ def test_gains_are_those_of_the_grasp_in_the_hands_frame(name):
     assert torch.allclose(here, pads[0])
 
 
-def test_contacts_without_balance_are_pressed_along_their_normals():
+def test_closing_gains_press_unbalanced_contacts_along_their_normals():
     hand = load_hand("allegro")
     grasp = grasp_of(hand)
     same = grasp.contacts.normals[:, :1].expand(1, 3, 3).contiguous()
@@ -192,7 +202,7 @@ def test_contacts_without_balance_are_pressed_along_their_normals():
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
-def test_eq28_the_learned_variance_tells_which_force_loop_is_the_fastest(name):
+def test_eq28_force_gains_follow_the_learned_variance(name):
     """Along its normal a loop has the bandwidth C_F over the compliance; no finger's force is known exactly."""
     hand, model = load_hand(name), load_stability(load_hand(name))
     grasp = grasp_of(hand)
@@ -206,7 +216,7 @@ def test_eq28_the_learned_variance_tells_which_force_loop_is_the_fastest(name):
     assert gains.force_source == "stability"
 
 
-def test_compliance_is_what_the_drives_yield():
+def test_tip_compliance_is_the_motion_for_a_newton():
     """Allegro's joints are driven one by one: pushing with 1 N moves the tip by n.J K^-1 J^T n."""
     hand = load_hand("allegro")
     joints = 0.5 * (hand.lower + hand.upper)
@@ -219,7 +229,7 @@ def test_compliance_is_what_the_drives_yield():
         assert float(tip_compliance(jacobian, pads, joint_stiffness(hand))[finger]) == pytest.approx(float(moved))
 
 
-def test_bad_arguments_are_named():
+def test_closing_gains_refuse_bad_arguments():
     hand = load_hand("allegro")
     grasp = grasp_of(hand)
     with pytest.raises(BadArgument, match=r"grasp: expected .*got 0 rows"):

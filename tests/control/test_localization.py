@@ -73,14 +73,14 @@ BALL_POINTS = unit(real([[1, 0.3, 0.5], [0.8, -0.2, -1], [-1, 0.1, 0.2]]))
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.015, 0.0), (-0.012, 0.02), (0.021, -0.027)])
-def test_a_ball_is_found_again_from_three_touches(shift):
+def test_localization_finds_a_ball_from_three_touches(shift):
     wanted = real([shift[0], 0.0, shift[1]])
     there = known(field(ball))
     found = locate(there, touch(there, CENTER + RADIUS * BALL_POINTS + wanted, BALL_POINTS))
     assert (found[:3] - wanted).norm() < PITCH / 2
 
 
-def test_one_touch_tells_where_a_ball_is_as_far_as_its_normal_is_known():
+def test_localization_by_one_touch_uses_its_normal():
     # the normal of one contact tells on which side of the ball it is: a plane would tell nothing along itself
     wanted, normal = real([0.02, 0.0, 0.012]), unit(real([[0.6, 0.0, -0.8]] * 3))
     there = known(field(ball))
@@ -95,7 +95,7 @@ def test_one_touch_tells_where_a_ball_is_as_far_as_its_normal_is_known():
 
 
 @pytest.mark.parametrize("turn", [-0.2, 0.1])
-def test_a_block_is_found_again_with_its_turn(turn):
+def test_localization_finds_a_turned_block(turn):
     points = CENTER + real([[0.03, 0.005, 0.03], [0.03, -0.005, -0.03], [-0.012, 0.0, 0.045]])
     normals, wanted = real([[1, 0, 0], [1, 0, 0], [0, 0, 1]]), real([0.008, 0.0, -0.014])
     there, (place, direct) = known(field(block)), displaced(wanted, turn)
@@ -103,7 +103,7 @@ def test_a_block_is_found_again_with_its_turn(turn):
     assert (found[:3] - wanted).norm() < 3e-3 and abs(float(found[4]) - turn) <= FINE_TURNS[-1]
 
 
-def test_the_search_does_not_depend_on_the_objects_frame():
+def test_localization_does_not_depend_on_the_objects_frame():
     pose = rigid(rotation_from_vector(real([0.4, -1.0, 2.0])), real([0.5, -0.2, 0.1]))
     wanted = real([0.01, 0.0, -0.017])
     one, other = known(field(ball)), known(field(ball, pose), pose)
@@ -111,7 +111,7 @@ def test_the_search_does_not_depend_on_the_objects_frame():
     assert (found[0] - found[1]).norm() < PITCH / 2
 
 
-def test_a_fingertip_in_the_air_is_outside_of_the_object():
+def test_localization_keeps_fingertips_in_the_air_outside():
     # a touch at the side of a slab tells nothing along it; the tip in the air does
     there = known(field(block))
     point, normal = CENTER + real([[0.03, 0, 0]] * 3), real([[1, 0, 0]] * 3)
@@ -122,7 +122,7 @@ def test_a_fingertip_in_the_air_is_outside_of_the_object():
     assert stopped[2] <= -0.008 + 0.004  # a tip of 10 mm, 3 mm from the end of the slab
 
 
-def test_a_finger_that_is_dead_or_tells_no_place_says_nothing():
+def test_localization_ignores_dead_fingers():
     there = known(field(ball))
     name = there.hand.finger_names[2]
     dead = dataclasses.replace(there, sensor=SensorModel(dead=(name,)))
@@ -135,13 +135,13 @@ def test_a_finger_that_is_dead_or_tells_no_place_says_nothing():
     assert (refused[:3] - wanted).norm() > (found[:3] - wanted).norm()
 
 
-def test_nothing_touched_is_nothing_moved():
+def test_localization_without_touches_finds_no_displacement():
     there = known(field(ball))
     far = CENTER + real([[0.2, 0, 0], [0, 0.2, 0], [0, 0, 0.2]])
     assert locate(there, touch(there, far, BALL_POINTS, (False, False, False), far)).norm() == 0.0
 
 
-def test_noise_moves_the_place_by_less_than_it_is_itself():
+def test_localization_error_is_small_under_noise():
     generator = torch.Generator().manual_seed(0)
     there, wanted, errors = known(field(ball)), real([0.01, 0.0, 0.014]), []
     for _ in range(20):
@@ -152,7 +152,7 @@ def test_noise_moves_the_place_by_less_than_it_is_itself():
     assert sorted(errors)[10] < 3e-3 and max(errors) < 7e-3
 
 
-def test_a_call_tries_one_turn():
+def test_localization_tries_one_turn_a_call():
     there = known(field(ball))
     search, touches = Localization(there), touch(there, CENTER + RADIUS * BALL_POINTS, BALL_POINTS)
     for k in range(len(TURNS) + len(FINE_TURNS)):

@@ -33,13 +33,13 @@ def pressing(contact=TOUCHING, **changes):
     return dataclasses.replace(seen, tactile=dataclasses.replace(seen.tactile, **changes))
 
 
-def test_three_balanced_contacts_are_secure():
+def test_grasp_check_accepts_balanced_contacts():
     check = judge(pressing())
     assert check.judged and check.secure
 
 
 @pytest.mark.parametrize("missing", [0, 1, 2])
-def test_a_finger_in_the_air_is_not(missing):
+def test_grasp_check_rejects_a_finger_in_the_air(missing):
     contact = TOUCHING.clone()
     contact[missing] = False
     check = judge(pressing(contact))
@@ -47,7 +47,7 @@ def test_a_finger_in_the_air_is_not(missing):
 
 
 @pytest.mark.parametrize(("degrees", "secure"), [(25.0, True), (36.0, False)])
-def test_contacts_that_balance_beyond_friction_are_not(degrees, secure):
+def test_grasp_check_rejects_forces_beyond_friction(degrees, secure):
     # all normals lean the same way across the line of the forces, by more or less than atan(0.6) = 31 degrees
     angle = torch.deg2rad(real(degrees))
     leaning = torch.stack([NORMALS[:, 0] * angle.cos(), angle.sin().expand(3), NORMALS[:, 2]], -1)
@@ -55,16 +55,16 @@ def test_contacts_that_balance_beyond_friction_are_not(degrees, secure):
 
 
 @pytest.mark.parametrize(("off", "secure"), [(0.9 * MISPLACED, True), (1.1 * MISPLACED, False)])
-def test_an_object_aside_is_not(off, secure):
+def test_grasp_check_rejects_a_misplaced_object(off, secure):
     assert judge(pressing(), torch.cat([real([0, 0, off]), STILL])).secure is secure
 
 
-def test_the_last_attempt_is_lifted_in_any_case():
+def test_grasp_check_accepts_the_last_attempt():
     check = judge(pressing(torch.zeros(3, dtype=torch.bool)), last=True)
     assert check.judged and check.secure
 
 
-def test_fingertips_that_tell_no_place_are_judged_by_their_touch():
+def test_grasp_check_without_places_judges_by_touch():
     nowhere = torch.full((3, 3), torch.nan).double()
     assert judge(pressing(points=nowhere, normals=nowhere)).secure
     dead = known()
@@ -74,14 +74,14 @@ def test_fingertips_that_tell_no_place_are_judged_by_their_touch():
     assert not judge(pressing(torch.tensor([True, False, False])), reference=dead).secure
 
 
-def test_a_hand_opens_before_its_palm_moves():
+def test_reopening_opens_before_the_palm_moves():
     start, shift = torch.full((9,), 0.1).double(), real([0.01, 0.005, -0.01])
     opening = Reopening(known(), torch.cat([shift, STILL]), start, STILL, 0.02)
     goal, palms, ticks = shift * real([1, 0, 1]), [STILL], 0  # along the table
     while not opening.done:
         joints, ticks = opening(PERIOD), ticks + 1
         palms.append(opening.palm)
-        if not torch.equal(joints, known().expand(known().pregrasp)):
+        if not torch.equal(joints, opening.opened):
             assert torch.equal(opening.palm, STILL)
     assert torch.equal(opening.palm, goal)
     speeds = torch.stack(palms).diff(dim=0).norm(dim=-1) / PERIOD
@@ -90,7 +90,7 @@ def test_a_hand_opens_before_its_palm_moves():
 
 
 @pytest.mark.parametrize(("reach", "length"), [(0.02, 0.02), (0.0, 0.0)])
-def test_the_palm_goes_no_farther_than_the_arm_yields(reach, length):
+def test_reopening_keeps_the_palm_within_its_reach(reach, length):
     opening = Reopening(known(), torch.cat([real([0.03, 0, 0.04]), STILL]), torch.zeros(9).double(), STILL, reach)
     while not opening.done:
         opening(PERIOD)
@@ -107,7 +107,7 @@ def close(controller: GraspController, seen) -> int:
 
 
 @pytest.mark.parametrize("closing", ["uncertainty", "fixed"])
-def test_a_hand_that_meets_nothing_closes_as_often_as_it_may(closing):
+def test_controller_closes_again_after_meeting_nothing(closing):
     controller = GraspController(known(), closing)
     ticks = close(controller, observation(0.02))
     assert controller.attempts == ClosingOptions().attempts
@@ -119,21 +119,21 @@ def test_a_hand_that_meets_nothing_closes_as_often_as_it_may(closing):
     [("uncertainty", ClosingOptions(attempts=1), True), ("uncertainty", NO_OPTIONS, True), ("uncertainty", None, False),
      ("position", None, True), ("paper", None, True)],
 )  # fmt: skip
-def test_a_hand_with_one_attempt_or_without_table_closes_once(closing, options, table):
+def test_controller_with_one_attempt_or_without_table_closes_once(closing, options, table):
     held = known() if table else reference()
     controller = GraspController(held, closing, options=options)
-    for _ in range(1500):
-        controller.step(observation(0.02), PERIOD)
+    for _ in range(240):
+        controller.step(observation(0.02), 0.05)
     assert controller.attempts == 1 and controller.reopening is None
 
 
-def test_a_good_grasp_is_lifted_at_once():
+def test_controller_accepts_a_good_grasp_at_once():
     controller = GraspController(known())
     press(controller, 3.0)
     assert controller.closed and controller.attempts == 1
 
 
-def test_the_second_closing_expects_the_object_where_it_was_found():
+def test_controller_expects_the_object_where_it_was_found():
     controller = GraspController(known())
     while controller.reopening is None:
         controller.step(observation(0.02), PERIOD)

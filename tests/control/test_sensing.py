@@ -34,7 +34,7 @@ def told(known, force, ticks=100, seed=None):
     return [sensor(touch(force), JACOBIAN, PERIOD) for _ in range(ticks)]
 
 
-def test_old_readings_are_those_of_before():
+def test_sensor_delay_repeats_earlier_readings():
     fresh = told(having(), (1.0, 2.0, 3.0))
     for late in (1, 4):
         old = told(having(delay=late / 100), (1.0, 2.0, 3.0))
@@ -44,13 +44,13 @@ def test_old_readings_are_those_of_before():
     assert (old[0].reading == 0).all()
 
 
-def test_noise_scales():
+def test_sensor_noise_scales():
     one, three = (torch.stack([t.reading for t in told(having(noise=n), (2.0, 2.0, 2.0), 100, 1)]) for n in (1.0, 3.0))
     clean = torch.stack([t.reading for t in told(having(), (2.0, 2.0, 2.0), 100)])
     assert torch.allclose(three - clean, 3 * (one - clean), atol=1e-12)
 
 
-def test_torques_tell_the_forces_but_not_where_they_act():
+def test_torque_sensor_measures_forces_without_places():
     last = told(having(kind="torque"), (1.0, 2.0, 0.0))[-1]
     assert torch.allclose(last.reading, real([1.0, 2.0, 0.0]), rtol=1e-3)
     assert torch.allclose(last.forces, -last.reading[:, None] * NORMALS, atol=1e-9)
@@ -58,13 +58,13 @@ def test_torques_tell_the_forces_but_not_where_they_act():
     assert not torch.isfinite(last.points).any() and not torch.isfinite(last.normals).any()
 
 
-def test_noise_of_torques_is_that_of_forces_along_the_axes_of_unit_levers():
-    readings = torch.stack([t.reading for t in told(having(kind="torque"), (2.0, 2.0, 2.0), 1500, 1)[50:]])
+def test_torque_sensor_noise_is_that_of_unit_levers():
+    readings = torch.stack([t.reading for t in told(having(kind="torque"), (2.0, 2.0, 2.0), 700, 1)[50:]])
     passed = math.sqrt(1 - math.exp(-0.4 * math.pi)) / math.sqrt(1 + math.exp(-0.4 * math.pi))  # of an AR(1) low-pass
-    assert float(readings.std()) == pytest.approx(TORQUE_NOISE * passed, rel=0.1)
+    assert float(readings.std()) == pytest.approx(TORQUE_NOISE * passed, rel=0.15)
 
 
-def test_a_robot_with_torque_sensors_feels_what_the_simulated_one_does():
+def test_feel_torques_equals_the_simulated_sensor():
     known, tactile = having(kind="torque"), no_contact()
     torques = torch.einsum("fcj,fc->j", JACOBIAN, touch((1.0, 2.0, 0.5)).forces)
     for expected in told(known, (1.0, 2.0, 0.5), 20):
@@ -72,7 +72,7 @@ def test_a_robot_with_torque_sensors_feels_what_the_simulated_one_does():
         assert torch.allclose(tactile.reading, expected.reading) and torch.equal(tactile.contact, expected.contact)
 
 
-def test_a_binary_fingertip_tells_the_same_of_every_force():
+def test_binary_sensor_reads_the_same_for_every_force():
     weak, strong = told(having(kind="binary"), (1.0, 0.1, 0.0))[-1], told(having(kind="binary"), (9.0, 0.1, 0.0))[-1]
     assert weak.contact.tolist() == [True, False, False]
     for name in ("reading", "forces", "contact", "average", "sliding"):
@@ -80,7 +80,7 @@ def test_a_binary_fingertip_tells_the_same_of_every_force():
     assert torch.equal(feel_flags(weak, weak.contact).reading, real([WAITING_FORCE, 0.0, 0.0]))
 
 
-def test_a_dead_fingertip_is_silent_and_the_others_are_as_ever():
+def test_dead_sensor_is_silent_and_others_are_unchanged():
     quiet, all_of_them = (told(x, (2.0, 2.0, 2.0), seed=3)[-1] for x in (having(dead=FINGERS[1:2]), having()))
     assert quiet.reading[1] == 0 and not quiet.contact[1] and not torch.isfinite(quiet.points[1]).any()
     for k in (0, 2):
@@ -100,7 +100,7 @@ def closes(sensor: SensorModel, contact, off: float, ticks=12) -> tuple[Uncertai
 DEAD, TWO = SensorModel(dead=FINGERS[2:]), torch.tensor([True, True, False])
 
 
-def test_a_finger_without_a_sensor_rests_at_its_contact_until_the_others_touch_and_then_searches():
+def test_dead_finger_rests_at_its_contact_then_searches():
     alone = torch.tensor([True, False, False])
     for contact, off, comes_on in ((alone, 0.01, True), (alone, -0.001, False), (TWO, -0.001, True)):
         law, steps = closes(DEAD, contact, off)
@@ -109,14 +109,14 @@ def test_a_finger_without_a_sensor_rests_at_its_contact_until_the_others_touch_a
             assert torch.allclose(steps, steps[:1], atol=1e-9)
 
 
-def test_a_finger_without_a_sensor_is_no_longer_waited_for_once_no_surface_is_left_to_meet():
+def test_dead_finger_counts_as_touching_far_beyond_its_contact():
     deviation = float((NORMALS[2] @ GAINS.covariance[2] @ NORMALS[2]).sqrt())
     for off, done in ((-0.9 * 3.0 * deviation, False), (-1.1 * 3.0 * deviation, True)):
         assert closes(DEAD, TWO, off)[0].done == done
     assert not closes(SensorModel(), TWO, -1.1 * 3.0 * deviation)[0].done  # one that could tell searches on
 
 
-def test_a_finger_without_a_sensor_stands_where_its_drives_push_against_something():
+def test_dead_finger_stops_where_its_drives_push():
     joints = torch.zeros(9).double()  # something keeps it where it is
     known = dataclasses.replace(reference(), kp=torch.full((9,), 100.0).double(), sensor=DEAD)
     law, seen = UncertaintyClosing(known, WAIT_ALONE), observation(-0.001, (0.3, 0.3, 0.0), TWO, joints)
@@ -127,7 +127,7 @@ def test_a_finger_without_a_sensor_stands_where_its_drives_push_against_somethin
     assert torch.allclose(ahead[-20:], ahead[-1:], atol=1e-9)
 
 
-def test_drives_feel_what_keeps_a_joint_from_its_target_and_not_that_it_moves():
+def test_drive_feel_measures_blocked_joints_but_not_motion():
     known, still = reference(), torch.zeros(9).double()
     drive = next(iter(known.hand.actuators.values()))
     pushed, moving = DriveFeel(known), DriveFeel(known)
@@ -139,7 +139,7 @@ def test_drives_feel_what_keeps_a_joint_from_its_target_and_not_that_it_moves():
     assert float(free.abs().max()) < 1e-6
 
 
-def test_a_dead_finger_in_the_air_says_nothing_of_where_the_object_is():
+def test_dead_finger_in_the_air_does_not_move_the_object_estimate():
     moved = {}
     for name, known in (("dead", having(dead=FINGERS[2:])), ("alive", reference())):
         law = UncertaintyClosing(known, ClosingOptions())
@@ -149,7 +149,7 @@ def test_a_dead_finger_in_the_air_says_nothing_of_where_the_object_is():
     assert moved["dead"] == 0 and moved["alive"] > 0
 
 
-def test_without_forces_the_squeeze_is_not_regulated_and_with_some_by_those_alone():
+def test_force_hold_regulates_by_sensed_forces_alone():
     start, silent = torch.zeros(9).double(), observation(0.0, (0.0, 0.0, 0.0), TOUCHING)
     for known, factor in ((having(kind="binary"), 1.0), (reference(), MAX_FACTOR)):
         hold = ForceHold(known, silent, start)
@@ -163,7 +163,7 @@ def test_without_forces_the_squeeze_is_not_regulated_and_with_some_by_those_alon
     assert hold.factor == pytest.approx(1.0)
 
 
-def test_no_finger_presses_harder_than_the_object_bears():
+def test_holdings_keep_the_largest_force():
     fragile, seen = dataclasses.replace(reference(), max_force=2.0), observation(0.0, (0.0, 0.0, 0.0), TOUCHING)
     for holding in ("force", "grip"):
         controller = GraspController(fragile, holding=holding)
@@ -177,7 +177,7 @@ def test_no_finger_presses_harder_than_the_object_bears():
 
 
 @pytest.mark.parametrize(("closing", "holding"), [("paper", "force"), ("position", "force"), ("uncertainty", "grip")])
-def test_what_needs_more_than_the_sensor_tells_is_refused(closing, holding):
+def test_closings_refuse_sensors_that_measure_too_little(closing, holding):
     for sensor in (SensorModel("binary"), SensorModel(dead=FINGERS[:1])):
         with pytest.raises(BadArgument, match="sensor"):
             TrialSpec(closing=closing, holding=holding, sensor=sensor)
@@ -189,14 +189,14 @@ def test_what_needs_more_than_the_sensor_tells_is_refused(closing, holding):
 @pytest.mark.parametrize(
     "changes", [{"noise": 1.0}, {"noise": 3.0}, {"kind": "torque"}, {"kind": "torque", "noise": 3.0}]
 )
-def test_noise_alone_is_no_touch(changes):
+def test_sensor_noise_alone_is_no_touch(changes):
     levers = 0.05 * JACOBIAN  # a torque's noise is 0.2 N here, twice a tactile fingertip's
     sensor = FingertipSensor(having(**changes), torch.Generator().manual_seed(2))
-    reports = [sensor(touch((0.0, 0.0, 0.0)), levers, PERIOD) for _ in range(500)]
+    reports = [sensor(touch((0.0, 0.0, 0.0)), levers, PERIOD) for _ in range(300)]
     assert not torch.stack([t.contact for t in reports]).any()
 
 
-def test_what_torques_barely_tell_is_no_force():
+def test_torque_sensor_suppresses_unobservable_forces():
     stretched = JACOBIAN.clone()
     stretched[0, 0] *= 1e-3  # the first finger is stretched out along its normal
     torques = 0.01 * torch.ones(9).double()

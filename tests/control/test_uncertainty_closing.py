@@ -1,4 +1,4 @@
-"""The closing law with each of its parts left out: without all of them it is the paper's, and the surest is first."""
+"""The closings: when fingers approach, wait, search, stop and press, and the paper's control law (Eqs. 25-28)."""
 
 import dataclasses
 
@@ -6,18 +6,24 @@ import numpy as np
 import pytest
 import torch
 
-from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
+from tests.point_fingers import FREE, GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
 from torchgrasp.control import ClosingReference, GraspController, TipContact, measure, no_contact
-from torchgrasp.control.law import MAX_SPEED, position_gain, surface_covariance
+from torchgrasp.control.law import MAX_SPEED, POSITION_FLOOR, POSITION_RATE, position_gain, surface_covariance
 from torchgrasp.control.observation import Observation
-from torchgrasp.control.paper.closings import PaperClosing, PositionClosing
-from torchgrasp.control.uncertainty_closing import UncertaintyClosing
-from torchgrasp.errors import BadArgument
+from torchgrasp.control.paper.closings import SETTLED, STOP_FORCE, PaperClosing, PositionClosing
+from torchgrasp.control.sensing import WAITING_FORCE
+from torchgrasp.control.uncertainty_closing import LEAD, PATIENCE, QUICK_TOUCH, UncertaintyClosing, with_equal_gains
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.specs import NO_OPTIONS, ClosingOptions, TrialSpec
+from torchgrasp.specs import NO_OPTIONS, ClosingOptions
 
+ONE, TWO = torch.tensor([True, False, False]), torch.tensor([True, True, False])
+RIGID_ARM = ClosingOptions(palm_reach=0.0, stops=0)
 SPRING = 2e3
 """Stiffness of the block [N/m]."""
+
+
+def closing(options: ClosingOptions = ClosingOptions()) -> UncertaintyClosing:  # noqa: B008, it is frozen
+    return UncertaintyClosing(reference(), options)
 
 
 def uncertain(*std_mm: float, force: float = 1e-3) -> ClosingReference:
@@ -33,44 +39,35 @@ def uncertain(*std_mm: float, force: float = 1e-3) -> ClosingReference:
     return dataclasses.replace(reference(), gains=gains)
 
 
-def press(controller: GraspController, seconds: float, start: float = 0.01) -> list[tuple[Observation, torch.Tensor]]:
+def press(controller: GraspController, seconds: float, until=lambda seen: False) -> list[Observation]:
     """Close on a block that stands where it was planned; the joints follow and slide the tips."""
     joints, tactile, path = torch.zeros(9).double(), no_contact(), []
     for _ in range(round(seconds / PERIOD)):
-        points = TARGET + start * NORMALS + joints.reshape(3, 3)
+        points = TARGET + 0.01 * NORMALS + joints.reshape(3, 3)
         push = SPRING * -((points + controller.targets.palm - TARGET) * NORMALS).sum(-1).clamp_max(0.0)
         contact = TipContact(push, -push[:, None] * NORMALS, points, NORMALS)
         tactile = measure(tactile, contact, NORMALS, real([0.01] * 3), PERIOD)
         seen = dataclasses.replace(observation(joints=joints), tips=points + 0.01 * NORMALS, tactile=tactile)
-        path.append((seen, controller.step(seen, PERIOD).joints))
-        joints = controller.targets.joints
+        path.append(seen)
+        if until(seen):
+            break
+        joints = controller.step(seen, PERIOD).joints
     return path
 
 
 def order(controller: GraspController) -> list[int]:
     """The fingers by their first touch, within the longest time of a closing."""
-    forces = torch.stack([seen.tactile.lagged[:, 0] for seen, _ in press(controller, 3.9)])
+    path = press(controller, 3.9, lambda seen: bool((seen.tactile.lagged[:, 0] > 0).all()))
+    forces = torch.stack([seen.tactile.lagged[:, 0] for seen in path])
     assert (forces[-1] > 0).all()
     return (forces > 0).double().argmax(0).argsort().tolist()
 
 
-@pytest.mark.parametrize("up", [1.0, -1.0])
-def test_fingers_that_search_in_vain_do_not_sink_below_the_table_but_move_freely_along_and_off_it(up):
-    """The fingers search along x, beyond their contacts; the table is across x, 5 mm behind those above it."""
-    above = NORMALS[:, 0] == up
-    table = Plane(real([up, 0, 0]), float(up * TARGET[above, 0].mean()) - 0.005)
-    low, free = (dataclasses.replace(reference(), table=t) for t in (table, None))
-    tips = {}
-    for name, known in (("low", low), ("free", free)):
-        law, joints = UncertaintyClosing(known, ClosingOptions(palm_reach=0.0, stops=0)), torch.zeros(9).double()
-        for _ in range(400):
-            at = TARGET + 0.02 * NORMALS + joints.reshape(3, 3)
-            joints = law(dataclasses.replace(observation(joints=joints), tips=at), PERIOD)
-        tips[name] = at[:, 0] * up
-    height = tips["low"] - table.offset - 0.01
-    assert float(height[above].min()) >= 0 and float(height[above].max()) < 1e-3
-    assert float(tips["free"][above].max()) < table.offset
-    assert float(tips["low"][~above].min()) > float(-0.03 + 0.01)
+def test_eq25_free_fingers_approach_their_contacts():
+    step = closing()(observation(), PERIOD).reshape(3, 3)
+    assert ((step * NORMALS).sum(-1) < 0).all()
+    assert step.norm(dim=-1).max() <= MAX_SPEED * PERIOD + 1e-12
+    assert step[:, 1:].abs().max() < 1e-9
 
 
 @pytest.mark.parametrize("contact", [False, True])
@@ -90,73 +87,147 @@ def test_eq25_of_the_paper_by_matrices(contact):
     assert np.allclose(found, PERIOD * bracket * min(1.0, MAX_SPEED / fastest), rtol=1e-4)
 
 
-@pytest.mark.parametrize("std_mm", [(1.0, 5.0, 10.0), (10.0, 5.0, 1.0), (5.0, 10.0, 1.0)])
-def test_the_more_certain_finger_touches_first_as_the_paper_says(std_mm):
-    certain_first = np.argsort(std_mm).tolist()
-    assert order(GraspController(uncertain(*std_mm), "paper")) == certain_first
+@pytest.mark.parametrize("std_mm", [(1.0, 5.0, 10.0), (5.0, 10.0, 1.0)])
+def test_paper_closing_touches_with_the_most_certain_finger_first(std_mm):
+    assert order(GraspController(uncertain(*std_mm), "paper")) == np.argsort(std_mm).tolist()
 
 
-def test_a_fast_force_loop_turns_that_order_round():
-    """Where the blend of an uncertain finger rises far from the contact, it is the force controller that closes it."""
+def test_paper_closing_touches_with_an_uncertain_finger_first_if_the_force_loop_is_fast():
     assert order(GraspController(uncertain(1, 5, 10, force=0.02), "paper"))[0] == 2
 
 
-def test_without_waiting_a_finger_presses_at_once():
-    one = torch.tensor([True, False, False])
-    seen = observation(0.0, (1.0, 0.0, 0.0), one)
-    for wait, sign in ((True, 1), (False, -1)):  # 1 N is more than the waiting force and less than the desired one
-        step = UncertaintyClosing(reference(), ClosingOptions(wait=wait))(seen, PERIOD).reshape(3, 3)
-        assert float(step[0] @ NORMALS[0]) * sign > 0
+def test_paper_closing_ends_when_fingers_have_arrived_with_steady_forces():
+    there, far = observation(0.0, contact=TOUCHING), observation(0.03, contact=TOUCHING)
+
+    def ticks(*, seen: Observation, rising: float = 0.0) -> int:
+        law = PaperClosing(reference())
+        for k in range(30):
+            average = torch.full((3,), rising * k).double()
+            law(dataclasses.replace(seen, tactile=dataclasses.replace(seen.tactile, average=average)), PERIOD)
+            if law.done:
+                return k
+        return 30
+
+    assert ticks(seen=there) < 20
+    assert ticks(seen=far) == ticks(seen=there, rising=0.05) == ticks(seen=observation(0.0)) == 30
 
 
-def test_without_the_switch_a_position_error_is_not_forgotten_at_a_touch():
+def test_fixed_gains_are_those_of_contacts_without_uncertainty():
+    gains = with_equal_gains(reference()).gains
+    assert torch.allclose(gains.position_gain, real(POSITION_RATE))
+    assert torch.allclose(gains.covariance, POSITION_FLOOR**2 * torch.eye(3).double())
+    assert (gains.force_gain == gains.force_gain[:, :1]).all()
+    assert torch.equal(gains.target, GAINS.target)
+
+
+def test_closing_lets_fingers_in_the_air_keep_pace():
+    near = dataclasses.replace(observation(0.2), tips=TARGET + 0.01 * NORMALS + real([[0.2], [0.1], [0.2]]) * NORMALS)
+    speed = -(closing()(near, PERIOD).reshape(3, 3) * NORMALS).sum(-1)
+    assert float(speed[1] / speed[0]) == pytest.approx((0.1 + POSITION_FLOOR) / (0.2 + POSITION_FLOOR), rel=1e-3)
+    assert float(speed[2]) == pytest.approx(float(speed[0]))
+
+
+def test_waiting_finger_rests_and_yields_to_more_than_the_waiting_force():
+    law, contact = closing(RIGID_ARM), ONE
+    for reading in (WAITING_FORCE, 0.1, 0.0, -0.1):
+        step = law(observation(0.02, (reading, 0, 0), contact), PERIOD).reshape(3, 3)
+        assert step[0].abs().max() < 1e-12
+        contact = FREE  # the finger rests although it no longer touches
+    step = law(observation(0.02, (1.0, 0, 0)), PERIOD).reshape(3, 3)
+    assert float((step[0] * NORMALS[0]).sum()) > 0
+    last = law(observation(0.02, (0.0, QUICK_TOUCH, QUICK_TOUCH)), PERIOD).reshape(3, 3)
+    assert float((last[0] * NORMALS[0]).sum()) < float((step[0] * NORMALS[0]).sum())  # all have touched: all press
+
+
+@pytest.mark.parametrize(("wait", "sign"), [(True, 1), (False, -1)])
+def test_finger_presses_at_once_without_waiting(wait, sign):
+    seen = observation(0.0, (1.0, 0.0, 0.0), ONE)  # more than the waiting force, less than the desired force
+    step = closing(ClosingOptions(wait=wait))(seen, PERIOD).reshape(3, 3)
+    assert float(step[0] @ NORMALS[0]) * sign > 0
+
+
+@pytest.mark.parametrize(("contact", "time"), [(TOUCHING, SETTLED), (ONE, PATIENCE)])
+def test_closing_ends_when_all_touch_or_patience_is_over(contact, time):
+    law, ticks = closing(), 0
+    while not law.done:
+        law(observation(contact=contact), PERIOD)
+        ticks += 1
+    assert ticks * PERIOD == pytest.approx(time, abs=1.5 * PERIOD)
+
+
+def test_closing_does_not_end_before_a_touch():
+    law = closing()
+    for _ in range(100):
+        law(observation(), 2 * PATIENCE / 100)
+    assert not law.done
+
+
+def test_targets_stay_near_the_joints_and_within_their_limits():
+    law, stopping = closing(), PositionClosing(reference())
+    for _ in range(150):
+        targets = law(observation(0.5), PERIOD)
+    assert targets.abs().max() == pytest.approx(LEAD)
+    for _ in range(60):
+        targets = stopping(observation(0.5), 0.5)
+    assert targets.abs().max() == pytest.approx(1.0)
+
+
+def test_late_finger_searches_beyond_its_planned_contact_and_presses_harder():
+    seen, law = observation(-0.03, (0.3, 0.3, 0.0), TWO), closing()
+    first = law(seen, PERIOD).reshape(3, 3)
+    assert float(first[2] @ NORMALS[2]) < -0.5 * MAX_SPEED * PERIOD
+    last = [law(seen, PERIOD) for _ in range(240)][-1]
+    assert last.abs().max() > 1.5 * LEAD  # the joints do not follow, as if blocked
+
+
+@pytest.mark.parametrize("up", [1.0, -1.0])
+def test_searching_finger_stays_above_the_table(up):
+    """The fingers search along x, beyond their contacts; the table is across x, 5 mm behind the contacts above it."""
+    above = NORMALS[:, 0] == up
+    table = Plane(real([up, 0, 0]), float(up * TARGET[above, 0].mean()) - 0.005)
+    low, free = (dataclasses.replace(reference(), table=t) for t in (table, None))
+    tips = {}
+    for name, known in (("low", low), ("free", free)):
+        law, joints = UncertaintyClosing(known, RIGID_ARM), torch.zeros(9).double()
+        for _ in range(200):
+            at = TARGET + 0.02 * NORMALS + joints.reshape(3, 3)
+            joints = law(dataclasses.replace(observation(joints=joints), tips=at), PERIOD)
+        tips[name] = at[:, 0] * up
+    height = tips["low"] - table.offset - 0.01
+    assert float(height[above].min()) >= 0 and float(height[above].max()) < 1e-3
+    assert float(tips["free"][above].max()) < table.offset
+    assert float(tips["low"][~above].min()) > float(-0.03 + 0.01)
+
+
+def test_touching_finger_is_force_controlled_whatever_its_position_error():
     seen = observation(0.03, (2.0, 2.0, 4.0), TOUCHING)  # the forces are as desired, the contacts 30 mm early
-    still = UncertaintyClosing(reference(), NO_OPTIONS)(seen, PERIOD)
-    assert still.abs().max() < 1e-9
+    assert UncertaintyClosing(reference(), NO_OPTIONS)(seen, PERIOD).abs().max() < 1e-9
     going = PaperClosing(reference())(seen, PERIOD).reshape(3, 3)
     assert ((going * NORMALS).sum(-1) < -1e-4).all()
 
 
-def test_the_papers_closing_ends_when_fingers_are_there_and_forces_are_steady():
-    there = observation(0.0, contact=TOUCHING)
-    far = observation(0.03, contact=TOUCHING)
-
-    def ticks(*, seen: Observation, rising: float = 0.0) -> int:
-        closing = PaperClosing(reference())
-        for k in range(100):
-            average = torch.full((3,), rising * k).double()
-            closing(dataclasses.replace(seen, tactile=dataclasses.replace(seen.tactile, average=average)), PERIOD)
-            if closing.done:
-                return k
-        return 100
-
-    assert ticks(seen=there) < 20
-    assert ticks(seen=far) == 100
-    assert ticks(seen=there, rising=0.05) == 100
-    assert ticks(seen=observation(0.0)) == 100
-
-
-def test_the_law_may_go_on_as_the_holding_and_then_presses_as_desired():
+def test_holding_law_presses_with_the_desired_forces():
     controller = GraspController(uncertain(2, 2, 2, force=0.005), holding="law")
-    waiting = press(controller, 2.5)
+    last = press(controller, 2.5)[-1]
     assert controller.hold is controller.closing
-    reading = waiting[-1][0].tactile.reading
-    assert torch.allclose(reading, real([3.0] * 3), rtol=0.05)
+    assert torch.allclose(last.tactile.reading, real([3.0] * 3), rtol=0.05)
 
 
-def test_the_papers_baseline_aims_at_the_contacts():
+def test_position_closing_stops_each_finger_for_good():
+    law = PositionClosing(reference())
+    first = law(observation(0.02, (STOP_FORCE, 0.0, 0.0)), PERIOD).reshape(3, 3)
+    assert first[0].abs().max() == 0
+    assert (first[1:].abs().amax(-1) > 0).all()
+    assert law(observation(0.02), PERIOD).reshape(3, 3)[0].abs().max() == 0
+    law(observation(), PERIOD)  # nothing is felt at the planned contacts: it continues
+    assert not law.done
+    law(observation(0.0005 - 0.02), PERIOD)
+    assert law.done
+
+
+def test_paper_position_closing_aims_at_the_contacts():
     controller = GraspController(reference(), "paper_position")
     assert isinstance(controller.closing, PositionClosing)
     assert torch.equal(controller.closing.aim, TARGET)
     controller.step(observation(0.5e-3), PERIOD)
     assert controller.closing.done
-
-
-def test_parts_and_laws_of_closings_without_any_are_refused():
-    for closing in ("paper", "position", "open_loop"):
-        with pytest.raises(BadArgument, match="options"):
-            GraspController(reference(), closing, options=ClosingOptions())
-        with pytest.raises(BadArgument, match="options"):
-            TrialSpec(closing=closing, options=ClosingOptions())
-    with pytest.raises(BadArgument, match="law"):
-        GraspController(reference(), "position", "law")

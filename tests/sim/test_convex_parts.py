@@ -18,7 +18,7 @@ def bracket():
     return extrude_triangulation(outline, np.array(triangles), 0.03)
 
 
-def test_a_convex_mesh_is_its_own_part(tmp_path):
+def test_convex_parts_of_a_convex_mesh_is_its_hull(tmp_path):
     mesh = trimesh.creation.cylinder(radius=0.03, height=0.12)
     parts = convex_parts(mesh, tmp_path)
     assert len(parts) == 1
@@ -26,7 +26,7 @@ def test_a_convex_mesh_is_its_own_part(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_parts_of_a_concave_mesh_fill_it_and_leave_the_gap(tmp_path, capfd):
+def test_convex_parts_fill_a_concave_mesh_and_are_cached(tmp_path, capfd):
     pytest.importorskip("coacd")
     mesh = bracket()
     parts = convex_parts(mesh, tmp_path)
@@ -51,7 +51,7 @@ def test_parts_of_a_concave_mesh_fill_it_and_leave_the_gap(tmp_path, capfd):
 
 
 @pytest.mark.sim
-def test_a_mesh_that_cannot_be_cut_in_its_time_is_refused(tmp_path, monkeypatch):
+def test_decompose_refuses_a_mesh_that_takes_too_long(tmp_path, monkeypatch):
     """The jug takes 4 s; here it has one."""
     pytest.importorskip("coacd")
     monkeypatch.setattr("torchgrasp.sim.decompose.SECONDS", 1.0)
@@ -61,7 +61,7 @@ def test_a_mesh_that_cannot_be_cut_in_its_time_is_refused(tmp_path, monkeypatch)
     assert not list(tmp_path.iterdir())
 
 
-def test_parts_given_are_used_as_they_are():
+def test_check_parts_keeps_convex_parts_and_refuses_others():
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     assert check_parts([box])[0] is box
     with pytest.raises(MeshError, match="part 0, which is not convex"):
@@ -70,13 +70,13 @@ def test_parts_given_are_used_as_they_are():
         check_parts([])
 
 
-def test_a_mesh_that_is_no_solid_is_refused():
+def test_convex_parts_refuses_an_open_mesh():
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     with pytest.raises(MeshError, match="open surface"):
         convex_parts(trimesh.Trimesh(box.vertices, box.faces[:-1]))
 
 
-def test_a_cube_whose_faces_are_flat_but_for_rounding_errors_gives_a_closed_part(tmp_path):
+def test_convex_parts_of_a_nearly_flat_cube_is_closed(tmp_path):
     """Its hull comes out of Qhull open, and would be refused as a part."""
     cube = trimesh.creation.box([0.04, 0.04, 0.04]).subdivide().subdivide().subdivide()
     noise = np.random.default_rng(0).uniform(-1e-10, 1e-10, cube.vertices.shape)
@@ -86,7 +86,7 @@ def test_a_cube_whose_faces_are_flat_but_for_rounding_errors_gives_a_closed_part
     assert part.volume == pytest.approx(0.04**3, rel=1e-4)
 
 
-def test_corners_in_a_plane_have_no_volume():
+def test_hull_of_corners_in_a_plane_has_no_volume():
     corners = np.zeros((12, 3))
     corners[0, 0], corners[10], corners[11] = -0.016, (-0.0325, 0.0, -0.0263), (-0.0325, 0.0, 0.0263)
     assert hull(corners).volume == 0

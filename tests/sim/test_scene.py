@@ -29,7 +29,7 @@ def mounted(urdf_path, **options):
     return mounted_urdf(SceneSpec(urdf_path, np.eye(4), {}, {}, (), ball, [ball], 0.1, **options))
 
 
-def test_the_mounted_urdf_holds_geometry_and_the_joints_of_the_mount():
+def test_mounted_urdf_has_geometry_and_mount_joints():
     path = load_hand("barrett").urdf_path
     assert APPROACH_JOINT not in mounted(path)
     text = mounted(path, approach=(0.0, 0.06, -0.08))
@@ -40,7 +40,7 @@ def test_the_mounted_urdf_holds_geometry_and_the_joints_of_the_mount():
     assert text.count("<collision") > 5
 
 
-def test_files_that_are_no_hand_are_refused(tmp_path):
+def test_mounted_urdf_refuses_files_that_are_no_hand(tmp_path):
     with pytest.raises(HandFileError):
         mounted(tmp_path / "none.urdf")
     (tmp_path / "two.urdf").write_text('<robot name="r"><link name="a"/><link name="b"/></robot>')
@@ -76,7 +76,7 @@ def standing(radius=0.03, height=0.12):
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("simulator", SIMULATORS)
 @pytest.mark.parametrize("timestep", [1 / 240, 1 / 500])
-def test_resting_weight(timestep, simulator):
+def test_scene_supports_the_objects_weight(timestep, simulator):
     *_, scene = build("barrett", standing(), simulator, timestep=timestep)
     forces = []
     for _ in range(200):
@@ -89,7 +89,7 @@ def test_resting_weight(timestep, simulator):
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("simulator", SIMULATORS)
-def test_object_has_the_mass_centre_and_inertia_of_its_mesh(simulator):
+def test_scene_object_has_the_inertia_of_its_mesh(simulator):
     radius, height, mass = 0.03, 0.12, 0.36
     mesh = standing(radius, height)
     mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]))
@@ -113,7 +113,7 @@ def test_object_has_the_mass_centre_and_inertia_of_its_mesh(simulator):
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("simulator", SIMULATORS)
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
-def test_simulators_obey_the_law(name, simulator):
+def test_scene_obeys_check_scene(name, simulator):
     pytest.importorskip(simulator)
     from torchgrasp.sim.scene import open_scene
 
@@ -131,7 +131,7 @@ BODY = """<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iy
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("simulator", SIMULATORS)
-def test_sliding_joints_move_their_tips_along_their_axes(tmp_path, simulator):
+def test_jacobian_of_sliding_joints_is_along_their_axes(tmp_path, simulator):
     pytest.importorskip(simulator)
     from torchgrasp.hand.hand import Actuator
     from torchgrasp.sim.scene import open_scene
@@ -160,7 +160,7 @@ def test_sliding_joints_move_their_tips_along_their_axes(tmp_path, simulator):
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("simulator", SIMULATORS)
-def test_a_force_pulls_at_the_mass_centre_and_the_lift_follows_a_speed(simulator):
+def test_scene_pulls_at_the_mass_centre_and_lifts_at_a_speed(simulator):
     mesh = standing()
     mesh.apply_translation([0.3, 0.0, 0.0])
     *_, scene = build("allegro", mesh, simulator, gravity=0.0, table=False)
@@ -177,7 +177,7 @@ def test_a_force_pulls_at_the_mass_centre_and_the_lift_follows_a_speed(simulator
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("simulator", SIMULATORS)
-def test_joints_without_a_drive_are_named(simulator):
+def test_open_scene_refuses_joints_without_a_drive(simulator):
     pytest.importorskip(simulator)
     from torchgrasp.sim.scene import open_scene
     from torchgrasp.sim.scene_spec import SceneSpec
@@ -193,7 +193,7 @@ def test_joints_without_a_drive_are_named(simulator):
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("simulator", SIMULATORS)
-def test_a_mount_that_yields_moves_the_hand_where_it_is_sent_and_lifts_it_as_well(simulator):
+def test_yielding_mount_shifts_and_lifts_the_hand(simulator):
     *_, world_from_hand, scene = build("barrett", standing(), simulator, yields=0.02)
     scene.shift(np.array([0.02, -0.01, 0.005]))
     scene.lift(0.05)
@@ -204,7 +204,7 @@ def test_a_mount_that_yields_moves_the_hand_where_it_is_sent_and_lifts_it_as_wel
     assert np.abs(moved[:3, :3]).max() < 1e-5
 
 
-def test_a_mount_has_no_joints_for_what_it_does_not_do():
+def test_mounted_urdf_has_shift_joints_only_if_the_mount_yields():
     path = load_hand("barrett").urdf_path
     assert not any(name in mounted(path) for name in SHIFT_JOINTS)
     assert all(name in mounted(path, yields=0.02) for name in SHIFT_JOINTS)

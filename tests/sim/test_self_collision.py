@@ -20,7 +20,7 @@ HANDS = ("allegro", "barrett", "allegro_biotac")
 
 
 @pytest.mark.parametrize("name", HANDS)
-def test_masks_let_the_named_pairs_collide_and_no_others(name):
+def test_pair_masks_let_only_named_pairs_collide(name):
     pairs = load_hand(name).self_pairs
     masks = pair_masks(pairs, first=3)
     named = {frozenset(pair) for pair in pairs}
@@ -30,7 +30,7 @@ def test_masks_let_the_named_pairs_collide_and_no_others(name):
     assert all(number & 0b111 == 0 and number < 2**31 for mask in masks.values() for number in mask)
 
 
-def test_more_links_than_bits_are_refused():
+def test_pair_masks_refuses_more_pairs_than_bits():
     links = [f"link_{k}" for k in range(40)]
     with pytest.raises(HandFileError, match="self_collision"):
         pair_masks(itertools.combinations(links, 2), first=3)
@@ -40,7 +40,7 @@ def test_more_links_than_bits_are_refused():
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("simulator", ["sapien", "mujoco"])
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
-def test_fingers_that_are_driven_through_each_other_stop_in_contact(name, simulator):
+def test_scene_stops_fingers_driven_through_each_other(name, simulator):
     """The hand's own boxes tell how deep its links end in each other: a reference that no simulator computes."""
     pytest.importorskip(simulator)
     hand = load_hand(name)
@@ -73,7 +73,7 @@ def test_fingers_that_are_driven_through_each_other_stop_in_contact(name, simula
 
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
-def test_a_trial_whose_hand_starts_in_itself_is_refused():
+def test_trial_refuses_a_hand_that_starts_in_itself():
     pytest.importorskip("sapien")
     hand, grasp = pinch("barrett")
     joints = hand.lower + (hand.upper - hand.lower) * torch.rand(
@@ -88,7 +88,7 @@ def test_a_trial_whose_hand_starts_in_itself_is_refused():
 
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
-def test_a_grasp_that_keeps_its_fingers_apart_is_the_same_to_the_last_bit():
+def test_trial_is_the_same_with_self_collision_if_fingers_stay_apart():
     there, here = (close("allegro", spec=dataclasses.replace(QUICK, self_collision=on)) for on in (True, False))
     assert there.status is Status.OK
     assert torch.equal(there.joints, here.joints) and torch.equal(there.object_pose, here.object_pose)

@@ -27,7 +27,7 @@ def both():
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
-def test_both_hold_a_cylinder_with_the_same_forces(name):
+def test_simulators_hold_a_cylinder_with_equal_forces(name):
     spec = dataclasses.replace(QUICK, noise=False)
     there, here = (close(name, spec=dataclasses.replace(spec, simulator=s)) for s in ("sapien", "mujoco"))
     assert there.held and here.held
@@ -37,14 +37,14 @@ def test_both_hold_a_cylinder_with_the_same_forces(name):
 
 
 @pytest.mark.promise("N15")
-def test_mujoco_gives_the_same_bits_here_and_in_another_process():
+def test_mujoco_gives_the_same_bits_in_another_process():
     first = digest(close("allegro", spec=QUICK, seed=3))
     assert first == digest(close("allegro", spec=QUICK, seed=3))
     assert first != digest(close("allegro", spec=QUICK, seed=4))
     assert first == digest_elsewhere("allegro", "mujoco", 3)
 
 
-def test_mujoco_tells_overlap_and_absence():
+def test_mujoco_reports_overlap_and_missing_contact():
     forward = torch.eye(4, dtype=torch.float64)
     forward[2, 3] = 0.2
     assert close("barrett", spec=QUICK, error=forward).status is Status.START_OVERLAP
@@ -54,7 +54,7 @@ def test_mujoco_tells_overlap_and_absence():
 
 
 @pytest.mark.parametrize("pull", [10.0, 300.0])
-def test_both_agree_on_a_pull(pull):
+def test_simulators_agree_on_a_pull(pull):
     hand, grasp = pinch("allegro")
     trial = GraspTrial(hand, grasp, cylinder())
     protocol = dataclasses.replace(PULL, pull=dataclasses.replace(PULL.pull, acceleration=pull))
@@ -65,7 +65,7 @@ def test_both_agree_on_a_pull(pull):
 
 @pytest.mark.parametrize("simulator", ["sapien", "mujoco"])
 @pytest.mark.parametrize(("effort", "held"), [(0.01, False), (0.7, True)])
-def test_drives_that_cannot_hold_the_weight_are_named(simulator, effort, held):
+def test_simulators_report_drives_that_are_too_weak(simulator, effort, held):
     hand, grasp = pinch("allegro")
     drives = {name: drive._replace(effort=effort) for name, drive in hand.actuators.items()}
     spec = dataclasses.replace(QUICK, simulator=simulator)
@@ -74,7 +74,7 @@ def test_drives_that_cannot_hold_the_weight_are_named(simulator, effort, held):
 
 
 @pytest.mark.parametrize("simulator", ["sapien", "mujoco"])
-def test_what_leaves_all_bounds_or_starts_in_the_object_never_counts_as_held(simulator, tmp_path, monkeypatch):
+def test_simulators_never_hold_a_diverged_or_overlapping_trial(simulator, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     hand, grasp = pinch("allegro")
     drives = {name: drive._replace(kp=1e12, kd=0.0, effort=1e30) for name, drive in hand.actuators.items()}
@@ -91,7 +91,7 @@ def test_what_leaves_all_bounds_or_starts_in_the_object_never_counts_as_held(sim
     assert not list(tmp_path.iterdir())
 
 
-def test_the_scene_as_mjcf_is_a_model_of_its_own():
+def test_scene_mjcf_is_a_complete_model():
     """What is exported opens without this library, and weighs what hand and object weigh."""
     import mujoco
 

@@ -37,7 +37,7 @@ def energy(points: torch.Tensor, rest: torch.Tensor, turned: torch.Tensor) -> to
     return 0.5 * TRANSLATION_STIFFNESS * slide + ROTATION_STIFFNESS * turn
 
 
-def test_shared_forces_add_up_to_the_wrench_and_are_the_smallest():
+def test_shared_forces_are_the_smallest_for_the_wrench():
     points = triangles(20)
     wrench = torch.randn(20, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     forces = shared_forces(points, wrench, torch.full((20,), 1e9).double())
@@ -51,7 +51,7 @@ def test_shared_forces_add_up_to_the_wrench_and_are_the_smallest():
     assert torch.allclose(capped / capped.norm(), forces / forces.norm(), atol=1.0)
 
 
-def test_springs_balance_and_pull_longer_sides_together():
+def test_spring_forces_balance_and_pull_together():
     points = triangles(20)
     stiffness = torch.tensor([10.0, 200.0, 70.0]).double().expand(20, 3)
     forces = spring_forces(points, side_lengths(points) - 0.01, stiffness)
@@ -61,7 +61,7 @@ def test_springs_balance_and_pull_longer_sides_together():
     assert spring_forces(points, side_lengths(points), stiffness).abs().max() == 0
 
 
-def test_the_wrench_is_the_gradient_of_an_energy():
+def test_restoring_wrench_is_the_gradient_of_an_energy():
     """A turn by v about the origin changes the energy by -torque . v, a shift by d by -force . d."""
     points = triangles(1)[0]
     rest = virtual_frame(points @ rotation_from_vector(real([0.3, -0.2, 0.1])).T + real([0.004, -0.002, 0.001]))
@@ -78,7 +78,7 @@ def test_the_wrench_is_the_gradient_of_an_energy():
         assert float(slope) == pytest.approx(-float(wrench[k]), rel=1e-5, abs=1e-8)
 
 
-def test_at_rest_the_drives_press_with_the_desired_forces():
+def test_impedance_at_rest_presses_with_the_desired_forces():
     seen = observation(0.0, contact=TOUCHING, reading=(2.0, 2.0, 4.0))
     hold = Impedance(reference(), seen, torch.zeros(9).double())
     first = hold(seen, PERIOD)
@@ -88,7 +88,7 @@ def test_at_rest_the_drives_press_with_the_desired_forces():
     assert torch.allclose(2.0 * last.reshape(3, 3), forces, atol=1e-9)
 
 
-def test_a_shifted_or_turned_grasp_is_pulled_back_and_stays_pressed():
+def test_impedance_restores_a_moved_grasp():
     seen = observation(0.0, contact=TOUCHING, reading=(2.0, 2.0, 4.0))
     hold = Impedance(reference(), seen, torch.zeros(9).double())
     tips, rest = seen.tips, hold.forces(seen.tips)
@@ -103,7 +103,7 @@ def test_a_shifted_or_turned_grasp_is_pulled_back_and_stays_pressed():
     assert float(far.norm(dim=-1).max()) == pytest.approx(float(rest.norm(dim=-1).max()))
 
 
-def test_forces_turn_with_the_hand_frame():
+def test_impedance_forces_turn_with_the_frame():
     seen = observation(0.0, contact=TOUCHING)
     hold = Impedance(reference(), seen, torch.zeros(9).double())
     moved = seen.tips + 0.002 * triangles(1, 3)[0] / 0.05
@@ -114,7 +114,7 @@ def test_forces_turn_with_the_hand_frame():
     assert torch.allclose(forces, hold.forces(moved) @ there[:3, :3].T, atol=1e-9)
 
 
-def test_tips_on_a_line_keep_the_last_frame():
+def test_impedance_keeps_its_frame_for_tips_on_a_line():
     seen = observation(0.0, contact=TOUCHING)
     hold = Impedance(reference(), seen, torch.zeros(9).double())
     line = seen.tips.mean(0) + torch.arange(3)[:, None] * real([0.01, 0.0, 0.0])
@@ -122,7 +122,7 @@ def test_tips_on_a_line_keep_the_last_frame():
     assert torch.equal(hold.frame, hold.rest)
 
 
-def test_a_grasp_that_feels_unstable_becomes_firmer_and_another_does_not():
+def test_impedance_firms_an_unstable_grasp_only():
     class Model(StabilityModel):
         """Stable is what presses with more than 5 N in all."""
 
@@ -151,7 +151,7 @@ def test_a_grasp_that_feels_unstable_becomes_firmer_and_another_does_not():
     assert (kept.raised, kept.springs.tolist()) == (1.0, [50.0] * 3)
 
 
-def test_coupled_joints_get_the_torque_of_their_actuator():
+def test_impedance_drives_coupled_joints_by_their_actuator():
     """Three actuators move three joints each: the generalised torque is C^T J^T f whatever their stiffness."""
     coupling = torch.kron(torch.eye(3), torch.tensor([[1.0], [0.5], [0.25]])).double()
     body = reference(coupling)

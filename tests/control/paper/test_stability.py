@@ -52,7 +52,7 @@ def test_lengths_are_those_of_the_code_in_any_frame():
     assert quiet[6:].exp().tolist() == pytest.approx([LEAST_FORCE, LEAST_FORCE, 1.0])
 
 
-def test_odds_tell_held_grasps_from_others():
+def test_log_odds_rank_held_grasps_above_others():
     """Both densities are Gaussians of known mean: the odds are their quadratic form, and rank held-out states."""
     held, failed = states(300, 2.0, 2), states(300, 0.7, 3)
     fitted = fit_stability(states(400, 2.0, 0), states(200, 0.7, 1), 1)
@@ -87,7 +87,7 @@ def test_preferred_forces_are_the_regression_on_the_lengths(model: StabilityMode
         model.preferred_forces(tips(float("nan")))
 
 
-def test_the_file_is_read_back_and_refused_by_another_hand(model: StabilityModel, tmp_path):
+def test_stability_file_is_read_back_and_refused_for_another_hand(model: StabilityModel, tmp_path):
     path = model.save(tmp_path / "stability.safetensors")
     assert path.stat().st_size < 100_000
     again = load_stability(load_hand("allegro"), path)
@@ -102,7 +102,7 @@ def test_the_file_is_read_back_and_refused_by_another_hand(model: StabilityModel
         load_stability(load_hand("allegro"), tmp_path / "broken.safetensors")
 
 
-def test_shipped_models_are_of_their_hands():
+def test_load_stability_finds_the_shipped_models():
     assert load_stability(load_hand("allegro_biotac")) is None
     for name in ("allegro", "barrett"):
         hand = load_hand(name)
@@ -118,7 +118,7 @@ def test_shipped_models_are_of_their_hands():
         assert float(firm) > 0 > float(weak)
 
 
-def test_bad_fits_are_refused(model: StabilityModel):
+def test_fit_stability_refuses_bad_fits(model: StabilityModel):
     with pytest.raises(BadArgument, match="components"):
         fit_stability(states(20, 2.0, 0), states(20, 1.0, 1), 4)
     with pytest.raises(BadArgument, match="share"):
