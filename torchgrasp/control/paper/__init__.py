@@ -1,1 +1,1 @@
-"""What the paper compares with: its control law and baselines, learned stability and object-level impedance. Not public."""
+"""The paper's control law and baselines, learned stability and object-level impedance. Not public."""
