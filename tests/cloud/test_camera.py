@@ -3,7 +3,8 @@ import pytest
 import torch
 import trimesh
 
-from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view
+from torchgrasp.cloud.camera import INTRINSICS, add_noise, cast_mesh, look_at, partial_view, render_depth
+from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.errors import BadArgument, MeshError
 from torchgrasp.geometry.frames import inverse
 
@@ -96,18 +97,58 @@ def test_fewer_pixels_than_points_give_all_pixels(box):
     assert len(far) == pytest.approx(616**2 * 0.08 * 0.10 / 7.97**2, rel=0.3)
 
 
-def test_refusals(box):
-    with pytest.raises(BadArgument, match="elevation"):
-        look_at(0.0, 90.0)
-    with pytest.raises(BadArgument, match="azimuth"):
-        look_at(float("nan"), 0.0, 0.5)
-    with pytest.raises(BadArgument, match="distance"):
-        look_at(0.0, 0.0, distance=-1.0)
-    with pytest.raises(BadArgument, match=r"n: expected .*got 3"):
-        partial_view(box, look_at(0.0, 0.0), n=3)
-    with pytest.raises(BadArgument, match="camera_pose"):
-        partial_view(box, 2 * look_at(0.0, 0.0))
-    with pytest.raises(MeshError):
-        partial_view(trimesh.Trimesh(), look_at(0.0, 0.0, 0.5))
-    with pytest.raises(MeshError):
-        look_at(0.0, 0.0, target=trimesh.Trimesh())
+@pytest.fixture(scope="module")
+def boxes():
+    near, far = trimesh.creation.box([0.06, 0.08, 0.10]), trimesh.creation.box([0.08, 0.08, 0.20])
+    return [near.apply_translation([0.05, 0.0, 0.05]), far.apply_translation([-0.08, 0.0, 0.10])]
+
+
+def test_render_depth_exact_depths_lie_on_the_labelled_mesh_or_the_table(boxes):
+    pose = look_at(10.0, 40.0, 0.7)
+    depth, labels = render_depth(boxes, pose, noise=False)
+    for k in (0, 1, 2):
+        points = cloud_from_depth(torch.where(labels == k, depth, 0.0), INTRINSICS, camera_pose=pose).points
+        if k == 0:
+            assert points[:, 2].abs().max() < 1e-9
+            assert 0.4 < points[:, :2].norm(dim=-1).max() < 0.6
+        else:
+            distance = trimesh.proximity.closest_point(boxes[k - 1], points[::20].numpy())[1]
+            assert distance.max() < 1e-9
+    assert not render_depth(boxes, pose, table=None, noise=False)[0][labels == 0].any()
+
+
+def test_a_nearer_thing_hides_another(boxes):
+    pose = look_at(0.0, 20.0, 0.6)
+    both = render_depth(boxes, pose, noise=False)[1] == 2
+    alone = render_depth(boxes[1:], pose, noise=False)[1] == 1
+    assert both.sum() < 0.9 * alone.sum()
+    assert not (both & ~alone).any()
+
+
+def test_the_noise_is_that_of_a_partial_view(boxes):
+    pose = look_at(25.0, 45.0, 0.6)
+    depth, labels = render_depth(boxes[:1], pose, table=None, seed=5)
+    exact = add_noise(*cast_mesh(boxes[0], pose), torch.Generator().manual_seed(5))
+    assert torch.equal(depth, exact)
+    cloud = partial_view(boxes[0], pose, n=10**6, seed=5)
+    whole = cloud_from_depth(depth, INTRINSICS, camera_pose=pose)
+    np.testing.assert_array_equal(np.sort(cloud.points[:, 0].numpy()), np.sort(whole.points[:, 0].numpy()))
+    assert torch.equal(labels, render_depth(boxes[:1], pose, table=None, noise=False)[1])
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (lambda box: look_at(0.0, 90.0), BadArgument, "elevation"),
+        (lambda box: look_at(float("nan"), 0.0, 0.5), BadArgument, "azimuth"),
+        (lambda box: look_at(0.0, 0.0, distance=-1.0), BadArgument, "distance"),
+        (lambda box: look_at(0.0, 0.0, target=trimesh.Trimesh()), MeshError, "target"),
+        (lambda box: partial_view(box, look_at(0.0, 0.0), n=3), BadArgument, "n: expected .*got 3"),
+        (lambda box: partial_view(box, 2 * look_at(0.0, 0.0)), BadArgument, "camera_pose"),
+        (lambda box: partial_view(trimesh.Trimesh(), look_at(0.0, 0.0, 0.5)), MeshError, "mesh"),
+        (lambda box: render_depth([box], 2 * look_at(0.0, 30.0)), BadArgument, "camera_pose"),
+    ],
+)
+def test_wrong_arguments_are_refused_by_name(box, call, error, words):
+    with pytest.raises(error, match=words):
+        call(box)

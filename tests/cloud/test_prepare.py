@@ -2,11 +2,23 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial.transform import Rotation
 
+from tests.make import directions
 from torchgrasp.cloud.camera import look_at, partial_view
-from torchgrasp.cloud.prepare import MAX_POINTS, clean_cloud, estimate_normals, prepare_cloud
+from torchgrasp.cloud.neighbours import fit_planes
+from torchgrasp.cloud.prepare import (
+    MAX_POINTS,
+    clean_cloud,
+    compare_normals,
+    estimate_normals,
+    guess_viewpoint,
+    prepare_cloud,
+    share_facing,
+)
 from torchgrasp.data.shipped import list_objects, load_object
 from torchgrasp.errors import TooFewPoints
+from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.values import PointCloud
 
@@ -14,6 +26,27 @@ from torchgrasp.values import PointCloud
 def truth(mesh, points):
     _, distance, face = trimesh.proximity.closest_point(mesh, points.numpy())
     return torch.from_numpy(mesh.face_normals[face]), torch.from_numpy(distance)
+
+
+def surface(mesh, n, seed=0):
+    points, face = trimesh.sample.sample_surface(mesh, n, seed=seed)
+    return PointCloud(torch.from_numpy(np.asarray(points)), torch.from_numpy(mesh.face_normals[face].copy()))
+
+
+def check_normals(cloud):
+    return compare_normals(cloud.points, cloud.normals)
+
+
+def estimate_viewpoint(cloud):
+    return guess_viewpoint(cloud.points, fit_planes(cloud.points)[0])
+
+
+def flip(cloud, share, seed=0):
+    """Flip a share of the normals, and tell which."""
+    flipped = torch.rand(len(cloud), generator=torch.Generator().manual_seed(seed), dtype=torch.float64) < share
+    return PointCloud(
+        cloud.points, torch.where(flipped[:, None], -cloud.normals, cloud.normals), cloud.viewpoint
+    ), flipped
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +96,7 @@ def test_given_normals_decide_the_side_of_a_cloud_seen_from_all_around():
 
 
 def test_outliers_go_and_the_others_come_closer_to_the_surface():
-    for name in list_objects():
+    for name in ("jug", "spray"):
         thing = load_object(name)
         generator = torch.Generator().manual_seed(0)
         stray = thing.view.points[:20] + torch.tensor([0.0, 0.0, 0.08]).double()
@@ -77,23 +110,6 @@ def test_outliers_go_and_the_others_come_closer_to_the_surface():
         _, after = truth(thing.mesh, cloud.points)
         assert after.max() < 0.012
         assert after.square().mean().sqrt() < before.square().mean().sqrt()
-
-
-def test_duplicates_change_nothing(ball_view):
-    twice = PointCloud(ball_view.points.repeat(3, 1), None, ball_view.viewpoint)
-    for function in (estimate_normals, clean_cloud):
-        once, thrice = function(ball_view), function(twice)
-        assert len(once) == len(thrice)
-        torch.testing.assert_close(once.points, thrice.points)
-        torch.testing.assert_close(once.normals, thrice.normals)
-
-
-def test_results_scale_with_the_cloud_and_keep_its_dtype(ball_view):
-    small, large = clean_cloud(ball_view), clean_cloud(PointCloud(7 * ball_view.points, None, 7 * ball_view.viewpoint))
-    torch.testing.assert_close(7 * small.points, large.points, atol=1e-12, rtol=1e-9)
-    torch.testing.assert_close(small.normals, large.normals, atol=1e-7, rtol=0)
-    single = clean_cloud(PointCloud(ball_view.points.float(), None, ball_view.viewpoint.float()))
-    assert single.points.dtype == single.normals.dtype == torch.float32
 
 
 def test_the_smallest_cloud_and_a_cloud_of_copies():
@@ -124,14 +140,6 @@ def rng(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
-def ball(n):
-    return unit(torch.randn(n, 3, generator=rng(), dtype=torch.float64))
-
-
-def random_signs(normals):
-    return normals * torch.randn(len(normals), 1, generator=rng(1), dtype=torch.float64).sign()
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_prepared_view_is_the_clean_cloud_and_its_points_in_float64(dtype):
     view = load_object("jug").view.to(dtype)
@@ -146,21 +154,21 @@ def test_a_prepared_view_is_the_clean_cloud_and_its_points_in_float64(dtype):
 def test_a_missing_viewpoint_is_estimated_also_of_a_whole_surface():
     unknown = prepare_cloud(PointCloud(load_object("jug").view.points), rng())
     assert unknown.viewpoint.shape == (3,) and unknown.one_sided
-    whole = prepare_cloud(PointCloud(0.04 * ball(600), ball(600)), rng())
+    whole = prepare_cloud(PointCloud(0.04 * directions(600), directions(600)), rng())
     assert whole.viewpoint.shape == (3,) and whole.cloud.viewpoint is None and not whole.one_sided
 
 
 def test_a_whole_surface_is_not_turned_towards_its_viewpoint():
     viewpoint = torch.tensor([0.0, 0.0, 0.5], dtype=torch.float64)
-    prepared = prepare_cloud(PointCloud(0.04 * ball(600), ball(600), viewpoint), rng())
+    prepared = prepare_cloud(PointCloud(0.04 * directions(600), directions(600), viewpoint), rng())
     assert ((prepared.normals * prepared.points).sum(-1) > 0).all() and not prepared.one_sided
 
 
 def test_without_cleaning_points_and_given_normals_stay_as_they_are():
-    points = 0.04 * ball(600)
-    prepared = prepare_cloud(PointCloud(points.repeat(2, 1), 3 * ball(600).repeat(2, 1)), rng(), clean=False)
+    points = 0.04 * directions(600)
+    prepared = prepare_cloud(PointCloud(points.repeat(2, 1), 3 * directions(600).repeat(2, 1)), rng(), clean=False)
     assert torch.equal(prepared.points, points)
-    torch.testing.assert_close(prepared.normals, ball(600))
+    torch.testing.assert_close(prepared.normals, directions(600))
     fitted = prepare_cloud(PointCloud(points), rng(), clean=False)
     assert torch.equal(fitted.points, points) and fitted.cloud.normals is not None
 
@@ -169,14 +177,62 @@ def test_without_cleaning_points_and_given_normals_stay_as_they_are():
 def test_normals_of_random_signs_are_ignored_however_often_a_point_was_given(copies):
     """Copies of a point agree with each other: counted as neighbours they would hide that the signs are random."""
     view = load_object("cylinder").view
-    normals = random_signs(estimate_normals(view).normals)
+    normals = flip(estimate_normals(view), 0.5)[0].normals
     spoilt = PointCloud(view.points.repeat(copies, 1), normals.repeat(copies, 1), view.viewpoint)
     prepared = prepare_cloud(spoilt, rng())
     assert torch.equal(prepared.normals, prepare_cloud(view, rng()).normals)
 
 
 def test_of_many_points_a_random_part_is_taken_by_the_generator():
-    cloud = PointCloud(0.04 * ball(5000), ball(5000))
+    cloud = PointCloud(0.04 * directions(5000), directions(5000))
     first, again, other = (prepare_cloud(cloud, rng(seed)) for seed in (0, 0, 1))
     assert len(first.points) == MAX_POINTS and len(first.cloud) > 4900
     assert torch.equal(first.points, again.points) and not torch.equal(first.points, other.points)
+
+
+@pytest.mark.promise("I8")
+@pytest.mark.parametrize("name", list_objects())
+def test_flips_are_reported_and_good_normals_are_not(name):
+    thing = load_object(name)
+    for cloud in (surface(thing.mesh, 1000), estimate_normals(thing.view)):
+        good = check_normals(cloud)
+        assert good.oriented and good.scaled == 0 and good.opposed < 0.03
+        assert float(good.flipped.double().mean()) < 0.04
+        spoilt, flipped = flip(cloud, 0.1)
+        found = check_normals(spoilt)
+        assert found.oriented and 0.1 < found.opposed < 0.25
+        assert float((found.flipped == flipped).double().mean()) > 0.95
+        assert not check_normals(flip(cloud, 0.5)[0]).oriented
+
+
+def test_a_thin_plate_and_a_coarse_ball_are_oriented():
+    assert check_normals(surface(trimesh.creation.box((0.15, 0.2, 0.002)), 1000)).oriented
+    axes = torch.cat([torch.eye(3), -torch.eye(3)]).double()
+    assert check_normals(PointCloud(0.05 * axes, axes)).oriented
+
+
+def test_the_guess_follows_a_rigid_motion_and_finds_the_camera(ball_view):
+    for seed in range(3):
+        turn = torch.from_numpy(Rotation.random(random_state=seed).as_matrix())
+        moved = PointCloud(ball_view.points @ turn.T + 0.3)
+        camera = ball_view.viewpoint @ turn.T
+        guess = estimate_viewpoint(moved) - 0.3
+        angle = torch.arccos(guess @ camera / torch.linalg.vector_norm(guess) / torch.linalg.vector_norm(camera))
+        assert torch.rad2deg(angle) < 25
+
+
+def test_a_cloud_in_the_frame_of_its_camera_was_seen_from_the_origin():
+    thing = load_object("jug")
+    pose = look_at(60.0, 35.0, target=thing.mesh)
+    torch.testing.assert_close(pose[:3, 3], thing.view.viewpoint, atol=1e-6, rtol=0)
+    assert estimate_viewpoint(PointCloud(apply(inverse(pose), thing.view.points))).tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("name", list_objects())
+def test_a_view_faces_its_camera_and_a_whole_surface_does_not(name):
+    view = estimate_normals(load_object(name).view)
+    assert share_facing(view.points, view.normals, view.viewpoint) > 0.9
+    both = torch.cat([view.normals, -view.normals])
+    assert share_facing(view.points.repeat(2, 1), both, view.viewpoint) == pytest.approx(0.5)
+    each = view.viewpoint.expand(len(view), 3)
+    assert share_facing(view.points, view.normals, each) == share_facing(view.points, view.normals, view.viewpoint)

@@ -78,7 +78,9 @@ def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = T
         if len(count) > max_views:
             raise BadArgument("viewpoint", f"{len(count)} different cameras", f"at most {max_views} cameras")
         if int(count.min()) < min_points:
-            raise TooFewPoints("points", f"{count.min()} points of one view", f"at least {min_points} of each view")
+            raise TooFewPoints(
+                "points", f"{count.min()} points of one view", f"at least {min_points} points of each view"
+            )
     if normals is not None and not compare_normals(points.double(), normals.double()).oriented:
         normals = None
     if clean and normals is not None and viewpoint is not None and share_facing(points, normals, viewpoint) < FACING:

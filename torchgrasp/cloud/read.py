@@ -109,7 +109,7 @@ def read_cloud_file(
     if not is_file(path):
         raise CloudFileError("path", f"{path}, which is no file", f"a {suffix} file")
     if path.stat().st_size > CLOUD_BYTES:
-        raise CloudFileError("path", f"{path} of {path.stat().st_size} bytes", f"at most {CLOUD_BYTES} bytes")
+        raise CloudFileError("path", f"{path} of {path.stat().st_size} bytes", f"a file of at most {CLOUD_BYTES} bytes")
     try:
         arrays = parsers[suffix](read_bytes(path))
     except Exception as error:  # zlib, zipfile, numpy and trimesh each raise their own
@@ -226,7 +226,9 @@ def _as_rows(source: str, name: str, array: Any) -> Tensor:
     if array.dtype.kind not in "fiu":
         raise CloudFileError("path", f"{source}: {name} of type {array.dtype}", "real numbers")
     if array.ndim not in ((1, 2, 3) if name == "viewpoint" else (2, 3)) or array.shape[-1] != 3:
-        raise CloudFileError("path", f"{source}: {name} of shape {array.shape}", "(n, 3), or (h, w, 3) of an image")
+        raise CloudFileError(
+            "path", f"{source}: {name} of shape {array.shape}", "an array of shape (n, 3), or (h, w, 3) of an image"
+        )
     if array.size > 3 * CLOUD_POINTS:
         raise CloudFileError("path", f"{source} with {array.size // 3} points", f"at most {CLOUD_POINTS} points")
     # A copy is owned, writable and of native bytes. Numbers beyond double precision become infinite, as if missing.
@@ -240,7 +242,9 @@ def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dic
     table = np.asarray(arrays["table"])
     if table.ndim not in (2, 3) or table.shape[-1] not in (3, 6) or table.dtype.kind not in "fiu":
         found = f"{source}: an array of shape {table.shape} and type {table.dtype}"
-        raise CloudFileError("path", found, "(n, 3) or (n, 6) real numbers, or (h, w, 3) or (h, w, 6) of an image")
+        raise CloudFileError(
+            "path", found, "real numbers of shape (n, 3) or (n, 6), or (h, w, 3) or (h, w, 6) of an image"
+        )
     split = {**arrays, "points": table[..., :3]}
     if table.shape[-1] == 6:
         more = table[..., 3:].reshape(-1, 3).astype(np.float64)

@@ -188,7 +188,7 @@ def _limit_near(urdf: Urdf, shapes: SelfCollision, frames: Float[Tensor, "3 4 l 
     left = shapes.count_near(frames, MEETING_DISTANCE) * ahead // frames.shape[3]
     if left > most:
         found = f"{len(shapes.pairs)} pairs of shapes so near each other that {left} separations must be measured"
-        raise urdf.wrong(found, f"at most {most} separations: fewer shapes in one place")
+        raise urdf.wrong(found, f"at most {most} separations, by fewer shapes in one place")
 
 
 def draw_postures(urdf: Urdf, coupling: Mapping[str, Mimic], n: int, seed: int) -> Float[Tensor, "j n"]:

@@ -90,7 +90,7 @@ def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
     for name, (low, high) in zip(names, limits.tolist(), strict=True):
         if not low < high:
             found = f"limit_margin {spec.limit_margin:g}, which leaves [{low:g}, {high:g}] to joint {name}"
-            raise spec.wrong(found, "lower < upper")
+            raise spec.wrong(found, "a range with lower < upper")
     coupling = torch.zeros(len(movable), len(names), dtype=torch.float64)
     offset = torch.zeros(len(movable), dtype=torch.float64)
     for row, joint in enumerate(movable):
@@ -150,7 +150,9 @@ class Fingertips(Value):
     def frames(self, values: Float[Tensor, "j n"]) -> tuple[Float[Tensor, "3 4 l n"], Float[Tensor, "3 4 f n"]]:
         """Return the frames of all links of `chains` and of the carriers."""
         if len(values) != len(self.chains.joint_names):
-            raise BadArgument("values", f"{len(values)} joints", f"all {len(self.chains.joint_names)} of the URDF")
+            raise BadArgument(
+                "values", f"{len(values)} joints", f"all {len(self.chains.joint_names)} joints of the URDF"
+            )
         frames = self.chains.frames(values)
         return frames, frames.index_select(2, self.carrier)
 

@@ -108,7 +108,7 @@ class SelfCollision(Value):
     def _place(self, frames: Float[Tensor, "3 4 l n"]) -> Placed:
         """Return the shapes' axes and centres in the palm's frame; raise `BadArgument` for frames of too few links."""
         if frames.shape[2] < self._links:
-            raise BadArgument("frames", f"{frames.shape[2]} links", f"at least {self._links}")
+            raise BadArgument("frames", f"{frames.shape[2]} links", f"at least {self._links} links")
         links, rotation = frames.index_select(2, self.link), self.rotation.to(frames)[..., None]
         axes = links[:, 0, None] * rotation[0] + links[:, 1, None] * rotation[1] + links[:, 2, None] * rotation[2]
         return axes, map_points(links, self.center)

@@ -18,7 +18,7 @@ from torchgrasp.limits import HAND_LINKS, HAND_SHAPES, MAX_EXTENT, URDF_BYTES
 
 SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "mesh": ("scale",)}
 """The attributes with the numbers of each kind of shape."""
-REPAIR = "torchgrasp hand new writes a clean copy"
+REPAIR = "(torchgrasp hand new writes a clean copy)"
 """The fix for what a published URDF may contain, and a clean URDF may not."""
 
 Triple = tuple[float, float, float]
@@ -126,12 +126,12 @@ def read_urdf(path: Path | str) -> Urdf:
     urdf = read_published(path)
     for link in urdf.links:
         if any(shape.kind == "mesh" for shape in link.shapes):
-            raise urdf.wrong(f"link {link.name} collision <mesh>", f"box, cylinder or sphere; {REPAIR}")
+            raise urdf.wrong(f"link {link.name} with a mesh", f"a box, cylinder or sphere {REPAIR}")
     for j in urdf.movable:
         if math.isinf(j.upper - j.lower):
-            raise urdf.wrong(f"joint {j.name} without a limit", f"lower and upper; {REPAIR}")
+            raise urdf.wrong(f"joint {j.name} without a limit", f"lower and upper limits {REPAIR}")
         if j.mimic and any(other.mimic for other in urdf.movable if other.name == j.mimic.source):
-            raise urdf.wrong(f"joint {j.name} mimics a coupled joint", f"an independent joint; {REPAIR}")
+            raise urdf.wrong(f"joint {j.name} that follows a coupled joint", f"an independent joint to follow {REPAIR}")
     return urdf
 
 
@@ -254,15 +254,19 @@ def _check_joints(urdf: Urdf) -> None:
         if j.kind not in ("revolute", "prismatic", "continuous"):
             raise urdf.wrong(f"joint {j.name} of type {j.kind!r}", "revolute, prismatic, continuous or fixed")
         if not _is_unit(math.hypot(*j.axis)):
-            raise urdf.wrong(f"joint {j.name} axis of length {math.hypot(*j.axis):g}", "a unit axis")
+            raise urdf.wrong(f"joint {j.name} with an axis of length {math.hypot(*j.axis):g}", "a unit axis")
         if not j.lower < j.upper:
-            raise urdf.wrong(f"joint {j.name} limits {j.lower}, {j.upper}", "lower < upper")
+            raise urdf.wrong(f"joint {j.name} with limits {j.lower}, {j.upper}", "limits with lower < upper")
         passed = [j.name]
         while mimic := movable[passed[-1]].mimic:
             if mimic.source not in movable:
-                raise urdf.wrong(f"joint {passed[-1]} mimics {mimic.source!r}", "a movable joint of the file to follow")
+                raise urdf.wrong(
+                    f"joint {passed[-1]} that follows {mimic.source!r}", "a movable joint of the file to follow"
+                )
             if mimic.source in passed:
-                raise urdf.wrong(f"joint {passed[-1]} mimics a coupled joint in a circle", "an independent joint")
+                raise urdf.wrong(
+                    f"joint {passed[-1]} that follows coupled joints in a circle", "an independent joint to follow"
+                )
             passed.append(mimic.source)
 
 

@@ -78,7 +78,7 @@ def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = No
     """
     draft = new_hand(path, Wish(tuple(tips), name or ""), seed)
     if draft.urdf:
-        raise read_published(path).wrong("; ".join(draft.repairs)[:1000], f"a clean URDF; {REPAIR}")
+        raise read_published(path).wrong("; ".join(draft.repairs)[:1000], f"a clean URDF {REPAIR}")
     return draft.toml
 
 
@@ -147,7 +147,7 @@ def _checked_tips(urdf: Urdf, tips: tuple[str, ...]) -> tuple[str, ...]:
     chosen = tips or ends
     if not FINGERTIPS[0] <= len(chosen) <= FINGERTIPS[1] or len(set(chosen)) < len(chosen):
         wanted = f"three to five different links in grasp order; the branches of {urdf.path} end in {list(ends)}"
-        raise BadArgument("tips", list(tips) or f"none, and {len(ends)} fingers", wanted)
+        raise BadArgument("tips", list(tips) or f"a hand of {len(ends)} fingers", wanted)
     shaped = {x.name for x in urdf.links if x.shapes}
     for tip in chosen:
         if tip not in shaped or not urdf.movers(tip):

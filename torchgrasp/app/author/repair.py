@@ -52,7 +52,7 @@ def keep_below(urdf: Urdf, root: str) -> Step:
     inside = {j.name for j in joints}
     for j in joints:
         if j.mimic and j.mimic.source not in inside:
-            raise urdf.wrong(f"joint {j.name} follows {j.mimic.source!r} above {root!r}", "a root above both")
+            raise urdf.wrong(f"joint {j.name} that follows {j.mimic.source!r} above {root!r}", "a root above both")
     links = tuple(x for x in urdf.links if x.name in kept)
     done = f"{len(names) - len(kept)} links that are not below {root} are left out"
     return dataclasses.replace(urdf, root=root, links=links, joints=joints), [done]
