@@ -152,7 +152,7 @@ class ContactPlan(Batch):
     """The planned contacts, one row for each start, in the order of the starts.
 
     `coefficients` is phi of Eq. (13). `quality` is Eq. (14), the distance [m] of the contacts' centre from the centre
-    of the cloud, or the value of the chosen objective. Less is better.
+    of the cloud. Less is better.
     """
 
     contacts: Annotated[Contacts, Rows("b")]

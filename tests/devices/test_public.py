@@ -60,9 +60,6 @@ SHAPES = {
     "plan_contacts": lambda shape, x: plan_contacts(shape, SPEC, 6),
     "plan_contacts, paper": lambda shape, x: plan_contacts(shape, ContactSpec.paper(), 2),
     "plan_contacts, given starts": lambda shape, x: plan_contacts(shape, SPEC, x[:12].reshape(4, 3, 3)),
-    "plan_contacts, epsilon": lambda shape, x: plan_contacts(shape, SPEC, 3, objective="epsilon"),
-    "plan_contacts, min_weight": lambda shape, x: plan_contacts(shape, SPEC, 3, objective="min_weight"),
-    "plan_contacts, probability": lambda shape, x: plan_contacts(shape, SPEC, 3, objective="probability"),
 }
 CONTACTS = {
     "certify": lambda contacts, shape: certify(contacts, SPEC),

@@ -101,9 +101,9 @@ def test_a_time_budget_bounds_how_many_starts_are_planned_and_changes_no_row(ell
     monkeypatch.setattr("torchgrasp.plan.solve.time.monotonic", lambda: now[0])
     whole = plan_contacts(ellipsoid, ContactSpec.paper(), starts=120)
 
-    def slow(shape, spec, first, stages, improve, plan=plan_chunk):
+    def slow(shape, spec, first, stages, plan=plan_chunk):
         now[0] += 0.01 * len(first)  # [s]: a hundred starts a second
-        return plan(shape, spec, first, stages, improve)
+        return plan(shape, spec, first, stages)
 
     monkeypatch.setattr("torchgrasp.plan.solve.plan_chunk", slow)
     for seconds, rows in ((1e-9, 25), (0.3, 25), (0.5, 50), (1.0, 100), (9.0, 120)):

@@ -3,13 +3,11 @@
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure_probability import ClosureProbability, closure_probability
 from torchgrasp.plan.internal_forces import least_friction_forces
-from torchgrasp.plan.objectives import Objective
 from torchgrasp.plan.problem import Shape
 from torchgrasp.plan.solve import plan_contacts
 
 __all__ = [
     "ClosureProbability",
-    "Objective",
     "Shape",
     "certify",
     "closure_probability",

@@ -12,7 +12,6 @@ from torchgrasp.base import join, pick, put
 from torchgrasp.checks import Count, Positive, Seed, checked
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.plan.feasibility import check_feasibility
-from torchgrasp.plan.objectives import Improvement, Objective, improvement
 from torchgrasp.plan.problem import ContactProblem, Shape
 from torchgrasp.plan.solver import FINISH, Stage, descend, project, start_state
 from torchgrasp.plan.starts import Settled, check_starts, chunk_sizes, drawn_starts, given_starts, settle_flatness
@@ -43,7 +42,6 @@ def plan_contacts(
     starts: Count | Float[Tensor, "b f 3"] = 1000,
     seed: Seed = 0,
     *,
-    objective: Objective = "center",
     time_budget: Positive | None = None,
 ) -> ContactPlan:
     """Plan `spec.fingertips` contacts from each of many starts, Eqs. (10)-(14): one row a start, in their order.
@@ -57,19 +55,10 @@ def plan_contacts(
         spec: what the contacts must satisfy; `ContactSpec()` by default.
         starts: number of starts, drawn from the sphere of `spec.start_radius` (Sec. 6.2), or starting points [m].
         seed: seed of the draw.
-        objective: what is minimised, from where the centre was reached; `quality` holds its values.
-            * "center": Eq. (14) alone.
-            * "epsilon": minus the radius of the largest ball in the hull of the wrenches (Ferrari and Canny 1992).
-            * "min_weight": minus the greatest margin of the certificate.
-            * "probability": minus the share of 400 surfaces drawn from a `ShapeGP` on which the contacts are closed
-              at `spec.friction`; 0 in failed rows.
-            * a function of contacts (b, f, 3) [m] and outward unit normals (b, f, 3) that returns costs (b,), each of
-              its own row alone, differentiable by autograd, in any unit.
         time_budget: seconds of wall time for the call. As many starts are planned as will fit, at least 25. None: all.
 
     Raises:
-        BadArgument: `starts` not positive, of a wrong shape, or outside the shape's domain; an unknown objective, or
-            a cost without a number for each row or without a gradient; another wrong argument.
+        BadArgument: `starts` not positive, of a wrong shape, or outside the shape's domain, or another wrong argument.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> plan = plan_contacts(fit_shape(load_object("jug").view), ContactSpec.paper(), starts=8)
@@ -82,11 +71,10 @@ def plan_contacts(
     spec = settled.spec
     if time_budget is not None and not time_budget > 0:  # also refuses NaN
         raise BadArgument("time_budget", time_budget, "a positive number of seconds, or None")
-    improve = improvement(objective, shape, spec, seed)
     chunks = _chunks(shape, settled, starts, seed)
     if time_budget is not None:
         chunks = _within(time_budget, chunks)
-    return join([plan_chunk(shape, spec, first, stages, improve) for first, stages in chunks])
+    return join([plan_chunk(shape, spec, first, stages) for first, stages in chunks])
 
 
 def _chunks(shape: Shape, settled: Settled, starts: int | Vectors, seed: int) -> Iterator[Chunk]:
@@ -124,13 +112,7 @@ def _within(seconds: float, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
             done, first = done + len(first[:fits]), first[fits:]
 
 
-def plan_chunk(
-    shape: Shape,
-    spec: ContactSpec,
-    first: Vectors,
-    stages: tuple[Stage, ...],
-    improve: Improvement | None = None,
-) -> ContactPlan:
+def plan_chunk(shape: Shape, spec: ContactSpec, first: Vectors, stages: tuple[Stage, ...]) -> ContactPlan:
     """Plan from normalised starts on the surface."""
     problem = ContactProblem.of(shape, spec)
     state = start_state(shape, first)
@@ -139,5 +121,4 @@ def plan_chunk(
     plan = check_feasibility(shape, spec, project(shape, state.points, steps=3))
     failed = torch.nonzero(plan.status != Status.OK)[:, 0]
     begun = check_feasibility(shape, spec, first[failed])
-    plan = put(plan, failed, pick(begun.status == Status.OK, begun, plan[failed]))
-    return plan if improve is None else improve(plan, state.tension)
+    return put(plan, failed, pick(begun.status == Status.OK, begun, plan[failed]))

@@ -5,7 +5,6 @@ evaluation, and steps may be long.
 """
 
 import dataclasses
-from collections.abc import Callable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -32,8 +31,6 @@ LONGEST_STEP = 0.3
 """A point moves at most this far in a step (normalised): about the range in which the surface is smooth."""
 TENSION_DAMPING = 0.1
 """Damping of the tensions relative to that of the points: tensions may change faster."""
-PULL = 0.1
-"""Length of an objective's weighted gradient at the start of its stage: a tenth of a unit constraint row."""
 SURFACE = 10.0
 """Weight of the surface: a step off it would be undone by the projection, which the cones then resist."""
 BOUNDS = 3.0
@@ -56,9 +53,7 @@ class Stage:
 
 
 FINISH = Stage(centre=0.0, cones=3.0, steps=30, settled=1e-8, exact=False)
-"""The last stage, feasibility alone: without an objective every residual can vanish."""
-EXACT_FINISH = dataclasses.replace(FINISH, exact=True)
-"""The same from where an objective has led, which is often the largest variance that is allowed."""
+"""The last stage, feasibility alone."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,22 +65,17 @@ class State(Batch):
     jet: SurfaceJet
 
 
-StateCost = Callable[[State], tuple[Float[Tensor, "b"], Float[Tensor, "b u"]]]
-"""The cost of contacts and its gradient by points and tensions."""
-
-
 @dataclasses.dataclass(frozen=True)
 class LinearConstraints(Linearisation):
     """Weighted residuals, their weights, and the Jacobian without weights.
 
-    `inside`: all points are in the domain. `downhill`: minus the gradient of an objective.
+    `inside`: all points are in the domain.
     """
 
     residual: Float[Tensor, "a r"]
     weight: Float[Tensor, "a r"]
     jacobian: Float[Tensor, "a r u"]
     inside: Bool[Tensor, "a"]
-    downhill: Float[Tensor, "a u"] | None = None
 
     @property
     def weighted_jacobian(self) -> Float[Tensor, "a r u"]:
@@ -95,16 +85,14 @@ class LinearConstraints(Linearisation):
 
 @dataclasses.dataclass(frozen=True)
 class Descent(Problem[State, LinearConstraints]):
-    """The cost of a stage: half the sum of weighted squares, plus `pull` times an objective."""
+    """The cost of a stage: half the sum of weighted squares."""
 
     shape: Shape
     problem: ContactProblem
     stage: Stage
-    objective: StateCost | None
-    pull: Float[Tensor, "b"] | None
 
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> LinearConstraints:
-        """Evaluate constraints and objective; bounds that hold weigh nothing."""
+        """Evaluate the constraints; bounds that hold weigh nothing."""
         constraints = self.problem.constraints(state.points, state.tension, state.jet)
         bounds = torch.full_like(constraints.bounds, BOUNDS)
         bounds[:, : state.points.shape[1]] = self.stage.cones
@@ -112,13 +100,9 @@ class Descent(Problem[State, LinearConstraints]):
         surface = torch.full_like(constraints.surface, SURFACE)
         weight = torch.cat([centre, surface, bounds * (constraints.bounds > 0)], 1)
         residual = weight * constraints.values
-        cost, downhill = residual.square().sum(1) / 2, None
-        if self.objective is not None and self.pull is not None:
-            value, gradient = self.objective(state)
-            pull = self.pull[rows]
-            cost, downhill = cost + pull * value, -pull[:, None] * gradient
+        cost = residual.square().sum(1) / 2
         inside = torch.linalg.vector_norm(state.points, dim=-1).amax(-1) < self.problem.domain_radius
-        return LinearConstraints(cost, residual, weight, constraints.jacobian, inside, downhill)
+        return LinearConstraints(cost, residual, weight, constraints.jacobian, inside)
 
     def step(self, model: LinearConstraints, damping: Damping) -> Steps:
         """Return the damped step, no point farther than `LONGEST_STEP`. Rows without a factor rest."""
@@ -128,7 +112,6 @@ class Descent(Problem[State, LinearConstraints]):
         normal = jacobian.mT @ jacobian + torch.diag_embed(damping[:, None] * scale)
         factor, failed = torch.linalg.cholesky_ex(normal)
         descent = -(jacobian.mT @ model.residual[..., None])
-        descent = descent if model.downhill is None else descent + model.downhill[..., None]
         x = torch.cholesky_solve(descent, factor)[..., 0]
         x = torch.where((failed == 0)[:, None], x, torch.nan)
         length = torch.linalg.vector_norm(split_unknowns(x)[0], dim=-1).amax(-1)
@@ -167,19 +150,12 @@ class Descent(Problem[State, LinearConstraints]):
 def promised_decrease(model: LinearConstraints, x: Float[Tensor, "a u"]) -> Float[Tensor, "a"]:
     """Return by how much a step lowers the model's cost."""
     linear = model.residual + (model.weighted_jacobian @ x[..., None])[..., 0]
-    promised = (model.residual.square().sum(1) - linear.square().sum(1)) / 2
-    return promised if model.downhill is None else promised + (model.downhill * x).sum(1)
+    return (model.residual.square().sum(1) - linear.square().sum(1)) / 2
 
 
-def descend(
-    shape: Shape, problem: ContactProblem, state: State, stage: Stage, objective: StateCost | None = None
-) -> State:
-    """Return the contacts after a stage; an objective's first gradient is weighted to the length `PULL`."""
-    pull = None
-    if objective is not None:
-        length = torch.linalg.vector_norm(objective(state)[1], dim=-1)
-        pull = PULL / torch.where(length > 0, length, 1.0)
-    return levenberg_marquardt(Descent(shape, problem, stage, objective, pull), state, stage.steps)[0]
+def descend(shape: Shape, problem: ContactProblem, state: State, stage: Stage) -> State:
+    """Return the contacts after a stage."""
+    return levenberg_marquardt(Descent(shape, problem, stage), state, stage.steps)[0]
 
 
 def project(shape: Shape, points: Float[Tensor, "b k 3"], steps: int) -> Float[Tensor, "b k 3"]:

@@ -8,6 +8,7 @@ weight. Geometry and derivatives are torchgrasp's, the weight and its derivative
 """
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -21,7 +22,6 @@ from torchgrasp import Contacts, ContactSpec, Hand, ShapeGP
 from torchgrasp.geometry.frames import rotation_from_vector, skew
 from torchgrasp.ik.clearance import CollisionWorld, along
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
-from torchgrasp.plan.objectives import cost_gradients
 from torchgrasp.plan.problem import triple_mean_jet
 from torchgrasp.plan.wrench import wrenches
 
@@ -139,7 +139,7 @@ class SingleStart:
         ])  # fmt: skip
         by_off = rows(torch.cat([moved.new_zeros(f, free), moved]), off_by_contacts) / UNIT
 
-        cost, by_point, by_normal = cost_gradients(partial(least_weight, self.spec), points, normals)
+        cost, by_point, by_normal = differentiate(partial(least_weight, self.spec), points, normals)
         cost_by_contacts = scale * by_point.reshape(1, -1) + (by_normal[0, :, None] @ turned).sum(0)
         by_cost = rows(moved.new_zeros(1, free), cost_by_contacts)
         facing = -(pads * normals).sum(-1)[0] - hand.tips.cone.cos()
@@ -176,6 +176,14 @@ def least_weight(spec: ContactSpec, points: Tensor, normals: Tensor) -> Tensor:
     weights, dual = torch.from_numpy(answer.x[:m] + answer.x[m]), torch.from_numpy(answer.eqlin.marginals[:6])
     change = weights @ (wrench - wrench.detach())  # the optimum moves by -dual . (dW weights)
     return m * (answer.fun - change @ dual)[None]
+
+
+def differentiate(cost: Callable[[Tensor, Tensor], Tensor], points: Tensor, normals: Tensor) -> tuple[Tensor, ...]:
+    """Return a cost and its gradients by points and normals."""
+    with torch.enable_grad():
+        leaves = points.detach().requires_grad_(), normals.detach().requires_grad_()
+        value = cost(*leaves)
+        return value.detach(), *torch.autograd.grad(value.sum(), leaves)
 
 
 def clearances(spatial: SpatialJacobian, world: CollisionWorld) -> tuple[Float[Tensor, "k"], Float[Tensor, "k d"]]:

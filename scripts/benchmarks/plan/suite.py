@@ -14,7 +14,7 @@ from benchmarks.plan.ipopt_comparison import POINTS, bench_peers
 from benchmarks.plan.probability import bench_probability
 from benchmarks.plan.sampler import bench_sampler
 from benchmarks.plan.scaling import bench_anytime, bench_growth, bench_memory
-from benchmarks.plan.true_surface import bench_fields, bench_objectives, bench_truth
+from benchmarks.plan.true_surface import bench_fields, bench_truth
 from torchgrasp import ContactSpec, Status, certify, fit_shape, plan_contacts
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.values import PointCloud
@@ -24,7 +24,6 @@ SUBJECTS = (
     "peers",
     "truth",
     "fields",
-    "objectives",
     "probability",
     "executable",
     "sampler",
@@ -51,7 +50,7 @@ def plan(
 
     Args:
         objects: folder with manifest.json and a folder for each object.
-        only: subjects to measure, of call, peers, truth, fields, objectives, probability, executable, sampler,
+        only: subjects to measure, of call, peers, truth, fields, probability, executable, sampler,
             fingertips, growth, memory and anytime.
         names: of the views of each object that are measured, such as view0; by default all.
         starts: of the planner, for each view and radius.
@@ -71,7 +70,6 @@ def plan(
         "peers": lambda: bench_peers(views, starts, tries, seed, threads),
         "truth": lambda: [bench_truth(views, starts, seed)],
         "fields": lambda: [bench_fields(views, max(starts // 5, 1), seed)],
-        "objectives": lambda: [bench_objectives(views, max(starts // 40, 4), seed)],
         "probability": lambda: bench_probability(objects, names, max(starts // 5, 1), seed, fingertips),
         "executable": lambda: bench_executable(views, starts, seed),
         "sampler": lambda: [bench_sampler(views, max(starts // 2, 1), seed)],

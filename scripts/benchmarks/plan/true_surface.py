@@ -1,10 +1,8 @@
 """What certificates on the estimated surface are worth on the true one, by specification; the mesh only judges."""
 
 import dataclasses
-import time
-from typing import Any, Literal
+from typing import Any
 
-import torch
 from torch import Tensor
 from tqdm import tqdm
 
@@ -19,13 +17,6 @@ FRICTION = 0.6
 """With which certified contacts must be closed on the true surface."""
 
 DEFAULT = ContactSpec(table=0.0)
-
-OBJECTIVES: tuple[Literal["center", "epsilon", "min_weight", "probability"], ...] = (
-    "center",
-    "epsilon",
-    "min_weight",
-    "probability",
-)
 
 CHANGED = {
     "friction_margin 1": dataclasses.replace(DEFAULT, friction_margin=1.0),
@@ -85,33 +76,6 @@ def bench_fields(views: list[Any], starts: int, seed: int) -> Row:
         f"one field of the specification changed: certified of the starts, and of these closed at friction {FRICTION}",
         "none",
         "; ".join(f"{label} {share:.0%} {survived:.3f}" for label, (share, survived) in mean.items()),
-        None,
-        {"found": results},
-    )
-
-
-def bench_objectives(views: list[Any], starts: int, seed: int) -> Row:
-    """Plan for each named objective with the default specification; the better quarter is that of least quality."""
-    results: dict[str, list[tuple[float, float, float]]] = {name: [] for name in OBJECTIVES}
-    clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter
-    for _, _, cloud, mesh in tqdm(views, desc="objectives", disable=None, leave=False):
-        shape = fit_shape(cloud, table=0.0)
-        for name in OBJECTIVES:
-            began = clock()
-            plan = plan_contacts(shape, DEFAULT, starts, seed, objective=name)
-            seconds = clock() - began
-            good = plan[plan.status == Status.OK]
-            if len(good):
-                closed = closed_on_mesh(good.contacts, mesh).double()
-                best = closed[good.quality.argsort()[: max(len(good) // 4, 1)]]
-                results[name].append((float(closed.mean()), float(best.mean()), 1e3 * seconds / starts))
-    mean = {name: [sum(column) / len(column) for column in zip(*rows, strict=True)] for name, rows in results.items()}
-    return Row(
-        f"{starts} starts planned for each objective: closed at friction {FRICTION}, all and the better quarter",
-        "none",
-        "; ".join(
-            f"{name} {every:.3f} {best:.3f}, {each:.1f} ms a start" for name, (every, best, each) in mean.items()
-        ),
         None,
         {"found": results},
     )
